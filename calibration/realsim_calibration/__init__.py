@@ -1,0 +1,1 @@
+"""Camera and hand-eye calibration from AprilTag views."""

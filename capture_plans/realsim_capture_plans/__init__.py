@@ -1,0 +1,1 @@
+"""Where the robot goes and what executes it: plans, devices, the simulated lab."""

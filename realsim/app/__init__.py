@@ -1,0 +1,1 @@
+"""The command line, the whole loop, and the reports: the one place that knows every stage."""

@@ -1,0 +1,1 @@
+"""Where things are: rigid transforms, cameras, depth, clouds, meshes, distance fields."""

@@ -1,0 +1,175 @@
+"""Projection of points into a distorted image, and the exact way back.
+
+Distortion is OpenCV's: Brown (k1 k2 p1 p2 k3) or rational (k1..k6). Going back is a Newton solve
+with the analytic 2x2 Jacobian, because OpenCV's fixed-point iteration is tens of pixels off on
+strong distortion; pixels outside the model's invertible region are reported, never guessed.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.records import CameraIntrinsics
+
+Array = NDArray[np.float64]
+NEWTON_STEPS = 12
+"""Enough for 4e-13 px on every invertible pixel of the lenses tried (k1 down to -0.3)."""
+
+
+def distort(coefficients: ArrayLike, xy: ArrayLike) -> Array:
+    """Return distorted normalised coordinates (..., 2) of ideal ones (..., 2).
+
+    Args:
+        coefficients: (8,) k1 k2 p1 p2 k3 k4 k5 k6.
+        xy: (..., 2) x/z, y/z.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.asarray(coefficients, dtype=np.float64)
+    xy = np.asarray(xy, dtype=np.float64)
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        -1,
+    )
+
+
+def distort_jacobian(coefficients: ArrayLike, xy: ArrayLike) -> Array:
+    """Return d distort / d xy (..., 2, 2) at ideal normalised coordinates (..., 2)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = np.asarray(coefficients, dtype=np.float64)
+    xy = np.asarray(xy, dtype=np.float64)
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    num = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    den = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = num / den
+    # d radial / d r2
+    slope = ((k1 + r2 * (2 * k2 + 3 * r2 * k3)) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / den
+    J = np.empty((*xy.shape[:-1], 2, 2))
+    J[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    J[..., 0, 1] = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    J[..., 1, 0] = J[..., 0, 1]
+    J[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return J
+
+
+def project(intrinsics: CameraIntrinsics, points_cam: ArrayLike) -> Array:
+    """Return pixels (..., 2) of camera points (..., 3) [m]; NaN where z <= 0."""
+    p = np.asarray(points_cam, dtype=np.float64)
+    z = p[..., 2:3]
+    xy = p[..., :2] / np.where(z > 0, z, np.nan)
+    if intrinsics.is_distorted:
+        xy = distort(intrinsics.distortion, xy)
+    return xy * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
+
+
+def projection_jacobian(
+    intrinsics: CameraIntrinsics, points_cam: ArrayLike
+) -> tuple[Array, Array, Array]:
+    """Return pixels and their derivatives with respect to the point and to the camera.
+
+    Args:
+        intrinsics: the camera.
+        points_cam: (N, 3) points in front of the camera [m].
+
+    Returns:
+        uv (N, 2) [px], d uv / d point (N, 2, 3) [px/m], and d uv / d camera (N, 2, 12) for
+        fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6.
+    """
+    p = np.asarray(points_cam, dtype=np.float64)
+    d = intrinsics.distortion
+    z = p[:, 2]
+    xy = p[:, :2] / z[:, None]
+    x, y = xy[:, 0], xy[:, 1]
+    dxy = distort(d, xy)
+    f = np.array([intrinsics.fx, intrinsics.fy])
+    uv = dxy * f + [intrinsics.cx, intrinsics.cy]
+
+    d_xy = np.zeros((len(p), 2, 3))
+    d_xy[:, 0, 0] = d_xy[:, 1, 1] = 1 / z
+    d_xy[:, 0, 2], d_xy[:, 1, 2] = -x / z, -y / z
+    d_point = f[:, None] * (distort_jacobian(d, xy) @ d_xy)
+
+    r2 = x * x + y * y
+    den = 1 + r2 * (d[5] + r2 * (d[6] + r2 * d[7]))
+    radial = (1 + r2 * (d[0] + r2 * (d[1] + r2 * d[4]))) / den
+    powers = r2[:, None] ** np.array([1, 2, 3])
+    d_cam = np.zeros((len(p), 2, 12))
+    d_cam[:, 0, 0], d_cam[:, 1, 1] = dxy[:, 0], dxy[:, 1]
+    d_cam[:, 0, 2] = d_cam[:, 1, 3] = 1.0
+    for axis in (0, 1):
+        a = f[axis] * xy[:, axis]
+        d_cam[:, axis, [4, 5, 8]] = a[:, None] * powers / den[:, None]
+        d_cam[:, axis, 9:12] = -(a * radial / den)[:, None] * powers
+    d_cam[:, 0, 6], d_cam[:, 0, 7] = f[0] * 2 * x * y, f[0] * (r2 + 2 * x * x)
+    d_cam[:, 1, 6], d_cam[:, 1, 7] = f[1] * (r2 + 2 * y * y), f[1] * 2 * x * y
+    return uv, d_point, d_cam
+
+
+def undistort(intrinsics: CameraIntrinsics, uv: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    """Return ideal normalised coordinates of pixels, and which of them exist.
+
+    Args:
+        intrinsics: the camera.
+        uv: (..., 2) pixels.
+
+    Returns:
+        xy (..., 2) with z = 1, NaN where the lens model cannot be inverted, and a mask (...).
+    """
+    uv = np.asarray(uv, dtype=np.float64)
+    target = (uv - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]
+    if not intrinsics.is_distorted:
+        return target, np.ones(target.shape[:-1], dtype=bool)
+    xy = target.copy()
+    for _ in range(NEWTON_STEPS):
+        error = distort(intrinsics.distortion, xy) - target
+        J = distort_jacobian(intrinsics.distortion, xy)
+        det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+        det = np.where(np.abs(det) < 1e-9, 1e-9, det)
+        step = np.stack(
+            [
+                J[..., 1, 1] * error[..., 0] - J[..., 0, 1] * error[..., 1],
+                J[..., 0, 0] * error[..., 1] - J[..., 1, 0] * error[..., 0],
+            ],
+            -1,
+        )
+        # Half a focal length at most per step keeps a wild pixel from leaping to another branch.
+        xy = xy - np.clip(step / det[..., None], -0.5, 0.5)
+    error_px = np.abs(distort(intrinsics.distortion, xy) - target).max(-1) * intrinsics.fx
+    det = np.linalg.det(distort_jacobian(intrinsics.distortion, xy))
+    valid = (error_px < 1e-6) & (det > 0)
+    return np.where(valid[..., None], xy, np.nan), valid
+
+
+def pixel_grid(width: int, height: int) -> Array:
+    """Return (height, width, 2) pixel centres x, y, which are integers."""
+    u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    return np.stack([u, v], -1)
+
+
+@lru_cache(maxsize=8)
+def _ray_table(key: tuple[float, ...]) -> NDArray[np.float32]:
+    width, height, fx, fy, cx, cy = key[:6]
+    intrinsics = CameraIntrinsics(
+        width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy,
+        distortion=np.array(key[6:]),
+    )  # fmt: skip
+    xy, _ = undistort(intrinsics, pixel_grid(int(width), int(height)))
+    table = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1).astype(np.float32)
+    table.setflags(write=False)
+    return table
+
+
+def ray_table(intrinsics: CameraIntrinsics) -> NDArray[np.float32]:
+    """Return the ray (height, width, 3) of every pixel centre in camera axes, z = 1.
+
+    Because z is 1, the parameter at which a ray meets a surface IS the depth along z. Pixels that
+    the lens model cannot reach are NaN. The table is computed once per camera and kept.
+    """
+    i = intrinsics
+    key = (i.width, i.height, i.fx, i.fy, i.cx, i.cy, *i.distortion.tolist())
+    return _ray_table(tuple(float(v) for v in key))

@@ -1,0 +1,1 @@
+"""Labels by exact ray casting, photographs, and depth-sensor models."""

@@ -1,0 +1,1 @@
+"""The browser in which a person accepts or rejects what was registered."""
