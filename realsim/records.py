@@ -102,7 +102,9 @@ class CameraIntrinsics:
         """
         K = np.asarray(K, dtype=np.float64).reshape(3, 3)
         if abs(K[0, 1]) > 1e-9 or not np.allclose(K[2], [0, 0, 1]) or abs(K[1, 0]) > 1e-9:
-            raise InputError(f"the camera matrix {K.tolist()} is not [[fx 0 cx] [0 fy cy] [0 0 1]].")
+            raise InputError(
+                f"the camera matrix {K.tolist()} is not [[fx 0 cx] [0 fy cy] [0 0 1]]."
+            )
         return cls(
             width=width,
             height=height,
@@ -116,7 +118,7 @@ class CameraIntrinsics:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class View:
-    """One frame of a session: where the arm said it was, and (once calibrated) where the camera is."""
+    """One frame: where the arm said it was and, once calibrated, where the camera is."""
 
     index: int
     """Number of the frame: its file name on disk."""
@@ -171,13 +173,14 @@ class CaptureSession:
                 return v
         raise InputError(
             f"view {index} is not in session '{self.name}'; it has "
-            f"{', '.join(str(v.index) for v in self.views[:12])}{'...' if len(self.views) > 12 else ''}."
+            f"{', '.join(str(v.index) for v in self.views[:12])}"
+            f"{'...' if len(self.views) > 12 else '.'}"
         )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class TagBoard:
-    """A flat grid of AprilTags; frame `board`: origin at the grid's first corner, z out of the print.
+    """A flat grid of AprilTags; frame `board` has its origin at the grid's first corner.
 
     Tag (row r, column c) has the id `first_id + r * columns + c`; x runs along the columns, y along
     the rows (down the printed page), so z points INTO the paper (OpenCV's board convention).
@@ -209,7 +212,7 @@ class TagBoard:
 
     @property
     def corners_board(self) -> Array:
-        """(tags, 4, 3) corners in the board frame [m], top-left, top-right, bottom-right, bottom-left."""
+        """(tags, 4, 3) corners in the board frame [m], clockwise from the top left as printed."""
         pitch = self.tag_size_m + self.gap_m
         r, c = np.divmod(np.arange(self.rows * self.columns), self.columns)
         square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
@@ -253,7 +256,11 @@ class HandEye:
         """Check that the poses are rigid and freeze the arrays."""
         object.__setattr__(self, "T_ee_cam", _rigid(self.T_ee_cam, "T_ee_cam"))
         object.__setattr__(self, "T_base_board", _rigid(self.T_base_board, "T_base_board"))
-        for name, shape in (("covariance", (6, 6)), ("intrinsics_sd", (12,)), ("view_rms_px", (None,))):
+        for name, shape in (
+            ("covariance", (6, 6)),
+            ("intrinsics_sd", (12,)),
+            ("view_rms_px", (None,)),
+        ):
             value = _frozen(getattr(self, name), np.float64, shape, name)
             object.__setattr__(self, name, value)
 
@@ -296,7 +303,9 @@ class Mesh:
         object.__setattr__(self, "vertices", v)
         object.__setattr__(self, "faces", f)
         if self.colors is not None:
-            object.__setattr__(self, "colors", _frozen(self.colors, np.uint8, (len(v), 3), "colors"))
+            object.__setattr__(
+                self, "colors", _frozen(self.colors, np.uint8, (len(v), 3), "colors")
+            )
         if self.uv is not None:
             object.__setattr__(self, "uv", _frozen(self.uv, np.float64, (len(v), 2), "uv"))
         if self.texture is not None:
@@ -357,7 +366,7 @@ class ObjectPose:
     """(4, 4) object in world [m]."""
     covariance: Array | None = None
     """(6, 6) of the right perturbation, rotation first [rad, m]."""
-    checks: dict[str, float] = field(default_factory=lambda: dict[str, float]())
+    checks: dict[str, float] = field(default_factory=dict[str, float])
     """Named checks without ground truth, e.g. agree (share of pixels that agree with the depth)."""
     verdict: Verdict = "unchecked"
     reasons: tuple[str, ...] = ()
@@ -446,7 +455,7 @@ class GraspSet:
     """(N,) whether the arm has a collision-free trajectory to closure."""
     failures: tuple[str, ...]
     """(N,) why the grasp stopped where it stopped; '' = passed all."""
-    parameters: dict[str, Any] = field(default_factory=lambda: dict[str, Any]())
+    parameters: dict[str, Any] = field(default_factory=dict[str, Any])
     """Everything the scores depend on, as plain JSON values."""
 
     def __post_init__(self) -> None:

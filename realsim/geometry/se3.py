@@ -93,8 +93,16 @@ def quaternion_wxyz(R: ArrayLike) -> Array:
     squares = np.stack(
         [1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], -1
     )
-    wx, wy, wz = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
-    xy, xz, yz = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
+    wx, wy, wz = (
+        R[..., 2, 1] - R[..., 1, 2],
+        R[..., 0, 2] - R[..., 2, 0],
+        R[..., 1, 0] - R[..., 0, 1],
+    )
+    xy, xz, yz = (
+        R[..., 0, 1] + R[..., 1, 0],
+        R[..., 0, 2] + R[..., 2, 0],
+        R[..., 1, 2] + R[..., 2, 1],
+    )
     rows = np.stack(
         [
             np.stack([squares[..., 0], wx, wy, wz], -1),
@@ -112,9 +120,9 @@ def quaternion_wxyz(R: ArrayLike) -> Array:
 
 def from_quaternion_wxyz(q: ArrayLike) -> Array:
     """Return the rotation (..., 3, 3) of a quaternion (..., 4), order w x y z, any length > 0."""
-    q = np.asarray(q, dtype=np.float64)
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    w, V = q[..., 0, None, None], hat(q[..., 1:])
+    given = np.asarray(q, dtype=np.float64)
+    unit: Array = given / np.linalg.norm(given, axis=-1, keepdims=True)
+    w, V = unit[..., 0, None, None], hat(unit[..., 1:])
     return np.eye(3) + 2.0 * w * V + 2.0 * (V @ V)
 
 
@@ -132,7 +140,7 @@ def left_jacobian_so3(w: ArrayLike) -> Array:
 
 
 def exp(xi: ArrayLike) -> Array:
-    """Return T (..., 4, 4) = exp(xi) of a twist (..., 6), rotation first [rad, m]."""
+    """Return the transform (..., 4, 4) of a twist (..., 6), rotation first [rad, m]."""
     xi = np.asarray(xi, dtype=np.float64)
     w, v = xi[..., :3], xi[..., 3:]
     return from_rt(exp_so3(w), (left_jacobian_so3(w) @ v[..., None])[..., 0])
@@ -242,6 +250,7 @@ def random_transform(rng: np.random.Generator, n: int | None = None, spread: flo
 
 def mean_rotation(Rs: ArrayLike) -> Array:
     """Return the chordal mean (3, 3) of rotations (N, 3, 3): the nearest rotation to their sum."""
-    U, _, Vt = np.linalg.svd(np.sum(np.asarray(Rs, dtype=np.float64), axis=0))
+    total: Array = np.sum(np.asarray(Rs, dtype=np.float64), axis=0)
+    U, _, Vt = np.linalg.svd(total)
     D = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
-    return U @ D @ Vt
+    return np.asarray(U @ D @ Vt, dtype=np.float64)
