@@ -1,0 +1,98 @@
+import numpy as np
+import pytest
+from realsim_calibration import CLOSED_FORMS, check_observable, daniilidis, park, shah
+
+from realsim.errors import DegenerateError, InputError
+from realsim.geometry import se3
+
+ALL = sorted(CLOSED_FORMS)
+
+
+def problem(seed, n=10, rot=0.0, trans=0.0):
+    rng = np.random.default_rng(seed)
+    X, Z = se3.random_transform(rng, spread=0.1), se3.random_transform(rng, spread=0.5)
+    C = se3.from_rt(se3.exp_so3(rng.normal(scale=0.5, size=(n, 3))), rng.normal(size=(n, 3)))
+    C[:, 2, 3] += 1.0
+    A = Z @ se3.invert(C) @ se3.invert(X)
+    noise = np.concatenate(
+        [rng.normal(scale=rot, size=(n, 3)), rng.normal(scale=trans, size=(n, 3))], -1
+    )
+    return A @ se3.exp(noise), C, X, Z
+
+
+def close(a, b, tol=1e-9):
+    return np.abs(a - b).max() < tol
+
+
+@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("seed", range(5))
+def test_exact_on_perfect_data(name, seed):
+    A, C, X, Z = problem(seed)
+    x, z = CLOSED_FORMS[name](A, C)
+    assert close(x, X) and close(z, Z)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_three_views_are_enough(name):
+    A, C, X, _ = problem(3, n=3)
+    assert close(CLOSED_FORMS[name](A, C)[0], X, 1e-7)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_frames_of_base_and_board_do_not_matter(name):
+    A, C, _, _ = problem(1, rot=0.01, trans=0.01)
+    rng = np.random.default_rng(9)
+    G, H = se3.random_transform(rng), se3.random_transform(rng)
+    x, z = CLOSED_FORMS[name](A, C)
+    x2, z2 = CLOSED_FORMS[name](G @ A, C)
+    assert close(x, x2, 1e-8) and close(G @ z, z2, 1e-8)
+    x3, _ = CLOSED_FORMS[name](A, C @ H)
+    # The board's origin is a lever arm for Shah's translation and the mean of the others' Z.
+    assert close(x[:3, :3], x3[:3, :3], 1e-8)
+    if name != "shah":
+        assert close(x, x3, 1e-8)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_order_does_not_matter(name):
+    A, C, _, _ = problem(2, rot=0.01, trans=0.01)
+    order = np.random.default_rng(0).permutation(len(A))
+    assert close(CLOSED_FORMS[name](A, C)[0], CLOSED_FORMS[name](A[order], C[order])[0])
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_error_shrinks_with_the_noise(name):
+    small = [se3.log(se3.invert(X) @ CLOSED_FORMS[name](A, C)[0]) for A, C, X, _ in
+             (problem(s, 20, 1e-4, 1e-4) for s in range(5))]  # fmt: skip
+    large = [se3.log(se3.invert(X) @ CLOSED_FORMS[name](A, C)[0]) for A, C, X, _ in
+             (problem(s, 20, 1e-2, 1e-2) for s in range(5))]  # fmt: skip
+    ratio = np.sqrt(np.mean(np.square(large)) / np.mean(np.square(small)))
+    assert 50 < ratio < 200
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_one_axis_is_refused_and_named(name):
+    rng = np.random.default_rng(0)
+    turns = np.outer(np.linspace(-1, 1, 8), [0, 0, 1.0])
+    A = se3.from_rt(se3.exp_so3(turns), rng.normal(size=(8, 3)))
+    with pytest.raises(DegenerateError, match=r"one axis only, \[-?0.00, -?0.00, 1.00\]"):
+        CLOSED_FORMS[name](A, A)
+
+
+@pytest.mark.parametrize("solve", [park, daniilidis, shah])
+def test_no_rotation_is_refused(solve):
+    A = se3.from_translation(np.random.default_rng(0).normal(size=(8, 3)))
+    with pytest.raises(DegenerateError, match="does not turn"):
+        solve(A, A)
+
+
+def test_two_views_are_refused():
+    A, _, _, _ = problem(0, n=2)
+    with pytest.raises(DegenerateError, match="2 usable views"):
+        check_observable(A)
+
+
+def test_unequal_stacks_are_refused():
+    A, C, _, _ = problem(0)
+    with pytest.raises(InputError, match="10 hand poses and 9 board poses"):
+        park(A, C[1:])
