@@ -90,8 +90,9 @@ def test_truth_lies_within_the_claimed_sigma(simulate):
     deg, mm = np.sqrt(np.mean(np.square(errors), 0))
     # These ten give 0.46 mm, thirty give 0.52: the board's scale is unknown and limits the depth.
     assert deg < 0.1 and mm < 0.5
-    # chi-square of 6 degrees of freedom: mean 6, the mean of ten has a deviation of 1.1
-    assert 3.0 < np.mean(nees) < 10.0
+    # Chi-square of 6 degrees of freedom would have mean 6. The errors here are white, and the
+    # covariance allows for smooth ones too (a quarter of the variance), so it is conservative.
+    assert 0.8 < np.mean(nees) < 8.0
     assert outside <= 2
 
 
