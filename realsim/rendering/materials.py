@@ -1,0 +1,228 @@
+"""What a surface looks like: smooth normals, mipmapped textures, and wood for the table.
+
+Reflectances are linear light in [0, 1]. Texture look-ups average over the footprint of the pixel
+(trilinear mipmaps), so that a printed edge stays where it was printed.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import Mesh
+from realsim.rendering.rays import BACKGROUND, PlacedMesh
+
+Array32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+CREASE_COS = float(np.cos(np.radians(30.0)))
+"""Faces that meet at a sharper angle keep their edge instead of being shaded as one surface."""
+REMAP_COLUMNS = 4096
+"""Look-ups are laid out in rows of this length, because OpenCV's images end at 32767 columns."""
+PLAIN_COLORS = (
+    (196, 84, 60), (72, 118, 168), (214, 172, 84), (96, 146, 104), (150, 106, 160),
+    (206, 130, 96), (84, 148, 152), (182, 186, 172), (142, 112, 84), (168, 64, 92),
+)  # fmt: skip
+"""sRGB-like paints of objects that have neither texture nor colours, by instance."""
+
+
+class MipTexture:
+    """A texture and its successive halvings, looked up by area."""
+
+    def __init__(self, image: NDArray[np.uint8], gamma: float, wrap: bool) -> None:
+        """Build the halvings.
+
+        Args:
+            image: (H, W, 3) encoded values, first row at v = 1.
+            gamma: exponent that decodes them to linear light.
+            wrap: whether the texture repeats; else its border continues.
+        """
+        import cv2
+
+        decode = np.round(65535.0 * (np.arange(256) / 255.0) ** gamma).astype(np.uint16)
+        level = decode[image]
+        self.levels = [level]
+        self.wrap = wrap
+        while min(level.shape[:2]) > 1:
+            height, width = level.shape[:2]
+            size = (max(1, width // 2), max(1, height // 2))
+            level = np.asarray(cv2.resize(level, size, interpolation=cv2.INTER_AREA), np.uint16)
+            self.levels.append(level)
+
+    def sample(self, uv: Array32, footprint: Array32) -> Array32:
+        """Return the mean reflectance (N, 3) about uv (N, 2) over a footprint (N,) in texels."""
+        level = np.log2(np.maximum(footprint, 1.0))
+        level = np.minimum(level, np.float32(len(self.levels) - 1))
+        low = level.astype(np.int32)
+        rest = (level - low)[:, None]
+        out = np.empty((len(uv), 3), np.float32)
+        for k in np.unique(low):
+            of_level = np.flatnonzero(low == k)
+            color = self._bilinear(int(k), uv[of_level])
+            mix = rest[of_level]
+            if k + 1 < len(self.levels) and bool(np.any(mix > 0)):
+                color += mix * (self._bilinear(int(k) + 1, uv[of_level]) - color)
+            out[of_level] = color
+        return out
+
+    def _bilinear(self, k: int, uv: Array32) -> Array32:
+        """Return the reflectance (N, 3) of one halving, interpolated between texel centres."""
+        import cv2
+
+        image = self.levels[k]
+        height, width = image.shape[:2]
+        n = len(uv)
+        columns = min(n, REMAP_COLUMNS)
+        rows = -(-n // columns)
+        x = np.zeros(rows * columns, np.float32)
+        y = np.zeros(rows * columns, np.float32)
+        u, v = uv[:, 0], 1.0 - uv[:, 1]
+        if self.wrap:
+            u, v = u - np.floor(u), v - np.floor(v)
+        x[:n], y[:n] = u * width - 0.5, v * height - 0.5
+        border = cv2.BORDER_WRAP if self.wrap else cv2.BORDER_REPLICATE
+        color = cv2.remap(
+            image, x.reshape(rows, columns), y.reshape(rows, columns), cv2.INTER_LINEAR,
+            borderMode=border,
+        )  # fmt: skip
+        return np.asarray(color, np.float32).reshape(-1, 3)[:n] * np.float32(1 / 65535)
+
+
+def corner_normals(mesh: Mesh) -> Array32:
+    """Return unit normals (F, 3, 3) per face corner, smooth except across creases.
+
+    A vertex's normal is the mean of its faces' weighted by their angle; a corner whose face
+    deviates from it by more than the crease angle keeps the face's own normal. Vertices at the
+    same place count as one, because STL files repeat them.
+    """
+    corners = mesh.vertices[mesh.faces]
+    edges = np.roll(corners, -1, axis=1) - corners
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal = normal / np.maximum(length, 1e-30)
+    unit = edges / np.maximum(np.linalg.norm(edges, axis=-1, keepdims=True), 1e-30)
+    cosine = -np.sum(unit * np.roll(unit, 1, axis=1), axis=-1)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+
+    key = np.round((mesh.vertices - mesh.vertices.min(0)) / 1e-6).astype(np.int64)
+    span = key.max(0) + 1
+    flat = (key[:, 0] * span[1] + key[:, 1]) * span[2] + key[:, 2]
+    _, place = np.unique(flat, return_inverse=True)
+    at = place[mesh.faces]
+    total = np.stack(
+        [np.bincount(at.ravel(), (angle * normal[:, None, k]).ravel()) for k in range(3)], -1
+    )
+    total /= np.maximum(np.linalg.norm(total, axis=-1, keepdims=True), 1e-30)
+    smooth = total[at]
+    keep = np.sum(smooth * normal[:, None], axis=-1, keepdims=True) > CREASE_COS
+    return np.where(keep, smooth, normal[:, None]).astype(np.float32)
+
+
+def _spectral_noise(rng: np.random.Generator, size: int, fx: float, fy: float) -> Array32:
+    """Return periodic noise (size, size), mean 0, sd 1, with about fx and fy waves per side."""
+    k = np.fft.fftfreq(size, 1.0 / size)
+    spectrum = np.fft.fft2(rng.normal(size=(size, size)))
+    spectrum *= np.exp(-0.5 * ((k[None, :] / fx) ** 2 + (k[:, None] / fy) ** 2))
+    spectrum[0, 0] = 0.0
+    noise = np.fft.ifft2(spectrum).real
+    return (noise / noise.std()).astype(np.float32)
+
+
+@lru_cache(maxsize=4)
+def wood_texture(size: int = 1024, seed: int = 7) -> NDArray[np.uint8]:
+    """Return a tileable picture (size, size, 3) of light wood, its grain along u."""
+    rng = np.random.default_rng(seed)
+    y = np.arange(size, dtype=np.float32)[:, None] / size
+    bend = _spectral_noise(rng, size, 1.0, 2.5)
+    rings = np.sin(2 * np.pi * (18 * y + 1.1 * bend))
+    pores = _spectral_noise(rng, size, 10.0, 220.0)
+    cloud = _spectral_noise(rng, size, 3.0, 5.0)
+    tone = 0.45 * rings + 0.25 * pores + 0.5 * cloud
+    light, dark = np.array([202.0, 172.0, 134.0]), np.array([170.0, 134.0, 96.0])
+    mix = np.clip(0.5 + 0.3 * tone, 0.0, 1.0)[..., None]
+    return np.round(light + (dark - light) * mix).astype(np.uint8)
+
+
+@lru_cache(maxsize=4)
+def speckle_texture(size: int = 512, seed: int = 11) -> NDArray[np.uint8]:
+    """Return a tileable grey picture (size, size, 3) of slight unevenness, mean near 228."""
+    rng = np.random.default_rng(seed)
+    coarse, fine = _spectral_noise(rng, size, 6.0, 6.0), _spectral_noise(rng, size, 60.0, 60.0)
+    grey = np.clip(np.round(228.0 + 7.0 * coarse + 4.0 * fine), 0, 255).astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=-1)
+
+
+class Surface:
+    """The look of one placed mesh: normals in world and reflectance at any point of any face."""
+
+    WOOD_PERIOD_M = 0.5
+    SPECKLE_PERIOD_M = 0.12
+
+    def __init__(self, placed: PlacedMesh, gamma: float) -> None:
+        """Choose the material: texture, vertex colours, wood (background) or paint."""
+        mesh = placed.mesh
+        R = placed.T_world_obj[:3, :3].astype(np.float32)
+        local = corner_normals(mesh)
+        self.normals: Array32 = local @ R.T
+        self.is_glossy = placed.instance != BACKGROUND
+        corners = mesh.vertices[mesh.faces]
+        self._colors: Array32 | None = None
+        self._texture: MipTexture | None = None
+        self._tint = np.ones(3, np.float32)
+        if mesh.texture is not None and mesh.uv is not None:
+            self._texture = MipTexture(mesh.texture, gamma, wrap=_repeats(mesh.uv))
+            self._uv = mesh.uv[mesh.faces].astype(np.float32)
+        elif mesh.colors is not None:
+            decode = (np.arange(256) / 255.0) ** gamma
+            self._colors = decode[mesh.colors][mesh.faces].astype(np.float32)
+            return
+        elif placed.instance == BACKGROUND:
+            self._texture = _shared_texture("wood", gamma)
+            self._uv = _planar_uv(corners, self.WOOD_PERIOD_M)
+        else:
+            paint = np.array(PLAIN_COLORS[placed.instance % len(PLAIN_COLORS)])
+            self._tint = ((paint / 255.0) ** gamma).astype(np.float32)
+            self._texture = _shared_texture("speckle", gamma)
+            self._uv = _planar_uv(corners, self.SPECKLE_PERIOD_M)
+        self._texels_per_m = _texel_density(corners, self._uv, self._texture.levels[0].shape)
+
+    def normal(self, face: Int32, weights: Array32) -> Array32:
+        """Return shading normals (N, 3), not normalised, at barycentric weights (N, 3)."""
+        return np.einsum("nij,ni->nj", self.normals[face], weights)
+
+    def reflectance(self, face: Int32, weights: Array32, footprint_m: Array32) -> Array32:
+        """Return the linear reflectance (N, 3), averaged over a footprint (N,) [m]."""
+        if self._texture is None:
+            assert self._colors is not None
+            return np.einsum("nij,ni->nj", self._colors[face], weights)
+        uv = np.einsum("nij,ni->nj", self._uv[face], weights)
+        color = self._texture.sample(uv, footprint_m * self._texels_per_m[face])
+        return color * self._tint
+
+
+@lru_cache(maxsize=8)
+def _shared_texture(name: str, gamma: float) -> MipTexture:
+    """Return a procedural texture, built once for all surfaces."""
+    return MipTexture(wood_texture() if name == "wood" else speckle_texture(), gamma, wrap=True)
+
+
+def _repeats(uv: NDArray[np.float64]) -> bool:
+    """Return whether texture coordinates leave [0, 1], so that the texture must repeat."""
+    return bool(uv.min() < -1e-6 or uv.max() > 1 + 1e-6)
+
+
+def _planar_uv(corners: NDArray[np.float64], period_m: float) -> Array32:
+    """Return texture coordinates (F, 3, 2) by projection along each face's dominant axis."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    axis = np.argmax(np.abs(normal), axis=1)
+    kept = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+    return (np.take_along_axis(corners, kept[:, None, :], axis=2) / period_m).astype(np.float32)
+
+
+def _texel_density(corners: NDArray[np.float64], uv: Array32, shape: tuple[int, ...]) -> Array32:
+    """Return texels per metre (F,) of each face: the root of the ratio of the two areas."""
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    texels = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) * shape[0] * shape[1]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+    )
+    return np.sqrt(texels / np.maximum(area, 1e-18)).astype(np.float32)

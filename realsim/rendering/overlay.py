@@ -1,0 +1,314 @@
+"""Drawings on pictures: outlines, grasps, axes, points, depth maps and contact sheets."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import camera, se3
+from realsim.records import CameraIntrinsics, GraspSet
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Color = tuple[int, int, int]
+INSTANCE_COLORS: tuple[Color, ...] = (
+    (0, 158, 230), (230, 159, 0), (0, 180, 130), (240, 228, 66), (213, 94, 0), (204, 121, 167),
+    (86, 110, 255), (255, 140, 180), (0, 210, 210), (170, 220, 70), (180, 120, 60), (160, 90, 220),
+    (255, 90, 90), (110, 170, 140), (250, 200, 150), (130, 130, 250),
+)  # fmt: skip
+"""Okabe and Ito's colour-blind-safe colours first, then ones that stay apart in brightness."""
+SCORE_STOPS = np.array([[214, 48, 49], [253, 185, 46], [34, 166, 84]], dtype=np.float64)
+"""Colours of the scores 0, 0.5 and 1: red, yellow, green."""
+UNTRIED: Color = (150, 150, 150)
+"""Colour of a grasp without a score."""
+FINGER_M = 0.05
+"""Length of a drawn finger, from its tip back to the palm [m]."""
+STEM_M = 0.04
+"""Length of the drawn approach stem behind the palm [m]."""
+PIECES = 8
+"""Straight pieces per drawn segment, so that lines bend with the lens."""
+SHIFT = 4
+"""Fractional bits of OpenCV's drawing coordinates: sixteenths of a pixel."""
+INK: Color = (24, 26, 30)
+PAPER: Color = (247, 247, 245)
+
+
+def instance_color(instance: int) -> Color:
+    """Return the colour (r, g, b) of an instance: always the same for the same number."""
+    return INSTANCE_COLORS[instance % len(INSTANCE_COLORS)]
+
+
+def score_color(score: float) -> Color:
+    """Return red, yellow or green for a score in [0, 1], grey for NaN."""
+    if not np.isfinite(score):
+        return UNTRIED
+    at = 2 * float(np.clip(score, 0, 1))
+    rgb = [np.interp(at, [0, 1, 2], SCORE_STOPS[:, k]) for k in range(3)]
+    return int(rgb[0]), int(rgb[1]), int(rgb[2])
+
+
+def draw_outlines(
+    rgb: Image,
+    ids: NDArray[np.int32],
+    colors: Mapping[int, Color] | None = None,
+    thickness: int = 2,
+) -> Image:
+    """Return the picture with every instance's mask outlined.
+
+    Args:
+        rgb: (H, W, 3).
+        ids: (H, W) instance per pixel, negative = none.
+        colors: colour per instance; default `instance_color`.
+        thickness: width of the line, which lies inside the mask [px].
+    """
+    import cv2
+
+    out = rgb.copy()
+    kernel = np.ones((3, 3), np.uint8)
+    for instance in np.unique(ids[ids >= 0]):
+        mask = (ids == instance).astype(np.uint8)
+        # Outside the picture counts as the object: an object cut by the border stays open there.
+        core = cv2.erode(mask, kernel, iterations=thickness,
+                         borderType=cv2.BORDER_CONSTANT, borderValue=1)  # fmt: skip
+        dark = cv2.dilate(mask, kernel) - mask
+        color = (colors or {}).get(int(instance), instance_color(int(instance)))
+        out[(mask > 0) & (np.asarray(core) == 0)] = color
+        # A dark hairline outside keeps the outline visible on any ground.
+        hairline = (dark > 0) & (ids < 0)
+        out[hairline] = (0.55 * out[hairline]).astype(np.uint8)
+    return out
+
+
+def _polyline(
+    canvas: Any, intrinsics: CameraIntrinsics, points_cam: Array, color: Color, width_px: int
+) -> None:
+    """Draw a line through camera points (N, 3), bent as the lens bends it, with a dark rim."""
+    import cv2
+
+    step = np.linspace(0, 1, PIECES, endpoint=False)[:, None]
+    parts = [a + step * (b - a) for a, b in pairwise(points_cam)]
+    line = np.concatenate([*parts, points_cam[-1:]])
+    uv = camera.project(intrinsics, line)
+    reach = 8 * max(intrinsics.width, intrinsics.height)
+    # A point behind the camera is NaN, and NaN is less than nothing.
+    seen: NDArray[np.bool_] = np.all(np.abs(uv) < reach, axis=-1)
+    for run in np.split(np.arange(len(uv)), np.flatnonzero(~seen)):
+        kept = run[seen[run]]
+        if len(kept) < 2:
+            continue
+        fixed = [np.round(uv[kept] * (1 << SHIFT)).astype(np.int32)]
+        cv2.polylines(canvas, fixed, False, INK, width_px + 2, cv2.LINE_AA, SHIFT)
+        cv2.polylines(canvas, fixed, False, color, width_px, cv2.LINE_AA, SHIFT)
+
+
+def gripper_lines(width_m: float) -> list[Array]:
+    """Return the lines (K, 3) of a gripper in its grasp frame [m]: a U and its stem.
+
+    The origin lies between the fingertips, z is the approach, y the closing axis: the fingers
+    stand at y = +- width / 2 and reach back along -z to the palm.
+    """
+    y = width_m / 2
+    u = [[0, -y, 0], [0, -y, -FINGER_M], [0, y, -FINGER_M], [0, y, 0]]
+    stem = [[0, 0, -FINGER_M], [0, 0, -FINGER_M - STEM_M]]
+    return [np.array(u, dtype=np.float64), np.array(stem, dtype=np.float64)]
+
+
+def draw_grasps(
+    rgb: Image,
+    intrinsics: CameraIntrinsics,
+    T_cam_obj: ArrayLike,
+    grasps: GraspSet,
+    indices: Sequence[int] | NDArray[np.int64] | None = None,
+    color_by: Literal["score", "instance"] = "score",
+) -> Image:
+    """Return the picture with grippers drawn far to near, nearer ones with wider lines.
+
+    Args:
+        rgb: (H, W, 3).
+        intrinsics: the raw camera of the picture.
+        T_cam_obj: (4, 4) the grasps' object in camera [m].
+        grasps: the grasps.
+        indices: which of them; default all.
+        color_by: by score red, yellow, green (grey = not tried), or by instance.
+    """
+    out = rgb.copy()
+    chosen = np.arange(len(grasps)) if indices is None else np.asarray(indices, dtype=np.int64)
+    Ts_cam_grasp = np.asarray(T_cam_obj, dtype=np.float64) @ grasps.Ts_obj_grasp[chosen]
+    depth = Ts_cam_grasp[:, 2, 3]
+    for k in np.argsort(-depth):
+        g = int(chosen[k])
+        if depth[k] <= 0:
+            continue
+        color = (
+            score_color(float(grasps.scores[g]))
+            if color_by == "score"
+            else instance_color(grasps.instance)
+        )
+        # About 2.5 mm thick at its depth, within what reads well.
+        width_px = int(np.clip(np.round(0.0025 * intrinsics.fx / depth[k]), 1, 6))
+        for line in gripper_lines(float(grasps.widths_m[g])):
+            points = se3.transform(Ts_cam_grasp[k], line)
+            _polyline(out, intrinsics, points, color, width_px)
+    return out
+
+
+def draw_axes(
+    rgb: Image, intrinsics: CameraIntrinsics, T_cam_x: ArrayLike, length_m: float = 0.05
+) -> Image:
+    """Return the picture with a frame's axes: x red, y green, z blue, far to near."""
+    out = rgb.copy()
+    T = np.asarray(T_cam_x, dtype=np.float64)
+    axes: list[tuple[int, Color]] = [(0, (226, 60, 60)), (1, (60, 180, 75)), (2, (66, 118, 240))]
+    for axis, color in sorted(axes, key=lambda a: -float(T[2, a[0]])):
+        tip = T[:3, 3] + length_m * T[:3, axis]
+        _polyline(out, intrinsics, np.stack([T[:3, 3], tip]), color, 3)
+    return out
+
+
+def draw_points(
+    rgb: Image, pixels: ArrayLike, color: Color = (255, 80, 80), radius_px: float = 2.5
+) -> Image:
+    """Return the picture with dots at pixels (N, 2); NaN and far-away ones are left out."""
+    import cv2
+
+    out = rgb.copy()
+    uv = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+    near = np.isfinite(uv).all(-1) & (np.abs(np.nan_to_num(uv)) < 8 * max(rgb.shape)).all(-1)
+    scale = 1 << SHIFT
+    for x, y in np.round(uv[near] * scale).astype(int):
+        at = (int(x), int(y))
+        cv2.circle(out, at, int((radius_px + 1) * scale), INK, -1, cv2.LINE_AA, SHIFT)
+        cv2.circle(out, at, int(radius_px * scale), color, -1, cv2.LINE_AA, SHIFT)
+    return out
+
+
+def depth_picture(
+    depth_m: ArrayLike, low_m: float | None = None, high_m: float | None = None
+) -> Image:
+    """Return depth (H, W) [m] as a picture: near is red, far is blue, no measurement is black.
+
+    Args:
+        depth_m: (H, W), 0 = none.
+        low_m: depth of the near end [m]; default the 1st percentile.
+        high_m: depth of the far end [m]; default the 99th percentile.
+    """
+    import cv2
+
+    depth = np.asarray(depth_m, dtype=np.float32)
+    valid = np.isfinite(depth) & (depth > 0)
+    if not bool(valid.any()):
+        return np.zeros((*depth.shape, 3), np.uint8)
+    low = float(np.percentile(depth[valid], 1)) if low_m is None else low_m
+    high = float(np.percentile(depth[valid], 99)) if high_m is None else high_m
+    nearness = 1 - np.clip((np.where(valid, depth, low) - low) / max(high - low, 1e-6), 0, 1)
+    # The ends of turbo are nearly black: keep off them, because black means none.
+    index = np.round(255 * (0.08 + 0.86 * nearness)).astype(np.uint8)
+    bgr = np.asarray(cv2.applyColorMap(index, cv2.COLORMAP_TURBO), np.uint8)
+    return np.where(valid[..., None], bgr[..., ::-1], 0).astype(np.uint8)
+
+
+def draw_legend(rgb: Image, entries: Sequence[tuple[str, Color]]) -> Image:
+    """Return the picture with a legend of (text, colour) in its upper left corner."""
+    import cv2
+
+    if not entries:
+        return rgb.copy()
+    out = rgb.copy()
+    size = float(np.clip(rgb.shape[0] / 1400, 0.36, 0.9))
+    widths = [cv2.getTextSize(t, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0] for t, _ in entries]
+    row = round(38 * size)
+    pad = round(14 * size)
+    w, h = min(max(widths) + row + 2 * pad, out.shape[1]), min(
+        row * len(entries) + 2 * pad, out.shape[0])  # fmt: skip
+    out[:h, :w] = np.round(0.25 * out[:h, :w] + 0.75 * np.array(PAPER)).astype(np.uint8)
+    for k, (text, color) in enumerate(entries):
+        y = pad + k * row
+        cv2.rectangle(out, (pad, y + row // 5), (pad + row // 2, y + row * 4 // 5), color, -1)
+        at = (pad + row * 3 // 4, y + row * 3 // 4)
+        cv2.putText(out, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, INK, 1, cv2.LINE_AA)
+    return out
+
+
+def contact_sheet(
+    images: Sequence[Image], columns: int, captions: Sequence[str] | None = None
+) -> Image:
+    """Return pictures in a grid, each above its caption.
+
+    Args:
+        images: (H, W, 3) or (H, W) each; all are fitted into the first one's size.
+        columns: pictures per row.
+        captions: one per picture, or None.
+
+    Raises:
+        InputError: no pictures, no columns, or another number of captions.
+    """
+    import cv2
+
+    if not images or columns < 1:
+        raise InputError("a contact sheet needs at least one picture and one column.")
+    if captions is not None and len(captions) != len(images):
+        raise InputError(f"{len(captions)} captions for {len(images)} pictures.")
+    height, width = images[0].shape[:2]
+    gap = max(6, width // 80)
+    size = float(np.clip(width / 900, 0.38, 1.2))
+    strip = round(34 * size) if captions is not None else 0
+    columns = min(columns, len(images))
+    rows = -(-len(images) // columns)
+    sheet = np.empty((rows * (height + strip + gap) + gap, columns * (width + gap) + gap, 3),
+                     np.uint8)  # fmt: skip
+    sheet[:] = PAPER
+    for k, image in enumerate(images):
+        r, c = divmod(k, columns)
+        y, x = gap + r * (height + strip + gap), gap + c * (width + gap)
+        picture = np.repeat(image[..., None], 3, -1) if image.ndim == 2 else image
+        factor = min(height / picture.shape[0], width / picture.shape[1])
+        w, h = round(picture.shape[1] * factor), round(picture.shape[0] * factor)
+        if (h, w) != picture.shape[:2]:
+            picture = cv2.resize(picture, (w, h), interpolation=cv2.INTER_AREA)
+        top, left = y + (height - h) // 2, x + (width - w) // 2
+        sheet[top : top + h, left : left + w] = picture
+        if captions is not None:
+            at = (x + 2, y + height + round(24 * size))
+            text = _fitted(captions[k], width - 4, size)
+            cv2.putText(sheet, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, INK, 1, cv2.LINE_AA)
+    return sheet
+
+
+def _fitted(text: str, width_px: int, size: float) -> str:
+    """Return the text, shortened by an ellipsis if it is wider than `width_px`."""
+    import cv2
+
+    def wide(t: str) -> bool:
+        return cv2.getTextSize(t, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0] > width_px
+
+    if not wide(text):
+        return text
+    while text and wide(text + "..."):
+        text = text[:-1]
+    return text + "..."
+
+
+def save_png(path: Path | str, rgb: Image) -> None:
+    """Write a picture (H, W, 3) as PNG, by way of a temporary name.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written.
+    """
+    import cv2
+
+    path = Path(path)
+    ok, data = cv2.imencode(".png", np.ascontiguousarray(rgb[..., ::-1]))
+    if not ok:
+        raise InputError(f"the picture of shape {rgb.shape} cannot be encoded as PNG.")
+    partial = path.with_name(path.name + ".part")
+    try:
+        partial.write_bytes(np.asarray(data).tobytes())
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be written: {error.strerror}. Does the folder exist?"
+        ) from error

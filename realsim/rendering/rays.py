@@ -1,0 +1,170 @@
+"""Placed meshes as one ray-castable scene, and the rays of a distorted camera.
+
+Rays go through integer pixel centres and have z = 1 in camera axes, so the parameter of a hit is
+the depth along z. Open3D's own `create_rays_pinhole` is not used: it shoots half a pixel off and
+knows no distortion.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import Mesh
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+GRID_M = 4.0
+"""Float32 coordinates have their origin on a grid of this pitch [m]: 2 m cost 0.1 um."""
+BACKGROUND = -1
+"""Instance number of things that occlude but carry no label (table, board)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PlacedMesh:
+    """A mesh and where it stands."""
+
+    instance: int
+    """0 or more: an object; -1: background that occludes but has no label (table, board)."""
+    mesh: Mesh
+    T_world_obj: Array
+    """(4, 4) mesh in world [m]."""
+
+    def __post_init__(self) -> None:
+        """Check the instance number and that the pose is rigid."""
+        if self.instance < BACKGROUND:
+            raise InputError(
+                f"a placed mesh has the instance {self.instance}; objects are numbered from 0, and "
+                "-1 is background."
+            )
+        T = se3.check_rigid(self.T_world_obj, f"T_world_obj of instance {self.instance}")
+        T.setflags(write=False)
+        object.__setattr__(self, "T_world_obj", T)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class HitBuffer:
+    """The first thing that each of N rays meets."""
+
+    t: Array32
+    """(N,) parameter along the ray's direction; inf = nothing was met."""
+    geometry: NDArray[np.int32]
+    """(N,) index of the placed mesh; -1 = nothing was met."""
+    instance: NDArray[np.int32]
+    """(N,) its instance; -1 = background or nothing."""
+    face: NDArray[np.int32]
+    """(N,) face of that mesh; -1 = nothing was met."""
+    uv: Array32
+    """(N, 2) barycentric weights of the face's second and third vertex."""
+    normal: Array32
+    """(N, 3) unit normal of the face in world, on the side the face's winding says."""
+
+
+class RayScene:
+    """Placed meshes, ready to be hit by rays.
+
+    Coordinates are kept relative to `center`, so that float32 loses nothing when the world's
+    origin is far away.
+    """
+
+    def __init__(self, placed: Sequence[PlacedMesh], center: ArrayLike | None = None) -> None:
+        """Build the ray-casting structure of the meshes (it is committed at the first cast).
+
+        Args:
+            placed: the meshes.
+            center: (3,) where the float32 coordinates have their origin [m]; the default is the
+                middle of the scene on a 4 m grid, so that an object alone and the same object in
+                company are rounded alike and give the same pixels.
+        """
+        from realsim.interop import import_open3d
+
+        open3d = import_open3d()
+        self.placed = tuple(placed)
+        world = [se3.transform(p.T_world_obj, p.mesh.vertices) for p in self.placed]
+        self.center: Array = np.zeros(3)
+        if center is not None:
+            self.center = np.array(center, dtype=np.float64)
+        elif world:
+            low = np.min([v.min(0) for v in world], axis=0)
+            high = np.max([v.max(0) for v in world], axis=0)
+            self.center = GRID_M * np.round((low + high) / (2 * GRID_M))
+        self._core: Any = open3d.core
+        self._scene: Any = open3d.t.geometry.RaycastingScene()
+        for p, v in zip(self.placed, world, strict=True):
+            self._scene.add_triangles(
+                self._core.Tensor((v - self.center).astype(np.float32)),
+                self._core.Tensor(p.mesh.faces.astype(np.uint32)),
+            )
+        # The last entry answers geometry -1 (nothing).
+        self._instances = np.array([*(p.instance for p in self.placed), BACKGROUND], np.int32)
+
+    def _rays(self, origins: Array, directions: Array32) -> Any:
+        """Return rays about `center` as a tensor (N, 6)."""
+        rays = np.empty((len(directions), 6), np.float32)
+        rays[:, :3] = origins - self.center
+        rays[:, 3:] = directions
+        return self._core.Tensor(rays)
+
+    def first_hits(self, origins: Array, directions: Array32) -> tuple[Array32, NDArray[np.int32]]:
+        """Return t (N,), inf = nothing, and the placed mesh (N,), -1 = nothing, of rays.
+
+        Args:
+            origins: (3,) or (N, 3) in world [m].
+            directions: (N, 3) in world.
+        """
+        if not self.placed or len(directions) == 0:
+            nothing = np.full(len(directions), np.inf, np.float32)
+            return nothing, np.full(len(directions), -1, np.int32)
+        hits = self._scene.cast_rays(self._rays(origins, directions))
+        # Open3D marks a miss by 2^32 - 1, which is -1 as int32.
+        return hits["t_hit"].numpy(), hits["geometry_ids"].numpy().view(np.int32)
+
+    def cast(self, origins: Array, directions: Array32) -> HitBuffer:
+        """Return everything about what rays meet first; arguments as of `first_hits`."""
+        n = len(directions)
+        if not self.placed or n == 0:
+            return HitBuffer(
+                t=np.full(n, np.inf, np.float32),
+                geometry=np.full(n, -1, np.int32),
+                instance=np.full(n, BACKGROUND, np.int32),
+                face=np.full(n, -1, np.int32),
+                uv=np.zeros((n, 2), np.float32),
+                normal=np.zeros((n, 3), np.float32),
+            )
+        hits = self._scene.cast_rays(self._rays(origins, directions))
+        geometry = hits["geometry_ids"].numpy().view(np.int32)
+        return HitBuffer(
+            t=hits["t_hit"].numpy(),
+            geometry=geometry,
+            instance=self._instances[geometry],
+            face=hits["primitive_ids"].numpy().view(np.int32),
+            uv=hits["primitive_uvs"].numpy(),
+            normal=hits["primitive_normals"].numpy(),
+        )
+
+    def occluded(self, origins: Array, directions: Array32) -> Mask:
+        """Return (N,) whether a ray meets anything; arguments as of `first_hits`."""
+        if not self.placed or len(directions) == 0:
+            return np.zeros(len(directions), dtype=bool)
+        return self._scene.test_occlusions(self._rays(origins, directions)).numpy()
+
+
+def rotated(directions: Array32, R: Array) -> Array32:
+    """Return directions (..., 3) turned by R (3, 3), in float32.
+
+    Written out instead of a matrix product: a (N, 3) @ (3, 3) product wakes all BLAS threads, and
+    their spinning costs more than the whole cast.
+    """
+    r = R.astype(np.float32)
+    x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
+    out = np.empty(directions.shape, np.float32)
+    for axis in range(3):
+        np.multiply(x, r[axis, 0], out=out[..., axis])
+        out[..., axis] += y * r[axis, 1]
+        out[..., axis] += z * r[axis, 2]
+    return out
