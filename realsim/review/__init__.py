@@ -1,1 +1,20 @@
-"""The browser in which a person accepts or rejects what was registered."""
+"""The web review: look at a registered session in the browser and judge every object."""
+
+from typing import TYPE_CHECKING, Any
+
+from realsim.review.journal import ReviewState, replay, reviewed_scene
+
+if TYPE_CHECKING:
+    from realsim.review.scene_nodes import SceneConfig
+    from realsim.review.server import ReviewServer
+
+__all__ = ["ReviewServer", "ReviewState", "SceneConfig", "replay", "reviewed_scene"]
+
+
+def __getattr__(name: str) -> Any:
+    """Load the server on first use: viser stays out of `import realsim.review`."""
+    if name in ("ReviewServer", "SceneConfig"):
+        from realsim.review import server
+
+        return getattr(server, name)
+    raise AttributeError(f"module 'realsim.review' has no attribute '{name}'")

@@ -1,0 +1,148 @@
+"""Grasps seen from one view: where they are in the camera, and which contacts it can see.
+
+A grasp's two contacts lie at +-width/2 along its closing axis y. A contact is seen if it is in the
+image and the straight line from the camera to it is free. The line is drawn to a point a clearance
+outside the contact, where the finger's pad would stand: the two sides of a convex object are never
+both in sight of one camera in the strict sense, yet the pads on both sides are what a camera above
+the grasp sees.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.geometry import camera, se3
+from realsim.records import CameraIntrinsics, GraspSet
+from realsim.rendering.labels import LabelRenderer
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+LENS_ROUND_TRIP = 1e-3
+"""How far [normalised] a projected point may come back from the lens model: a point far out of
+view can be folded into the image by the distortion polynomial, and then does not come back."""
+
+
+class GraspVisibility(IntEnum):
+    """How much of a grasp a view sees."""
+
+    HIDDEN = 0
+    """Neither contact."""
+    PARTLY = 1
+    """One of the two contacts."""
+    VISIBLE = 2
+    """Both contacts."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SightConfig:
+    """When a contact counts as seen."""
+
+    clearance_m: float = 0.002
+    """How far outside the contact the line of sight ends [m]: half a thin pad. With it a camera
+    0.5 m above a 50 mm wide box sees both contacts down to 40 mm below the edge."""
+    tolerance_m: float = 0.001
+    """How far before the end of the line a surface may lie without hiding it [m]; above float32
+    rounding (0.1 um) and the error of a decimated mesh, below the clearance."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class GraspsInView:
+    """The grasps of one object instance in one view."""
+
+    obj_id: int
+    instance: int
+    Ts_cam_grasp: Array
+    """(N, 4, 4) grasp in camera [m]."""
+    widths_m: Array
+    """(N,) distance of the contacts [m]."""
+    scores: Array
+    """(N,) in [0, 1]; NaN = not tried."""
+    reachable: Mask
+    """(N,) whether the arm reaches it."""
+    contact_seen: Mask
+    """(N, 2) whether the contact at -y and at +y is seen."""
+
+    @property
+    def visibility(self) -> NDArray[np.uint8]:
+        """(N,) codes of `GraspVisibility`: how many contacts are seen."""
+        return np.sum(self.contact_seen, axis=1).astype(np.uint8)
+
+
+def contact_points(Ts_x_grasp: ArrayLike, widths_m: ArrayLike, clearance_m: float = 0.0) -> Array:
+    """Return the contacts (N, 2, 3) at -y and +y in frame x [m].
+
+    Args:
+        Ts_x_grasp: (N, 4, 4) grasps.
+        widths_m: (N,) distance of the contacts [m].
+        clearance_m: how much further out the points lie [m].
+    """
+    T = np.asarray(Ts_x_grasp, dtype=np.float64).reshape(-1, 4, 4)
+    reach = np.asarray(widths_m, dtype=np.float64) / 2 + clearance_m
+    offset = T[:, :3, 1] * reach[:, None]
+    return T[:, None, :3, 3] + offset[:, None] * np.array([-1.0, 1.0])[:, None]
+
+
+def in_image(intrinsics: CameraIntrinsics, points_cam: ArrayLike) -> Mask:
+    """Return (N,) which camera points (N, 3) [m] fall on a pixel of the image."""
+    p = np.asarray(points_cam, dtype=np.float64)
+    uv = camera.project(intrinsics, p)
+    known = np.all(np.isfinite(uv), axis=1)
+    inside = np.zeros(len(p), dtype=bool)
+    u, v = uv[known, 0], uv[known, 1]
+    inside[known] = (u >= -0.5) & (u < intrinsics.width - 0.5)
+    inside[known] &= (v >= -0.5) & (v < intrinsics.height - 0.5)
+    if intrinsics.is_distorted and np.any(inside):
+        xy, valid = camera.undistort(intrinsics, uv[inside])
+        back = np.abs(xy - p[inside, :2] / p[inside, 2:3]).max(-1)
+        inside[inside] = valid & (np.nan_to_num(back, nan=np.inf) < LENS_ROUND_TRIP)
+    return inside
+
+
+def free_lines(
+    renderer: LabelRenderer, eye_world: ArrayLike, points_world: ArrayLike, tolerance_m: float
+) -> Mask:
+    """Return (N,) whether the straight lines from `eye_world` (3,) to points (N, 3) are free."""
+    eye = np.asarray(eye_world, dtype=np.float64)
+    lines = np.asarray(points_world, dtype=np.float64).reshape(-1, 3) - eye
+    length = np.linalg.norm(lines, axis=1)
+    rays = np.concatenate([np.broadcast_to(eye, lines.shape), lines / length[:, None]], axis=1)
+    return np.asarray(renderer.cast_rays(rays).t >= length - tolerance_m, dtype=bool)
+
+
+def grasps_in_view(
+    renderer: LabelRenderer,
+    intrinsics: CameraIntrinsics,
+    T_world_cam: ArrayLike,
+    T_world_obj: ArrayLike,
+    grasps: GraspSet,
+    config: SightConfig,
+) -> GraspsInView:
+    """Return one object's grasps in the camera, each contact marked as seen or not.
+
+    Args:
+        renderer: the scene that may stand in the way.
+        intrinsics: the camera.
+        T_world_cam: (4, 4) camera in world [m].
+        T_world_obj: (4, 4) the grasped object in world [m].
+        grasps: its grasps, in object coordinates.
+        config: when a contact counts as seen.
+    """
+    T_cam_world = se3.invert(T_world_cam)
+    Ts_cam_grasp = T_cam_world @ np.asarray(T_world_obj, dtype=np.float64) @ grasps.Ts_obj_grasp
+    pads_cam = contact_points(Ts_cam_grasp, grasps.widths_m, config.clearance_m).reshape(-1, 3)
+    seen = in_image(intrinsics, pads_cam)
+    if np.any(seen):
+        T = np.asarray(T_world_cam, dtype=np.float64)
+        pads_world = se3.transform(T, pads_cam[seen])
+        seen[seen] = free_lines(renderer, T[:3, 3], pads_world, config.tolerance_m)
+    return GraspsInView(
+        obj_id=grasps.obj_id,
+        instance=grasps.instance,
+        Ts_cam_grasp=Ts_cam_grasp,
+        widths_m=grasps.widths_m,
+        scores=grasps.scores,
+        reachable=grasps.reachable,
+        contact_seen=seen.reshape(-1, 2),
+    )

@@ -1,0 +1,151 @@
+"""The journal is a monoid action on the state, loses nothing, and undo is an inverse."""
+
+import json
+import multiprocessing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim import InputError, ObjectPose, Scene
+from realsim.geometry import se3
+from realsim.review import journal
+
+
+def placed(instance: int = 0, x: float = 0.0) -> ObjectPose:
+    return ObjectPose(obj_id=3, instance=instance, T_world_obj=se3.from_translation([x, 0, 0]))
+
+
+def random_journal(rng: np.random.Generator, n: int) -> list[journal.Entry]:
+    """Return n lines with decisions, comments, and undos of random earlier lines."""
+    lines: list[journal.Entry] = []
+    for _ in range(n):
+        kind = rng.integers(4)
+        obj = placed(int(rng.integers(3)))
+        if kind == 3 and lines:
+            target = lines[int(rng.integers(len(lines)))]
+            obj = placed(target.instance)
+            lines.append(journal.new_entry("undo", obj, "ada", undoes=target.id))
+        elif kind == 2:
+            lines.append(journal.new_entry("comment", obj, "ada", comment="look here"))
+        else:
+            lines.append(journal.new_entry("accept" if kind else "reject", obj, "ada"))
+    return lines
+
+
+def test_replay_of_concatenated_journals_is_replay_after_replay() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        a, b = random_journal(rng, 12), random_journal(rng, 9)
+        b += [journal.new_entry("undo", placed(a[0].instance), "bob", undoes=a[0].id)]
+        assert journal.replay(b, journal.replay(a)) == journal.replay(a + b)
+        assert journal.replay(b, journal.replay(a)).standing == journal.replay(a + b).standing
+
+
+def test_a_line_read_twice_counts_once() -> None:
+    a = random_journal(np.random.default_rng(2), 20)
+    assert journal.replay(a + a) == journal.replay(a)
+
+
+def test_undo_is_the_inverse_and_undo_of_undo_the_identity() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(30):
+        before = journal.replay(random_journal(rng, 8))
+        line = journal.new_entry("accept", placed(1), "ada")
+        undo = journal.new_entry("undo", placed(1), "ada", undoes=line.id)
+        redo = journal.new_entry("undo", placed(1), "ada", undoes=undo.id)
+        assert journal.replay([line, undo], before).standing == before.standing
+        assert journal.replay([line, undo, redo], before).standing == (*before.standing, line)
+
+
+def test_the_last_standing_decision_counts() -> None:
+    yes, no = (journal.new_entry(a, placed(), "ada") for a in ("accept", "reject"))
+    key = (0, journal.subject_of(placed()))
+    assert journal.replay([yes, no]).decision(*key) == no
+    assert journal.replay([no, yes]).decision(*key) == yes
+    undo = journal.new_entry("undo", placed(), "ada", undoes=no.id)
+    assert journal.replay([yes, no, undo]).decision(*key) == yes
+
+
+def test_a_decision_is_about_one_pose_only() -> None:
+    state = journal.replay([journal.new_entry("reject", placed(x=0.0), "ada", comment="floats")])
+    here = Scene(name="s", objects=(placed(x=0.0),))
+    moved = Scene(name="s", objects=(placed(x=0.001),))
+    assert journal.reviewed_scene(here, state).objects[0].verdict == "rejected"
+    assert "floats" in journal.reviewed_scene(here, state).objects[0].reasons[-1]
+    assert journal.reviewed_scene(moved, state).objects[0].verdict == "unchecked"
+
+
+def test_file_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "review" / "journal.jsonl"
+    assert journal.read(path).entries == ()
+    lines = random_journal(np.random.default_rng(4), 25)
+    lines.append(journal.new_entry("comment", placed(), "Żółw", comment='naïve\n"quoted" 物'))
+    for line in lines:
+        journal.append(path, line)
+    content = journal.read(path)
+    assert content.entries == tuple(lines)
+    assert content.damaged == ()
+
+
+def test_appending_never_changes_what_stands_there(tmp_path: Path) -> None:
+    path = tmp_path / "journal.jsonl"
+    before = b""
+    for line in random_journal(np.random.default_rng(5), 10):
+        journal.append(path, line)
+        now = path.read_bytes()
+        assert now.startswith(before) and now.endswith(b"\n")
+        before = now
+
+
+def test_a_torn_line_spoils_no_other(tmp_path: Path) -> None:
+    path = tmp_path / "journal.jsonl"
+    first, second = random_journal(np.random.default_rng(6), 2)
+    journal.append(path, first)
+    with path.open("ab") as file:
+        file.write(b'{"format": 1, "id": "abc", "ti')  # a process was killed here
+    assert journal.read(path) == journal.JournalContent(entries=(first,), damaged=(2,))
+    journal.append(path, second)
+    assert journal.read(path) == journal.JournalContent(entries=(first, second), damaged=(2,))
+
+
+def test_foreign_lines_are_refused_with_their_number(tmp_path: Path) -> None:
+    path = tmp_path / "journal.jsonl"
+    path.write_text(json.dumps({"format": 99}) + "\n")
+    with pytest.raises(InputError, match=r"line 1.*format 1"):
+        journal.read(path)
+    path.write_text(json.dumps({"format": 1, "mood": "good"}) + "\n")
+    with pytest.raises(InputError, match="mood"):
+        journal.read(path)
+
+
+def test_unsigned_or_empty_decisions_are_refused() -> None:
+    with pytest.raises(InputError, match="name"):
+        journal.new_entry("accept", placed(), "  ")
+    with pytest.raises(InputError, match="comment is empty"):
+        journal.new_entry("comment", placed(), "ada")
+    good = journal.new_entry("accept", placed(), "ada")
+    with pytest.raises(InputError, match="undo"):
+        replace(good, undoes="x")
+
+
+def _write_many(path: Path, reviewer: str, n: int) -> None:
+    for k in range(n):
+        journal.append(path, journal.new_entry("comment", placed(k), reviewer, comment="x" * 300))
+
+
+def test_two_processes_lose_no_line(tmp_path: Path) -> None:
+    path = tmp_path / "journal.jsonl"
+    context = multiprocessing.get_context("spawn")
+    writers = [context.Process(target=_write_many, args=(path, w, 200)) for w in ("ada", "bob")]
+    for w in writers:
+        w.start()
+    for w in writers:
+        w.join(60)
+        assert w.exitcode == 0
+    content = journal.read(path)
+    assert content.damaged == ()
+    for name in ("ada", "bob"):
+        mine = [e.instance for e in content.entries if e.reviewer == name]
+        assert mine == list(range(200))

@@ -1,0 +1,359 @@
+"""Label transfer of a small synthetic session: files, laws across them, and resuming."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from realsim_sim_bridge import transfer_files
+from realsim_sim_bridge.transfer import TransferConfig, annotate, overlay_picture, table_slab
+from realsim_sim_bridge.transfer_pictures import best_and_worst
+
+from realsim import (
+    CameraIntrinsics,
+    CaptureSession,
+    GraspSet,
+    InputError,
+    Mesh,
+    ObjectModel,
+    ObjectPose,
+    Scene,
+    SupportPlane,
+    View,
+)
+from realsim.formats import bop, images
+from realsim.formats.bop_labels import mask_of
+from realsim.geometry import se3
+from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim.store import SessionStore
+
+INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
+TABLE = se3.from_translation([0.5, 0.0, 0.1])
+CONFIG = TransferConfig()
+
+
+def box(size: tuple[float, float, float]) -> Mesh:
+    s = (
+        np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        * np.array(size)
+        / 2
+    )
+    return Mesh(vertices=s, faces=table_slab(CONFIG).faces)
+
+
+MODELS = {
+    1: ObjectModel(obj_id=1, name="tall", mesh=box((0.04, 0.04, 0.12))),
+    7: ObjectModel(obj_id=7, name="flat", mesh=box((0.08, 0.06, 0.03))),
+}
+# The tall box stands between the first camera and the flat one.
+SCENE = Scene(
+    name="two boxes",
+    objects=(
+        ObjectPose(
+            obj_id=1, instance=0, verdict="accepted",
+            T_world_obj=TABLE @ se3.from_translation([-0.04, 0.0, 0.06]),
+        ),
+        ObjectPose(
+            obj_id=7, instance=3, verdict="doubtful", reasons=("one view only",),
+            T_world_obj=TABLE @ se3.from_translation([0.04, 0.01, 0.015]),
+        ),
+    ),
+    plane=SupportPlane(T_world_table=TABLE),
+)  # fmt: skip
+CAMERAS = {
+    0: se3.look_at([0.1, 0.0, 0.35], [0.5, 0.0, 0.12]),
+    2: se3.look_at([0.5, 0.05, 0.6], [0.5, 0.0, 0.12]),
+    5: se3.look_at([0.75, 0.3, 0.35], [0.5, 0.0, 0.12]),
+}
+
+
+def grasp_set(instance: int, obj_id: int, n: int = 6) -> GraspSet:
+    rng = np.random.default_rng(instance)
+    Ts = se3.from_rt(np.diag([1.0, -1.0, -1.0]), rng.normal(scale=0.01, size=(n, 3)))
+    nan4 = np.full((n, 4), np.nan)
+    return GraspSet(
+        obj_id=obj_id, instance=instance, Ts_obj_grasp=Ts, widths_m=np.full(n, 0.05),
+        scores=np.append(rng.uniform(size=n - 1), np.nan), base_scores=np.zeros(n), slip_m=nan4,
+        slip_rad=nan4, reachable=rng.uniform(size=n) < 0.5, failures=("",) * n,
+    )  # fmt: skip
+
+
+GRASPS = [grasp_set(0, 1), grasp_set(3, 7)]
+
+
+def make_session(folder: Path, unmodelled: bool = False) -> SessionStore:
+    """Return a session of three views; with `unmodelled`, a hand hides the flat box from above."""
+    session = CaptureSession(name="boxes", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(folder, session)
+    placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
+    placed.append(PlacedMesh(-1, table_slab(TransferConfig(plane_clearance_m=0.0)), TABLE))
+    if unmodelled:
+        hand = se3.from_translation([0.53, 0.02, 0.35])
+        placed.append(PlacedMesh(-1, box((0.05, 0.05, 0.01)), hand))
+    renderer = LabelRenderer(placed)
+    for index, T in CAMERAS.items():
+        labels = renderer.render(INTRINSICS, T)
+        grey = np.where(labels.ids >= 0, 90 + 30 * labels.ids, 200).astype(np.uint8)
+        depth = labels.depth_m.copy()
+        depth[:, :4] = 0.0  # a stereo camera's blind border
+        store.add_view(View(index=index, T_world_cam=T), np.stack([grey] * 3, -1), depth)
+    return store
+
+
+def parts(store: SessionStore) -> dict[int, dict[str, Any]]:
+    return {i: store.read_json(f"annotations/{i:06d}.json") for i in CAMERAS}
+
+
+def mask(store: SessionStore, folder: str, view: int, k: int) -> NDArray[np.bool_]:
+    return images.read_grey(store.path(f"{folder}/{view:06d}_{k:06d}.png")) > 0
+
+
+def snapshot(store: SessionStore) -> dict[str, bytes]:
+    """Return the bytes of everything the transfer writes."""
+    found = {}
+    for pattern in ("mask/*", "mask_visib/*", "annotations/*", "grasps/views/*", "scene_gt*"):
+        found |= {
+            str(p.relative_to(store.folder)): p.read_bytes() for p in store.folder.glob(pattern)
+        }
+    return found
+
+
+@pytest.fixture(scope="module")
+def annotated(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
+    store = make_session(tmp_path_factory.mktemp("s") / "boxes")
+    summary = annotate(store, SCENE, MODELS, GRASPS)
+    assert (summary.views, summary.skipped, summary.objects) == (3, 0, (0, 3))
+    assert summary.doubtful == (3,) and summary.left_out == () and summary.grasps == 12
+    assert all(a > 0.99 for a in summary.agreement.values())
+    assert "3 views annotated" in str(summary)
+    return store
+
+
+def test_the_bop_reader_gives_back_the_poses(annotated: SessionStore) -> None:
+    scene = bop.read_scene(bop.find_scenes(annotated.folder)[0])
+    for index, T_world_cam in CAMERAS.items():
+        found = scene.ground_truth[index]
+        assert [a.obj_id for a in found] == [1, 7]
+        for a, placed in zip(found, SCENE.objects, strict=True):
+            np.testing.assert_allclose(T_world_cam @ a.T_cam_obj, placed.T_world_obj, atol=1e-9)
+
+
+def test_masks_nest_and_counts_agree_with_them(annotated: SessionStore) -> None:
+    info = annotated.read_json("scene_gt_info.json")
+    hidden_somewhere = False
+    for index in CAMERAS:
+        together = np.zeros((120, 160), int)
+        for k, entry in enumerate(info[str(index)]):
+            whole = mask(annotated, "mask", index, k)
+            visible = mask(annotated, "mask_visib", index, k)
+            together += visible
+            assert not np.any(visible & ~whole)
+            assert entry["px_count_visib"] == np.count_nonzero(visible)
+            assert entry["px_count_all"] == np.count_nonzero(whole)  # nothing leaves the image
+            assert entry["px_count_valid"] <= entry["px_count_all"]
+            assert entry["visib_fract"] == pytest.approx(visible.sum() / whole.sum())
+            hidden_somewhere |= entry["visib_fract"] < 0.9
+        assert together.max() == 1  # a pixel sees one object
+    assert hidden_somewhere
+
+
+def test_the_photograph_shows_what_the_visible_masks_say(annotated: SessionStore) -> None:
+    for index in CAMERAS:
+        grey = annotated.rgb(index)[..., 0]
+        for k, placed in enumerate(SCENE.objects):
+            seen = grey == 90 + 30 * placed.instance
+            visible = mask(annotated, "mask_visib", index, k)
+            # The table that hides things lies 2 mm lower than the one in the photograph.
+            assert np.mean(seen[visible]) > 0.97 and np.mean(visible[seen]) == 1.0
+
+
+def test_coco_holds_the_visible_masks(annotated: SessionStore) -> None:
+    coco = annotated.read_json("scene_gt_coco.json")
+    assert [c["name"] for c in coco["categories"]] == ["tall", "flat"]
+    k_of = {1: 0, 7: 1}
+    for a in coco["annotations"]:
+        saved = mask(annotated, "mask_visib", a["image_id"], k_of[a["category_id"]])
+        np.testing.assert_array_equal(mask_of(a["segmentation"]), saved)
+    assert len(coco["annotations"]) == 6
+
+
+def test_grasps_of_a_view_are_the_objects_grasps_in_its_camera(annotated: SessionStore) -> None:
+    seen: list[int] = []
+    for index, T_world_cam in CAMERAS.items():
+        with np.load(annotated.path(f"grasps/views/{index:06d}.npz")) as data:
+            got = dict(data)
+        expected = [
+            se3.invert(T_world_cam) @ SCENE.object(g.instance).T_world_obj @ g.Ts_obj_grasp
+            for g in GRASPS
+        ]
+        np.testing.assert_allclose(got["Ts_cam_grasp"], np.concatenate(expected), atol=1e-12)
+        np.testing.assert_array_equal(got["instance"], [0] * 6 + [3] * 6)
+        np.testing.assert_array_equal(got["scores"], np.concatenate([g.scores for g in GRASPS]))
+        reachable = np.concatenate([g.reachable for g in GRASPS])
+        np.testing.assert_array_equal(got["reachable"], reachable)
+        np.testing.assert_array_equal(got["visibility"], got["contact_seen"].sum(1))
+        seen += got["visibility"].tolist()
+    assert {0, 2} <= set(seen)
+
+
+def test_the_sidecar_flags_doubt_and_describes_the_objects(annotated: SessionStore) -> None:
+    for part in parts(annotated).values():
+        assert [o["verdict"] for o in part["objects"]] == ["accepted", "doubtful"]
+        assert part["objects"][1]["reasons"] == ["one view only"]
+    tall = annotated.read_json("annotations/objects.json")["objects"][0]
+    np.testing.assert_allclose(tall["physical"]["extent_m"], [0.04, 0.04, 0.12])
+    np.testing.assert_allclose(tall["physical"]["centroid_obj_m"], np.zeros(3), atol=1e-12)
+    assert tall["physical"]["volume_m3"] == pytest.approx(0.04 * 0.04 * 0.12)
+    assert tall["physical"]["convex_hull_volume_fraction"] == pytest.approx(1.0)
+
+
+def test_an_unmodelled_occluder_is_noticed(tmp_path: Path) -> None:
+    store = make_session(tmp_path / "s", unmodelled=True)
+    annotate(store, SCENE, MODELS, GRASPS)
+    flat_from_above = parts(store)[2]["objects"][1]["depth"]
+    assert flat_from_above["nearer"] > 0.2
+    assert flat_from_above["agree"] == pytest.approx(1 - flat_from_above["nearer"], abs=0.02)
+    assert parts(store)[2]["objects"][0]["depth"]["nearer"] < 0.2
+
+
+def test_again_is_skipped_and_from_scratch_is_the_same(
+    annotated: SessionStore, tmp_path: Path
+) -> None:
+    before = snapshot(annotated)
+    calls: list[tuple[int, int]] = []
+    again = annotate(
+        annotated, SCENE, MODELS, GRASPS, progress=lambda done, total: calls.append((done, total))
+    )
+    assert again.skipped == 3 and calls == [(1, 3), (2, 3), (3, 3)]
+    assert snapshot(annotated) == before
+    fresh = make_session(tmp_path / "fresh")
+    annotate(fresh, SCENE, MODELS, GRASPS)
+    assert {k: v for k, v in snapshot(fresh).items() if "coco" not in k} == {
+        k: v
+        for k, v in before.items()
+        if "coco" not in k  # coco carries the creation date
+    }
+
+
+class Killed(Exception):
+    """Stands for a SIGKILL."""
+
+
+def kill_after(n: int):
+    def progress(done: int, total: int) -> None:
+        if done == n:
+            raise Killed
+
+    return progress
+
+
+def test_a_killed_run_goes_on_where_it_stopped(tmp_path: Path, annotated: SessionStore) -> None:
+    store = make_session(tmp_path / "s")
+    with pytest.raises(Killed):
+        annotate(store, SCENE, MODELS, GRASPS, progress=kill_after(2))
+    assert not store.has("scene_gt.json")
+    summary = annotate(SessionStore.open(store.folder), SCENE, MODELS, GRASPS)
+    assert summary.skipped == 2
+    done, reference = snapshot(store), snapshot(annotated)
+    assert {k: v for k, v in done.items() if "coco" not in k} == {
+        k: v for k, v in reference.items() if "coco" not in k
+    }
+
+
+def moved(scene: Scene) -> Scene:
+    first, *others = scene.objects
+    T = first.T_world_obj @ se3.from_translation([0.0, 0.02, 0.0])
+    return replace(scene, objects=(replace(first, T_world_obj=T), *others))
+
+
+def test_changed_inputs_are_done_again(tmp_path: Path) -> None:
+    store = make_session(tmp_path / "s")
+    annotate(store, SCENE, MODELS, GRASPS)
+    assert annotate(store, moved(SCENE), MODELS, GRASPS).skipped == 0
+    assert annotate(store, moved(SCENE), MODELS, GRASPS[:1]).skipped == 0
+    one_camera = CAMERAS[2] @ se3.from_translation([0.001, 0, 0])
+    store.set_cameras(INTRINSICS, {2: one_camera})
+    assert annotate(store, moved(SCENE), MODELS, GRASPS[:1]).skipped == 2
+
+
+def test_going_back_after_a_kill_leaves_no_foreign_masks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = make_session(tmp_path / "s")
+    annotate(store, SCENE, MODELS, GRASPS)
+    before = snapshot(store)
+
+    def killed(*_: Any) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(transfer_files, "write_part", killed)
+        with pytest.raises(Killed):
+            annotate(store, moved(SCENE), MODELS, GRASPS)
+    assert snapshot(store) != before
+    assert annotate(store, SCENE, MODELS, GRASPS).skipped == 2
+    assert snapshot(store) == before
+
+
+def test_a_rejected_object_leaves_and_takes_its_masks_along(tmp_path: Path) -> None:
+    store = make_session(tmp_path / "s")
+    annotate(store, SCENE, MODELS, GRASPS)
+    only = replace(SCENE, objects=(SCENE.objects[0], replace(SCENE.objects[1], verdict="rejected")))
+    summary = annotate(store, only, MODELS, GRASPS)
+    assert summary.left_out == (3,) and summary.grasps == 6
+    names = sorted(p.name for p in (store.folder / "mask").iterdir())
+    assert names == [f"{i:06d}_000000.png" for i in CAMERAS]
+    assert all(len(rows) == 1 for rows in store.read_json("scene_gt.json").values())
+    with np.load(store.path("grasps/views/000000.npz")) as data:
+        assert set(data["instance"].tolist()) == {0}
+    assert all(c["name"] != "flat" for c in store.read_json("scene_gt_coco.json")["categories"])
+
+
+def test_without_cameras_it_says_calibrate_first(tmp_path: Path) -> None:
+    session = CaptureSession(name="raw", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(tmp_path / "s", session)
+    store.add_view(View(index=4), np.zeros((120, 160, 3), np.uint8))
+    with pytest.raises(InputError, match=r"view 4.*calibrate first"):
+        annotate(store, SCENE, MODELS, GRASPS)
+    assert not store.has("scene_gt.json")
+
+
+def test_missing_models_and_foreign_grasps_are_named(annotated: SessionStore) -> None:
+    with pytest.raises(InputError, match=r"\[7\].*tall \(1\)"):
+        annotate(annotated, SCENE, {1: MODELS[1]}, GRASPS)
+    with pytest.raises(InputError, match="instance 0 are of object 7"):
+        annotate(annotated, SCENE, MODELS, [grasp_set(0, 7)])
+    with pytest.raises(InputError, match="instance 9"):
+        annotate(annotated, SCENE, MODELS, [grasp_set(9, 7)])
+
+
+def test_a_view_without_depth_is_labelled_all_the_same(tmp_path: Path) -> None:
+    session = CaptureSession(name="colour", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(tmp_path / "s", session)
+    store.add_view(View(index=0, T_world_cam=CAMERAS[2]), np.zeros((120, 160, 3), np.uint8))
+    summary = annotate(store, SCENE, MODELS, GRASPS)
+    entry = json.loads(store.path("annotations/000000.json").read_text())["objects"][0]
+    assert entry["px_count_valid"] == 0 and entry["px_count_visib"] > 100
+    assert entry["depth"]["agree"] is None and np.isnan(summary.agreement[0])
+
+
+def test_best_and_worst_are_the_extremes() -> None:
+    grasps = grasp_set(0, 1, n=30)
+    chosen = best_and_worst(grasps, 8)
+    tried = np.sort(grasps.scores[:-1])
+    np.testing.assert_array_equal(
+        np.sort(grasps.scores[chosen]), np.concatenate([tried[:4], tried[-4:]])
+    )
+
+
+def test_the_overlay_draws_on_the_objects_only(annotated: SessionStore) -> None:
+    pytest.importorskip("realsim.rendering.overlay")
+    picture = overlay_picture(annotated, 2, SCENE, MODELS, GRASPS, max_grasps=4)
+    before = annotated.rgb(2)
+    assert picture.shape == before.shape and picture.dtype == np.uint8
+    changed = np.any(picture != before, axis=-1)
+    assert 0.02 < np.mean(changed) < 0.5
+    assert not np.any(changed[:, :5])

@@ -1,0 +1,198 @@
+"""Grasps in view and frame labels: laws and known answers on boxes."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from realsim_sim_bridge import frame_labels
+from realsim_sim_bridge.transfer_grasps import (
+    GraspsInView,
+    GraspVisibility,
+    SightConfig,
+    contact_points,
+    free_lines,
+    grasps_in_view,
+    in_image,
+)
+
+from realsim import CameraIntrinsics, GraspSet, Mesh, ObjectPose
+from realsim.formats.bop_labels import bbox_of
+from realsim.geometry import camera, se3
+from realsim.rendering.labels import LabelRenderer, PlacedMesh
+
+INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
+SIDE = 0.05
+
+
+def box(size: tuple[float, float, float]) -> Mesh:
+    """Return a box about the origin with outward faces."""
+    s = (
+        np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        * np.array(size)
+        / 2
+    )
+    faces = [
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ]  # fmt: skip
+    return Mesh(vertices=s, faces=np.array(faces, np.int32))
+
+
+def grasp_set(Ts: NDArray[np.float64], width: float = SIDE) -> GraspSet:
+    n = len(Ts)
+    nan4 = np.full((n, 4), np.nan)
+    return GraspSet(
+        obj_id=1, instance=0, Ts_obj_grasp=Ts, widths_m=np.full(n, width),
+        scores=np.linspace(0, 1, n), base_scores=np.zeros(n), slip_m=nan4, slip_rad=nan4,
+        reachable=np.arange(n) % 2 == 0, failures=("",) * n,
+    )  # fmt: skip
+
+
+# A grasp from above: z (approach) down, y (closing) along the world's y, 15 mm below the top.
+TOP_GRASP = se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, SIDE / 2 - 0.015])
+
+
+def seen_from(eye: list[float], *walls: PlacedMesh) -> GraspsInView:
+    renderer = LabelRenderer([PlacedMesh(0, box((SIDE,) * 3), np.eye(4)), *walls])
+    T = se3.look_at(eye, [0, 0, 0])
+    grasps = grasp_set(TOP_GRASP[None])
+    return grasps_in_view(renderer, INTRINSICS, T, np.eye(4), grasps, SightConfig())
+
+
+def test_contacts_lie_half_a_width_along_the_closing_axis() -> None:
+    rng = np.random.default_rng(0)
+    Ts = se3.random_transform(rng, 20)
+    widths = rng.uniform(0, 0.1, 20)
+    c = contact_points(Ts, widths)
+    np.testing.assert_allclose(np.linalg.norm(c[:, 1] - c[:, 0], axis=1), widths, atol=1e-12)
+    np.testing.assert_allclose(c.mean(1), Ts[:, :3, 3], atol=1e-12)
+    T = se3.random_transform(rng)
+    np.testing.assert_allclose(
+        contact_points(T @ Ts, widths).reshape(-1, 3),
+        se3.transform(T, c.reshape(-1, 3)),
+        atol=1e-12,
+    )
+
+
+def test_from_above_both_contacts_are_seen() -> None:
+    assert seen_from([0.0, 0.0, 0.5]).visibility[0] == GraspVisibility.VISIBLE
+
+
+def test_from_the_side_of_one_finger_only_that_contact_is_seen() -> None:
+    grasp_y = TOP_GRASP[:3, 1]  # the grasp's +y in the world
+    view = seen_from(list(0.5 * grasp_y + [0.0, 0.0, 0.1]))
+    np.testing.assert_array_equal(view.contact_seen[0], [False, True])
+    assert view.visibility[0] == GraspVisibility.PARTLY
+
+
+def test_behind_a_wall_nothing_is_seen() -> None:
+    wall = PlacedMesh(-1, box((0.3, 0.3, 0.01)), se3.from_translation([0, 0, 0.2]))
+    assert seen_from([0.0, 0.0, 0.5], wall).visibility[0] == GraspVisibility.HIDDEN
+
+
+def test_out_of_the_image_nothing_is_seen() -> None:
+    renderer = LabelRenderer([PlacedMesh(0, box((SIDE,) * 3), np.eye(4))])
+    away = se3.look_at([0.0, 0.0, 0.5], [0.6, 0.0, 0.0])
+    view = grasps_in_view(
+        renderer, INTRINSICS, away, np.eye(4), grasp_set(TOP_GRASP[None]), SightConfig()
+    )
+    assert view.visibility[0] == GraspVisibility.HIDDEN
+
+
+def test_grasps_move_with_the_world() -> None:
+    rng = np.random.default_rng(1)
+    W = se3.random_transform(rng, spread=0.3)
+    Ts = TOP_GRASP @ se3.from_rt(se3.exp_so3(rng.normal(size=(40, 3)) * 0.8), np.zeros((40, 3)))
+    mesh = box((SIDE,) * 3)
+    T = se3.look_at([0.2, 0.1, 0.4], [0, 0, 0])
+    a, b = (
+        grasps_in_view(
+            LabelRenderer([PlacedMesh(0, mesh, X)]), INTRINSICS, X @ T, X, grasp_set(Ts),
+            SightConfig(),
+        )
+        for X in (np.eye(4), W)
+    )  # fmt: skip
+    np.testing.assert_allclose(a.Ts_cam_grasp, b.Ts_cam_grasp, atol=1e-12)
+    np.testing.assert_array_equal(a.visibility, b.visibility)
+    assert len(set(a.visibility.tolist())) > 1
+
+
+def test_a_line_to_the_surface_is_free_and_through_it_is_not() -> None:
+    renderer = LabelRenderer([PlacedMesh(0, box((SIDE,) * 3), np.eye(4))])
+    depths = SIDE / 2 + np.array([0.01, 0.0, -0.0005, -0.002, -0.03])
+    points = np.stack([np.zeros(5), np.zeros(5), depths], -1)
+    free = free_lines(renderer, [0.0, 0.0, 0.5], points, 0.001)
+    np.testing.assert_array_equal(free, [True, True, True, False, False])
+
+
+def test_in_image_agrees_with_projection_and_refuses_folded_points() -> None:
+    barrel = CameraIntrinsics(
+        width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5,
+        distortion=np.array([-0.35, 0.05, 0, 0, 0]),
+    )  # fmt: skip
+    rng = np.random.default_rng(2)
+    p = rng.uniform([-2, -2, -0.5], [2, 2, 1.0], (4000, 3))
+    for cam in (INTRINSICS, barrel):
+        inside = in_image(cam, p)
+        assert np.all(p[inside, 2] > 0)
+        uv = camera.project(cam, p[inside])
+        assert np.all(np.abs(uv - [79.5, 59.5]) <= [80.0, 60.0])
+        # Nothing far outside the field of view may be taken for a point in the image.
+        assert np.max(np.abs(p[inside, :2] / p[inside, 2:])) < 1.0
+    folded = np.array([[2.4, 0.0, 1.0]])
+    assert np.abs(camera.project(barrel, folded)[0, 0] - 79.5) < 2000
+    assert not in_image(barrel, folded)[0]
+
+
+def label(eye: list[float], target: list[float], depth_error: float = 0.0):
+    pose = ObjectPose(obj_id=1, instance=0, T_world_obj=np.eye(4))
+    mesh = box((SIDE,) * 3)
+    T = se3.look_at(eye, target)
+    labels = LabelRenderer([PlacedMesh(0, mesh, np.eye(4))]).render(INTRINSICS, T)
+    depth = np.where(labels.depth_m > 0, labels.depth_m + depth_error, 0).astype(np.float32)
+    return labels, frame_labels.label_object(pose, mesh, labels, depth, INTRINSICS, T, 0.01)
+
+
+def test_an_unhidden_object_is_whole() -> None:
+    labels, got = label([0.1, 0.2, 0.4], [0, 0, 0])
+    assert got.info["visib_fract"] == 1.0
+    assert got.info["bbox_obj"] == got.info["bbox_visib"] == list(bbox_of(labels.ids == 0))
+    assert (
+        got.info["px_count_all"]
+        == got.info["px_count_valid"]
+        == got.info["px_count_visib"]
+        == np.sum(labels.ids == 0)
+    )
+    assert got.agreement.agree == 1.0 and got.agreement.measured == 1.0
+    np.testing.assert_allclose(got.T_cam_obj[:3, 3], [0, 0, np.sqrt(0.21)], atol=1e-12)
+
+
+@pytest.mark.parametrize(("error", "share"), [(-0.03, "nearer"), (0.03, "farther")])
+def test_wrong_depth_is_named(error: float, share: str) -> None:
+    _, got = label([0.1, 0.2, 0.4], [0, 0, 0], error)
+    assert getattr(got.agreement, share) == 1.0
+    assert got.agreement.agree == 0.0
+    assert np.isnan(got.agreement.bias_m)
+
+
+def test_depth_bias_is_measured() -> None:
+    _, got = label([0.1, 0.2, 0.4], [0, 0, 0], 0.004)
+    assert got.agreement.bias_m == pytest.approx(0.004, abs=1e-6)
+
+
+def test_a_box_beyond_the_border_is_where_a_wider_camera_sees_it() -> None:
+    eye, target = [0.0, -0.05, 0.3], [0.14, 0.03, 0.0]
+    _, cut = label(eye, target)
+    wide = CameraIntrinsics(width=480, height=360, fx=150.0, fy=150.0, cx=239.5, cy=179.5)
+    T = se3.look_at(eye, target)
+    ids = LabelRenderer([PlacedMesh(0, box((SIDE,) * 3), np.eye(4))]).render(wide, T).ids
+    x, y, w, h = bbox_of(ids == 0)
+    assert cut.info["px_count_visib"] < cut.info["px_count_all"] == np.sum(ids == 0)
+    np.testing.assert_allclose(cut.info["bbox_obj"], (x - 160, y - 120, w, h), atol=1.01)
+    assert cut.info["bbox_obj"][1] + cut.info["bbox_obj"][3] > 119
+
+
+def test_an_object_out_of_view_has_no_box() -> None:
+    _, got = label([0.0, 0.0, 0.5], [5.0, 0.0, 0.0])
+    assert got.info["bbox_obj"] == got.info["bbox_visib"] == [-1, -1, -1, -1]
+    assert got.info["px_count_visib"] == 0 and got.info["visib_fract"] == 0.0
+    assert np.isnan(got.agreement.measured)
