@@ -155,8 +155,8 @@ class CaptureSession:
         """Check the depth unit and that view numbers are unique."""
         if not (np.isfinite(self.depth_unit_m) and 1e-6 <= self.depth_unit_m <= 0.01):
             raise InputError(
-                f"session '{self.name}': the depth unit is {self.depth_unit_m} m per count; between "
-                "1e-6 and 0.01 is accepted (0.001 for millimetres, 0.0001 for a D405)."
+                f"session '{self.name}': the depth unit is {self.depth_unit_m} m per count; "
+                "between 1e-6 and 0.01 is accepted (0.001 for millimetres, 0.0001 for a D405)."
             )
         indices = [v.index for v in self.views]
         if len(set(indices)) != len(indices):

@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 RIGID_TOLERANCE = 1e-5
 """How far R^T R may be from the identity: float32 files pass, a scaled or sheared matrix fails."""
 
+EXACT_TOLERANCE = 1e-14
+"""A rotation this near to orthonormal is left as it is, so that checking twice changes nothing."""
+
 
 def hat(w: ArrayLike) -> Array:
     """Return the skew matrix (..., 3, 3) with `hat(w) @ p = cross(w, p)`."""
@@ -208,8 +211,9 @@ def check_rigid(T: ArrayLike, name: str) -> Array:
             f"{RIGID_TOLERANCE:g} is accepted; mean scale {scale:.4g}). If it carries a scale, "
             "divide the rotation by it and apply the scale to the mesh."
         )
-    U, _, Vt = np.linalg.svd(R)
-    T[..., :3, :3] = U @ Vt
+    if error > EXACT_TOLERANCE:
+        U, _, Vt = np.linalg.svd(R)
+        T[..., :3, :3] = U @ Vt
     return T
 
 

@@ -20,6 +20,8 @@ import numpy as np
 from realsim.errors import InputError
 from realsim.records import ObjectPose, Scene, Verdict
 
+JOURNAL_FILE = "review/journal.jsonl"
+"""Where in a session the decisions stand."""
 Action = Literal["accept", "reject", "comment", "undo"]
 FORMAT = 1
 """Version of the line format; a reader refuses a newer one."""

@@ -16,10 +16,10 @@ from realsim.errors import InputError
 from realsim.formats.bop_models import load_models
 from realsim.records import ObjectPose, Scene
 from realsim.review import content, guard, journal
+from realsim.review.journal import JOURNAL_FILE
 from realsim.review.scene_nodes import GraspFilter, SceneConfig, SceneNodes
 from realsim.store import SessionStore, load_grasps, load_scene
 
-JOURNAL_FILE = "review/journal.jsonl"
 ALL_OBJECTS = "all objects"
 GOOD_SCORE = 0.5
 """Grasps drawn at first: the good ones; all of them hide the objects."""

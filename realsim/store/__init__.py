@@ -1,1 +1,28 @@
 """A session on disk: atomic, checksummed, resumable."""
+
+from realsim.store.records_json import tag_board_from_json, tag_board_to_json
+from realsim.store.results import (
+    load_board,
+    load_grasps,
+    load_hand_eye,
+    load_scene,
+    save_board,
+    save_grasps,
+    save_hand_eye,
+    save_scene,
+)
+from realsim.store.session_store import SessionStore
+
+__all__ = [
+    "SessionStore",
+    "load_board",
+    "load_grasps",
+    "load_hand_eye",
+    "load_scene",
+    "save_board",
+    "save_grasps",
+    "save_hand_eye",
+    "save_scene",
+    "tag_board_from_json",
+    "tag_board_to_json",
+]

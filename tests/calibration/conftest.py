@@ -3,10 +3,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from realsim_calibration import BoardView, TagDetections
 
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, TagBoard
+from realsim_calibration import BoardView, TagDetections
 
 Array = NDArray[np.float64]
 MODULES = 8  # of a 36h11 tag with its black border

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
-from realsim_calibration import CLOSED_FORMS, check_observable, daniilidis, park, shah
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
+from realsim_calibration import CLOSED_FORMS, check_observable, daniilidis, park, shah
 
 ALL = sorted(CLOSED_FORMS)
 

@@ -2,12 +2,12 @@ import time
 
 import numpy as np
 import pytest
-from realsim_calibration import DetectionConfig, TagDetections, detect_tags
-from realsim_calibration.edges import EdgeConfig, bilinear, fit_lines
 
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, TagBoard
+from realsim_calibration import DetectionConfig, TagDetections, detect_tags
+from realsim_calibration.edges import EdgeConfig, bilinear, fit_lines
 
 BOARD = TagBoard(rows=2, columns=3, tag_size_m=0.032, gap_m=0.008)
 CAMERA = CameraIntrinsics(width=480, height=360, fx=600.0, fy=600.0, cx=239.5, cy=179.5)

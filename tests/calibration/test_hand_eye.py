@@ -2,6 +2,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
+from realsim.errors import DegenerateError, InputError, UnitError
+from realsim.geometry import se3
 from realsim_calibration import (
     CLOSED_FORMS,
     BoardView,
@@ -23,9 +26,6 @@ from realsim_calibration.joint_solve import (
     view_residuals,
 )
 from realsim_calibration.uncertainty import estimate_uncertainty
-
-from realsim.errors import DegenerateError, InputError, UnitError
-from realsim.geometry import se3
 
 
 def error_of(hand_eye, sim):

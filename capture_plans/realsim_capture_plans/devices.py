@@ -1,0 +1,134 @@
+"""What a capture needs of an arm and of a depth camera, whoever made them.
+
+Frames and units: joints in rad in the order of `kinematics.DhChain`; `T_base_ee` (4, 4) is the
+bare flange in the controller's `base` [m] (no tool offset may be configured); images follow
+`CameraIntrinsics`, integer pixel = pixel centre; depth is float32 metres along z, 0 = none, and
+is aligned to the colour image pixel by pixel. Time stamps are seconds of one clock per device.
+
+Every call blocks until it is done: `move` returns when the arm stands at its goal, `grab` returns
+a frame exposed after the call began. Whatever stops a device is a DeviceError.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError, RealsimError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics
+from realsim_capture_plans.kinematics import JOINTS, JointLimits
+
+Array = NDArray[np.float64]
+
+
+class DeviceError(RealsimError):
+    """A device cannot go on: protective stop, connection lost, no camera, no steady frame."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ArmState:
+    """Where the arm says it is, at one moment."""
+
+    joints: Array
+    """(6,) measured joint angles [rad]."""
+    T_base_ee: Array
+    """(4, 4) the controller's own (factory-calibrated) flange pose in its base [m]."""
+    time_s: float
+    """Time stamp of the reading [s]."""
+
+    def __post_init__(self) -> None:
+        """Check shapes and freeze the arrays."""
+        joints = np.array(self.joints, dtype=np.float64)
+        if joints.shape != (JOINTS,) or not np.all(np.isfinite(joints)):
+            raise InputError(f"the arm's joints are {joints.tolist()}; 6 finite angles are needed.")
+        T = se3.check_rigid(self.T_base_ee, "the arm's T_base_ee")
+        for name, value in (("joints", joints), ("T_base_ee", T)):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Frame:
+    """One colour image with its depth."""
+
+    rgb: NDArray[np.uint8]
+    """(H, W, 3) colour."""
+    depth_m: NDArray[np.float32]
+    """(H, W) depth along z [m], 0 = no measurement."""
+    time_s: float
+    """Time stamp of the exposure [s]."""
+
+    def __post_init__(self) -> None:
+        """Check that the images belong together and freeze them."""
+        rgb = np.array(self.rgb)
+        depth = np.array(self.depth_m)
+        if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+            raise InputError(f"rgb is {rgb.dtype} {rgb.shape}; uint8 (H, W, 3) is needed.")
+        if depth.dtype != np.float32 or depth.shape != rgb.shape[:2]:
+            raise InputError(
+                f"depth is {depth.dtype} {depth.shape}; float32 metres of the colour image's size "
+                f"{rgb.shape[:2]} are needed."
+            )
+        for name, value in (("rgb", rgb), ("depth_m", depth)):
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+
+class Arm(Protocol):
+    """A six-joint arm that goes where it is told and says where it is."""
+
+    @property
+    def name(self) -> str:
+        """Model name, a key of `kinematics.CHAINS` where the chain is known."""
+        ...
+
+    @property
+    def limits(self) -> JointLimits:
+        """Limits of the joints."""
+        ...
+
+    def move(self, joints: ArrayLike) -> None:
+        """Go to joints (6,) [rad] on the straight line in joint space; return when standing still.
+
+        Raises:
+            InputError: the goal is not 6 finite angles within the limits; the arm has not moved.
+            DeviceError: the arm stopped on its way (protective or emergency stop, connection).
+        """
+        ...
+
+    def state(self) -> ArmState:
+        """Return where the arm is now.
+
+        Raises:
+            DeviceError: the arm does not answer.
+        """
+        ...
+
+
+class DepthCamera(Protocol):
+    """A camera whose depth is aligned to its colour image."""
+
+    @property
+    def name(self) -> str:
+        """Model and serial number."""
+        ...
+
+    @property
+    def intrinsics(self) -> CameraIntrinsics:
+        """The factory's camera model of the images that `grab` returns."""
+        ...
+
+    @property
+    def depth_unit_m(self) -> float:
+        """Metres per count of the sensor's own 16-bit depth."""
+        ...
+
+    def grab(self) -> Frame:
+        """Return a frame whose exposure began after this call.
+
+        Raises:
+            DeviceError: no frame came.
+        """
+        ...

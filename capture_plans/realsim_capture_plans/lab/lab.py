@@ -1,0 +1,198 @@
+"""The simulated lab: an arm, a camera in its hand, a table, a tag board and objects.
+
+It stands behind the same device protocols as the hardware, so that a capture cannot tell. What the
+pipeline may know is `board`, `models`, `nominal_T_ee_cam` and what the devices report; everything
+else is in `truth`, which exists to be written for the report, into a folder beside the session.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.parts import part, part_names
+from realsim.records import Mesh, ObjectModel, ObjectPose, TagBoard
+from realsim_capture_plans.lab import truth as lab_truth
+from realsim_capture_plans.lab.arm import SimulatedArm
+from realsim_capture_plans.lab.camera import SimulatedDepthCamera
+from realsim_capture_plans.lab.placement import CrowdedError, PlacementConfig, place_objects
+from realsim_capture_plans.lab.truth import LabConfig, LabTruth
+
+if TYPE_CHECKING:
+    from realsim.rendering.rays import PlacedMesh
+
+Array = NDArray[np.float64]
+
+BOARD = TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.01)
+"""270 x 190 mm of tags: what an A4 sheet holds."""
+BOARD_MARGIN_M = 0.0125
+"""White paper around the tags [m]."""
+BOARD_HEIGHT_M = 0.005
+"""Height of the board's middle over the table [m]: it is glued to a plate."""
+BOARD_TILT_DEG = 0.5
+"""Angle by which the plate rocks on the table [deg]."""
+TABLE_CENTER = (0.45, 0.0)
+"""Middle of the work space in base [m]: where a UR5 reaches most of a hemisphere."""
+TABLE_SIZE_M = (1.3, 1.5, 0.03)
+"""Slab of the table: depth, width, thickness [m]."""
+AIM_HEIGHT_M = 0.03
+"""Height of the point to look at over the table [m]: half of a typical object."""
+
+
+class SimulatedLab:
+    """A UR5 with a D405 at a table, in software. The same seed gives the same bytes."""
+
+    def __init__(self, config: LabConfig | None = None) -> None:
+        """Furnish the lab; the table is empty at first.
+
+        Args:
+            config: what stands in it; None is `LabConfig()`.
+
+        Raises:
+            InputError: a part is not known, or the objects do not fit onto the table.
+        """
+        config = config or LabConfig()
+        self.config = config
+        self.board = BOARD
+        self.nominal_T_ee_cam = lab_truth.T_EE_CAM_NOMINAL.copy()
+        self.table_height = 0.0
+        self.scene_center = np.array([*TABLE_CENTER, self.table_height + AIM_HEIGHT_M])
+        instances = _instances(config)
+        self.models: dict[int, ObjectModel] = {m.obj_id: m for m in instances}
+        self.truth = self._build_truth(instances)
+        self.arm = SimulatedArm()
+        self._on_table: Sequence[PlacedMesh] = self._table_only()
+        self.camera = SimulatedDepthCamera(config, self.truth, self.arm, lambda: self._on_table)
+
+    def _build_truth(self, instances: Sequence[ObjectModel]) -> LabTruth:
+        config = self.config
+        Ts = _layout(config, instances, np.array([*TABLE_CENTER, self.table_height]))
+        return LabTruth(
+            seed=config.seed,
+            T_ee_cam=lab_truth.true_mount(config),
+            intrinsics=lab_truth.true_intrinsics(config),
+            chain=lab_truth.true_chain(config),
+            repeat_m=config.repeat_mm / 1e3,
+            repeat_rad=float(np.radians(config.repeat_deg)),
+            objects=tuple(
+                ObjectPose(obj_id=m.obj_id, instance=k, T_world_obj=T)
+                for k, (m, T) in enumerate(zip(instances, Ts, strict=True))
+            ),
+            T_world_board=self._board_pose(),
+            table_height_m=self.table_height,
+        )
+
+    def _board_pose(self) -> Array:
+        """Return the board (4, 4) in the middle of the table, face up, a little turned."""
+        rng = lab_truth.stream(self.config.seed, lab_truth.BOARD)
+        yaw = rng.uniform(-0.3, 0.3)
+        tilt = np.radians(BOARD_TILT_DEG) * rng.uniform(-1, 1, size=2)
+        # x along the base's y axis: the board's long side lies across the arm's reach.
+        face_up = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+        R = se3.exp_so3([0.0, 0.0, yaw]) @ se3.exp_so3([*tilt, 0.0]) @ face_up
+        middle = np.array([*self.board.size_m, 0.0]) / 2
+        center = np.array([*TABLE_CENTER, self.table_height + BOARD_HEIGHT_M])
+        return se3.from_rt(R, center - R @ middle)
+
+    def _table_only(self) -> list["PlacedMesh"]:
+        from realsim.rendering.rays import BACKGROUND, PlacedMesh
+
+        slab = _slab(TABLE_SIZE_M)
+        below = se3.from_translation([*TABLE_CENTER, self.table_height - TABLE_SIZE_M[2] / 2])
+        return [PlacedMesh(BACKGROUND, slab, below)]
+
+    def clear(self) -> None:
+        """Take everything off the table."""
+        self._on_table = self._table_only()
+
+    def place_board(self) -> None:
+        """Lay the calibration board onto the empty table."""
+        from realsim.rendering.board import board_mesh
+        from realsim.rendering.rays import BACKGROUND, PlacedMesh
+
+        sheet = board_mesh(self.board, BOARD_MARGIN_M)
+        paper = PlacedMesh(BACKGROUND, sheet, self.truth.T_world_board)
+        self._on_table = [*self._table_only(), paper]
+
+    def place_objects(self) -> None:
+        """Put the objects onto the empty table."""
+        from realsim.rendering.rays import PlacedMesh
+
+        self._on_table = [
+            *self._table_only(),
+            *(
+                PlacedMesh(o.instance, self.models[o.obj_id].mesh, o.T_world_obj)
+                for o in self.truth.objects
+            ),
+        ]
+
+    def operator_starts(self, rng: np.random.Generator) -> list[ObjectPose]:
+        """Return the rough poses that a person would give: which object, about where, about how.
+
+        This is the simulated operator: the truth, turned and shifted by a normal angle and a
+        normal distance of `operator_deg` and `operator_mm`, each in a random direction.
+        """
+        starts: list[ObjectPose] = []
+        for o in self.truth.objects:
+            angle = np.radians(self.config.operator_deg) * rng.normal()
+            distance = self.config.operator_mm / 1e3 * rng.normal()
+            T = o.T_world_obj @ lab_truth.offset(rng, distance, angle)
+            starts.append(ObjectPose(obj_id=o.obj_id, instance=o.instance, T_world_obj=T))
+        return starts
+
+    def write_truth(self, folder: Path | str, views: Mapping[int, ArrayLike] | None = None) -> Path:
+        """Write the ground truth to FOLDER/truth.json and return the file.
+
+        Args:
+            folder: a folder of its own, beside the session and never in it.
+            views: {number: joints (6,)} of the captured views, whose true camera poses are then
+                written too. They follow from the seed and the joints, so they may also come from
+                a session that another process captured.
+        """
+        return lab_truth.write_truth(folder, lab_truth.with_views(self.truth, views or {}))
+
+
+def _instances(config: LabConfig) -> list[ObjectModel]:
+    """Return the model of every instance."""
+    names = config.objects
+    if names is None:
+        available = part_names()
+        if config.n_objects > len(available):
+            raise InputError(
+                f"{config.n_objects} different objects were asked for; {len(available)} parts are "
+                "shipped. Name them in `objects`, where a name may stand more than once."
+            )
+        rng = lab_truth.stream(config.seed, lab_truth.LAYOUT)
+        drawn = rng.choice(len(available), size=config.n_objects, replace=False)
+        names = tuple(available[k] for k in drawn)
+    return [part(name) for name in names]
+
+
+def _layout(config: LabConfig, instances: Sequence[ObjectModel], center: Array) -> Array:
+    """Return where the instances stand (n, 4, 4), in the least disc that takes them.
+
+    Raises:
+        InputError: they do not fit into the widest either.
+    """
+    *narrow, widest = config.disc_radii_m
+    for radius in narrow:
+        rng = lab_truth.stream(config.seed, lab_truth.LAYOUT)
+        try:
+            return place_objects(instances, center, rng, PlacementConfig(radius_m=radius))
+        except CrowdedError:
+            continue
+    rng = lab_truth.stream(config.seed, lab_truth.LAYOUT)
+    return place_objects(instances, center, rng, PlacementConfig(radius_m=widest))
+
+
+def _slab(size_m: tuple[float, float, float]) -> Mesh:
+    """Return a plain box about the origin; without colours a background is rendered as wood."""
+    from realsim.geometry import parts_solids as solids
+
+    x, y, z = size_m
+    vertices, faces = solids.weld([solids.extrude(solids.rectangle(x, y), -z / 2, z / 2)])
+    return Mesh(vertices=vertices, faces=faces)

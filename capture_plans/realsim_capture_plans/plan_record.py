@@ -1,0 +1,215 @@
+"""What a capture plan is, and the numbers it is made with."""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_capture_plans.collision import Box, CollisionModel
+from realsim_capture_plans.kinematics import CHAINS, JOINTS, DhChain
+
+Array = NDArray[np.float64]
+
+
+def default_mount() -> Array:
+    """Return the nominal T_ee_cam (4, 4): beside the flange, optical axis parallel to tool z."""
+    return se3.from_translation([0.0, -0.065, 0.035])
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PlanConfig:
+    """Where views may be, what must stay free, and how fast the arm goes."""
+
+    radius_m: tuple[float, float] = (0.28, 0.42)
+    """Camera to scene centre [m]. A D405's depth noise grows with z^2: 0.5 mm at 0.28 m, 1.2 mm
+    at 0.42 m; nearer, 1.11 r of image height does not hold a 0.3 m scene."""
+    radii: int = 3
+    """Radii tried between the two."""
+    elevation_deg: tuple[float, float] = (25.0, 85.0)
+    """Of the camera above the table, seen from the scene centre [deg]; lower views meet the table
+    and hide objects behind each other."""
+    rolls: int = 8
+    """Turns about the optical axis tried per direction: free roll makes 94 % of the directions
+    reachable, upright images only 70 %."""
+    oversampling: int = 4
+    """Directions tried per view wanted."""
+    least_directions: int = 200
+    """Directions tried at least, so that small plans see where the reachable set ends."""
+    board_distance_m: tuple[float, float] = (0.22, 0.40)
+    """Camera to the board's aim point in calibration views [m]: varied, it separates the focal
+    length from the distance."""
+    board_tilt_deg: float = 45.0
+    """Greatest angle between optical axis and board normal [deg]; tags blur beyond."""
+    aim_jitter_m: float = 0.03
+    """Aim points fill a square of this half-width on the board [m], so that the board moves over
+    the whole image and the distortion is seen in the corners."""
+    board_oversampling: int = 12
+    """Poses tried per calibration view wanted."""
+    table_height_m: float = 0.0
+    """z of the table's top in base [m]."""
+    table_rectangle_m: tuple[float, float, float, float] = (-0.6, 1.0, -0.8, 0.8)
+    """x from, x to, y from, y to of the table in base [m]."""
+    keep_out_m: tuple[float, float, float] = (0.30, 0.30, 0.12)
+    """Size of the box on the table round the scene centre that only objects may fill [m]."""
+    board_keep_out_m: tuple[float, float, float] = (0.30, 0.30, 0.02)
+    """The same for a board that lies on the table [m]."""
+    clearance_m: float = 0.010
+    """Least distance to everything [m]: covers 1-5 mm of uncalibrated kinematics."""
+    sigma_min: float = 0.05
+    """Least singular value of the Jacobian [rad, m mixed]; below it, wrists spin near singular
+    poses."""
+    edge_step_rad: float = 0.04
+    """Greatest joint step between checked configurations of a move [rad]: at most 37 mm at the
+    stretched arm's tip, in practice 5 mm or less."""
+    turn_reach_rad: float = 4.2
+    """A joint may be this far from home [rad]: more than half a turn, so that a tour can pass the
+    seam at pi, and little enough that cables do not wind up."""
+    branch_limit: int = 120
+    """Joint candidates kept per view, those nearest home."""
+    speed: float = 1.05
+    """Of the leading joint [rad/s] (ur_rtde's moveJ default)."""
+    acceleration: float = 1.4
+    """Of the leading joint [rad/s^2] (ur_rtde's moveJ default)."""
+    tour_rounds: int = 8
+    """Rounds of order and branch choice; they stop changing after three or four."""
+
+    def __post_init__(self) -> None:
+        """Check ranges."""
+        for name in ("radius_m", "elevation_deg", "board_distance_m"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high:
+                raise InputError(
+                    f"PlanConfig.{name} is ({low}, {high}); least, greatest, both > 0."
+                )
+        if self.elevation_deg[1] > 90 or not 0 < self.board_tilt_deg < 90:
+            raise InputError("PlanConfig: elevations and tilts lie between 0 and 90 degrees.")
+        if self.radius_m[1] > 2.0 or self.board_distance_m[1] > 2.0:
+            raise InputError(
+                f"PlanConfig: radii {self.radius_m} and distances {self.board_distance_m} are in "
+                "metres and a UR5 reaches 0.85 m. Were millimetres given?"
+            )
+        if min(self.speed, self.acceleration, self.clearance_m, self.edge_step_rad) <= 0:
+            raise InputError("PlanConfig: speed, acceleration, clearance, step must be positive.")
+
+    def collision_model(
+        self, chain: DhChain, T_ee_cam: ArrayLike, center: ArrayLike, kind: str
+    ) -> CollisionModel:
+        """Return the collision model of a plan of this kind about `center` (3,) in base [m]."""
+        x0, x1, y0, y1 = self.table_rectangle_m
+        top = self.table_height_m
+        size = self.keep_out_m if kind == "hemisphere" else self.board_keep_out_m
+        x, y, _ = np.asarray(center, dtype=np.float64).tolist()
+        table = Box(lower=(x0, y0, -np.inf), upper=(x1, y1, top))
+        keep_out = Box(
+            lower=(x - size[0] / 2, y - size[1] / 2, -np.inf),
+            upper=(x + size[0] / 2, y + size[1] / 2, top + size[2]),
+        )
+        return CollisionModel(chain, T_ee_cam, table, keep_out, self.clearance_m)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class CapturePlan:
+    """Views in the order in which they are taken, and how to get from each to the next.
+
+    Move k ends at view k; it starts at view k-1, move 0 at `home`. Straight lines in joint space
+    between home, the via points and the views have been checked for collision.
+    """
+
+    kind: Literal["hemisphere", "calibration"]
+    robot: str
+    """Key of `kinematics.CHAINS`."""
+    home: Array
+    """(6,) where the tour begins [rad]."""
+    joints: Array
+    """(N, 6) joints at each view [rad]."""
+    Ts_base_ee: Array
+    """(N, 4, 4) flange at each view [m]."""
+    Ts_base_cam: Array
+    """(N, 4, 4) camera at each view, if the mount is as nominal [m]."""
+    T_ee_cam_nominal: Array
+    """(4, 4) the mount that the plan was made for [m]."""
+    center_world: Array
+    """(3,) what the views look at [m]."""
+    vias: tuple[tuple[int, Array], ...]
+    """(move k, (K, 6) joints to pass) of the moves that are not straight."""
+    reference_view: int
+    """The most top-down view."""
+    config: PlanConfig
+    metrics: dict[str, float] = field(default_factory=dict)
+    """How good the plan is; the keys are explained in the README."""
+
+    def __post_init__(self) -> None:
+        """Check shapes and freeze the arrays."""
+        n = len(self.joints)
+        shapes = {
+            "home": (JOINTS,), "joints": (n, JOINTS), "Ts_base_ee": (n, 4, 4),
+            "Ts_base_cam": (n, 4, 4), "T_ee_cam_nominal": (4, 4), "center_world": (3,),
+        }  # fmt: skip
+        for name, shape in shapes.items():
+            array = np.array(getattr(self, name), dtype=np.float64)
+            if array.shape != shape or not np.all(np.isfinite(array)):
+                raise InputError(f"plan: {name} has shape {array.shape}; {shape} is needed.")
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if self.robot not in CHAINS:
+            raise InputError(f"robot '{self.robot}' is not known; there are {', '.join(CHAINS)}.")
+        if n == 0 or not 0 <= self.reference_view < n:
+            raise InputError(f"reference view {self.reference_view} is not one of {n} views.")
+        vias: list[tuple[int, Array]] = []
+        for k, via in self.vias:
+            q = np.array(via, dtype=np.float64)
+            if not 0 <= k < n or q.ndim != 2 or q.shape[1] != JOINTS:
+                raise InputError(f"via points of move {k} have shape {q.shape}; (K, 6) is needed.")
+            q.setflags(write=False)
+            vias.append((k, q))
+        object.__setattr__(self, "vias", tuple(vias))
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """The plan as plain JSON values, without schema and hash."""
+        arrays = ("home", "joints", "Ts_base_ee", "Ts_base_cam", "T_ee_cam_nominal", "center_world")
+        return {
+            "kind": self.kind,
+            "robot": self.robot,
+            **{name: getattr(self, name).tolist() for name in arrays},
+            "vias": [[k, q.tolist()] for k, q in self.vias],
+            "reference_view": self.reference_view,
+            "config": {k: list(v) if isinstance(v, tuple) else v for k, v in _fields(self.config)},
+            "metrics": self.metrics,
+        }
+
+    @property
+    def content_hash(self) -> str:
+        """The sha256 of the content, written as JSON with sorted keys and no spaces."""
+        text = json.dumps(self.content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self.joints)
+
+    def move(self, k: int) -> Array:
+        """Return the corners (K, 6) of move k, its start and its view included [rad]."""
+        start = self.home if k == 0 else self.joints[k - 1]
+        via = [q for edge, q in self.vias if edge == k]
+        return np.concatenate([start[None], *via, self.joints[k][None]])
+
+    def collision_model(self) -> CollisionModel:
+        """Return the model that the plan was checked with."""
+        return self.config.collision_model(
+            CHAINS[self.robot], self.T_ee_cam_nominal, self.center_world, self.kind
+        )
+
+    def directions(self) -> Array:
+        """Return the unit vectors (N, 3) from the centre to the cameras."""
+        d = self.Ts_base_cam[:, :3, 3] - self.center_world
+        return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True), dtype=np.float64)
+
+
+def _fields(config: PlanConfig) -> list[tuple[str, Any]]:
+    return list(asdict(config).items())

@@ -1,0 +1,209 @@
+"""The command line: one command per job, each importing what it needs only when it runs.
+
+Exit codes: 0 done, 1 done but a check failed, 2 something given cannot be used, 130 interrupted.
+"""
+
+import sys
+from pathlib import Path
+
+import click
+
+from realsim import __version__
+from realsim.errors import RealsimError
+
+FOLDER = click.Path(path_type=Path)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, prog_name="realsim")
+def commands() -> None:
+    """Turn robot captures into grasping data that one can trust.
+
+    Start with `realsim demo`: the whole loop in a simulated lab, no hardware needed. Every command
+    goes on where it stopped when it is run again.
+    """
+
+
+@commands.command()
+@click.option("--out", type=FOLDER, default=Path("demo"), show_default=True, help="Folder to fill.")
+@click.option("--views", default=24, show_default=True, type=click.IntRange(4, 1024))
+@click.option("--objects", default=5, show_default=True, type=click.IntRange(1, 40))
+@click.option("--seed", default=0, show_default=True, help="Another seed, another scene.")
+@click.option(
+    "--grasps",
+    default=60,
+    show_default=True,
+    type=click.IntRange(1, 2000),
+    help="Candidates to try on each object, at most.",
+)
+@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 64))
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def demo(
+    out: Path, views: int, objects: int, seed: int, grasps: int, workers: int, quiet: bool
+) -> None:  # fmt: skip
+    """Run the whole loop in a simulated lab and compare it with the truth."""
+    from realsim.app.console import Console
+    from realsim.app.demo import DemoConfig, run_demo, show_demo
+
+    config = DemoConfig(
+        views=views, objects=objects, seed=seed, grasps_per_object=grasps, workers=workers
+    )
+    console = Console(quiet=quiet)
+    show_demo(run_demo(config, out, console), console)
+
+
+@commands.command()
+@click.argument("dataset", type=FOLDER)
+@click.option("--out", type=FOLDER, required=True, help="Folder for the upgraded BOP dataset.")
+@click.option(
+    "--start",
+    default="gt",
+    show_default=True,
+    help="Start poses: 'gt' (scene_gt.json) or a folder under keyframe_poses/.",
+)
+@click.option("--scenes", default="", help="Scene numbers, comma-separated; all by default.")
+@click.option("--models", type=FOLDER, default=None, help="Models folder, if not DATASET/models.")
+@click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000))
+@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 64))
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def upgrade(
+    dataset: Path, out: Path, start: str, scenes: str, models: Path | None, grasps: int,
+    workers: int, quiet: bool,
+) -> None:  # fmt: skip
+    """Refine the poses of a BOP dataset, try grasps on it, and write it out with labels.
+
+    DATASET is a BOP root, a split, or one scene folder; nothing in it is changed.
+    """
+    from realsim.app.console import Console
+    from realsim.app.upgrade import UpgradeConfig, run_upgrade, show_upgrade
+
+    config = UpgradeConfig(
+        start=start, scenes=_numbers(scenes), models=models, grasps_per_object=grasps,
+        workers=workers,
+    )  # fmt: skip
+    console = Console(quiet=quiet)
+    show_upgrade(run_upgrade(config, dataset, out, console), console)
+
+
+@commands.command()
+@click.argument("session", type=FOLDER)
+@click.option("--quiet", is_flag=True)
+def calibrate(session: Path, quiet: bool) -> None:
+    """Hand-eye calibration from the board views under SESSION/calibration/capture."""
+    from realsim.app.console import Console
+    from realsim.app.stages import calibrate_session, open_session, show_hand_eye
+
+    console = Console(quiet=quiet)
+    show_hand_eye(calibrate_session(open_session(session), console), console)
+
+
+@commands.command()
+@click.argument("session", type=FOLDER)
+@click.option("--quiet", is_flag=True)
+def register(session: Path, quiet: bool) -> None:
+    """Find the pose of every object from SESSION/registration/starts.json."""
+    from realsim.app.console import Console
+    from realsim.app.stages import open_session, register_session, show_scene
+
+    console = Console(quiet=quiet)
+    store = open_session(session)
+    show_scene(store, register_session(store, console), console)
+
+
+@commands.command()
+@click.argument("session", type=FOLDER)
+@click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000))
+@click.option("--seed", default=0, show_default=True)
+@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 64))
+@click.option("--quiet", is_flag=True)
+def school(session: Path, grasps: int, seed: int, workers: int, quiet: bool) -> None:
+    """Try grasps on the registered objects of SESSION in the Robot School."""
+    from realsim.app.console import Console
+    from realsim.app.stages import open_session, school_session, show_grasps
+
+    console = Console(quiet=quiet)
+    store = open_session(session)
+    sets = school_session(store, console, grasps_per_object=grasps, seed=seed, workers=workers)
+    show_grasps(store, sets, console)
+
+
+@commands.command()
+@click.argument("session", type=FOLDER)
+@click.option("--quiet", is_flag=True)
+def annotate(session: Path, quiet: bool) -> None:
+    """Write masks, poses, visibility and grasps for every frame of SESSION."""
+    from realsim.app.console import Console
+    from realsim.app.stages import annotate_session, open_session
+
+    console = Console(quiet=quiet)
+    summary = annotate_session(open_session(session), console)
+    console.say(str(summary))
+
+
+@commands.command()
+@click.argument("session", type=FOLDER)
+@click.option("--truth", type=FOLDER, default=None, help="The simulated lab's truth folder.")
+def report(session: Path, truth: Path | None) -> None:
+    """Write SESSION/reports/report.html: one self-contained page with pictures."""
+    from realsim.app.console import Console
+    from realsim.app.report import write_report
+    from realsim.app.stages import open_session
+    from realsim.app.truth import loop_errors
+
+    store = open_session(session)
+    errors = None if truth is None else loop_errors(store, truth)
+    Console().say(str(write_report(store, errors)))
+
+
+@commands.command()
+@click.argument("session", type=FOLDER)
+@click.option("--host", default="127.0.0.1", show_default=True)
+@click.option("--port", default=8080, show_default=True, type=click.IntRange(0, 65535))
+def review(session: Path, host: str, port: int) -> None:
+    """Look at SESSION in the browser; accept or reject each object."""
+    import time
+
+    from realsim.app.stages import open_session
+    from realsim.review import ReviewServer
+
+    server = ReviewServer(open_session(session), host=host, port=port)
+    server.start()
+    click.echo(f"reviewing {session} at {server.url} (Ctrl-C ends)")
+    try:
+        while True:
+            time.sleep(1.0)
+    finally:
+        server.stop()
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    """Return the numbers of a comma-separated list."""
+    try:
+        return tuple(int(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        raise click.BadParameter(f"'{text}' is not a comma-separated list of numbers") from None
+
+
+def main() -> None:
+    """Run the command line; end with exit code 2 and one paragraph on bad input."""
+    try:
+        commands(standalone_mode=False)
+    except click.exceptions.Exit as stop:
+        sys.exit(stop.exit_code)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (click.Abort, KeyboardInterrupt):
+        click.echo("interrupted; the same command goes on from here.", err=True)
+        sys.exit(130)
+    except RealsimError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(2)
+    except OSError as error:
+        where = f" ({error.filename})" if error.filename else ""
+        click.echo(
+            f"error: the system refused a file operation: {error.strerror or error}{where}. "
+            "Check that the path exists, that it may be written, and that the disk is not full.",
+            err=True,
+        )
+        sys.exit(2)

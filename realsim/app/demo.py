@@ -1,0 +1,216 @@
+"""The whole loop in the simulated lab: plan, capture, calibrate, register, school, annotate.
+
+The pipeline sees only what a real lab would give it: images, joint angles, the controller's poses,
+the camera's factory values, the operator's rough poses. The truth goes to a folder of its own,
+which only the report opens.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from realsim.app.console import Console, StageTime
+from realsim.app.stages import (
+    BOARD_VIEWS,
+    GRASP_HEADER,
+    annotate_session,
+    calibrate_session,
+    grasp_rows,
+    register_session,
+    save_starts,
+    school_session,
+    session_models,
+    show_hand_eye,
+    show_scene,
+)
+from realsim.errors import InputError
+from realsim.records import CaptureSession, GraspSet, HandEye, Scene
+from realsim.store import SessionStore
+
+if TYPE_CHECKING:
+    from realsim.app.truth import LoopErrors
+    from realsim_capture_plans import CapturePlan
+    from realsim_capture_plans.lab import SimulatedLab
+
+BOARD_VIEW_SHARE = 24
+"""Most board views of a demo; a smaller demo takes as many as scene views, 12 at least."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DemoConfig:
+    """What the demo captures."""
+
+    views: int = 24
+    """Views of the scene."""
+    objects: int = 5
+    """Objects on the table."""
+    seed: int = 0
+    """Seed of everything random: scene, noise, sampling."""
+    grasps_per_object: int = 60
+    """Grasp candidates tried on each object, at most."""
+    workers: int = 2
+    """Processes in the Robot School."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class DemoResult:
+    """What the demo made and how far it is from the truth."""
+
+    folder: Path
+    store: SessionStore
+    hand_eye: HandEye
+    scene: Scene
+    grasps: list[GraspSet]
+    errors: "LoopErrors"
+    report: Path
+    times: list[StageTime]
+
+
+def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
+    """Run the loop in `out`, going on where an earlier run stopped.
+
+    Raises:
+        InputError: the folder holds a demo of another setup, or something else.
+    """
+    from threadpoolctl import threadpool_limits
+
+    from realsim.app.report import write_report
+    from realsim.app.truth import loop_errors
+    from realsim_capture_plans.lab import LabConfig, SimulatedLab
+
+    _claim(out, config)
+    # One BLAS thread: on small matrices the spinning of more costs more than the work.
+    with threadpool_limits(limits=1):
+        lab = SimulatedLab(LabConfig(seed=config.seed, n_objects=config.objects))
+        store = _capture_all(lab, config, out, console)
+        joints = {v.index: v.joints for v in store.session.views if v.joints is not None}
+        lab.write_truth(out / "truth", joints)
+        hand_eye = calibrate_session(store, console)
+        scene = register_session(store, console)
+        grasps = school_session(
+            store, console, grasps_per_object=config.grasps_per_object, seed=config.seed,
+            workers=config.workers,
+        )  # fmt: skip
+        annotate_session(store, console)
+        with console.stage("report"):
+            errors = loop_errors(store, out / "truth")
+            report = write_report(store, errors, times=console.times)
+    return DemoResult(
+        folder=out, store=store, hand_eye=hand_eye, scene=scene, grasps=grasps, errors=errors,
+        report=report, times=console.times,
+    )  # fmt: skip
+
+
+def _claim(out: Path, config: DemoConfig) -> None:
+    """Take the folder for this demo, or say why it cannot be had."""
+    from realsim.store.atomic import write_json
+
+    note = out / "demo.json"
+    wanted = {k: v for k, v in asdict(config).items() if k != "workers"}
+    if out.exists() and not out.is_dir():
+        raise InputError(f"'{out}' is a file; give --out a folder that may be made or filled.")
+    if note.is_file():
+        found = json.loads(note.read_text())
+        if found != wanted:
+            told = ", ".join(f"{k}={v}" for k, v in found.items())
+            raise InputError(
+                f"'{out}' holds a demo of another setup ({told}). Choose another --out, or delete "
+                "the folder to begin anew; the same setup would go on where it stopped."
+            )
+        return
+    if out.is_dir() and any(out.iterdir()):
+        raise InputError(
+            f"'{out}' is not empty and holds no demo. Choose another --out: nothing of yours is "
+            "overwritten."
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(note, wanted)
+
+
+def _capture_all(
+    lab: "SimulatedLab", config: DemoConfig, out: Path, console: Console
+) -> SessionStore:
+    """Plan and capture the board views and the scene views."""
+    from realsim.formats.bop_models import save_models
+    from realsim.store import save_board
+    from realsim_capture_plans import (
+        PlanConfig,
+        calibration_plan,
+        capture,
+        hemisphere_plan,
+        load_plan,
+        save_plan,
+    )
+
+    board_views = max(12, min(BOARD_VIEW_SHARE, config.views))
+    session = out / "session"
+    with console.stage("plan", f"{config.views} + {board_views} views") as tick:
+        plans: list[CapturePlan] = []
+        for name, make, n in (
+            ("plan.json", hemisphere_plan, config.views),
+            ("board_plan.json", calibration_plan, board_views),
+        ):
+            if not (out / name).is_file():
+                rng = np.random.default_rng([config.seed, 1, len(plans)])
+                plan = make(n, lab.scene_center, lab.nominal_T_ee_cam, PlanConfig(), rng)
+                save_plan(plan, out / name)
+            plans.append(load_plan(out / name))
+            tick(len(plans), 2)
+    store = _open_or_create(session, lab, config, {"plan_hash": plans[0].content_hash})
+    board = _open_or_create(
+        session / BOARD_VIEWS, lab, config, {"plan_hash": plans[1].content_hash}
+    )
+    save_board(store, lab.board)
+    with console.stage("capture", f"tag board, {board_views} views") as tick:
+        lab.place_board()
+        capture(plans[1], lab.arm, lab.camera, board, progress=tick)
+    with console.stage("capture", f"{config.objects} objects, {config.views} views") as tick:
+        lab.place_objects()
+        capture(plans[0], lab.arm, lab.camera, store, progress=tick)
+    save_models(store.folder / "models", lab.models)
+    starts = lab.operator_starts(np.random.default_rng([config.seed, 2]))
+    save_starts(store, starts, "rough poses given by the simulated operator")
+    return store
+
+
+def _open_or_create(
+    folder: Path, lab: "SimulatedLab", config: DemoConfig, extra: dict[str, Any]
+) -> SessionStore:
+    """Open a session that an earlier run began, or begin it."""
+    if (folder / "session.json").is_file():
+        return SessionStore.open(folder)
+    session = CaptureSession(
+        name=f"simulated lab, seed {config.seed}",
+        intrinsics=lab.camera.intrinsics,
+        views=(),
+        depth_unit_m=lab.camera.depth_unit_m,
+    )
+    about = {"arm": lab.arm.name, "camera": lab.camera.name, "gravity_up_world": [0.0, 0.0, 1.0]}
+    return SessionStore.create(folder, session, about | extra)
+
+
+def show_demo(result: DemoResult, console: Console) -> None:
+    """Print the tables, the errors against the truth, the pictures, and what to do next."""
+    show_hand_eye(result.hand_eye, console)
+    show_scene(result.store, result.scene, console)
+    models = session_models(result.store)
+    console.table("Robot School", GRASP_HEADER, grasp_rows(result.grasps, models))
+    console.table(
+        "Errors against the truth of the simulated lab",
+        ["figure", "measured", "goal"],
+        result.errors.rows(),
+    )
+    total = sum(t.cpu_s for t in result.times), sum(t.wall_s for t in result.times)
+    rows = [[t.name, f"{t.cpu_s:.1f}", f"{t.wall_s:.1f}"] for t in result.times]
+    console.table(
+        "Time", ["stage", "CPU [s]", "clock [s]"],
+        [*rows, ["all", f"{total[0]:.1f}", f"{total[1]:.1f}"]],
+    )  # fmt: skip
+    pictures = sorted((result.store.folder / "reports").glob("*.png"))
+    console.say(f"report    {result.report}")
+    for picture in pictures[:8]:
+        console.say(f"picture   {picture}")
+    console.say(f"review    realsim review {result.store.folder}")

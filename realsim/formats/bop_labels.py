@@ -1,0 +1,202 @@
+"""Writing BOP's annotations into a session: poses, masks, visibility and COCO.
+
+The n-th object of an image is the same one in scene_gt.json, in scene_gt_info.json and in the mask
+files IMAGE_n.png; keep the order.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.formats import bop_units
+from realsim.store.atomic import json_bytes
+from realsim.store.session_store import SessionStore, rgb_path
+
+Bbox = tuple[int, int, int, int]
+"""x, y, width, height [px]."""
+Mask = NDArray[np.bool_]
+Json = dict[str, Any]
+
+NO_BBOX: Bbox = (-1, -1, -1, -1)
+"""What BOP writes for an object that is not visible."""
+
+
+def mask_path(index: int, k: int, *, visible: bool) -> str:
+    """Return where the mask of the k-th object of an image is, relative to the session."""
+    return f"{'mask_visib' if visible else 'mask'}/{index:06d}_{k:06d}.png"
+
+
+def bbox_of(mask: Mask, *, inclusive: bool = False) -> Bbox:
+    """Return the box of a mask.
+
+    BOP's scene_gt_info has width = max - min, COCO (`inclusive`) has max - min + 1.
+    """
+    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
+    if len(columns) == 0:
+        return NO_BBOX
+    more = 1 if inclusive else 0
+    return (
+        int(columns[0]),
+        int(rows[0]),
+        int(columns[-1] - columns[0]) + more,
+        int(rows[-1] - rows[0]) + more,
+    )
+
+
+def rle_of(mask: Mask) -> Json:
+    """Return a mask as COCO's uncompressed run lengths: column by column, zeros first."""
+    flat = np.asarray(mask, dtype=np.bool_).ravel(order="F")
+    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
+    runs = np.diff(np.concatenate([[0], changes, [flat.size]]))
+    counts: list[int] = runs.tolist()
+    if flat.size and flat[0]:
+        counts = [0, *counts]
+    return {"counts": counts, "size": list(mask.shape)}
+
+
+def mask_of(rle: Json) -> Mask:
+    """Return the mask (H, W) of COCO's uncompressed run lengths."""
+    height, width = rle["size"]
+    counts = np.asarray(rle["counts"], dtype=np.int64)
+    if counts.sum() != height * width:
+        raise InputError(
+            f"run lengths add up to {counts.sum()} pixels; {height} x {width} are needed."
+        )
+    values = np.arange(len(counts)) % 2 == 1
+    return np.repeat(values, counts).reshape((height, width), order="F")
+
+
+def gt_info_entry(
+    mask: Mask,
+    mask_visib: Mask,
+    depth_m: NDArray[Any] | None,
+    *,
+    px_count_all: int | None = None,
+    bbox_obj: Bbox | None = None,
+) -> Json:
+    """Return one object's entry of scene_gt_info.json.
+
+    Args:
+        mask: (H, W) the whole silhouette, as if nothing stood in front.
+        mask_visib: (H, W) its visible part.
+        depth_m: (H, W) measured depth [m], for px_count_valid; None = no depth.
+        px_count_all: pixels of the silhouette also beyond the image; None = those inside.
+        bbox_obj: box of the silhouette, also beyond the image; None = of the part inside.
+    """
+    inside, visible = int(np.count_nonzero(mask)), int(np.count_nonzero(mask_visib))
+    everything = inside if px_count_all is None else int(px_count_all)
+    if everything < inside or np.any(mask_visib & ~mask):
+        raise InputError(
+            f"a mask of {inside} pixels, {visible} of them visible, {everything} in all: the "
+            "visible part must lie in the silhouette, and that in the whole."
+        )
+    valid = 0 if depth_m is None else int(np.count_nonzero(np.asarray(depth_m)[mask] > 0))
+    box = bbox_of(mask) if bbox_obj is None else bbox_obj
+    return {
+        "bbox_obj": list(box) if visible else list(NO_BBOX),
+        "bbox_visib": list(bbox_of(mask_visib)),
+        "px_count_all": everything,
+        "px_count_valid": valid,
+        "px_count_visib": visible,
+        "visib_fract": visible / everything if everything else 0.0,
+    }
+
+
+def write_masks(
+    store: SessionStore, index: int, masks: Sequence[tuple[ArrayLike, ArrayLike]]
+) -> None:
+    """Write (whole, visible) masks (H, W) of the objects of an image, in their order."""
+    for k, (mask, mask_visib) in enumerate(masks):
+        for image, visible in ((mask, False), (mask_visib, True)):
+            path = mask_path(index, k, visible=visible)
+            store.write_image(path, np.asarray(image, dtype=np.bool_))
+
+
+def write_scene_gt(
+    store: SessionStore, annotations: Mapping[int, Sequence[tuple[int, ArrayLike]]]
+) -> None:
+    """Write scene_gt.json.
+
+    Args:
+        store: the session.
+        annotations: image -> (object id, T_cam_obj (4, 4) [m]) of each object.
+
+    Raises:
+        UnitError: an object would be on the lens or farther than any table.
+    """
+    scene: Json = {}
+    for index in sorted(annotations):
+        rows: list[Json] = []
+        for obj_id, T_cam_obj in annotations[index]:
+            rotation, translation = bop_units.lists_from_rigid(T_cam_obj)
+            bop_units.object_in_camera(rotation, translation, f"object {obj_id} of image {index}")
+            rows.append({"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": int(obj_id)})
+        scene[str(index)] = rows
+    store.write_json("scene_gt.json", scene)
+
+
+def write_scene_gt_info(store: SessionStore, entries: Mapping[int, Sequence[Json]]) -> None:
+    """Write scene_gt_info.json from the entries of `gt_info_entry`, by image."""
+    store.write_json("scene_gt_info.json", {str(i): list(entries[i]) for i in sorted(entries)})
+
+
+def write_scene_gt_coco(
+    store: SessionStore,
+    masks: Mapping[int, Sequence[tuple[int, Mask | Json]]],
+    names: Mapping[int, str],
+) -> None:
+    """Write scene_gt_coco.json with the visible masks as run lengths.
+
+    Objects without a visible pixel get no annotation, as in BOP's own files.
+
+    Args:
+        store: the session.
+        masks: image -> (object id, visible mask (H, W), or its `rle_of`) of each object.
+        names: object id -> name.
+    """
+    pictures: list[Json] = []
+    annotations: list[Json] = []
+    camera = store.session.intrinsics
+    for index in sorted(masks):
+        pictures.append(
+            {
+                "id": index,
+                "file_name": rgb_path(index),
+                "width": camera.width,
+                "height": camera.height,
+            }
+        )
+        for obj_id, given in masks[index]:
+            rle = given if isinstance(given, dict) else rle_of(given)
+            mask = mask_of(rle)
+            if not mask.any():
+                continue
+            annotations.append(
+                {
+                    "id": len(annotations) + 1,
+                    "image_id": index,
+                    "category_id": int(obj_id),
+                    "iscrowd": 0,
+                    "area": int(np.count_nonzero(mask)),
+                    "bbox": list(bbox_of(mask, inclusive=True)),
+                    "segmentation": rle,
+                    "width": camera.width,
+                    "height": camera.height,
+                }
+            )
+    categories = [
+        {"id": int(i), "name": names[i], "supercategory": store.session.name} for i in sorted(names)
+    ]
+    info = {"description": store.session.name, "date_created": store.created}
+    document = {
+        "info": info,
+        "licenses": [],
+        "categories": categories,
+        "images": pictures,
+        "annotations": annotations,
+    }
+    # On one line: run lengths, indented one number a line, would be most of the session.
+    store.write_bytes("scene_gt_coco.json", json_bytes(document, indent=None))

@@ -1,0 +1,171 @@
+"""Object models as BOP keeps them: obj_%06d.ply in millimetres and models_info.json."""
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError, UnitError
+from realsim.formats import images
+from realsim.formats.bop_units import MM_PER_M
+from realsim.geometry import se3
+from realsim.geometry.mesh import diameter, load_mesh, ply_bytes
+from realsim.records import Mesh, ObjectModel
+from realsim.store import atomic
+
+Array = NDArray[np.float64]
+INFO_FILE = "models_info.json"
+LARGEST_DIAMETER_M = 3.0
+"""An object on a table is smaller: a larger one was read in the wrong unit."""
+UNIT_RATIO = 100.0
+"""Diameters of the mesh and of models_info.json that differ by more than this have two units;
+decimated or re-measured meshes differ by a few per cent."""
+
+
+def model_file(obj_id: int) -> str:
+    """Return the name of a model's mesh."""
+    return f"obj_{obj_id:06d}.ply"
+
+
+def save_models(folder: Path | str, models: Mapping[int, ObjectModel]) -> None:
+    """Write models as BOP does: meshes [mm], textures beside them, then models_info.json.
+
+    Name and density, which BOP has no keys for, are added to models_info.json; BOP's readers take
+    the keys they know.
+
+    Raises:
+        InputError: a key is not the id of its model.
+    """
+    folder = Path(folder)
+    info: dict[str, Any] = {}
+    for obj_id in sorted(models):
+        model = models[obj_id]
+        if model.obj_id != obj_id:
+            raise InputError(f"model '{model.name}' has the id {model.obj_id}, not {obj_id}.")
+        texture_file = ""
+        if model.mesh.texture is not None:
+            texture_file = Path(model_file(obj_id)).with_suffix(".png").name
+            atomic.write_bytes(folder / texture_file, images.png_bytes(model.mesh.texture))
+        data = ply_bytes(model.mesh, "mm", texture_file=texture_file)
+        atomic.write_bytes(folder / model_file(obj_id), data)
+        info[str(obj_id)] = _info_of(model)
+    # Last: a folder with models_info.json is complete.
+    atomic.write_json(folder / INFO_FILE, info)
+
+
+def _info_of(model: ObjectModel) -> dict[str, Any]:
+    low_mm = model.mesh.bounds[0] * MM_PER_M
+    size_mm = model.mesh.extent * MM_PER_M
+    info: dict[str, Any] = {"diameter": diameter(model.mesh) * MM_PER_M}
+    info |= {f"min_{axis}": float(low_mm[i]) for i, axis in enumerate("xyz")}
+    info |= {f"size_{axis}": float(size_mm[i]) for i, axis in enumerate("xyz")}
+    discrete = [_matrix_mm(S) for S in model.symmetries if not np.allclose(S, np.eye(4))]
+    if discrete:
+        info["symmetries_discrete"] = discrete
+    if model.symmetry_axes:
+        info["symmetries_continuous"] = [
+            {"axis": list(axis), "offset": [x * MM_PER_M for x in point]}
+            for axis, point in model.symmetry_axes
+        ]
+    return info | {"name": model.name, "density": model.density}
+
+
+def _matrix_mm(S: Array) -> list[float]:
+    S = S.copy()
+    S[:3, 3] *= MM_PER_M
+    numbers: list[float] = S.ravel().tolist()
+    return numbers
+
+
+def load_models(
+    folder: Path | str, obj_ids: Collection[int] | None = None
+) -> dict[int, ObjectModel]:
+    """Return the models of a BOP models folder, in metres.
+
+    Args:
+        folder: holds obj_%06d.ply and models_info.json.
+        obj_ids: only these; None = all.
+
+    Raises:
+        InputError: no models there, an id without mesh, or broken files.
+        UnitError: a mesh is not in millimetres.
+    """
+    from realsim.store.session_store import read_json_file
+
+    folder = Path(folder)
+    files = {int(p.stem[4:]): p for p in folder.glob("obj_*.ply") if p.stem[4:].isdecimal()}
+    if not files:
+        raise InputError(
+            f"{folder} has no models; files obj_000001.ply, obj_000002.ply, ... are expected, as "
+            "in the folder 'models' of a BOP dataset."
+        )
+    if not (folder / INFO_FILE).is_file():
+        raise InputError(
+            f"{folder} has meshes but no {INFO_FILE}, so their symmetries are not known. Write one "
+            'with a diameter [mm] per object, e.g. {"1": {"diameter": 172.1}}.'
+        )
+    info: Any = read_json_file(folder / INFO_FILE)
+    require_meshes(files if obj_ids is None else obj_ids, files, str(folder))
+    return {
+        i: _load_model(i, files[i], info.get(str(i), {}))
+        for i in sorted(files if obj_ids is None else obj_ids)
+    }
+
+
+def require_meshes(wanted: Collection[int], present: Collection[int], where: str) -> None:
+    """Raise if an object id has no mesh.
+
+    Raises:
+        InputError: names the ids that are missing and those that are there.
+    """
+    missing = sorted(set(wanted) - set(present))
+    if missing:
+        raise InputError(
+            f"object {', '.join(map(str, missing))} has no mesh in {where}; there are "
+            f"{', '.join(map(str, sorted(present))) or 'none'}. Add {model_file(missing[0])}, or "
+            "leave these objects out."
+        )
+
+
+def _load_model(obj_id: int, file: Path, info: dict[str, Any]) -> ObjectModel:
+    mesh = load_mesh(file, "mm")
+    _check_diameter(mesh, info, file)
+    symmetries = [np.eye(4)]
+    for numbers in info.get("symmetries_discrete", ()):
+        S = np.asarray(numbers, dtype=np.float64).reshape(4, 4).copy()
+        S[:3, 3] /= MM_PER_M
+        symmetries.append(se3.check_rigid(S, f"a symmetry of object {obj_id} in {INFO_FILE}"))
+    axes = tuple(
+        (_three(s["axis"], 1.0), _three(s["offset"], 1.0 / MM_PER_M))
+        for s in info.get("symmetries_continuous", ())
+    )
+    return ObjectModel(
+        obj_id=obj_id,
+        name=str(info.get("name", file.stem)),
+        mesh=mesh,
+        symmetries=np.stack(symmetries),
+        symmetry_axes=axes,
+        density=float(info.get("density", 1000.0)),
+    )
+
+
+def _three(values: Any, factor: float) -> tuple[float, float, float]:
+    x, y, z = (float(v) * factor for v in values)
+    return x, y, z
+
+
+def _check_diameter(mesh: Mesh, info: dict[str, Any], file: Path) -> None:
+    found_mm = diameter(mesh) * MM_PER_M
+    if found_mm > LARGEST_DIAMETER_M * MM_PER_M:
+        raise UnitError(
+            f"{file} has a diameter of {found_mm:.4g} mm; BOP models are in millimetres and at "
+            f"most {LARGEST_DIAMETER_M:g} m is accepted. Is it in micrometres?"
+        )
+    said_mm = info.get("diameter")
+    if said_mm is not None and not 1 / UNIT_RATIO < found_mm / float(said_mm) < UNIT_RATIO:
+        raise UnitError(
+            f"{file} has a diameter of {found_mm:.4g} mm, but {INFO_FILE} says {said_mm:.4g} mm: "
+            "one of them is not in millimetres. Scale the file that is wrong by 1000."
+        )

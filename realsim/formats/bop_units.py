@@ -1,0 +1,136 @@
+"""BOP's numbers and ours: millimetres and row-major lists there, metres and T_a_b here.
+
+The only place, together with `bop_models`, where BOP's units change.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError, UnitError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics
+
+Array = NDArray[np.float64]
+MM_PER_M = 1000.0
+NEAREST_MM = 10.0
+"""An object whose origin is nearer than this to the camera is not seen by any depth camera: the
+file holds metres."""
+FARTHEST_MM = 20_000.0
+"""An object farther than 20 m is on no table: the file holds micrometres or was converted twice."""
+
+
+def rigid_from_lists(rotation: Any, translation_mm: Any, name: str) -> Array:
+    """Return T (4, 4) [m] of a row-major rotation (9 numbers or nested) and a translation [mm].
+
+    Raises:
+        NotRigidError: the rotation is not one.
+        InputError: the lists do not have 9 and 3 numbers.
+    """
+    try:
+        R = np.asarray(rotation, dtype=np.float64).reshape(3, 3)
+        t = np.asarray(translation_mm, dtype=np.float64).reshape(3)
+    except (ValueError, TypeError) as error:
+        raise InputError(
+            f"{name}: a rotation of 9 numbers (row by row) and a translation of 3 [mm] are "
+            f"expected, found {rotation!r} and {translation_mm!r}."
+        ) from error
+    return se3.check_rigid(se3.from_rt(R, t / MM_PER_M), name)
+
+
+def lists_from_rigid(T: ArrayLike) -> tuple[list[float], list[float]]:
+    """Return the row-major rotation (9) and the translation (3) [mm] of T (4, 4) [m]."""
+    T = np.asarray(T, dtype=np.float64)
+    rotation: list[float] = T[:3, :3].ravel().tolist()
+    translation_mm: list[float] = (T[:3, 3] * MM_PER_M).tolist()
+    return rotation, translation_mm
+
+
+def object_in_camera(rotation: Any, translation_mm: Any, name: str) -> Array:
+    """Return T_cam_obj (4, 4) [m] of BOP's cam_R_m2c and cam_t_m2c.
+
+    Raises:
+        UnitError: the object would be on the lens or beyond any table.
+    """
+    T_cam_obj = rigid_from_lists(rotation, translation_mm, name)
+    distance_mm = float(np.linalg.norm(T_cam_obj[:3, 3])) * MM_PER_M
+    if distance_mm < NEAREST_MM:
+        raise UnitError(
+            f"{name}: cam_t_m2c is {distance_mm:.4g} long; as millimetres the object would touch "
+            f"the lens. This looks like metres in a millimetre file ({distance_mm:.4g} m). "
+            "Multiply cam_t_m2c by 1000."
+        )
+    if distance_mm > FARTHEST_MM:
+        raise UnitError(
+            f"{name}: cam_t_m2c is {distance_mm:.4g} long; as millimetres the object would be "
+            f"{distance_mm / MM_PER_M:.4g} m away, at most {FARTHEST_MM / MM_PER_M:g} m is "
+            "accepted. Were millimetres multiplied by 1000 again? Divide cam_t_m2c by 1000."
+        )
+    return T_cam_obj
+
+
+def camera_entry(
+    intrinsics: CameraIntrinsics, depth_unit_m: float, T_world_cam: ArrayLike | None
+) -> dict[str, Any]:
+    """Return one image's entry of scene_camera.json.
+
+    cam_distortion (OpenCV's k1 k2 p1 p2 k3 k4 k5 k6) is ours: BOP has no distortion, and leaving
+    it out would make a distorted image look like an ideal one.
+    """
+    entry: dict[str, Any] = {
+        "cam_K": intrinsics.K.ravel().tolist(),
+        # Rounded at 1e-9 mm so that 0.0001 m reads 0.1 mm and not 0.09999999999999999.
+        "depth_scale": round(depth_unit_m * MM_PER_M, 9),
+    }
+    if intrinsics.is_distorted:
+        entry["cam_distortion"] = intrinsics.distortion.tolist()
+    if T_world_cam is not None:
+        rotation, translation = lists_from_rigid(se3.invert(T_world_cam))
+        entry["cam_R_w2c"], entry["cam_t_w2c"] = rotation, translation
+    return entry
+
+
+def intrinsics_of(entry: dict[str, Any], width: int, height: int, name: str) -> CameraIntrinsics:
+    """Return the camera of an entry of scene_camera.json.
+
+    Raises:
+        InputError: cam_K is missing or not a camera matrix.
+    """
+    if "cam_K" not in entry:
+        raise InputError(
+            f"{name} has no cam_K; it has: {', '.join(entry) or 'nothing'}. The 9 numbers of the "
+            "camera matrix, row by row, are needed."
+        )
+    K = np.asarray(entry["cam_K"], dtype=np.float64)
+    if K.size != 9:
+        raise InputError(f"{name}: cam_K has {K.size} numbers; 9 (row by row) are expected.")
+    distortion = entry.get("cam_distortion")
+    return CameraIntrinsics.from_K(K.reshape(3, 3), width, height, distortion)
+
+
+def depth_unit_of(entry: dict[str, Any], name: str) -> float:
+    """Return metres per count of the depth images of an entry of scene_camera.json.
+
+    Raises:
+        InputError: depth_scale is missing: guessing it would scale the world.
+    """
+    if "depth_scale" not in entry:
+        raise InputError(
+            f"{name} has no depth_scale, so the unit of its depth images is not known; it has: "
+            f"{', '.join(entry) or 'nothing'}. Add depth_scale (1.0 if a count is 1 mm, 0.1 if it "
+            "is 0.1 mm)."
+        )
+    return float(entry["depth_scale"]) / MM_PER_M
+
+
+def T_world_cam_of(entry: dict[str, Any], name: str) -> Array | None:
+    """Return T_world_cam (4, 4) [m] of an entry of scene_camera.json, None where it has none."""
+    if ("cam_R_w2c" in entry) != ("cam_t_w2c" in entry):
+        raise InputError(f"{name} has only one of cam_R_w2c and cam_t_w2c; both or none belong.")
+    if "cam_R_w2c" not in entry:
+        return None
+    T_cam_world = rigid_from_lists(
+        entry["cam_R_w2c"], entry["cam_t_w2c"], f"cam_R_w2c, cam_t_w2c of {name}"
+    )
+    return se3.invert(T_cam_world)

@@ -1,0 +1,135 @@
+"""From a depth image to points and normals, and where a depth image is not to be trusted."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.geometry.camera import ray_table
+from realsim.records import CameraIntrinsics
+
+Array = NDArray[np.float64]
+SECOND_DIFFERENCE_STEP_PX = 4
+"""Stereo noise is correlated over a few pixels; differences of neighbours would not see it."""
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution whose median absolute deviation is 1."""
+
+
+def check_depth(depth_m: NDArray[np.float32], intrinsics: CameraIntrinsics) -> None:
+    """Check that a depth image belongs to the camera and is in metres.
+
+    Raises:
+        InputError: its size is not the camera's, or its values cannot be metres.
+    """
+    wanted = (intrinsics.height, intrinsics.width)
+    if depth_m.shape != wanted:
+        raise InputError(
+            f"the depth image has shape {depth_m.shape}; the camera's is {wanted} (height, width)."
+        )
+    if depth_m.dtype.kind != "f":
+        raise InputError(
+            f"the depth image has type {depth_m.dtype}; float32 metres are expected. "
+            "Multiply the raw counts by the depth unit."
+        )
+
+
+def points_from_depth(
+    depth_m: NDArray[np.float32], intrinsics: CameraIntrinsics, stride: int = 1
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return the measured points of a depth image and the pixels they come from.
+
+    Args:
+        depth_m: (H, W) depth along z [m]; 0 or NaN = none.
+        intrinsics: the camera; its distortion is undone.
+        stride: every how many rows and columns a pixel is used.
+
+    Returns:
+        points_cam (N, 3) [m] and pixels (N, 2) as x, y.
+    """
+    check_depth(depth_m, intrinsics)
+    rays = ray_table(intrinsics)[::stride, ::stride]
+    z = depth_m[::stride, ::stride]
+    valid = (z > 0) & np.isfinite(z) & np.isfinite(rays[..., 0])
+    v, u = np.nonzero(valid)
+    points = rays[v, u].astype(np.float64) * z[v, u, None]
+    return points, np.stack([u, v], -1).astype(np.int64) * stride
+
+
+def normals_from_depth(
+    depth_m: NDArray[np.float32], intrinsics: CameraIntrinsics, jump: float = 0.02
+) -> Array:
+    """Return the surface normal (H, W, 3) at every pixel, towards the camera; NaN where unknown.
+
+    The normal is the cross product of the central differences of the points to the left and right
+    and above and below. It is unknown where one of the four is missing or lies across a depth jump.
+
+    Args:
+        depth_m: (H, W) depth along z [m]; 0 = none.
+        intrinsics: the camera.
+        jump: depth difference between the two points of a difference that breaks the surface [m].
+    """
+    check_depth(depth_m, intrinsics)
+    z = np.where(depth_m > 0, depth_m, np.nan).astype(np.float64)
+    points = ray_table(intrinsics).astype(np.float64) * z[..., None]
+    normals = np.full(points.shape, np.nan)
+    du = points[1:-1, 2:] - points[1:-1, :-2]
+    dv = points[2:, 1:-1] - points[:-2, 1:-1]
+    n = np.cross(dv, du)
+    length = np.linalg.norm(n, axis=-1, keepdims=True)
+    known = (np.abs(du[..., 2]) < jump) & (np.abs(dv[..., 2]) < jump) & (length[..., 0] > 0)
+    known &= np.isfinite(z[1:-1, 1:-1])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        n = n / length
+    towards = np.sum(n * points[1:-1, 1:-1], axis=-1) > 0
+    n = np.where(towards[..., None], -n, n)
+    normals[1:-1, 1:-1][known] = n[known]
+    return normals
+
+
+def edge_mask(
+    depth_m: NDArray[np.float32], jump: ArrayLike, margin_px: int = 1
+) -> NDArray[np.bool_]:
+    """Return where (H, W) a depth image jumps: flying pixels live there.
+
+    A pixel is at an edge if the measured depths within `margin_px` of it span more than `jump`.
+
+    Args:
+        depth_m: (H, W) depth along z [m]; 0 = none (a hole is not an edge).
+        jump: span that is an edge [m]; a number or one per pixel (H, W).
+        margin_px: half the width of the window [px].
+    """
+    import cv2
+
+    kernel = np.ones((2 * margin_px + 1, 2 * margin_px + 1), dtype=np.uint8)
+    depth = np.ascontiguousarray(depth_m, dtype=np.float32)
+    far = cv2.dilate(depth, kernel)
+    near = cv2.erode(np.where(depth > 0, depth, np.float32(np.inf)), kernel)
+    return np.asarray((far > 0) & (far - near > np.asarray(jump)), dtype=bool)
+
+
+def depth_noise_per_m(depths_m: list[NDArray[np.float32]]) -> float:
+    """Return k of the stereo noise model sigma_z = k z^2 [1/m], measured from the images.
+
+    On a smooth surface the second difference z(u-s) - 2 z(u) + z(u+s) is noise of variance
+    6 sigma_z^2 (s = 4 px, so that the correlation of a matching window does not hide it); the
+    median absolute value over all pixels is blind to edges.
+
+    Args:
+        depths_m: depth images (H, W) [m]; 0 = none.
+
+    Raises:
+        InputError: there are too few measured pixels to tell.
+    """
+    s = SECOND_DIFFERENCE_STEP_PX
+    samples: list[Array] = []
+    for depth in depths_m:
+        z = depth[::s].astype(np.float64)
+        a, b, c = z[:, : -2 * s], z[:, s:-s], z[:, 2 * s :]
+        known = (a > 0) & (b > 0) & (c > 0)
+        samples.append((np.abs(a - 2 * b + c)[known]) / np.square(b[known]))
+    values = np.concatenate(samples) if samples else np.zeros(0)
+    if len(values) < 100:
+        raise InputError(
+            f"only {len(values)} places in {len(depths_m)} depth images have measured neighbours; "
+            "at least 100 are needed. Is the depth all zero?"
+        )
+    return float(np.median(values) * MAD_TO_SIGMA / np.sqrt(6.0))

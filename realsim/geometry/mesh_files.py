@@ -1,0 +1,162 @@
+"""Triangle meshes in files: reading any common format, writing PLY, and checking the unit.
+
+`unit` names what the file holds; a claim that cannot be true is an error instead of a pot of 90
+metres.
+"""
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError, UnitError
+from realsim.geometry.mesh_shape import vertex_normals, welded_mesh
+from realsim.records import Mesh
+
+Array = NDArray[np.float64]
+Unit = Literal["m", "mm"]
+
+METRES: dict[str, float] = {"m": 1.0, "mm": 1e-3}
+FORMATS = (".ply", ".obj", ".stl", ".glb")
+SMALLEST_M = 0.002
+"""A 'millimetre' file whose largest extent is below 2 mm holds metres: nothing that a gripper
+grasps is so small."""
+LARGEST_M = 3.0
+"""A 'metre' file whose largest extent is above 3 m holds millimetres: nothing on a table is so
+large."""
+
+
+def check_unit(largest_extent: float, unit: Unit, name: str) -> None:
+    """Raise if a mesh of this largest extent (in its file's numbers) cannot be in that unit.
+
+    Raises:
+        UnitError: the extent is implausible; the message says what it would be in the other unit.
+    """
+    if unit not in METRES:
+        raise UnitError(f"{name}: the unit '{unit}' is not known; 'm' and 'mm' are.")
+    extent_m = largest_extent * METRES[unit]
+    if unit == "mm" and extent_m < SMALLEST_M:
+        raise UnitError(
+            f"{name} is said to be in mm, but its largest extent is {largest_extent:.4g} mm; in "
+            f"metres it would be {largest_extent:.4g} m. At least {SMALLEST_M * 1e3:g} mm is "
+            "accepted. If the file is in metres, load it with unit='m'."
+        )
+    if unit == "m" and extent_m > LARGEST_M:
+        raise UnitError(
+            f"{name} is said to be in m, but its largest extent is {largest_extent:.4g} m; in "
+            f"millimetres it would be {largest_extent:.4g} mm = {largest_extent / 1e3:.4g} m. At "
+            f"most {LARGEST_M:g} m is accepted. If the file is in millimetres, load it with "
+            "unit='mm'."
+        )
+
+
+def load_mesh(path: Path | str, unit: Unit) -> Mesh:
+    """Read a ply, obj, stl or glb file as one mesh in metres.
+
+    Textures, texture coordinates and vertex colours are kept. STL repeats every corner, so its
+    equal vertices are merged; elsewhere vertices stay as they are in the file.
+
+    Args:
+        path: the file; the parts of a scene are merged.
+        unit: what one unit of the file is.
+
+    Raises:
+        InputError: no such file, not a mesh, no triangles.
+        UnitError: the size of the mesh contradicts the unit.
+    """
+    import trimesh
+
+    path = Path(path)
+    if path.suffix.lower() not in FORMATS:
+        raise InputError(f"{path}: '{path.suffix}' is not a mesh format; {', '.join(FORMATS)} are.")
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; a mesh file was expected there.")
+    try:
+        loaded: Any = trimesh.load_scene(path, process=False).to_mesh()
+    except Exception as error:  # a broken file raises whatever the format's reader trips over
+        raise InputError(
+            f"{path} cannot be read as a {path.suffix[1:]} mesh ({type(error).__name__}: {error}). "
+            "Export it again; triangles with vertices are needed."
+        ) from error
+    vertices = np.asarray(getattr(loaded, "vertices", ()), dtype=np.float64).reshape(-1, 3)
+    faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int32).reshape(-1, 3)
+    if len(faces) == 0:
+        raise InputError(
+            f"{path} has {len(vertices)} vertices and no triangles; a surface mesh is needed, "
+            "not a point cloud."
+        )
+    check_unit(float(np.ptp(vertices, axis=0).max()), unit, str(path))
+    colors, uv, texture = _appearance(loaded, len(vertices))
+    mesh = Mesh(
+        vertices=vertices * METRES[unit], faces=faces, colors=colors, uv=uv, texture=texture
+    )
+    return welded_mesh(mesh) if path.suffix.lower() == ".stl" else mesh
+
+
+def _appearance(
+    loaded: Any, n: int
+) -> tuple[NDArray[np.uint8] | None, Array | None, NDArray[np.uint8] | None]:
+    """Return colours, texture coordinates and texture of a trimesh mesh, where it has them."""
+    visual = loaded.visual
+    if visual.kind == "texture":
+        material = visual.material
+        image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+        if image is not None and visual.uv is not None and len(visual.uv) == n:
+            uv = np.asarray(visual.uv, dtype=np.float64)[:, :2]
+            return None, uv, np.asarray(image.convert("RGB"), dtype=np.uint8)
+        color = np.asarray(material.main_color, dtype=np.uint8)[:3]
+        return np.tile(color, (n, 1)), None, None
+    if visual.kind in ("vertex", "face"):
+        return np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3], None, None
+    return None, None, None
+
+
+def ply_bytes(mesh: Mesh, unit: Unit, *, ascii: bool = False, texture_file: str = "") -> bytes:
+    """Return the mesh as the bytes of a PLY file with normals, as BOP's models have them.
+
+    Args:
+        mesh: the mesh [m]; its colours and texture coordinates are written where it has them.
+        unit: unit of the file; BOP's is mm.
+        ascii: text instead of little-endian binary.
+        texture_file: name of the texture beside it, noted as BOP does it.
+    """
+    columns: list[tuple[str, str, NDArray[Any]]] = []
+    xyz = mesh.vertices / METRES[unit]
+    columns += [(name, "<f4", xyz[:, i]) for i, name in enumerate("xyz")]
+    normals = vertex_normals(mesh)
+    columns += [(name, "<f4", normals[:, i]) for i, name in enumerate(("nx", "ny", "nz"))]
+    if mesh.uv is not None:
+        columns += [("texture_u", "<f4", mesh.uv[:, 0]), ("texture_v", "<f4", mesh.uv[:, 1])]
+    if mesh.colors is not None:
+        names = ("red", "green", "blue")
+        columns += [(name, "u1", mesh.colors[:, i]) for i, name in enumerate(names)]
+    types = {"<f4": "float", "u1": "uchar"}
+    lines = ["ply", f"format {'ascii' if ascii else 'binary_little_endian'} 1.0"]
+    lines += [f"comment TextureFile {texture_file}"] if texture_file else []
+    lines += [f"element vertex {len(xyz)}"]
+    lines += [f"property {types[kind]} {name}" for name, kind, _ in columns]
+    lines += [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices"]
+    header = "\n".join([*lines, "end_header", ""]).encode("ascii")
+    table = np.empty(len(xyz), dtype=[(name, kind) for name, kind, _ in columns])
+    for name, _, values in columns:
+        table[name] = values
+    if ascii:
+        # 9 digits bring every float32 back exactly.
+        rows = [" ".join(f"{v:.9g}" for v in row.tolist()) for row in table]
+        rows += [f"3 {a} {b} {c}" for a, b, c in mesh.faces.tolist()]
+        return header + ("\n".join(rows) + "\n").encode("ascii")
+    triangles = np.empty(len(mesh.faces), dtype=[("n", "u1"), ("v", "<i4", (3,))])
+    triangles["n"], triangles["v"] = 3, mesh.faces
+    return header + table.tobytes() + triangles.tobytes()
+
+
+def save_ply(path: Path | str, mesh: Mesh, unit: Unit, *, ascii: bool = False) -> None:
+    """Write the mesh as PLY, its texture beside it as a PNG of the same name."""
+    path = Path(path)
+    texture_file = path.with_suffix(".png").name if mesh.texture is not None else ""
+    if mesh.texture is not None:
+        import cv2
+
+        cv2.imwrite(str(path.with_suffix(".png")), mesh.texture[..., ::-1])
+    path.write_bytes(ply_bytes(mesh, unit, ascii=ascii, texture_file=texture_file))

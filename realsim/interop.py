@@ -1,0 +1,245 @@
+"""Where the libraries differ: quaternion order, pixel origin, camera axes, and how they load.
+
+Inside realsim there is one convention (`T_a_b`, OpenCV camera axes, integer pixel centres, twists
+rotation first). Every other one is converted here, each by a function with a known-answer test:
+
+| library     | quaternion | pixel centre | camera axes              | pose                      |
+|-------------|------------|--------------|--------------------------|---------------------------|
+| gtsam       | w x y z    | as given     | OpenCV                   | Pose3, twist rotation first |
+| pybullet    | x y z w    | -            | OpenGL, column-major list | (position, quaternion)    |
+| pycolmap    | x y z w    | +0.5         | OpenCV                   | cam_from_world            |
+| viser       | w x y z    | -            | OpenCV                   | (wxyz, position)          |
+| UR          | rotation vector | -       | -                        | [x y z rx ry rz]          |
+"""
+
+import ctypes
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError, MissingLibraryError
+from realsim.geometry import se3
+
+Array = NDArray[np.float64]
+
+APT_PACKAGES = {"libEGL": "libegl1", "libGL": "libgl1", "libusb": "libusb-1.0-0"}
+"""Debian/Ubuntu package of each shared library that the wheels expect from the system."""
+T_CAM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""OpenGL camera axes (x right, y up, z backward) in OpenCV's; its own inverse."""
+COLMAP_PIXEL_SHIFT = 0.5
+"""COLMAP puts the centre of the first pixel at (0.5, 0.5), OpenCV and BOP at (0, 0)."""
+
+
+# --- libraries that need something of the system -----------------------------------------------
+
+
+def _preload_libusb() -> None:
+    """Load the libusb of the `libusb-package` wheel, so that none of the system is needed."""
+    try:
+        import libusb_package
+    except ImportError:
+        return  # the system's own libusb may do; if not, the import that follows says so
+    path: Any = libusb_package.get_library_path()
+    if path is not None:
+        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+
+
+def _missing_library(module: str, error: Exception) -> MissingLibraryError:
+    """Return the error that names what to install, from what the loader said."""
+    text = str(error)
+    packages = [package for library, package in APT_PACKAGES.items() if library in text]
+    if not packages:
+        return MissingLibraryError(
+            f"{module} cannot be imported: {text}. Install it with the project's dependencies "
+            "(`uv sync`, or `pip install realsim`)."
+        )
+    # The loader names only the first missing library; libEGL and libGL go together.
+    if "libusb-1.0-0" not in packages:
+        packages = ["libegl1", "libgl1"]
+    return MissingLibraryError(
+        f"{module} is installed, but a library of the system is missing: {text}. It comes with "
+        f"{' and '.join(packages)}; install with `sudo apt-get install --no-install-recommends "
+        f"{' '.join(packages)}`."
+    )
+
+
+def import_open3d() -> Any:
+    """Return the module `open3d`; the only way realsim imports it.
+
+    Raises:
+        MissingLibraryError: a shared library is missing; the message names the apt packages.
+    """
+    try:
+        _preload_libusb()
+        import open3d  # pyright: ignore[reportMissingTypeStubs]
+    except (ImportError, OSError) as error:
+        raise _missing_library("open3d", error) from error
+    module: ModuleType = open3d
+    return module
+
+
+def import_pyrealsense2() -> Any:
+    """Return the module `pyrealsense2`; the only way realsim imports it.
+
+    Raises:
+        MissingLibraryError: it or its libusb is missing; the message says what to install.
+    """
+    try:
+        _preload_libusb()
+        import pyrealsense2
+    except (ImportError, OSError) as error:
+        raise _missing_library("pyrealsense2", error) from error
+    module: ModuleType = pyrealsense2
+    return module
+
+
+# --- rotations --------------------------------------------------------------------------------
+
+
+def quaternion_xyzw_from_R(R: ArrayLike) -> Array:
+    """Return the unit quaternion (..., 4), order x y z w (pybullet, pycolmap, ROS, scipy)."""
+    return np.roll(se3.quaternion_wxyz(np.asarray(R, dtype=np.float64)[..., :3, :3]), -1, axis=-1)
+
+
+def R_from_quaternion_xyzw(q: ArrayLike) -> Array:
+    """Return the rotation (..., 3, 3) of a quaternion (..., 4), order x y z w.
+
+    Raises:
+        InputError: a quaternion has no length, so it has no direction.
+    """
+    q = np.asarray(q, dtype=np.float64)
+    if not np.all(np.linalg.norm(q, axis=-1) > 1e-9):
+        raise InputError(
+            f"the quaternion {q.tolist()} has no length; four numbers x y z w of unit length are "
+            "expected."
+        )
+    return se3.from_quaternion_wxyz(np.roll(q, 1, axis=-1))
+
+
+# --- gtsam ------------------------------------------------------------------------------------
+
+
+def pose3_from_T(T: ArrayLike) -> Any:
+    """Return the gtsam.Pose3 of a (4, 4) transform."""
+    import gtsam
+
+    # Pose3's constructor takes whatever matrix it is given, so it is made rigid first.
+    return gtsam.Pose3(se3.check_rigid(T, "the transform given to gtsam"))
+
+
+def T_from_pose3(pose: Any) -> Array:
+    """Return the (4, 4) transform of a gtsam.Pose3."""
+    return np.array(pose.matrix(), dtype=np.float64)
+
+
+# --- pybullet ---------------------------------------------------------------------------------
+
+
+def T_from_pybullet(position: ArrayLike, xyzw: ArrayLike) -> Array:
+    """Return the (4, 4) transform of pybullet's position (3,) [m] and quaternion x y z w."""
+    return se3.from_rt(R_from_quaternion_xyzw(xyzw), position)
+
+
+def pybullet_from_T(T: ArrayLike) -> tuple[list[float], list[float]]:
+    """Return position [m] and quaternion x y z w of a (4, 4) transform, as pybullet wants them.
+
+    A body's position in pybullet is that of its centre of mass, not of its mesh's origin: what
+    stands here is the frame given, nothing more.
+    """
+    T = np.asarray(T, dtype=np.float64)
+    position: list[float] = T[:3, 3].tolist()
+    xyzw: list[float] = quaternion_xyzw_from_R(T[:3, :3]).tolist()
+    return position, xyzw
+
+
+# --- viser ------------------------------------------------------------------------------------
+
+
+def viser_wxyz_position(T: ArrayLike) -> tuple[Array, Array]:
+    """Return quaternions w x y z (..., 4) and positions (..., 3) of transforms, as viser wants."""
+    T = np.asarray(T, dtype=np.float64)
+    return se3.quaternion_wxyz(T[..., :3, :3]), T[..., :3, 3].copy()
+
+
+# --- pycolmap ---------------------------------------------------------------------------------
+
+
+def colmap_from_opencv_px(uv: ArrayLike) -> Array:
+    """Return COLMAP's pixel coordinates (..., 2) of OpenCV's (integers are centres)."""
+    return np.asarray(uv, dtype=np.float64) + COLMAP_PIXEL_SHIFT
+
+
+def opencv_from_colmap_px(uv: ArrayLike) -> Array:
+    """Return OpenCV's pixel coordinates (..., 2) of COLMAP's (centres at +0.5)."""
+    return np.asarray(uv, dtype=np.float64) - COLMAP_PIXEL_SHIFT
+
+
+def rigid3d_from_T(T_cam_world: ArrayLike) -> Any:
+    """Return the pycolmap.Rigid3d `cam_from_world` of T_cam_world (4, 4)."""
+    import pycolmap
+
+    T = se3.check_rigid(T_cam_world, "T_cam_world")
+    rotation = pycolmap.Rotation3d(quaternion_xyzw_from_R(T[:3, :3]))
+    return pycolmap.Rigid3d(rotation, T[:3, 3].copy())
+
+
+def T_from_rigid3d(cam_from_world: Any) -> Array:
+    """Return T_cam_world (4, 4) of a pycolmap.Rigid3d `cam_from_world`."""
+    R = R_from_quaternion_xyzw(cam_from_world.rotation.quat)
+    return se3.from_rt(R, cam_from_world.translation)
+
+
+# --- Universal Robots -------------------------------------------------------------------------
+
+
+def T_from_rotation_vector_pose(pose: ArrayLike) -> Array:
+    """Return the (4, 4) transform of a UR controller's pose [x y z rx ry rz] [m, rad].
+
+    The last three are a rotation VECTOR (axis times angle), not roll, pitch and yaw.
+    """
+    x = np.asarray(pose, dtype=np.float64)
+    if x.shape[-1] != 6:
+        raise InputError(
+            f"a UR pose has six numbers [x y z rx ry rz], got an array of shape {x.shape}."
+        )
+    return se3.from_rt(se3.exp_so3(x[..., 3:]), x[..., :3])
+
+
+def rotation_vector_pose_from_T(T: ArrayLike) -> Array:
+    """Return the UR controller's pose [x y z rx ry rz] (..., 6) [m, rad] of a transform."""
+    T = np.asarray(T, dtype=np.float64)
+    return np.concatenate([T[..., :3, 3], se3.log_so3(T[..., :3, :3])], axis=-1)
+
+
+# --- OpenGL cameras ---------------------------------------------------------------------------
+
+
+def T_world_gl_from_cam(T_world_cam: ArrayLike) -> Array:
+    """Return the pose (..., 4, 4) of the same camera in OpenGL axes (y up, z backward)."""
+    return np.asarray(T_world_cam, dtype=np.float64) @ T_CAM_GL
+
+
+def T_world_cam_from_gl(T_world_gl: ArrayLike) -> Array:
+    """Return T_world_cam (..., 4, 4), OpenCV axes, of a camera given in OpenGL axes."""
+    return np.asarray(T_world_gl, dtype=np.float64) @ T_CAM_GL
+
+
+def opengl_view_matrix(T_world_cam: ArrayLike) -> list[float]:
+    """Return pybullet's view matrix: T_gl_world, 16 numbers, column by column."""
+    T_gl_world = se3.invert(T_world_gl_from_cam(T_world_cam))
+    columns: list[float] = T_gl_world.T.ravel().tolist()
+    return columns
+
+
+# --- arrays -----------------------------------------------------------------------------------
+
+
+def native(array: ArrayLike, dtype: Any) -> NDArray[Any]:
+    """Return a contiguous array in this machine's own byte order.
+
+    Arrays of scipy.io.loadmat say '<f8', which open3d.core.Tensor refuses although it means the
+    same ("unsupported python array format").
+    """
+    return np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("="))

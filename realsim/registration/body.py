@@ -1,0 +1,134 @@
+"""One object instance as the fit sees it: distance field, surface samples, ray-casting scene."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.geometry.camera import project, ray_table
+from realsim.geometry.distance_field import DistanceField, raycasting_scene
+from realsim.geometry.mesh import sample_surface
+from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose
+
+Array = NDArray[np.float64]
+SAMPLE_SEED = 0
+"""Surface samples are part of the model: always the same."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Body:
+    """An object instance with everything that is derived from its mesh once."""
+
+    start: ObjectPose
+    """Where the search starts."""
+    model: ObjectModel
+    field: DistanceField
+    samples: Array
+    """(S, 3) points on the surface, evenly spread [m]."""
+    normals: Array
+    """(S, 3) outward normals of the samples."""
+    ray_scene: Any
+    """Open3D RaycastingScene of the mesh in its own frame."""
+
+    @property
+    def T_start(self) -> Array:
+        """(4, 4) the start pose T_world_obj."""
+        return self.start.T_world_obj
+
+    @property
+    def center_obj(self) -> Array:
+        """(3,) centre of the bounding box in the object's frame [m]."""
+        return self.model.mesh.bounds.mean(0)
+
+    @property
+    def radius_m(self) -> float:
+        """Half the diagonal of the bounding box [m]."""
+        return float(0.5 * np.linalg.norm(self.model.mesh.extent))
+
+    def center(self, T_world_obj: Array) -> Array:
+        """Return the centre of the bounding box (3,) in world [m]."""
+        return T_world_obj[:3, :3] @ self.center_obj + T_world_obj[:3, 3]
+
+
+def make_body(
+    start: ObjectPose, model: ObjectModel, cells: int, samples: int, folder: Path | None = None
+) -> Body:
+    """Return the body of an object instance.
+
+    Args:
+        start: the pose the search starts from.
+        model: the object.
+        cells: cells of the distance field along the longest side.
+        samples: surface samples.
+        folder: where distance fields are kept between runs; None = in memory.
+    """
+    points, normals = sample_surface(model.mesh, samples, np.random.default_rng(SAMPLE_SEED))
+    return Body(
+        start=start,
+        model=model,
+        field=DistanceField.from_mesh(model.mesh, cells, folder),
+        samples=points,
+        normals=normals,
+        ray_scene=raycasting_scene(model.mesh),
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Footprint:
+    """The pixels at which one object would be seen, were nothing in front of it."""
+
+    rows: NDArray[np.int64]
+    """(N,) image rows, multiples of the stride."""
+    columns: NDArray[np.int64]
+    """(N,) image columns, multiples of the stride."""
+    z: Array
+    """(N,) depth of the surface along the camera's z [m]."""
+
+
+def pixel_box(
+    body: Body, intrinsics: CameraIntrinsics, T_cam_obj: Array
+) -> tuple[int, int, int, int]:
+    """Return the image box (left, top, right, bottom; the last two exclusive) that holds the body.
+
+    The whole image if a corner of the body's box lies behind the camera; empty if it is outside.
+    """
+    low, high = body.model.mesh.bounds
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    corners_cam = se3.transform(T_cam_obj, low + corners * (high - low))
+    if corners_cam[:, 2].max() <= 0:
+        return 0, 0, 0, 0
+    if corners_cam[:, 2].min() < 1e-3:
+        return 0, 0, intrinsics.width, intrinsics.height
+    uv = project(intrinsics, corners_cam)
+    left, top = np.floor(uv.min(0)).astype(int) - 2
+    right, bottom = np.ceil(uv.max(0)).astype(int) + 3
+    width, height = intrinsics.width, intrinsics.height
+    box = np.clip([left, top, right, bottom], 0, [width, height, width, height])
+    return int(box[0]), int(box[1]), int(box[2]), int(box[3])
+
+
+def footprint(body: Body, intrinsics: CameraIntrinsics, T_cam_obj: Array, stride: int) -> Footprint:
+    """Return where the body is seen, by ray casting every `stride`-th pixel of its image box."""
+    from realsim.interop import import_open3d
+
+    o3d = import_open3d()
+    left, top, right, bottom = pixel_box(body, intrinsics, T_cam_obj)
+    rows = np.arange(-(-top // stride) * stride, bottom, stride)
+    columns = np.arange(-(-left // stride) * stride, right, stride)
+    v, u = (a.ravel() for a in np.meshgrid(rows, columns, indexing="ij"))
+    directions = ray_table(intrinsics)[v, u]
+    known = np.isfinite(directions[:, 0])
+    v, u, directions = v[known], u[known], directions[known]
+    if len(v) == 0:
+        return Footprint(rows=v, columns=u, z=np.zeros(0))
+    T_obj_cam = se3.invert(T_cam_obj)
+    rays = np.empty((len(v), 6), dtype=np.float32)
+    rays[:, :3] = T_obj_cam[:3, 3]
+    rays[:, 3:] = directions @ T_obj_cam[:3, :3].T
+    # Rays have z = 1 in the camera, so the parameter of the hit is the depth.
+    t = body.ray_scene.cast_rays(o3d.core.Tensor(rays), 1)["t_hit"].numpy()
+    hit = np.isfinite(t)
+    return Footprint(rows=v[hit], columns=u[hit], z=t[hit].astype(np.float64))

@@ -1,0 +1,113 @@
+"""The paper's way, kept as the baseline: robust ICP of each mesh in ONE reference frame.
+
+The model's points visible from the reference camera at the start pose are brought onto the cropped
+cloud of that frame by Open3D's point-to-plane ICP with Tukey's kernel, coarse to fine.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import DegenerateError
+from realsim.geometry import se3
+from realsim.geometry.camera import ray_table
+from realsim.geometry.depth import points_from_depth
+from realsim.interop import import_open3d
+from realsim.records import CameraIntrinsics, SupportPlane
+from realsim.registration.body import Body, footprint
+from realsim.registration.evidence import DepthFrame
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SingleViewConfig:
+    """The constants of the baseline (facts of real single frames: the best variant tried)."""
+
+    reach_m: tuple[float, ...] = (0.020, 0.010, 0.005)
+    """Greatest distance of a correspondence in each round, coarse to fine."""
+    tukey_m: tuple[float, ...] = (0.008, 0.004, 0.0025)
+    """Cut-off of Tukey's kernel in each round."""
+    steps: int = 40
+    """Greatest number of iterations in each round."""
+    source_points: int = 4000
+    """Visible model points used."""
+    crop_m: float = 0.020
+    """The cloud is cropped to the start's bounding sphere plus this."""
+    target_points: int = 15_000
+    """About so many measured points of the crop are used."""
+
+
+def reference_frame(
+    frames: Sequence[DepthFrame], plane: SupportPlane | None, center: Array
+) -> DepthFrame:
+    """Return the frame that looks most steeply down onto the objects, as the paper's does."""
+    if plane is None:
+        distances = [float(np.linalg.norm(f.T_world_cam[:3, 3] - center)) for f in frames]
+        return frames[int(np.argmin(distances))]
+    up = plane.T_world_table[:3, 2]
+    offsets = np.stack([f.T_world_cam[:3, 3] - center for f in frames])
+    return frames[int(np.argmax(offsets @ up / np.linalg.norm(offsets, axis=1)))]
+
+
+def fit_single_view(
+    body: Body, intrinsics: CameraIntrinsics, frame: DepthFrame, config: SingleViewConfig
+) -> Array:
+    """Return T_world_obj (4, 4) by robust point-to-plane ICP in one frame.
+
+    Raises:
+        DegenerateError: the object is not in the frame, or nothing was measured where it should be.
+    """
+    o3d = import_open3d()
+    T_cam_obj = se3.invert(frame.T_world_cam) @ body.T_start
+    source = _visible_points(body, intrinsics, T_cam_obj, config)
+    target_points = _cropped(body, intrinsics, frame, T_cam_obj, config)
+    if len(source) < 50 or len(target_points) < 50:
+        raise DegenerateError(
+            f"view {frame.index} sees {len(source)} model points of object "
+            f"{body.model.name} and {len(target_points)} measured points near it; "
+            "50 of each are needed."
+        )
+    target = _point_cloud(o3d, target_points)
+    target.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(knn=20))
+    target.orient_normals_towards_camera_location(np.zeros(3))
+    cloud = _point_cloud(o3d, source)
+    registration: Any = o3d.pipelines.registration
+    T = T_cam_obj
+    for reach, tukey in zip(config.reach_m, config.tukey_m, strict=True):
+        method = registration.TransformationEstimationPointToPlane(registration.TukeyLoss(k=tukey))
+        criteria = registration.ICPConvergenceCriteria(1e-7, 1e-7, config.steps)
+        T = registration.registration_icp(cloud, target, reach, T, method, criteria).transformation
+    return frame.T_world_cam @ se3.check_rigid(np.array(T), "the pose found by ICP")
+
+
+def _visible_points(
+    body: Body, intrinsics: CameraIntrinsics, T_cam_obj: Array, config: SingleViewConfig
+) -> Array:
+    """Return the points (N, 3) of the model that the camera sees, in the object's frame."""
+    seen = footprint(body, intrinsics, T_cam_obj, 1)
+    every = max(1, int(np.ceil(len(seen.z) / config.source_points)))
+    rays = ray_table(intrinsics)[seen.rows[::every], seen.columns[::every]]
+    return se3.transform(se3.invert(T_cam_obj), rays * seen.z[::every, None])
+
+
+def _cropped(
+    body: Body,
+    intrinsics: CameraIntrinsics,
+    frame: DepthFrame,
+    T_cam_obj: Array,
+    config: SingleViewConfig,
+) -> Array:
+    """Return the measured points (N, 3) within the start's bounding sphere, in the camera."""
+    points, _ = points_from_depth(frame.depth_m, intrinsics, 1)
+    near = np.linalg.norm(points - body.center(T_cam_obj), axis=1) < body.radius_m + config.crop_m
+    points = points[near]
+    return points[:: max(1, len(points) // config.target_points)]
+
+
+def _point_cloud(o3d: Any, points: Array) -> Any:
+    """Return an Open3D cloud of the points."""
+    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.ascontiguousarray(points)))

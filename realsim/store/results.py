@@ -1,0 +1,169 @@
+"""The results of the stages in a session's folder: hand-eye, board, scene and grasps."""
+
+import io
+import math
+import zipfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from realsim.errors import InputError
+from realsim.records import STAGES, GraspSet, HandEye, Scene, TagBoard
+from realsim.store import atomic, records_json
+from realsim.store.records_json import number_to_json
+from realsim.store.session_store import SessionStore, read_json_file
+
+HAND_EYE_FILE = "calibration/hand_eye.json"
+BOARD_FILE = "calibration/board.json"
+SCENE_FILE = "registration/scene.json"
+GRASP_FOLDER = "grasps"
+ARRAYS = ("Ts_obj_grasp", "widths_m", "scores", "base_scores", "slip_m", "slip_rad", "reachable")
+GRASP_FORMAT_VERSION = 1
+
+
+# --- one record, one file ---------------------------------------------------------------------
+
+
+def save_hand_eye(store: SessionStore, result: HandEye, name: str = HAND_EYE_FILE) -> None:
+    """Write the calibration into the session."""
+    store.write_json(name, records_json.hand_eye_to_json(result))
+
+
+def load_hand_eye(store: SessionStore, name: str = HAND_EYE_FILE) -> HandEye:
+    """Return the calibration of the session."""
+    return records_json.hand_eye_from_json(store.read_json(name))
+
+
+def save_board(store: SessionStore, board: TagBoard, name: str = BOARD_FILE) -> None:
+    """Write the calibration board into the session."""
+    store.write_json(name, records_json.tag_board_to_json(board))
+
+
+def load_board(store: SessionStore, name: str = BOARD_FILE) -> TagBoard:
+    """Return the calibration board of the session."""
+    return records_json.tag_board_from_json(store.read_json(name))
+
+
+def save_scene(store: SessionStore, scene: Scene, name: str = SCENE_FILE) -> None:
+    """Write the registered scene into the session."""
+    store.write_json(name, records_json.scene_to_json(scene))
+
+
+def load_scene(store: SessionStore, name: str = SCENE_FILE) -> Scene:
+    """Return the registered scene of the session."""
+    return records_json.scene_from_json(store.read_json(name))
+
+
+# --- grasps -----------------------------------------------------------------------------------
+
+
+def grasp_stem(grasps: GraspSet) -> str:
+    """Return the file name of a grasp set without its ending."""
+    return f"{grasps.instance:06d}_obj{grasps.obj_id:06d}"
+
+
+def grasp_counts(grasps: GraspSet) -> dict[str, Any]:
+    """Return how many candidates got how far, and why the others did not."""
+    tried = ~np.isnan(grasps.base_scores)
+    passed = {
+        stage: int(np.count_nonzero(grasps.base_scores[tried] >= (k + 1) / len(STAGES)))
+        for k, stage in enumerate(STAGES)
+    }
+    return {
+        "candidates": len(grasps),
+        "reachable": int(np.count_nonzero(grasps.reachable)),
+        "tried": int(np.count_nonzero(tried)),
+        "passed": passed,
+        "good": int(np.count_nonzero(grasps.good)),
+        "failures": dict(sorted(Counter(f for f in grasps.failures if f).items())),
+    }
+
+
+def grasps_to_json(grasps: GraspSet) -> dict[str, Any]:
+    """Return the readable side of a grasp set; the arrays are in the npz file beside it."""
+    rows = [
+        {
+            "index": i,
+            "score": number_to_json(float(grasps.scores[i])),
+            "base_score": number_to_json(float(grasps.base_scores[i])),
+            "reachable": bool(grasps.reachable[i]),
+            "failure": grasps.failures[i],
+            "slip_mm": _by_stage(1e3 * grasps.slip_m[i]),
+            "slip_deg": _by_stage(np.degrees(grasps.slip_rad[i])),
+        }
+        for i in range(len(grasps))
+    ]
+    return {
+        "format_version": GRASP_FORMAT_VERSION,
+        "obj_id": int(grasps.obj_id),
+        "instance": int(grasps.instance),
+        "counts": grasp_counts(grasps),
+        "parameters": grasps.parameters,
+        "grasps": rows,
+    }
+
+
+def _by_stage(values: Any) -> dict[str, Any]:
+    rounded = (float(v) if not math.isfinite(v) else round(float(v), 6) for v in values)
+    return {stage: number_to_json(v) for stage, v in zip(STAGES, rounded, strict=True)}
+
+
+def save_grasps(store_or_folder: SessionStore | Path | str, grasps: GraspSet) -> Path:
+    """Write a grasp set as npz (exact) and JSON (readable), and return the npz file's path.
+
+    Args:
+        store_or_folder: a session, whose folder grasps/ is used, or the folder itself.
+        grasps: the grasp set.
+    """
+    arrays: dict[str, Any] = {name: getattr(grasps, name) for name in ARRAYS}
+    arrays["failures"] = np.array(grasps.failures, dtype=np.str_).reshape(len(grasps))
+    stem = grasp_stem(grasps)
+    # The npz comes last: a set whose npz is there is complete.
+    parts = {
+        f"{stem}.json": atomic.json_bytes(grasps_to_json(grasps)),
+        f"{stem}.npz": atomic.npz_bytes(**arrays),
+    }
+    in_store = isinstance(store_or_folder, SessionStore)
+    folder = store_or_folder.folder / GRASP_FOLDER if in_store else Path(store_or_folder)
+    for name, data in parts.items():
+        if isinstance(store_or_folder, SessionStore):
+            store_or_folder.write_bytes(f"{GRASP_FOLDER}/{name}", data)
+        else:
+            atomic.write_bytes(folder / name, data)
+    return folder / f"{stem}.npz"
+
+
+def load_grasps(folder: SessionStore | Path | str) -> list[GraspSet]:
+    """Return all complete grasp sets of a session or of a folder, by instance number.
+
+    Raises:
+        InputError: a file is broken.
+    """
+    path = folder.folder if isinstance(folder, SessionStore) else Path(folder)
+    if (path / GRASP_FOLDER).is_dir():
+        path = path / GRASP_FOLDER
+    return [_load_grasp_set(file) for file in sorted(path.glob("*_obj*.npz"))]
+
+
+def _load_grasp_set(file: Path) -> GraspSet:
+    keys = ("obj_id", "instance", "parameters")
+    head = records_json.need(read_json_file(file.with_suffix(".json")), keys, f"{file.stem}.json")
+    try:
+        with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as npz:
+            arrays = {name: npz[name] for name in ARRAYS}
+            failures = tuple(str(f) for f in npz["failures"].tolist())
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(
+            f"{file} is not a complete grasp file ({error}). Delete it and its .json, and run the "
+            "school again for this object."
+        ) from error
+    grasps = GraspSet(
+        obj_id=int(head["obj_id"]),
+        instance=int(head["instance"]),
+        failures=failures,
+        parameters=head["parameters"],
+        **arrays,
+    )
+    return records_json.exactly(grasps, Ts_obj_grasp=arrays["Ts_obj_grasp"])

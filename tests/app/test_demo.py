@@ -1,0 +1,93 @@
+"""The whole loop in the simulated lab: it reaches its goals, and a kill costs nothing."""
+
+import hashlib
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.app.console import Console
+from realsim.app.demo import DemoConfig, run_demo
+
+SMALL = ["--views", "6", "--objects", "2", "--grasps", "8", "--quiet"]
+
+
+def start_demo(out: Path) -> subprocess.Popen[str]:
+    code = "from realsim.app.cli import main; main()"
+    return subprocess.Popen(
+        [sys.executable, "-c", code, "demo", "--out", str(out), *SMALL],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def kill_when(out: Path, reached: Callable[[Path], bool]) -> bool:
+    """Start a demo and SIGKILL it as soon as `reached`; return whether it was caught alive."""
+    process = start_demo(out)
+    deadline = time.monotonic() + 240
+    while process.poll() is None and time.monotonic() < deadline:
+        if reached(out / "session"):
+            process.send_signal(signal.SIGKILL)
+            process.communicate()
+            return True
+        time.sleep(0.005)
+    process.kill()
+    process.communicate()
+    return False
+
+
+def digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.slow
+def test_the_loop_reaches_its_goals(tmp_path: Path) -> None:
+    config = DemoConfig(views=24, objects=5, grasps_per_object=12)
+    result = run_demo(config, tmp_path / "demo", Console(quiet=True))
+    figures = result.errors.figures()
+    assert figures["handeye_mm"] <= 0.5
+    assert figures["handeye_deg"] <= 0.1
+    assert figures["object_mssd_mm"] <= 1.0
+    assert figures["mask_iou"] >= 0.95
+    assert all(o.covariance is not None for o in result.scene.objects)
+    tried = sum(int(np.isfinite(s.scores).sum()) for s in result.grasps)
+    assert tried > 20
+    assert result.report.stat().st_size > 100_000
+    # A second run finds everything done and gives the same report figures.
+    again = run_demo(config, tmp_path / "demo", Console(quiet=True))
+    assert again.errors.figures() == figures
+
+
+@pytest.mark.slow
+def test_a_demo_killed_in_every_stage_ends_like_one_left_alone(tmp_path: Path) -> None:
+    def lines(path: Path) -> int:
+        return path.read_text().count("\n") if path.is_file() else 0
+
+    killed = tmp_path / "killed"
+    moments: dict[str, Callable[[Path], bool]] = {
+        "capture": lambda s: lines(s / "robot.jsonl") == 3,
+        "school": lambda s: any((s / "grasps/cache").glob("*")),
+        "annotate": lambda s: any((s / "mask_visib").glob("*.png")),
+    }
+    caught = {name: kill_when(killed, moment) for name, moment in moments.items()}
+    assert caught == {"capture": True, "school": True, "annotate": True}
+    finished = start_demo(killed)
+    _, err = finished.communicate(timeout=400)
+    assert finished.returncode == 0, err
+
+    alone = tmp_path / "alone"
+    undisturbed = start_demo(alone)
+    _, err = undisturbed.communicate(timeout=400)
+    assert undisturbed.returncode == 0, err
+    for pattern in ("rgb/*.png", "depth/*.png", "mask_visib/*.png"):
+        a = {p.name: digest(p) for p in (killed / "session").glob(pattern)}
+        b = {p.name: digest(p) for p in (alone / "session").glob(pattern)}
+        assert a == b and a, pattern
+    for name in ("scene_gt.json", "registration/scene.json"):
+        left = json.loads((killed / "session" / name).read_text())
+        assert left == json.loads((alone / "session" / name).read_text()), name

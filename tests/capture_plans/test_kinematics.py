@@ -1,0 +1,128 @@
+"""Laws of the arm: forward and inverse undo each other, the Jacobian is the derivative."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_capture_plans.collision import (
+    Box,
+    box_distance,
+    segment_box_distance,
+    segment_distance,
+)
+from realsim_capture_plans.kinematics import UR5, UR5E, DhChain
+
+
+def calibrated(chain: DhChain, seed: int) -> DhChain:
+    """A chain as a factory calibration leaves it: about 0.5 mm and 1 mrad off in every number."""
+    rng = np.random.default_rng(seed)
+    return replace(
+        chain,
+        delta_a=rng.normal(0, 5e-4, 6),
+        delta_d=rng.normal(0, 5e-4, 6),
+        delta_alpha=rng.normal(0, 1e-3, 6),
+        delta_theta=rng.normal(0, 1e-3, 6),
+    )
+
+
+CHAINS = [UR5, UR5E, calibrated(UR5, 1)]
+IDS = ["UR5", "UR5e", "UR5 calibrated"]
+
+
+def regular_joints(chain: DhChain, n: int, seed: int = 0) -> np.ndarray:
+    q = np.random.default_rng(seed).uniform(-np.pi, np.pi, (3 * n, 6))
+    return q[chain.sigma_min(q) > 0.05][:n]
+
+
+@pytest.mark.parametrize("chain", CHAINS, ids=IDS)
+def test_forward_of_every_inverse_is_the_pose(chain: DhChain) -> None:
+    Ts = chain.forward(regular_joints(chain, 60))
+    q, owner = chain.inverse_branches(Ts)
+    assert np.abs(chain.forward(q) - Ts[owner]).max() < 1e-9
+    assert set(owner) == set(range(len(Ts)))
+
+
+@pytest.mark.parametrize("chain", CHAINS, ids=IDS)
+def test_inverse_finds_the_joints_that_made_the_pose(chain: DhChain) -> None:
+    for q in regular_joints(chain, 20, seed=3):
+        found = chain.inverse(chain.forward(q))
+        inside = chain.limits.contains(q)
+        assert inside  # the draw stays within half a turn, which all limits allow
+        assert np.abs(found - q).max(-1).min() < 1e-6
+        assert np.all(chain.limits.contains(found))
+
+
+def test_whole_turns_are_all_distinct_and_all_reach_the_pose() -> None:
+    q = np.array([0.3, -1.2, 1.4, -0.8, 1.5, 0.2])
+    found = UR5.inverse(UR5.forward(q))
+    assert np.abs(UR5.forward(found) - UR5.forward(q)).max() < 1e-9
+    assert len(np.unique(np.round(found, 6), axis=0)) == len(found)
+    # Each joint but the elbow has exactly one other whole turn inside +-2 pi.
+    assert len(found) % 32 == 0
+
+
+def test_nothing_out_of_reach_is_returned() -> None:
+    assert UR5.inverse(se3.from_translation([2.0, 0.0, 0.3])).shape == (0, 6)
+
+
+@pytest.mark.parametrize("chain", CHAINS, ids=IDS)
+def test_jacobian_is_the_derivative_of_forward(chain: DhChain) -> None:
+    q = regular_joints(chain, 40, seed=5)
+    J = chain.jacobian(q)
+    h = 1e-6
+    for i in range(6):
+        step = np.eye(6)[i] * h
+        twist = se3.log(se3.invert(chain.forward(q - step)) @ chain.forward(q + step)) / (2 * h)
+        assert np.abs(J[..., i] - twist).max() < 1e-8
+
+
+def test_known_poses_of_the_nominal_ur5() -> None:
+    # At zero the arm lies along -x: x = a2 + a3, y = -(d4 + d6), z = d1 - d5.
+    T = UR5.forward(np.zeros(6))
+    assert T[:3, 3] == pytest.approx([-0.81725, -0.19145, -0.005491], abs=1e-12)
+    # Turning the base turns the whole pose.
+    turned = UR5.forward([0.7, 0, 0, 0, 0, 0])
+    assert turned[:3, :3] == pytest.approx(se3.exp_so3([0, 0, 0.7]) @ T[:3, :3])
+    # A UR5e is not a UR5.
+    q = np.array([0.1, -1.5, 1.6, -1.6, -1.6, 0.0])
+    gap_mm = 1e3 * np.linalg.norm(UR5E.forward(q)[:3, 3] - UR5.forward(q)[:3, 3])
+    assert 40 < gap_mm < 100
+
+
+def test_batches_of_any_shape_agree_with_single_calls() -> None:
+    q = regular_joints(UR5, 6).reshape(2, 3, 6)
+    assert UR5.forward(q)[1, 2] == pytest.approx(UR5.forward(q[1, 2]), abs=1e-15)
+    assert UR5.jacobian(q)[0, 1] == pytest.approx(UR5.jacobian(q[0, 1]), abs=1e-15)
+
+
+def test_a_calibration_given_as_nominal_numbers_is_refused() -> None:
+    general = replace(UR5, alpha=UR5.alpha + np.array([0.01, 0.02, -0.015, 0.02, 0.01, 0.0]))
+    with pytest.raises(InputError, match="delta_"):
+        general.inverse(general.forward([0.1, -1.2, 1.3, -0.5, -1.4, 0.2]))
+
+
+def test_segment_distances_agree_with_dense_sampling() -> None:
+    rng = np.random.default_rng(7)
+    ends = rng.normal(size=(4, 200, 3))
+    ends[3, :20] = ends[2, :20] + (ends[1, :20] - ends[0, :20])  # parallel ones too
+    s = np.linspace(0, 1, 201)[:, None]
+    first = ends[0][:, None] + s * (ends[1] - ends[0])[:, None]
+    second = ends[2][:, None] + s * (ends[3] - ends[2])[:, None]
+    dense = np.stack(
+        [
+            np.linalg.norm(a[:, None] - b[None], axis=-1).min()
+            for a, b in zip(first, second, strict=True)
+        ]
+    )
+    exact = segment_distance(*ends)
+    assert np.all(exact <= dense + 1e-12)
+    assert np.abs(exact - dense).max() < 0.02
+    box = Box(lower=(-0.5, -0.4, -np.inf), upper=(0.5, 0.6, 0.1))
+    dense_box = box_distance(first, box).min(1)
+    found = segment_box_distance(ends[0], ends[1], box)
+    length = np.linalg.norm(ends[1] - ends[0], axis=-1)
+    assert np.abs(found - dense_box).max() < 0.01
+    assert np.all(found <= dense_box + 1e-3 * length)

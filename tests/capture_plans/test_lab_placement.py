@@ -1,0 +1,120 @@
+"""Objects rest on the table as physics would have it, apart from each other, in the disc."""
+
+import numpy as np
+import pytest
+
+from realsim.errors import DegenerateError, InputError
+from realsim.geometry import se3
+from realsim.geometry.mesh import mass_properties
+from realsim.geometry.parts import part, part_names
+from realsim.records import Mesh
+from realsim_capture_plans.lab.placement import (
+    PlacementConfig,
+    footprint,
+    footprint_gap,
+    place_objects,
+    random_rest,
+    stable_rests,
+)
+
+CENTER = np.array([0.4, -0.1, 0.02])
+
+
+def scene(seed, n=6, **config):
+    rng = np.random.default_rng(seed)
+    models = [part(name) for name in rng.choice(part_names(), n, replace=False)]
+    return models, place_objects(models, CENTER, rng, PlacementConfig(**config))
+
+
+@pytest.mark.parametrize("name", part_names())
+def test_the_center_of_mass_stands_over_the_contact_polygon(name):
+    mesh = part(name).mesh
+    center = mass_properties(mesh, 1.0).center_of_mass
+    down, probability = stable_rests(mesh, 4e-4)
+    assert probability.sum() == pytest.approx(1)
+    assert np.all(probability > 0)
+    for n in down:
+        depth = mesh.vertices @ n
+        touching = mesh.vertices[depth > depth.max() - 1e-6]
+        assert len(touching) >= 3
+        # In the contact plane the centre must not be beyond the touching points in any direction.
+        rng = np.random.default_rng(0)
+        for _ in range(30):
+            axis = np.cross(n, rng.normal(size=3))
+            axis /= np.linalg.norm(axis)
+            assert (touching @ axis).max() >= center @ axis + 3.9e-4
+
+
+def test_a_box_falls_on_its_faces_by_their_solid_angles():
+    down, probability = stable_rests(part("box").mesh, 4e-4)
+    assert len(down) == 6
+    size = part("box").mesh.extent
+    for n, p in zip(down, probability, strict=True):
+        k = int(np.argmax(np.abs(n)))
+        a, b = np.delete(size, k) / 2
+        h = size[k] / 2
+        # Solid angle of a rectangle 2a x 2b from a height h over its middle.
+        omega = 4 * np.arcsin(a * b / np.sqrt((a * a + h * h) * (b * b + h * h)))
+        assert p == pytest.approx(omega / (4 * np.pi), rel=1e-6)
+
+
+def test_what_rolls_for_ever_is_refused():
+    square = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]) * 1e-4
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    with pytest.raises(DegenerateError, match="roll"):
+        stable_rests(Mesh(vertices=square, faces=faces), 4e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_layouts_touch_the_table_stay_in_the_disc_and_keep_their_distance(seed):
+    models, Ts = scene(seed)
+    outlines = []
+    for m, T in zip(models, Ts, strict=True):
+        p = se3.transform(T, m.mesh.vertices)
+        assert p[:, 2].min() == pytest.approx(CENTER[2], abs=1e-12)
+        assert np.linalg.norm(p[:, :2] - CENTER[:2], axis=1).max() < 0.17 + 1e-9
+        outlines.append(footprint(m.mesh, T))
+    for i, a in enumerate(outlines):
+        for b in outlines[:i]:
+            assert footprint_gap(a, b) >= 0.008 - 1e-9
+
+
+def test_the_same_generator_gives_the_same_layout():
+    np.testing.assert_array_equal(scene(5)[1], scene(5)[1])
+    assert np.abs(scene(5)[1] - scene(6)[1]).max() > 0.01
+
+
+def test_every_yaw_and_rest_comes_up():
+    rng = np.random.default_rng(0)
+    Rs = np.stack([random_rest(part("cube"), rng, 4e-4)[:3, :3] for _ in range(300)])
+    up = np.argmax(np.abs(Rs[:, 2]), axis=1) + 3 * (Rs[:, 2].sum(1) > 0)
+    counts = np.bincount(up, minlength=6)
+    assert counts.min() > 25
+    assert np.ptp(np.arctan2(Rs[:, 1, 0], Rs[:, 0, 0])) > 6
+
+
+def test_too_many_objects_are_refused_with_the_number_that_fits():
+    with pytest.raises(InputError, match=r"only \d+ of 12 objects fit"):
+        scene(0, n=12, radius_m=0.1, restarts=2, tries=50)
+
+
+def square(x, y, side=0.02, turn=0.0):
+    R = se3.exp_so3([0, 0, turn])[:2, :2]
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side / 2
+    return corners @ R.T + [x, y]
+
+
+def test_footprint_gap_is_exact_face_to_face_and_never_too_large():
+    assert footprint_gap(square(0, 0), square(0.05, 0)) == pytest.approx(0.03)
+    assert footprint_gap(square(0, 0), square(0.015, 0)) == pytest.approx(-0.005)
+    rng = np.random.default_rng(1)
+    for _ in range(50):
+        a = square(0, 0, turn=rng.uniform(0, 6))
+        b = square(*rng.uniform(0.03, 0.06, 2), turn=rng.uniform(0, 6))
+        edge = np.linspace(0, 1, 40)[:, None, None]
+        pa = (a + edge * (np.roll(a, -1, 0) - a)).reshape(-1, 2)
+        pb = (b + edge * (np.roll(b, -1, 0) - b)).reshape(-1, 2)
+        distance = np.linalg.norm(pa[:, None] - pb, axis=-1).min()
+        gap = footprint_gap(a, b)
+        assert 0.7 * distance - 1e-4 <= gap <= distance + 1e-12
+        assert gap == pytest.approx(footprint_gap(b, a))

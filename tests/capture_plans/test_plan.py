@@ -1,0 +1,209 @@
+"""Laws of capture plans: exactly n views, every pose and every move as promised."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import DegenerateError, InputError
+from realsim.geometry import se3
+from realsim_capture_plans.collision import interpolate
+from realsim_capture_plans.kinematics import UR5
+from realsim_capture_plans.moves import detour
+from realsim_capture_plans.ordering import move_seconds, tour
+from realsim_capture_plans.plan import calibration_plan, hemisphere_plan
+from realsim_capture_plans.plan_file import load_plan, plan_picture, plan_to_json, save_plan
+from realsim_capture_plans.plan_record import CapturePlan, PlanConfig, default_mount
+from realsim_capture_plans.viewpoints import golden_cap
+
+CENTER = np.array([0.375, 0.0, 0.05])
+BOARD = np.array([0.375, 0.0, 0.0])
+N = 24
+
+
+@pytest.fixture(scope="module")
+def scene_plan() -> CapturePlan:
+    return hemisphere_plan(N, CENTER, default_mount(), PlanConfig(), np.random.default_rng(1))
+
+
+@pytest.fixture(scope="module")
+def board_plan() -> CapturePlan:
+    return calibration_plan(N, BOARD, default_mount(), PlanConfig(), np.random.default_rng(1))
+
+
+@pytest.fixture(params=["scene_plan", "board_plan"])
+def plan(request: pytest.FixtureRequest) -> CapturePlan:
+    return request.getfixturevalue(request.param)
+
+
+def test_exactly_n_poses_that_follow_from_the_joints(plan: CapturePlan) -> None:
+    assert len(plan) == N
+    assert np.abs(UR5.forward(plan.joints) - plan.Ts_base_ee).max() < 1e-9
+    assert np.abs(plan.Ts_base_ee @ plan.T_ee_cam_nominal - plan.Ts_base_cam).max() < 1e-12
+    assert np.all(UR5.limits.contains(plan.joints))
+    assert np.all(UR5.sigma_min(plan.joints) >= plan.config.sigma_min)
+
+
+def test_every_move_keeps_the_clearance_on_a_finer_grid_than_planned(plan: CapturePlan) -> None:
+    model = plan.collision_model()
+    for k in range(len(plan)):
+        corners = plan.move(k)
+        samples, _ = interpolate(corners[:-1], corners[1:], plan.config.edge_step_rad / 2)
+        clearance = model.clearance(samples)
+        # Between checked configurations a link moves a few millimetres at most.
+        assert min(d.min() for d in clearance.values()) > plan.config.clearance_m - 0.004
+
+
+def test_moves_join_up_and_metrics_are_theirs(plan: CapturePlan) -> None:
+    corners = [plan.move(k) for k in range(N)]
+    assert np.array_equal(corners[0][0], plan.home)
+    for before, after in pairwise(corners):
+        assert np.array_equal(before[-1], after[0])
+    legs = np.concatenate([np.abs(np.diff(c, axis=0)) for c in corners])
+    assert plan.metrics["travel_total_rad"] == pytest.approx(legs.sum())
+    assert plan.metrics["seconds"] == pytest.approx(move_seconds(legs.max(1), plan.config).sum())
+    assert plan.metrics["colliding_legs"] == 0
+
+
+def test_scene_views_look_at_the_centre_from_the_allowed_shell(scene_plan: CapturePlan) -> None:
+    p = scene_plan
+    centre_cam = np.stack([se3.transform(se3.invert(T), CENTER[None])[0] for T in p.Ts_base_cam])
+    assert np.abs(centre_cam[:, :2]).max() < 1e-9
+    low, high = p.config.radius_m
+    assert centre_cam[:, 2].min() > low - 1e-9 and centre_cam[:, 2].max() < high + 1e-9
+    elevation = np.degrees(np.arcsin(p.directions()[:, 2]))
+    assert elevation.min() > p.config.elevation_deg[0] - 1e-6
+    assert elevation.max() < p.config.elevation_deg[1] + 1e-6
+    assert p.reference_view == np.argmax(p.directions()[:, 2])
+
+
+def test_scene_views_cover_the_cap_nearly_as_well_as_an_ideal_spiral(
+    scene_plan: CapturePlan,
+) -> None:
+    target = golden_cap(4000, scene_plan.config.elevation_deg)
+
+    def hole(directions: np.ndarray) -> float:
+        return float(np.degrees(np.arccos((target @ directions.T).max(1).min())))
+
+    assert scene_plan.metrics["hole_deg"] == pytest.approx(hole(scene_plan.directions()))
+    ideal = hole(golden_cap(N, scene_plan.config.elevation_deg))
+    assert scene_plan.metrics["hole_deg"] < 1.35 * ideal
+
+
+def test_tour_is_far_shorter_than_the_spiral_order(scene_plan: CapturePlan) -> None:
+    # The order in which a golden spiral numbers its points: from the top down.
+    naive = scene_plan.joints[np.argsort(-scene_plan.directions()[:, 2])]
+    spiral = move_seconds(np.abs(np.diff(naive, axis=0)).max(1), scene_plan.config).sum()
+    assert scene_plan.metrics["seconds"] < 0.8 * spiral
+
+
+def test_board_views_roll_all_round_and_vary_tilt_and_distance(board_plan: CapturePlan) -> None:
+    m = board_plan.metrics
+    # One view per 15 degrees of roll: neighbours are at most two sectors apart.
+    assert m["roll_gap_deg"] < 2 * 360 / N + 1e-9
+    assert m["tilt_max_deg"] <= board_plan.config.board_tilt_deg + 1e-6
+    assert m["tilt_max_deg"] - m["tilt_min_deg"] > 25
+    low, high = board_plan.config.board_distance_m
+    assert low - 1e-9 <= m["distance_min_m"] < low + 0.06
+    assert high - 0.06 < m["distance_max_m"] <= high + 1e-9
+    # The optical axes meet the board inside the square of aim points, spread over it.
+    T = board_plan.Ts_base_cam
+    s = (BOARD[2] - T[:, 2, 3]) / T[:, 2, 2]
+    aim = T[:, :3, 3] + s[:, None] * T[:, :3, 2] - BOARD
+    assert np.abs(aim).max() <= np.sqrt(2) * board_plan.config.aim_jitter_m + 1e-9
+    assert np.ptp(aim[:, :2], axis=0).min() > board_plan.config.aim_jitter_m
+
+
+def test_the_same_seed_gives_the_same_plan() -> None:
+    def make(seed: int) -> CapturePlan:
+        return calibration_plan(
+            8, BOARD, default_mount(), PlanConfig(), np.random.default_rng(seed)
+        )
+
+    assert make(4).content_hash == make(4).content_hash
+    assert make(4).content_hash != make(5).content_hash
+
+
+def test_file_round_trip_is_exact(plan: CapturePlan, tmp_path: Path) -> None:
+    save_plan(plan, tmp_path / "plan.json")
+    back = load_plan(tmp_path / "plan.json")
+    assert back.content_hash == plan.content_hash
+    assert np.array_equal(back.joints, plan.joints)
+    assert back.config == plan.config
+    assert [k for k, _ in back.vias] == [k for k, _ in plan.vias]
+
+
+def test_a_changed_file_and_a_newer_version_are_refused(
+    scene_plan: CapturePlan, tmp_path: Path
+) -> None:
+    path = tmp_path / "plan.json"
+    data = json.loads(json.dumps(plan_to_json(scene_plan)))
+    data["content"]["joints"][3][2] += 1e-6
+    path.write_text(json.dumps(data))
+    with pytest.raises(InputError, match="was changed"):
+        load_plan(path)
+    path.write_text(json.dumps(plan_to_json(scene_plan) | {"schema_version": 99}))
+    with pytest.raises(InputError, match="version 99"):
+        load_plan(path)
+    path.write_text("{}")
+    with pytest.raises(InputError, match="schema"):
+        load_plan(path)
+    with pytest.raises(InputError, match="no plan"):
+        load_plan(tmp_path / "other.json")
+
+
+def test_too_few_reachable_views_say_how_many_and_what_to_do() -> None:
+    with pytest.raises(DegenerateError, match=r"only \d+ are reachable.*0\.30-0\.40"):
+        hemisphere_plan(
+            24, [1.25, 0.4, 0.05], default_mount(), PlanConfig(), np.random.default_rng(0)
+        )
+    with pytest.raises(InputError, match="millimetres"):
+        PlanConfig(radius_m=(280.0, 420.0))
+
+
+def test_a_detour_is_found_round_the_keep_out_box(scene_plan: CapturePlan) -> None:
+    # A box as high as the nearest views: straight moves across it collide.
+    config = replace(scene_plan.config, keep_out_m=(0.16, 0.16, 0.26))
+    model = config.collision_model(UR5, default_mount(), CENTER, "hemisphere")
+    q = scene_plan.joints[model.free(scene_plan.joints)]
+    a, b = np.triu_indices(len(q), 1)
+    blocked = np.flatnonzero(~model.edges_free(q[a], q[b], config.edge_step_rad))
+    assert len(blocked) > 0
+    first, last = q[a[blocked[0]]], q[b[blocked[0]]]
+    via = detour(first, last, scene_plan.home, model, config, np.random.default_rng(2))
+    corners = np.concatenate([first[None], via, last[None]])
+    assert np.all(model.edges_free(corners[:-1], corners[1:], config.edge_step_rad))
+
+
+def test_the_tour_of_points_on_a_line_is_the_line() -> None:
+    rng = np.random.default_rng(0)
+    place = rng.permutation(12)
+    stops = [np.array([[0.1 * p, 0, 0, 0, 0, 0], [9.0, 9, 9, 9, 9, 9]]) for p in place]
+    order, choice = tour(stops, np.full(6, [-0.1, 0, 0, 0, 0, 0]), PlanConfig())
+    assert np.array_equal(place[order], np.arange(12))
+    assert np.all(choice == 0)
+
+
+def test_move_times_are_continuous_and_trapezoidal() -> None:
+    c = PlanConfig()
+    knee = c.speed**2 / c.acceleration
+    assert move_seconds(knee, c) == pytest.approx(float(move_seconds(knee * (1 - 1e-9), c)))
+    assert move_seconds(2.0, c) == pytest.approx(2.0 / 1.05 + 1.05 / 1.4)
+    assert move_seconds(0.0, c) == 0.0
+
+
+def test_the_picture_is_written(scene_plan: CapturePlan, tmp_path: Path) -> None:
+    plan_picture(scene_plan, tmp_path / "plan.png")
+    assert (tmp_path / "plan.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.slow
+def test_256_views() -> None:
+    plan = hemisphere_plan(256, CENTER, default_mount(), PlanConfig(), np.random.default_rng(0))
+    assert len(plan) == 256
+    assert plan.metrics["colliding_legs"] == 0
+    assert plan.metrics["hole_deg"] < 10.0
+    assert plan.metrics["seconds"] < 200.0

@@ -1,0 +1,463 @@
+"""BOP scenes: what is written is read again, real data is read right, broken data is named."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError, NotRigidError, UnitError
+from realsim.formats import bop, bop_labels, bop_models
+from realsim.geometry import se3
+from realsim.geometry.mesh import diameter, mass_properties, symmetry_transforms
+from realsim.geometry.metrics import mssd
+from realsim.records import CameraIntrinsics, CaptureSession, Mesh, ObjectModel, View
+from realsim.store import SessionStore
+
+DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+YCBV = DATA / "scenes/ycbv_mini"
+needs_ycbv = pytest.mark.skipif(not YCBV.is_dir(), reason=f"no YCB-V data at {YCBV}")
+
+CAMERA = CameraIntrinsics(width=64, height=48, fx=60, fy=60, cx=32, cy=24)
+
+
+def make_scene(folder, n=2):
+    """Return a session with n images and the annotations that were written into it."""
+    session = CaptureSession(name="s", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(folder, session)
+    rng = np.random.default_rng(0)
+    annotations = {}
+    for i in range(n):
+        rgb = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+        T = se3.look_at(rng.uniform(0.3, 0.5, 3), [0, 0, 0])
+        store.add_view(View(index=i, T_world_cam=T), rgb, rng.uniform(0.2, 1, (48, 64)))
+        poses = se3.random_transform(rng, 2, spread=0.05)
+        poses[:, 2, 3] += 0.5
+        annotations[i] = [(3, poses[0]), (5, poses[1])]
+    bop_labels.write_scene_gt(store, annotations)
+    return store, annotations
+
+
+def edited(folder, name, change):
+    path = folder / name
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+def read(folder):
+    (ref,) = bop.find_scenes(folder)
+    return bop.read_scene(ref)
+
+
+def cube(size=0.06):
+    import trimesh
+
+    solid = trimesh.creation.box((size, size, size))
+    return Mesh(vertices=solid.vertices, faces=solid.faces)
+
+
+# --- round trips ---------------------------------------------------------------------------------
+
+
+def test_poses_and_cameras_come_back(tmp_path):
+    store, annotations = make_scene(tmp_path / "test/000003")
+    scene = read(tmp_path)
+    assert scene.ground_truth_file == "scene_gt.json" and not scene.approximate
+    for i, rows in annotations.items():
+        for (obj_id, T), found in zip(rows, scene.ground_truth[i], strict=True):
+            assert found.obj_id == obj_id
+            np.testing.assert_allclose(found.T_cam_obj, T, atol=1e-12)
+        np.testing.assert_allclose(
+            scene.Ts_world_cam[i], store.session.view(i).T_world_cam, atol=1e-12
+        )
+        assert np.array_equal(scene.rgb(i), store.rgb(i))
+        assert np.array_equal(scene.depth_m(i), store.depth_m(i))
+    bop.check_models(scene, {3, 5, 7})
+    with pytest.raises(InputError, match=r"object 5 has no mesh in .* there are 3, 7"):
+        bop.check_models(scene, {3, 7})
+
+
+def test_the_file_holds_bops_units_and_row_major_lists(tmp_path):
+    store, annotations = make_scene(tmp_path)
+    T = annotations[1][0][1]
+    entry = store.read_json("scene_gt.json")["1"][0]
+    assert entry["obj_id"] == 3
+    assert entry["cam_R_m2c"] == T[:3, :3].ravel().tolist()
+    np.testing.assert_allclose(entry["cam_t_m2c"], 1e3 * T[:3, 3])
+    camera = store.read_json("scene_camera.json")["1"]
+    assert camera["cam_K"] == [60, 0, 32, 0, 60, 24, 0, 0, 1] and camera["depth_scale"] == 0.1
+
+
+def test_a_root_a_split_and_a_scene_are_all_accepted(tmp_path):
+    for scene in ("test/000001", "test/000002", "train/000004"):
+        make_scene(tmp_path / scene, 1)
+    found = [(r.split, r.scene_id) for r in bop.find_scenes(tmp_path)]
+    assert found == [("test", 1), ("test", 2), ("train", 4)]
+    assert [r.scene_id for r in bop.find_scenes(tmp_path / "test")] == [1, 2]
+    assert [r.scene_id for r in bop.find_scenes(tmp_path / "train/000004")] == [4]
+
+
+def test_models_come_back(tmp_path):
+    texture = np.random.default_rng(0).integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    plain = cube()
+    uv = np.random.default_rng(1).random((8, 2))
+    textured = Mesh(vertices=plain.vertices, faces=plain.faces, uv=uv, texture=texture)
+    flip = se3.from_rt(np.diag([1.0, -1, -1]), [0.001, 0, 0])
+    models = {
+        2: ObjectModel(obj_id=2, name="die", mesh=plain, density=640.0),
+        9: ObjectModel(
+            obj_id=9,
+            name="can",
+            mesh=textured,
+            symmetries=np.stack([np.eye(4), flip]),
+            symmetry_axes=(((0.0, 0.0, 1.0), (0.002, 0.0, 0.0)),),
+        ),
+    }
+    bop_models.save_models(tmp_path, models)
+    back = bop_models.load_models(tmp_path)
+    assert set(back) == {2, 9} and set(bop_models.load_models(tmp_path, [9])) == {9}
+    assert (back[2].name, back[2].density, back[9].name) == ("die", 640.0, "can")
+    for i, model in models.items():
+        np.testing.assert_allclose(back[i].mesh.vertices, model.mesh.vertices, atol=1e-8)
+        np.testing.assert_allclose(
+            symmetry_transforms(back[i]), symmetry_transforms(model), atol=1e-12
+        )
+    np.testing.assert_array_equal(back[9].mesh.texture, texture)
+    np.testing.assert_allclose(back[9].mesh.uv, uv, atol=1e-7)
+    info = json.loads((tmp_path / "models_info.json").read_text())
+    assert info["2"]["diameter"] == pytest.approx(60 * np.sqrt(3))
+    assert info["2"]["size_x"] == pytest.approx(60) and info["2"]["min_x"] == pytest.approx(-30)
+    assert "symmetries_discrete" not in info["2"]
+    assert info["9"]["symmetries_discrete"][0][3] == pytest.approx(1.0)
+    assert info["9"]["symmetries_continuous"][0]["offset"] == pytest.approx([2, 0, 0])
+    # Saving what was loaded changes nothing any more.
+    bop_models.save_models(tmp_path / "again", back)
+    for name in ("obj_000002.ply", "obj_000009.ply", "obj_000009.png"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / name).read_bytes()
+
+
+# --- labels --------------------------------------------------------------------------------------
+
+
+def blobs():
+    rng = np.random.default_rng(3)
+    for density in (0.0, 0.02, 0.5, 1.0):
+        yield rng.random((48, 64)) < density
+    square = np.zeros((48, 64), bool)
+    square[10:20, 5:9] = True
+    yield square
+
+
+def test_run_lengths_come_back_and_go_down_the_columns():
+    for mask in blobs():
+        rle = bop_labels.rle_of(mask)
+        assert np.array_equal(bop_labels.mask_of(rle), mask)
+        assert sum(rle["counts"]) == mask.size and rle["size"] == [48, 64]
+        assert all(n > 0 for n in rle["counts"][1:])
+    assert bop_labels.rle_of(np.array([[0, 1], [1, 1]], bool))["counts"] == [1, 3]
+    assert bop_labels.rle_of(np.array([[1, 0], [1, 1]], bool))["counts"] == [0, 2, 1, 1]
+    with pytest.raises(InputError, match="add up to 5"):
+        bop_labels.mask_of({"counts": [2, 3], "size": [2, 3]})
+
+
+def test_boxes_are_bops_in_gt_info_and_cocos_in_coco():
+    *_, square = blobs()
+    assert bop_labels.bbox_of(square) == (5, 10, 3, 9)
+    assert bop_labels.bbox_of(square, inclusive=True) == (5, 10, 4, 10)
+    assert bop_labels.bbox_of(square & False) == (-1, -1, -1, -1)
+
+
+def test_visibility_is_counted():
+    *_, mask = blobs()
+    visible = mask.copy()
+    visible[:15] = False
+    depth_m = np.ones((48, 64), np.float32)
+    depth_m[:, 5] = 0
+    info = bop_labels.gt_info_entry(mask, visible, depth_m, px_count_all=80)
+    assert (info["px_count_all"], info["px_count_valid"], info["px_count_visib"]) == (80, 30, 20)
+    assert info["visib_fract"] == 0.25 and info["bbox_visib"] == [5, 15, 3, 4]
+    assert info["bbox_obj"] == [5, 10, 3, 9]
+    hidden = bop_labels.gt_info_entry(mask, mask & False, None)
+    assert hidden["visib_fract"] == 0 and hidden["bbox_obj"] == [-1, -1, -1, -1]
+    with pytest.raises(InputError, match="must lie in the silhouette"):
+        bop_labels.gt_info_entry(visible, mask, None)
+
+
+def test_masks_and_coco_are_written(tmp_path):
+    store, _ = make_scene(tmp_path)
+    *_, mask = blobs()
+    other = np.roll(mask, 20, axis=1)
+    bop_labels.write_masks(store, 1, [(mask | other, mask), (other, other)])
+    assert np.array_equal(store.read_image("mask_visib/000001_000000.png") > 0, mask)
+    assert np.array_equal(store.read_image("mask/000001_000000.png") > 0, mask | other)
+    masks = {0: [(3, mask & False)], 1: [(3, mask), (5, bop_labels.rle_of(other))]}
+    bop_labels.write_scene_gt_coco(store, masks, {3: "die", 5: "can"})
+    coco = store.read_json("scene_gt_coco.json")
+    assert [i["file_name"] for i in coco["images"]] == ["rgb/000000.png", "rgb/000001.png"]
+    assert [(a["image_id"], a["category_id"]) for a in coco["annotations"]] == [(1, 3), (1, 5)]
+    first = coco["annotations"][0]
+    assert first["area"] == 40 and first["bbox"] == [5, 10, 4, 10]
+    assert np.array_equal(bop_labels.mask_of(first["segmentation"]), mask)
+    assert {c["id"]: c["name"] for c in coco["categories"]} == {3: "die", 5: "can"}
+    bop_labels.write_scene_gt_info(store, {1: [bop_labels.gt_info_entry(mask, mask, None)]})
+    assert store.read_json("scene_gt_info.json")["1"][0]["visib_fract"] == 1
+    # The extra files do not disturb reading the scene.
+    assert read(tmp_path).ground_truth_file == "scene_gt.json" and store.verify() == []
+
+
+def test_poses_that_cannot_be_are_not_written(tmp_path):
+    store, _ = make_scene(tmp_path, 1)
+    before = (tmp_path / "scene_gt.json").read_bytes()
+    with pytest.raises(UnitError, match=r"would be 600 m away"):
+        bop_labels.write_scene_gt(store, {0: [(1, se3.from_translation([0, 0, 600.0]))]})
+    assert (tmp_path / "scene_gt.json").read_bytes() == before
+
+
+# --- broken data ---------------------------------------------------------------------------------
+
+
+def first_object(data):
+    return data["0"][0]
+
+
+def set_translation(factor):
+    def change(data):
+        row = first_object(data)
+        row["cam_t_m2c"] = [factor * x for x in row["cam_t_m2c"]]
+
+    return change
+
+
+BROKEN = {
+    "metres in a millimetre file": (
+        "scene_gt.json", set_translation(1e-3), UnitError, "looks like metres in a millimetre file",
+    ),
+    "converted twice": ("scene_gt.json", set_translation(1e3), UnitError, "Divide cam_t_m2c by"),
+    "a scaled rotation": (
+        "scene_gt.json",
+        lambda d: first_object(d).update(cam_R_m2c=[2, 0, 0, 0, 2, 0, 0, 0, 2]),
+        NotRigidError,
+        "mean scale 2",
+    ),
+    "a mirrored rotation": (
+        "scene_gt.json",
+        lambda d: first_object(d).update(cam_R_m2c=[1, 0, 0, 0, 1, 0, 0, 0, -1]),
+        NotRigidError,
+        "mirrored",
+    ),
+    "eight numbers": (
+        "scene_gt.json",
+        lambda d: first_object(d).update(cam_R_m2c=[1] * 8),
+        InputError,
+        "9 numbers",
+    ),
+    "no object id": (
+        "scene_gt.json", lambda d: first_object(d).pop("obj_id"), InputError, "obj_id",
+    ),
+    "no depth scale": (
+        "scene_camera.json", lambda d: d["0"].pop("depth_scale"), InputError, "no depth_scale",
+    ),
+    "no camera matrix": (
+        "scene_camera.json", lambda d: d["0"].pop("cam_K"), InputError, "no cam_K",
+    ),
+    "a camera that changes": (
+        "scene_camera.json",
+        lambda d: d["1"]["cam_K"].__setitem__(0, 61),
+        InputError,
+        "images 0 and 1 have different cameras",
+    ),
+    "a depth scale that changes": (
+        "scene_camera.json",
+        lambda d: d["1"].update(depth_scale=1.0),
+        InputError,
+        "different depth_scale",
+    ),
+    "half a camera pose": (
+        "scene_camera.json", lambda d: d["1"].pop("cam_t_w2c"), InputError, "only one of",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_broken_scenes_are_named(tmp_path, what):
+    make_scene(tmp_path)
+    file, change, error, says = BROKEN[what]
+    edited(tmp_path, file, change)
+    with pytest.raises(error, match=says) as raised:
+        read(tmp_path)
+    assert file in str(raised.value)
+
+
+def test_one_camera_of_several_can_be_read_alone(tmp_path):
+    make_scene(tmp_path)
+    edited(tmp_path, "scene_camera.json", lambda d: d["1"]["cam_K"].__setitem__(0, 61))
+    (ref,) = bop.find_scenes(tmp_path)
+    assert bop.read_scene(ref, [1]).session.intrinsics.fx == 61
+    with pytest.raises(InputError, match="image 8"):
+        bop.read_scene(ref, [8])
+
+
+def test_folders_without_a_scene_are_named(tmp_path):
+    with pytest.raises(InputError, match="not a folder"):
+        bop.find_scenes(tmp_path / "nowhere")
+    (tmp_path / "pictures").mkdir()
+    with pytest.raises(InputError, match=r"Looked for scene_camera\.json .* has: pictures"):
+        bop.find_scenes(tmp_path)
+
+
+def test_an_empty_scene_is_an_error_and_missing_images_are_listed(tmp_path):
+    make_scene(tmp_path, 3)
+    (tmp_path / "rgb/000001.png").unlink()
+    scene = read(tmp_path)
+    assert scene.missing_images == (1,) and [v.index for v in scene.session.views] == [0, 2]
+    shutil.rmtree(tmp_path / "rgb")
+    with pytest.raises(InputError, match="empty scene"):
+        read(tmp_path)
+
+
+def test_another_ground_truth_is_used_but_said_to_be_approximate(tmp_path):
+    make_scene(tmp_path, 1)
+    (tmp_path / "scene_gt.json").rename(tmp_path / "scene_gt_rough.json")
+    scene = read(tmp_path)
+    assert scene.approximate and scene.ground_truth_file == "scene_gt_rough.json"
+    assert len(scene.ground_truth[0]) == 2
+    shutil.copy(tmp_path / "scene_gt_rough.json", tmp_path / "scene_gt_other.json")
+    with pytest.raises(InputError, match=r"scene_gt_other\.json, scene_gt_rough\.json"):
+        read(tmp_path)
+    for file in tmp_path.glob("scene_gt*"):
+        file.unlink()
+    bare = read(tmp_path)
+    assert bare.ground_truth == {} and bare.ground_truth_file is None and not bare.approximate
+
+
+def test_a_truncated_image_is_named(tmp_path):
+    make_scene(tmp_path, 1)
+    path = tmp_path / "depth/000000.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(InputError, match=r"depth.000000\.png is truncated"):
+        read(tmp_path).depth_m(0)
+    shutil.copy(tmp_path / "rgb/000000.png", path)
+    with pytest.raises(InputError, match="one channel of 16 bit"):
+        read(tmp_path).depth_m(0)
+
+
+def test_models_in_the_wrong_unit_are_found_out(tmp_path):
+    models = {1: ObjectModel(obj_id=1, name="die", mesh=cube())}
+    bop_models.save_models(tmp_path, models)
+    edited(tmp_path, "models_info.json", lambda d: d["1"].update(diameter=0.104))
+    with pytest.raises(UnitError, match=r"models_info\.json says 0\.104 mm"):
+        bop_models.load_models(tmp_path)
+    from realsim.geometry.mesh import save_ply
+
+    save_ply(tmp_path / "obj_000001.ply", cube(), "m")
+    with pytest.raises(UnitError, match="unit='m'"):
+        bop_models.load_models(tmp_path)
+
+
+def test_missing_models_are_named(tmp_path):
+    with pytest.raises(InputError, match="has no models"):
+        bop_models.load_models(tmp_path)
+    bop_models.save_models(tmp_path, {4: ObjectModel(obj_id=4, name="die", mesh=cube())})
+    with pytest.raises(InputError, match=r"object 2, 3 has no mesh .* there are 4"):
+        bop_models.load_models(tmp_path, [2, 3, 4])
+    (tmp_path / "models_info.json").unlink()
+    with pytest.raises(InputError, match="symmetries are not known"):
+        bop_models.load_models(tmp_path)
+
+
+# --- real data -----------------------------------------------------------------------------------
+
+
+@needs_ycbv
+def test_real_scenes_are_read(tmp_path):
+    refs = bop.find_scenes(YCBV)
+    assert [r.scene_id for r in refs] == [50, 51, 52, 53, 54]
+    scenes = [bop.read_scene(r) for r in refs]
+    assert [s.approximate for s in scenes] == [False, False, True, True, False]
+    assert scenes[2].ground_truth_file == "scene_gt_APPROX_wrong_frame.json"
+    s = scenes[0]
+    assert s.session.depth_unit_m == pytest.approx(1e-4) and s.Ts_world_cam is None
+    assert (s.session.intrinsics.width, s.session.intrinsics.height) == (640, 480)
+    depth_m = s.depth_m(1)
+    assert 0.5 < np.median(depth_m[depth_m > 0]) < 2.0
+    assert s.rgb(1).shape == (480, 640, 3)
+    # The depth at an object's centre is a little in front of it, not a thousand times off.
+    measured = 0
+    for a in s.ground_truth[1]:
+        u, v, _ = np.rint(s.session.intrinsics.K @ a.T_cam_obj[:3, 3] / a.T_cam_obj[2, 3])
+        z = float(depth_m[int(v), int(u)])
+        measured += z > 0
+        assert z == 0 or abs(z - a.T_cam_obj[2, 3]) < 0.15
+    assert measured >= 3
+
+
+@needs_ycbv
+def test_a_real_scene_makes_the_round_trip(tmp_path):
+    scene = bop.read_scene(bop.find_scenes(YCBV)[0])
+    session = CaptureSession(
+        name="copy",
+        intrinsics=scene.session.intrinsics,
+        views=(),
+        depth_unit_m=scene.session.depth_unit_m,
+    )
+    store = SessionStore.create(tmp_path / "test/000050", session)
+    store.add_view(View(index=1), scene.rgb(1), scene.depth_m(1))
+    rows = [(a.obj_id, a.T_cam_obj) for a in scene.ground_truth[1]]
+    bop_labels.write_scene_gt(store, {1: rows})
+    back = read(tmp_path)
+    assert np.array_equal(back.rgb(1), scene.rgb(1))
+    assert np.array_equal(back.depth_m(1), scene.depth_m(1))
+    for a, b in zip(scene.ground_truth[1], back.ground_truth[1], strict=True):
+        assert a.obj_id == b.obj_id
+        np.testing.assert_allclose(a.T_cam_obj, b.T_cam_obj, atol=1e-12)
+
+
+@needs_ycbv
+def test_real_models_have_the_diameters_that_are_said():
+    models = bop_models.load_models(YCBV / "models", [2, 13])
+    info = json.loads((YCBV / "models/models_info.json").read_text())
+    for i, model in models.items():
+        assert 1e3 * diameter(model.mesh) == pytest.approx(info[str(i)]["diameter"], rel=1e-3)
+        assert 1e-5 < mass_properties(model.mesh, 1000.0).volume_m3 < 5e-3
+
+
+@needs_ycbv
+def test_keyframe_poses_are_quaternions_first_in_metres():
+    for ref in bop.find_scenes(YCBV):
+        if ref.scene_id not in (50, 51, 54):
+            continue
+        truth = {a.obj_id: a.T_cam_obj for a in bop.read_scene(ref).ground_truth[1]}
+        same = bop.read_keyframe_poses(YCBV, ref.scene_id, 1, source="ground_truth")
+        assert set(same) == set(truth)
+        for i, T in truth.items():
+            np.testing.assert_allclose(same[i], T, atol=2e-5)
+        estimated = bop.read_keyframe_poses(YCBV, ref.scene_id, 1)
+        offsets_mm = [1e3 * np.linalg.norm(estimated[i][:3, 3] - truth[i][:3, 3]) for i in truth]
+        assert 1 < min(offsets_mm) and max(offsets_mm) < 30
+    cracker = bop_models.load_models(YCBV / "models", [2])[2]
+    T = bop.read_keyframe_poses(YCBV, 50, 1)[2]
+    U = bop.read_keyframe_poses(YCBV, 50, 1, source="ground_truth")[2]
+    assert 0.010 < mssd(U, T, cracker.mesh.vertices) < 0.030
+
+
+@needs_ycbv
+def test_objects_that_were_not_found_are_not_there():
+    # CosyPose missed the soup can in 28 of the 190 keyframes of scene 50.
+    rows = [line.split("/") for line in (YCBV / "keyframe.txt").read_text().split()]
+    found = [
+        5 - 1 in bop.read_keyframe_poses(YCBV, 50, int(image))
+        for scene, image in rows
+        if scene == "0050"
+    ]
+    assert (len(found), found.count(False)) == (190, 28)
+
+
+@needs_ycbv
+def test_keyframes_that_are_not_there_are_named():
+    with pytest.raises(InputError, match="image 2 is not a keyframe of scene 50"):
+        bop.read_keyframe_poses(YCBV, 50, 2)
+    with pytest.raises(InputError, match="cosypose, ground_truth"):
+        bop.read_keyframe_poses(YCBV, 50, 1, source="megapose")

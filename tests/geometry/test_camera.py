@@ -1,0 +1,114 @@
+"""Projection: the way back is exact, the derivatives are the derivatives, OpenCV agrees."""
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import camera
+from realsim.records import CameraIntrinsics
+
+LENSES = {
+    "pinhole": [],
+    "brown": [-0.055, 0.066, 0.0004, -0.0007, -0.021],
+    "rational": [0.31, 0.09, -0.0002, 0.0003, 0.004, 0.36, 0.15, 0.02],
+    "strong": [-0.28, 0.09, 0.001, -0.002, -0.012],
+}
+
+
+def lens(name):
+    return CameraIntrinsics(
+        width=1280, height=720, fx=900.0, fy=898.0, cx=640.3, cy=358.7,
+        distortion=np.array(LENSES[name]),
+    )  # fmt: skip
+
+
+def points_in_view(n=400):
+    rng = np.random.default_rng(1)
+    z = rng.uniform(0.2, 0.8, n)
+    return np.stack([rng.uniform(-0.65, 0.65, n) * z, rng.uniform(-0.36, 0.36, n) * z, z], -1)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_undistort_undoes_project(name):
+    p = points_in_view()
+    xy, valid = camera.undistort(lens(name), camera.project(lens(name), p))
+    assert valid.all()
+    np.testing.assert_allclose(xy, p[:, :2] / p[:, 2:], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_project_undoes_undistort_over_the_whole_image(name):
+    uv = camera.pixel_grid(1280, 720)[::24, ::24].reshape(-1, 2)
+    xy, valid = camera.undistort(lens(name), uv)
+    assert valid.all()
+    back = camera.project(lens(name), np.concatenate([xy, np.ones((len(xy), 1))], -1))
+    np.testing.assert_allclose(back, uv, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_opencv_projects_to_the_same_pixels(name):
+    import cv2
+
+    i, p = lens(name), points_in_view()
+    theirs, _ = cv2.projectPoints(p, np.zeros(3), np.zeros(3), i.K, i.distortion)
+    np.testing.assert_allclose(camera.project(i, p), theirs[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_jacobians_are_finite_differences(name):
+    i, p = lens(name), points_in_view(30)
+    uv, d_point, d_cam = camera.projection_jacobian(i, p)
+    np.testing.assert_allclose(uv, camera.project(i, p), atol=1e-10)
+    h = 1e-6
+    for k in range(3):
+        e = h * np.eye(3)[k]
+        numeric = (camera.project(i, p + e) - camera.project(i, p - e)) / (2 * h)
+        np.testing.assert_allclose(d_point[:, :, k], numeric, atol=2e-4, rtol=1e-6)
+    start = np.concatenate([[i.fx, i.fy, i.cx, i.cy], i.distortion])
+
+    def moved(k, step):
+        x = start.copy()
+        x[k] += step
+        c = CameraIntrinsics(
+            width=i.width, height=i.height, fx=x[0], fy=x[1], cx=x[2], cy=x[3], distortion=x[4:]
+        )
+        return camera.project(c, p)
+
+    for k in range(12):
+        numeric = (moved(k, h) - moved(k, -h)) / (2 * h)
+        np.testing.assert_allclose(d_cam[:, :, k], numeric, atol=1e-5, rtol=1e-6)
+
+
+def test_points_behind_the_camera_have_no_pixel():
+    assert np.isnan(camera.project(lens("pinhole"), [[0, 0, -1.0], [0.1, 0, 0.0]])).all()
+
+
+def test_pixels_beyond_the_fold_are_reported_not_guessed():
+    # k1 = -0.5 folds the image back at r = sqrt(2/3): nothing is seen beyond 0.544 f.
+    i = CameraIntrinsics(
+        width=2000, height=2000, fx=900, fy=900, cx=1000, cy=1000, distortion=np.array([-0.5])
+    )
+    xy, valid = camera.undistort(i, [[1000.0, 1000.0], [1400.0, 1000.0], [1999.0, 1000.0]])
+    assert valid.tolist() == [True, True, False]
+    assert np.isnan(xy[2]).all() and np.isfinite(xy[:2]).all()
+
+
+def test_rays_have_depth_one_and_go_through_pixel_centres():
+    i = lens("brown")
+    rays = camera.ray_table(i)
+    assert rays.shape == (720, 1280, 3) and rays.dtype == np.float32
+    assert (rays[..., 2] == 1).all()
+    np.testing.assert_allclose(
+        camera.project(i, rays[100, 200].astype(float)), [200, 100], atol=1e-3
+    )
+    assert camera.ray_table(i) is rays
+
+
+def test_the_centre_pixel_of_a_known_camera():
+    i = CameraIntrinsics(width=640, height=480, fx=600, fy=500, cx=320, cy=240)
+    np.testing.assert_allclose(camera.project(i, [0.1, -0.2, 2.0]), [350, 190])
+
+
+def test_a_camera_matrix_with_skew_is_refused():
+    with pytest.raises(InputError, match="camera matrix"):
+        CameraIntrinsics.from_K([[600, 1, 320], [0, 600, 240], [0, 0, 1]], 640, 480)

@@ -1,0 +1,116 @@
+"""The signed distance field against closed forms."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from realsim.errors import InputError
+from realsim.geometry import distance_field, se3
+from realsim.geometry.distance_field import DistanceField
+from realsim.records import Mesh
+
+HALF = np.array([0.03, 0.04, 0.05])
+RADIUS = 0.04
+
+
+def as_mesh(m: trimesh.Trimesh) -> Mesh:
+    return Mesh(vertices=np.array(m.vertices), faces=np.array(m.faces, dtype=np.int32))
+
+
+@pytest.fixture(scope="module")
+def box():
+    return DistanceField.from_mesh(as_mesh(trimesh.creation.box(2 * HALF)), 48)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return DistanceField.from_mesh(as_mesh(trimesh.creation.icosphere(4, RADIUS)), 48)
+
+
+def box_distance(p):
+    q = np.abs(p) - HALF
+    return np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0)
+
+
+def shell(rng, n, low, high):
+    u = rng.normal(size=(n, 3))
+    return u / np.linalg.norm(u, axis=1, keepdims=True) * rng.uniform(low, high, (n, 1))
+
+
+def test_box_distance_is_exact_on_flat_faces(box):
+    rng = np.random.default_rng(0)
+    p = rng.uniform(-1, 1, (4000, 3)) * (HALF + 4 * box.cell)
+    error = np.abs(box.distance(p) - box_distance(p))
+    near = np.abs(box_distance(p)) < (distance_field.NEAR_CELLS - 2) * box.cell
+    # Away from edges and the medial axis the field is linear; at them half a cell is missed.
+    assert np.median(error[near]) < 1e-6
+    assert error[near].max() < 0.6 * box.cell
+    # Far inside, where four cells are bridged, the ridge of the field is cut off.
+    assert error.max() < 0.6 * distance_field.FAR_STEP * box.cell
+
+
+def test_sphere_distance_and_gradient(sphere):
+    p = shell(np.random.default_rng(1), 4000, 0.8 * RADIUS, 1.1 * RADIUS)
+    d, g = sphere.distance_gradient(p)
+    r = np.linalg.norm(p, axis=1)
+    # Facets of the icosphere (0.05 mm sagitta at most) plus cell^2 / 8R of interpolation.
+    assert np.abs(d - (r - RADIUS)).max() < 1e-4 + sphere.cell**2 / RADIUS
+    np.testing.assert_allclose(np.linalg.norm(g, axis=1), 1.0, atol=0.05)
+    # The length is off by up to cell / R = 4 % within a cell; the direction by far less.
+    direction = g / np.linalg.norm(g, axis=1, keepdims=True)
+    assert np.sum(direction * p / r[:, None], axis=1).min() > 0.995
+
+
+def test_gradient_is_the_derivative_of_the_value(sphere):
+    p = shell(np.random.default_rng(2), 500, 0.5 * RADIUS, 2.5 * RADIUS)
+    _, g = sphere.distance_gradient(p)
+    step = 1e-7
+    numeric = np.stack(
+        [(sphere.distance(p + step * e) - sphere.distance(p - step * e)) / (2 * step)
+         for e in np.eye(3)], -1,
+    )  # fmt: skip
+    assert np.mean(np.abs(numeric - g).max(1) < 1e-3) > 0.99
+
+
+def test_outside_the_grid_distance_grows_and_points_away(box):
+    p = np.array([[0.5, 0.0, 0.0], [0.3, 0.4, 0.5]])
+    d, g = box.distance_gradient(p)
+    assert np.all(d >= box_distance(p) - 1e-6)
+    assert np.all(d < 1.2 * box_distance(p) + 0.01)
+    np.testing.assert_allclose(g[0], [1, 0, 0], atol=1e-6)
+
+
+def test_a_moved_mesh_has_the_moved_field():
+    rng = np.random.default_rng(3)
+    mesh = as_mesh(trimesh.creation.box(2 * HALF))
+    T = se3.random_transform(rng, spread=0.1)
+    moved = DistanceField.from_mesh(
+        Mesh(vertices=se3.transform(T, mesh.vertices), faces=mesh.faces), 48
+    )
+    p = rng.uniform(-1.2, 1.2, (500, 3)) * HALF
+    still = DistanceField.from_mesh(mesh, 48)
+    difference = moved.distance(se3.transform(T, p)) - still.distance(p)
+    assert np.abs(difference).max() < moved.cell
+    mapped = still.distance(se3.transform(T, p), se3.invert(T))
+    np.testing.assert_allclose(mapped, still.distance(p), atol=1e-9)
+
+
+def test_a_hole_does_not_turn_the_inside_out():
+    solid = trimesh.creation.icosphere(3, RADIUS)
+    holed = Mesh(vertices=np.array(solid.vertices), faces=np.array(solid.faces[3:], np.int32))
+    p = shell(np.random.default_rng(4), 800, 0.3 * RADIUS, 0.9 * RADIUS)
+    assert np.mean(DistanceField.from_mesh(holed, 32).distance(p) < 0) > 0.99
+
+
+def test_a_field_is_computed_once_and_kept_in_the_folder(tmp_path, monkeypatch):
+    mesh = as_mesh(trimesh.creation.box(HALF))
+    first = DistanceField.from_mesh(mesh, 16, tmp_path)
+    copy = Mesh(vertices=mesh.vertices.copy(), faces=mesh.faces.copy())
+    assert DistanceField.from_mesh(copy, 16, tmp_path) is first
+    assert DistanceField.from_mesh(copy, 20) is not first
+    monkeypatch.setattr(distance_field, "_memory", type(distance_field._memory)())
+    again = DistanceField.from_mesh(mesh, 16, tmp_path)
+    assert again is not first
+    np.testing.assert_array_equal(again.grid, first.grid)
+    with pytest.raises(InputError):
+        DistanceField.from_mesh(mesh, 2)

@@ -1,0 +1,244 @@
+"""Records written and read are the same records, bit for bit."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from realsim import store as stores
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import (
+    CameraIntrinsics,
+    CaptureSession,
+    GraspSet,
+    HandEye,
+    ObjectPose,
+    Scene,
+    SupportPlane,
+    TagBoard,
+    View,
+)
+from realsim.store import records_json as rj
+
+few = settings(max_examples=25, deadline=None)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def through_text(value):
+    return json.loads(json.dumps(value, allow_nan=False))
+
+
+def assert_same(a, b):
+    """Every field is equal, arrays bit for bit."""
+    assert type(a) is type(b)
+    for name in a.__dataclass_fields__:
+        x, y = getattr(a, name), getattr(b, name)
+        if hasattr(x, "__dataclass_fields__"):
+            assert_same(x, y)
+        elif isinstance(x, np.ndarray):
+            assert x.dtype == y.dtype and x.shape == y.shape, name
+            assert x.tobytes() == y.tobytes(), name
+            assert not y.flags.writeable, name
+        elif isinstance(x, tuple) and x and hasattr(x[0], "__dataclass_fields__"):
+            for p, q in zip(x, y, strict=True):
+                assert_same(p, q)
+        else:
+            assert repr(x) == repr(y), name  # NaN is not equal to itself
+
+
+def camera(rng):
+    fx, fy, cx, cy = rng.uniform(100, 1000, 4).tolist()
+    return CameraIntrinsics(
+        width=640, height=480, fx=fx, fy=fy, cx=cx, cy=cy, distortion=rng.normal(size=8)
+    )
+
+
+def hand_eye(rng):
+    A = rng.normal(size=(6, 6))
+    return HandEye(
+        T_ee_cam=se3.random_transform(rng),
+        covariance=A @ A.T,
+        T_base_board=se3.random_transform(rng),
+        intrinsics=camera(rng),
+        intrinsics_sd=rng.random(12),
+        view_indices=(0, 2, 5),
+        view_rms_px=np.array([0.1, np.nan, np.inf]),
+        held_out_px=float("nan"),
+        rejected=((1, "blurred"),),
+        method="joint",
+        starts=(("park", 3.2), ("tsai", float("inf"))),
+    )
+
+
+def scene(rng):
+    A = rng.normal(size=(6, 6))
+    objects = tuple(
+        ObjectPose(
+            obj_id=3,
+            instance=k,
+            T_world_obj=se3.random_transform(rng),
+            covariance=A @ A.T if k else None,
+            checks={"agree": float(rng.random()), "free": float("nan"), "gap": float("-inf")},
+            verdict="doubtful",
+            reasons=("hidden",),
+        )
+        for k in range(3)
+    )
+    plane = SupportPlane(
+        T_world_table=se3.random_transform(rng), rms_m=float(rng.random()), inliers=77
+    )
+    return Scene(name="table 1", objects=objects, plane=plane)
+
+
+def grasps(rng, n=20, instance=2):
+    slip = rng.random((n, 4))
+    slip[:1], slip[1:2] = np.nan, np.inf
+    scores = rng.random(n)
+    scores[:3] = np.nan
+    return GraspSet(
+        obj_id=7,
+        instance=instance,
+        Ts_obj_grasp=se3.random_transform(rng, n) if n else np.zeros((0, 4, 4)),
+        widths_m=rng.random(n),
+        scores=scores,
+        base_scores=np.where(np.isnan(scores), np.nan, np.round(4 * rng.random(n)) / 4),
+        slip_m=slip,
+        slip_rad=slip[::-1],
+        reachable=rng.random(n) > 0.5,
+        failures=tuple(["lost in lift", "", "Widerstand über Null"][i % 3] for i in range(n)),
+        parameters={"friction": 0.5, "stages": ["close", "lift"], "seed": 4},
+    )
+
+
+def views(rng):
+    return View(
+        index=4,
+        T_base_ee=se3.random_transform(rng),
+        joints=rng.normal(size=6),
+        T_world_cam=se3.random_transform(rng),
+        time_s=float(rng.random()),
+    )
+
+
+@few
+@given(seeds)
+@pytest.mark.parametrize(
+    ("make", "to_json", "from_json"),
+    [
+        (camera, rj.intrinsics_to_json, rj.intrinsics_from_json),
+        (views, rj.view_to_json, rj.view_from_json),
+        (hand_eye, rj.hand_eye_to_json, rj.hand_eye_from_json),
+        (scene, rj.scene_to_json, rj.scene_from_json),
+    ],
+)
+def test_reading_undoes_writing_bit_for_bit(make, to_json, from_json, seed):
+    record = make(np.random.default_rng(seed))
+    text = through_text(to_json(record))
+    back = from_json(text)
+    assert_same(record, back)
+    assert through_text(to_json(back)) == text
+
+
+def test_boards_and_bare_records():
+    board = TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.009, first_id=3)
+    assert_same(board, rj.tag_board_from_json(through_text(rj.tag_board_to_json(board))))
+    assert_same(View(index=1), rj.view_from_json(through_text(rj.view_to_json(View(index=1)))))
+    empty = Scene(name="empty", objects=())
+    assert_same(empty, rj.scene_from_json(through_text(rj.scene_to_json(empty))))
+
+
+def test_numbers_that_json_lacks():
+    values = np.array([[1.5, np.nan], [np.inf, -np.inf]])
+    assert rj.array_to_json(values) == [[1.5, None], ["inf", "-inf"]]
+    np.testing.assert_array_equal(
+        rj.array_from_json(through_text(rj.array_to_json(values))), values
+    )
+
+
+def test_a_rotation_edited_by_hand_is_made_rigid_again():
+    data = rj.view_to_json(views(np.random.default_rng(0)))
+    data["T_base_ee"] = np.round(data["T_base_ee"], 6).tolist()
+    R = rj.view_from_json(data).T_base_ee[:3, :3]
+    assert np.abs(R.T @ R - np.eye(3)).max() < 1e-14
+
+
+def test_numpy_scalars_become_plain_numbers():
+    rng = np.random.default_rng(0)
+    plain, f, i = camera(rng), np.float32, np.int64
+    odd = CameraIntrinsics(width=i(640), height=i(480), fx=f(600), fy=f(600), cx=f(3), cy=f(4))
+    assert rj.intrinsics_from_json(through_text(rj.intrinsics_to_json(odd))).fx == 600
+    assert_same(plain, rj.intrinsics_from_json(rj.intrinsics_to_json(plain)))
+    view = View(index=i(3), time_s=np.float32(0.5))
+    assert rj.view_from_json(through_text(rj.view_to_json(view))).index == 3
+    pose = ObjectPose(
+        obj_id=i(2), instance=i(0), T_world_obj=np.eye(4), checks={"agree": np.float32(0.5)}
+    )
+    back = rj.object_pose_from_json(through_text(rj.object_pose_to_json(pose)))
+    assert back.checks == {"agree": 0.5}
+
+
+def test_missing_keys_are_named():
+    with pytest.raises(InputError, match=r"lacks T_world_obj; it has: obj_id, instance"):
+        rj.object_pose_from_json({"obj_id": 1, "instance": 0})
+    with pytest.raises(InputError, match="found list"):
+        rj.scene_from_json([])
+
+
+def new_store(folder):
+    session = CaptureSession(
+        name="s", intrinsics=camera(np.random.default_rng(0)), views=(), depth_unit_m=1e-3
+    )
+    return stores.SessionStore.create(folder, session)
+
+
+def test_results_live_in_the_session(tmp_path):
+    rng = np.random.default_rng(5)
+    store, h, s = new_store(tmp_path), hand_eye(rng), scene(rng)
+    board = TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.009)
+    sets = [grasps(rng, instance=2), grasps(rng, n=0, instance=0)]
+    stores.save_hand_eye(store, h)
+    stores.save_scene(store, s)
+    stores.save_board(store, board)
+    for g in sets:
+        stores.save_grasps(store, g)
+    store = stores.SessionStore.open(tmp_path)
+    assert_same(stores.load_hand_eye(store), h)
+    assert_same(stores.load_scene(store), s)
+    assert_same(stores.load_board(store), board)
+    for where in (store, tmp_path, tmp_path / "grasps"):
+        back = stores.load_grasps(where)
+        assert [g.instance for g in back] == [0, 2]
+        assert_same(back[1], sets[0])
+        assert_same(back[0], sets[1])
+    assert store.verify() == []
+    with pytest.raises(InputError, match="has the step that writes it been run"):
+        stores.load_scene(store, "registration/other.json")
+
+
+def test_the_readable_side_of_grasps_says_what_happened(tmp_path):
+    g = grasps(np.random.default_rng(1))
+    path = stores.save_grasps(tmp_path, g)
+    assert path.name == "000002_obj000007.npz"
+    data = json.loads(path.with_suffix(".json").read_text())
+    counts = data["counts"]
+    assert counts["candidates"] == 20 and counts["tried"] == 17
+    assert counts["good"] == int(np.nansum(g.scores >= 0.5))
+    assert counts["passed"]["pendulum"] == int(np.sum(g.base_scores == 1))
+    assert counts["reachable"] == int(g.reachable.sum())
+    assert sum(counts["failures"].values()) == sum(1 for f in g.failures if f)
+    row = data["grasps"][5]
+    assert row["slip_mm"]["lift"] == pytest.approx(1e3 * g.slip_m[5, 1], abs=1e-6)
+    assert row["slip_deg"]["pendulum"] == pytest.approx(np.degrees(g.slip_rad[5, 3]), abs=1e-6)
+    assert data["grasps"][0]["slip_mm"]["close"] is None
+    assert data["grasps"][1]["slip_mm"]["close"] == "inf"
+    assert data["parameters"] == g.parameters
+
+
+def test_a_torn_grasp_file_is_named(tmp_path):
+    path = stores.save_grasps(tmp_path, grasps(np.random.default_rng(1)))
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(InputError, match=r"000002_obj000007\.npz is not a complete grasp file"):
+        stores.load_grasps(tmp_path)

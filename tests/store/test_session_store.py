@@ -1,0 +1,433 @@
+"""A session comes back bit for bit, and no kill leaves half a view."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, CaptureSession, View
+from realsim.store import SessionStore, atomic
+from realsim.store.manifest import Manifest, entry_of
+
+CAMERA = CameraIntrinsics(
+    width=64, height=48, fx=60.1, fy=60.2, cx=31.7, cy=23.9,
+    distortion=np.array([-0.05, 0.06, 1e-4, -2e-4, 0.01]),
+)  # fmt: skip
+UNIT = 1e-4
+
+
+def empty_session(name="table"):
+    return CaptureSession(name=name, intrinsics=CAMERA, views=(), depth_unit_m=UNIT)
+
+
+def make_view(index, with_robot=True):
+    rng = np.random.default_rng(index)
+    if not with_robot:
+        return View(index=index)
+    return View(
+        index=index,
+        T_base_ee=se3.random_transform(rng),
+        joints=rng.normal(size=6),
+        time_s=1e9 * rng.random(),
+    )
+
+
+def make_images(index):
+    rng = np.random.default_rng([index, 1])
+    rgb = rng.integers(0, 256, (48, 64, 3), dtype=np.uint8)
+    depth_m = rng.uniform(0.1, 1.0, (48, 64)).astype(np.float32)
+    depth_m[:4] = 0
+    return rgb, depth_m
+
+
+def filled(folder, n=3):
+    store = SessionStore.create(folder, empty_session(), {"plan": "hemisphere"})
+    for i in range(n):
+        store.add_view(make_view(i), *make_images(i))
+    return store
+
+
+def assert_same_view(a, b):
+    assert a.index == b.index and a.time_s == b.time_s
+    for name in ("T_base_ee", "joints", "T_world_cam"):
+        x, y = getattr(a, name), getattr(b, name)
+        assert (x is None) == (y is None)
+        assert x is None or np.array_equal(x, y), name
+
+
+# --- round trips ---------------------------------------------------------------------------------
+
+
+def test_a_session_comes_back_bit_for_bit(tmp_path):
+    filled(tmp_path / "s", 5)
+    store = SessionStore.open(tmp_path / "s")
+    assert store.completed == {0, 1, 2, 3, 4} and store.extra == {"plan": "hemisphere"}
+    s = store.session
+    assert s.name == "table" and s.depth_unit_m == UNIT
+    assert np.array_equal(s.intrinsics.distortion, CAMERA.distortion)
+    assert np.array_equal(s.intrinsics.K, CAMERA.K)
+    for view in s.views:
+        assert_same_view(view, make_view(view.index))
+        rgb, depth_m = make_images(view.index)
+        assert np.array_equal(store.rgb(view.index), rgb)
+        found = store.depth_m(view.index)
+        assert found.dtype == np.float32
+        np.testing.assert_allclose(found, depth_m, atol=UNIT / 2 + 1e-7)
+        assert (found[:4] == 0).all()
+    assert store.verify() == []
+
+
+def test_depth_that_does_not_fit_becomes_no_measurement(tmp_path):
+    store = SessionStore.create(tmp_path, empty_session())
+    depth_m = np.full((48, 64), 0.5, np.float32)
+    depth_m[0, :4] = [np.nan, -0.1, 70_000 * UNIT, np.inf]
+    depth_m[0, 4:6] = [65_535 * UNIT, UNIT]
+    store.add_view(View(index=0), make_images(0)[0], depth_m)
+    found = store.depth_m(0)[0, :6]
+    np.testing.assert_allclose(found, [0, 0, 0, 0, 6.5535, 1e-4], rtol=1e-6)
+
+
+def test_views_without_robot_and_without_depth(tmp_path):
+    store = SessionStore.create(tmp_path, empty_session())
+    store.add_view(make_view(4, with_robot=False), make_images(4)[0])
+    store = SessionStore.open(tmp_path)
+    view = store.session.view(4)
+    assert view.T_base_ee is None and view.joints is None and view.T_world_cam is None
+    assert not store.has_depth(4)
+    with pytest.raises(InputError, match="without depth"):
+        store.depth_m(4)
+
+
+def test_camera_poses_come_back_bit_for_bit(tmp_path):
+    store = filled(tmp_path)
+    Ts = se3.random_transform(np.random.default_rng(9), 3)
+    new = CameraIntrinsics(width=64, height=48, fx=61, fy=61, cx=32, cy=24)
+    store.set_cameras(new, {i: Ts[i] for i in (0, 1)})
+    for s in (store.session, SessionStore.open(tmp_path).session):
+        assert s.intrinsics.fx == 61 and not s.intrinsics.is_distorted
+        checked = [View(index=0, T_world_cam=T).T_world_cam for T in Ts]
+        assert np.array_equal(s.view(0).T_world_cam, checked[0])
+        assert np.array_equal(s.view(1).T_world_cam, checked[1])
+        assert s.view(2).T_world_cam is None
+        assert np.array_equal(s.view(2).T_base_ee, make_view(2).T_base_ee)
+    entry = store.read_json("scene_camera.json")["1"]
+    R = np.reshape(entry["cam_R_w2c"], (3, 3))
+    np.testing.assert_allclose(R, Ts[1][:3, :3].T, atol=1e-12)
+    np.testing.assert_allclose(entry["cam_t_w2c"], 1e3 * se3.invert(Ts[1])[:3, 3], atol=1e-9)
+    assert "cam_distortion" not in entry
+    with pytest.raises(InputError, match="view 8"):
+        store.set_cameras(new, {8: np.eye(4)})
+
+
+def test_a_pose_known_at_capture_stays_with_its_view(tmp_path):
+    T = se3.random_transform(np.random.default_rng(0))
+    view = View(index=0, T_world_cam=T)
+    SessionStore.create(tmp_path, empty_session()).add_view(view, *make_images(0))
+    assert_same_view(SessionStore.open(tmp_path).session.view(0), view)
+
+
+def test_the_folder_is_a_bop_scene_from_its_first_frame_on(tmp_path):
+    from realsim.formats.bop import find_scenes, read_scene
+
+    store = filled(tmp_path / "test/000007", 1)
+    store.set_cameras(CAMERA, {0: se3.from_translation([0.1, 0.2, 0.3])})
+    (ref,) = find_scenes(tmp_path)
+    assert (ref.split, ref.scene_id) == ("test", 7)
+    scene = read_scene(ref)
+    assert scene.session.depth_unit_m == UNIT and scene.ground_truth_file is None
+    assert np.array_equal(scene.session.intrinsics.K, CAMERA.K)
+    assert np.array_equal(scene.session.intrinsics.distortion, CAMERA.distortion)
+    np.testing.assert_allclose(scene.Ts_world_cam[0][:3, 3], [0.1, 0.2, 0.3], atol=1e-12)
+    assert np.array_equal(scene.rgb(0), store.rgb(0))
+    assert np.array_equal(scene.depth_m(0), store.depth_m(0))
+
+
+def test_the_same_files_come_back(tmp_path):
+    store = filled(tmp_path, 1)
+    values = {"a": [1, 0.1, None, "x"]}
+    store.write_json("reports/a.json", values)
+    assert store.read_json("reports/a.json") == values and store.has("reports/a.json")
+    store.write_npz("reports/a.npz", x=np.arange(4), y=np.eye(2))
+    first = (tmp_path / "reports/a.npz").read_bytes()
+    time.sleep(1.1)
+    store.write_npz("reports/a.npz", x=np.arange(4), y=np.eye(2))
+    assert (tmp_path / "reports/a.npz").read_bytes() == first
+    mask = make_images(0)[1] > 0.5
+    store.write_image("mask/a.png", mask)
+    assert np.array_equal(store.read_image("mask/a.png") > 0, mask)
+    assert store.verify() == []
+
+
+# --- what cannot be ------------------------------------------------------------------------------
+
+
+def test_bad_requests_say_what_would_do(tmp_path):
+    store = filled(tmp_path, 2)
+    rgb, depth_m = make_images(0)
+    with pytest.raises(InputError, match="already holds a session"):
+        SessionStore.create(tmp_path, empty_session())
+    with pytest.raises(InputError, match="holds no session"):
+        SessionStore.open(tmp_path / "rgb")
+    with pytest.raises(InputError, match="view 1 is already"):
+        store.add_view(View(index=1), rgb, depth_m)
+    with pytest.raises(InputError, match="size"):
+        store.add_view(View(index=5), rgb[:, :32], depth_m)
+    with pytest.raises(InputError, match="size"):
+        store.add_view(View(index=5), rgb, depth_m[:24])
+    with pytest.raises(InputError, match=r"view 9 .* 0, 1"):
+        store.rgb(9)
+    with pytest.raises(InputError, match="inside the session"):
+        store.write_json("../outside.json", {})
+    with pytest.raises(ValueError, match="JSON"):
+        store.write_json("nan.json", {"x": float("nan")})
+    assert store.completed == {0, 1} and not store.has("nan.json") and store.verify() == []
+    with pytest.raises(InputError, match="add_view"):
+        SessionStore.create(
+            tmp_path / "new",
+            CaptureSession(name="s", intrinsics=CAMERA, views=(View(index=0),), depth_unit_m=UNIT),
+        )
+
+
+def test_a_newer_format_is_refused(tmp_path):
+    store = filled(tmp_path, 1)
+    header = store.read_json("session.json")
+    atomic.write_json(tmp_path / "session.json", header | {"format_version": 99})
+    with pytest.raises(InputError, match="newer realsim"):
+        SessionStore.open(tmp_path)
+
+
+@pytest.mark.parametrize("keep", [0, 20, 400, -1])
+def test_a_truncated_png_is_named(tmp_path, keep):
+    filled(tmp_path, 1)
+    for name, read in (("rgb", SessionStore.rgb), ("depth", SessionStore.depth_m)):
+        path = tmp_path / name / "000000.png"
+        path.write_bytes(path.read_bytes()[:keep])
+        store = SessionStore.open(tmp_path)
+        with pytest.raises(InputError, match=rf"{name}.000000\.png is (truncated|not)") as error:
+            read(store, 0)
+        assert "capture the view again" in str(error.value)
+    assert {(f.path, f.kind) for f in store.verify()} == {
+        ("rgb/000000.png", "changed"),
+        ("depth/000000.png", "changed"),
+    }
+
+
+def test_a_view_whose_image_was_deleted_is_taken_again(tmp_path):
+    filled(tmp_path, 3)
+    (tmp_path / "depth/000001.png").unlink()
+    store = SessionStore.open(tmp_path)
+    assert store.completed == {0, 2}
+    assert [(f.path, f.kind) for f in store.verify()] == [("depth/000001.png", "missing")]
+    store.add_view(make_view(1), *make_images(1))
+    assert SessionStore.open(tmp_path).completed == {0, 1, 2} and store.verify() == []
+
+
+def test_a_changed_byte_is_found(tmp_path):
+    store = filled(tmp_path, 1)
+    path = tmp_path / "rgb/000000.png"
+    data = bytearray(path.read_bytes())
+    data[200] ^= 1
+    path.write_bytes(bytes(data))
+    (fault,) = store.verify()
+    assert fault.path == "rgb/000000.png" and "checksum" in fault.found
+
+
+# --- kills ---------------------------------------------------------------------------------------
+
+
+def test_every_prefix_of_a_view_that_a_kill_can_leave_is_cleaned_up(tmp_path):
+    # All files in the order in which add_view writes them, cut at every step and within lines.
+    store = filled(tmp_path / "whole", 1)
+    robot_before = (tmp_path / "whole/robot.jsonl").read_bytes()
+    manifest_before = (tmp_path / "whole/manifest.jsonl").read_bytes()
+    store.add_view(make_view(1), *make_images(1))
+    robot = (tmp_path / "whole/robot.jsonl").read_bytes()
+    manifest = (tmp_path / "whole/manifest.jsonl").read_bytes()
+    assert robot.startswith(robot_before)
+    steps = [
+        ("rgb only", ["rgb/000001.png"], robot_before, manifest_before, 1),
+        ("both images", ["rgb/000001.png", "depth/000001.png"], robot_before, manifest_before, 1),
+        ("torn robot line", ["rgb/000001.png", "depth/000001.png"], robot[:-9], manifest_before, 1),
+        ("no manifest line", ["rgb/000001.png", "depth/000001.png"], robot, manifest_before, 2),
+        ("torn manifest", ["rgb/000001.png", "depth/000001.png"], robot, manifest[:-300], 2),
+    ]
+    for k, (what, images, robot_bytes, manifest_bytes, views) in enumerate(steps):
+        folder = tmp_path / str(k)
+        filled(folder, 1)
+        for image in [*images, "session.json"]:
+            (folder / image).write_bytes((tmp_path / "whole" / image).read_bytes())
+        (folder / "robot.jsonl").write_bytes(robot_bytes)
+        (folder / "manifest.jsonl").write_bytes(manifest_bytes)
+        (folder / "rgb" / f".000009.png.{2**22 + 1}.part").write_bytes(b"half")
+        store = SessionStore.open(folder)
+        assert store.completed == set(range(views)), what
+        if views == 1:
+            store.add_view(make_view(1), *make_images(1))
+        store = SessionStore.open(folder)
+        assert store.completed == {0, 1} and store.verify() == [], what
+        assert set(store.read_json("scene_camera.json")) == {"0", "1"}, what
+        assert_same_view(store.session.view(1), make_view(1))
+        listed = Manifest(folder).entries
+        assert {"rgb/000001.png", "depth/000001.png", "robot.jsonl"} <= set(listed), what
+        assert not list(folder.rglob("*.part")), what
+
+
+def grow(path, lines):
+    """Wait until a file has that many more lines than now: a busy machine takes its time."""
+
+    def count():
+        return path.read_bytes().count(b"\n") if path.exists() else 0
+
+    goal, end = count() + lines, time.monotonic() + 30
+    while count() < goal:
+        assert time.monotonic() < end, f"{path} does not grow"
+        time.sleep(0.001)
+
+
+CAPTURE = """
+import sys
+sys.path.insert(0, {tests!r})
+from test_session_store import SessionStore, make_view, make_images
+store = SessionStore.open({folder!r})
+print("ready", flush=True)
+for i in range(10_000):
+    if i not in store.completed:
+        store.add_view(make_view(i), *make_images(i))
+"""
+
+
+def test_killed_captures_lose_at_most_the_view_in_flight(tmp_path):
+    folder = tmp_path / "s"
+    SessionStore.create(folder, empty_session())
+    code = CAPTURE.format(tests=os.path.dirname(__file__), folder=str(folder))
+    rng = np.random.default_rng(0)
+    before: set[int] = set()
+    for _ in range(4):
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+        assert process.stdout.readline() == "ready\n"
+        grow(folder / "robot.jsonl", 3)
+        time.sleep(rng.uniform(0, 0.02))
+        process.send_signal(signal.SIGKILL)
+        process.wait(timeout=20)
+        process.stdout.close()
+        lines = (folder / "robot.jsonl").read_bytes().count(b"\n")
+        store = SessionStore.open(folder)
+        assert before <= store.completed == set(range(lines))
+        assert store.verify() == [] and not list(folder.rglob("*.part"))
+        assert len(json.loads((folder / "scene_camera.json").read_text())) == lines
+        before = store.completed
+    assert len(before) > 5
+    assert SessionStore.open(folder).verify() == []
+    for i in (0, max(before)):
+        assert np.array_equal(store.rgb(i), make_images(i)[0])
+        assert_same_view(store.session.view(i), make_view(i))
+
+
+SETTING = """
+import sys
+sys.path.insert(0, {tests!r})
+from test_session_store import SessionStore, CAMERA
+from realsim.geometry import se3
+store = SessionStore.open({folder!r})
+print("ready", flush=True)
+for k in range(100_000):
+    store.set_cameras(CAMERA, {{i: se3.from_translation([k, i, 0]) for i in range(3)}})
+    store.write_json("reports/a.json", k)
+"""
+
+
+def test_killed_calibrations_leave_one_set_of_cameras(tmp_path):
+    folder = tmp_path / "s"
+    filled(folder, 3)
+    code = SETTING.format(tests=os.path.dirname(__file__), folder=str(folder))
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+        assert process.stdout.readline() == "ready\n"
+        grow(folder / "manifest.jsonl", 5)
+        time.sleep(rng.uniform(0, 0.01))
+        process.send_signal(signal.SIGKILL)
+        process.wait(timeout=20)
+        process.stdout.close()
+        store = SessionStore.open(folder)
+        assert store.verify() == []
+        k = {v.T_world_cam[0, 3] for v in store.session.views}
+        assert len(k) == 1
+        entry = store.read_json("scene_camera.json")["2"]
+        np.testing.assert_allclose(entry["cam_t_w2c"], [-1e3 * k.pop(), -2e3, 0], atol=1e-6)
+
+
+# --- atomic files and the manifest ---------------------------------------------------------------
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    atomic.write_text(tmp_path / "a.txt", "old")
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        atomic.write_text(tmp_path / "a.txt", "new")
+    assert (tmp_path / "a.txt").read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_files_of_running_processes_are_left_alone(tmp_path):
+    mine = tmp_path / f".a.{os.getpid()}.part"
+    dead = tmp_path / f".b.{2**22 + 1}.part"
+    for path in (mine, dead):
+        path.write_bytes(b"x")
+    assert atomic.leftovers(tmp_path) == [(dead, tmp_path / "b")]
+    Manifest(tmp_path).finish_interrupted()
+    assert mine.exists() and not dead.exists()
+
+
+def test_a_file_killed_between_its_line_and_its_name_gets_its_name(tmp_path):
+    store = filled(tmp_path, 1)
+    store.write_json("reports/a.json", [1])
+    dead = 2**22 + 1
+    new = atomic.json_bytes([2])
+    (tmp_path / f"reports/.a.json.{dead}.part").write_bytes(new)
+    # Not listed yet: the old file holds.
+    store = SessionStore.open(tmp_path)
+    assert store.read_json("reports/a.json") == [1] and store.verify() == []
+    (tmp_path / f"reports/.a.json.{dead}.part").write_bytes(new)
+    Manifest(tmp_path).add([entry_of("reports/a.json", new)])
+    store = SessionStore.open(tmp_path)
+    assert store.read_json("reports/a.json") == [2] and store.verify() == []
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_a_view_taken_again_is_listed_again_after_a_kill(tmp_path):
+    store = filled(tmp_path, 2)
+    before = (tmp_path / "manifest.jsonl").read_bytes()
+    (tmp_path / "rgb/000001.png").unlink()
+    store.add_view(make_view(1), make_images(7)[0], make_images(7)[1])
+    (tmp_path / "manifest.jsonl").write_bytes(before)
+    store = SessionStore.open(tmp_path)
+    assert store.verify() == [] and store.completed == {0, 1}
+    assert np.array_equal(store.rgb(1), make_images(7)[0])
+
+
+def test_the_last_entry_of_a_path_wins_and_a_torn_line_is_cut_off(tmp_path):
+    manifest = Manifest(tmp_path)
+    (tmp_path / "a").write_bytes(b"two")
+    manifest.add([entry_of("a", b"one"), entry_of("gone", b"x")])
+    manifest.add([entry_of("a", b"two")])
+    path = tmp_path / "manifest.jsonl"
+    whole = path.read_bytes()
+    path.write_bytes(whole + b'{"path": "b", "sha2')
+    again = Manifest(tmp_path)
+    assert path.read_bytes() == whole and set(again.entries) == {"a", "gone"}
+    assert [(f.path, f.kind) for f in again.verify()] == [("gone", "missing")]
+    path.write_bytes(b"nonsense\n" + whole)
+    with pytest.raises(InputError, match="line 1"):
+        Manifest(tmp_path)
