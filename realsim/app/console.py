@@ -67,8 +67,7 @@ class Console:
                 bar.update(task, completed=done, total=total)
 
             yield tick
-            if bar.tasks[0].total is None:
-                bar.update(task, total=1, completed=1)
+            bar.update(task, total=bar.tasks[0].total or 1, completed=bar.tasks[0].total or 1)
         self.times.append(
             StageTime(name=name, cpu_s=cpu_seconds() - cpu, wall_s=time.perf_counter() - wall)
         )
@@ -84,10 +83,11 @@ class Console:
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
         """Print a table; the first column is text, the others are right-aligned."""
         from rich.table import Table
+        from rich.text import Text
 
         table = Table(title=title, title_justify="left", title_style="bold")
         for k, name in enumerate(header):
-            table.add_column(name, justify="left" if k == 0 else "right", overflow="fold")
+            table.add_column(Text(name), justify="left" if k == 0 else "right", overflow="fold")
         for row in rows:
-            table.add_row(*[str(cell) for cell in row])
+            table.add_row(*[Text(str(cell)) for cell in row])
         self._out.print(table)

@@ -32,6 +32,7 @@ def plot_calibration(hand_eye: HandEye, views: Sequence[View], path: Path) -> No
     left.annotate(
         f"held-out {hand_eye.held_out_px:.2f} px", (0.99, hand_eye.held_out_px), color=BAD,
         xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8,
+        bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.8},
     )  # fmt: skip
     left.set_title("Reprojection through the robot pose", fontsize=9, loc="left")
     left.set_xlabel("board view", fontsize=8)

@@ -95,6 +95,26 @@ def part(name: str) -> ObjectModel:
     )
 
 
+def object_names() -> tuple[str, ...]:
+    """Return the names of all objects at hand: the shipped parts, then PyBullet's meshes."""
+    return (*_PARTS, *(entry[0] for entry in _BULLET.values()))
+
+
+def object_model(name: str) -> ObjectModel:
+    """Return a shipped part or one of PyBullet's meshes by its name.
+
+    Raises:
+        InputError: neither has this name.
+        MissingLibraryError: it is PyBullet's, and pybullet_data is not installed.
+    """
+    if name in _PARTS:
+        return part(name)
+    for obj_id, entry in _BULLET.items():
+        if entry[0] == name:
+            return pybullet_models([obj_id])[0]
+    raise InputError(f"there is no object '{name}'; there are: {', '.join(object_names())}.")
+
+
 def pybullet_model_ids() -> tuple[int, ...]:
     """Return the ids of the meshes that can be taken from the installed pybullet_data."""
     return tuple(_BULLET)

@@ -154,7 +154,7 @@ def log(T: ArrayLike) -> Array:
     T = np.asarray(T, dtype=np.float64)
     w = log_so3(T[..., :3, :3])
     v = np.linalg.solve(left_jacobian_so3(w), T[..., :3, 3:4])[..., 0]
-    return np.concatenate([w, v], axis=-1)
+    return np.asarray(np.concatenate([w, v], axis=-1), dtype=np.float64)
 
 
 def adjoint(T: ArrayLike) -> Array:

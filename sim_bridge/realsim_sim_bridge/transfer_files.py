@@ -106,7 +106,7 @@ def reopen_view(store: SessionStore, view: int) -> None:
     Else a kill in between would leave the old annotation, digest and all, beside new masks, and
     going back to the old inputs would take it for complete.
     """
-    store.path(part_path(view)).unlink(missing_ok=True)
+    store.remove(part_path(view))
 
 
 def write_part(store: SessionStore, view: int, part: Mapping[str, Any]) -> None:
@@ -193,7 +193,7 @@ def remove_stale(store: SessionStore, parts: Mapping[int, Mapping[str, Any]]) ->
         if re.fullmatch(pattern, name) and f"{folder}/{name}" not in wanted
     ]
     for path in stale:
-        store.path(path).unlink()
+        store.remove(path)
     return stale
 
 

@@ -8,9 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from realsim_sim_bridge import transfer_files
-from realsim_sim_bridge.transfer import TransferConfig, annotate, overlay_picture, table_slab
-from realsim_sim_bridge.transfer_pictures import best_and_worst
 
 from realsim import (
     CameraIntrinsics,
@@ -29,6 +26,9 @@ from realsim.formats.bop_labels import mask_of
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore
+from realsim_sim_bridge import transfer_files
+from realsim_sim_bridge.transfer import TransferConfig, annotate, overlay_picture, table_slab
+from realsim_sim_bridge.transfer_pictures import best_and_worst
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 TABLE = se3.from_translation([0.5, 0.0, 0.1])

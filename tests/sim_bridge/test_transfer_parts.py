@@ -3,6 +3,11 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
+from realsim import CameraIntrinsics, GraspSet, Mesh, ObjectPose
+from realsim.formats.bop_labels import bbox_of
+from realsim.geometry import camera, se3
+from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim_sim_bridge import frame_labels
 from realsim_sim_bridge.transfer_grasps import (
     GraspsInView,
@@ -13,11 +18,6 @@ from realsim_sim_bridge.transfer_grasps import (
     grasps_in_view,
     in_image,
 )
-
-from realsim import CameraIntrinsics, GraspSet, Mesh, ObjectPose
-from realsim.formats.bop_labels import bbox_of
-from realsim.geometry import camera, se3
-from realsim.rendering.labels import LabelRenderer, PlacedMesh
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 SIDE = 0.05

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.parts import part, part_names
+from realsim.geometry.parts import object_model, part_names
 from realsim.records import Mesh, ObjectModel, ObjectPose, TagBoard
 from realsim_capture_plans.lab import truth as lab_truth
 from realsim_capture_plans.lab.arm import SimulatedArm
@@ -39,6 +39,9 @@ TABLE_CENTER = (0.45, 0.0)
 """Middle of the work space in base [m]: where a UR5 reaches most of a hemisphere."""
 TABLE_SIZE_M = (1.3, 1.5, 0.03)
 """Slab of the table: depth, width, thickness [m]."""
+SINGLE_SURFACE_MESHES = ("bunny", "blob_033")
+"""PyBullet's meshes that the lab draws by itself: the others are overlapping closed pieces, whose
+volume, and so their mass, counts the overlaps twice. They can be named in `objects`."""
 AIM_HEIGHT_M = 0.03
 """Height of the point to look at over the table [m]: half of a typical object."""
 
@@ -160,16 +163,16 @@ def _instances(config: LabConfig) -> list[ObjectModel]:
     """Return the model of every instance."""
     names = config.objects
     if names is None:
-        available = part_names()
+        available = (*part_names(), *SINGLE_SURFACE_MESHES)
         if config.n_objects > len(available):
             raise InputError(
-                f"{config.n_objects} different objects were asked for; {len(available)} parts are "
-                "shipped. Name them in `objects`, where a name may stand more than once."
+                f"{config.n_objects} different objects were asked for; there are "
+                f"{len(available)}. Name them in `objects`, where a name may stand more than once."
             )
         rng = lab_truth.stream(config.seed, lab_truth.LAYOUT)
         drawn = rng.choice(len(available), size=config.n_objects, replace=False)
         names = tuple(available[k] for k in drawn)
-    return [part(name) for name in names]
+    return [object_model(name) for name in names]
 
 
 def _layout(config: LabConfig, instances: Sequence[ObjectModel], center: Array) -> Array:

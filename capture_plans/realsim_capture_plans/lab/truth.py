@@ -41,9 +41,9 @@ class LabConfig:
     seed: int = 0
     """Everything else follows from it."""
     n_objects: int = 5
-    """Objects on the table, drawn from the shipped parts."""
+    """Objects on the table, drawn from the shipped parts and PyBullet's meshes."""
     objects: tuple[str, ...] | None = None
-    """Names of the parts, one for each instance; None draws `n_objects` different ones."""
+    """Names of the objects, one for each instance; None draws `n_objects` different ones."""
     width: int = 1280
     """Image width [px]."""
     height: int = 720

@@ -1,0 +1,7 @@
+"""Robot School: which grasps the arm reaches and physics holds, and how well."""
+
+from realsim_sim_bridge.school.config import SchoolConfig
+from realsim_sim_bridge.school.school import run_school
+from realsim_sim_bridge.school.score import ScoreLimits, recompute_scores
+
+__all__ = ["SchoolConfig", "ScoreLimits", "recompute_scores", "run_school"]

@@ -1,0 +1,30 @@
+"""Everything Robot School can be told."""
+
+from dataclasses import dataclass, field
+
+from realsim_sim_bridge.school.candidates import CandidateConfig
+from realsim_sim_bridge.school.convex import ConvexConfig
+from realsim_sim_bridge.school.hand import HandGeometry
+from realsim_sim_bridge.school.reach import ReachConfig
+from realsim_sim_bridge.school.score import ScoreLimits
+from realsim_sim_bridge.school.slip_test import SlipConfig
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SchoolConfig:
+    """Everything a grasp's score depends on; `asdict` of it is plain JSON."""
+
+    seed: int = 0
+    """Seed of all chance; each object has its own stream, whatever the others do."""
+    max_candidates: int = 60
+    """Candidates kept per object, chosen to be far apart."""
+    least_mass_kg: float = 0.001
+    """Lighter objects are not tried [kg]: below a gram a mesh has the wrong unit."""
+    greatest_mass_kg: float = 20.0
+    """Heavier ones neither [kg]: the arm carries 3."""
+    hand: HandGeometry = field(default_factory=HandGeometry)
+    candidates: CandidateConfig = field(default_factory=CandidateConfig)
+    convex: ConvexConfig = field(default_factory=ConvexConfig)
+    reach: ReachConfig = field(default_factory=ReachConfig)
+    slip: SlipConfig = field(default_factory=SlipConfig)
+    score: ScoreLimits = field(default_factory=ScoreLimits)

@@ -1,0 +1,133 @@
+"""The motions of the four stages, as the load an object feels in a hand that stands still.
+
+The hand is fixed and its motion is replayed as inertial forces: an object of mass m at c, held by a
+hand with acceleration a and turning about an axis through p with angle theta(t), feels in the
+hand's frame
+
+    F = m (R(theta)^T g - a - alpha x (c - p) - omega x (omega x (c - p)))
+    M = -(I alpha + omega x I omega)
+
+(d'Alembert; the Coriolis term is zero as long as the object does not slide). The profiles' values
+are chosen here because the paper gives none: docs/decisions/0005-slip-test-parameters.md.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MIN_JERK_SPEED = 1.875
+"""Peak speed of a minimum-jerk move, in units of distance / duration."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SlipMotion:
+    """Amplitudes, frequencies and durations of the stages."""
+
+    gravity: float = 9.81
+    """[m/s^2], along -z of the table."""
+    close_speed: float = 0.1
+    """Speed of each finger [m/s]: the Franka Hand's top speed."""
+    close_settle_s: float = 0.2
+    """Time at full force after the last finger can have arrived [s]."""
+    lift_height_m: float = 0.20
+    """Vertical displacement [m]; the paper's."""
+    lift_s: float = 1.0
+    """Duration of the minimum-jerk lift [s]: peak 0.375 m/s and 1.15 m/s^2."""
+    lift_hold_s: float = 0.15
+    """Rest after the lift [s]."""
+    oscillation_m: float = 0.05
+    """Amplitude of the horizontal oscillation [m], from the middle to either end."""
+    oscillation_hz: float = 1.5
+    """Frequency [Hz]: with 5 cm a peak of 4.4 m/s^2, a third of the Panda's Cartesian limit."""
+    oscillation_cycles: int = 2
+    """Cycles along the table's x, and as many along its y."""
+    pendulum_deg: float = 60.0
+    """Joint 5 goes to +this, to -this and back [deg], cut at the joint's limits."""
+    pendulum_s: float = 3.2
+    """Duration of the whole swing [s]: peak 2.45 rad/s, the Panda's limit is 2.61."""
+
+
+def min_jerk(distance: float, duration_s: float, t: Array) -> tuple[Array, Array, Array]:
+    """Return position, speed and acceleration (T,) of a minimum-jerk move at times t (T,)."""
+    u = np.clip(t / duration_s, 0.0, 1.0)
+    position = distance * u**3 * (10 - 15 * u + 6 * u**2)
+    speed = distance / duration_s * 30 * u**2 * (1 - u) ** 2
+    acceleration = distance / duration_s**2 * 60 * u * (1 - u) * (1 - 2 * u)
+    return position, speed, acceleration
+
+
+def _times(duration_s: float, dt: float) -> Array:
+    """Return the times (T,) [s] at which the steps of a duration start."""
+    return np.arange(round(duration_s / dt), dtype=np.float64) * dt
+
+
+def lift_acceleration(motion: SlipMotion, dt: float) -> Array:
+    """Return the hand's acceleration (T, 3) [m/s^2] during the lift, table axes."""
+    t = _times(motion.lift_s + motion.lift_hold_s, dt)
+    a = np.zeros((len(t), 3))
+    a[:, 2] = min_jerk(motion.lift_height_m, motion.lift_s, t)[2]
+    return a
+
+
+def oscillation_acceleration(motion: SlipMotion, dt: float) -> Array:
+    """Return the hand's acceleration (T, 3) [m/s^2] during the oscillation, table axes.
+
+    x(t) = A (1 - cos 2 pi f t): from rest to rest within whole cycles, 2 A from end to end.
+    """
+    omega = 2 * np.pi * motion.oscillation_hz
+    n = round(motion.oscillation_cycles / motion.oscillation_hz / dt)
+    wave = motion.oscillation_m * omega**2 * np.cos(omega * np.arange(n) * dt)
+    a = np.zeros((2 * n, 3))
+    a[:n, 0], a[n:, 1] = wave, wave
+    return a
+
+
+def pendulum_angle(motion: SlipMotion, dt: float, low: float, high: float) -> Array:
+    """Return angle, speed and acceleration (3, T) of joint 5: 0 -> high -> low -> 0 [rad]."""
+    quarter = motion.pendulum_s / 4
+    moves = ((0.0, high, quarter), (high, low, 2 * quarter), (low, 0.0, quarter))
+    pieces: list[Array] = []
+    for start, end, duration in moves:
+        t = _times(duration, dt)
+        position, speed, acceleration = min_jerk(end - start, duration, t)
+        pieces.append(np.stack([start + position, speed, acceleration]))
+    return np.concatenate(pieces, axis=1)
+
+
+def pendulum_load(angle: Array, axis: Array, gravity: float) -> tuple[Array, Array, Array]:
+    """Return what every pendulum step needs of a pair, in table axes at the stage's start.
+
+    Args:
+        angle: (3, T) angle, speed and acceleration of the joint.
+        axis: (3,) unit axis of the joint.
+        gravity: [m/s^2] along -z.
+
+    Returns:
+        gravity in the hand's frame (T, 3), omega (T, 3) and alpha (T, 3).
+    """
+    theta, speed, acceleration = angle
+    g = np.array([0.0, 0.0, -gravity])
+    # g in the hand's frame is exp(-axis theta) g (Rodrigues).
+    cos, sin = np.cos(theta)[:, None], np.sin(theta)[:, None]
+    turned = cos * g - sin * np.cross(axis, g) + (1 - cos) * axis * (axis @ g)
+    return turned, speed[:, None] * axis, acceleration[:, None] * axis
+
+
+def inertial_wrench(
+    load: tuple[Array, Array, Array], arm: Array, mass: float, inertia: Array
+) -> tuple[Array, Array]:
+    """Return force (T, 3) [N] and torque (T, 3) [N m] on an object in the turning hand.
+
+    Args:
+        load: gravity, omega and alpha (T, 3) from `pendulum_load`.
+        arm: (3,) from the axis to the centre of mass [m].
+        mass: [kg].
+        inertia: (3, 3) about the centre of mass [kg m^2], in the axes of the load.
+    """
+    g, omega, alpha = load
+    force = mass * (g - np.cross(alpha, arm) - np.cross(omega, np.cross(omega, arm)))
+    torque = -(alpha @ inertia.T + np.cross(omega, omega @ inertia.T))
+    return force, torque

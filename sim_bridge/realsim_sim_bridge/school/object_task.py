@@ -1,0 +1,253 @@
+"""The first job of an object in the school: its candidates, and which of them the arm takes.
+
+Any process can do it; the result is left in the cache, so that nothing is done twice.
+"""
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.mesh import mass_properties, sample_surface
+from realsim.records import Mesh
+from realsim_sim_bridge.school import panda
+from realsim_sim_bridge.school.arrays_on_disk import read_arrays, write_arrays
+from realsim_sim_bridge.school.candidates import Surroundings, sample_candidates
+from realsim_sim_bridge.school.config import SchoolConfig
+from realsim_sim_bridge.school.convex import convex_parts
+from realsim_sim_bridge.school.reach import ReachTask, check_reach
+from realsim_sim_bridge.school.slip_world import SlipBody
+
+Array = NDArray[np.float64]
+
+RESULTS_VERSION = 1
+"""Raised whenever the same inputs give other results, so that old cache files are not used."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ObjectTask:
+    """One object where it stands."""
+
+    obj_id: int
+    instance: int
+    name: str
+    mesh: Mesh
+    """Without colours [m]."""
+    density: float
+    """[kg/m^3]."""
+    T_table_obj: Array
+    """(4, 4) [m]."""
+    neighbours: Surroundings
+    """Points on all other objects, table frame."""
+    middle_xy: tuple[float, float]
+    """Middle of the scene on the table [m]."""
+    config: SchoolConfig
+    cache: Path | None
+
+    def key(self) -> str:
+        """Return a hash of everything the result depends on."""
+        digest = hashlib.sha256()
+        for array in (
+            self.mesh.vertices,
+            self.mesh.faces,
+            self.T_table_obj,
+            self.neighbours.points,
+            self.neighbours.instances,
+            np.array([self.density, *self.middle_xy]),
+        ):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        notes = [RESULTS_VERSION, version("pybullet"), self.obj_id, self.instance]
+        digest.update(json.dumps([*notes, asdict(self.config)], sort_keys=True).encode())
+        return digest.hexdigest()[:24]
+
+    def path(self, what: str) -> Path | None:
+        """Return where `what` of this task is kept."""
+        name = f"instance_{self.instance:06d}_{self.key()}.{what}.npz"
+        return None if self.cache is None else self.cache / name
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Prepared:
+    """An object's candidates, which of them the arm takes, and its body for the engine."""
+
+    Ts_obj_grasp: Array
+    """(N, 4, 4) [m]."""
+    widths_m: Array
+    openings_m: Array
+    """(N,) [m]."""
+    reachable: NDArray[np.bool_]
+    joints: Array
+    """(N, 7) at the grasp [rad]; NaN where not reachable."""
+    joints_lifted: Array
+    """(N, 7) after the lift [rad]; NaN likewise."""
+    reasons: tuple[str, ...]
+    """(N,) why not reachable."""
+    body: SlipBody | None
+    """None = the object is not tried."""
+    notes: dict[str, Any]
+    """What the set's parameters say about the object."""
+
+    @property
+    def tested(self) -> NDArray[np.int64]:
+        """The rows that go into the slip test."""
+        if self.body is None:
+            return np.zeros(0, dtype=np.int64)
+        return np.nonzero(self.reachable)[0].astype(np.int64)
+
+
+def prepare(task: ObjectTask) -> Prepared:
+    """Return the object's candidates and which of them the arm takes.
+
+    An object that cannot be tried (no volume, mass out of range) has no body; the notes say why.
+    """
+    path = task.path("prepared")
+    if path is not None and path.is_file():
+        return _read_prepared(path)
+    config = task.config
+    rng = np.random.default_rng([config.seed, task.instance])
+    found = sample_candidates(
+        task.mesh,
+        task.T_table_obj,
+        task.neighbours,
+        config.candidates,
+        config.hand,
+        rng,
+        config.max_candidates,
+    )
+    notes: dict[str, Any] = {"counts": found.counts}
+    body, why_not = _body(task, notes)
+    n = len(found.widths_m)
+    if body is None:
+        notes["not_tried"] = why_not
+        nowhere = np.full((n, panda.JOINTS), np.nan)
+        reachable, joints, lifted = np.zeros(n, dtype=np.bool_), nowhere, nowhere
+        reasons = (f"not tried: {why_not}",) * n
+    else:
+        points = _object_points(task)
+        reach = check_reach(
+            ReachTask(
+                Ts_table_grasp=task.T_table_obj @ found.Ts_obj_grasp,
+                widths_m=found.widths_m,
+                openings_m=found.openings_m,
+                obj=points,
+                neighbours=task.neighbours,
+                middle_xy=task.middle_xy,
+            ),
+            config.reach,
+            config.hand,
+            rng,
+        )
+        reachable, joints, lifted = reach.reachable, reach.joints, reach.joints_lifted
+        reasons = reach.reasons
+        notes["counts"] |= {"reachable": int(reachable.sum()), "planned": reach.planned}
+    prepared = Prepared(
+        Ts_obj_grasp=found.Ts_obj_grasp,
+        widths_m=found.widths_m,
+        openings_m=found.openings_m,
+        reachable=reachable,
+        joints=joints,
+        joints_lifted=lifted,
+        reasons=reasons,
+        body=body,
+        notes=notes,
+    )
+    if path is not None:
+        _write_prepared(path, prepared)
+    return prepared
+
+
+def _object_points(task: ObjectTask) -> Surroundings:
+    """Return points on the grasped object itself, table frame."""
+    return surface_points(
+        task.mesh, task.T_table_obj, task.instance, task.config.candidates.object_points
+    )
+
+
+def surface_points(mesh: Mesh, T_table_obj: Array, instance: int, count: int) -> Surroundings:
+    """Return `count` points on an object and its vertices (at most as many), table frame."""
+    points = sample_surface(mesh, count, np.random.default_rng(instance))[0]
+    points = np.concatenate([points, mesh.vertices[:count]])
+    return Surroundings(
+        points=se3.transform(T_table_obj, points),
+        instances=np.full(len(points), instance, dtype=np.int64),
+    )
+
+
+def _body(task: ObjectTask, notes: dict[str, Any]) -> tuple[SlipBody | None, str]:
+    """Return the object for the engine, or None and why it is not tried."""
+    config = task.config
+    try:
+        mass = mass_properties(task.mesh, task.density)
+    except InputError as error:
+        return None, str(error)
+    notes |= {
+        "mass_kg": mass.mass_kg,
+        "center_of_mass_m": mass.center_of_mass.tolist(),
+        "watertight": mass.is_watertight,
+    }
+    if not config.least_mass_kg <= mass.mass_kg <= config.greatest_mass_kg:
+        return None, (
+            f"the object '{task.name}' weighs {mass.mass_kg:.4g} kg at {task.density:g} kg/m^3; "
+            f"between {config.least_mass_kg:g} and {config.greatest_mass_kg:g} kg is accepted. "
+            "Is its mesh in metres?"
+        )
+    if notes["counts"]["kept"] == 0:
+        return None, "no candidate is left; the counts say what each filter took"
+    try:
+        convex = convex_parts(task.mesh, config.convex, task.cache)
+    except InputError as error:
+        return None, str(error)
+    notes["convex"] = {
+        "parts": len(convex.parts),
+        "volume_ratio": convex.volume_ratio,
+        "method": convex.method,
+    }
+    body = SlipBody(
+        parts=convex.parts,
+        mass_kg=mass.mass_kg,
+        center_of_mass=mass.center_of_mass,
+        inertia=mass.inertia,
+    )
+    return body, ""
+
+
+# --- on disk ----------------------------------------------------------------------------------
+
+_ROW_ARRAYS = ("Ts_obj_grasp", "widths_m", "openings_m", "reachable", "joints", "joints_lifted")
+
+
+def _write_prepared(path: Path, prepared: Prepared) -> None:
+    """Keep what was prepared."""
+    arrays: dict[str, NDArray[Any]] = {name: getattr(prepared, name) for name in _ROW_ARRAYS}
+    if prepared.body is not None:
+        arrays |= {
+            "body_mass": np.array(prepared.body.mass_kg),
+            "body_center": prepared.body.center_of_mass,
+            "body_inertia": prepared.body.inertia,
+            "part_vertices": np.concatenate(prepared.body.parts),
+            "part_counts": np.array([len(part) for part in prepared.body.parts]),
+        }
+    write_arrays(path, arrays, {"reasons": prepared.reasons, "notes": prepared.notes})
+
+
+def _read_prepared(path: Path) -> Prepared:
+    """Return what was prepared before."""
+    arrays, notes = read_arrays(path)
+    body = None
+    if "body_mass" in arrays:
+        ends = np.cumsum(arrays["part_counts"])[:-1]
+        body = SlipBody(
+            parts=tuple(np.split(arrays["part_vertices"], ends)),
+            mass_kg=float(arrays["body_mass"]),
+            center_of_mass=arrays["body_center"],
+            inertia=arrays["body_inertia"],
+        )
+    rows: dict[str, NDArray[Any]] = {name: arrays[name] for name in _ROW_ARRAYS}
+    return Prepared(**rows, reasons=tuple(notes["reasons"]), body=body, notes=notes["notes"])

@@ -1,0 +1,121 @@
+"""Antipodal candidates: their geometry, what is filtered, and that chance is the seed's alone."""
+
+import numpy as np
+
+from realsim.geometry import se3
+from realsim.records import Mesh
+from realsim_sim_bridge.school.candidates import CandidateConfig, Surroundings, sample_candidates
+from realsim_sim_bridge.school.convex import ConvexConfig, convex_parts
+from realsim_sim_bridge.school.hand import HandGeometry
+from realsim_sim_bridge.school.hand_free import boxes_free, lowest_corner
+
+HAND = HandGeometry()
+
+
+def solid(shape):
+    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
+
+
+def box(x=0.05, y=0.05, z=0.05):
+    import trimesh
+
+    return solid(trimesh.creation.box((x, y, z)))
+
+
+def candidates(mesh, height=0.025, seed=0, surroundings=None, limit=60):
+    return sample_candidates(
+        mesh,
+        se3.from_translation([0.0, 0.0, height]),
+        surroundings or Surroundings(),
+        CandidateConfig(surface_points=400),
+        HAND,
+        np.random.default_rng(seed),
+        limit,
+    )
+
+
+def test_contacts_lie_on_the_surface_and_inside_both_friction_cones():
+    found = candidates(box())
+    assert 0 < len(found.widths_m) <= 60
+    for side in (-0.5, 0.5):
+        y = found.Ts_obj_grasp[:, :3, 1]
+        contact = found.Ts_obj_grasp[:, :3, 3] + side * found.widths_m[:, None] * y
+        # On a box the outermost coordinate is the face's.
+        assert np.allclose(np.abs(contact).max(axis=1), 0.025, atol=1e-6)
+        face = np.argmax(np.abs(contact), axis=1)
+        assert np.all(np.abs(np.take_along_axis(y, face[:, None], 1)) >= np.sqrt(0.5) - 1e-6)
+
+
+def test_counts_add_up():
+    c = candidates(box()).counts
+    taken = c["hand_in_table"] + c["hand_in_object"] + c["hand_in_neighbour"]
+    assert c["turned"] == 8 * c["antipodal_pairs"] and c["free"] == c["turned"] - taken
+    assert c["kept"] == min(60, c["free"]) and c["hand_in_table"] > 0
+
+
+def test_same_seed_same_bytes_and_another_seed_others():
+    a, b, c = (candidates(box(), seed=s) for s in (5, 5, 6))
+    assert a.Ts_obj_grasp.tobytes() == b.Ts_obj_grasp.tobytes()
+    assert a.Ts_obj_grasp.tobytes() != c.Ts_obj_grasp.tobytes()
+
+
+def test_hands_are_free_of_table_object_and_neighbours():
+    near = np.random.default_rng(0).uniform([0.05, -0.05, 0.0], [0.07, 0.05, 0.08], (2000, 3))
+    neighbours = Surroundings(points=near, instances=np.ones(2000, dtype=np.int64))
+    found = candidates(box(), surroundings=neighbours)
+    assert found.counts["hand_in_neighbour"] > 0
+    Ts = se3.from_translation([0.0, 0.0, 0.025]) @ found.Ts_obj_grasp
+    boxes = HAND.boxes(found.openings_m)
+    assert lowest_corner(boxes, Ts).min() > 0
+    assert boxes_free(boxes, Ts, near, 0.0).all()
+
+
+def test_too_wide_an_object_has_no_candidates_and_the_counts_say_so():
+    found = candidates(box(0.2, 0.2, 0.2), height=0.1)
+    assert len(found.widths_m) == 0 and found.counts["too_wide"] > 100
+
+
+def test_walls_of_a_cup_are_grasped_across_the_wall():
+    import trimesh
+
+    cup = solid(trimesh.creation.annulus(0.028, 0.032, 0.08, sections=48))
+    found = candidates(cup, height=0.04, limit=400)
+    assert np.any(found.widths_m < 0.008) and np.any(found.widths_m > 0.04)
+
+
+def test_candidates_are_spread_over_the_object():
+    few, many = candidates(box(), limit=10), candidates(box(), limit=1000)
+
+    def nearest(found):
+        p = found.Ts_obj_grasp[:, :3, [2, 3]].reshape(len(found.widths_m), -1)
+        d = np.linalg.norm(p[:, None] - p, axis=2) + 9 * np.eye(len(p))
+        return d.min(axis=1).mean()
+
+    assert len(few.widths_m) == 10 and nearest(few) > 2 * nearest(many)
+
+
+def test_boxes_free_agrees_with_looking_at_each_point():
+    rng = np.random.default_rng(1)
+    Ts, points = se3.random_transform(rng, 40, spread=0.05), rng.normal(scale=0.08, size=(60, 3))
+    boxes = HAND.boxes(rng.uniform(0.0, 0.08, 40))
+    local = np.stack([se3.transform(T, points) for T in se3.invert(Ts)])
+    inside = (local[:, :, None] > boxes[:, None, :, 0] - 1e-3) & (
+        local[:, :, None] < boxes[:, None, :, 1] + 1e-3
+    )
+    expected = ~inside.all(axis=-1).any(axis=(1, 2))
+    assert np.array_equal(boxes_free(boxes, Ts, points, 1e-3), expected)
+    assert 0 < expected.sum() < 40
+
+
+def test_a_convex_mesh_is_its_hull_and_a_ring_is_cut(tmp_path):
+    import trimesh
+
+    whole = convex_parts(box(), ConvexConfig(), tmp_path)
+    assert whole.method == "hull" and len(whole.parts) == 1
+    assert abs(whole.volume_ratio - 1) < 1e-9
+    ring = solid(trimesh.creation.annulus(0.02, 0.03, 0.03, sections=24))
+    cut = convex_parts(ring, ConvexConfig(), tmp_path)
+    assert cut.method == "coacd" and len(cut.parts) > 3 and 0.9 < cut.volume_ratio < 1.2
+    again = convex_parts(ring, ConvexConfig(), tmp_path)
+    assert all(np.array_equal(a, b) for a, b in zip(cut.parts, again.parts, strict=True))
+    assert len(list(tmp_path.glob("convex_*.npz"))) == 2
