@@ -13,6 +13,10 @@ rotation first). Every other one is converted here, each by a function with a kn
 """
 
 import ctypes
+import os
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
@@ -44,6 +48,23 @@ def _preload_libusb() -> None:
     path: Any = libusb_package.get_library_path()
     if path is not None:
         ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+
+
+@contextmanager
+def quiet_stdout() -> Generator[None]:
+    """Send what C code prints to stdout nowhere: PyBullet greets at import and at each connect.
+
+    Works on the file descriptor, which Python's own redirection does not reach.
+    """
+    sys.stdout.flush()
+    kept = os.dup(1)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 def _missing_library(module: str, error: Exception) -> MissingLibraryError:

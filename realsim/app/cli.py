@@ -82,7 +82,10 @@ def upgrade(
         workers=workers,
     )  # fmt: skip
     console = Console(quiet=quiet)
-    show_upgrade(run_upgrade(config, dataset, out, console), console)
+    result = run_upgrade(config, dataset, out, console)
+    show_upgrade(result, console)
+    if result.failed:
+        sys.exit(1)
 
 
 @commands.command()

@@ -4,6 +4,8 @@ The dataset itself is only read. Every scene becomes a session (which is a BOP s
 OUT/SPLIT/SCENE, so that all later commands (`realsim review`, `realsim report`) work on it.
 """
 
+import contextlib
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,34 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.console import Console
-from realsim.app.stages import annotate_session, register_session, save_starts, school_session
-from realsim.errors import InputError
+from realsim.app.stages import (
+    annotate_session,
+    register_session,
+    save_starts,
+    school_session,
+    session_models,
+)
+from realsim.app.upgrade_source import SceneSource, UpgradeConfig, prepare, world_starts
+from realsim.errors import InputError, RealsimError
 from realsim.formats.bop import BopScene, BopSceneRef
 from realsim.geometry import se3
 from realsim.records import CaptureSession, GraspSet, ObjectModel, ObjectPose, Scene, View
 from realsim.store import SessionStore
 
 Array = NDArray[np.float64]
-CAMERA_SPREAD_LIMIT_M = 0.010
-"""Camera poses taken from the annotations of several objects may differ by so much, no more."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class UpgradeConfig:
-    """How a dataset is upgraded."""
-
-    start: str = "gt"
-    """'gt' = the dataset's own annotations, else a folder name under keyframe_poses/."""
-    scenes: tuple[int, ...] = ()
-    """Scene numbers; none = all."""
-    models: Path | None = None
-    """Folder of the models, when it is not DATASET/models."""
-    grasps_per_object: int = 60
-    """Grasp candidates tried on each object, at most."""
-    seed: int = 0
-    """Seed of everything random."""
-    workers: int = 2
-    """Processes in the Robot School."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -64,6 +53,8 @@ class UpgradeResult:
 
     out: Path
     scenes: list[UpgradedScene]
+    failed: dict[str, str]
+    """Scene folder -> why it was left out."""
 
 
 def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Console) -> UpgradeResult:
@@ -93,14 +84,26 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
             "outside it."
         )
     models = load_models(config.models or root / "models")
-    _make_folder(out)
-    save_models(out / "models", models)
+    _refuse_what_cannot_be_written(out)
     done: list[UpgradedScene] = []
+    failed: dict[str, str] = {}
     with threadpool_limits(limits=1):
         for ref in refs:
             console.say(f"scene {ref.scene_id} ({ref.folder.name})")
-            done.append(_upgrade_scene(ref, root, models, config, out, console))
-    return UpgradeResult(out=out, scenes=done)
+            try:
+                source = prepare(ref, root, models, config)
+            except RealsimError as error:
+                # One broken scene of many is reported at the end; a single one ends the command.
+                if len(refs) == 1:
+                    raise
+                failed[ref.folder.name] = str(error)
+                console.say(f"scene {ref.folder.name} is left out: {error}")
+                continue
+            done.append(_upgrade_scene(source, config, out, console))
+    if not done:
+        raise InputError(f"none of the {len(refs)} scenes can be used; the reasons stand above.")
+    save_models(out / "models", models)
+    return UpgradeResult(out=out, scenes=done, failed=failed)
 
 
 def _dataset_root(ref: BopSceneRef) -> Path:
@@ -108,51 +111,46 @@ def _dataset_root(ref: BopSceneRef) -> Path:
     return ref.folder.parent.parent
 
 
-def _make_folder(out: Path) -> None:
-    """Make the output folder and prove that it can be written."""
+def _refuse_what_cannot_be_written(out: Path) -> None:
+    """Raise if the output folder cannot be made or filled; nothing is left behind."""
     if out.exists() and not out.is_dir():
         raise InputError(f"--out '{out}' is a file; give a folder that may be made or filled.")
+    known = not out.exists() or not any(out.iterdir()) or (out / "models").is_dir()
+    if not known and not any(out.glob("*/*/session.json")):
+        raise InputError(
+            f"--out '{out}' is not empty and holds no upgrade. Choose another folder: nothing of "
+            "yours is overwritten."
+        )
+    made = [p for p in (out, *out.parents) if not p.exists()]
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".write-probe.tmp"
-        probe.write_bytes(b"")
-        probe.unlink()
+        with tempfile.TemporaryFile(dir=out):
+            pass
     except OSError as error:
         raise InputError(
             f"--out '{out}' cannot be written ({error.strerror}); choose another folder or change "
             "its permissions."
         ) from error
+    finally:
+        for path in made:
+            with contextlib.suppress(OSError):
+                path.rmdir()
 
 
 def _upgrade_scene(
-    ref: BopSceneRef,
-    root: Path,
-    models: dict[int, ObjectModel],
-    config: UpgradeConfig,
-    out: Path,
-    console: Console,
+    source: SceneSource, config: UpgradeConfig, out: Path, console: Console
 ) -> UpgradedScene:
     """Upgrade one scene, going on where an earlier run stopped."""
     from realsim.app.report import write_report
-    from realsim.formats.bop import read_scene
     from realsim.formats.bop_models import save_models
 
-    bop = read_scene(ref)
-    annotations, notes = _start_poses(bop, root, models, config)
-    Ts_world_cam = camera_poses(bop, annotations)
-    store = _copy_views(bop, Ts_world_cam, out / ref.split / ref.folder.name)
-    used = {obj for rows in annotations.values() for obj, _ in rows}
-    absent = sorted(used - set(models))
-    if absent:
-        raise InputError(
-            f"scene {ref.scene_id} names object {', '.join(map(str, absent))}, but the models "
-            f"folder has no mesh for it; it has {', '.join(map(str, sorted(models)))}."
-        )
-    save_models(store.folder / "models", {k: models[k] for k in sorted(used)})
-    starts = world_starts(annotations, Ts_world_cam)
+    ref, notes = source.bop.ref, list(source.notes)
+    store = _copy_views(source.bop, source.Ts_world_cam, out / ref.split / ref.folder.name)
+    save_models(store.folder / "models", source.models)
+    starts = world_starts(source.annotations, source.Ts_world_cam)
     save_starts(store, starts, f"{config.start} of {ref.folder.name}")
     scene = register_session(store, console)
-    notes += _registration_notes(store, bop)
+    notes += _registration_notes(store)
     grasps = school_session(
         store, console, grasps_per_object=config.grasps_per_object, seed=config.seed,
         workers=config.workers,
@@ -160,96 +158,13 @@ def _upgrade_scene(
     annotate_session(store, console)
     with console.stage("report"):
         write_report(store, None, notes=notes)
-    moved = {o.instance: moved_from_start(o, starts, models) for o in scene.objects}
+    moved = {o.instance: moved_from_start(o, starts, source.models) for o in scene.objects}
     return UpgradedScene(
         store=store, scene=scene, grasps=grasps, notes=notes,
         moved_mm={k: v[0] for k, v in moved.items()},
         moved_deg={k: v[1] for k, v in moved.items()},
         pictures=sorted((store.folder / "reports").glob("*.png")),
     )  # fmt: skip
-
-
-def _start_poses(
-    bop: BopScene, root: Path, models: dict[int, ObjectModel], config: UpgradeConfig
-) -> tuple[dict[int, list[tuple[int, Array]]], list[str]]:
-    """Return {image: [(obj_id, T_cam_obj)]} to start from, and what must be said about it."""
-    from realsim.formats.bop import read_keyframe_poses
-
-    notes: list[str] = []
-    if config.start == "gt":
-        if not any(bop.ground_truth.values()):
-            raise InputError(
-                f"scene {bop.ref.scene_id} has no annotated object; nothing to start from. Give "
-                "--start a folder of estimates under keyframe_poses/."
-            )
-        if bop.approximate:
-            notes.append(
-                f"its annotations come from {bop.ground_truth_file}, which calls itself "
-                "approximate: they serve as a rough start only, and are not a reference."
-            )
-        rows = {k: [(a.obj_id, a.T_cam_obj) for a in v] for k, v in bop.ground_truth.items()}
-        return rows, notes
-    rows = {}
-    for view in bop.session.views:
-        found = read_keyframe_poses(root, bop.ref.scene_id, view.index, source=config.start)
-        rows[view.index] = sorted(found.items())
-    return rows, notes
-
-
-def camera_poses(
-    bop: BopScene, annotations: dict[int, list[tuple[int, Array]]]
-) -> dict[int, Array]:
-    """Return T_world_cam of every image: the dataset's own, or from objects that stand still.
-
-    Without camera poses in the dataset, world is the first image's camera, and the others follow
-    from the objects seen in both images: T_first_cam = T_first_obj @ T_obj_cam, averaged.
-
-    Raises:
-        InputError: the objects of two images do not agree on how the camera moved.
-    """
-    if bop.Ts_world_cam is not None:
-        return bop.Ts_world_cam
-    indices = [v.index for v in bop.session.views]
-    first = dict(annotations[indices[0]])
-    cameras = {indices[0]: np.eye(4)}
-    for index in indices[1:]:
-        shared = [(o, T) for o, T in annotations[index] if o in first]
-        if not shared:
-            raise InputError(
-                f"image {index} of scene {bop.ref.scene_id} has no camera pose (cam_R_w2c) and no "
-                f"object in common with image {indices[0]}; its place cannot be found."
-            )
-        Ts = np.stack([first[o] @ se3.invert(T) for o, T in shared])
-        centre = np.median(Ts[:, :3, 3], axis=0)
-        spread = float(np.max(np.linalg.norm(Ts[:, :3, 3] - centre, axis=1)))
-        if spread > CAMERA_SPREAD_LIMIT_M:
-            raise InputError(
-                f"the annotations of images {indices[0]} and {index} of scene {bop.ref.scene_id} "
-                f"disagree by {1e3 * spread:.0f} mm about how the camera moved (at most "
-                f"{1e3 * CAMERA_SPREAD_LIMIT_M:.0f} mm): the objects were moved between them, or "
-                "an annotation is wrong. Upgrade such images as scenes of their own."
-            )
-        cameras[index] = se3.from_rt(se3.mean_rotation(Ts[:, :3, :3]), centre)
-    return cameras
-
-
-def world_starts(
-    annotations: dict[int, list[tuple[int, Array]]], Ts_world_cam: dict[int, Array]
-) -> list[ObjectPose]:
-    """Return one start per object of the scene, from the first image that shows it."""
-    starts: list[ObjectPose] = []
-    first = next(iter(annotations))
-    for k, (obj_id, T_cam_obj) in enumerate(annotations[first]):
-        T = Ts_world_cam[first] @ T_cam_obj
-        starts.append(ObjectPose(obj_id=obj_id, instance=k, T_world_obj=T))
-    known = {s.obj_id for s in starts}
-    for index, rows in annotations.items():
-        for obj_id, T_cam_obj in rows:
-            if obj_id not in known:
-                known.add(obj_id)
-                T = Ts_world_cam[index] @ T_cam_obj
-                starts.append(ObjectPose(obj_id=obj_id, instance=len(starts), T_world_obj=T))
-    return starts
 
 
 def _copy_views(bop: BopScene, Ts_world_cam: dict[int, Array], folder: Path) -> SessionStore:
@@ -271,7 +186,7 @@ def _copy_views(bop: BopScene, Ts_world_cam: dict[int, Array], folder: Path) -> 
     return store
 
 
-def _registration_notes(store: SessionStore, bop: BopScene) -> list[str]:
+def _registration_notes(store: SessionStore) -> list[str]:
     """Return what the registration found out about the start poses as a whole."""
     report: dict[str, Any] = store.read_json("registration/report.json")
     offset = report.get("common_offset_mm")
@@ -301,13 +216,12 @@ def show_upgrade(result: UpgradeResult, console: Console) -> None:
     rows: list[list[str]] = []
     for done in result.scenes:
         by_instance = {s.instance: s for s in done.grasps}
+        names = {k: m.name for k, m in session_models(done.store).items()}
         for o in done.scene.objects:
             grasps = by_instance.get(o.instance)
             tried = 0 if grasps is None else int(np.isfinite(grasps.scores).sum())
             good = 0 if grasps is None else int(grasps.good.sum())
-            from realsim.app.stages import session_models
-
-            name = session_models(done.store)[o.obj_id].name
+            name = names[o.obj_id]
             rows.append(
                 [
                     f"{done.store.folder.name} {name}",
@@ -336,4 +250,6 @@ def show_upgrade(result: UpgradeResult, console: Console) -> None:
             console.warn(f"scene {done.store.folder.name}: {note}")
         for picture in done.pictures:
             console.say(f"picture   {picture}")
+    for name, reason in result.failed.items():
+        console.warn(f"scene {name} was left out: {reason}")
     console.say(f"dataset   {result.out}")

@@ -162,3 +162,19 @@ def test_realsim_itself_loads_numpy_only():
         "print(sorted(heavy & set(sys.modules)))"
     )
     assert done.stdout.strip() == "[]", done.stderr
+
+
+def test_quiet_stdout_silences_c_code_and_gives_stdout_back() -> None:
+    code = (
+        "import os\n"
+        "from realsim.interop import quiet_stdout\n"
+        "print('before', flush=True)\n"
+        "with quiet_stdout():\n"
+        "    os.write(1, b'NOISE')\n"
+        "    import pybullet\n"
+        "print('after')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout.split() == ["before", "after"]

@@ -97,10 +97,11 @@ class SlipWorld:
             physics: the engine's settings.
             geometry: sizes of the hand.
         """
-        import pybullet
-        from pybullet_utils.bullet_client import BulletClient
+        with interop.quiet_stdout():
+            import pybullet
+            from pybullet_utils.bullet_client import BulletClient
 
-        self._engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
+            self._engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
         self._physics = physics
         self.dt = 1.0 / physics.rate_hz
         self._T_obj_body, self._moments = body.principal_frame()
