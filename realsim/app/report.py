@@ -9,6 +9,7 @@ from pathlib import Path
 from string import Template
 
 import numpy as np
+from numpy.typing import NDArray
 
 from realsim import __version__
 from realsim.app import report_plots
@@ -20,6 +21,7 @@ from realsim.store import SessionStore
 
 OVERLAY_VIEWS = 4
 """Annotated photographs in a report: the first view and others spread over the session."""
+THUMBNAIL_WIDTH_PX = 400
 SHEET_VIEWS = 12
 """Thumbnails of the captured views."""
 
@@ -139,12 +141,20 @@ def _photograph_section(page: Page, store: SessionStore, folder: Path) -> None:
     if len(indices) > 1:
         pick = np.unique(np.linspace(0, len(indices) - 1, SHEET_VIEWS).round().astype(int))
         shown = [indices[k] for k in pick]
-        sheet = contact_sheet(
-            [store.rgb(k) for k in shown], columns=4, captions=[f"view {k}" for k in shown]
-        )
+        small = [_thumbnail(store.rgb(k)) for k in shown]
+        sheet = contact_sheet(small, columns=4, captions=[f"view {k}" for k in shown])
         save_png(folder / "views.png", sheet)
         page.section("Captured views", f"{len(shown)} of {len(indices)} are shown.")
         page.picture(folder / "views.png", "captured views")
+
+
+def _thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a picture at the width of a thumbnail."""
+    import cv2
+
+    height = round(rgb.shape[0] * THUMBNAIL_WIDTH_PX / rgb.shape[1])
+    small = cv2.resize(rgb, (THUMBNAIL_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(small, dtype=np.uint8)
 
 
 def _calibration_section(page: Page, store: SessionStore, folder: Path) -> None:

@@ -316,7 +316,7 @@ def _object_entries(scene: Scene, models: Mapping[int, ObjectModel]) -> list[dic
             entry["annotated"] = placed.verdict != "rejected"
             entry["physical"] = {
                 "extent_m": model.mesh.extent.tolist(),
-                "diameter_m": model.diameter_m,
+                "diameter_m": mesh_shape.diameter(model.mesh),
                 "centroid_obj_m": matter.center_of_mass.tolist(),
                 "volume_m3": matter.volume_m3,
                 "density_kg_m3": model.density,

@@ -35,9 +35,9 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene = root / "test/000001"
     models = {m.obj_id: m for m in (part("box"), part("wedge"))}
     placed = [
-        PlacedMesh(k, m.mesh, se3.from_translation([0.12 * k - 0.06, 0, -m.mesh.vertices[:, 2].min()]))
+        PlacedMesh(k, m.mesh, se3.from_translation([0.12 * k - 0.06, 0, -m.mesh.bounds[0, 2]]))
         for k, m in enumerate(models.values())
-    ]  # fmt: skip
+    ]
     labels = LabelRenderer([*placed, PlacedMesh(-1, slab(), np.eye(4))]).render(CAMERA, T_WORLD_CAM)
     for name in ("rgb", "depth"):
         (scene / name).mkdir(parents=True)
@@ -62,7 +62,7 @@ def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def upgrade(dataset: Path, out: Path, *more: str) -> tuple[int, str]:
-    """Run `realsim upgrade` in this process; return the exit code main() would give, and the text."""
+    """Run `realsim upgrade` in this process; return the exit code of main() and the text."""
     done = CliRunner().invoke(
         cli.commands, ["upgrade", str(dataset), "--out", str(out), "--quiet", *more]
     )

@@ -1,0 +1,29 @@
+"""How a record takes its arrays: a private copy, its shape checked, made read-only."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+
+Array = NDArray[np.float64]
+
+
+def frozen(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: str) -> NDArray[Any]:
+    """Return a read-only copy of `value`, its shape checked (None = any length)."""
+    array = np.array(value, dtype=dtype)
+    if array.ndim != len(shape) or any(
+        n is not None and n != m for n, m in zip(shape, array.shape, strict=True)
+    ):
+        wanted = tuple("N" if n is None else n for n in shape)
+        raise InputError(f"{name} has shape {array.shape}; the shape must be {wanted}.")
+    array.setflags(write=False)
+    return array
+
+
+def rigid(value: ArrayLike, name: str) -> Array:
+    """Return a read-only rigid (4, 4) copy of `value`."""
+    T = se3.check_rigid(value, name)
+    return frozen(T, np.float64, (4, 4), name)
