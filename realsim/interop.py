@@ -51,20 +51,25 @@ def _preload_libusb() -> None:
 
 
 @contextmanager
-def quiet_stdout() -> Generator[None]:
-    """Send what C code prints to stdout nowhere: PyBullet greets at import and at each connect.
+def quiet_output() -> Generator[None]:
+    """Send what C code prints nowhere: PyBullet greets at import and at each connect.
 
-    Works on the file descriptor, which Python's own redirection does not reach.
+    Works on the file descriptors, which Python's own redirection does not reach. Exceptions pass.
     """
     sys.stdout.flush()
-    kept = os.dup(1)
+    sys.stderr.flush()
+    kept = {number: os.dup(number) for number in (1, 2)}
     try:
         with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 1)
+            for number in kept:
+                os.dup2(nowhere.fileno(), number)
         yield
     finally:
-        os.dup2(kept, 1)
-        os.close(kept)
+        # Into a file or a pipe C prints with a buffer, which would come out after the switch back.
+        ctypes.CDLL(None).fflush(None)
+        for number, copy in kept.items():
+            os.dup2(copy, number)
+            os.close(copy)
 
 
 def _missing_library(module: str, error: Exception) -> MissingLibraryError:

@@ -164,17 +164,19 @@ def test_realsim_itself_loads_numpy_only():
     assert done.stdout.strip() == "[]", done.stderr
 
 
-def test_quiet_stdout_silences_c_code_and_gives_stdout_back() -> None:
+def test_quiet_output_silences_c_code_and_gives_the_streams_back() -> None:
     code = (
         "import os\n"
-        "from realsim.interop import quiet_stdout\n"
+        "from realsim.interop import quiet_output\n"
         "print('before', flush=True)\n"
-        "with quiet_stdout():\n"
-        "    os.write(1, b'NOISE')\n"
-        "    import pybullet\n"
+        "with quiet_output():\n"
+        "    os.write(1, b'NOISE'); os.write(2, b'NOISE')\n"
+        "    import ctypes, pybullet\n"
+        "    ctypes.CDLL(None).puts(b'BUFFERED')\n"
         "print('after')"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout.split() == ["before", "after"]
+    assert done.stderr == ""

@@ -97,7 +97,7 @@ class SlipWorld:
             physics: the engine's settings.
             geometry: sizes of the hand.
         """
-        with interop.quiet_stdout():
+        with interop.quiet_output():
             import pybullet
             from pybullet_utils.bullet_client import BulletClient
 

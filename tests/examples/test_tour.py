@@ -1,0 +1,84 @@
+"""What the documents tell a reader to type exists: commands, options, Python names, files."""
+
+import ast
+import importlib
+import re
+from pathlib import Path
+
+import click
+import pytest
+
+from realsim.app.cli import commands
+
+ROOT = Path(__file__).parents[2]
+CHAPTERS = sorted((ROOT / "docs" / "tour").glob("*.md"))
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PYTHON = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"^```.*?^```$|^(?: {4}|\t).*$|`[^`\n]+`", re.MULTILINE | re.DOTALL)
+COMMAND = re.compile(r"(?<!from )(?<!import )\brealsim ([a-z][a-z-]*)\b([^\n`#]*)")
+LINK = re.compile(r"\]\(([^)#]+)(?:#[^)]*)?\)")
+
+
+def snippets(document: Path) -> list[str]:
+    return PYTHON.findall(document.read_text(encoding="utf-8"))
+
+
+def commands_of(text: str) -> list[tuple[str, list[str]]]:
+    """Return every `realsim COMMAND --option ...` that stands in code."""
+    code = "\n".join(CODE.findall(text))
+    return [(name, re.findall(r"--[a-z-]+", rest)) for name, rest in COMMAND.findall(code)]
+
+
+def options_of(name: str) -> set[str]:
+    command = commands.commands[name]
+    return {flag for p in command.params if isinstance(p, click.Option) for flag in p.opts}
+
+
+def test_commands_are_found_in_code_only() -> None:
+    text = (
+        "realsim turns\n\n    uv run realsim demo --out x  # realsim\n\nand `realsim fly --high`.\n"
+    )
+    assert commands_of(text) == [("demo", ["--out"]), ("fly", ["--high"])]
+    assert commands_of("    from realsim import View\n") == []
+
+
+def test_there_is_a_chapter_for_every_stage() -> None:
+    names = " ".join(p.stem for p in CHAPTERS)
+    for stage in ("plan", "capture", "calibrate", "register", "school", "annotate", "review"):
+        assert stage in names
+    assert sum(len(snippets(p)) for p in CHAPTERS) >= 7
+
+
+@pytest.mark.parametrize("chapter", CHAPTERS, ids=lambda p: p.stem)
+def test_snippets_compile_and_import_what_exists(chapter: Path) -> None:
+    for code in snippets(chapter):
+        tree = ast.parse(code, filename=chapter.name)
+        compile(tree, chapter.name, "exec")
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                module = importlib.import_module(str(node.module))
+                missing = [a.name for a in node.names if not hasattr(module, a.name)]
+                assert not missing, f"{chapter.name}: {node.module} has no {missing}"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+def test_named_commands_and_options_exist(document: Path) -> None:
+    for name, options in commands_of(document.read_text(encoding="utf-8")):
+        assert name in commands.commands, f"`realsim {name}` is not a command"
+        unknown = set(options) - options_of(name)
+        assert not unknown, f"`realsim {name}` has no {sorted(unknown)}"
+
+
+def test_the_readme_names_commands() -> None:
+    assert {"demo", "upgrade"} <= {name for name, _ in commands_of(DOCUMENTS[0].read_text())}
+
+
+@pytest.mark.parametrize("chapter", CHAPTERS, ids=lambda p: p.stem)
+def test_links_lead_somewhere(chapter: Path) -> None:
+    for target in LINK.findall(chapter.read_text(encoding="utf-8")):
+        assert "://" in target or (chapter.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("chapter", CHAPTERS, ids=lambda p: p.stem)
+def test_chapters_stay_short(chapter: Path) -> None:
+    assert chapter.read_text(encoding="utf-8").count("\n") <= 50
