@@ -1,4 +1,4 @@
-"""Robot School: ten grasps of one part, from the arm's reach to the stages of the slip test."""
+"""Robot School: ten grasps of one part, from the arm's reach to the four stages of the slip."""
 
 import numpy as np
 

@@ -15,14 +15,12 @@ import numpy as np
 from realsim.app.console import Console, StageTime
 from realsim.app.stages import (
     BOARD_VIEWS,
-    GRASP_HEADER,
     annotate_session,
     calibrate_session,
-    grasp_rows,
     register_session,
     save_starts,
     school_session,
-    session_models,
+    show_grasps,
     show_hand_eye,
     show_scene,
 )
@@ -196,8 +194,7 @@ def show_demo(result: DemoResult, console: Console) -> None:
     """Print the tables, the errors against the truth, the pictures, and what to do next."""
     show_hand_eye(result.hand_eye, console)
     show_scene(result.store, result.scene, console)
-    models = session_models(result.store)
-    console.table("Robot School", GRASP_HEADER, grasp_rows(result.grasps, models))
+    show_grasps(result.store, result.grasps, console)
     console.table(
         "Errors against the truth of the simulated lab",
         ["figure", "measured", "goal"],

@@ -7,7 +7,7 @@ stages can be run one by one, by the demo, or again after an interruption.
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -167,6 +167,7 @@ def register_session(store: SessionStore, console: Console) -> Scene:
     from realsim.store import load_scene, save_scene
 
     starts, models = load_starts(store), session_models(store)
+    config = _registration_config(store)
     views = [v for v in store.session.views if v.T_world_cam is not None]
     if not views:
         raise InputError(
@@ -177,7 +178,7 @@ def register_session(store: SessionStore, console: Console) -> Scene:
     chosen = [views[k] for k in pick]
     key = content_key(
         store.folder / "scene_camera.json", store.folder / "registration/starts.json",
-        store.folder / "models/models_info.json", [v.index for v in chosen],
+        *sorted((store.folder / "models").iterdir()), asdict(config), [v.index for v in chosen],
     )  # fmt: skip
     with console.stage("register", f"{len(starts)} objects, {len(chosen)} views") as tick:
         if is_current(store, "register", key):
@@ -190,7 +191,7 @@ def register_session(store: SessionStore, console: Console) -> Scene:
         up = store.extra.get("gravity_up_world")
         result = register_scene(
             store.session.name, store.session.intrinsics, frames, models, starts,
-            _registration_config(store),
+            config,
             gravity_up_world=None if up is None else np.array(up), progress=tick,
         )  # fmt: skip
         save_scene(store, result.scene)
@@ -253,23 +254,20 @@ def school_session(
     Raises:
         InputError: the session has not been registered, or has no supporting plane.
     """
-    from realsim.store import load_scene, save_grasps
+    from realsim.store import save_grasps
     from realsim_sim_bridge.school import SchoolConfig, run_school
 
-    if not (store.folder / "registration/scene.json").is_file():
-        raise InputError(
-            f"session '{store.folder}' is not registered yet: run "
-            f"`realsim register {store.folder}` first."
-        )
-    scene, models = load_scene(store), session_models(store)
+    scene, models = judged_scene(store), session_models(store)
     config = SchoolConfig(max_candidates=grasps_per_object, seed=seed)
     with console.stage("school", f"up to {grasps_per_object} grasps an object") as tick:
         sets = run_school(
             scene, models, config, workers=workers, cache=store.folder / "grasps/cache",
             progress=tick,
         )  # fmt: skip
-        for grasp_set in sets:
-            save_grasps(store, grasp_set)
+        stems = {save_grasps(store, grasp_set).stem for grasp_set in sets}
+        for file in (store.folder / "grasps").glob("*.*"):
+            if file.is_file() and file.stem not in stems:
+                store.remove(f"grasps/{file.name}")  # of an object that has been rejected since
     return sets
 
 
@@ -325,7 +323,23 @@ def show_scene(store: SessionStore, scene: Scene, console: Console) -> None:
 
 def show_grasps(store: SessionStore, sets: Sequence[GraspSet], console: Console) -> None:
     """Print the outcome of the Robot School per object."""
-    console.table("Robot School", GRASP_HEADER, grasp_rows(sets, session_models(store)))
+    models = session_models(store)
+    console.table("Robot School", GRASP_HEADER, grasp_rows(sets, models))
+    for s in sets:
+        if len(s) == 0:
+            console.warn(f"{models[s.obj_id].name}: {why_no_grasp(s)}")
+
+
+def why_no_grasp(grasps: GraspSet) -> str:
+    """Return in words what took all candidates of an object."""
+    counts = grasps.parameters.get("counts") or {}
+    if not counts.get("turned"):
+        return f"not tried: {grasps.parameters.get('not_tried') or 'no antipodal pair fits'}"
+    return (
+        f"no candidate is free: of {counts['turned']}, {counts['hand_in_table']} would touch the "
+        f"table, {counts['hand_in_object']} the object itself, {counts['hand_in_neighbour']} a "
+        "neighbour"
+    )
 
 
 GRASP_HEADER = ["object", "tried", "reachable", "lifted", "all four", "good", "mean score"]

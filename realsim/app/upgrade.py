@@ -195,8 +195,8 @@ def _registration_notes(store: SessionStore) -> list[str]:
     x, y, z = offset["offset_mm"]
     return [
         f"all objects moved together by ({x:.1f}, {y:.1f}, {z:.1f}) mm from their start poses, "
-        f"agreeing within {offset['spread_mm']:.1f} mm: the given poses look like those of "
-        "another frame."
+        f"agreeing within {offset['spread_mm']:.1f} mm: the given poses are off as a "
+        "whole, as those of a neighbouring frame, of a moved camera, or with a common depth error."
     ]
 
 

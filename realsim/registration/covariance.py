@@ -38,6 +38,8 @@ class Uncertainty:
     """(6, 6) of the right perturbation of T_world_obj, rotation first [rad, m]."""
     unobservable: tuple[str, ...]
     """Axes that the points do not determine, in words."""
+    blind: Array
+    """(6, K) the same axes: orthonormal motions about the box centre, turns times the radius."""
     sensitivities: tuple[float, ...]
     """(6,) root mean square cosine along each principal axis, least first."""
 
@@ -71,6 +73,7 @@ def uncertainty(body: Body, fit: Fit, stride: int, config: CovarianceConfig) -> 
     return Uncertainty(
         covariance=0.5 * (C + C.T),
         unobservable=tuple(_axis_name(vectors[:, i]) for i in np.flatnonzero(blind)),
+        blind=vectors[:, blind],
         sensitivities=tuple(float(s) for s in sensitivity),
     )
 

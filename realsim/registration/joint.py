@@ -108,7 +108,7 @@ def joint_fit(
             # One step of no length: the information at the pose that is kept.
             still = tuple(s for s in solver.fine[-1:])
             kept = solve_pose(body, own[i], before[i], still, solver, spaces[i])
-            fits[i] = _at(kept, before[i])
+            fits[i] = kept.at(before[i])
             history.append({"kept_search_pose": body.start.instance, "gain": [old, new]})
     return fits, own, history
 
@@ -128,17 +128,3 @@ def assigned(
             mine &= d <= np.abs(other.field.distance(cloud.points, se3.invert(poses[j])))
         own.append(cloud.select(mine))
     return own
-
-
-def _at(fit: Fit, T_world_obj: Array) -> Fit:
-    """Return the fit's figures with another pose."""
-    return Fit(
-        T_world_obj=T_world_obj,
-        information=fit.information,
-        weight=fit.weight,
-        variance=fit.variance,
-        points=fit.points,
-        offered=fit.offered,
-        steps=fit.steps,
-        history_mm=fit.history_mm,
-    )

@@ -3,7 +3,8 @@
 1. Evidence: every frame's measured points near each object; the support plane around them.
 2. Search: many starts around the given one, each fitted; rendered in several frames; best kept.
 3. Joint fit: all objects together on all frames, each point to the model it is nearest to.
-4. Covariance, verification, and the same for the single-view baseline.
+4. What the points do not determine is set back to the start's value.
+5. Covariance, verification, and the same for the single-view baseline.
 With one frame it is the same code with one frame.
 """
 
@@ -25,6 +26,7 @@ from realsim.records import (
     SupportPlane,
     names_of,
 )
+from realsim.registration.blind import BlindConfig, Kept, keep_start
 from realsim.registration.body import Body, make_body
 from realsim.registration.compare import CompareConfig, Comparer, make_comparer, spread_frames
 from realsim.registration.covariance import CovarianceConfig, Uncertainty, uncertainty
@@ -42,7 +44,7 @@ from realsim.registration.hypotheses import Found, SearchConfig, search
 from realsim.registration.joint import JointConfig, joint_fit
 from realsim.registration.plane import PlaneConfig, find_support_plane
 from realsim.registration.single_view import SingleViewConfig, fit_single_view, reference_frame
-from realsim.registration.solver import Fit, FreeSpace, SolverConfig
+from realsim.registration.solver import FreeSpace, SolverConfig
 from realsim.registration.verify import (
     OffsetConfig,
     VerifyConfig,
@@ -78,6 +80,7 @@ class RegistrationConfig:
     search: SearchConfig = field(default_factory=SearchConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
     joint: JointConfig = field(default_factory=JointConfig)
+    blind: BlindConfig = field(default_factory=BlindConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     verify: VerifyConfig = field(default_factory=VerifyConfig)
     offset: OffsetConfig = field(default_factory=OffsetConfig)
@@ -135,8 +138,9 @@ def register_scene(
         _search_one(work, body, near, tick)
         for body, near in zip(bodies, evidence.near, strict=True)
     ]
-    fits, clouds, history = _joint(work, bodies, found)
+    kept, clouds, history = _joint(work, bodies, found)
     tick()
+    fits = [k.fit for k in kept]
     poses = [f.T_world_obj for f in fits]
     uncertain = [
         uncertainty(b, f, evidence.stride, config.covariance)
@@ -157,8 +161,8 @@ def register_scene(
         "joint": history,
         "single_view": single_report,
         "objects": [
-            _object_report(b, o, f, s.report, u)
-            for b, o, f, s, u in zip(bodies, objects, fits, found, uncertain, strict=True)
+            _object_report(b, o, k, s.report, u)
+            for b, o, k, s, u in zip(bodies, objects, kept, found, uncertain, strict=True)
         ],
     }
     return Registration(
@@ -269,8 +273,11 @@ def _search_one(work: _Work, body: Body, near: Cloud, tick: Callable[[], None]) 
 
 def _joint(
     work: _Work, bodies: Sequence[Body], found: Sequence[Found]
-) -> tuple[list[Fit], list[Cloud], list[dict[str, Any]]]:
-    """Return the fits of all objects together, the points of each, and the sweeps' history."""
+) -> tuple[list[Kept], list[Cloud], list[dict[str, Any]]]:
+    """Return the fits of all objects together, the points of each, and the sweeps' history.
+
+    What the points of an object do not determine is as it was at its start.
+    """
     config = work.config
     poses = [f.fit.T_world_obj for f in found]
     moved = [
@@ -297,7 +304,22 @@ def _joint(
         for b, T in zip(bodies, poses, strict=True)
     ]
     spaces = [work.free_space(c.frames) for c in comparers]
-    return joint_fit(bodies, poses, clouds, (comparers, spaces), (config.joint, config.solver))
+    fits, own, history = joint_fit(
+        bodies, poses, clouds, (comparers, spaces), (config.joint, config.solver)
+    )
+    kept = [
+        keep_start(
+            body,
+            fit,
+            uncertainty(body, fit, work.evidence.stride, config.covariance),
+            data,
+            (config.blind, config.solver),
+        )
+        for body, fit, data in zip(
+            bodies, fits, zip(own, comparers, spaces, strict=True), strict=True
+        )
+    ]
+    return kept, own, history
 
 
 def _objects(
@@ -316,7 +338,7 @@ def _objects(
             instance=b.start.instance,
             T_world_obj=T,
             covariance=None if u is None else u.covariance,
-            checks=c.checks,
+            checks=c.checks if u is None else c.checks | {"blind_axes": float(u.blind.shape[1])},
             verdict=c.verdict,
             reasons=c.reasons,
         )
@@ -363,9 +385,10 @@ def _plane_report(plane: SupportPlane | None, reason: str) -> dict[str, Any]:
 
 
 def _object_report(
-    body: Body, pose: ObjectPose, fit: Fit, search_report: dict[str, Any], u: Uncertainty
+    body: Body, pose: ObjectPose, kept: Kept, search_report: dict[str, Any], u: Uncertainty
 ) -> dict[str, Any]:
     """Return what happened to one object, as JSON values."""
+    fit = kept.fit
     T, T0 = pose.T_world_obj, body.T_start
     return {
         "instance": pose.instance,
@@ -379,6 +402,7 @@ def _object_report(
         "residual_rms_mm": list(fit.history_mm),
         "variance_of_unit_weight": fit.variance,
         "unobservable": list(u.unobservable),
+        "blind": kept.report,
         "sensitivities": list(u.sensitivities),
         "search": search_report,
     }

@@ -8,7 +8,7 @@ Free space: a model sample that lies in front of the measured surface (where the
 through) is drawn back along its normal; without it a model may grow out of what was seen.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numba
@@ -109,6 +109,10 @@ class Fit:
     """Steps taken."""
     history_mm: tuple[float, ...] = field(default=())
     """RMS residual at the end of every stage [mm]."""
+
+    def at(self, T_world_obj: Array) -> "Fit":
+        """Return the fit's figures with another pose (4, 4)."""
+        return replace(self, T_world_obj=T_world_obj)
 
 
 @numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]

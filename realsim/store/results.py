@@ -77,7 +77,9 @@ def grasp_counts(grasps: GraspSet) -> dict[str, Any]:
         "tried": int(np.count_nonzero(tried)),
         "passed": passed,
         "good": int(np.count_nonzero(grasps.good)),
-        "failures": dict(sorted(Counter(f for f in grasps.failures if f).items())),
+        "failures": dict(
+            sorted(Counter(f.partition(":")[0] for f in grasps.failures if f).items())
+        ),
     }
 
 

@@ -1,0 +1,204 @@
+"""Along what the points cannot see, a pose keeps its start's value.
+
+The depth of a round can does not show how it is turned about its axis, but its label does: a fit
+that drifts about that axis would quietly turn the label. Of all poses that the points cannot tell
+apart, T_fit S(alpha) with S the blind turns and shifts, the one nearest to the start is taken:
+    turn about the axis (p, a):  T_fit S(-theta), theta the twist about a of R_start^T R_fit
+    (swing-twist: of the quaternion (w, v) of that rotation, tan(theta / 2) = (v . a) / w),
+    shift along d:               T_fit S(-s), s = d . R_fit^T (c_fit - c_start).
+Then the other directions are fitted again, because the axis is known only as well as the points
+tell. The pose is taken only if it explains the images as well as before.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.records import ObjectModel
+from realsim.registration.body import Body
+from realsim.registration.compare import Comparer
+from realsim.registration.covariance import Uncertainty
+from realsim.registration.evidence import Cloud
+from realsim.registration.solver import Fit, FreeSpace, SolverConfig, solve_pose
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BlindConfig:
+    """When and how a blind direction is set back to the start."""
+
+    tolerated_loss: float = 0.025
+    """Greatest share of the rendered gain that may be lost: what the facets and the noise of a
+    round body cost; a handle that is turned away costs more."""
+    least_turn_share: float = 0.5
+    """A blind motion whose turn (times the radius) is less than this share of it is a shift."""
+    declared_deg: float = 5.0
+    """A declared continuous symmetry within this angle of a blind turn is the same axis..."""
+    declared_m: float = 0.005
+    """...if it also passes the fitted axis this near."""
+    rounds: int = 3
+    """Alternations of setting back and fitting the rest; the third moves nothing by 0.02 mm."""
+    passes: int = 30
+    """Greatest number of turns through several blind axes until nothing is left."""
+    settled_deg: float = 1e-4
+    """A pass that turns less than this ends them."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class BlindAxis:
+    """One direction in the object's frame that the points do not determine."""
+
+    turn: bool
+    """Whether it is a turn about the axis or a shift along it."""
+    axis: Array
+    """(3,) unit direction."""
+    point: Array
+    """(3,) a point on the axis [m]; of a shift, the box centre."""
+    declared: bool
+    """Whether the model declares this continuous symmetry."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Kept:
+    """The fit after the blind directions were set back, and what was done."""
+
+    fit: Fit
+    axes: tuple[BlindAxis, ...]
+    report: dict[str, Any]
+    """Empty if nothing is blind."""
+
+
+def blind_axes(body: Body, u: Uncertainty, config: BlindConfig) -> list[BlindAxis]:
+    """Return the blind turns and shifts of a pose, declared symmetries in place of fitted axes.
+
+    The blind motions are a subspace; the singular vectors of its rotation part split it into turns
+    and shifts. A turn with the motion v of the box centre (per radian) goes round the line through
+    centre + a x v with direction a.
+    """
+    if u.blind.shape[1] == 0:
+        return []
+    _, _, mixing = np.linalg.svd(u.blind[:3])
+    motions = (u.blind @ mixing.T).T
+    axes: list[BlindAxis] = []
+    for motion in motions:
+        turning = float(np.linalg.norm(motion[:3]))
+        if turning >= config.least_turn_share:
+            a = motion[:3] / turning
+            point = body.center_obj + np.cross(a, motion[3:] * body.radius_m / turning)
+            axes.append(_declared(body.model, a, point, config))
+        else:
+            d = motion[3:] / np.linalg.norm(motion[3:])
+            axes.append(BlindAxis(turn=False, axis=d, point=body.center_obj, declared=False))
+    return axes
+
+
+def _declared(model: ObjectModel, axis: Array, point: Array, config: BlindConfig) -> BlindAxis:
+    """Return the model's continuous symmetry that this turn is, or the turn as it was found."""
+    for direction, origin in model.symmetry_axes:
+        a = np.asarray(direction, dtype=np.float64)
+        a = a / np.linalg.norm(a)
+        off = point - np.asarray(origin, dtype=np.float64)
+        distance = float(np.linalg.norm(off - (off @ a) * a))
+        if abs(a @ axis) > np.cos(np.radians(config.declared_deg)) and distance < config.declared_m:
+            return BlindAxis(turn=True, axis=a, point=point - off + (off @ a) * a, declared=True)
+    return BlindAxis(turn=True, axis=axis, point=point, declared=False)
+
+
+def twist_rad(R: Array, axis: Array) -> float:
+    """Return the turn of the rotation R (3, 3) about the unit axis (3,): its twist [rad].
+
+    The twist is the rotation about the axis that is nearest to R; 0 for a half turn across it.
+    """
+    w, *v = se3.quaternion_wxyz(R)
+    along = float(np.dot(v, axis))
+    # Two quaternions stand for R; the one with w >= 0 turns by at most half a circle.
+    return 2.0 * float(np.arctan2(np.copysign(along, along * w), abs(w))) if along else 0.0
+
+
+def nearest_to_start(
+    T_fit: Array, T_start: Array, center_obj: Array, axes: list[BlindAxis], config: BlindConfig
+) -> Array:
+    """Return of the poses T_fit S, S any blind motion, the one nearest to the start.
+
+    Several blind turns are taken back one after the other until nothing is left (of a sphere, the
+    start's rotation); shifts come last because turns about the axes move the centre.
+    """
+    T = T_fit
+    turns = [a for a in axes if a.turn]
+    for _ in range(config.passes):
+        most = 0.0
+        for a in turns:
+            angle = twist_rad(T_start[:3, :3].T @ T[:3, :3], a.axis)
+            P = se3.from_translation(a.point)
+            back = se3.from_rt(se3.exp_so3(-angle * a.axis), np.zeros(3))
+            T = T @ P @ back @ se3.invert(P)
+            most = max(most, abs(angle))
+        if most < np.radians(config.settled_deg):
+            break
+    gap = T[:3, :3].T @ (T_start - T)[:3, 3] + (T[:3, :3].T @ T_start[:3, :3] - np.eye(3)) @ (
+        center_obj
+    )
+    for a in axes:
+        if not a.turn:
+            T = T @ se3.from_translation((gap @ a.axis) * a.axis)
+    return T
+
+
+def keep_start(
+    body: Body,
+    fit: Fit,
+    u: Uncertainty,
+    data: tuple[Cloud, Comparer, FreeSpace | None],
+    configs: tuple[BlindConfig, SolverConfig],
+) -> Kept:
+    """Return the fit with its blind directions as they were at the start.
+
+    Args:
+        body: the object; its start is what is kept.
+        fit: of the points that do not see those directions.
+        u: its uncertainty, which names them.
+        data: the object's points, the frames to render in, and the images of free space.
+        configs: see `BlindConfig`, and of the solver.
+    """
+    cloud, comparer, free_space = data
+    config, solver = configs
+    axes = blind_axes(body, u, config)
+    if not axes:
+        return Kept(fit=fit, axes=(), report={})
+    T, new = fit.T_world_obj, fit
+    for _ in range(config.rounds):
+        T = nearest_to_start(T, body.T_start, body.center_obj, axes, config)
+        new = solve_pose(body, cloud, T, solver.fine[-1:], solver, free_space)
+        T = new.T_world_obj
+    T = nearest_to_start(T, body.T_start, body.center_obj, axes, config)
+    stride = comparer.stride_of(body, fit.T_world_obj)
+    before = comparer.gain(body, fit.T_world_obj, stride)[0]
+    after = comparer.gain(body, T, stride)[0]
+    taken = after >= before - config.tolerated_loss * abs(before)
+    report = {
+        "axes": [_axis_report(a, body, fit.T_world_obj, T) for a in axes],
+        "gain_px": [before, after],
+        "start_kept": bool(taken),
+    }
+    return Kept(fit=new.at(T) if taken else fit, axes=tuple(axes), report=report)
+
+
+def _axis_report(axis: BlindAxis, body: Body, T_fit: Array, T_kept: Array) -> dict[str, Any]:
+    """Return one axis as JSON values: what the fit had moved along it, and what is left."""
+    figures: dict[str, Any] = {
+        "kind": "turn about" if axis.turn else "shift along",
+        "axis_obj": [float(x) for x in axis.axis],
+        "declared": axis.declared,
+    }
+    for name, T in (("fit", T_fit), ("kept", T_kept)):
+        if axis.turn:
+            angle = twist_rad(body.T_start[:3, :3].T @ T[:3, :3], axis.axis)
+            figures[f"{name}_deg"] = float(np.degrees(angle))
+        else:
+            off = T[:3, :3].T @ (body.center(T) - body.center(body.T_start))
+            figures[f"{name}_mm"] = float(1e3 * off @ axis.axis)
+    return figures
