@@ -38,8 +38,6 @@ class Uncertainty:
     """(6, 6) of the right perturbation of T_world_obj, rotation first [rad, m]."""
     unobservable: tuple[str, ...]
     """Axes that the points do not determine, in words."""
-    blind: Array
-    """(6, K) the same axes: orthonormal motions about the box centre, turns times the radius."""
     sensitivities: tuple[float, ...]
     """(6,) root mean square cosine along each principal axis, least first."""
 
@@ -53,12 +51,8 @@ def uncertainty(body: Body, fit: Fit, stride: int, config: CovarianceConfig) -> 
     Along eigenvectors of H whose sensitivity sqrt(lambda / sum w) is too small, the prior replaces
     k s^2 / lambda. Mapped to the object's origin by the adjoint.
     """
-    radius = body.radius_m
-    scale = np.array([radius, radius, radius, 1.0, 1.0, 1.0])
-    H = fit.information / np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(H)
-    values = np.maximum(values, 0.0)
-    sensitivity = np.sqrt(values / fit.weight) if fit.weight > 0 else np.zeros(6)
+    values, vectors, scale = _principal_axes(body, fit)
+    sensitivity = _sensitivities(values, fit)
     blind = sensitivity < config.unobservable_sensitivity
     inflation = max(1.0, config.correlation_area_px / stride**2) * max(1.0, fit.variance)
     if not np.isfinite(inflation):
@@ -73,9 +67,30 @@ def uncertainty(body: Body, fit: Fit, stride: int, config: CovarianceConfig) -> 
     return Uncertainty(
         covariance=0.5 * (C + C.T),
         unobservable=tuple(_axis_name(vectors[:, i]) for i in np.flatnonzero(blind)),
-        blind=vectors[:, blind],
         sensitivities=tuple(float(s) for s in sensitivity),
     )
+
+
+def blind_motions(body: Body, fit: Fit, config: CovarianceConfig) -> Array:
+    """Return the motions (6, K) that the points do not determine.
+
+    They are orthonormal, about the box centre, rotation first, turns times the body's radius [m].
+    """
+    values, vectors, _ = _principal_axes(body, fit)
+    return vectors[:, _sensitivities(values, fit) < config.unobservable_sensitivity]
+
+
+def _principal_axes(body: Body, fit: Fit) -> tuple[Array, Array, Array]:
+    """Return eigenvalues (6,) and vectors (6, 6) of the scaled information, and the scale (6,)."""
+    radius = body.radius_m
+    scale = np.array([radius, radius, radius, 1.0, 1.0, 1.0])
+    values, vectors = np.linalg.eigh(fit.information / np.outer(scale, scale))
+    return np.maximum(values, 0.0), vectors, scale
+
+
+def _sensitivities(values: Array, fit: Fit) -> Array:
+    """Return the root mean square cosine (6,) along each principal axis; 0 without points."""
+    return np.sqrt(values / fit.weight) if fit.weight > 0 else np.zeros(6)
 
 
 def _axis_name(vector: Array) -> str:

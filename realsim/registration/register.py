@@ -47,8 +47,10 @@ from realsim.registration.single_view import SingleViewConfig, fit_single_view, 
 from realsim.registration.solver import FreeSpace, SolverConfig
 from realsim.registration.verify import (
     OffsetConfig,
+    SinkingConfig,
     VerifyConfig,
     common_offset,
+    common_sinking,
     verify_objects,
 )
 
@@ -84,6 +86,7 @@ class RegistrationConfig:
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     verify: VerifyConfig = field(default_factory=VerifyConfig)
     offset: OffsetConfig = field(default_factory=OffsetConfig)
+    sinking: SinkingConfig = field(default_factory=SinkingConfig)
     single_view: SingleViewConfig = field(default_factory=SingleViewConfig)
 
 
@@ -152,12 +155,8 @@ def register_scene(
     tick()
     report = {
         "frames": [f.index for f in ordered],
-        "stride_px": evidence.stride,
-        "noise_per_m": evidence.noise.per_m,
         "plane": _plane_report(plane, no_plane),
-        "common_offset_mm": common_offset(
-            bodies, poses, [o.verdict != "rejected" for o in objects], config.offset
-        ),
+        **_common_report(work, bodies, objects),
         "joint": history,
         "single_view": single_report,
         "objects": [
@@ -307,14 +306,9 @@ def _joint(
     fits, own, history = joint_fit(
         bodies, poses, clouds, (comparers, spaces), (config.joint, config.solver)
     )
+    constants = (config.blind, config.covariance, config.solver)
     kept = [
-        keep_start(
-            body,
-            fit,
-            uncertainty(body, fit, work.evidence.stride, config.covariance),
-            data,
-            (config.blind, config.solver),
-        )
+        keep_start(body, fit, data, constants)
         for body, fit, data in zip(
             bodies, fits, zip(own, comparers, spaces, strict=True), strict=True
         )
@@ -338,7 +332,7 @@ def _objects(
             instance=b.start.instance,
             T_world_obj=T,
             covariance=None if u is None else u.covariance,
-            checks=c.checks if u is None else c.checks | {"blind_axes": float(u.blind.shape[1])},
+            checks=c.checks if u is None else c.checks | {"blind_axes": float(len(u.unobservable))},
             verdict=c.verdict,
             reasons=c.reasons,
         )
@@ -382,6 +376,21 @@ def _plane_report(plane: SupportPlane | None, reason: str) -> dict[str, Any]:
     if plane is None:
         return {"found": False, "reason": reason}
     return {"found": True, "rms_mm": 1e3 * plane.rms_m, "inliers": plane.inliers}
+
+
+def _common_report(
+    work: _Work, bodies: Sequence[Body], objects: Sequence[ObjectPose]
+) -> dict[str, Any]:
+    """Return what holds for all objects together, as JSON values."""
+    config, evidence = work.config, work.evidence
+    poses = [o.T_world_obj for o in objects]
+    good = [o.verdict != "rejected" for o in objects]
+    return {
+        "stride_px": evidence.stride,
+        "noise_per_m": evidence.noise.per_m,
+        "common_offset_mm": common_offset(bodies, poses, good, config.offset),
+        "common_sinking": common_sinking(bodies, poses, good, work.plane, config.sinking),
+    }
 
 
 def _object_report(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
-from realsim.records import Verdict
+from realsim.records import SupportPlane, Verdict
 from realsim.registration.body import Body, footprint
 from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud, DepthFrame
@@ -293,5 +293,67 @@ def common_offset(
         "offset_mm": [float(v) for v in middle],
         "spread_mm": spread,
         "objects": len(moves),
+        "consistent": bool(consistent),
+    }
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SinkingConfig:
+    """When objects that sink into the table speak of a wrong scale, not of wrong poses."""
+
+    least_objects: int = 3
+    """Two objects may agree by chance."""
+    least_share: float = 0.02
+    """A smaller share of the height is within what meshes and planes are off by (3 mm of 15 cm)."""
+    rest_share: float = 0.5
+    """What the common share leaves of the gaps (RMS) must stay below this part of them."""
+
+
+def common_sinking(
+    bodies: Sequence[Body],
+    poses: Sequence[Array],
+    use: Sequence[bool],
+    plane: SupportPlane | None,
+    config: SinkingConfig,
+) -> dict[str, object]:
+    """Return whether all objects sink into (or float over) the plane by one share of their height.
+
+    Depth that reads short by a share makes the whole measured world smaller, so models that are
+    fitted to it are too tall by that share: gap_i = share * height_i, found by least squares. The
+    depth alone cannot tell short depth from models that are too large.
+
+    Args:
+        bodies: the objects.
+        poses: where they were found.
+        use: which of them were found well enough to count.
+        plane: what they stand on; None = nothing to compare with.
+        config: see there.
+    """
+    nothing: dict[str, object] = {
+        "share_of_height": None,
+        "rest_mm": None,
+        "objects": 0,
+        "consistent": False,
+    }
+    if plane is None or not any(use):
+        return nothing
+    T_table_world = se3.invert(plane.T_world_table)
+    rows: list[tuple[float, float]] = []
+    for body, T, counts in zip(bodies, poses, use, strict=True):
+        if counts:
+            z = 1e3 * se3.transform(T_table_world @ T, body.model.mesh.vertices)[:, 2]
+            rows.append((float(z.max() - z.min()), float(z.min())))
+    heights, gaps = np.array(rows).T
+    share = float(heights @ gaps / (heights @ heights))
+    rest = float(np.sqrt(np.mean(np.square(gaps - share * heights))))
+    consistent = (
+        len(rows) >= config.least_objects
+        and abs(share) >= config.least_share
+        and rest <= config.rest_share * float(np.sqrt(np.mean(np.square(gaps))))
+    )
+    return {
+        "share_of_height": share,
+        "rest_mm": rest,
+        "objects": len(rows),
         "consistent": bool(consistent),
     }

@@ -30,7 +30,7 @@ def overlay_picture(
     scene: Scene,
     models: Mapping[int, ObjectModel],
     grasp_sets: Sequence[GraspSet],
-    max_grasps: int = 40,
+    max_grasps: int = 30,
 ) -> Rgb:
     """Return the photograph of a view with everything that was transferred onto it.
 

@@ -4,14 +4,19 @@ import numpy as np
 import pytest
 
 from realsim.geometry import se3
-from realsim.records import ObjectPose
+from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.body import make_body
 from realsim.registration.compare import CompareConfig, make_comparer, spread_frames
 from realsim.registration.covariance import CovarianceConfig, uncertainty
 from realsim.registration.evidence import EvidenceConfig, averaged, gather, without_table
 from realsim.registration.plane import PlaneConfig, find_support_plane
 from realsim.registration.solver import SolverConfig, solve_pose
-from realsim.registration.verify import VerifyConfig, verify_objects
+from realsim.registration.verify import (
+    SinkingConfig,
+    VerifyConfig,
+    common_sinking,
+    verify_objects,
+)
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +70,26 @@ def test_objects_inside_each_other_are_flagged(clutter, checker):
     checked = checker[1](poses)
     assert checked[0].checks["penetration_mm"] > 10
     assert checked[1].verdict == "rejected"
+
+
+def test_sinking_by_one_share_of_the_height_is_told_from_sinking(clutter, checker):
+    bodies, plane = checker[0], SupportPlane(T_world_table=np.eye(4))
+    poses = [t.T_world_obj for t in clutter.truth]
+    heights = [
+        float(np.ptp(se3.transform(T, b.model.mesh.vertices)[:, 2]))
+        for b, T in zip(bodies, poses, strict=True)
+    ]
+
+    def said(moves):
+        moved = [se3.from_translation([0, 0, m]) @ T for m, T in zip(moves, poses, strict=True)]
+        return common_sinking(bodies, moved, [True] * len(moved), plane, SinkingConfig())
+
+    short = said([-0.04 * h for h in heights])
+    assert short["consistent"]
+    assert short["share_of_height"] == pytest.approx(-0.04, abs=1e-6)
+    assert not said([0.0] * len(poses))["consistent"]
+    assert not said([0.005, -0.005, 0.005, -0.005])["consistent"]
+    assert not common_sinking(bodies, poses, [True] * 4, None, SinkingConfig())["consistent"]
 
 
 def test_round_axis_is_reported_and_a_box_has_none(clutter, make_scene):

@@ -1,0 +1,139 @@
+"""Along what the depth cannot see a pose keeps its start's value; what it sees is corrected."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.geometry import se3
+from realsim.geometry.mesh import symmetry_transforms
+from realsim.geometry.metrics import mssd
+from realsim.geometry.parts import part
+from realsim.records import ObjectPose
+from realsim.registration.blind import BlindAxis, BlindConfig, nearest_to_start, twist_rad
+from realsim.registration.register import DepthFrame, RegistrationConfig, register_scene
+
+CONFIG = RegistrationConfig(field_cells=80, with_single_view=False)
+Z = np.array([0.0, 0.0, 1.0])
+ROUND_PARTS = (
+    ("cylinder_can", (-0.06, 0.05), 0.3, (0.0, 0.0, 0.0)),
+    ("mug", (0.06, 0.05), 1.0, (0.0, 0.0, 0.0)),
+    ("bowl", (0.0, -0.08), 0.0, (0.0, 0.0, 0.0)),
+)
+CAN, MUG, BOWL = 0, 1, 2
+
+
+def off(pose: ObjectPose, model, rng) -> ObjectPose:
+    """The pose 10 mm and 10 deg off: 8 deg about the object's z, 6 deg across it."""
+    across, v = rng.normal(size=3) * [1, 1, 0], rng.normal(size=3)
+    tilt = np.radians(6) * across / np.linalg.norm(across)
+    R = se3.exp_so3(tilt) @ se3.exp_so3(np.radians(8) * Z)
+    C = se3.from_translation(model.mesh.bounds.mean(0))
+    move = C @ se3.from_rt(R, 0.01 * v / np.linalg.norm(v)) @ se3.invert(C)
+    return ObjectPose(
+        obj_id=pose.obj_id, instance=pose.instance, T_world_obj=pose.T_world_obj @ move
+    )
+
+
+@pytest.fixture(scope="module")
+def case(make_scene):
+    """(scene, starts, registration); no model declares a symmetry."""
+    scene = make_scene(ROUND_PARTS, 8, 4)
+    plain = {
+        k: replace(m, symmetries=np.eye(4)[None], symmetry_axes=()) for k, m in scene.models.items()
+    }
+    scene = replace(scene, models=plain)
+    rng = np.random.default_rng(1)
+    starts = [off(t, plain[t.obj_id], rng) for t in scene.truth]
+    return scene, starts, registered(scene, scene.frames, starts)
+
+
+def registered(scene, frames, starts):
+    return register_scene("round", scene.intrinsics, frames, scene.models, starts, CONFIG)
+
+
+def error_mm(scene, instance: int, name: str, T) -> float:
+    """MSSD over the part's full symmetry group, in steps that move no rim by 0.1 mm."""
+    group = symmetry_transforms(part(name), 0.002)
+    model = scene.models[scene.truth[instance].obj_id]
+    return 1e3 * mssd(scene.truth[instance].T_world_obj, T, model.mesh.vertices, group)
+
+
+def turn_deg(T_a, T_b) -> float:
+    """Turn about the object's z from a to b."""
+    return float(np.degrees(twist_rad(T_a[:3, :3].T @ T_b[:3, :3], Z)))
+
+
+def test_a_can_keeps_its_turn_and_finds_its_place(case):
+    scene, starts, result = case
+    T = result.scene.object(CAN).T_world_obj
+    assert abs(turn_deg(starts[CAN].T_world_obj, T)) < 0.5
+    assert error_mm(scene, CAN, "cylinder_can", T) < 1.0
+    assert result.scene.object(CAN).checks["blind_axes"] == 1
+    assert result.scene.object(CAN).verdict == "accepted"
+    blind = result.report["objects"][CAN]["blind"]
+    assert blind["start_kept"]
+    assert abs(blind["axes"][0]["axis_obj"][2]) > 0.999
+    assert not blind["axes"][0]["declared"]
+
+
+def test_a_handle_is_seen_and_its_turn_corrected(case):
+    scene, starts, result = case
+    T = result.scene.object(MUG).T_world_obj
+    assert result.scene.object(MUG).checks["blind_axes"] == 0
+    assert result.report["objects"][MUG]["blind"] == {}
+    assert abs(turn_deg(starts[MUG].T_world_obj, T)) > 7
+    assert abs(turn_deg(scene.truth[MUG].T_world_obj, T)) < 0.5
+
+
+def test_a_thin_bowl_is_found_and_keeps_its_turn(case):
+    scene, starts, result = case
+    T = result.scene.object(BOWL).T_world_obj
+    assert error_mm(scene, BOWL, "bowl", T) < 0.6
+    assert abs(turn_deg(starts[BOWL].T_world_obj, T)) < 0.5
+
+
+def test_blind_turns_move_with_the_world(case):
+    scene, starts, _ = case
+    T = se3.random_transform(np.random.default_rng(5))
+    frames = [
+        DepthFrame(index=f.index, depth_m=f.depth_m, T_world_cam=T @ f.T_world_cam)
+        for f in scene.frames
+    ]
+    moved = [replace(s, T_world_obj=T @ s.T_world_obj) for s in starts[:2]]
+    two = registered(scene, frames, moved)
+    still = registered(scene, scene.frames, starts[:2])
+    for a, b in zip(still.scene.objects, two.scene.objects, strict=True):
+        vertices = scene.models[a.obj_id].mesh.vertices
+        assert 1e3 * mssd(T @ a.T_world_obj, b.T_world_obj, vertices) < 0.05
+
+
+def test_twist_is_the_turn_about_the_axis():
+    rng = np.random.default_rng(0)
+    for angle in rng.uniform(-3.1, 3.1, 20):
+        axis = rng.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        R = se3.random_rotation(rng)
+        assert twist_rad(se3.exp_so3(angle * axis), axis) == pytest.approx(angle, abs=1e-12)
+        left = R @ se3.exp_so3(-twist_rad(R, axis) * axis)
+        assert twist_rad(left, axis) == pytest.approx(0.0, abs=1e-12)
+        # What is left is the least rotation that any turn about the axis leaves.
+        other = R @ se3.exp_so3(angle * axis)
+        assert se3.angle(left) <= se3.angle(other) + 1e-12
+
+
+def test_nearest_pose_moves_only_along_the_blind_directions():
+    rng = np.random.default_rng(2)
+    T0, T, center = se3.random_transform(rng), se3.random_transform(rng), rng.normal(size=3)
+    axes = [BlindAxis(turn=True, axis=a, point=center, declared=False) for a in np.eye(3)]
+    ball = nearest_to_start(T, T0, center, axes, BlindConfig())
+    np.testing.assert_allclose(ball[:3, :3], T0[:3, :3], atol=1e-5)
+    np.testing.assert_allclose(se3.transform(ball, center), se3.transform(T, center), atol=1e-12)
+
+    slide = BlindAxis(turn=False, axis=Z, point=center, declared=False)
+    slid = nearest_to_start(T, T0, center, [slide], BlindConfig())
+    np.testing.assert_allclose(slid[:3, :3], T[:3, :3], atol=1e-15)
+    gap = (se3.transform(T0, center) - se3.transform(slid, center))[0] @ T[:3, :3]
+    assert gap[2] == pytest.approx(0.0, abs=1e-12)
+    again = nearest_to_start(slid, T0, center, [slide], BlindConfig())
+    np.testing.assert_allclose(again, slid, atol=1e-12)
