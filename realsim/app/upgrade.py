@@ -187,17 +187,36 @@ def _copy_views(bop: BopScene, Ts_world_cam: dict[int, Array], folder: Path) -> 
 
 
 def _registration_notes(store: SessionStore) -> list[str]:
-    """Return what the registration found out about the start poses as a whole."""
+    """Return what the registration found out about the scene as a whole."""
     report: dict[str, Any] = store.read_json("registration/report.json")
-    offset = report.get("common_offset_mm")
-    if not offset or not offset.get("consistent"):
-        return []
-    x, y, z = offset["offset_mm"]
-    return [
-        f"all objects moved together by ({x:.1f}, {y:.1f}, {z:.1f}) mm from their start poses, "
-        f"agreeing within {offset['spread_mm']:.1f} mm: the given poses are off as a "
-        "whole, as those of a neighbouring frame, of a moved camera, or with a common depth error."
+    notes: list[str] = []
+    offset = report["common_offset_mm"]
+    if offset["consistent"]:
+        x, y, z = offset["offset_mm"]
+        notes.append(
+            f"all objects moved together by ({x:.1f}, {y:.1f}, {z:.1f}) mm from their start poses, "
+            f"agreeing within {offset['spread_mm']:.1f} mm: the given poses are off as a whole, as "
+            "those of a neighbouring frame, of a moved camera, or with a common depth error."
+        )
+    sinking = report["common_sinking"]
+    if sinking["consistent"]:
+        notes.append(
+            f"the objects sink into the table by {-100 * sinking['share_of_height']:.1f} % of "
+            "their height, all alike: the depth reads short, or the models are too large."
+        )
+    kept = [
+        f"{o['name']} ({axis['fit_deg']:.0f} deg)"
+        for o in report["objects"]
+        if o["blind"].get("start_kept")
+        for axis in o["blind"]["axes"]
+        if not axis["declared"] and abs(axis["fit_deg"]) >= 1.0
     ]
+    if kept:
+        notes.append(
+            f"the depth cannot see how these are turned about their own axis: {', '.join(kept)}; "
+            "the start's turn was kept (in brackets: what the fit alone would have turned)."
+        )
+    return notes
 
 
 def moved_from_start(

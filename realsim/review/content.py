@@ -111,19 +111,24 @@ def region_of(objects: Sequence[ObjectPose], views: Sequence[View], margin_m: fl
     return Region(center, distance)
 
 
-def first_look(region: Region, views: Sequence[View]) -> tuple[Array, Array]:
+def first_look(region: Region, views: Sequence[View], up: Array) -> tuple[Array, Array]:
     """Return where a new browser's camera stands and what it looks at, (3,) and (3,) [m].
 
     It stands where the cameras stand, on the side of the first one, but nearer, so that no frustum
     is in the way.
+
+    Args:
+        region: what to look at.
+        views: views with a camera pose.
+        up: (3,) unit vector out of the table, in world.
     """
     Ts = np.array([v.T_world_cam for v in views])
     offset = Ts[0, :3, 3] - region.center
-    horizontal = offset * [1.0, 1.0, 0.0]
+    horizontal = offset - up * (up @ offset)
     length = float(np.linalg.norm(horizontal))
-    side = horizontal / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
+    side = horizontal / length if length > 1e-6 else np.linalg.svd(up[None])[2][1]
     distance = LOOK_NEARER * float(np.median(np.linalg.norm(Ts[:, :3, 3] - region.center, axis=1)))
-    direction = np.cos(LOOK_DOWN_RAD) * side + [0.0, 0.0, np.sin(LOOK_DOWN_RAD)]
+    direction = np.cos(LOOK_DOWN_RAD) * side + np.sin(LOOK_DOWN_RAD) * up
     return region.center + distance * direction, region.center
 
 

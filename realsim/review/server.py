@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import viser
 from viser import _messages as viser_messages
 
@@ -182,7 +183,12 @@ class ReviewServer:
             nodes.add_table(self.scene.plane)
         nodes.show_objects(True, by_verdict=False)
         self._nodes = nodes
-        position, target = content.first_look(region, views)
+        # World is a camera where a data set has no robot: up is the table's normal, not z.
+        plane = self.scene.plane
+        up = np.array([0.0, 0.0, 1.0]) if plane is None else plane.T_world_table[:3, 2]
+        server.scene.set_up_direction(up)
+        position, target = content.first_look(region, views, up)
+        server.initial_camera.up = tuple(up)
         server.initial_camera.position = tuple(position)
         server.initial_camera.look_at = tuple(target)
 
