@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="one small loop, under 50 s")
     parser.add_argument("--seeds", type=int, default=1, help="loops to run; figures are medians")
     args = parser.parse_args()
-    config = {"views": 12, "objects": 3, "grasps_per_object": 12} if args.quick else {}
+    config = {"views": 6, "objects": 2, "grasps_per_object": 10} if args.quick else {}
     rows = [run(DemoConfig(seed=seed, **config))[1] for seed in range(args.seeds)]
     figures = {key: float(np.median([r[key] for r in rows])) for key in rows[0]}
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from realsim_capture_plans.lab import SimulatedLab
 
 BOARD_VIEW_SHARE = 24
-"""Most board views of a demo; a smaller demo takes as many as scene views, 12 at least."""
+"""Most board views of a demo; a smaller demo takes as many as scene views, 10 at least."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -143,7 +143,7 @@ def _capture_all(
         save_plan,
     )
 
-    board_views = max(12, min(BOARD_VIEW_SHARE, config.views))
+    board_views = max(10, min(BOARD_VIEW_SHARE, config.views))
     session = out / "session"
     with console.stage("plan", f"{config.views} + {board_views} views") as tick:
         plans: list[CapturePlan] = []
