@@ -209,7 +209,7 @@ def _registration_notes(store: SessionStore) -> list[str]:
         for o in report["objects"]
         if o["blind"].get("start_kept")
         for axis in o["blind"]["axes"]
-        if not axis["declared"] and abs(axis["fit_deg"]) >= 1.0
+        if not axis["declared"] and abs(axis.get("fit_deg", 0.0)) >= 1.0
     ]
     if kept:
         notes.append(

@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from realsim.app import cli
+from realsim.app import cli, stages
+from realsim.app.console import Console
 from realsim.errors import RealsimError
 from realsim.formats.bop_models import save_models
 from realsim.geometry import se3
+from realsim.geometry.mesh import load_mesh, save_ply
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim.review import ReviewServer
+from realsim.store import SessionStore
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
 T_WORLD_CAM = se3.look_at([0.0, -0.45, 0.45], [0.0, 0.0, 0.02])
@@ -192,3 +196,33 @@ def test_the_pristine_dataset_is_upgraded(pristine: Path, tmp_path: Path) -> Non
     for name in ("mask", "mask_visib", "scene_gt_info.json", "scene_gt_coco.json", "grasps"):
         assert (scene / name).exists(), name
     assert list((scene / "reports").glob("overlay_*.png"))
+    store = SessionStore.open(scene)
+    assert store.verify() == []
+    _reviewed_session_follows_the_reviewer(store)
+    _changed_mesh_is_registered_anew(store)
+
+
+def _reviewed_session_follows_the_reviewer(store: SessionStore) -> None:
+    """A person's rejection takes the object out of the school and out of every label."""
+    console = Console(quiet=True)
+    ReviewServer(store, port=0).reject(0, "anna", "wrong side up")
+    sets = stages.school_session(store, console, grasps_per_object=4, workers=1)
+    assert [s.instance for s in sets] == [1]
+    assert [p.name for p in (store.folder / "grasps").glob("*.npz")] == ["000001_obj000008.npz"]
+    stages.annotate_session(store, console)
+    assert [row["obj_id"] for row in store.read_json("scene_gt.json")["3"]] == [8]
+    assert len(list((store.folder / "mask").glob("*.png"))) == 1
+    assert store.verify() == []
+
+
+def _changed_mesh_is_registered_anew(store: SessionStore) -> None:
+    """The same inputs are not computed again; another mesh under the same name is."""
+    console = Console(quiet=True)
+    noted = store.path("stages/register.json").read_bytes()
+    stages.register_session(store, console)
+    assert store.path("stages/register.json").read_bytes() == noted
+    file = store.folder / "models/obj_000008.ply"
+    mesh = load_mesh(file, "mm")
+    save_ply(file, Mesh(vertices=mesh.vertices * 1.0001, faces=mesh.faces), "mm")
+    stages.register_session(store, console)
+    assert store.path("stages/register.json").read_bytes() != noted
