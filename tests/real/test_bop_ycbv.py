@@ -1,0 +1,111 @@
+"""Real BOP data: genuine YCB-Video frames are read right, and come through a round trip."""
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.formats import bop, bop_labels, bop_models
+from realsim.geometry.mesh import diameter, mass_properties
+from realsim.geometry.metrics import mssd
+from realsim.records import CaptureSession, View
+from realsim.store import SessionStore
+
+DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+YCBV = DATA / "scenes/ycbv_mini"
+needs_ycbv = pytest.mark.skipif(not YCBV.is_dir(), reason=f"no YCB-V data at {YCBV}")
+
+
+@needs_ycbv
+def test_real_scenes_are_read(tmp_path):
+    refs = bop.find_scenes(YCBV)
+    assert [r.scene_id for r in refs] == [50, 51, 52, 53, 54]
+    scenes = [bop.read_scene(r) for r in refs]
+    assert [s.approximate for s in scenes] == [False, False, True, True, False]
+    assert scenes[2].ground_truth_file == "scene_gt_APPROX_wrong_frame.json"
+    s = scenes[0]
+    assert s.session.depth_unit_m == pytest.approx(1e-4) and s.Ts_world_cam is None
+    assert (s.session.intrinsics.width, s.session.intrinsics.height) == (640, 480)
+    depth_m = s.depth_m(1)
+    assert 0.5 < np.median(depth_m[depth_m > 0]) < 2.0
+    assert s.rgb(1).shape == (480, 640, 3)
+    # The depth at an object's centre is a little in front of it, not a thousand times off.
+    measured = 0
+    for a in s.ground_truth[1]:
+        u, v, _ = np.rint(s.session.intrinsics.K @ a.T_cam_obj[:3, 3] / a.T_cam_obj[2, 3])
+        z = float(depth_m[int(v), int(u)])
+        measured += z > 0
+        assert z == 0 or abs(z - a.T_cam_obj[2, 3]) < 0.15
+    assert measured >= 3
+
+
+@needs_ycbv
+def test_a_real_scene_makes_the_round_trip(tmp_path):
+    scene = bop.read_scene(bop.find_scenes(YCBV)[0])
+    session = CaptureSession(
+        name="copy",
+        intrinsics=scene.session.intrinsics,
+        views=(),
+        depth_unit_m=scene.session.depth_unit_m,
+    )
+    store = SessionStore.create(tmp_path / "test/000050", session)
+    store.add_view(View(index=1), scene.rgb(1), scene.depth_m(1))
+    rows = [(a.obj_id, a.T_cam_obj) for a in scene.ground_truth[1]]
+    bop_labels.write_scene_gt(store, {1: rows})
+    back = bop.read_scene(bop.find_scenes(tmp_path)[0])
+    assert np.array_equal(back.rgb(1), scene.rgb(1))
+    assert np.array_equal(back.depth_m(1), scene.depth_m(1))
+    for a, b in zip(scene.ground_truth[1], back.ground_truth[1], strict=True):
+        assert a.obj_id == b.obj_id
+        np.testing.assert_allclose(a.T_cam_obj, b.T_cam_obj, atol=1e-12)
+
+
+@needs_ycbv
+def test_real_models_have_the_diameters_that_are_said():
+    models = bop_models.load_models(YCBV / "models", [2, 13])
+    info = json.loads((YCBV / "models/models_info.json").read_text())
+    for i, model in models.items():
+        assert 1e3 * diameter(model.mesh) == pytest.approx(info[str(i)]["diameter"], rel=1e-3)
+        assert 1e-5 < mass_properties(model.mesh, 1000.0).volume_m3 < 5e-3
+
+
+@needs_ycbv
+def test_keyframe_poses_are_quaternions_first_in_metres():
+    for ref in bop.find_scenes(YCBV):
+        if ref.scene_id not in (50, 51, 54):
+            continue
+        truth = {a.obj_id: a.T_cam_obj for a in bop.read_scene(ref).ground_truth[1]}
+        same = bop.read_keyframe_poses(YCBV, ref.scene_id, 1, source="ground_truth")
+        assert set(same) == set(truth)
+        for i, T in truth.items():
+            np.testing.assert_allclose(same[i], T, atol=2e-5)
+        estimated = bop.read_keyframe_poses(YCBV, ref.scene_id, 1)
+        offsets_mm = [1e3 * np.linalg.norm(estimated[i][:3, 3] - truth[i][:3, 3]) for i in truth]
+        assert 1 < min(offsets_mm) and max(offsets_mm) < 30
+    cracker = bop_models.load_models(YCBV / "models", [2])[2]
+    T = bop.read_keyframe_poses(YCBV, 50, 1)[2]
+    U = bop.read_keyframe_poses(YCBV, 50, 1, source="ground_truth")[2]
+    assert 0.010 < mssd(U, T, cracker.mesh.vertices) < 0.030
+
+
+@needs_ycbv
+def test_objects_that_were_not_found_are_not_there():
+    # CosyPose missed the soup can in 28 of the 190 keyframes of scene 50.
+    rows = [line.split("/") for line in (YCBV / "keyframe.txt").read_text().split()]
+    found = [
+        5 - 1 in bop.read_keyframe_poses(YCBV, 50, int(image))
+        for scene, image in rows
+        if scene == "0050"
+    ]
+    assert (len(found), found.count(False)) == (190, 28)
+
+
+@needs_ycbv
+def test_keyframes_that_are_not_there_are_named():
+    with pytest.raises(InputError, match="image 2 is not a keyframe of scene 50"):
+        bop.read_keyframe_poses(YCBV, 50, 2)
+    with pytest.raises(InputError, match="cosypose, ground_truth"):
+        bop.read_keyframe_poses(YCBV, 50, 1, source="megapose")
