@@ -1,23 +1,27 @@
 """realsim: real-to-sim-and-back calibration and registration for robot-grasping data.
 
 The spine: what a scene is (records), where things are (geometry), and where they are kept (store).
-Importing it loads numpy and nothing heavier.
+The names below are loaded on first use: `import realsim` and `realsim --help` load not even numpy.
 """
 
-from realsim.errors import InputError, RealsimError
-from realsim.records import (
-    CameraIntrinsics,
-    CaptureSession,
-    GraspSet,
-    HandEye,
-    Mesh,
-    ObjectModel,
-    ObjectPose,
-    Scene,
-    SupportPlane,
-    TagBoard,
-    View,
-)
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from realsim.errors import InputError, RealsimError
+    from realsim.records import (
+        CameraIntrinsics,
+        CaptureSession,
+        GraspSet,
+        HandEye,
+        Mesh,
+        ObjectModel,
+        ObjectPose,
+        Scene,
+        SupportPlane,
+        TagBoard,
+        View,
+    )
 
 __version__ = "0.1.0"
 __all__ = [
@@ -35,3 +39,11 @@ __all__ = [
     "TagBoard",
     "View",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Load a promised name from where it lives."""
+    if name not in __all__:
+        raise AttributeError(f"module 'realsim' has no attribute '{name}'")
+    where = "realsim.errors" if name.endswith("Error") else "realsim.records"
+    return getattr(import_module(where), name)
