@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-HEAVY = ("numpy", "open3d", "pybullet", "gtsam", "cv2", "viser", "trimesh", "scipy", "numba", "matplotlib")
+HEAVY = "numpy open3d pybullet gtsam cv2 viser trimesh scipy numba matplotlib".split()
 
 
 def realsim(*args: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
