@@ -94,7 +94,8 @@ def upgrade(
 def calibrate(session: Path, quiet: bool) -> None:
     """Hand-eye calibration from the board views under SESSION/calibration/capture."""
     from realsim.app.console import Console
-    from realsim.app.stages import calibrate_session, open_session, show_hand_eye
+    from realsim.app.show import show_hand_eye
+    from realsim.app.stages import calibrate_session, open_session
 
     console = Console(quiet=quiet)
     show_hand_eye(calibrate_session(open_session(session), console), console)
@@ -106,7 +107,8 @@ def calibrate(session: Path, quiet: bool) -> None:
 def register(session: Path, quiet: bool) -> None:
     """Find the pose of every object from SESSION/registration/starts.json."""
     from realsim.app.console import Console
-    from realsim.app.stages import open_session, register_session, show_scene
+    from realsim.app.show import show_scene
+    from realsim.app.stages import open_session, register_session
 
     console = Console(quiet=quiet)
     store = open_session(session)
@@ -122,7 +124,8 @@ def register(session: Path, quiet: bool) -> None:
 def school(session: Path, grasps: int, seed: int, workers: int, quiet: bool) -> None:
     """Try grasps on the registered objects of SESSION in the Robot School."""
     from realsim.app.console import Console
-    from realsim.app.stages import open_session, school_session, show_grasps
+    from realsim.app.show import show_grasps
+    from realsim.app.stages import open_session, school_session
 
     console = Console(quiet=quiet)
     store = open_session(session)
@@ -171,6 +174,8 @@ def review(session: Path, host: str, port: int) -> None:
 
     server = ReviewServer(open_session(session), host=host, port=port)
     server.start()
+    if port and f":{port}" not in server.url:
+        click.echo(f"note: port {port} is in use; another one was taken.", err=True)
     click.echo(f"reviewing {session} at {server.url} (Ctrl-C ends)")
     try:
         while True:
@@ -182,7 +187,7 @@ def review(session: Path, host: str, port: int) -> None:
 def _numbers(text: str) -> tuple[int, ...]:
     """Return the numbers of a comma-separated list."""
     try:
-        return tuple(int(part) for part in text.split(",") if part.strip())
+        return tuple(int(part) for part in text.split(",")) if text else ()
     except ValueError:
         raise click.BadParameter(f"'{text}' is not a comma-separated list of numbers") from None
 

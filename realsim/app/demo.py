@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from realsim.app.console import Console, StageTime
+from realsim.app.show import show_grasps, show_hand_eye, show_scene
 from realsim.app.stages import (
     BOARD_VIEWS,
     annotate_session,
@@ -20,13 +21,11 @@ from realsim.app.stages import (
     register_session,
     save_starts,
     school_session,
-    show_grasps,
-    show_hand_eye,
-    show_scene,
 )
 from realsim.errors import InputError
 from realsim.records import CaptureSession, GraspSet, HandEye, Scene
 from realsim.store import SessionStore
+from realsim.store.lock import only_run_in
 
 if TYPE_CHECKING:
     from realsim.app.truth import LoopErrors
@@ -81,7 +80,7 @@ def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
 
     _claim(out, config)
     # One BLAS thread: on small matrices the spinning of more costs more than the work.
-    with threadpool_limits(limits=1):
+    with only_run_in(out), threadpool_limits(limits=1):
         lab = SimulatedLab(LabConfig(seed=config.seed, n_objects=config.objects))
         store = _capture_all(lab, config, out, console)
         joints = {v.index: v.joints for v in store.session.views if v.joints is not None}

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from realsim import __version__
 from realsim.app import report_plots
 from realsim.app.console import StageTime
-from realsim.app.stages import BOARD_VIEWS, GRASP_HEADER, grasp_rows, session_models
+from realsim.app.show import GRASP_HEADER, grasp_rows
+from realsim.app.stages import BOARD_VIEWS, session_models
 from realsim.app.truth import LoopErrors
 from realsim.records import HandEye, Scene
 from realsim.store import SessionStore

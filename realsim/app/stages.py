@@ -6,7 +6,7 @@ stages can be run one by one, by the demo, or again after an interruption.
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from realsim.app.console import Console
-from realsim.errors import InputError
-from realsim.geometry import se3
-from realsim.records import GraspSet, HandEye, ObjectModel, ObjectPose, Scene
+from realsim.errors import InputError, UnitError
+from realsim.records import GraspSet, HandEye, ObjectModel, ObjectPose, Scene, View
 from realsim.store import SessionStore
 
 if TYPE_CHECKING:
@@ -25,6 +24,8 @@ if TYPE_CHECKING:
 
 BOARD_VIEWS = "calibration/capture"
 """Where in a session the views of the tag board lie: a session of their own."""
+FARTHEST_START_M = 4.0
+"""Objects lie nearer to the cameras than this; millimetres would make it a thousand times more."""
 REGISTRATION_VIEWS = 48
 """At most so many views enter the registration, spread evenly: more cost memory, not accuracy,
 as long as a constant hand-eye error limits the result (facts: 0.40 mm at 32, 0.29 mm at 256)."""
@@ -44,8 +45,28 @@ def open_session(folder: Path) -> SessionStore:
     if not (folder / "session.json").is_file():
         inner = sorted(p.parent.name for p in folder.glob("*/session.json"))
         hint = f" Did you mean {', '.join(str(folder / n) for n in inner)}?" if inner else ""
-        raise InputError(f"'{folder}' holds no session.json, so it is not a session.{hint}")
+        raise InputError(
+            f"'{folder}' holds no session.json, so it is not a session.{hint} Give a folder that "
+            "`realsim demo` or `realsim upgrade` has filled, such as demo/session."
+        )
     return SessionStore.open(folder)
+
+
+def require_sound(store: SessionStore) -> None:
+    """Raise if what was captured is not what is on disk: a run refused is better than a view lost.
+
+    Raises:
+        InputError: a photograph, a depth image or the list of views is missing or changed.
+    """
+    captured = ("rgb/", "depth/", "robot.jsonl")
+    faults = [f for f in store.verify() if f.path.startswith(captured)]
+    if faults:
+        named = "; ".join(f"{f.path} is {f.kind} ({f.found})" for f in faults[:3])
+        more = f" and {len(faults) - 3} more" if len(faults) > 3 else ""
+        raise InputError(
+            f"session '{store.folder}' is not as it was captured: {named}{more}. Restore the files "
+            "from a copy, or capture the views again; nothing was computed from what is left."
+        )
 
 
 def content_key(*parts: Any) -> str:
@@ -62,7 +83,10 @@ def content_key(*parts: Any) -> str:
 def is_current(store: SessionStore, stage: str, key: str) -> bool:
     """Return whether this stage has already been done with these inputs."""
     path = store.folder / "stages" / f"{stage}.json"
-    return path.is_file() and json.loads(path.read_text()).get("key") == key
+    try:
+        return path.is_file() and json.loads(path.read_text())["key"] == key
+    except (ValueError, KeyError, TypeError):
+        return False  # a damaged note is no note: the stage is done again
 
 
 def mark_current(store: SessionStore, stage: str, key: str) -> None:
@@ -87,6 +111,7 @@ def calibrate_session(store: SessionStore, console: Console) -> HandEye:
             "board first, or place the cameras by importing a calibration."
         )
     views_store = SessionStore.open(folder)
+    require_sound(views_store)
     board = load_board(store)
     views = views_store.session.views
     key = content_key(
@@ -166,6 +191,7 @@ def register_session(store: SessionStore, console: Console) -> Scene:
     from realsim.registration.register import DepthFrame, register_scene
     from realsim.store import load_scene, save_scene
 
+    require_sound(store)
     starts, models = load_starts(store), session_models(store)
     config = _registration_config(store)
     views = [v for v in store.session.views if v.T_world_cam is not None]
@@ -174,11 +200,13 @@ def register_session(store: SessionStore, console: Console) -> Scene:
             f"no view of session '{store.folder}' has a camera pose yet: run "
             f"`realsim calibrate {store.folder}` first."
         )
+    _check_distances(starts, views)
     pick = np.unique(np.linspace(0, len(views) - 1, REGISTRATION_VIEWS).round().astype(int))
     chosen = [views[k] for k in pick]
     key = content_key(
         store.folder / "scene_camera.json", store.folder / "registration/starts.json",
         *sorted((store.folder / "models").iterdir()), asdict(config), [v.index for v in chosen],
+        store.folder / "robot.jsonl",
     )  # fmt: skip
     with console.stage("register", f"{len(starts)} objects, {len(chosen)} views") as tick:
         if is_current(store, "register", key):
@@ -194,11 +222,35 @@ def register_session(store: SessionStore, console: Console) -> Scene:
             config,
             gravity_up_world=None if up is None else np.array(up), progress=tick,
         )  # fmt: skip
-        save_scene(store, result.scene)
+        store.write_json("registration/report.json", _finite(result.report))
         save_scene(store, result.single_view, "registration/single_view.json")
-        store.write_json("registration/report.json", result.report)
+        save_scene(store, result.scene)
         mark_current(store, "register", key)
     return result.scene
+
+
+def _check_distances(starts: Sequence[ObjectPose], views: Sequence[View]) -> None:
+    """Raise if a start lies further from the cameras than any table-top: other units, likely."""
+    cameras = np.stack([v.T_world_cam[:3, 3] for v in views if v.T_world_cam is not None])
+    for s in starts:
+        distance = float(np.min(np.linalg.norm(cameras - s.T_world_obj[:3, 3], axis=1)))
+        if distance > FARTHEST_START_M:
+            raise UnitError(
+                f"the start of instance {s.instance} lies {distance:.3g} m from the nearest "
+                f"camera; at most {FARTHEST_START_M:g} m is accepted. Metres are expected in "
+                "registration/starts.json and in the camera poses: were millimetres given?"
+            )
+
+
+def _finite(value: Any) -> Any:
+    """Return JSON values with NaN and infinity, which JSON has not, as null."""
+    if isinstance(value, dict):
+        return {str(k): _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
 
 
 def _registration_config(store: SessionStore) -> "RegistrationConfig":
@@ -280,86 +332,10 @@ def annotate_session(store: SessionStore, console: Console) -> "TransferSummary"
     from realsim.store import load_grasps
     from realsim_sim_bridge.transfer import annotate
 
+    require_sound(store)
     scene = judged_scene(store)
     with console.stage("annotate", f"{len(store.session.views)} frames") as tick:
         return annotate(
             store, scene, session_models(store), load_grasps(store.folder / "grasps"),
             progress=tick,
         )  # fmt: skip
-
-
-def show_hand_eye(hand_eye: HandEye, console: Console) -> None:
-    """Print the hand-eye and what speaks for it."""
-    t, w = hand_eye.T_ee_cam[:3, 3] * 1e3, np.degrees(se3.log_so3(hand_eye.T_ee_cam[:3, :3]))
-    rows = [
-        ["camera in tool, translation [mm]", " ".join(f"{v:.2f}" for v in t)],
-        ["camera in tool, rotation vector [deg]", " ".join(f"{v:.3f}" for v in w)],
-        ["1 sigma (worst axis)", f"{hand_eye.sigma_mm:.3f} mm / {hand_eye.sigma_deg:.4f} deg"],
-        ["reprojection of held-out views", f"{hand_eye.held_out_px:.3f} px"],
-        ["views used / rejected", f"{len(hand_eye.view_indices)} / {len(hand_eye.rejected)}"],
-    ]
-    console.table("Hand-eye calibration", ["", "value"], rows)
-    for index, reason in hand_eye.rejected:
-        console.warn(f"board view {index} was not used: {reason}")
-
-
-def show_scene(store: SessionStore, scene: Scene, console: Console) -> None:
-    """Print what was registered, worst first, with the reasons for any doubt."""
-    models = session_models(store)
-    order = {"rejected": 0, "doubtful": 1, "unchecked": 2, "accepted": 3}
-    rows: list[list[str]] = []
-    for o in sorted(scene.objects, key=lambda o: (order[o.verdict], o.checks.get("agree", 0.0))):
-        sigma = "-"
-        if o.covariance is not None:
-            sigma = f"{1e3 * np.sqrt(np.linalg.eigvalsh(o.covariance[3:, 3:])[-1]):.2f}"
-        agree = o.checks.get("agree", float("nan"))
-        rows.append([f"{o.instance} {models[o.obj_id].name}", o.verdict, f"{agree:.3f}", sigma,
-                     "; ".join(o.reasons)])  # fmt: skip
-    console.table(
-        f"Objects of {scene.name}",
-        ["object", "verdict", "agrees with depth", "sigma [mm]", "why"], rows,
-    )  # fmt: skip
-
-
-def show_grasps(store: SessionStore, sets: Sequence[GraspSet], console: Console) -> None:
-    """Print the outcome of the Robot School per object."""
-    models = session_models(store)
-    console.table("Robot School", GRASP_HEADER, grasp_rows(sets, models))
-    for s in sets:
-        if len(s) == 0:
-            console.warn(f"{models[s.obj_id].name}: {why_no_grasp(s)}")
-
-
-def why_no_grasp(grasps: GraspSet) -> str:
-    """Return in words what took all candidates of an object."""
-    counts = grasps.parameters.get("counts") or {}
-    if not counts.get("turned"):
-        return f"not tried: {grasps.parameters.get('not_tried') or 'no antipodal pair fits'}"
-    return (
-        f"no candidate is free: of {counts['turned']}, {counts['hand_in_table']} would touch the "
-        f"table, {counts['hand_in_object']} the object itself, {counts['hand_in_neighbour']} a "
-        "neighbour"
-    )
-
-
-GRASP_HEADER = ["object", "tried", "reachable", "lifted", "all four", "good", "mean score"]
-
-
-def grasp_rows(sets: Sequence[GraspSet], models: Mapping[int, ObjectModel]) -> list[list[str]]:
-    """Return the rows of the Robot School's table."""
-    rows: list[list[str]] = []
-    for s in sets:
-        tried = np.isfinite(s.scores)
-        mean = f"{np.mean(s.scores[tried]):.2f}" if tried.any() else "-"
-        rows.append(
-            [
-                f"{s.instance} {models[s.obj_id].name}",
-                str(int(tried.sum())),
-                str(int(s.reachable.sum())),
-                str(int(np.sum(s.base_scores[tried] >= 0.5))),
-                str(int(np.sum(s.base_scores[tried] >= 1.0))),
-                str(int(s.good.sum())),
-                mean,
-            ]
-        )
-    return rows

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.console import Console
+from realsim.app.show import why_no_grasp
 from realsim.app.stages import (
     annotate_session,
     register_session,
@@ -27,6 +28,7 @@ from realsim.formats.bop import BopScene, BopSceneRef
 from realsim.geometry import se3
 from realsim.records import CaptureSession, GraspSet, ObjectModel, ObjectPose, Scene, View
 from realsim.store import SessionStore
+from realsim.store.lock import only_run_in
 
 Array = NDArray[np.float64]
 
@@ -99,7 +101,9 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
                 failed[ref.folder.name] = str(error)
                 console.say(f"scene {ref.folder.name} is left out: {error}")
                 continue
-            done.append(_upgrade_scene(source, config, out, console))
+            out.mkdir(parents=True, exist_ok=True)
+            with only_run_in(out):
+                done.append(_upgrade_scene(source, config, out, console))
     if not done:
         raise InputError(f"none of the {len(refs)} scenes can be used; the reasons stand above.")
     save_models(out / "models", models)
@@ -224,10 +228,14 @@ def moved_from_start(
 ) -> tuple[float, float]:
     """Return how far an object moved from its start: [mm] and [deg], nearest symmetry."""
     start = next(s for s in starts if s.instance == pose.instance)
-    S = models[pose.obj_id].symmetries
-    delta = se3.invert(start.T_world_obj) @ pose.T_world_obj @ S
-    k = int(np.argmin(se3.angle(delta)))
-    return 1e3 * float(np.linalg.norm(delta[k, :3, 3])), float(np.degrees(se3.angle(delta[k])))
+    model = models[pose.obj_id]
+    ends = pose.T_world_obj @ model.symmetries
+    angles = se3.angle(se3.invert(start.T_world_obj) @ ends)
+    k = int(np.argmin(angles))
+    # At the middle of the box: a mesh's origin may lie beside it and swing with every turn.
+    middle = model.mesh.bounds.mean(0)[None]
+    step = se3.transform(ends[k], middle) - se3.transform(start.T_world_obj, middle)
+    return 1e3 * float(np.linalg.norm(step)), float(np.degrees(angles[k]))
 
 
 def show_upgrade(result: UpgradeResult, console: Console) -> None:
@@ -262,6 +270,9 @@ def show_upgrade(result: UpgradeResult, console: Console) -> None:
                 f"{done.store.folder.name}: supporting plane found, RMS "
                 f"{1e3 * plane.rms_m:.1f} mm over {plane.inliers} points"
             )
+        for s in done.grasps:
+            if len(s) == 0:
+                console.warn(f"{done.store.folder.name} object {s.obj_id}: {why_no_grasp(s)}")
         for o in done.scene.objects:
             if o.reasons:
                 console.warn(f"{done.store.folder.name} object {o.obj_id}: {'; '.join(o.reasons)}")

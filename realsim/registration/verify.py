@@ -1,7 +1,7 @@
 """Is a pose right? Checks without ground truth, and a verdict whose reasons hold the numbers."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,6 +112,30 @@ def verify_objects(
             checks["plane_gap_mm"] = 1e3 * height
         checks["penetration_mm"] = _penetration_mm(i, bodies, poses)
         results.append(_judged(checks, stride, slack, config))
+    return _without_doubles(results, bodies, poses)
+
+
+def _without_doubles(
+    results: list[Checked], bodies: Sequence[Body], poses: Sequence[Array]
+) -> list[Checked]:
+    """Return the checks with every object rejected that stands where its own double stands.
+
+    Two solid bodies of one kind cannot have their middles nearer than half their least extent; one
+    thing that is named twice explains the depth as well as one.
+    """
+    for j, body in enumerate(bodies):
+        for i in range(j):
+            if bodies[i].start.obj_id != body.start.obj_id:
+                continue
+            apart = float(np.linalg.norm(bodies[i].center(poses[i]) - body.center(poses[j])))
+            if apart < 0.5 * float(body.model.mesh.extent.min()):
+                reason = (
+                    f"stands where instance {bodies[i].start.instance} of the same object stands "
+                    f"({1e3 * apart:.1f} mm apart): one thing named twice"
+                )
+                results[j] = replace(
+                    results[j], verdict="rejected", reasons=(*results[j].reasons, reason)
+                )
     return results
 
 

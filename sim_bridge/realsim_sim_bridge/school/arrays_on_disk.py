@@ -3,11 +3,15 @@
 import json
 import os
 import tempfile
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.errors import InputError
 
 NOTES = "notes_json"
 """Name of the array that holds the notes as UTF-8 JSON."""
@@ -31,8 +35,29 @@ def write_arrays(path: Path, arrays: dict[str, NDArray[Any]], notes: dict[str, A
 
 
 def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Return arrays and notes of a file of `write_arrays`."""
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files if name != NOTES}
-        notes: dict[str, Any] = json.loads(file[NOTES].tobytes().decode())
+    """Return arrays and notes of a file of `write_arrays`.
+
+    Raises:
+        InputError: the file is damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files if name != NOTES}
+            notes: dict[str, Any] = json.loads(file[NOTES].tobytes().decode())
+    except (zipfile.BadZipFile, ValueError, KeyError, EOFError, OSError, zlib.error) as error:
+        raise InputError(
+            f"{path} is damaged ({type(error).__name__}). Delete it: its content is computed again."
+        ) from error
     return arrays, notes
+
+
+def is_whole(path: Path) -> bool:
+    """Return whether a file of `write_arrays` is there and whole; a damaged one is deleted."""
+    if not path.is_file():
+        return False
+    try:
+        read_arrays(path)
+    except InputError:
+        path.unlink()
+        return False
+    return True

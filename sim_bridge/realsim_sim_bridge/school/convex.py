@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry.mesh import hull_vertices, mass_properties, welded_mesh
 from realsim.records import Mesh
-from realsim_sim_bridge.school.arrays_on_disk import read_arrays, write_arrays
+from realsim_sim_bridge.school.arrays_on_disk import is_whole, read_arrays, write_arrays
 
 Array = NDArray[np.float64]
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
@@ -65,7 +65,7 @@ def convex_parts(mesh: Mesh, config: ConvexConfig, cache: Path | None = None) ->
     """Return the convex parts of a mesh [m], from the cache folder if they are there."""
     mesh = welded_mesh(mesh)
     path = None if cache is None else cache / f"convex_{_content(mesh, config)}.npz"
-    if path is not None and path.is_file():
+    if path is not None and is_whole(path):
         return _read(path)
     solid = mass_properties(mesh, density=1.0)
     if solid.is_watertight and 1.0 / solid.hull_volume_fraction <= config.hull_ratio:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from realsim.records import STAGES, GraspSet
 from realsim_sim_bridge.school import panda
-from realsim_sim_bridge.school.arrays_on_disk import read_arrays, write_arrays
+from realsim_sim_bridge.school.arrays_on_disk import is_whole, read_arrays, write_arrays
 from realsim_sim_bridge.school.object_task import ObjectTask, Prepared
 from realsim_sim_bridge.school.score import score_stages
 from realsim_sim_bridge.school.slip_test import Slips, SlipTrial, run_slip_test
@@ -46,7 +46,7 @@ def rows_path(task: ObjectTask, rows: Rows) -> Path | None:
 def slips_of_rows(task: ObjectTask, prepared: Prepared, rows: Rows) -> Slips:
     """Return the slips of some rows of the candidates, all tested in one world."""
     path = rows_path(task, rows)
-    if path is not None and path.is_file():
+    if path is not None and is_whole(path):
         arrays, notes = read_arrays(path)
         return Slips(
             slip_m=arrays["slip_m"],

@@ -18,7 +18,7 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties, sample_surface
 from realsim.records import Mesh
 from realsim_sim_bridge.school import panda
-from realsim_sim_bridge.school.arrays_on_disk import read_arrays, write_arrays
+from realsim_sim_bridge.school.arrays_on_disk import is_whole, read_arrays, write_arrays
 from realsim_sim_bridge.school.candidates import Surroundings, sample_candidates
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.convex import convex_parts
@@ -108,7 +108,7 @@ def prepare(task: ObjectTask) -> Prepared:
     An object that cannot be tried (no volume, mass out of range) has no body; the notes say why.
     """
     path = task.path("prepared")
-    if path is not None and path.is_file():
+    if path is not None and is_whole(path):
         return _read_prepared(path)
     config = task.config
     rng = np.random.default_rng([config.seed, task.instance])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import GraspSet, Mesh, ObjectModel, Scene, names_of
+from realsim_sim_bridge.school.arrays_on_disk import is_whole
 from realsim_sim_bridge.school.candidates import Surroundings
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.kept_sets import read_grasp_set, write_grasp_set
@@ -130,7 +131,7 @@ class _Pupil:
     def __post_init__(self) -> None:
         """Take the finished set from the cache if it is there."""
         path = self.task.path("grasps")
-        if path is not None and path.is_file():
+        if path is not None and is_whole(path):
             self.grasp_set = read_grasp_set(path)
 
     @property

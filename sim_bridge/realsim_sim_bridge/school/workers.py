@@ -1,6 +1,7 @@
 """Processes that work for the school and end with it."""
 
 import os
+import signal
 import threading
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor
@@ -41,6 +42,9 @@ def executor(workers: int) -> Generator[Executor]:
             try:
                 yield pool
             except BaseException:
+                # A job may take half a minute, and an interrupted user does not wait for it.
+                for process in list(pool._processes.values()):  # pyright: ignore[reportPrivateUsage]
+                    process.terminate()
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
     finally:
@@ -52,7 +56,11 @@ def executor(workers: int) -> Generator[Executor]:
 
 
 def _end_with_parent() -> None:
-    """End this process when its parent is gone: a killed parent cannot tell its pool to stop."""
+    """End this process when its parent is gone: a killed parent cannot tell its pool to stop.
+
+    Ctrl-C reaches every process of the terminal; the parent alone answers it.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = parent_process()
     if parent is None:
         return

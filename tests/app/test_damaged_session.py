@@ -1,0 +1,124 @@
+"""A session that is not as it was captured is refused; damaged notes and caches are redone."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.app import stages
+from realsim.app.console import Console
+from realsim.errors import InputError, UnitError
+from realsim.formats.bop_models import save_models
+from realsim.geometry import se3
+from realsim.geometry.parts import part
+from realsim.records import CameraIntrinsics, CaptureSession, Mesh, ObjectPose, View
+from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim.store import SessionStore, load_scene
+from realsim.store.lock import only_run_in
+from realsim_sim_bridge.school.arrays_on_disk import is_whole, write_arrays
+
+CAMERA = CameraIntrinsics(width=240, height=180, fx=220.0, fy=220.0, cx=120.0, cy=90.0)
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> SessionStore:
+    """A session of four views of a box on a table, with its start."""
+    model = part("box")
+    T = se3.from_translation([0.0, 0.0, -model.mesh.bounds[0, 2]])
+    corners = np.array([[-0.4, -0.4, 0], [0.4, -0.4, 0], [0.4, 0.4, 0], [-0.4, 0.4, 0]])
+    table = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]]))
+    renderer = LabelRenderer([PlacedMesh(0, model.mesh, T), PlacedMesh(-1, table, np.eye(4))])
+    session = CaptureSession(name="box", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(tmp_path / "s", session, {"gravity_up_world": [0, 0, 1]})
+    for k in range(4):
+        eye = [0.35 * np.cos(1.5 * k), 0.35 * np.sin(1.5 * k), 0.35]
+        T_world_cam = se3.look_at(eye, [0, 0, 0.04])
+        depth = renderer.render(CAMERA, T_world_cam).depth_m
+        rgb = np.full((180, 240, 3), 90, np.uint8)
+        store.add_view(View(index=k, T_world_cam=T_world_cam), rgb, depth)
+    save_models(store.folder / "models", {model.obj_id: model})
+    stages.save_starts(store, [ObjectPose(obj_id=model.obj_id, instance=0, T_world_obj=T)], "test")
+    return store
+
+
+def starts_of(store: SessionStore) -> list[ObjectPose]:
+    return stages.load_starts(store)
+
+
+@pytest.mark.parametrize("spoil", ["zero depth", "cut list", "lost photograph"])
+def test_a_changed_capture_is_refused_even_after_it_was_registered(
+    store: SessionStore, spoil: str
+) -> None:
+    stages.register_session(store, QUIET)
+    if spoil == "zero depth":
+        store.path("depth/000002.png").write_bytes(store.path("depth/000001.png").read_bytes())
+    elif spoil == "cut list":
+        path = store.path("robot.jsonl")
+        path.write_bytes(path.read_bytes()[: path.stat().st_size * 55 // 100])
+    else:
+        store.path("rgb/000003.png").unlink()
+    again = SessionStore.open(store.folder)
+    for stage in (stages.register_session, stages.annotate_session):
+        with pytest.raises(InputError, match="not as it was captured"):
+            stage(again, QUIET)
+
+
+def test_a_damaged_note_is_no_note(store: SessionStore) -> None:
+    stages.register_session(store, QUIET)
+    store.path("stages/register.json").write_text('{"key": "abc')
+    scene = stages.register_session(store, QUIET)
+    assert scene.objects[0].verdict == "accepted"
+    assert "key" in json.loads(store.path("stages/register.json").read_text())
+
+
+def test_an_object_out_of_every_view_is_rejected_and_all_files_are_written(
+    store: SessionStore,
+) -> None:
+    (start,) = starts_of(store)
+    away = se3.from_translation([2.0, 0.0, 0.0]) @ start.T_world_obj
+    far = ObjectPose(obj_id=start.obj_id, instance=1, T_world_obj=away)
+    stages.save_starts(store, [start, far], "test")
+    scene = stages.register_session(store, QUIET)
+    assert [o.verdict for o in scene.objects] == ["accepted", "rejected"]
+    assert len(store.read_json("registration/report.json")["objects"]) == 2
+    assert [o.verdict for o in load_scene(store).objects] == ["accepted", "rejected"]
+
+
+def test_one_thing_named_twice_is_counted_once(store: SessionStore) -> None:
+    (start,) = starts_of(store)
+    double = ObjectPose(obj_id=start.obj_id, instance=9, T_world_obj=start.T_world_obj)
+    stages.save_starts(store, [start, double], "test")
+    scene = stages.register_session(store, QUIET)
+    assert [o.verdict for o in scene.objects] == ["accepted", "rejected"]
+    assert "named twice" in scene.objects[1].reasons[-1]
+
+
+def test_starts_in_millimetres_are_found_out(store: SessionStore) -> None:
+    (start,) = starts_of(store)
+    T = start.T_world_obj.copy()
+    T[:3, 3] = [300.0, 20.0, 52.0]
+    wrong = ObjectPose(obj_id=start.obj_id, instance=0, T_world_obj=T)
+    stages.save_starts(store, [wrong], "test")
+    with pytest.raises(UnitError, match="millimetres"):
+        stages.register_session(store, QUIET)
+
+
+def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
+    with only_run_in(tmp_path):
+        with pytest.raises(InputError, match="another run"), only_run_in(tmp_path):
+            pass
+    with only_run_in(tmp_path):
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("damage", [b"", b"junk", None])
+def test_a_damaged_cache_file_is_thrown_away(tmp_path: Path, damage: bytes | None) -> None:
+    path = tmp_path / "kept.npz"
+    write_arrays(path, {"a": np.arange(1000.0)}, {"n": 1})
+    assert is_whole(path)
+    path.write_bytes(path.read_bytes()[:500] if damage is None else damage)
+    assert not is_whole(path)
+    assert not path.exists()
