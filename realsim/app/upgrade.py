@@ -6,6 +6,7 @@ OUT/SPLIT/SCENE, so that all later commands (`realsim review`, `realsim report`)
 
 import contextlib
 import tempfile
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from realsim.formats.bop import BopScene, BopSceneRef
 from realsim.geometry import se3
 from realsim.records import CaptureSession, GraspSet, ObjectModel, ObjectPose, Scene, View
 from realsim.store import SessionStore
+from realsim.store.atomic import write_json
 from realsim.store.lock import only_run_in
 
 Array = NDArray[np.float64]
@@ -107,7 +109,29 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
     if not done:
         raise InputError(f"none of the {len(refs)} scenes can be used; the reasons stand above.")
     save_models(out / "models", models)
+    _write_root_files(out, done)
     return UpgradeResult(out=out, scenes=done, failed=failed)
+
+
+def _write_root_files(out: Path, done: list[UpgradedScene]) -> None:
+    """Write what BOP's tools look for at a dataset's root: the camera and each split's targets."""
+    session = done[0].store.session
+    i = session.intrinsics
+    camera = {"fx": i.fx, "fy": i.fy, "cx": i.cx, "cy": i.cy, "width": i.width, "height": i.height,
+              "depth_scale": 1e3 * session.depth_unit_m}  # fmt: skip
+    write_json(out / "camera.json", camera)
+    targets: dict[str, list[dict[str, int]]] = {}
+    for scene in done:
+        folder = scene.store.folder
+        number = int(folder.name) if folder.name.isdecimal() else 0
+        for image, rows in scene.store.read_json("scene_gt.json").items():
+            counts = Counter(int(row["obj_id"]) for row in rows)
+            targets.setdefault(folder.parent.name, []).extend(
+                {"scene_id": number, "im_id": int(image), "obj_id": o, "inst_count": n}
+                for o, n in sorted(counts.items())
+            )
+    for split, rows in targets.items():
+        write_json(out / f"{split}_targets_bop19.json", rows)
 
 
 def _dataset_root(ref: BopSceneRef) -> Path:

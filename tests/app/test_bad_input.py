@@ -196,6 +196,10 @@ def test_the_pristine_dataset_is_upgraded(pristine: Path, tmp_path: Path) -> Non
     for name in ("mask", "mask_visib", "scene_gt_info.json", "scene_gt_coco.json", "grasps"):
         assert (scene / name).exists(), name
     assert list((scene / "reports").glob("overlay_*.png"))
+    camera = json.loads((tmp_path / "out/camera.json").read_text())
+    assert camera["fx"] == 300.0 and camera["depth_scale"] == pytest.approx(0.1)
+    targets = json.loads((tmp_path / "out/test_targets_bop19.json").read_text())
+    assert targets[0] == {"scene_id": 1, "im_id": 3, "obj_id": 1, "inst_count": 1}
     store = SessionStore.open(scene)
     assert store.verify() == []
     _reviewed_session_follows_the_reviewer(store)
