@@ -12,13 +12,7 @@ from realsim_calibration.closed_forms import (
 from realsim_calibration.detection import DetectionConfig, TagDetections, detect_tags
 from realsim_calibration.edges import EdgeConfig
 from realsim_calibration.gates import GateConfig
-from realsim_calibration.hand_eye import (
-    BoardView,
-    HandEyeConfig,
-    HandEyeReport,
-    calibrate_hand_eye,
-    calibrate_hand_eye_report,
-)
+from realsim_calibration.views import BoardView
 from realsim_calibration.joint_solve import JointConfig
 
 __all__ = [
@@ -28,13 +22,9 @@ __all__ = [
     "DetectionConfig",
     "EdgeConfig",
     "GateConfig",
-    "HandEyeConfig",
-    "HandEyeReport",
     "JointConfig",
     "MotionConfig",
     "TagDetections",
-    "calibrate_hand_eye",
-    "calibrate_hand_eye_report",
     "check_observable",
     "daniilidis",
     "detect_tags",

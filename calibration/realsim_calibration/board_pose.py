@@ -10,15 +10,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.camera import project, projection_jacobian, undistort
-from realsim.records import CameraIntrinsics, TagBoard
-from realsim_calibration.detection import TagDetections
+from realsim.geometry.camera import undistort
+from realsim.records import CameraIntrinsics
+from realsim_calibration.view_system import refined_pose
 
 Array = NDArray[np.float64]
 REFINE_STEPS = 15
 """Gauss-Newton from IPPE's solution converges in four; the twin may take longer."""
+FIRST_DAMPING = 1e-4
+"""Levenberg-Marquardt's first damping, relative: nearly a Gauss-Newton step."""
+RELATIVE_GAIN = 1e-9
+"""A step that gains less of the cost is the last: the pose moves by 3e-5 of its own noise."""
+SAME_POSE_RAD = 1e-3
+"""Solutions nearer than this are one: a planar pose's own noise is ten times as large."""
 MIN_POINTS = 4
 """A planar pose needs four points."""
 
@@ -37,34 +42,21 @@ class BoardPose:
     """Its reprojection RMS [px]; infinite where there is none."""
 
 
-def board_points(detections: TagDetections, board: TagBoard) -> tuple[Array, Array]:
-    """Return corners in the board frame (n, 3) [m] and in the image (n, 2) [px].
-
-    Raises:
-        InputError: a tag does not belong to the board.
-    """
-    row = detections.ids - board.first_id
-    wrong = (row < 0) | (row >= board.rows * board.columns)
-    if wrong.any():
-        raise InputError(
-            f"tags {detections.ids[wrong].tolist()} are not on the board, whose ids run from "
-            f"{board.first_id} to {board.first_id + board.rows * board.columns - 1}."
-        )
-    points = board.corners_board[row].reshape(-1, 3)
-    return points, detections.corners_px.reshape(-1, 2)
-
-
 def estimate_board_pose(
-    detections: TagDetections, board: TagBoard, intrinsics: CameraIntrinsics
+    points: Array, uv: Array, intrinsics: CameraIntrinsics
 ) -> BoardPose | None:
     """Return the board's pose in the camera, None where no pose in front of the camera fits.
+
+    Args:
+        points: (n, 3) points in the board frame [m].
+        uv: (n, 2) where they are in the image [px].
+        intrinsics: the camera.
 
     IPPE (Collins & Bartoli, IJCV 2014) gives both planar solutions and SQPnP one more start; all
     are refined in pixels.
     """
     import cv2
 
-    points, uv = board_points(detections, board)
     xy, valid = undistort(intrinsics, uv)
     if valid.sum() < MIN_POINTS:
         return None
@@ -78,7 +70,8 @@ def estimate_board_pose(
     found: list[tuple[float, Array]] = []
     for T in starts:
         refined, rms = refine_board_pose(T, points, uv, intrinsics)
-        fresh = all(se3.angle(se3.invert(refined) @ other) > 1e-3 for _, other in found)
+        turns = [se3.angle(se3.invert(refined) @ other) for _, other in found]
+        fresh = all(turn > SAME_POSE_RAD for turn in turns)
         if np.isfinite(rms) and fresh:
             found.append((rms, refined))
     if not found:
@@ -92,37 +85,10 @@ def refine_board_pose(
     T_cam_board: Array, points: Array, uv: Array, intrinsics: CameraIntrinsics
 ) -> tuple[Array, float]:
     """Return the pose of locally least reprojection and its RMS [px] (Levenberg-Marquardt)."""
-    T, damping = T_cam_board, 1e-4
-    cost = _cost(T, points, uv, intrinsics)
-    for _ in range(REFINE_STEPS):
-        if not np.isfinite(cost):
-            break
-        cam = se3.transform(T, points)
-        predicted, d_point, _ = projection_jacobian(intrinsics, cam)
-        J = (d_point @ T[:3, :3] @ np.concatenate([-se3.hat(points), _eyes(points)], -1)).reshape(
-            -1, 6
-        )
-        r = (uv - predicted).ravel()
-        H, g = J.T @ J, J.T @ r
-        step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
-        moved = T @ se3.exp(step)
-        new = _cost(moved, points, uv, intrinsics)
-        if new < cost:
-            done = cost - new < 1e-12 * cost
-            T, cost, damping = moved, new, damping * 0.1
-            if done:
-                break
-        else:
-            damping *= 10
+    lens = np.concatenate([[intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy],
+                           intrinsics.distortion])  # fmt: skip
+    T, cost = refined_pose(
+        np.ascontiguousarray(T_cam_board), lens, np.ascontiguousarray(points),
+        np.ascontiguousarray(uv), REFINE_STEPS, FIRST_DAMPING, RELATIVE_GAIN,
+    )  # fmt: skip
     return T, float(np.sqrt(cost / len(points)))
-
-
-def _eyes(points: Array) -> Array:
-    return np.broadcast_to(np.eye(3), (len(points), 3, 3))
-
-
-def _cost(T: Array, points: Array, uv: Array, intrinsics: CameraIntrinsics) -> float:
-    """Return the sum of squared 2-D errors [px^2], infinite where a point is behind the camera."""
-    error = project(intrinsics, se3.transform(T, points)) - uv
-    total = float(np.sum(error**2))
-    return total if np.isfinite(total) else np.inf

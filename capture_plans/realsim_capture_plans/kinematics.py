@@ -11,7 +11,7 @@ after which the analytic inverse does not hold any more: it then only seeds a Ne
 chain as it is, so that the inverse is exact for every chain.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from functools import lru_cache
 from itertools import product
 from typing import Any
@@ -21,28 +21,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.dh import JOINTS, UR5_ARM, UR5E_ARM, DhArm, checked_row, jacobian_of
 
 Array = NDArray[np.float64]
-JOINTS = 6
 NEWTON_STEPS = 25
 """Quadratic convergence takes 3-5 from a calibration delta; more only at singular poses."""
 POSE_TOLERANCE = 1e-10
 """Norm of the residual twist [rad, m] at which a solution counts as exact."""
 SAME_SOLUTION_RAD = 1e-5
 """Two solutions that are nearer than this in every joint are the same branch."""
-
-
-def _row(value: ArrayLike, name: str) -> Array:
-    """Return a read-only (6,) copy."""
-    row = np.array(value, dtype=np.float64)
-    if row.shape != (JOINTS,) or not np.all(np.isfinite(row)):
-        raise InputError(f"{name} is {row.tolist()}; {JOINTS} finite numbers are needed.")
-    row.setflags(write=False)
-    return row
-
-
-def _zeros() -> Array:
-    return np.zeros(JOINTS)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -61,7 +48,8 @@ class JointLimits:
     def __post_init__(self) -> None:
         """Check the order of the limits and freeze the arrays."""
         for name in ("lower", "upper", "speed", "acceleration"):
-            object.__setattr__(self, name, _row(getattr(self, name), f"joint limits: {name}"))
+            row = checked_row(getattr(self, name), f"joint limits: {name}")
+            object.__setattr__(self, name, row)
         if np.any(self.lower >= self.upper):
             raise InputError("joint limits: every lower limit must be below its upper limit.")
         if np.any(self.speed <= 0) or np.any(self.acceleration <= 0):
@@ -84,64 +72,16 @@ UR_LIMITS = JointLimits(
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class DhChain:
-    """Six revolute joints: nominal DH numbers, and what a calibration adds to them."""
+class DhChain(DhArm):
+    """An arm that can also be asked backwards, with its limits."""
 
-    name: str
-    a: Array
-    """(6,) link lengths [m]."""
-    d: Array
-    """(6,) link offsets [m]."""
-    alpha: Array
-    """(6,) link twists [rad]."""
-    theta: Array = field(default_factory=_zeros)
-    """(6,) joint zero offsets [rad]."""
-    delta_a: Array = field(default_factory=_zeros)
-    """(6,) calibrated minus nominal a [m]."""
-    delta_d: Array = field(default_factory=_zeros)
-    """(6,) calibrated minus nominal d [m]; tens of metres are normal for the parallel joints."""
-    delta_alpha: Array = field(default_factory=_zeros)
-    """(6,) calibrated minus nominal alpha [rad]."""
-    delta_theta: Array = field(default_factory=_zeros)
-    """(6,) calibrated minus nominal theta [rad]."""
     limits: JointLimits = UR_LIMITS
 
-    def __post_init__(self) -> None:
-        """Freeze the arrays."""
-        for part in ("a", "d", "alpha", "theta"):
-            for name in (part, f"delta_{part}"):
-                object.__setattr__(self, name, _row(getattr(self, name), f"{self.name}: {name}"))
-
-    def link_frames(self, joints: ArrayLike) -> Array:
-        """Return T_base_link (..., 7, 4, 4) of the base and the six links at joints (..., 6)."""
-        q = np.asarray(joints, dtype=np.float64) + (self.theta + self.delta_theta)
-        a, d = self.a + self.delta_a, self.d + self.delta_d
-        alpha = self.alpha + self.delta_alpha
-        ca, sa = np.cos(alpha), np.sin(alpha)
-        c, s = np.cos(q), np.sin(q)
-        links = np.zeros((*q.shape, 4, 4))
-        links[..., 0, 0], links[..., 0, 1], links[..., 0, 2] = c, -s * ca, s * sa
-        links[..., 1, 0], links[..., 1, 1], links[..., 1, 2] = s, c * ca, -c * sa
-        links[..., 2, 1], links[..., 2, 2] = sa, ca
-        links[..., 0, 3], links[..., 1, 3], links[..., 2, 3] = a * c, a * s, d
-        links[..., 3, 3] = 1.0
-        frames = np.empty((*q.shape[:-1], JOINTS + 1, 4, 4))
-        frames[..., 0, :, :] = np.eye(4)
-        for i in range(JOINTS):
-            frames[..., i + 1, :, :] = frames[..., i, :, :] @ links[..., i, :, :]
-        return frames
-
-    def forward(self, joints: ArrayLike) -> Array:
-        """Return T_base_ee (..., 4, 4) [m] at joints (..., 6) [rad]."""
-        return self.link_frames(joints)[..., JOINTS, :, :]
-
-    def jacobian(self, joints: ArrayLike) -> Array:
-        """Return J (..., 6, 6) with `forward(q + dq) = forward(q) @ exp(J @ dq)` to first order.
-
-        Rows are the twist in ee axes, rotation first [rad, m]; column i is joint i's axis:
-        w_i = R_ee_base z_i and v_i = R_ee_base (z_i x (p_ee - p_i)).
-        """
-        return _jacobian(self.link_frames(joints))
+    @classmethod
+    def of(cls, arm: DhArm, limits: JointLimits = UR_LIMITS) -> "DhChain":
+        """Return the chain of an arm."""
+        numbers = {f.name: getattr(arm, f.name) for f in fields(DhArm)}
+        return cls(**numbers, limits=limits)
 
     def sigma_min(self, joints: ArrayLike) -> Array:
         """Return the least singular value (...) of the Jacobian (rad and m taken as they are)."""
@@ -193,7 +133,7 @@ class DhChain:
             if not np.any(todo):
                 break
             # The pseudo-inverse with a cut keeps a singular wrist from leaping away.
-            step = np.linalg.pinv(_jacobian(frames[todo]), rcond=1e-6) @ error[todo, :, None]
+            step = np.linalg.pinv(jacobian_of(frames[todo]), rcond=1e-6) @ error[todo, :, None]
             q[todo] += np.clip(step[..., 0], -0.2, 0.2)
             frames[todo] = self.link_frames(q[todo])
             error[todo] = se3.log(se3.invert(frames[todo, JOINTS]) @ T[todo])
@@ -209,16 +149,6 @@ class DhChain:
             ]
             rows.append(np.array(list(product(*choices)), dtype=np.float64).reshape(-1, JOINTS))
         return np.concatenate(rows) if rows else np.zeros((0, JOINTS))
-
-
-def _jacobian(frames: Array) -> Array:
-    """Return the body Jacobian (..., 6, 6) of link frames (..., 7, 4, 4)."""
-    axes = frames[..., :JOINTS, :3, 2]
-    lever = frames[..., JOINTS:, :3, 3] - frames[..., :JOINTS, :3, 3]
-    R_base_ee = frames[..., JOINTS, :3, :3]
-    rotation = axes @ R_base_ee  # rows are R_ee_base @ z_i
-    translation = np.cross(axes, lever) @ R_base_ee
-    return np.swapaxes(np.concatenate([rotation, translation], -1), -1, -2)
 
 
 @lru_cache(maxsize=8)
@@ -250,22 +180,9 @@ def _repeated(q: Array, owner: NDArray[np.intp]) -> NDArray[np.bool_]:
     return repeated
 
 
-_UR_ALPHA = np.array([1.0, 0.0, 0.0, 1.0, -1.0, 0.0]) * (np.pi / 2)
-
-UR5 = DhChain(
-    name="UR5",
-    a=np.array([0.0, -0.425, -0.39225, 0.0, 0.0, 0.0]),
-    d=np.array([0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823]),
-    alpha=_UR_ALPHA,
-)
-"""UR5 of the CB3 series, nominal (Universal Robots: DH parameters for calculations)."""
-
-UR5E = DhChain(
-    name="UR5e",
-    a=np.array([0.0, -0.425, -0.3922, 0.0, 0.0, 0.0]),
-    d=np.array([0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996]),
-    alpha=_UR_ALPHA,
-)
+UR5 = DhChain.of(UR5_ARM)
+"""UR5 of the CB3 series, nominal."""
+UR5E = DhChain.of(UR5E_ARM)
 """UR5e, nominal. Its flange is 64 mm off a UR5's at the same joints: never swap them."""
 
 CHAINS = {chain.name: chain for chain in (UR5, UR5E)}

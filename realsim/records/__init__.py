@@ -4,14 +4,8 @@ Records are frozen; their arrays are private read-only copies; shapes and ranges
 here, at construction. All units are SI (m, rad, s, kg, N) unless the name says otherwise.
 """
 
-from realsim.records.capture import (
-    DISTORTION_TERMS,
-    CameraIntrinsics,
-    CaptureSession,
-    HandEye,
-    TagBoard,
-    View,
-)
+from realsim.records.calibration import ArmErrorMap, Check, HandEye, RobotErrorMap
+from realsim.records.capture import DISTORTION_TERMS, CameraIntrinsics, CaptureSession, View
 from realsim.records.grasps import STAGES, GraspSet
 from realsim.records.objects import (
     Mesh,
@@ -22,20 +16,36 @@ from realsim.records.objects import (
     Verdict,
     names_of,
 )
+from realsim.records.targets import (
+    TAG_CELLS,
+    CharucoBoard,
+    Chessboard,
+    CircleGrid,
+    TagBoard,
+    Target,
+)
 
 __all__ = [
     "DISTORTION_TERMS",
     "STAGES",
+    "TAG_CELLS",
+    "ArmErrorMap",
     "CameraIntrinsics",
     "CaptureSession",
+    "CharucoBoard",
+    "Check",
+    "Chessboard",
+    "CircleGrid",
     "GraspSet",
     "HandEye",
     "Mesh",
     "ObjectModel",
     "ObjectPose",
+    "RobotErrorMap",
     "Scene",
     "SupportPlane",
     "TagBoard",
+    "Target",
     "Verdict",
     "View",
     "names_of",

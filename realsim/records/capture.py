@@ -1,7 +1,6 @@
-"""What a capture is: the camera, the views, the session, the tag board, the hand-eye."""
+"""What a capture is: the camera, the views, the session."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -150,100 +149,3 @@ class CaptureSession:
             f"{', '.join(str(v.index) for v in self.views[:12])}"
             f"{'...' if len(self.views) > 12 else '.'}"
         )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class TagBoard:
-    """A flat grid of AprilTags; frame `board` has its origin at the grid's first corner.
-
-    Tag (row r, column c) has the id `first_id + r * columns + c`; x runs along the columns, y along
-    the rows (down the printed page), so z points INTO the paper (OpenCV's board convention).
-    """
-
-    rows: int
-    columns: int
-    tag_size_m: float
-    """Edge of a tag's black square [m]."""
-    gap_m: float
-    """White gap between neighbouring tags [m]."""
-    family: Literal["tag36h11"] = "tag36h11"
-    first_id: int = 0
-
-    def __post_init__(self) -> None:
-        """Check counts and sizes."""
-        if self.rows < 1 or self.columns < 1:
-            raise InputError(f"a tag board needs rows and columns, got {self.rows}x{self.columns}.")
-        if not (0.001 <= self.tag_size_m <= 1.0) or not (0.0 < self.gap_m <= 1.0):
-            raise InputError(
-                f"tag size {self.tag_size_m} m and gap {self.gap_m} m: metres are expected, tags "
-                "between 0.001 and 1 m. Were millimetres given?"
-            )
-
-    @property
-    def ids(self) -> NDArray[np.int64]:
-        """(rows * columns,) tag ids."""
-        return self.first_id + np.arange(self.rows * self.columns)
-
-    @property
-    def corners_board(self) -> Array:
-        """(tags, 4, 3) corners in the board frame [m], clockwise from the top left as printed."""
-        pitch = self.tag_size_m + self.gap_m
-        r, c = np.divmod(np.arange(self.rows * self.columns), self.columns)
-        square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
-        origin = np.stack([c * pitch, r * pitch, np.zeros(len(r))], -1)
-        return origin[:, None] + square[None] * self.tag_size_m
-
-    @property
-    def size_m(self) -> tuple[float, float]:
-        """Extent along x and y of the outermost corners [m]."""
-        pitch = self.tag_size_m + self.gap_m
-        return self.columns * pitch - self.gap_m, self.rows * pitch - self.gap_m
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class HandEye:
-    """A hand-eye calibration: the camera in the hand, and everything that says how good it is."""
-
-    T_ee_cam: Array
-    """(4, 4) camera in the controller's tool frame [m]."""
-    covariance: Array
-    """(6, 6) of the right perturbation of T_ee_cam, rotation first [rad, m]."""
-    T_base_board: Array
-    """(4, 4) board in base [m]."""
-    intrinsics: CameraIntrinsics
-    """The camera as calibrated together with the hand-eye."""
-    intrinsics_sd: Array
-    """(4 + 8,) 1-sigma of fx fy cx cy [px] and of the 8 distortion terms (0 = held fixed)."""
-    view_indices: tuple[int, ...]
-    """Views used."""
-    view_rms_px: Array
-    """(views used,) reprojection RMS of each view through the robot pose [px]."""
-    held_out_px: float
-    """RMS of views predicted by a fit without them, through the robot pose [px]."""
-    rejected: tuple[tuple[int, str], ...] = ()
-    """(view, reason) of every view that was not used."""
-    method: str = ""
-    starts: tuple[tuple[str, float], ...] = ()
-    """(closed form, its reprojection RMS [px]) of every start tried."""
-
-    def __post_init__(self) -> None:
-        """Check that the poses are rigid and freeze the arrays."""
-        object.__setattr__(self, "T_ee_cam", rigid(self.T_ee_cam, "T_ee_cam"))
-        object.__setattr__(self, "T_base_board", rigid(self.T_base_board, "T_base_board"))
-        for name, shape in (
-            ("covariance", (6, 6)),
-            ("intrinsics_sd", (12,)),
-            ("view_rms_px", (None,)),
-        ):
-            value = frozen(getattr(self, name), np.float64, shape, name)
-            object.__setattr__(self, name, value)
-
-    @property
-    def sigma_deg(self) -> float:
-        """Largest 1-sigma of the rotation about any axis [deg]."""
-        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1])))
-
-    @property
-    def sigma_mm(self) -> float:
-        """Largest 1-sigma of the translation along any axis [mm]."""
-        return float(1e3 * np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))

@@ -1,0 +1,438 @@
+"""Benchmark of the points found on rendered targets, whose true places are known.
+
+    uv run python benchmarks/corner_accuracy.py [--views N] [--json FILE] [--kinds tags charuco ...]
+
+Every view is a picture of a flat target at 0.5 m (1280x720 px, f = 900 px), tilted by up to 55 deg
+and rolled at random, rendered with 8x8 rays a pixel, blurred and made noisy. Figures: RMS of the
+points' 2-D error [px], the mean error (bias) [px], the share of the visible points that was found,
+the predicted sigma over the measured one, and CPU milliseconds a picture. OpenCV's own detectors
+are measured on the same pictures.
+"""
+
+import os
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import camera, se3
+from realsim.records import CameraIntrinsics
+from realsim.records.targets import (
+    TAG_CELLS,
+    CharucoBoard,
+    Chessboard,
+    CircleGrid,
+    TagBoard,
+    Target,
+)
+from realsim_calibration.detect.charuco import charuco_markers, white_parity
+from realsim_calibration.detect.find import find_target
+from realsim_calibration.detect.markers import FAMILY_DICTIONARY, predefined_dictionary
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+SUPER = 8
+"""Rays per pixel and axis."""
+BLOCK_ROWS = 60
+"""Pixel rows that are rendered at once."""
+TEXTURE_M = 1e-4
+"""Edge of a texture pixel [m]."""
+MARGIN_M = 0.03
+"""White paper about the target [m]."""
+INK, PAPER, TABLE = 30, 215, 120
+"""Gray levels."""
+DISTANCE_M = 0.5
+MAX_TILT_DEG = 55.0
+LEVELS = {"moderate": (0.8, 4.0), "strong": (1.5, 6.0)}
+"""(blur sigma [px], noise [gray levels])."""
+GOAL_PX = {"moderate": 0.10, "strong": 0.22}
+CAMERA = CameraIntrinsics(width=1280, height=720, fx=900.0, fy=900.0, cx=639.5, cy=359.5)
+LENS = CameraIntrinsics(
+    width=1280, height=720, fx=900.0, fy=900.0, cx=639.5, cy=359.5,
+    distortion=np.array([-0.25, 0.08, 0.001, -0.001]),
+)  # fmt: skip
+DOT_SHARE = 0.25
+"""Radius of a dot in distances to its nearest neighbour; a large origin dot has 1.6 times it."""
+KINDS: dict[str, Target] = {
+    "tags 36h11": TagBoard(rows=4, columns=6, tag_size_m=0.04, gap_m=0.01),
+    "tags 36h10": TagBoard(rows=4, columns=6, tag_size_m=0.04, gap_m=0.01, family="tag36h10"),
+    "tags 25h9": TagBoard(rows=4, columns=6, tag_size_m=0.035, gap_m=0.01, family="tag25h9"),
+    "tags 16h5": TagBoard(rows=4, columns=6, tag_size_m=0.03, gap_m=0.01, family="tag16h5"),
+    "tags kalibr": TagBoard(
+        rows=4, columns=6, tag_size_m=0.04, gap_m=0.012, ids_from="bottom", corner_squares=True
+    ),
+    "charuco": CharucoBoard(rows=7, columns=10, square_m=0.03, marker_m=0.022),
+    "charuco 6x6_100": CharucoBoard(
+        rows=6, columns=9, square_m=0.033, marker_m=0.02, dictionary="DICT_6X6_100", legacy=True
+    ),
+    "chessboard": Chessboard(rows=6, columns=9, square_m=0.025),
+    "circles": CircleGrid(rows=7, columns=10, pitch_m=0.025),
+    "circles origin": CircleGrid(rows=8, columns=8, pitch_m=0.025, large_origin=True),
+    "circles asymmetric": CircleGrid(rows=11, columns=4, pitch_m=0.02, asymmetric=True),
+}
+"""What is measured."""
+
+
+def _ink_squares(target: Target) -> Array:
+    """Return the black squares (n, 3): x, y of the corner and the edge [m]."""
+    if isinstance(target, TagBoard) and target.corner_squares:
+        g, pitch = target.gap_m, target.tag_size_m + target.gap_m
+        r, c = np.divmod(np.arange((target.rows + 1) * (target.columns + 1)), target.columns + 1)
+        return np.stack([c * pitch - g, r * pitch - g, np.full(len(r), g)], -1)
+    if isinstance(target, Chessboard):
+        rows, columns, start = target.rows + 1, target.columns + 1, -target.square_m
+        parity = 1
+    elif isinstance(target, CharucoBoard):
+        rows, columns, start, parity = target.rows, target.columns, 0.0, white_parity(target)
+    else:
+        return np.zeros((0, 3))
+    r, c = np.divmod(np.arange(rows * columns), columns)
+    black = (r + c) % 2 != parity
+    x, y = c[black] * target.square_m + start, r[black] * target.square_m + start
+    return np.stack([x, y, np.full(len(x), target.square_m)], -1)
+
+
+def _ink_markers(target: Target) -> list[tuple[Array, NDArray[np.bool_]]]:
+    """Return (top left corner [m] and edge [m] (3,), ink (cells, cells)) of every marker."""
+    if isinstance(target, TagBoard):
+        name, cells = FAMILY_DICTIONARY[target.family], TAG_CELLS[target.family]
+        ids, corners, edge = target.ids, target.corners_board[:, 0, :2], target.tag_size_m
+    elif isinstance(target, CharucoBoard):
+        corners, edge = charuco_markers(target)[:, 0], target.marker_m
+        name, ids = target.dictionary, np.arange(len(corners))
+        cells = int(predefined_dictionary(name).markerSize) + 2
+    else:
+        return []
+    from cv2 import aruco
+
+    dictionary = predefined_dictionary(name)
+    return [
+        (np.array([*p, edge]), aruco.generateImageMarker(dictionary, int(i), cells) == 0)
+        for p, i in zip(corners, ids, strict=True)
+    ]
+
+
+def _ink_dots(target: Target) -> Array:
+    """Return the dots (n, 3): middle and radius [m]."""
+    if not isinstance(target, CircleGrid):
+        return np.zeros((0, 3))
+    near = target.pitch_m * (np.sqrt(2.0) if target.asymmetric else 1.0)
+    radius = np.full(target.rows * target.columns, DOT_SHARE * near)
+    if target.large_origin:
+        radius[0] *= 1.6
+    return np.concatenate([target.points_board[:, :2], radius[:, None]], -1)
+
+
+def draw_target(target: Target) -> tuple[Image, Array]:
+    """Return the printed page and the map (3, 3) from board metres to its pixels."""
+    points = target.points_board[:, :2]
+    edge = getattr(target, "square_m", 0.0) + MARGIN_M
+    low, high = points.min(0) - edge, points.max(0) + edge
+    width, height = np.ceil((high - low) / TEXTURE_M).astype(int)
+    page = np.full((height, width), PAPER, np.uint8)
+    # Page pixel k covers low + [k, k + 1] * TEXTURE_M.
+    x = low[0] + (np.arange(width) + 0.5) * TEXTURE_M
+    y = low[1] + (np.arange(height) + 0.5) * TEXTURE_M
+    for left, top, size in _ink_squares(target):
+        page[_span(y, top, size), _span(x, left, size)] = INK
+    for (left, top, size), ink in _ink_markers(target):
+        rows, columns = _span(y, top, size), _span(x, left, size)
+        r = np.clip((y[rows] - top) / size * len(ink), 0, len(ink) - 1).astype(int)
+        c = np.clip((x[columns] - left) / size * len(ink), 0, len(ink) - 1).astype(int)
+        page[rows, columns] = np.where(ink[np.ix_(r, c)], INK, PAPER)
+    for u, v, radius in _ink_dots(target):
+        rows, columns = _span(y, v - radius, 2 * radius), _span(x, u - radius, 2 * radius)
+        inside = (x[columns] - u) ** 2 + (y[rows, None] - v) ** 2 < radius**2
+        page[rows, columns] = np.where(inside, INK, page[rows, columns])
+    per_m = 1.0 / TEXTURE_M
+    return page, np.array(
+        [[per_m, 0, -low[0] * per_m - 0.5], [0, per_m, -low[1] * per_m - 0.5], [0, 0, 1]]
+    )
+
+
+def _span(centres: Array, start: float, size: float) -> slice:
+    """Return the pixels whose middles lie in [start, start + size)."""
+    a, b = np.searchsorted(centres, [start, start + size])
+    return slice(int(a), int(b))
+
+
+def photograph(
+    target: Target,
+    T_cam_board: Array,
+    rng: np.random.Generator,
+    blur_px: float,
+    noise: float,
+    intrinsics: CameraIntrinsics = CAMERA,
+) -> Image:
+    """Return a picture of the target: 8x8 rays a pixel through the lens, blur, noise."""
+    import cv2
+
+    page, to_page = draw_target(target)
+    image = np.full((intrinsics.height, intrinsics.width), float(TABLE))
+    to_page = to_page @ np.linalg.inv(T_cam_board[:3, [0, 1, 3]])
+    (left, top), (right, bottom) = _extent(page, to_page, intrinsics)
+    for row in range(top, bottom, BLOCK_ROWS):
+        rows, columns = slice(row, min(row + BLOCK_ROWS, bottom)), slice(left, right)
+        image[rows, columns] = _block(page, to_page, intrinsics, rows, columns)
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px))
+    image = image + rng.normal(scale=noise, size=image.shape)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def _extent(page: Image, to_page: Array, intrinsics: CameraIntrinsics) -> Array:
+    """Return the first pixel and the one after the last (2, 2) of the page in the picture."""
+    h, w = page.shape
+    rim = np.linspace(0, 1, 21)
+    ends = [np.stack(np.broadcast_arrays(*p), -1) for p in ((rim, 0), (rim, 1), (0, rim), (1, rim))]
+    xyw = np.c_[np.concatenate(ends) * [w, h], np.ones(84)] @ np.linalg.inv(to_page).T
+    uv = camera.project(intrinsics, xyw)
+    limit = [intrinsics.width, intrinsics.height]
+    return np.clip([np.floor(uv.min(0)) - 2, np.ceil(uv.max(0)) + 3], 0, limit).astype(int)
+
+
+def _block(
+    page: Image, to_page: Array, intrinsics: CameraIntrinsics, rows: slice, columns: slice
+) -> Array:
+    """Return the mean of the rays of a block of pixels."""
+    import cv2
+
+    h, w = rows.stop - rows.start, columns.stop - columns.start
+    corner = np.array([columns.start, rows.start]) - 0.5 + 0.5 / SUPER
+    if intrinsics.is_distorted:
+        # The lens is smooth: rays between the pixels of a coarse grid are interpolated, written out
+        # because the fixed-point remap of OpenCV rounds positions to 1/32 of the grid.
+        gx = np.arange(columns.start - 2.0, columns.stop + 4.0, 2.0)
+        gy = np.arange(rows.start - 2.0, rows.stop + 4.0, 2.0)
+        xy, _ = camera.undistort(intrinsics, np.stack(np.meshgrid(gx, gy), -1))
+        x = (corner[0] + np.arange(w * SUPER) / SUPER - gx[0]) / 2.0
+        y = (corner[1] + np.arange(h * SUPER) / SUPER - gy[0]) / 2.0
+        i, j = x.astype(int), y.astype(int)
+        a, b = (x - i)[:, None], (y - j)[:, None, None]
+        xy = xy[j] * (1 - b) + xy[j + 1] * b
+        xy = xy[:, i] * (1 - a) + xy[:, i + 1] * a
+        p = xy @ to_page[:, :2].T + to_page[:, 2]
+        where = (p[..., :2] / p[..., 2:]).astype(np.float32)
+        fine = cv2.remap(page, where, None, cv2.INTER_NEAREST, borderValue=TABLE)
+    else:
+        ray = np.array([[1 / SUPER, 0, corner[0]], [0, 1 / SUPER, corner[1]], [0, 0, 1]])
+        M = to_page @ np.linalg.inv(intrinsics.K) @ ray
+        flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+        size = (w * SUPER, h * SUPER)
+        fine = cv2.warpPerspective(page, M, size, flags=flags, borderValue=TABLE)
+    return cv2.resize(np.asarray(fine, np.float32), (w, h), interpolation=cv2.INTER_AREA)
+
+
+def look(target: Target, rng: np.random.Generator) -> Array:
+    """Return T_cam_board of a camera 0.5 m from the target's middle, tilted and rolled."""
+    points = target.points_board
+    middle = (points.min(0) + points.max(0)) / 2
+    tilt, azimuth = np.radians(rng.uniform(0, MAX_TILT_DEG)), rng.uniform(0, 2 * np.pi)
+    away = [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)]
+    # The board's z points into the paper: the camera stands on its negative side.
+    T = se3.look_at(middle + DISTANCE_M * np.array(away), middle, rng.uniform(-np.pi, np.pi))
+    return se3.invert(T)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Found:
+    """Errors of one target's points over all views."""
+
+    errors: Array
+    """(n, 2) found minus true [px]."""
+    sd_px: Array
+    """(n,) predicted 1-sigma of a coordinate [px]; NaN where not predicted."""
+    visible: int
+    """Points that were inside the pictures, 5 px from their border."""
+    views: int
+    found_views: int
+    cpu_ms: float
+    """CPU time a picture [ms]."""
+
+    @property
+    def rms_px(self) -> float:
+        """RMS 2-D error [px]."""
+        return float(np.sqrt(np.mean(np.sum(self.errors**2, -1)))) if len(self.errors) else np.nan
+
+    @property
+    def bias_px(self) -> float:
+        """Length of the mean error [px]."""
+        return float(np.linalg.norm(self.errors.mean(0))) if len(self.errors) else np.nan
+
+    @property
+    def row(self) -> dict[str, float]:
+        """The figures by name."""
+        return {
+            "rms_px": self.rms_px,
+            "bias_px": self.bias_px,
+            "found": len(self.errors) / max(self.visible, 1),
+            "views": self.found_views / max(self.views, 1),
+            "sd_ratio": float(np.sqrt(2 * np.mean(self.sd_px**2)) / self.rms_px)
+            if len(self.sd_px)
+            else np.nan,
+            "cpu_ms": self.cpu_ms,
+        }
+
+
+Finder = Callable[[Image, Target], tuple[NDArray[np.int64], Array, Array]]
+
+
+def ours(image: Image, target: Target) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return point numbers, places and predicted sigmas of our own finder."""
+    d = find_target(image, target)
+    return d.point_ids, d.uv, np.full(len(d), np.nan) if d.sd_px is None else d.sd_px
+
+
+def opencv(image: Image, target: Target) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return the same of OpenCV's detectors, each with the refinement that suits it best."""
+    import cv2
+    from cv2 import aruco
+
+    ids, uv = np.zeros(0, np.int64), np.zeros((0, 2))
+    if isinstance(target, TagBoard):
+        parameters = aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+        dictionary = predefined_dictionary(FAMILY_DICTIONARY[target.family])
+        corners, found, _ = aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
+        if found is not None:
+            row = {int(tag): k for k, tag in enumerate(target.ids)}
+            kept = [(row[int(i)], q) for i, q in zip(found.ravel(), corners) if int(i) in row]
+            ids = np.array([4 * r + j for r, _ in kept for j in range(4)], np.int64)
+            uv = np.array([q for _, q in kept], dtype=np.float64).reshape(-1, 2)
+    elif isinstance(target, CharucoBoard):
+        board = aruco.CharucoBoard(
+            (target.columns, target.rows),
+            target.square_m,
+            target.marker_m,
+            predefined_dictionary(target.dictionary),
+        )
+        board.setLegacyPattern(target.legacy)
+        corners, found, _, _ = aruco.CharucoDetector(board).detectBoard(image)
+        if found is not None:
+            ids, uv = np.asarray(found).ravel().astype(np.int64), np.asarray(corners, np.float64)
+    else:
+        shape = (target.columns, target.rows)
+        if isinstance(target, Chessboard):
+            ok, corners = cv2.findChessboardCornersSB(image, shape, flags=cv2.CALIB_CB_ACCURACY)
+        else:
+            flag = (
+                cv2.CALIB_CB_ASYMMETRIC_GRID if target.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
+            )
+            ok, corners = cv2.findCirclesGrid(image, shape, flags=flag)
+        if ok:
+            uv = np.asarray(corners, dtype=np.float64)
+            ids = np.arange(len(uv))
+    return ids, uv.reshape(-1, 2), np.full(len(ids), np.nan)
+
+
+def _ends(target: Target) -> list[NDArray[np.int64]]:
+    """Return the numberings that a finder cannot tell apart."""
+    n = np.arange(len(target.points_board))
+    if isinstance(target, TagBoard | CharucoBoard):
+        return [n]
+    grid = n.reshape(target.rows, target.columns)
+    turns = [np.rot90(g, k) for g in (grid, grid.T) for k in range(4)]
+    return [t.ravel() for t in turns if t.shape == grid.shape]
+
+
+@lru_cache(maxsize=64)
+def _view(kind: str, level: str, seed: int, ideal: bool) -> Image:
+    """Return the picture of a seed; all finders see the same."""
+    rng = np.random.default_rng(seed)
+    T = look(KINDS[kind], rng)
+    return photograph(KINDS[kind], T, rng, *LEVELS[level], CAMERA if ideal else LENS)
+
+
+def measure(
+    kind: str,
+    level: str,
+    seeds: Sequence[int],
+    finder: Finder = ours,
+    *,
+    ideal: bool = True,
+) -> Found:
+    """Return the errors of one kind of target, one view a seed; through LENS where not ideal."""
+    intrinsics = CAMERA if ideal else LENS
+    target, (blur, noise) = KINDS[kind], LEVELS[level]
+    # Our numbering is right but for a half turn; OpenCV's may also start at any other end.
+    ends = _ends(target) if finder is opencv or getattr(target, "half_turn", False) else None
+    errors, sd, visible, found_views, cpu = [], [], 0, 0, 0.0
+    for seed in seeds:
+        T = look(target, np.random.default_rng(seed))
+        image = _view(kind, level, seed, ideal)
+        truth = camera.project(intrinsics, se3.transform(T, target.points_board))
+        limit = [intrinsics.width - 6, intrinsics.height - 6]
+        visible += int(np.all((truth > 5) & (truth < limit), axis=-1).sum())
+        start = time.process_time()
+        ids, uv, sigma = finder(image, target)
+        cpu += time.process_time() - start
+        if not len(ids):
+            continue
+        found_views += 1
+        choices = [uv - truth[end[ids]] for end in (ends or _ends(target)[:1])]
+        errors.append(min(choices, key=lambda e: float(np.sum(e**2))))
+        sd.append(sigma)
+    return Found(
+        errors=np.concatenate(errors) if errors else np.zeros((0, 2)),
+        sd_px=np.concatenate(sd) if sd else np.zeros(0),
+        visible=visible,
+        views=len(seeds),
+        found_views=found_views,
+        cpu_ms=1e3 * cpu / max(len(seeds), 1),
+    )
+
+
+def corner_rms_px(kind: str, level: str, seeds: Sequence[int]) -> float:
+    """Return the RMS 2-D error of a target's points [px]; kinds and levels as in the tables."""
+    return measure(kind, level, seeds).rms_px
+
+
+def main() -> None:
+    """Measure every kind at every level, print the table, write the JSON."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--views", type=int, default=6, help="pictures per kind and level")
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
+    parser.add_argument("--no-opencv", action="store_true", help="skip the comparison")
+    args = parser.parse_args()
+    finders: dict[str, Finder] = {"ours": ours} if args.no_opencv else {
+        "ours": ours, "opencv": opencv
+    }  # fmt: skip
+    figures: dict[str, dict[str, float]] = {}
+    print(f"{'target':20}{'level':10}{'by':8}{'rms px':>8}{'goal':>6}{'bias':>8}{'found':>7}"
+          f"{'views':>7}{'sd/rms':>8}{'ms':>7}")  # fmt: skip
+    for kind in args.kinds:
+        for level in LEVELS:
+            for name, finder in finders.items():
+                row = measure(kind, level, range(args.views), finder).row
+                figures[f"{kind} | {level} | {name}"] = row
+                print(f"{kind:20}{level:10}{name:8}{row['rms_px']:8.3f}{GOAL_PX[level]:6.2f}"
+                      f"{row['bias_px']:8.3f}{row['found']:7.0%}{row['views']:7.0%}"
+                      f"{row['sd_ratio']:8.2f}{row['cpu_ms']:7.0f}")  # fmt: skip
+    if args.json:
+        document = {
+            "benchmark": "corner_accuracy",
+            "machine": {"cpu": platform.machine(), "cores": os.cpu_count()},
+            "versions": {p: version(p) for p in ("numpy", "opencv-python-headless")},
+            "views": args.views,
+            "goals_px": GOAL_PX,
+            "figures": figures,
+        }
+        args.json.write_text(json.dumps(document, indent=1))
+
+
+if __name__ == "__main__":
+    main()

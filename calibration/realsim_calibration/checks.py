@@ -1,0 +1,249 @@
+"""What a person should know of a hand-eye calibration: verdicts, each with a sentence of advice."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import ArmErrorMap, Check
+from realsim_calibration.results import HandEyeReport
+
+Array = NDArray[np.float64]
+Verdict = Literal["good", "warn", "bad", "unknown"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CheckConfig:
+    """From which value on a figure is worth a warning, and from which it is bad."""
+
+    views: tuple[int, int] = (12, 5)
+    """Used views: fewer let the covariance rest on too few of them."""
+    rejected_share: tuple[float, float] = (0.15, 0.4)
+    """Share of views that were dropped."""
+    roll_deg: tuple[float, float] = (60.0, 20.0)
+    """Range of camera roll: without roll the error was 2 to 6 times larger in simulation."""
+    sigma_mm: tuple[float, float] = (1.0, 3.0)
+    """1-sigma of the camera's place."""
+    sigma_deg: tuple[float, float] = (0.1, 0.4)
+    """1-sigma of the camera's direction: 0.1 deg is 0.7 mm at 0.4 m."""
+    unseen_mm: tuple[float, float] = (2.0, 6.0)
+    """Board's place predicted without the view: a UR5e's own errors leave 1 to 2 mm."""
+    optimism: tuple[float, float] = (1.6, 3.0)
+    """Unseen over seen error: beyond, the fit follows single views."""
+    scale_sigmas: float = 3.0
+    """A board size that is off by more than this many sigma ..."""
+    scale: tuple[float, float] = (0.003, 0.02)
+    """... and by this share is another board than the one that was named."""
+    warp_mm: tuple[float, float] = (0.5, 3.0)
+    """Lift of the board's border: glue the print to something flatter."""
+    robot_deg: tuple[float, float] = (0.1, 0.5)
+    """RMS rotation error of the robot's poses."""
+    robot_mm: tuple[float, float] = (1.0, 4.0)
+    """RMS position error of the robot's poses."""
+    joint_offset_deg: tuple[float, float] = (0.05, 0.3)
+    """Zero error of a joint: beyond, the controller's kinematics are nominal, not calibrated."""
+    lens_sigmas: float = 4.0
+    """A lens term this many prior sigma away from the given camera is another camera."""
+
+
+def _verdict(value: float, limits: tuple[float, float], *, high_is_bad: bool = True) -> Verdict:
+    """Return the verdict of a figure."""
+    if not np.isfinite(value):
+        return "unknown"
+    sign = 1.0 if high_is_bad else -1.0
+    if sign * value > sign * limits[1]:
+        return "bad"
+    return "warn" if sign * value > sign * limits[0] else "good"
+
+
+def roll_range_deg(Ts_cam_board: Sequence[Array]) -> float:
+    """Return the range of camera roll about the optical axis [deg]: 360 less the largest gap."""
+    angles = np.sort(np.degrees([np.arctan2(T[1, 0], T[0, 0]) for T in Ts_cam_board]) % 360.0)
+    gaps = np.diff(np.append(angles, angles[0] + 360.0))
+    return float(360.0 - gaps.max())
+
+
+def hand_eye_checks(report: HandEyeReport, config: CheckConfig) -> tuple[Check, ...]:
+    """Return every check of a hand-eye calibration."""
+    return (
+        _motion(report),
+        _views(report, config),
+        _roll(report, config),
+        _sigma(report, config),
+        _held_out(report, config),
+        _optimism(report, config),
+        _scale(report, config),
+        _flatness(report, config),
+        _robot(report, config),
+        *_arm(report, config),
+    )
+
+
+def _advice(verdict: Verdict, text: str) -> str:
+    return "" if verdict == "good" else text
+
+
+def _motion(r: HandEyeReport) -> Check:
+    ratio = f", slides agree within {abs(r.screw_ratio - 1):.1%}" if r.screw_ratio > 0 else ""
+    return Check(
+        name="conventions",
+        verdict="good",
+        sentence=f"hand and camera turn alike (median mismatch {r.mismatch_deg:.2f} deg{ratio}).",
+        value=r.mismatch_deg,
+        unit="deg",
+    )
+
+
+def _views(r: HandEyeReport, c: CheckConfig) -> Check:
+    used, given = len(r.used), len(r.views)
+    verdict = _verdict(used, c.views, high_is_bad=False)
+    share = _verdict(1 - used / given, c.rejected_share)
+    worst: Verdict = max(verdict, share, key=["good", "unknown", "warn", "bad"].index)
+    gone = [v for v in r.views if not v.used]
+    names = "; dropped: " + ", ".join(v.label for v in gone[:6]) if gone else ""
+    more = f" and {len(gone) - 6} more" if len(gone) > 6 else ""
+    return Check(
+        name="views",
+        verdict=worst,
+        sentence=f"{used} of {given} views were used{names}{more}.",
+        advice=_advice(worst, "Take 24 views or more in which the whole target is sharp, and look "
+                       "at the reasons of the dropped ones."),
+        value=used,
+        views=tuple(v.index for v in gone),
+    )  # fmt: skip
+
+
+def _roll(r: HandEyeReport, c: CheckConfig) -> Check:
+    verdict = _verdict(r.roll_range_deg, c.roll_deg, high_is_bad=False)
+    axis = float(1e3 * np.sqrt(r.X_covariance[5, 5]))
+    return Check(
+        name="roll",
+        verdict=verdict,
+        sentence=f"the camera rolls through {r.roll_range_deg:.0f} deg about its optical axis; its "
+        f"place along that axis is known to +-{axis:.2f} mm.",
+        advice=_advice(verdict, f"Roll the hand by {c.roll_deg[0]:g} deg or more between views: it "
+                       "improves the result more than further views do."),
+        value=r.roll_range_deg,
+        unit="deg",
+    )  # fmt: skip
+
+
+def _sigma(r: HandEyeReport, c: CheckConfig) -> Check:
+    verdicts = (_verdict(r.sigma_mm, c.sigma_mm), _verdict(r.sigma_deg, c.sigma_deg))
+    worst: Verdict = max(verdicts, key=["good", "unknown", "warn", "bad"].index)
+    return Check(
+        name="uncertainty",
+        verdict=worst,
+        sentence=f"the camera's place is known to {r.sigma_mm:.2f} mm and {r.sigma_deg:.3f} deg "
+        "(1 sigma, worst axis).",
+        advice=_advice(worst, "Add views: other tilts, other rolls, other distances; `next best "
+                       "view` names the ones that help most."),
+        value=r.sigma_mm,
+        unit="mm",
+    )  # fmt: skip
+
+
+def _held_out(r: HandEyeReport, c: CheckConfig) -> Check:
+    verdict = _verdict(r.held_out_mm, c.unseen_mm)
+    worst = sorted(r.used, key=lambda v: -v.unseen_px)[:3]
+    return Check(
+        name="held-out error",
+        verdict=verdict,
+        sentence=f"views that the fit has not seen are predicted to {r.held_out_px:.2f} px, "
+        f"{r.held_out_mm:.2f} mm and {r.held_out_deg:.3f} deg; worst "
+        + ", ".join(f"{v.label} ({v.unseen_px:.2f} px)" for v in worst) + ".",
+        advice=_advice(verdict, "Is the board fixed, the arm at rest at every picture, the robot's "
+                       "own calibration in use? The views named are where to look."),
+        value=r.held_out_px,
+        unit="px",
+        views=tuple(v.index for v in worst),
+    )  # fmt: skip
+
+
+def _optimism(r: HandEyeReport, c: CheckConfig) -> Check:
+    ratio = r.held_out_px / max(r.seen_px, 1e-9)
+    verdict = _verdict(ratio, c.optimism)
+    return Check(
+        name="overfitting",
+        verdict=verdict,
+        sentence=f"seen views fit to {r.seen_px:.2f} px, unseen ones to {r.held_out_px:.2f} px "
+        f"({ratio:.1f} times).",
+        advice=_advice(verdict, "The fit follows single views: take more."),
+        value=ratio,
+    )  # fmt: skip
+
+
+def _scale(r: HandEyeReport, c: CheckConfig) -> Check:
+    b = r.board
+    sd = float(b.sd[0])
+    off = abs(b.scale - 1)
+    if sd == 0:
+        return Check(name="board size", verdict="unknown", sentence="the board's size was held.")
+    beyond = off > c.scale_sigmas * sd
+    verdict = _verdict(off, c.scale) if beyond else "good"
+    return Check(
+        name="board size",
+        verdict=verdict,
+        sentence=f"by the robot's metres the board is {b.scale:.4f} +-{sd:.4f} times the size "
+        f"given; its height against its width is {1 + b.aspect:.4f}.",
+        advice=_advice(verdict, "Measure the print over several squares with a calliper: printers "
+                       "scale by a percent, and a wrong square size spoils every length."),
+        value=b.scale,
+    )  # fmt: skip
+
+
+def _flatness(r: HandEyeReport, c: CheckConfig) -> Check:
+    verdict = _verdict(r.board.warp_mm, c.warp_mm)
+    return Check(
+        name="board flatness",
+        verdict=verdict,
+        sentence=f"the board bends by up to {r.board.warp_mm:.2f} mm; the fit allows for it.",
+        advice=_advice(verdict, "Glue the print to glass or aluminium."),
+        value=r.board.warp_mm,
+        unit="mm",
+    )
+
+
+def _robot(r: HandEyeReport, c: CheckConfig) -> Check:
+    errors = np.array([v.robot_error for v in r.used])
+    deg = float(np.degrees(np.sqrt(np.mean(np.sum(errors[:, :3] ** 2, -1)))))
+    mm = float(1e3 * np.sqrt(np.mean(np.sum(errors[:, 3:] ** 2, -1))))
+    verdicts = (_verdict(deg, c.robot_deg), _verdict(mm, c.robot_mm))
+    worst: Verdict = max(verdicts, key=["good", "unknown", "warn", "bad"].index)
+    if r.robot_map is None:
+        kind = "no map of it predicts unseen views better"
+    elif isinstance(r.robot_map, ArmErrorMap):
+        kind = "part of it is the arm's joints and links, which are corrected"
+    else:
+        kind = "part of it is smooth and corrected by a map, valid among the poses of these views"
+    return Check(
+        name="robot poses",
+        verdict=worst,
+        sentence=f"the robot's poses are off by {mm:.2f} mm and {deg:.3f} deg (RMS); {kind}.",
+        advice=_advice(worst, "Use the controller's factory-calibrated pose, not a nominal URDF; "
+                       "keep to poses like those calibrated with."),
+        value=mm,
+        unit="mm",
+    )  # fmt: skip
+
+
+def _arm(r: HandEyeReport, c: CheckConfig) -> tuple[Check, ...]:
+    if r.joint_offsets is None:
+        return ()
+    inner = np.degrees(r.joint_offsets[1:5])
+    value = float(np.abs(inner[:, 0]).max())
+    verdict = _verdict(value, c.joint_offset_deg)
+    text = ", ".join(f"{k + 2}: {o:+.3f}+-{s:.3f}" for k, (o, s) in enumerate(inner))
+    return (
+        Check(
+            name="joint zeros",
+            verdict=verdict,
+            sentence=f"zero offsets of joints [deg] {text}.",
+            advice=_advice(verdict, "These look like nominal kinematics: read calibration.conf "
+                           "from the controller."),
+            value=value,
+            unit="deg",
+        ),
+    )  # fmt: skip

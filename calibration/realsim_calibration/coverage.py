@@ -1,0 +1,134 @@
+"""Which part of the image and which directions a calibration has seen, and what is missing."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+
+Array = NDArray[np.float64]
+QUARTERS = ("upper left", "upper right", "lower left", "lower right")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CoverageConfig:
+    """When a part of the image or of the orientations counts as seen."""
+
+    columns: int = 8
+    """Cells across the image: small enough that an empty one matters to the lens."""
+    rows: int = 6
+    """Cells down the image."""
+    good_share: float = 0.8
+    """Share of cells with corners from which on nothing is asked for."""
+    thin_quarter: float = 0.5
+    """A quarter of the image with a smaller share of its cells seen is named."""
+    good_reach: float = 0.9
+    """Distance of the outermost corners from the image's middle, relative to half the diagonal."""
+    good_tilt_deg: float = 20.0
+    """Tilts that the board should reach: without them focal length and distance trade places."""
+    reach_quantile: float = 0.99
+    """Corner whose distance counts as the reach: a single stray corner says little."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Coverage:
+    """Where corners were, and how the board stood."""
+
+    counts: NDArray[np.int64]
+    """(rows, columns) corners in every cell of the image."""
+    share: float
+    """Share of cells with corners."""
+    reach: float
+    """Distance of the outermost corners from the image's middle, relative to half the diagonal."""
+    tilt_deg: Array
+    """(views,) angle between the board's normal and the optical axis [deg]."""
+    tilt_azimuth_deg: Array
+    """(views,) direction in the image that the board's normal points to [deg]."""
+    distance_m: Array
+    """(views,) distance of the board's middle along the optical axis [m]."""
+    normal_spread_deg: float
+    """Largest angle between the board's normals of any two views [deg]."""
+    advice: str
+    """What to add; empty where nothing is missing."""
+
+    @property
+    def distance_ratio(self) -> float:
+        """Largest distance relative to the smallest."""
+        return float(self.distance_m.max() / self.distance_m.min())
+
+
+def measure_coverage(
+    uv: Array, image_size: tuple[int, int], poses: Array, config: CoverageConfig | None = None
+) -> Coverage:
+    """Return the coverage of corners (N, 2) [px] by boards at poses (views, 4, 4) [m].
+
+    Raises:
+        InputError: there is no corner or no view.
+    """
+    config = config or CoverageConfig()
+    uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+    if len(uv) == 0 or len(poses) == 0:
+        raise InputError("coverage: there are no corners; give the views that were detected.")
+    width, height = image_size
+    cells = np.floor((uv + 0.5) / [width / config.columns, height / config.rows]).astype(np.int64)
+    cells = np.clip(cells, 0, [config.columns - 1, config.rows - 1])
+    counts = np.zeros((config.rows, config.columns), dtype=np.int64)
+    np.add.at(counts, (cells[:, 1], cells[:, 0]), 1)
+    middle = (np.array([width, height]) - 1) / 2
+    radius = np.linalg.norm(uv - middle, axis=-1) / np.hypot(width / 2, height / 2)
+    normal = poses[:, :3, 2] * np.where(poses[:, 2:3, 2] > 0, -1.0, 1.0)
+    tilt = np.degrees(np.arccos(np.clip(-normal[:, 2], -1, 1)))
+    share = float(np.mean(counts > 0))
+    reach = float(np.quantile(radius, config.reach_quantile))
+    spread = float(np.degrees(np.arccos(np.clip(np.min(normal @ normal.T), -1, 1))))
+    return Coverage(
+        counts=counts,
+        share=share,
+        reach=reach,
+        tilt_deg=tilt,
+        tilt_azimuth_deg=np.degrees(np.arctan2(normal[:, 1], normal[:, 0])),
+        distance_m=poses[:, 2, 3].copy(),
+        normal_spread_deg=spread,
+        advice=_advice(counts, share, reach, tilt, spread, config),
+    )
+
+
+def _advice(
+    counts: NDArray[np.int64],
+    share: float,
+    reach: float,
+    tilt: Array,
+    spread: float,
+    config: CoverageConfig,
+) -> str:
+    parts: list[str] = []
+    seen = counts > 0
+    r, c = config.rows // 2, config.columns // 2
+    quarters = (seen[:r, :c], seen[:r, c:], seen[r:, :c], seen[r:, c:])
+    shares = [float(q.mean()) for q in quarters]
+    empty = [name for name, s in zip(QUARTERS, shares, strict=True) if s == 0]
+    thin = [n for n, s in zip(QUARTERS, shares, strict=True) if 0 < s < config.thin_quarter]
+    if empty:
+        parts.append(f"There are no corners in the {_list(empty)} quarter of the image.")
+    if thin:
+        parts.append(f"There are few corners in the {_list(thin)} quarter of the image.")
+    if not empty and not thin and share < config.good_share:
+        parts.append(f"Only {share:.0%} of the image has corners.")
+    if reach < config.good_reach:
+        parts.append(
+            f"Corners reach {reach:.0%} of the way to the image's corners: add views with the "
+            "board in the corners, where the distortion is largest."
+        )
+    if float(tilt.max()) < config.good_tilt_deg:
+        parts.append(
+            f"The board is tilted by {float(tilt.max()):.0f} deg at most: tilt it by 30 deg about "
+            "two axes."
+        )
+    elif spread < config.good_tilt_deg:
+        parts.append("All views see the board under the same angle: tilt it to other sides too.")
+    return " ".join(parts)
+
+
+def _list(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]

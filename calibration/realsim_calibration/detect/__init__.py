@@ -1,0 +1,1 @@
+"""Find the points of printed targets in images."""

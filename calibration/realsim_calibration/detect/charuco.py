@@ -1,0 +1,209 @@
+"""Find the inner corners of a ChArUco board: markers say which, the saddles say where."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import CameraIntrinsics
+from realsim.records.targets import CharucoBoard
+from realsim_calibration.detect.homography import (
+    apply_homography,
+    fit_homography,
+    fit_trimmed,
+    seen_from_front,
+)
+from realsim_calibration.detect.images import gray_image, size_of
+from realsim_calibration.detect.markers import decode_markers
+from realsim_calibration.detect.saddles import SaddleConfig, refine_saddles
+from realsim_calibration.views import TargetDetection
+
+Array = NDArray[np.float64]
+REASONS_TOLD = 6
+"""Corners named one by one in `rejected`; the rest is counted."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CharucoConfig:
+    """When a ChArUco corner is good enough to calibrate with."""
+
+    saddles: SaddleConfig = field(default_factory=SaddleConfig)
+    """How corners are measured."""
+    layout_share: float = 0.5
+    """Furthest that a marker's corner may lie from where the others put it, in marker sides."""
+    min_markers: int = 2
+    """Least number of markers that agree: one alone may be chance."""
+    near_markers: int = 6
+    """A corner is expected where the map of so many nearest markers puts it: few, so that the
+    lens does not bend the map."""
+    min_points: int = 4
+    """Fewer corners give no pose."""
+
+
+def charuco_markers(board: CharucoBoard) -> Array:
+    """Return the markers' corners (n, 4, 2) by id [m], clockwise from the top left."""
+    r, c = np.divmod(np.arange(board.rows * board.columns), board.columns)
+    white = (r + c) % 2 == white_parity(board)
+    inset = (board.square_m - board.marker_m) / 2
+    origin = np.stack([c, r], -1)[white] * board.square_m + inset
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float64)
+    return origin[:, None] + square * board.marker_m
+
+
+def white_parity(board: CharucoBoard) -> int:
+    """Return (row + column) % 2 of the white squares: 0 in the old pattern with even rows."""
+    return 0 if board.legacy and board.rows % 2 == 0 else 1
+
+
+def find_charuco(
+    rgb: NDArray[np.uint8],
+    board: CharucoBoard,
+    config: CharucoConfig | None = None,
+    *,
+    intrinsics: CameraIntrinsics | None = None,
+) -> TargetDetection:
+    """Return the inner corners of a ChArUco board that are seen next to a decoded marker.
+
+    Raises:
+        InputError: the image is not 8 bit, or the dictionary is not known.
+    """
+    config = config or CharucoConfig()
+    gray = gray_image(rgb)
+    ids, quads = decode_markers(gray, board.dictionary)
+    good, quads, rejected = _on_board(ids, quads, board, config)
+    ids, quads = ids[good], quads[good]
+    if not len(ids):
+        return _nothing(gray, rejected)
+    point_ids, start, arms = _expected(ids, quads, board, config)
+    row, column = np.divmod(point_ids, board.columns - 1)
+    dark = (row + column) % 2 != white_parity(board)
+    clear = (board.square_m - board.marker_m) / 2 / board.square_m
+    found = refine_saddles(gray, start, arms, dark, clear, config.saddles, intrinsics)
+    rejected += _told(point_ids, found.faults)
+    if found.good.sum() < config.min_points:
+        return _nothing(gray, [*rejected, f"{int(found.good.sum())} corners are too few"])
+    return TargetDetection(
+        point_ids=point_ids[found.good],
+        uv=found.uv[found.good],
+        sd_px=found.sd_px[found.good],
+        image_size=size_of(gray),
+        rejected=tuple(rejected),
+    )
+
+
+def _nothing(gray: NDArray[np.uint8], rejected: list[str]) -> TargetDetection:
+    return TargetDetection(
+        point_ids=np.zeros(0, np.int64),
+        uv=np.zeros((0, 2)),
+        image_size=size_of(gray),
+        rejected=tuple(rejected),
+    )
+
+
+def _told(point_ids: NDArray[np.int64], faults: tuple[str, ...]) -> list[str]:
+    """Return the faults of corners as sentences, the first few one by one."""
+    bad = [(int(i), f) for i, f in zip(point_ids, faults, strict=True) if f]
+    told = [f"corner {i}: {f}" for i, f in bad[:REASONS_TOLD]]
+    if len(bad) > REASONS_TOLD:
+        told.append(f"{len(bad) - REASONS_TOLD} more corners of this kind")
+    return told
+
+
+def _on_board(
+    ids: NDArray[np.int64], quads: Array, board: CharucoBoard, config: CharucoConfig
+) -> tuple[NDArray[np.bool_], Array, list[str]]:
+    """Return which markers (n,) lie where the board has them, their corners as the board counts
+    them, and why others do not."""
+    known = charuco_markers(board)
+    values, counts = np.unique(ids, return_counts=True)
+    twice = np.isin(ids, values[counts > 1])
+    ours = ids < len(known)
+    rejected = [f"marker {i}: not on this board" for i in np.unique(ids[~ours])]
+    rejected += [f"marker {i}: seen more than once" for i in np.unique(ids[twice & ours])]
+    usable = ours & ~twice
+    if usable.sum() < config.min_markers:
+        if usable.any():
+            rejected.append(f"{int(usable.sum())} marker alone may be chance")
+        return np.zeros(len(ids), dtype=bool), quads, rejected
+    side = np.linalg.norm(quads - np.roll(quads, -1, axis=1), axis=-1)
+    limit = config.layout_share * float(np.median(side[usable]))
+    least = max(config.min_markers, int(np.ceil(usable.sum() / 2)))
+    # Some generators print the codes turned on the page; the grid says by how much.
+    for roll in (0, 2, 1, 3):
+        turned = np.roll(quads, roll, axis=1)
+        good = _agreeing(ids, turned, known, usable, limit)
+        if good.sum() >= least:
+            rejected += [
+                f"marker {i}: does not lie where the rest of the board puts it"
+                for i in ids[usable & ~good]
+            ]
+            return good, turned, rejected
+    rejected.append(
+        f"{int(usable.sum())} markers were read, but they do not lie as the board file says"
+        + _remedy(ids, quads, board, usable, limit, least)
+    )
+    return np.zeros(len(ids), dtype=bool), quads, rejected
+
+
+def _agreeing(
+    ids: NDArray[np.int64], quads: Array, known: Array, usable: NDArray[np.bool_], limit: float
+) -> NDArray[np.bool_]:
+    """Return which markers (n,) one map of the plane explains, seen from the printed side."""
+    good = np.zeros(len(ids), dtype=bool)
+    board = known[ids[usable]].reshape(-1, 2)
+    H, inside = fit_trimmed(board, quads[usable].reshape(-1, 2), limit)
+    fits = inside.reshape(-1, 4).all(-1)
+    if fits.any() and seen_from_front(H, board[np.repeat(fits, 4)]):
+        good[usable] = fits
+    return good
+
+
+def _remedy(
+    ids: NDArray[np.int64],
+    quads: Array,
+    board: CharucoBoard,
+    usable: NDArray[np.bool_],
+    limit: float,
+    least: int,
+) -> str:
+    """Return how they do lie, where a usual mistake explains it."""
+    turned = replace(board, rows=board.columns, columns=board.rows)
+    candidates = (
+        (replace(board, legacy=not board.legacy), f"with legacy={not board.legacy}"),
+        (turned, f"with {turned.rows} rows and {turned.columns} columns of squares"),
+        (replace(turned, legacy=not board.legacy),
+         f"with {turned.rows} rows, {turned.columns} columns and legacy={not board.legacy}"),
+    )  # fmt: skip
+    for candidate, how in candidates:
+        known = charuco_markers(candidate)
+        ours = usable & (ids < len(known))
+        if ours.sum() >= least and _agreeing(ids, quads, known, ours, limit).sum() >= least:
+            return f"; {how} they would"
+    return ". Are rows, columns, square and marker size right?"
+
+
+def _expected(
+    ids: NDArray[np.int64], quads: Array, board: CharucoBoard, config: CharucoConfig
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return the inner corners next to a marker (n,), where they should be (n, 2), and the vectors
+    (n, 4, 2) to their neighbours [px]."""
+    known = charuco_markers(board)[ids]
+    middle = known.mean(1)
+    side = board.square_m
+    out: list[int] = []
+    start: list[Array] = []
+    arms: list[Array] = []
+    step = side * np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]], dtype=np.float64)
+    for k, p in enumerate(board.points_board[:, :2]):
+        # A marker next to the corner has its middle half a diagonal off; one more square is far.
+        distance = np.linalg.norm(middle - p, axis=-1)
+        if distance.min() > side:
+            continue
+        near = np.argsort(distance)[: config.near_markers]
+        near = near[distance[near] < 3 * side]
+        H = fit_homography(known[near].reshape(-1, 2), quads[near].reshape(-1, 2))
+        seen = apply_homography(H, p + step)
+        out.append(k)
+        start.append(seen[0])
+        arms.append(seen[1:] - seen[0])
+    return np.array(out, np.int64), np.array(start).reshape(-1, 2), np.array(arms).reshape(-1, 4, 2)

@@ -1,0 +1,258 @@
+"""Find a whole chessboard: OpenCV says which corners, the saddles say where."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import CameraIntrinsics
+from realsim.records.targets import Chessboard
+from realsim_calibration.detect.edges import bilinear
+from realsim_calibration.detect.images import gray_image, size_of
+from realsim_calibration.detect.saddles import SaddleConfig, grid_arms, refine_saddles
+from realsim_calibration.views import TargetDetection
+
+Array = NDArray[np.float64]
+MIN_PART = (3, 3)
+"""Least part of a chessboard that OpenCV looks for, in inner corners."""
+LINE_SHARE = 0.6
+"""Share of a line that must be corners for it to be part of a chessboard."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ChessboardConfig:
+    """When a chessboard is good enough to calibrate with."""
+
+    saddles: SaddleConfig = field(default_factory=SaddleConfig)
+    """How corners are measured."""
+    search_px: int = 1600
+    """Larger images are searched at this width or height first; corners are always measured in the
+    full image."""
+    min_share: float = 0.7
+    """Least share of the corners that must be measurable; fewer mean glare or a wrong grid."""
+    look_for_twins: bool = True
+    """Search once more beside the board found: of two equal boards neither can be trusted."""
+
+
+def find_chessboard(
+    rgb: NDArray[np.uint8],
+    board: Chessboard,
+    config: ChessboardConfig | None = None,
+    *,
+    intrinsics: CameraIntrinsics | None = None,
+) -> TargetDetection:
+    """Return the inner corners of a chessboard that is seen as a whole.
+
+    The first corner is next to a black outer square where the colours tell the ends apart;
+    otherwise x runs along the image's x as closely as the board allows.
+
+    Raises:
+        InputError: the image is not 8 bit.
+    """
+    config = config or ChessboardConfig()
+    gray = gray_image(rgb)
+    grid, fault = _whole(gray, board, config)
+    if grid is None:
+        return _nothing(gray, fault)
+    grid, dark = number_corners(gray, grid)
+    r, c = np.divmod(np.arange(grid.shape[0] * grid.shape[1]), grid.shape[1])
+    found = refine_saddles(
+        gray,
+        grid.reshape(-1, 2),
+        grid_arms(grid).reshape(-1, 4, 2),
+        ((r + c) % 2 == 0) == dark,
+        1.0,
+        config.saddles,
+        intrinsics,
+    )
+    faults = tuple(f"corner {k}: {f}" for k, f in enumerate(found.faults) if f)
+    if found.good.mean() < config.min_share:
+        share = f"{int(found.good.sum())} of {len(r)} corners could be measured"
+        return _nothing(gray, share, *faults[:3])
+    return TargetDetection(
+        point_ids=np.flatnonzero(found.good),
+        uv=found.uv[found.good],
+        sd_px=found.sd_px[found.good],
+        image_size=size_of(gray),
+        rejected=faults,
+    )
+
+
+def _nothing(gray: NDArray[np.uint8], *reasons: str) -> TargetDetection:
+    return TargetDetection(
+        point_ids=np.zeros(0, np.int64),
+        uv=np.zeros((0, 2)),
+        image_size=size_of(gray),
+        rejected=tuple(r for r in reasons if r),
+    )
+
+
+def _whole(
+    gray: NDArray[np.uint8], board: Chessboard, config: ChessboardConfig
+) -> tuple[Array | None, str]:
+    """Return the corners (rows, columns, 2) in an order of the right shape, or what is wrong."""
+    shapes = {(board.rows, board.columns), (board.columns, board.rows)}
+    grid = largest_chessboard(gray, config.search_px)
+    if grid is None or (grid.shape[:2] not in shapes and _fits_in(grid, board)):
+        # A plain search of the exact size finds a few that the other does not.
+        exact = _classic(gray, board)
+        if exact is None:
+            return None, _partly(grid, board)
+        if _goes_on(gray, exact):
+            return None, (
+                f"the chessboard in the picture is larger than {board.columns}x{board.rows} inner "
+                "corners: correct rows and columns"
+            )
+        grid = exact
+    if grid.shape[:2] not in shapes:
+        grid = _without_clutter(gray, grid)
+    if grid.shape[:2] not in shapes:
+        return None, (
+            f"the picture shows a chessboard of {grid.shape[1]}x{grid.shape[0]} inner corners, not "
+            f"of {board.columns}x{board.rows}: correct rows and columns"
+        )
+    if config.look_for_twins:
+        other = largest_chessboard(_covered(gray, grid), config.search_px)
+        if other is not None and other.shape[:2] in shapes:
+            return None, "two equal chessboards are in view: cover one"
+    if grid.shape[:2] != (board.rows, board.columns):
+        grid = grid.transpose(1, 0, 2)
+    return grid, ""
+
+
+def _fits_in(grid: Array, board: Chessboard) -> bool:
+    """Return whether the grid may be a part of the board."""
+    small, large = sorted(grid.shape[:2]), sorted((board.rows, board.columns))
+    return small[0] <= large[0] and small[1] <= large[1]
+
+
+def _partly(grid: Array | None, board: Chessboard) -> str:
+    """Return what was found of a board that is not whole."""
+    total = board.rows * board.columns
+    if grid is None:
+        return f"no chessboard: 0 of {total} inner corners"
+    r, c = grid.shape[:2]
+    return (
+        f"{r * c} of {total} inner corners ({c}x{r} of {board.columns}x{board.rows}): a chessboard "
+        "must be seen whole, with its white margin, and free of glare"
+    )
+
+
+def largest_chessboard(gray: NDArray[np.uint8], search_px: int) -> Array | None:
+    """Return the corners (r, c, 2) of the largest chessboard in view [px], whatever its size."""
+    import cv2
+
+    for small, scale in _sizes(gray, search_px):
+        ok, corners, meta = cv2.findChessboardCornersSBWithMeta(
+            small, MIN_PART, cv2.CALIB_CB_LARGER
+        )
+        if ok:
+            grid = np.asarray(corners, dtype=np.float64).reshape(*np.asarray(meta).shape[:2], 2)
+            return (grid + 0.5) * scale - 0.5
+    return None
+
+
+def _classic(gray: NDArray[np.uint8], board: Chessboard) -> Array | None:
+    """Return the corners (rows, columns, 2) as the older search of one exact size finds them."""
+    import cv2
+
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH + cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB_CB_FAST_CHECK
+    ok, corners = cv2.findChessboardCorners(gray, (board.columns, board.rows), flags=flags)
+    if not ok:
+        return None
+    return np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2)
+
+
+def _sizes(gray: NDArray[np.uint8], search_px: int) -> list[tuple[NDArray[np.uint8], float]]:
+    """Return the image shrunk to at most `search_px`, if it is larger, then as it is; with the
+    size of a pixel."""
+    import cv2
+
+    halvings = int(np.ceil(np.log2(max(gray.shape) / search_px)))
+    if halvings < 1:
+        return [(gray, 1.0)]
+    scale = 2**halvings
+    size = (gray.shape[1] // scale, gray.shape[0] // scale)
+    cut = gray[: size[1] * scale, : size[0] * scale]
+    small = np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    return [(small, float(scale)), (gray, 1.0)]
+
+
+def _covered(gray: NDArray[np.uint8], grid: Array) -> NDArray[np.uint8]:
+    """Return the image with the board painted over, a square's width around it included."""
+    import cv2
+
+    middle = grid.mean((0, 1))
+    rim = np.concatenate([grid[0], grid[-1], grid[:, 0], grid[:, -1]])
+    grown = middle + (rim - middle) * (1 + 2.2 / (min(grid.shape[:2]) - 1))
+    hull = cv2.convexHull(np.rint(grown).astype(np.int32))
+    return np.asarray(
+        cv2.fillPoly(gray.copy(), [np.asarray(hull)], float(np.median(gray))), dtype=np.uint8
+    )
+
+
+def _goes_on(gray: NDArray[np.uint8], grid: Array) -> bool:
+    """Return whether a further line of corners follows on any side."""
+    for turn in range(4):
+        turned = np.rot90(grid, turn)
+        beyond = 2 * turned[0] - turned[1]
+        if _line_share(gray, np.concatenate([beyond[None], turned])) > LINE_SHARE:
+            return True
+    return False
+
+
+def _line_share(gray: NDArray[np.uint8], grid: Array) -> float:
+    """Return the share of the first row (c, 2) of a grid that is corners of a chessboard."""
+    arms = grid_arms(grid)[0]
+    dark = np.arange(len(arms)) % 2 == 0
+    return max(float(refine_saddles(gray, grid[0], arms, d).good.mean()) for d in (dark, ~dark))
+
+
+def _without_clutter(gray: NDArray[np.uint8], grid: Array) -> Array:
+    """Return the grid without outer lines that are no corners: the paper's edge is taken for a
+    line of them."""
+    for turn in range(4):
+        turned = np.rot90(grid, turn)
+        while len(turned) > min(MIN_PART) and _line_share(gray, turned) < LINE_SHARE:
+            turned = turned[1:]
+        grid = np.rot90(turned, -turn)
+    return grid
+
+
+def number_corners(gray: NDArray[np.uint8], grid: Array) -> tuple[Array, bool]:
+    """Return the corners (rows, columns, 2) numbered clockwise as seen, and whether the square
+    between the first corner's +x and +y is dark.
+
+    Of the numberings that keep the shape, those are left out that are mirrored, then those that
+    begin at a white square, if one begins at a black one; then x goes along the image's x.
+    """
+    choices: list[tuple[bool, float, Array]] = []
+    for turned in _same_shape(grid):
+        x, y = turned[0, -1] - turned[0, 0], turned[-1, 0] - turned[0, 0]
+        if x[0] * y[1] - x[1] * y[0] <= 0:
+            continue
+        choices.append((_first_is_dark(gray, turned), float(x[0] / np.linalg.norm(x)), turned))
+    dark, _, best = max(choices, key=lambda choice: choice[:2])
+    return best, dark
+
+
+def _same_shape(grid: Array) -> list[Array]:
+    """Return the numberings of a grid (r, c, 2) with as many rows and columns."""
+    turns = [np.rot90(g, k) for g in (grid, grid[:, ::-1]) for k in range(4)]
+    return [g for g in turns if g.shape == grid.shape]
+
+
+def _first_is_dark(gray: NDArray[np.uint8], grid: Array) -> bool:
+    """Return whether the squares of the first one's colour are the dark ones."""
+    middle = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    level = bilinear(gray.astype(np.float64), middle)
+    r, c = np.indices(level.shape)
+    even = (r + c) % 2 == 0
+    # Neighbours are compared, because light may fall off across the board.
+    step = np.concatenate(
+        [
+            (np.diff(level, axis=0) * np.where(even[:-1], 1, -1)).ravel(),
+            (np.diff(level, axis=1) * np.where(even[:, :-1], 1, -1)).ravel(),
+        ]
+    )
+    return bool(step.mean() > 0)

@@ -1,0 +1,269 @@
+"""Find a whole grid of dots, number it, and measure where the dots' middles are seen."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import CameraIntrinsics
+from realsim.records.targets import CircleGrid
+from realsim_calibration.detect.edges import bend, straighten
+from realsim_calibration.detect.ellipses import (
+    DotConfig,
+    Dots,
+    find_blobs,
+    outline_bias,
+    refine_dots,
+)
+from realsim_calibration.detect.homography import apply_homography, fit_homography, seen_from_front
+from realsim_calibration.detect.images import gray_image, size_of
+from realsim_calibration.detect.lattice import Laid, grow_lattice, lay_pattern
+from realsim_calibration.views import TargetDetection
+
+Array = NDArray[np.float64]
+BIAS_ROUNDS = 2
+"""Map, bias, map without bias: the second bias differs from the third by 1e-4 px."""
+MIN_CUBIC = 30
+"""Dots from which the ten terms of a cubic are taken; fewer follow the noise."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CirclesConfig:
+    """When a circle grid is good enough to calibrate with."""
+
+    dots: DotConfig = field(default_factory=DotConfig)
+    """What counts as a dot, and how it is measured."""
+    large_area: float = 1.6
+    """Least area of the large origin dot in others' areas."""
+    max_misfit: float = 0.25
+    """Furthest that a dot may lie from where one map of the plane puts it, in pitches: the lens
+    bends a grid by less, a wrong lattice is off by more."""
+    min_share: float = 0.7
+    """Least share of the dots that must be measurable."""
+
+
+def grid_nodes(grid: CircleGrid) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
+    """Return the dots as nodes (n, 2) of a lattice whose steps run clockwise, and the further lines
+    that a larger grid would have."""
+
+    def nodes(r: NDArray[np.int64], c: NDArray[np.int64]) -> NDArray[np.int64]:
+        if not grid.asymmetric:
+            return np.stack([c, r], -1)
+        # The steps of the lattice are (1, 1) and (-1, 1).
+        x, y = 2 * c + r % 2, r
+        return np.stack([(x + y) // 2, (y - x) // 2], -1)
+
+    rows, columns = np.arange(grid.rows), np.arange(grid.columns)
+    beyond = [nodes(np.full_like(columns, r), columns) for r in (-1, grid.rows)]
+    beyond += [nodes(rows, np.full_like(rows, c)) for c in (-1, grid.columns)]
+    r, c = np.divmod(np.arange(grid.rows * grid.columns), grid.columns)
+    return nodes(r, c), beyond
+
+
+def find_circles(
+    rgb: NDArray[np.uint8],
+    grid: CircleGrid,
+    config: CirclesConfig | None = None,
+    *,
+    intrinsics: CameraIntrinsics | None = None,
+) -> TargetDetection:
+    """Return the middles of a circle grid that is seen as a whole, dark dots or bright ones.
+
+    The first dot is the large one where the grid has one; otherwise x runs along the image's x as
+    closely as the grid allows. Perspective and, with intrinsics, the lens are taken out of the
+    ellipses' middles.
+
+    Raises:
+        InputError: the image is not 8 bit.
+    """
+    config = config or CirclesConfig()
+    gray = gray_image(rgb)
+    reasons: list[str] = []
+    for image in (gray, 255 - gray):
+        detection, reason = _of_one_shade(image, grid, config, intrinsics)
+        if detection is not None:
+            return detection
+        reasons.append(reason)
+    # The shade that shows more dots explains more.
+    reason = max(reasons, key=_dots_told)
+    return TargetDetection(
+        point_ids=np.zeros(0, np.int64),
+        uv=np.zeros((0, 2)),
+        image_size=size_of(gray),
+        rejected=(reason,),
+    )
+
+
+def _dots_told(reason: str) -> int:
+    first = reason.split(" ", 1)[0]
+    return int(first) if first.isdigit() else 10**6
+
+
+def _of_one_shade(
+    gray: NDArray[np.uint8],
+    grid: CircleGrid,
+    config: CirclesConfig,
+    intrinsics: CameraIntrinsics | None,
+) -> tuple[TargetDetection | None, str]:
+    """Return the grid of dark dots, or why there is none."""
+    middles, axes = find_blobs(gray, config.dots)
+    lattice = grow_lattice(middles)
+    pattern, beyond = grid_nodes(grid)
+    total = len(pattern)
+    laid = lay_pattern(lattice, pattern, beyond)
+    if not laid or laid[0].seen < total:
+        return None, _partly(lattice, laid, grid)
+    if all(one.larger for one in laid):
+        return None, (
+            f"the grid of dots in the picture is larger than {grid.columns}x{grid.rows}: correct "
+            "rows and columns"
+        )
+    laid = [one for one in laid if not one.larger]
+    rest = np.setdiff1d(np.arange(len(middles)), laid[0].points)
+    second = lay_pattern(grow_lattice(middles[rest]), pattern, beyond)
+    if second and second[0].seen == total:
+        return None, "two equal circle grids are in view: cover one"
+    board = grid.points_board[:, :2]
+    points, reason = _numbered(laid, middles, axes, board, (grid, config))
+    if points is None:
+        mirror = lay_pattern(lattice, pattern, beyond, mirrored=True)
+        if grid.large_origin and mirror and mirror[0].seen == total:
+            other, _ = _numbered(mirror, middles, axes, board, (grid, config))
+            if other is not None:
+                reason = "the large dot is at the wrong corner: is the picture mirrored?"
+        return None, reason
+    middles, axes = middles[points], axes[points]
+    dots = refine_dots(gray, middles, axes, _gaps(middles, axes), config.dots)
+    return _measured(gray, dots, grid, config, intrinsics)
+
+
+def _partly(lattice: dict[tuple[int, int], int], laid: list[Laid], grid: CircleGrid) -> str:
+    """Return what was found of a grid that is not whole."""
+    total, seen = grid.rows * grid.columns, laid[0].seen if laid else 0
+    text = f"{seen} of {total} dots of the {grid.columns}x{grid.rows} grid"
+    if seen < len(lattice):
+        other = replace(grid, asymmetric=not grid.asymmetric)
+        nodes, beyond = grid_nodes(other)
+        fits = lay_pattern(lattice, nodes, beyond)
+        if fits and fits[0].seen == total:
+            return f"{text}; with asymmetric={other.asymmetric} all would fit"
+    turned = replace(grid, rows=grid.columns, columns=grid.rows)
+    fits = lay_pattern(lattice, *grid_nodes(turned))
+    if fits and fits[0].seen == total:
+        return f"{text}; with {turned.rows} rows and {turned.columns} columns all would fit"
+    return f"{text}: a circle grid must be seen whole, free of glare, and its dots must not touch"
+
+
+def _numbered(
+    laid: list[Laid],
+    middles: Array,
+    axes: Array,
+    board: Array,
+    how: tuple[CircleGrid, CirclesConfig],
+) -> tuple[NDArray[np.int64] | None, str]:
+    """Return the point of every dot, or why none of the numberings will do."""
+    grid, config = how
+    best: tuple[float, NDArray[np.int64]] | None = None
+    ratios: list[float] = []
+    for one in laid:
+        uv = middles[one.points]
+        H = fit_homography(board, uv)
+        misfit = np.linalg.norm(apply_homography(H, board) - uv, axis=-1).max()
+        step = float(np.linalg.norm(apply_homography(H, board[0] + _right(grid)) - uv[0]))
+        if misfit > config.max_misfit * step:
+            continue
+        # A dot's area on the board: the image's, over the map's derivative.
+        w = np.concatenate([board, np.ones((len(board), 1))], -1) @ H[2]
+        area = np.abs(np.linalg.det(axes[one.points]) * w**3 / np.linalg.det(H))
+        ratio = float(area[0] / np.median(area))
+        ratios.append(ratio)
+        along = apply_homography(H, board.mean(0) + _right(grid)) - apply_homography(
+            H, board.mean(0)
+        )
+        score = ratio if grid.large_origin else float(along[0] / np.linalg.norm(along))
+        if best is None or score > best[0]:
+            best = (score, one.points)
+    if best is None:
+        return None, "the dots do not lie on one flat grid"
+    if grid.large_origin and best[0] < config.large_area:
+        return None, (
+            f"no dot that can be the first is larger than the others (its area is "
+            f"{max(ratios):.2f} of theirs, at least {config.large_area:g} is expected): is "
+            "large_origin right?"
+        )
+    return best[1], ""
+
+
+def _right(grid: CircleGrid) -> Array:
+    return np.array([grid.pitch_m, 0.0])
+
+
+def _gaps(middles: Array, axes: Array) -> Array:
+    """Return the white space (n,) between a dot and the nearest [px]."""
+    radius = np.linalg.eigvalsh(axes)[:, 1]
+    apart = np.linalg.norm(middles[:, None] - middles[None], axis=-1)
+    apart = apart - radius[:, None] - radius[None]
+    np.fill_diagonal(apart, np.inf)
+    return apart.min(1)
+
+
+def _measured(
+    gray: NDArray[np.uint8],
+    dots: Dots,
+    grid: CircleGrid,
+    config: CirclesConfig,
+    intrinsics: CameraIntrinsics | None,
+) -> tuple[TargetDetection | None, str]:
+    """Return the detection, the bias of the ellipses' middles taken out."""
+    good = np.array([not f for f in dots.faults], dtype=bool)
+    faults = tuple(f"dot {k}: {f}" for k, f in enumerate(dots.faults) if f)
+    if good.mean() < config.min_share:
+        return None, f"{int(good.sum())} of {len(good)} dots could be measured; {faults[0]}"
+    board = grid.points_board[:, :2]
+    ids = np.flatnonzero(good)
+    uv = middles = dots.uv[good]
+    for _ in range(BIAS_ROUNDS):
+        H = fit_homography(board[good], straighten(intrinsics, uv))
+        if not seen_from_front(H, board):
+            return None, "the dots are numbered mirror-wise: is the picture mirrored?"
+        to_image = _to_image(H, board[good], uv, intrinsics)
+        uv = middles - outline_bias(to_image, board[good], _radii(H, dots, grid)[good])
+    return (
+        TargetDetection(
+            point_ids=ids,
+            uv=uv,
+            sd_px=dots.sd_px[good],
+            image_size=size_of(gray),
+            rejected=faults,
+        ),
+        "",
+    )
+
+
+def _to_image(
+    H: Array, board: Array, uv: Array, intrinsics: CameraIntrinsics | None
+) -> Callable[[Array], Array]:
+    """Return the map of board points into the image: through the lens where it is known, else with
+    a cubic in place of it."""
+    if intrinsics is not None or len(board) < MIN_CUBIC:
+        return lambda points: bend(intrinsics, apply_homography(H, points))
+    middle, size = board.mean(0), np.ptp(board, axis=0).max() / 2
+
+    def terms(points: Array) -> Array:
+        x, y = np.moveaxis((points - middle) / size, -1, 0)
+        return np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], -1)
+
+    w = np.linalg.lstsq(terms(board), uv - apply_homography(H, board), rcond=None)[0]
+    return lambda points: apply_homography(H, points) + terms(points) @ w
+
+
+def _radii(H: Array, dots: Dots, grid: CircleGrid) -> Array:
+    """Return the dots' radii on the board (n,) [m]: one for all, the large dot's its own."""
+    board = grid.points_board[:, :2]
+    w = np.concatenate([board, np.ones((len(board), 1))], -1) @ H[2]
+    each = np.sqrt(dots.area / np.pi * np.abs(w**3 / np.linalg.det(H)))
+    radii = np.full(len(board), float(np.median(each)))
+    if grid.large_origin:
+        radii[0] = each[0]
+    return radii

@@ -1,0 +1,279 @@
+"""Dots: find dark ellipses, measure their outlines to a few hundredths of a pixel.
+
+The middle of the ellipse is not where the dot's middle is seen: perspective and the lens move it.
+`outline_bias` says by how much, for a given map of the board into the image.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim_calibration.detect.edges import bilinear, fit_blurred_steps
+from realsim_calibration.detect.small_dots import fit_small_dots
+
+Array = NDArray[np.float64]
+NO_PATTERN_PX = 1e3
+"""Distance of the next edge behind a dot's edge: beyond any profile [px]."""
+MIN_OUTLINE = 6
+"""Least number of pixels around a dot."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DotConfig:
+    """What counts as a dot, and how its outline is measured."""
+
+    min_radius_px: float = 1.8
+    """Shortest half axis of a dot [px]: below it the blur has eaten it."""
+    max_area_share: float = 0.02
+    """Largest dot as a share of the image."""
+    max_misfit: float = 0.12
+    """How far area and second moments may depart from an ellipse's; small dots are ragged."""
+    max_flatness: float = 4.5
+    """Longest half axis in shortest ones: a dot seen at 77 deg."""
+    windows: tuple[float, ...] = (0.02, 0.06, 0.18)
+    """Windows of the local threshold as shares of the longer image side, small dots to large."""
+    threshold: float = 8.0
+    """A dot is darker than its window's mean by this [gray levels of 255]."""
+    profiles: int = 32
+    """Gray profiles about a dot; a multiple of four."""
+    samples: int = 13
+    """Samples per profile."""
+    half_window_px: float = 3.5
+    """Longest reach of a profile [px]."""
+    min_half_window_px: float = 1.5
+    """Shortest reach of a profile [px]."""
+    radius_share: float = 0.85
+    """Reach of a profile in shortest half axes: the opposite edge stays out of view."""
+    passes: int = 3
+    """Measure about the refined outline this often."""
+    outlier_sigmas: float = 3.0
+    """Edge points further than this off the ellipse are dropped."""
+    residual_floor_px: float = 0.03
+    """Least scatter for the outlier rule [px]."""
+    independent_px: float = 1.3
+    """Profiles closer than this share their noise [px]; enters the predicted error alone."""
+    min_contrast: float = 15.0
+    """Least step across the outline [gray levels of 255]."""
+    max_residual_px: float = 0.6
+    """Largest scatter of the outline about the ellipse [px]: beyond it the dot is covered."""
+    small_px: float = 12.0
+    """Dots up to this half axis are fitted to all their pixels, larger ones by their outline, where
+    the gain is small and the cost is not [px]."""
+    max_apart_px: float = 0.7
+    """Furthest that the two fits' middles may lie apart [px]: more, and the dot is covered."""
+    smoothing_px: float = 0.8
+    """Sigma of the smoothing before dots are looked for [px]: noise makes specks otherwise."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Dots:
+    """Ellipses c + A (cos, sin) with symmetric A, and how well they were seen."""
+
+    uv: Array
+    """(n, 2) middles of the ellipses [px]."""
+    axes: Array
+    """(n, 2, 2) A [px]."""
+    sd_px: Array
+    """(n,) predicted 1-sigma of a coordinate [px]."""
+    faults: tuple[str, ...]
+    """(n,) why a dot cannot be used, '' where it can."""
+
+    @property
+    def area(self) -> Array:
+        """(n,) [px^2]."""
+        return np.pi * np.abs(np.linalg.det(self.axes))
+
+
+def find_blobs(gray: NDArray[np.uint8], config: DotConfig) -> tuple[Array, Array]:
+    """Return middles (n, 2) and axes (n, 2, 2) of dark ellipses in an image, roughly [px]."""
+    import cv2
+
+    found: list[tuple[float, Array, Array]] = []
+    gray = np.asarray(cv2.GaussianBlur(gray, (0, 0), config.smoothing_px), dtype=np.uint8)
+    for window in config.windows:
+        block = max(5, 2 * round(window * max(gray.shape) / 2) + 1)
+        dark = cv2.adaptiveThreshold(
+            gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, block, config.threshold
+        )
+        # Two levels: outlines of dark regions have no parent, outlines of holes in them have one.
+        contours, tree = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+        most = config.max_area_share * gray.size
+        for contour, (_, _, _, parent) in zip(contours, [] if tree is None else tree[0]):
+            if parent >= 0 or len(contour) < MIN_OUTLINE:
+                continue
+            blob = _ellipse_of(cv2.moments(contour), most, config)
+            if blob is not None:
+                found.append(blob)
+    found.sort(key=lambda blob: blob[0])
+    middles, axes = np.zeros((0, 2)), np.zeros((0, 2, 2))
+    for _, middle, A in found:
+        reach = np.sqrt(abs(np.linalg.det(A)))
+        if not len(middles) or np.linalg.norm(middles - middle, axis=-1).min() > 0.7 * reach:
+            middles, axes = np.vstack([middles, middle]), np.vstack([axes, A[None]])
+    return middles, axes
+
+
+def _ellipse_of(
+    m: dict[str, float], most: float, config: DotConfig
+) -> tuple[float, Array, Array] | None:
+    """Return (misfit, middle, A) of the ellipse with the moments of an outline, None if it is
+    no ellipse."""
+    area = m["m00"]
+    if not (0.5 * np.pi * config.min_radius_px**2 < area < most):
+        return None
+    C = np.array([[m["mu20"], m["mu11"]], [m["mu11"], m["mu02"]]]) / area
+    small, large = np.linalg.eigvalsh(C)
+    if small <= 0 or large > config.max_flatness**2 * small:
+        return None
+    misfit = abs(area / (4 * np.pi * np.sqrt(small * large)) - 1)
+    # The outline runs through pixel centres, so that the dot is half a pixel larger.
+    axes = 2 * np.sqrt([small, large]) + 0.5
+    if misfit > config.max_misfit or axes[0] < config.min_radius_px:
+        return None
+    V = np.linalg.eigh(C)[1]
+    return misfit, np.array([m["m10"], m["m01"]]) / area, (V * axes) @ V.T
+
+
+def refine_dots(
+    gray: NDArray[np.uint8], middles: Array, axes: Array, gap: Array, config: DotConfig
+) -> Dots:
+    """Return the dots' outlines, to a few hundredths of a pixel.
+
+    Args:
+        gray: (H, W) image.
+        middles: (n, 2) rough middles [px].
+        axes: (n, 2, 2) rough A of c + A (cos, sin) [px].
+        gap: (n,) white space to the next dot [px].
+        config: how outlines are measured.
+    """
+    image = gray.astype(np.float64)
+    n, m = len(middles), config.profiles // 4
+    uv, A = middles.copy(), axes.copy()
+    angle = np.linspace(0, 2 * np.pi, 4 * m, endpoint=False)
+    u = np.stack([np.cos(angle), np.sin(angle)], -1)
+    blur = None
+    rms, share, sd, contrast = (np.zeros(n) for _ in range(4))
+    for _ in range(config.passes):
+        normal = u @ np.linalg.inv(A)
+        normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        foot = uv[:, None] + u @ A
+        radius = np.linalg.eigvalsh(A)[:, 0]
+        reach = np.minimum(config.radius_share * radius, 0.5 * gap)
+        reach = np.clip(reach, config.min_half_window_px, config.half_window_px)
+        t = np.linspace(-1.0, 1.0, config.samples) * reach[:, None]
+        profiles = bilinear(image, foot[:, :, None] + t[:, None, :, None] * normal[:, :, None])
+        t4 = np.repeat(t[:, None], 4, axis=1)
+        far = np.full((n, 4), NO_PATTERN_PX)
+        shift, step, blur = fit_blurred_steps(
+            t4, profiles.reshape(n, 4, m, config.samples), far, blur
+        )
+        shift, step = shift.reshape(n, 4 * m), step.reshape(n, 4 * m)
+        contrast = np.median(step, axis=-1)
+        usable = (np.abs(shift) < 0.9 * reach[:, None]) & (step > 0.3 * contrast[:, None])
+        change, weight, rms = _fit_change(u, normal, shift, usable, config)
+        uv = uv + change[:, :2]
+        A = A + _symmetric(change[:, 2:])
+        share = weight.mean(-1)
+        independent = np.minimum(weight.sum(-1), 2 * np.pi * radius / config.independent_px)
+        sd = rms * np.sqrt(2.0 / np.maximum(independent, 1.0))
+    assert blur is not None
+    faults = list(_faults(uv, middles, A, (rms, share, contrast), gray.shape, config))
+    small = np.array([not f for f in faults], dtype=bool)
+    small &= np.linalg.eigvalsh(A)[:, 1] <= config.small_px
+    if small.any():
+        k = np.flatnonzero(small)
+        margin = np.clip(0.5 * gap[k], config.min_half_window_px, config.half_window_px)
+        fit = fit_small_dots(image, uv[k], A[k], blur[k], margin)
+        apart = np.linalg.norm(fit.uv - uv[k], axis=-1)
+        for i in np.flatnonzero(~(apart <= config.max_apart_px)):
+            faults[k[i]] = f"outline and inside disagree by {apart[i]:.1f} px: covered?"
+        kept = apart <= config.max_apart_px
+        uv[k[kept]], A[k[kept]], sd[k[kept]] = fit.uv[kept], fit.axes[kept], fit.sd_px[kept]
+    return Dots(uv=uv, axes=A, sd_px=sd, faults=tuple(faults))
+
+
+def _symmetric(c: Array) -> Array:
+    """Return symmetric matrices (n, 2, 2) of xx, xy, yy (n, 3)."""
+    return np.stack([np.stack([c[:, 0], c[:, 1]], -1), np.stack([c[:, 1], c[:, 2]], -1)], 1)
+
+
+def _fit_change(
+    u: Array, normal: Array, shift: Array, usable: NDArray[np.bool_], config: DotConfig
+) -> tuple[Array, Array, Array]:
+    """Return the change (n, 5) of middle and A that moves the outline by `shift` along its
+    normals, weights (n, m) 0 or 1, and the RMS that remains (n,) [px]."""
+    nx, ny = normal[..., 0], normal[..., 1]
+    J = np.stack([nx, ny, nx * u[:, 0], nx * u[:, 1] + ny * u[:, 0], ny * u[:, 1]], -1)
+    weight = usable.astype(np.float64)
+    change, residual = np.zeros((len(shift), 5)), shift
+    for _ in range(3):
+        Jw = J * weight[..., None]
+        H = np.swapaxes(Jw, 1, 2) @ J + 1e-9 * np.eye(5)
+        change = np.linalg.solve(H, np.swapaxes(Jw, 1, 2) @ shift[..., None])[..., 0]
+        residual = shift - (J @ change[..., None])[..., 0]
+        scale = 1.4826 * np.median(np.abs(residual), axis=-1, keepdims=True)
+        scale = np.maximum(scale, config.residual_floor_px)
+        weight = (usable & (np.abs(residual) <= config.outlier_sigmas * scale)).astype(np.float64)
+    rms = np.sqrt((weight * residual**2).sum(-1) / np.maximum(weight.sum(-1) - 5, 1.0))
+    return np.clip(change, -2.0, 2.0), weight, rms
+
+
+def _faults(
+    uv: Array,
+    start: Array,
+    A: Array,
+    seen: tuple[Array, Array, Array],
+    shape: tuple[int, ...],
+    config: DotConfig,
+) -> tuple[str, ...]:
+    """Return why each dot cannot be used, '' where it can."""
+    rms, share, contrast = seen
+    small, large = np.linalg.eigvalsh(A).T
+    limit = np.array([shape[1] - 1, shape[0] - 1])
+    faults: list[str] = []
+    for k in range(len(uv)):
+        x_reach = np.linalg.norm(A[k], axis=-1)
+        inside = bool(np.all(uv[k] - x_reach >= 0) and np.all(uv[k] + x_reach <= limit))
+        moved = float(np.linalg.norm(uv[k] - start[k]))
+        # Written as "is it good", so that a NaN is a fault.
+        checks = (
+            (inside, "cut by the image border"),
+            (contrast[k] >= config.min_contrast,
+             f"low contrast: {contrast[k]:.0f} levels (at least {config.min_contrast:g})"),
+            (small[k] >= 0.7 * config.min_radius_px, "too small"),
+            (share[k] >= 0.6, f"covered or broken: {share[k]:.0%} of its outline fits"),
+            (rms[k] <= config.max_residual_px,
+             f"outline scatters by {rms[k]:.2f} px (at most {config.max_residual_px:g})"),
+            (moved <= 0.5 * large[k], f"outline lies {moved:.1f} px from the blob"),
+        )  # fmt: skip
+        faults.append(next((reason for good, reason in checks if not good), ""))
+    return tuple(faults)
+
+
+def outline_bias(to_image: Callable[[Array], Array], middles: Array, radius: Array) -> Array:
+    """Return (n, 2) by how much the fitted ellipse's middle is off the image of the dot's [px].
+
+    Args:
+        to_image: the map of board points (..., 2) into pixels, lens and all.
+        middles: (n, 2) the dots' middles on the board [m].
+        radius: (n,) their radii [m].
+    """
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = np.stack([np.cos(angle), np.sin(angle)], -1)
+    seen = to_image(middles[:, None] + radius[:, None, None] * ring)
+    true = to_image(middles)
+    return _conic_middles(seen - true[:, None])
+
+
+def _conic_middles(points: Array) -> Array:
+    """Return the middles (n, 2) of the conics a x^2 + b xy + c y^2 + d x + e y = 1 that fit points
+    (n, m, 2) about the origin best."""
+    scale = np.abs(points).max(axis=(1, 2), keepdims=True)
+    x, y = np.moveaxis(points / scale, -1, 0)
+    J = np.stack([x * x, x * y, y * y, x, y], -1)
+    Jt = np.swapaxes(J, 1, 2)
+    a, b, c, d, e = np.linalg.solve(Jt @ J, Jt.sum(-1)[..., None])[..., 0].T
+    det = 4 * a * c - b * b
+    return np.stack([b * e - 2 * c * d, b * d - 2 * a * e], -1) / det[:, None] * scale[:, 0]

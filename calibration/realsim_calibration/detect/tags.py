@@ -1,0 +1,232 @@
+"""Find the AprilTags of a board in an image, with corners to a few hundredths of a pixel.
+
+OpenCV's detector finds and decodes the quads; their corners are then measured anew from the edges
+(`edges`). Corners run clockwise from the top left of the tag as printed, as in
+`TagBoard.corners_board`, and integer pixels are pixel centres (the AprilTag libraries are half a
+pixel off that in both axes).
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.records import CameraIntrinsics, TagBoard
+from realsim.records.targets import TAG_CELLS
+from realsim_calibration.detect.edges import EdgeConfig, RefinedQuads, refine_quads
+from realsim_calibration.detect.guided_tags import read_missing_tags
+from realsim_calibration.detect.images import gray_image
+from realsim_calibration.detect.markers import FAMILY_DICTIONARY, decode_markers
+from realsim_calibration.detect.tag_layout import check_layout
+
+Array = NDArray[np.float64]
+WEAK_FAMILIES = ("tag16h5",)
+"""Families whose codes turn up by chance in any picture: one tag of a board proves nothing."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DetectionConfig:
+    """When a tag is good enough to calibrate with."""
+
+    edges: EdgeConfig = field(default_factory=EdgeConfig)
+    """How the tags' edges are measured."""
+    square_cut_px: float = 4.0
+    """Stretch at the ends of a side that is not sampled where a black square touches the tag's
+    corner [px]: twice a strong blur and more."""
+    square_move_share: float = 0.08
+    """Furthest that refinement may move a corner there, in tag sides: the rough outline runs on
+    into the square, by less than a module."""
+    layout_share: float = 0.5
+    """Furthest that a corner may lie from where the rest of the board puts it, in tag sides; a
+    strong lens bends a board by 0.2, a wrong tag is off by more than one."""
+    min_side_px: float = 16.0
+    """Shortest side [px]: below two pixels per module the border no longer separates the edge
+    from the pattern."""
+    min_contrast: float = 25.0
+    """Least step across an edge [gray levels of 255]; noise of 4 levels then stays under 0.2 px."""
+    max_residual_px: float = 0.35
+    """Largest scatter of edge points about the lines [px]: beyond it the side is bent or
+    covered."""
+    min_inlier_share: float = 0.5
+    """Least share of the profiles that must carry each side."""
+    max_move_px: float = 3.0
+    """Furthest that refinement may move a corner [px]; more means it found another edge."""
+
+
+def _per_tag(value: ArrayLike | None, n: int, name: str) -> Array:
+    """Return (n,) read-only numbers, NaN where nothing was measured."""
+    array = np.full(n, np.nan) if value is None else np.array(value, dtype=np.float64)
+    if array.shape != (n,):
+        raise InputError(f"tag detections: {name} has shape {array.shape} for {n} tags.")
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class TagDetections:
+    """The tags seen in one image, sorted by id."""
+
+    ids: NDArray[np.int64]
+    """(n,) tag ids, ascending."""
+    corners_px: Array
+    """(n, 4, 2) corners, clockwise from the top left as printed [px]."""
+    sharpness_px: Array | None = None
+    """(n,) sigma of the blurred edge [px]; small is sharp. NaN = not measured."""
+    contrast: Array | None = None
+    """(n,) step across the edges [gray levels of 255]."""
+    residual_px: Array | None = None
+    """(n,) RMS distance of the edge points to their lines [px]."""
+    corner_sd_px: Array | None = None
+    """(n,) predicted 1-sigma of a corner [px]."""
+    rejected: tuple[tuple[int, str], ...] = ()
+    """(tag id, reason) of every decoded tag that was not used."""
+
+    def __post_init__(self) -> None:
+        """Sort by id, check shapes, freeze."""
+        ids = np.array(self.ids, dtype=np.int64).ravel()
+        corners = np.array(self.corners_px, dtype=np.float64).reshape(-1, 4, 2)
+        if len(ids) != len(corners):
+            raise InputError(f"tag detections: {len(ids)} ids for {len(corners)} tags.")
+        if len(set(ids.tolist())) != len(ids):
+            raise InputError("tag detections: a tag id occurs twice in one image.")
+        if not np.all(np.isfinite(corners)):
+            raise InputError("tag detections: a corner is not a finite number.")
+        order = np.argsort(ids)
+        ids, corners = ids[order], corners[order]
+        ids.setflags(write=False)
+        corners.setflags(write=False)
+        object.__setattr__(self, "ids", ids)
+        object.__setattr__(self, "corners_px", corners)
+        for name in ("sharpness_px", "contrast", "residual_px", "corner_sd_px"):
+            value = _per_tag(getattr(self, name), len(ids), name)[order]
+            object.__setattr__(self, name, _per_tag(value, len(ids), name))
+
+    def __len__(self) -> int:
+        """Return the number of tags."""
+        return len(self.ids)
+
+
+def detect_tags(
+    rgb: NDArray[np.uint8],
+    board: TagBoard,
+    config: DetectionConfig | None = None,
+    *,
+    intrinsics: CameraIntrinsics | None = None,
+) -> TagDetections:
+    """Return the board's tags in an image.
+
+    Args:
+        rgb: (H, W, 3) or gray (H, W) image, uint8.
+        board: which ids belong to the board, and how wide the white gap is.
+        config: when a tag is good enough.
+        intrinsics: with them, edges are fitted as the bent curves that the lens makes of them.
+
+    Raises:
+        InputError: the image is not 8 bit, or not (H, W) or (H, W, 3).
+    """
+    config = config or DetectionConfig()
+    gray = gray_image(rgb)
+    ids, corners, border = _decode(gray, board)
+    rejected: list[tuple[int, str]] = []
+    ours = np.isin(ids, board.ids)
+    rejected += [(int(i), "not a tag of this board") for i in np.unique(ids[~ours])]
+    # The same id decoded twice is two boards or a mirror image: neither can be trusted.
+    values, counts = np.unique(ids, return_counts=True)
+    twice = np.isin(ids, values[counts > 1])
+    rejected += [(int(i), "seen more than once") for i in np.unique(ids[twice & ours])]
+    missing = np.setdiff1d(board.ids, ids[twice])
+    keep = ours & ~twice
+    seen = (ids[keep], corners[keep], border)
+    ids, corners, misplaced = _on_board(gray, seen, missing, board, config)
+    rejected += misplaced
+    if not len(ids):
+        return TagDetections(ids=ids, corners_px=corners, rejected=tuple(sorted(rejected)))
+    clear = (border / (TAG_CELLS[board.family] + 2 * (border - 1)), board.gap_m / board.tag_size_m)
+    edges = config.edges
+    if board.corner_squares:
+        edges = replace(edges, corner_cut_px=max(edges.corner_cut_px, config.square_cut_px))
+    refined = refine_quads(gray, corners, clear, edges, intrinsics)
+    most = config.max_move_px
+    if board.corner_squares:
+        side = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)))
+        most = max(most, config.square_move_share * side)
+    limits = replace(config, max_move_px=most)
+    reasons = [_fault(refined, corners, k, gray.shape, limits) for k in range(len(ids))]
+    rejected += [(int(i), r) for i, r in zip(ids, reasons, strict=True) if r]
+    good = np.array([not r for r in reasons], dtype=bool)
+    return TagDetections(
+        ids=ids[good],
+        corners_px=refined.corners_px[good],
+        sharpness_px=refined.sharpness_px[good],
+        contrast=refined.contrast[good],
+        residual_px=refined.residual_px[good],
+        corner_sd_px=refined.corner_sd_px[good],
+        rejected=tuple(sorted(rejected)),
+    )
+
+
+def _decode(gray: NDArray[np.uint8], board: TagBoard) -> tuple[NDArray[np.int64], Array, int]:
+    """Return ids, quads (n, 4, 2) and the width of the black border in modules."""
+    name = FAMILY_DICTIONARY[board.family]
+    ids, corners = decode_markers(gray, name, touching=board.corner_squares)
+    if board.corner_squares and not np.isin(ids, board.ids).any():
+        # Kalibr prints its tags with a border of two modules.
+        wide = decode_markers(gray, name, touching=True, border=2)
+        if len(wide[0]):
+            return *wide, 2
+    return ids, corners, 1
+
+
+def _on_board(
+    gray: NDArray[np.uint8],
+    seen: tuple[NDArray[np.int64], Array, int],
+    missing: NDArray[np.int64],
+    board: TagBoard,
+    config: DetectionConfig,
+) -> tuple[NDArray[np.int64], Array, list[tuple[int, str]]]:
+    """Return the tags that lie where the board has them, those found with their help, and why
+    others do not count."""
+    ids, corners, border = seen
+    if len(ids) == 1 and board.rows * board.columns > 1 and board.family in WEAK_FAMILIES:
+        return ids[:0], corners[:0], [(int(ids[0]), f"one {board.family} alone may be chance")]
+    if len(ids) < 2:
+        return ids, corners, []
+    layout = check_layout(ids, corners, board, config.layout_share)
+    bad = [(int(i), layout.reason) for i in ids[~layout.good]]
+    # Some generators print the codes turned on the page; the grid says by how much.
+    ids, corners = ids[layout.good], np.roll(corners[layout.good], layout.roll, axis=1)
+    if len(ids) < 2:
+        return ids, corners, bad
+    missing = np.setdiff1d(missing, ids)
+    code = (border, layout.roll)
+    more_ids, more = read_missing_tags(gray, board, (ids, corners), missing, code)
+    told = [(i, r) for i, r in bad if i not in more_ids]
+    return np.concatenate([ids, more_ids]), np.concatenate([corners, more]), told
+
+
+def _fault(
+    refined: RefinedQuads, start: Array, k: int, shape: tuple[int, ...], config: DetectionConfig
+) -> str:
+    """Return why tag k cannot be used, '' where it can."""
+    corners = refined.corners_px[k]
+    side = float(np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=-1).min())
+    moved = float(np.linalg.norm(corners - start[k], axis=-1).max())
+    contrast, share = float(refined.contrast[k]), float(refined.inlier_share[k])
+    residual = float(refined.residual_px[k])
+    inside = bool(corners.min() >= 0 and np.all(corners.max(0) <= [shape[1] - 1, shape[0] - 1]))
+    # Written as "is it good", so that a NaN is a fault. The first fault is the one that is told.
+    checks = (
+        (side >= config.min_side_px,
+         f"too small: its shortest side is {side:.1f} px (at least {config.min_side_px:g})"),
+        (contrast >= config.min_contrast,
+         f"low contrast: {contrast:.0f} levels (at least {config.min_contrast:g})"),
+        (share >= config.min_inlier_share,
+         f"edge covered or broken: {share:.0%} of a side's profiles fit"),
+        (residual <= config.max_residual_px,
+         f"residual: edges scatter by {residual:.2f} px (at most {config.max_residual_px:g})"),
+        (moved <= config.max_move_px,
+         f"residual: the refined corners lie {moved:.1f} px from the detected ones"),
+        (inside, "cut by the image border"),
+    )  # fmt: skip
+    return next((reason for good, reason in checks if not good), "")

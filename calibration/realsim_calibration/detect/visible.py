@@ -1,0 +1,200 @@
+"""What does a picture show, whatever the board file says? For messages where nothing was found."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
+from realsim_calibration.detect.chessboard import largest_chessboard
+from realsim_calibration.detect.ellipses import DotConfig, find_blobs
+from realsim_calibration.detect.images import gray_image
+from realsim_calibration.detect.lattice import grow_lattice, unimodular
+from realsim_calibration.detect.markers import (
+    FAMILY_DICTIONARY,
+    decode_markers,
+    dictionary_names,
+    predefined_dictionary,
+)
+from realsim_calibration.detect.saddles import grid_arms, refine_saddles
+from realsim_calibration.views import TargetDetection
+
+SEARCH_PX = 1600
+"""Larger pictures are halved until they fit: a diagnosis need not see the smallest marker."""
+LARGEST = (
+    "DICT_APRILTAG_36h11",
+    "DICT_6X6_1000",
+    "DICT_5X5_1000",
+    "DICT_4X4_1000",
+    "DICT_7X7_1000",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_ARUCO_MIP_36h12",
+    "DICT_APRILTAG_25h9",
+    "DICT_APRILTAG_36h10",
+    "DICT_APRILTAG_16h5",
+)
+"""Dictionaries that hold all others; the commonest first."""
+MIN_MARKERS = {"DICT_4X4_1000": 4, "DICT_APRILTAG_16h5": 4, "DICT_ARUCO_ORIGINAL": 4}
+"""Markers from which a dictionary is believed where clutter decodes by chance."""
+USUAL_MIN_MARKERS = 2
+MIN_SADDLES = 0.8
+"""Share of a chessboard's corners that must be measurable: noise makes false ones."""
+MIN_DOTS = 16
+"""Least lattice of dots that is told of: a row of screws is no target."""
+FLATTEST = 1.35
+"""A dot's half axes may differ by so much between neighbours on a lattice that is a target."""
+
+
+def what_is_visible(image: NDArray[np.uint8]) -> str:
+    """Return what an image shows of any kind of target, as a clause: "17 markers of DICT_6X6_100".
+
+    All dictionaries are tried, plain and mirrored, then chessboards, then grids of dots: one to
+    three seconds. "nothing that looks like a target" where there is none.
+
+    Raises:
+        InputError: the image is not 8 bit.
+    """
+    gray = _halved(gray_image(image))
+    seen, side = _markers(gray)
+    board = _chessboard(gray, side)
+    dots, count = _dots(gray)
+    if board is not None and 2 * board.shape[0] * board.shape[1] > count:
+        r, c = board.shape[:2]
+        text = f"a chessboard with {max(r, c)}x{min(r, c)} inner corners"
+        return f"{text} and {seen} (a ChArUco board?)" if seen else text
+    if seen or dots:
+        return seen or dots
+    mirrored, _ = _markers(np.ascontiguousarray(gray[:, ::-1]))
+    if mirrored:
+        return f"{mirrored}, but MIRRORED: flip the picture left to right"
+    return f"nothing that looks like a target ({_exposure(gray)})"
+
+
+def explain_missing(
+    image: NDArray[np.uint8], target: Target, detection: TargetDetection | None = None
+) -> str:
+    """Return a sentence on why a target was not found: what the board file asks for, what the
+    picture shows, and what to do.
+
+    Raises:
+        InputError: the image is not 8 bit.
+    """
+    text = f"The board file asks for {describe(target)}; the picture shows {what_is_visible(image)}"
+    if detection is not None and detection.rejected:
+        told = "; ".join(detection.rejected[:3])
+        more = len(detection.rejected) - 3
+        text += f". Not used: {told}" + (f" and {more} more" if more > 0 else "")
+    return f"{text}. Correct the board file, or take a picture of the right board."
+
+
+def describe(target: Target) -> str:
+    """Return a target in words."""
+    if isinstance(target, TagBoard):
+        ids = target.ids
+        return (
+            f"{target.rows * target.columns} tags of {FAMILY_DICTIONARY[target.family]}, ids "
+            f"{ids.min()} to {ids.max()}"
+        )
+    if isinstance(target, CharucoBoard):
+        old = " in the old pattern" if target.legacy else ""
+        return (
+            f"a ChArUco board of {target.columns}x{target.rows} squares with markers of "
+            f"{target.dictionary}{old}"
+        )
+    if isinstance(target, Chessboard):
+        return f"a chessboard with {target.columns}x{target.rows} inner corners"
+    assert isinstance(target, CircleGrid)
+    shape = "an asymmetric" if target.asymmetric else "a"
+    large = " with a large first dot" if target.large_origin else ""
+    return f"{shape} grid of {target.columns}x{target.rows} dots{large}"
+
+
+def _halved(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the picture at a size that is searched quickly."""
+    import cv2
+
+    while max(gray.shape) > SEARCH_PX:
+        gray = np.asarray(cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    return gray
+
+
+def _chessboard(gray: NDArray[np.uint8], marker_px: float) -> NDArray[np.float64] | None:
+    """Return the corners (r, c, 2) of a chessboard whose corners are ones and whose squares are
+    larger than the markers seen."""
+    grid = largest_chessboard(gray, SEARCH_PX)
+    if grid is None:
+        return None
+    arms = grid_arms(grid)
+    if np.median(np.linalg.norm(arms, axis=-1)) < marker_px:
+        return None
+    even = np.indices(grid.shape[:2]).sum(0).ravel() % 2 == 0
+    share = max(
+        float(refine_saddles(gray, grid.reshape(-1, 2), arms.reshape(-1, 4, 2), d).good.mean())
+        for d in (even, ~even)
+    )
+    return grid if share >= MIN_SADDLES else None
+
+
+def _markers(gray: NDArray[np.uint8]) -> tuple[str, float]:
+    """Return the markers of the dictionary that explains most, '' where none does, and the median
+    side of them [px]."""
+    best: tuple[int, str, NDArray[np.int64], float] | None = None
+    for name in LARGEST:
+        ids, quads = decode_markers(gray, name)
+        different = len(np.unique(ids))
+        if different < MIN_MARKERS.get(name, USUAL_MIN_MARKERS):
+            continue
+        if best is None or different > best[0]:
+            side = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=-1)
+            best = (different, name, ids, float(np.median(side)))
+    if best is None:
+        return "", 0.0
+    different, name, ids, side = best
+    double = len(ids) - different
+    twice = f" ({double} of them more than once: two boards?)" if double else ""
+    name = _smallest(name, int(ids.max()))
+    return f"{different} markers of {name}, ids {ids.min()} to {ids.max()}{twice}", side
+
+
+def _smallest(name: str, most: int) -> str:
+    """Return the smallest dictionary of the same markers that holds an id; a larger one begins
+    with the same codes."""
+    if not name.endswith("_1000"):
+        return name
+    stem = name[: -len("1000")]
+    sizes = sorted(
+        (len(predefined_dictionary(n).bytesList), n)
+        for n in dictionary_names()
+        if n.startswith(stem)
+    )
+    return next(n for size, n in sizes if most < size) + " (or larger)"
+
+
+def _dots(gray: NDArray[np.uint8]) -> tuple[str, int]:
+    """Return the grid of dots in words, '' where there is none, and how many there are."""
+    best: dict[tuple[int, int], int] = {}
+    for shade in (gray, 255 - gray):
+        middles, axes = find_blobs(np.asarray(shade, dtype=np.uint8), DotConfig())
+        lattice = grow_lattice(middles)
+        radius = np.sqrt(np.abs(np.linalg.det(axes[list(lattice.values())])))
+        if len(radius) and np.median(np.abs(radius / np.median(radius) - 1)) > FLATTEST - 1:
+            continue
+        best = max(best, lattice, key=len)
+    if len(best) < MIN_DOTS:
+        return "", 0
+    nodes = np.array(list(best))
+    # The basis in which the lattice fills its bounding box best is the board's own.
+    extents = [np.ptp(nodes @ M.T, axis=0) + 1 for M in unimodular()]
+    w, h = min(extents, key=lambda e: int(e.prod()))
+    if len(nodes) >= 0.9 * w * h:
+        return f"a grid of {max(w, h)}x{min(w, h)} dots", len(nodes)
+    diagonal = np.array([[1, -1], [1, 1]])
+    rows = min((np.ptp(nodes @ (diagonal @ M).T, axis=0) + 1 for M in unimodular()),
+               key=lambda e: int(e.prod()))  # fmt: skip
+    if len(nodes) >= 0.45 * rows.prod():
+        return f"an asymmetric grid of {len(nodes)} dots", len(nodes)
+    return f"a grid of at least {len(nodes)} dots, not all of it", len(nodes)
+
+
+def _exposure(gray: NDArray[np.uint8]) -> str:
+    """Return how bright the picture is: most failures are too dark, too bright or out of focus."""
+    low, high = np.percentile(gray, [1, 99])
+    return f"gray levels {low:.0f} to {high:.0f} of 255"

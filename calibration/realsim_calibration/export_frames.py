@@ -1,0 +1,183 @@
+"""What an exported calibration says of itself: frames, the transform, accuracy, warnings.
+
+Other programs know no robot error map, so what they get is `X_alone`: the camera's place fitted
+without one. The camera frame is always the OPTICAL one (x right, y down, z forward), unless a
+`camera_link` is asked for.
+"""
+
+import re
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim import __version__
+from realsim.errors import InputError
+from realsim.geometry import metrics, se3
+from realsim.records.checked_arrays import rigid
+from realsim_calibration.results import HandEyeReport
+
+Array = NDArray[np.float64]
+FRAME_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.\-]*(/[A-Za-z0-9_.\-]+)*")
+"""What tf2 takes for a frame: no spaces, no leading slash."""
+FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*")
+LOCK_COSINE = 1e-12
+"""Cosine of the pitch below which roll and yaw turn about the same axis."""
+
+
+def _optical_in_link() -> Array:
+    """Return T_link_optical (4, 4) of REP 103 axes, x forward, y left, z up, at the same origin."""
+    return se3.from_rt([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FrameNames:
+    """How the frames are called in the program that reads the export."""
+
+    robot_base: str = "base"
+    """Frame in which the controller gives the tool's pose. On UR robots that is `base`, not
+    `base_link`: the two are turned by 180 deg about z."""
+    hand: str = "tool0"
+    """Frame whose pose the controller gave: the flange only where no tool offset was active."""
+    camera_optical: str = "camera_color_optical_frame"
+    """Optical frame of the calibrated image: x right, y down, z forward."""
+    target: str = "calibration_target"
+    """The printed target; easy_handeye wants a name for it."""
+    camera_link: str = ""
+    """Body frame of the camera to publish instead of the optical one, empty = the optical one.
+    Needed where the camera's driver publishes the optical frame below its `camera_link` already: a
+    frame of tf has one parent only."""
+    T_link_optical: Array = field(default_factory=_optical_in_link)
+    """(4, 4) optical frame in `camera_link` [m], as the camera's driver publishes it. The default
+    turns the axes (REP 103: x forward, y left, z up) and takes the origins for one; the colour
+    camera of a RealSense is off by up to 15 mm (59 mm on some models)."""
+    name: str = "hand_eye"
+    """Name of the calibration, and of its easy_handeye files."""
+
+    def __post_init__(self) -> None:
+        """Check that the names can be used."""
+        names = {
+            "robot_base": self.robot_base,
+            "hand": self.hand,
+            "camera_optical": self.camera_optical,
+            "target": self.target,
+        }
+        if self.camera_link:
+            names["camera_link"] = self.camera_link
+        for what, name in names.items():
+            if not FRAME_NAME.fullmatch(name):
+                raise InputError(
+                    f"the frame name {name!r} of {what} cannot be used: letters, digits and _ - . "
+                    "/ are accepted, without a leading slash (tf2 refuses it) and without spaces."
+                )
+        if len(set(names.values())) < len(names):
+            raise InputError(f"two frames have the same name: {names}. Every frame needs its own.")
+        if not FILE_NAME.fullmatch(self.name):
+            raise InputError(
+                f"the calibration's name {self.name!r} cannot be a file name: letters, digits and "
+                "_ - . are accepted."
+            )
+        object.__setattr__(self, "T_link_optical", rigid(self.T_link_optical, "T_link_optical"))
+
+
+def parent_frame(report: HandEyeReport, frames: FrameNames) -> str:
+    """Return the frame that carries the camera: the hand, or the robot's base (eye to hand)."""
+    return frames.hand if report.mode == "eye_in_hand" else frames.robot_base
+
+
+def published_transform(report: HandEyeReport, frames: FrameNames) -> tuple[Array, str, str]:
+    """Return (T_parent_child (4, 4) [m], parent, child): what the ROS formats carry."""
+    parent = parent_frame(report, frames)
+    if not frames.camera_link:
+        return np.asarray(report.X_alone), parent, frames.camera_optical
+    return report.X_alone @ se3.invert(frames.T_link_optical), parent, frames.camera_link
+
+
+def number(value: float) -> str:
+    """Return a number that reads back bit for bit, also where YAML 1.1 wants a point in it.
+
+    Python's shortest text of 1e-17 has no point, and PyYAML reads such a number as a string.
+    """
+    text = repr(float(value))
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text
+
+
+def quaternion_xyzw(T: Array) -> list[float]:
+    """Return the unit quaternion x y z w, the order of ROS, w >= 0, of T (4, 4)."""
+    w, x, y, z = (float(v) for v in se3.quaternion_wxyz(T[:3, :3]))
+    return [x, y, z, w]
+
+
+def roll_pitch_yaw(R: Array) -> tuple[float, float, float]:
+    """Return roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll), R (3, 3).
+
+    These are URDF's angles about FIXED axes x, y, z. The roll is taken from Rz(-yaw) R, so that the
+    three together give R to machine precision for every pitch, +-90 deg included.
+    """
+    level = np.hypot(R[0, 0], R[1, 0]) > LOCK_COSINE
+    yaw = float(np.arctan2(R[1, 0], R[0, 0])) if level else 0.0
+    rest = se3.exp_so3([0.0, 0.0, -yaw]) @ R
+    pitch = float(np.arctan2(-rest[2, 0], rest[0, 0]))
+    return float(np.arctan2(-rest[1, 2], rest[1, 1])), pitch, yaw
+
+
+def _accuracy_line(report: HandEyeReport) -> str:
+    """Return how well unseen views are predicted."""
+    if not np.isfinite(report.held_out_px):
+        return "WARNING: how well it predicts views that it had not seen is not known."
+    through = " and its error map" if report.robot_map is not None else ""
+    return (
+        f"Views that the fit had not seen: {report.held_out_px:.2f} px, {report.held_out_mm:.2f} "
+        f"mm, {report.held_out_deg:.3f} deg RMS, through the robot's own pose{through}."
+    )
+
+
+def note_lines(
+    report: HandEyeReport, frames: FrameNames, *, child: str | None = None
+) -> tuple[str, ...]:
+    """Return what must be known of the numbers: frames, units, accuracy, warnings; a line each.
+
+    Args:
+        report: the calibration.
+        frames: names of the frames.
+        child: the frame exported; None = the optical one.
+    """
+    parent = parent_frame(report, frames)
+    child = child or frames.camera_optical
+    covariance = report.X_alone_covariance
+    mm = 1e3 * np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
+    deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
+    axes = (
+        "the camera's OPTICAL frame: x right, y down, z forward"
+        if child == frames.camera_optical
+        else "the camera's body: x forward, y left, z up (REP 103)"
+    )
+    reported = (
+        f"{frames.hand} must be the frame whose pose the controller reported (tool offset and all)."
+        if report.mode == "eye_in_hand"
+        else f"{frames.robot_base} must be the frame in which the controller reports its tool."
+    )
+    lines = [
+        f"Hand-eye calibration by realsim {__version__}, {report.mode.replace('_', ' ')}.",
+        f"Maps points of {child} ({axes}) into {parent}. Metres, radians.",
+        reported,
+        f"1 sigma along the worst axis: {mm:.3f} mm, {deg:.4f} deg. Numbers read back exactly.",
+        _accuracy_line(report),
+    ]
+    if report.robot_map is not None:
+        moved = float(metrics.translation_error_mm(report.X, report.X_alone))
+        turned = float(metrics.rotation_error_deg(report.X, report.X_alone))
+        lines.append(
+            "This is the camera's place fitted WITHOUT the robot's error map, for programs that "
+            f"know none: {moved:.2f} mm and {turned:.3f} deg from the one in calibration.json, "
+            "which is valid with the map only."
+        )
+    if not report.checks:
+        lines.append("WARNING: nothing was checked.")
+    lines += [f"WARNING: {w}" for w in report.warnings]
+    return tuple(" ".join(line.split()) for line in lines)
+
+
+def comments(lines: tuple[str, ...]) -> str:
+    """Return lines as comments of shell, YAML and Python."""
+    return "".join(f"# {line}\n" for line in lines)

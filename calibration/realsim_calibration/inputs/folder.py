@@ -1,0 +1,229 @@
+"""A folder of images and its poses, paired; what is doubtful about them is said."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim_calibration.inputs.image_files import content_of, list_images
+from realsim_calibration.inputs.pairing import Pairing, pair
+from realsim_calibration.inputs.pose_file import read_pose_file
+from realsim_calibration.inputs.raw_poses import RawPoses, listed_readings
+from realsim_calibration.inputs.readings import PoseReading
+
+Array = NDArray[np.float64]
+NOT_MEASURED = "its pose holds NaN or infinite numbers: it was not measured"
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FolderInput:
+    """Images with their poses, one row each."""
+
+    images: tuple[Path, ...]
+    labels: tuple[str, ...]
+    """File names of the images."""
+    depths: tuple[Path | None, ...]
+    """16-bit depth image of each, or None; not necessarily aligned to it."""
+    poses: RawPoses
+    """The poses in the order of the images."""
+    reading: PoseReading | None
+    """How to read them, if it was said."""
+    pairing: str
+    """How images and poses were paired."""
+    unpaired_images: tuple[tuple[str, str], ...]
+    """(file name, reason)."""
+    unpaired_poses: tuple[tuple[str, str], ...]
+    """(where it stands, reason)."""
+    duplicate_images: tuple[tuple[str, ...], ...]
+    """Names of images whose files are equal byte by byte."""
+    duplicate_poses: tuple[tuple[str, ...], ...]
+    """Where poses with the very same numbers stand."""
+    warnings: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Return the number of pairs."""
+        return len(self.images)
+
+    @property
+    def joints(self) -> Array | None:
+        """(n, j) joint angles [rad], None where they are not known."""
+        return self.poses.joints
+
+    def Ts_base_ee(self, reading: PoseReading | None = None) -> Array:
+        """Return the poses (n, 4, 4) [m] of a reading, by default of the one that was said.
+
+        Raises:
+            InputError: no reading was said, or it does not fit the file.
+        """
+        chosen = self.reading if reading is None else reading
+        if chosen is None:
+            raise InputError(
+                f"{self.poses.path}: it was not said how the poses are to be read. The numbers "
+                f"admit {listed_readings(self.poses.possible)}. Give one of them, or let the "
+                "images decide."
+            )
+        return self.poses.poses(chosen)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class BoardPosesInput:
+    """Robot poses and poses of the board in the camera, row by row, without images."""
+
+    robot: RawPoses
+    board: RawPoses
+    """T_cam_board, or its inverse where read as inverted."""
+    pairing: str
+    unpaired_robot: tuple[tuple[str, str], ...]
+    unpaired_board: tuple[tuple[str, str], ...]
+
+
+def read_image_folder(
+    images: Path | str,
+    poses: Path | str,
+    *,
+    reading: PoseReading | None = None,
+    key: str | None = None,
+) -> FolderInput:
+    """Return the images of a folder, each with its pose.
+
+    Pairs by the image names beside the poses, else by the names or numbers of the pose files, else
+    by the lines' numbers or order if the counts agree.
+
+    Args:
+        images: the folder.
+        poses: file or folder of the poses; may be the images' folder.
+        reading: how the poses are to be read, if it is known.
+        key: which key of the poses' file holds them, where there are several.
+
+    Raises:
+        InputError: unreadable, nothing to pair, counts that differ without names, or a reading
+            that does not fit.
+    """
+    listing = list_images(Path(images))
+    raw = read_pose_file(poses, key=key)
+    names = [p.name for p in listing.images]
+    try:
+        found = pair(names, raw.labels, raw.stems, raw.where)
+    except InputError as error:
+        raise InputError(f"{images} and {raw.path}: {error}") from error
+    measured = raw.measured
+    kept = [(i, r) for i, r in found.pairs if measured[r]]
+    lost = [(i, r) for i, r in found.pairs if not measured[r]]
+    if not kept:
+        raise InputError(f"{raw.path}: no pose that belongs to an image holds finite numbers.")
+    rows = raw.subset([r for _, r in kept])
+    if reading is not None:
+        rows.poses(reading)
+    chosen = [listing.images[i] for i, _ in kept]
+    same_images = _equal_groups([p.name for p in chosen], [content_of(p) for p in chosen])
+    same_poses = _equal_groups(rows.where, [v.tobytes() for v in rows.values + 0.0])
+    return FolderInput(
+        images=tuple(chosen),
+        labels=tuple(p.name for p in chosen),
+        depths=tuple(listing.depths[i] for i, _ in kept),
+        poses=rows,
+        reading=reading,
+        pairing=found.sentence,
+        unpaired_images=(
+            *((names[i], why) for i, why in found.unpaired_images),
+            *((names[i], NOT_MEASURED) for i, _ in lost),
+            *listing.ignored,
+        ),
+        unpaired_poses=(
+            *((raw.where[r], why) for r, why in found.unpaired_poses),
+            *((raw.where[r], "NaN or infinite numbers") for _, r in lost),
+        ),
+        duplicate_images=same_images,
+        duplicate_poses=same_poses,
+        warnings=(*found.warnings, *_warnings(same_images, same_poses, found, len(lost))),
+    )
+
+
+def read_board_poses(
+    robot: Path | str,
+    board: Path | str,
+    *,
+    robot_key: str | None = None,
+    board_key: str | None = None,
+) -> BoardPosesInput:
+    """Return robot poses and board poses that were measured elsewhere, row by row.
+
+    Args:
+        robot: file or folder of T_base_ee.
+        board: file or folder of T_cam_board; the same formats are read.
+        robot_key: which key of the robot's file holds the poses.
+        board_key: which key of the board's file holds them.
+
+    Raises:
+        InputError: unreadable, or counts that differ without names.
+    """
+    a, b = read_pose_file(robot, key=robot_key), read_pose_file(board, key=board_key)
+    names = [label or stem for label, stem in zip(b.labels, b.stems, strict=True)]
+    try:
+        if all(names):
+            found = pair(names, a.labels, a.stems, a.where)
+        elif len(a) != len(b):
+            raise InputError(
+                f"there are {len(a)} robot poses and {len(b)} board poses, and no names say which "
+                "belong together. Write the image's name beside each pose of both files."
+            )
+        else:
+            sentence = f"Paired by order, as the counts agree ({len(a)}). No names confirm it."
+            found = Pairing(pairs=tuple((k, k) for k in range(len(a))), sentence=sentence)
+    except InputError as error:
+        raise InputError(f"{a.path} and {b.path}: {error}") from error
+    fine = [(i, r) for i, r in found.pairs if a.measured[r] and b.measured[i]]
+    lost = [(i, r) for i, r in found.pairs if (i, r) not in fine]
+    reason = "NaN or infinite numbers in it or in its partner"
+    return BoardPosesInput(
+        robot=a.subset([r for _, r in fine]),
+        board=b.subset([i for i, _ in fine]),
+        pairing=found.sentence,
+        unpaired_robot=(
+            *((a.where[r], why) for r, why in found.unpaired_poses),
+            *((a.where[r], reason) for _, r in lost),
+        ),
+        unpaired_board=(
+            *((b.where[i], why) for i, why in found.unpaired_images),
+            *((b.where[i], reason) for i, _ in lost),
+        ),
+    )
+
+
+def _equal_groups(names: Sequence[str], contents: Sequence[bytes]) -> tuple[tuple[str, ...], ...]:
+    """Return the names of what is equal, group by group."""
+    groups: dict[bytes, list[str]] = {}
+    for name, content in zip(names, contents, strict=True):
+        groups.setdefault(content, []).append(name)
+    return tuple(tuple(g) for g in groups.values() if len(g) > 1)
+
+
+def _warnings(
+    same_images: Sequence[Sequence[str]],
+    same_poses: Sequence[Sequence[str]],
+    found: Pairing,
+    not_measured: int,
+) -> tuple[str, ...]:
+    """Return the sentences for what is doubtful."""
+    said: list[str] = []
+    if same_images:
+        groups = "; ".join(", ".join(g) for g in same_images[:6])
+        said.append(
+            f"{len(same_images)} images are there more than once, byte by byte ({groups}): at "
+            "least one of each has the pose of another. Delete the copies with their poses."
+        )
+    if same_poses:
+        groups = "; ".join(", ".join(g) for g in same_poses[:6])
+        said.append(
+            f"{len(same_poses)} poses are there more than once, with the very same numbers "
+            f"({groups}): a controller never repeats all digits. Was an old pose stored again?"
+        )
+    left = len(found.unpaired_images), len(found.unpaired_poses)
+    if any(left):
+        said.append(f"{left[0]} images have no pose, {left[1]} poses have no image.")
+    if not_measured:
+        said.append(f"{not_measured} images were left out: {NOT_MEASURED}.")
+    return tuple(said)

@@ -1,0 +1,254 @@
+"""Reading poses from any file, from a folder with one file a pose, or from a list of those."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from realsim.errors import InputError
+from realsim_calibration.inputs.columns import LABEL_NAMES, PoseTable, raw_from_table
+from realsim_calibration.inputs.natural_order import natural_key
+from realsim_calibration.inputs.pose_arrays import table_from_npy, table_from_npz
+from realsim_calibration.inputs.pose_text import decoded, table_from_text
+from realsim_calibration.inputs.pose_tree import table_from_tree
+from realsim_calibration.inputs.raw_poses import RawPoses
+from realsim_calibration.inputs.tree_loading import loaded_json, loaded_yaml
+
+ENDINGS = (".txt", ".csv", ".tsv", ".dat", ".log", ".json", ".yaml", ".yml", ".npy", ".npz")
+"""Endings of pose files."""
+MAX_TEXT_BYTES = 64 * 2**20
+"""Size of a text file; 10000 poses take 3 MB."""
+MAX_YAML_BYTES = 2 * 2**20
+"""Size of a YAML file, which takes about a second for 150 kB to read."""
+MAX_LISTING_BYTES = 2**20
+"""Size of a list of poses and images."""
+MAX_FOLDER_FILES = 20_000
+"""Files of one pose each in a folder."""
+_TREES = (".json", ".yaml", ".yml")
+
+
+def read_pose_file(path: Path | str, *, key: str | None = None) -> RawPoses:
+    """Return the poses of a file, of a folder with a file for each, or of a list of such files.
+
+    Accepted: lines of numbers (txt, csv, tsv; header optional), JSON and YAML (lists, dicts from
+    image to pose, ROS poses, OpenCV's FileStorage), npy and npz. A list names a pose file and an
+    image for each view. Robot poses and poses of the board in the camera are read alike.
+
+    Args:
+        path: the file or folder.
+        key: which key or array holds the poses, where there are several.
+
+    Raises:
+        InputError: missing, damaged, too large, or no poses; names the line, entry or file.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _from_folder(path, key)
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; a file or a folder of poses was expected there.")
+    tree = _tree(path) if path.suffix.lower() in _TREES else None
+    if tree is not None:
+        listed = _listing(tree)
+        if listed:
+            return _from_listing(path, listed, key)
+    return raw_from_table(_table(path, key, tree))
+
+
+def _text(path: Path) -> str:
+    """Return a text file's content."""
+    limit = MAX_YAML_BYTES if path.suffix.lower() in (".yaml", ".yml") else MAX_TEXT_BYTES
+    size = path.stat().st_size
+    if size > limit:
+        raise InputError(
+            f"{path} has {size / 2**20:.1f} MB; at most {limit / 2**20:.0f} MB of poses are read "
+            "from such a file. Is it the right one?"
+        )
+    if size == 0:
+        raise InputError(f"{path} is empty. Was it copied or written completely?")
+    try:
+        return decoded(path, path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error}).") from error
+
+
+def _tree(path: Path) -> Any:
+    """Return the tree of a JSON or YAML file."""
+    text = _text(path)
+    return (loaded_json if path.suffix.lower() == ".json" else loaded_yaml)(path, text)
+
+
+def _table(path: Path, key: str | None, tree: Any = None) -> PoseTable:
+    """Return the table of one file."""
+    ending = path.suffix.lower()
+    if ending not in ENDINGS and ending:
+        raise InputError(f"{path}: poses are read from {', '.join(ENDINGS)} files, not {ending}.")
+    if ending == ".npy":
+        return table_from_npy(path)
+    if ending == ".npz":
+        return table_from_npz(path, key)
+    if ending in _TREES:
+        return table_from_tree(path, _tree(path) if tree is None else tree, key)
+    text = _text(path)
+    if re.match(r"\s*(\{|\[\s*[\[{])", text):
+        try:
+            return table_from_tree(path, loaded_json(path, text), key)
+        except InputError:
+            if text.lstrip().startswith("{"):
+                raise
+    return table_from_text(path, text)
+
+
+def _listing(tree: Any) -> list[tuple[str, str]]:
+    """Return the (pose file, image file) pairs of a list, none where the tree is no such list."""
+    if isinstance(tree, dict):
+        for value in tree.values():
+            if isinstance(value, list) and _listing(value):
+                return _listing(value)
+        return []
+    pairs: list[tuple[str, str]] = []
+    for entry in tree if isinstance(tree, list) else []:
+        if not isinstance(entry, dict):
+            return []
+        pose = next((v for k, v in entry.items() if "pose" in k.lower()), None)
+        image = next((v for k, v in entry.items() if k.lower() in LABEL_NAMES), None)
+        if not isinstance(pose, str) or not isinstance(image, str):
+            return []
+        pairs.append((pose, image))
+    return pairs
+
+
+def _from_listing(path: Path, pairs: Sequence[tuple[str, str]], key: str | None) -> RawPoses:
+    """Return the poses of a list of pose and image files, in its order."""
+    root = path.parent.resolve()
+    files: list[Path] = []
+    for k, (pose, image) in enumerate(pairs):
+        file = (root / pose).resolve()
+        if not file.is_relative_to(root):
+            raise InputError(
+                f"{path}, entry {k}: the pose file '{pose}' lies outside of the list's folder."
+            )
+        if not file.is_file():
+            raise InputError(f"{path}, entry {k}: the pose file '{pose}' of '{image}' is missing.")
+        files.append(file)
+    twice = sorted({p for p, _ in pairs if [q for q, _ in pairs].count(p) > 1}, key=natural_key)
+    if twice:
+        raise InputError(f"{path} names pose files more than once: {', '.join(twice[:8])}.")
+    raw = _combined(path, files, [p for p, _ in pairs], key)
+    note = f"{path.name} says which pose belongs to which image."
+    return replace(raw, labels=tuple(i for _, i in pairs), notes=(note, *raw.notes))
+
+
+def _from_folder(folder: Path, key: str | None) -> RawPoses:
+    """Return the poses of a folder: by a list in or beside it, else one file a pose."""
+    for place in (folder, folder.parent):
+        lists = _listings_in(place, folder)
+        if len(lists) > 1:
+            names = ", ".join(p.name for p, _ in lists)
+            raise InputError(f"{place} holds several lists of poses and images: {names}. Give one.")
+        if lists:
+            path, pairs = lists[0]
+            raw = _from_listing(path, pairs, key)
+            listed = {(path.parent / p).resolve() for p, _ in pairs}
+            others = [f for f in _pose_files(folder)[0] if f.resolve() not in listed | {path}]
+            if others and place != folder:
+                note = f"Not on the list and not read: {', '.join(f.name for f in others[:8])}."
+                raw = replace(raw, notes=(*raw.notes, note))
+            return raw
+    files, note = _pose_files(folder)
+    if not files:
+        raise InputError(
+            f"{folder} holds no pose files ({', '.join(ENDINGS)}). Give the file or the folder "
+            "that holds the robot's poses."
+        )
+    if len(files) == 1:
+        raw = read_pose_file(files[0], key=key)
+        note = f"{files[0].name} is the only pose file of the folder."
+    else:
+        raw = _combined(folder, files, [f.name for f in files], key)
+    return replace(raw, notes=((note,) if note else ()) + raw.notes)
+
+
+def _listings_in(place: Path, folder: Path) -> list[tuple[Path, list[tuple[str, str]]]]:
+    """Return the lists in a place that name pose files of the folder."""
+    found: list[tuple[Path, list[tuple[str, str]]]] = []
+    for path in sorted(p for p in place.iterdir() if p.suffix.lower() in _TREES and p.is_file()):
+        if path.stat().st_size > MAX_LISTING_BYTES:
+            continue
+        data = path.read_bytes()
+        if b"pose" not in data or not any(w.encode() in data for w in LABEL_NAMES):
+            continue
+        try:
+            pairs = _listing(_tree(path))
+        except InputError:
+            if place == folder:
+                continue  # it is read as a pose file, which says what is wrong
+            raise
+        if any((place / p).resolve().is_relative_to(folder.resolve()) for p, _ in pairs):
+            found.append((path, pairs))
+    return found
+
+
+def _pose_files(folder: Path) -> tuple[list[Path], str]:
+    """Return a folder's pose files in natural order, and what was left out."""
+    files = [
+        p
+        for p in folder.iterdir()
+        if p.suffix.lower() in ENDINGS and p.is_file() and not p.name.startswith(".")
+    ]
+    if len(files) > MAX_FOLDER_FILES:
+        raise InputError(f"{folder} holds {len(files)} files; at most {MAX_FOLDER_FILES} are read.")
+    kinds: dict[tuple[str, str], list[Path]] = {}
+    for p in files:
+        kinds.setdefault((re.sub(r"\d+", "#", p.stem), p.suffix.lower()), []).append(p)
+    series = sorted((v for v in kinds.values() if len(v) > 1), key=len, reverse=True)
+    if len(series) > 1:
+        shown = "; ".join(f"{len(s)} like {min(s).name}" for s in series)
+        raise InputError(
+            f"{folder} holds several series of files ({shown}). Give the poses a folder of their "
+            "own."
+        )
+    chosen = series[0] if series else files
+    left = sorted(p.name for p in files if p not in chosen)
+    note = f"Not read, as their names are unlike the others: {', '.join(left[:8])}." if left else ""
+    return sorted(chosen, key=lambda p: natural_key(p.name)), note
+
+
+def _combined(path: Path, files: Sequence[Path], names: Sequence[str], key: str | None) -> RawPoses:
+    """Return the poses of files that hold one each."""
+    tables: list[PoseTable] = []
+    for file, name in zip(files, names, strict=True):
+        table = _table(file, key)
+        if len(table.values) != 1:
+            raise InputError(
+                f"{file} holds {len(table.values)} poses; beside {len(files) - 1} other pose files "
+                "each must hold one."
+            )
+        first = tables[0] if tables else table
+        if table.names != first.names:
+            raise InputError(
+                f"{file} holds {_columns(table)}, {files[0].name} {_columns(first)}: all files "
+                "must be written alike."
+            )
+        table.where = [name]
+        table.stems = [file.stem]
+        tables.append(table)
+    return raw_from_table(
+        PoseTable(
+            path=path,
+            names=tables[0].names,
+            values=np.concatenate([t.values for t in tables]),
+            labels=[t.labels[0] for t in tables],
+            stems=[t.stems[0] for t in tables],
+            where=[t.where[0] for t in tables],
+            notes=list(tables[0].notes),
+        )
+    )
+
+
+def _columns(table: PoseTable) -> str:
+    """Return what a table holds, for a message."""
+    named = [n for n in table.names if n]
+    return f"{len(table.names)} numbers" + (f" ({', '.join(named[:10])})" if named else "")

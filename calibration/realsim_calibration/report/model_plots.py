@@ -1,0 +1,175 @@
+"""What was estimated: the covariance of X, the target's shape, the robot's errors, the choices."""
+
+from typing import Any
+
+import numpy as np
+
+from realsim_calibration.report import style
+from realsim_calibration.report.summary import Array, rest_of_map
+from realsim_calibration.results import HandEyeReport
+
+CAMERA_AXES = ("x (right)", "y (down)", "z (forward)")
+PAIRS = ((0, 1), (0, 2), (1, 2))
+MOST_CANDIDATES = 12
+DRAWN_BEND = 0.06
+"""Share of the target's size to which its largest displacement is enlarged in the drawing."""
+
+
+def plot_uncertainty(report: HandEyeReport) -> Any:
+    """Plot the 1 and 2 sigma ellipses of X along the camera's axes: translation and rotation."""
+    figure = style.new_figure(5.4)
+    axes = figure.subplots(2, 3)
+    C = report.X_covariance
+    rows = (
+        ("translation", "mm", 1e6 * C[3:, 3:], style.BLUE),
+        ("rotation about", "deg", np.degrees(np.degrees(C[:3, :3])), style.GOOD),
+    )
+    for row, (what, unit, cov, color) in zip(axes, rows, strict=True):
+        limit = 2.35 * float(np.sqrt(np.diag(cov).max())) or 1.0
+        for ax, (i, j) in zip(row, PAIRS, strict=True):
+            _ellipses(ax, cov[np.ix_((i, j), (i, j))], color)
+            ax.set_xlim(-limit, limit)
+            ax.set_ylim(-limit, limit)
+            ax.set_aspect("equal")
+            ax.set_xlabel(f"{what} {CAMERA_AXES[i]} [{unit}]")
+            ax.set_ylabel(f"{what} {CAMERA_AXES[j]} [{unit}]")
+            ax.locator_params(nbins=5)
+            ax.grid()
+            ax.set_axisbelow(True)
+        sd = np.sqrt(np.diag(cov))
+        row[0].set_title(
+            f"1 sigma x, y, z: {sd[0]:.3g}, {sd[1]:.3g}, {sd[2]:.3g} {unit}", fontsize=9
+        )
+    axes[0, 2].legend(loc="lower right", bbox_to_anchor=(1.02, 1.0), ncols=2, borderaxespad=0.2)
+    return figure
+
+
+def _ellipses(ax: Any, cov: Array, color: str) -> None:
+    """Draw the ellipses of 1 and 2 sigma of a (2, 2) covariance about the origin."""
+    values, vectors = np.linalg.eigh(cov)
+    t = np.linspace(0, 2 * np.pi, 181)
+    circle = np.stack([np.cos(t), np.sin(t)])
+    ellipse = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * circle)
+    ax.fill(*(2 * ellipse), color=color, alpha=0.16, lw=0)
+    ax.plot(*(2 * ellipse), color=color, lw=0.9, label="2 sigma (86 %)")
+    ax.fill(*ellipse, color=color, alpha=0.30, lw=0)
+    ax.plot(*ellipse, color=color, lw=1.6, label="1 sigma (39 %)")
+    ax.plot(0, 0, "+", color=style.INK, ms=6)
+
+
+def plot_board(report: HandEyeReport) -> Any:
+    """Plot the target's bend as a height map, and its shape against the drawing, enlarged."""
+    from matplotlib.ticker import MaxNLocator
+
+    figure = style.new_figure(3.6)
+    left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
+    board, points = report.board, report.target.points_board[:, :2]
+    low, high = points.min(0), points.max(0)
+    middle = (low + high) / 2
+    x, y = np.meshgrid(*(np.linspace(low[k], high[k], 61) - middle[k] for k in (0, 1)))
+    lift = 1e3 * _lift(report, x, y)
+    most = max(0.01, float(np.abs(lift).max()))
+    mm = 1e3 * (points - middle)
+    levels = MaxNLocator(nbins=14, symmetric=True).tick_values(-most, most)
+    surface = left.contourf(1e3 * x, 1e3 * y, lift, levels=levels, cmap="RdBu_r")
+    left.plot(mm[:, 0], mm[:, 1], ".", ms=2, color=style.INK, alpha=0.55)
+    style.color_bar(figure, surface, left, "out of the plane, into the paper [mm]")
+    bent = np.any(board.sd[2:] != 0) or np.any(board.warp != 0)
+    left.set_title(f"Bend: up to {np.abs(lift).max():.2f} mm" if bent else "Bend: taken for flat")
+    _outline(right, report, high - low)
+    for ax in (left, right):
+        ax.set_aspect("equal")
+        ax.invert_yaxis()
+        ax.set_xlabel("x [mm]")
+        ax.set_ylabel("y, down the page [mm]")
+    return figure
+
+
+def _lift(report: HandEyeReport, x: Array, y: Array) -> Array:
+    """Return how far the target's points lie out of its plane [m], x, y from its middle [m]."""
+    b = report.board
+    u, v = x / b.half_extent_m, y / b.half_extent_m
+    return b.scale * b.half_extent_m * (b.warp[0] * u**2 + b.warp[1] * u * v + b.warp[2] * v**2)
+
+
+def _outline(ax: Any, report: HandEyeReport, size: Array) -> None:
+    """Draw the target's outline as drawn and as it is, the difference enlarged."""
+    b = report.board
+    corners = 0.5e3 * size * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
+    real = corners * [b.scale, b.scale * (1 + b.aspect)]
+    off = float(np.abs(real - corners).max())
+    factor = style.round_number(DRAWN_BEND * 1e3 * float(size.max()) / max(off, 1e-9))
+    factor = max(1.0, min(factor, 1000.0))
+    drawn = corners + factor * (real - corners)
+    ax.plot(*corners.T, color=style.MUTED, lw=1.2, ls=(0, (4, 3)), label="as drawn")
+    ax.plot(*drawn.T, color=style.BLUE, lw=1.8, label=f"as it is, difference times {factor:g}")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    held = " (held)" if b.sd[0] == 0 else f" ± {100 * b.sd[0]:.2f}"
+    tall = " (held)" if b.sd[1] == 0 else f" ± {100 * b.sd[1]:.2f}"
+    ax.set_title(
+        f"Size {100 * (b.scale - 1):+.2f}{held} %\nheight / width {100 * b.aspect:+.2f}{tall} %"
+    )
+    ax.margins(0.12)
+
+
+def plot_robot(report: HandEyeReport) -> Any:
+    """Plot the robot's error of every used view, as it is and after the map."""
+    figure = style.new_figure(3.2)
+    axes = figure.subplots(1, 2)
+    used = report.used
+    before = np.array([v.robot_error for v in used]).reshape(-1, 6)
+    rests = [rest for v in used if (rest := rest_of_map(report, v)) is not None]
+    k = np.arange(len(used))
+    for ax, part, factor, unit, name in (
+        (axes[0], slice(3, 6), 1e3, "mm", "Position error of the hand"),
+        (axes[1], slice(0, 3), 1e3, "mrad", "Orientation error of the hand"),
+    ):
+        total = factor * np.linalg.norm(before[:, part], axis=-1)
+        rms = float(np.sqrt(np.mean(total**2))) if len(total) else float("nan")
+        if len(rests) != len(used):
+            ax.bar(k, total, width=0.7, color=style.BLUE, label=f"whole, RMS {rms:.2f} {unit}")
+        else:
+            rest = factor * np.linalg.norm(np.array(rests).reshape(-1, 6)[:, part], axis=-1)
+            left = float(np.sqrt(np.mean(rest**2))) if len(rest) else float("nan")
+            ax.bar(k, total, width=0.8, color=style.PALE, label=f"whole, RMS {rms:.2f} {unit}")
+            ax.bar(k, rest, width=0.4, color=style.BLUE,
+                   label=f"left by the map, RMS {left:.2f} {unit}")  # fmt: skip
+        ax.set_title(name, pad=20)
+        ax.set_ylabel(f"[{unit}]")
+        ax.set_xlabel("view")
+        step = max(1, int(np.ceil(len(used) / 24)))
+        ax.set_xticks(k[::step], [str(v.index) for v in used[::step]], rotation=90, fontsize=6.5)
+        ax.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.2)
+        ax.grid(axis="y")
+        ax.set_axisbelow(True)
+    return figure
+
+
+def plot_choices(report: HandEyeReport) -> Any:
+    """Plot how well every error map predicts unseen views, and where every closed form started."""
+    maps, starts = report.map_scores[:MOST_CANDIDATES], report.starts[:MOST_CANDIDATES]
+    figure = style.new_figure(1.2 + 0.2 * max(4, len(maps), len(starts)))
+    left, right = figure.subplots(1, 2)
+    chosen = min((s for _, s in maps), default=float("nan"))
+    for ax, pairs, title in (
+        (left, maps, "Error maps: unseen views, geometric mean"),
+        (right, starts, "Closed forms that the fit could start from"),
+    ):
+        values = [v for _, v in pairs]
+        if not len(style.finite(values)):
+            style.empty_axes(ax, "none was tried")
+            continue
+        best = chosen if ax is left else min(style.finite(values))
+        most = float(style.finite(values).max())
+        for k, value in enumerate(values):
+            color = style.BLUE if value == best else style.PALE
+            ax.barh(k, value if np.isfinite(value) else 0.0, height=0.7, color=color)
+            words = f"{value:.3g}" if np.isfinite(value) else "failed"
+            ax.text((value if np.isfinite(value) else 0.0) + most * 0.01, k, words, va="center",
+                    fontsize=7.5, color=style.INK)  # fmt: skip
+        ax.set_yticks(range(len(pairs)), [style.short_label(n) for n, _ in pairs])
+        ax.set_ylim(len(pairs) - 0.4, -0.6)
+        ax.set_xlim(0, most * 1.12)
+        ax.set_title(title)
+        ax.set_xlabel("reprojection RMS [px]")
+    return figure

@@ -1,0 +1,382 @@
+"""The calibration's page: verdict, checks, figures and pictures in one self-contained HTML file."""
+
+import base64
+import html
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim import __version__
+from realsim.records import ArmErrorMap, CameraIntrinsics, Check
+from realsim.store import atomic
+from realsim_calibration.depth_bias import DepthBiasReport
+from realsim_calibration.lens_models import TERM_NAMES
+from realsim_calibration.lens_report import IntrinsicsReport, LensView
+from realsim_calibration.report import (
+    coverage_plots,
+    lens_plots,
+    model_plots,
+    residual_plots,
+    scene_3d,
+    style,
+)
+from realsim_calibration.report.residual_plots import Images
+from realsim_calibration.report.summary import (
+    Judgement,
+    accuracy_rows,
+    carrier,
+    check_rows,
+    pose_rows,
+    verdict,
+    viewpoint,
+    worst_first,
+)
+from realsim_calibration.results import HandEyeReport, ViewReport
+
+PAGE_NAME = "calibration_report.html"
+WIDE_COLUMNS = 4
+"""Columns from which a table takes the whole width of the page."""
+
+
+@dataclass(eq=False, kw_only=True, slots=True)
+class _Page:
+    """The body while it is being written, and the files that lie beside it."""
+
+    folder: Path
+    parts: list[str] = field(default_factory=list[str])
+    written: list[Path] = field(default_factory=list[Path])
+
+    def section(self, title: str, text: str = "") -> None:
+        """Begin a section."""
+        self.parts.append(f"<h2>{html.escape(title)}</h2>")
+        if text:
+            self.parts.append(f"<p>{html.escape(text)}</p>")
+
+    def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """Add a table; the four verdicts become coloured words."""
+        self.parts.append(table_html(header, rows))
+
+    def picture(self, name: str, draw: Callable[[], Any], caption: str) -> None:
+        """Draw a picture, write it beside the page and put it into the page itself."""
+        with style.paper_style():
+            data = style.png_bytes(draw())
+        atomic.write_bytes(self.folder / name, data)
+        self.written.append(self.folder / name)
+        text = html.escape(caption)
+        self.parts.append(
+            f'<figure><img src="data:image/png;base64,{base64.b64encode(data).decode()}" '
+            f'alt="{text}"><figcaption>{text}</figcaption></figure>'
+        )
+
+
+def table_html(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table, every cell escaped; a first cell that is a verdict is coloured."""
+    head = "".join(f"<th>{html.escape(h)}</th>" for h in header)
+    lines: list[str] = []
+    for row in rows:
+        cells = [html.escape(str(c)) for c in row]
+        if row and row[0] in style.VERDICT_COLORS:
+            cells[0] = f'<span class="pill {row[0]}">{row[0]}</span>'
+        lines.append("<tr>" + "".join(f"<td>{c}</td>" for c in cells) + "</tr>")
+    wide = ' class="wide"' if len(header) >= WIDE_COLUMNS else ""
+    return f"<table{wide}><tr>{head}</tr>{''.join(lines)}</table>"
+
+
+def write_calibration_report(
+    report: HandEyeReport,
+    folder: Path | str,
+    *,
+    images: Images | None = None,
+    intrinsics_report: IntrinsicsReport | None = None,
+    depth_report: DepthBiasReport | None = None,
+    title: str = "Hand-eye calibration",
+) -> list[Path]:
+    """Write the page and its pictures and return the files, the page first.
+
+    Args:
+        report: the calibration.
+        folder: where to write; made where needed.
+        images: gives the photograph of a view by its index, for the worst views.
+        intrinsics_report: a calibration of the lens alone, to be compared.
+        depth_report: the depth camera's bias.
+        title: heading of the page.
+    """
+    page = _Page(folder=Path(folder))
+    _verdict_section(page, report)
+    _place_section(page, report)
+    _residual_section(page, report, images)
+    _coverage_section(page, report)
+    _model_section(page, report)
+    _lens_section(page, report, intrinsics_report)
+    if depth_report is not None:
+        _depth_section(page, depth_report)
+    _appendix(page, report)
+    template = Template((files("realsim_calibration.report") / "page_template.html").read_text())
+    text = template.substitute(
+        title=html.escape(title),
+        about=html.escape(_about(report)),
+        body="\n".join(page.parts),
+        version=__version__,
+    )
+    atomic.write_text(page.folder / PAGE_NAME, text)
+    return [page.folder / PAGE_NAME, *page.written]
+
+
+def _about(report: HandEyeReport) -> str:
+    """Return one line on what was calibrated."""
+    i, (x, y) = report.intrinsics, report.target.size_m
+    where = "in the hand" if report.mode == "eye_in_hand" else "beside the robot"
+    return (
+        f"Camera {where}, {i.width} x {i.height} px, {len(report.used)} of {len(report.views)} "
+        f"views used, {type(report.target).__name__} of {1e3 * x:.0f} x {1e3 * y:.0f} mm"
+    )
+
+
+def _banner(judgement: Judgement) -> str:
+    """Return the verdict as a coloured box."""
+    return (
+        f'<div class="verdict {judgement.verdict}"><strong>{html.escape(judgement.headline)}'
+        f"</strong>{html.escape(judgement.sentence)}</div>"
+    )
+
+
+def _verdict_section(page: _Page, report: HandEyeReport) -> None:
+    """Say in one sentence what to do, then show figures and checks."""
+    page.parts.append(_banner(verdict(report)))
+    cards = [
+        (f"{report.held_out_px:.2f} px", "error of unseen views"),
+        (f"{report.held_out_mm:.2f} mm", "the same, as a distance"),
+        (f"{report.held_out_deg:.3f}°", "the same, as an angle"),
+        (f"± {report.sigma_mm:.2f} mm", "camera's place, 1 sigma"),
+        (f"± {report.sigma_deg:.3f}°", "camera's rotation, 1 sigma"),
+        (f"{len(report.used)} / {len(report.views)}", "views used / given"),
+    ]
+    page.parts.append(
+        '<div class="cards">'
+        + "".join(
+            f'<div class="card"><b>{html.escape(value.replace("nan", "?"))}</b>'
+            f"<span>{html.escape(what)}</span></div>"
+            for value, what in cards
+        )
+        + "</div>"
+    )
+    page.section("Checks", "" if report.checks else "Nothing was checked.")
+    if report.checks:
+        page.table(["", "check", "value", "what was found", "what to do"], check_rows(report))
+
+
+def _place_section(page: _Page, report: HandEyeReport) -> None:
+    """Show where the camera is."""
+    what = carrier(report)
+    page.section("Where the camera is")
+    hang = ", which hangs with its z axis down" if report.mode == "eye_in_hand" else ""
+    page.picture(
+        "camera_place.png", lambda: scene_3d.plot_camera_in_hand(report),
+        f"Camera and {what} frame{hang}. Axes: x red, y green, z blue. Grey: a flange of 63 mm for "
+        "scale. Yellow: the field of view. If this is not how the camera is mounted, a convention "
+        "is wrong.",
+    )  # fmt: skip
+    page.table(["figure", "value"], [*pose_rows(report), *accuracy_rows(report)])
+    page.picture(
+        "scene.png", lambda: scene_3d.plot_scene(report),
+        "Robot base, target and cameras, coloured by the error of the unseen view; dotted red: "
+        "dropped views. The dot is the target's first point.",
+    )  # fmt: skip
+
+
+def _residual_section(page: _Page, report: HandEyeReport, images: Images | None) -> None:
+    """Show how well every view fits."""
+    page.section(
+        "How well the views fit",
+        "All errors are measured through the robot's own pose. An unseen view was predicted by a "
+        "calibration that did not know it.",
+    )
+    page.picture(
+        "views.png", lambda: residual_plots.plot_views(report),
+        "If unseen errors are much larger than seen ones, there are too few views. One long bar is "
+        "a view to look at; many alike are the robot's accuracy.",
+    )  # fmt: skip
+    page.picture(
+        "residuals.png", lambda: residual_plots.plot_residuals(report),
+        "Predicted minus detected. Arrows of neighbours that agree on the right mean that the lens "
+        "or the target's shape is not described well; the robot's errors average out there.",
+    )  # fmt: skip
+    worst = residual_plots.worst_views(report)
+    if worst:
+        page.picture(
+            "worst_views.png", lambda: residual_plots.plot_worst_views(report, worst, images),
+            "The views that the others predict worst. Arrows that all agree: the robot's pose. "
+            "Arrows in disorder: blur, a wrong detection, or a bent target.",
+        )  # fmt: skip
+
+
+def _coverage_section(page: _Page, report: HandEyeReport) -> None:
+    """Show what the calibration has seen."""
+    page.section("What the calibration has seen")
+    page.picture(
+        "coverage.png", lambda: coverage_plots.plot_coverage(report),
+        "Left: hatched parts of the image never held a point; the lens is a guess there. Middle: "
+        "from where the target was seen, its normal in the centre. Right: how the camera was "
+        "rolled about its optical axis; a full circle is best.",
+    )  # fmt: skip
+
+
+def _model_section(page: _Page, report: HandEyeReport) -> None:
+    """Show the estimates beside X: covariance, target, robot, choices."""
+    page.section("How sure it is")
+    page.picture(
+        "uncertainty.png", lambda: model_plots.plot_uncertainty(report),
+        "Covariance of the camera's place along the camera's own axes. A long ellipse names the "
+        "direction that further views should fix.",
+    )  # fmt: skip
+    page.section("The target's shape")
+    page.picture(
+        "board.png", lambda: model_plots.plot_board(report),
+        "Left: how far the print lies out of its plane. Right: its size against the drawing. Both "
+        "are measured against the robot's own metre.",
+    )  # fmt: skip
+    page.section("The robot's errors")
+    if report.used:
+        text = (
+            "No error map predicts unseen views better than the controller's own poses."
+            if report.robot_map is None
+            else "The map knows the arm's lengths and angles; it needs the joints."
+            if isinstance(report.robot_map, ArmErrorMap)
+            else "The map is an interpolator: outside of the calibrated region it is a guess."
+        )
+        page.picture("robot.png", lambda: model_plots.plot_robot(report), text)
+    if report.joint_offsets is not None:
+        rows = [
+            [f"joint {k + 1}", f"{v:+.3f} ± {sd:.3f}"]
+            for k, (v, sd) in enumerate(np.degrees(report.joint_offsets))
+        ]
+        page.table(["zero offset", "[deg]"], rows)
+    if report.map_scores or report.starts:
+        page.picture(
+            "choices.png", lambda: model_plots.plot_choices(report),
+            "Dark: the smallest. Left: which error map predicts unseen views best. Right: every "
+            "closed form before the joint fit.",
+        )  # fmt: skip
+
+
+def _lens_section(
+    page: _Page, report: HandEyeReport, intrinsics_report: IntrinsicsReport | None
+) -> None:
+    """Show the lens as calibrated with the hand-eye, and alone where that was done."""
+    page.section("The lens")
+    caption = (
+        "Left: how far the lens moves the picture from an ideal camera's. Right: how well a "
+        "pixel's direction is known, the turn that a pose would absorb taken out; dashed: the "
+        "outline of all points, beyond it the lens is a guess; hatched: pixels that no ray reaches "
+        "with these numbers. Cross: the principal point."
+    )
+    page.picture(
+        "lens.png",
+        lambda: lens_plots.plot_lens(
+            report.intrinsics, report.intrinsics_covariance, _points(report.used)
+        ),
+        f"As calibrated together with the hand-eye. {caption}",
+    )
+    header = ["term", "with the hand-eye"]
+    columns = [_lens_column(report.intrinsics, report.intrinsics_covariance)]
+    if intrinsics_report is not None:
+        r = intrinsics_report
+        header.append("lens alone")
+        columns.append(_lens_column(r.intrinsics, r.covariance))
+        page.picture(
+            "lens_alone.png",
+            lambda: lens_plots.plot_lens(r.intrinsics, r.open_covariance, _points(r.used)),
+            f"The lens alone, {r.model}. {caption}",
+        )
+    page.table(header, [[name, *[c[k] for c in columns]] for k, name in enumerate(TERM_NAMES)])
+    if intrinsics_report is not None:
+        page.table(
+            ["lens model", "unseen [px]", "seen [px]", ""],
+            [
+                [m.model, f"{m.held_out_px:.3f}", f"{m.seen_px:.3f}", "chosen" if m.chosen else ""]
+                for m in intrinsics_report.held_out
+            ],
+        )
+        _checks_of(page, intrinsics_report.checks, "Checks of the lens alone")
+
+
+def _points(views: Sequence[ViewReport] | Sequence[LensView]) -> NDArray[np.float64]:
+    """Return the points (n, 2) of some views [px]."""
+    return np.concatenate([v.uv for v in views] or [np.zeros((0, 2))])
+
+
+def _lens_column(i: CameraIntrinsics, covariance: NDArray[np.float64]) -> list[str]:
+    """Return the twelve terms of a lens with 1 sigma."""
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    values = [i.fx, i.fy, i.cx, i.cy, *i.distortion]
+    return [
+        f"{v:.6g} ± {s:.2g}" if s > 0 else f"{v:.6g} (held)"
+        for v, s in zip(values, sd, strict=True)
+    ]
+
+
+def _checks_of(page: _Page, checks: Sequence[Check], title: str) -> None:
+    """Add the checks of another report, worst first."""
+    if not checks:
+        return
+    page.section(title)
+    page.table(
+        ["", "check", "what was found", "what to do"],
+        [[c.verdict, c.name, c.sentence, c.advice] for c in worst_first(checks)],
+    )
+
+
+def _depth_section(page: _Page, report: DepthBiasReport) -> None:
+    """Show the depth camera's bias."""
+    page.section("The depth camera's bias")
+    page.picture(
+        "depth_bias.png", lambda: lens_plots.plot_depth_bias(report),
+        "Left: measured minus true depth of every view and the fitted curve. Right: what is left "
+        "where each view is corrected by the others.",
+    )  # fmt: skip
+    _checks_of(page, report.checks, "Checks of the depth camera")
+
+
+def _appendix(page: _Page, report: HandEyeReport) -> None:
+    """Add every view and the matrices, folded away."""
+    rows: list[list[str]] = []
+    for v in report.views:
+        p = viewpoint(report, v)
+        figures = [
+            f"{v.seen_px:.3f}", f"{v.unseen_px:.3f}", f"{v.unseen_mm:.3f}", f"{v.unseen_deg:.4f}"
+        ]  # fmt: skip
+        rows.append(
+            [
+                v.label,
+                str(v.index),
+                str(len(v.uv)),
+                *(figures if v.used else ["-"] * 4),
+                f"{1e3 * p.distance_m:.0f}",
+                f"{p.tilt_deg:.0f}",
+                f"{p.roll_deg:.0f}",
+                "" if v.used else f"dropped: {v.reason}",
+            ]
+        )
+    header = [
+        "view", "index", "points", "seen [px]", "unseen [px]", "unseen [mm]", "unseen [deg]",
+        "distance [mm]", "tilt [deg]", "roll [deg]", "",
+    ]  # fmt: skip
+    page.parts.append("<details open><summary>Every view</summary>")
+    page.table(header, rows)
+    page.parts.append("</details><details open><summary>The numbers, to copy</summary>")
+    what, other = ("ee", "base") if report.mode == "eye_in_hand" else ("base", "ee")
+    suffix = ", only together with the robot's error map" if report.robot_map is not None else ""
+    for name, T in (
+        (f"T_{what}_cam{suffix} [m]", report.X),
+        (f"T_{what}_cam without a map, for other programs [m]", report.X_alone),
+        (f"T_{other}_board [m]", report.Z),
+    ):
+        text = np.array2string(np.asarray(T), precision=9, suppress_small=True, separator=", ")
+        page.parts.append(f"<pre>{html.escape(name)}\n{html.escape(text)}</pre>")
+    page.parts.append("</details>")

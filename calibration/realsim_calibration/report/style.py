@@ -1,0 +1,149 @@
+"""How the pictures of a calibration look: one paper, one ink, colours that the colour-blind see."""
+
+import io
+import warnings
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+INK, MUTED, FAINT = "#22303c", "#8a99a8", "#dfe5ea"
+GOOD, WARN, BAD = "#2a9d8f", "#e9a13b", "#c8553d"
+BLUE, PALE = "#2b6ca3", "#a9c7e0"
+AXIS_COLORS = ("#c8553d", "#4c9a3f", "#2b6ca3")
+"""x, y, z of a frame."""
+VERDICT_COLORS = {"good": GOOD, "warn": WARN, "bad": BAD, "unknown": MUTED}
+ERROR_MAP = "viridis"
+"""Colour map of errors: dark is small, bright is large."""
+DPI = 140
+PAGE_WIDTH_IN = 10.4
+"""Width of a picture that fills the page [inch]."""
+LABEL_LENGTH = 26
+"""Characters of a file name beside a bar."""
+SETTINGS: dict[str, Any] = {
+    "font.size": 8.5,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.titlecolor": INK,
+    "axes.titleweight": "bold",
+    "axes.labelcolor": INK,
+    "axes.edgecolor": MUTED,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5,
+    "legend.frameon": False,
+    "legend.fontsize": 7.5,
+    "figure.facecolor": "white",
+    "grid.color": FAINT,
+    "grid.linewidth": 0.6,
+    # File names may hold dollar signs, which are no formulas.
+    "text.parse_math": False,
+}
+
+
+@contextmanager
+def paper_style() -> Generator[None]:
+    """Draw what is drawn inside in the report's style."""
+    from matplotlib import rc_context
+
+    with rc_context(cast(Any, SETTINGS)), warnings.catch_warnings():
+        # A file name in a script that the font lacks is drawn as boxes, which is no news.
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        yield
+
+
+def new_figure(height_in: float, width_in: float = PAGE_WIDTH_IN) -> Any:
+    """Return an empty figure whose axes will not overlap."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
+
+
+def png_bytes(figure: Any) -> bytes:
+    """Return a figure as PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+def short_label(text: str, length: int = LABEL_LENGTH) -> str:
+    """Return a name on one line, its middle left out where it is long."""
+    line = "".join(c if c.isprintable() else " " for c in " ".join(text.split()))
+    if len(line) <= length:
+        return line
+    tail = (length - 1) // 2
+    return f"{line[: length - 1 - tail]}…{line[-tail:]}"
+
+
+def round_number(value: float) -> float:
+    """Return the largest 1, 2 or 5 times a power of ten that is not above a positive value."""
+    if not np.isfinite(value) or value <= 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(value))
+    return float(max(m * power for m in (1.0, 2.0, 5.0) if m * power <= value * (1 + 1e-9)))
+
+
+def image_axes(ax: Any, width: int, height: int) -> None:
+    """Make axes an image plane: pixels, y down, the image's border drawn."""
+    ax.set_xlim(-0.5, width - 0.5)
+    ax.set_ylim(height - 0.5, -0.5)
+    ax.set_aspect("equal")
+    ax.spines[["top", "right"]].set_visible(True)
+    ax.set_xlabel("u [px]")
+    ax.set_ylabel("v [px]")
+
+
+def draw_arrows(
+    ax: Any, at: ArrayLike, arrows: ArrayLike, width_px: float, **looks: Any
+) -> tuple[Any, float]:
+    """Draw arrows (n, 2) [px] enlarged on an image plane, with a key; return quiver and factor.
+
+    The factor is round and makes the 95th percentile about a twentieth of the image's width.
+    """
+    at, arrows = np.asarray(at, dtype=np.float64), np.asarray(arrows, dtype=np.float64)
+    lengths = np.linalg.norm(arrows, axis=-1)
+    usual = float(np.percentile(lengths, 95)) if len(lengths) else 0.0
+    factor = round_number(width_px / 20 / max(usual, 1e-9))
+    moved = factor * arrows
+    quiver = ax.quiver(
+        at[:, 0], at[:, 1], moved[:, 0], moved[:, 1], *([lengths] if "cmap" in looks else []),
+        angles="xy", scale_units="xy", scale=1.0, **looks,
+    )  # fmt: skip
+    key = round_number(0.99 * width_px / 12 / factor)
+    ax.quiverkey(
+        quiver, 0.83, 1.045, factor * key, f"{key:g} px", labelpos="E", coordinates="axes",
+        color=INK, labelcolor=INK, fontproperties={"size": 7.5},
+    )  # fmt: skip
+    return quiver, factor
+
+
+def color_bar(figure: Any, artist: Any, ax: Any, label: str) -> Any:
+    """Add a slim colour bar, as tall as the axes."""
+    if ax.name == "rectilinear":
+        bar = figure.colorbar(artist, cax=ax.inset_axes((1.02, 0.0, 0.025, 1.0)))
+    else:
+        bar = figure.colorbar(artist, ax=ax, shrink=0.75, aspect=28, pad=0.1)
+    bar.set_label(label, color=INK)
+    bar.outline.set_visible(False)
+    return bar
+
+
+def empty_axes(ax: Any, text: str) -> None:
+    """Say in the place of a plot why there is none."""
+    ax.set_axis_off()
+    ax.text(0.5, 0.5, text, ha="center", va="center", color=MUTED, transform=ax.transAxes)
+
+
+def finite(values: Sequence[float] | Array) -> Array:
+    """Return the finite ones of some numbers."""
+    array = np.asarray(values, dtype=np.float64)
+    return array[np.isfinite(array)]

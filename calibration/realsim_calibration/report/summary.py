@@ -1,0 +1,228 @@
+"""A calibration in words and numbers: verdict, headline figures, checks; and where views stood."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import metrics, se3
+from realsim.records import Check, RobotErrorMap
+from realsim_calibration.export_frames import quaternion_xyzw, roll_pitch_yaw
+from realsim_calibration.results import HandEyeReport, ViewReport
+
+Array = NDArray[np.float64]
+Verdict = Literal["good", "warn", "bad", "unknown"]
+WORST_FIRST: tuple[Verdict, ...] = ("bad", "warn", "unknown", "good")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Judgement:
+    """A calibration in one sentence."""
+
+    verdict: Verdict
+    headline: str
+    """What to do with it, in a few words."""
+    sentence: str
+    """Why."""
+
+
+def worst_first(checks: Sequence[Check]) -> list[Check]:
+    """Return checks, worst first, else in their own order."""
+    return sorted(checks, key=lambda c: WORST_FIRST.index(c.verdict))
+
+
+def verdict(report: HandEyeReport) -> Judgement:
+    """Return the judgement of a calibration from its checks."""
+    checks = worst_first(report.checks)
+    bad = [c for c in checks if c.verdict == "bad"]
+    warn = [c for c in checks if c.verdict == "warn"]
+    unknown = [c for c in checks if c.verdict == "unknown"]
+    figures = (
+        f"Views that it had not seen are predicted within {report.held_out_px:.2f} px, "
+        f"{report.held_out_mm:.2f} mm and {report.held_out_deg:.3f} deg (RMS)."
+        if np.isfinite(report.held_out_px)
+        else "How well it predicts views that it had not seen is not known."
+    )
+    if bad:
+        return Judgement(
+            verdict="bad",
+            headline="Do not use this calibration yet",
+            sentence=f"{len(bad)} of {len(checks)} checks failed. {_words(bad[0])}",
+        )
+    if warn:
+        return Judgement(
+            verdict="warn",
+            headline="Usable, with care",
+            sentence=f"{len(warn)} of {len(checks)} checks gave a warning. {_words(warn[0])} "
+            f"{figures}",
+        )
+    if len(unknown) == len(checks):
+        return Judgement(
+            verdict="unknown", headline="Not judged", sentence=f"Nothing was checked. {figures}"
+        )
+    rest = f", {len(unknown)} could not be made" if unknown else ""
+    return Judgement(
+        verdict="good",
+        headline="Good to use",
+        sentence=f"{len(checks) - len(unknown)} checks passed{rest}. {figures}",
+    )
+
+
+def _words(check: Check) -> str:
+    """Return a check's sentence, its name before it."""
+    return f"{check.name[:1].upper()}{check.name[1:]}: {check.sentence}"
+
+
+def check_rows(report: HandEyeReport) -> list[list[str]]:
+    """Return (verdict, check, value, what was found, what to do) of every check, worst first."""
+    names = {v.index: v.label for v in report.views}
+    rows: list[list[str]] = []
+    for c in worst_first(report.checks):
+        found = c.sentence
+        if c.views:
+            found += f" Views: {', '.join(names.get(k, str(k)) for k in c.views)}."
+        value = f"{c.value:.4g} {c.unit}".strip() if np.isfinite(c.value) else ""
+        rows.append([c.verdict, c.name, value, found, c.advice])
+    return rows
+
+
+def carrier(report: HandEyeReport) -> str:
+    """Return what carries the camera: "tool" or "base"."""
+    return "tool" if report.mode == "eye_in_hand" else "base"
+
+
+def pose_rows(report: HandEyeReport) -> list[list[str]]:
+    """Return the rows that say where the camera is, with 1 sigma along the axes of the carrier."""
+    X, what = report.X, carrier(report)
+    # The covariance is that of a right perturbation: along the camera's axes.
+    in_carrier = X[:3, :3] @ report.X_covariance[3:, 3:] @ X[:3, :3].T
+    sd = 1e3 * np.sqrt(np.diag(in_carrier))
+    place = [f"{a} {1e3 * v:.3f} ± {s:.3f}" for a, v, s in zip("xyz", X[:3, 3], sd, strict=True)]
+    q = ", ".join(f"{v:.6f}" for v in quaternion_xyzw(X))
+    rpy = ", ".join(f"{np.degrees(v):.3f}" for v in roll_pitch_yaw(X[:3, :3]))
+    rows = [
+        [f"camera in the {what} [mm], ± 1 sigma", ", ".join(place)],
+        ["roll, pitch, yaw about fixed axes [deg]", f"{rpy} (± {report.sigma_deg:.4f})"],
+        ["quaternion x, y, z, w", q],
+        ["looks along", looks_along(report)],
+        ["1 sigma, worst axis", f"{report.sigma_mm:.3f} mm, {report.sigma_deg:.4f} deg"],
+    ]
+    moved = float(metrics.translation_error_mm(report.X, report.X_alone))
+    turned = float(metrics.rotation_error_deg(report.X, report.X_alone))
+    if report.robot_map is None:
+        rows.append(["robot error map", "none: the controller's poses are taken as they are"])
+    else:
+        rows.append(
+            [
+                "robot error map",
+                f"in use; without it (X alone, for other programs) the camera is {moved:.2f} mm "
+                f"and {turned:.3f} deg elsewhere",
+            ]
+        )
+    return rows
+
+
+def looks_along(report: HandEyeReport) -> str:
+    """Return the optical axis in words: the nearest axis of the carrier and the angle to it."""
+    z, what = report.X[:3, 2], carrier(report)
+    k = int(np.argmax(np.abs(z)))
+    off = np.degrees(np.arccos(np.clip(abs(z[k]), 0.0, 1.0)))
+    sign = "+" if z[k] > 0 else "-"
+    return f"{what} {sign}{'xyz'[k]}, {off:.1f} deg off it"
+
+
+def accuracy_rows(report: HandEyeReport) -> list[list[str]]:
+    """Return the rows that say how good the calibration is."""
+    ratio = report.held_out_px / report.seen_px if report.seen_px > 0 else float("nan")
+    return [
+        [
+            "unseen views (each predicted without it)",
+            f"{report.held_out_px:.3f} px, {report.held_out_mm:.3f} mm, "
+            f"{report.held_out_deg:.4f} deg RMS",
+        ],
+        ["seen views (in-sample)", f"{report.seen_px:.3f} px RMS; unseen / seen = {ratio:.2f}"],
+        ["what a perfect calibration of this kind leaves", f"{report.floor_px:.3f} px"],
+        ["corner noise", f"{report.sigma_px:.3f} px"],
+        ["views used, dropped", f"{len(report.used)}, {len(report.rejected)}"],
+        ["roll about the optical axis", f"{report.roll_range_deg:.0f} deg"],
+    ]
+
+
+def summary_rows(report: HandEyeReport) -> list[list[str]]:
+    """Return (figure, value) rows for a table in the terminal."""
+    b = report.board
+    return [
+        *pose_rows(report),
+        *accuracy_rows(report),
+        ["target's scale", f"{b.scale:.5f} ± {b.sd[0]:.5f}, warp {b.warp_mm:.2f} mm"],
+    ]
+
+
+# --- where the views stood ----------------------------------------------------------------------
+
+
+def camera_in_board(report: HandEyeReport, view: ViewReport) -> Array:
+    """Return T_board_cam (4, 4) [m] of a view, through the robot's pose and its map."""
+    A = corrected(report, view)
+    if report.mode == "eye_in_hand":
+        return se3.invert(report.Z) @ A @ report.X
+    return se3.invert(report.Z) @ se3.invert(A) @ report.X
+
+
+def corrected(report: HandEyeReport, view: ViewReport) -> Array:
+    """Return T_base_ee (4, 4) [m] of a view, the error that a map of poses knows taken out.
+
+    A map of the arm needs joints, which a view's report does not have: the controller's pose is
+    returned, millimetres off, which is enough to draw it.
+    """
+    if isinstance(report.robot_map, RobotErrorMap):
+        return report.robot_map.corrected(view.T_base_ee)
+    return np.asarray(view.T_base_ee)
+
+
+def rest_of_map(report: HandEyeReport, view: ViewReport) -> Array | None:
+    """Return the robot's error (6,) that a map of poses leaves, rotation first [rad, m].
+
+    None where there is no such map.
+    """
+    if not isinstance(report.robot_map, RobotErrorMap):
+        return None
+    known = se3.exp(report.robot_map.twist(view.T_base_ee))
+    return se3.log(se3.invert(known) @ se3.exp(view.robot_error))
+
+
+def board_middle(report: HandEyeReport) -> Array:
+    """Return the middle (3,) of the target's points in the board frame [m]."""
+    points = report.target.points_board
+    return (points.min(0) + points.max(0)) / 2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Viewpoint:
+    """From where a view sees the target."""
+
+    tilt_deg: float
+    """Between the target's normal and the line from its middle to the camera [deg]."""
+    azimuth_deg: float
+    """Direction of that line about the normal, from the target's x axis [deg]."""
+    roll_deg: float
+    """Turn of the camera about its optical axis [deg]."""
+    distance_m: float
+
+
+def viewpoint(report: HandEyeReport, view: ViewReport) -> Viewpoint:
+    """Return from where a view sees the target."""
+    T = camera_in_board(report, view)
+    away = T[:3, 3] - board_middle(report)
+    distance = float(np.linalg.norm(away))
+    # The board's z points into the paper, away from the camera.
+    tilt = np.degrees(np.arccos(np.clip(-away[2] / max(distance, 1e-12), -1.0, 1.0)))
+    T_cam_board = se3.invert(T)
+    return Viewpoint(
+        tilt_deg=float(tilt),
+        azimuth_deg=float(np.degrees(np.arctan2(away[1], away[0]))),
+        roll_deg=float(np.degrees(np.arctan2(T_cam_board[1, 0], T_cam_board[0, 0]))),
+        distance_m=distance,
+    )

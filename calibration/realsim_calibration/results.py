@@ -1,0 +1,186 @@
+"""What a hand-eye calibration says of itself: the estimate, every view, every check."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.records import ArmErrorMap, CameraIntrinsics, Check, HandEye, RobotErrorMap, Target
+
+Array = NDArray[np.float64]
+Mode = Literal["eye_in_hand", "eye_to_hand"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class BoardShape:
+    """How the printed target differs from its drawing.
+
+    P = middle + s ((x, (1 + a) y, L (w1 x'^2 + w2 x' y' + w3 y'^2))), x' = x / L, y' = y / L, with
+    x, y from the middle and L half the longer side.
+    """
+
+    scale: float
+    """Size relative to the drawing."""
+    aspect: float
+    """a: the height's scale relative to the width's, less 1."""
+    warp: Array
+    """(3,) w1, w2, w3: bending along x, twist, bending along y; multiply by L for metres."""
+    sd: Array
+    """(5,) 1-sigma of scale, aspect, w1, w2, w3 (0 = held)."""
+    half_extent_m: float
+    """L."""
+
+    @property
+    def warp_mm(self) -> float:
+        """Largest lift of the target's border from its flat drawing [mm]."""
+        x, y = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21))
+        lift = self.warp[0] * x**2 + self.warp[1] * x * y + self.warp[2] * y**2
+        return float(1e3 * self.half_extent_m * np.abs(lift).max())
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ViewReport:
+    """One view's part in the calibration."""
+
+    index: int
+    label: str
+    """File name, or the index."""
+    used: bool
+    reason: str
+    """Why it was not used; empty where it was."""
+    T_base_ee: Array
+    """(4, 4) as the controller gave it [m]."""
+    uv: Array
+    """(n, 2) detected points [px]."""
+    residuals: Array
+    """(n, 2) predicted through the robot's pose minus detected [px]; (0, 2) where not used."""
+    seen_px: float
+    """RMS of the residuals [px]; NaN where not used."""
+    unseen_px: float
+    """The same, predicted by the fit without this view [px]; NaN where not used."""
+    unseen_mm: float
+    """Distance of the board's middle, as the camera alone sees it, from where the fit without this
+    view expects it [mm]; NaN where not used."""
+    unseen_deg: float
+    """Angle between the two board poses [deg]; NaN where not used."""
+    robot_error: Array
+    """(6,) estimated robot error right of T_base_ee, map and rest together [rad, m]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class HandEyeReport:
+    """A hand-eye calibration with its diagnosis.
+
+    X is where the camera sits: T_ee_cam (eye in hand) or T_base_cam (eye to hand). Z is where the
+    target sits: T_base_board (eye in hand) or T_ee_board (eye to hand).
+    """
+
+    mode: Mode
+    target: Target
+    X: Array
+    """(4, 4) camera in hand or base, to be used WITH the map [m]."""
+    X_covariance: Array
+    """(6, 6) of the right perturbation of X, rotation first [rad, m]."""
+    Z: Array
+    """(4, 4) target in base or hand [m]."""
+    X_alone: Array
+    """(4, 4) the camera's place fitted WITHOUT a map: for tools that know none [m]."""
+    X_alone_covariance: Array
+    """(6, 6) of the right perturbation of X_alone [rad, m]."""
+    intrinsics: CameraIntrinsics
+    intrinsics_covariance: Array
+    """(12, 12) of fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6; zero rows = held."""
+    board: BoardShape
+    robot_map: RobotErrorMap | ArmErrorMap | None
+    """None: no map predicts unseen views better than the controller's own poses."""
+    map_scores: tuple[tuple[str, float], ...]
+    """(candidate, geometric mean of the unseen views' RMS [px]) of every map tried, "none" first."""
+    joint_offsets: Array | None
+    """(6, 2) joint zero offsets and their 1-sigma [rad] where joints and arm are known. Those of
+    the first and the last joint cannot be told from another board or camera place."""
+    sigma_px: float
+    """Unit-weight standard deviation of a corner coordinate [px]."""
+    robot_ratio: float
+    """lambda: the robot's share in the error of a view relative to the corners'."""
+    views: tuple[ViewReport, ...]
+    """Every view that was given, by index."""
+    seen_px: float
+    """RMS over the used views, through the robot's pose [px]: in-sample."""
+    held_out_px: float
+    """RMS over the used views, each predicted by a fit without it [px]."""
+    held_out_mm: float
+    """RMS of unseen_mm [mm]."""
+    held_out_deg: float
+    """RMS of unseen_deg [deg]."""
+    starts: tuple[tuple[str, float], ...]
+    """(closed form, its reprojection RMS [px])."""
+    mismatch_deg: float
+    """Median mismatch of the turns of hand and camera over all pairs, before any gate [deg]."""
+    screw_ratio: float
+    """Slide of the hand / slide of the camera along the screw axes; NaN = hardly any slide."""
+    roll_range_deg: float
+    """Range of camera roll about the optical axis [deg]."""
+    checks: tuple[Check, ...]
+    information: Array
+    """(29, 29) information about X (6), Z (6), the camera (12) and the board's shape (5: scale,
+    aspect, warp), the map eliminated: for the next best view."""
+
+    @property
+    def floor_px(self) -> float:
+        """Error that a perfect calibration of this kind would leave, sqrt(seen held-out) [px]."""
+        return float(np.sqrt(self.seen_px * self.held_out_px))
+
+    @property
+    def used(self) -> tuple[ViewReport, ...]:
+        """The views that took part."""
+        return tuple(v for v in self.views if v.used)
+
+    @property
+    def rejected(self) -> tuple[tuple[int, str], ...]:
+        """(index, reason) of the others."""
+        return tuple((v.index, v.reason) for v in self.views if not v.used)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The sentence of every check that is not good."""
+        return tuple(
+            f"{c.sentence} {c.advice}".strip() for c in self.checks if c.verdict in ("warn", "bad")
+        )
+
+    @property
+    def sigma_mm(self) -> float:
+        """Largest 1-sigma of X's translation along any axis [mm]."""
+        return float(1e3 * np.sqrt(np.linalg.eigvalsh(self.X_covariance[3:, 3:])[-1]))
+
+    @property
+    def sigma_deg(self) -> float:
+        """Largest 1-sigma of X's rotation about any axis [deg]."""
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.X_covariance[:3, :3])[-1])))
+
+    @property
+    def hand_eye(self) -> HandEye:
+        """The session's record of an eye-in-hand calibration.
+
+        Raises:
+            InputError: the camera does not sit in the hand.
+        """
+        if self.mode != "eye_in_hand":
+            raise InputError("a camera that stands still has no place in the hand: use X.")
+        return HandEye(
+            T_ee_cam=self.X,
+            covariance=self.X_covariance,
+            T_base_board=self.Z,
+            intrinsics=self.intrinsics,
+            intrinsics_sd=np.sqrt(np.diag(self.intrinsics_covariance)),
+            view_indices=tuple(v.index for v in self.used),
+            view_rms_px=np.array([v.seen_px for v in self.used]),
+            held_out_px=self.held_out_px,
+            rejected=self.rejected,
+            method="joint reprojection fit: hand-eye, board and its shape, lens, robot error per "
+            "view" + (", robot error map" if self.robot_map is not None else ""),
+            starts=self.starts,
+            robot_map=self.robot_map,
+            checks=self.checks,
+        )

@@ -1,0 +1,197 @@
+"""What a calibration found: the hand-eye, the robot's error map, the checks with their advice."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.dh import DhArm
+from realsim.records.capture import CameraIntrinsics
+from realsim.records.checked_arrays import Array, frozen, rigid
+
+MAP_FEATURES = 12
+"""Features of a pose in an error map: position (3) and rotation matrix (9)."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Check:
+    """One thing that was looked at, what was found, and what to do about it."""
+
+    name: str
+    """Short, the same for every run: "board scale"."""
+    verdict: Literal["good", "warn", "bad", "unknown"]
+    sentence: str
+    """What was found, with the figures."""
+    advice: str = ""
+    """What to do; empty where the verdict is good."""
+    value: float = float("nan")
+    """The figure that was judged; NaN where there is none."""
+    unit: str = ""
+    views: tuple[int, ...] = ()
+    """Views that the check names."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class RobotErrorMap:
+    """The robot's pose error as a linear function of its pose: T_true = T Exp(B(T) W).
+
+    B(T) W = W phi(T) ("ee": error in the axes of the tool) or R^T W phi(T) for both halves ("base":
+    in the axes of the base), phi = [(p - mean_p) / sd_p, vec(R) - mean_R]. It is an interpolator:
+    beyond the poses it was fitted on it is a guess.
+    """
+
+    frame: Literal["ee", "base"]
+    mean: Array
+    """(12,) mean of position [m] and of the rotation matrix, row by row."""
+    sd_m: float
+    """Spread of the positions, the same for all three axes [m]."""
+    weights: Array
+    """(6, 12) W, rotation first [rad, m per unit feature]."""
+    reach: Array
+    """(views, 12) features of the poses it was fitted on."""
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        for name, shape in (
+            ("mean", (MAP_FEATURES,)),
+            ("weights", (6, MAP_FEATURES)),
+            ("reach", (None, MAP_FEATURES)),
+        ):
+            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, shape, name))
+
+    def features(self, T: ArrayLike) -> Array:
+        """Return phi (..., 12) of robot poses (..., 4, 4)."""
+        T = np.asarray(T, dtype=np.float64)
+        raw = np.concatenate([T[..., :3, 3], T[..., :3, :3].reshape(*T.shape[:-2], 9)], -1)
+        return (raw - self.mean) / np.array([self.sd_m] * 3 + [1.0] * 9)
+
+    def twist(self, T: ArrayLike) -> Array:
+        """Return the error (..., 6) right of robot poses (..., 4, 4), rotation first [rad, m]."""
+        T = np.asarray(T, dtype=np.float64)
+        error = self.features(T) @ self.weights.T
+        if self.frame == "ee":
+            return error
+        to_tool = np.swapaxes(T[..., :3, :3], -1, -2)
+        halves = [(to_tool @ error[..., h, None])[..., 0] for h in (slice(0, 3), slice(3, 6))]
+        return np.concatenate(halves, -1)
+
+    def corrected(self, T: ArrayLike) -> Array:
+        """Return where the robot really is, T Exp(B(T) W) (..., 4, 4)."""
+        return np.asarray(T, dtype=np.float64) @ se3.exp(self.twist(T))
+
+    def beyond(self, T: ArrayLike) -> Array:
+        """Return how far poses (..., 4, 4) lie from the nearest fitted one, in spreads of those.
+
+        1 is the largest distance that a fitted pose has to its own nearest neighbour: beyond about
+        2 the map is a guess.
+        """
+        phi = self.features(T)
+        between = np.linalg.norm(self.reach[:, None] - self.reach[None], axis=-1)
+        np.fill_diagonal(between, np.inf)
+        usual = float(between.min(1).max())
+        away = np.linalg.norm(phi[..., None, :] - self.reach, axis=-1).min(-1)
+        return away / max(usual, 1e-9)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ArmErrorMap:
+    """The robot's pose error as errors of its arm's Denavit-Hartenberg numbers; needs the joints."""
+
+    arm: DhArm
+    """The arm as it is said to be."""
+    errors: Array
+    """(24,) to be added to its theta, alpha [rad], a, d [m], six each."""
+    T_flange_tool: Array
+    """(4, 4) the controller's tool frame in the flange [m]."""
+
+    def __post_init__(self) -> None:
+        """Freeze the arrays."""
+        object.__setattr__(self, "errors", frozen(self.errors, np.float64, (24,), "errors"))
+        object.__setattr__(self, "T_flange_tool", rigid(self.T_flange_tool, "T_flange_tool"))
+
+    def corrected(self, T: ArrayLike, joints: ArrayLike) -> Array:
+        """Return where the robot really is (..., 4, 4) at poses (..., 4, 4) and joints (..., 6)."""
+        moved = se3.invert(self.arm.forward(joints)) @ self.arm.corrected(self.errors).forward(
+            joints
+        )
+        G = self.T_flange_tool
+        return np.asarray(T, dtype=np.float64) @ se3.invert(G) @ moved @ G
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class HandEye:
+    """A hand-eye calibration: the camera in the hand, and everything that says how good it is."""
+
+    T_ee_cam: Array
+    """(4, 4) camera in the controller's tool frame [m]."""
+    covariance: Array
+    """(6, 6) of the right perturbation of T_ee_cam, rotation first [rad, m]."""
+    T_base_board: Array
+    """(4, 4) board in base [m]."""
+    intrinsics: CameraIntrinsics
+    """The camera as calibrated together with the hand-eye."""
+    intrinsics_sd: Array
+    """(4 + 8,) 1-sigma of fx fy cx cy [px] and of the 8 distortion terms (0 = held fixed)."""
+    view_indices: tuple[int, ...]
+    """Views used."""
+    view_rms_px: Array
+    """(views used,) reprojection RMS of each view through the robot pose [px]."""
+    held_out_px: float
+    """RMS of views predicted by a fit without them, through the robot pose [px]."""
+    rejected: tuple[tuple[int, str], ...] = ()
+    """(view, reason) of every view that was not used."""
+    method: str = ""
+    starts: tuple[tuple[str, float], ...] = ()
+    """(closed form, its reprojection RMS [px]) of every start tried."""
+    robot_map: RobotErrorMap | ArmErrorMap | None = None
+    """The robot's error map that belongs to T_ee_cam; None = the controller's poses are taken as
+    they are."""
+    checks: tuple[Check, ...] = ()
+    """Everything that was checked, with verdict and advice."""
+
+    def __post_init__(self) -> None:
+        """Check that the poses are rigid and freeze the arrays."""
+        object.__setattr__(self, "T_ee_cam", rigid(self.T_ee_cam, "T_ee_cam"))
+        object.__setattr__(self, "T_base_board", rigid(self.T_base_board, "T_base_board"))
+        for name, shape in (
+            ("covariance", (6, 6)),
+            ("intrinsics_sd", (12,)),
+            ("view_rms_px", (None,)),
+        ):
+            value = frozen(getattr(self, name), np.float64, shape, name)
+            object.__setattr__(self, name, value)
+
+    @property
+    def sigma_deg(self) -> float:
+        """Largest 1-sigma of the rotation about any axis [deg]."""
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1])))
+
+    @property
+    def sigma_mm(self) -> float:
+        """Largest 1-sigma of the translation along any axis [mm]."""
+        return float(1e3 * np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
+
+    def camera_poses(self, Ts_base_ee: ArrayLike, joints: ArrayLike | None = None) -> Array:
+        """Return T_base_cam (..., 4, 4) [m] at the controller's poses (..., 4, 4).
+
+        Args:
+            Ts_base_ee: the controller's poses [m].
+            joints: (..., 6) joint angles [rad]; needed where the robot's error is one of its arm.
+
+        Raises:
+            InputError: the robot's error map needs joints and there are none.
+        """
+        T = np.asarray(Ts_base_ee, dtype=np.float64)
+        if isinstance(self.robot_map, RobotErrorMap):
+            T = self.robot_map.corrected(T)
+        elif isinstance(self.robot_map, ArmErrorMap):
+            if joints is None:
+                raise InputError(
+                    "the hand-eye calibration corrects errors of the arm's joints and links, so "
+                    "joint angles are needed for a camera pose. Give them, or calibrate without."
+                )
+            T = self.robot_map.corrected(T, joints)
+        return T @ self.T_ee_cam

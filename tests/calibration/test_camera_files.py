@@ -1,0 +1,240 @@
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from realsim.errors import InputError
+from realsim.geometry.camera import project
+from realsim.records import CameraIntrinsics
+from realsim_calibration.camera_files import read_camera, write_camera
+
+ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+CAMERA = CameraIntrinsics(
+    width=1280, height=720, fx=912.25, fy=911.5, cx=641.125, cy=355.75,
+    distortion=np.array([0.11, -0.21, 0.0007, -0.0004, 0.09, 0, 0, 0]),
+)  # fmt: skip
+FORMATS = ("realsim", "ros", "opencv")
+K_ROWS = "[912.25, 0, 641.125, 0, 911.5, 355.75, 0, 0, 1]"
+
+
+def same(a, b):
+    return (
+        (a.width, a.height, a.fx, a.fy, a.cx, a.cy) == (b.width, b.height, b.fx, b.fy, b.cx, b.cy)
+        and a.distortion.tolist() == b.distortion.tolist()
+    )  # fmt: skip
+
+
+def given_file(folder, name, content):
+    path = folder / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+term = st.floats(-0.9, 0.9, allow_subnormal=False)
+
+
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    f=st.floats(200, 4000),
+    ratio=st.floats(0.9, 1.1),
+    center=st.tuples(st.floats(1, 1279), st.floats(1, 719)),
+    d=st.lists(term, min_size=0, max_size=8),
+    form=st.sampled_from(FORMATS),
+)
+def test_what_was_written_is_read_bit_for_bit(tmp_path, f, ratio, center, d, form):
+    camera = CameraIntrinsics(
+        width=1280, height=720, fx=f, fy=f * ratio, cx=center[0], cy=center[1],
+        distortion=np.array(d),
+    )  # fmt: skip
+    path = tmp_path / f"camera_{form}"
+    write_camera(path, camera, format=form)
+    assert same(read_camera(path), camera)
+
+
+def test_opencv_reads_what_was_written_and_the_other_way_round(tmp_path):
+    import cv2
+
+    ours = tmp_path / "ours.yaml"
+    write_camera(ours, CAMERA, format="opencv")
+    stored = cv2.FileStorage(str(ours), cv2.FileStorage_READ)
+    assert np.array_equal(stored.getNode("camera_matrix").mat(), CAMERA.K)
+    assert np.array_equal(
+        stored.getNode("distortion_coefficients").mat().ravel(), CAMERA.distortion[:5]
+    )
+    for suffix in ("yaml", "xml", "json"):
+        path = tmp_path / f"theirs.{suffix}"
+        storage = cv2.FileStorage(str(path), cv2.FileStorage_WRITE)
+        storage.write("calibration_time", "Fri 20 Nov 2026")
+        storage.write("image_width", CAMERA.width)
+        storage.write("image_height", CAMERA.height)
+        storage.write("cameraMatrix", CAMERA.K)
+        storage.write("distCoeffs", CAMERA.distortion[:5].reshape(1, 5))
+        storage.release()
+        read = read_camera(path)
+        assert np.allclose(read.K, CAMERA.K, rtol=1e-12)
+        assert np.allclose(read.distortion, CAMERA.distortion, rtol=1e-12)
+        assert (read.width, read.height) == (1280, 720)
+
+
+def test_ros_camera_info_of_the_calibrator(tmp_path):
+    text = (
+        "image_width: 1280\nimage_height: 720\ncamera_name: wrist\ncamera_matrix:\n  rows: 3\n"
+        f"  cols: 3\n  data: {K_ROWS}\ndistortion_model: rational_polynomial\n"
+        "distortion_coefficients:\n  rows: 1\n  cols: 8\n"
+        "  data: [0.1, 0.2, 0.001, 0.002, 0.3, 0.4, 0.5, 0.6]\n"
+    )
+    camera = read_camera(given_file(tmp_path, "wrist.yaml", text))
+    assert camera.fx == 912.25 and camera.cy == 355.75
+    assert camera.distortion.tolist() == [0.1, 0.2, 0.001, 0.002, 0.3, 0.4, 0.5, 0.6]
+
+
+def test_the_other_kinds_of_json(tmp_path):
+    K = [[912.25, 0, 641.125], [0, 911.5, 355.75], [0, 0, 1]]
+    size = {"width": 1280, "height": 720}
+    four = {"fx": 912.25, "fy": 911.5}
+    d = CAMERA.distortion[:5].tolist()
+    cases = {
+        "matrix": {"intrinsic": K, "distortion": [d], "resolution": [1280, 720]},
+        "realsense": {**four, **size, "ppx": 641.125, "ppy": 355.75, "coeffs": d},
+        "nested": {"color": {"K": K, "D": d, **size}},
+    }
+    for name, content in cases.items():
+        assert same(read_camera(given_file(tmp_path, name + ".json", content)), CAMERA), name
+    bop = {**four, **size, "cx": 641.125, "cy": 355.75, "depth_scale": 0.1}
+    assert not read_camera(given_file(tmp_path, "camera.json", bop)).is_distorted
+
+
+@pytest.mark.parametrize(
+    ("line", "fx", "fy", "d"),
+    [
+        ("1 SIMPLE_PINHOLE 640 480 500 320 240", 500, 500, []),
+        ("1 PINHOLE 640 480 500 510 320 240", 500, 510, []),
+        ("1 SIMPLE_RADIAL 640 480 500 320 240 0.1", 500, 500, [0.1]),
+        ("1 RADIAL 640 480 500 320 240 0.1 -0.2", 500, 500, [0.1, -0.2]),
+        ("1 OPENCV 640 480 500 510 320 240 .1 .2 .003 .004", 500, 510, [0.1, 0.2, 0.003, 0.004]),
+        (
+            "1 FULL_OPENCV 640 480 500 510 320 240 .1 .2 .003 .004 .5 .6 .7 .8",
+            500, 510, [0.1, 0.2, 0.003, 0.004, 0.5, 0.6, 0.7, 0.8],
+        ),
+    ],
+)  # fmt: skip
+def test_colmap_pixels_move_by_half_a_pixel(tmp_path, line, fx, fy, d):
+    import pycolmap
+
+    path = given_file(tmp_path, "cameras.txt", "# Camera list\n# ...\n" + line + "\n")
+    camera = read_camera(path)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (fx, fy, 319.5, 239.5)
+    assert camera.distortion[: len(d)].tolist() == d
+    words = line.split()
+    theirs = pycolmap.Camera(
+        model=words[1], width=640, height=480, params=[float(w) for w in words[4:]]
+    )
+    points = np.array([[0.1, -0.2, 1.0], [-0.3, 0.15, 1.2], [0.0, 0.0, 1.0]])
+    uv = np.array([theirs.img_from_cam(p) for p in points]).reshape(-1, 2)
+    assert np.allclose(project(camera, points), uv - 0.5, atol=1e-9)
+
+
+BAD = {
+    "no size": ({"K": [1, 0, 0, 0, 1, 0, 0, 0, 1]}, "how large its images are"),
+    "no camera": ({"poses": []}, "holds no camera"),
+    "no centre": ({"fx": 500, "fy": 500, "width": 640, "height": 480}, "no principal point"),
+    "fisheye": (
+        {"K": [500, 0, 320, 0, 500, 240, 0, 0, 1], "D": [0.1, 0.2, 0.3, 0.4], "width": 640,
+         "height": 480, "distortion_model": "kannala_brandt"},
+        "kannala_brandt",
+    ),
+    "thin prism": (
+        {"K": [500, 0, 320, 0, 500, 240, 0, 0, 1], "D": [0.1] * 12, "width": 640, "height": 480},
+        "12 distortion coefficients",
+    ),
+    "several": (
+        {"left": {"fx": 1, "fy": 1}, "right": {"fx": 1, "fy": 1}}, "several cameras (left, right)",
+    ),
+    "nan": (
+        {"fx": float("nan"), "fy": 500, "cx": 320, "cy": 240, "width": 640, "height": 480},
+        "not a finite number",
+    ),
+    "transposed": (
+        {"K": [500, 0, 0, 0, 500, 0, 320, 240, 1], "width": 640, "height": 480}, "transposed",
+    ),
+    "copied": (
+        {"fx": 640.8, "fy": 357.5, "ppx": 640.8, "ppy": 357.5, "width": 1280, "height": 720},
+        "repeat the principal point",
+    ),
+    "outside": (
+        {"fx": 500, "fy": 500, "cx": 960, "cy": 540, "width": 640, "height": 480},
+        "outside the image",
+    ),
+    "rows": (
+        {"camera_matrix": {"rows": 3, "cols": 3, "data": [1, 2]}, "width": 640, "height": 480},
+        "claims 3x3 numbers and holds 2",
+    ),
+    "words": (
+        {"fx": "long", "fy": 500, "cx": 320, "cy": 240, "width": 640, "height": 480}, "numbers",
+    ),
+    "list": ("[1, 2]", "holds a list"),
+    "torn": ('{"fx": 1', "damaged"),
+    "empty": ("", "is empty"),
+    "yaml": ("a: [1, 2", "damaged"),
+    "deep": ("{" + '"a":{' * 3000, "damaged"),
+    "bomb": ("a: &a [1]\nb: [*a, *a]\n", "references"),
+    "tag": ("!!python/object/apply:os.getcwd []\n", "damaged"),
+    "entities": ("<!DOCTYPE x [<!ENTITY a 'b'>]><opencv_storage/>", "entities"),
+    "other xml": ("<robot/>", "kind <robot>"),
+    "many cameras": ("# Camera list\n1 PINHOLE 9 9 1 1 4 4\n2 PINHOLE 9 9 1 1 4 4\n", "2 cameras"),
+    "colmap fisheye": ("# Camera list\n1 OPENCV_FISHEYE 640 480 1 1 1 1 0 0 0 0\n", "no place"),
+    "colmap short": ("# Camera list\n1 PINHOLE 640 480 500\n", "has 4 parameters, found 1"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sorted(BAD))
+def test_what_is_not_a_camera_is_refused_with_the_reason(tmp_path, name):
+    content, reason = BAD[name]
+    path = given_file(tmp_path, "some_camera", content)
+    with pytest.raises(InputError) as error:
+        read_camera(path)
+    assert reason in str(error.value)
+    assert "some_camera" in str(error.value) or name == "thin prism"
+
+
+def test_large_binary_and_missing_files_are_refused(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        read_camera(tmp_path / "none.yaml")
+    (tmp_path / "large").write_bytes(b" " * 5_000_000)
+    with pytest.raises(InputError, match=r"5\.0 MB"):
+        read_camera(tmp_path / "large")
+    (tmp_path / "picture.png").write_bytes(b"\x89PNG\xff\xfe\x00")
+    with pytest.raises(InputError, match="as text"):
+        read_camera(tmp_path / "picture.png")
+
+
+def test_nothing_is_written_in_an_unknown_format_or_name(tmp_path):
+    with pytest.raises(InputError, match="not known"):
+        write_camera(tmp_path / "a", CAMERA, format="matlab")
+    with pytest.raises(InputError, match="letters"):
+        write_camera(tmp_path / "a", CAMERA, format="ros", name="x\ny: 1")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.real
+def test_real_files():
+    rtde = ROOT / "handeye" / "rtde_ur5e" / "cam_params_calibrated.json"
+    if not rtde.is_file():
+        pytest.skip(f"no real data at {rtde} (set REALSIM_DATA)")
+    camera = read_camera(rtde)
+    assert camera.fx == 1357.9359483399705 and (camera.width, camera.height) == (1920, 1080)
+    assert camera.distortion[4] == -3.768200390450599
+    bop = ROOT / "scenes" / "ycbv_mini" / "camera.json"
+    if bop.is_file():
+        assert read_camera(bop).fx == 1066.778
+    # This one's focal lengths are its principal point again.
+    koch = ROOT / "handeye" / "koch_ur5" / "meta.json"
+    if koch.is_file():
+        with pytest.raises(InputError, match="repeat the principal point"):
+            read_camera(koch)

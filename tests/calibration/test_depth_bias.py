@@ -1,0 +1,477 @@
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from realsim.errors import DegenerateError, InputError, UnitError
+from realsim.geometry import se3
+from realsim.geometry.camera import pixel_grid, project, undistort
+from realsim.records import CameraIntrinsics, TagBoard
+from realsim.records.depth_bias import DepthBias
+from realsim_calibration.depth_bias import DepthBiasReport, estimate_depth_bias
+from realsim_calibration.depth_board import DepthBoardView
+from realsim_calibration.depth_fit import DepthBiasConfig
+from realsim_calibration.results import BoardShape
+from realsim_calibration.views import TargetDetection
+
+Array = NDArray[np.float64]
+BOARD = TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.01)
+CAMERA = CameraIntrinsics(width=320, height=200, fx=162.0, fy=161.0, cx=161.0, cy=98.0)
+BASELINE = 0.018
+EXACT = DepthBiasConfig(board_scale_sd=0.0, focal_sd=1e-9)
+FAR = np.linspace(0.2, 0.5, 12)
+
+
+def pose_at(rng: np.random.Generator, distance: float, tilt_deg: float = 35.0) -> Array:
+    """Return T_cam_board of a camera that looks at the board's middle."""
+    middle = np.array([*BOARD.size_m, 0.0]) / 2
+    tilt, azimuth = np.radians(rng.uniform(0.3, 1.0) * tilt_deg), rng.uniform(0, 2 * np.pi)
+    away = [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)]
+    eye = middle + distance * np.array(away)
+    return se3.invert(se3.look_at(eye, middle, rng.uniform(-np.pi, np.pi)))
+
+
+def exact_depth(T: Array, camera: CameraIntrinsics, warp: Array | None = None) -> Array:
+    """Return (H, W) depth of the board's surface by bisection along every ray; 0 = not in front."""
+    xy, _ = undistort(camera, pixel_grid(camera.width, camera.height))
+    T_board_cam = se3.invert(T)
+    rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1) @ T_board_cam[:3, :3].T
+    eye = T_board_cam[:3, 3]
+    flat = -eye[2] / rays[..., 2]
+    if warp is None:
+        return np.where(flat > 0, flat, 0.0)
+
+    def over(t: Array) -> Array:
+        p = eye + t[..., None] * rays
+        L = max(BOARD.size_m) / 2
+        x, y = (p[..., 0] - BOARD.size_m[0] / 2) / L, (p[..., 1] - BOARD.size_m[1] / 2) / L
+        return p[..., 2] - L * (warp[0] * x * x + warp[1] * x * y + warp[2] * y * y)
+
+    low, high = flat * 0.9, flat * 1.1
+    sign = np.sign(over(low))
+    for _ in range(40):
+        mid = (low + high) / 2
+        same = np.sign(over(mid)) == sign
+        low, high = np.where(same, mid, low), np.where(same, high, mid)
+    return np.where(flat > 0, low, 0.0)
+
+
+def sensed(
+    depth: Array, truth: DepthBias, rng: np.random.Generator, noise_px: float = 0.08
+) -> NDArray[np.float32]:
+    """Return what a stereo camera with this bias reports: correlated noise, holes, fliers."""
+    from scipy.ndimage import gaussian_filter
+
+    fB = CAMERA.fx * BASELINE
+    jitter = gaussian_filter(rng.normal(size=depth.shape), 2.0)
+    jitter *= noise_px / jitter.std() / fB
+    inverse = np.where(depth > 0, 1 / truth.measured(np.where(depth > 0, depth, 1.0)), 0.0) + jitter
+    if noise_px > 0:
+        flying = rng.random(depth.shape) < 0.05
+        inverse = np.where(flying, inverse * rng.uniform(0.5, 1.0, depth.shape), inverse)
+        inverse[rng.random(depth.shape) < 0.1] = 0
+        u, v = rng.integers(0, CAMERA.width), rng.integers(0, CAMERA.height)
+        inverse[max(v - 20, 0) : v + 20, max(u - 20, 0) : u + 20] = 0  # a hole without cause
+    z = np.where(inverse > 0.2, 1 / np.maximum(inverse, 1e-6), 0.0)
+    return (np.round(z / 1e-4) * 1e-4).astype(np.float32)
+
+
+def detected(
+    T: Array, rng: np.random.Generator, corner_px: float, points: Array | None = None
+) -> TargetDetection:
+    uv = project(CAMERA, se3.transform(T, BOARD.points_board if points is None else points))
+    uv = uv + rng.normal(scale=corner_px, size=uv.shape) if corner_px else uv
+    inside = np.all((uv > 0) & (uv < [CAMERA.width - 1, CAMERA.height - 1]), axis=-1)
+    ids = np.flatnonzero(inside)
+    return TargetDetection(point_ids=ids, uv=uv[ids], image_size=(CAMERA.width, CAMERA.height))
+
+
+def views_of(
+    truth: DepthBias,
+    seed: int = 0,
+    *,
+    distances: Array = FAR,
+    noise_px: float = 0.08,
+    corner_px: float = 0.1,
+    pose_sd: tuple[float, float] = (0.0, 0.0),
+) -> list[DepthBoardView]:
+    """Return views; `pose_sd` shakes the depth camera per view: an error common to a view."""
+    rng = np.random.default_rng(seed)
+    found: list[DepthBoardView] = []
+    for k, distance in enumerate(distances):
+        T = pose_at(rng, float(distance))
+        shake = np.concatenate([rng.normal(scale=sd, size=3) for sd in pose_sd])
+        depth = sensed(exact_depth(T @ se3.exp(shake), CAMERA), truth, rng, noise_px)
+        found.append(DepthBoardView(index=k, depth_m=depth, detection=detected(T, rng, corner_px)))
+    return found
+
+
+def run(views: list[DepthBoardView], config: DepthBiasConfig | None = EXACT) -> DepthBiasReport:
+    return estimate_depth_bias(views, BOARD, CAMERA, config)
+
+
+# ---- laws of the record
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_corrected_inverts_measured(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    bias = DepthBias(scale=1 + rng.normal(scale=0.02), offset_per_m=rng.normal(scale=0.02))
+    z = rng.uniform(0.1, 1.5, (20, 30))
+    np.testing.assert_allclose(bias.corrected(bias.measured(z)), z, rtol=1e-12)
+    np.testing.assert_allclose(1 / bias.corrected(z), bias.scale / z + bias.offset_per_m)
+
+
+def test_none_changes_nothing_and_holes_stay_holes() -> None:
+    depth = np.array([[0.0, np.nan, 0.3, 1.0]], np.float32)
+    same = DepthBias.none().corrected(depth)
+    assert same.dtype == np.float32
+    np.testing.assert_array_equal(same, depth)
+    bias = DepthBias(scale=1.01, offset_per_m=-0.9)
+    out = bias.corrected(np.array([0.0, np.nan, 0.3, 5.0]))
+    assert out[0] == 0 and np.isnan(out[1]) and out[2] > 0 and out[3] == 0
+    assert DepthBias.unmeasured().sigma_m(0.4) > 0 == DepthBias.none().sigma_m(0.4)
+
+
+def test_sigma_is_that_of_drawn_corrections() -> None:
+    C = np.array([[4e-6, -1.5e-5], [-1.5e-5, 9e-5]])
+    bias = DepthBias(scale=1.01, offset_per_m=0.01, covariance=C)
+    draws = np.random.default_rng(0).multivariate_normal([1.01, 0.01], C, 20000)
+    for z in (0.2, 0.5, 1.0):
+        spread = np.std(z / (draws[:, 0] + draws[:, 1] * z))
+        assert bias.sigma_m(z) == pytest.approx(spread, rel=0.03)
+
+
+def test_impossible_biases_are_refused() -> None:
+    for bad in ({"scale": 10.0}, {"scale": np.nan}, {"offset_per_m": np.inf},
+                {"covariance": -np.eye(2)}, {"range_m": (0.5, 0.2)}):  # fmt: skip
+        with pytest.raises(InputError):
+            DepthBias(**bad)
+
+
+# ---- laws of the estimator
+
+
+def test_exact_data_give_the_exact_bias() -> None:
+    truth = DepthBias(scale=1.012, offset_per_m=-0.015)
+    report = run(views_of(truth, noise_px=0.0, corner_px=0.0))
+    # counts of 0.1 mm and the weak prior are all that is left
+    assert report.bias.scale == pytest.approx(truth.scale, abs=3e-4)
+    assert report.bias.offset_per_m == pytest.approx(truth.offset_per_m, abs=1e-3)
+    assert report.held_out_m < 5e-5 < report.uncorrected_m
+    assert report.bias.separable
+    focal = CAMERA.fx
+    assert report.disparity_px == pytest.approx(0.015 / 1.012 * focal * BASELINE, abs=3e-3)
+
+
+def test_correcting_the_input_leaves_no_bias_and_order_does_not_matter() -> None:
+    views = views_of(DepthBias(scale=0.99, offset_per_m=0.02), seed=3)
+    report = run(views)
+    again = run([replace(v, depth_m=report.bias.corrected(v.depth_m)) for v in views])
+    assert again.bias.scale == pytest.approx(1.0, abs=0.2 * np.sqrt(report.bias.covariance[0, 0]))
+    assert abs(again.bias.offset_per_m) < 0.2 * np.sqrt(report.bias.covariance[1, 1])
+    turned = run(views[::-1])
+    np.testing.assert_allclose(turned.bias.scale, report.bias.scale, rtol=1e-12)
+    np.testing.assert_allclose(turned.bias.covariance, report.bias.covariance, rtol=1e-9)
+
+
+def test_a_larger_board_makes_a_larger_world() -> None:
+    """Depth is known relative to the board: s times the board is s times the true depth."""
+    truth = DepthBias(scale=1.0, offset_per_m=0.0)
+    views = views_of(truth, noise_px=0.0, corner_px=0.0)
+    larger = replace(BOARD, tag_size_m=BOARD.tag_size_m * 1.01, gap_m=BOARD.gap_m * 1.01)
+    report = estimate_depth_bias(views, larger, CAMERA, EXACT)
+    assert report.bias.scale == pytest.approx(1 / 1.01, abs=5e-4)
+    honest = estimate_depth_bias(views, larger, CAMERA, replace(EXACT, board_scale_sd=0.01))
+    assert np.sqrt(honest.board_covariance[0, 0]) == pytest.approx(0.01, rel=0.03)
+
+
+def test_a_focal_length_error_is_within_its_sigma() -> None:
+    truth = DepthBias(scale=1.0, offset_per_m=0.0)
+    views = views_of(truth, noise_px=0.0, corner_px=0.0)
+    wrong = replace(CAMERA, fx=CAMERA.fx * 1.003, fy=CAMERA.fy * 1.003)
+    C = np.zeros((12, 12))
+    C[:2, :2] = np.outer([CAMERA.fx, CAMERA.fy], [CAMERA.fx, CAMERA.fy]) * 0.003**2
+    report = estimate_depth_bias(
+        views, BOARD, wrong, replace(EXACT, board_scale_sd=0.0), intrinsics_covariance=C
+    )
+    error = np.array([report.bias.scale - 1, report.bias.offset_per_m])
+    sd = np.sqrt(np.diag(report.board_covariance))
+    assert abs(error[0]) == pytest.approx(sd[0], rel=0.15)  # one sigma was applied
+    assert sd[0] > 10 * np.sqrt(report.view_covariance[0, 0])
+
+
+def test_warp_is_taken_from_the_boards_shape() -> None:
+    warp, L = np.array([0.012, 0.004, -0.008]), max(BOARD.size_m) / 2
+    shape = BoardShape(scale=1.0, aspect=0.0, warp=warp, sd=np.zeros(5), half_extent_m=L)
+    points = BOARD.points_board.copy()
+    xy = (points[:, :2] - np.array(BOARD.size_m) / 2) / L
+    points[:, 2] = L * (warp[0] * xy[:, 0] ** 2 + warp[1] * xy.prod(1) + warp[2] * xy[:, 1] ** 2)
+    truth, rng = DepthBias(scale=1.01, offset_per_m=-0.01), np.random.default_rng(5)
+    views: list[DepthBoardView] = []
+    for k, distance in enumerate(FAR):
+        T = pose_at(rng, distance)
+        depth = sensed(exact_depth(T, CAMERA, warp), truth, rng, 0.0)
+        views.append(
+            DepthBoardView(index=k, depth_m=depth, detection=detected(T, rng, 0.0, points))
+        )
+    bent = estimate_depth_bias(views, BOARD, CAMERA, EXACT, shape=shape)
+    flat = estimate_depth_bias(views, BOARD, CAMERA, EXACT)
+    assert bent.bias.scale == pytest.approx(1.01, abs=5e-4)
+    assert bent.bias.offset_per_m == pytest.approx(-0.01, abs=2e-3)
+    assert bent.scatter_per_m < 0.2 * flat.scatter_per_m
+
+
+def test_own_depth_camera_beside_the_colour_camera() -> None:
+    """Depth from a second camera, 15 mm aside and of another resolution, without alignment."""
+    truth, rng = DepthBias(scale=1.008, offset_per_m=-0.01), np.random.default_rng(8)
+    depth_camera = CameraIntrinsics(width=240, height=180, fx=140.0, fy=140.0, cx=119.5, cy=92.0)
+    beside = se3.from_rt(se3.exp_so3([0.01, -0.02, 0.005]), [0.015, 0.002, -0.001])
+    views: list[DepthBoardView] = []
+    for k, distance in enumerate(FAR):
+        T = pose_at(rng, distance)
+        depth = truth.measured(exact_depth(se3.invert(beside) @ T, depth_camera))
+        views.append(DepthBoardView(index=k, depth_m=depth, detection=detected(T, rng, 0.0)))
+    report = estimate_depth_bias(
+        views, BOARD, CAMERA, EXACT, depth_intrinsics=depth_camera, T_color_depth=beside
+    )
+    assert report.bias.scale == pytest.approx(1.008, abs=1e-4)
+    assert report.bias.offset_per_m == pytest.approx(-0.01, abs=4e-4)
+
+
+# ---- statistics
+
+
+def test_sigma_covers_the_truth() -> None:
+    """Noise growing with z^2, holes, fliers, corner noise, and an error common to each view."""
+    truth = DepthBias(scale=1.008, offset_per_m=-0.012)
+    squared: list[float] = []
+    for seed in range(24):
+        report = run(views_of(truth, seed, pose_sd=(2e-3, 0.4e-3)))
+        error = [report.bias.scale - truth.scale, report.bias.offset_per_m - truth.offset_per_m]
+        squared.append(float(error @ np.linalg.solve(report.bias.covariance, error)))
+    # chi^2 of 2 degrees: mean 2, 95 % below 6
+    assert 1.0 < np.mean(squared) < 3.3
+    assert np.mean(np.array(squared) < 6.0) >= 0.85
+
+
+def test_noise_is_measured_and_grows_with_the_square_of_distance() -> None:
+    report = run(views_of(DepthBias.none(), 1, noise_px=0.16, corner_px=0.05))
+    assert report.bias.noise_per_m == pytest.approx(0.16 / (CAMERA.fx * BASELINE), rel=0.15)
+    assert report.noise_exponent == pytest.approx(2.0, abs=0.3)
+
+
+def test_temporal_noise_needs_frames() -> None:
+    rng, views = np.random.default_rng(0), []
+    for k, distance in enumerate(np.linspace(0.2, 0.5, 5)):
+        T = pose_at(rng, distance)
+        frames = [sensed(exact_depth(T, CAMERA), DepthBias.none(), rng) for _ in range(4)]
+        views.append(
+            DepthBoardView(index=k, depth_m=np.stack(frames), detection=detected(T, rng, 0.05))
+        )
+    report = run(views)
+    for v in report.views:
+        expected = v.distance_m**2 * 0.08 / (CAMERA.fx * BASELINE)
+        assert v.temporal_noise_m == pytest.approx(expected, rel=0.5)
+    assert all(np.isnan(v.temporal_noise_m) for v in run(views_of(DepthBias.none())).views)
+
+
+def test_a_bad_view_does_not_bend_the_result() -> None:
+    truth = DepthBias(scale=1.01, offset_per_m=-0.01)
+    views = views_of(truth, 2)
+    clean = run(views)
+    spoiled = replace(views[4], depth_m=views[4].depth_m * np.float32(1.05))
+    report = run([*views[:4], spoiled, *views[5:]])
+    sd = np.sqrt(np.diag(report.bias.covariance))
+    assert abs(report.bias.scale - clean.bias.scale) < 2 * sd[0]
+    worst = max(report.views, key=lambda v: abs(v.unseen_m / v.distance_m))
+    assert worst.index == 4
+
+
+def test_a_thing_in_front_of_the_board_is_left_out() -> None:
+    truth = DepthBias(scale=1.01, offset_per_m=-0.01)
+    views = views_of(truth, 4)
+    covered: list[DepthBoardView] = []
+    for v in views:
+        depth = v.depth_m.copy()
+        depth[:, 100:135] = np.minimum(depth[:, 100:135], np.float32(0.15))
+        covered.append(replace(v, depth_m=depth))
+    clean, report = run(views), run(covered)
+    assert report.bias.scale == pytest.approx(clean.bias.scale, abs=3e-3)
+    assert min(v.inlier_share for v in report.views if v.used) < 0.95
+
+
+# ---- refusals
+
+
+def test_one_distance_gives_only_the_sum() -> None:
+    truth = DepthBias(scale=1.01, offset_per_m=-0.012)
+    report = run(views_of(truth, 6, distances=np.full(10, 0.35)))
+    assert not report.bias.separable
+    check = next(c for c in report.checks if c.name == "depth range")
+    assert check.verdict == "warn" and "0.2 to 0.5 m" in check.advice
+    z = float(truth.measured(0.35))
+    assert abs(report.bias.corrected(z) - 0.35) < 3 * report.bias.sigma_m(z)
+    assert report.bias.sigma_m(z) < 0.4e-3 < report.bias.sigma_m(0.8)
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0, 100.0, 1000.0])
+def test_a_wrong_unit_is_named(factor: float) -> None:
+    views = views_of(DepthBias.none())
+    with pytest.raises(UnitError, match=r"0\.001.*0\.0001"):
+        run([replace(v, depth_m=v.depth_m * np.float32(factor)) for v in views])
+
+
+def test_a_wrong_board_size_is_named() -> None:
+    views = views_of(DepthBias.none())
+    larger = replace(BOARD, tag_size_m=0.042, gap_m=0.014)
+    with pytest.raises(InputError, match="ruler"):
+        estimate_depth_bias(views, larger, CAMERA, EXACT)
+
+
+def test_shifted_depth_is_refused() -> None:
+    views = views_of(DepthBias.none(), 7)
+    shifted = [replace(v, depth_m=np.roll(v.depth_m, 9, axis=1)) for v in views]
+    with pytest.raises(InputError, match="aligned to the colour image") as caught:
+        run(shifted)
+    assert "(-9, +0)" in str(caught.value) or "(-9, -0)" in str(caught.value)
+    a_little = run([replace(v, depth_m=np.roll(v.depth_m, 1, axis=0)) for v in views])
+    check = next(c for c in a_little.checks if c.name == "depth alignment")
+    assert check.value == pytest.approx(1.0, abs=0.4)
+
+
+def test_another_focal_length_under_the_same_size_is_refused() -> None:
+    """A depth image that was resized, not aligned: planes come out at other angles."""
+    rng, views = np.random.default_rng(9), []
+    other = replace(CAMERA, fx=CAMERA.fx * 1.5, fy=CAMERA.fy * 1.5)
+    for k, distance in enumerate(FAR):
+        T = pose_at(rng, distance)
+        depth = sensed(exact_depth(T, other), DepthBias.none(), rng)
+        views.append(DepthBoardView(index=k, depth_m=depth, detection=detected(T, rng, 0.05)))
+    with pytest.raises(InputError, match="turned by"):
+        run(views)
+
+
+def test_another_size_is_refused() -> None:
+    views = [replace(v, depth_m=v.depth_m[:150]) for v in views_of(DepthBias.none())]
+    with pytest.raises(InputError, match="resizing the image does not align it"):
+        run(views)
+    with pytest.raises(InputError, match="T_color_depth"):
+        estimate_depth_bias(views, BOARD, CAMERA, EXACT, depth_intrinsics=CAMERA)
+
+
+def test_too_little_depth_is_said_per_view() -> None:
+    views = views_of(DepthBias.none())
+    empty = [replace(v, depth_m=np.zeros_like(v.depth_m)) for v in views]
+    with pytest.raises(DegenerateError, match="0 of 12 views"):
+        run(empty)
+    report = run([*views[:8], *empty[8:]])
+    unused = [v for v in report.views if not v.used]
+    assert [v.index for v in unused] == [8, 9, 10, 11]
+    assert all("have a value" in v.reason for v in unused)
+    check = next(c for c in report.checks if c.name == "depth coverage")
+    assert check.verdict == "warn" and check.views == (8, 9, 10, 11)
+
+
+def test_range_images_are_recognised() -> None:
+    xy, _ = undistort(CAMERA, pixel_grid(CAMERA.width, CAMERA.height))
+    length = np.linalg.norm(np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1), axis=-1)
+    views = views_of(DepthBias.none(), 11)
+    ranges = [replace(v, depth_m=v.depth_m * length) for v in views]
+    kind = {c.name: c.verdict for c in run(views).checks}["depth kind"]
+    assert kind == "good"
+    assert {c.name: c.verdict for c in run(ranges).checks}["depth kind"] == "bad"
+
+
+def test_counts_and_duplicates_are_refused() -> None:
+    with pytest.raises(InputError, match="depth unit"):
+        DepthBoardView(index=0, depth_m=np.zeros((4, 4), np.uint16), T_cam_board=np.eye(4))
+    with pytest.raises(InputError, match="neither"):
+        DepthBoardView(index=0, depth_m=np.zeros((4, 4)))
+    v = views_of(DepthBias.none())
+    with pytest.raises(InputError, match="unique"):
+        run([v[0], v[0]])
+
+
+# ---- the simulated lab, and real data
+
+
+@pytest.mark.slow
+def test_the_simulated_cameras_disparity_bias_is_found() -> None:
+    from realsim_capture_plans import PlanConfig, calibration_plan
+    from realsim_capture_plans.lab import LabConfig, SimulatedLab
+
+    lab = SimulatedLab(
+        LabConfig(seed=0, n_objects=1, width=640, height=360, disparity_bias_px=0.05)
+    )
+    lab.place_board()
+    rng, camera, board = np.random.default_rng(0), lab.truth.intrinsics, lab.board
+    plan = calibration_plan(10, lab.scene_center, lab.nominal_T_ee_cam, PlanConfig(), rng)
+    views: list[DepthBoardView] = []
+    for k, joints in enumerate(plan.joints):
+        lab.arm.move(joints)
+        frame = lab.camera.grab()
+        T = se3.invert(lab.truth.T_world_cam(lab.arm.state().joints)) @ lab.truth.T_world_board
+        uv = project(camera, se3.transform(T, board.points_board))
+        uv = uv + rng.normal(scale=0.1, size=uv.shape)
+        ids = np.flatnonzero(np.all((uv > 0) & (uv < [639, 359]), axis=-1))
+        detection = TargetDetection(point_ids=ids, uv=uv[ids], image_size=(640, 360))
+        views.append(DepthBoardView(index=k, depth_m=frame.depth_m, detection=detection))
+    report = estimate_depth_bias(views, board, camera, EXACT)
+    offset = -0.05 / (camera.fx * BASELINE)
+    sd = np.sqrt(np.diag(report.bias.covariance))
+    assert abs(report.bias.scale - 1.0) < 3 * sd[0] < 0.003
+    assert abs(report.bias.offset_per_m - offset) < 3 * sd[1] < abs(offset)
+    assert report.held_out_m < 0.3 * report.uncorrected_m
+
+
+REAL = Path(os.environ.get("REALSIM_DATA", "../shared/data")) / "handeye/rtde_ur5e"
+
+
+@pytest.mark.real
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"{REAL} is not there (REALSIM_DATA)")
+def test_real_depth_that_is_not_aligned_is_refused() -> None:
+    """Depth 1024x768 of an L515 (0.25 mm) beside 1920x1080 colour, intrinsics unknown."""
+    import cv2
+
+    from realsim.formats.images import read_depth, read_grey
+    from realsim.records import CharucoBoard
+
+    known = json.loads((REAL / "cam_params_calibrated.json").read_text())
+    camera = CameraIntrinsics.from_K(known["intrinsic"], 1920, 1080, known["distortion"])
+    target = CharucoBoard(
+        rows=7, columns=5, square_m=0.033, marker_m=0.02, dictionary="DICT_6X6_100"
+    )
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_100)
+    finder = cv2.aruco.CharucoDetector(cv2.aruco.CharucoBoard((5, 7), 0.033, 0.02, dictionary))
+    views: list[DepthBoardView] = []
+    for k in range(0, 24, 2):
+        corners, ids, _, _ = finder.detectBoard(read_grey(REAL / f"Hand-Eye-Data/{k}.jpg"))
+        depth = read_depth(REAL / f"Hand-Eye-Data/{k}.png", 0.00025)
+        if ids is None or len(ids) < 8:
+            continue
+        found = TargetDetection(
+            point_ids=ids.ravel(), uv=corners.reshape(-1, 2), image_size=(1920, 1080)
+        )
+        views.append(DepthBoardView(index=k, depth_m=depth, detection=found, name=f"{k}.png"))
+    assert len(views) >= 10
+    with pytest.raises(InputError, match=r"1024x768.*1920x1080: this depth is not aligned"):
+        estimate_depth_bias(views, target, camera)
+
+    def resized(unit: float) -> list[DepthBoardView]:
+        def grown(depth: NDArray[np.floating]) -> NDArray[np.floating]:
+            depth = depth * np.float32(unit / 0.00025)
+            return np.asarray(cv2.resize(depth, (1920, 1080), interpolation=cv2.INTER_NEAREST))
+
+        return [replace(v, depth_m=grown(v.depth_m)) for v in views]
+
+    with pytest.raises(InputError, match=r"turned by .*is the depth aligned to the colour image"):
+        estimate_depth_bias(resized(0.00025), target, camera)
+    with pytest.raises(UnitError, match="wrong by 4"):
+        estimate_depth_bias(resized(0.001), target, camera)
+    with pytest.raises(UnitError, match=r"wrong by 0\.4"):
+        estimate_depth_bias(resized(0.0001), target, camera)

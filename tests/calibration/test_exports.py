@@ -1,0 +1,471 @@
+"""What a calibration leaves behind: every format reads back as the same transform."""
+
+import ast
+import dataclasses
+import json
+import math
+import shlex
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.dh import DhArm
+from realsim.records import (
+    ArmErrorMap,
+    CameraIntrinsics,
+    CharucoBoard,
+    Check,
+    Chessboard,
+    CircleGrid,
+    RobotErrorMap,
+    TagBoard,
+    Target,
+)
+from realsim_calibration import ros_exports
+from realsim_calibration.calibration_file import calibration_text, read_calibration
+from realsim_calibration.export_frames import (
+    FrameNames,
+    note_lines,
+    number,
+    published_transform,
+    roll_pitch_yaw,
+)
+from realsim_calibration.exports import opencv_text, write_exports
+from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
+
+Array = NDArray[np.float64]
+EXACT = 1e-9
+TARGETS: tuple[Target, ...] = (
+    TagBoard(rows=4, columns=6, tag_size_m=0.03, gap_m=0.01, ids_from="bottom"),
+    CharucoBoard(rows=7, columns=5, square_m=0.033, marker_m=0.02),
+    Chessboard(rows=6, columns=8, square_m=0.0219),
+    CircleGrid(rows=10, columns=10, pitch_m=0.0254, large_origin=True),
+)
+NASTY = 'a"b\\c <script>alert(1)</script> $x_$ -- ünï\n# : {x}'
+
+axis = hnp.arrays(np.float64, 3, elements=st.floats(-1, 1)).filter(
+    lambda v: np.linalg.norm(v) > 1e-3
+)
+angles = st.one_of(
+    st.floats(-math.pi, math.pi),
+    st.sampled_from([0.0, math.pi, math.pi / 2, -math.pi / 2, 1e-17, 1e-9, math.pi - 1e-9]),
+)
+
+
+@st.composite
+def transforms(draw: st.DrawFn) -> Array:
+    """Return rigid transforms, among them turns by 0, 90 and 180 deg about the axes."""
+    w = draw(st.one_of(axis, st.sampled_from([np.eye(3)[k] for k in range(3)])))
+    R = se3.exp_so3(w / np.linalg.norm(w) * draw(angles))
+    if draw(st.booleans()):
+        R = se3.from_rt([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.zeros(3))[:3, :3] @ R
+    t = [draw(st.floats(-2, 2)) for _ in range(3)]
+    return se3.from_rt(R, t)
+
+
+def views_of(rng: np.random.Generator, n: int) -> tuple[ViewReport, ...]:
+    views: list[ViewReport] = []
+    for k in range(n):
+        used = k % 4 != 3
+        points = 12 if used else 0
+        views.append(
+            ViewReport(
+                index=3 * k, label=f"{k}.png" if k else NASTY, used=used,
+                reason="" if used else "dropped: " + NASTY,
+                T_base_ee=se3.random_transform(rng), uv=rng.uniform(0, 600, (12, 2)),
+                residuals=rng.normal(size=(points, 2)), seen_px=0.3 if used else math.nan,
+                unseen_px=0.4 if used else math.nan, unseen_mm=0.2 if used else math.nan,
+                unseen_deg=0.1 if used else math.nan, robot_error=rng.normal(size=6) * 1e-3,
+            )
+        )  # fmt: skip
+    return tuple(views)
+
+
+def covariance(rng: np.random.Generator, n: int, scale: float) -> Array:
+    M = rng.normal(size=(n, n)) * scale
+    return M @ M.T
+
+
+def arm_map(rng: np.random.Generator) -> ArmErrorMap:
+    rows = rng.normal(size=(4, 6))
+    arm = DhArm(name="ur5", a=rows[0], d=rows[1], alpha=rows[2], delta_theta=rows[3] * 1e-3)
+    return ArmErrorMap(
+        arm=arm, errors=rng.normal(size=24) * 1e-3, T_flange_tool=se3.random_transform(rng)
+    )
+
+
+def make_report(
+    X_alone: Array, mode: Mode = "eye_in_hand", target: Target = TARGETS[0], seed: int = 0
+) -> HandEyeReport:
+    rng = np.random.default_rng(seed)
+    error_map = RobotErrorMap(
+        frame="base", mean=rng.normal(size=12), sd_m=0.1, weights=rng.normal(size=(6, 12)) * 1e-4,
+        reach=rng.normal(size=(9, 12)),
+    )  # fmt: skip
+    return HandEyeReport(
+        mode=mode, target=target, X=X_alone @ se3.exp(rng.normal(size=6) * 1e-3),
+        X_covariance=covariance(rng, 6, 1e-4), Z=se3.random_transform(rng), X_alone=X_alone,
+        X_alone_covariance=covariance(rng, 6, 1e-4),
+        intrinsics=CameraIntrinsics(
+            width=1280, height=720, fx=644.1, fy=643.2, cx=643.3, cy=356.4,
+            distortion=np.array([-0.05, 0.04, 6e-4, -4e-4, 1e-17, 0, 0, 0]),
+        ),
+        intrinsics_covariance=covariance(rng, 12, 1e-2),
+        board=BoardShape(
+            scale=0.996, aspect=-0.002, warp=rng.normal(size=3) * 1e-3,
+            sd=np.array([1e-3, 1e-3, 1e-3, 0, 0]), half_extent_m=0.115,
+        ),
+        robot_map=(error_map, None, arm_map(rng))[seed % 3],
+        map_scores=(("none", 0.51), ("base 1", 0.33)),
+        joint_offsets=None if seed % 3 else rng.normal(size=(6, 2)), sigma_px=0.2, robot_ratio=0.3,
+        views=views_of(rng, 8), seen_px=0.3, held_out_px=0.4, held_out_mm=0.3, held_out_deg=0.05,
+        starts=(("park", 5.8), ("shah", math.inf)), mismatch_deg=0.2, screw_ratio=math.nan,
+        roll_range_deg=200.0,
+        checks=(
+            Check(name="board scale", verdict="good", sentence="The scale is 0.996.", value=0.996),
+            Check(name="robot", verdict="bad", sentence=NASTY, advice="Do -- that.", views=(3, 6)),
+        ),
+        information=covariance(rng, 29, 1.0),
+    )  # fmt: skip
+
+
+def rigid_of(xyz: Any, xyzw: Any) -> Array:
+    """Return T of a translation and a quaternion x y z w, by a formula of its own."""
+    x, y, z, w = (float(v) for v in xyzw)
+    assert abs(x * x + y * y + z * z + w * w - 1) < 1e-12
+    R = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return se3.from_rt(R, [float(v) for v in xyz])
+
+
+def yaml11(text: str) -> Any:
+    """Return what a YAML 1.1 reader takes a text for.
+
+    By the letter of YAML 1.1 a bare y is true; PyYAML, the reader of ROS, leaves it a name.
+    """
+    yaml = YAML(typ="safe", pure=True)
+    yaml.version = (1, 1)
+
+    def named(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {"y" if k is True else k: named(v) for k, v in value.items()}
+        return value
+
+    return named(yaml.load("%YAML 1.1\n---\n" + text))
+
+
+def same(a: Array, b: Array) -> bool:
+    return bool(np.abs(a - b).max() < EXACT)
+
+
+FRAMES = FrameNames(robot_base="base", hand="tool0", camera_optical="cam_optical", name="ur5")
+LINK = FrameNames(
+    camera_link="camera_link", T_link_optical=se3.from_rt(FRAMES.T_link_optical[:3, :3],
+    [0.0, 0.015, 0.001]),
+)  # fmt: skip
+
+
+# --- laws ---------------------------------------------------------------------------------------
+
+
+@given(X=transforms(), mode=st.sampled_from(["eye_in_hand", "eye_to_hand"]))
+@settings(max_examples=60, deadline=None)
+def test_easy_handeye_reads_the_same_transform(X: Array, mode: Mode) -> None:
+    report = make_report(X, mode)
+    two = yaml11(ros_exports.easy_handeye2_text(report, FRAMES))
+    t, q = two["transform"]["translation"], two["transform"]["rotation"]
+    assert all(type(v) is float for v in (*t.values(), *q.values()))
+    assert same(rigid_of([t[k] for k in "xyz"], [q[k] for k in "xyzw"]), X)
+    one = yaml11(ros_exports.easy_handeye_text(report, FRAMES))
+    T = one["transformation"]
+    assert all(type(v) is float for v in T.values())
+    assert same(rigid_of([T[k] for k in "xyz"], [T[k] for k in ("qx", "qy", "qz", "qw")]), X)
+
+
+@given(X=transforms(), frames=st.sampled_from([FRAMES, LINK]))
+@settings(max_examples=60, deadline=None)
+def test_ros_commands_and_launch_carry_the_same_transform(X: Array, frames: FrameNames) -> None:
+    report = make_report(X)
+    expected, parent, child = published_transform(report, frames)
+    words = shlex.split(ros_exports.ros2_command(report, frames))
+    assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
+    named = dict(zip(words[4::2], words[5::2], strict=True))
+    assert (named["--frame-id"], named["--child-frame-id"]) == (parent, child)
+    xyz = [named[f"--{k}"] for k in "xyz"]
+    assert same(rigid_of(xyz, [named[f"--q{k}"] for k in "xyzw"]), expected)
+
+    old = shlex.split(ros_exports.ros1_command(report, frames))
+    assert len(old) == 12 and old[-2:] == [parent, child]
+    assert same(rigid_of(old[3:6], old[6:10]), expected)
+
+    tree = ast.parse(ros_exports.ros2_launch_text(report, frames))
+    lists = [n for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg == "arguments"]
+    assert ast.literal_eval(lists[0].value) == words[4:]
+
+
+@given(X=transforms(), frames=st.sampled_from([FRAMES, LINK]))
+@settings(max_examples=60, deadline=None)
+def test_urdf_reads_the_same_transform(X: Array, frames: FrameNames) -> None:
+    """rpy about fixed axes: R = Rz Ry Rx, read with this formula and compared."""
+    root = ET.fromstring(ros_exports.urdf_text(make_report(X), frames))
+    T = np.eye(4)
+    links = [link.attrib["name"] for link in root.findall("link")]
+    for joint in root.findall("joint"):
+        origin, child = joint.find("origin"), joint.find("child")
+        assert origin is not None and child is not None and joint.attrib["type"] == "fixed"
+        assert child.attrib["link"] in links
+        r, p, y = (float(v) for v in origin.attrib["rpy"].split())
+        R = se3.exp_so3([0, 0, y]) @ se3.exp_so3([0, p, 0]) @ se3.exp_so3([r, 0, 0])
+        T = T @ se3.from_rt(R, [float(v) for v in origin.attrib["xyz"].split()])
+    # Down to the optical frame the chain is X in either case.
+    assert links[-1] == frames.camera_optical
+    assert same(T, X)
+
+
+@given(X=transforms(), near=st.floats(-1e-6, 1e-6), flip=st.sampled_from([-1, 1]))
+@settings(max_examples=200, deadline=None)
+def test_roll_pitch_yaw_near_the_lock(X: Array, near: float, flip: int) -> None:
+    for R in (
+        X[:3, :3],
+        X[:3, :3] @ se3.exp_so3([0, flip * (math.pi / 2 + near), 0]),
+        se3.exp_so3([0, 0, near]) @ se3.exp_so3([0, flip * (math.pi / 2 + near), 0]),
+    ):
+        r, p, y = roll_pitch_yaw(R)
+        back = se3.exp_so3([0, 0, y]) @ se3.exp_so3([0, p, 0]) @ se3.exp_so3([r, 0, 0])
+        assert np.abs(back - R).max() < 1e-11
+
+
+@given(X=transforms(), mode=st.sampled_from(["eye_in_hand", "eye_to_hand"]))
+@settings(max_examples=30, deadline=None)
+def test_opencv_reads_the_same_transform(X: Array, mode: Mode) -> None:
+    report = make_report(X, mode)
+    text = opencv_text(report, FRAMES)
+    storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    at, target = ("gripper", "base") if mode == "eye_in_hand" else ("base", "gripper")
+    R, t = (storage.getNode(f"{k}_cam2{at}").mat() for k in "Rt")
+    assert t.shape == (3, 1) and same(se3.from_rt(R, t[:, 0]), X)
+    R, t = (storage.getNode(f"{k}_target2{target}").mat() for k in "Rt")
+    assert same(se3.from_rt(R, t[:, 0]), report.Z)
+    assert same(storage.getNode("camera_matrix").mat(), report.intrinsics.K)
+    assert same(storage.getNode("dist_coeffs").mat()[0], report.intrinsics.distortion)
+    assert int(storage.getNode("image_width").real()) == 1280
+
+
+@given(X=transforms(), seed=st.integers(0, 11), target=st.sampled_from(TARGETS))
+@settings(max_examples=25, deadline=None)
+def test_json_round_trip_is_exact(
+    X: Array, seed: int, target: Target, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    mode: Mode = "eye_in_hand" if seed % 2 else "eye_to_hand"
+    report = make_report(X, mode, target, seed)
+    path = tmp_path_factory.mktemp("json") / "calibration.json"
+    path.write_text(calibration_text(report, FRAMES), encoding="utf-8")
+    again = read_calibration(path)
+    assert type(again.target) is type(report.target)
+    assert calibration_text(again, FRAMES) == path.read_text(encoding="utf-8")
+    assert_same_record(report, again)
+
+
+def assert_same_record(a: Any, b: Any) -> None:
+    """Compare dataclasses field by field; a rotation may be made orthonormal within 1e-12."""
+    assert type(a) is type(b)
+    for field in dataclasses.fields(a):
+        x, y = getattr(a, field.name), getattr(b, field.name)
+        if dataclasses.is_dataclass(x):
+            assert_same_record(x, y)
+        elif isinstance(x, np.ndarray):
+            np.testing.assert_allclose(y, x, rtol=0, atol=1e-12, err_msg=field.name)
+            assert y.shape == x.shape
+        elif isinstance(x, tuple) and x and dataclasses.is_dataclass(x[0]):
+            for u, v in zip(x, y, strict=True):
+                assert_same_record(u, v)
+        elif isinstance(x, float) and math.isnan(x):
+            assert math.isnan(y)
+        else:
+            assert x == y, field.name
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_numbers_are_floats_of_yaml_too(value: float) -> None:
+    text = number(value)
+    assert float(text) == value
+    read = yaml11(f"v: {text}\n")["v"]
+    assert type(read) is float and read == value
+
+
+# --- known answers ------------------------------------------------------------------------------
+
+
+def test_camera_link_of_a_camera_that_looks_along_the_tool() -> None:
+    """Optical = tool axes, 0.1 m ahead: the body's x axis is then the tool's z axis."""
+    report = make_report(se3.from_translation([0.0, 0.0, 0.1]))
+    T, parent, child = published_transform(report, FrameNames(camera_link="camera_link"))
+    assert (parent, child) == ("tool0", "camera_link")
+    np.testing.assert_allclose(T[:3, 0], [0, 0, 1], atol=1e-15)  # forward
+    np.testing.assert_allclose(T[:3, 1], [-1, 0, 0], atol=1e-15)  # left
+    np.testing.assert_allclose(T[:3, 2], [0, -1, 0], atol=1e-15)  # up = against the image's y
+    np.testing.assert_allclose(T[:3, 3], [0, 0, 0.1], atol=1e-15)
+
+
+def test_easy_handeye2_has_the_keys_of_its_message_and_no_others() -> None:
+    """set_message_fields refuses unknown keys, so the layout must be the message's own."""
+    read = yaml11(ros_exports.easy_handeye2_text(make_report(np.eye(4), "eye_to_hand"), FRAMES))
+    assert list(read) == ["parameters", "transform"]
+    assert read["parameters"] == {
+        "name": "ur5",
+        "calibration_type": "eye_on_base",
+        "robot_base_frame": "base",
+        "robot_effector_frame": "tool0",
+        "tracking_base_frame": "cam_optical",
+        "tracking_marker_frame": "calibration_target",
+        "freehand_robot_movement": True,
+        "move_group_namespace": "/",
+        "move_group": "manipulator",
+    }
+    old = yaml11(ros_exports.easy_handeye_text(make_report(np.eye(4)), FRAMES))
+    assert old["parameters"]["eye_on_hand"] is True and old["parameters"]["namespace"] == "/ur5/"
+
+
+def test_eye_to_hand_hangs_below_the_base() -> None:
+    report = make_report(se3.from_translation([1.0, 0, 0]), "eye_to_hand")
+    assert published_transform(report, FRAMES)[1:] == ("base", "cam_optical")
+
+
+def test_every_text_says_frames_units_accuracy_and_warnings() -> None:
+    report = make_report(se3.from_translation([0.0, 0.0, 0.1]))
+    notes = "\n".join(note_lines(report, FRAMES))
+    for text in (
+        ros_exports.easy_handeye2_text(report, FRAMES),
+        ros_exports.easy_handeye_text(report, FRAMES),
+        ros_exports.ros1_script(report, FRAMES),
+        ros_exports.ros2_script(report, FRAMES),
+        ros_exports.ros2_launch_text(report, FRAMES),
+        ros_exports.urdf_text(report, FRAMES),
+        opencv_text(report, FRAMES),
+    ):
+        assert "OPTICAL" in text and "Metres" in text and "1 sigma" in text
+        assert "WITHOUT the robot's error map" in text and "WARNING" in text
+    assert "alert(1)" in notes and all("\n" not in n for n in note_lines(report, FRAMES))
+
+
+def test_the_shell_scripts_run_one_command_with_the_words(tmp_path: Path) -> None:
+    """A shell runs the script with a `ros2` that prints its arguments: comments stay comments."""
+    fake = tmp_path / "ros2"
+    fake.write_text('#!/bin/sh\nfor w in "$@"; do echo "$w"; done\n')
+    fake.chmod(0o755)
+    report = make_report(se3.from_translation([0.1, -0.2, 1e-17]))
+    script = tmp_path / "publish.sh"
+    script.write_text(ros_exports.ros2_script(report, FRAMES))
+    ran = subprocess.run(
+        ["/bin/sh", str(script)], env={"PATH": f"{tmp_path}:/bin:/usr/bin"}, capture_output=True,
+        text=True, check=True,
+    )  # fmt: skip
+    assert ran.stdout.split() == shlex.split(ros_exports.ros2_command(report, FRAMES))[1:]
+
+
+def test_camera_info_is_plumb_bob_or_rational() -> None:
+    report = make_report(np.eye(4))
+    info = yaml11(ros_exports.camera_info_text(report, FRAMES))
+    assert info["distortion_model"] == "plumb_bob"
+    assert info["distortion_coefficients"]["data"] == list(report.intrinsics.distortion[:5])
+    assert info["camera_matrix"]["data"] == list(report.intrinsics.K.ravel())
+    wide = CameraIntrinsics(
+        width=640, height=480, fx=300.0, fy=300.0, cx=319.5, cy=239.5,
+        distortion=np.arange(1, 9) * 0.01,
+    )  # fmt: skip
+    info = yaml11(
+        ros_exports.camera_info_text(dataclasses.replace(report, intrinsics=wide), FRAMES)
+    )
+    assert info["distortion_model"] == "rational_polynomial"
+    assert len(info["distortion_coefficients"]["data"]) == 8
+
+
+def test_write_exports_writes_readable_files(tmp_path: Path) -> None:
+    report = make_report(se3.exp([0.1, 0.2, 0.3, 0.04, 0.05, 0.06]))
+    paths = write_exports(report, tmp_path / "out", frames=FRAMES)
+    assert all(p.is_file() and p.stat().st_size > 0 for p in paths)
+    on_disk = {p for p in (tmp_path / "out").rglob("*") if p.is_file()}
+    assert set(paths) == on_disk  # nothing half-written is left beside them
+    with np.load(tmp_path / "out/calibration.npz") as arrays:
+        assert np.array_equal(arrays["T_parent_cam"], report.X_alone)
+        assert str(arrays["parent"]) == "tool0" and str(arrays["cam"]) == "cam_optical"
+    assert np.abs(read_calibration(paths[0]).X - report.X).max() < 1e-12
+    launch = next(p for p in paths if p.name == "camera_pose.launch.py")
+    subprocess.run([sys.executable, "-m", "py_compile", str(launch)], check=True)
+
+
+# --- what is refused ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"hand": "/tool0"}, {"hand": "tool 0"}, {"hand": "base"}, {"name": "../x"}, {"target": ""}],
+)
+def test_frame_names_that_tf_refuses(wrong: dict[str, str]) -> None:
+    with pytest.raises(InputError):
+        FrameNames(**wrong)
+
+
+def damaged(key: str, value: Any, drop: bool = False) -> str:
+    document = json.loads(calibration_text(make_report(np.eye(4)), FRAMES))
+    at = document
+    *way, last = key.split("/")
+    for step in way:
+        at = at[int(step) if step.isdigit() else step]
+    if drop:
+        del at[last]
+    else:
+        at[last] = value
+    return json.dumps(document)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{", "cannot be read as JSON"),
+        ("[1, 2]", "schema"),
+        (damaged("schema", "other"), "schema 'other'"),
+        (damaged("version", 99), "version 99"),
+        (damaged("mode", "sideways"), "sideways"),
+        (damaged("X", None, drop=True), "'X' is missing"),
+        (damaged("X/covariance", [[1.0]]), "shape"),
+        (damaged("X/quaternion_xyzw", [1.0, 0.0, 0.0, 0.0]), "different transforms"),
+        (damaged("X_alone/translation_m", [0.0, 0.0, 5.0]), "different transforms"),
+        (damaged("views/2/uv", [[1.0, "x"]]), "'uv' cannot be used"),
+        (damaged("views/0/index", None), "whole number"),
+        (damaged("views", 3), "list of named entries"),
+        (damaged("target/rows", None, drop=True), "does not fit"),
+        (damaged("target/type", "Egg"), "Egg"),
+        (damaged("checks/0/verdict", "superb"), "superb"),
+        (damaged("robot_map/kind", "odd"), "odd"),
+        (damaged("robot_map/frame", "odd"), "odd"),
+        (damaged("map_scores", [["none"]]), "names and numbers"),
+    ],
+)
+def test_a_damaged_file_is_named(text: str, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"calibration\.json") as error:
+        read_calibration(path)
+    assert says in str(error.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        read_calibration(tmp_path / "none.json")

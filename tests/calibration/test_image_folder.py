@@ -1,0 +1,394 @@
+import json
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_calibration.inputs import (
+    list_images,
+    load_image,
+    pair,
+    read_board_poses,
+    read_image_folder,
+    reading_from_text,
+)
+
+ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+HANDEYE = ROOT / "handeye"
+real = pytest.mark.skipif(
+    not HANDEYE.is_dir(), reason=f"no real data at {HANDEYE} (set REALSIM_DATA)"
+)
+READING = reading_from_text("quat_xyzw,m")
+
+
+def pixels(seed, size=(24, 32)):
+    return np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
+
+
+def save(path, array):
+    Image.fromarray(array).save(path)
+    return path
+
+
+def make_images(folder, names):
+    folder.mkdir(exist_ok=True)
+    for k, name in enumerate(names):
+        save(folder / name, pixels(k))
+    return folder
+
+
+def rows(n, seed=0):
+    return READING.numbers(se3.random_transform(np.random.default_rng(seed), n, spread=0.5))
+
+
+def write_rows(path, raw, names=None):
+    lines = [" ".join(map(repr, r.tolist())) for r in raw]
+    if names:
+        lines = [f"{a} {b}" for a, b in zip(names, lines, strict=True)]
+    path.write_text("\n".join(lines))
+    return path
+
+
+# --- pairing ----------------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    n=st.integers(2, 30),
+    order=st.randoms(use_true_random=False),
+    how=st.sampled_from(["names", "stems", "upper case", "numbers", "folders"]),
+    missing=st.integers(0, 3),
+)
+def test_names_pair_whatever_the_order(n, order, how, missing):
+    numbers = order.sample(range(200), n)
+    images = sorted((f"img_{k:04d}.png" for k in numbers), key=str)
+    mine = order.sample(numbers, max(n - missing, 1))
+    labels, stems = [None] * len(mine), [""] * len(mine)
+    if how in ("stems", "numbers"):
+        stems = [f"img_{k:04d}" if how == "stems" else f"pose{k}" for k in mine]
+    else:
+        labels = [f"img_{k:04d}.png" for k in mine]
+        labels = [x.upper() for x in labels] if how == "upper case" else labels
+        labels = [f"shots/{x}" for x in labels] if how == "folders" else labels
+    where = [f"line {k}" for k in mine]
+    try:
+        found = pair(images, labels, stems, where)
+    except InputError as error:
+        # as many numbers as images, all shifted by the same: only random "numbers" could do that
+        assert how == "numbers" and "count from different starts" in str(error)
+        return
+    if how == "numbers" and len(mine) == 1 and found.sentence.startswith("Paired by order"):
+        return
+    assert len(found.pairs) == len(mine)
+    for image, row in found.pairs:
+        assert int(images[image][4:8]) == mine[row]
+    left = {images[i] for i, _ in found.unpaired_images}
+    assert left == {f"img_{k:04d}.png" for k in set(numbers) - set(mine)}
+
+
+def test_ten_comes_after_nine():
+    names = [f"0-{k}.jpg" for k in range(1, 13)]
+    found = pair(names, [None] * 12, [""] * 12, [f"line {k}" for k in range(1, 13)])
+    assert found.pairs == tuple((k, k) for k in range(12)) and "by number" in found.sentence
+    shuffled = sorted(names)  # 0-1, 0-10, 0-11, 0-12, 0-2, ...
+    found = pair(shuffled, [None] * 12, [""] * 12, [f"line {k}" for k in range(1, 13)])
+    assert all(shuffled[i] == f"0-{r + 1}.jpg" for i, r in found.pairs)
+
+
+def test_counts_that_differ_without_names_are_refused_with_both_sides():
+    names = [f"{k}.png" for k in range(1, 41) if k not in (17, 23)]
+    with pytest.raises(InputError) as error:
+        pair(names, [None] * 40, [""] * 40, [f"line {k}" for k in range(1, 41)])
+    for part in ("38 images and 40 poses", "number 17, 23 missing", "1.png", "line 40", "beside"):
+        assert part in str(error.value)
+
+
+def test_shifted_numbers_are_refused():
+    images = [f"{k}.png" for k in range(1, 25)]
+    stems = [str(k) for k in range(24)]
+    with pytest.raises(InputError, match=r"poses \+1: 1.png.*different starts"):
+        pair(images, [None] * 24, stems, stems)
+
+
+def test_bare_order_says_that_nothing_confirms_it_and_names_gaps():
+    names = [f"{k}.png" for k in (1, 2, 4, 5)]
+    found = pair(names, [None] * 4, [""] * 4, ["line 1", "line 2", "line 3", "line 4"])
+    assert "No names confirm it" in found.sentence and "number 3 missing" in found.warnings[0]
+    assert found.pairs == ((0, 0), (1, 1), (2, 2), (3, 3))
+
+
+@pytest.mark.parametrize(
+    ("labels", "says"),
+    [
+        (["a.png", "a.png", "b.png"], r"'a.png' 2 times \(line 1, line 2\)"),
+        (["a.png", "a.jpg", "b.png"], "several names of the poses mean the image 'a.png'"),
+        (["x.png", "y.png", None], "none of the 3 names.*x.png, y.png; the images are a.png"),
+    ],
+)
+def test_names_that_cannot_pair_are_refused(labels, says):
+    with pytest.raises(InputError, match=says):
+        pair(["a.png", "b.png"], labels, [""] * 3, ["line 1", "line 2", "line 3"])
+
+
+# --- folders ----------------------------------------------------------------------------------
+
+
+def test_unpaired_unmeasured_and_duplicates_are_named(tmp_path):
+    names = [f"{k}.png" for k in range(12)]
+    images = make_images(tmp_path / "i", names)
+    (images / "7.png").write_bytes((images / "3.png").read_bytes())
+    raw = rows(12)
+    raw[5] = np.nan
+    raw[9] = raw[8]
+    listed = [*names[:11], "gone.png"]
+    found = read_image_folder(images, write_rows(tmp_path / "p.txt", raw, listed), reading=READING)
+    assert found.labels == tuple(n for k, n in enumerate(names) if k not in (5, 11))
+    assert dict(found.unpaired_images).keys() == {"5.png", "11.png"}
+    assert dict(found.unpaired_poses).keys() == {"line 6", "line 12"}
+    assert found.duplicate_images == (("3.png", "7.png"),)
+    assert found.duplicate_poses == (("line 9", "line 10"),)
+    assert len(found.warnings) == 4 and "Paired by the image names" in found.pairing
+    T = READING.apply(raw[[k for k in range(11) if k != 5]])
+    assert np.abs(found.Ts_base_ee() - T).max() < 1e-14
+
+
+def test_a_reading_must_be_said_and_must_fit(tmp_path):
+    images = make_images(tmp_path / "i", [f"{k}.png" for k in range(4)])
+    file = write_rows(tmp_path / "p.txt", rows(4))
+    found = read_image_folder(images, file)
+    assert found.reading is None
+    with pytest.raises(InputError, match=r"not said.*quat_xyzw,m; quat_wxyz,m"):
+        found.Ts_base_ee()
+    with pytest.raises(InputError, match="takes 6 numbers"):
+        read_image_folder(images, file, reading=reading_from_text("rotvec,m"))
+
+
+def test_poses_and_depth_beside_the_images(tmp_path):
+    raw = rows(11)
+    for k, row in enumerate(raw):
+        save(tmp_path / f"color_{k}.jpg", pixels(k))
+        Image.fromarray(np.full((4, 4), 500 + k, np.uint16)).save(tmp_path / f"depth_{k}.png")
+        (tmp_path / f"pose_{k}.json").write_text(json.dumps({"pose": row.tolist()}))
+    (tmp_path / "camera.json").write_text('{"fx": 600}')
+    found = read_image_folder(tmp_path, tmp_path, reading=READING)
+    assert found.labels == tuple(f"color_{k}.jpg" for k in range(11))
+    assert [d.name for d in found.depths] == [f"depth_{k}.png" for k in range(11)]
+    assert found.pairing.startswith("Paired by the numbers in the names")
+    assert any("camera.json" in n for n in found.poses.notes)
+    assert np.abs(found.Ts_base_ee() - READING.apply(raw)).max() < 1e-14
+
+
+def test_a_list_of_pairs_decides_and_is_checked(tmp_path):
+    images = make_images(tmp_path / "i", [f"{k}.png" for k in range(6)])
+    (tmp_path / "p").mkdir()
+    raw = rows(6)
+    for k in range(6):
+        write_rows(tmp_path / "p" / f"{k}.txt", raw[k : k + 1])
+    turned = [{"pose": f"p/{k}.txt", "image": f"i/{5 - k}.png"} for k in range(6)]
+    (tmp_path / "cal.json").write_text(json.dumps({"data": turned}))
+    for poses in (tmp_path / "p", tmp_path / "cal.json"):
+        found = read_image_folder(images, poses, reading=READING)
+        assert np.abs(found.Ts_base_ee() - READING.apply(raw[::-1])).max() < 1e-14
+    for bad, says in (("p/9.txt", "entry 0: the pose file 'p/9.txt' of"), ("../x.txt", "outside")):
+        turned[0]["pose"] = bad
+        (tmp_path / "cal.json").write_text(json.dumps({"data": turned}))
+        with pytest.raises(InputError, match=says):
+            read_image_folder(images, tmp_path / "cal.json")
+
+
+def test_a_listing_that_skips_poses_says_so(tmp_path):
+    make_images(tmp_path / "i", ["0.png", "1.png", "2.png"])
+    (tmp_path / "p").mkdir()
+    for k in range(4):
+        write_rows(tmp_path / "p" / f"{k}.txt", rows(1, k))
+    pairs = [{"pose": f"p/{k}.txt", "image": f"i/{k}.png"} for k in range(3)]
+    (tmp_path / "cal.json").write_text(json.dumps(pairs))
+    found = read_image_folder(tmp_path / "i", tmp_path / "p")
+    assert len(found) == 3 and any(
+        "Not on the list and not read: 3.txt" in n for n in found.poses.notes
+    )
+
+
+def test_files_that_differ_or_hold_several_poses_are_named(tmp_path):
+    for k in range(3):
+        write_rows(tmp_path / f"{k}.txt", rows(1, k))
+    (tmp_path / "1.txt").write_text("1 2 3 0.1 0.2 0.3\n")
+    make_images(tmp_path / "i", ["0.png", "1.png", "2.png"])
+    with pytest.raises(InputError, match=r"1.txt holds 6 numbers, 0.txt 7 numbers"):
+        read_image_folder(tmp_path / "i", tmp_path)
+    write_rows(tmp_path / "1.txt", rows(2))
+    with pytest.raises(InputError, match=r"1.txt holds 2 poses; beside 2 other"):
+        read_image_folder(tmp_path / "i", tmp_path)
+
+
+def test_folders_without_usable_images_say_what_is_there(tmp_path):
+    with pytest.raises(InputError, match="is no folder"):
+        list_images(tmp_path / "none")
+    make_images(tmp_path / "colour", ["0.png"])
+    with pytest.raises(InputError, match="images in colour: give that folder"):
+        list_images(tmp_path)
+    deep = tmp_path / "deep"
+    deep.mkdir()
+    Image.fromarray(np.zeros((4, 4), np.uint16)).save(deep / "0.png")
+    with pytest.raises(InputError, match="1 images of 16 bit and none of 8"):
+        list_images(deep)
+    save(tmp_path / "colour" / "0.jpg", pixels(0))
+    with pytest.raises(InputError, match="two images of one name"):
+        list_images(tmp_path / "colour")
+
+
+def test_board_poses_of_other_count_are_refused(tmp_path):
+    a, b = write_rows(tmp_path / "a.txt", rows(5)), write_rows(tmp_path / "b.txt", rows(4))
+    with pytest.raises(InputError, match="5 robot poses and 4 board poses"):
+        read_board_poses(a, b)
+    names = [f"{k}.png" for k in range(5)]
+    a = write_rows(tmp_path / "a.txt", rows(5), names)
+    b = write_rows(tmp_path / "b.txt", rows(5)[[4, 2, 0]], [names[4], names[2], names[0]])
+    both = read_board_poses(a, b)
+    assert np.array_equal(both.robot.values, both.board.values) and len(both.robot) == 3
+    assert [w for w, _ in both.unpaired_robot] == ["line 2", "line 4"]
+
+
+# --- images -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("ending", ["png", "bmp", "tif", "ppm"])
+def test_lossless_images_come_back_exactly(tmp_path, ending):
+    colour, grey = pixels(1), pixels(2)[..., 0]
+    assert np.array_equal(load_image(save(tmp_path / f"c.{ending}", colour)), colour)
+    loaded = load_image(save(tmp_path / f"g.{ending}", grey))
+    assert all(np.array_equal(loaded[..., c], grey) for c in range(3))
+    opaque = np.dstack([colour, np.full(grey.shape, 255, np.uint8)])
+    assert np.array_equal(load_image(save(tmp_path / "o.png", opaque)), colour)
+
+
+def test_jpeg_pixels_are_those_of_opencv(tmp_path):
+    import cv2
+
+    smooth = cv2.GaussianBlur(pixels(3, (120, 160)), (0, 0), 5)
+    path = save(tmp_path / "a.jpg", smooth)
+    theirs = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(int)
+    assert np.abs(load_image(path).astype(int) - theirs).max() <= 2
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png", "bmp", "tif"])
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.9])
+def test_truncated_images_are_refused(tmp_path, ending, share):
+    path = save(tmp_path / f"a.{ending}", pixels(4, (200, 300)))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(InputError, match=r"a\.\w+ (is empty|is damaged|is not an image)"):
+        load_image(path)
+
+
+def test_files_that_were_copied_in_part_are_refused(tmp_path):
+    for ending in ("jpg", "png"):
+        path = save(tmp_path / f"a.{ending}", pixels(5, (200, 300)))
+        data = path.read_bytes()
+        half = len(data) // 2
+        path.write_bytes(data[:half] + bytes(len(data) - half))
+        with pytest.raises(InputError, match=r"truncated|damaged"):
+            load_image(path)
+
+
+def test_images_that_are_no_plain_colour_are_refused(tmp_path):
+    deep = tmp_path / "deep.png"
+    Image.fromarray(np.full((4, 4), 700, np.uint16)).save(deep)
+    clear = save(tmp_path / "clear.png", np.full((4, 4, 4), 100, np.uint8))
+    turned = tmp_path / "turned.jpg"
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(pixels(6)).save(turned, exif=exif)
+    (tmp_path / "text.png").write_text("no image")
+    for path, says in (
+        (deep, "more than 8 bits"),
+        (clear, "partly transparent"),
+        (turned, "shown turned"),
+        (tmp_path / "text.png", "not an image"),
+        (tmp_path / "none.png", "does not exist"),
+    ):
+        with pytest.raises(InputError, match=says):
+            load_image(path)
+
+
+def test_colour_of_16_bit_is_not_cut_down_in_silence(tmp_path):
+    import cv2
+
+    path = tmp_path / "deep_colour.png"
+    cv2.imwrite(str(path), np.full((8, 8, 3), 40000, np.uint16))
+    with pytest.raises(InputError, match="more than 8 bits"):
+        load_image(path)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    place=st.floats(0, 1), byte=st.integers(0, 255), ending=st.sampled_from(["png", "jpg", "tif"])
+)
+def test_no_damage_whatever_ends_in_a_traceback(place, byte, ending):
+    with tempfile.TemporaryDirectory() as folder:
+        path = save(Path(folder) / f"a.{ending}", pixels(7))
+        data = bytearray(path.read_bytes())
+        data[int(place * (len(data) - 1))] = byte
+        path.write_bytes(bytes(data))
+        try:
+            image = load_image(path)
+        except InputError as error:
+            assert str(path) in str(error)
+        else:
+            assert image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8
+
+
+# --- real data --------------------------------------------------------------------------------
+
+
+@real
+def test_rtde_pairs_with_joints_and_depth():
+    place = HANDEYE / "rtde_ur5e" / "Hand-Eye-Data"
+    found = read_image_folder(place, place, reading=reading_from_text("rotvec,m"))
+    assert len(found) == len(list(place.glob("*.jpg"))) and not found.unpaired_images
+    assert found.labels[9:11] == ("9.jpg", "10.jpg") and found.joints.shape == (len(found), 6)
+    for label, depth, T in zip(found.labels, found.depths, found.Ts_base_ee(), strict=True):
+        pose = json.loads((place / label).with_suffix(".json").read_text())["pose_flange"]
+        assert np.allclose(T[:3, 3], pose[:3], atol=1e-15)
+        assert np.allclose(T[:3, :3], se3.exp_so3(pose[3:]), atol=1e-12)
+        assert depth.name == label.replace(".jpg", ".png")
+    assert load_image(found.images[0]).shape == (1080, 1920, 3)
+    with pytest.raises(InputError, match="more than 8 bits"):
+        load_image(found.depths[0])
+
+
+@real
+def test_rosi_pairs_by_its_list():
+    place = HANDEYE / "rosi_circles"
+    found = read_image_folder(place / "images", place / "poses")
+    assert len(found) == 15 and str(found.poses.stated) == "quat_xyzw,m"
+    assert [Path(w).stem for w in found.poses.where] == [Path(n).stem for n in found.labels]
+    assert found.labels[10] == "10.png" and not found.warnings
+
+
+@real
+def test_muligheder_line_i_belongs_to_image_i():
+    place = HANDEYE / "muligheder_ur5e"
+    found = read_image_folder(place / "images", place / "40_poses_test.txt")
+    assert len(found) == 40 and "by number" in found.pairing
+    for label, where in zip(found.labels, found.poses.where, strict=True):
+        assert label == f"0-{where.removeprefix('line ')}.jpg"
+    assert reading_from_text("rotvec,m") in found.poses.possible
+    assert not found.duplicate_images and not found.duplicate_poses
+
+
+@real
+def test_muligheder_without_one_image_is_refused(tmp_path):
+    place = HANDEYE / "muligheder_ur5e"
+    for k in range(1, 41):
+        if k != 17:
+            (tmp_path / f"0-{k}.jpg").symlink_to(place / "images" / f"0-{k}.jpg")
+    with pytest.raises(InputError, match=r"39 images and 40 poses.*number 17 missing"):
+        read_image_folder(tmp_path, place / "40_poses_test.txt")

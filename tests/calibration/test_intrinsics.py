@@ -1,0 +1,461 @@
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import DegenerateError, InputError
+from realsim.geometry import se3
+from realsim.geometry.camera import project
+from realsim.records import CameraIntrinsics, Chessboard, CircleGrid
+from realsim_calibration.bundle import (
+    Observations,
+    State,
+    _normal,  # pyright: ignore[reportPrivateUsage]
+    camera_vector,
+    shaped_points,
+)
+from realsim_calibration.coverage import measure_coverage
+from realsim_calibration.intrinsics import calibrate_intrinsics
+from realsim_calibration.lens_fit import IntrinsicsConfig
+from realsim_calibration.lens_start import (
+    homography,
+    mirror_poses,
+    pose_of_homography,
+    zhang_focal,
+)
+from realsim_calibration.views import TargetDetection
+
+ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+LENS = CameraIntrinsics(
+    width=1280, height=720, fx=902.0, fy=900.0, cx=650.0, cy=352.0,
+    distortion=np.array([-0.12, 0.08, 0.0008, -0.0005, 0, 0, 0, 0]),
+)  # fmt: skip
+BOARD = Chessboard(rows=6, columns=8, square_m=0.025)
+FOUR = IntrinsicsConfig(models=("k1 k2 p1 p2",))
+
+
+def half_extent(board):
+    return float(np.ptp(board.points_board, axis=0).max() / 2)
+
+
+def print_shape(board, shape):
+    """Points (N, 3) of a print that is stretched and bent, from the board's middle."""
+    drawing = board.points_board[:, :2]
+    flat = drawing - (drawing.min(0) + drawing.max(0)) / 2
+    return shaped_points(flat, np.asarray(shape, dtype=float), half_extent(board))
+
+
+def board_pose(rng, lens, tilt_deg, spread, distances):
+    tilt = np.radians(tilt_deg) * np.sqrt(rng.uniform())
+    azimuth, roll = rng.uniform(0, 2 * np.pi), rng.uniform(-np.pi, np.pi)
+    R = se3.exp_so3(tilt * np.array([np.cos(azimuth), np.sin(azimuth), 0]))
+    R = R @ se3.exp_so3([0, 0, roll])
+    at = rng.uniform(0.5 - spread / 2, 0.5 + spread / 2, size=2) * [lens.width, lens.height]
+    xy = (at - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
+    return se3.from_rt(R, rng.uniform(*distances) * np.append(xy, 1.0))
+
+
+def see(
+    seed, views=20, lens=LENS, noise=0.1, tilt=45.0, shape=(0, 0, 0, 0), spread=0.8, board=BOARD,
+    distances=(0.3, 0.6),
+):  # fmt: skip
+    """Detections of a board at random poses; corners outside the image are not found."""
+    rng = np.random.default_rng(seed)
+    points = print_shape(board, shape)
+    found = []
+    while len(found) < views:
+        T = board_pose(rng, lens, tilt, spread, distances)
+        uv = project(lens, se3.transform(T, points))
+        uv = uv + rng.normal(scale=noise, size=uv.shape) if noise else uv
+        inside = np.all((uv > 0) & (uv < [lens.width - 1, lens.height - 1]), axis=-1)
+        if inside.sum() >= 12:
+            found.append(detection(np.flatnonzero(inside), uv[inside], lens))
+    return found
+
+
+def detection(ids, uv, lens=LENS):
+    return TargetDetection(point_ids=ids, uv=uv, image_size=(lens.width, lens.height))
+
+
+def vector(report):
+    return camera_vector(report.intrinsics)
+
+
+# --- laws -------------------------------------------------------------------------------------
+
+
+def test_derivatives_are_those_of_the_cost():
+    lens = replace(LENS, distortion=np.array([-0.12, 0.08, 8e-4, -5e-4, 0.02, 0.01, 0.02, 0.01]))
+    seen = see(0, views=3, lens=lens, noise=0.5)
+    drawing = BOARD.points_board[:, :2]
+    flat = drawing - (drawing.min(0) + drawing.max(0)) / 2
+    obs = Observations(
+        flat=np.concatenate([flat[d.point_ids] for d in seen]),
+        uv=np.concatenate([d.uv for d in seen]),
+        weight=np.linspace(0.5, 2.0, sum(len(d) for d in seen)),
+        offsets=np.cumsum([0, *(len(d) for d in seen)]).astype(np.int64),
+        half_extent_m=half_extent(BOARD),
+        image_size=(1280, 720),
+    )
+    rng = np.random.default_rng(0)
+    poses = np.stack([board_pose(rng, lens, 45.0, 0.8, (0.3, 0.6)) for _ in seen])
+    state = State(
+        camera=camera_vector(lens), board=np.array([0.002, 0.01, -0.02, 0.005]), poses=poses
+    )
+
+    def costs(at):
+        return _normal(at, obs, 1.0, 1e9).costs
+
+    g = _normal(state, obs, 1.0, 1e9).g
+    for k in range(16):
+        step = np.zeros(16)
+        step[k] = 1e-6 * max(abs(state.theta[k]), 1.0)
+        slope = (costs(state.moved(step)) - costs(state.moved(-step))) / (4 * step[k])
+        assert np.allclose(slope, g[:, k], rtol=2e-4, atol=1e-3 * np.abs(g[:, k]).max()), k
+    for k in range(6):
+        twist = np.eye(6)[k] * 1e-6
+        there, back = (replace(state, poses=poses @ se3.exp(s * twist)) for s in (1, -1))
+        slope = (costs(there) - costs(back)) / 4e-6
+        assert np.allclose(slope, g[:, 16 + k], rtol=2e-4), k
+
+
+def test_a_homography_gives_back_its_pose_and_focal_length():
+    rng = np.random.default_rng(1)
+    lens = CameraIntrinsics(width=1280, height=720, fx=800, fy=800, cx=639.5, cy=359.5)
+    flat = print_shape(BOARD, (0, 0, 0, 0))
+    poses = np.stack([board_pose(rng, lens, 45.0, 0.5, (0.4, 0.8)) for _ in range(5)])
+    H = np.stack([homography(flat[:, :2], project(lens, se3.transform(T, flat))) for T in poses])
+    assert zhang_focal(H, (1280, 720)) == pytest.approx(800, rel=1e-7)
+    assert np.allclose(pose_of_homography(np.linalg.inv(lens.K) @ H), poses, atol=1e-8)
+
+
+def test_mirroring_a_pose_twice_changes_nothing():
+    rng = np.random.default_rng(2)
+    poses = np.stack([board_pose(rng, LENS, 60.0, 0.8, (0.3, 0.6)) for _ in range(20)])
+    assert np.allclose(mirror_poses(mirror_poses(poses)), poses, atol=1e-9)
+    assert np.min(se3.angle(se3.invert(poses) @ mirror_poses(poses))) > 1e-3
+
+
+def test_perfect_corners_give_back_lens_and_print():
+    shape = (0.002, 0.008, -0.004, 0.01)
+    report = calibrate_intrinsics(see(3, noise=0, shape=shape), BOARD, config=FOUR)
+    truth = camera_vector(LENS)
+    assert np.allclose(vector(report)[:4] / truth[:4], 1, atol=1e-6)
+    assert np.allclose(vector(report)[4:], truth[4:], atol=1e-6)
+    assert report.board.aspect == pytest.approx(shape[0], abs=1e-6)
+    assert np.allclose(report.board.warp, shape[1:], atol=1e-6)
+    assert report.rms_px < 1e-4
+
+
+def test_the_order_of_the_views_does_not_matter():
+    seen = see(4, views=14)
+    order = np.random.default_rng(0).permutation(len(seen))
+    a = calibrate_intrinsics(seen, BOARD)
+    b = calibrate_intrinsics([seen[i] for i in order], BOARD)
+    assert a.model == b.model and a.terms == b.terms
+    assert np.allclose(vector(a), vector(b), rtol=1e-6, atol=1e-6)
+    assert np.allclose(a.sd, b.sd, rtol=1e-3)
+    assert a.held_out_px == pytest.approx(b.held_out_px, rel=1e-6)
+
+
+def test_the_boards_unit_does_not_matter():
+    seen = see(5, views=12)
+    double = Chessboard(rows=6, columns=8, square_m=0.05)
+    a = calibrate_intrinsics(seen, BOARD, config=FOUR)
+    b = calibrate_intrinsics(seen, double, config=FOUR)
+    assert np.allclose(vector(a), vector(b), rtol=1e-6, atol=1e-7)
+    assert np.allclose(a.covariance, b.covariance, rtol=1e-3, atol=1e-12)
+    assert np.allclose(b.views[0].T_cam_board[:3, 3], 2 * a.views[0].T_cam_board[:3, 3], rtol=1e-6)
+
+
+def test_exchanging_the_image_axes_exchanges_the_terms():
+    seen = see(6, views=14)
+    grid = np.arange(48).reshape(6, 8)
+    mirrored = Chessboard(rows=8, columns=6, square_m=0.025)
+    other = {int(old): int(new) for old, new in zip(grid.T.ravel(), range(48), strict=True)}
+    swapped = [
+        TargetDetection(
+            point_ids=[other[int(i)] for i in d.point_ids], uv=d.uv[:, ::-1], image_size=(720, 1280)
+        )
+        for d in seen
+    ]
+    # Beliefs about the print's height relative to its width are not symmetric to second order.
+    a = vector(calibrate_intrinsics(seen, BOARD, config=FOUR))
+    b = vector(calibrate_intrinsics(swapped, mirrored, config=FOUR))
+    assert np.allclose(b[[1, 0, 3, 2]], a[:4], rtol=1e-5)
+    assert np.allclose(b[[4, 5, 7, 6]], a[4:8], atol=1e-5)
+
+
+def test_an_image_twice_as_large_has_twice_the_focal_length():
+    seen = see(7, views=14)
+    large = [
+        TargetDetection(point_ids=d.point_ids, uv=2 * d.uv + 0.5, image_size=(2560, 1440))
+        for d in seen
+    ]
+    a = vector(calibrate_intrinsics(seen, BOARD, config=FOUR))
+    b = vector(calibrate_intrinsics(large, BOARD, config=FOUR))
+    assert np.allclose(b[:2], 2 * a[:2], rtol=1e-6)
+    assert np.allclose(b[2:4], 2 * a[2:4] + 0.5, rtol=1e-6)
+    assert np.allclose(b[4:], a[4:], atol=1e-6)
+
+
+# --- statistics -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("warped", [False, True])
+def test_the_covariance_says_how_large_errors_are(warped):
+    rng = np.random.default_rng(8)
+    truth, inside, whole = camera_vector(LENS), [], []
+    for trial in range(25):
+        shape = rng.normal(scale=[0.002, 0.006, 0.006, 0.006]) if warped else (0, 0, 0, 0)
+        report = calibrate_intrinsics(see(100 + trial, shape=shape), BOARD, config=FOUR)
+        f = np.flatnonzero(report.sd)
+        e = (vector(report) - truth)[f]
+        inside.append(np.abs(e) < 1.96 * report.sd[f])
+        whole.append(e @ np.linalg.solve(report.covariance[np.ix_(f, f)], e) / len(f))
+    # 25 trials of 8 terms that go together: 95 % of them to within 4 %.
+    assert 0.87 <= np.mean(np.concatenate(inside)) <= 1.0
+    assert 0.5 < np.mean(whole) < 1.5
+
+
+def test_corner_errors_shared_by_a_view_widen_the_covariance():
+    rng = np.random.default_rng(9)
+    seen = see(9, views=24)
+    # A smooth distortion of every view, like a bent page that moves between the pictures.
+    drawing = BOARD.points_board[:, :2] - BOARD.points_board[:, :2].mean(0)
+    x, y = (drawing / half_extent(BOARD)).T
+    smooth = np.stack([x**2, x * y, y**2, x**3, y**3], -1)
+    bent = [
+        detection(d.point_ids, np.clip(d.uv + (smooth @ rng.normal(scale=0.2, size=(5, 2)))[
+            d.point_ids], 0, [1279, 719]))
+        for d in seen
+    ]  # fmt: skip
+    plain, shared = (calibrate_intrinsics(s, BOARD, config=FOUR) for s in (seen, bent))
+    assert plain.inflation < 2.5 < shared.inflation
+    # The residuals alone would not explain it.
+    assert shared.sd[0] / plain.sd[0] > 1.2 * shared.sigma_px / plain.sigma_px
+
+
+def test_a_bent_board_taken_for_flat_gives_a_wrong_lens():
+    seen = see(10, views=24, shape=(0.004, 0.02, 0, 0.01))
+    truth = camera_vector(LENS)
+    shaped = calibrate_intrinsics(seen, BOARD, config=FOUR)
+    flat = calibrate_intrinsics(seen, BOARD, config=replace(FOUR, board_shape=False))
+    assert abs(vector(shaped)[0] - truth[0]) < 4 * shaped.sd[0]
+    assert abs(vector(flat)[0] - truth[0]) > 3 * abs(vector(shaped)[0] - truth[0])
+    assert np.abs(shaped.board.aspect - 0.004) < 4 * shaped.board.sd[1]
+    assert {c.name: c.verdict for c in shaped.checks}["board shape"] == "warn"
+
+
+def test_the_lens_is_known_best_where_the_corners_were():
+    report = calibrate_intrinsics(see(11, spread=0.3, distances=(0.5, 0.8)), BOARD)
+    middle, corner = report.projection_sd_px([[639.5, 359.5], [0.0, 0.0]])
+    assert 0 < 4 * middle < corner
+    uv, sd = report.projection_sd_grid(8, 6)
+    assert uv.shape == (6, 8, 2) and sd.shape == (6, 8)
+    assert sd[0, 0] == pytest.approx(corner)
+    more = calibrate_intrinsics(see(12, views=40, spread=1.0), BOARD)
+    assert more.projection_sd_px([[0.0, 0.0]])[0] < 0.3 * corner
+
+
+# --- choice and refusal -----------------------------------------------------------------------
+
+
+def test_the_model_is_chosen_on_unseen_views():
+    pinhole = replace(LENS, distortion=np.zeros(8))
+    assert calibrate_intrinsics(see(13, lens=pinhole), BOARD).model == "pinhole"
+    report = calibrate_intrinsics(see(13, views=30), BOARD)
+    table = {s.model: s for s in report.held_out}
+    assert list(table) == ["pinhole", "k1", "k1 k2", "k1 k2 p1 p2", "Brown 5", "rational 8"]
+    assert table["pinhole"].held_out_px > 3 * table[report.model].held_out_px
+    assert {"k1", "k2"} <= set(report.terms)
+    assert sum(s.chosen for s in report.held_out) == 1
+    assert report.rms_px < report.held_out_px < 1.5 * report.rms_px
+    strong = replace(LENS, distortion=np.array([-0.3, 0.15, 0, 0, 0.05, 0, 0, 0]))
+    wide = calibrate_intrinsics(see(14, views=40, lens=strong, spread=1.0, noise=0.02), BOARD)
+    assert wide.model in ("Brown 5", "rational 8")
+
+
+def test_terms_that_the_views_do_not_determine_are_held_and_named():
+    seen = see(15, views=10, spread=0.2, tilt=35.0, distances=(0.6, 0.9))
+    report = calibrate_intrinsics(seen, BOARD, config=IntrinsicsConfig(models=("Brown 5",)))
+    held = dict(report.refused)
+    assert "k3" in held and "held at 0" in held["k3"]
+    assert report.intrinsics.distortion[4] == 0 and report.sd[8] == 0
+    assert "k3" not in report.terms
+    check = {c.name: c for c in report.checks}["refused terms"]
+    assert check.verdict == "warn" and "k3" in check.sentence and check.advice
+
+
+def test_views_from_the_front_do_not_give_a_focal_length():
+    with pytest.raises(DegenerateError, match="tilt the board by 30 deg about two axes"):
+        calibrate_intrinsics(see(16, tilt=0.0), BOARD)
+    with pytest.raises(DegenerateError, match="tilt the board by 30 deg"):
+        calibrate_intrinsics(see(16, views=8, tilt=3.0, noise=0.3), BOARD)
+
+
+def test_one_view_or_the_same_view_again_does_not_give_a_lens():
+    seen = see(17, views=2)
+    with pytest.raises(DegenerateError, match="one view"):
+        calibrate_intrinsics(seen[:1], BOARD)
+    with pytest.raises(DegenerateError, match=r"under the same angle|squarely"):
+        calibrate_intrinsics(seen[:1] * 6, BOARD)
+
+
+def test_one_view_with_a_start_stays_near_it_and_says_so():
+    start = replace(LENS, fx=905.0, fy=903.0)
+    report = calibrate_intrinsics(see(18, views=1), BOARD, start=start)
+    assert np.all(np.abs(vector(report)[:2] - [905, 903]) < 3 * 0.02 * 905)
+    assert report.sd[0] > 1 and report.start == "given"
+    verdicts = {c.name: c.verdict for c in report.checks}
+    assert verdicts["views"] == "warn" and verdicts["lens model"] == "warn"
+
+
+def test_a_wrong_start_does_not_matter_where_views_are_many():
+    seen = see(19, views=24)
+    start = CameraIntrinsics(width=1280, height=720, fx=930, fy=930, cx=639.5, cy=359.5)
+    a = calibrate_intrinsics(seen, BOARD, config=FOUR)
+    b = calibrate_intrinsics(seen, BOARD, start=start, config=FOUR)
+    assert np.all(np.abs(vector(a) - vector(b))[:8] < 0.5 * a.sd[:8])
+    check = {c.name: c for c in b.checks}["given intrinsics"]
+    assert check.verdict == "warn" and "differs" in check.sentence
+
+
+# --- outliers and input -----------------------------------------------------------------------
+
+
+def test_wrong_corners_and_views_are_named_and_left_out():
+    seen = see(20, views=16)
+    clean = calibrate_intrinsics(seen, BOARD, config=FOUR)
+    uv = seen[3].uv.copy()
+    uv[5] += [0, -9.0] if uv[5, 1] > 20 else [0, 9.0]
+    spoilt = list(seen)
+    spoilt[3] = detection(seen[3].point_ids, uv)
+    rng = np.random.default_rng(0)
+    mixed = rng.permutation(len(seen[7]))
+    spoilt[7] = detection(seen[7].point_ids, seen[7].uv[mixed])
+    names = [f"{i}.png" for i in range(16)]
+    report = calibrate_intrinsics(spoilt, BOARD, names=names, config=FOUR)
+    assert [v.name for v in report.views if not v.used] == ["7.png"]
+    assert "wrongly found" in report.views[7].reason
+    assert [p for p, _ in report.views[3].outliers] == [int(seen[3].point_ids[5])]
+    assert report.views[3].outliers[0][1] == pytest.approx(9, abs=1)
+    assert "7.png" in " ".join(report.warnings)
+    assert np.all(np.abs(vector(report) - vector(clean))[:8] < 1.5 * clean.sd[:8])
+
+
+def test_small_and_straight_views_are_left_out_with_the_reason():
+    seen = see(21, views=12, noise=0.05, spread=0.3, distances=(0.5, 0.7))
+    few = detection(seen[0].point_ids[:4], seen[0].uv[:4])
+    row = np.flatnonzero(seen[1].point_ids < 8)
+    line = detection(seen[1].point_ids[row], seen[1].uv[row])
+    none = detection([], np.zeros((0, 2)))
+    report = calibrate_intrinsics([*seen, few, line, none], BOARD, config=FOUR)
+    assert [v.reason for v in report.views[-3:]] == [
+        "4 corners, 6 are needed", "its corners lie on one line", "0 corners, 6 are needed",
+    ]  # fmt: skip
+    assert len(report.used) == 12
+
+
+def test_what_cannot_be_is_refused_with_names():
+    seen = see(22, views=5)
+    odd = TargetDetection(point_ids=seen[2].point_ids, uv=seen[2].uv / 2, image_size=(640, 360))
+    with pytest.raises(InputError, match=r"not c\.png \(640x360\)"):
+        calibrate_intrinsics(
+            [*seen[:2], odd, *seen[3:]], BOARD, names=[f"{c}.png" for c in "abcde"]
+        )
+    half = replace(LENS, width=640, height=360, cx=320, cy=180)
+    with pytest.raises(InputError, match="scale the intrinsics"):
+        calibrate_intrinsics(
+            seen, BOARD, start=replace(LENS, width=640, height=360, cx=320, cy=180)
+        )
+    with pytest.raises(InputError, match="no views"):
+        calibrate_intrinsics([], BOARD)
+    with pytest.raises(InputError, match="3 names for 5 views"):
+        calibrate_intrinsics(seen, BOARD, names=["a", "b", "c"])
+    with pytest.raises(InputError, match="not on the target"):
+        calibrate_intrinsics(seen, Chessboard(rows=3, columns=3, square_m=0.025))
+    outside = detection(seen[0].point_ids, seen[0].uv + 2000)
+    with pytest.raises(InputError, match="outside its image"):
+        calibrate_intrinsics([*seen, outside], BOARD)
+    blind = replace(seen[0], sd_px=np.full(len(seen[0]), np.nan))
+    with pytest.raises(InputError, match="predicted sigmas"):
+        calibrate_intrinsics([*seen, blind], BOARD)
+    with pytest.raises(InputError, match="lens model 'fisheye' is not known"):
+        IntrinsicsConfig(models=("fisheye",))
+
+
+def test_predicted_sigmas_weigh_the_corners():
+    rng = np.random.default_rng(23)
+    good, blurred = see(23, views=16, noise=0.03), []
+    for i, d in enumerate(good):
+        sd = np.full(len(d), 0.03 if i % 2 else 0.3)
+        uv = np.clip(d.uv + rng.normal(size=d.uv.shape) * (sd[:, None] - 0.03), 0, [1279, 719])
+        blurred.append(replace(d, uv=uv, sd_px=sd))
+    blind = [replace(d, sd_px=None) for d in blurred]
+    truth = camera_vector(LENS)[:8]
+    weighed, same = (calibrate_intrinsics(s, BOARD, config=FOUR) for s in (blurred, blind))
+    assert np.median(weighed.sd[:8] / same.sd[:8]) < 0.8
+    assert np.all(np.abs(vector(weighed)[:8] - truth) < 4 * weighed.sd[:8])
+
+
+def test_coverage_names_what_is_missing():
+    poses = np.stack([se3.from_rt(se3.exp_so3([0.5 * s, 0.4, 0]), [0, 0, 0.5]) for s in (-1, 1)])
+    u, v = np.meshgrid(np.linspace(0, 639, 30), np.linspace(0, 479, 30))
+    everywhere = np.stack([u.ravel(), v.ravel()], -1)
+    full = measure_coverage(everywhere, (640, 480), poses)
+    assert full.share == 1 and full.reach > 0.9 and full.advice == ""
+    assert full.counts.sum() == len(everywhere)
+    missing = everywhere[(everywhere[:, 0] < 320) | (everywhere[:, 1] < 240)]
+    part = measure_coverage(missing, (640, 480), poses)
+    assert "no corners in the lower right quarter" in part.advice
+    straight = np.stack([se3.from_translation([0, 0, z]) for z in (0.4, 0.8)])
+    flat = measure_coverage(everywhere, (640, 480), straight)
+    assert "tilt it by 30 deg" in flat.advice and flat.distance_ratio == pytest.approx(2)
+
+
+def test_many_views_take_seconds():
+    board = Chessboard(rows=10, columns=14, square_m=0.02)
+    seen = see(24, views=256, board=board)
+    calibrate_intrinsics(seen[:8], board, config=FOUR)
+    before = time.process_time()
+    report = calibrate_intrinsics(seen, board, config=FOUR)
+    # Two seconds of one core; the bound leaves room for slower machines.
+    assert time.process_time() - before < 6.0
+    assert len(report.used) == 256
+
+
+# --- real images ------------------------------------------------------------------------------
+
+
+@pytest.mark.real
+@pytest.mark.slow
+def test_unseen_views_of_a_real_camera_are_predicted_as_well_as_by_opencv():
+    import cv2
+
+    folder = ROOT / "handeye" / "rosi_circles" / "images"
+    if not folder.is_dir():
+        pytest.skip(f"no real data at {folder} (set REALSIM_DATA)")
+    board = CircleGrid(rows=10, columns=10, pitch_m=0.0254)
+    seen = []
+    for path in sorted(folder.glob("*.png")):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        parameters = cv2.SimpleBlobDetector.Params()
+        parameters.maxArea, parameters.minDistBetweenBlobs = 4000.0, 5.0
+        blobs = cv2.SimpleBlobDetector.create(parameters)
+        found, uv = cv2.findCirclesGrid(image, (10, 10), None, cv2.CALIB_CB_SYMMETRIC_GRID, blobs)
+        if found:
+            seen.append(
+                TargetDetection(
+                    point_ids=np.arange(100), uv=uv.reshape(-1, 2), image_size=(640, 480)
+                )
+            )
+    assert len(seen) >= 10
+    report = calibrate_intrinsics(seen, board)
+    print(f"rosi_circles: {len(seen)} views, '{report.model}', {report.held_out_px:.3f} px unseen")
+    assert report.held_out_px < 0.4
+    assert 515 < report.intrinsics.fx < 550
+    assert report.sd[0] < 10

@@ -1,0 +1,426 @@
+import json
+import os
+import shutil
+import tempfile
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_calibration.gates import rotation_mismatch_deg
+from realsim_calibration.inputs import (
+    ROTATIONS,
+    PoseReading,
+    read_board_poses,
+    read_pose_file,
+    reading_from_text,
+)
+
+ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+HANDEYE = ROOT / "handeye"
+real = pytest.mark.skipif(
+    not HANDEYE.is_dir(), reason=f"no real data at {HANDEYE} (set REALSIM_DATA)"
+)
+
+
+@contextmanager
+def folder():
+    path = Path(tempfile.mkdtemp())
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path)
+
+
+def all_readings():
+    for rotation, length, inverted, first in product(
+        ROTATIONS, ("m", "mm"), (False, True), (True, False)
+    ):
+        plain = PoseReading(
+            rotation=rotation, length_unit=length, inverted=inverted, position_first=first
+        )
+        yield plain
+        if plain.has_angles:
+            yield replace(plain, angle_unit="deg")
+
+
+READINGS = list(all_readings())
+
+
+def random_poses(seed, n):
+    return se3.random_transform(np.random.default_rng(seed), n, spread=0.5)
+
+
+# --- every reading in every layout --------------------------------------------------------------
+
+
+def number(x, comma=False):
+    text = repr(float(x))
+    return text.replace(".", ",") if comma else text
+
+
+def write_lines(path, raw, separator, names=None, head="", comma=False):
+    lines = [head] if head else []
+    for k, row in enumerate(raw):
+        fields = [number(x, comma) for x in row]
+        lines.append(separator.join([names[k], *fields] if names else fields))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def as_json(path, tree):
+    path.write_text(json.dumps(tree))
+    return path
+
+
+def write_opencv(path, raw):
+    import cv2
+
+    store = cv2.FileStorage(str(path), cv2.FileStorage_WRITE)
+    store.write("poses", np.ascontiguousarray(raw))
+    store.release()
+    return path
+
+
+def write_files(path, raw, one):
+    path.mkdir()
+    for k, row in enumerate(raw):
+        one(path / f"pose_{k}", row)
+    return path
+
+
+def write_npz(path, raw, names):
+    np.savez(path, poses=raw, images=np.array(names))
+    return path
+
+
+def square(raw):
+    return raw.reshape(-1, 4, 4).tolist() if raw.shape[1] == 16 else raw.tolist()
+
+
+def save_json(stem, row):
+    joints = np.linspace(-1, 1, 6).tolist()
+    stem.with_suffix(".json").write_text(json.dumps({"joints": joints, "tcp": row.tolist()}))
+
+
+LAYOUTS = {
+    "spaces": lambda d, r, n: write_lines(d / "a.txt", r, " ", head="# exported"),
+    "commas": lambda d, r, n: write_lines(d / "a.csv", r, ","),
+    "comma and space": lambda d, r, n: write_lines(d / "a.csv", r, ", "),
+    "named lines": lambda d, r, n: write_lines(d / "a.csv", r, ",", n),
+    "named lines, spaces": lambda d, r, n: write_lines(d / "a.txt", r, "  ", n),
+    "decimal commas": lambda d, r, n: write_lines(d / "a.csv", r, ";", comma=True),
+    "tabs": lambda d, r, n: write_lines(d / "a.tsv", r, "\t", n),
+    "UR": lambda d, r, n: write_lines(d / "a.log", r, ", ", head="") and brackets(d / "a.log"),
+    "json lists": lambda d, r, n: as_json(d / "a.json", r.tolist()),
+    "json nested": lambda d, r, n: as_json(d / "a.json", {"poses": square(r), "images": n}),
+    "json by image": lambda d, r, n: as_json(d / "a.json", dict(zip(n, square(r), strict=True))),
+    "json entries": lambda d, r, n: as_json(
+        d / "a.json",
+        {"fps": 30, "frames": [{"file": a, "T": p} for a, p in zip(n, square(r), strict=True)]},
+    ),
+    "yaml": lambda d, r, n: as_json(d / "a.yaml", r.tolist()),
+    "opencv": lambda d, r, n: write_opencv(d / "a.yml", r),
+    "opencv json": lambda d, r, n: write_opencv(d / "a.json", r),
+    "npy": lambda d, r, n: np.save(d / "a.npy", r) or d / "a.npy",
+    "npz": lambda d, r, n: write_npz(d / "a.npz", r, n),
+    "json files": lambda d, r, n: write_files(d / "p", r, save_json),
+    "txt files": lambda d, r, n: write_files(
+        d / "p", r, lambda p, row: np.savetxt(p.with_suffix(".txt"), row[None], fmt="%.17g")
+    ),
+    "column files": lambda d, r, n: write_files(
+        d / "p", r, lambda p, row: np.savetxt(p.with_suffix(".txt"), row, fmt="%.17g")
+    ),
+    "npy files": lambda d, r, n: write_files(
+        d / "p", r, lambda p, row: np.save(p.with_suffix(".npy"), row)
+    ),
+}
+
+
+def brackets(path):
+    path.write_text("".join(f"p[{line}]\n" for line in path.read_text().splitlines()))
+    return path
+
+
+def check(raw_poses, reading, T):
+    assert len(raw_poses) == len(T)
+    assert any(
+        p == reading or (raw_poses.values.shape[1] == 16 and same_matrix(p, reading))
+        for p in raw_poses.possible
+    ), (str(reading), [str(p) for p in raw_poses.possible])
+    assert np.abs(raw_poses.poses(reading) - T).max() < 1e-12
+
+
+def same_matrix(p, reading):
+    return replace(p, position_first=reading.position_first) == reading
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(3, 14),
+    reading=st.sampled_from(READINGS),
+    wide=st.booleans(),
+)
+def test_every_reading_survives_every_layout(layout, seed, n, reading, wide):
+    T = random_poses(seed, n)
+    raw = reading.numbers(T, width=reading.widths[0 if wide else -1])
+    names = [f"img_{k}.png" for k in range(n)]
+    with folder() as place:
+        found = read_pose_file(LAYOUTS[layout](place, raw, names))
+    check(found, reading, T)
+    if layout in ("named lines", "named lines, spaces", "tabs", "npz", "json by image"):
+        assert list(found.labels) == names
+    if layout == "json files":
+        assert np.allclose(found.joints, np.linspace(-1, 1, 6), atol=1e-15)
+        assert found.stems[-1] == f"pose_{n - 1}"
+
+
+@pytest.mark.parametrize("length", ["m", "mm"])
+@pytest.mark.parametrize(
+    ("header", "text"),
+    [
+        ("x,y,z,qx,qy,qz,qw", "quat_xyzw"),
+        ("tx ty tz q_w q_x q_y q_z", "quat_wxyz"),
+        ("qw;qx;qy;qz;pos_x;pos_y;pos_z", "quat_wxyz,rotation_first"),
+        ("x,y,z,rx,ry,rz", "rotvec"),
+        ("x,y,z,rx,ry,rz", "euler_zyz,rad"),
+        ("x,y,z,roll,pitch,yaw", "euler_xyz,deg"),
+        ("yaw,pitch,roll,x,y,z", "euler_ZYX,deg,rotation_first"),
+        ("X,Y,Z,A,B,C", "euler_ZYX,deg"),
+        ("X,Y,Z,W,P,R", "euler_xyz,deg"),
+        ("x,y,z,rotvec_x,rotvec_y,rotvec_z", "rotvec"),
+        ("actual_TCP_pose_0 " + " ".join(f"actual_TCP_pose_{k}" for k in range(1, 6)), "rotvec"),
+        ("x,y,z," + ",".join(f"r{r}{c}" for r in range(3) for c in range(3)), "matrix"),
+    ],
+)
+def test_header_names_say_what_columns_are(header, text, length):
+    reading = reading_from_text(f"{text},{length}")
+    T = random_poses(5, 9)
+    raw = reading.numbers(T, width=12 if text == "matrix" else None)
+    separator = next(s for s in ";, " if s in header)
+    with folder() as place:
+        for k, start in enumerate(("", "# ")):
+            path = write_lines(place / f"{k}.txt", raw, separator, head=start + header)
+            found = read_pose_file(path)
+            # names say where the position is, so the reading's order does not matter
+            check(found, replace(reading, position_first=True), T)
+            assert np.abs(found.poses(reading) - T).max() < 1e-12
+            if "q" in header.lower() or text == "matrix":
+                assert found.stated == replace(reading, position_first=True)
+
+
+def test_units_in_names_extra_columns_and_joints():
+    T = random_poses(6, 8)
+    reading = reading_from_text("euler_xyz,deg,mm")
+    joints = np.random.default_rng(0).uniform(-170, 170, (8, 6))
+    table = np.hstack([joints, reading.numbers(T), np.full((8, 1), 7.0)])
+    head = ",".join(["image", *(f"q{k} [deg]" for k in range(6))])
+    head += ",x (mm),y (mm),z (mm),roll_deg,pitch_deg,yaw_deg,force"
+    names = [f"{k}.png" for k in range(8)]
+    with folder() as place:
+        found = read_pose_file(write_lines(place / "a.csv", table, ",", names, head=head))
+    assert {str(p) for p in found.possible} == {
+        f"euler_{o},deg,mm{i}" for o in ("xyz", "XYZ") for i in ("", ",inverted")
+    }
+    assert np.allclose(found.joints, np.radians(joints), atol=1e-14)
+    assert list(found.labels) == names and any("force" in n for n in found.notes)
+    check(found, reading, T)
+    with pytest.raises(InputError, match="contradicts the file: length unit is mm, not m"):
+        found.poses(reading_from_text("euler_xyz,deg,m"))
+    with pytest.raises(InputError, match="not rotation_vector"):
+        found.poses(reading_from_text("rotvec,deg,mm"))
+
+
+def test_time_and_index_columns_are_told_from_the_pose():
+    T = random_poses(7, 6)
+    reading = reading_from_text("quat_xyzw,m")
+    times = 1305031102.17 + np.cumsum(np.full(6, 0.03))
+    with folder() as place:
+        tum = write_lines(place / "a.txt", np.column_stack([times, reading.numbers(T)]), " ")
+        check(read_pose_file(tum), reading, T)
+        vector = reading_from_text("rotvec,m")
+        rows = np.column_stack([np.arange(3, 9), vector.numbers(T)])
+        counted = read_pose_file(write_lines(place / "b.txt", rows, " "))
+    check(counted, vector, T)
+    assert counted.stems == tuple("345678")
+
+
+def test_words_before_the_numbers_are_names_only_if_they_differ():
+    raw = reading_from_text("rotvec,m").numbers(random_poses(11, 4))
+    with folder() as place:
+        same = read_pose_file(write_lines(place / "a.txt", raw, " ", ["pose:"] * 4))
+        numbered = read_pose_file(write_lines(place / "b.txt", raw, " ", ["0:", "1:", "2:", "3:"]))
+    assert same.labels == numbered.labels == (None,) * 4
+    assert same.stems == ("",) * 4 and numbered.stems == tuple("0123")
+
+
+def test_text_of_spreadsheets_and_windows():
+    raw = reading_from_text("rotvec,m").numbers(random_poses(12, 4))
+    text = "\r\n".join(" ".join(map(number, r)) for r in raw)
+    with folder() as place:
+        for k, data in enumerate(
+            (text.encode("utf-16"), text.encode("utf-8-sig"), text.replace(".", ",").encode())
+        ):
+            (place / f"{k}.txt").write_bytes(data)
+            assert np.array_equal(read_pose_file(place / f"{k}.txt").values, raw)
+
+
+def test_the_order_of_keys_means_nothing():
+    T = random_poses(13, 6)
+    keys = ["x", "y", "z", "qx", "qy", "qz", "qw"]
+    q = reading_from_text("quat_xyzw,m")
+    rng = np.random.default_rng(0)
+    tree = []
+    for row in q.numbers(T).tolist():
+        entry = dict(zip(keys, row, strict=True))
+        tree.append({k: entry[k] for k in rng.permutation(keys)})
+    with folder() as place:
+        found = read_pose_file(as_json(place / "a.json", tree))
+    assert found.stated is not None and np.abs(found.poses(found.stated) - T).max() < 1e-12
+
+
+def test_ros_poses_and_parts():
+    T = random_poses(8, 5)
+    q = reading_from_text("quat_xyzw,m").numbers(T)
+
+    def ros(row):
+        position = dict(zip("xyz", row[:3].tolist(), strict=True))
+        return {
+            "position": position,
+            "orientation": dict(zip("xyzw", row[3:].tolist(), strict=True)),
+        }
+
+    parts = [{"R": t[:3, :3].tolist(), "t": t[:3, 3:].tolist(), "id": k} for k, t in enumerate(T)]
+    with folder() as place:
+        stamped = [{"header": {"seq": k}, "pose": ros(r)} for k, r in enumerate(q)]
+        path = place / "a.yaml"
+        path.write_text("---\n".join(json.dumps(s) + "\n" for s in stamped))  # several documents
+        found = read_pose_file(path)
+        assert str(found.stated) == "quat_xyzw,m"
+        check(found, found.stated, T)
+        found = read_pose_file(as_json(place / "b.json", parts))
+        assert str(found.stated) == "matrix,m"
+        check(found, found.stated, T)
+        tree = [
+            {"rvec": r[3:].tolist(), "tvec_mm": r[:3].tolist()}
+            for r in reading_from_text("rotvec,mm").numbers(T)
+        ]
+        found = read_pose_file(as_json(place / "c.json", tree))
+        assert str(found.stated) == "rotvec,rad,mm"
+        check(found, found.stated, T)
+        tree = [{"position": r[:3].tolist(), "quaternion": r[3:].tolist()} for r in q]
+        found = read_pose_file(as_json(place / "d.json", tree))
+        assert {p.rotation for p in found.possible} == {"quaternion_xyzw", "quaternion_wxyz"}
+        check(found, reading_from_text("quat_xyzw,m"), T)
+
+
+def test_matrices_as_blocks_of_lines_and_of_few_decimals():
+    T = random_poses(9, 5)
+    with folder() as place:
+        text = "\n\n".join("\n".join(" ".join(map(number, row)) for row in t) for t in T)
+        (place / "a.txt").write_text(text)
+        found = read_pose_file(place / "a.txt")
+        assert str(found.stated) == "matrix,m" and found.where[1] == "line 6"
+        check(found, found.stated, T)
+        (place / "b.txt").write_text("\n".join(" ".join(f"{x:.4f}" for x in t.ravel()) for t in T))
+        rounded = read_pose_file(place / "b.txt")
+    assert any("few decimals" in n for n in rounded.notes)
+    back = rounded.poses(rounded.stated)
+    assert np.abs(back - T).max() < 1e-4 and se3.check_rigid(back, "rounded") is not None
+
+
+def test_numbers_leave_open_what_they_do_not_say():
+    T = random_poses(10, 12)
+    with folder() as place:
+        six = read_pose_file(
+            write_lines(place / "a.txt", reading_from_text("euler_ZYX,deg,mm").numbers(T), " ")
+        )
+        assert {p.angle_unit for p in six.possible if p.position_first} == {"deg"}
+        assert {p.length_unit for p in six.possible if p.position_first} == {"mm"}
+        assert {p.rotation for p in six.possible} == {
+            r for r in ROTATIONS if r[:3] in ("eul", "rot")
+        }
+        assert six.stated is None
+        near = T.copy()
+        near[:, :3, 3] = 10.0 / 1000 * se3.random_rotation(np.random.default_rng(0), 12)[:, 0]
+        open_unit = read_pose_file(
+            write_lines(place / "b.txt", reading_from_text("quat_wxyz,mm").numbers(near), " ")
+        )
+        assert {p.length_unit for p in open_unit.possible} == {"m", "mm"}
+        assert {p.rotation for p in open_unit.possible if p.position_first} == {
+            "quaternion_xyzw",
+            "quaternion_wxyz",
+        }
+        still = np.tile(np.eye(4), (4, 1, 1))
+        both = read_pose_file(as_json(place / "c.json", still.tolist()))
+    assert {p.rotation for p in both.possible} == {"matrix", "matrix_column_major"}
+
+
+# --- real data ------------------------------------------------------------------------------------
+
+
+@real
+def test_rtde_folder_of_one_json_a_pose():
+    raw = read_pose_file(HANDEYE / "rtde_ur5e" / "Hand-Eye-Data")
+    assert len(raw) == len(list((HANDEYE / "rtde_ur5e" / "Hand-Eye-Data").glob("*.json")))
+    assert raw.stems[9:11] == ("9", "10") and raw.stated is None
+    assert any("pose_flange" in n for n in raw.notes)
+    first = json.loads((HANDEYE / "rtde_ur5e" / "Hand-Eye-Data" / "10.json").read_text())
+    assert np.array_equal(raw.joints[10], first["joints"])
+    assert str(raw.possible[0]) == "rotvec,rad,m"
+    assert np.array_equal(raw.poses(raw.possible[0])[10, :3, 3], first["pose_flange"][:3])
+
+
+@real
+def test_rosi_poses_are_stated_and_listed():
+    for place in ("poses", "cal_data.yaml", ""):
+        raw = read_pose_file(HANDEYE / "rosi_circles" / place)
+        assert len(raw) == 15 and str(raw.stated) == "quat_xyzw,m"
+        assert raw.labels[2] == "images/10.png" and raw.where[2] == "poses/10.yaml"
+
+
+@real
+def test_muligheder_lines():
+    raw = read_pose_file(HANDEYE / "muligheder_ur5e" / "40_poses_test.txt")
+    assert len(raw) == 40 and raw.stated is None and raw.where[39] == "line 40"
+    assert reading_from_text("rotvec,m") in raw.possible
+    assert {p.angle_unit for p in raw.possible} == {"rad"}
+
+
+@real
+def test_koch_files_agree_with_each_other_in_every_format():
+    koch = HANDEYE / "koch_ur5"
+    matrices = read_pose_file(koch / "robot_poses.yaml")
+    assert str(matrices.stated) == "matrix,mm" and len(matrices) == 20
+    T = matrices.poses(matrices.stated)
+    listed = read_pose_file(koch / "meta.json", key="robot_poses")
+    assert np.abs(listed.poses(listed.stated) - T).max() < 1e-12
+    assert np.abs(np.degrees(listed.joints[0, 0]) + 61.03393202791763) < 1e-9
+    # the same poses as x y z a b c: of all readings the right one must be among those left open
+    cart = read_pose_file(koch / "meta.json", key="cart_pose")
+    near = [p for p in cart.possible if np.abs(cart.poses(p) - T).max() < 1e-6]
+    assert [str(p) for p in near] == ["rotvec,rad,mm"]
+    with pytest.raises(InputError, match="3 lists of poses"):
+        read_pose_file(koch / "meta.json")
+
+
+@real
+def test_koch_board_poses_fit_the_robot_in_one_direction_only():
+    koch = HANDEYE / "koch_ur5"
+    both = read_board_poses(koch / "robot_poses.yaml", koch / "cam_poses.yaml")
+    assert len(both.robot) == len(both.board) == 20
+    mismatch = {
+        (a.inverted, b.inverted): rotation_mismatch_deg(both.robot.poses(a), both.board.poses(b))
+        for a in both.robot.possible
+        for b in both.board.possible
+    }
+    assert mismatch[False, False] < 1 < 20 < mismatch[True, False]

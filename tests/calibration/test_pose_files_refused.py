@@ -1,0 +1,142 @@
+import io
+import json
+import shutil
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from realsim.errors import InputError
+from realsim_calibration.inputs import read_pose_file
+
+
+@contextmanager
+def folder():
+    path = Path(tempfile.mkdtemp())
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path)
+
+
+def write_json(path, tree):
+    path.write_text(json.dumps(tree))
+    return path
+
+
+# --- what is refused ---------------------------------------------------------------------------
+
+
+ROW = "0.5 -0.1 0.4 1.1 2.8 -0.1\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("a.txt", "", "is empty"),
+        ("a.txt", "# nothing\n", "no line of numbers"),
+        ("a.txt", ROW + "0.5 -0.1 0.4 1.1 2.8\n" + ROW, "line 2: 5 fields.*line 1 has 6"),
+        ("a.txt", ROW + ROW + "0.5 -0.1 oops 1.1 2.8 -0.1\n", "line 3: field 3 is 'oops'"),
+        ("a.txt", "0.5 -0.1 0.4\n" * 3, "3 numbers a pose"),
+        ("a.txt", "0.5 -0.1 0.4 1.1 2.8 -0.1 9\n" * 3, "no pose format fits its 7 numbers"),
+        ("a.txt", "nan nan nan nan nan nan\n" * 3, "all 3 poses hold NaN"),
+        ("a.csv", "0.5,-0.1,,1.1,2.8,-0.1\n", "line 1: field 3 is empty"),
+        ("a.csv", "x,y,z,rx,ry,rz\n1,2,3,4,5\n", "line 2: 5 fields.*the header has 6"),
+        ("a.csv", "x,y,z,foo,bar\n1,2,3,4,5\n", "complete rotation is missing"),
+        ("a.csv", "x,x,y,z,qx,qy,qz,qw\n1,1,2,3,0,0,0,1\n", "two columns mean x"),
+        ("a.csv", "x_mm,y_m,z_mm,rx,ry,rz\n1,2,3,4,5,6\n", "state the units"),
+        ("a.csv", "x,y,z,rx,ry,rz,qx,qy,qz,qw\n1,2,3,4,5,6,0,0,0,1\n", "two rotations"),
+        ("a.csv", "a,b,0.5,1,2,3,4,5\n", "several columns hold words"),
+        ("a.json", "[[1, 2, 3", "line 1, column"),
+        ("a.json", '{"a.png": [1,2,3,4,5,6],\n "a.png": [1,2,3,4,5,6]}', "'a.png' stands twice"),
+        ("a.json", "[[1,2,3,4,5,6],[1,2,3]]", r"entry 1: an array of shape \(3,\)"),
+        ("a.json", '[{"x":1,"y":2,"z":3}]', "entry 0: no pose under the keys x, y, z"),
+        ("a.json", '{"a":[[1,2,3,4,5,6]],"b":[[1,2,3,4,5,6]]}', r"2 lists of poses \(a, b\)"),
+        ("a.json", '{"poses":[[1,2,3,4,5,6]],"images":["a","b"]}', "'images' holds 2 entries"),
+        ("a.json", "[true, 1, 2, 3, 4, 5]", "entry 0: 'True' is no pose"),
+        ("a.json", "3", "no poses"),
+        ("a.json", "[" * 100000, "nested too deeply"),
+        ("a.yaml", "poses: [1, 2\n  b: }", "line 2: not YAML"),
+        ("a.yaml", "a: !!python/object/apply:os.system ['true']\n", "not YAML that can be read"),
+        (
+            "a.yaml",
+            "p: !!opencv-matrix\n   rows: 2\n   cols: 6\n   dt: d\n   data: [1.,2.]\n",
+            "2 rows and 6 columns holds 2 values",
+        ),
+        ("a.xml", "<a/>", "not .xml"),
+        ("a.npy", "no array", "not a readable npy"),
+        ("a.npz", "no archive", "not a readable npz"),
+    ],
+)
+def test_malformed_files_are_refused_by_place(tmp_path, name, content, says):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=says):
+        read_pose_file(tmp_path / name)
+
+
+def test_bombs_and_pickles_are_refused(tmp_path):
+    lines = ["a0: &a0 [1, 2, 3, 4, 5, 6]"]
+    lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 12)]
+    (tmp_path / "bomb.yaml").write_text("\n".join(lines))
+    (tmp_path / "loop.yaml").write_text("a: &a [*a]")
+    for name in ("bomb.yaml", "loop.yaml"):
+        with pytest.raises(InputError, match="list of poses"):
+            read_pose_file(tmp_path / name)
+    np.save(tmp_path / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    np.savez(tmp_path / "a.npz", a=np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    for name in ("a.npy", "a.npz"):
+        with pytest.raises(InputError, match=r"pickled|Python objects"):
+            read_pose_file(tmp_path / name)
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f8", "fortran_order": False, "shape": (10**11, 6)}
+    )
+    (tmp_path / "huge.npy").write_bytes(header.getvalue())
+    with pytest.raises(InputError, match="not a readable npy"):
+        read_pose_file(tmp_path / "huge.npy")
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    data=st.binary(max_size=200)
+    | st.text(max_size=200).map(lambda s: s.encode("utf-8", "replace")),
+    ending=st.sampled_from(["txt", "csv", "json", "yaml", "npy", "npz"]),
+)
+def test_no_content_whatever_ends_in_a_traceback(data, ending):
+    with folder() as place:
+        path = place / f"a.{ending}"
+        path.write_bytes(data)
+        try:
+            read_pose_file(path)
+        except InputError as error:
+            assert str(path) in str(error)
+
+
+json_trees = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=7)
+        | st.dictionaries(
+            st.sampled_from(
+                "x y z qw qx position orientation pose poses R t q joints image data rows".split()
+            ),
+            inner,
+            max_size=5,
+        )
+    ),
+    max_leaves=30,
+)
+
+
+@settings(max_examples=200, deadline=None)
+@given(tree=json_trees)
+def test_no_tree_whatever_ends_in_a_traceback(tree):
+    with folder() as place:
+        try:
+            read_pose_file(write_json(place / "a.json", tree))
+        except InputError as error:
+            assert str(place) in str(error)

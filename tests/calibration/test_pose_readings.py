@@ -1,0 +1,122 @@
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from realsim.errors import InputError, NotRigidError, UnitError
+from realsim.geometry import se3
+from realsim_calibration.inputs import EULER_ORDERS, ROTATIONS, PoseReading, reading_from_text
+
+
+def all_readings():
+    for rotation, length, inverted, first in product(
+        ROTATIONS, ("m", "mm"), (False, True), (True, False)
+    ):
+        plain = PoseReading(
+            rotation=rotation, length_unit=length, inverted=inverted, position_first=first
+        )
+        yield plain
+        if plain.has_angles:
+            yield replace(plain, angle_unit="deg")
+
+
+READINGS = list(all_readings())
+
+
+def random_poses(seed, n):
+    return se3.random_transform(np.random.default_rng(seed), n, spread=0.5)
+
+
+# --- readings -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", EULER_ORDERS)
+def test_euler_orders_are_scipys(order):
+    angles = np.random.default_rng(1).uniform(-7, 7, (50, 3))
+    T = PoseReading(rotation=f"euler_{order}").apply(np.hstack([np.zeros((50, 3)), angles]))
+    assert np.abs(T[:, :3, :3] - Rotation.from_euler(order, angles).as_matrix()).max() < 1e-14
+
+
+@pytest.mark.parametrize("order", EULER_ORDERS)
+def test_euler_angles_give_the_rotation_back_at_gimbal_lock(order):
+    reading = PoseReading(rotation=f"euler_{order}")
+    middle = np.array([0.0, np.pi / 2, np.pi / 2 + 1e-9, np.pi, np.pi / 2 - 1e-7])
+    raw = np.zeros((5, 6))
+    raw[:, 3], raw[:, 4], raw[:, 5] = 0.7, middle, -2.1
+    T = reading.apply(raw)
+    assert np.abs(reading.apply(reading.numbers(T)) - T).max() < 1e-14
+
+
+def test_known_poses():
+    c = np.cos(np.pi / 6)
+    R = [[c, -0.5, 0], [0.5, c, 0], [0, 0, 1]]  # 30 deg about z
+    w, s = np.cos(np.pi / 12), np.sin(np.pi / 12)
+    for text, row in {
+        "rotvec,mm": [100, 200, 300, 0, 0, np.pi / 6],
+        "rotvec,deg,m": [0.1, 0.2, 0.3, 0, 0, 30],
+        "quat_xyzw,m": [0.1, 0.2, 0.3, 0, 0, s, w],
+        "quat_wxyz,m": [0.1, 0.2, 0.3, w, 0, 0, s],
+        "euler_xyz,deg,m,rotation_first": [0, 0, 30, 0.1, 0.2, 0.3],
+        "euler_ZYX,deg,m": [0.1, 0.2, 0.3, 30, 0, 0],
+        "matrix,m": [*R[0], 0.1, *R[1], 0.2, *R[2], 0.3, 0, 0, 0, 1],
+        "matrix_column_major,m": [c, 0.5, 0, 0, -0.5, c, 0, 0, 0, 0, 1, 0, 0.1, 0.2, 0.3, 1],
+    }.items():
+        T = reading_from_text(text).apply(row)[0]
+        assert np.allclose(T[:3, :3], R, atol=1e-12), text
+        assert np.allclose(T[:3, 3], [0.1, 0.2, 0.3], atol=1e-12), text
+        inverse = reading_from_text(text + ",inverted").apply(row)[0]
+        assert np.allclose(inverse @ T, np.eye(4), atol=1e-12), text
+
+
+@pytest.mark.parametrize("reading", READINGS, ids=str)
+def test_texts_and_numbers_of_every_reading_come_back(reading):
+    assert reading_from_text(str(reading)) == reading
+    T = random_poses(3, 6)
+    for width in reading.widths:
+        raw = reading.numbers(T, width=width)
+        assert raw.shape == (6, width) and reading.fits(raw).all()
+        assert np.abs(reading.apply(raw) - T).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("rotvec", "length unit"),
+        ("mm,inverted", "rotation's format"),
+        ("rotvec,mm,m", "two things"),
+        ("euler_XYZ,mm", "angle unit"),
+        ("euler_XYx,deg,mm", "not known"),
+        ("euler_xxy,deg,mm", "not known"),
+        ("quat,m", "not known"),
+        ("quat_xyzw,deg,m", "no angles"),
+    ],
+)
+def test_unclear_readings_are_refused_with_what_is_accepted(text, says):
+    with pytest.raises(InputError, match=says):
+        reading_from_text(text)
+
+
+def test_rows_that_are_no_poses_are_named():
+    reading = PoseReading(rotation="matrix")
+    raw = reading.numbers(random_poses(0, 5))
+    names = [f"line {k}" for k in range(10, 15)]
+    for change, error, says in (
+        (lambda r: r.__setitem__((2, 0), np.nan), InputError, r"line 12 \(1 of 5\).*NaN"),
+        (lambda r: r.__setitem__((1, slice(0, 3)), -r[1, :3]), NotRigidError, "line 11.*mirrored"),
+        (lambda r: r.__setitem__((3, slice(0, 3)), 2 * r[3, :3]), NotRigidError, "line 13.*not a"),
+        (lambda r: r.__setitem__((4, 12), 0.2), NotRigidError, "line 14.*last row"),
+        (lambda r: r.__setitem__((4, 3), 650.0), UnitError, "line 14.*millimetres"),
+    ):
+        bad = raw.copy()
+        change(bad)
+        with pytest.raises(error, match=says):
+            reading.apply(bad, rows=names)
+        assert reading.fits(bad).sum() == (5 if error is UnitError else 4)
+    with pytest.raises(NotRigidError, match=r"row 1.*length 1"):
+        PoseReading(rotation="quaternion_xyzw").apply(
+            [[0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 1, 1, 0, 0]]
+        )
+    with pytest.raises(InputError, match="takes 7 numbers"):
+        PoseReading(rotation="quaternion_xyzw").apply(np.zeros((3, 6)))
