@@ -36,6 +36,7 @@ from realsim_calibration.rotation_readings import (
 )
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
 Rng = np.random.Generator
 BOARD = Chessboard(rows=5, columns=9, square_m=0.02)
 """Odd by odd inner corners: the same turned by 180 deg."""
@@ -99,9 +100,11 @@ def draw_session(
         place = place @ se3.from_translation([0.0, 0.0, -0.9])
         place = place @ se3.exp(np.concatenate([rng.normal(scale=0.2, size=3), np.zeros(3)]))
     T = place @ (se3.invert(Cs) if eye_in_hand else Cs) @ se3.invert(in_hand)
-    noise = lambda length, angle: se3.exp(  # noqa: E731
-        np.concatenate([rng.normal(scale=angle, size=(n, 3)), rng.normal(scale=length, size=(n, 3))], -1)
-    )
+
+    def noise(length: float, angle: float) -> Array:
+        turns, slips = (rng.normal(scale=sd, size=(n, 3)) for sd in (angle, length))
+        return se3.exp(np.concatenate([turns, slips], -1))
+
     return Session(
         T=T @ noise(*robot), C=Cs @ noise(0.3e-3, np.radians(0.1)),
         nominal=T @ noise(1e-3, 2e-3), eye_in_hand=eye_in_hand,
@@ -116,9 +119,8 @@ def _numbers(convention: Convention, R: Array) -> Array:
 def _misread(s: Session, meant: Convention, read_as: Convention, factor: float = 1.0) -> Session:
     R = s.T[:, :3, :3]
     wrong = read_as.decode(factor * _numbers(meant, R))
-    return replace(
-        s, T=se3.from_rt(wrong, s.T[:, :3, 3]), expected=("rotation_reading",), true_R=R, nominal=None
-    )
+    T = se3.from_rt(wrong, s.T[:, :3, 3])
+    return replace(s, T=T, expected=("rotation_reading",), true_R=R, nominal=None)
 
 
 def _other(rng: Rng, conventions: tuple[Convention, ...], meant: Convention) -> Convention:
@@ -227,11 +229,11 @@ def mispaired(s: Session, rng: Rng) -> Session:
     a, b = _far_pair(s, rng)
     C = s.C.copy()
     C[a] = C[b]
-    keep = np.arange(len(C)) != b
+    keep = np.flatnonzero(np.arange(len(C)) != b)
     return replace(_take(s, keep, keep, C), expected=("mispaired_image",), views=(a - (b < a),))
 
 
-def _take(s: Session, poses: Array, images: Array, C: Array | None = None) -> Session:
+def _take(s: Session, poses: Rows, images: Rows, C: Array | None = None) -> Session:
     C = s.C if C is None else C
     nominal = None if s.nominal is None else s.nominal[poses]
     return replace(s, T=s.T[poses], C=C[images], nominal=nominal)
@@ -249,9 +251,15 @@ def shifted(s: Session, rng: Rng) -> Session:
 
 
 def shifted_later(s: Session, rng: Rng) -> Session:
-    """A detection failed in the middle: every later image is paired with an earlier pose."""
+    """A detection failed in the middle: every later image is paired with an earlier pose.
+
+    Three later images at least still have a pose to which they can be traced.
+    """
     k, n = _shift(rng), len(s.T)
-    m = int(rng.integers(max(n // 4, 4), 3 * n // 4 - 2))
+    first = max(n // 4, 4)
+    while n - 2 * abs(k) - 3 < first:
+        k -= int(np.sign(k))
+    m = int(rng.integers(first, min(3 * n // 4 - 2, n - 2 * abs(k) - 3) + 1))
     gap = np.concatenate([np.arange(m), np.arange(m + abs(k), n)])
     every = np.arange(len(gap))
     poses, images = (every, gap) if k > 0 else (gap, every)

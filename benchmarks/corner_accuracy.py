@@ -307,7 +307,11 @@ def opencv(image: Image, target: Target) -> tuple[NDArray[np.int64], Array, Arra
         corners, found, _ = aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
         if found is not None:
             row = {int(tag): k for k, tag in enumerate(target.ids)}
-            kept = [(row[int(i)], q) for i, q in zip(found.ravel(), corners) if int(i) in row]
+            kept = [
+                (row[int(i)], q)
+                for i, q in zip(found.ravel(), corners, strict=True)
+                if int(i) in row
+            ]
             ids = np.array([4 * r + j for r, _ in kept for j in range(4)], np.int64)
             uv = np.array([q for _, q in kept], dtype=np.float64).reshape(-1, 2)
     elif isinstance(target, CharucoBoard):
@@ -364,7 +368,7 @@ def measure(
 ) -> Found:
     """Return the errors of one kind of target, one view a seed; through LENS where not ideal."""
     intrinsics = CAMERA if ideal else LENS
-    target, (blur, noise) = KINDS[kind], LEVELS[level]
+    target = KINDS[kind]
     # Our numbering is right but for a half turn; OpenCV's may also start at any other end.
     ends = _ends(target) if finder is opencv or getattr(target, "half_turn", False) else None
     errors, sd, visible, found_views, cpu = [], [], 0, 0, 0.0

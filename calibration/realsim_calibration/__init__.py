@@ -1,6 +1,7 @@
-"""Camera and hand-eye calibration from AprilTag views."""
+"""Camera and hand-eye calibration: targets, lens, hand-eye, robot errors, depth bias, reports."""
 
 from realsim_calibration.board_pose import BoardPose, estimate_board_pose
+from realsim_calibration.calibrate import Calibration, CalibrationConfig, calibrate
 from realsim_calibration.closed_forms import (
     CLOSED_FORMS,
     MotionConfig,
@@ -9,26 +10,56 @@ from realsim_calibration.closed_forms import (
     park,
     shah,
 )
-from realsim_calibration.detection import DetectionConfig, TagDetections, detect_tags
-from realsim_calibration.edges import EdgeConfig
+from realsim_calibration.conventions import diagnose, prove_reading
+from realsim_calibration.depth_bias import estimate_depth_bias
+from realsim_calibration.depth_board import DepthBoardView
+from realsim_calibration.detect.find import FindConfig, find_target
+from realsim_calibration.from_poses import calibrate_from_poses
 from realsim_calibration.gates import GateConfig
-from realsim_calibration.views import BoardView
+from realsim_calibration.hand_eye import (
+    HandEyeConfig,
+    calibrate_hand_eye,
+    calibrate_hand_eye_report,
+)
+from realsim_calibration.intrinsics import calibrate_intrinsics
 from realsim_calibration.joint_solve import JointConfig
+from realsim_calibration.lens_fit import IntrinsicsConfig
+from realsim_calibration.live_calibration import LiveCalibration
+from realsim_calibration.next_view import choose_next_views, rank_next_views
+from realsim_calibration.results import HandEyeReport
+from realsim_calibration.views import BoardView, TargetDetection, detection_of
 
 __all__ = [
     "CLOSED_FORMS",
     "BoardPose",
     "BoardView",
-    "DetectionConfig",
-    "EdgeConfig",
+    "Calibration",
+    "CalibrationConfig",
+    "DepthBoardView",
+    "FindConfig",
     "GateConfig",
+    "HandEyeConfig",
+    "HandEyeReport",
+    "IntrinsicsConfig",
     "JointConfig",
+    "LiveCalibration",
     "MotionConfig",
-    "TagDetections",
+    "TargetDetection",
+    "calibrate",
+    "calibrate_from_poses",
+    "calibrate_hand_eye",
+    "calibrate_hand_eye_report",
+    "calibrate_intrinsics",
     "check_observable",
+    "choose_next_views",
     "daniilidis",
-    "detect_tags",
+    "detection_of",
+    "diagnose",
     "estimate_board_pose",
+    "estimate_depth_bias",
+    "find_target",
     "park",
+    "prove_reading",
+    "rank_next_views",
     "shah",
 ]

@@ -15,7 +15,6 @@ What a file does not say (the image size) or what has no place in the record (a 
 error: a guess would be a wrong calibration.
 """
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -27,12 +26,10 @@ from realsim.errors import InputError
 from realsim.interop import opencv_from_colmap_px
 from realsim.records import CameraIntrinsics
 from realsim.store.records_json import intrinsics_from_json, intrinsics_to_json
+from realsim_calibration.camera_file_syntax import Fields, first_line, named_values, read_text
 
 Array = NDArray[np.float64]
-Fields = dict[str, Any]
 Format = Literal["realsim", "ros", "opencv"]
-LARGEST_BYTES = 4_000_000
-"""A camera file is a few kilobytes; one with hundreds of poses in it may have a megabyte."""
 SMALLEST_SIDE = 8
 """An image this small is no image [px]."""
 ASPECT_RANGE = (0.5, 2.0)
@@ -41,6 +38,8 @@ MATRIX_KEYS = (
     "camera_matrix", "cameraMatrix", "Camera_Matrix", "CameraMatrix", "intrinsic_matrix",
     "intrinsic", "intrinsics", "camMatrix", "mtx", "K", "M", "M1", "K1", "k",
 )  # fmt: skip
+CAMERA_KEYS = (*MATRIX_KEYS, "fx")
+"""Keys that only a camera has."""
 DISTORTION_KEYS = (
     "distortion_coefficients", "dist_coeffs", "distCoeffs", "Distortion_Coefficients",
     "dist_coeff", "distortion", "distCoeff", "distortion_coeffs", "dist", "coeffs", "D", "D1", "d",
@@ -72,150 +71,15 @@ def read_camera(path: Path | str) -> CameraIntrinsics:
             one of a lens model that the record has no place for, or no image size.
     """
     path = Path(path)
-    text = _text(path)
+    text = read_text(path)
     if path.name == "cameras.txt" or text.lstrip().startswith("# Camera list"):
         return _checked(_colmap(text, path), path)
-    fields = _fields(text, path)
+    fields = named_values(text, path, CAMERA_KEYS)
     try:
         camera = _camera(fields, path)
     except (ValueError, TypeError, OverflowError) as error:
-        raise InputError(f"the camera file {path} is damaged: {_first_line(error)}") from error
+        raise InputError(f"the camera file {path} is damaged: {first_line(error)}") from error
     return _checked(camera, path)
-
-
-def _text(path: Path) -> str:
-    """Return a text file's contents.
-
-    Raises:
-        InputError: it is missing, too large, or no text.
-    """
-    if not path.is_file():
-        raise InputError(f"the camera file {path} does not exist.")
-    size = path.stat().st_size
-    if size > LARGEST_BYTES:
-        raise InputError(
-            f"the camera file {path} has {size / 1e6:.1f} MB; {LARGEST_BYTES / 1e6:.0f} MB are "
-            "accepted. Is it a picture or a bag?"
-        )
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (UnicodeDecodeError, OSError) as error:
-        raise InputError(f"the camera file {path} cannot be read as text: {error}.") from error
-    if not text.strip():
-        raise InputError(f"the camera file {path} is empty.")
-    return text
-
-
-# --- syntax -----------------------------------------------------------------------------------
-
-
-def _fields(text: str, path: Path) -> Fields:
-    """Return the top-level fields of a JSON, XML or YAML file.
-
-    Raises:
-        InputError: it is damaged, or is no mapping.
-    """
-    start = text.lstrip()[:1]
-    try:
-        if start == "{":
-            data: Any = json.loads(text)
-        elif start == "<":
-            data = _xml(text, path)
-        elif start == "[":
-            raise InputError(f"{path} holds a list; a camera file holds named values.")
-        else:
-            data = _yaml(text, path)
-        if not isinstance(data, Mapping):
-            raise InputError(f"{path} holds no named values, so no camera.")
-        fields = _plain({str(key): value for key, value in data.items()})
-    except (ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise InputError(f"the camera file {path} is damaged: {_first_line(error)}") from error
-    inner = [k for k, v in fields.items() if _has(v, (*MATRIX_KEYS, "fx"))]
-    if _has(fields, (*MATRIX_KEYS, "fx")) or not inner:
-        return fields
-    if len(inner) > 1:
-        raise InputError(
-            f"{path} holds several cameras ({', '.join(inner[:6])}); give a file with one."
-        )
-    return fields[inner[0]]
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
-
-
-def _has(value: Any, keys: tuple[str, ...]) -> bool:
-    return isinstance(value, dict) and any(key in value for key in keys)
-
-
-def _plain(fields: Fields) -> Fields:
-    """Return fields with matrices written as {rows, cols, data} made arrays."""
-    plain: Fields = {}
-    for key, value in fields.items():
-        if isinstance(value, Mapping) and "data" in value:
-            data = np.array(value["data"], dtype=np.float64).ravel()
-            rows, cols = int(value.get("rows", 1)), int(value.get("cols", data.size))
-            if rows * cols != data.size:
-                raise ValueError(f"{key} claims {rows}x{cols} numbers and holds {data.size}")
-            plain[key] = data.reshape(rows, cols)
-        elif isinstance(value, Mapping):
-            plain[key] = {str(k): v for k, v in value.items()}
-            plain[key] = _plain(plain[key])
-        else:
-            plain[key] = value
-    return plain
-
-
-def _yaml(text: str, path: Path) -> Any:
-    """Return a YAML file's value; OpenCV's dialect starts with %YAML:1.0 and tags its matrices."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    lines = text.splitlines()
-    if lines[0].startswith("%YAML"):
-        lines = lines[1:]
-    lines = [line for line in lines if not line.lstrip().startswith("#")]
-    cleaned = "\n".join(lines).replace("!!opencv-matrix", "")
-    if "&" in cleaned and "*" in cleaned:
-        raise InputError(f"{path} uses YAML references, which no camera file needs.")
-    try:
-        # The safe loader makes plain values only: no tag in the file can run anything.
-        return YAML(typ="safe", pure=True).load(cleaned)
-    except YAMLError as error:
-        raise ValueError(_first_line(error)) from error
-
-
-def _xml(text: str, path: Path) -> Fields:
-    """Return the matrices and numbers of OpenCV's XML."""
-    from xml.etree import ElementTree
-
-    if "<!" in text.replace("<!--", ""):
-        raise InputError(f"{path} declares XML entities, which no camera file needs.")
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ValueError(str(error)) from error
-    if root.tag != "opencv_storage":
-        raise InputError(f"{path} is XML of the kind <{root.tag}>; OpenCV's is read.")
-    return {node.tag: _xml_value(node) for node in root}
-
-
-def _xml_value(node: Any) -> Any:
-    data = node.find("data")
-    if data is not None:
-        return {
-            "rows": int(node.findtext("rows", "1")),
-            "cols": int(node.findtext("cols", "1")),
-            "data": [float(x) for x in (data.text or "").split()],
-        }
-    if len(node):
-        return {child.tag: _xml_value(child) for child in node}
-    words = (node.text or "").split()
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        return (node.text or "").strip()
-    return numbers[0] if len(numbers) == 1 else numbers
 
 
 # --- meaning ----------------------------------------------------------------------------------

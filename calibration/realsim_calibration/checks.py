@@ -68,7 +68,6 @@ def roll_range_deg(Ts_cam_board: Sequence[Array]) -> float:
 def hand_eye_checks(report: HandEyeReport, config: CheckConfig) -> tuple[Check, ...]:
     """Return every check of a hand-eye calibration."""
     return (
-        _motion(report),
         _views(report, config),
         _roll(report, config),
         _sigma(report, config),
@@ -83,17 +82,6 @@ def hand_eye_checks(report: HandEyeReport, config: CheckConfig) -> tuple[Check, 
 
 def _advice(verdict: Verdict, text: str) -> str:
     return "" if verdict == "good" else text
-
-
-def _motion(r: HandEyeReport) -> Check:
-    ratio = f", slides agree within {abs(r.screw_ratio - 1):.1%}" if r.screw_ratio > 0 else ""
-    return Check(
-        name="conventions",
-        verdict="good",
-        sentence=f"hand and camera turn alike (median mismatch {r.mismatch_deg:.2f} deg{ratio}).",
-        value=r.mismatch_deg,
-        unit="deg",
-    )
 
 
 def _views(r: HandEyeReport, c: CheckConfig) -> Check:

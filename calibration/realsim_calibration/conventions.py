@@ -191,13 +191,17 @@ def _search(
     given = simple(p, "none", "as given", p.T, p.C, config)
     if (reason := _untestable(p, config)) is not None:
         return replace(given, fault="untestable", sentence=reason[0], advice=reason[1]), [given]
-    if given.score <= config.sure_score:
+    if given.score <= config.sure_score and given.fit.errors.max() <= config.pairing.floor:
         return _sound(p, given, nominal, config), [given]
     tried = [*raw_readings(p, raw, config), inverted(p, config)]
     tried += [h for h in (flipped_boards(p, config), paired_otherwise(p, config), moved(p, config))
               if h is not None]  # fmt: skip
-    tried += reread_rotations(p, config)
+    tried += reread_rotations(p, config, thorough=False)
     best = _best(given, tried, config)
+    # Slow but complete, for poses too few or too parallel for a vote.
+    if given.score > config.accept_score and _doubtful(best, config):
+        tried += reread_rotations(p, config, thorough=True)
+        best = _best(given, tried, config)
     if best is None and given.score > config.accept_score:
         tried += reread_as_degrees(p, config)
         best = _best(given, tried, config)
@@ -214,6 +218,11 @@ def _search(
         return replace(best, sentence=best.sentence + figures), listed
     if given.score <= config.accept_score:
         return _sound(p, given, nominal, config), listed
+    return _unknown(given, tried), listed
+
+
+def _unknown(given: Hypothesis, tried: Sequence[Hypothesis]) -> Hypothesis:
+    """Return that no reading fits, with the figures of the best."""
     second = min(tried, key=lambda h: h.score)
     return replace(
         given, fault="unknown",
@@ -222,7 +231,7 @@ def _search(
         f"fits; the best, {second.name}, leaves {second.fit.usual_deg:.1f} deg, {_mm(second)}.",
         advice="Check that images and poses belong to the same session, that the board (or, with a "
         "fixed camera, the board in the hand) did not move, and how the rotation is written.",
-    ), listed  # fmt: skip
+    )  # fmt: skip
 
 
 def _mm(h: Hypothesis) -> str:
@@ -231,12 +240,24 @@ def _mm(h: Hypothesis) -> str:
     return f"{length:.1f} mm" if length < 1e4 else "metres"
 
 
+def _doubtful(best: Hypothesis | None, config: DiagnosisConfig) -> bool:
+    return best is None or (
+        best.fault in ("rotation_reading", "radians_as_degrees")
+        and best.score > config.doubtful_score
+    )
+
+
 def _best(
     given: Hypothesis, tried: Sequence[Hypothesis], config: DiagnosisConfig
 ) -> Hypothesis | None:
     """Return the reading that fits far better than the given one, the simplest of equals."""
     gain = config.gain if len(given.T) >= config.few_views else config.gain_few
-    fitting = [h for h in tried if h.score <= config.accept_score and h.score * gain < given.score]
+    fitting = [
+        h
+        for h in tried
+        if h.score <= config.accept_score
+        and h.score * (gain if h.gain is None else h.gain) < given.score
+    ]
     if not fitting:
         return None
     limit = config.tie * min(h.score for h in fitting)

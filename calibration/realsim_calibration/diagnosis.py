@@ -38,6 +38,15 @@ class DiagnosisConfig:
     """Another reading must fit this many times better than the poses as given ..."""
     gain_few: float = 3.0
     """... or this many with few views, where chance helps."""
+    gross_error: float = 8.0
+    """Single views are called mispaired from this error on: 4 deg or 8 % of the distance; planar
+    poses of good real sets reach 6 ..."""
+    gain_gross: float = 1.15
+    """... and then the rest must fit only this many times better."""
+    accept_degrees: float = 2.7
+    """Degrees taken for radians are believed up to this score: each number may be any of 57."""
+    doubtful_score: float = 1.5
+    """Where no quick reading fits better than this, every pair of conventions is fitted."""
     few_views: int = 8
     """Fewer views than this are few."""
     tie: float = 1.25

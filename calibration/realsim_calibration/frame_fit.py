@@ -25,6 +25,12 @@ from realsim_calibration.closed_forms import HALF_TURN
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+RIDGE = 1e-9
+"""Share of the mean curvature that decides what the views do not determine."""
+SETTLED = 1e-9
+"""A step shorter than this, in units of the distance and radians, ends the fit."""
+COLLAPSED = 0.02
+"""A ratio that makes the camera's motion this part of the hand's is a collapse, not a fit."""
 MIN_VIEWS = 3
 """Two frames and a ratio are 13 unknowns, a view gives 6 equations."""
 
@@ -214,7 +220,10 @@ def _start_rotations(
 def _start_translations(
     A: Array, q: Array, Rx: Array, distance: float, config: FitConfig, rng: np.random.Generator
 ) -> Array:
-    """Return (7,) t_X, z, s that most views agree with, given R_X: R_A t_X - z + s R_A R_X q = -t_A."""
+    """Return (7,) t_X, z, s that most views agree with, given R_X.
+
+    R_A t_X - z + s R_A R_X q = -t_A.
+    """
     n = len(A)
     rows = np.zeros((n, 3, 7))
     rows[:, :, :3], rows[:, :, 3:6] = A[:, :3, :3], -np.eye(3)
@@ -231,7 +240,7 @@ def _start_translations(
     found = np.concatenate([found, (everything / column)[None]])
     slips = np.linalg.norm(np.einsum("nri,gi->gnr", rows, found) - rhs, axis=-1)
     # A ratio far below the spread of the hand is a collapse, not a fit.
-    ratio = np.maximum(np.abs(found[:, 6:]), 0.02 * size / distance)
+    ratio = np.maximum(np.abs(found[:, 6:]), COLLAPSED * size / distance)
     loss = np.minimum(slips / ratio / (distance * config.unit_part), config.agree)
     return found[int(np.argmin(np.sum(loss**2, 1) + 1e3 * (found[:, 6] <= 0)))]
 
@@ -244,32 +253,23 @@ def _refine(
     Rx, Rz, (tx, z, s) = start[0], start[1], (start[2][:3], start[2][3:6], float(start[2][6]))
     n, distance = len(A), max(float(np.median(np.linalg.norm(q, axis=-1))), 1e-12)
     spread = float(np.median(np.linalg.norm(A[:, :3, 3] - np.median(A[:, :3, 3], 0), axis=-1)))
-    unit_r = np.radians(config.unit_deg)
-    least = max(0.02 * spread / distance, 1e-9)
+    least = max(COLLAPSED * spread / distance, 1e-9)
     s = max(s, least)
-    for step in range(config.steps + 1):
-        J, r = linearise(A, Rc, q, Rx, Rz, tx, z, s)
-        unit = np.array([unit_r] * 3 + [s * distance * config.unit_part] * 3)
-        errors = np.linalg.norm(r / unit, axis=-1)
-        width = config.agree * max(float(np.median(errors)), 1.0)
-        root = (1.0 / (1.0 + (errors / width) ** 2))[:, None]
-        column = np.array([1.0] * 6 + [s * distance] * 6 + [s])
-        Jw = (J / unit[:, None] * root[..., None]).reshape(-1, 13) * column
-        rw = (r / unit * root).ravel()
-        H = Jw.T @ Jw
-        if step == config.steps:
+    for _ in range(config.steps):
+        J, r, errors = _weighted(A, Rc, q, (Rx, Rz, tx, z, s), distance, config)
+        H = J.T @ J
+        move = -np.linalg.solve(H + RIDGE * np.trace(H) / 13 * np.eye(13), J.T @ r)
+        if np.linalg.norm(move) < SETTLED:
             break
-        move = -np.linalg.solve(H + 1e-9 * np.trace(H) / 13 * np.eye(13), Jw.T @ rw)
-        if np.linalg.norm(move) < 1e-9:
-            break
-        x = move * column
-        Rx, Rz = Rx @ se3.exp_so3(x[:3]), Rz @ se3.exp_so3(x[3:6])
-        tx, z = tx + x[6:9], z + x[9:12]
+        Rx, Rz = Rx @ se3.exp_so3(move[:3]), Rz @ se3.exp_so3(move[3:6])
+        tx, z = tx + s * distance * move[6:9], z + s * distance * move[9:12]
         # The unit of the residual follows s: a step may not carry it through zero.
         s = max(s * float(np.exp(np.clip(move[12], -1.0, 1.0))), least)
+    J, rw, errors = _weighted(A, Rc, q, (Rx, Rz, tx, z, s), distance, config)
+    r = linearise(A, Rc, q, Rx, Rz, tx, z, s)[1]
     freedom = max(6 * n - 13, 1)
     capped = np.minimum(errors, config.cap)
-    inverse = np.linalg.pinv(H, hermitian=True)
+    inverse = np.linalg.pinv(J.T @ J, hermitian=True)
     return FrameFit(
         X=se3.from_rt(Rx, tx), Z=se3.from_rt(Rz, z - s * Rz @ middle), middle=middle,
         length_ratio=s,
@@ -278,6 +278,25 @@ def _refine(
         slips=np.linalg.norm(r[:, 3:], axis=-1) / s, errors=errors,
         score=float(np.sqrt(np.sum(capped**2) * 6 / freedom)), usual=float(np.median(errors)),
     )  # fmt: skip
+
+
+def _weighted(
+    A: Array, Rc: Array, q: Array, frames: tuple[Array, Array, Array, Array, float],
+    distance: float, config: FitConfig,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return J (6 n, 13) and residuals (6 n) in units, weighted, and the errors (n,) before that.
+
+    Lengths among the unknowns are in units of the distance, s in units of itself.
+    """
+    s = frames[4]
+    J, r = linearise(A, Rc, q, *frames)
+    unit = np.array([np.radians(config.unit_deg)] * 3 + [s * distance * config.unit_part] * 3)
+    errors = np.linalg.norm(r / unit, axis=-1)
+    width = config.agree * max(float(np.median(errors)), 1.0)
+    root = (1.0 / (1.0 + (errors / width) ** 2))[:, None]
+    column = np.array([1.0] * 6 + [s * distance] * 6 + [s])
+    J = (J / unit[:, None] * root[..., None]).reshape(-1, 13) * column
+    return J, (r / unit * root).ravel(), errors
 
 
 def linearise(

@@ -10,11 +10,19 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
-from realsim.records import CameraIntrinsics, HandEye, Target
+from realsim.records import CameraIntrinsics, Check, HandEye, Target
 from realsim_calibration.board_pose import BoardPose, estimate_board_pose
 from realsim_calibration.checks import CheckConfig, hand_eye_checks, roll_range_deg
 from realsim_calibration.closed_forms import CLOSED_FORMS, MotionConfig, check_observable
-from realsim_calibration.gates import GateConfig, angle_gate, check_conventions, px_gate
+from realsim_calibration.diagnosis import DiagnosisConfig
+from realsim_calibration.faults import SINGLE_VIEWS, check_of, examine, half_turned, renumbered
+from realsim_calibration.gates import (
+    GateConfig,
+    angle_gate,
+    px_gate,
+    rotation_mismatch_deg,
+    screw_ratio,
+)
 from realsim_calibration.joint_solve import JointConfig, JointProblem, Setup, ViewCorners
 from realsim_calibration.noise_scale import NoiseConfig
 from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
@@ -33,6 +41,7 @@ class HandEyeConfig:
     """Everything the hand-eye calibration may be told."""
 
     mode: Mode = "eye_in_hand"
+    diagnosis: DiagnosisConfig = field(default_factory=DiagnosisConfig)
     gates: GateConfig = field(default_factory=GateConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     joint: JointConfig = field(default_factory=JointConfig)
@@ -94,22 +103,74 @@ def calibrate_hand_eye_report(
     """Return the hand-eye calibration with its diagnosis; see `calibrate_hand_eye`."""
     config = config or HandEyeConfig()
     candidates, rejected = _candidates(views, target, intrinsics0, config)
+    candidates, turned = _counted_from_one_end(candidates, target, intrinsics0)
     A, C = _stacks(candidates)
     check_observable(A, config.motion)
-    mismatch, ratio = check_conventions(A, C, target, config.gates)
+    given = np.array([c.view.T_base_ee for c in candidates])
+    diagnosis = examine(
+        given, C, [c.view.label for c in candidates], target, config.mode,
+        _nominal(candidates, arm), config.diagnosis,
+    )  # fmt: skip
+    conventions = check_of(diagnosis, [c.view.index for c in candidates])
+    if diagnosis is not None and diagnosis.fault in SINGLE_VIEWS:
+        rejected |= {candidates[k].view.index: diagnosis.sentence for k in diagnosis.views}
+        keep = [k for k in range(len(candidates)) if k not in diagnosis.views]
+        candidates, A, C = [candidates[k] for k in keep], A[keep], C[keep]
     twins = [_plausible_twin(c.pose, config.gates) for c in candidates]
     C, dropped, _ = angle_gate(A, C, twins, config.gates)
     rejected |= {candidates[k].view.index: reason for k, reason in dropped.items()}
     keep = [k for k in range(len(candidates)) if k not in dropped]
-    candidates, C = [candidates[k] for k in keep], C[keep]
+    candidates, A, C = [candidates[k] for k in keep], A[keep], C[keep]
+    mismatch, ratio = rotation_mismatch_deg(A, C), screw_ratio(A, C, config.gates)
     candidates, start, starts, more = _start(candidates, C, intrinsics0, config)
     rejected |= more
     setup = _setup(candidates, target, intrinsics0, config)
     joints = _joints(candidates) if arm is not None else None
     solution = solve(setup, start, config, arm if joints is not None else None, joints)
-    return _report(
+    report = _report(
         views, target, intrinsics0, config, candidates, rejected, starts, solution, mismatch, ratio
     )
+    first = (conventions,) if turned is None else (conventions, turned)
+    return replace(report, checks=first + hand_eye_checks(report, config.checks))
+
+
+def _counted_from_one_end(
+    candidates: list[Candidate], target: Target, intrinsics: CameraIntrinsics
+) -> tuple[list[Candidate], Check | None]:
+    """Return the candidates with boards that were counted from the wrong end counted anew."""
+    A, C = _stacks(candidates)
+    turns = half_turned(A, C, target)
+    if turns is None:
+        return candidates, None
+    mended: list[Candidate] = []
+    for c, flip in zip(candidates, turns.flips, strict=True):
+        if not flip:
+            mended.append(c)
+            continue
+        view = replace(c.view, detection=renumbered(c.view.detection, target))
+        points = view.detection.points(target)
+        pose = estimate_board_pose(points, view.detection.uv, intrinsics)
+        if pose is not None:
+            mended.append(
+                Candidate(view=view, points=points, uv=view.detection.uv, pose=pose, A=c.A)
+            )
+    names = [c.view.label for c, flip in zip(candidates, turns.flips, strict=True) if flip]
+    check = Check(
+        name="half turns",
+        verdict="good",
+        sentence=f"the target looks the same turned by 180 deg; in {len(names)} of "
+        f"{len(candidates)} views it was counted from the other end, which is mended by the "
+        f"robot's turns ({turns.before_deg:.1f} deg misfit before, {turns.after_deg:.2f} after).",
+        value=float(len(names)),
+        views=tuple(c.view.index for c, f in zip(candidates, turns.flips, strict=True) if f),
+    )
+    return mended, check
+
+
+def _nominal(candidates: list[Candidate], arm: DhArm | None) -> Array | None:
+    """Return the flange by the arm's own kinematics (N, 4, 4), None where it is not known."""
+    joints = _joints(candidates)
+    return None if arm is None or joints is None else arm.forward(joints)
 
 
 def _setup(
@@ -246,12 +307,14 @@ def _report(
     from realsim_calibration.joint_solve import camera_of
 
     state, problem = solution.state, solution.problem
+    sides = np.ptp(target.points_board, axis=0) / 2
     shape = BoardShape(
         scale=float(state.board[0]),
         aspect=float(state.board[1]),
         warp=state.board[2:],
         sd=np.where(problem.free[12:], np.sqrt(np.diag(solution.covariance)[24:SHARED]), 0.0),
         half_extent_m=problem.setup.half_extent,
+        half_sides_m=(float(sides[0]), float(sides[1])),
     )
     lens = solution.covariance[12:24, 12:24].copy()
     held = ~problem.free[:12]
@@ -265,10 +328,13 @@ def _report(
         Z=state.Z,
         X_alone=solution.alone.X,
         X_alone_covariance=solution.alone_covariance[:6, :6],
+        Z_alone=solution.alone.Z,
+        intrinsics_alone=camera_of(solution.alone.camera, intrinsics0),
         intrinsics=camera_of(state.camera, intrinsics0),
         intrinsics_covariance=lens,
         board=shape,
         robot_map=solution.robot_map,
+        map_name=solution.map_name,
         map_scores=solution.scores,
         joint_offsets=solution.joint_offsets,
         sigma_px=solution.sigma_px,
@@ -285,7 +351,7 @@ def _report(
         checks=(),
         information=solution.information,
     )
-    return replace(report, checks=hand_eye_checks(report, config.checks))
+    return report
 
 
 def _rms(values: Sequence[float]) -> float:
@@ -309,6 +375,8 @@ def _view_reports(
                 used=part is not None,
                 reason=rejected.get(view.index, ""),
                 T_base_ee=view.T_base_ee,
+                joints=view.joints,
+                point_ids=view.detection.point_ids,
                 uv=view.detection.uv,
                 residuals=np.zeros((0, 2)) if part is None else part.residuals,
                 seen_px=nan if part is None else part.seen_px,

@@ -1,4 +1,4 @@
-"""Readings of the poses that would make hand and camera agree, each with its fit and its sentence."""
+"""Readings of the poses that would make hand and camera agree, each with its fit and sentence."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.diagnosis import DiagnosisConfig, Evidence, Fault
-from realsim_calibration.frame_fit import FrameFit, fit_frames, hand_side
+from realsim_calibration.frame_fit import FrameFit, fit_frames, hand_side, mismatch
 from realsim_calibration.gates import rotation_mismatch_deg, screw_ratio
 from realsim_calibration.half_turns import synchronise_half_turns
 from realsim_calibration.pairing import Pairing, find_move, find_pairing
-from realsim_calibration.rotation_readings import Reread, reread, reread_degrees
+from realsim_calibration.rotation_readings import Reread, every_reading, reread, reread_degrees
 from realsim_calibration.tool_offset import describe_offset
 
 Array = NDArray[np.float64]
@@ -75,6 +75,8 @@ class Hypothesis:
     advice: str = ""
     views: tuple[int, ...] = ()
     note: str = ""
+    gain: float | None = None
+    """How many times better than as given it must fit; None = as configured."""
 
 
 def evidence_of(h: Hypothesis, eye_in_hand: bool, config: DiagnosisConfig) -> Evidence:
@@ -94,6 +96,8 @@ def evidence_of(h: Hypothesis, eye_in_hand: bool, config: DiagnosisConfig) -> Ev
     )
 
 
+SNAPS = 2
+"""How often degrees known modulo 2 pi are chosen anew with better frames."""
 SMALL_RATIO = 0.02
 """Length ratios below this belong to a board in millimetres."""
 
@@ -144,33 +148,25 @@ def inverted(p: Poses, config: DiagnosisConfig) -> Hypothesis:
         )  # fmt: skip
     h = simple(p, "robot_inverted", "hand poses inverted", se3.invert(p.T), p.C, config)
     x, z = (float(np.linalg.norm(T[:3, 3])) for T in (h.fit.X, h.fit.Z))
+    likely = "the file holds T_ee_base"
     if p.eye_in_hand:
+        other_way = "the camera stands still and sees the board in the hand"
         places = (
-            f"With them inverted the camera sits {_mm(x, h)} from the tool and the board {_mm(z, h)} "
-            "from the base"
+            f"the camera sits {_mm(x, h)} from the tool and the board {_mm(z, h)} from the base"
         )
-        likely, other_way = (
-            "the file holds T_ee_base",
-            "the camera stands still and sees the board in the hand",
-        )
-        swap = x > z
     else:
+        other_way = "the camera sits in the hand and the board stands still"
         places = (
-            f"With them inverted the camera stands {_mm(x, h)} from the base and the board {_mm(z, h)} "
-            "from the tool"
+            f"the camera stands {_mm(x, h)} from the base and the board {_mm(z, h)} from the tool"
         )
-        likely, other_way = (
-            "the file holds T_ee_base",
-            "the camera sits in the hand and the board stands still",
-        )
-        swap = x < z
-    if swap:
+    # What is in the hand is nearer to it than what stands in the base.
+    if (x > z) == p.eye_in_hand:
         likely, other_way = other_way, likely
     return Hypothesis(
         fault="robot_inverted", name=h.name, fit=h.fit, score=h.score, T=h.T, C=h.C, rows=h.rows,
         sentence="The hand poses are inverted: hand and camera agree when every hand pose is "
         f"inverted. Either {likely}, or {other_way}: poses alone cannot tell the two apart. "
-        f"{places}, which speaks for the first.",
+        f"With them inverted {places}, which speaks for the first.",
         advice="Say which it is: give T_base_ee, which maps points of the tool into the base, or "
         "choose the other place of the camera (eye in hand or eye to hand).",
         note="the hand poses were inverted.",
@@ -205,47 +201,73 @@ def _can_turn(target: Target) -> bool:
     return isinstance(target, (Chessboard, CircleGrid))
 
 
-def reread_rotations(p: Poses, config: DiagnosisConfig) -> list[Hypothesis]:
-    """Return the hypotheses that the hand's rotations were decoded by another convention."""
+def reread_rotations(p: Poses, config: DiagnosisConfig, *, thorough: bool) -> list[Hypothesis]:
+    """Return the hypotheses that the hand's rotations were decoded by another convention.
+
+    Args:
+        p: the poses.
+        config: how readings are judged.
+        thorough: fit every pair of conventions instead of the few that win the vote.
+    """
     D = se3.invert(p.C) if p.eye_in_hand else p.C
     R, t = p.T[:, :3, :3], p.T[:, :3, 3]
+    readings = every_reading(R) if thorough else reread(R, t, D, config.readings)
     found = [
         _reread(p, "rotation_reading", r, config,
                 f"They agree when what was read as {r.read_as} is read as {r.meant}.")
-        for r in reread(R, t, D, config.readings)
+        for r in readings
     ]  # fmt: skip
     i, j = np.triu_indices(len(R), 1)
-    hand = np.median(se3.angle(np.swapaxes(R[i], -1, -2) @ R[j]))
-    cam = np.median(se3.angle(np.swapaxes(p.C[i, :3, :3], -1, -2) @ p.C[j, :3, :3]))
+    hand, cam = (
+        float(np.sqrt(np.mean(se3.angle(np.swapaxes(S[i], -1, -2) @ S[j]) ** 2)))
+        for S in (R, p.C[:, :3, :3])
+    )
     if hand < config.small_turn_part * cam:
+        scale = float(np.degrees(1.0))
+        readings = every_reading(R, scale) if thorough else reread(R, t, D, config.readings, scale)
         found += [
             _reread(p, "radians_as_degrees", r, config,
                     f"Angles in radians were taken for degrees: the hand turns by "
-                    f"{np.degrees(hand):.2f} deg (median of the pairs), the camera by "
+                    f"{np.degrees(hand):.2f} deg (RMS of the pairs), the camera by "
                     f"{np.degrees(cam):.1f}; times 180 / pi, read as {r.meant}, they agree.")
-            for r in reread(R, t, D, config.readings, scale=float(np.degrees(1.0)))
+            for r in readings
         ]  # fmt: skip
-    return found
+    found.sort(key=lambda h: h.score)
+    return found[: config.readings.finalists]
 
 
 def reread_as_degrees(p: Poses, config: DiagnosisConfig) -> list[Hypothesis]:
     """Return the hypotheses that numbers in degrees were taken for radians.
 
     They are named but not mended: a degree is known modulo 2 pi only, so that the first and the
-    last angle of all views may be off by the same multiple, which X and Z take up unseen.
+    last angle of all views may be off by the same multiple, which X and Z take up unseen. Because
+    the readings have so much freedom, they must fit better than others.
     """
     D = se3.invert(p.C) if p.eye_in_hand else p.C
-    found = [
-        _reread(p, "degrees_as_radians", r, config,
-                "Angles in degrees were taken for radians: hand and camera agree when the numbers "
-                f"are read as {r.meant}.")
-        for r in reread_degrees(p.T[:, :3, :3], p.T[:, :3, 3], D, config.readings)
-    ]  # fmt: skip
+    found: list[Hypothesis] = []
+    for r in reread_degrees(p.T[:, :3, :3], p.T[:, :3, 3], D, config.readings):
+        h = _reread(p, "degrees_as_radians", r, config,
+                    "Angles in degrees were taken for radians: hand and camera agree when the "
+                    f"numbers are read as {r.meant}.")  # fmt: skip
+        for _ in range(SNAPS):
+            if r.snap is None:
+                break
+            Rs = r.snap(_predicted_rotations(p, h))
+            h = _reread(p, "degrees_as_radians", replace(r, Rs=Rs), config, h.sentence)
+        found.append(h)
     return [
         replace(h, note="", advice="Read the file again with its angles in degrees; the poses as "
                 "decoded have lost them.")
         for h in found
+        if h.score <= config.accept_degrees
     ]  # fmt: skip
+
+
+def _predicted_rotations(p: Poses, h: Hypothesis) -> Array:
+    """Return the hand rotations (n, 3, 3) that the fitted frames and the images predict."""
+    back = np.swapaxes(h.fit.X[:3, :3] @ p.C[:, :3, :3], -1, -2)
+    A = h.fit.Z[:3, :3] @ back
+    return A if p.eye_in_hand else np.swapaxes(A, -1, -2)
 
 
 def _reread(
@@ -286,7 +308,12 @@ def paired_otherwise(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
     fault, name, sentence, views = _pairing_text(p, found)
     if fault == "none":
         return None
+    A = hand_side(p.T, p.eye_in_hand)
+    bad = np.diag(mismatch(found.fit, A, p.C, config.fit))[list(views)]
+    # A few views among many hardly move the score, but each is far off by itself.
+    gross = fault != "shifted_pairing" and bool(np.all(bad > config.gross_error))
     return Hypothesis(
+        gain=config.gain_gross if gross else None,
         fault=fault, name=name, fit=found.fit, score=score, T=p.T[found.rows[:, 0]],
         C=p.C[found.rows[:, 1]], rows=found.rows, sentence=sentence, views=views,
         advice="Pair by file name or time stamp, never by position in a list: a failed detection "
@@ -328,6 +355,12 @@ def _pairing_text(p: Poses, found: Pairing) -> tuple[Fault, str, str, tuple[int,
             for k in found.strays
         ]
         more = f" Images {pairs} are swapped as well." if found.swapped else ""
+        run = list(range(found.strays[0], len(shifts)))
+        if len(run) > 2 and list(found.strays) == run:
+            more += (
+                f" From {p.labels[run[0]]} on none fits: a detection may have failed there and "
+                "shifted the rest of the list."
+            )
         return (
             "mispaired_image", f"without views {p.names(found.strays)}",
             f"The images of these views do not belong to their hand poses: {', '.join(texts)}; the "
@@ -367,7 +400,9 @@ def moved(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
     return Hypothesis(
         fault=fault, name=f"{what} from view {p.labels[m.start]} on", fit=fit, score=m.score, T=T,
         C=p.C, rows=_whole(len(T)),
-        sentence=f"From view {p.labels[m.start]} on the {what} ({how}): {cause}.",
+        sentence=f"From view {p.labels[m.start]} on the {what} ({how}): {cause}."
+        + (" These views turn too little to tell whether it was the hand's side or the other that "
+           "moved." if m.either else ""),
         advice="Calibrate each stretch of views for itself, or repeat the session.",
         views=views, note="the later hand poses were carried back by the fitted move.",
     )  # fmt: skip

@@ -287,6 +287,7 @@ def _report(
             warp=fit.state.board[1:].copy(),
             sd=shape_sd,
             half_extent_m=obs.half_extent_m,
+            half_sides_m=corners.half_sides_m,
         ),
         start="",
         checks=(),

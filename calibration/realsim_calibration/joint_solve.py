@@ -195,15 +195,11 @@ class JointProblem:
             covariance[:2, :2] = relative * np.outer(center[:2], center[:2])
         return center, covariance
 
-    def optimize(
+    def graph(
         self, start: JointState, sigma: float, ratio: Array, roots: list[Array],
         basis: ErrorBasis | None, *, robot: bool = True,
-    ) -> JointState:  # fmt: skip
-        """Return the least-squares state for fixed sigma, lambda and roots of the corner weights.
-
-        Raises:
-            DegenerateError: the views do not determine the parameters.
-        """
+    ) -> tuple[Any, Any]:  # fmt: skip
+        """Return the gtsam graph for fixed sigma, lambda (2,) and corner weights, and its values."""
         import gtsam
 
         from realsim.interop import pose3_from_T
@@ -236,6 +232,20 @@ class JointProblem:
             elif robot and basis is not None:
                 error = _smooth_error(basis.columns[n])
                 graph.add(gtsam.CustomFactor(robot_noise, [self.d[n], self.w], error))
+        return graph, values
+
+    def optimize(
+        self, start: JointState, sigma: float, ratio: Array, roots: list[Array],
+        basis: ErrorBasis | None, *, robot: bool = True,
+    ) -> JointState:  # fmt: skip
+        """Return the least-squares state for fixed sigma, lambda and roots of the corner weights.
+
+        Raises:
+            DegenerateError: the views do not determine the parameters.
+        """
+        import gtsam
+
+        graph, values = self.graph(start, sigma, ratio, roots, basis, robot=robot)
         parameters = gtsam.LevenbergMarquardtParams()
         parameters.setMaxIterations(self.config.max_iterations)
         parameters.setRelativeErrorTol(self.config.step_tolerance)

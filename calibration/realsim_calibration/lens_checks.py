@@ -73,12 +73,11 @@ def _views(report: IntrinsicsReport, limits: CheckLimits) -> Check:
         more = f"; and {len(left_out) - 4} more" if len(left_out) > 4 else ""
         sentence += f" Left out: {shown}{more}."
     few = n < limits.good_views
-    many_out = len(left_out) > len(report.views) / 4
     advice = f"Take at least {limits.good_views} views." if few else ""
-    if many_out:
+    if left_out:
         advice = (advice + " Look at the views that were left out.").strip()
     return Check(
-        name="views", verdict="warn" if few or many_out else "good", sentence=sentence,
+        name="views", verdict="warn" if few or left_out else "good", sentence=sentence,
         advice=advice, value=float(n), views=tuple(v.index for v in left_out),
     )  # fmt: skip
 

@@ -202,9 +202,9 @@ def _why_refused(
         return ""
     camera = camera_record(fit.state.camera, obs.image_size)
     effect = border_effect(camera, covariance.camera, term)
-    if np.isinf(effect):
+    if np.isinf(effect) and name.startswith("k"):
         return f"with it the lens folds back before the image's border: {at}"
-    if effect > config.border_limit_px:
+    if np.isfinite(effect) and effect > config.border_limit_px:
         return (
             f"one sigma of it (+-{sd:.2g}) moves the image's border by {effect:.1f} px "
             f"({config.border_limit_px:g} px is the limit), because no corners are there: {at}"

@@ -175,26 +175,30 @@ def estimate_scale(model: LinearModel, basis: ErrorBasis, ratio: Array, sigma: f
     return basis.scaled(one * float(np.exp(found.x)))
 
 
-def smooth_size(basis: ErrorBasis) -> tuple[float, float]:
-    """Return the RMS of a basis' prior errors over the views: rotation [rad], translation [m]."""
-    size = np.sqrt(np.mean(np.sum(basis.columns**2, -1), axis=0))
-    return float(np.sqrt(np.mean(size[:3] ** 2))), float(np.sqrt(np.mean(size[3:] ** 2)))
+def _sizes(twists: Array) -> Array:
+    """Return the RMS per axis of twists (..., 6): rotation [rad], translation [m]."""
+    halves = (twists[..., :3], twists[..., 3:])
+    return np.array([float(np.sqrt(np.mean(half**2))) for half in halves])
 
 
-def unknown_arm_columns(Ts: Array, size: tuple[float, float]) -> Array:
+def unknown_arm_columns(linear: ErrorBasis, weights: Array, hidden_factor: float) -> Array:
     """Return errors (views, 6, 78) that an unknown arm may have: what no joints can tell.
 
-    A constant error in the tool's axes (6 columns), which no camera tells from another place of the
-    camera, and errors linear in the pose in base axes (72), each as large as `size` (rotation
-    [rad], translation [m]).
-    """
-    from realsim_calibration.robot_error import map_basis
+    Errors linear in the pose (72 columns), of the size that the views show, and a constant error in
+    the tool's axes (6 columns), which no camera tells from another place of the camera:
+    `hidden_factor` times as large.
 
-    sd = np.repeat(size, 3)
-    constant = np.broadcast_to(np.diag(sd), (len(Ts), 6, 6))
-    linear = map_basis(Ts, "base", 1.0, 1.0).columns
-    turned = np.einsum("r,nrc->nrc", sd, linear) / np.sqrt(12.0)
-    return np.concatenate([constant, turned], -1)
+    Args:
+        linear: a basis of linear errors.
+        weights: (72,) what the views say of its weights.
+        hidden_factor: see RobotErrorConfig.
+    """
+    shown = _sizes(linear.columns @ weights)
+    prior = _sizes(np.sqrt(np.sum(linear.columns**2, -1)))
+    share = np.repeat(np.minimum(shown / np.maximum(prior, 1e-15), 1.0), 3)
+    constant = np.diag(hidden_factor * np.repeat(shown, 3))
+    constant = np.broadcast_to(constant, (len(linear.columns), 6, 6))
+    return np.concatenate([constant, linear.columns * share[:, None]], -1)
 
 
 def pose_of(state: JointState, to_hand: bool, A: Array, error: Array) -> Array:

@@ -7,7 +7,7 @@ belongs to another pose, or to none. If instead a stretch fits other frames of i
 the tool or the board was moved.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -19,6 +19,11 @@ from realsim_calibration.frame_fit import MIN_VIEWS, FitConfig, FrameFit, fit_fr
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 MovedFrame = Literal["X", "Z"]
+MOVED_FRAMES: tuple[MovedFrame, ...] = ("X", "Z")
+PREFER_TOOL = np.radians(3.0)
+"""A tool is changed more often than a board is shifted without turning it [rad]."""
+MOVE_ROUNDS = 3
+"""The move and the frames are found in turn, from the frames of either stretch."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -42,6 +47,10 @@ class PairingConfig:
     apart, three are a new shift."""
     max_dropped: float = 0.3
     """Largest share of views that a pairing may leave over."""
+    alike: float = 1.1
+    """Moves whose scores are within this factor cannot be told apart."""
+    max_dropped_run: float = 0.5
+    """The same where they all stand at the beginning or at the end of the list."""
     min_stretch: int = 4
     """Views of a stretch for which frames of its own are accepted."""
 
@@ -72,13 +81,12 @@ class Moved:
     """X: the camera against the frame that A maps from. Z: the board against that it maps to."""
     start: int
     """First row after the move."""
-    before: FrameFit
-    after: FrameFit
-    """Frames of both stretches, fitted apart."""
     step: Array
-    """(4, 4) X_before X_after^-1 or Z_before Z_after^-1: the move, on the hand's side."""
+    """(4, 4) X_before X_after^-1 or Z_before Z_after^-1 [hand's unit]."""
     score: float
-    """RMS of both stretches' scores, the frame that did not move shared."""
+    """Score of all views with the move taken back."""
+    either: bool = False
+    """Whether a move of the other frame explains the views as well."""
 
 
 def find_pairing(A: Array, C: Array, middle: Array, config: PairingConfig) -> Pairing | None:
@@ -179,7 +187,16 @@ def _pairing(
             best = int(table[:, j].argmin())
             if table[best, j] <= gate:
                 elsewhere.append((j, best))
-    if len(rows) < MIN_VIEWS + 1 or len(rows) < (1 - config.max_dropped) * n:
+    for a, b in _mutual(elsewhere, shifts):
+        swapped = (*swapped, (a, b))
+        rows += [(int(pose[b]), a), (int(pose[a]), b)]
+        strays = [k for k in strays if k not in (a, b)]
+        elsewhere = [e for e in elsewhere if e[0] not in (a, b)]
+    rows.sort(key=lambda row: row[1])
+    dropped = [j for j in range(n) if j not in {image for _, image in rows}]
+    at_end = dropped == list(range(n - len(dropped), n)) or dropped == list(range(len(dropped)))
+    most = config.max_dropped_run if at_end else config.max_dropped
+    if len(rows) < MIN_VIEWS + 1 or len(rows) < (1 - most) * n:
         return None
     kept = np.array(rows, dtype=np.int64)
     return Pairing(
@@ -187,6 +204,12 @@ def _pairing(
         elsewhere=tuple(elsewhere),
         fit=fit_frames(A[kept[:, 0]], C[kept[:, 1]], middle, config.fit),
     )  # fmt: skip
+
+
+def _mutual(elsewhere: list[tuple[int, int]], shifts: Rows) -> list[tuple[int, int]]:
+    """Return pairs of images that fit each other's pose."""
+    place = {j: int(i - shifts[j]) for j, i in elsewhere}
+    return [(j, k) for j, k in place.items() if j < k and place.get(k) == j]
 
 
 def _swaps(
@@ -236,24 +259,61 @@ def find_move(A: Array, C: Array, middle: Array, config: PairingConfig) -> Moved
         if min(start, n - start) < config.min_stretch:
             continue
         found += _moves_at(A, C, middle, start, config)
-    return min(found, key=lambda m: m.score, default=None)
+    return _likeliest(found, config)
+
+
+def _likeliest(found: list[Moved], config: PairingConfig) -> Moved | None:
+    """Return the move of least score; of two that fit alike the one without a turn.
+
+    A tool offset is set as a pure shift. Where the hand hardly turns, a shifted board explains it
+    too, which is said.
+    """
+    best = min(found, key=lambda m: m.score, default=None)
+    if best is None:
+        return None
+    alike = [m for m in found if m.score <= config.alike * best.score]
+    chosen = min(alike, key=lambda m: float(se3.angle(m.step)) + (m.frame == "Z") * PREFER_TOOL)
+    other = any(m.frame != chosen.frame for m in alike)
+    return replace(chosen, either=other)
 
 
 def _moves_at(A: Array, C: Array, middle: Array, start: int, config: PairingConfig) -> list[Moved]:
     """Return both kinds of move at a row, each with the score of a model that shares the rest."""
-    before = fit_frames(A[:start], C[:start], middle, config.fit)
-    after = fit_frames(A[start:], C[start:], middle, config.fit)
-    step_X = before.X @ se3.invert(after.X)
-    step_Z = before.Z @ se3.invert(after.Z)
-    # A step of X is taken over by the later hand poses from the right, one of Z from the left.
-    right, left = A.copy(), A.copy()
-    right[start:] = A[start:] @ se3.invert(step_X)
-    left[start:] = step_Z @ A[start:]
+    halves = [
+        fit_frames(A[s], C[s], middle, config.fit) for s in (slice(start), slice(start, None))
+    ]
     moves: list[Moved] = []
-    kinds: tuple[tuple[MovedFrame, Array, Array], ...] = (("X", right, step_X), ("Z", left, step_Z))
-    for frame, hands, step in kinds:
-        score = fit_frames(hands, C, middle, config.fit).score
-        moves.append(
-            Moved(frame=frame, start=start, before=before, after=after, step=step, score=score)
-        )
+    for frame in MOVED_FRAMES:
+        for fit in halves:
+            step, best = _carried(A, C, middle, start, frame, fit, config)
+            moves.append(Moved(frame=frame, start=start, step=step, score=best.score))
     return moves
+
+
+def _carried(
+    A: Array, C: Array, middle: Array, start: int, frame: MovedFrame, fit: FrameFit,
+    config: PairingConfig,
+) -> tuple[Array, FrameFit]:  # fmt: skip
+    """Return the move of a frame at a row, and the fit of all views with the move taken back.
+
+    Every view shows where the frame stands, given the other one: X_i = A_i^-1 Z C_i^-1 or
+    Z_i = A_i X C_i. The move is from the mean before to the mean after.
+    """
+    step = np.eye(4)
+    for _ in range(MOVE_ROUNDS):
+        seen = C.copy()
+        seen[:, :3, 3] *= fit.length_ratio
+        if frame == "X":
+            places = se3.invert(A) @ fit.Z @ se3.invert(seen)
+            step = _mean(places[:start]) @ se3.invert(_mean(places[start:]))
+            hands = np.concatenate([A[:start], A[start:] @ se3.invert(step)])
+        else:
+            places = A @ fit.X @ seen
+            step = _mean(places[:start]) @ se3.invert(_mean(places[start:]))
+            hands = np.concatenate([A[:start], step @ A[start:]])
+        fit = fit_frames(hands, C, middle, config.fit)
+    return step, fit
+
+
+def _mean(Ts: Array) -> Array:
+    return se3.from_rt(se3.mean_rotation(Ts[:, :3, :3]), np.median(Ts[:, :3, 3], 0))

@@ -31,11 +31,15 @@ class BoardShape:
     """(5,) 1-sigma of scale, aspect, w1, w2, w3 (0 = held)."""
     half_extent_m: float
     """L."""
+    half_sides_m: tuple[float, float] | None = None
+    """Half the extent of the points along x and y; the larger one is L. None: both are L."""
 
     @property
     def warp_mm(self) -> float:
-        """Largest lift of the target's border from its flat drawing [mm]."""
-        x, y = np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21))
+        """Largest lift of the target's points from their flat drawing [mm]."""
+        along = np.linspace(-1, 1, 21)
+        sides = self.half_sides_m or (self.half_extent_m, self.half_extent_m)
+        x, y = np.meshgrid(*(along * side / self.half_extent_m for side in sides))
         lift = self.warp[0] * x**2 + self.warp[1] * x * y + self.warp[2] * y**2
         return float(1e3 * self.half_extent_m * np.abs(lift).max())
 
@@ -52,6 +56,10 @@ class ViewReport:
     """Why it was not used; empty where it was."""
     T_base_ee: Array
     """(4, 4) as the controller gave it [m]."""
+    joints: Array | None
+    """(6,) joint angles [rad]; None where they are not known."""
+    point_ids: NDArray[np.int64]
+    """(n,) which points of the target were detected."""
     uv: Array
     """(n, 2) detected points [px]."""
     residuals: Array
@@ -89,12 +97,18 @@ class HandEyeReport:
     """(4, 4) the camera's place fitted WITHOUT a map: for tools that know none [m]."""
     X_alone_covariance: Array
     """(6, 6) of the right perturbation of X_alone [rad, m]."""
+    Z_alone: Array
+    """(4, 4) the target's place that belongs to X_alone [m]."""
+    intrinsics_alone: CameraIntrinsics
+    """The camera that belongs to X_alone."""
     intrinsics: CameraIntrinsics
     intrinsics_covariance: Array
     """(12, 12) of fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6; zero rows = held."""
     board: BoardShape
     robot_map: RobotErrorMap | ArmErrorMap | None
     """None: no map predicts unseen views better than the controller's own poses."""
+    map_name: str
+    """The chosen one of `map_scores`."""
     map_scores: tuple[tuple[str, float], ...]
     """(candidate, geometric mean of the unseen views' RMS [px]) of every map tried, "none" first."""
     joint_offsets: Array | None

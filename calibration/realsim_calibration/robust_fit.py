@@ -27,7 +27,6 @@ from realsim_calibration.noise_scale import (
     estimate_scale,
     largest_ratio,
     pose_of,
-    smooth_size,
     unknown_arm_columns,
     whiteness,
 )
@@ -71,6 +70,7 @@ class Solution:
     alone_covariance: Array
     """(29, 29)."""
     robot_map: RobotErrorMap | ArmErrorMap | None
+    map_name: str
     scores: tuple[tuple[str, float], ...]
     joint_offsets: Array | None
     views: tuple[SolvedView, ...]
@@ -139,6 +139,7 @@ def solve(
         alone=alone,
         alone_covariance=shared(_covariance(model, none.fit, none, columns, known, independent)),
         robot_map=None if best.basis is None else map_record(best.basis, state.weights, Ts, arm),
+        map_name=best.name,
         scores=tuple((c.name, c.fit.score) for c in choices),
         joint_offsets=_offsets(best, state, covariance),
         views=_views(problem, state, best.basis, final),
@@ -231,8 +232,8 @@ def _hidden_errors(
     if known is not None:
         return known.columns
     scaled = estimate_scale(model, map_basis(Ts, "base", 1.0, 1e-4), none.ratio, sigma)
-    rotation, translation = smooth_size(scaled)
-    return unknown_arm_columns(Ts, (hidden * rotation, hidden * translation))
+    weights = model.fit(scaled, none.ratio, sigma).step[29:]
+    return unknown_arm_columns(scaled, weights, hidden)
 
 
 def _covariance(

@@ -14,6 +14,7 @@ coincide.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import permutations
 
 import numpy as np
@@ -57,6 +58,8 @@ class Convention:
     """(..., k) numbers -> (..., 3, 3)."""
     encode: Callable[[Array], Array]
     """(n, 3, 3) -> (n, forms, k): every form in which a rotation can have been written."""
+    middle: int | None = None
+    """Place of the middle Euler angle, which programs write within 90 deg; None = no angles."""
 
 
 def _axis_rotation(axis: int, angle: Array) -> Array:
@@ -103,6 +106,7 @@ def _euler(name: str, order: str, slots: tuple[int, int, int]) -> Convention:
         name=name,
         decode=lambda v: euler_rotation(order, slots, v),
         encode=lambda R: euler_numbers(order, slots, R),
+        middle=slots[1],
     )
 
 
@@ -155,6 +159,8 @@ class Reread:
     """(n, 3, 3)."""
     agreement: float
     """RMS of the votes' distances from the winner, each at most `agree_deg`, over `agree_deg`."""
+    snap: Callable[[Array], Array] | None = None
+    """For degrees known modulo 2 pi: the rotations they allow nearest to predicted ones."""
 
 
 def base_rotations(t_A: Array, D: Array, config: ReadingConfig) -> list[Array]:
@@ -249,6 +255,35 @@ def reread(
     return found[: config.finalists]
 
 
+def usual_form(convention: Convention, numbers: Array) -> Array:
+    """Return of numbers (n, forms, k) the form that programs write (n, k)."""
+    if convention.middle is None:
+        size = np.linalg.norm(numbers, axis=-1)
+    else:
+        size = np.abs(numbers[..., convention.middle])
+    return numbers[np.arange(len(numbers)), size.argmin(-1)]
+
+
+def every_reading(R: Array, scale: float = 1.0) -> list[Reread]:
+    """Return what every pair of conventions makes of rotations (n, 3, 3), in the usual form.
+
+    For poses whose positions do not fix the base's rotation well enough for a vote.
+    """
+    found: list[Reread] = []
+    families = (three_number_conventions(), four_number_conventions())
+    for family in families if scale == 1.0 else families[:1]:
+        for E in family:
+            numbers = E.encode(R) * scale
+            for F in family if scale == 1.0 else (E,):
+                if F is E and scale == 1.0:
+                    continue
+                Rs = F.decode(usual_form(F if scale == 1.0 else E, numbers))
+                if all(np.abs(Rs - other.Rs).max() > 1e-9 for other in found):
+                    found.append(Reread(name=f"{F.name}, not {E.name}", meant=F.name,
+                                        read_as=E.name, Rs=Rs, agreement=1.0))  # fmt: skip
+    return found
+
+
 def _best_vote(
     forms: Array, bases: list[Array], D: Array, config: ReadingConfig, meant: str, read_as: str
 ) -> Reread:
@@ -275,19 +310,41 @@ def reread_degrees(R: Array, t_A: Array, D: Array, config: ReadingConfig) -> lis
     found: list[Reread] = []
     for Rz in bases:
         Rs, cost = vote(forms, Rz @ D[:, :3, :3], config, voters=3)
-        found.append(_degrees("rotation vector", Rs, cost))
+        found.append(_degrees("rotation vector", Rs, cost, partial(_nearest_form, forms)))
     for order in permutations(AXES):
         name = "".join(order)
+        snap = partial(_nearest_degrees, name, euler_numbers(name, (0, 1, 2), R))
         for Rz in bases:
             Rs, cost = _euler_degrees(name, R, Rz @ D[:, :3, :3], config)
-            found.append(_degrees(f"Euler angles (product {name.upper()})", Rs, cost))
-    found.sort(key=lambda r: r.agreement)
-    return found[: config.finalists]
+            found.append(_degrees(f"Euler angles (product {name.upper()})", Rs, cost, snap))
+    return sorted(found, key=lambda r: r.agreement)
 
 
-def _degrees(name: str, Rs: Array, cost: float) -> Reread:
+def _degrees(name: str, Rs: Array, cost: float, snap: Callable[[Array], Array]) -> Reread:
     return Reread(name=f"{name} in degrees, not radians", meant=f"{name} in degrees",
-                  read_as="radians", Rs=Rs, agreement=cost)  # fmt: skip
+                  read_as="radians", Rs=Rs, agreement=cost, snap=snap)  # fmt: skip
+
+
+def _nearest_form(forms: Array, predicted: Array) -> Array:
+    """Return of forms (n, f, 3, 3) those nearest to predicted rotations (n, 3, 3)."""
+    off = np.linalg.norm(forms - predicted[:, None], axis=(-2, -1))
+    return forms[np.arange(len(forms)), off.argmin(-1)]
+
+
+def _nearest_degrees(order: str, numbers: Array, predicted: Array) -> Array:
+    """Return the rotations of the degrees nearest to predicted ones (n, 3, 3).
+
+    Args:
+        order: product of the rotations.
+        numbers: (n, 2, 3) the degrees modulo 2 pi, both forms.
+        predicted: (n, 3, 3).
+    """
+    degrees = np.degrees(euler_numbers(order, (0, 1, 2), predicted))[:, :, None]
+    rest = _wrap(degrees - numbers[:, None])
+    n = len(numbers)
+    chosen = np.abs(rest).max(-1).reshape(n, -1).argmin(1)
+    meant = (degrees - rest).reshape(n, -1, 3)[np.arange(n), chosen]
+    return euler_rotation(order, (0, 1, 2), np.radians(meant))
 
 
 def _euler_degrees(order: str, R: Array, G: Array, config: ReadingConfig) -> tuple[Array, float]:
@@ -319,12 +376,8 @@ def _euler_degrees(order: str, R: Array, G: Array, config: ReadingConfig) -> tup
     predicted = np.degrees(euler_numbers(order, (0, 1, 2), G @ np.swapaxes(Rx, -1, -2)[:, None]))
     cost = _off(predicted[:, :, :1], numbers[None], config).mean(1)
     winner = int(np.argmin(cost))
-    degrees = predicted[winner][:, :, None]
-    rest = _wrap(degrees - numbers[:, None])
-    n = len(R)
-    chosen = np.abs(rest).max(-1).reshape(n, -1).argmin(1)
-    meant = (degrees - rest).reshape(n, -1, 3)[np.arange(n), chosen]
-    return euler_rotation(order, (0, 1, 2), np.radians(meant)), float(np.sqrt(cost[winner]))
+    meant = _nearest_degrees(order, numbers, G @ Rx[winner].T)
+    return meant, float(np.sqrt(cost[winner]))
 
 
 def _wrap(angle: Array) -> Array:

@@ -194,7 +194,7 @@ def _sentence(
         texts = [f"{n} views {describe_offset(E)}" for E, n in zip(offsets, counts, strict=True)]
         parts.append(f"The tool offset changes within the poses: {'; '.join(texts)}.")
         advice = "Give every pose for the same tool: read the flange, or set one TCP throughout."
-    elif _differs(offsets[0], config):
+    elif offsets and _differs(offsets[0], config):
         parts.append(f"The poses are of a point {describe_offset(offsets[0])}.")
         advice = (
             "A tool offset (TCP) is active in the controller: the camera's place will be given "

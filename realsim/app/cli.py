@@ -89,16 +89,56 @@ def upgrade(
 
 
 @commands.command()
-@click.argument("session", type=FOLDER)
-@click.option("--quiet", is_flag=True)
-def calibrate(session: Path, quiet: bool) -> None:
-    """Hand-eye calibration from the board views under SESSION/calibration/capture."""
-    from realsim.app.console import Console
-    from realsim.app.show import show_hand_eye
-    from realsim.app.stages import calibrate_session, open_session
+@click.argument("what", metavar="TARGET")
+@click.option("--out", type=FOLDER, default=Path("boards"), show_default=True, help="Folder.")
+@click.option("--paper", default="A4", show_default=True, help="A5 to A0, letter, 300x400mm, auto.")
+@click.option("--preview", is_flag=True, help="A PNG beside the PDF.")
+@click.option("--cut-marks", is_flag=True)
+@click.option("--overwrite", is_flag=True, help="Replace a sheet of the same name.")
+def board(
+    what: str, out: Path, paper: str, preview: bool, cut_marks: bool, overwrite: bool
+) -> None:
+    """Print a calibration target: a PDF at exact scale with a ruler, and its target file.
 
-    console = Console(quiet=quiet)
-    show_hand_eye(calibrate_session(open_session(session), console), console)
+    TARGET is one line, or a target file:
+
+    \b
+      aprilgrid:6x4,tag=30mm,gap=10mm           AprilTags, 6 columns x 4 rows
+      charuco:5x7,square=33mm,marker=20mm,dict=APRILTAG_36h11
+      chessboard:9x6,square=25mm                inner corners
+      circles:10x10,pitch=25.4mm,large-origin
+      tag:7,size=80mm                           one AprilTag
+    """
+    from realsim_calibration.sheets import make_board
+
+    for path in make_board(
+        what, out, paper, preview=preview, cut_marks=cut_marks, overwrite=overwrite
+    ):
+        click.echo(path)
+
+
+@commands.command()
+@click.argument("source", type=FOLDER)
+@click.option("--board", default="", help="Target: one line (see `realsim board`) or a file.")
+@click.option("--poses", type=FOLDER, default=None, help="Pose file or folder.  [SOURCE]")
+@click.option("--reading", default="", help="How poses are read: rotvec,m  quat_xyzw,mm  ...")
+@click.option("--key", default="", help="Entry of the pose file, where there are several.")
+@click.option("--board-poses", type=FOLDER, default=None, help="Camera poses instead of images.")
+@click.option("--camera", type=FOLDER, default=None, help="File with known intrinsics.")
+@click.option("--eye-to-hand", is_flag=True, help="The camera stands still, the target moves.")
+@click.option("--robot", default="", help="UR5 or UR5e; found out where joints are given.")
+@click.option("--out", type=FOLDER, default=Path("calibration"), show_default=True)
+@click.option("--live", is_flag=True, help="Watch SOURCE for new views and say when to stop.")
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def calibrate(source: Path, quiet: bool, live: bool, **options: object) -> None:
+    """Calibrate lens and hand-eye: SOURCE is a session, or a folder of images with poses.
+
+    Ends with exit code 1 when a check of the result is bad.
+    """
+    from realsim.app.calibrate import run_calibrate
+
+    if not run_calibrate(source, live=live, quiet=quiet, **options):
+        sys.exit(1)
 
 
 @commands.command()

@@ -6,24 +6,8 @@ import numpy as np
 
 from realsim.app.console import Console
 from realsim.app.stages import session_models
-from realsim.geometry import se3
-from realsim.records import GraspSet, HandEye, ObjectModel, Scene
+from realsim.records import GraspSet, ObjectModel, Scene
 from realsim.store import SessionStore
-
-
-def show_hand_eye(hand_eye: HandEye, console: Console) -> None:
-    """Print the hand-eye and what speaks for it."""
-    t, w = hand_eye.T_ee_cam[:3, 3] * 1e3, np.degrees(se3.log_so3(hand_eye.T_ee_cam[:3, :3]))
-    rows = [
-        ["camera in tool, translation [mm]", " ".join(f"{v:.2f}" for v in t)],
-        ["camera in tool, rotation vector [deg]", " ".join(f"{v:.3f}" for v in w)],
-        ["1 sigma (worst axis)", f"{hand_eye.sigma_mm:.3f} mm / {hand_eye.sigma_deg:.4f} deg"],
-        ["reprojection of held-out views", f"{hand_eye.held_out_px:.3f} px"],
-        ["views used / rejected", f"{len(hand_eye.view_indices)} / {len(hand_eye.rejected)}"],
-    ]
-    console.table("Hand-eye calibration", ["", "value"], rows)
-    for index, reason in hand_eye.rejected:
-        console.warn(f"board view {index} was not used: {reason}")
 
 
 def show_scene(store: SessionStore, scene: Scene, console: Console) -> None:

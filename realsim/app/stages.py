@@ -101,8 +101,9 @@ def calibrate_session(store: SessionStore, console: Console) -> HandEye:
         InputError: there are no board views, or no calibration/board.json.
         DegenerateError: the views do not determine the hand-eye.
     """
-    from realsim.store import load_board, load_hand_eye, save_hand_eye
-    from realsim_calibration import BoardView, calibrate_hand_eye, detect_tags
+    from realsim.app.board_views import read_board_views, write_results
+    from realsim.store import load_hand_eye, save_hand_eye
+    from realsim_calibration import calibrate_hand_eye_report
 
     folder = store.folder / BOARD_VIEWS
     if not (folder / "session.json").is_file():
@@ -112,7 +113,6 @@ def calibrate_session(store: SessionStore, console: Console) -> HandEye:
         )
     views_store = SessionStore.open(folder)
     require_sound(views_store)
-    board = load_board(store)
     views = views_store.session.views
     key = content_key(
         folder / "robot.jsonl", store.folder / "calibration/board.json", folder / "session.json"
@@ -121,14 +121,11 @@ def calibrate_session(store: SessionStore, console: Console) -> HandEye:
         if is_current(store, "calibrate", key):
             hand_eye = load_hand_eye(store)
         else:
-            seen: list[BoardView] = []
-            for k, view in enumerate(views):
-                if view.T_base_ee is None:
-                    raise InputError(f"board view {view.index} has no robot pose.")
-                found = detect_tags(views_store.rgb(view.index), board)
-                seen.append(BoardView(index=view.index, T_base_ee=view.T_base_ee, detections=found))
-                tick(k + 1, len(views))
-            hand_eye = calibrate_hand_eye(seen, board, views_store.session.intrinsics)
+            seen, target, arm = read_board_views(store, views_store, tick)
+            camera = views_store.session.intrinsics
+            report = calibrate_hand_eye_report(seen, target, camera, arm=arm)
+            hand_eye = report.hand_eye
+            write_results(report, store, views_store)
             save_hand_eye(store, hand_eye)
         place_cameras(store, hand_eye)
         mark_current(store, "calibrate", key)
@@ -136,9 +133,9 @@ def calibrate_session(store: SessionStore, console: Console) -> HandEye:
 
 
 def place_cameras(store: SessionStore, hand_eye: HandEye) -> None:
-    """Write T_world_cam = T_base_ee @ T_ee_cam for every view that has a robot pose."""
+    """Write T_world_cam for every view that has a robot pose, robot errors corrected."""
     cameras = {
-        v.index: v.T_base_ee @ hand_eye.T_ee_cam
+        v.index: hand_eye.camera_poses(v.T_base_ee, v.joints)
         for v in store.session.views
         if v.T_base_ee is not None
     }

@@ -11,10 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
+from realsim.geometry.dh import DhArm
 from realsim.records import (
+    ArmErrorMap,
     CameraIntrinsics,
+    Check,
     HandEye,
     ObjectPose,
+    RobotErrorMap,
     Scene,
     SupportPlane,
     TagBoard,
@@ -25,6 +29,10 @@ Array = NDArray[np.float64]
 Json = dict[str, Any]
 Record = TypeVar("Record")
 
+ARM_NUMBERS = ("a", "d", "alpha", "theta", "delta_a", "delta_d", "delta_alpha", "delta_theta")
+"""The fields of a DhArm that hold six numbers."""
+CHECK_TEXTS = ("name", "verdict", "sentence", "advice", "unit")
+"""The fields of a Check that are text."""
 SAME = 1e-9
 """A stored transform that is rigid to this is restored bit for bit; one that was edited by hand
 keeps the orthonormal rotation that the record's constructor made of it."""
@@ -155,7 +163,13 @@ def tag_board_to_json(board: TagBoard) -> Json:
     """Return a tag board as JSON values [m]."""
     counts = {name: int(getattr(board, name)) for name in ("rows", "columns", "first_id")}
     sizes = {name: float(getattr(board, name)) for name in ("tag_size_m", "gap_m")}
-    return {**counts, **sizes, "family": board.family}
+    return {
+        **counts,
+        **sizes,
+        "family": board.family,
+        "ids_from": board.ids_from,
+        "corner_squares": board.corner_squares,
+    }
 
 
 def tag_board_from_json(data: Any) -> TagBoard:
@@ -168,10 +182,73 @@ def tag_board_from_json(data: Any) -> TagBoard:
         gap_m=float(d["gap_m"]),
         family=d["family"],
         first_id=int(d["first_id"]),
+        ids_from=d.get("ids_from", "top"),
+        corner_squares=bool(d.get("corner_squares", False)),
     )
 
 
 # --- calibration ------------------------------------------------------------------------------
+
+
+def robot_map_to_json(error: RobotErrorMap | ArmErrorMap | None) -> Json | None:
+    """Return a robot's error map as JSON values; None where there is none."""
+    if error is None:
+        return None
+    if isinstance(error, RobotErrorMap):
+        return {
+            "kind": "pose map",
+            "frame": error.frame,
+            "sd_m": number_to_json(error.sd_m),
+            **{name: array_to_json(getattr(error, name)) for name in ("mean", "weights", "reach")},
+        }
+    arm = {name: array_to_json(getattr(error.arm, name)) for name in ARM_NUMBERS}
+    return {
+        "kind": "arm",
+        "arm": {"name": error.arm.name, **arm},
+        "errors": array_to_json(error.errors),
+        "T_flange_tool": array_to_json(error.T_flange_tool),
+    }
+
+
+def robot_map_from_json(data: Any) -> RobotErrorMap | ArmErrorMap | None:
+    """Return the map of `robot_map_to_json`."""
+    if data is None:
+        return None
+    kind = need(data, ("kind",), "the robot's error map")["kind"]
+    if kind == "pose map":
+        d = need(data, ("frame", "sd_m", "mean", "weights", "reach"), "the robot's error map")
+        return RobotErrorMap(
+            frame=d["frame"],
+            mean=array_from_json(d["mean"]),
+            sd_m=number_from_json(d["sd_m"]),
+            weights=array_from_json(d["weights"]),
+            reach=array_from_json(d["reach"]),
+        )
+    if kind != "arm":
+        raise InputError(f"the robot's error map is of kind '{kind}'; 'pose map' or 'arm' is known.")
+    d = need(data, ("arm", "errors", "T_flange_tool"), "the robot's error map")
+    arm = need(d["arm"], ("name", *ARM_NUMBERS), "the arm of the robot's error map")
+    numbers = {name: array_from_json(arm[name]) for name in ARM_NUMBERS}
+    return ArmErrorMap(
+        arm=DhArm(name=str(arm["name"]), **numbers),
+        errors=array_from_json(d["errors"]),
+        T_flange_tool=array_from_json(d["T_flange_tool"]),
+    )
+
+
+def check_to_json(check: Check) -> Json:
+    """Return a check as JSON values."""
+    texts = {name: getattr(check, name) for name in CHECK_TEXTS}
+    return {**texts, "value": number_to_json(check.value), "views": [int(v) for v in check.views]}
+
+
+def check_from_json(data: Any) -> Check:
+    """Return the check of `check_to_json`."""
+    d = need(data, (*CHECK_TEXTS, "value", "views"), "a check")
+    texts = {name: d[name] for name in CHECK_TEXTS}
+    return Check(
+        **texts, value=number_from_json(d["value"]), views=tuple(int(v) for v in d["views"])
+    )
 
 
 def hand_eye_to_json(result: HandEye) -> Json:
@@ -190,6 +267,8 @@ def hand_eye_to_json(result: HandEye) -> Json:
         "view_rms_px": array_to_json(result.view_rms_px),
         "rejected": [[int(index), reason] for index, reason in result.rejected],
         "starts": [[name, number_to_json(rms)] for name, rms in result.starts],
+        "robot_map": robot_map_to_json(result.robot_map),
+        "checks": [check_to_json(check) for check in result.checks],
     }
 
 
@@ -210,6 +289,8 @@ def hand_eye_from_json(data: Any) -> HandEye:
         rejected=tuple((int(i), str(why)) for i, why in d["rejected"]),
         method=str(d["method"]),
         starts=tuple((str(name), number_from_json(rms)) for name, rms in d["starts"]),
+        robot_map=robot_map_from_json(d.get("robot_map")),
+        checks=tuple(check_from_json(check) for check in d.get("checks", ())),
     )
     return exactly(result, T_ee_cam=d["T_ee_cam"], T_base_board=d["T_base_board"])
 

@@ -5,27 +5,17 @@ import pytest
 
 from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
-from realsim_calibration import (
-    CLOSED_FORMS,
-    BoardView,
+from realsim.geometry.camera import project
+from realsim_calibration import CLOSED_FORMS, JointConfig
+from realsim_calibration.board_pose import estimate_board_pose
+from realsim_calibration.detect.find import find_target
+from realsim_calibration.gates import GateConfig, angle_differences, px_gate, screw_ratio
+from realsim_calibration.hand_eye import (
     HandEyeConfig,
-    JointConfig,
     calibrate_hand_eye,
     calibrate_hand_eye_report,
-    detect_tags,
-    estimate_board_pose,
 )
-from realsim_calibration.board_pose import board_points
-from realsim_calibration.gates import GateConfig, angle_differences, px_gate, screw_ratio
-from realsim_calibration.joint_solve import (
-    JointState,
-    ViewCorners,
-    camera_of,
-    camera_vector,
-    solve_joint,
-    view_residuals,
-)
-from realsim_calibration.uncertainty import estimate_uncertainty
+from realsim_calibration.views import BoardView
 
 
 def error_of(hand_eye, sim):
@@ -34,37 +24,6 @@ def error_of(hand_eye, sim):
 
 def calibrate(sim, views=None, config=None):
     return calibrate_hand_eye(views or sim.views, sim.board, sim.intrinsics0, config)
-
-
-def view_corners(sim, view):
-    points, uv = board_points(view.detections, sim.board)
-    return ViewCorners(index=view.index, T_base_ee=view.T_base_ee, points=points, uv=uv,
-                       middle=np.array([*sim.board.size_m, 0.0]) / 2)  # fmt: skip
-
-
-def test_residuals_vanish_at_the_truth_and_have_the_right_derivatives(simulate):
-    sim = simulate(0, views=3, robot=(0.0, 0.0), pixel=0.0)
-    view = view_corners(sim, sim.views[1])
-    camera = camera_vector(sim.intrinsics)
-
-    def residual(x=0, z=0, e=0, k=0, s=0):
-        r, _ = view_residuals(view, sim.T_ee_cam @ se3.exp(np.zeros(6) + x),
-                              sim.T_base_board @ se3.exp(np.zeros(6) + z),
-                              start @ se3.exp(np.zeros(6) + e),
-                              camera_of(camera + k, sim.intrinsics), 1.0 + s)  # fmt: skip
-        return r
-
-    start = np.eye(4)
-    assert np.abs(residual()).max() < 1e-9
-    start = se3.exp([0.01, -0.02, 0.01, 0.005, 0.01, -0.003])
-    _, J = view_residuals(view, sim.T_ee_cam, sim.T_base_board, start, sim.intrinsics, 1.0)
-    for name, n in (("x", 6), ("z", 6), ("e", 6), ("k", 12)):
-        for c in range(n):
-            h = np.eye(n)[c] * 1e-6
-            numeric = (residual(**{name: h}) - residual(**{name: -h})) / 2e-6
-            assert np.allclose(J[name][:, c], numeric, rtol=1e-4, atol=1e-4), (name, c)
-    numeric = (residual(s=1e-6) - residual(s=-1e-6)) / 2e-6
-    assert np.allclose(J["s"][:, 0], numeric, rtol=1e-4, atol=1e-4)
 
 
 def test_perfect_data_gives_the_truth(simulate):
@@ -118,7 +77,7 @@ def test_a_known_board_and_camera_leave_less_doubt(simulate):
     assert fixed.sigma_mm < free.sigma_mm
     assert np.array_equal(fixed.intrinsics.distortion, sim.intrinsics.distortion)
     assert not fixed.intrinsics_sd[4:].any() and free.intrinsics_sd[4] > 0
-    assert not free.intrinsics_sd[8:].any()
+    assert not free.intrinsics_sd[9:].any()
 
 
 def test_order_of_views_does_not_matter(simulate):
@@ -138,35 +97,24 @@ def test_moving_the_base_moves_only_the_board(simulate):
     assert np.abs(G @ a.T_base_board - b.T_base_board).max() < 1e-7
 
 
-def test_the_graph_gives_the_same_marginal(simulate):
-    import gtsam
-
-    sim = simulate(5, views=10)
-    views = [view_corners(sim, v) for v in sim.views]
-    start = JointState(T_ee_cam=sim.T_ee_cam, T_base_board=sim.T_base_board,
-                       camera=camera_vector(sim.intrinsics0), scale=1.0,
-                       errors=np.zeros((10, 6)))  # fmt: skip
-    fit = solve_joint(views, start, sim.intrinsics0, JointConfig())
-    ours = estimate_uncertainty(fit, views, sim.intrinsics0).marginal
-    marginals = gtsam.Marginals(fit.graph, fit.values)
-    theirs = marginals.marginalCovariance(gtsam.symbol("x", 0))
-    assert np.allclose(ours[:6, :6], theirs, rtol=1e-5, atol=1e-14)
-    # At the optimum the pulls of views and priors cancel.
-    total = fit.pulls.sum(0)[:12]
-    assert np.abs(total).max() < 1e-2 * np.abs(fit.pulls[:, :12]).max()
-
-
 def test_one_step_leave_one_out_matches_a_refit(simulate):
     sim = simulate(6, views=10)
-    report = calibrate_hand_eye_report(sim.views, sim.board, sim.intrinsics0)
+    plain = HandEyeConfig(robot_map=False)
+    report = calibrate_hand_eye_report(sim.views, sim.board, sim.intrinsics0, plain)
     exact = []
     for k in range(10):
         others = [v for v in sim.views if v.index != k]
-        refit = calibrate_hand_eye_report(others, sim.board, sim.intrinsics0)
-        h, scale = refit.hand_eye, refit.board_scale
-        view = view_corners(sim, sim.views[k])
-        r, _ = view_residuals(view, h.T_ee_cam, h.T_base_board, np.eye(4), h.intrinsics, scale)
-        exact.append(np.sqrt(np.mean(np.sum(r.reshape(-1, 2) ** 2, -1))))
+        refit = calibrate_hand_eye_report(others, sim.board, sim.intrinsics0, plain)
+        view, board = sim.views[k], refit.board
+        middle = np.array([*sim.board.size_m, 0.0]) / 2
+        local = view.detection.points(sim.board) - middle
+        lift = local[:, :2] / board.half_extent_m
+        terms = np.stack([lift[:, 0] ** 2, lift[:, 0] * lift[:, 1], lift[:, 1] ** 2], -1)
+        local[:, 1] *= 1 + board.aspect
+        local[:, 2] = board.half_extent_m * terms @ board.warp
+        T = se3.invert(view.T_base_ee @ refit.X) @ refit.Z
+        uv = project(refit.intrinsics, se3.transform(T, middle + board.scale * local))
+        exact.append(np.sqrt(np.mean(np.sum((uv - view.detection.uv) ** 2, -1))))
     exact_rms = np.sqrt(np.mean(np.square(exact)))
     assert 0.8 < report.hand_eye.held_out_px / exact_rms < 1.25
     assert report.hand_eye.held_out_px > np.sqrt(np.mean(report.hand_eye.view_rms_px**2))
@@ -175,11 +123,11 @@ def test_one_step_leave_one_out_matches_a_refit(simulate):
 def test_a_swapped_pair_is_dropped_and_named(simulate):
     sim = simulate(7)
     views = list(sim.views)
-    views[3] = replace(views[3], detections=sim.views[17].detections)
-    views[17] = replace(views[17], detections=sim.views[3].detections)
+    views[3] = replace(views[3], detection=sim.views[17].detection)
+    views[17] = replace(views[17], detection=sim.views[3].detection)
     h = calibrate(sim, views)
     assert [k for k, _ in h.rejected] == [3, 17]
-    assert all("angle gate" in reason for _, reason in h.rejected)
+    assert all("3 and 17" in reason for _, reason in h.rejected)
     e = error_of(h, sim)
     assert np.degrees(np.linalg.norm(e[:3])) < 0.2 and np.linalg.norm(e[3:]) < 1.5e-3
 
@@ -192,18 +140,15 @@ def test_a_pair_swapped_between_parallel_poses_is_dropped_by_its_pixels(simulate
         T = sim.truth_ee[5] @ se3.from_translation([side, 0, 0])
         other = sim.truth_ee[5] @ se3.from_translation([-side, 0, 0])
         seen = sim.see(other @ sim.T_ee_cam, rng, 0.1)
-        views[k] = BoardView(index=k, T_base_ee=T, detections=seen)
+        views[k] = BoardView(index=k, T_base_ee=T, detection=seen)
     h = calibrate(sim, views)
     assert [k for k, _ in h.rejected] == [5, 11]
-    assert all("pixel gate" in reason for _, reason in h.rejected)
 
 
 def test_inverted_poses_are_told(simulate):
     sim = simulate(9)
     views = [replace(v, T_base_ee=se3.invert(v.T_base_ee)) for v in sim.views]
-    with pytest.raises(
-        InputError, match=r"as given \d+\.\d+ deg; inverted 0\.\d+ deg.*inverted: g"
-    ):
+    with pytest.raises(InputError, match=r"hand poses are inverted.*as given: \d+\.\d+ deg"):
         calibrate(sim, views)
 
 
@@ -212,7 +157,7 @@ def test_a_shifted_pairing_is_told(simulate):
     views = [
         replace(v, T_base_ee=sim.views[(k + 1) % 24].T_base_ee) for k, v in enumerate(sim.views)
     ]
-    with pytest.raises(InputError, match="They fit when paired with the image after"):
+    with pytest.raises(InputError, match="images 0 to 23 fit the pose 1 earlier"):
         calibrate(sim, views)
 
 
@@ -223,7 +168,7 @@ def test_millimetres_and_a_wrong_board_are_told(simulate):
         T = v.T_base_ee.copy()
         T[:3, 3] *= 1000
         views.append(replace(v, T_base_ee=T))
-    with pytest.raises(UnitError, match="hand poses in millimetres"):
+    with pytest.raises(UnitError, match="hand poses are in millimetres"):
         calibrate(sim, views)
     double = replace(sim.board, tag_size_m=0.06, gap_m=0.02)
     with pytest.raises(UnitError, match=r"tag's edge (29\.\d+|30\.\d*|30) mm instead of 60 mm"):
@@ -238,21 +183,22 @@ def test_degenerate_motion_names_the_axis(simulate):
         turn = se3.from_rt(se3.exp_so3([0, 0, 0.1 * k - 0.5]), rng.normal(scale=0.02, size=3))
         T = sim.truth_ee[0] @ turn
         views.append(
-            BoardView(index=k, T_base_ee=T, detections=sim.see(T @ sim.T_ee_cam, rng, 0.1))
+            BoardView(index=k, T_base_ee=T, detection=sim.see(T @ sim.T_ee_cam, rng, 0.1))
         )
     with pytest.raises(DegenerateError, match=r"one axis only, \[-?0\.00, -?0\.00, 1\.00\]"):
         calibrate(sim, views)
-    with pytest.raises(DegenerateError, match="2 usable views"):
+    with pytest.raises(DegenerateError, match="2 of 2 views show the target; at least 3"):
         calibrate(sim, views[:2])
 
 
 def test_few_views_and_no_roll_give_a_warning(simulate):
     few = calibrate_hand_eye_report(*_args(simulate(1, views=6)))
-    assert any("only 6 views" in w for w in few.warnings) and "WARNING" in few.hand_eye.method
+    assert any("6 of 6 views were used" in w for w in few.warnings)
     flat = calibrate_hand_eye_report(*_args(simulate(1, roll=False)))
-    assert any("rolls by only" in w for w in flat.warnings)
+    assert any("rolls through" in w for w in flat.warnings)
     good = calibrate_hand_eye_report(*_args(simulate(1)))
-    assert not good.warnings and good.roll_range_deg > 180
+    assert "roll" not in {c.name for c in good.checks if c.verdict != "good"}
+    assert good.roll_range_deg > 180
 
 
 def _args(sim):
@@ -261,7 +207,7 @@ def _args(sim):
 
 def test_a_view_without_tags_and_a_repeated_index_are_handled(simulate):
     sim = simulate(2, views=10)
-    blind = replace(sim.views[4], detections=detect_tags(np.zeros((9, 9), np.uint8), sim.board))
+    blind = replace(sim.views[4], detection=sim.views[4].detection.__class__(point_ids=[], uv=[], image_size=(1280, 720)))
     views = [*sim.views[:4], blind, *sim.views[5:]]
     assert calibrate(sim, views).rejected[0][0] == 4
     with pytest.raises(InputError, match="same index"):
@@ -283,7 +229,8 @@ def test_x_free_measures_do_not_depend_on_x(simulate):
 def test_board_pose_keeps_the_twin_apart(simulate):
     sim = simulate(4, views=6, pixel=0.05)
     for view, ee in zip(sim.views, sim.truth_ee, strict=True):
-        pose = estimate_board_pose(view.detections, sim.board, sim.intrinsics)
+        points = view.detection.points(sim.board)
+        pose = estimate_board_pose(points, view.detection.uv, sim.intrinsics)
         truth = se3.invert(ee @ sim.T_ee_cam) @ sim.T_base_board
         e = se3.log(se3.invert(truth) @ pose.T_cam_board)
         assert np.abs(e[:3]).max() < 2e-3 and np.abs(e[3:]).max() < 1e-3
@@ -301,7 +248,7 @@ def test_from_rendered_images_to_the_hand_eye(simulate, render):
     for v, ee in zip(sim.views, sim.truth_ee, strict=True):
         T_cam_board = se3.invert(ee @ sim.T_ee_cam) @ sim.T_base_board
         image = render(sim.board, sim.intrinsics, T_cam_board, rng, 0.7, 3.0)
-        views.append(replace(v, detections=detect_tags(image, sim.board)))
+        views.append(replace(v, detection=find_target(image, sim.board)))
     h = calibrate_hand_eye(views, sim.board, nominal)
     e = error_of(h, sim)
     assert np.degrees(np.linalg.norm(e[:3])) < 0.4 and np.linalg.norm(e[3:]) < 3e-3

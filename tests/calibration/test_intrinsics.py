@@ -17,7 +17,6 @@ from realsim_calibration.bundle import (
     camera_vector,
     shaped_points,
 )
-from realsim_calibration.coverage import measure_coverage
 from realsim_calibration.intrinsics import calibrate_intrinsics
 from realsim_calibration.lens_fit import IntrinsicsConfig
 from realsim_calibration.lens_start import (
@@ -369,9 +368,7 @@ def test_what_cannot_be_is_refused_with_names():
         )
     half = replace(LENS, width=640, height=360, cx=320, cy=180)
     with pytest.raises(InputError, match="scale the intrinsics"):
-        calibrate_intrinsics(
-            seen, BOARD, start=replace(LENS, width=640, height=360, cx=320, cy=180)
-        )
+        calibrate_intrinsics(seen, BOARD, start=half)
     with pytest.raises(InputError, match="no views"):
         calibrate_intrinsics([], BOARD)
     with pytest.raises(InputError, match="3 names for 5 views"):
@@ -400,21 +397,6 @@ def test_predicted_sigmas_weigh_the_corners():
     weighed, same = (calibrate_intrinsics(s, BOARD, config=FOUR) for s in (blurred, blind))
     assert np.median(weighed.sd[:8] / same.sd[:8]) < 0.8
     assert np.all(np.abs(vector(weighed)[:8] - truth) < 4 * weighed.sd[:8])
-
-
-def test_coverage_names_what_is_missing():
-    poses = np.stack([se3.from_rt(se3.exp_so3([0.5 * s, 0.4, 0]), [0, 0, 0.5]) for s in (-1, 1)])
-    u, v = np.meshgrid(np.linspace(0, 639, 30), np.linspace(0, 479, 30))
-    everywhere = np.stack([u.ravel(), v.ravel()], -1)
-    full = measure_coverage(everywhere, (640, 480), poses)
-    assert full.share == 1 and full.reach > 0.9 and full.advice == ""
-    assert full.counts.sum() == len(everywhere)
-    missing = everywhere[(everywhere[:, 0] < 320) | (everywhere[:, 1] < 240)]
-    part = measure_coverage(missing, (640, 480), poses)
-    assert "no corners in the lower right quarter" in part.advice
-    straight = np.stack([se3.from_translation([0, 0, z]) for z in (0.4, 0.8)])
-    flat = measure_coverage(everywhere, (640, 480), straight)
-    assert "tilt it by 30 deg" in flat.advice and flat.distance_ratio == pytest.approx(2)
 
 
 def test_many_views_take_seconds():

@@ -14,8 +14,12 @@ from realsim_calibration.detect.homography import (
     seen_from_front,
 )
 from realsim_calibration.detect.images import gray_image, size_of
-from realsim_calibration.detect.markers import decode_markers
-from realsim_calibration.detect.saddles import SaddleConfig, refine_saddles
+from realsim_calibration.detect.markers import (
+    TWO_BOARDS,
+    decode_markers,
+    several_boards,
+)
+from realsim_calibration.detect.saddles import OUTSIDE, SaddleConfig, Saddles, refine_saddles
 from realsim_calibration.views import TargetDetection
 
 Array = NDArray[np.float64]
@@ -33,9 +37,13 @@ class CharucoConfig:
     """Furthest that a marker's corner may lie from where the others put it, in marker sides."""
     min_markers: int = 2
     """Least number of markers that agree: one alone may be chance."""
+    agreeing_share: float = 0.7
+    """Least share of the markers that must agree: of a wrong layout a skewed map explains half."""
     near_markers: int = 6
     """A corner is expected where the map of so many nearest markers puts it: few, so that the
     lens does not bend the map."""
+    near_corners: int = 8
+    """A corner without a readable marker is expected where so many found ones put it."""
     min_points: int = 4
     """Fewer corners give no pose."""
 
@@ -75,17 +83,23 @@ def find_charuco(
     if not len(ids):
         return _nothing(gray, rejected)
     point_ids, start, arms = _expected(ids, quads, board, config)
-    row, column = np.divmod(point_ids, board.columns - 1)
-    dark = (row + column) % 2 != white_parity(board)
-    clear = (board.square_m - board.marker_m) / 2 / board.square_m
-    found = refine_saddles(gray, start, arms, dark, clear, config.saddles, intrinsics)
-    rejected += _told(point_ids, found.faults)
-    if found.good.sum() < config.min_points:
-        return _nothing(gray, [*rejected, f"{int(found.good.sum())} corners are too few"])
+    uv, sd = np.full((2, len(board.points_board), 2), np.nan)
+    tried: dict[int, str] = {}
+    # What was found says where corners without a readable marker must be, and so on outwards.
+    while len(point_ids):
+        found = _refined(gray, (point_ids, start, arms), board, (config, intrinsics))
+        tried |= dict(zip(point_ids.tolist(), found.faults, strict=True))
+        uv[point_ids[found.good]] = found.uv[found.good]
+        sd[point_ids[found.good], 0] = found.sd_px[found.good]
+        point_ids, start, arms = _beside(uv, tried, board, config)
+    rejected += _told({k: fault for k, fault in tried.items() if fault and fault != OUTSIDE})
+    good = np.flatnonzero(np.isfinite(uv[:, 0]))
+    if len(good) < config.min_points:
+        return _nothing(gray, [*rejected, f"{len(good)} corners are too few"])
     return TargetDetection(
-        point_ids=point_ids[found.good],
-        uv=found.uv[found.good],
-        sd_px=found.sd_px[found.good],
+        point_ids=good,
+        uv=uv[good],
+        sd_px=sd[good, 0],
         image_size=size_of(gray),
         rejected=tuple(rejected),
     )
@@ -100,9 +114,23 @@ def _nothing(gray: NDArray[np.uint8], rejected: list[str]) -> TargetDetection:
     )
 
 
-def _told(point_ids: NDArray[np.int64], faults: tuple[str, ...]) -> list[str]:
+def _refined(
+    gray: NDArray[np.uint8],
+    expected: tuple[NDArray[np.int64], Array, Array],
+    board: CharucoBoard,
+    how: tuple[CharucoConfig, CameraIntrinsics | None],
+) -> Saddles:
+    """Return expected corners (numbers, places, arms) as they are measured."""
+    point_ids, start, arms = expected
+    row, column = np.divmod(point_ids, board.columns - 1)
+    dark = (row + column) % 2 != white_parity(board)
+    clear = (board.square_m - board.marker_m) / 2 / board.square_m
+    return refine_saddles(gray, start, arms, dark, clear, how[0].saddles, how[1])
+
+
+def _told(faults: dict[int, str]) -> list[str]:
     """Return the faults of corners as sentences, the first few one by one."""
-    bad = [(int(i), f) for i, f in zip(point_ids, faults, strict=True) if f]
+    bad = sorted(faults.items())
     told = [f"corner {i}: {f}" for i, f in bad[:REASONS_TOLD]]
     if len(bad) > REASONS_TOLD:
         told.append(f"{len(bad) - REASONS_TOLD} more corners of this kind")
@@ -112,8 +140,7 @@ def _told(point_ids: NDArray[np.int64], faults: tuple[str, ...]) -> list[str]:
 def _on_board(
     ids: NDArray[np.int64], quads: Array, board: CharucoBoard, config: CharucoConfig
 ) -> tuple[NDArray[np.bool_], Array, list[str]]:
-    """Return which markers (n,) lie where the board has them, their corners as the board counts
-    them, and why others do not."""
+    """Return which markers (n,) lie on the board, all corners as it counts them, and faults."""
     known = charuco_markers(board)
     values, counts = np.unique(ids, return_counts=True)
     twice = np.isin(ids, values[counts > 1])
@@ -121,18 +148,26 @@ def _on_board(
     rejected = [f"marker {i}: not on this board" for i in np.unique(ids[~ours])]
     rejected += [f"marker {i}: seen more than once" for i in np.unique(ids[twice & ours])]
     usable = ours & ~twice
+    if several_boards(ids[ours]):
+        return np.zeros(len(ids), dtype=bool), quads, [TWO_BOARDS, *rejected]
     if usable.sum() < config.min_markers:
         if usable.any():
             rejected.append(f"{int(usable.sum())} marker alone may be chance")
         return np.zeros(len(ids), dtype=bool), quads, rejected
     side = np.linalg.norm(quads - np.roll(quads, -1, axis=1), axis=-1)
     limit = config.layout_share * float(np.median(side[usable]))
-    least = max(config.min_markers, int(np.ceil(usable.sum() / 2)))
+    least = max(config.min_markers, int(np.ceil(config.agreeing_share * usable.sum())))
     # Some generators print the codes turned on the page; the grid says by how much.
     for roll in (0, 2, 1, 3):
         turned = np.roll(quads, roll, axis=1)
         good = _agreeing(ids, turned, known, usable, limit)
-        if good.sum() >= least:
+        if good.sum() < least:
+            continue
+        # A wrong pattern may explain most markers, moved by a square: a better one counts more.
+        better = ""
+        if good.sum() < usable.sum():
+            better = _remedy(ids, quads, board, usable, limit, int(good.sum()) + 1)
+        if not better.startswith(";"):
             rejected += [
                 f"marker {i}: does not lie where the rest of the board puts it"
                 for i in ids[usable & ~good]
@@ -185,15 +220,11 @@ def _remedy(
 def _expected(
     ids: NDArray[np.int64], quads: Array, board: CharucoBoard, config: CharucoConfig
 ) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return the inner corners next to a marker (n,), where they should be (n, 2), and the vectors
-    (n, 4, 2) to their neighbours [px]."""
+    """Return the inner corners next to a marker, where to expect them, and their arms [px]."""
     known = charuco_markers(board)[ids]
     middle = known.mean(1)
     side = board.square_m
-    out: list[int] = []
-    start: list[Array] = []
-    arms: list[Array] = []
-    step = side * np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]], dtype=np.float64)
+    places: list[tuple[int, Array]] = []
     for k, p in enumerate(board.points_board[:, :2]):
         # A marker next to the corner has its middle half a diagonal off; one more square is far.
         distance = np.linalg.norm(middle - p, axis=-1)
@@ -201,9 +232,34 @@ def _expected(
             continue
         near = np.argsort(distance)[: config.near_markers]
         near = near[distance[near] < 3 * side]
-        H = fit_homography(known[near].reshape(-1, 2), quads[near].reshape(-1, 2))
-        seen = apply_homography(H, p + step)
-        out.append(k)
-        start.append(seen[0])
-        arms.append(seen[1:] - seen[0])
-    return np.array(out, np.int64), np.array(start).reshape(-1, 2), np.array(arms).reshape(-1, 4, 2)
+        places.append((k, fit_homography(known[near].reshape(-1, 2), quads[near].reshape(-1, 2))))
+    return _starts(places, board)
+
+
+def _beside(
+    uv: Array, tried: dict[int, str], board: CharucoBoard, config: CharucoConfig
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return corners not tried yet beside those found (uv, NaN where not), as `_expected` does."""
+    places: list[tuple[int, Array]] = []
+    found = np.flatnonzero(np.isfinite(uv[:, 0]))
+    known = board.points_board[:, :2]
+    for k in np.setdiff1d(np.arange(len(uv)), list(tried)):
+        distance = np.linalg.norm(known[found] - known[k], axis=-1) / board.square_m
+        near = found[np.argsort(distance)[: config.near_corners]]
+        if len(near) < config.near_corners or distance.min() > 1.5:
+            continue
+        # Points on one line say nothing about what lies beside it.
+        if np.linalg.matrix_rank(known[near] - known[near].mean(0), tol=0.5 * board.square_m) < 2:
+            continue
+        places.append((int(k), fit_homography(known[near], uv[near])))
+    return _starts(places, board)
+
+
+def _starts(
+    places: list[tuple[int, Array]], board: CharucoBoard
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return numbers (n,), rough corners (n, 2) and arms (n, 4, 2) [px] under maps (3, 3)."""
+    step = np.array([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]]) * board.square_m
+    seen = [apply_homography(H, board.points_board[k, :2] + step) for k, H in places]
+    at = np.array(seen).reshape(-1, 5, 2)
+    return np.array([k for k, _ in places], np.int64), at[:, 0], at[:, 1:] - at[:, :1]

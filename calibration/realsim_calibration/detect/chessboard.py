@@ -108,8 +108,8 @@ def _whole(
         grid = _without_clutter(gray, grid)
     if grid.shape[:2] not in shapes:
         return None, (
-            f"the picture shows a chessboard of {grid.shape[1]}x{grid.shape[0]} inner corners, not "
-            f"of {board.columns}x{board.rows}: correct rows and columns"
+            f"the picture shows a chessboard of {max(grid.shape[:2])}x{min(grid.shape[:2])} inner "
+            f"corners, not of {board.columns}x{board.rows}: correct rows and columns"
         )
     if config.look_for_twins:
         other = largest_chessboard(_covered(gray, grid), config.search_px)
@@ -164,8 +164,7 @@ def _classic(gray: NDArray[np.uint8], board: Chessboard) -> Array | None:
 
 
 def _sizes(gray: NDArray[np.uint8], search_px: int) -> list[tuple[NDArray[np.uint8], float]]:
-    """Return the image shrunk to at most `search_px`, if it is larger, then as it is; with the
-    size of a pixel."""
+    """Return the image shrunk to `search_px` if it is larger, then as it is; with pixel sizes."""
     import cv2
 
     halvings = int(np.ceil(np.log2(max(gray.shape) / search_px)))
@@ -209,8 +208,7 @@ def _line_share(gray: NDArray[np.uint8], grid: Array) -> float:
 
 
 def _without_clutter(gray: NDArray[np.uint8], grid: Array) -> Array:
-    """Return the grid without outer lines that are no corners: the paper's edge is taken for a
-    line of them."""
+    """Return the grid without outer lines that are no corners, such as the paper's edge."""
     for turn in range(4):
         turned = np.rot90(grid, turn)
         while len(turned) > min(MIN_PART) and _line_share(gray, turned) < LINE_SHARE:
@@ -220,9 +218,9 @@ def _without_clutter(gray: NDArray[np.uint8], grid: Array) -> Array:
 
 
 def number_corners(gray: NDArray[np.uint8], grid: Array) -> tuple[Array, bool]:
-    """Return the corners (rows, columns, 2) numbered clockwise as seen, and whether the square
-    between the first corner's +x and +y is dark.
+    """Return the corners (rows, columns, 2) numbered, and whether the first square is dark.
 
+    The first square is the one between the first corner's +x and +y.
     Of the numberings that keep the shape, those are left out that are mirrored, then those that
     begin at a white square, if one begins at a black one; then x goes along the image's x.
     """

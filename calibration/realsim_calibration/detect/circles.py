@@ -44,8 +44,7 @@ class CirclesConfig:
 
 
 def grid_nodes(grid: CircleGrid) -> tuple[NDArray[np.int64], list[NDArray[np.int64]]]:
-    """Return the dots as nodes (n, 2) of a lattice whose steps run clockwise, and the further lines
-    that a larger grid would have."""
+    """Return the dots as nodes (n, 2) of a lattice, and the lines a larger grid would add."""
 
     def nodes(r: NDArray[np.int64], c: NDArray[np.int64]) -> NDArray[np.int64]:
         if not grid.asymmetric:
@@ -244,8 +243,7 @@ def _measured(
 def _to_image(
     H: Array, board: Array, uv: Array, intrinsics: CameraIntrinsics | None
 ) -> Callable[[Array], Array]:
-    """Return the map of board points into the image: through the lens where it is known, else with
-    a cubic in place of it."""
+    """Return the map of board points into the image; a cubic stands for an unknown lens."""
     if intrinsics is not None or len(board) < MIN_CUBIC:
         return lambda points: bend(intrinsics, apply_homography(H, points))
     middle, size = board.mean(0), np.ptp(board, axis=0).max() / 2

@@ -265,8 +265,7 @@ def fit_lines(
 def line_intersections(
     center1: Array, normal1: Array, center2: Array, normal2: Array
 ) -> tuple[Array, Array]:
-    """Return where lines (..., 2) through a point with a unit normal meet, (..., 2), and the sine
-    of their angle (...)."""
+    """Return where lines (point, unit normal) meet (..., 2), and the sine of their angle (...)."""
     c1, c2 = (normal1 * center1).sum(-1), (normal2 * center2).sum(-1)
     det = normal1[..., 0] * normal2[..., 1] - normal1[..., 1] * normal2[..., 0]
     det = np.where(np.abs(det) < 1e-6, 1e-6, det)
@@ -290,8 +289,7 @@ def _corner_sd(s: Array, weight: Array, rms: Array, sine: Array) -> Array:
 
 
 def straighten(intrinsics: CameraIntrinsics | None, uv: Array) -> Array:
-    """Return undistorted pixels (..., 2): `uv` without intrinsics or where the lens model has no
-    inverse."""
+    """Return undistorted pixels (..., 2); as they are where the lens has no model or inverse."""
     if intrinsics is None:
         return uv
     xy, valid = undistort(intrinsics, uv)

@@ -100,8 +100,8 @@ def find_blobs(gray: NDArray[np.uint8], config: DotConfig) -> tuple[Array, Array
         # Two levels: outlines of dark regions have no parent, outlines of holes in them have one.
         contours, tree = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
         most = config.max_area_share * gray.size
-        for contour, (_, _, _, parent) in zip(contours, [] if tree is None else tree[0]):
-            if parent >= 0 or len(contour) < MIN_OUTLINE:
+        for k, contour in enumerate(contours):
+            if tree[0][k][3] >= 0 or len(contour) < MIN_OUTLINE:
                 continue
             blob = _ellipse_of(cv2.moments(contour), most, config)
             if blob is not None:
@@ -118,8 +118,7 @@ def find_blobs(gray: NDArray[np.uint8], config: DotConfig) -> tuple[Array, Array
 def _ellipse_of(
     m: dict[str, float], most: float, config: DotConfig
 ) -> tuple[float, Array, Array] | None:
-    """Return (misfit, middle, A) of the ellipse with the moments of an outline, None if it is
-    no ellipse."""
+    """Return (misfit, middle, A) of the ellipse with an outline's moments, None if it is none."""
     area = m["m00"]
     if not (0.5 * np.pi * config.min_radius_px**2 < area < most):
         return None
@@ -202,8 +201,10 @@ def _symmetric(c: Array) -> Array:
 def _fit_change(
     u: Array, normal: Array, shift: Array, usable: NDArray[np.bool_], config: DotConfig
 ) -> tuple[Array, Array, Array]:
-    """Return the change (n, 5) of middle and A that moves the outline by `shift` along its
-    normals, weights (n, m) 0 or 1, and the RMS that remains (n,) [px]."""
+    """Return the change (n, 5) of middle and A that moves the outline by `shift`.
+
+    And the weights (n, m), 0 or 1, and the RMS that remains (n,) [px].
+    """
     nx, ny = normal[..., 0], normal[..., 1]
     J = np.stack([nx, ny, nx * u[:, 0], nx * u[:, 1] + ny * u[:, 0], ny * u[:, 1]], -1)
     weight = usable.astype(np.float64)
@@ -217,7 +218,8 @@ def _fit_change(
         scale = np.maximum(scale, config.residual_floor_px)
         weight = (usable & (np.abs(residual) <= config.outlier_sigmas * scale)).astype(np.float64)
     rms = np.sqrt((weight * residual**2).sum(-1) / np.maximum(weight.sum(-1) - 5, 1.0))
-    return np.clip(change, -2.0, 2.0), weight, rms
+    limited = np.clip(change, -2.0, 2.0).astype(np.float64)
+    return limited, weight, np.asarray(rms, dtype=np.float64)
 
 
 def _faults(
@@ -268,8 +270,10 @@ def outline_bias(to_image: Callable[[Array], Array], middles: Array, radius: Arr
 
 
 def _conic_middles(points: Array) -> Array:
-    """Return the middles (n, 2) of the conics a x^2 + b xy + c y^2 + d x + e y = 1 that fit points
-    (n, m, 2) about the origin best."""
+    """Return the middles (n, 2) of the conics that fit points (n, m, 2) about the origin.
+
+    Least squares of a x^2 + b xy + c y^2 + d x + e y = 1.
+    """
     scale = np.abs(points).max(axis=(1, 2), keepdims=True)
     x, y = np.moveaxis(points / scale, -1, 0)
     J = np.stack([x * x, x * y, y * y, x, y], -1)

@@ -51,13 +51,13 @@ def read_missing_tags(
         apart = np.linalg.norm(known.mean(1) - square.mean(0), axis=-1)
         near = np.argsort(apart)[:NEAR_TAGS]
         H = fit_homography(known[near].reshape(-1, 2), corners[near].reshape(-1, 2))
-        seen = apply_homography(H, square)
-        if not (np.all(seen > 0) and np.all(seen < limit)):
+        quad = apply_homography(H, square)
+        if not (np.all(quad > 0) and np.all(quad < limit)):
             continue
         # One code for the page: rolled corners put its own top left first.
-        if _reads(image, np.roll(seen, -roll, axis=0), _code(board.family, int(tag), border)):
+        if _reads(image, np.roll(quad, -roll, axis=0), _code(board.family, int(tag), border)):
             new_ids.append(int(tag))
-            new.append(seen)
+            new.append(quad)
     return np.array(new_ids, np.int64), np.array(new).reshape(-1, 4, 2)
 
 
@@ -76,8 +76,9 @@ def _reads(image: Array, corners: Array, white: NDArray[np.bool_]) -> bool:
     """Return whether the cells within corners (4, 2) read as they should."""
     n = len(white)
     unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float64)
-    y, x = (np.indices(white.shape) + 0.5) / n
-    level = bilinear(image, apply_homography(fit_homography(unit, corners), np.stack([x, y], -1)))
+    middle = (np.arange(n) + 0.5) / n
+    at = np.stack(np.meshgrid(middle, middle), -1)
+    level = bilinear(image, apply_homography(fit_homography(unit, corners), at))
     low, high = np.median(level[~white]), np.median(level[white])
     if high - low < MIN_STEP:
         return False

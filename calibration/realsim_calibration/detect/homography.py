@@ -56,10 +56,10 @@ def fit_trimmed(board: Array, uv: Array, limit_px: float) -> tuple[Array, NDArra
     """Return H and which points (n,) it brings to within `limit_px`; RANSAC, then least squares."""
     import cv2
 
-    H, _ = cv2.findHomography(board, uv, cv2.RANSAC, limit_px, maxIters=500, confidence=0.999)
-    if H is None:
+    robust, _ = cv2.findHomography(board, uv, cv2.RANSAC, limit_px, maxIters=500, confidence=0.999)
+    H = np.asarray(robust, dtype=np.float64)
+    if H.shape != (3, 3):  # None where the points lie on a line
         return np.eye(3), np.zeros(len(board), dtype=bool)
-    H = np.asarray(H, dtype=np.float64)
     inside = np.linalg.norm(apply_homography(H, board) - uv, axis=-1) <= limit_px
     for _ in range(3):
         if inside.sum() < 4:

@@ -20,15 +20,24 @@ WEAK_DICTIONARIES = ("DICT_APRILTAG_16h5", "DICT_4X4_", "DICT_ARUCO_ORIGINAL")
 """Few bits or codes that differ in few: no bit is corrected, else clutter decodes."""
 TOUCHING_KERNELS = (3, 5)
 """Widths of the white dilation that parts tags from squares at their corners [px]."""
+TWO_BOARDS = "two equal boards are in view: cover one"
+"""Why nothing is used where markers are seen twice."""
+TWICE_SHARE = 0.15
+"""Share of the markers seen more than once from which two boards are in view; one is clutter."""
+
+
+def several_boards(ids: NDArray[np.int64]) -> bool:
+    """Return whether so many markers (n,) are seen more than once that it must be two boards."""
+    values, counts = np.unique(ids, return_counts=True)
+    twice = int((counts > 1).sum())
+    return twice >= 2 and twice >= TWICE_SHARE * len(values)
 
 
 def dictionary_names() -> tuple[str, ...]:
     """Return the names of OpenCV's predefined dictionaries."""
     from cv2 import aruco
 
-    return tuple(
-        sorted(n for n in dir(aruco) if n.startswith("DICT_") and not _doubled(n, aruco))
-    )
+    return tuple(sorted(n for n in dir(aruco) if n.startswith("DICT_") and not _doubled(n, aruco)))
 
 
 def _doubled(name: str, module: Any) -> bool:
@@ -92,8 +101,9 @@ def decode_markers(
         more_ids, more = _decoded(detector, np.asarray(parted, dtype=np.uint8))
         more = _grown(more, width // 2)
         fresh = ~_near(more, corners)
-        ids, corners = np.concatenate([ids, more_ids[fresh]]), np.concatenate(
-            [corners, more[fresh]]
+        ids, corners = (
+            np.concatenate([ids, more_ids[fresh]]),
+            np.concatenate([corners, more[fresh]]),
         )
     return ids, corners
 

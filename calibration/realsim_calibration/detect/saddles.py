@@ -27,6 +27,8 @@ from realsim_calibration.detect.edges import (
 Array = NDArray[np.float64]
 NO_PATTERN_PX = 1e3
 """Distance of the next edge behind a chessboard's edge: beyond any profile [px]."""
+OUTSIDE = "outside the image"
+"""The fault of a corner that is not in view: nothing is wrong with it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -250,7 +252,7 @@ def _faults(
         inside = 0 <= u <= shape[1] - 1 and 0 <= v <= shape[0] - 1
         # Written as "is it good", so that a NaN is a fault.
         checks = (
-            (inside, "outside the image"),
+            (inside, OUTSIDE),
             (found.contrast[k] >= config.min_contrast,
              f"low contrast: {found.contrast[k]:.0f} levels (at least {config.min_contrast:g})"),
             (found.sine[k] >= config.min_sine, "seen too obliquely"),
@@ -266,8 +268,10 @@ def _faults(
 
 
 def grid_arms(grid: Array) -> Array:
-    """Return the vectors (r, c, 4, 2) to the neighbours along +x, +y, -x, -y of a grid (r, c, 2);
-    at the rim the opposite one, turned about."""
+    """Return the vectors (r, c, 4, 2) to the neighbours along +x, +y, -x, -y of a grid (r, c, 2).
+
+    At the rim it is the opposite one, turned about.
+    """
     dx, dy = np.diff(grid, axis=1), np.diff(grid, axis=0)
     right = np.concatenate([dx, dx[:, -1:]], axis=1)
     left = -np.concatenate([dx[:, :1], dx], axis=1)

@@ -66,8 +66,9 @@ def fit_small_dots(
     # Of the plane, slopes per pixel; p at the first middle.
     plane = np.stack([paper, 0 * paper, 0 * paper], -1)
     frame = np.concatenate(
-        [np.ones((*pixel.shape[:2], 1)), pixel - np.rint(middles)[:, None]], -1
+        [np.ones((*pixel.shape[:2], 1)), 1.0 * pixel - np.rint(middles)[:, None]], -1
     )
+    frame = frame.astype(np.float64)
     covariance, scatter = np.zeros((len(uv), 2)), np.full(len(uv), FIRST_NOISE**2)
     for _ in range(STEPS):
         J, model = _linearised(pixel - uv[:, None], A, sigma, dark, frame, plane)
@@ -97,8 +98,10 @@ def fit_small_dots(
 def _linearised(
     d: Array, A: Array, sigma: Array, dark: Array, frame: Array, plane: Array
 ) -> tuple[Array, Array]:
-    """Return the derivatives (n, m, 10) with respect to middle, A (xx, xy, yy), blur, darkness and
-    plane, and the model (n, m)."""
+    """Return the model's derivatives (n, m, 10), and the model (n, m).
+
+    With respect to middle, A (xx, xy, yy), blur, darkness and plane.
+    """
     from scipy.special import ndtr
 
     B = np.linalg.inv(A)

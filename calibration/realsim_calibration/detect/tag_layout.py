@@ -9,8 +9,9 @@ from realsim.records import TagBoard
 from realsim_calibration.detect.homography import fit_trimmed, seen_from_front
 
 Array = NDArray[np.float64]
-MIN_SHARE = 0.5
-"""Least share of the tags that must agree: fewer, and the board file does not fit the picture."""
+MIN_SHARE = 0.7
+"""Least share of the tags that must agree: fewer, and the board file does not fit the picture. With
+rows counted from the wrong end a skewed map can explain half of them."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -31,12 +32,20 @@ def check_layout(
     """Return which of two or more tags (n, 4, 2) agree with the board to within `share` sides."""
     side = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=-1)
     limit = share * float(np.median(side))
+    least = max(2, int(np.ceil(MIN_SHARE * len(ids))))
     for roll in (0, 2, 1, 3):
         good = _agreeing(ids, np.roll(corners, roll, axis=1), board, limit)
-        if good.sum() >= max(2, np.ceil(MIN_SHARE * len(ids))):
+        if good.sum() < least:
+            continue
+        better = ""
+        if not good.all():
+            better = _remedy(ids, corners, board, limit, int(good.sum()) + 1)
+        if not better.startswith(";"):
             reason = "does not lie where the rest of the board puts it"
             return TagLayout(good=good, roll=roll, reason=reason)
-    reason = "the tags do not lie as the board file says" + _remedy(ids, corners, board, limit)
+    reason = "the tags do not lie as the board file says" + _remedy(
+        ids, corners, board, limit, least
+    )
     return TagLayout(good=np.zeros(len(ids), dtype=bool), roll=0, reason=reason)
 
 
@@ -54,7 +63,9 @@ def _agreeing(
     return good
 
 
-def _remedy(ids: NDArray[np.int64], corners: Array, board: TagBoard, limit: float) -> str:
+def _remedy(
+    ids: NDArray[np.int64], corners: Array, board: TagBoard, limit: float, least: int
+) -> str:
     """Return how they do lie, where a usual mistake explains it."""
     other = "top" if board.ids_from == "bottom" else "bottom"
     turned = replace(board, rows=board.columns, columns=board.rows)
@@ -67,6 +78,6 @@ def _remedy(ids: NDArray[np.int64], corners: Array, board: TagBoard, limit: floa
     for candidate, how in candidates:
         for roll in (0, 2, 1, 3):
             good = _agreeing(ids, np.roll(corners, roll, axis=1), candidate, limit)
-            if good.sum() >= max(2, np.ceil(MIN_SHARE * len(ids))):
+            if good.sum() >= least:
                 return f"; {how} they would"
     return ". Are rows, columns, first id, tag size and gap right?"

@@ -17,7 +17,12 @@ from realsim.records.targets import TAG_CELLS
 from realsim_calibration.detect.edges import EdgeConfig, RefinedQuads, refine_quads
 from realsim_calibration.detect.guided_tags import read_missing_tags
 from realsim_calibration.detect.images import gray_image
-from realsim_calibration.detect.markers import FAMILY_DICTIONARY, decode_markers
+from realsim_calibration.detect.markers import (
+    FAMILY_DICTIONARY,
+    TWO_BOARDS,
+    decode_markers,
+    several_boards,
+)
 from realsim_calibration.detect.tag_layout import check_layout
 
 Array = NDArray[np.float64]
@@ -31,12 +36,17 @@ class DetectionConfig:
 
     edges: EdgeConfig = field(default_factory=EdgeConfig)
     """How the tags' edges are measured."""
+    max_blur_px: float = 2.0
+    """Largest sigma of the edges' blur [px]: the profiles reach 3.5 px, beyond it they see no
+    plateau and corners drift by half a pixel."""
     square_cut_px: float = 4.0
     """Stretch at the ends of a side that is not sampled where a black square touches the tag's
     corner [px]: twice a strong blur and more."""
     square_move_share: float = 0.08
     """Furthest that refinement may move a corner there, in tag sides: the rough outline runs on
     into the square, by less than a module."""
+    guided_rounds: int = 3
+    """How often tags are looked for beside those found: every round reaches further out."""
     layout_share: float = 0.5
     """Furthest that a corner may lie from where the rest of the board puts it, in tag sides; a
     strong lens bends a board by 0.2, a wrong tag is off by more than one."""
@@ -135,25 +145,54 @@ def detect_tags(
     values, counts = np.unique(ids, return_counts=True)
     twice = np.isin(ids, values[counts > 1])
     rejected += [(int(i), "seen more than once") for i in np.unique(ids[twice & ours])]
+    if several_boards(ids[ours]):
+        return _no_tags([*rejected, *((int(i), TWO_BOARDS) for i in np.unique(ids[ours & ~twice]))])
     missing = np.setdiff1d(board.ids, ids[twice])
     keep = ours & ~twice
-    seen = (ids[keep], corners[keep], border)
-    ids, corners, misplaced = _on_board(gray, seen, missing, board, config)
+    seen = (ids[keep], corners[keep])
+    ids, corners, misplaced, roll = _on_board(*seen, board, config)
     rejected += misplaced
+    found = _measured(gray, ids, corners, border, (board, config, intrinsics))
+    # What was found says where the rest must be; what is found there helps the next round.
+    for _ in range(config.guided_rounds if board.rows * board.columns > 1 else 0):
+        left = np.setdiff1d(missing, [*found.ids, *(i for i, _ in found.rejected)])
+        if len(found) < 2 or not len(left):
+            break
+        code = (border, roll)
+        more = read_missing_tags(gray, board, (found.ids, found.corners_px), left, code)
+        if not len(more[0]):
+            break
+        found = _both(found, _measured(gray, *more, border, (board, config, intrinsics)))
+    told = [(i, r) for i, r in rejected if i not in found.ids]
+    return replace(found, rejected=tuple(sorted({*told, *found.rejected})))
+
+
+def _no_tags(rejected: list[tuple[int, str]]) -> TagDetections:
+    return TagDetections(
+        ids=np.zeros(0, np.int64), corners_px=np.zeros((0, 4, 2)), rejected=tuple(sorted(rejected))
+    )
+
+
+def _measured(
+    gray: NDArray[np.uint8],
+    ids: NDArray[np.int64],
+    corners: Array,
+    border: int,
+    how: tuple[TagBoard, DetectionConfig, CameraIntrinsics | None],
+) -> TagDetections:
+    """Return those of the tags (n,) with rough corners (n, 4, 2) that can be measured well."""
+    board, config, intrinsics = how
     if not len(ids):
-        return TagDetections(ids=ids, corners_px=corners, rejected=tuple(sorted(rejected)))
+        return TagDetections(ids=ids, corners_px=corners)
     clear = (border / (TAG_CELLS[board.family] + 2 * (border - 1)), board.gap_m / board.tag_size_m)
-    edges = config.edges
+    edges, limits = config.edges, config
     if board.corner_squares:
         edges = replace(edges, corner_cut_px=max(edges.corner_cut_px, config.square_cut_px))
-    refined = refine_quads(gray, corners, clear, edges, intrinsics)
-    most = config.max_move_px
-    if board.corner_squares:
         side = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)))
-        most = max(most, config.square_move_share * side)
-    limits = replace(config, max_move_px=most)
+        most = max(config.max_move_px, config.square_move_share * side)
+        limits = replace(config, max_move_px=most)
+    refined = refine_quads(gray, corners, clear, edges, intrinsics)
     reasons = [_fault(refined, corners, k, gray.shape, limits) for k in range(len(ids))]
-    rejected += [(int(i), r) for i, r in zip(ids, reasons, strict=True) if r]
     good = np.array([not r for r in reasons], dtype=bool)
     return TagDetections(
         ids=ids[good],
@@ -162,7 +201,24 @@ def detect_tags(
         contrast=refined.contrast[good],
         residual_px=refined.residual_px[good],
         corner_sd_px=refined.corner_sd_px[good],
-        rejected=tuple(sorted(rejected)),
+        rejected=tuple((int(i), r) for i, r in zip(ids, reasons, strict=True) if r),
+    )
+
+
+def _both(a: TagDetections, b: TagDetections) -> TagDetections:
+    """Return the tags of both."""
+
+    def joined(name: str) -> Array:
+        return np.concatenate([getattr(a, name), getattr(b, name)])
+
+    return TagDetections(
+        ids=np.concatenate([a.ids, b.ids]),
+        corners_px=joined("corners_px"),
+        sharpness_px=joined("sharpness_px"),
+        contrast=joined("contrast"),
+        residual_px=joined("residual_px"),
+        corner_sd_px=joined("corner_sd_px"),
+        rejected=a.rejected + b.rejected,
     )
 
 
@@ -170,39 +226,28 @@ def _decode(gray: NDArray[np.uint8], board: TagBoard) -> tuple[NDArray[np.int64]
     """Return ids, quads (n, 4, 2) and the width of the black border in modules."""
     name = FAMILY_DICTIONARY[board.family]
     ids, corners = decode_markers(gray, name, touching=board.corner_squares)
-    if board.corner_squares and not np.isin(ids, board.ids).any():
+    seen = int(np.isin(ids, board.ids).sum())
+    if board.corner_squares and 2 * seen < len(board.ids):
         # Kalibr prints its tags with a border of two modules.
         wide = decode_markers(gray, name, touching=True, border=2)
-        if len(wide[0]):
+        if np.isin(wide[0], board.ids).sum() > seen:
             return *wide, 2
     return ids, corners, 1
 
 
 def _on_board(
-    gray: NDArray[np.uint8],
-    seen: tuple[NDArray[np.int64], Array, int],
-    missing: NDArray[np.int64],
-    board: TagBoard,
-    config: DetectionConfig,
-) -> tuple[NDArray[np.int64], Array, list[tuple[int, str]]]:
-    """Return the tags that lie where the board has them, those found with their help, and why
-    others do not count."""
-    ids, corners, border = seen
+    ids: NDArray[np.int64], corners: Array, board: TagBoard, config: DetectionConfig
+) -> tuple[NDArray[np.int64], Array, list[tuple[int, str]], int]:
+    """Return the tags on the board, corners in its order, others' faults, the codes' turns."""
     if len(ids) == 1 and board.rows * board.columns > 1 and board.family in WEAK_FAMILIES:
-        return ids[:0], corners[:0], [(int(ids[0]), f"one {board.family} alone may be chance")]
+        return ids[:0], corners[:0], [(int(ids[0]), f"one {board.family} alone may be chance")], 0
     if len(ids) < 2:
-        return ids, corners, []
+        return ids, corners, [], 0
     layout = check_layout(ids, corners, board, config.layout_share)
     bad = [(int(i), layout.reason) for i in ids[~layout.good]]
     # Some generators print the codes turned on the page; the grid says by how much.
-    ids, corners = ids[layout.good], np.roll(corners[layout.good], layout.roll, axis=1)
-    if len(ids) < 2:
-        return ids, corners, bad
-    missing = np.setdiff1d(missing, ids)
-    code = (border, layout.roll)
-    more_ids, more = read_missing_tags(gray, board, (ids, corners), missing, code)
-    told = [(i, r) for i, r in bad if i not in more_ids]
-    return np.concatenate([ids, more_ids]), np.concatenate([corners, more]), told
+    corners = np.roll(corners[layout.good], layout.roll, axis=1)
+    return ids[layout.good], corners, bad, layout.roll
 
 
 def _fault(
@@ -221,6 +266,9 @@ def _fault(
          f"too small: its shortest side is {side:.1f} px (at least {config.min_side_px:g})"),
         (contrast >= config.min_contrast,
          f"low contrast: {contrast:.0f} levels (at least {config.min_contrast:g})"),
+        (float(refined.sharpness_px[k]) <= config.max_blur_px,
+         f"out of focus: edges are blurred by {refined.sharpness_px[k]:.1f} px (at most "
+         f"{config.max_blur_px:g})"),
         (share >= config.min_inlier_share,
          f"edge covered or broken: {share:.0%} of a side's profiles fit"),
         (residual <= config.max_residual_px,

@@ -21,33 +21,36 @@ SEARCH_PX = 1600
 """Larger pictures are halved until they fit: a diagnosis need not see the smallest marker."""
 LARGEST = (
     "DICT_APRILTAG_36h11",
-    "DICT_6X6_1000",
-    "DICT_5X5_1000",
-    "DICT_4X4_1000",
-    "DICT_7X7_1000",
+    "DICT_6X6_250",
+    "DICT_5X5_250",
+    "DICT_4X4_250",
+    "DICT_7X7_250",
     "DICT_ARUCO_ORIGINAL",
     "DICT_ARUCO_MIP_36h12",
     "DICT_APRILTAG_25h9",
     "DICT_APRILTAG_36h10",
     "DICT_APRILTAG_16h5",
 )
-"""Dictionaries that hold all others; the commonest first."""
-MIN_MARKERS = {"DICT_4X4_1000": 4, "DICT_APRILTAG_16h5": 4, "DICT_ARUCO_ORIGINAL": 4}
+"""Dictionaries that hold all smaller ones, the commonest first; of a thousand the
+first 250 codes will do, because every code costs time."""
+MIN_MARKERS = {"DICT_4X4_250": 4, "DICT_APRILTAG_16h5": 4, "DICT_ARUCO_ORIGINAL": 4}
 """Markers from which a dictionary is believed where clutter decodes by chance."""
 USUAL_MIN_MARKERS = 2
 MIN_SADDLES = 0.8
 """Share of a chessboard's corners that must be measurable: noise makes false ones."""
+MIN_FILLED = 0.6
+"""Share of a lattice's bounding box that must hold dots: specks of noise grow ragged lattices."""
 MIN_DOTS = 16
 """Least lattice of dots that is told of: a row of screws is no target."""
-FLATTEST = 1.35
-"""A dot's half axes may differ by so much between neighbours on a lattice that is a target."""
+SIZE_SPREAD = 0.35
+"""Median departure of dots' radii from their median: a target's dots are of one size."""
 
 
 def what_is_visible(image: NDArray[np.uint8]) -> str:
     """Return what an image shows of any kind of target, as a clause: "17 markers of DICT_6X6_100".
 
-    All dictionaries are tried, plain and mirrored, then chessboards, then grids of dots: one to
-    three seconds. "nothing that looks like a target" where there is none.
+    All dictionaries are tried, plain and mirrored, then chessboards, then grids of dots: about a
+    second. "nothing that looks like a target" where there is none.
 
     Raises:
         InputError: the image is not 8 bit.
@@ -56,23 +59,23 @@ def what_is_visible(image: NDArray[np.uint8]) -> str:
     seen, side = _markers(gray)
     board = _chessboard(gray, side)
     dots, count = _dots(gray)
+    if not seen:
+        mirrored, _ = _markers(np.ascontiguousarray(gray[:, ::-1]))
+        if mirrored:
+            return f"{mirrored}, but MIRRORED: flip the picture left to right"
     if board is not None and 2 * board.shape[0] * board.shape[1] > count:
         r, c = board.shape[:2]
         text = f"a chessboard with {max(r, c)}x{min(r, c)} inner corners"
         return f"{text} and {seen} (a ChArUco board?)" if seen else text
     if seen or dots:
         return seen or dots
-    mirrored, _ = _markers(np.ascontiguousarray(gray[:, ::-1]))
-    if mirrored:
-        return f"{mirrored}, but MIRRORED: flip the picture left to right"
     return f"nothing that looks like a target ({_exposure(gray)})"
 
 
 def explain_missing(
     image: NDArray[np.uint8], target: Target, detection: TargetDetection | None = None
 ) -> str:
-    """Return a sentence on why a target was not found: what the board file asks for, what the
-    picture shows, and what to do.
+    """Return why a target was not found: what was asked for, what is there, what to do.
 
     Raises:
         InputError: the image is not 8 bit.
@@ -112,13 +115,13 @@ def _halved(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     import cv2
 
     while max(gray.shape) > SEARCH_PX:
-        gray = np.asarray(cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+        half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        gray = np.asarray(half, dtype=np.uint8)
     return gray
 
 
 def _chessboard(gray: NDArray[np.uint8], marker_px: float) -> NDArray[np.float64] | None:
-    """Return the corners (r, c, 2) of a chessboard whose corners are ones and whose squares are
-    larger than the markers seen."""
+    """Return the corners (r, c, 2) of a real chessboard with squares larger than the markers."""
     grid = largest_chessboard(gray, SEARCH_PX)
     if grid is None:
         return None
@@ -134,8 +137,7 @@ def _chessboard(gray: NDArray[np.uint8], marker_px: float) -> NDArray[np.float64
 
 
 def _markers(gray: NDArray[np.uint8]) -> tuple[str, float]:
-    """Return the markers of the dictionary that explains most, '' where none does, and the median
-    side of them [px]."""
+    """Return the markers of the dictionary that explains most, and their median side [px]."""
     best: tuple[int, str, NDArray[np.int64], float] | None = None
     for name in LARGEST:
         ids, quads = decode_markers(gray, name)
@@ -155,11 +157,10 @@ def _markers(gray: NDArray[np.uint8]) -> tuple[str, float]:
 
 
 def _smallest(name: str, most: int) -> str:
-    """Return the smallest dictionary of the same markers that holds an id; a larger one begins
-    with the same codes."""
-    if not name.endswith("_1000"):
+    """Return the smallest dictionary that holds an id; a larger one begins with the same codes."""
+    if not name.endswith("_250"):
         return name
-    stem = name[: -len("1000")]
+    stem = name[: -len("250")]
     sizes = sorted(
         (len(predefined_dictionary(n).bytesList), n)
         for n in dictionary_names()
@@ -175,7 +176,7 @@ def _dots(gray: NDArray[np.uint8]) -> tuple[str, int]:
         middles, axes = find_blobs(np.asarray(shade, dtype=np.uint8), DotConfig())
         lattice = grow_lattice(middles)
         radius = np.sqrt(np.abs(np.linalg.det(axes[list(lattice.values())])))
-        if len(radius) and np.median(np.abs(radius / np.median(radius) - 1)) > FLATTEST - 1:
+        if len(radius) and np.median(np.abs(radius / np.median(radius) - 1)) > SIZE_SPREAD:
             continue
         best = max(best, lattice, key=len)
     if len(best) < MIN_DOTS:
@@ -191,6 +192,8 @@ def _dots(gray: NDArray[np.uint8]) -> tuple[str, int]:
                key=lambda e: int(e.prod()))  # fmt: skip
     if len(nodes) >= 0.45 * rows.prod():
         return f"an asymmetric grid of {len(nodes)} dots", len(nodes)
+    if len(nodes) < MIN_FILLED * w * h:
+        return "", 0
     return f"a grid of at least {len(nodes)} dots, not all of it", len(nodes)
 
 

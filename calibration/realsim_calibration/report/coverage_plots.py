@@ -6,7 +6,7 @@ import numpy as np
 
 from realsim_calibration.report import style
 from realsim_calibration.report.residual_plots import CELLS_ACROSS
-from realsim_calibration.report.summary import viewpoint
+from realsim_calibration.report.summary import amount, viewpoint
 from realsim_calibration.results import HandEyeReport
 
 ROLL_BIN_DEG = 15
@@ -83,7 +83,9 @@ def _rolls(ax: Any, report: HandEyeReport) -> None:
     nearest = apart.min(1) if len(rolls) else np.ones(len(middles))
     ax.set_rlabel_position(float(np.degrees(middles[int(np.argmax(nearest))])))
     _polar_looks(ax)
-    ax.set_title(f"Camera roll: {report.roll_range_deg:.0f}° (views)", pad=14, loc="center")
+    ax.set_title(
+        f"Camera roll: {amount(report.roll_range_deg, 0, '°')} (views)", pad=14, loc="center"
+    )
 
 
 def _polar_looks(ax: Any) -> None:

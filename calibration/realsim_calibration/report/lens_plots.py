@@ -9,7 +9,7 @@ from realsim.records import CameraIntrinsics
 from realsim_calibration.depth_bias import DepthBiasReport
 from realsim_calibration.lens_covariance import projection_sd
 from realsim_calibration.report import style
-from realsim_calibration.report.summary import Array
+from realsim_calibration.report.summary import Array, amount
 
 FIELD_ACROSS = 49
 """Points of the field along the image's width."""
@@ -143,8 +143,8 @@ def plot_depth_bias(report: DepthBiasReport) -> Any:
     right.plot(1e3 * z, 1e3 * np.array([v.unseen_m for v in used]), "o", ms=4, color=style.BLUE)
     right.axhline(0, color=style.MUTED, lw=0.7)
     right.set_title(
-        f"Views corrected by the others: {1e3 * report.held_out_m:.2f} mm RMS, "
-        f"{1e3 * report.uncorrected_m:.2f} before", pad=20,
+        f"Views corrected by the others: {amount(1e3 * report.held_out_m, 2, 'mm')} RMS, "
+        f"{amount(1e3 * report.uncorrected_m, 2, 'mm')} before", pad=20,
     )  # fmt: skip
     right.set_xlabel("distance [mm]")
     right.set_ylabel("error after correction [mm]")

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from realsim_calibration.report import style
-from realsim_calibration.report.summary import Array, rest_of_map
+from realsim_calibration.report.summary import Array, amount, rest_of_map
 from realsim_calibration.results import HandEyeReport
 
 CAMERA_AXES = ("x (right)", "y (down)", "z (forward)")
@@ -64,9 +64,8 @@ def plot_board(report: HandEyeReport) -> Any:
     figure = style.new_figure(3.6)
     left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
     board, points = report.board, report.target.points_board[:, :2]
-    low, high = points.min(0), points.max(0)
-    middle = (low + high) / 2
-    x, y = np.meshgrid(*(np.linspace(low[k], high[k], 61) - middle[k] for k in (0, 1)))
+    middle = (points.min(0) + points.max(0)) / 2
+    x, y = np.meshgrid(*(np.linspace(-half, half, 61) for half in board.half_sides_m))
     lift = 1e3 * _lift(report, x, y)
     most = max(0.01, float(np.abs(lift).max()))
     mm = 1e3 * (points - middle)
@@ -75,8 +74,8 @@ def plot_board(report: HandEyeReport) -> Any:
     left.plot(mm[:, 0], mm[:, 1], ".", ms=2, color=style.INK, alpha=0.55)
     style.color_bar(figure, surface, left, "out of the plane, into the paper [mm]")
     bent = np.any(board.sd[2:] != 0) or np.any(board.warp != 0)
-    left.set_title(f"Bend: up to {np.abs(lift).max():.2f} mm" if bent else "Bend: taken for flat")
-    _outline(right, report, high - low)
+    left.set_title(f"Bend: up to {board.warp_mm:.2f} mm" if bent else "Bend: taken for flat")
+    _outline(right, report, 2 * np.array(board.half_sides_m))
     for ax in (left, right):
         ax.set_aspect("equal")
         ax.invert_yaxis()
@@ -112,28 +111,35 @@ def _outline(ax: Any, report: HandEyeReport, size: Array) -> None:
     ax.margins(0.12)
 
 
+def _rms_text(values: Array, unit: str) -> str:
+    """Return the RMS of some numbers in words."""
+    mean = float(np.mean(values**2)) if len(values) else float("nan")
+    return amount(float(np.sqrt(mean)), 2, unit)
+
+
 def plot_robot(report: HandEyeReport) -> Any:
     """Plot the robot's error of every used view, as it is and after the map."""
     figure = style.new_figure(3.2)
     axes = figure.subplots(1, 2)
     used = report.used
     before = np.array([v.robot_error for v in used]).reshape(-1, 6)
-    rests = [rest for v in used if (rest := rest_of_map(report, v)) is not None]
+    rests = {n: rest for n, v in enumerate(used) if (rest := rest_of_map(report, v)) is not None}
+    known = list(rests)
     k = np.arange(len(used))
     for ax, part, factor, unit, name in (
         (axes[0], slice(3, 6), 1e3, "mm", "Position error of the hand"),
         (axes[1], slice(0, 3), 1e3, "mrad", "Orientation error of the hand"),
     ):
         total = factor * np.linalg.norm(before[:, part], axis=-1)
-        rms = float(np.sqrt(np.mean(total**2))) if len(total) else float("nan")
-        if len(rests) != len(used):
-            ax.bar(k, total, width=0.7, color=style.BLUE, label=f"whole, RMS {rms:.2f} {unit}")
+        whole = f"whole, RMS {_rms_text(total, unit)}"
+        if len(known) == 0:
+            ax.bar(k, total, width=0.7, color=style.BLUE, label=whole)
         else:
-            rest = factor * np.linalg.norm(np.array(rests).reshape(-1, 6)[:, part], axis=-1)
-            left = float(np.sqrt(np.mean(rest**2))) if len(rest) else float("nan")
-            ax.bar(k, total, width=0.8, color=style.PALE, label=f"whole, RMS {rms:.2f} {unit}")
-            ax.bar(k, rest, width=0.4, color=style.BLUE,
-                   label=f"left by the map, RMS {left:.2f} {unit}")  # fmt: skip
+            rest = factor * np.linalg.norm(np.array([rests[n] for n in known])[:, part], axis=-1)
+            some = "" if len(known) == len(used) else f" in {len(known)} views"
+            ax.bar(k, total, width=0.8, color=style.PALE, label=whole)
+            ax.bar(known, rest, width=0.4, color=style.BLUE,
+                   label=f"left by the map{some}, RMS {_rms_text(rest, unit)}")  # fmt: skip
         ax.set_title(name, pad=20)
         ax.set_ylabel(f"[{unit}]")
         ax.set_xlabel("view")
@@ -145,26 +151,34 @@ def plot_robot(report: HandEyeReport) -> Any:
     return figure
 
 
+def _shown_maps(report: HandEyeReport) -> tuple[tuple[str, float], ...]:
+    """Return the maps' scores that there is room for, the chosen one among them."""
+    shown = report.map_scores[:MOST_CANDIDATES]
+    chosen = tuple(s for s in report.map_scores[MOST_CANDIDATES:] if s[0] == report.map_name)
+    return (*shown[: len(shown) - len(chosen)], *chosen)
+
+
 def plot_choices(report: HandEyeReport) -> Any:
     """Plot how well every error map predicts unseen views, and where every closed form started."""
-    maps, starts = report.map_scores[:MOST_CANDIDATES], report.starts[:MOST_CANDIDATES]
+    maps, starts = _shown_maps(report), report.starts[:MOST_CANDIDATES]
     figure = style.new_figure(1.2 + 0.2 * max(4, len(maps), len(starts)))
     left, right = figure.subplots(1, 2)
-    chosen = min((s for _, s in maps), default=float("nan"))
-    for ax, pairs, title in (
-        (left, maps, "Error maps: unseen views, geometric mean"),
-        (right, starts, "Closed forms that the fit could start from"),
+    least = min((px for _, px in starts if np.isfinite(px)), default=float("nan"))
+    first = next((name for name, px in starts if px == least), "")
+    for ax, pairs, dark, title in (
+        (left, maps, report.map_name, "Error maps: unseen views, geometric mean"),
+        (right, starts, first, "Closed forms that the fit could start from"),
     ):
         values = [v for _, v in pairs]
         if not len(style.finite(values)):
             style.empty_axes(ax, "none was tried")
             continue
-        best = chosen if ax is left else min(style.finite(values))
         most = float(style.finite(values).max())
-        for k, value in enumerate(values):
-            color = style.BLUE if value == best else style.PALE
+        for k, (name, value) in enumerate(pairs):
+            color = style.BLUE if name == dark else style.PALE
             ax.barh(k, value if np.isfinite(value) else 0.0, height=0.7, color=color)
             words = f"{value:.3g}" if np.isfinite(value) else "failed"
+            words += ", chosen" if name == dark and ax is left else ""
             ax.text((value if np.isfinite(value) else 0.0) + most * 0.01, k, words, va="center",
                     fontsize=7.5, color=style.INK)  # fmt: skip
         ax.set_yticks(range(len(pairs)), [style.short_label(n) for n, _ in pairs])

@@ -28,8 +28,10 @@ from realsim_calibration.report import (
 )
 from realsim_calibration.report.residual_plots import Images
 from realsim_calibration.report.summary import (
+    NOT_KNOWN,
     Judgement,
     accuracy_rows,
+    amount,
     carrier,
     check_rows,
     pose_rows,
@@ -150,18 +152,17 @@ def _verdict_section(page: _Page, report: HandEyeReport) -> None:
     """Say in one sentence what to do, then show figures and checks."""
     page.parts.append(_banner(verdict(report)))
     cards = [
-        (f"{report.held_out_px:.2f} px", "error of unseen views"),
-        (f"{report.held_out_mm:.2f} mm", "the same, as a distance"),
-        (f"{report.held_out_deg:.3f}°", "the same, as an angle"),
-        (f"± {report.sigma_mm:.2f} mm", "camera's place, 1 sigma"),
-        (f"± {report.sigma_deg:.3f}°", "camera's rotation, 1 sigma"),
+        (amount(report.held_out_px, 2, "px"), "error of unseen views"),
+        (amount(report.held_out_mm, 2, "mm"), "the same, as a distance"),
+        (amount(report.held_out_deg, 3, "deg"), "the same, as an angle"),
+        (f"± {amount(report.sigma_mm, 2, 'mm')}", "camera's place, 1 sigma"),
+        (f"± {amount(report.sigma_deg, 3, 'deg')}", "camera's rotation, 1 sigma"),
         (f"{len(report.used)} / {len(report.views)}", "views used / given"),
     ]
     page.parts.append(
         '<div class="cards">'
         + "".join(
-            f'<div class="card"><b>{html.escape(value.replace("nan", "?"))}</b>'
-            f"<span>{html.escape(what)}</span></div>"
+            f'<div class="card"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>'
             for value, what in cards
         )
         + "</div>"
@@ -243,25 +244,28 @@ def _model_section(page: _Page, report: HandEyeReport) -> None:
     )  # fmt: skip
     page.section("The robot's errors")
     if report.used:
+        bare = sum(v.joints is None for v in report.used)
+        unknown = f" The joints of {bare} views are not known." if bare else ""
         text = (
             "No error map predicts unseen views better than the controller's own poses."
             if report.robot_map is None
-            else "The map knows the arm's lengths and angles; it needs the joints."
+            else "The map knows the arm's lengths and angles; it needs the joints." + unknown
             if isinstance(report.robot_map, ArmErrorMap)
             else "The map is an interpolator: outside of the calibrated region it is a guess."
         )
         page.picture("robot.png", lambda: model_plots.plot_robot(report), text)
     if report.joint_offsets is not None:
         rows = [
-            [f"joint {k + 1}", f"{v:+.3f} ± {sd:.3f}"]
+            [f"joint {k + 1}", f"{v:+.3f} ± {amount(sd, 3)}" if np.isfinite(v) else NOT_KNOWN]
             for k, (v, sd) in enumerate(np.degrees(report.joint_offsets))
         ]
         page.table(["zero offset", "[deg]"], rows)
     if report.map_scores or report.starts:
         page.picture(
             "choices.png", lambda: model_plots.plot_choices(report),
-            "Dark: the smallest. Left: which error map predicts unseen views best. Right: every "
-            "closed form before the joint fit.",
+            "Left: how well every error map predicts unseen views; dark: the chosen one, which must be "
+            "better by more than its noise. "
+            "Right: every closed form before the joint fit; dark: the smallest.",
         )  # fmt: skip
 
 
@@ -299,7 +303,12 @@ def _lens_section(
         page.table(
             ["lens model", "unseen [px]", "seen [px]", ""],
             [
-                [m.model, f"{m.held_out_px:.3f}", f"{m.seen_px:.3f}", "chosen" if m.chosen else ""]
+                [
+                    m.model,
+                    amount(m.held_out_px, 3),
+                    amount(m.seen_px, 3),
+                    "chosen" if m.chosen else "",
+                ]
                 for m in intrinsics_report.held_out
             ],
         )
@@ -316,7 +325,7 @@ def _lens_column(i: CameraIntrinsics, covariance: NDArray[np.float64]) -> list[s
     sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     values = [i.fx, i.fy, i.cx, i.cy, *i.distortion]
     return [
-        f"{v:.6g} ± {s:.2g}" if s > 0 else f"{v:.6g} (held)"
+        f"{v:.6g} (held)" if s == 0 else f"{v:.6g} ± {s:.2g}" if s > 0 else f"{v:.6g} ± {NOT_KNOWN}"
         for v, s in zip(values, sd, strict=True)
     ]
 
@@ -349,17 +358,20 @@ def _appendix(page: _Page, report: HandEyeReport) -> None:
     for v in report.views:
         p = viewpoint(report, v)
         figures = [
-            f"{v.seen_px:.3f}", f"{v.unseen_px:.3f}", f"{v.unseen_mm:.3f}", f"{v.unseen_deg:.4f}"
-        ]  # fmt: skip
+            amount(v.seen_px, 3),
+            amount(v.unseen_px, 3),
+            amount(v.unseen_mm, 3),
+            amount(v.unseen_deg, 4),
+        ]
         rows.append(
             [
                 v.label,
                 str(v.index),
                 str(len(v.uv)),
                 *(figures if v.used else ["-"] * 4),
-                f"{1e3 * p.distance_m:.0f}",
-                f"{p.tilt_deg:.0f}",
-                f"{p.roll_deg:.0f}",
+                amount(1e3 * p.distance_m, 0),
+                amount(p.tilt_deg, 0),
+                amount(p.roll_deg, 0),
                 "" if v.used else f"dropped: {v.reason}",
             ]
         )
@@ -376,6 +388,7 @@ def _appendix(page: _Page, report: HandEyeReport) -> None:
         (f"T_{what}_cam{suffix} [m]", report.X),
         (f"T_{what}_cam without a map, for other programs [m]", report.X_alone),
         (f"T_{other}_board [m]", report.Z),
+        (f"T_{other}_board that belongs to the camera without a map [m]", report.Z_alone),
     ):
         text = np.array2string(np.asarray(T), precision=9, suppress_small=True, separator=", ")
         page.parts.append(f"<pre>{html.escape(name)}\n{html.escape(text)}</pre>")

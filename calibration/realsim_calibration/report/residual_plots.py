@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim_calibration.report import style
-from realsim_calibration.report.summary import Array
+from realsim_calibration.report.summary import Array, amount
 from realsim_calibration.results import HandEyeReport, ViewReport
 
 Images = Callable[[int], NDArray[np.uint8] | None]
@@ -99,8 +99,11 @@ def plot_worst_views(
             ax, view.uv, view.residuals, width_px, color=style.BAD, width=0.005
         )
         ax.plot(view.uv[:, 0], view.uv[:, 1], ".", ms=2, color=style.INK)
-        ax.set_title(style.short_label(view.label), fontsize=8.5)
-        ax.set_xlabel(f"unseen {view.unseen_px:.2f} px; arrows {factor:g} times{note}", fontsize=8)
+        ax.set_title(style.view_label(view.label, view.index), fontsize=8.5)
+        ax.set_xlabel(
+            f"unseen {amount(view.unseen_px, 2, 'px')}; arrows {factor:g} times{note}",
+            fontsize=8,
+        )
         ax.set_ylabel("")
     return figure
 
@@ -157,7 +160,7 @@ def plot_views(report: HandEyeReport) -> Any:
             ax.barh(k, largest, height=0.72, color=style.BAD, alpha=0.13)
             reason = style.short_label(f"dropped: {v.reason}", 120)
             ax.text(largest * 0.008, k, reason, va="center", fontsize=7, color=style.BAD)
-    ax.set_yticks(range(len(shown)), [style.short_label(v.label) for v in shown])
+    ax.set_yticks(range(len(shown)), [style.view_label(v.label, v.index) for v in shown])
     for tick, v in zip(ax.get_yticklabels(), shown, strict=True):
         tick.set_color(style.INK if v.used else style.BAD)
     ax.set_ylim(len(shown) - 0.4, -0.6)
@@ -166,7 +169,7 @@ def plot_views(report: HandEyeReport) -> Any:
     handles = {
         "predicted without this view": Patch(color=style.PALE),
         "fitted with it": Patch(color=style.BLUE),
-        f"RMS of all unseen, {report.held_out_px:.2f} px": line,
+        f"RMS of all unseen, {amount(report.held_out_px, 2, 'px')}": line,
     }
     left_out = len(report.views) - len(shown)
     more = f", {left_out} better ones are in the table below" if left_out else ""

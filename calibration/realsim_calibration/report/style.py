@@ -1,9 +1,10 @@
 """How the pictures of a calibration look: one paper, one ink, colours that the colour-blind see."""
 
 import io
-import warnings
+import unicodedata
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from typing import Any, cast
 
 import numpy as np
@@ -23,7 +24,12 @@ PAGE_WIDTH_IN = 10.4
 """Width of a picture that fills the page [inch]."""
 LABEL_LENGTH = 26
 """Characters of a file name beside a bar."""
+FONT = "DejaVu Sans"
+"""matplotlib's own font, the same on every machine; it has no Chinese, Japanese or Korean."""
+NOT_DRAWN = "?"
+"""Stands for a letter that the font lacks and that has no Latin form."""
 SETTINGS: dict[str, Any] = {
+    "font.family": FONT,
     "font.size": 8.5,
     "axes.titlesize": 9.5,
     "axes.titlelocation": "left",
@@ -55,9 +61,7 @@ def paper_style() -> Generator[None]:
     """Draw what is drawn inside in the report's style."""
     from matplotlib import rc_context
 
-    with rc_context(cast(Any, SETTINGS)), warnings.catch_warnings():
-        # A file name in a script that the font lacks is drawn as boxes, which is no news.
-        warnings.filterwarnings("ignore", message="Glyph .* missing")
+    with rc_context(cast(Any, SETTINGS)):
         yield
 
 
@@ -75,9 +79,37 @@ def png_bytes(figure: Any) -> bytes:
     return buffer.getvalue()
 
 
+@cache
+def _font_letters() -> frozenset[int]:
+    """Return the characters that the font can draw."""
+    from matplotlib.font_manager import findfont, get_font
+
+    return frozenset(get_font(findfont(FONT)).get_charmap())
+
+
+def drawable(text: str) -> str:
+    """Return a text with letters that the font lacks in their Latin form, or as "?"."""
+    letters = _font_letters()
+    drawn: list[str] = []
+    for c in text:
+        if ord(c) in letters or not c.isprintable():
+            drawn.append(c)
+            continue
+        plain = unicodedata.normalize("NFKD", c).encode("ascii", "ignore").decode()
+        drawn.append(plain or NOT_DRAWN)
+    return "".join(drawn)
+
+
+def view_label(label: str, index: int) -> str:
+    """Return how a picture names a view: its label, or its index where that cannot be drawn."""
+    drawn = drawable(label)
+    lost = drawn.count(NOT_DRAWN) > label.count(NOT_DRAWN)
+    return f"view {index}" if lost else short_label(drawn)
+
+
 def short_label(text: str, length: int = LABEL_LENGTH) -> str:
-    """Return a name on one line, its middle left out where it is long."""
-    line = "".join(c if c.isprintable() else " " for c in " ".join(text.split()))
+    """Return a name on one line that can be drawn, its middle left out where it is long."""
+    line = drawable("".join(c if c.isprintable() else " " for c in " ".join(text.split())))
     if len(line) <= length:
         return line
     tail = (length - 1) // 2

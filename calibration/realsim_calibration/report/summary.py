@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import metrics, se3
-from realsim.records import Check, RobotErrorMap
-from realsim_calibration.export_frames import quaternion_xyzw, roll_pitch_yaw
+from realsim.records import ArmErrorMap, Check, RobotErrorMap
+from realsim_calibration.exports.frames import quaternion_xyzw, roll_pitch_yaw
 from realsim_calibration.results import HandEyeReport, ViewReport
 
 Array = NDArray[np.float64]
 Verdict = Literal["good", "warn", "bad", "unknown"]
+NOT_KNOWN = "not known"
 WORST_FIRST: tuple[Verdict, ...] = ("bad", "warn", "unknown", "good")
 
 
@@ -28,6 +29,11 @@ class Judgement:
     """Why."""
 
 
+def amount(value: float, digits: int, unit: str = "") -> str:
+    """Return a number with its unit, "not known" where it is none."""
+    return f"{value:.{digits}f} {unit}".strip() if np.isfinite(value) else NOT_KNOWN
+
+
 def worst_first(checks: Sequence[Check]) -> list[Check]:
     """Return checks, worst first, else in their own order."""
     return sorted(checks, key=lambda c: WORST_FIRST.index(c.verdict))
@@ -40,8 +46,8 @@ def verdict(report: HandEyeReport) -> Judgement:
     warn = [c for c in checks if c.verdict == "warn"]
     unknown = [c for c in checks if c.verdict == "unknown"]
     figures = (
-        f"Views that it had not seen are predicted within {report.held_out_px:.2f} px, "
-        f"{report.held_out_mm:.2f} mm and {report.held_out_deg:.3f} deg (RMS)."
+        f"Views that it had not seen are predicted within {amount(report.held_out_px, 2, 'px')}, "
+        f"{amount(report.held_out_mm, 2, 'mm')} and {amount(report.held_out_deg, 3, 'deg')} (RMS)."
         if np.isfinite(report.held_out_px)
         else "How well it predicts views that it had not seen is not known."
     )
@@ -99,7 +105,9 @@ def pose_rows(report: HandEyeReport) -> list[list[str]]:
     # The covariance is that of a right perturbation: along the camera's axes.
     in_carrier = X[:3, :3] @ report.X_covariance[3:, 3:] @ X[:3, :3].T
     sd = 1e3 * np.sqrt(np.diag(in_carrier))
-    place = [f"{a} {1e3 * v:.3f} ± {s:.3f}" for a, v, s in zip("xyz", X[:3, 3], sd, strict=True)]
+    place = [
+        f"{a} {1e3 * v:.3f} ± {amount(s, 3)}" for a, v, s in zip("xyz", X[:3, 3], sd, strict=True)
+    ]
     q = ", ".join(f"{v:.6f}" for v in quaternion_xyzw(X))
     rpy = ", ".join(f"{np.degrees(v):.3f}" for v in roll_pitch_yaw(X[:3, :3]))
     rows = [
@@ -136,27 +144,29 @@ def looks_along(report: HandEyeReport) -> str:
 def accuracy_rows(report: HandEyeReport) -> list[list[str]]:
     """Return the rows that say how good the calibration is."""
     ratio = report.held_out_px / report.seen_px if report.seen_px > 0 else float("nan")
+    compared = f"; unseen / seen = {ratio:.2f}" if np.isfinite(ratio) else ""
     return [
         [
             "unseen views (each predicted without it)",
-            f"{report.held_out_px:.3f} px, {report.held_out_mm:.3f} mm, "
-            f"{report.held_out_deg:.4f} deg RMS",
+            f"{amount(report.held_out_px, 3, 'px')}, {amount(report.held_out_mm, 3, 'mm')}, "
+            f"{amount(report.held_out_deg, 4, 'deg')} RMS",
         ],
-        ["seen views (in-sample)", f"{report.seen_px:.3f} px RMS; unseen / seen = {ratio:.2f}"],
-        ["what a perfect calibration of this kind leaves", f"{report.floor_px:.3f} px"],
-        ["corner noise", f"{report.sigma_px:.3f} px"],
+        ["seen views (in-sample)", f"{amount(report.seen_px, 3, 'px')} RMS{compared}"],
+        ["what a perfect calibration of this kind leaves", amount(report.floor_px, 3, "px")],
+        ["corner noise", amount(report.sigma_px, 3, "px")],
         ["views used, dropped", f"{len(report.used)}, {len(report.rejected)}"],
-        ["roll about the optical axis", f"{report.roll_range_deg:.0f} deg"],
+        ["roll about the optical axis", amount(report.roll_range_deg, 0, "deg")],
     ]
 
 
 def summary_rows(report: HandEyeReport) -> list[list[str]]:
     """Return (figure, value) rows for a table in the terminal."""
     b = report.board
+    size = f"{b.scale:.5f} " + (f"± {amount(b.sd[0], 5)}" if b.sd[0] != 0 else "(held)")
     return [
         *pose_rows(report),
         *accuracy_rows(report),
-        ["target's scale", f"{b.scale:.5f} ± {b.sd[0]:.5f}, warp {b.warp_mm:.2f} mm"],
+        ["target's scale", f"{size}, warp {amount(b.warp_mm, 2, 'mm')}"],
     ]
 
 
@@ -172,25 +182,33 @@ def camera_in_board(report: HandEyeReport, view: ViewReport) -> Array:
 
 
 def corrected(report: HandEyeReport, view: ViewReport) -> Array:
-    """Return T_base_ee (4, 4) [m] of a view, the error that a map of poses knows taken out.
+    """Return T_base_ee (4, 4) [m] of a view, the error that the map knows taken out.
 
-    A map of the arm needs joints, which a view's report does not have: the controller's pose is
-    returned, millimetres off, which is enough to draw it.
+    A map of the arm needs joints: of a view without any the controller's pose is returned,
+    millimetres off, which is enough to draw it.
     """
+    known = _mapped(report, view)
+    return np.asarray(view.T_base_ee) if known is None else known
+
+
+def _mapped(report: HandEyeReport, view: ViewReport) -> Array | None:
+    """Return where the map says that the hand is (4, 4) [m]; None where it says nothing."""
     if isinstance(report.robot_map, RobotErrorMap):
         return report.robot_map.corrected(view.T_base_ee)
-    return np.asarray(view.T_base_ee)
+    if isinstance(report.robot_map, ArmErrorMap) and view.joints is not None:
+        return report.robot_map.corrected(view.T_base_ee, view.joints)
+    return None
 
 
 def rest_of_map(report: HandEyeReport, view: ViewReport) -> Array | None:
-    """Return the robot's error (6,) that a map of poses leaves, rotation first [rad, m].
+    """Return the robot's error (6,) that the map leaves, rotation first [rad, m].
 
-    None where there is no such map.
+    None where there is no map, or one of the arm and the view's joints are not known.
     """
-    if not isinstance(report.robot_map, RobotErrorMap):
+    mapped = _mapped(report, view)
+    if mapped is None:
         return None
-    known = se3.exp(report.robot_map.twist(view.T_base_ee))
-    return se3.log(se3.invert(known) @ se3.exp(view.robot_error))
+    return se3.log(se3.invert(mapped) @ view.T_base_ee @ se3.exp(view.robot_error))
 
 
 def board_middle(report: HandEyeReport) -> Array:

@@ -1,7 +1,8 @@
 """What an exported calibration says of itself: frames, the transform, accuracy, warnings.
 
-Other programs know no robot error map, so what they get is `X_alone`: the camera's place fitted
-without one. The camera frame is always the OPTICAL one (x right, y down, z forward), unless a
+Other programs know no robot error map, so what they get is `X_alone`, the camera's place fitted
+without one, with `Z_alone` and `intrinsics_alone` of the same fit: numbers of two fits do not fit
+one another. The camera frame is always the OPTICAL one (x right, y down, z forward), unless a
 `camera_link` is asked for.
 """
 
@@ -21,6 +22,8 @@ Array = NDArray[np.float64]
 FRAME_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_.\-]*(/[A-Za-z0-9_.\-]+)*")
 """What tf2 takes for a frame: no spaces, no leading slash."""
 FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*")
+NO_MAP = "none"
+"""Name of the fit without a map in `map_scores`."""
 LOCK_COSINE = 1e-12
 """Cosine of the pitch below which roll and yaw turn about the same axis."""
 
@@ -126,9 +129,27 @@ def _accuracy_line(report: HandEyeReport) -> str:
     if not np.isfinite(report.held_out_px):
         return "WARNING: how well it predicts views that it had not seen is not known."
     through = " and its error map" if report.robot_map is not None else ""
-    return (
+    line = (
         f"Views that the fit had not seen: {report.held_out_px:.2f} px, {report.held_out_mm:.2f} "
         f"mm, {report.held_out_deg:.3f} deg RMS, through the robot's own pose{through}."
+    )
+    scores = dict(report.map_scores)
+    bare, best = scores.get(NO_MAP, np.nan), scores.get(report.map_name, np.nan)
+    if report.robot_map is None or not np.isfinite(bare) or not np.isfinite(best):
+        return line
+    return (
+        f"{line} Without the map, as exported here: {bare:.2f} px where the map has {best:.2f} px "
+        "(geometric mean over the views)."
+    )
+
+
+def fit_line(report: HandEyeReport) -> str:
+    """Return which fit the camera's and the target's numbers of an export belong to."""
+    if report.robot_map is None:
+        return "Camera matrix, distortion, and the target's place belong to this hand-eye: one fit."
+    return (
+        "Camera matrix, distortion, and the target's place belong to the hand-eye fitted WITHOUT "
+        "the robot's error map: do not mix them with those of calibration.json that need the map."
     )
 
 

@@ -16,12 +16,12 @@ from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check, RobotErrorMap, Target
 from realsim.records.checked_arrays import frozen, rigid
 from realsim.store import atomic
-from realsim_calibration.export_frames import FrameNames, parent_frame, quaternion_xyzw
+from realsim_calibration.exports.frames import FrameNames, parent_frame, quaternion_xyzw
 from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
 
 Array = NDArray[np.float64]
 SCHEMA = "realsim.calibration"
-VERSION = 1
+VERSION = 2
 ROW_LENGTH = 10
 """Numbers up to which a list of rows is written one row a line."""
 SAME_ROTATION = 1e-6
@@ -109,7 +109,8 @@ def _document(report: HandEyeReport, frames: FrameNames) -> dict[str, Any]:
         "X_alone": _transform(
             report.X_alone, parent, cam, "without a map", report.X_alone_covariance
         ),
-        "Z": _transform(report.Z, other, frames.target, "as it is", None),
+        "Z": _transform(report.Z, other, frames.target, "together with X", None),
+        "Z_alone": _transform(report.Z_alone, other, frames.target, "together with X_alone", None),
         "accuracy": {
             "seen_px": report.seen_px,
             "held_out_px": report.held_out_px,
@@ -124,12 +125,18 @@ def _document(report: HandEyeReport, frames: FrameNames) -> dict[str, Any]:
         },
         "checks": [dataclasses.asdict(c) for c in report.checks],
         "intrinsics": {
+            "use": "together with X",
             **dataclasses.asdict(report.intrinsics),
             "covariance": report.intrinsics_covariance,
+        },
+        "intrinsics_alone": {
+            "use": "together with X_alone",
+            **dataclasses.asdict(report.intrinsics_alone),
         },
         "target": {"type": type(report.target).__name__, **dataclasses.asdict(report.target)},
         "board": {**dataclasses.asdict(report.board), "warp_mm": report.board.warp_mm},
         "robot_map": _map_entries(report.robot_map),
+        "map_name": report.map_name,
         "map_scores": [list(pair) for pair in report.map_scores],
         "joint_offsets": report.joint_offsets,
         "starts": [list(pair) for pair in report.starts],
@@ -306,10 +313,13 @@ def _report(d: _Entry) -> HandEyeReport:
         Z=_read_transform(d.part("Z")),
         X_alone=_read_transform(d.part("X_alone")),
         X_alone_covariance=d.part("X_alone").array("covariance", (6, 6)),
+        Z_alone=_read_transform(d.part("Z_alone")),
+        intrinsics_alone=_intrinsics(d.part("intrinsics_alone")),
         intrinsics=_intrinsics(d.part("intrinsics")),
         intrinsics_covariance=d.part("intrinsics").array("covariance", (12, 12)),
         board=_board(d.part("board")),
         robot_map=None if d.raw("robot_map") is None else _map(d.part("robot_map")),
+        map_name=d.text("map_name"),
         map_scores=d.scores("map_scores"),
         joint_offsets=None if offsets is None else d.array("joint_offsets", (6, 2)),
         views=tuple(_view(v) for v in d.parts("views")),
@@ -348,12 +358,14 @@ def _intrinsics(d: _Entry) -> CameraIntrinsics:
 
 def _board(d: _Entry) -> BoardShape:
     """Return the target's shape."""
+    sides = d.array("half_sides_m", (2,))
     return BoardShape(
         scale=d.number("scale"),
         aspect=d.number("aspect"),
         warp=d.array("warp", (3,)),
         sd=d.array("sd", (5,)),
         half_extent_m=d.number("half_extent_m"),
+        half_sides_m=(float(sides[0]), float(sides[1])),
     )
 
 
@@ -398,13 +410,18 @@ def _check(d: _Entry) -> Check:
 def _view(d: _Entry) -> ViewReport:
     """Return one view."""
     T = rigid(d.array("T_base_ee", (4, 4)), f"{d.where}: 'T_base_ee'")
+    ids, uv = d.integers("point_ids"), d.array("uv", (None, 2))
+    if len(ids) != len(uv):
+        raise d.wrong("point_ids", f"has {len(ids)} numbers for {len(uv)} points")
     return ViewReport(
         index=d.integer("index"),
         label=d.text("label"),
         used=bool(d.raw("used")),
         reason=d.text("reason"),
         T_base_ee=T,
-        uv=d.array("uv", (None, 2)),
+        joints=None if d.raw("joints") is None else d.array("joints", (6,)),
+        point_ids=np.array(ids, dtype=np.int64),
+        uv=uv,
         residuals=d.array("residuals", (None, 2)),
         seen_px=d.number("seen_px"),
         unseen_px=d.number("unseen_px"),

@@ -6,9 +6,11 @@ import shlex
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim_calibration.export_frames import (
+from realsim import __version__
+from realsim_calibration.exports.frames import (
     FrameNames,
     comments,
+    fit_line,
     note_lines,
     number,
     published_transform,
@@ -181,8 +183,11 @@ def ros2_launch_text(report: HandEyeReport, frames: FrameNames) -> str:
 
 
 def camera_info_text(report: HandEyeReport, frames: FrameNames) -> str:
-    """Return the camera as ROS's camera_info_manager reads it (raw image, rectification = 1)."""
-    i = report.intrinsics
+    """Return the camera as ROS's camera_info_manager reads it (raw image, rectification = 1).
+
+    It is intrinsics_alone: the published transform is X_alone, and the two were fitted together.
+    """
+    i = report.intrinsics_alone
     rational = bool(np.any(i.distortion[5:] != 0))
     d = i.distortion if rational else i.distortion[:5]
     P = np.concatenate([i.K, np.zeros((3, 1))], -1)
@@ -192,8 +197,14 @@ def camera_info_text(report: HandEyeReport, frames: FrameNames) -> str:
         return f"{name}:\n  rows: {M.shape[0]}\n  cols: {M.shape[1]}\n  data: [{values}]\n"
 
     return (
-        "# The camera as calibrated together with the hand-eye. Pixels; integer pixels are pixel\n"
-        f"# centres. The image's frame is {frames.camera_optical}.\n"
+        comments(
+            (
+                f"Camera of a hand-eye calibration by realsim {__version__}. Pixels; integer "
+                "pixels are pixel centres.",
+                f"The image's frame is {frames.camera_optical}.",
+                fit_line(report),
+            )
+        )
         + f'image_width: {i.width}\nimage_height: {i.height}\ncamera_name: "{frames.name}"\n'
         + matrix("camera_matrix", i.K)
         + f"distortion_model: {'rational_polynomial' if rational else 'plumb_bob'}\n"

@@ -1,0 +1,78 @@
+"""The whole calibration of a set of views: lens, then hand-eye; from images, or from poses alone."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from realsim.geometry.dh import DhArm
+from realsim.records import CameraIntrinsics, Check, Target
+from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
+from realsim_calibration.intrinsics import calibrate_intrinsics
+from realsim_calibration.lens_fit import IntrinsicsConfig
+from realsim_calibration.lens_report import IntrinsicsReport
+from realsim_calibration.results import HandEyeReport
+from realsim_calibration.views import BoardView
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CalibrationConfig:
+    """Everything a calibration may be told."""
+
+    hand_eye: HandEyeConfig = field(default_factory=HandEyeConfig)
+    intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
+    own_focal_sd: float = 0.1
+    """Prior of the focal length in the hand-eye fit around an own calibration of the same views,
+    relative: hardly any, since these views say it themselves."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Calibration:
+    """A calibrated camera on a robot."""
+
+    hand_eye: HandEyeReport
+    lens: IntrinsicsReport | None
+    """The camera's own calibration from the same views; None where a given camera was used."""
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """Every check of both."""
+        lens = () if self.lens is None else self.lens.checks
+        return (*self.hand_eye.checks, *lens)
+
+
+def calibrate(
+    views: Sequence[BoardView],
+    target: Target,
+    *,
+    intrinsics0: CameraIntrinsics | None = None,
+    arm: DhArm | None = None,
+    config: CalibrationConfig | None = None,
+) -> Calibration:
+    """Return lens and hand-eye of a set of views.
+
+    Args:
+        views: views of a target that stands still (or sits in the hand), in any order.
+        target: the printed target.
+        intrinsics0: a camera known beforehand (the factory's); without it the lens is calibrated
+            from the same views first.
+        arm: the arm's kinematics; with the views' joints its errors are modelled.
+        config: gates, priors, steps, and where the camera sits.
+
+    Raises:
+        InputError: wrong conventions, mixed-up views, images of several sizes, another target.
+        UnitError: hand poses or target in the wrong unit.
+        DegenerateError: the views do not determine lens or hand-eye; says what to add.
+    """
+    config = config or CalibrationConfig()
+    lens: IntrinsicsReport | None = None
+    hand_eye = config.hand_eye
+    camera = intrinsics0
+    if camera is None:
+        ordered = sorted(views, key=lambda v: v.index)
+        detections = [v.detection for v in ordered]
+        lens = calibrate_intrinsics(
+            detections, target, names=[v.label for v in ordered], config=config.intrinsics
+        )
+        camera = lens.intrinsics
+        hand_eye = replace(hand_eye, joint=replace(hand_eye.joint, focal_sd=config.own_focal_sd))
+    report = calibrate_hand_eye_report(views, target, camera, hand_eye, arm)
+    return Calibration(hand_eye=report, lens=lens)

@@ -1,0 +1,71 @@
+"""All files of a calibration at once.
+
+What other programs get is `X_alone` with the camera and the target's place that belong to it, see
+`frames`; X with the robot's error map is in `calibration.json` only (`calibration_file`).
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.store import atomic
+from realsim_calibration.exports import ros
+from realsim_calibration.exports.calibration_file import write_calibration
+from realsim_calibration.exports.frames import FrameNames, fit_line, note_lines, parent_frame
+from realsim_calibration.exports.opencv import opencv_text
+from realsim_calibration.results import HandEyeReport
+
+Array = NDArray[np.float64]
+
+
+def npz_arrays(report: HandEyeReport, frames: FrameNames) -> dict[str, Array | NDArray[np.str_]]:
+    """Return the arrays of `calibration.npz`: transforms [m], covariances rotation first [rad, m].
+
+    `T_parent_cam` is X_alone, `T_target_parent_board` Z_alone, `K` and `distortion` those of
+    intrinsics_alone: one fit, without an error map. `parent`, `cam` and `target_parent` are the
+    names of the frames.
+    """
+    camera = report.intrinsics_alone
+    target_parent = frames.robot_base if report.mode == "eye_in_hand" else frames.hand
+    return {
+        "T_parent_cam": np.asarray(report.X_alone),
+        "T_parent_cam_covariance": np.asarray(report.X_alone_covariance),
+        "T_target_parent_board": np.asarray(report.Z_alone),
+        "K": camera.K,
+        "distortion": np.asarray(camera.distortion),
+        "image_size": np.array([camera.width, camera.height], dtype=float),
+        "mode": np.array(report.mode),
+        "parent": np.array(parent_frame(report, frames)),
+        "cam": np.array(frames.camera_optical),
+        "target_parent": np.array(target_parent),
+        "notes": np.array((*note_lines(report, frames), fit_line(report))),
+    }
+
+
+def write_exports(report: HandEyeReport, folder: Path | str, *, frames: FrameNames) -> list[Path]:
+    """Write the calibration in every format and return the files; each is whole or not there.
+
+    Args:
+        report: the calibration.
+        folder: where to write; made where needed, files of the same names are replaced.
+        frames: how the frames are called in the programs that will read it.
+    """
+    folder = Path(folder)
+    texts: dict[str, Callable[[HandEyeReport, FrameNames], str]] = {
+        f"easy_handeye2/{frames.name}.calib": ros.easy_handeye2_text,
+        f"easy_handeye/{frames.name}.yaml": ros.easy_handeye_text,
+        "ros2_static_transform.sh": ros.ros2_script,
+        "ros1_static_transform.sh": ros.ros1_script,
+        "camera_pose.launch.py": ros.ros2_launch_text,
+        "camera.urdf": ros.urdf_text,
+        "camera_info.yaml": ros.camera_info_text,
+        "opencv.yml": opencv_text,
+    }
+    written = [write_calibration(report, folder / "calibration.json", frames=frames)]
+    for name, text in texts.items():
+        atomic.write_text(folder / name, text(report, frames))
+        written.append(folder / name)
+    atomic.write_npz(folder / "calibration.npz", **npz_arrays(report, frames))
+    return [*written, folder / "calibration.npz"]

@@ -1,0 +1,496 @@
+"""Every kind of target on rendered pictures, whose true points are known."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import camera, se3
+from realsim.records import CameraIntrinsics
+from realsim.records.targets import TAG_CELLS, CharucoBoard, Chessboard, CircleGrid, TagBoard
+from realsim_calibration.detect.ellipses import outline_bias
+from realsim_calibration.detect.find import find_target
+from realsim_calibration.detect.homography import (
+    apply_homography,
+    fit_homography,
+    seen_from_front,
+)
+from realsim_calibration.detect.lattice import grow_lattice, lay_pattern
+from realsim_calibration.detect.saddles import grid_arms, refine_saddles
+from realsim_calibration.detect.visible import explain_missing, what_is_visible
+
+CAMERA = CameraIntrinsics(width=640, height=480, fx=600.0, fy=600.0, cx=319.5, cy=239.5)
+PER_M, MARGIN, SUPER = 8000.0, 240, 6  # page pixels per metre and about the target, rays a pixel
+TARGETS = {
+    "tags": TagBoard(rows=3, columns=4, tag_size_m=0.032, gap_m=0.008),
+    "tag25h9": TagBoard(rows=2, columns=3, tag_size_m=0.035, gap_m=0.01, family="tag25h9"),
+    "tag36h10": TagBoard(rows=2, columns=3, tag_size_m=0.04, gap_m=0.01, family="tag36h10"),
+    "tag16h5": TagBoard(rows=3, columns=3, tag_size_m=0.03, gap_m=0.01, family="tag16h5"),
+    "kalibr": TagBoard(
+        rows=3, columns=3, tag_size_m=0.04, gap_m=0.012, ids_from="bottom", corner_squares=True
+    ),
+    "one tag": TagBoard(rows=1, columns=1, tag_size_m=0.064, gap_m=0.02, first_id=7),
+    "charuco": CharucoBoard(rows=5, columns=7, square_m=0.025, marker_m=0.018),
+    "charuco old": CharucoBoard(
+        rows=6, columns=7, square_m=0.025, marker_m=0.018, dictionary="DICT_5X5_100", legacy=True
+    ),
+    "chessboard": Chessboard(rows=6, columns=7, square_m=0.02),
+    "circles": CircleGrid(rows=5, columns=7, pitch_m=0.025, large_origin=True),
+    "square circles": CircleGrid(rows=6, columns=6, pitch_m=0.025, large_origin=True),
+    "asymmetric": CircleGrid(rows=7, columns=4, pitch_m=0.02, asymmetric=True),
+}  # fmt: skip
+
+
+def page_of(target, border=1, turned=0):
+    """Return the printed page (0 ink, 255 paper); the board's origin is at pixel edge MARGIN."""
+    from cv2 import aruco
+
+    extent = np.ceil(np.ptp(target.points_board[:, :2], axis=0) * PER_M).astype(int)
+    edge = getattr(target, "square_m", 0.0) * PER_M
+    w, h = extent + 2 * MARGIN + round(2 * edge)
+    page = np.full((h, w), 255, np.uint8)
+    if isinstance(target, TagBoard):
+        dictionary = aruco.getPredefinedDictionary(
+            getattr(aruco, "DICT_APRILTAG_" + target.family[3:])
+        )
+        size, gap = round(target.tag_size_m * PER_M), round(target.gap_m * PER_M)
+        cells = TAG_CELLS[target.family] + 2 * (border - 1)
+        for row in range(target.rows):
+            for column in range(target.columns):
+                number = target.rows - 1 - row if target.ids_from == "bottom" else row
+                tag = target.first_id + number * target.columns + column
+                code = aruco.generateImageMarker(dictionary, tag, cells, borderBits=border)
+                share = np.arange(size) * cells // size
+                y, x = MARGIN + row * (size + gap), MARGIN + column * (size + gap)
+                page[y : y + size, x : x + size] = np.rot90(code, turned)[np.ix_(share, share)]
+        if target.corner_squares:
+            for row in range(target.rows + 1):
+                for column in range(target.columns + 1):
+                    y, x = (MARGIN - gap + k * (size + gap) for k in (row, column))
+                    page[y : y + gap, x : x + gap] = 0
+    elif isinstance(target, CharucoBoard):
+        dictionary = aruco.getPredefinedDictionary(getattr(aruco, target.dictionary))
+        board = aruco.CharucoBoard(
+            (target.columns, target.rows), target.square_m, target.marker_m, dictionary
+        )
+        board.setLegacyPattern(target.legacy)
+        w, h = target.columns * round(edge), target.rows * round(edge)
+        page[MARGIN : MARGIN + h, MARGIN : MARGIN + w] = board.generateImage((w, h))
+    elif isinstance(target, Chessboard):
+        squares = np.indices((target.rows + 1, target.columns + 1)).sum(0) % 2 * 255
+        drawn = np.kron(squares, np.ones((round(edge), round(edge)))).astype(np.uint8)
+        start = MARGIN - round(edge)
+        page[start : start + drawn.shape[0], start : start + drawn.shape[1]] = drawn
+    else:
+        y, x = np.mgrid[:h, :w]
+        near = target.pitch_m * (np.sqrt(2) if target.asymmetric else 1.0)
+        for k, (u, v, _) in enumerate(target.points_board * PER_M + MARGIN - 0.5):
+            radius = 0.25 * near * PER_M * (1.6 if k == 0 and target.large_origin else 1.0)
+            page[(x - u) ** 2 + (y - v) ** 2 < radius**2] = 0
+    return page
+
+
+def picture(
+    target, T, rng=None, blur=0.8, noise=4.0, page=None, intrinsics=CAMERA, also=(), shade=0.0
+):
+    """Return a picture of the page, and of further ones at the poses `also`."""
+    import cv2
+
+    rng = rng or np.random.default_rng(0)
+    page = page_of(target) if page is None else page
+    ink = np.where(page > 0, 215, 30).astype(np.uint8)
+    to_page = np.array([[PER_M, 0, MARGIN - 0.5], [0, PER_M, MARGIN - 0.5], [0, 0, 1]])
+    half = (SUPER - 1) / 2
+    fine = np.full((480 * SUPER, 640 * SUPER), 120, np.uint8)
+    for pose in (T, *also):
+        H = intrinsics.K @ pose[:3, [0, 1, 3]] @ np.linalg.inv(to_page)
+        big = np.array([[SUPER, 0, half], [0, SUPER, half], [0, 0, 1.0]]) @ H
+        cv2.warpPerspective(
+            ink, big, fine.shape[::-1], fine, cv2.INTER_NEAREST, cv2.BORDER_TRANSPARENT
+        )
+    image = cv2.resize(fine, (640, 480), interpolation=cv2.INTER_AREA).astype(np.float64)
+    image = cv2.GaussianBlur(image, (0, 0), blur)
+    image = image * (1 + shade * (np.arange(640) / 639 - 0.5))
+    image = image + rng.normal(scale=noise, size=image.shape)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def pose(target, tilt_deg, azimuth_deg=30.0, roll_deg=20.0, distance=0.4, aim=(0.0, 0.0)):
+    """Return T_cam_board of a camera that looks at the target's middle, moved by `aim` [m]."""
+    points = target.points_board
+    middle = (points.min(0) + points.max(0)) / 2 + np.array([*aim, 0.0])
+    tilt, azimuth = np.radians([tilt_deg, azimuth_deg])
+    away = [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)]
+    T = se3.look_at(middle + distance * np.array(away), middle, np.radians(roll_deg))
+    return se3.invert(T)
+
+
+def truth(target, T, intrinsics=CAMERA):
+    return camera.project(intrinsics, se3.transform(T, target.points_board))
+
+
+def errors(target, views, blur, noise, seed=0):
+    rng = np.random.default_rng(seed)
+    found, sd, points = [], [], 0
+    for _ in range(views):
+        T = pose(target, rng.uniform(0, 50), rng.uniform(0, 360), rng.uniform(0, 360))
+        d = find_target(picture(target, T, rng, blur, noise), target)
+        found.append(d.uv - truth(target, T)[d.point_ids])
+        sd.append(d.sd_px)
+        points += len(target.points_board)
+    assert sum(map(len, found)) >= 0.9 * points
+    return np.concatenate(found), np.concatenate(sd)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_points_of_every_target_are_sharp_unbiased_and_rightly_numbered(name):
+    e, sd = errors(TARGETS[name], 3, 0.8, 4.0)
+    rms = np.sqrt(np.mean(np.sum(e**2, -1)))
+    assert rms < 0.06  # 0.10 is the goal; a wrong number would be many pixels
+    assert np.abs(e.mean(0)).max() < (0.02 if len(e) > 30 else 0.03)
+    assert 0.6 < np.sqrt(2 * np.mean(sd**2)) / rms < 1.6
+
+
+@pytest.mark.parametrize("name", ["tags", "kalibr", "charuco", "chessboard", "circles"])
+def test_points_survive_strong_blur(name):
+    e, _ = errors(TARGETS[name], 3, 1.5, 6.0, seed=1)
+    assert np.sqrt(np.mean(np.sum(e**2, -1))) < 0.15  # 0.22 is the goal
+
+
+@pytest.mark.parametrize("name", ["tags", "charuco", "chessboard", "circles", "asymmetric"])
+@pytest.mark.parametrize("quarter", [1, 2])
+def test_turning_the_image_turns_the_points(name, quarter):
+    target = TARGETS[name]
+    image = picture(target, pose(target, 35.0))
+    d = find_target(image, target)
+    turned = find_target(np.ascontiguousarray(np.rot90(image, quarter)), target)
+    uv = turned.uv
+    size = np.array([639, 479]) if quarter % 2 == 0 else np.array([479, 639])
+    for _ in range(quarter):  # a turn back by a quarter: (u, v) -> (W - 1 - v, u)
+        uv = np.stack([size[::-1][0] - uv[:, 1], uv[:, 0]], -1)
+        size = size[::-1]
+    both, a, b = np.intersect1d(d.point_ids, turned.point_ids, return_indices=True)
+    assert len(both) >= 0.9 * len(target.points_board)
+    assert np.abs(d.uv[a] - uv[b]).max() < 0.05
+
+
+@pytest.mark.parametrize("name", ["tags", "charuco", "chessboard", "circles", "asymmetric"])
+def test_an_upside_down_camera_changes_no_number(name):
+    target = TARGETS[name]
+    for roll in (0.0, 90.0, 180.0, 270.0):
+        T = pose(target, 20.0, roll_deg=roll)
+        d = find_target(picture(target, T), target)
+        assert len(d) >= 0.9 * len(target.points_board)
+        assert np.abs(d.uv - truth(target, T)[d.point_ids]).max() < 0.3
+
+
+def test_targets_with_two_ends_are_numbered_clockwise_along_the_image():
+    for target in (
+        Chessboard(rows=5, columns=7, square_m=0.02),
+        Chessboard(rows=6, columns=6, square_m=0.02),
+        CircleGrid(rows=5, columns=6, pitch_m=0.02),
+        CircleGrid(rows=6, columns=4, pitch_m=0.02, asymmetric=True),
+    ):
+        for roll in (10.0, 170.0):
+            d = find_target(picture(target, pose(target, 30.0, roll_deg=roll)), target)
+            assert len(d) == len(target.points_board)
+            H = fit_homography(target.points_board[:, :2], d.uv)
+            assert seen_from_front(H, target.points_board[:, :2])
+            assert np.abs(apply_homography(H, target.points_board[:, :2]) - d.uv).max() < 0.2
+            assert d.uv[1, 0] > d.uv[0, 0]
+
+
+def test_a_strong_lens_is_undone_where_it_is_known():
+    import cv2
+
+    lens = CameraIntrinsics.from_K(CAMERA.K, 640, 480, [-0.35, 0.1])
+    xy, _ = camera.undistort(lens, camera.pixel_grid(640, 480))
+    where = (xy * 600.0 + [319.5, 239.5]).astype(np.float32)
+    for name in ("tags", "charuco", "chessboard", "circles"):
+        target = TARGETS[name]
+        T = pose(target, 25.0, distance=0.33)
+        image = cv2.remap(picture(target, T, noise=1.0), where, None, cv2.INTER_CUBIC)
+        rms = []
+        for intrinsics in (None, lens):
+            d = find_target(image, target, intrinsics=intrinsics)
+            assert len(d) >= 0.9 * len(target.points_board)
+            e = d.uv - truth(target, T, lens)[d.point_ids]
+            rms.append(np.sqrt(np.mean(np.sum(e**2, -1))))
+        assert rms[1] < 0.05 and rms[1] < rms[0] + 0.005, name
+
+
+def test_light_that_falls_off_does_not_pull_the_points():
+    for name in ("charuco", "chessboard", "circles"):
+        target = TARGETS[name]
+        T = pose(target, 15.0)
+        image = picture(target, T, noise=0.0, shade=0.5)
+        d = find_target(image, target)
+        assert np.abs((d.uv - truth(target, T)[d.point_ids]).mean(0)).max() < 0.02
+
+
+def test_tags_and_charuco_may_be_cut_and_covered():
+    for name in ("tags", "charuco", "kalibr"):
+        target = TARGETS[name]
+        T = pose(target, 20.0, aim=(0.09, 0.0))
+        image = picture(target, T, noise=2.0)
+        uv = truth(target, T)
+        x, y = np.rint(uv[np.linalg.norm(uv - [300, 240], axis=-1).argmin()]).astype(int)
+        image[y - 12 : y + 12, x - 12 : x + 12] = 128
+        d = find_target(image, target)
+        assert 4 <= len(d) < len(uv)
+        assert np.abs(d.uv - uv[d.point_ids]).max() < 0.25
+
+
+@pytest.mark.parametrize("name", ["chessboard", "circles", "asymmetric"])
+def test_a_cut_chessboard_or_grid_is_refused_with_what_was_seen(name):
+    target = TARGETS[name]
+    d = find_target(picture(target, pose(target, 10.0, roll_deg=0.0, aim=(0.17, 0.0))), target)
+    assert len(d) == 0
+    assert f"of {len(target.points_board)} " in d.rejected[0]
+    assert "seen whole" in d.rejected[0]
+
+
+def test_a_glint_costs_the_chessboard_one_corner():
+    import cv2
+
+    target = TARGETS["chessboard"]
+    T = pose(target, 15.0)
+    image = picture(target, T)
+    uv = truth(target, T)
+    cv2.circle(image, tuple(int(v) for v in np.rint(uv[17] + 4)), 5, 235, -1)
+    d = find_target(image, target)
+    assert len(d) >= 40
+    assert np.abs(d.uv - uv[d.point_ids]).max() < 0.3
+
+
+@pytest.mark.parametrize("name", ["tags", "charuco", "chessboard", "circles"])
+def test_two_equal_boards_are_refused(name):
+    target = TARGETS[name]
+    aims = ((-0.12, -0.01), (0.12, 0.01))
+    poses = [pose(target, 10.0, 0.0, 0.0, distance=0.55, aim=a) for a in aims]
+    one = find_target(picture(target, poses[0]), target)
+    assert len(one) >= 0.9 * len(target.points_board)
+    d = find_target(picture(target, poses[0], also=poses[1:]), target)
+    assert len(d) == 0
+    assert any("two equal" in r or "more than once" in r for r in d.rejected)
+
+
+def test_a_mirrored_picture_gives_no_points():
+    for name in ("tags", "tag16h5", "charuco", "circles"):
+        target = TARGETS[name]
+        image = np.ascontiguousarray(picture(target, pose(target, 20.0))[:, ::-1])
+        d = find_target(image, target)
+        assert len(d) == 0
+        if name == "circles":
+            assert "mirrored" in d.rejected[0]
+        elif name != "tag16h5":
+            assert "MIRRORED" in explain_missing(image, target, d)
+
+
+def test_a_board_file_that_does_not_match_is_told_apart():
+    tags, charuco, old = TARGETS["tags"], TARGETS["charuco"], TARGETS["charuco old"]
+    chess, circles = TARGETS["chessboard"], TARGETS["circles"]
+    cases = (
+        (tags, replace(tags, ids_from="bottom"), "ids_from='top'"),
+        (tags, replace(tags, rows=4, columns=3), "with 3 rows and 4 columns"),
+        (tags, replace(tags, first_id=200), "not a tag of this board"),
+        (old, replace(old, legacy=False), "legacy=True"),
+        (charuco, replace(charuco, rows=7, columns=5), "5 rows and 7 columns"),
+        (chess, replace(chess, columns=6), "7x6 inner corners, not of 6x6"),
+        (chess, replace(chess, columns=8), "42 of 48 inner corners"),
+        (circles, replace(circles, columns=6), "larger"),
+        (circles, replace(circles, rows=7, columns=5), "mirrored"),
+        (
+            TARGETS["asymmetric"],
+            replace(TARGETS["asymmetric"], asymmetric=False),
+            "asymmetric=True",
+        ),
+    )
+    for printed, claimed, words in cases:
+        d = find_target(picture(printed, pose(printed, 20.0)), claimed)
+        assert len(d) == 0, words
+        assert any(words in r for r in d.rejected), (words, d.rejected)
+
+
+def test_a_missing_large_dot_is_named():
+    plain = replace(TARGETS["circles"], large_origin=False)
+    d = find_target(picture(plain, pose(plain, 20.0)), TARGETS["circles"])
+    assert len(d) == 0 and "larger than the others" in d.rejected[0]
+
+
+def test_what_is_visible_names_what_was_printed():
+    expected = {
+        "tags": "12 markers of DICT_APRILTAG_36h11, ids 0 to 11",
+        "tag16h5": "9 markers of DICT_APRILTAG_16h5",
+        "charuco old": "21 markers of DICT_5X5_50",
+        "chessboard": "a chessboard with 7x6 inner corners",
+        "circles": "a grid of 7x5 dots",
+        "asymmetric": "an asymmetric grid of 28 dots",
+    }
+    for name, words in expected.items():
+        target = TARGETS[name]
+        assert words in what_is_visible(picture(target, pose(target, 20.0))), name
+    message = explain_missing(
+        picture(TARGETS["charuco old"], pose(TARGETS["charuco old"], 20.0)), TARGETS["charuco"]
+    )
+    assert "DICT_APRILTAG_36h11" in message and "DICT_5X5_50" in message and "Correct" in message
+
+
+def test_nothing_is_found_in_nothing():
+    rng = np.random.default_rng(0)
+    pictures = (
+        np.zeros((480, 640, 3), np.uint8),
+        np.full((480, 640), 255, np.uint8),
+        rng.integers(0, 256, (480, 640), dtype=np.uint8),
+    )
+    for image in pictures:
+        for target in TARGETS.values():
+            assert len(find_target(image, target)) == 0
+        assert "nothing that looks like a target" in what_is_visible(image)
+
+
+def test_a_picture_out_of_focus_has_no_points_or_good_ones():
+    for name in ("tags", "charuco", "chessboard", "circles"):
+        target = TARGETS[name]
+        T = pose(target, 20.0)
+        for blur in (3.0, 6.0):
+            d = find_target(picture(target, T, blur=blur), target)
+            if len(d):
+                e = np.linalg.norm(d.uv - truth(target, T)[d.point_ids], axis=-1)
+                assert np.sqrt(np.mean(e**2)) < 0.5, (name, blur)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((480, 640)),
+        np.full((480, 640, 3), np.nan, np.float32),
+        np.zeros((480, 640), np.uint16),
+        np.zeros((480, 640, 4), np.uint8),
+        np.zeros((0, 0), np.uint8),
+        np.zeros((480, 640, 3), bool),
+    ],
+)
+def test_what_is_no_8_bit_image_is_refused(image):
+    for target in (TARGETS["tags"], TARGETS["chessboard"]):
+        with pytest.raises(InputError, match=r"8-bit RGB|at least 32 px"):
+            find_target(image, target)
+    with pytest.raises(InputError):
+        what_is_visible(image)
+
+
+def test_intrinsics_of_another_size_and_unknown_dictionaries_are_refused():
+    with pytest.raises(InputError, match=r"320x240 px.*640x480"):
+        find_target(np.zeros((240, 320), np.uint8), TARGETS["tags"], intrinsics=CAMERA)
+    board = replace(TARGETS["charuco"], dictionary="DICT_9X9_50")
+    with pytest.raises(InputError, match=r"DICT_9X9_50.*DICT_6X6_250"):
+        find_target(np.zeros((480, 640), np.uint8), board)
+
+
+def test_codes_turned_on_the_page_and_wide_borders_are_understood():
+    tags = TARGETS["tags"]
+    T = pose(tags, 25.0)
+    for turned in (1, 2, 3):
+        d = find_target(picture(tags, T, page=page_of(tags, turned=turned)), tags)
+        assert len(d) == len(tags.points_board)
+        assert np.abs(d.uv - truth(tags, T)).max() < 0.3
+    kalibr = TARGETS["kalibr"]
+    T = pose(kalibr, 25.0)
+    d = find_target(picture(kalibr, T, page=page_of(kalibr, border=2)), kalibr)
+    assert len(d) >= 0.9 * len(kalibr.points_board)
+    assert np.abs(d.uv - truth(kalibr, T)[d.point_ids]).max() < 0.3
+
+
+def test_bright_dots_on_black_are_found_too():
+    target = TARGETS["circles"]
+    T = pose(target, 25.0)
+    d = find_target(255 - picture(target, T), target)
+    assert len(d) == 35 and np.abs(d.uv - truth(target, T)).max() < 0.1
+
+
+def test_the_bias_of_an_ellipse_is_that_of_its_conic():
+    # Middle of the ellipse from the dual conic H C* H^T, C* = diag(r^2, r^2, -1) moved by p.
+    T = pose(TARGETS["circles"], 50.0)
+    H = CAMERA.K @ T[:3, [0, 1, 3]]
+    p, r = np.array([[0.03, 0.02], [0.1, 0.08]]), np.array([0.006, 0.01])
+    bias = outline_bias(lambda q: apply_homography(H, q), p, r)
+    for k in range(2):
+        move = np.array([[1, 0, p[k, 0]], [0, 1, p[k, 1]], [0, 0, 1]])
+        D = H @ move @ np.diag([r[k] ** 2, r[k] ** 2, -1.0]) @ move.T @ H.T
+        expected = D[:2, 2] / D[2, 2] - apply_homography(H, p[k])
+        assert np.allclose(bias[k], expected, atol=1e-8) and np.linalg.norm(expected) > 0.03
+
+
+def test_a_saddle_is_exact_without_noise_and_needs_the_right_colours():
+    y, x = np.mgrid[:60, :60].astype(float)
+    for centre, angle in (((30.3, 29.6), 0.2), ((29.5, 30.9), 0.9)):
+        u, v = x - centre[0], y - centre[1]
+        a = u * np.cos(angle) + v * np.sin(angle)
+        b = -u * np.sin(angle + 0.2) + v * np.cos(angle + 0.2)
+        image = np.rint(120 + 80 * np.tanh(1.2 * a) * np.tanh(1.2 * b)).astype(np.uint8)
+        along_a = 20 * np.array([np.cos(angle + 0.2), np.sin(angle + 0.2)])  # where b = 0
+        along_b = 20 * np.array([-np.sin(angle), np.cos(angle)])
+        arms = np.stack([along_a, along_b, -along_a, -along_b])[None]
+        start = np.array([centre]) + np.array([0.8, -0.6])
+        found = refine_saddles(image, start, arms, np.array([False]))
+        assert found.good.all() and np.abs(found.uv - centre).max() < 0.01
+        wrong = refine_saddles(image, start, arms, np.array([True]))
+        assert not wrong.good.any() and "contrast" in wrong.faults[0]
+    assert (
+        len(refine_saddles(image, np.zeros((0, 2)), np.zeros((0, 4, 2)), np.zeros(0, bool)).uv) == 0
+    )
+
+
+def test_arms_of_a_grid_point_to_its_neighbours():
+    grid = np.stack(np.meshgrid(np.arange(4.0), np.arange(3.0)), -1)
+    arms = grid_arms(grid)
+    assert np.allclose(arms, [[1, 0], [0, 1], [-1, 0], [0, -1]])
+
+
+def test_homography_round_trip_and_handedness():
+    rng = np.random.default_rng(0)
+    target = TARGETS["chessboard"]
+    board = target.points_board[:, :2]
+    for _ in range(5):
+        T = pose(target, rng.uniform(0, 60), rng.uniform(0, 360), rng.uniform(0, 360))
+        H = fit_homography(board, truth(target, T))
+        expected = CAMERA.K @ T[:3, [0, 1, 3]]
+        assert np.allclose(H / H[2, 2], expected / expected[2, 2], atol=1e-6)
+        assert seen_from_front(H, board)
+        assert not seen_from_front(np.diag([-1.0, 1.0, 1.0]) @ H, board)
+
+
+def test_a_lattice_grows_among_specks_and_takes_the_pattern_in_any_basis():
+    rng = np.random.default_rng(3)
+    r, c = np.divmod(np.arange(42), 7)
+    pattern = np.stack([c, r], -1)
+    nodes = pattern @ np.array([[21.0, 9.0], [-4.0, 12.0]]) + [200, 150]
+    specks = rng.uniform(0, 130, size=(60, 2))
+    points = np.concatenate([specks, nodes])[rng.permutation(102)]
+    lattice = grow_lattice(points)
+    assert len(lattice) == 42
+    laid = lay_pattern(lattice, pattern, [])
+    ways = {tuple(np.rint(points[one.points[0]]).astype(int)) for one in laid}
+    assert laid[0].seen == 42 and len(laid) == 2  # a rectangle looks the same turned by 180 deg
+    assert ways == {tuple(np.rint(nodes[k]).astype(int)) for k in (0, 41)}
+    for one in laid:
+        a, b = (
+            points[one.points[1]] - points[one.points[0]],
+            points[one.points[7]] - points[one.points[0]],
+        )
+        assert a[0] * b[1] - a[1] * b[0] > 0
+    assert lay_pattern(lattice, np.stack([c, r + c % 2], -1), [])[0].seen < 42
+
+
+@pytest.mark.slow
+def test_finding_takes_little_time():
+    for name in ("tags", "charuco", "chessboard", "circles"):
+        target = TARGETS[name]
+        image = picture(target, pose(target, 20.0))
+        find_target(image, target)
+        start = time.process_time()
+        for _ in range(3):
+            find_target(image, target)
+        assert (time.process_time() - start) / 3 < 0.6, name

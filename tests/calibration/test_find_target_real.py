@@ -1,0 +1,138 @@
+"""Targets in real pictures: everything is found, and OpenCV's own points fit a camera no better."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid
+from realsim_calibration.detect.find import find_target
+from realsim_calibration.detect.homography import fit_homography, seen_from_front
+from realsim_calibration.detect.markers import predefined_dictionary
+from realsim_calibration.detect.visible import explain_missing
+
+ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+DATA = ROOT / "handeye"
+pytestmark = [
+    pytest.mark.real,
+    pytest.mark.skipif(not DATA.is_dir(), reason=f"no real data at {DATA} (set REALSIM_DATA)"),
+]
+SETS = {
+    "rtde_ur5e": (
+        "Hand-Eye-Data/*.jpg",
+        CharucoBoard(rows=7, columns=5, square_m=0.033, marker_m=0.02, dictionary="DICT_6X6_100"),
+    ),
+    "rosi_circles": (
+        "images/*.png",
+        CircleGrid(rows=10, columns=10, pitch_m=0.0254, large_origin=True),
+    ),
+    # The folder's note says 8x6 inner corners; the pictures show 10x7 squares.
+    "muligheder_ur5e": ("images/*.jpg", Chessboard(rows=6, columns=9, square_m=0.0219)),
+}
+
+
+def load(name, every=1):
+    import cv2
+
+    pattern, target = SETS[name]
+    files = sorted((DATA / name).glob(pattern), key=lambda p: int(p.stem.split("-")[-1]))
+    assert files, f"no pictures in {DATA / name}"
+    return [cv2.cvtColor(cv2.imread(str(f)), cv2.COLOR_BGR2RGB) for f in files[::every]], target
+
+
+def opencv_points(image, target):
+    """Return (n, 2) with NaN for missing points, in our numbering for the circles."""
+    import cv2
+    from cv2 import aruco
+
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    uv = np.full((len(target.points_board), 2), np.nan)
+    if isinstance(target, CharucoBoard):
+        board = aruco.CharucoBoard(
+            (target.columns, target.rows),
+            target.square_m,
+            target.marker_m,
+            predefined_dictionary(target.dictionary),
+        )
+        corners, ids, _, _ = aruco.CharucoDetector(board).detectBoard(gray)
+        if ids is not None:
+            uv[np.ravel(ids)] = np.reshape(corners, (-1, 2))
+        return uv
+    shape = (target.columns, target.rows)
+    if isinstance(target, Chessboard):
+        ok, corners = cv2.findChessboardCornersSB(gray, shape, flags=cv2.CALIB_CB_ACCURACY)
+    else:
+        p = cv2.SimpleBlobDetector_Params()
+        p.minArea, p.maxArea, p.minThreshold, p.maxThreshold = 25, 5000, 20, 220
+        p.filterByCircularity = p.filterByConvexity = p.filterByInertia = False
+        p.minDistBetweenBlobs = 5
+        blobs = cv2.SimpleBlobDetector_create(p)
+        ok, corners = cv2.findCirclesGrid(
+            gray, shape, flags=cv2.CALIB_CB_SYMMETRIC_GRID, blobDetector=blobs
+        )
+    return np.reshape(corners, (-1, 2)) if ok else uv
+
+
+def camera_rms(uvs, target, size):
+    import cv2
+
+    points = target.points_board.astype(np.float32)
+    seen = [(u, np.isfinite(u[:, 0])) for u in uvs]
+    seen = [(u, m) for u, m in seen if m.sum() >= 6]
+    return cv2.calibrateCamera(
+        [points[m] for _, m in seen], [u[m].astype(np.float32) for u, m in seen], size, None, None
+    )[0]
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_all_views_are_found_and_fit_a_camera_better_than_with_opencv(name):
+    pictures, target = load(name, every=3 if name == "muligheder_ur5e" else 2)
+    board = target.points_board
+    ours, theirs = [], []
+    for image in pictures:
+        d = find_target(image, target)
+        assert len(d) >= len(board) - 1, d.rejected
+        uv = np.full((len(board), 2), np.nan)
+        uv[d.point_ids] = d.uv
+        ours.append(uv)
+        assert seen_from_front(fit_homography(board[d.point_ids, :2], d.uv), board[:, :2])
+        other = opencv_points(image, target)
+        # OpenCV may begin at another end: number its points by ours.
+        apart = np.linalg.norm(other[None] - uv[:, None], axis=-1)
+        apart[~np.isfinite(apart)] = np.inf
+        matched = other[apart.argmin(1)]
+        matched[(apart.min(1) > 5.0) | ~np.isfinite(uv[:, 0])] = np.nan
+        theirs.append(matched)
+    size = (pictures[0].shape[1], pictures[0].shape[0])
+    a, b = camera_rms(ours, target, size), camera_rms(theirs, target, size)
+    print(f"{name}: {len(pictures)} views, {a:.4f} px, with OpenCV's points {b:.4f} px")
+    assert a < b
+
+
+def test_the_large_dot_comes_first():
+    pictures, target = load("rosi_circles", every=4)
+    for image in pictures:
+        d = find_target(image, target)
+        gray = image.mean(-1)
+        step = np.linalg.norm(d.uv[-1] - d.uv[-2])
+        y, x = np.indices(gray.shape)
+        dark = {}
+        for k in (0, 9, 90, 99):
+            at = d.uv[np.flatnonzero(d.point_ids == k)]
+            if len(at):
+                inside = np.hypot(x - at[0, 0], y - at[0, 1]) < 0.5 * step
+                dark[k] = gray[inside].mean()
+        assert min(dark, key=dark.get) == 0 or 0 not in dark
+
+
+def test_a_wrong_board_file_is_answered_with_what_is_there():
+    pictures, board = load("rtde_ur5e", every=30)
+    wrong = CharucoBoard(rows=7, columns=5, square_m=0.033, marker_m=0.02)
+    d = find_target(pictures[0], wrong)
+    assert len(d) == 0
+    message = explain_missing(pictures[0], wrong, d)
+    assert "17 markers of DICT_6X6_50" in message and "DICT_APRILTAG_36h11" in message
+    pictures, _ = load("muligheder_ur5e", every=50)
+    d = find_target(pictures[0], Chessboard(rows=6, columns=8, square_m=0.0219))
+    assert len(d) == 0 and "9x6 inner corners, not of 8x6" in d.rejected[0]
