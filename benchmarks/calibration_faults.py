@@ -75,7 +75,9 @@ def draw_session(
     eye_in_hand = bool(rng.random() < 0.5)
     middle = BOARD.points_board.mean(0)
     C: list[Array] = []
-    start = se3.invert(se3.look_at(middle + [0.05, 0.08, -0.4], middle, rng.uniform(-3, 3)))
+    start = se3.invert(
+        se3.look_at(middle + np.array([0.05, 0.08, -0.4]), middle, rng.uniform(-3, 3))
+    )
     for _ in range(n):
         if small_deg > 0:
             w = rng.normal(size=3)
@@ -92,7 +94,7 @@ def draw_session(
     Cs = np.array(C)
     in_hand = se3.from_rt(
         se3.exp_so3([0.1, -0.05, 1.5]) @ se3.exp_so3(rng.normal(scale=0.3, size=3)),
-        rng.normal(scale=0.05, size=3) + [0.0, 0.0, 0.06],
+        rng.normal(loc=[0.0, 0.0, 0.06], scale=0.05),
     )
     down = np.diag([1.0, -1.0, -1.0]) @ se3.exp_so3(rng.normal(scale=0.15, size=3))
     place = se3.from_rt(down, [rng.uniform(0.35, 0.6), rng.uniform(-0.3, 0.3), 0.02])

@@ -7,7 +7,8 @@ camera has a lens that its maker does not know of. The calibration gets what a r
 import numpy as np
 
 from realsim.geometry import camera, se3
-from realsim_calibration import BoardView, TagDetections, calibrate_hand_eye
+from realsim.geometry.dh import UR5_ARM
+from realsim_calibration import BoardView, TargetDetection, calibrate_hand_eye
 from realsim_capture_plans import PlanConfig, calibration_plan
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
 
@@ -18,19 +19,25 @@ rng = np.random.default_rng(0)
 plan = calibration_plan(16, lab.scene_center, lab.nominal_T_ee_cam, PlanConfig(), rng)
 
 board, lens = lab.board, lab.truth.intrinsics
-corners_world = se3.transform(lab.truth.T_world_board, board.corners_board.reshape(-1, 3))
+corners_world = se3.transform(lab.truth.T_world_board, board.points_board)
 views: list[BoardView] = []
 for k, joints in enumerate(plan.joints):
     lab.arm.move(joints)
     # What a detector would find in the photograph: the true corners and some noise.
     T_cam_world = se3.invert(lab.truth.T_world_cam(joints))
-    uv = camera.project(lens, se3.transform(T_cam_world, corners_world)).reshape(-1, 4, 2)
+    uv = camera.project(lens, se3.transform(T_cam_world, corners_world))
     uv = uv + rng.normal(scale=PIXEL_NOISE, size=uv.shape)
-    inside = np.all((uv > 0) & (uv < [lens.width - 1, lens.height - 1]), axis=(1, 2))
-    seen = TagDetections(ids=board.ids[inside], corners_px=uv[inside])
-    views.append(BoardView(index=k, T_base_ee=lab.arm.state().T_base_ee, detections=seen))
+    inside = np.flatnonzero(np.all((uv > 0) & (uv < [lens.width - 1, lens.height - 1]), axis=1))
+    seen = TargetDetection(
+        point_ids=inside, uv=uv[inside], image_size=(lens.width, lens.height)
+    )
+    state = lab.arm.state()
+    views.append(
+        BoardView(index=k, T_base_ee=state.T_base_ee, joints=state.joints, detection=seen)
+    )
 
-result = calibrate_hand_eye(views, board, lab.camera.intrinsics)
+# The arm's kinematics and the joints let the calibration model the arm's own errors.
+result = calibrate_hand_eye(views, board, lab.camera.intrinsics, arm=UR5_ARM)
 
 off = se3.invert(lab.truth.T_ee_cam) @ result.T_ee_cam
 drawing = se3.invert(lab.truth.T_ee_cam) @ lab.nominal_T_ee_cam

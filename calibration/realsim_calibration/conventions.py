@@ -316,20 +316,22 @@ def _sound(
         f"{_mm(given)}. {scale}"
     )
     none = replace(given, fault="none", sentence=text)
-    if nominal is None:
-        return none
+    return none if nominal is None else _with_tool(p, none, nominal, config)
+
+
+def _with_tool(p: Poses, none: Hypothesis, nominal: Array, config: DiagnosisConfig) -> Hypothesis:
+    """Return what the nominal kinematics add to sound poses."""
     offset = tool_offset(p.T, nominal, config.tool)
-    if not offset.known:
-        return replace(none, sentence=f"{text} {offset.sentence}")
-    if offset.active and len(offset.offsets) > 1:
-        fault: Fault = "tool_change"
-    elif offset.active:
-        fault = "tool_offset"
-    elif offset.base_turned:
+    fault: Fault = "none"
+    if offset.known and offset.active:
+        fault = "tool_change" if len(offset.offsets) > 1 else "tool_offset"
+    elif offset.known and offset.base_turned:
         fault = "base_turned"
-    else:
-        return replace(none, sentence=f"{text} {offset.sentence}")
-    return replace(none, fault=fault, sentence=f"{offset.sentence} {text}", advice=offset.advice)
+    if fault == "none":
+        return replace(none, sentence=f"{none.sentence} {offset.sentence}")
+    return replace(
+        none, fault=fault, sentence=f"{offset.sentence} {none.sentence}", advice=offset.advice
+    )
 
 
 def _unit(

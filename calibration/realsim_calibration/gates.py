@@ -1,4 +1,4 @@
-"""Which views may take part: tests that need no hand-eye, and one that needs only a rough one.
+"""Which views may take part: tests that need no hand-eye, and two that need only a rough one.
 
 For right data A_ij X = X B_ij, so that the hand and the camera turn by the same angle, about axes
 that one rotation maps onto each other, and slide by the same length along them, whatever X is.
@@ -7,7 +7,7 @@ are named; a bad view breaks it for itself and is dropped. Two corrupted views l
 fit worse than no fit. Angles alone do not see inverted poses: tr(R_i^T R_j) = tr(R_i R_j^T).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,7 @@ from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.records import TagBoard
 from realsim_calibration.closed_forms import HALF_TURN, motions, nearest_rotation
+from realsim_calibration.frame_fit import FitConfig, fit_frames, hand_side, mismatch
 
 Array = NDArray[np.float64]
 
@@ -43,6 +44,12 @@ class GateConfig:
     """... and this error [px]."""
     twin_ratio: float = 2.0
     """The mirror twin of a planar pose may stand in when its px is at most this much worse."""
+    frame_ratio: float = 5.0
+    """A view is dropped when its error through the fitted frames exceeds this many medians ..."""
+    frame_floor: float = 4.0
+    """... and this, in units of `FitConfig`: 2 deg or 4 % of the distance to the board. Views of
+    good real sets reach 4.1 medians where the board is small and seen at a slant."""
+    fit: FitConfig = field(default_factory=FitConfig)
 
 
 def angle_differences(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike) -> Array:
@@ -199,6 +206,48 @@ def angle_gate(
             f"angle gate: it turns {np.degrees(views[k]):.2f} deg (median over the other views) "
             f"differently from the hand; the limit is {np.degrees(limit):.2f} deg. Image and hand "
             "pose do not belong together, or the hand moved during the exposure."
+        )
+    return chosen, dropped, swapped
+
+
+def frame_gate(
+    Ts_base_ee: Array,
+    Ts_cam_board: Array,
+    twins: list[Array | None],
+    middle: ArrayLike,
+    config: GateConfig,
+    *,
+    eye_in_hand: bool = True,
+) -> tuple[Array, dict[int, str], list[int]]:
+    """Return the board poses, the views to drop with the reason, and the views whose twin is used.
+
+    The frames X and Z are fitted robustly, rotations and translations together, and every view is
+    judged by both errors: where the hand moves without turning the angles see nothing, and the
+    place of the board must tell.
+
+    Args:
+        Ts_base_ee: (n, 4, 4) hand poses [m].
+        Ts_cam_board: (n, 4, 4) board poses [m].
+        twins: per view the mirror solution where it fits the image almost as well, else None.
+        middle: (3,) the board's middle in its frame [m].
+        config: the gate.
+        eye_in_hand: whether the camera sits in the hand.
+    """
+    A = hand_side(Ts_base_ee, eye_in_hand)
+    fit = fit_frames(A, Ts_cam_board, middle, config.fit)
+    limit = max(config.frame_ratio * fit.usual, config.frame_floor)
+    chosen, dropped, swapped = Ts_cam_board.copy(), dict[int, str](), list[int]()
+    for k in np.flatnonzero(fit.errors > limit):
+        twin = twins[k]
+        if twin is not None and mismatch(fit, A[k : k + 1], twin[None], config.fit)[0, 0] <= limit:
+            chosen[k] = twin
+            swapped.append(int(k))
+            continue
+        dropped[int(k)] = (
+            f"frame gate: its board is {1e3 * fit.slips[k]:.1f} mm and "
+            f"{np.degrees(fit.angles[k]):.2f} deg from where the other views put it (they scatter "
+            f"by {fit.usual_mm:.1f} mm and {fit.usual_deg:.2f} deg). Image and hand pose do not "
+            "belong together, the board's pose is wrong, or the hand moved during the exposure."
         )
     return chosen, dropped, swapped
 

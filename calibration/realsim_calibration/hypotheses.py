@@ -107,15 +107,13 @@ def _whole(n: int) -> Rows:
 
 
 def simple(
-    p: Poses, fault: Fault, name: str, T: Array, C: Array, config: DiagnosisConfig,
-    sentence: str = "", advice: str = "", views: tuple[int, ...] = (), note: str = "",
-) -> Hypothesis:  # fmt: skip
-    """Return a hypothesis that keeps every view."""
+    p: Poses, fault: Fault, name: str, T: Array, C: Array, config: DiagnosisConfig
+) -> Hypothesis:
+    """Return a hypothesis that keeps every view, still without words."""
     fit = p.fit(T, C, config)
     return Hypothesis(
-        fault=fault, name=name, fit=fit, score=fit.score, T=T, C=C, rows=_whole(len(T)),
-        sentence=sentence, advice=advice, views=views, note=note,
-    )  # fmt: skip
+        fault=fault, name=name, fit=fit, score=fit.score, T=T, C=C, rows=_whole(len(T))
+    )
 
 
 def _off_axis(C: Array, middle: Array) -> tuple[bool, float]:
@@ -138,8 +136,8 @@ def inverted(p: Poses, config: DiagnosisConfig) -> Hypothesis:
     aside = other_front and front and off > config.plausible_off_axis * other_off
     if behind or aside:
         where = "behind the camera" if behind else f"{np.degrees(off):.0f} deg off its axis"
-        return simple(
-            p, "camera_inverted", "camera poses inverted", p.T, other, config,
+        return replace(
+            simple(p, "camera_inverted", "camera poses inverted", p.T, other, config),
             sentence="The camera poses are inverted: they fit as T_board_cam, and as given the "
             f"board would lie {where}.",
             advice="Give T_cam_board, which maps points of the board into the camera (what "
@@ -186,8 +184,9 @@ def flipped_boards(p: Poses, config: DiagnosisConfig) -> Hypothesis | None:
     if not turns.flips.any():
         return None
     views = tuple(int(k) for k in np.flatnonzero(turns.flips))
-    return simple(
-        p, "board_flips", f"{len(views)} boards turned by 180 deg", p.T, turns.repaired, config,
+    name = f"{len(views)} boards turned by 180 deg"
+    return replace(
+        simple(p, "board_flips", name, p.T, turns.repaired, config),
         sentence=f"{len(views)} of {len(p.T)} boards were read turned by 180 deg: views "
         f"{p.names(views)}. The difference of the turns of hand and camera falls from "
         f"{turns.before_deg:.1f} to {turns.after_deg:.2f} deg RMS when they are turned back.",
@@ -274,8 +273,8 @@ def _reread(
     p: Poses, fault: Fault, r: Reread, config: DiagnosisConfig, sentence: str
 ) -> Hypothesis:
     T = se3.from_rt(r.Rs, p.T[:, :3, 3])
-    return simple(
-        p, fault, r.name, T, p.C, config, sentence=sentence,
+    return replace(
+        simple(p, fault, r.name, T, p.C, config), sentence=sentence,
         advice=f"Read the rotations as {r.meant}.",
         note=f"the rotations were read as {r.name}.",
     )  # fmt: skip
@@ -286,9 +285,9 @@ def raw_readings(
 ) -> list[Hypothesis]:
     """Return the hypotheses that the pose file is to be read otherwise."""
     return [
-        simple(
-            p, "rotation_reading", f"file read as {name}", np.asarray(T, dtype=np.float64), p.C,
-            config, sentence=f"Hand and camera agree when the pose file is read as {name}.",
+        replace(
+            simple(p, "rotation_reading", f"file read as {name}", np.array(T), p.C, config),
+            sentence=f"Hand and camera agree when the pose file is read as {name}.",
             advice=f"Read the file as {name}.", note=f"the pose file was read as {name}.",
         )
         for name, T in raw

@@ -24,6 +24,8 @@ from realsim.geometry import se3
 
 Array = NDArray[np.float64]
 AXES = "xyz"
+JUDGES = 12
+"""Views that judge the pairs of the first two Euler angles: chance passes one in 10^5."""
 PAIRS_KEPT = 30
 """Pairs of the first two Euler angles, of 3000, for which the third is tried."""
 
@@ -363,10 +365,10 @@ def _euler_degrees(order: str, R: Array, G: Array, config: ReadingConfig) -> tup
     legal = (np.abs(pairs[:, 0]) <= 180.0) & (np.abs(pairs[:, 1]) <= 90.0)
     pairs, form = pairs[legal], form[legal]
     start = euler_rotation(order, (0, 1, 2), np.radians(np.c_[pairs, 0 * pairs[:, 0]]))
-    column = np.einsum("vab,pb->pva", G, start[:, :, k] @ G[0])
+    column = np.einsum("vab,pb->pva", G[:JUDGES], start[:, :, k] @ G[0])
     seen = np.stack([np.arctan2(-e * column[..., j], column[..., k]),
                      np.arcsin(np.clip(e * column[..., i], -1, 1))], -1)  # fmt: skip
-    cost = _off(np.degrees(seen)[:, :, None], numbers[None, :, :, :2], config).mean(1)
+    cost = _off(np.degrees(seen)[:, :, None], numbers[None, :JUDGES, :, :2], config).mean(1)
     best = np.argsort(cost)[:PAIRS_KEPT]
     tried = np.concatenate(
         [np.c_[np.broadcast_to(pairs[p], (len(turns), 2)), c[form[p]]] for p in best]

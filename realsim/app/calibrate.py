@@ -35,6 +35,14 @@ def run_calibrate(source: Path, *, live: bool, quiet: bool, **options: Any) -> b
             f"'{source}' is not a folder; a session (it holds session.json) or a folder of images "
             "with robot poses is expected."
         )
+    if not options["board"] and options["board_poses"] is None:
+        inner = sorted(p.parent.name for p in source.glob("*/session.json"))
+        hint = f" Did you mean {', '.join(str(source / n) for n in inner)}?" if inner else ""
+        raise InputError(
+            f"'{source}' holds no session.json, so it is not a session.{hint} For a folder of "
+            "images with robot poses say which target they show: --board "
+            "charuco:5x7,square=33mm,marker=20mm,dict=6X6_100, or a file of `realsim board`."
+        )
     request = _request(source, options)
     if live:
         from realsim.app.live import run_live

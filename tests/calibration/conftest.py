@@ -146,9 +146,7 @@ class Simulation:
         x = x / np.linalg.norm(x)
         return se3.from_rt(np.stack([x, np.cross(z, x), z], -1), eye)
 
-    def see(
-        self, T_base_cam: Array, rng: np.random.Generator, pixel: float
-    ) -> TargetDetection:
+    def see(self, T_base_cam: Array, rng: np.random.Generator, pixel: float) -> TargetDetection:
         corners = se3.transform(se3.invert(T_base_cam) @ self.T_base_board, self.board.points_board)
         uv = camera.project(self.intrinsics, corners)
         uv = (uv + rng.normal(scale=pixel, size=uv.shape)).reshape(-1, 4, 2)
@@ -296,7 +294,7 @@ def printed_points(board: TagBoard) -> Array:
 
 
 def arm_views(board: TagBoard, views: int, mode: Mode, with_joints: bool) -> list[BoardView]:
-    """Return views of an arm with errors; views 7 and 15 are bad, view 3 has an odd name."""
+    """Return views of an arm with errors (eye to hand: of any robot); 7 and 15 are bad."""
     rng = np.random.default_rng(0)
     w, h = board.size_m
     Z = se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0.45 - w / 2, 0.1 + h / 2, 0.02])
@@ -315,10 +313,14 @@ def arm_views(board: TagBoard, views: int, mode: Mode, with_joints: bool) -> lis
             if mode == "eye_in_hand"
             else X @ se3.invert(T_board_cam) @ se3.invert(Z)
         )
-        q = joints_of(T_hand, rng)
-        if q is None:
-            continue
-        A = real.forward(q) @ se3.exp(rng.normal(scale=1e-4, size=6))
+        q, told = None, T_hand
+        A = T_hand @ se3.exp(rng.normal(scale=3e-4, size=6))
+        if mode == "eye_in_hand":
+            q = joints_of(T_hand, rng)
+            if q is None:
+                continue
+            A = real.forward(q) @ se3.exp(rng.normal(scale=1e-4, size=6))
+            told = ARM.forward(q)
         T = se3.invert(A @ X) @ Z if mode == "eye_in_hand" else se3.invert(X) @ A @ Z
         uv = camera.project(TRUE_LENS, se3.transform(T, printed))
         uv = uv + rng.normal(scale=0.12, size=uv.shape)
@@ -326,7 +328,7 @@ def arm_views(board: TagBoard, views: int, mode: Mode, with_joints: bool) -> lis
         k = len(shots)
         bad = k == 15
         inside = inside[:4] if bad else inside
-        told = ARM.forward(q) @ se3.exp([0.1 * (k == 7), 0, 0, 0, 0, 0])
+        told = told @ se3.exp([0.1 * (k == 7), 0, 0, 0, 0, 0])
         found = TargetDetection(
             point_ids=inside, uv=uv[inside], image_size=(1280, 720),
             rejected=("<b>$bold$</b>",) if bad else (),

@@ -1,39 +1,64 @@
 """`calibration.json`: every number comes back, and a damaged file is named."""
 
-axis = hnp.arrays(np.float64, 3, elements=st.floats(-1, 1)).filter(
-    lambda v: np.linalg.norm(v) > 1e-3
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
+from realsim_calibration.exports import FrameNames, calibration_text, read_calibration
+from realsim_calibration.results import HandEyeReport, Mode
+
+Array = NDArray[np.float64]
+Maker = Callable[..., HandEyeReport]
+FRAMES = FrameNames(robot_base="base", hand="tool0", camera_optical="cam_optical", name="ur5")
+TARGETS: tuple[Target, ...] = (
+    TagBoard(rows=4, columns=6, tag_size_m=0.03, gap_m=0.01, ids_from="bottom"),
+    CharucoBoard(rows=7, columns=5, square_m=0.033, marker_m=0.02),
+    Chessboard(rows=6, columns=8, square_m=0.0219),
+    CircleGrid(rows=10, columns=10, pitch_m=0.0254, large_origin=True),
 )
-angles = st.one_of(
-    st.floats(-math.pi, math.pi),
-    st.sampled_from([0.0, math.pi, math.pi / 2, -math.pi / 2, 1e-17, 1e-9, math.pi - 1e-9]),
+
+
+@given(
+    twist=st.tuples(*[st.floats(-1.5, 1.5)] * 6),
+    seed=st.integers(0, 11),
+    target=st.sampled_from(TARGETS),
 )
-
-
-@st.composite
-def transforms(draw: st.DrawFn) -> Array:
-    """Return rigid transforms, among them turns by 0, 90 and 180 deg about the axes."""
-    w = draw(st.one_of(axis, st.sampled_from([np.eye(3)[k] for k in range(3)])))
-    R = se3.exp_so3(w / np.linalg.norm(w) * draw(angles))
-    if draw(st.booleans()):
-        R = se3.from_rt([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.zeros(3))[:3, :3] @ R
-    t = [draw(st.floats(-2, 2)) for _ in range(3)]
-    return se3.from_rt(R, t)
-
-
-
-@given(X=transforms(), seed=st.integers(0, 11), target=st.sampled_from(TARGETS))
 @settings(max_examples=25, deadline=None)
 def test_json_round_trip_is_exact(
-    X: Array, seed: int, target: Target, tmp_path_factory: pytest.TempPathFactory
+    full_record: Maker,
+    twist: tuple[float, ...],
+    seed: int,
+    target: Target,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     mode: Mode = "eye_in_hand" if seed % 2 else "eye_to_hand"
-    report = make_report(X, mode, target, seed)
+    report = full_record(se3.exp(twist), mode, target, seed)
     path = tmp_path_factory.mktemp("json") / "calibration.json"
     path.write_text(calibration_text(report, FRAMES), encoding="utf-8")
     again = read_calibration(path)
     assert type(again.target) is type(report.target)
     assert calibration_text(again, FRAMES) == path.read_text(encoding="utf-8")
     assert_same_record(report, again)
+
+
+def test_a_board_without_sides_comes_back(full_record: Maker, tmp_path: Path) -> None:
+    report = full_record(np.eye(4))
+    square = dataclasses.replace(report.board, half_sides_m=None)
+    path = tmp_path / "calibration.json"
+    path.write_text(calibration_text(dataclasses.replace(report, board=square), FRAMES))
+    assert_same_record(square, read_calibration(path).board)
 
 
 def assert_same_record(a: Any, b: Any) -> None:
@@ -55,13 +80,16 @@ def assert_same_record(a: Any, b: Any) -> None:
             assert x == y, field.name
 
 
-def damaged(key: str, value: Any, drop: bool = False) -> str:
-    document = json.loads(calibration_text(make_report(np.eye(4)), FRAMES))
+DROPPED = object()
+
+
+def damaged(report: HandEyeReport, key: str, value: Any) -> str:
+    document = json.loads(calibration_text(report, FRAMES))
     at = document
     *way, last = key.split("/")
     for step in way:
         at = at[int(step) if step.isdigit() else step]
-    if drop:
+    if value is DROPPED:
         del at[last]
     else:
         at[last] = value
@@ -69,31 +97,37 @@ def damaged(key: str, value: Any, drop: bool = False) -> str:
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("key", "value", "says"),
     [
-        ("{", "cannot be read as JSON"),
-        ("[1, 2]", "schema"),
-        (damaged("schema", "other"), "schema 'other'"),
-        (damaged("version", 99), "version 99"),
-        (damaged("mode", "sideways"), "sideways"),
-        (damaged("X", None, drop=True), "'X' is missing"),
-        (damaged("X/covariance", [[1.0]]), "shape"),
-        (damaged("X/quaternion_xyzw", [1.0, 0.0, 0.0, 0.0]), "different transforms"),
-        (damaged("X_alone/translation_m", [0.0, 0.0, 5.0]), "different transforms"),
-        (damaged("views/2/uv", [[1.0, "x"]]), "'uv' cannot be used"),
-        (damaged("views/0/index", None), "whole number"),
-        (damaged("views", 3), "list of named entries"),
-        (damaged("target/rows", None, drop=True), "does not fit"),
-        (damaged("target/type", "Egg"), "Egg"),
-        (damaged("checks/0/verdict", "superb"), "superb"),
-        (damaged("robot_map/kind", "odd"), "odd"),
-        (damaged("robot_map/frame", "odd"), "odd"),
-        (damaged("map_scores", [["none"]]), "names and numbers"),
+        ("schema", "other", "schema 'other'"),
+        ("version", 99, "version 99"),
+        ("mode", "sideways", "sideways"),
+        ("X", DROPPED, "'X' is missing"),
+        ("X/covariance", [[1.0]], "shape"),
+        ("X/quaternion_xyzw", [1.0, 0.0, 0.0, 0.0], "different transforms"),
+        ("X_alone/translation_m", [0.0, 0.0, 5.0], "different transforms"),
+        ("views/2/uv", [[1.0, "x"]], "'uv' cannot be used"),
+        ("views/0/index", None, "whole number"),
+        ("views", 3, "list of named entries"),
+        ("target/rows", DROPPED, "does not fit"),
+        ("target/type", "Egg", "Egg"),
+        ("checks/0/verdict", "superb", "superb"),
+        ("robot_map/kind", "odd", "odd"),
+        ("robot_map/frame", "odd", "odd"),
+        ("map_name", None, "not a text"),
+        ("Z_alone", DROPPED, "'Z_alone' is missing"),
+        ("intrinsics_alone/fx", "wide", "'fx' cannot be used"),
+        ("views/0/point_ids", [1, 2], "2 numbers for 12 points"),
+        ("views/1/joints", [0.0], "shape"),
+        ("board/half_sides_m", [0.1], "shape"),
+        ("map_scores", [["none"]], "names and numbers"),
     ],
 )
-def test_a_damaged_file_is_named(text: str, says: str, tmp_path: Path) -> None:
+def test_a_damaged_entry_is_named(
+    full_record: Maker, key: str, value: Any, says: str, tmp_path: Path
+) -> None:
     path = tmp_path / "calibration.json"
-    path.write_text(text)
+    path.write_text(damaged(full_record(np.eye(4)), key, value))
     with pytest.raises(InputError, match=r"calibration\.json") as error:
         read_calibration(path)
     assert says in str(error.value)
@@ -102,3 +136,11 @@ def test_a_damaged_file_is_named(text: str, says: str, tmp_path: Path) -> None:
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         read_calibration(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(("text", "says"), [("{", "cannot be read as JSON"), ("[1, 2]", "schema")])
+def test_another_file_is_named(text: str, says: str, tmp_path: Path) -> None:
+    path = tmp_path / "calibration.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=says):
+        read_calibration(path)

@@ -6,8 +6,8 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, TagBoard
-from realsim_calibration import DetectionConfig, TagDetections, detect_tags
-from realsim_calibration.edges import EdgeConfig, bilinear, fit_lines
+from realsim_calibration.detect.edges import EdgeConfig, bilinear, fit_lines
+from realsim_calibration.detect.tags import DetectionConfig, TagDetections, detect_tags
 
 BOARD = TagBoard(rows=2, columns=3, tag_size_m=0.032, gap_m=0.008)
 CAMERA = CameraIntrinsics(width=480, height=360, fx=600.0, fy=600.0, cx=239.5, cy=179.5)

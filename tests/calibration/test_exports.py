@@ -2,12 +2,12 @@
 
 import ast
 import dataclasses
-import json
 import math
 import shlex
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,32 +22,22 @@ from ruamel.yaml import YAML
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.dh import DhArm
-from realsim.records import (
-    ArmErrorMap,
-    CameraIntrinsics,
-    CharucoBoard,
-    Check,
-    Chessboard,
-    CircleGrid,
-    RobotErrorMap,
-    TagBoard,
-    Target,
-)
-from realsim_calibration import ros_exports
-from realsim_calibration.calibration_file import calibration_text, read_calibration
-from realsim_calibration.export_frames import (
+from realsim.records import CameraIntrinsics
+from realsim_calibration.exports import (
     FrameNames,
     note_lines,
-    number,
+    opencv_text,
     published_transform,
-    roll_pitch_yaw,
+    read_calibration,
+    ros,
+    write_exports,
 )
-from realsim_calibration.exports import opencv_text, write_exports
-from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
+from realsim_calibration.exports.frames import number, roll_pitch_yaw
+from realsim_calibration.results import HandEyeReport, Mode
 
 Array = NDArray[np.float64]
 EXACT = 1e-9
+Maker = Callable[..., HandEyeReport]
 axis = hnp.arrays(np.float64, 3, elements=st.floats(-1, 1)).filter(
     lambda v: np.linalg.norm(v) > 1e-3
 )
@@ -96,7 +86,7 @@ def yaml11(text: str) -> Any:
     return named(yaml.load("%YAML 1.1\n---\n" + text))
 
 
-def same(a: Array, b: Array) -> bool:
+def same(a: NDArray[Any], b: NDArray[Any]) -> bool:
     return bool(np.abs(a - b).max() < EXACT)
 
 
@@ -112,13 +102,13 @@ LINK = FrameNames(
 
 @given(X=transforms(), mode=st.sampled_from(["eye_in_hand", "eye_to_hand"]))
 @settings(max_examples=60, deadline=None)
-def test_easy_handeye_reads_the_same_transform(X: Array, mode: Mode) -> None:
-    report = make_report(X, mode)
-    two = yaml11(ros_exports.easy_handeye2_text(report, FRAMES))
+def test_easy_handeye_reads_the_same_transform(full_record: Maker, X: Array, mode: Mode) -> None:
+    report = full_record(X, mode)
+    two = yaml11(ros.easy_handeye2_text(report, FRAMES))
     t, q = two["transform"]["translation"], two["transform"]["rotation"]
     assert all(type(v) is float for v in (*t.values(), *q.values()))
     assert same(rigid_of([t[k] for k in "xyz"], [q[k] for k in "xyzw"]), X)
-    one = yaml11(ros_exports.easy_handeye_text(report, FRAMES))
+    one = yaml11(ros.easy_handeye_text(report, FRAMES))
     T = one["transformation"]
     assert all(type(v) is float for v in T.values())
     assert same(rigid_of([T[k] for k in "xyz"], [T[k] for k in ("qx", "qy", "qz", "qw")]), X)
@@ -126,30 +116,32 @@ def test_easy_handeye_reads_the_same_transform(X: Array, mode: Mode) -> None:
 
 @given(X=transforms(), frames=st.sampled_from([FRAMES, LINK]))
 @settings(max_examples=60, deadline=None)
-def test_ros_commands_and_launch_carry_the_same_transform(X: Array, frames: FrameNames) -> None:
-    report = make_report(X)
+def test_ros_commands_and_launch_carry_the_same_transform(
+    full_record: Maker, X: Array, frames: FrameNames
+) -> None:
+    report = full_record(X)
     expected, parent, child = published_transform(report, frames)
-    words = shlex.split(ros_exports.ros2_command(report, frames))
+    words = shlex.split(ros.ros2_command(report, frames))
     assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
     named = dict(zip(words[4::2], words[5::2], strict=True))
     assert (named["--frame-id"], named["--child-frame-id"]) == (parent, child)
     xyz = [named[f"--{k}"] for k in "xyz"]
     assert same(rigid_of(xyz, [named[f"--q{k}"] for k in "xyzw"]), expected)
 
-    old = shlex.split(ros_exports.ros1_command(report, frames))
+    old = shlex.split(ros.ros1_command(report, frames))
     assert len(old) == 12 and old[-2:] == [parent, child]
     assert same(rigid_of(old[3:6], old[6:10]), expected)
 
-    tree = ast.parse(ros_exports.ros2_launch_text(report, frames))
+    tree = ast.parse(ros.ros2_launch_text(report, frames))
     lists = [n for n in ast.walk(tree) if isinstance(n, ast.keyword) and n.arg == "arguments"]
     assert ast.literal_eval(lists[0].value) == words[4:]
 
 
 @given(X=transforms(), frames=st.sampled_from([FRAMES, LINK]))
 @settings(max_examples=60, deadline=None)
-def test_urdf_reads_the_same_transform(X: Array, frames: FrameNames) -> None:
+def test_urdf_reads_the_same_transform(full_record: Maker, X: Array, frames: FrameNames) -> None:
     """rpy about fixed axes: R = Rz Ry Rx, read with this formula and compared."""
-    root = ET.fromstring(ros_exports.urdf_text(make_report(X), frames))
+    root = ET.fromstring(ros.urdf_text(full_record(X), frames))
     T = np.eye(4)
     links = [link.attrib["name"] for link in root.findall("link")]
     for joint in root.findall("joint"):
@@ -179,17 +171,17 @@ def test_roll_pitch_yaw_near_the_lock(X: Array, near: float, flip: int) -> None:
 
 @given(X=transforms(), mode=st.sampled_from(["eye_in_hand", "eye_to_hand"]))
 @settings(max_examples=30, deadline=None)
-def test_opencv_reads_the_same_transform(X: Array, mode: Mode) -> None:
-    report = make_report(X, mode)
+def test_opencv_reads_the_same_transform(full_record: Maker, X: Array, mode: Mode) -> None:
+    report = full_record(X, mode)
     text = opencv_text(report, FRAMES)
     storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     at, target = ("gripper", "base") if mode == "eye_in_hand" else ("base", "gripper")
     R, t = (storage.getNode(f"{k}_cam2{at}").mat() for k in "Rt")
     assert t.shape == (3, 1) and same(se3.from_rt(R, t[:, 0]), X)
     R, t = (storage.getNode(f"{k}_target2{target}").mat() for k in "Rt")
-    assert same(se3.from_rt(R, t[:, 0]), report.Z)
-    assert same(storage.getNode("camera_matrix").mat(), report.intrinsics.K)
-    assert same(storage.getNode("dist_coeffs").mat()[0], report.intrinsics.distortion)
+    assert same(se3.from_rt(R, t[:, 0]), report.Z_alone)
+    assert same(storage.getNode("camera_matrix").mat(), report.intrinsics_alone.K)
+    assert same(storage.getNode("dist_coeffs").mat()[0], report.intrinsics_alone.distortion)
     assert int(storage.getNode("image_width").real()) == 1280
 
 
@@ -204,9 +196,9 @@ def test_numbers_are_floats_of_yaml_too(value: float) -> None:
 # --- known answers ------------------------------------------------------------------------------
 
 
-def test_camera_link_of_a_camera_that_looks_along_the_tool() -> None:
+def test_camera_link_of_a_camera_that_looks_along_the_tool(full_record: Maker) -> None:
     """Optical = tool axes, 0.1 m ahead: the body's x axis is then the tool's z axis."""
-    report = make_report(se3.from_translation([0.0, 0.0, 0.1]))
+    report = full_record(se3.from_translation([0.0, 0.0, 0.1]))
     T, parent, child = published_transform(report, FrameNames(camera_link="camera_link"))
     assert (parent, child) == ("tool0", "camera_link")
     np.testing.assert_allclose(T[:3, 0], [0, 0, 1], atol=1e-15)  # forward
@@ -215,9 +207,9 @@ def test_camera_link_of_a_camera_that_looks_along_the_tool() -> None:
     np.testing.assert_allclose(T[:3, 3], [0, 0, 0.1], atol=1e-15)
 
 
-def test_easy_handeye2_has_the_keys_of_its_message_and_no_others() -> None:
+def test_easy_handeye2_has_the_keys_of_its_message_and_no_others(full_record: Maker) -> None:
     """set_message_fields refuses unknown keys, so the layout must be the message's own."""
-    read = yaml11(ros_exports.easy_handeye2_text(make_report(np.eye(4), "eye_to_hand"), FRAMES))
+    read = yaml11(ros.easy_handeye2_text(full_record(np.eye(4), "eye_to_hand"), FRAMES))
     assert list(read) == ["parameters", "transform"]
     assert read["parameters"] == {
         "name": "ur5",
@@ -230,25 +222,25 @@ def test_easy_handeye2_has_the_keys_of_its_message_and_no_others() -> None:
         "move_group_namespace": "/",
         "move_group": "manipulator",
     }
-    old = yaml11(ros_exports.easy_handeye_text(make_report(np.eye(4)), FRAMES))
+    old = yaml11(ros.easy_handeye_text(full_record(np.eye(4)), FRAMES))
     assert old["parameters"]["eye_on_hand"] is True and old["parameters"]["namespace"] == "/ur5/"
 
 
-def test_eye_to_hand_hangs_below_the_base() -> None:
-    report = make_report(se3.from_translation([1.0, 0, 0]), "eye_to_hand")
+def test_eye_to_hand_hangs_below_the_base(full_record: Maker) -> None:
+    report = full_record(se3.from_translation([1.0, 0, 0]), "eye_to_hand")
     assert published_transform(report, FRAMES)[1:] == ("base", "cam_optical")
 
 
-def test_every_text_says_frames_units_accuracy_and_warnings() -> None:
-    report = make_report(se3.from_translation([0.0, 0.0, 0.1]))
+def test_every_text_says_frames_units_accuracy_and_warnings(full_record: Maker) -> None:
+    report = full_record(se3.from_translation([0.0, 0.0, 0.1]))
     notes = "\n".join(note_lines(report, FRAMES))
     for text in (
-        ros_exports.easy_handeye2_text(report, FRAMES),
-        ros_exports.easy_handeye_text(report, FRAMES),
-        ros_exports.ros1_script(report, FRAMES),
-        ros_exports.ros2_script(report, FRAMES),
-        ros_exports.ros2_launch_text(report, FRAMES),
-        ros_exports.urdf_text(report, FRAMES),
+        ros.easy_handeye2_text(report, FRAMES),
+        ros.easy_handeye_text(report, FRAMES),
+        ros.ros1_script(report, FRAMES),
+        ros.ros2_script(report, FRAMES),
+        ros.ros2_launch_text(report, FRAMES),
+        ros.urdf_text(report, FRAMES),
         opencv_text(report, FRAMES),
     ):
         assert "OPTICAL" in text and "Metres" in text and "1 sigma" in text
@@ -256,46 +248,49 @@ def test_every_text_says_frames_units_accuracy_and_warnings() -> None:
     assert "alert(1)" in notes and all("\n" not in n for n in note_lines(report, FRAMES))
 
 
-def test_the_shell_scripts_run_one_command_with_the_words(tmp_path: Path) -> None:
+def test_the_shell_scripts_run_one_command_with_the_words(
+    full_record: Maker, tmp_path: Path
+) -> None:
     """A shell runs the script with a `ros2` that prints its arguments: comments stay comments."""
     fake = tmp_path / "ros2"
     fake.write_text('#!/bin/sh\nfor w in "$@"; do echo "$w"; done\n')
     fake.chmod(0o755)
-    report = make_report(se3.from_translation([0.1, -0.2, 1e-17]))
+    report = full_record(se3.from_translation([0.1, -0.2, 1e-17]))
     script = tmp_path / "publish.sh"
-    script.write_text(ros_exports.ros2_script(report, FRAMES))
+    script.write_text(ros.ros2_script(report, FRAMES))
     ran = subprocess.run(
         ["/bin/sh", str(script)], env={"PATH": f"{tmp_path}:/bin:/usr/bin"}, capture_output=True,
         text=True, check=True,
     )  # fmt: skip
-    assert ran.stdout.split() == shlex.split(ros_exports.ros2_command(report, FRAMES))[1:]
+    assert ran.stdout.split() == shlex.split(ros.ros2_command(report, FRAMES))[1:]
 
 
-def test_camera_info_is_plumb_bob_or_rational() -> None:
-    report = make_report(np.eye(4))
-    info = yaml11(ros_exports.camera_info_text(report, FRAMES))
+def test_camera_info_is_plumb_bob_or_rational(full_record: Maker) -> None:
+    report = full_record(np.eye(4))
+    info = yaml11(ros.camera_info_text(report, FRAMES))
     assert info["distortion_model"] == "plumb_bob"
-    assert info["distortion_coefficients"]["data"] == list(report.intrinsics.distortion[:5])
-    assert info["camera_matrix"]["data"] == list(report.intrinsics.K.ravel())
+    assert info["distortion_coefficients"]["data"] == list(report.intrinsics_alone.distortion[:5])
+    assert info["camera_matrix"]["data"] == list(report.intrinsics_alone.K.ravel())
     wide = CameraIntrinsics(
         width=640, height=480, fx=300.0, fy=300.0, cx=319.5, cy=239.5,
-        distortion=np.arange(1, 9) * 0.01,
+        distortion=np.linspace(0.01, 0.08, 8),
     )  # fmt: skip
-    info = yaml11(
-        ros_exports.camera_info_text(dataclasses.replace(report, intrinsics=wide), FRAMES)
-    )
+    info = yaml11(ros.camera_info_text(dataclasses.replace(report, intrinsics_alone=wide), FRAMES))
     assert info["distortion_model"] == "rational_polynomial"
     assert len(info["distortion_coefficients"]["data"]) == 8
 
 
-def test_write_exports_writes_readable_files(tmp_path: Path) -> None:
-    report = make_report(se3.exp([0.1, 0.2, 0.3, 0.04, 0.05, 0.06]))
+def test_write_exports_writes_readable_files(full_record: Maker, tmp_path: Path) -> None:
+    report = full_record(se3.exp([0.1, 0.2, 0.3, 0.04, 0.05, 0.06]))
     paths = write_exports(report, tmp_path / "out", frames=FRAMES)
     assert all(p.is_file() and p.stat().st_size > 0 for p in paths)
     on_disk = {p for p in (tmp_path / "out").rglob("*") if p.is_file()}
     assert set(paths) == on_disk  # nothing half-written is left beside them
     with np.load(tmp_path / "out/calibration.npz") as arrays:
         assert np.array_equal(arrays["T_parent_cam"], report.X_alone)
+        assert np.array_equal(arrays["T_target_parent_board"], report.Z_alone)
+        assert np.array_equal(arrays["K"], report.intrinsics_alone.K)
+        assert any("do not mix" in note for note in arrays["notes"])
         assert str(arrays["parent"]) == "tool0" and str(arrays["cam"]) == "cam_optical"
     assert np.abs(read_calibration(paths[0]).X - report.X).max() < 1e-12
     launch = next(p for p in paths if p.name == "camera_pose.launch.py")
@@ -309,6 +304,6 @@ def test_write_exports_writes_readable_files(tmp_path: Path) -> None:
     "wrong",
     [{"hand": "/tool0"}, {"hand": "tool 0"}, {"hand": "base"}, {"name": "../x"}, {"target": ""}],
 )
-def test_frame_names_that_tf_refuses(wrong: dict[str, str]) -> None:
+def test_frame_names_that_tf_refuses(wrong: dict[str, Any]) -> None:
     with pytest.raises(InputError):
         FrameNames(**wrong)

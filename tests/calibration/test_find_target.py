@@ -10,15 +10,12 @@ from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import TAG_CELLS, CharucoBoard, Chessboard, CircleGrid, TagBoard
-from realsim_calibration.detect.ellipses import outline_bias
 from realsim_calibration.detect.find import find_target
 from realsim_calibration.detect.homography import (
     apply_homography,
     fit_homography,
     seen_from_front,
 )
-from realsim_calibration.detect.lattice import grow_lattice, lay_pattern
-from realsim_calibration.detect.saddles import grid_arms, refine_saddles
 from realsim_calibration.detect.visible import explain_missing, what_is_visible
 
 CAMERA = CameraIntrinsics(width=640, height=480, fx=600.0, fy=600.0, cx=319.5, cy=239.5)
@@ -408,80 +405,6 @@ def test_bright_dots_on_black_are_found_too():
     T = pose(target, 25.0)
     d = find_target(255 - picture(target, T), target)
     assert len(d) == 35 and np.abs(d.uv - truth(target, T)).max() < 0.1
-
-
-def test_the_bias_of_an_ellipse_is_that_of_its_conic():
-    # Middle of the ellipse from the dual conic H C* H^T, C* = diag(r^2, r^2, -1) moved by p.
-    T = pose(TARGETS["circles"], 50.0)
-    H = CAMERA.K @ T[:3, [0, 1, 3]]
-    p, r = np.array([[0.03, 0.02], [0.1, 0.08]]), np.array([0.006, 0.01])
-    bias = outline_bias(lambda q: apply_homography(H, q), p, r)
-    for k in range(2):
-        move = np.array([[1, 0, p[k, 0]], [0, 1, p[k, 1]], [0, 0, 1]])
-        D = H @ move @ np.diag([r[k] ** 2, r[k] ** 2, -1.0]) @ move.T @ H.T
-        expected = D[:2, 2] / D[2, 2] - apply_homography(H, p[k])
-        assert np.allclose(bias[k], expected, atol=1e-8) and np.linalg.norm(expected) > 0.03
-
-
-def test_a_saddle_is_exact_without_noise_and_needs_the_right_colours():
-    y, x = np.mgrid[:60, :60].astype(float)
-    for centre, angle in (((30.3, 29.6), 0.2), ((29.5, 30.9), 0.9)):
-        u, v = x - centre[0], y - centre[1]
-        a = u * np.cos(angle) + v * np.sin(angle)
-        b = -u * np.sin(angle + 0.2) + v * np.cos(angle + 0.2)
-        image = np.rint(120 + 80 * np.tanh(1.2 * a) * np.tanh(1.2 * b)).astype(np.uint8)
-        along_a = 20 * np.array([np.cos(angle + 0.2), np.sin(angle + 0.2)])  # where b = 0
-        along_b = 20 * np.array([-np.sin(angle), np.cos(angle)])
-        arms = np.stack([along_a, along_b, -along_a, -along_b])[None]
-        start = np.array([centre]) + np.array([0.8, -0.6])
-        found = refine_saddles(image, start, arms, np.array([False]))
-        assert found.good.all() and np.abs(found.uv - centre).max() < 0.01
-        wrong = refine_saddles(image, start, arms, np.array([True]))
-        assert not wrong.good.any() and "contrast" in wrong.faults[0]
-    assert (
-        len(refine_saddles(image, np.zeros((0, 2)), np.zeros((0, 4, 2)), np.zeros(0, bool)).uv) == 0
-    )
-
-
-def test_arms_of_a_grid_point_to_its_neighbours():
-    grid = np.stack(np.meshgrid(np.arange(4.0), np.arange(3.0)), -1)
-    arms = grid_arms(grid)
-    assert np.allclose(arms, [[1, 0], [0, 1], [-1, 0], [0, -1]])
-
-
-def test_homography_round_trip_and_handedness():
-    rng = np.random.default_rng(0)
-    target = TARGETS["chessboard"]
-    board = target.points_board[:, :2]
-    for _ in range(5):
-        T = pose(target, rng.uniform(0, 60), rng.uniform(0, 360), rng.uniform(0, 360))
-        H = fit_homography(board, truth(target, T))
-        expected = CAMERA.K @ T[:3, [0, 1, 3]]
-        assert np.allclose(H / H[2, 2], expected / expected[2, 2], atol=1e-6)
-        assert seen_from_front(H, board)
-        assert not seen_from_front(np.diag([-1.0, 1.0, 1.0]) @ H, board)
-
-
-def test_a_lattice_grows_among_specks_and_takes_the_pattern_in_any_basis():
-    rng = np.random.default_rng(3)
-    r, c = np.divmod(np.arange(42), 7)
-    pattern = np.stack([c, r], -1)
-    nodes = pattern @ np.array([[21.0, 9.0], [-4.0, 12.0]]) + [200, 150]
-    specks = rng.uniform(0, 130, size=(60, 2))
-    points = np.concatenate([specks, nodes])[rng.permutation(102)]
-    lattice = grow_lattice(points)
-    assert len(lattice) == 42
-    laid = lay_pattern(lattice, pattern, [])
-    ways = {tuple(np.rint(points[one.points[0]]).astype(int)) for one in laid}
-    assert laid[0].seen == 42 and len(laid) == 2  # a rectangle looks the same turned by 180 deg
-    assert ways == {tuple(np.rint(nodes[k]).astype(int)) for k in (0, 41)}
-    for one in laid:
-        a, b = (
-            points[one.points[1]] - points[one.points[0]],
-            points[one.points[7]] - points[one.points[0]],
-        )
-        assert a[0] * b[1] - a[1] * b[0] > 0
-    assert lay_pattern(lattice, np.stack([c, r + c % 2], -1), [])[0].seen < 42
 
 
 @pytest.mark.slow

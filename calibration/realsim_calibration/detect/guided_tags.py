@@ -19,6 +19,8 @@ NEAR_TAGS = 4
 """Known tags that tell where a neighbour is; few, so that the lens does not bend the map."""
 WRONG_SHARE = 0.1
 """Share of a code's cells, border included, that may read wrong: 6 of 64."""
+WRONG_BORDER = 1
+"""Cells of the outermost ring that may read white: more, and a side is covered."""
 MIN_STEP = 20.0
 """Least difference between the white and the black cells [gray levels of 255]."""
 
@@ -82,4 +84,6 @@ def _reads(image: Array, corners: Array, white: NDArray[np.bool_]) -> bool:
     low, high = np.median(level[~white]), np.median(level[white])
     if high - low < MIN_STEP:
         return False
-    return bool(((level > (low + high) / 2) != white).mean() <= WRONG_SHARE)
+    wrong = (level > (low + high) / 2) != white
+    ring = wrong.sum() - wrong[1:-1, 1:-1].sum()
+    return bool(wrong.mean() <= WRONG_SHARE and ring <= WRONG_BORDER)

@@ -358,14 +358,14 @@ def _intrinsics(d: _Entry) -> CameraIntrinsics:
 
 def _board(d: _Entry) -> BoardShape:
     """Return the target's shape."""
-    sides = d.array("half_sides_m", (2,))
+    sides = None if d.raw("half_sides_m") is None else d.array("half_sides_m", (2,))
     return BoardShape(
         scale=d.number("scale"),
         aspect=d.number("aspect"),
         warp=d.array("warp", (3,)),
         sd=d.array("sd", (5,)),
         half_extent_m=d.number("half_extent_m"),
-        half_sides_m=(float(sides[0]), float(sides[1])),
+        half_sides_m=None if sides is None else (float(sides[0]), float(sides[1])),
     )
 
 

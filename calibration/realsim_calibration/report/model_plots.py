@@ -65,7 +65,8 @@ def plot_board(report: HandEyeReport) -> Any:
     left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
     board, points = report.board, report.target.points_board[:, :2]
     middle = (points.min(0) + points.max(0)) / 2
-    x, y = np.meshgrid(*(np.linspace(-half, half, 61) for half in board.half_sides_m))
+    sides = board.half_sides_m or (board.half_extent_m, board.half_extent_m)
+    x, y = np.meshgrid(*(np.linspace(-half, half, 61) for half in sides))
     lift = 1e3 * _lift(report, x, y)
     most = max(0.01, float(np.abs(lift).max()))
     mm = 1e3 * (points - middle)
@@ -75,7 +76,7 @@ def plot_board(report: HandEyeReport) -> Any:
     style.color_bar(figure, surface, left, "out of the plane, into the paper [mm]")
     bent = np.any(board.sd[2:] != 0) or np.any(board.warp != 0)
     left.set_title(f"Bend: up to {board.warp_mm:.2f} mm" if bent else "Bend: taken for flat")
-    _outline(right, report, 2 * np.array(board.half_sides_m))
+    _outline(right, report, 2 * np.array(sides))
     for ax in (left, right):
         ax.set_aspect("equal")
         ax.invert_yaxis()

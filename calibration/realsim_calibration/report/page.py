@@ -263,8 +263,8 @@ def _model_section(page: _Page, report: HandEyeReport) -> None:
     if report.map_scores or report.starts:
         page.picture(
             "choices.png", lambda: model_plots.plot_choices(report),
-            "Left: how well every error map predicts unseen views; dark: the chosen one, which must be "
-            "better by more than its noise. "
+            "Left: how well every error map predicts unseen views; dark: the chosen one, which "
+            "must be better by more than its noise. "
             "Right: every closed form before the joint fit; dark: the smallest.",
         )  # fmt: skip
 

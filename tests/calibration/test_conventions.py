@@ -1,0 +1,513 @@
+import importlib.util
+import json
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError, NotRigidError
+from realsim.geometry import se3
+from realsim.records import Chessboard, CircleGrid
+from realsim_calibration.conventions import diagnose, prove_reading
+from realsim_calibration.frame_fit import fit_frames, hand_side, mismatch
+from realsim_calibration.gates import GateConfig, angle_gate, frame_gate
+from realsim_calibration.half_turns import HalfTurnConfig, synchronise_half_turns, turn_board
+from realsim_calibration.hypotheses import size_name
+from realsim_calibration.motion_check import check_motion
+from realsim_calibration.rotation_readings import (
+    four_number_conventions,
+    three_number_conventions,
+)
+from realsim_calibration.tool_offset import describe_offset, tool_offset
+
+ROOT = Path(__file__).parents[2]
+KOCH = Path(os.environ.get("REALSIM_DATA", ROOT / "../shared/data")) / "handeye" / "koch_ur5"
+real = pytest.mark.skipif(not KOCH.is_dir(), reason=f"no real data at {KOCH} (set REALSIM_DATA)")
+
+
+def load_benchmark():
+    spec = importlib.util.spec_from_file_location(
+        "calibration_faults", ROOT / "benchmarks" / "calibration_faults.py"
+    )
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+faults = load_benchmark()
+MIDDLE = faults.BOARD.points_board.mean(0)
+CONVENTIONS = {c.name: c for c in (*three_number_conventions(), *four_number_conventions())}
+
+
+def session(seed, **kind):
+    return faults.draw_session(np.random.default_rng(seed), **kind)
+
+
+# Laws
+
+
+@pytest.mark.parametrize("name", sorted(CONVENTIONS))
+def test_every_form_of_a_rotation_decodes_to_it(name):
+    R = se3.random_rotation(np.random.default_rng(0), 200)
+    forms = CONVENTIONS[name].decode(CONVENTIONS[name].encode(R))
+    assert np.abs(forms - R[:, None]).max() < 1e-9
+
+
+def test_conventions_differ_from_each_other():
+    R = se3.random_rotation(np.random.default_rng(1), 5)
+    three = three_number_conventions()
+    numbers = three[0].encode(R)[:, 0]
+    decoded = np.array([c.decode(numbers) for c in three])
+    apart = np.abs(decoded[:, None] - decoded[None]).max((2, 3, 4))
+    assert apart[~np.eye(len(three), dtype=bool)].min() > 1e-3
+
+
+def test_euler_conventions_are_those_of_the_textbook():
+    a, b, c = 0.3, -0.7, 1.1
+    Rx, Ry, Rz = (se3.exp_so3(np.eye(3)[k] * v) for k, v in enumerate((a, b, c)))
+    decode = {
+        n: conv.decode(np.array([a, b, c])) for n, conv in CONVENTIONS.items() if "uat" not in n
+    }
+    assert np.allclose(decode["Euler XYZ (moving axes)"], Rx @ Ry @ Rz)
+    assert np.allclose(decode["Euler xyz (fixed axes)"], Rz @ Ry @ Rx)
+    assert np.allclose(decode["rx ry rz as the product Ry Rz Rx"], Ry @ Rz @ Rx)
+
+
+@pytest.mark.parametrize("eye_in_hand", [True, False])
+def test_the_fit_of_perfect_data_is_the_truth(eye_in_hand):
+    rng = np.random.default_rng(3)
+    X, Z = se3.random_transform(rng, spread=0.1), se3.random_transform(rng, spread=0.5)
+    C = session(0).C
+    T = Z @ se3.invert(C) @ se3.invert(X)
+    T = T if eye_in_hand else se3.invert(T)
+    fit = fit_frames(hand_side(T, eye_in_hand), C, MIDDLE)
+    assert np.abs(fit.X - X).max() < 1e-6 and np.abs(fit.Z - Z).max() < 1e-6
+    assert abs(fit.length_ratio - 1) < 1e-6 and fit.score < 1e-4
+    own = np.diag(mismatch(fit, hand_side(T, eye_in_hand), C, faults_fit()))
+    assert own.max() < 1e-4
+
+
+def faults_fit():
+    return GateConfig().fit
+
+
+def test_the_fit_does_not_depend_on_the_frames_of_base_tool_and_board():
+    s = session(1)
+    rng = np.random.default_rng(0)
+    L, R, B = (se3.random_transform(rng, spread=0.3) for _ in range(3))
+    A = hand_side(s.T, s.eye_in_hand)
+    first = fit_frames(A, s.C, MIDDLE)
+    moved = fit_frames(L @ A @ R, s.C @ B, se3.transform(se3.invert(B), MIDDLE[None])[0])
+    assert np.allclose(first.errors, moved.errors, atol=1e-3)
+    assert np.allclose(moved.X, se3.invert(R) @ first.X, atol=1e-4)
+
+
+def test_the_ratio_of_lengths_follows_the_unit():
+    s = session(2)
+    A = hand_side(s.T, s.eye_in_hand)
+    metre = fit_frames(A, s.C, MIDDLE)
+    A[:, :3, 3] *= 1000.0
+    millimetre = fit_frames(A, s.C, MIDDLE)
+    assert millimetre.length_ratio == pytest.approx(1000 * metre.length_ratio, rel=1e-6)
+    assert millimetre.score == pytest.approx(metre.score, rel=1e-4)
+
+
+def test_the_claimed_sigma_of_the_ratio_is_honest():
+    z = []
+    for seed in range(40):
+        s = session(seed)
+        fit = fit_frames(hand_side(s.T, s.eye_in_hand), s.C, MIDDLE)
+        z.append((fit.length_ratio - 1) / fit.ratio_sd)
+    assert 0.5 < np.sqrt(np.mean(np.square(z))) < 2.0
+
+
+def test_two_half_turns_are_none():
+    F = turn_board(MIDDLE, 2)
+    assert np.allclose(F @ F, np.eye(4)) and np.allclose(turn_board(MIDDLE, 4), np.eye(4))
+    assert np.allclose(F[:3, :3] @ MIDDLE + F[:3, 3], MIDDLE)
+
+
+# Faults
+
+
+@pytest.mark.parametrize("fault", sorted(faults.FAULTS))
+def test_every_fault_is_named(fault):
+    for trial in range(1 if fault == "degrees_as_radians" else 2):
+        rng = np.random.default_rng([100, trial])
+        s = faults.FAULTS[fault](faults.draw_session(rng, views=(12, 24)), rng)
+        d = faults.ask(s)
+        assert faults.named(s, d), (s.expected, s.views, d.fault, d.views, d.sentence)
+        assert d.sentence and d.advice
+        assert d.labels == tuple(str(k) for k in d.views)
+
+
+@pytest.mark.parametrize("kind", sorted(faults.CLEAN))
+def test_clean_sessions_raise_no_alarm(kind):
+    for seed in range(4):
+        d = faults.ask(session(seed, **faults.CLEAN[kind]))
+        assert d.fault == "none", d.sentence
+        assert d.repaired_base_ee is None and not d.views
+
+
+@pytest.mark.slow
+def test_the_benchmark_counts_and_tells():
+    share, table = faults.faults_named_share(1, 5)
+    assert share == sum(row[1] for row in table) / len(table) > 0.9
+    assert all(sum(row[3].values()) == 1 for row in table)
+
+
+def test_a_repair_makes_the_data_clean():
+    rng = np.random.default_rng(8)
+    clean = faults.draw_session(rng, views=(12, 16))
+    for fault in ("euler_order", "robot_inverted", "flipped", "swapped", "robot_in_mm", "frozen"):
+        d = faults.ask(faults.FAULTS[fault](clean, rng))
+        again = diagnose(
+            d.repaired_base_ee, d.repaired_cam_board, target=faults.BOARD,
+            mode="eye_in_hand" if clean.eye_in_hand else "eye_to_hand",
+        )  # fmt: skip
+        assert d.note and again.fault == "none", (fault, again.sentence)
+        assert len(d.repaired_rows) == len(d.repaired_base_ee)
+
+
+def test_a_shuffled_list_is_unknown_with_figures():
+    s = session(4, views=(12, 12))
+    d = faults.ask(replace(s, C=s.C[np.random.default_rng(0).permutation(len(s.C))], nominal=None))
+    assert d.fault == "unknown" and "none of" in d.sentence and d.repaired_base_ee is None
+    assert d.evidence[0].hypothesis == "as given" and len(d.evidence) > 5
+
+
+def test_a_raw_reading_that_fits_is_named():
+    s = session(5)
+    numbers = np.degrees(three_number_conventions()[0].encode(s.T[:, :3, :3])[:, 0])
+    wrong = se3.from_rt(se3.exp_so3(numbers), s.T[:, :3, 3])
+    d = diagnose(
+        wrong, s.C, target=faults.BOARD, raw=[("rotation vector in degrees", s.T)],
+        mode="eye_in_hand" if s.eye_in_hand else "eye_to_hand",
+    )  # fmt: skip
+    assert d.fault == "rotation_reading" and "in degrees" in d.sentence
+    assert np.allclose(d.repaired_base_ee, s.T)
+
+
+def test_inverted_poses_ask_where_the_camera_is():
+    s = session(6)
+    d = faults.ask(faults.FAULTS["robot_inverted"](s, np.random.default_rng(0)))
+    assert "Either" in d.sentence and "eye in hand or eye to hand" in d.advice
+
+
+def test_a_small_print_error_is_a_scale_and_not_a_fault():
+    s = session(7)
+    C = s.C.copy()
+    C[:, :3, 3] *= 1.02
+    d = faults.ask(replace(s, C=C, nominal=None))
+    assert d.fault == "none" and d.length_ratio == pytest.approx(1 / 1.02, rel=0.01)
+
+
+def test_the_size_of_the_board_is_said():
+    assert size_name(Chessboard(rows=6, columns=9, square_m=0.035), 0.5444) == (
+        "the square is 19.05 mm, not 35 mm"
+    )
+    assert "pitch" in size_name(CircleGrid(rows=7, columns=7, pitch_m=0.02), 1.2)
+
+
+def test_views_are_called_by_their_names():
+    rng = np.random.default_rng(9)
+    s = faults.swapped(faults.draw_session(rng), rng)
+    names = [f"{k:03d}.png" for k in range(len(s.T))]
+    mode = "eye_in_hand" if s.eye_in_hand else "eye_to_hand"
+    d = diagnose(s.T, s.C, labels=names, target=faults.BOARD, mode=mode)
+    assert d.labels == tuple(names[k] for k in s.views)
+    assert all(name in d.sentence for name in d.labels)
+
+
+def test_a_hand_that_does_not_turn_cannot_be_tested():
+    rng = np.random.default_rng(0)
+    C = np.repeat(session(0).C[:1], 10, 0)
+    T = np.repeat(session(0).T[:1], 10, 0)
+    shift = rng.normal(scale=0.05, size=(10, 3))
+    T[:, :3, 3] += shift
+    C[:, :3, 3] += shift
+    assert diagnose(T, C).fault == "untestable"
+
+
+def test_bad_input_is_refused_in_words():
+    s = session(0)
+    with pytest.raises(InputError, match="at least 4"):
+        diagnose(s.T[:3], s.C[:3])
+    with pytest.raises(InputError, match="hand poses"):
+        diagnose(s.T[:-1], s.C)
+    with pytest.raises(NotRigidError):
+        diagnose(2 * s.T, s.C)
+    with pytest.raises(InputError, match="labels"):
+        diagnose(s.T, s.C, labels=["a"])
+    with pytest.raises(InputError, match="no reading"):
+        prove_reading([], s.C)
+
+
+# Readings of a pose file
+
+
+def readings(s):
+    found = []
+    numbers = three_number_conventions()[0].encode(s.T[:, :3, :3])[:, 0]
+    for c in three_number_conventions():
+        found.append((c.name, se3.from_rt(c.decode(numbers), s.T[:, :3, 3])))
+    found.append(("millimetres", se3.from_rt(s.T[:, :3, :3], s.T[:, :3, 3] / 1000)))
+    return found
+
+
+def test_the_reading_of_a_pose_file_is_proven():
+    for seed in range(2):
+        s = session(seed, views=(12, 16))
+        proof = prove_reading(readings(s), s.C, target=faults.BOARD)
+        assert proof.best == "rotation vector" and proof.decisive and proof.ratio > 3
+        assert proof.best_mode == ("eye_in_hand" if s.eye_in_hand else "eye_to_hand")
+        assert "fits" in proof.sentence and len(proof.fits) == 2 * len(readings(s))
+
+
+def test_inverted_poses_of_the_other_place_are_one_reading():
+    s = session(0)
+    both = [("T_base_ee", s.T), ("T_ee_base", se3.invert(s.T)), ("again", s.T)]
+    proof = prove_reading(both, s.C, target=faults.BOARD)
+    other = "eye_to_hand" if proof.best_mode == "eye_in_hand" else "eye_in_hand"
+    assert f"T_ee_base ({other})" in proof.equivalent or proof.best == "T_ee_base"
+    assert f"again ({proof.best_mode})" in proof.equivalent
+    assert proof.decisive and "inverted" in proof.sentence
+
+
+def test_no_reading_is_proven_where_none_fits():
+    s = session(1)
+    shuffled = s.C[np.random.default_rng(0).permutation(len(s.C))]
+    proof = prove_reading(readings(s), shuffled, target=faults.BOARD)
+    assert not proof.decisive and "No reading fits" in proof.sentence
+
+
+# Half turns
+
+
+@pytest.mark.parametrize("quarter", [False, True])
+def test_turned_boards_are_found_even_if_half_are(quarter):
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        s = faults.draw_session(rng)
+        n = len(s.C)
+        turned = rng.permutation(n)[: (n - 1) // 2]
+        quarters = np.zeros(n, dtype=int)
+        quarters[turned] = rng.integers(1, 4, len(turned)) if quarter else 2
+        C = np.array([T @ turn_board(MIDDLE, int(q)) for T, q in zip(s.C, quarters, strict=True)])
+        found = synchronise_half_turns(s.T, C, MIDDLE, HalfTurnConfig(quarter_turns=quarter))
+        assert np.array_equal((found.quarters + quarters) % 4, np.zeros(n)) and found.decisive
+        assert np.allclose(found.repaired, s.C, atol=1e-12)
+        assert found.after_deg < 0.5 < 20 < found.before_deg and found.margins_deg.min() > 2
+
+
+def test_no_board_is_turned_in_clean_sessions():
+    for seed in range(20):
+        s = session(seed)
+        found = synchronise_half_turns(s.T, s.C, MIDDLE)
+        assert not found.flips.any() and not found.decisive
+        assert found.before_deg == found.after_deg
+
+
+# Tool offset
+
+
+def test_a_tool_offset_is_described():
+    assert describe_offset(se3.from_translation([0, 0, 0.2007])) == (
+        "200.7 mm along the flange's z"
+    )
+    assert "-x" in describe_offset(se3.from_translation([-0.1, 0, 0]))
+    assert "turned by 90.0 deg" in describe_offset(se3.exp([0, 0, np.pi / 2, 0, 0, 0]))
+
+
+def test_poses_of_another_robot_are_not_explained():
+    s, other = session(0, views=(20, 20)), session(1, views=(20, 20))
+    offset = tool_offset(s.T, other.T)
+    assert not offset.known and not offset.active and "model" in offset.advice
+
+
+def test_groups_of_a_changed_tool_are_those_given():
+    s = session(2, views=(20, 20))
+    T = s.T.copy()
+    T[8:] = T[8:] @ se3.from_translation([0.0, 0.03, 0.15])
+    offset = tool_offset(T, s.nominal)
+    assert offset.active and len(offset.offsets) == 2
+    assert np.array_equal(np.unique(offset.groups[:8]), [offset.groups[0]])
+    assert np.array_equal(np.unique(offset.groups[8:]), [offset.groups[-1]])
+    step = se3.invert(offset.offsets[offset.groups[0]]) @ offset.offsets[offset.groups[-1]]
+    assert np.allclose(step[:3, 3], [0, 0.03, 0.15], atol=3e-3)
+
+
+# Gates and motion
+
+
+def test_the_frame_gate_sees_swapped_views_of_equal_orientation():
+    s = session(3, views=(20, 20))
+    A = hand_side(s.T, s.eye_in_hand)
+    fit = fit_frames(A, s.C, MIDDLE)
+    rng = np.random.default_rng(0)
+    C = s.C.copy()
+    # Two views that differ by a shift only.
+    C[5, :3, :3] = C[4, :3, :3]
+    C[5, :3, 3] = C[4, :3, 3] + [0.08, 0.02, 0.0]
+    T = hand_side(fit.Z @ se3.invert(C) @ se3.invert(fit.X), s.eye_in_hand)
+    T = T @ se3.exp(rng.normal(scale=3e-4, size=(20, 6)))
+    C[[4, 5]] = C[[5, 4]]
+    none = [None] * 20
+    dropped = frame_gate(T, C, none, MIDDLE, GateConfig(), eye_in_hand=s.eye_in_hand)[1]
+    assert dropped.keys() == {4, 5} and "mm and" in dropped[4]
+    assert not angle_gate(T, C, none, GateConfig())[1]
+
+
+def test_a_mirror_twin_stands_in():
+    s = session(4, views=(20, 20))
+    C, twins = s.C.copy(), [None] * 20
+    twins[7] = C[7].copy()
+    C[7] = C[7] @ turn_about_middle([0.6, 0.0, 0.0])
+    chosen, dropped, used = frame_gate(
+        s.T, C, twins, MIDDLE, GateConfig(), eye_in_hand=s.eye_in_hand
+    )
+    assert used == [7] and not dropped and np.array_equal(chosen, s.C)
+
+
+def turn_about_middle(w):
+    R = se3.exp_so3(w)
+    return se3.from_rt(R, MIDDLE - R @ MIDDLE)
+
+
+def test_the_frame_gate_keeps_clean_views():
+    for seed in range(20):
+        s = session(seed)
+        gate = frame_gate(
+            s.T, s.C, [None] * len(s.T), MIDDLE, GateConfig(), eye_in_hand=s.eye_in_hand
+        )
+        assert not gate[1] and not gate[2]
+
+
+def camera_session(turns, places):
+    """Poses of a camera in the hand that turns by `turns` and moves by `places` before a board."""
+    start = se3.from_rt(np.diag([1.0, 1.0, 1.0]), [-MIDDLE[0], -MIDDLE[1], 0.4])
+    C = se3.from_rt(se3.exp_so3(turns), places) @ start
+    X = se3.from_rt(se3.exp_so3([0.2, 0.1, 1.0]), [0.03, -0.05, 0.08])
+    return se3.random_transform(np.random.default_rng(0)) @ se3.invert(C) @ se3.invert(X), C
+
+
+def test_missing_motion_is_said():
+    rng = np.random.default_rng(0)
+    n = 15
+    none, free = np.zeros((n, 3)), rng.normal(size=(n, 3))
+    shift = 0.05 * rng.normal(size=(n, 3))
+    full = check_motion(*camera_session(0.5 * free * [1, 1, 2], shift), MIDDLE)
+    assert not full.sentences and full.sd_mm.max() < 2
+    still = check_motion(*camera_session(none, shift), MIDDLE)
+    assert "without turning" in still.sentences[0] and "not known at all" in still.sentences[0]
+    optical = check_motion(*camera_session(0.5 * free * [0, 0, 1], shift), MIDDLE)
+    assert "optical axis only" in optical.sentences[0] and optical.sd_mm[2] > 1e3
+    single = check_motion(*camera_session(0.5 * free * [1, 0, 0], shift), MIDDLE)
+    assert "[1.00, 0.00, 0.00]" in single.sentences[0] and single.sd_mm[0] > 1e3
+    no_roll = check_motion(*camera_session(0.4 * free * [1, 1, 0], shift), MIDDLE)
+    assert any("little roll" in t for t in no_roll.sentences)
+    small = check_motion(*camera_session(0.05 * free, shift), MIDDLE)
+    assert any("small" in t for t in small.sentences) and small.sd_mm.max() > full.sd_mm.max()
+    twice = camera_session(0.5 * free, shift)
+    twice[0][3] = twice[0][9]
+    repeated = check_motion(*twice, MIDDLE)
+    assert repeated.identical == ((3, 9),) and "rows 3, 9" in repeated.sentences[-1]
+
+
+def test_a_board_in_one_place_of_the_image_is_said():
+    s = session(0)
+    C = s.C.copy()
+    q = C[:, :3, :3] @ MIDDLE + C[:, :3, 3]
+    C[:, :3, 3] += np.array([0, 0, 1]) * np.linalg.norm(q, axis=-1)[:, None] - q
+    T = s.T if s.eye_in_hand else se3.invert(s.T)
+    fit = fit_frames(T, s.C, MIDDLE)
+    T = fit.Z @ se3.invert(C) @ se3.invert(fit.X)
+    assert any("same place of the image" in t for t in check_motion(T, C, MIDDLE).sentences)
+
+
+def test_the_predicted_sigma_is_that_of_repeated_sessions():
+    rng = np.random.default_rng(2)
+    T, C = camera_session(rng.normal(scale=0.5, size=(14, 3)), 0.05 * rng.normal(size=(14, 3)))
+    predicted = check_motion(T, C, MIDDLE)
+    X, found = fit_frames(T, C, MIDDLE).X, []
+    for _ in range(120):
+        angle = rng.normal(scale=np.radians(0.1), size=(14, 3))
+        noise = np.concatenate([angle, rng.normal(scale=1e-3, size=(14, 3))], -1)
+        about = se3.from_translation(C[:, :3, :3] @ MIDDLE + C[:, :3, 3])
+        moved = about @ se3.exp(noise) @ se3.invert(about) @ C
+        moved[:, :3, 3] *= 1 + rng.normal(scale=0.003)
+        found.append(1e3 * X[:3, :3].T @ (fit_frames(T, moved, MIDDLE).X[:3, 3] - X[:3, 3]))
+    # The fit knows nothing of the board's size, so along z it scatters more than the best possible.
+    ratio = np.std(found, 0)[:2] / predicted.sd_mm[:2]
+    assert np.all((ratio > 0.7) & (ratio < 1.5))
+
+
+# Real
+
+
+@pytest.fixture(scope="module")
+def koch():
+    meta = json.loads((KOCH / "meta.json").read_text())
+    stacks = []
+    for key in ("robot_poses", "cam_poses"):
+        T = np.array(meta[key]).reshape(-1, 4, 4)
+        T[:, :3, 3] /= 1000.0
+        stacks.append(se3.check_rigid(T, key))
+    return stacks[0], stacks[1], np.radians(meta["joints"])
+
+
+def ur5_flange(joints):
+    """Nominal kinematics of a UR5: d, a, alpha of every joint."""
+    quarter = np.pi / 2
+    links = [
+        (0.089159, 0, quarter), (0, -0.425, 0), (0, -0.39225, 0), (0.10915, 0, quarter),
+        (0.09465, 0, -quarter), (0.0823, 0, 0),
+    ]  # fmt: skip
+    T = np.repeat(np.eye(4)[None], len(joints), 0)
+    for (d, a, alpha), q in zip(links, np.asarray(joints).T, strict=True):
+        turn = se3.from_rt(se3.exp_so3(q[:, None] * [0.0, 0.0, 1.0]), np.zeros(3))
+        link = se3.from_rt(se3.exp_so3([alpha, 0.0, 0.0]), np.zeros(3))
+        T = T @ turn @ se3.from_translation([a, 0, d]) @ link
+    return T
+
+
+@real
+@pytest.mark.real
+def test_a_real_ur5_is_sound_and_its_tool_is_named(koch):
+    A, C, joints = koch
+    assert diagnose(A, C).fault == "none"
+    d = diagnose(A, C, nominal=ur5_flange(joints))
+    assert d.fault == "tool_offset" and d.harmless and "mm along the flange's z" in d.sentence
+    offset = tool_offset(A, ur5_flange(joints))
+    assert np.allclose(offset.offsets[0][:3, 3], [0, 0, 0.2007], atol=1.5e-3)
+
+
+@real
+@pytest.mark.real
+def test_millimetres_of_a_real_file_are_named(koch):
+    A, C, _ = koch
+    raw = A.copy()
+    raw[:, :3, 3] *= 1000
+    d = diagnose(raw, C)
+    assert d.fault == "robot_unit" and np.allclose(d.repaired_base_ee, A)
+
+
+@real
+@pytest.mark.real
+@pytest.mark.parametrize(
+    "fault",
+    sorted(
+        faults.FAULTS.keys() - {"flipped", "tool_left_active", "base_turned", "degrees_as_radians"}
+    ),
+)
+def test_faults_in_real_poses_are_named(koch, fault):
+    A, C, _ = koch
+    rng = np.random.default_rng(3)
+    s = faults.Session(T=A, C=C, nominal=None, eye_in_hand=True)
+    d = faults.ask(replace(faults.FAULTS[fault](s, rng), target=faults.BOARD))
+    expected = faults.FAULTS[fault](s, np.random.default_rng(3))
+    assert faults.named(expected, d), (expected.expected, expected.views, d.fault, d.sentence)
