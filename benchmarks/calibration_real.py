@@ -191,7 +191,8 @@ def run_fold(fold: Fold) -> FoldResult:
         )
         for k in train
     ]  # fmt: skip
-    where = {"set_name": data.name, "seed": fold.seed, "number": fold.number, "swapped": swapped}
+    where: dict[str, Any] = {"set_name": data.name, "seed": fold.seed, "number": fold.number}
+    where["swapped"] = swapped
     try:
         report = calibrate(views, data.target, arm=data.arm if fold.joints else None).hand_eye
     except RealsimError as error:
@@ -202,7 +203,8 @@ def run_fold(fold: Fold) -> FoldResult:
         seen = data.detections[k]
         T_cam_board = se3.invert(T @ report.X) @ report.Z
         uv = project(report.intrinsics, se3.transform(T_cam_board, points[seen.point_ids]))
-        px.append(float(np.sqrt(np.mean(np.sum((uv - seen.uv) ** 2, -1)))))
+        error = float(np.sqrt(np.mean(np.sum((uv - seen.uv) ** 2, -1))))
+        px.append(error if np.isfinite(error) else float("inf"))
     return FoldResult(
         px=tuple(px), map_name=report.map_name, rejected=tuple(i for i, _ in report.rejected),
         **where,

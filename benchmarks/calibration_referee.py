@@ -8,7 +8,8 @@ fold: lens by calibrateCamera on the training views, board poses by solvePnP, X 
 averaging where the method gives none), then every test view's points through its robot pose. The
 pose-only set is left out one by one. Input, per set S: S_A (n, 4, 4), S_points (m, 3), S_ids and
 S_uv of all views one after the other, S_start (n + 1,), S_size (2,), S_folds (seeds, n); and
-poses_A, poses_C (n, 4, 4). Output: {"px": {S: {method: [px per seed]}}, "poses_mm": {method: [..]}}.
+poses_A, poses_C (n, 4, 4). Output: {"px": {S: {method: [px per seed]}}, "poses_mm": {method: [mm
+per view]}}.
 """
 
 import json
@@ -35,6 +36,11 @@ def rigid(R: Array, t: Array) -> Array:
     T[:3, :3] = R if R.shape == (3, 3) else cv.Rodrigues(R)[0]
     T[:3, 3] = np.ravel(t)
     return T
+
+
+def inverse_of(T: Array) -> Array:
+    """Return the inverse pose."""
+    return np.asarray(np.linalg.inv(T), dtype=np.float64)
 
 
 def mean_pose(Ts: Array) -> Array:
@@ -64,7 +70,7 @@ def closed_forms(A: Array, C: Array) -> dict[str, tuple[Array, Array] | None]:
                 list(C[:, :3, :3]), list(C[:, :3, 3]), list(inverse[:, :3, :3]),
                 list(inverse[:, :3, 3]), method=getattr(cv, f"CALIB_ROBOT_WORLD_HAND_EYE_{name}"),
             )  # fmt: skip
-            found[name.lower()] = (np.linalg.inv(rigid(Rc, tc)), np.linalg.inv(rigid(Rw, tw)))
+            found[name.lower()] = (inverse_of(rigid(Rc, tc)), inverse_of(rigid(Rw, tw)))
         except (cv.error, np.linalg.LinAlgError):
             found[name.lower()] = None
     return found

@@ -186,12 +186,3 @@ def _left_out(H: Array, U: Array, residual: Array) -> Array:
     V = V.reshape(len(H), len(U), -1).transpose(1, 0, 2)  # H^-1 U_i^T (views, dim, 24)
     inner = np.eye(U.shape[1]) - U @ V
     return (V @ np.linalg.solve(inner, residual[..., None]))[..., 0]
-
-
-def shared_information(information: Array) -> Array:
-    """Return the information (29, 29) about the shared parameters, the robot's map eliminated."""
-    H = information
-    if len(H) == SHARED:
-        return H
-    cross = H[:SHARED, SHARED:]
-    return H[:SHARED, :SHARED] - cross @ np.linalg.solve(H[SHARED:, SHARED:], cross.T)

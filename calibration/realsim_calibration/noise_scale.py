@@ -130,28 +130,28 @@ def estimate_ratio(
 
 
 def estimate_arm(
-    model: LinearModel, basis: ErrorBasis, sigma: float, most: float,
+    model: LinearModel, basis: ErrorBasis, sigma: float,
     config: NoiseConfig, errors: RobotErrorConfig,
 ) -> tuple[Array, ErrorBasis]:  # fmt: skip
     """Return lambda (2,) and the arm's basis with its angles and lengths scaled to the views.
 
     Four logarithms: lambda for rotation and translation, angles, lengths. The scales have a prior
-    of a factor of four, so that few views leave them where arms usually are.
+    of a factor of two, so that few views leave them where arms usually are.
     """
 
     def factors(x: Array) -> Array:
         return np.repeat(np.exp(np.clip(x[2:], -7.0, 7.0)), ARM_ANGLES)
 
     def deviance(x: Array) -> float:
-        ratio, price = _ratio_prior(x[:2], most, config)
+        ratio, price = _ratio_prior(x[:2], config.most, config)
         prior = float(np.sum((x[2:] / errors.scale_log_sd) ** 2))
         return model.deviance(basis.scaled(factors(x)), ratio, sigma) + prior + price
 
-    start = np.array([*[float(np.log(min(config.bound, most)))] * 2, 0.0, 0.0])
+    start = np.array([*[float(np.log(config.bound))] * 2, 0.0, 0.0])
     x = _search(deviance, start, 2 * config.evaluations)
     # Twenty-four errors tell their own size only roughly: E[scale^2] is above the likeliest one.
     x[2:] += [_log_variance(deviance, x, k, errors.scale_log_sd) for k in (2, 3)]
-    return _ratio_prior(x[:2], most, config)[0], basis.scaled(factors(x))
+    return _ratio_prior(x[:2], config.most, config)[0], basis.scaled(factors(x))
 
 
 def _log_variance(deviance: Callable[[Array], float], x: Array, k: int, prior_sd: float) -> float:

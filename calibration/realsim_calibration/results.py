@@ -139,7 +139,8 @@ class HandEyeReport:
     checks: tuple[Check, ...]
     information: Array
     """(29, 29) information about X (6), Z (6), the camera (12) and the board's shape (5: scale,
-    aspect, warp), the map eliminated: for the next best view."""
+    aspect, warp) with the robot's map held: for the next best view. What X_covariance has beyond
+    its inverse no further view lowers at once: errors of the arm that look like another X."""
 
     @property
     def floor_px(self) -> float:

@@ -36,6 +36,10 @@ class RobotErrorConfig:
     """A weight of a map at strength 1 [rad and m per unit feature]."""
     map_strengths: tuple[float, ...] = (0.1, 0.3, 1.0)
     """Ridges that are tried: half a millimetre at the edge of the poses, times these."""
+    map_gain: float = 1.0
+    """A map must predict unseen views better than no map by so many standard errors ..."""
+    arm_gain: float = 2.0
+    """... and by so many better than the arm's own numbers, which cannot bend as freely."""
     arm_angle_sd: float = 2e-4
     """Error of a joint zero or twist [rad]: 0.1-0.3 mm at the tool is left after a factory
     calibration; re-estimated from the views (`scales`)."""
@@ -49,8 +53,9 @@ class RobotErrorConfig:
     differ from nominal by 1 to 3 mm."""
     arm_margin: float = 3.0
     """... and this many times better than any other arm."""
-    scale_log_sd: float = 1.4
-    """1-sigma of the logarithm of the re-estimated scales: a factor of 4 either way."""
+    scale_log_sd: float = 0.7
+    """1-sigma of the logarithm of the re-estimated scales: a factor of 2 either way. Of an arm's
+    24 errors a capture shows a dozen, too few to tell the size of the hidden ones alone."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -19,7 +19,7 @@ from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim_calibration.board_pose import refine_board_pose
 from realsim_calibration.joint_solve import JointProblem, JointState, Setup, camera_of
-from realsim_calibration.linear_model import LinearFit, LinearModel, shared_information
+from realsim_calibration.linear_model import LinearFit, LinearModel
 from realsim_calibration.noise_scale import (
     Whiteness,
     estimate_arm,
@@ -30,8 +30,15 @@ from realsim_calibration.noise_scale import (
     unknown_arm_columns,
     whiteness,
 )
-from realsim_calibration.robot_error import ErrorBasis, arm_basis, map_basis, map_record
+from realsim_calibration.robot_error import (
+    ErrorBasis,
+    RobotErrorConfig,
+    arm_basis,
+    map_basis,
+    map_record,
+)
 from realsim_calibration.uncertainty import noise_covariance, shared, with_arm
+from realsim_calibration.view_system import SHARED
 
 if TYPE_CHECKING:
     from realsim_calibration.hand_eye import HandEyeConfig
@@ -64,7 +71,7 @@ class Solution:
     covariance: Array
     """(29, 29) of the shared parameters."""
     information: Array
-    """(29, 29), the map eliminated."""
+    """(29, 29), the map held."""
     alone: JointState
     """The fit without a map."""
     alone_covariance: Array
@@ -111,13 +118,14 @@ def solve(
         bounded = ratio if fixed else np.minimum(ratio, config.noise.bound)
         choices += _maps(model, Ts, sigma, bounded, config)
     if arm is not None and joints is not None:
-        arm_ratio, known = estimate_arm(
-            model, arm_basis(arm, joints, Ts, config.robot), sigma, most, config.noise, config.robot
-        )
+        # What is left of the robot's error beside the arm's own is noise: lambda needs no bound.
+        noise = replace(config.noise, least=fixed, most=fixed) if fixed else config.noise
+        basis = arm_basis(arm, joints, Ts, config.robot)
+        arm_ratio, known = estimate_arm(model, basis, sigma, noise, config.robot)
         fit = model.fit(known, arm_ratio, sigma)
         if config.robot_map:
             choices.append(_Choice(basis=known, ratio=arm_ratio, fit=fit))
-    best = _chosen(choices)
+    best = _chosen(choices, config.robot)
     if best.basis is not None and best.basis.kind != "arm" and not fixed:
         ratio = estimate_ratio(model, best.basis, sigma, most, config.noise)
         best = _Choice(basis=best.basis, ratio=ratio, fit=model.fit(best.basis, ratio, sigma))
@@ -135,7 +143,7 @@ def solve(
         ratio=best.ratio,
         white=white,
         covariance=shared(covariance),
-        information=shared_information(final.information),
+        information=final.information[:SHARED, :SHARED],
         alone=alone,
         alone_covariance=shared(_covariance(model, none.fit, none, columns, known, independent)),
         robot_map=None if best.basis is None else map_record(best.basis, state.weights, Ts, arm),
@@ -203,25 +211,28 @@ def _maps(
     return choices
 
 
-def _chosen(choices: list[_Choice]) -> _Choice:
-    """Return the candidate that predicts unseen views best; simpler ones win within the noise.
+def _chosen(choices: list[_Choice], config: RobotErrorConfig) -> _Choice:
+    """Return the candidate that predicts unseen views best; sounder ones win within the noise.
 
-    A map must beat no map, and a map must beat the arm's own numbers, by more than one standard
-    error of the paired logarithms of the unseen views' errors.
+    A map must beat no map, and the arm's own numbers, by so many standard errors of the paired
+    logarithms of the unseen views' errors.
     """
     none = choices[0]
     arms = [c for c in choices if c.basis is not None and c.basis.kind == "arm"]
     maps = [c for c in choices if c.basis is not None and c.basis.kind != "arm"]
     best = min(maps, key=lambda c: c.fit.score) if maps else none
-    for simple in (none, *arms):
-        if best is simple:
-            continue
-        gain = np.log(simple.fit.unseen_px) - np.log(best.fit.unseen_px)
-        error = float(np.std(gain)) / np.sqrt(len(gain))
-        better_arm = simple is not none and simple.fit.score < none.fit.score
-        if float(np.mean(gain)) < error and (simple is none or better_arm or best is none):
-            best = simple
+    if best is not none and _gain_in_errors(none, best) < config.map_gain:
+        best = none
+    for arm in arms:
+        if _gain_in_errors(arm, best) < config.arm_gain:
+            best = arm
     return best
+
+
+def _gain_in_errors(sound: _Choice, other: _Choice) -> float:
+    """Return by how many standard errors another candidate predicts unseen views better."""
+    gain = np.log(sound.fit.unseen_px) - np.log(other.fit.unseen_px)
+    return float(np.mean(gain)) / max(float(np.std(gain)) / np.sqrt(len(gain)), 1e-12)
 
 
 def _hidden_errors(

@@ -33,12 +33,12 @@ def read_board_views(
             "`realsim board` writes one beside every sheet: copy it there."
         )
     target = target_from_json(store.read_json(BOARD_FILE))
-    views = views_store.session.views
+    views, camera = views_store.session.views, views_store.session.intrinsics
     seen: list[BoardView] = []
     for k, view in enumerate(views):
         if view.T_base_ee is None:
             raise InputError(f"board view {view.index} has no robot pose.")
-        found = find_target(views_store.rgb(view.index), target)
+        found = find_target(views_store.rgb(view.index), target, intrinsics=camera)
         seen.append(
             BoardView(
                 index=view.index, T_base_ee=view.T_base_ee, detection=found, joints=view.joints
