@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.records import Chessboard
-from realsim_calibration.conventions import diagnose
-from realsim_calibration.diagnosis import Diagnosis
-from realsim_calibration.half_turns import turn_board
-from realsim_calibration.rotation_readings import (
+from realsim_calibration.faults.diagnose import diagnose
+from realsim_calibration.faults.diagnosis import Diagnosis
+from realsim_calibration.faults.half_turns import turn_board
+from realsim_calibration.faults.rotation_readings import (
     Convention,
     four_number_conventions,
     three_number_conventions,

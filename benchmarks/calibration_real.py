@@ -34,7 +34,7 @@ from realsim_calibration.inputs import (
     read_image_folder,
     reading_from_text,
 )
-from realsim_calibration.target_text import parse_target
+from realsim_calibration.targets.target_text import parse_target
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

@@ -25,15 +25,15 @@ from realsim_calibration import (
     TargetDetection,
     calibrate_hand_eye_report,
 )
-from realsim_calibration.joint_solve import (
+from realsim_calibration.fit.joint_solve import (
     JointProblem,
     JointState,
     Setup,
     ViewCorners,
     camera_vector,
 )
-from realsim_calibration.linear_model import LinearModel
-from realsim_calibration.robust_fit import solve
+from realsim_calibration.fit.linear_model import LinearModel
+from realsim_calibration.fit.robust_fit import solve
 from realsim_capture_plans.kinematics import UR5E
 
 Array = NDArray[np.float64]

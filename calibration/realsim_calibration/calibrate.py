@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check, Target
 from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
-from realsim_calibration.intrinsics import calibrate_intrinsics
-from realsim_calibration.lens_fit import IntrinsicsConfig
-from realsim_calibration.lens_report import IntrinsicsReport
+from realsim_calibration.lens.intrinsics import calibrate_intrinsics
+from realsim_calibration.lens.fit import IntrinsicsConfig
+from realsim_calibration.lens.report import IntrinsicsReport
 from realsim_calibration.results import HandEyeReport
 from realsim_calibration.views import BoardView
 

@@ -11,24 +11,31 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check, HandEye, Target
-from realsim_calibration.board_pose import BoardPose, estimate_board_pose
+from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
 from realsim_calibration.checks import CheckConfig, hand_eye_checks, roll_range_deg
-from realsim_calibration.closed_forms import CLOSED_FORMS, MotionConfig, check_observable
-from realsim_calibration.diagnosis import DiagnosisConfig
-from realsim_calibration.faults import SINGLE_VIEWS, check_of, examine, half_turned, renumbered
-from realsim_calibration.gates import (
+from realsim_calibration.fit.closed_forms import CLOSED_FORMS, MotionConfig, check_observable
+from realsim_calibration.faults.diagnosis import DiagnosisConfig
+from realsim_calibration.faults.consequences import (
+    SINGLE_VIEWS,
+    check_of,
+    examine,
+    half_turned,
+    motion_check_of,
+    renumbered,
+)
+from realsim_calibration.faults.gates import (
     GateConfig,
-    angle_gate,
+    frame_gate,
     px_gate,
     rotation_mismatch_deg,
     screw_ratio,
 )
-from realsim_calibration.joint_solve import JointConfig, JointProblem, Setup, ViewCorners
-from realsim_calibration.noise_scale import NoiseConfig
+from realsim_calibration.fit.joint_solve import JointConfig, JointProblem, Setup, ViewCorners
+from realsim_calibration.fit.noise_scale import NoiseConfig
 from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
-from realsim_calibration.robot_error import RobotErrorConfig
-from realsim_calibration.robust_fit import Solution, solve
-from realsim_calibration.view_system import SHARED
+from realsim_calibration.fit.robot_error import RobotErrorConfig
+from realsim_calibration.fit.robust_fit import Solution, solve
+from realsim_calibration.fit.view_system import SHARED
 from realsim_calibration.views import BoardView
 
 Array = NDArray[np.float64]
@@ -115,22 +122,31 @@ def calibrate_hand_eye_report(
     if diagnosis is not None and diagnosis.fault in SINGLE_VIEWS:
         rejected |= {candidates[k].view.index: diagnosis.sentence for k in diagnosis.views}
         keep = [k for k in range(len(candidates)) if k not in diagnosis.views]
-        candidates, A, C = [candidates[k] for k in keep], A[keep], C[keep]
+        candidates, given, C = [candidates[k] for k in keep], given[keep], C[keep]
     twins = [_plausible_twin(c.pose, config.gates) for c in candidates]
-    C, dropped, _ = angle_gate(A, C, twins, config.gates)
+    middle = target.points_board.mean(0)
+    C, dropped, _ = frame_gate(
+        given, C, twins, middle, config.gates, eye_in_hand=config.mode == "eye_in_hand"
+    )
     rejected |= {candidates[k].view.index: reason for k, reason in dropped.items()}
     keep = [k for k in range(len(candidates)) if k not in dropped]
-    candidates, A, C = [candidates[k] for k in keep], A[keep], C[keep]
+    candidates, C = [candidates[k] for k in keep], C[keep]
+    A = _stacks(candidates)[0]
     mismatch, ratio = rotation_mismatch_deg(A, C), screw_ratio(A, C, config.gates)
     candidates, start, starts, more = _start(candidates, C, intrinsics0, config)
     rejected |= more
+    C_used = _stacks(candidates)[1]
     setup = _setup(candidates, target, intrinsics0, config)
     joints = _joints(candidates) if arm is not None else None
     solution = solve(setup, start, config, arm if joints is not None else None, joints)
     report = _report(
         views, target, intrinsics0, config, candidates, rejected, starts, solution, mismatch, ratio
     )
-    first = (conventions,) if turned is None else (conventions, turned)
+    moved = motion_check_of(
+        np.array([c.view.T_base_ee for c in candidates]), C_used, middle,
+        eye_in_hand=config.mode == "eye_in_hand",
+    )  # fmt: skip
+    first = tuple(c for c in (conventions, turned, moved) if c is not None)
     return replace(report, checks=first + hand_eye_checks(report, config.checks))
 
 
@@ -304,7 +320,7 @@ def _report(
     starts: tuple[tuple[str, float], ...], solution: Solution, mismatch: float, ratio: float,
 ) -> HandEyeReport:  # fmt: skip
     """Return everything that is known of the calibration."""
-    from realsim_calibration.joint_solve import camera_of
+    from realsim_calibration.fit.joint_solve import camera_of
 
     state, problem = solution.state, solution.problem
     sides = np.ptp(target.points_board, axis=0) / 2

@@ -10,7 +10,7 @@ from realsim.geometry.dh import ARMS, DhArm
 from realsim.records import Target
 from realsim.store import SessionStore
 from realsim_calibration import BoardView, HandEyeReport, find_target
-from realsim_calibration.robot_error import RobotErrorConfig, matching_arm
+from realsim_calibration.fit.robot_error import RobotErrorConfig, matching_arm
 
 BOARD_FILE = "calibration/board.json"
 RESULTS = "calibration"
@@ -25,7 +25,7 @@ def read_board_views(
     Raises:
         InputError: no target file, or a view without a robot pose.
     """
-    from realsim_calibration.target_file import target_from_json
+    from realsim_calibration.targets.target_file import target_from_json
 
     if not store.has(BOARD_FILE):
         raise InputError(

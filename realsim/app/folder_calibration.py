@@ -113,8 +113,8 @@ def target_of(text: str) -> Target:
     Raises:
         InputError: neither; says what is accepted.
     """
-    from realsim_calibration.target_file import read_target
-    from realsim_calibration.target_text import parse_target, target_usage
+    from realsim_calibration.targets.target_file import read_target
+    from realsim_calibration.targets.target_text import parse_target, target_usage
 
     if not text:
         raise InputError(
@@ -126,7 +126,7 @@ def target_of(text: str) -> Target:
 
 
 def _camera_of(path: Path | None) -> CameraIntrinsics | None:
-    from realsim_calibration.camera_files import read_camera
+    from realsim_calibration.lens.camera_files import read_camera
 
     return None if path is None else read_camera(path)
 
@@ -136,7 +136,7 @@ def _detections(
 ) -> list[TargetDetection]:
     """Return the points found in every image; what was found before is not looked for again."""
     from realsim_calibration.inputs import load_image
-    from realsim_calibration.target_text import format_target
+    from realsim_calibration.targets.target_text import format_target
 
     found: list[TargetDetection] = []
     with console.stage("find the target", f"{len(images)} images") as tick:
@@ -187,7 +187,7 @@ def _require_target(
         return
     from realsim_calibration.detect.visible import what_is_visible
     from realsim_calibration.inputs import load_image
-    from realsim_calibration.target_text import format_target
+    from realsim_calibration.targets.target_text import format_target
 
     shown = what_is_visible(load_image(folder.images[0]))
     raise InputError(

@@ -18,9 +18,9 @@ def run_live(request: FolderRequest, console: Console) -> bool:
     """
     from dataclasses import replace
 
-    from realsim_calibration.camera_files import read_camera
+    from realsim_calibration.lens.camera_files import read_camera
     from realsim_calibration.inputs import load_image, read_pose_file, reading_from_text
-    from realsim_calibration.live_calibration import watch_folder
+    from realsim_calibration.planning.live_calibration import watch_folder
 
     if request.camera is None or not request.reading:
         raise InputError(

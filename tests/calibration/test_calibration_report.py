@@ -16,8 +16,8 @@ import pytest
 from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check
 from realsim.records.depth_bias import DepthBias
-from realsim_calibration.depth_bias import DepthBiasReport, DepthViewReport
-from realsim_calibration.intrinsics import calibrate_intrinsics
+from realsim_calibration.depth.bias import DepthBiasReport, DepthViewReport
+from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.report import check_rows, summary_rows, verdict
 from realsim_calibration.report.page import PAGE_NAME, table_html, write_calibration_report
 from realsim_calibration.results import BoardShape, HandEyeReport

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from realsim.errors import InputError
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
-from realsim_calibration.camera_files import read_camera, write_camera
+from realsim_calibration.lens.camera_files import read_camera, write_camera
 
 ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 CAMERA = CameraIntrinsics(

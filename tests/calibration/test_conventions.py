@@ -11,17 +11,17 @@ import pytest
 from realsim.errors import InputError, NotRigidError
 from realsim.geometry import se3
 from realsim.records import Chessboard, CircleGrid
-from realsim_calibration.conventions import diagnose, prove_reading
-from realsim_calibration.frame_fit import fit_frames, hand_side, mismatch
-from realsim_calibration.gates import GateConfig, angle_gate, frame_gate
-from realsim_calibration.half_turns import HalfTurnConfig, synchronise_half_turns, turn_board
-from realsim_calibration.hypotheses import size_name
-from realsim_calibration.motion_check import check_motion
-from realsim_calibration.rotation_readings import (
+from realsim_calibration.faults.diagnose import diagnose, prove_reading
+from realsim_calibration.faults.frame_fit import fit_frames, hand_side, mismatch
+from realsim_calibration.faults.gates import GateConfig, angle_gate, frame_gate
+from realsim_calibration.faults.half_turns import HalfTurnConfig, synchronise_half_turns, turn_board
+from realsim_calibration.faults.hypotheses import size_name
+from realsim_calibration.faults.motion_check import check_motion
+from realsim_calibration.faults.rotation_readings import (
     four_number_conventions,
     three_number_conventions,
 )
-from realsim_calibration.tool_offset import describe_offset, tool_offset
+from realsim_calibration.faults.tool_offset import describe_offset, tool_offset
 
 ROOT = Path(__file__).parents[2]
 KOCH = Path(os.environ.get("REALSIM_DATA", ROOT / "../shared/data")) / "handeye" / "koch_ur5"

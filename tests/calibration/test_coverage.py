@@ -3,7 +3,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.coverage import measure_coverage
+from realsim_calibration.lens.coverage import measure_coverage
 
 
 def test_coverage_names_what_is_missing():

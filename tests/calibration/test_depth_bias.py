@@ -12,9 +12,9 @@ from realsim.geometry import se3
 from realsim.geometry.camera import pixel_grid, project, undistort
 from realsim.records import CameraIntrinsics, TagBoard
 from realsim.records.depth_bias import DepthBias
-from realsim_calibration.depth_bias import DepthBiasReport, estimate_depth_bias
-from realsim_calibration.depth_board import DepthBoardView
-from realsim_calibration.depth_fit import DepthBiasConfig
+from realsim_calibration.depth.bias import DepthBiasReport, estimate_depth_bias
+from realsim_calibration.depth.board import DepthBoardView
+from realsim_calibration.depth.fit import DepthBiasConfig
 from realsim_calibration.results import BoardShape
 from realsim_calibration.views import TargetDetection
 

@@ -7,9 +7,9 @@ from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim_calibration import CLOSED_FORMS, JointConfig
-from realsim_calibration.board_pose import estimate_board_pose
+from realsim_calibration.fit.board_pose import estimate_board_pose
 from realsim_calibration.detect.find import find_target
-from realsim_calibration.gates import GateConfig, angle_differences, px_gate, screw_ratio
+from realsim_calibration.faults.gates import GateConfig, angle_differences, px_gate, screw_ratio
 from realsim_calibration.hand_eye import (
     HandEyeConfig,
     calibrate_hand_eye,

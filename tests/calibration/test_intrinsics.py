@@ -10,16 +10,16 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Chessboard, CircleGrid
-from realsim_calibration.bundle import (
+from realsim_calibration.lens.bundle import (
     Observations,
     State,
     _normal,  # pyright: ignore[reportPrivateUsage]
     camera_vector,
     shaped_points,
 )
-from realsim_calibration.intrinsics import calibrate_intrinsics
-from realsim_calibration.lens_fit import IntrinsicsConfig
-from realsim_calibration.lens_start import (
+from realsim_calibration.lens.intrinsics import calibrate_intrinsics
+from realsim_calibration.lens.fit import IntrinsicsConfig
+from realsim_calibration.lens.start import (
     homography,
     mirror_poses,
     pose_of_homography,

@@ -6,7 +6,7 @@ import pytest
 from realsim.geometry import camera, se3
 from realsim.geometry.dh import UR5E_ARM
 from realsim.records import ArmErrorMap, CameraIntrinsics, RobotErrorMap
-from realsim_calibration.joint_solve import (
+from realsim_calibration.fit.joint_solve import (
     FLAT,
     JointConfig,
     JointProblem,
@@ -14,16 +14,16 @@ from realsim_calibration.joint_solve import (
     ViewCorners,
     camera_vector,
 )
-from realsim_calibration.linear_model import LinearModel
-from realsim_calibration.noise_scale import NoiseConfig, largest_ratio, whiteness
-from realsim_calibration.robot_error import (
+from realsim_calibration.fit.linear_model import LinearModel
+from realsim_calibration.fit.noise_scale import NoiseConfig, largest_ratio, whiteness
+from realsim_calibration.fit.robot_error import (
     RobotErrorConfig,
     arm_basis,
     map_basis,
     map_record,
     pose_features,
 )
-from realsim_calibration.view_system import (
+from realsim_calibration.fit.view_system import (
     camera_from_board,
     refined_pose,
     residual_norm,
@@ -170,7 +170,7 @@ def test_leaving_a_view_out_by_woodbury_is_a_solve_without_it(simulate):
 
 
 def test_the_likelihood_finds_the_robots_share(simulate):
-    from realsim_calibration.noise_scale import estimate_ratio
+    from realsim_calibration.fit.noise_scale import estimate_ratio
 
     found = []
     for robot in (0.1e-3, 1e-3):

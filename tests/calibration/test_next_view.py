@@ -13,13 +13,13 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Check, Chessboard, TagBoard, Target
-from realsim_calibration.live_calibration import (
+from realsim_calibration.planning.live_calibration import (
     LiveCalibration,
     LiveConfig,
     WatchConfig,
     watch_folder,
 )
-from realsim_calibration.next_view import (
+from realsim_calibration.planning.next_view import (
     NextViewConfig,
     board_geometry,
     choose_next_views,
@@ -29,8 +29,8 @@ from realsim_calibration.next_view import (
     view_information,
 )
 from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
-from realsim_calibration.view_needs import roll_range_deg, second_turn_deg
-from realsim_calibration.view_proposals import ViewLimits, describe_move, propose_views
+from realsim_calibration.planning.view_needs import roll_range_deg, second_turn_deg
+from realsim_calibration.planning.view_proposals import ViewLimits, describe_move, propose_views
 from realsim_calibration.views import BoardView, TargetDetection
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.gates import rotation_mismatch_deg
+from realsim_calibration.faults.gates import rotation_mismatch_deg
 from realsim_calibration.inputs import (
     ROTATIONS,
     PoseReading,

@@ -18,7 +18,7 @@ from realsim_calibration.sheets import (
     paper_size,
     write_sheet,
 )
-from realsim_calibration.target_text import parse_target
+from realsim_calibration.targets.target_text import parse_target
 
 pdfium = pytest.importorskip("pypdfium2", reason="rasterising a PDF needs pypdfium2")
 

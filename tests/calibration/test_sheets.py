@@ -22,8 +22,8 @@ from realsim_calibration.sheets import (
     write_sheet,
 )
 from realsim_calibration.sheets.artwork import outlines
-from realsim_calibration.target_file import read_target, target_to_json
-from realsim_calibration.target_text import parse_target
+from realsim_calibration.targets.target_file import read_target, target_to_json
+from realsim_calibration.targets.target_text import parse_target
 
 pdfium = pytest.importorskip("pypdfium2", reason="rasterising a PDF needs pypdfium2")
 

@@ -12,14 +12,14 @@ from hypothesis import strategies as st
 from realsim.errors import InputError, UnitError
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim.store.records_json import tag_board_to_json
-from realsim_calibration.marker_sets import dictionary_name, dictionary_names, dictionary_size
-from realsim_calibration.target_file import (
+from realsim_calibration.targets.marker_sets import dictionary_name, dictionary_names, dictionary_size
+from realsim_calibration.targets.target_file import (
     LARGEST_BYTES,
     read_target,
     target_from_json,
     target_to_json,
 )
-from realsim_calibration.target_text import (
+from realsim_calibration.targets.target_text import (
     FORMS,
     describe,
     format_length,

@@ -6,8 +6,8 @@ import numpy as np
 
 from realsim.geometry.camera import undistort
 from realsim.records import CameraIntrinsics
-from realsim_calibration.depth_bias import DepthBiasReport
-from realsim_calibration.lens_covariance import projection_sd
+from realsim_calibration.depth.bias import DepthBiasReport
+from realsim_calibration.lens.covariance import projection_sd
 from realsim_calibration.report import style
 from realsim_calibration.report.summary import Array, amount
 

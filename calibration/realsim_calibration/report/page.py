@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from realsim import __version__
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check
 from realsim.store import atomic
-from realsim_calibration.depth_bias import DepthBiasReport
-from realsim_calibration.lens_models import TERM_NAMES
-from realsim_calibration.lens_report import IntrinsicsReport, LensView
+from realsim_calibration.depth.bias import DepthBiasReport
+from realsim_calibration.lens.models import TERM_NAMES
+from realsim_calibration.lens.report import IntrinsicsReport, LensView
 from realsim_calibration.report import (
     coverage_plots,
     lens_plots,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.records import TAG_CELLS, CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
-from realsim_calibration.marker_sets import (
+from realsim_calibration.targets.marker_sets import (
     check_markers,
     load_dictionary,
     marker_modules,

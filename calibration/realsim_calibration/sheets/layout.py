@@ -21,7 +21,7 @@ from realsim_calibration.sheets.drawing import (
     text_width_mm,
     wrap,
 )
-from realsim_calibration.target_text import describe, format_target
+from realsim_calibration.targets.target_text import describe, format_target
 
 Place = Literal["bottom", "side"]
 Marks = list[Line | Area | Label]

@@ -1,0 +1,1 @@
+"""Bias of a depth camera from views of the board."""

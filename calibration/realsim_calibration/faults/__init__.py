@@ -1,0 +1,1 @@
+"""What is wrong with the data, shown without a hand-eye; what is done about it."""

@@ -1,0 +1,68 @@
+"""Views that repeat another: the same view twice, one pose for several images, one image twice."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim_calibration.faults.diagnosis import DiagnosisConfig
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Copies:
+    """Groups of rows that repeat each other, by kind."""
+
+    duplicates: tuple[tuple[int, ...], ...]
+    """The same pose and the same image."""
+    frozen: tuple[tuple[int, ...], ...]
+    """The same pose, different images."""
+    repeated: tuple[tuple[int, ...], ...]
+    """The same image, different poses."""
+
+
+def find_copies(T: Array, C: Array, middle: Array, config: DiagnosisConfig) -> Copies:
+    """Return the groups of (n, 4, 4) hand and board poses that repeat each other."""
+    unit = _length_unit(T)
+    same_hand = _near(T, 1e-3 * config.same_pose_mm * unit, np.radians(config.same_pose_deg))
+    q = C[:, :3, :3] @ middle + C[:, :3, 3]
+    distance = max(float(np.median(np.linalg.norm(q, axis=-1))), 1e-12)
+    turn = se3.angle(np.swapaxes(C[:, :3, :3], -1, -2)[:, None] @ C[None, :, :3, :3])
+    slip = np.linalg.norm(q[:, None] - q[None], axis=-1) / distance
+    seen = np.hypot(turn / np.radians(config.fit.unit_deg), slip / config.fit.unit_part)
+    # The same image gives the same numbers; a second photograph of the same view does not.
+    same_image = seen < 1e-6 * config.same_view
+    return Copies(
+        duplicates=_groups(same_hand & (seen < config.same_view)),
+        frozen=_groups(same_hand & (seen > config.other_view)),
+        repeated=_groups(same_image & ~same_hand),
+    )
+
+
+def _length_unit(T: Array) -> float:
+    """Return 1000 where the poses are plainly in millimetres, else 1."""
+    return 1000.0 if float(np.median(np.linalg.norm(T[:, :3, 3], axis=-1))) > 20.0 else 1.0
+
+
+def _near(T: Array, length: float, angle: float) -> NDArray[np.bool_]:
+    far = np.linalg.norm(T[:, None, :3, 3] - T[None, :, :3, 3], axis=-1)
+    turn = se3.angle(np.swapaxes(T[:, :3, :3], -1, -2)[:, None] @ T[None, :, :3, :3])
+    return (far < length) & (turn < angle)
+
+
+def _groups(linked: NDArray[np.bool_]) -> tuple[tuple[int, ...], ...]:
+    """Return the rows that are linked with each other, groups of two and more."""
+    n = len(linked)
+    free, groups = set(range(n)), list[tuple[int, ...]]()
+    while free:
+        group, todo = set[int](), {min(free)}
+        while todo:
+            row = todo.pop()
+            group.add(row)
+            todo |= {int(k) for k in np.flatnonzero(linked[row]) if k != row} - group
+        free -= group
+        if len(group) > 1:
+            groups.append(tuple(sorted(group)))
+    return tuple(groups)

@@ -1,0 +1,173 @@
+"""Records of the convention test: what was tried, what fits, what is wrong and how to mend it."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim_calibration.faults.frame_fit import FitConfig
+from realsim_calibration.faults.gates import GateConfig
+from realsim_calibration.faults.half_turns import HalfTurnConfig
+from realsim_calibration.faults.pairing import PairingConfig
+from realsim_calibration.results import Mode
+from realsim_calibration.faults.rotation_readings import ReadingConfig
+from realsim_calibration.faults.tool_offset import ToolOffsetConfig
+
+Array = NDArray[np.float64]
+Fault = Literal[
+    "none", "unknown", "untestable",
+    "duplicated_views", "frozen_pose", "repeated_image",
+    "mispaired_image", "swapped_images", "shifted_pairing",
+    "board_flips", "board_size", "board_unit", "board_moved",
+    "robot_inverted", "camera_inverted", "rotation_reading",
+    "degrees_as_radians", "radians_as_degrees", "robot_unit",
+    "tool_offset", "tool_change", "camera_moved", "base_turned",
+]  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DiagnosisConfig:
+    """When data are right, and when another reading of them is believed."""
+
+    sure_score: float = 1.0
+    """Below this nothing else is tried: 0.5 deg and 1 % of the distance, RMS of the views."""
+    accept_score: float = 5.0
+    """A reading fits up to this score: real sets measure 1 to 2.5, wrong readings 10 to 20."""
+    gain: float = 2.0
+    """Another reading must fit this many times better than the poses as given ..."""
+    gain_few: float = 3.0
+    """... or this many with few views, where chance helps."""
+    gross_error: float = 8.0
+    """Single views are called mispaired from this error on: 4 deg or 8 % of the distance; planar
+    poses of good real sets reach 6 ..."""
+    gain_gross: float = 1.15
+    """... and then the rest must fit only this many times better."""
+    accept_degrees: float = 2.7
+    """Degrees taken for radians are believed up to this score: each number may be any of 57."""
+    doubtful_score: float = 1.5
+    """Where no quick reading fits better than this, every pair of conventions is fitted."""
+    few_views: int = 8
+    """Fewer views than this are few."""
+    tie: float = 1.25
+    """Readings whose scores are within this factor fit equally well: the simpler one is named."""
+    max_size_ratio: float = 1.1
+    """A board this many times larger or smaller than said has another size; less is reported as a
+    scale: printers and intrinsics are off by up to 5 %."""
+    size_sigmas: float = 5.0
+    """... and the difference must be this many standard deviations."""
+    same_pose_mm: float = 0.02
+    """Poses nearer than this are one reading of the controller: arms at rest scatter more [mm]."""
+    same_pose_deg: float = 0.002
+    """The same for the angle [deg]."""
+    same_view: float = 0.5
+    """Images of one pose are one view below this error, in units of `FitConfig` ..."""
+    other_view: float = 2.0
+    """... and different ones beyond this."""
+    least_turn_deg: float = 2.0
+    """RMS turn about the second axis below which conventions cannot be tested [deg]."""
+    small_turn_part: float = 0.2
+    """Hand turns below this part of the camera's look like radians read as degrees."""
+    plausible_off_axis: float = 1.5
+    """Camera poses are taken for inverted when the board would lie this many times further off the
+    optical axis than inverted."""
+    decisive: float = 3.0
+    """A reading of a pose file is proven when the next one fits this many times worse."""
+    fit: FitConfig = field(default_factory=FitConfig)
+    pairing: PairingConfig = field(default_factory=PairingConfig)
+    half_turns: HalfTurnConfig = field(default_factory=HalfTurnConfig)
+    readings: ReadingConfig = field(default_factory=ReadingConfig)
+    tool: ToolOffsetConfig = field(default_factory=ToolOffsetConfig)
+    gates: GateConfig = field(default_factory=GateConfig)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Evidence:
+    """How well one reading of the data fits."""
+
+    hypothesis: str
+    rotation_mismatch_deg: float
+    """Median over the pairs of the difference of the turns of hand and camera [deg]."""
+    screw_ratio: float
+    """Slide of the hand / slide of the camera along the screw axes; NaN = hardly any slide."""
+    view_deg: float
+    """Median rotation error of the views through the fitted frames [deg]."""
+    view_mm: float
+    """Median distance of the board's middle from where it should be [mm]."""
+    length_ratio: float
+    """The hand's lengths over the camera's; 1 for right data."""
+    score: float
+    """Both errors over all views, capped: below 1 good, beyond 5 it does not fit."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Diagnosis:
+    """The most plausible single fault of a set of poses."""
+
+    fault: Fault
+    sentence: str
+    """What was found, with the figures."""
+    advice: str
+    """What to do; empty where nothing is wrong."""
+    views: tuple[int, ...]
+    """Rows of the views that the fault concerns; empty = all of them."""
+    labels: tuple[str, ...]
+    """Their names."""
+    evidence: tuple[Evidence, ...]
+    """What was tried, as given first, then the best first."""
+    length_ratio: float
+    """The hand's lengths over the camera's under the reading that fits."""
+    ratio_sd: float
+    """1-sigma of it, relative."""
+    repaired_base_ee: Array | None = None
+    """(k, 4, 4) hand poses under the reading that fits; None where nothing can be mended. Use them
+    only with a loud warning."""
+    repaired_cam_board: Array | None = None
+    """(k, 4, 4) the board poses that belong to them."""
+    repaired_rows: NDArray[np.int64] | None = None
+    """(k, 2) row of the given hand pose and of the given board pose of every repaired view."""
+    note: str = ""
+    """What the repair did."""
+
+    @property
+    def harmless(self) -> bool:
+        """Whether a calibration of the data as given is right (though worth a note)."""
+        return self.fault in (
+            "none",
+            "untestable",
+            "duplicated_views",
+            "tool_offset",
+            "base_turned",
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ReadingFit:
+    """How well one reading of a pose file fits, for one place of the camera."""
+
+    name: str
+    mode: Mode
+    evidence: Evidence
+    penalised: float
+    """The score times 1 + |ln ratio| / ln 1.5: another unit fits as well but for its lengths."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ReadingProof:
+    """Which reading of a pose file fits the images."""
+
+    fits: tuple[ReadingFit, ...]
+    """Every candidate for both places of the camera, the best first."""
+    best: str
+    best_mode: Mode
+    equivalent: tuple[str, ...]
+    """Other readings that give the same poses as the best, "name (mode)"."""
+    runner_up: str
+    """The next best of other poses, "name (mode)"; empty where there is none."""
+    ratio: float
+    """Penalised score of the runner-up over that of the best."""
+    decisive: bool
+    """Whether the best fits, and far better than the runner-up."""
+    mode_sure: bool
+    """Whether the size of the frames tells where the camera sits."""
+    sentence: str

@@ -1,0 +1,315 @@
+"""Robust fit of the two constant frames in A_i X C_i = Z, with a free ratio of lengths.
+
+C_i = T_cam_board. Camera in the hand: A_i = T_base_ee, X = T_ee_cam, Z = T_base_board. Fixed
+camera: A_i = T_ee_base, X = T_base_cam, Z = T_ee_board. With m the board's middle, whose place in
+the camera q_i = C_i m is far surer than the camera's place seen from a board of uncertain tilt:
+
+    R_Ai R_X R_Ci = R_Z,        R_Ai (s R_X q_i + t_X) + t_Ai = z
+
+s is how many times longer a metre of the camera is in the hand's unit: 1 for right data. Half of
+the views may be wrong. The rotations start from triples of views (Park's mean of their turns, the
+triple that most views agree with, MSAC after Torr & Zisserman, CVIU 78(1), 2000), the translations
+from groups of views given the rotations (linear), and all 13 unknowns are refined together by
+Gauss-Newton with Geman-McClure weights.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_calibration.fit.closed_forms import HALF_TURN
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+RIDGE = 1e-9
+"""Share of the mean curvature that decides what the views do not determine."""
+SETTLED = 1e-9
+"""A step shorter than this, in units of the distance and radians, ends the fit."""
+COLLAPSED = 0.02
+"""A ratio that makes the camera's motion this part of the hand's is a collapse, not a fit."""
+MIN_VIEWS = 3
+"""Two frames and a ratio are 13 unknowns, a view gives 6 equations."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FitConfig:
+    """What counts as agreement, and how hard the fit looks for it."""
+
+    unit_deg: float = 0.5
+    """A rotation error of this size counts 1 [deg]: twice that of a good robot and board."""
+    unit_part: float = 0.01
+    """A translation error of this part of the camera's distance counts 1: 4 mm at 0.4 m."""
+    agree: float = 3.0
+    """Views with a larger error do not speak for a sample."""
+    cap: float = 20.0
+    """No view counts more than this in the score: one bad view must not outweigh a reading."""
+    samples: int = 120
+    """Triples and groups that are tried: with half of the views wrong, one in eight triples is
+    good, and 120 miss all of them once in 10^7 times."""
+    group: int = 5
+    """Views that start the translations: 15 equations for 7 unknowns."""
+    steps: int = 12
+    """Gauss-Newton steps: the start is near, six are usual."""
+    seed: int = 0
+    """Of the samples: the same data give the same answer."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FrameFit:
+    """The frames that fit most views, and how each view fits."""
+
+    X: Array
+    """(4, 4) the camera in the frame that A maps from [hand's unit]."""
+    Z: Array
+    """(4, 4) the board, its length in the hand's unit, in the frame that A maps to."""
+    middle: Array
+    """(3,) m [camera's unit]."""
+    length_ratio: float
+    """s: the hand's lengths over the camera's; 1 for right data."""
+    ratio_sd: float
+    """1-sigma of s / s from the scatter of the views that agree."""
+    distance: float
+    """Median |q| [camera's unit]."""
+    angles: Array
+    """(n,) rotation error per view [rad]."""
+    slips: Array
+    """(n,) translation error per view [camera's unit]."""
+    errors: Array
+    """(n,) both in units of `FitConfig`."""
+    score: float
+    """RMS of the capped errors, corrected for the 13 unknowns: 0.2 to 1.5 for right data."""
+    usual: float
+    """Median error of the views."""
+
+    @property
+    def usual_deg(self) -> float:
+        """Median rotation error [deg]."""
+        return float(np.degrees(np.median(self.angles)))
+
+    @property
+    def usual_mm(self) -> float:
+        """Median translation error [mm, where the camera's unit is the metre]."""
+        return float(1e3 * np.median(self.slips))
+
+
+def hand_side(Ts_base_ee: ArrayLike, eye_in_hand: bool) -> Array:
+    """Return A (n, 4, 4): T_base_ee for a camera in the hand, T_ee_base for a fixed one."""
+    T = np.asarray(Ts_base_ee, dtype=np.float64)
+    return T if eye_in_hand else se3.invert(T)
+
+
+def fit_frames(
+    A: ArrayLike, C: ArrayLike, middle: ArrayLike = (0.0, 0.0, 0.0), config: FitConfig | None = None
+) -> FrameFit:
+    """Return the frames and the ratio of lengths that most views agree with.
+
+    Args:
+        A: (n, 4, 4) hand poses (`hand_side`), any unit of length.
+        C: (n, 4, 4) board poses, any unit of length.
+        middle: (3,) the board's middle in the board's frame, in the unit of C.
+        config: what counts as agreement.
+
+    Raises:
+        InputError: fewer than three views, or stacks of different lengths.
+    """
+    config = config or FitConfig()
+    A, C = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
+    if len(A) != len(C) or len(A) < MIN_VIEWS:
+        raise InputError(
+            f"hand-eye: {len(A)} hand poses and {len(C)} board poses; at least {MIN_VIEWS} views "
+            "with one of each are needed."
+        )
+    m = np.asarray(middle, dtype=np.float64)
+    q = C[:, :3, :3] @ m + C[:, :3, 3]
+    rng = np.random.default_rng(config.seed)
+    Ra, Rc = A[:, :3, :3], C[:, :3, :3]
+    Rx, Rz = _start_rotations(Ra, np.swapaxes(Rc, -1, -2), config, rng)
+    distance = max(float(np.median(np.linalg.norm(q, axis=-1))), 1e-12)
+    linear = _start_translations(A, q, Rx, distance, config, rng)
+    return _refine(A, Rc, q, (Rx, Rz, linear), m, config)
+
+
+def mismatch(fit: FrameFit, A: ArrayLike, C: ArrayLike, config: FitConfig) -> Array:
+    """Return the error (k, l) of k hand poses with l board poses through frames already known."""
+    A, C = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
+    left = A @ fit.X
+    Rs = fit.Z[:3, :3] @ np.swapaxes(C[:, :3, :3], -1, -2)
+    angle = _chord_angle(left[:, None, :3, :3], Rs[None])
+    seen = fit.length_ratio * (C[:, :3, :3] @ fit.middle + C[:, :3, 3])
+    where = np.einsum("kij,lj->kli", left[:, :3, :3], seen) + left[:, None, :3, 3]
+    z = fit.Z[:3, :3] @ fit.middle * fit.length_ratio + fit.Z[:3, 3]
+    slip = np.linalg.norm(where - z, axis=-1) / fit.length_ratio
+    return _units(angle, slip, fit.distance, config)
+
+
+def _units(angles: Array, slips: Array, distance: float, config: FitConfig) -> Array:
+    return np.hypot(angles / np.radians(config.unit_deg), slips / (distance * config.unit_part))
+
+
+def _chord_angle(R: Array, S: Array) -> Array:
+    """Return the angle between rotations from their chord, exact for small angles [rad]."""
+    chord = np.linalg.norm(R - S, axis=(-2, -1))
+    return 2 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0))
+
+
+def _nearest_rotations(M: Array) -> Array:
+    """Return the rotations nearest to matrices (..., 3, 3)."""
+    U, _, Vt = np.linalg.svd(M)
+    U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    return U @ Vt
+
+
+def _draw(n: int, size: int, samples: int, rng: np.random.Generator) -> Indices:
+    """Return (samples, size) different views each; all groups where there are few."""
+    if n <= size:
+        return np.arange(n)[None]
+    if n <= 3 * size:
+        every = np.array(list(combinations(range(n), size)))
+        return rng.permutation(every)[:samples]
+    return np.argsort(rng.random((samples, n)), axis=1)[:, :size]
+
+
+def _turns(Ra: Array, Rd: Array) -> tuple[Array, Array]:
+    """Return the turns (n, n, 3) of hand and camera between views, 0 near half turns [rad]."""
+    n = len(Ra)
+    i, j = np.triu_indices(n, 1)
+    a = se3.log_so3(np.swapaxes(Ra[j], -1, -2) @ Ra[i])
+    b = se3.log_so3(np.swapaxes(Rd[j], -1, -2) @ Rd[i])
+    longest = np.maximum(np.linalg.norm(a, axis=-1), np.linalg.norm(b, axis=-1))
+    clear = (longest < HALF_TURN)[:, None]
+    turns = np.zeros((2, n, n, 3))
+    turns[0, i, j], turns[1, i, j] = a * clear, b * clear
+    return turns[0], turns[1]
+
+
+def _start_rotations(
+    Ra: Array, Rd: Array, config: FitConfig, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return R_X and R_Z that most views agree with."""
+    a, b = _turns(Ra, Rd)
+    triples = np.sort(_draw(len(Ra), 3, 3 * config.samples, rng), axis=1)
+    i, j, k = triples.T
+    M = sum(a[p, q][:, :, None] * b[p, q][:, None, :] for p, q in ((i, j), (i, k), (j, k)))
+    M = np.asarray(M, dtype=np.float64)
+    # Triples that turn about one axis only say little: the better third is kept.
+    order = np.argsort(-np.linalg.svd(M, compute_uv=False)[:, 1])[: config.samples]
+    everything = np.einsum("ijk,ijl->kl", a, b)
+    Rx = _nearest_rotations(np.concatenate([M[order], everything[None]]))
+    Zs = Ra @ Rx[:, None] @ np.swapaxes(Rd, -1, -2)
+    members = np.concatenate([Zs[np.arange(len(order))[:, None], triples[order]].sum(1),
+                              Zs[-1:].sum(1)])  # fmt: skip
+    Rz = _nearest_rotations(members)
+    limit = np.radians(config.unit_deg) * config.agree
+    loss = np.minimum(_chord_angle(Zs, Rz[:, None]), limit)
+    best = int(np.argmin(np.sum(loss**2, 1)))
+    X, Z = Rx[best], Rz[best]
+    for _ in range(2):
+        good = _chord_angle(Ra @ X @ np.swapaxes(Rd, -1, -2), Z) < limit
+        if good.sum() < MIN_VIEWS:
+            break
+        w = good[:, None] & good[None, :]
+        X = _nearest_rotations(np.einsum("ij,ijk,ijl->kl", w.astype(float), a, b))
+        Z = _nearest_rotations((Ra[good] @ X @ np.swapaxes(Rd[good], -1, -2)).sum(0))
+    return X, Z
+
+
+def _start_translations(
+    A: Array, q: Array, Rx: Array, distance: float, config: FitConfig, rng: np.random.Generator
+) -> Array:
+    """Return (7,) t_X, z, s that most views agree with, given R_X.
+
+    R_A t_X - z + s R_A R_X q = -t_A.
+    """
+    n = len(A)
+    rows = np.zeros((n, 3, 7))
+    rows[:, :, :3], rows[:, :, 3:6] = A[:, :3, :3], -np.eye(3)
+    rows[:, :, 6] = np.einsum("nij,jk,nk->ni", A[:, :3, :3], Rx, q)
+    rhs = -A[:, :3, 3]
+    groups = _draw(n, min(config.group, n), config.samples, rng)
+    size = max(float(np.median(np.linalg.norm(rhs - np.median(rhs, 0), axis=-1))), 1e-12)
+    column = np.array([1, 1, 1, 1, 1, 1, distance])
+    H = np.einsum("gvri,gvrj->gij", rows[groups] / column, rows[groups] / column)
+    g = np.einsum("gvri,gvr->gi", rows[groups] / column, rhs[groups])
+    # A trace of ridge decides what a group does not: no place along a common axis is made up.
+    found = np.linalg.solve(H + 1e-9 * len(groups[0]) * np.eye(7), g[..., None])[..., 0] / column
+    everything = np.linalg.lstsq((rows / column).reshape(-1, 7), rhs.ravel(), rcond=1e-9)[0]
+    found = np.concatenate([found, (everything / column)[None]])
+    slips = np.linalg.norm(np.einsum("nri,gi->gnr", rows, found) - rhs, axis=-1)
+    # A ratio far below the spread of the hand is a collapse, not a fit.
+    ratio = np.maximum(np.abs(found[:, 6:]), COLLAPSED * size / distance)
+    loss = np.minimum(slips / ratio / (distance * config.unit_part), config.agree)
+    return found[int(np.argmin(np.sum(loss**2, 1) + 1e3 * (found[:, 6] <= 0)))]
+
+
+def _refine(
+    A: Array, Rc: Array, q: Array, start: tuple[Array, Array, Array], middle: Array,
+    config: FitConfig,
+) -> FrameFit:  # fmt: skip
+    """Return the joint robust least-squares fit from a start R_X, R_Z, (t_X, z, s)."""
+    Rx, Rz, (tx, z, s) = start[0], start[1], (start[2][:3], start[2][3:6], float(start[2][6]))
+    n, distance = len(A), max(float(np.median(np.linalg.norm(q, axis=-1))), 1e-12)
+    spread = float(np.median(np.linalg.norm(A[:, :3, 3] - np.median(A[:, :3, 3], 0), axis=-1)))
+    least = max(COLLAPSED * spread / distance, 1e-9)
+    s = max(s, least)
+    for _ in range(config.steps):
+        J, r, errors = _weighted(A, Rc, q, (Rx, Rz, tx, z, s), distance, config)
+        H = J.T @ J
+        move = -np.linalg.solve(H + RIDGE * np.trace(H) / 13 * np.eye(13), J.T @ r)
+        if np.linalg.norm(move) < SETTLED:
+            break
+        Rx, Rz = Rx @ se3.exp_so3(move[:3]), Rz @ se3.exp_so3(move[3:6])
+        tx, z = tx + s * distance * move[6:9], z + s * distance * move[9:12]
+        # The unit of the residual follows s: a step may not carry it through zero.
+        s = max(s * float(np.exp(np.clip(move[12], -1.0, 1.0))), least)
+    J, rw, errors = _weighted(A, Rc, q, (Rx, Rz, tx, z, s), distance, config)
+    r = linearise(A, Rc, q, Rx, Rz, tx, z, s)[1]
+    freedom = max(6 * n - 13, 1)
+    capped = np.minimum(errors, config.cap)
+    inverse = np.linalg.pinv(J.T @ J, hermitian=True)
+    return FrameFit(
+        X=se3.from_rt(Rx, tx), Z=se3.from_rt(Rz, z - s * Rz @ middle), middle=middle,
+        length_ratio=s,
+        ratio_sd=float(np.sqrt(max(inverse[12, 12], 0.0) * float(rw @ rw) / freedom)),
+        distance=distance, angles=np.linalg.norm(r[:, :3], axis=-1),
+        slips=np.linalg.norm(r[:, 3:], axis=-1) / s, errors=errors,
+        score=float(np.sqrt(np.sum(capped**2) * 6 / freedom)), usual=float(np.median(errors)),
+    )  # fmt: skip
+
+
+def _weighted(
+    A: Array, Rc: Array, q: Array, frames: tuple[Array, Array, Array, Array, float],
+    distance: float, config: FitConfig,
+) -> tuple[Array, Array, Array]:  # fmt: skip
+    """Return J (6 n, 13) and residuals (6 n) in units, weighted, and the errors (n,) before that.
+
+    Lengths among the unknowns are in units of the distance, s in units of itself.
+    """
+    s = frames[4]
+    J, r = linearise(A, Rc, q, *frames)
+    unit = np.array([np.radians(config.unit_deg)] * 3 + [s * distance * config.unit_part] * 3)
+    errors = np.linalg.norm(r / unit, axis=-1)
+    width = config.agree * max(float(np.median(errors)), 1.0)
+    root = (1.0 / (1.0 + (errors / width) ** 2))[:, None]
+    column = np.array([1.0] * 6 + [s * distance] * 6 + [s])
+    J = (J / unit[:, None] * root[..., None]).reshape(-1, 13) * column
+    return J, (r / unit * root).ravel(), errors
+
+
+def linearise(
+    A: Array, Rc: Array, q: Array, Rx: Array, Rz: Array, tx: Array, z: Array, s: float
+) -> tuple[Array, Array]:
+    """Return J (n, 6, 13) and residuals (n, 6): R_X, R_Z turned on the right, then t_X, z, s."""
+    Ra = A[:, :3, :3]
+    RaRx = Ra @ Rx
+    J = np.zeros((len(A), 6, 13))
+    # The turn is measured on the right of R_X: R_C R_Z^T R_A R_X.
+    J[:, :3, :3], J[:, :3, 3:6] = np.eye(3), -Rc
+    J[:, 3:, :3] = -s * RaRx @ se3.hat(q)
+    J[:, 3:, 6:9], J[:, 3:, 9:12] = Ra, -np.eye(3)
+    J[:, 3:, 12] = (RaRx @ q[..., None])[..., 0]
+    slip = s * J[:, 3:, 12] + Ra @ tx + A[:, :3, 3] - z
+    return J, np.concatenate([se3.log_so3(Rc @ Rz.T @ RaRx), slip], -1)

@@ -1,0 +1,319 @@
+"""Which image belongs to which hand pose: shifted lists, swapped and foreign images, moved things.
+
+Frames fitted on a stretch of views that is consistent in itself (shifted by a few, or not) tell for
+every pose and every image how well they fit together. The best path through this table, which may
+change its shift only for a price (Viterbi), is the pairing; what lies off the path is swapped,
+belongs to another pose, or to none. If instead a stretch fits other frames of its own, the camera,
+the tool or the board was moved.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim_calibration.faults.frame_fit import MIN_VIEWS, FitConfig, FrameFit, fit_frames, mismatch
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+MovedFrame = Literal["X", "Z"]
+MOVED_FRAMES: tuple[MovedFrame, ...] = ("X", "Z")
+PREFER_TOOL = np.radians(3.0)
+"""A tool is changed more often than a board is shifted without turning it [rad]."""
+MOVE_ROUNDS = 3
+"""The move and the frames are found in turn, from the frames of either stretch."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PairingConfig:
+    """What is tried, and what counts as belonging together."""
+
+    fit: FitConfig = field(default_factory=FitConfig)
+    max_shift: int = 4
+    """Largest shift of the images against the poses that is tried."""
+    ratio: float = 4.0
+    """Pose and image belong together when their error is below this many usual errors ..."""
+    floor: float = 6.0
+    """... or below this one in units of `FitConfig`: 3 deg or 6 % of the distance. Planar poses of
+    good real sets reach 5."""
+    swap_floor: float = 3.0
+    """Two views that fit far better exchanged are swapped from this error on."""
+    swap_gain: float = 4.0
+    """Exchanged they must fit this many times better."""
+    switch_price: float = 2.0
+    """Price of another shift, in views that do not fit: two views off the path are cheaper kept
+    apart, three are a new shift."""
+    max_dropped: float = 0.3
+    """Largest share of views that a pairing may leave over."""
+    alike: float = 1.1
+    """Moves whose scores are within this factor cannot be told apart."""
+    max_dropped_run: float = 0.5
+    """The same where they all stand at the beginning or at the end of the list."""
+    min_stretch: int = 4
+    """Views of a stretch for which frames of its own are accepted."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Pairing:
+    """Which hand pose every image belongs to."""
+
+    rows: Rows
+    """(k, 2) row of the pose and row of the image, by image."""
+    shifts: Rows
+    """(n,) pose row less image row along the path."""
+    swapped: tuple[tuple[int, int], ...]
+    """Rows of images that were exchanged."""
+    strays: tuple[int, ...]
+    """Rows of images that fit no pose, or that of another image; they are left out of `rows`."""
+    elsewhere: tuple[tuple[int, int], ...]
+    """(image row, pose row) of strays whose pose was found."""
+    fit: FrameFit
+    """Frames fitted to `rows`."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Moved:
+    """From some view on a frame that must stand still stands elsewhere."""
+
+    frame: MovedFrame
+    """X: the camera against the frame that A maps from. Z: the board against that it maps to."""
+    start: int
+    """First row after the move."""
+    step: Array
+    """(4, 4) X_before X_after^-1 or Z_before Z_after^-1 [hand's unit]."""
+    score: float
+    """Score of all views with the move taken back."""
+    either: bool = False
+    """Whether a move of the other frame explains the views as well."""
+
+
+def find_pairing(A: Array, C: Array, middle: Array, config: PairingConfig) -> Pairing | None:
+    """Return the pairing that fits best, None where no stretch of the lists is consistent."""
+    best = _best_stretch(A, C, middle, config)
+    if best is None:
+        return None
+    fit = best
+    result: Pairing | None = None
+    # Twice: the first frames come from a part of the views, the second from all that were paired.
+    for _ in range(2):
+        table = mismatch(fit, A, C, config.fit)
+        paired = table[table < config.floor * config.fit.agree]
+        usual = float(np.median(np.min(table, 0))) if len(paired) else np.inf
+        gate = max(config.ratio * usual, config.floor)
+        shifts = _path(table, gate, config)
+        result = _pairing(A, C, middle, table, shifts, gate, config)
+        if result is None:
+            return None
+        fit = result.fit
+    return result
+
+
+def _best_stretch(A: Array, C: Array, middle: Array, config: PairingConfig) -> FrameFit | None:
+    """Return the frames of the most consistent stretch: all, the first or the second half."""
+    n = len(A)
+    fits: list[FrameFit] = []
+    for shift in range(-config.max_shift, config.max_shift + 1):
+        a, c = A[max(shift, 0) : n + min(shift, 0)], C[max(-shift, 0) : n - max(shift, 0)]
+        half = len(a) // 2
+        for part in (slice(None), slice(half), slice(half, None)):
+            if len(a[part]) >= MIN_VIEWS + 1:
+                fits.append(fit_frames(a[part], c[part], middle, config.fit))
+    if not fits:
+        return None
+    # A few views fit wrong frames by chance: the stretch that explains most of the table wins.
+    fits.sort(key=lambda f: f.usual)
+    return min(fits[:6], key=lambda f: _explained(mismatch(f, A, C, config.fit), config))
+
+
+def _explained(table: Array, config: PairingConfig) -> float:
+    """Return the mean capped error of the images with their best pose of a permitted shift."""
+    n = len(table)
+    i, j = np.indices((n, n))
+    near = np.where(np.abs(i - j) <= config.max_shift, table, np.inf)
+    return float(np.mean(np.minimum(near.min(0), config.fit.cap)))
+
+
+def _path(table: Array, gate: float, config: PairingConfig) -> Rows:
+    """Return the shift (n,) of every image along the cheapest path."""
+    n = len(table)
+    shifts = np.arange(-config.max_shift, config.max_shift + 1)
+    cost = np.full((n, len(shifts)), 1.0)
+    for s, shift in enumerate(shifts):
+        j = np.arange(max(-shift, 0), n - max(shift, 0))
+        cost[j, s] = np.minimum(table[j + shift, j] / gate, 1.0)
+    # Standing still is preferred where the data do not care.
+    cost = cost + 1e-3 * np.abs(shifts)
+    price = config.switch_price * (1 - np.eye(len(shifts)))
+    total, back = cost[0], np.zeros((n, len(shifts)), dtype=np.int64)
+    for j in range(1, n):
+        step = total[:, None] + price
+        back[j] = step.argmin(0)
+        total = step.min(0) + cost[j]
+    path = np.empty(n, dtype=np.int64)
+    path[-1] = int(total.argmin())
+    for j in range(n - 1, 0, -1):
+        path[j - 1] = back[j, path[j]]
+    # Images before a change whose pose is missing fit neither shift: they belong to the change.
+    for j in range(n - 1, 0, -1):
+        if path[j] != path[j - 1] and cost[j - 1, path[j - 1]] >= 1.0:
+            path[j - 1] = path[j]
+    return shifts[path]
+
+
+def _pairing(
+    A: Array, C: Array, middle: Array, table: Array, shifts: Rows, gate: float,
+    config: PairingConfig,
+) -> Pairing | None:  # fmt: skip
+    n = len(table)
+    pose = np.arange(n) + shifts
+    inside = (pose >= 0) & (pose < n)
+    own = np.full(n, np.inf)
+    own[inside] = table[pose[inside], np.flatnonzero(inside)]
+    swapped = _swaps(table, pose, own, inside, config)
+    exchanged = {row for pair in swapped for row in pair}
+    rows: list[tuple[int, int]] = []
+    strays: list[int] = []
+    elsewhere: list[tuple[int, int]] = []
+    partner = {a: b for a, b in swapped} | {b: a for a, b in swapped}
+    for j in range(n):
+        if j in exchanged:
+            rows.append((int(pose[partner[j]]), j))
+        elif own[j] <= gate:
+            rows.append((int(pose[j]), j))
+        elif inside[j]:
+            strays.append(j)
+            best = int(table[:, j].argmin())
+            if table[best, j] <= gate:
+                elsewhere.append((j, best))
+    for a, b in _mutual(elsewhere, shifts):
+        swapped = (*swapped, (a, b))
+        rows += [(int(pose[b]), a), (int(pose[a]), b)]
+        strays = [k for k in strays if k not in (a, b)]
+        elsewhere = [e for e in elsewhere if e[0] not in (a, b)]
+    rows.sort(key=lambda row: row[1])
+    dropped = [j for j in range(n) if j not in {image for _, image in rows}]
+    at_end = dropped == list(range(n - len(dropped), n)) or dropped == list(range(len(dropped)))
+    most = config.max_dropped_run if at_end else config.max_dropped
+    if len(rows) < MIN_VIEWS + 1 or len(rows) < (1 - most) * n:
+        return None
+    kept = np.array(rows, dtype=np.int64)
+    return Pairing(
+        rows=kept, shifts=shifts, swapped=swapped, strays=tuple(strays),
+        elsewhere=tuple(elsewhere),
+        fit=fit_frames(A[kept[:, 0]], C[kept[:, 1]], middle, config.fit),
+    )  # fmt: skip
+
+
+def _mutual(elsewhere: list[tuple[int, int]], shifts: Rows) -> list[tuple[int, int]]:
+    """Return pairs of images that fit each other's pose."""
+    place = {j: int(i - shifts[j]) for j, i in elsewhere}
+    return [(j, k) for j, k in place.items() if j < k and place.get(k) == j]
+
+
+def _swaps(
+    table: Array, pose: Rows, own: Array, inside: NDArray[np.bool_], config: PairingConfig
+) -> tuple[tuple[int, int], ...]:
+    """Return pairs of images that fit far better exchanged, the clearest first."""
+    suspects = [int(j) for j in np.flatnonzero(inside & (own > config.swap_floor))]
+    usual = float(np.median(own[inside]))
+    found: list[tuple[float, int, int]] = []
+    for k, a in enumerate(suspects):
+        for b in suspects[k + 1 :]:
+            exchanged = float(np.hypot(table[pose[a], b], table[pose[b], a]))
+            if exchanged * config.swap_gain < np.hypot(own[a], own[b]) and exchanged < max(
+                config.ratio * usual, config.swap_floor
+            ):
+                found.append((exchanged, a, b))
+    taken: set[int] = set()
+    pairs: list[tuple[int, int]] = []
+    for _, a, b in sorted(found):
+        if a not in taken and b not in taken:
+            taken |= {a, b}
+            pairs.append((a, b))
+    return tuple(pairs)
+
+
+def find_move(A: Array, C: Array, middle: Array, config: PairingConfig) -> Moved | None:
+    """Return the move of the camera, tool or board after which the views fit anew, else None."""
+    n = len(A)
+    half = n // 2
+    found: list[Moved] = []
+    for part in (slice(half), slice(half, None)):
+        if half < config.min_stretch:
+            return None
+        seed = fit_frames(A[part], C[part], middle, config.fit)
+        errors = np.minimum(np.diag(mismatch(seed, A, C, config.fit)), config.fit.cap)
+        if part.start is None:
+            cost = (
+                np.cumsum(np.append(0, errors))
+                + np.cumsum(np.append(0, (config.fit.cap - errors)[::-1]))[::-1]
+            )
+        else:
+            cost = (
+                np.cumsum(np.append(0, config.fit.cap - errors))
+                + np.cumsum(np.append(0, errors[::-1]))[::-1]
+            )
+        start = int(np.argmin(cost))
+        if min(start, n - start) < config.min_stretch:
+            continue
+        found += _moves_at(A, C, middle, start, config)
+    return _likeliest(found, config)
+
+
+def _likeliest(found: list[Moved], config: PairingConfig) -> Moved | None:
+    """Return the move of least score; of two that fit alike the one without a turn.
+
+    A tool offset is set as a pure shift. Where the hand hardly turns, a shifted board explains it
+    too, which is said.
+    """
+    best = min(found, key=lambda m: m.score, default=None)
+    if best is None:
+        return None
+    alike = [m for m in found if m.score <= config.alike * best.score]
+    chosen = min(alike, key=lambda m: float(se3.angle(m.step)) + (m.frame == "Z") * PREFER_TOOL)
+    other = any(m.frame != chosen.frame for m in alike)
+    return replace(chosen, either=other)
+
+
+def _moves_at(A: Array, C: Array, middle: Array, start: int, config: PairingConfig) -> list[Moved]:
+    """Return both kinds of move at a row, each with the score of a model that shares the rest."""
+    halves = [
+        fit_frames(A[s], C[s], middle, config.fit) for s in (slice(start), slice(start, None))
+    ]
+    moves: list[Moved] = []
+    for frame in MOVED_FRAMES:
+        for fit in halves:
+            step, best = _carried(A, C, middle, start, frame, fit, config)
+            moves.append(Moved(frame=frame, start=start, step=step, score=best.score))
+    return moves
+
+
+def _carried(
+    A: Array, C: Array, middle: Array, start: int, frame: MovedFrame, fit: FrameFit,
+    config: PairingConfig,
+) -> tuple[Array, FrameFit]:  # fmt: skip
+    """Return the move of a frame at a row, and the fit of all views with the move taken back.
+
+    Every view shows where the frame stands, given the other one: X_i = A_i^-1 Z C_i^-1 or
+    Z_i = A_i X C_i. The move is from the mean before to the mean after.
+    """
+    step = np.eye(4)
+    for _ in range(MOVE_ROUNDS):
+        seen = C.copy()
+        seen[:, :3, 3] *= fit.length_ratio
+        if frame == "X":
+            places = se3.invert(A) @ fit.Z @ se3.invert(seen)
+            step = _mean(places[:start]) @ se3.invert(_mean(places[start:]))
+            hands = np.concatenate([A[:start], A[start:] @ se3.invert(step)])
+        else:
+            places = A @ fit.X @ seen
+            step = _mean(places[:start]) @ se3.invert(_mean(places[start:]))
+            hands = np.concatenate([A[:start], step @ A[start:]])
+        fit = fit_frames(hands, C, middle, config.fit)
+    return step, fit
+
+
+def _mean(Ts: Array) -> Array:
+    return se3.from_rt(se3.mean_rotation(Ts[:, :3, :3]), np.median(Ts[:, :3, 3], 0))

@@ -1,0 +1,306 @@
+"""From a closed form to the calibration: noise scales, the robot's error map, covariances.
+
+    1. joint fit without robot errors, then with them at lambda = 0.3; corners re-weighted
+    2. linearise there: is the corner noise independent inside views, how large may lambda be
+    3. candidates for the robot's smooth error: none, maps in tool and base axes, the arm's own
+       numbers; each judged by predicting every view without it
+    4. joint fit with the chosen one, lambda and sigma re-estimated
+    5. covariance from noise and from what the arm may still hide
+"""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.geometry.dh import DhArm
+from realsim.records import ArmErrorMap, RobotErrorMap
+from realsim_calibration.fit.board_pose import refine_board_pose
+from realsim_calibration.fit.joint_solve import JointProblem, JointState, Setup, camera_of
+from realsim_calibration.fit.linear_model import LinearFit, LinearModel
+from realsim_calibration.fit.noise_scale import (
+    Whiteness,
+    estimate_arm,
+    estimate_ratio,
+    estimate_scale,
+    largest_ratio,
+    pose_of,
+    unknown_arm_columns,
+    whiteness,
+)
+from realsim_calibration.fit.robot_error import (
+    ErrorBasis,
+    RobotErrorConfig,
+    arm_basis,
+    map_basis,
+    map_record,
+)
+from realsim_calibration.fit.uncertainty import noise_covariance, shared, with_arm
+from realsim_calibration.fit.view_system import SHARED
+
+if TYPE_CHECKING:
+    from realsim_calibration.hand_eye import HandEyeConfig
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SolvedView:
+    """One used view's part; the fields are those of ViewReport."""
+
+    residuals: Array
+    seen_px: float
+    unseen_px: float
+    unseen_mm: float
+    unseen_deg: float
+    robot_error: Array
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Solution:
+    """The calibration."""
+
+    problem: JointProblem
+    state: JointState
+    sigma_px: float
+    ratio: Array
+    """(2,) lambda of rotation and of translation."""
+    white: Whiteness
+    covariance: Array
+    """(29, 29) of the shared parameters."""
+    information: Array
+    """(29, 29), the map held."""
+    alone: JointState
+    """The fit without a map."""
+    alone_covariance: Array
+    """(29, 29)."""
+    robot_map: RobotErrorMap | ArmErrorMap | None
+    map_name: str
+    scores: tuple[tuple[str, float], ...]
+    joint_offsets: Array | None
+    views: tuple[SolvedView, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Choice:
+    """A candidate with its fit."""
+
+    basis: ErrorBasis | None
+    ratio: Array
+    fit: LinearFit
+
+    @property
+    def name(self) -> str:
+        return "none" if self.basis is None else self.basis.name
+
+
+def solve(
+    setup: Setup, start: tuple[Array, Array], config: "HandEyeConfig",
+    arm: DhArm | None, joints: Array | None,
+) -> Solution:  # fmt: skip
+    """Return the calibration from a closed-form start (X, Z).
+
+    Raises:
+        DegenerateError: the views do not determine the parameters.
+    """
+    problem = JointProblem(setup, config.joint)
+    state, sigma, roots = _first_fit(problem, start, config)
+    model = LinearModel(problem, state, roots)
+    fixed = config.joint.robot_ratio
+    white, most, ratio = _robot_share(problem, model, state, sigma, config)
+    none = _Choice(basis=None, ratio=ratio, fit=model.fit(None, ratio, sigma))
+    choices = [none]
+    Ts = np.stack([v.T_base_ee for v in setup.views])
+    known: ErrorBasis | None = None
+    if config.robot_map:
+        bounded = ratio if fixed else np.minimum(ratio, config.noise.bound)
+        choices += _maps(model, Ts, sigma, bounded, config)
+    if arm is not None and joints is not None:
+        # What is left of the robot's error beside the arm's own is noise: lambda needs no bound.
+        noise = replace(config.noise, least=fixed, most=fixed) if fixed else config.noise
+        basis = arm_basis(arm, joints, Ts, config.robot)
+        arm_ratio, known = estimate_arm(model, basis, sigma, noise, config.robot)
+        fit = model.fit(known, arm_ratio, sigma)
+        if config.robot_map:
+            choices.append(_Choice(basis=known, ratio=arm_ratio, fit=fit))
+    best = _chosen(choices, config.robot)
+    if best.basis is not None and best.basis.kind != "arm" and not fixed:
+        ratio = estimate_ratio(model, best.basis, sigma, most, config.noise)
+        best = _Choice(basis=best.basis, ratio=ratio, fit=model.fit(best.basis, ratio, sigma))
+    alone = state.moved(none.fit.step)
+    state, sigma, roots = _final_fit(problem, state, best, roots)
+    model = LinearModel(problem, state, roots)
+    final = model.fit(best.basis, best.ratio, sigma)
+    columns = _hidden_errors(model, none, known, Ts, sigma, config.robot.hidden_factor)
+    independent = white.excess <= 0
+    covariance = _covariance(model, final, best, columns, known, independent)
+    return Solution(
+        problem=problem,
+        state=state,
+        sigma_px=sigma,
+        ratio=best.ratio,
+        white=white,
+        covariance=shared(covariance),
+        information=final.information[:SHARED, :SHARED],
+        alone=alone,
+        alone_covariance=shared(_covariance(model, none.fit, none, columns, known, independent)),
+        robot_map=None if best.basis is None else map_record(best.basis, state.weights, Ts, arm),
+        map_name=best.name,
+        scores=tuple((c.name, c.fit.score) for c in choices),
+        joint_offsets=_offsets(best, state, covariance),
+        views=_views(problem, state, best.basis, final),
+    )
+
+
+def _first_fit(
+    problem: JointProblem, start: tuple[Array, Array], config: "HandEyeConfig"
+) -> tuple[JointState, float, list[Array]]:
+    """Return the fit at the bounded lambda, sigma, and the roots of the corner weights."""
+    joint = config.joint
+    ratio = np.full(2, joint.robot_ratio or config.noise.bound)
+    state, roots = problem.start(*start), problem.ones()
+    state = problem.optimize(state, joint.start_sigma_px, ratio, roots, None, robot=False)
+    sigma, roots = problem.spread(state, joint.start_sigma_px, ratio, None)
+    for _ in range(joint.rounds - 1):
+        state = problem.optimize(state, sigma, ratio, roots, None)
+        sigma, roots = problem.spread(state, sigma, ratio, None)
+    return state, sigma, roots
+
+
+def _robot_share(
+    problem: JointProblem, model: LinearModel, state: JointState, sigma: float,
+    config: "HandEyeConfig",
+) -> tuple[Whiteness, float, Array]:  # fmt: skip
+    """Return whether corners are independent, the largest lambda, and lambda (2,) without a map."""
+    noise = config.noise
+    if config.joint.robot_ratio:
+        white = whiteness(problem, state, noise)
+        return white, config.joint.robot_ratio, np.full(2, config.joint.robot_ratio)
+    free = estimate_ratio(model, None, sigma, noise.most, noise)
+    # Judged where the lens is fitted with the robot's share as it would like to be.
+    white = whiteness(problem, state.moved(model.fit(None, free, sigma).step), noise)
+    most = largest_ratio(white, noise)
+    if most < noise.most:
+        free = estimate_ratio(model, None, sigma, most, noise)
+    return white, most, free
+
+
+def _final_fit(
+    problem: JointProblem, state: JointState, best: _Choice, roots: list[Array]
+) -> tuple[JointState, float, list[Array]]:
+    """Return the joint fit with the chosen robot error, from the linear solution."""
+    weights = best.fit.step[29:]
+    moved = replace(state.moved(best.fit.step[:29]), weights=weights)
+    state = problem.optimize(moved, best.fit.sigma_px, best.ratio, roots, best.basis)
+    sigma, roots = problem.spread(state, best.fit.sigma_px, best.ratio, best.basis)
+    return state, sigma, roots
+
+
+def _maps(
+    model: LinearModel, Ts: Array, sigma: float, ratio: Array, config: "HandEyeConfig"
+) -> list[_Choice]:
+    """Return the fits with a map in tool or base axes, weakest first."""
+    choices: list[_Choice] = []
+    for strength in config.robot.map_strengths:
+        for kind in ("ee", "base"):
+            basis = map_basis(Ts, kind, strength, config.robot.map_unit)
+            fit = model.fit(basis, ratio, sigma)
+            choices.append(_Choice(basis=basis, ratio=ratio, fit=fit))
+    return choices
+
+
+def _chosen(choices: list[_Choice], config: RobotErrorConfig) -> _Choice:
+    """Return the candidate that predicts unseen views best; sounder ones win within the noise.
+
+    A map must beat no map, and the arm's own numbers, by so many standard errors of the paired
+    logarithms of the unseen views' errors.
+    """
+    none = choices[0]
+    arms = [c for c in choices if c.basis is not None and c.basis.kind == "arm"]
+    maps = [c for c in choices if c.basis is not None and c.basis.kind != "arm"]
+    best = min(maps, key=lambda c: c.fit.score) if maps else none
+    if best is not none and _gain_in_errors(none, best) < config.map_gain:
+        best = none
+    for arm in arms:
+        if _gain_in_errors(arm, best) < config.arm_gain:
+            best = arm
+    return best
+
+
+def _gain_in_errors(sound: _Choice, other: _Choice) -> float:
+    """Return by how many standard errors another candidate predicts unseen views better."""
+    gain = np.log(sound.fit.unseen_px) - np.log(other.fit.unseen_px)
+    return float(np.mean(gain)) / max(float(np.std(gain)) / np.sqrt(len(gain)), 1e-12)
+
+
+def _hidden_errors(
+    model: LinearModel, none: _Choice, known: ErrorBasis | None, Ts: Array, sigma: float,
+    hidden: float,
+) -> Array:  # fmt: skip
+    """Return errors (views, 6, q) that the arm may have, per standard deviation."""
+    if known is not None:
+        return known.columns
+    scaled = estimate_scale(model, map_basis(Ts, "base", 1.0, 1e-4), none.ratio, sigma)
+    weights = model.fit(scaled, none.ratio, sigma).step[29:]
+    return unknown_arm_columns(scaled, weights, hidden)
+
+
+def _covariance(
+    model: LinearModel, fit: LinearFit, choice: _Choice, columns: Array,
+    known: ErrorBasis | None, independent: bool,
+) -> Array:  # fmt: skip
+    """Return the covariance of all parameters of a fit."""
+    covariance = noise_covariance(fit, independent=independent)
+    if known is not None and choice.basis is known:
+        return covariance  # the arm's errors are parameters of the fit
+    return with_arm(covariance, model.influence(fit, choice.ratio, columns))
+
+
+def _offsets(best: _Choice, state: JointState, covariance: Array) -> Array | None:
+    """Return the joint zero offsets and their 1-sigma (6, 2) [rad] of an arm's fit."""
+    if best.basis is None or best.basis.kind != "arm":
+        return None
+    unit = best.basis.unit[:6]
+    sd = np.sqrt(np.diag(covariance)[29:35])
+    return np.stack([state.weights[:6] * unit, sd * unit], -1)
+
+
+def _views(
+    problem: JointProblem, state: JointState, basis: ErrorBasis | None, fit: LinearFit
+) -> tuple[SolvedView, ...]:
+    """Return the part of every view that took part."""
+    found: list[SolvedView] = []
+    for n in range(len(problem.setup.views)):
+        smooth = np.zeros(6) if basis is None else basis.columns[n] @ state.weights
+        residuals = problem.residuals(state, n, smooth)
+        without = state.moved(fit.away[n])
+        error = np.zeros(6) if basis is None else basis.columns[n] @ without.weights
+        mm, deg = _place_error(problem, without, n, error)
+        found.append(
+            SolvedView(
+                residuals=residuals,
+                seen_px=float(np.sqrt(np.mean(np.sum(residuals**2, -1)))),
+                unseen_px=float(fit.unseen_px[n]),
+                unseen_mm=mm,
+                unseen_deg=deg,
+                robot_error=state.errors[n],
+            )
+        )
+    return tuple(found)
+
+
+def _place_error(
+    problem: JointProblem, state: JointState, n: int, error: Array
+) -> tuple[float, float]:
+    """Return how far the board is from where a fit expects it: middle [mm], angle [deg]."""
+    setup, view = problem.setup, problem.setup.views[n]
+    expected = pose_of(state, setup.to_hand, view.T_base_ee, error)
+    points = problem.shaped_points(state.board, view.xy)
+    camera = camera_of(state.camera, setup.intrinsics0)
+    seen, _ = refine_board_pose(expected, points, view.uv, camera)
+    apart = se3.transform(seen, setup.middle) - se3.transform(expected, setup.middle)
+    return 1e3 * float(np.linalg.norm(apart)), float(
+        np.degrees(se3.angle(se3.invert(expected) @ seen))
+    )

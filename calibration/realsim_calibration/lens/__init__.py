@@ -1,0 +1,1 @@
+"""Camera intrinsics: own calibration with covariance, model choice, coverage; camera files."""

@@ -1,0 +1,294 @@
+"""Camera calibration: the lens from pictures of a printed target, with its covariance and limits.
+
+    report = calibrate_intrinsics(detections, target)
+    report.intrinsics, report.sd, report.held_out, report.warnings
+
+The steps: corners of all views, checked - Zhang's start - bundle adjustment with the print's shape
+- outliers out - is the focal length determined at all? - every lens model, the terms that the views
+do not determine held and named - choice of the model on unseen views - covariance by view.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import DegenerateError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, Target
+from realsim_calibration.lens.bundle import (
+    CAMERA_TERMS,
+    Fit,
+    Observations,
+    Prior,
+    adjust,
+    camera_record,
+    camera_vector,
+)
+from realsim_calibration.lens.coverage import measure_coverage
+from realsim_calibration.lens.checks import intrinsics_checks
+from realsim_calibration.lens.choice import (
+    ChoiceConfig,
+    ModelScore,
+    fold_of_views,
+    halves,
+    score_models,
+)
+from realsim_calibration.lens.covariance import global_covariance
+from realsim_calibration.lens.fit import (
+    Candidate,
+    IntrinsicsConfig,
+    fit_candidates,
+    model_prior,
+    robust_sigma,
+    settle,
+)
+from realsim_calibration.lens.models import (
+    MODELS,
+    lens_prior,
+)
+from realsim_calibration.lens.observations import Corners, find_outliers, gather
+from realsim_calibration.lens.report import IntrinsicsReport, LensView
+from realsim_calibration.lens.start import choose_twins, start_state, view_errors
+from realsim_calibration.results import BoardShape
+from realsim_calibration.views import TargetDetection
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+REFERENCE = "Brown 5"
+"""The model that everybody expects: its undetermined terms are named even where a smaller one is
+chosen, and it says how uncertain the lens is where there were no corners."""
+TILT_ADVICE = (
+    "Add views that tilt the board by 30 deg about two axes (towards you, away from you, to the "
+    "left, to the right), or give the factory's intrinsics as `start`."
+)
+
+
+def calibrate_intrinsics(
+    detections: Sequence[TargetDetection],
+    target: Target,
+    *,
+    names: Sequence[str] | None = None,
+    start: CameraIntrinsics | None = None,
+    config: IntrinsicsConfig | None = None,
+) -> IntrinsicsReport:
+    """Return a camera's intrinsics from views of a printed target.
+
+    Args:
+        detections: the target's points in every image; images without any may be among them.
+        target: the print, in metres; its size does not matter to the lens.
+        names: the views' names for messages; their numbers where None.
+        start: intrinsics known beforehand (the factory's): the fit starts there and its priors are
+            centred there. With them a single view is enough for what it can tell.
+        config: the choices.
+
+    Raises:
+        InputError: image sizes differ, points do not belong to the target or the image, no view.
+        DegenerateError: the views do not determine the focal length; the message says what to add.
+    """
+    config = config or IntrinsicsConfig()
+    corners = gather(detections, target, names, start, config.outliers)
+    _require_views(corners, start)
+    corners, fit, prior, how = _first_fit(corners, start, config)
+    corners, fit = _clean(corners, fit, start, config)
+    _check_focal(corners, fit, start, config)
+    candidates = fit_candidates(corners.obs, fit, prior, config)
+    model, scores = _choose_model(corners.obs, candidates, config)
+    chosen = candidates[model]
+    # What the lens may do where there are no corners is what the wider model would do there.
+    wider = candidates[REFERENCE] if _is_wider(REFERENCE, model, candidates) else chosen
+    report = _report(corners, target, chosen, wider, config)
+    report = replace(report, held_out=scores, start=how)
+    return replace(report, checks=intrinsics_checks(report, prior, start, config.limits))
+
+
+def _is_wider(name: str, model: str, candidates: dict[str, Candidate]) -> bool:
+    order = list(candidates)
+    return name in order and order.index(name) > order.index(model)
+
+
+def _require_views(corners: Corners, start: CameraIntrinsics | None) -> None:
+    """Raise unless enough views are left: two, or one with known intrinsics.
+
+    Raises:
+        DegenerateError: they are not.
+    """
+    n = corners.obs.views
+    if n >= (2 if start is None else 1):
+        return
+    reasons = [f"{m}: {r}" for m, r in zip(corners.names, corners.reasons, strict=True) if r]
+    if n == 1 and not reasons:
+        raise DegenerateError(
+            f"camera fit: one view ({corners.name_of(0)}) does not determine a lens. {TILT_ADVICE}"
+        )
+    shown = "; ".join(reasons[:4]) + ("; ..." if len(reasons) > 4 else "")
+    raise DegenerateError(
+        f"camera fit: {n} of {len(corners.names)} views can be used ({shown}), which does not "
+        "determine a lens. Is the target described as printed (rows, columns, order of the points) "
+        f"and whole in the image? {TILT_ADVICE}"
+    )
+
+
+def _first_fit(
+    corners: Corners, start: CameraIntrinsics | None, config: IntrinsicsConfig
+) -> tuple[Corners, Fit, Prior, str]:
+    """Return a fit with a flexible lens to find outliers with, and the prior of all models.
+
+    Views that fit no camera at all are left out.
+    """
+    given = None if start is None else camera_vector(start)
+    state, how = start_state(corners.obs, given)
+    errors = view_errors(state, corners.obs)
+    fits = np.isfinite(errors)
+    if not fits.all():
+        corners = corners.without(~fits, "its corners fit no camera: wrongly found or numbered")
+        _require_views(corners, start)
+        state, errors = state.only_views(fits), errors[fits]
+    obs = corners.obs
+    prior = lens_prior(config.beliefs, float(state.camera[0]), obs.image_size, start)
+    # The misfit of the closed form is taken for noise.
+    sigma = max(float(np.median(errors)), config.sigma_floor_px)
+    fit = adjust(state, obs, model_prior(prior, "k1", config), sigma, config.solver)
+    # The beliefs about the distortion need the focal length, which is known well enough by now.
+    prior = lens_prior(config.beliefs, float(fit.state.camera[0]), obs.image_size, start)
+    sigma = robust_sigma(fit.residuals, obs.weight, config.sigma_floor_px)
+    state = choose_twins(fit.state, obs, sigma, config.solver)
+    fit = settle(state, obs, model_prior(prior, "Brown 5", config), sigma, config)
+    return corners, fit, prior, how
+
+
+def _clean(
+    corners: Corners,
+    fit: Fit,
+    start: CameraIntrinsics | None,
+    config: IntrinsicsConfig,
+) -> tuple[Corners, Fit]:
+    """Return corners and fit without outlier corners and views, which are named."""
+    for _ in range(config.outliers.rounds):
+        cleaned, keep_views = find_outliers(corners, fit, config.outliers)
+        if cleaned is None:
+            break
+        corners = cleaned
+        _require_views(corners, start)
+        fit = settle(fit.state.only_views(keep_views), corners.obs, fit.prior, fit.sigma_px, config)
+    return corners, fit
+
+
+def _check_focal(
+    corners: Corners, fit: Fit, start: CameraIntrinsics | None, config: IntrinsicsConfig
+) -> None:
+    """Raise unless the views determine the focal length; a start's prior always does.
+
+    Raises:
+        DegenerateError: they do not.
+    """
+    if start is not None:
+        return
+    coverage = measure_coverage(
+        corners.obs.uv, corners.obs.image_size, fit.state.poses, config.coverage
+    )
+    n = corners.obs.views
+    if coverage.normal_spread_deg < config.least_spread_deg:
+        tilt = float(np.median(coverage.tilt_deg))
+        how = (
+            "face the board squarely" if tilt < config.coverage.good_tilt_deg / 2
+            else f"see the board under the same angle ({tilt:.0f} deg)"
+        )  # fmt: skip
+        raise DegenerateError(
+            f"camera fit: all {n} views {how} (its normals differ by "
+            f"{coverage.normal_spread_deg:.1f} deg at most, {config.least_spread_deg:g} deg are "
+            f"needed), so the focal length cannot be told from the distance. {TILT_ADVICE}"
+        )
+    simple = settle(
+        fit.state, corners.obs, model_prior(fit.prior, "k1", config), fit.sigma_px, config
+    )
+    camera = simple.state.camera
+    relative = float(np.max(global_covariance(simple).sd[:2] / camera[:2]))
+    if not relative < config.focal_limit:
+        raise DegenerateError(
+            f"camera fit: {n} views leave the focal length uncertain by {relative:.1%} (1 sigma; "
+            f"{config.focal_limit:.0%} is the limit), tilts reach "
+            f"{float(coverage.tilt_deg.max()):.0f} deg. {TILT_ADVICE}"
+        )
+
+
+def _choose_model(
+    obs: Observations, candidates: dict[str, Candidate], config: IntrinsicsConfig
+) -> tuple[str, tuple[ModelScore, ...]]:
+    """Return the model and the table of all; the table is empty where views are too few."""
+    order = list(candidates)
+    _, good = halves(obs)
+    if int(good.sum()) < config.least_scored_views:
+        fallback = config.few_views_model
+        return fallback if fallback in order else order[0], ()
+    # Dealing the views out like folds takes some from every part of the image.
+    parts = -(-obs.views // config.choice_views)
+    keep = fold_of_views(obs, parts) == 0
+    some = obs.only_views(keep)
+    folds = fold_of_views(some, min(config.folds, some.views))
+    choice = ChoiceConfig(
+        steps=config.fold_steps,
+        worth=config.worth,
+        margin_se=config.margin_se,
+        solver=config.solver,
+    )
+    fits = {name: (c.fit.only_views(keep, obs), c.refused) for name, c in candidates.items()}
+    table = score_models(fits, some, folds, choice)
+    return next((s.model for s in table if s.chosen), order[0]), table
+
+
+def _report(
+    corners: Corners,
+    target: Target,
+    chosen: Candidate,
+    wider: Candidate,
+    config: IntrinsicsConfig,
+) -> IntrinsicsReport:
+    """Return the report; the table, the start and the checks are left out."""
+    obs, fit, cov = corners.obs, chosen.fit, chosen.covariance
+    terms = tuple(t for t in MODELS[chosen.model] if t not in dict(chosen.refused))
+    to_middle = se3.from_translation(-np.append(corners.middle, 0.0))
+    views: list[LensView] = []
+    place = {int(i): k for k, i in enumerate(corners.indices)}
+    for i, (name, reason) in enumerate(zip(corners.names, corners.reasons, strict=True)):
+        cut = slice(0, 0)
+        T = np.full((4, 4), np.nan)
+        if i in place:
+            k = place[i]
+            cut = slice(int(obs.offsets[k]), int(obs.offsets[k + 1]))
+            T = fit.state.poses[k] @ to_middle
+        r = fit.residuals[cut]
+        rms = float(np.sqrt(np.mean(np.sum(r**2, -1)))) if len(r) else float("nan")
+        views.append(
+            LensView(
+                index=i, name=name, used=i in place, reason=reason, uv=obs.uv[cut], residuals=r,
+                rms_px=rms, T_cam_board=T, outliers=corners.outliers.get(i, ()),
+            )
+        )  # fmt: skip
+    shape_sd = np.concatenate([[0.0], cov.sd[CAMERA_TERMS:]])
+    return IntrinsicsReport(
+        target=target,
+        intrinsics=camera_record(fit.state.camera, obs.image_size),
+        covariance=cov.camera,
+        open_covariance=wider.opened.camera,
+        inflation=cov.inflation,
+        model=chosen.model,
+        terms=terms,
+        held_out=(),
+        refused=tuple(r for r in wider.refused if r[0] not in terms),
+        sigma_px=fit.sigma_px,
+        rms_px=float(np.sqrt(np.mean(np.sum(fit.residuals**2, -1)))),
+        views=tuple(views),
+        coverage=measure_coverage(obs.uv, obs.image_size, fit.state.poses, config.coverage),
+        board=BoardShape(
+            scale=1.0,
+            aspect=float(fit.state.board[0]),
+            warp=fit.state.board[1:].copy(),
+            sd=shape_sd,
+            half_extent_m=obs.half_extent_m,
+            half_sides_m=corners.half_sides_m,
+        ),
+        start="",
+        checks=(),
+    )

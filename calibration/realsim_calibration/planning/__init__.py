@@ -1,0 +1,1 @@
+"""Which view next, and when to stop."""

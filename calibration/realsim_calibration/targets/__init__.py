@@ -1,0 +1,1 @@
+"""Printed targets as text and files."""
