@@ -28,13 +28,9 @@ for k, joints in enumerate(plan.joints):
     uv = camera.project(lens, se3.transform(T_cam_world, corners_world))
     uv = uv + rng.normal(scale=PIXEL_NOISE, size=uv.shape)
     inside = np.flatnonzero(np.all((uv > 0) & (uv < [lens.width - 1, lens.height - 1]), axis=1))
-    seen = TargetDetection(
-        point_ids=inside, uv=uv[inside], image_size=(lens.width, lens.height)
-    )
+    seen = TargetDetection(point_ids=inside, uv=uv[inside], image_size=(lens.width, lens.height))
     state = lab.arm.state()
-    views.append(
-        BoardView(index=k, T_base_ee=state.T_base_ee, joints=state.joints, detection=seen)
-    )
+    views.append(BoardView(index=k, T_base_ee=state.T_base_ee, joints=state.joints, detection=seen))
 
 # The arm's kinematics and the joints let the calibration model the arm's own errors.
 result = calibrate_hand_eye(views, board, lab.camera.intrinsics, arm=UR5_ARM)

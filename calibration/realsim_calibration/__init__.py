@@ -1,7 +1,12 @@
 """Camera and hand-eye calibration: targets, lens, hand-eye, robot errors, depth bias, reports."""
 
-from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
 from realsim_calibration.calibrate import Calibration, CalibrationConfig, calibrate
+from realsim_calibration.depth.bias import estimate_depth_bias
+from realsim_calibration.depth.board import DepthBoardView
+from realsim_calibration.detect.find import FindConfig, find_target
+from realsim_calibration.faults.diagnose import diagnose, prove_reading
+from realsim_calibration.faults.gates import GateConfig
+from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
 from realsim_calibration.fit.closed_forms import (
     CLOSED_FORMS,
     MotionConfig,
@@ -10,20 +15,15 @@ from realsim_calibration.fit.closed_forms import (
     park,
     shah,
 )
-from realsim_calibration.faults.diagnose import diagnose, prove_reading
-from realsim_calibration.depth.bias import estimate_depth_bias
-from realsim_calibration.depth.board import DepthBoardView
-from realsim_calibration.detect.find import FindConfig, find_target
+from realsim_calibration.fit.joint_solve import JointConfig
 from realsim_calibration.from_poses import calibrate_from_poses
-from realsim_calibration.faults.gates import GateConfig
 from realsim_calibration.hand_eye import (
     HandEyeConfig,
     calibrate_hand_eye,
     calibrate_hand_eye_report,
 )
-from realsim_calibration.lens.intrinsics import calibrate_intrinsics
-from realsim_calibration.fit.joint_solve import JointConfig
 from realsim_calibration.lens.fit import IntrinsicsConfig
+from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.planning.live_calibration import LiveCalibration
 from realsim_calibration.planning.next_view import choose_next_views, rank_next_views
 from realsim_calibration.results import HandEyeReport

@@ -1,4 +1,4 @@
-"""The whole calibration of a set of views: lens, then hand-eye; from images, or from poses alone."""
+"""The whole calibration of a set of views: the lens, then the hand-eye."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check, Target
 from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
-from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.lens.fit import IntrinsicsConfig
+from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.lens.report import IntrinsicsReport
 from realsim_calibration.results import HandEyeReport
 from realsim_calibration.views import BoardView

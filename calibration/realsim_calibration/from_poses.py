@@ -15,8 +15,8 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Chessboard
-from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
 from realsim_calibration.fit.joint_solve import JointConfig
+from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
 from realsim_calibration.results import HandEyeReport
 from realsim_calibration.views import BoardView, detection_of
 

@@ -1,79 +1,28 @@
-"""Hand-eye calibration from views of a target: gates, starts, joint fit, robot errors, uncertainty."""
+"""Hand-eye calibration from views of a target: screening, joint fit, report."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.errors import DegenerateError, InputError
-from realsim.geometry import se3
-from realsim.geometry.camera import project
 from realsim.geometry.dh import DhArm
-from realsim.records import CameraIntrinsics, Check, HandEye, Target
-from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
-from realsim_calibration.checks import CheckConfig, hand_eye_checks, roll_range_deg
-from realsim_calibration.fit.closed_forms import CLOSED_FORMS, MotionConfig, check_observable
-from realsim_calibration.faults.diagnosis import DiagnosisConfig
-from realsim_calibration.faults.consequences import (
-    SINGLE_VIEWS,
-    check_of,
-    examine,
-    half_turned,
-    motion_check_of,
-    renumbered,
-)
-from realsim_calibration.faults.gates import (
-    GateConfig,
-    frame_gate,
-    px_gate,
-    rotation_mismatch_deg,
-    screw_ratio,
-)
-from realsim_calibration.fit.joint_solve import JointConfig, JointProblem, Setup, ViewCorners
-from realsim_calibration.fit.noise_scale import NoiseConfig
-from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
-from realsim_calibration.fit.robot_error import RobotErrorConfig
+from realsim.records import CameraIntrinsics, HandEye, Target
+from realsim_calibration.checks import hand_eye_checks
+from realsim_calibration.fit.joint_solve import Setup, ViewCorners, camera_of
 from realsim_calibration.fit.robust_fit import Solution, solve
 from realsim_calibration.fit.view_system import SHARED
+from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
+from realsim_calibration.screening import (
+    Candidate,
+    HandEyeConfig,
+    Screened,
+    joints_of,
+    screen,
+)
 from realsim_calibration.views import BoardView
 
 Array = NDArray[np.float64]
-TWIN_FLOOR_PX = 0.1
-"""Poses that fit the corners to a tenth of a pixel are equally good."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class HandEyeConfig:
-    """Everything the hand-eye calibration may be told."""
-
-    mode: Mode = "eye_in_hand"
-    diagnosis: DiagnosisConfig = field(default_factory=DiagnosisConfig)
-    gates: GateConfig = field(default_factory=GateConfig)
-    motion: MotionConfig = field(default_factory=MotionConfig)
-    joint: JointConfig = field(default_factory=JointConfig)
-    noise: NoiseConfig = field(default_factory=NoiseConfig)
-    robot: RobotErrorConfig = field(default_factory=RobotErrorConfig)
-    checks: CheckConfig = field(default_factory=CheckConfig)
-    robot_map: bool = True
-    """Whether maps of the robot's error are tried."""
-    min_points: int = 8
-    """Fewest points of a usable view: two tags; one tag alone has a mirror twin and no lever. A
-    target with fewer points is taken whole."""
-    gate_rounds: int = 2
-    """How often the pixel gate and the closed forms alternate: a bad view bends the first start."""
-
-
-@dataclass(eq=False, kw_only=True, slots=True)
-class Candidate:
-    """A view on its way through the gates."""
-
-    view: BoardView
-    points: Array
-    uv: Array
-    pose: BoardPose
-    A: Array
-    """(4, 4) the hand in the base, or the base in the hand where the camera stands still [m]."""
 
 
 def calibrate_hand_eye(
@@ -109,88 +58,18 @@ def calibrate_hand_eye_report(
 ) -> HandEyeReport:
     """Return the hand-eye calibration with its diagnosis; see `calibrate_hand_eye`."""
     config = config or HandEyeConfig()
-    candidates, rejected = _candidates(views, target, intrinsics0, config)
-    candidates, turned = _counted_from_one_end(candidates, target, intrinsics0)
-    A, C = _stacks(candidates)
-    check_observable(A, config.motion)
-    given = np.array([c.view.T_base_ee for c in candidates])
-    diagnosis = examine(
-        given, C, [c.view.label for c in candidates], target, config.mode,
-        _nominal(candidates, arm), config.diagnosis,
-    )  # fmt: skip
-    conventions = check_of(diagnosis, [c.view.index for c in candidates])
-    if diagnosis is not None and diagnosis.fault in SINGLE_VIEWS:
-        rejected |= {candidates[k].view.index: diagnosis.sentence for k in diagnosis.views}
-        keep = [k for k in range(len(candidates)) if k not in diagnosis.views]
-        candidates, given, C = [candidates[k] for k in keep], given[keep], C[keep]
-    twins = [_plausible_twin(c.pose, config.gates) for c in candidates]
-    middle = target.points_board.mean(0)
-    C, dropped, _ = frame_gate(
-        given, C, twins, middle, config.gates, eye_in_hand=config.mode == "eye_in_hand"
-    )
-    rejected |= {candidates[k].view.index: reason for k, reason in dropped.items()}
-    keep = [k for k in range(len(candidates)) if k not in dropped]
-    candidates, C = [candidates[k] for k in keep], C[keep]
-    A = _stacks(candidates)[0]
-    mismatch, ratio = rotation_mismatch_deg(A, C), screw_ratio(A, C, config.gates)
-    candidates, start, starts, more = _start(candidates, C, intrinsics0, config)
-    rejected |= more
-    C_used = _stacks(candidates)[1]
-    setup = _setup(candidates, target, intrinsics0, config)
-    joints = _joints(candidates) if arm is not None else None
-    solution = solve(setup, start, config, arm if joints is not None else None, joints)
-    report = _report(
-        views, target, intrinsics0, config, candidates, rejected, starts, solution, mismatch, ratio
-    )
-    moved = motion_check_of(
-        np.array([c.view.T_base_ee for c in candidates]), C_used, middle,
-        eye_in_hand=config.mode == "eye_in_hand",
-    )  # fmt: skip
-    first = tuple(c for c in (conventions, turned, moved) if c is not None)
-    return replace(report, checks=first + hand_eye_checks(report, config.checks))
-
-
-def _counted_from_one_end(
-    candidates: list[Candidate], target: Target, intrinsics: CameraIntrinsics
-) -> tuple[list[Candidate], Check | None]:
-    """Return the candidates with boards that were counted from the wrong end counted anew."""
-    A, C = _stacks(candidates)
-    turns = half_turned(A, C, target)
-    if turns is None:
-        return candidates, None
-    mended: list[Candidate] = []
-    for c, flip in zip(candidates, turns.flips, strict=True):
-        if not flip:
-            mended.append(c)
-            continue
-        view = replace(c.view, detection=renumbered(c.view.detection, target))
-        points = view.detection.points(target)
-        pose = estimate_board_pose(points, view.detection.uv, intrinsics)
-        if pose is not None:
-            mended.append(
-                Candidate(view=view, points=points, uv=view.detection.uv, pose=pose, A=c.A)
-            )
-    names = [c.view.label for c, flip in zip(candidates, turns.flips, strict=True) if flip]
-    check = Check(
-        name="half turns",
-        verdict="good",
-        sentence=f"the target looks the same turned by 180 deg; in {len(names)} of "
-        f"{len(candidates)} views it was counted from the other end, which is mended by the "
-        f"robot's turns ({turns.before_deg:.1f} deg misfit before, {turns.after_deg:.2f} after).",
-        value=float(len(names)),
-        views=tuple(c.view.index for c, f in zip(candidates, turns.flips, strict=True) if f),
-    )
-    return mended, check
-
-
-def _nominal(candidates: list[Candidate], arm: DhArm | None) -> Array | None:
-    """Return the flange by the arm's own kinematics (N, 4, 4), None where it is not known."""
-    joints = _joints(candidates)
-    return None if arm is None or joints is None else arm.forward(joints)
+    screened = screen(views, target, intrinsics0, config, arm)
+    setup = _setup(screened.candidates, target, intrinsics0, config)
+    joints = joints_of(screened.candidates) if arm is not None else None
+    solution = solve(setup, screened.start, config, arm if joints is not None else None, joints)
+    return _report(views, target, intrinsics0, config, screened, solution)
 
 
 def _setup(
-    candidates: list[Candidate], target: Target, intrinsics0: CameraIntrinsics, config: HandEyeConfig
+    candidates: list[Candidate],
+    target: Target,
+    intrinsics0: CameraIntrinsics,
+    config: HandEyeConfig,
 ) -> Setup:
     """Return the joint fit's input."""
     points = target.points_board
@@ -212,116 +91,11 @@ def _setup(
     )
 
 
-def _joints(candidates: list[Candidate]) -> Array | None:
-    """Return the joints (views, 6), None where a view has none."""
-    found = [c.view.joints for c in candidates]
-    return None if any(q is None for q in found) else np.array(found, dtype=np.float64)
-
-
-def _candidates(
-    views: Sequence[BoardView], target: Target, intrinsics: CameraIntrinsics, config: HandEyeConfig
-) -> tuple[list[Candidate], dict[int, str]]:
-    """Return the views that show the target, by index, and the others with the reason."""
-    ordered = sorted(views, key=lambda v: v.index)
-    indices = [v.index for v in ordered]
-    if len(set(indices)) != len(indices):
-        raise InputError("hand-eye: two views have the same index; every view needs its own.")
-    candidates: list[Candidate] = []
-    rejected: dict[int, str] = {}
-    size = (intrinsics.width, intrinsics.height)
-    least = min(config.min_points, len(target.points_board))
-    for view in ordered:
-        found = view.detection
-        if len(found) and tuple(found.image_size) != size:
-            raise InputError(
-                f"hand-eye: the image of view {view.label} is {found.image_size[0]}x"
-                f"{found.image_size[1]} px, the camera's are {size[0]}x{size[1]}. Images of one "
-                "size are needed: leave this view out or rescale nothing."
-            )
-        if len(found) < least:
-            why = f"shows {len(found)} points of the target; at least {least} are needed"
-            rejected[view.index] = "; ".join([why, *found.rejected[:2]]) + "."
-            continue
-        points = found.points(target)
-        pose = estimate_board_pose(points, found.uv, intrinsics)
-        if pose is None:
-            rejected[view.index] = "no pose in front of the camera fits its points."
-            continue
-        A = view.T_base_ee if config.mode == "eye_in_hand" else se3.invert(view.T_base_ee)
-        candidates.append(Candidate(view=view, points=points, uv=found.uv, pose=pose, A=A))
-    if len(candidates) < config.motion.min_views:
-        raise DegenerateError(
-            f"hand-eye: {len(candidates)} of {len(ordered)} views show the target; at least "
-            f"{config.motion.min_views} are needed, 24 are advised. "
-            + " ".join(f"View {i} {why}" for i, why in list(rejected.items())[:3])
-        )
-    return candidates, rejected
-
-
-def _stacks(candidates: list[Candidate]) -> tuple[Array, Array]:
-    """Return (N, 4, 4) hand poses and board poses."""
-    A = np.array([c.A for c in candidates]).reshape(-1, 4, 4)
-    return A, np.array([c.pose.T_cam_board for c in candidates]).reshape(-1, 4, 4)
-
-
-def _plausible_twin(pose: BoardPose, gates: GateConfig) -> Array | None:
-    """Return the mirror solution where it fits the image almost as well."""
-    limit = gates.twin_ratio * max(pose.rms_px, TWIN_FLOOR_PX)
-    return pose.twin if pose.twin_rms_px <= limit else None
-
-
-def _start(
-    candidates: list[Candidate], C: Array, intrinsics: CameraIntrinsics, config: HandEyeConfig
-) -> tuple[list[Candidate], tuple[Array, Array], tuple[tuple[str, float], ...], dict[int, str]]:
-    """Return the views that pass the pixel gate, the best closed form, all of them, the others."""
-    rejected: dict[int, str] = {}
-    tried = _closed_forms(candidates, C, intrinsics, config)
-    for _ in range(config.gate_rounds):
-        bad = px_gate(_best(tried)[2], config.gates)
-        if not bad:
-            break
-        rejected |= {candidates[k].view.index: reason for k, reason in bad.items()}
-        keep = [k for k in range(len(candidates)) if k not in bad]
-        candidates, C = [candidates[k] for k in keep], C[keep]
-        tried = _closed_forms(candidates, C, intrinsics, config)
-    X, Z, _ = _best(tried)
-    starts = tuple((name, float(np.sqrt(np.mean(px**2)))) for name, (_, _, px) in tried.items())
-    return candidates, (X, Z), starts, rejected
-
-
-def _closed_forms(
-    candidates: list[Candidate], C: Array, intrinsics: CameraIntrinsics, config: HandEyeConfig
-) -> dict[str, tuple[Array, Array, Array]]:
-    """Return (X, Z, px per view) of every closed form."""
-    A, _ = _stacks(candidates)
-    check_observable(A, config.motion)
-    tried: dict[str, tuple[Array, Array, Array]] = {}
-    for name, solve_closed in CLOSED_FORMS.items():
-        X, Z = solve_closed(A, C)
-        tried[name] = (X, Z, np.array([_view_px(c, X, Z, intrinsics) for c in candidates]))
-    return tried
-
-
-def _best(tried: dict[str, tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
-    """Return the closed form of least median px: a mean would follow the worst view."""
-    return min(tried.values(), key=lambda entry: float(np.median(entry[2])))
-
-
-def _view_px(c: Candidate, X: Array, Z: Array, intrinsics: CameraIntrinsics) -> float:
-    """Return a view's reprojection RMS through the robot pose [px], infinite behind the camera."""
-    error = project(intrinsics, se3.transform(se3.invert(c.A @ X) @ Z, c.points)) - c.uv
-    px = float(np.sqrt(np.mean(np.sum(error**2, -1))))
-    return px if np.isfinite(px) else np.inf
-
-
 def _report(
     views: Sequence[BoardView], target: Target, intrinsics0: CameraIntrinsics,
-    config: HandEyeConfig, candidates: list[Candidate], rejected: dict[int, str],
-    starts: tuple[tuple[str, float], ...], solution: Solution, mismatch: float, ratio: float,
+    config: HandEyeConfig, screened: Screened, solution: Solution,
 ) -> HandEyeReport:  # fmt: skip
     """Return everything that is known of the calibration."""
-    from realsim_calibration.fit.joint_solve import camera_of
-
     state, problem = solution.state, solution.problem
     sides = np.ptp(target.points_board, axis=0) / 2
     shape = BoardShape(
@@ -355,19 +129,20 @@ def _report(
         joint_offsets=solution.joint_offsets,
         sigma_px=solution.sigma_px,
         robot_ratio=float(np.sqrt(np.prod(solution.ratio))),
-        views=_view_reports(views, candidates, rejected, solution),
+        views=_view_reports(views, screened, solution),
         seen_px=_rms([v.seen_px for v in used]),
         held_out_px=_rms([v.unseen_px for v in used]),
         held_out_mm=_rms([v.unseen_mm for v in used]),
         held_out_deg=_rms([v.unseen_deg for v in used]),
-        starts=starts,
-        mismatch_deg=mismatch,
-        screw_ratio=ratio,
-        roll_range_deg=roll_range_deg([c.pose.T_cam_board for c in candidates]),
+        starts=screened.starts,
+        mismatch_deg=screened.mismatch_deg,
+        screw_ratio=screened.screw_ratio,
+        roll_range_deg=screened.roll_range_deg,
         checks=(),
         information=solution.information,
     )
-    return report
+    checks = screened.checks + hand_eye_checks(report, config.checks)
+    return replace(report, checks=checks)
 
 
 def _rms(values: Sequence[float]) -> float:
@@ -375,11 +150,10 @@ def _rms(values: Sequence[float]) -> float:
 
 
 def _view_reports(
-    views: Sequence[BoardView], candidates: list[Candidate], rejected: dict[int, str],
-    solution: Solution,
-) -> tuple[ViewReport, ...]:  # fmt: skip
+    views: Sequence[BoardView], screened: Screened, solution: Solution
+) -> tuple[ViewReport, ...]:
     """Return every given view's part, by index."""
-    used = {c.view.index: v for c, v in zip(candidates, solution.views, strict=True)}
+    used = {c.view.index: v for c, v in zip(screened.candidates, solution.views, strict=True)}
     rows: list[ViewReport] = []
     for view in sorted(views, key=lambda v: v.index):
         part = used.get(view.index)
@@ -389,7 +163,7 @@ def _view_reports(
                 index=view.index,
                 label=view.label,
                 used=part is not None,
-                reason=rejected.get(view.index, ""),
+                reason=screened.rejected.get(view.index, ""),
                 T_base_ee=view.T_base_ee,
                 joints=view.joints,
                 point_ids=view.detection.point_ids,

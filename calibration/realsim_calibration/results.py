@@ -110,7 +110,7 @@ class HandEyeReport:
     map_name: str
     """The chosen one of `map_scores`."""
     map_scores: tuple[tuple[str, float], ...]
-    """(candidate, geometric mean of the unseen views' RMS [px]) of every map tried, "none" first."""
+    """(candidate, geometric mean of the unseen views' RMS [px]), "none" first."""
     joint_offsets: Array | None
     """(6, 2) joint zero offsets and their 1-sigma [rad] where joints and arm are known. Those of
     the first and the last joint cannot be told from another board or camera place."""

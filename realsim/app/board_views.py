@@ -1,18 +1,29 @@
 """The board views of a session: read them for the calibration, leave its results beside them."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from realsim.app.console import Tick
-from realsim.errors import InputError
+from realsim.errors import InputError, RealsimError
 from realsim.geometry.dh import ARMS, DhArm
 from realsim.records import Target
 from realsim.store import SessionStore
-from realsim_calibration import BoardView, HandEyeReport, find_target
+from realsim.store.records_json import check_to_json, number_to_json
+from realsim_calibration import (
+    BoardView,
+    DepthBoardView,
+    HandEyeReport,
+    estimate_depth_bias,
+    find_target,
+)
+from realsim_calibration.depth.bias import DepthBiasReport
 from realsim_calibration.fit.robot_error import RobotErrorConfig, matching_arm
 
 BOARD_FILE = "calibration/board.json"
+DEPTH_FILE = "calibration/depth_bias.json"
+"""What is known of the depth camera's scale and offset."""
 RESULTS = "calibration"
 """Folder of the session that takes report, pictures and exports."""
 
@@ -57,11 +68,55 @@ def arm_of(views: Sequence[BoardView]) -> DhArm | None:
     return matching_arm(np.array(joints), Ts, tuple(ARMS.values()), RobotErrorConfig())
 
 
-def write_results(report: HandEyeReport, store: SessionStore, views_store: SessionStore) -> None:
-    """Write report, pictures and the files for other tools into the session."""
+def write_results(
+    report: HandEyeReport, seen: Sequence[BoardView], store: SessionStore, views_store: SessionStore
+) -> None:
+    """Write report, pictures, depth bias and the files for other tools into the session."""
     from realsim_calibration.exports import FrameNames, write_exports
     from realsim_calibration.report import write_calibration_report
 
     folder = store.folder / RESULTS
+    depth = _depth_bias(report, seen, store, views_store)
     write_exports(report, folder / "exports", frames=FrameNames())
-    write_calibration_report(report, folder / "report", images=views_store.rgb)
+    write_calibration_report(
+        report, folder / "report", images=views_store.rgb, depth_report=depth
+    )
+
+
+def _depth_bias(
+    report: HandEyeReport, seen: Sequence[BoardView], store: SessionStore, views_store: SessionStore
+) -> DepthBiasReport | None:
+    """Return the depth camera's bias and note it in the session; None where it cannot be told."""
+    used = {v.index for v in report.used}
+    views = [
+        DepthBoardView(
+            index=v.index, depth_m=views_store.depth_m(v.index), detection=v.detection, name=v.label
+        )
+        for v in seen
+        if v.index in used
+    ]
+    try:
+        found = estimate_depth_bias(
+            views, report.target, report.intrinsics, shape=report.board,
+            intrinsics_covariance=report.intrinsics_covariance,
+        )  # fmt: skip
+    except RealsimError as error:
+        store.write_json(DEPTH_FILE, {"known": False, "why": str(error)})
+        return None
+    store.write_json(DEPTH_FILE, {"known": True, **depth_bias_to_json(found)})
+    return found
+
+
+def depth_bias_to_json(found: DepthBiasReport) -> dict[str, Any]:
+    """Return a depth bias as JSON values: a prior for the registration, and its checks."""
+    bias = found.bias
+    return {
+        "model": "1 / z_true = scale / z_measured + offset_per_m",
+        "scale": bias.scale,
+        "offset_per_m": bias.offset_per_m,
+        "covariance": bias.covariance.tolist(),
+        "noise_per_m": number_to_json(bias.noise_per_m),
+        "range_m": [number_to_json(v) for v in bias.range_m],
+        "separable": bias.separable,
+        "checks": [check_to_json(check) for check in found.checks],
+    }

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 
 from realsim.app.console import Console
-from realsim.errors import InputError
+from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.records import Check, HandEye
 from realsim_calibration import HandEyeReport
 
+NEXT_VIEWS = 3
+"""Further views that are proposed."""
 ORDER = ("bad", "warn", "unknown", "good")
 
 
@@ -52,6 +54,7 @@ def run_calibrate(source: Path, *, live: bool, quiet: bool, **options: Any) -> b
 
     result, files = calibrate_folder(request, console)
     show_report(result.hand_eye, result.checks, console)
+    show_next_views(result.hand_eye, console)
     console.say(f"report: {files[0]}")
     console.say(f"{len(files) - 1} pictures and files for other tools beside it, in {request.out}")
     return not any(c.verdict == "bad" for c in result.checks)
@@ -63,8 +66,8 @@ def _refuse_folder_options(options: dict[str, Any]) -> None:
     given = [f"--{name.replace('_', '-')}" for name in mine if options.get(name)]
     if given:
         raise InputError(
-            f"{', '.join(given)}: a session says these itself (calibration/board.json, robot.jsonl, "
-            "session.json). Leave them out, or give a plain folder of images."
+            f"{', '.join(given)}: a session says these itself (calibration/board.json, robot.jsonl "
+            "and session.json). Leave them out, or give a plain folder of images."
         )
 
 
@@ -116,6 +119,26 @@ def show_report(report: HandEyeReport, checks: Sequence[Check], console: Console
     for view in report.views:
         if not view.used:
             console.warn(f"{view.label} was not used: {view.reason}")
+
+
+def show_next_views(report: HandEyeReport, console: Console) -> None:
+    """Print the views that would lower the uncertainty most."""
+    from realsim_calibration import choose_next_views
+    from realsim_calibration.planning.view_proposals import propose_views
+
+    try:
+        views = choose_next_views(report, propose_views(report), NEXT_VIEWS)
+    except RealsimError:
+        return  # a calibration that is this poor has said so in its checks
+    rows = [
+        [
+            f"{k + 1}", f"{100 * v.distance_m:.0f} cm", f"{v.tilt_deg:.0f} deg",
+            f"{v.roll_deg:+.0f} deg", f"{v.sigma_mm:.2f} mm / {v.sigma_deg:.3f} deg",
+        ]
+        for k, v in enumerate(views)
+    ]  # fmt: skip
+    header = ["view", "distance", "tilt", "roll in the image", "sigma expected then"]
+    console.table("Further views that would help most, in this order", header, rows)
 
 
 def show_checks(checks: Sequence[Check], console: Console) -> None:

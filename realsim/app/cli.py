@@ -98,7 +98,7 @@ def upgrade(
 def board(
     what: str, out: Path, paper: str, preview: bool, cut_marks: bool, overwrite: bool
 ) -> None:
-    """Print a calibration target: a PDF at exact scale with a ruler, and its target file.
+    r"""Print a calibration target: a PDF at exact scale with a ruler, and its target file.
 
     TARGET is one line, or a target file:
 

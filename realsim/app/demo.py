@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from realsim.app.console import Console, StageTime
 from realsim.app.calibrate import show_hand_eye
+from realsim.app.console import Console, StageTime
 from realsim.app.show import show_grasps, show_scene
 from realsim.app.stages import (
     BOARD_VIEWS,

@@ -313,9 +313,7 @@ def _from_pose_files(
     return result, _write(result, request.out, (), console)
 
 
-def _write(
-    result: Calibration, out: Path, images: Sequence[Path], console: Console
-) -> list[Path]:
+def _write(result: Calibration, out: Path, images: Sequence[Path], console: Console) -> list[Path]:
     """Write report, pictures and exports; return the paths, the page first."""
     from realsim_calibration.exports import FrameNames, write_exports
     from realsim_calibration.inputs import load_image

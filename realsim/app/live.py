@@ -18,8 +18,8 @@ def run_live(request: FolderRequest, console: Console) -> bool:
     """
     from dataclasses import replace
 
-    from realsim_calibration.lens.camera_files import read_camera
     from realsim_calibration.inputs import load_image, read_pose_file, reading_from_text
+    from realsim_calibration.lens.camera_files import read_camera
     from realsim_calibration.planning.live_calibration import watch_folder
 
     if request.camera is None or not request.reading:
@@ -41,7 +41,7 @@ def run_live(request: FolderRequest, console: Console) -> bool:
     done = False
     for status in watch_folder(request.images, live, read_view):
         console.say(status.sentence)
-        done = status.done
+        done = status.state == "done"
         if done:
             break
     return done

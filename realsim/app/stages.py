@@ -125,7 +125,7 @@ def calibrate_session(store: SessionStore, console: Console) -> HandEye:
             camera = views_store.session.intrinsics
             report = calibrate_hand_eye_report(seen, target, camera, arm=arm)
             hand_eye = report.hand_eye
-            write_results(report, store, views_store)
+            write_results(report, seen, store, views_store)
             save_hand_eye(store, hand_eye)
         place_cameras(store, hand_eye)
         mark_current(store, "calibrate", key)

@@ -98,7 +98,7 @@ class RobotErrorMap:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class ArmErrorMap:
-    """The robot's pose error as errors of its arm's Denavit-Hartenberg numbers; needs the joints."""
+    """The robot's error as errors of its arm's Denavit-Hartenberg numbers; needs the joints."""
 
     arm: DhArm
     """The arm as it is said to be."""

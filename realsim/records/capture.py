@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from realsim.errors import InputError
 from realsim.records.checked_arrays import Array, frozen, rigid

@@ -146,7 +146,7 @@ class CharucoBoard:
     def points_board(self) -> Array:
         """((rows - 1) (columns - 1), 3) inner corners [m]."""
         inner = _grid(self.rows - 1, self.columns - 1, self.square_m)
-        return inner + [self.square_m, self.square_m, 0.0]
+        return inner + np.array([self.square_m, self.square_m, 0.0])
 
     @property
     def size_m(self) -> tuple[float, float]:

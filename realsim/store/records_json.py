@@ -225,7 +225,9 @@ def robot_map_from_json(data: Any) -> RobotErrorMap | ArmErrorMap | None:
             reach=array_from_json(d["reach"]),
         )
     if kind != "arm":
-        raise InputError(f"the robot's error map is of kind '{kind}'; 'pose map' or 'arm' is known.")
+        raise InputError(
+            f"the robot's error map is of kind '{kind}'; 'pose map' or 'arm' is known."
+        )
     d = need(data, ("arm", "errors", "T_flange_tool"), "the robot's error map")
     arm = need(d["arm"], ("name", *ARM_NUMBERS), "the arm of the robot's error map")
     numbers = {name: array_from_json(arm[name]) for name in ARM_NUMBERS}

@@ -7,8 +7,13 @@ import pytest
 
 from realsim.geometry import se3
 from realsim_calibration import CLOSED_FORMS
+from realsim_calibration.faults.gates import (
+    GateConfig,
+    angle_gate,
+    rotation_mismatch_deg,
+    screw_ratio,
+)
 from realsim_calibration.fit.closed_forms import mean_board
-from realsim_calibration.faults.gates import GateConfig, angle_gate, rotation_mismatch_deg, screw_ratio
 
 ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 KOCH = ROOT / "handeye" / "koch_ur5"

@@ -17,8 +17,8 @@ from realsim_calibration.lens.bundle import (
     camera_vector,
     shaped_points,
 )
-from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.lens.fit import IntrinsicsConfig
+from realsim_calibration.lens.intrinsics import calibrate_intrinsics
 from realsim_calibration.lens.start import (
     homography,
     mirror_poses,

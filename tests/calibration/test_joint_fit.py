@@ -221,7 +221,10 @@ def test_records_of_maps_give_the_basis_errors():
         assert isinstance(record, RobotErrorMap)
         assert np.allclose(record.twist(Ts), basis.columns @ w, atol=1e-15)
         assert np.allclose(se3.log(se3.invert(Ts) @ record.corrected(Ts)), basis.columns @ w)
-        assert record.beyond(Ts).max() == 0 and record.beyond(Ts @ se3.exp([2, 0, 0, 3, 0, 0])).min() > 1
+        assert (
+            record.beyond(Ts).max() == 0
+            and record.beyond(Ts @ se3.exp([2, 0, 0, 3, 0, 0])).min() > 1
+        )
     joints = rng.uniform(-2, 2, (15, 6))
     tool = se3.from_rt(se3.exp_so3([0.1, 0.2, 0.3]), [0.0, 0.01, 0.2])
     held = UR5E_ARM.forward(joints) @ tool

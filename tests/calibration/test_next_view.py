@@ -28,9 +28,9 @@ from realsim_calibration.planning.next_view import (
     rank_next_views,
     view_information,
 )
-from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
 from realsim_calibration.planning.view_needs import roll_range_deg, second_turn_deg
 from realsim_calibration.planning.view_proposals import ViewLimits, describe_move, propose_views
+from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
 from realsim_calibration.views import BoardView, TargetDetection
 
 Array = NDArray[np.float64]

@@ -12,7 +12,11 @@ from hypothesis import strategies as st
 from realsim.errors import InputError, UnitError
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim.store.records_json import tag_board_to_json
-from realsim_calibration.targets.marker_sets import dictionary_name, dictionary_names, dictionary_size
+from realsim_calibration.targets.marker_sets import (
+    dictionary_name,
+    dictionary_names,
+    dictionary_size,
+)
 from realsim_calibration.targets.target_file import (
     LARGEST_BYTES,
     read_target,

@@ -96,9 +96,7 @@ def motion_check_of(
     )
 
 
-def half_turned(
-    Ts_base_ee: Array, Ts_cam_board: Array, target: Target
-) -> HalfTurns | None:
+def half_turned(Ts_base_ee: Array, Ts_cam_board: Array, target: Target) -> HalfTurns | None:
     """Return which boards were numbered from the wrong end, None where the target tells."""
     if not target.half_turn or len(Ts_base_ee) < MIN_VIEWS:
         return None

@@ -39,8 +39,8 @@ from realsim_calibration.faults.hypotheses import (
     simple,
     size_name,
 )
-from realsim_calibration.results import Mode
 from realsim_calibration.faults.tool_offset import tool_offset
+from realsim_calibration.results import Mode
 
 Array = NDArray[np.float64]
 UNITS = (("millimetres", 1000.0), ("centimetres", 100.0), ("inches", 39.3701))

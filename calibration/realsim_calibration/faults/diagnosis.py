@@ -10,9 +10,9 @@ from realsim_calibration.faults.frame_fit import FitConfig
 from realsim_calibration.faults.gates import GateConfig
 from realsim_calibration.faults.half_turns import HalfTurnConfig
 from realsim_calibration.faults.pairing import PairingConfig
-from realsim_calibration.results import Mode
 from realsim_calibration.faults.rotation_readings import ReadingConfig
 from realsim_calibration.faults.tool_offset import ToolOffsetConfig
+from realsim_calibration.results import Mode
 
 Array = NDArray[np.float64]
 Fault = Literal[

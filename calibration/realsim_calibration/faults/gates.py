@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.records import TagBoard
-from realsim_calibration.fit.closed_forms import HALF_TURN, motions, nearest_rotation
 from realsim_calibration.faults.frame_fit import FitConfig, fit_frames, hand_side, mismatch
+from realsim_calibration.fit.closed_forms import HALF_TURN, motions, nearest_rotation
 
 Array = NDArray[np.float64]
 

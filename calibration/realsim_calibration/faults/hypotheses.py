@@ -13,7 +13,12 @@ from realsim_calibration.faults.frame_fit import FrameFit, fit_frames, hand_side
 from realsim_calibration.faults.gates import rotation_mismatch_deg, screw_ratio
 from realsim_calibration.faults.half_turns import synchronise_half_turns
 from realsim_calibration.faults.pairing import Pairing, find_move, find_pairing
-from realsim_calibration.faults.rotation_readings import Reread, every_reading, reread, reread_degrees
+from realsim_calibration.faults.rotation_readings import (
+    Reread,
+    every_reading,
+    reread,
+    reread_degrees,
+)
 from realsim_calibration.faults.tool_offset import describe_offset
 
 Array = NDArray[np.float64]

@@ -14,7 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim_calibration.faults.frame_fit import MIN_VIEWS, FitConfig, FrameFit, fit_frames, mismatch
+from realsim_calibration.faults.frame_fit import (
+    MIN_VIEWS,
+    FitConfig,
+    FrameFit,
+    fit_frames,
+    mismatch,
+)
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

@@ -42,9 +42,7 @@ class BoardPose:
     """Its reprojection RMS [px]; infinite where there is none."""
 
 
-def estimate_board_pose(
-    points: Array, uv: Array, intrinsics: CameraIntrinsics
-) -> BoardPose | None:
+def estimate_board_pose(points: Array, uv: Array, intrinsics: CameraIntrinsics) -> BoardPose | None:
     """Return the board's pose in the camera, None where no pose in front of the camera fits.
 
     Args:

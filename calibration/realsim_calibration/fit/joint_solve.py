@@ -1,6 +1,6 @@
 """The joint fit: camera, target and its shape, lens, and the robot's errors, in one GTSAM graph.
 
-    T_cam_board,i = X^-1 D_i^-1 A_i^-1 Z              (X^-1 A_i D_i Z for a camera that stands still)
+    T_cam_board,i = X^-1 D_i^-1 A_i^-1 Z             (X^-1 A_i D_i Z for a camera that stands still)
     cost = sum_ij w_ij |pi_K(T_i P_j(b)) - u_ij|^2 / sigma^2
          + sum_i |S^-1/2 (log D_i - B_i w)|^2 + |w|^2 + priors of K and b
     S = sigma^2 diag(lambda_r^2 / f^2 I, lambda_t^2 d^2 / f^2 I)
@@ -10,7 +10,7 @@ factor per view that ties its robot error to the smooth part B_i w. lambda bound
 so that corner errors that are common to a view (a warped print) are not blamed on the robot.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -199,7 +199,7 @@ class JointProblem:
         self, start: JointState, sigma: float, ratio: Array, roots: list[Array],
         basis: ErrorBasis | None, *, robot: bool = True,
     ) -> tuple[Any, Any]:  # fmt: skip
-        """Return the gtsam graph for fixed sigma, lambda (2,) and corner weights, and its values."""
+        """Return the gtsam graph for fixed sigma, lambda (2,), corner weights, and its values."""
         import gtsam
 
         from realsim.interop import pose3_from_T
@@ -221,7 +221,7 @@ class JointProblem:
             values.insert(self.w, start.weights if len(start.weights) else np.zeros(p))
             one = gtsam.noiseModel.Isotropic.Sigma(p, 1.0)
             graph.add(gtsam.PriorFactorVector(self.w, np.zeros(p), one))
-        for n, view in enumerate(self.setup.views):
+        for n in range(len(self.setup.views)):
             keys = [self.x, self.z, self.k, self.b]
             if robot:
                 keys.append(self.d[n])
@@ -368,7 +368,6 @@ def smooth_errors(basis: ErrorBasis | None, weights: Array, views: int) -> Array
 
 def _smooth_error(columns: Array) -> Any:
     """Return the error function log D - B w of the factor between a robot error and the map."""
-
     import gtsam
 
     minus = np.asfortranarray(-columns)

@@ -1,6 +1,6 @@
-"""The joint fit in its linear neighbourhood: everything that needs many fits, at the price of one.
+"""The joint fit in its linear neighbourhood: all that needs many fits, at the price of one.
 
-At a fitted state every view i gives rows r_i + J_i dtheta + D_i d, d = B_i w + e its robot error and
+At a fitted state every view i gives rows r_i + J_i dtheta + D_i d, d = B_i w + e its robot error,
 e ~ N(0, S sigma^2). With D_i = Q_i R_i, turning the rows by Q_i confines robot noise to the first
 six, whose covariance is 1 + R_i S R_i^T; whitening these leaves an ordinary ridge regression in
 theta = (X, Z, camera, board, w). Another lambda, another basis, another sigma, the fit without one
@@ -87,7 +87,8 @@ class LinearModel:
     def _factors(self, ratio: Array) -> Array:
         """Return the Cholesky factors (views, 6, 6) of 1 + R S R^T."""
         scaled = self.turned_D * (np.repeat(ratio, 3) * self.unit_sd)
-        return np.linalg.cholesky(np.eye(6) + scaled @ np.swapaxes(scaled, 1, 2))
+        factors = np.linalg.cholesky(np.eye(6) + scaled @ np.swapaxes(scaled, 1, 2))
+        return np.asarray(factors, dtype=np.float64)
 
     def _robot_rows(self, basis: ErrorBasis | None, ratio: Array) -> Array:
         """Return the whitened robot rows (views, 6, 29 + p + 1), residual last."""
@@ -121,7 +122,7 @@ class LinearModel:
             rest = max(float(step @ G @ step + 2 * step @ g + c), 1e-12)
             sigma = float(np.sqrt(rest / self.freedom))
         H = G / sigma**2 + prior
-        step = np.linalg.solve(H, -g / sigma**2 - prior @ offset)
+        step = np.asarray(np.linalg.solve(H, -g / sigma**2 - prior @ offset), np.float64)
         moved = offset + step
         return step, sigma, H, rest, float(moved @ prior @ moved)
 

@@ -1,12 +1,11 @@
 """How much of the error is the robot's: estimated from the views, and bounded where they mislead.
 
-lambda, the robot's share, maximises the marginal likelihood of the linear model. That estimate takes
-corner errors for independent. Where they are not (a print that is not flat in a way the board's
-shape does not cover, a lens model that is too simple), the likelihood blames the robot for them and
-unseen views are predicted worse. Whether they are independent can be seen inside each view, whatever
-the robot did: the residuals left by a free pose are split into smooth ones (polynomials of the place
-on the board) and rough ones. F = their ratio of variances is 1 for independent errors; the excess
-bounds lambda,
+lambda, the robot's share, maximises the marginal likelihood of the linear model. That takes corner
+errors for independent. Where they are not (a print bent in a way the board's shape does not cover,
+a lens model that is too simple), the likelihood blames the robot for them and unseen views are
+predicted worse. Whether they are can be seen inside each view, whatever the robot did: residuals
+left by a free pose are split into smooth ones (polynomials of the place on the board) and rough
+ones. F = their ratio of variances is 1 for independent errors; the excess bounds lambda,
 
     lambda <= bound / max(F - 1 - 2 sd(F), 0),      but at least bound.
 """

@@ -158,9 +158,7 @@ def map_record(
     """Return the map of fitted weights (p,) in prior standard deviations."""
     if basis.kind == "arm":
         assert arm is not None and basis.T_flange_tool is not None
-        return ArmErrorMap(
-            arm=arm, errors=weights * basis.unit, T_flange_tool=basis.T_flange_tool
-        )
+        return ArmErrorMap(arm=arm, errors=weights * basis.unit, T_flange_tool=basis.T_flange_tool)
     phi, mean, spread = pose_features(Ts)
     return RobotErrorMap(
         frame=basis.kind,

@@ -1,11 +1,11 @@
 """From a closed form to the calibration: noise scales, the robot's error map, covariances.
 
-    1. joint fit without robot errors, then with them at lambda = 0.3; corners re-weighted
-    2. linearise there: is the corner noise independent inside views, how large may lambda be
-    3. candidates for the robot's smooth error: none, maps in tool and base axes, the arm's own
-       numbers; each judged by predicting every view without it
-    4. joint fit with the chosen one, lambda and sigma re-estimated
-    5. covariance from noise and from what the arm may still hide
+1. joint fit without robot errors, then with them at lambda = 0.3; corners re-weighted
+2. linearise there: is the corner noise independent inside views, how large may lambda be
+3. candidates for the robot's smooth error: none, maps in tool and base axes, the arm's own
+numbers; each judged by predicting every view without it
+4. joint fit with the chosen one, lambda and sigma re-estimated
+5. covariance from noise and from what the arm may still hide
 """
 
 from dataclasses import dataclass, replace
@@ -41,7 +41,7 @@ from realsim_calibration.fit.uncertainty import noise_covariance, shared, with_a
 from realsim_calibration.fit.view_system import SHARED
 
 if TYPE_CHECKING:
-    from realsim_calibration.hand_eye import HandEyeConfig
+    from realsim_calibration.screening import HandEyeConfig
 
 Array = NDArray[np.float64]
 

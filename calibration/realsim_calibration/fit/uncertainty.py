@@ -24,8 +24,8 @@ X = slice(0, 6)
 
 
 def noise_covariance(fit: LinearFit, *, independent: bool) -> Array:
-    """Return the covariance (29 + p, 29 + p) from noise, jackknifed unless corners are independent."""
-    marginal = np.linalg.inv(fit.information)
+    """Return the covariance (29 + p, ...) from noise, jackknifed unless corners are independent."""
+    marginal: Array = np.asarray(np.linalg.inv(fit.information), dtype=np.float64)
     if independent:
         return marginal
     n = len(fit.away)

@@ -4,8 +4,8 @@
     T_cam_board = X^-1 A D Z            camera that stands still
 
 The residuals of a view depend on the poses X, Z and D only through T_cam_board, that is through a
-twist xi with T <- Exp(xi) T. The n points therefore give a (2n, 23) Jacobian (xi 6, camera 12, board
-shape 5) whatever the graph looks like; a QR decomposition of it and of the residual leaves 24 rows
+twist xi with T <- Exp(xi) T. The n points therefore give a (2n, 23) Jacobian (xi 6, camera 12,
+board 5) whatever the graph looks like; a QR decomposition of it and of the residual leaves 24 rows
 with the same sum of squares and the same normal equations, and the chain rule
 
     X: xi = -x        Z: xi = Ad(T) z        D: xi = -Ad(X^-1) d   or   Ad(X^-1 A D) d
@@ -81,7 +81,9 @@ def camera_from_board(X: Any, Z: Any, A: Any, D: Any, to_hand: bool) -> Any:
 
 
 @_compiled
-def _point_rows(M: Any, row: int, p: Any, lens: Any, measured: Any, root: float, chain: Any) -> None:
+def _point_rows(
+    M: Any, row: int, p: Any, lens: Any, measured: Any, root: float, chain: Any
+) -> None:
     """Fill two rows of [xi | camera | board | residual] for the point p in the camera frame."""
     z = p[2]
     if z <= 1e-6:
@@ -128,7 +130,9 @@ def _point_rows(M: Any, row: int, p: Any, lens: Any, measured: Any, root: float,
 
 
 @_compiled
-def _rows(T: Any, lens: Any, board: Any, half: float, middle: Any, xy: Any, uv: Any, root: Any) -> Any:
+def _rows(
+    T: Any, lens: Any, board: Any, half: float, middle: Any, xy: Any, uv: Any, root: Any
+) -> Any:
     """Return [xi | camera | board | residual] (2n, 24) of all points of a view."""
     n = len(xy)
     M = np.zeros((2 * n, COLUMNS))
@@ -254,7 +258,7 @@ def refined_pose(
 
 
 @_compiled
-def residual_norm(
+def residual_norm(  # noqa: PLR0913, PLR0917 - compiled code takes no records
     X: Any, Z: Any, A: Any, D: Any, to_hand: bool, lens: Any, board: Any,
     half: float, middle: Any, xy: Any, uv: Any, root: Any,
 ) -> float:  # fmt: skip
@@ -268,7 +272,7 @@ def residual_norm(
 
 
 @_compiled
-def view_rows(
+def view_rows(  # noqa: PLR0913, PLR0917 - compiled code takes no records
     X: Any, Z: Any, A: Any, D: Any, to_hand: bool, lens: Any, board: Any,
     half: float, middle: Any, xy: Any, uv: Any, root: Any,
 ) -> Any:  # fmt: skip
@@ -278,7 +282,7 @@ def view_rows(
 
 
 @_compiled
-def view_equations(
+def view_equations(  # noqa: PLR0913, PLR0917 - compiled code takes no records
     X: Any, Z: Any, A: Any, D: Any, to_hand: bool, lens: Any, board: Any,
     half: float, middle: Any, xy: Any, uv: Any, root: Any,
 ) -> Any:  # fmt: skip

@@ -16,9 +16,9 @@ from realsim_calibration.lens.bundle import (
     adjust,
     camera_record,
 )
-from realsim_calibration.lens.coverage import CoverageConfig
 from realsim_calibration.lens.checks import CheckLimits
 from realsim_calibration.lens.covariance import GlobalCovariance, border_effect, global_covariance
+from realsim_calibration.lens.coverage import CoverageConfig
 from realsim_calibration.lens.models import MODELS, TERM_NAMES, LensBeliefs, free_terms
 from realsim_calibration.lens.observations import OutlierConfig
 

@@ -26,7 +26,6 @@ from realsim_calibration.lens.bundle import (
     camera_record,
     camera_vector,
 )
-from realsim_calibration.lens.coverage import measure_coverage
 from realsim_calibration.lens.checks import intrinsics_checks
 from realsim_calibration.lens.choice import (
     ChoiceConfig,
@@ -36,6 +35,7 @@ from realsim_calibration.lens.choice import (
     score_models,
 )
 from realsim_calibration.lens.covariance import global_covariance
+from realsim_calibration.lens.coverage import measure_coverage
 from realsim_calibration.lens.fit import (
     Candidate,
     IntrinsicsConfig,

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.records import CameraIntrinsics, Check, Target
-from realsim_calibration.lens.coverage import Coverage
 from realsim_calibration.lens.choice import ModelScore
 from realsim_calibration.lens.covariance import projection_sd
+from realsim_calibration.lens.coverage import Coverage
 from realsim_calibration.lens.models import TERM_NAMES
 from realsim_calibration.results import BoardShape
 

@@ -19,9 +19,9 @@ from realsim_calibration.planning.next_view import (
     predicted_boards,
     rank_next_views,
 )
-from realsim_calibration.results import HandEyeReport
 from realsim_calibration.planning.view_needs import NeedsConfig, SeenBoard, missing
 from realsim_calibration.planning.view_proposals import ViewLimits, describe_move, propose_views
+from realsim_calibration.results import HandEyeReport
 from realsim_calibration.views import Array, BoardView
 
 State = Literal["collecting", "improving", "done", "bad"]

@@ -22,7 +22,12 @@ from realsim_calibration.sheets.layout import (
     page_of,
 )
 from realsim_calibration.targets.target_file import read_target, target_to_json
-from realsim_calibration.targets.target_text import describe, format_target, parse_length, parse_target
+from realsim_calibration.targets.target_text import (
+    describe,
+    format_target,
+    parse_length,
+    parse_target,
+)
 
 PAPERS_MM: dict[str, tuple[float, float]] = {
     "A5": (148.0, 210.0),

@@ -1,0 +1,73 @@
+"""What the figures of `calibration.py` should be, and over how many trials they are taken."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Goal:
+    """What a figure should be."""
+
+    low: float = -np.inf
+    high: float = np.inf
+
+    def __str__(self) -> str:
+        if np.isfinite(self.low) and np.isfinite(self.high):
+            return f"{self.low:g}" if self.low == self.high else f"{self.low:g} to {self.high:g}"
+        return f">= {self.low:g}" if np.isfinite(self.low) else f"<= {self.high:g}"
+
+    def met(self, value: float) -> bool:
+        """Return whether a figure is as good as it should be."""
+        return bool(self.low <= value <= self.high)
+
+
+COVERED = Goal(low=0.93, high=0.97)
+GOALS = {
+    "heldout_ratio_geomean": Goal(low=5.5),
+    "heldout_ratio_min": Goal(low=1.0),
+    "rtde_px": Goal(high=0.40),
+    "rosi_px": Goal(high=1.25),
+    "muligheder_px": Goal(high=1.25),
+    "swapped_px_ratio": Goal(high=1.25),
+    "swapped_named_share": Goal(low=1.0, high=1.0),
+    "koch_mm": Goal(high=1.65),
+    "koch_median_mm": Goal(high=1.1),
+    "solve_cpu_s": Goal(high=1.2),
+    "crb_ratio": Goal(high=1.2),
+    "coverage95": COVERED,
+    "coverage95_white": COVERED,
+    "coverage95_kinematic": COVERED,
+    "coverage95_unknown_arm": COVERED,
+    "faults_named_share": Goal(low=1.0, high=1.0),
+    "corner_rms_px": Goal(high=0.10),
+    "corner_rms_strong_px": Goal(high=0.22),
+}
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Size:
+    """How much is run."""
+
+    seeds: int
+    """Seeds of the folds."""
+    swapped_folds: int
+    """Folds per seed with swapped poses."""
+    trials: int
+    """Coverage trials per robot."""
+    crb_trials: int
+    fault_trials: int
+    """Sessions per fault."""
+    corner_views: int
+    """Pictures per target and level."""
+    time_repeats: int
+
+
+FULL = Size(
+    seeds=4, swapped_folds=5, trials=200, crb_trials=40, fault_trials=10, corner_views=6,
+    time_repeats=3,
+)  # fmt: skip
+QUICK = Size(
+    seeds=1, swapped_folds=2, trials=16, crb_trials=3, fault_trials=1, corner_views=1,
+    time_repeats=1,
+)  # fmt: skip

@@ -1,0 +1,288 @@
+"""Which views take part: found, sound, plausible; and the closed form that the fit starts from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import DegenerateError, InputError
+from realsim.geometry import se3
+from realsim.geometry.camera import project
+from realsim.geometry.dh import DhArm
+from realsim.records import CameraIntrinsics, Check, Target
+from realsim_calibration.checks import CheckConfig, roll_range_deg
+from realsim_calibration.faults.consequences import (
+    SINGLE_VIEWS,
+    check_of,
+    examine,
+    half_turned,
+    motion_check_of,
+    renumbered,
+)
+from realsim_calibration.faults.diagnosis import DiagnosisConfig
+from realsim_calibration.faults.gates import (
+    GateConfig,
+    frame_gate,
+    px_gate,
+    rotation_mismatch_deg,
+    screw_ratio,
+)
+from realsim_calibration.fit.board_pose import BoardPose, estimate_board_pose
+from realsim_calibration.fit.closed_forms import CLOSED_FORMS, MotionConfig, check_observable
+from realsim_calibration.fit.joint_solve import JointConfig
+from realsim_calibration.fit.noise_scale import NoiseConfig
+from realsim_calibration.fit.robot_error import RobotErrorConfig
+from realsim_calibration.results import Mode
+from realsim_calibration.views import BoardView
+
+Array = NDArray[np.float64]
+TWIN_FLOOR_PX = 0.1
+"""Poses that fit the corners to a tenth of a pixel are equally good."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class HandEyeConfig:
+    """Everything the hand-eye calibration may be told."""
+
+    mode: Mode = "eye_in_hand"
+    diagnosis: DiagnosisConfig = field(default_factory=DiagnosisConfig)
+    gates: GateConfig = field(default_factory=GateConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    joint: JointConfig = field(default_factory=JointConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    robot: RobotErrorConfig = field(default_factory=RobotErrorConfig)
+    checks: CheckConfig = field(default_factory=CheckConfig)
+    robot_map: bool = True
+    """Whether maps of the robot's error are tried."""
+    min_points: int = 8
+    """Fewest points of a usable view: two tags; one tag alone has a mirror twin and no lever. A
+    target with fewer points is taken whole."""
+    gate_rounds: int = 2
+    """How often the pixel gate and the closed forms alternate: a bad view bends the first start."""
+
+
+@dataclass(eq=False, kw_only=True, slots=True)
+class Candidate:
+    """A view on its way through the gates."""
+
+    view: BoardView
+    points: Array
+    uv: Array
+    pose: BoardPose
+    A: Array
+    """(4, 4) the hand in the base, or the base in the hand where the camera stands still [m]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Screened:
+    """The views that take part, and what was found on the way."""
+
+    candidates: list[Candidate]
+    rejected: dict[int, str]
+    """Reason of every other view, by index."""
+    start: tuple[Array, Array]
+    """(X, Z) of the best closed form."""
+    starts: tuple[tuple[str, float], ...]
+    """(closed form, its reprojection RMS [px])."""
+    mismatch_deg: float
+    screw_ratio: float
+    roll_range_deg: float
+    checks: tuple[Check, ...]
+
+
+def screen(
+    views: Sequence[BoardView], target: Target, intrinsics0: CameraIntrinsics,
+    config: HandEyeConfig, arm: DhArm | None,
+) -> Screened:  # fmt: skip
+    """Return the views that can be trusted and a start.
+
+    Raises:
+        InputError: wrong conventions, mixed-up views, or views of another target.
+        UnitError: hand poses or target in the wrong unit.
+        DegenerateError: too few views, or a motion that does not determine the hand-eye.
+    """
+    in_hand = config.mode == "eye_in_hand"
+    candidates, rejected = _candidates(views, target, intrinsics0, config)
+    candidates, turned = _counted_from_one_end(candidates, target, intrinsics0)
+    A, C = _stacks(candidates)
+    check_observable(A, config.motion)
+    labels = [c.view.label for c in candidates]
+    diagnosis = examine(
+        _given(candidates), C, labels, target, config.mode, _nominal(candidates, arm),
+        config.diagnosis,
+    )  # fmt: skip
+    conventions = check_of(diagnosis, [c.view.index for c in candidates])
+    if diagnosis is not None and diagnosis.fault in SINGLE_VIEWS:
+        rejected |= {candidates[k].view.index: diagnosis.sentence for k in diagnosis.views}
+        keep = [k for k in range(len(candidates)) if k not in diagnosis.views]
+        candidates, C = [candidates[k] for k in keep], C[keep]
+    twins = [_plausible_twin(c.pose, config.gates) for c in candidates]
+    middle = target.points_board.mean(0)
+    C, dropped, _ = frame_gate(
+        _given(candidates), C, twins, middle, config.gates, eye_in_hand=in_hand
+    )
+    rejected |= {candidates[k].view.index: reason for k, reason in dropped.items()}
+    keep = [k for k in range(len(candidates)) if k not in dropped]
+    candidates, C = [candidates[k] for k in keep], C[keep]
+    A = _stacks(candidates)[0]
+    mismatch, ratio = rotation_mismatch_deg(A, C), screw_ratio(A, C, config.gates)
+    candidates, start, starts, more = _start(candidates, C, intrinsics0, config)
+    used = _stacks(candidates)[1]
+    motion = motion_check_of(_given(candidates), used, middle, eye_in_hand=in_hand)
+    return Screened(
+        candidates=candidates,
+        rejected=rejected | more,
+        start=start,
+        starts=starts,
+        mismatch_deg=mismatch,
+        screw_ratio=ratio,
+        roll_range_deg=roll_range_deg(list(used)),
+        checks=tuple(c for c in (conventions, turned, motion) if c is not None),
+    )
+
+
+def joints_of(candidates: Sequence[Candidate]) -> Array | None:
+    """Return the joints (views, 6) [rad], None where a view has none."""
+    found = [c.view.joints for c in candidates]
+    return None if any(q is None for q in found) else np.array(found, dtype=np.float64)
+
+
+def _given(candidates: list[Candidate]) -> Array:
+    """Return the controller's poses (N, 4, 4) as they were given [m]."""
+    return np.array([c.view.T_base_ee for c in candidates]).reshape(-1, 4, 4)
+
+
+def _counted_from_one_end(
+    candidates: list[Candidate], target: Target, intrinsics: CameraIntrinsics
+) -> tuple[list[Candidate], Check | None]:
+    """Return the candidates with boards that were counted from the wrong end counted anew."""
+    A, C = _stacks(candidates)
+    turns = half_turned(A, C, target)
+    if turns is None:
+        return candidates, None
+    mended: list[Candidate] = []
+    for c, flip in zip(candidates, turns.flips, strict=True):
+        if not flip:
+            mended.append(c)
+            continue
+        view = replace(c.view, detection=renumbered(c.view.detection, target))
+        points = view.detection.points(target)
+        pose = estimate_board_pose(points, view.detection.uv, intrinsics)
+        if pose is not None:
+            mended.append(
+                Candidate(view=view, points=points, uv=view.detection.uv, pose=pose, A=c.A)
+            )
+    names = [c.view.label for c, flip in zip(candidates, turns.flips, strict=True) if flip]
+    check = Check(
+        name="half turns",
+        verdict="good",
+        sentence=f"the target looks the same turned by 180 deg; in {len(names)} of "
+        f"{len(candidates)} views it was counted from the other end, which is mended by the "
+        f"robot's turns ({turns.before_deg:.1f} deg misfit before, {turns.after_deg:.2f} after).",
+        value=float(len(names)),
+        views=tuple(c.view.index for c, f in zip(candidates, turns.flips, strict=True) if f),
+    )
+    return mended, check
+
+
+def _nominal(candidates: list[Candidate], arm: DhArm | None) -> Array | None:
+    """Return the flange by the arm's own kinematics (N, 4, 4), None where it is not known."""
+    joints = joints_of(candidates)
+    return None if arm is None or joints is None else arm.forward(joints)
+
+
+def _candidates(
+    views: Sequence[BoardView], target: Target, intrinsics: CameraIntrinsics, config: HandEyeConfig
+) -> tuple[list[Candidate], dict[int, str]]:
+    """Return the views that show the target, by index, and the others with the reason."""
+    ordered = sorted(views, key=lambda v: v.index)
+    indices = [v.index for v in ordered]
+    if len(set(indices)) != len(indices):
+        raise InputError("hand-eye: two views have the same index; every view needs its own.")
+    candidates: list[Candidate] = []
+    rejected: dict[int, str] = {}
+    size = (intrinsics.width, intrinsics.height)
+    least = min(config.min_points, len(target.points_board))
+    for view in ordered:
+        found = view.detection
+        if len(found) and tuple(found.image_size) != size:
+            raise InputError(
+                f"hand-eye: the image of view {view.label} is {found.image_size[0]}x"
+                f"{found.image_size[1]} px, the camera's are {size[0]}x{size[1]}. Images of one "
+                "size are needed: leave this view out or rescale nothing."
+            )
+        if len(found) < least:
+            why = f"shows {len(found)} points of the target; at least {least} are needed"
+            rejected[view.index] = "; ".join([why, *found.rejected[:2]]) + "."
+            continue
+        points = found.points(target)
+        pose = estimate_board_pose(points, found.uv, intrinsics)
+        if pose is None:
+            rejected[view.index] = "no pose in front of the camera fits its points."
+            continue
+        A = view.T_base_ee if config.mode == "eye_in_hand" else se3.invert(view.T_base_ee)
+        candidates.append(Candidate(view=view, points=points, uv=found.uv, pose=pose, A=A))
+    if len(candidates) < config.motion.min_views:
+        raise DegenerateError(
+            f"hand-eye: {len(candidates)} of {len(ordered)} views show the target; at least "
+            f"{config.motion.min_views} are needed, 24 are advised. "
+            + " ".join(f"View {i} {why}" for i, why in list(rejected.items())[:3])
+        )
+    return candidates, rejected
+
+
+def _stacks(candidates: list[Candidate]) -> tuple[Array, Array]:
+    """Return (N, 4, 4) hand poses and board poses."""
+    A = np.array([c.A for c in candidates]).reshape(-1, 4, 4)
+    return A, np.array([c.pose.T_cam_board for c in candidates]).reshape(-1, 4, 4)
+
+
+def _plausible_twin(pose: BoardPose, gates: GateConfig) -> Array | None:
+    """Return the mirror solution where it fits the image almost as well."""
+    limit = gates.twin_ratio * max(pose.rms_px, TWIN_FLOOR_PX)
+    return pose.twin if pose.twin_rms_px <= limit else None
+
+
+def _start(
+    candidates: list[Candidate], C: Array, intrinsics: CameraIntrinsics, config: HandEyeConfig
+) -> tuple[list[Candidate], tuple[Array, Array], tuple[tuple[str, float], ...], dict[int, str]]:
+    """Return the views that pass the pixel gate, the best closed form, all of them, the others."""
+    rejected: dict[int, str] = {}
+    tried = _closed_forms(candidates, C, intrinsics, config)
+    for _ in range(config.gate_rounds):
+        bad = px_gate(_best(tried)[2], config.gates)
+        if not bad:
+            break
+        rejected |= {candidates[k].view.index: reason for k, reason in bad.items()}
+        keep = [k for k in range(len(candidates)) if k not in bad]
+        candidates, C = [candidates[k] for k in keep], C[keep]
+        tried = _closed_forms(candidates, C, intrinsics, config)
+    X, Z, _ = _best(tried)
+    starts = tuple((name, float(np.sqrt(np.mean(px**2)))) for name, (_, _, px) in tried.items())
+    return candidates, (X, Z), starts, rejected
+
+
+def _closed_forms(
+    candidates: list[Candidate], C: Array, intrinsics: CameraIntrinsics, config: HandEyeConfig
+) -> dict[str, tuple[Array, Array, Array]]:
+    """Return (X, Z, px per view) of every closed form."""
+    A, _ = _stacks(candidates)
+    check_observable(A, config.motion)
+    tried: dict[str, tuple[Array, Array, Array]] = {}
+    for name, solve_closed in CLOSED_FORMS.items():
+        X, Z = solve_closed(A, C)
+        tried[name] = (X, Z, np.array([_view_px(c, X, Z, intrinsics) for c in candidates]))
+    return tried
+
+
+def _best(tried: dict[str, tuple[Array, Array, Array]]) -> tuple[Array, Array, Array]:
+    """Return the closed form of least median px: a mean would follow the worst view."""
+    return min(tried.values(), key=lambda entry: float(np.median(entry[2])))
+
+
+def _view_px(c: Candidate, X: Array, Z: Array, intrinsics: CameraIntrinsics) -> float:
+    """Return a view's reprojection RMS through the robot pose [px], infinite behind the camera."""
+    error = project(intrinsics, se3.transform(se3.invert(c.A @ X) @ Z, c.points)) - c.uv
+    px = float(np.sqrt(np.mean(np.sum(error**2, -1))))
+    return px if np.isfinite(px) else np.inf
