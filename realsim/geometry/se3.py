@@ -170,8 +170,12 @@ def adjoint(T: ArrayLike) -> Array:
 
 def angle(R: ArrayLike) -> Any:
     """Return the rotation angle [rad] of rotations (..., 3, 3) or transforms (..., 4, 4)."""
-    R = np.asarray(R, dtype=np.float64)[..., :3, :3]
-    return np.linalg.norm(log_so3(R), axis=-1)
+    R = np.asarray(R, dtype=np.float64)
+    x = R[..., 2, 1] - R[..., 1, 2]
+    y = R[..., 0, 2] - R[..., 2, 0]
+    z = R[..., 1, 0] - R[..., 0, 1]
+    twice_cos = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0
+    return np.arctan2(np.sqrt(x * x + y * y + z * z), twice_cos)
 
 
 def check_rigid(T: ArrayLike, name: str) -> Array:

@@ -160,20 +160,21 @@ def report_of(
     X, Z = X0 @ se3.exp(theta[:6]), Z0 @ se3.exp(theta[6:12])
     views = tuple(
         ViewReport(
-            index=k, label=str(k), used=True, reason="", T_base_ee=A, uv=uv, residuals=r,
+            index=k, label=str(k), used=True, reason="", T_base_ee=A, joints=None,
+            point_ids=np.arange(len(uv)), uv=uv, residuals=r,
             seen_px=float(np.sqrt(np.mean(np.sum(r**2, -1)))), unseen_px=held_out_px,
             unseen_mm=0.2, unseen_deg=0.05, robot_error=np.zeros(6),
         )
         for k, (A, uv, r) in enumerate(zip(hands, seen, residuals, strict=True))
     )  # fmt: skip
+    lens = replace(CAMERA, fx=fx, fy=fy, cx=cx, cy=cy, distortion=d)
     return HandEyeReport(
         mode=mode, target=BOARD, X=X, X_covariance=C[:6, :6], Z=Z, X_alone=X,
-        X_alone_covariance=C[:6, :6],
-        intrinsics=replace(CAMERA, fx=fx, fy=fy, cx=cx, cy=cy, distortion=d),
+        X_alone_covariance=C[:6, :6], Z_alone=Z, intrinsics_alone=lens, intrinsics=lens,
         intrinsics_covariance=camera_cov,
         board=BoardShape(scale=1 + theta[17], aspect=0.0, warp=np.zeros(3), sd=sd,
                          half_extent_m=max(BOARD.size_m) / 2),
-        robot_map=None, map_scores=(("none", held_out_px),), joint_offsets=None, sigma_px=SIGMA,
+        robot_map=None, map_name="none", map_scores=(("none", held_out_px),), joint_offsets=None, sigma_px=SIGMA,
         robot_ratio=RATIO, views=views, seen_px=0.2, held_out_px=held_out_px, held_out_mm=0.2,
         held_out_deg=0.05, starts=(), mismatch_deg=0.1, screw_ratio=1.0, roll_range_deg=180.0,
         checks=checks, information=information,

@@ -91,3 +91,13 @@ def test_float32_rotations_become_exactly_orthonormal():
     checked = se3.check_rigid(T, "T")
     assert np.abs(checked[:3, :3].T @ checked[:3, :3] - np.eye(3)).max() < 1e-15 * 4
     np.testing.assert_allclose(checked, T, atol=1e-6)
+
+
+def test_angle_is_the_length_of_the_logarithm():
+    rng = np.random.default_rng(0)
+    axes = rng.normal(size=(200, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = np.concatenate([np.geomspace(1e-9, 0.1, 100), np.pi - np.geomspace(1e-9, 0.1, 100)])
+    R = se3.exp_so3(axes * angles[:, None])
+    assert np.allclose(se3.angle(R), angles, rtol=0, atol=1e-12)
+    assert np.allclose(se3.angle(R), np.linalg.norm(se3.log_so3(R), axis=-1), atol=1e-7)

@@ -19,7 +19,7 @@ from realsim_calibration.planning.next_view import (
     predicted_boards,
     rank_next_views,
 )
-from realsim_calibration.planning.view_needs import NeedsConfig, SeenBoard, missing
+from realsim_calibration.planning.view_needs import Need, NeedsConfig, SeenBoard, missing
 from realsim_calibration.planning.view_proposals import ViewLimits, describe_move, propose_views
 from realsim_calibration.results import HandEyeReport
 from realsim_calibration.views import Array, BoardView
@@ -64,6 +64,9 @@ class LiveConfig:
     """... by more than this share."""
     least_gain: float = 0.02
     """The run ends when the best next view lowers the expected error by less than this share."""
+    hidden_factor: float = 2.0
+    """While roll, tilt or the hand's second axis lack, both sigmas must be this many times better
+    than wanted: errors of arm and lens then hide in the camera's place, and sigma knows of none."""
     min_points: int = 4
     """Fewest points of a usable view."""
     same_deg: float = 2.0
@@ -191,22 +194,22 @@ class LiveCalibration:
         self._seen.append(SeenBoard(view=view, T_cam_board=poses[0][1]))
         return ""
 
-    def _collecting(self, note: str, needs: tuple[str, ...], why: str = "") -> LiveStatus:
+    def _collecting(self, note: str, needs: tuple[Need, ...], why: str = "") -> LiveStatus:
         n, least = len(self._seen), self.config.min_views
-        todo = needs[0] if needs else "go on with other poses"
+        todo = needs[0].sentence if needs else "go on with other poses"
         count = f"{n} of {least} views for a first result" if n < least else f"{n} views"
         return self._status("collecting", note, needs, f"{count}. {why}Next: {todo}.")
 
     def _status(
-        self, state: State, note: str, needs: tuple[str, ...], sentence: str, **more: Any
+        self, state: State, note: str, needs: tuple[Need, ...], sentence: str, **more: Any
     ) -> LiveStatus:
         said = f"{note[0].upper()}{note[1:]}. {sentence}" if note else sentence
         return LiveStatus(
             state=state, sentence=said, views=len(self._views), usable=len(self._seen), note=note,
-            needs=needs, **more,
+            needs=tuple(n.sentence for n in needs), **more,
         )  # fmt: skip
 
-    def _calibrated(self, note: str, needs: tuple[str, ...]) -> LiveStatus:
+    def _calibrated(self, note: str, needs: tuple[Need, ...]) -> LiveStatus:
         """Calibrate, and return where the run stands."""
         usable = [s.view for s in self._seen]
         try:
@@ -233,14 +236,24 @@ class LiveCalibration:
             told = f"{bad[0].sentence} {bad[0].advice}".strip()
             return self._status("bad", note, needs, f"Something is wrong: {told}", **more)
         # Told beside the next pose, not in its place: sentence and `next_view` must agree.
-        lacking = f" Still missing: {needs[0]}." if needs else ""
+        lacking = f" Still missing: {needs[0].sentence}." if needs else ""
         end = self._end(report, best)
-        if end:
+        hidden = self._hidden(report, needs)
+        if end and not hidden:
             more |= {"next_view": None, "move": ""}
             return self._status("done", note, needs, f"Done. {figures}. {end}{lacking}", **more)
-        todo = move or (needs[0] if needs else "go on with other poses")
-        said = f"{figures}. Next: {todo}.{lacking if move else ''}"
+        if end:
+            lacking = f" Before the end: {hidden}: errors may hide that no view so far shows."
+        todo = move or (needs[0].sentence if needs else "go on with other poses")
+        said = f"{figures}. Next: {todo}.{lacking if move or end else ''}"
         return self._status("improving", note, needs, said, **more)
+
+    def _hidden(self, report: HandEyeReport, needs: tuple[Need, ...]) -> str:
+        """Return what must be done before the run may end, '' where nothing must."""
+        c = self.config
+        told = next((n.sentence for n in needs if n.hidden), "")
+        worst = max(report.sigma_mm / c.sigma_mm, report.sigma_deg / c.sigma_deg)
+        return told if worst * c.hidden_factor > 1 else ""
 
     def _end(self, report: HandEyeReport, best: NextView | None) -> str:
         """Return why the run may end, '' where it may not."""

@@ -10,8 +10,15 @@ which is eliminated; s the corner noise, lambda the robot's share, d the median 
 ranked by the expected RMS displacement of a point seen in the image at the working distance:
 sqrt(tr(M Cov_X)), M the mean of [-hat(p) I]^T [-hat(p) I]. It weighs radians against metres.
 
-Information says how Cov shrinks, the report how large it is now: Cov_X is mapped by the congruence
-that makes the inverse information the report's covariance, so adding a view never increases it.
+Information says how the noise shrinks, the report how large the covariance C of X is now. What C
+has beyond the inverse information N = (H^-1)_X are errors of the arm that look like another X: a
+floor that no view lowers. With N = L L^T and eigenvalues w, V of L^-1 C L^-T (free of units)
+
+    Cov_X(after) = A (H + H_view)^-1_X A^T + F
+    F = L V diag(max(w - 1, 0)) V^T L^T,    A = L V diag(min(w, 1)^1/2) V^T L^-1
+
+A is 1 unless the report knows X better than the information says. Before any view this is C; a view
+never increases it, and never lowers it below F.
 """
 
 from collections.abc import Sequence
@@ -186,9 +193,19 @@ def view_information(
 ) -> Array:
     """Return what each planned view would add to `report.information` (n, 29, 29).
 
-    Held terms have zero rows as there; a pose that does not see the target adds nothing.
+    Terms with zero rows there have zero rows here; a pose that does not see the target adds
+    nothing.
     """
     return _Planned(report, Ts_planned, config or NextViewConfig()).informations
+
+
+def covariance_floor(report: HandEyeReport) -> Array:
+    """Return F (6, 6), the part of X's covariance that no further view lowers [rad, m].
+
+    Raises:
+        DegenerateError: the calibration so far does not determine X.
+    """
+    return _Knowledge(report, np.eye(6)).floor
 
 
 def displacement_metric(report: HandEyeReport, config: NextViewConfig) -> Array:
@@ -219,7 +236,7 @@ def shaped_points(report: HandEyeReport) -> tuple[Array, Array]:
 
 
 class _Knowledge:
-    """The information so far, and how it maps to the covariance of X."""
+    """The information so far, and what of X's covariance it can lower."""
 
     def __init__(self, report: HandEyeReport, metric: Array) -> None:
         self._free = np.diag(report.information) > 0
@@ -233,14 +250,17 @@ class _Knowledge:
         self._unit = 1 / np.sqrt(np.diag(self._H))
         self._metric = metric
         try:
-            now = np.linalg.cholesky(self._inverse(self._H[None])[0])
-            reported = np.linalg.cholesky(report.X_covariance)
+            L = np.linalg.cholesky(self._inverse(self._H[None])[0])
+            to_unit = np.linalg.inv(L)
+            w, V = np.linalg.eigh(to_unit @ report.X_covariance @ to_unit.T)
         except np.linalg.LinAlgError as error:
             raise DegenerateError(
                 "next view: the views so far do not determine X (its information is singular). "
                 "Capture views that tilt the hand about two axes and roll it."
             ) from error
-        self._map = reported @ np.linalg.inv(now)
+        root = L @ V
+        self.floor: Array = root * np.maximum(w - 1, 0) @ root.T
+        self._map = root * np.sqrt(np.clip(w, 0, 1)) @ V.T @ to_unit
 
     def _inverse(self, H: Array) -> Array:
         """Return the X block (n, 6, 6) of the inverses of (n, k, k)."""
@@ -254,7 +274,7 @@ class _Knowledge:
     def covariances(self, added: Array) -> Array:
         """Return Cov_X (n, 6, 6) after each of the informations (n, 29, 29)."""
         more = added[:, self._free][:, :, self._free]
-        return self._map @ self._inverse(self._H + more) @ self._map.T
+        return self._map @ self._inverse(self._H + more) @ self._map.T + self.floor
 
     def rms(self, covariances: Array) -> Array:
         """Return the expected RMS displacement (n,) [m]."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -32,6 +33,24 @@ class NeedsConfig:
     """Least ratio of the farthest to the nearest view: size and distance are told apart by it."""
     cells: int = 7
     """Least number of the image's 3 x 3 cells with points: the lens is measured where they are."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Need:
+    """Something that the views so far lack."""
+
+    about: Literal["target", "roll", "tilt", "turn", "distance", "image"]
+    sentence: str
+    """What to do in further views."""
+
+    @property
+    def hidden(self) -> bool:
+        """Whether sigma cannot speak for it.
+
+        Without a turn about an axis errors of arm and lens look like another place of the camera,
+        and no residual shows them.
+        """
+        return self.about in ("roll", "tilt", "turn")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -68,43 +87,47 @@ def second_turn_deg(Ts_base_ee: Array) -> float:
 
 def missing(
     seen: Sequence[SeenBoard], target: Target, camera: CameraIntrinsics, config: NeedsConfig
-) -> tuple[str, ...]:
+) -> tuple[Need, ...]:
     """Return what to do in further views, the most useful first; empty where nothing lacks."""
     if not seen:
-        return ("show the target to the camera",)
+        return (Need(about="target", sentence="show the target to the camera"),)
     places = [board_geometry(s.T_cam_board, target) for s in seen]
-    needs: list[str] = []
+    needs: list[Need] = []
     roll = roll_range_deg([p.roll_deg for p in places])
     if roll < config.roll_deg:
-        needs.append(
-            f"roll the hand by {config.roll_deg:.0f} deg about the optical axis (so far {roll:.0f})"
-        )
+        told = f"{config.roll_deg:.0f} deg about the optical axis (so far {roll:.0f})"
+        needs.append(Need(about="roll", sentence=f"roll the hand by {told}"))
     needs += _tilts(np.array([[p.tilt_deg, p.azimuth_deg] for p in places]), config)
     turn = second_turn_deg(np.stack([s.view.T_base_ee for s in seen]))
-    if turn < config.hand_turn_deg and not any("tilt" in n or "roll" in n for n in needs):
-        needs.append(f"turn the hand about a second axis (so far {turn:.0f} deg)")
+    if turn < config.hand_turn_deg and not needs:
+        told = f"turn the hand about a second axis (so far {turn:.0f} deg)"
+        needs.append(Need(about="turn", sentence=told))
     fill = max(_fill(s.view, camera) for s in seen)
     distances = [p.distance_m for p in places]
     if fill < config.fill:
-        needs.append(f"move closer: the board fills {fill:.0%} of the image")
+        told = f"move closer: the board fills {fill:.0%} of the image"
+        needs.append(Need(about="distance", sentence=told))
     elif max(distances) < config.distance_ratio * min(distances):
-        needs.append(
+        told = (
             f"change the distance ({min(distances):.2f} to {max(distances):.2f} m so far), by a "
             "quarter at least"
         )
+        needs.append(Need(about="distance", sentence=told))
     return (*needs, *_corners(seen, camera, config))
 
 
-def _tilts(places: Array, config: NeedsConfig) -> list[str]:
+def _tilts(places: Array, config: NeedsConfig) -> list[Need]:
     """Return what tilts (n, 2) of angle and azimuth [deg] lack."""
     angle, azimuth = np.radians(places[:, 0]), np.radians(places[:, 1])
     slants = np.degrees(angle[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], -1))
     values = np.linalg.eigvalsh(slants.T @ slants / len(slants))
     second, first = np.sqrt(np.maximum(values, 0.0))
     if first < config.tilt_deg:
-        return [f"tilt the camera by 20 to 45 deg (so far {first:.0f})"]
+        told = f"tilt the camera by 20 to 45 deg (so far {first:.0f})"
+        return [Need(about="tilt", sentence=told)]
     if second < config.tilt_deg:
-        return [f"tilt about a second axis by 20 to 45 deg (so far {second:.0f})"]
+        told = f"tilt about a second axis by 20 to 45 deg (so far {second:.0f})"
+        return [Need(about="tilt", sentence=told)]
     return []
 
 
@@ -116,7 +139,7 @@ def _fill(view: BoardView, camera: CameraIntrinsics) -> float:
 
 def _corners(
     seen: Sequence[SeenBoard], camera: CameraIntrinsics, config: NeedsConfig
-) -> tuple[str, ...]:
+) -> tuple[Need, ...]:
     """Return where in the image the target has not been, corners first."""
     uv = np.concatenate([s.view.detection.uv for s in seen])
     cell = np.clip((uv / [camera.width, camera.height] * 3).astype(int), 0, 2)
@@ -127,4 +150,5 @@ def _corners(
     order = [(0, 0), (2, 2), (0, 2), (2, 0), (0, 1), (2, 1), (1, 0), (1, 2), (1, 1)]
     r, c = next(rc for rc in order if not filled[rc])
     name = "middle" if r == c == 1 else f"{ROWS[r]} {COLUMNS[c]}"
-    return (f"show the board in the {name} part of the image",)
+    told = f"show the board in the {name} part of the image"
+    return (Need(about="image", sentence=told),)
