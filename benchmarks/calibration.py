@@ -18,7 +18,7 @@ import json
 import multiprocessing
 import platform
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -72,6 +72,9 @@ class Run:
     """What a figure was taken over."""
     details: dict[str, Any] = field(default_factory=dict[str, Any])
 
+    started: dict[str, Iterator[Any]] = field(default_factory=dict[str, Iterator[Any]])
+    """Work handed to the processes ahead of its turn, by name."""
+
     def put(self, key: str, value: float, over: str) -> None:
         """Note a figure."""
         self.figures[key], self.counts[key] = float(value), over
@@ -81,7 +84,8 @@ class Run:
         tasks = list(tasks)
         found: list[B] = []
         with self.console.stage(name, f"{len(tasks)} runs") as tick:
-            for result in self.pool.map(function, tasks):
+            results = self.started.pop(name, None) or self.pool.map(function, tasks)
+            for result in results:
                 found.append(result)
                 tick(len(found), len(tasks))
         return found
@@ -277,6 +281,9 @@ def run_parts(run: Run, parts: Sequence[str]) -> None:
     """Run the parts asked for."""
     if "time" in parts:
         run_time(run)
+    if "faults" in parts:
+        # Long single tasks first, so that no process waits for them at the end.
+        run.started["faults"] = run.pool.map(_faults, range(run.size.fault_trials))
     sets = read_sets(run) if "real" in parts else []
     poses = read_koch(run.data) if "koch" in parts else None
     referee = None

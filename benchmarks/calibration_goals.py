@@ -68,6 +68,6 @@ FULL = Size(
     time_repeats=3,
 )  # fmt: skip
 QUICK = Size(
-    seeds=1, swapped_folds=2, trials=16, crb_trials=3, fault_trials=1, corner_views=1,
+    seeds=1, swapped_folds=2, trials=12, crb_trials=2, fault_trials=1, corner_views=1,
     time_repeats=1,
 )  # fmt: skip

@@ -93,3 +93,17 @@ def test_a_lattice_grows_among_specks_and_takes_the_pattern_in_any_basis():
         )
         assert a[0] * b[1] - a[1] * b[0] > 0
     assert lay_pattern(lattice, np.stack([c, r + c % 2], -1), [])[0].seen < 42
+
+
+def test_a_lattice_of_large_points_is_found_beside_more_small_ones():
+    """A printed sheet: the middle of all points lies in its text."""
+    rng = np.random.default_rng(4)
+    r, c = np.divmod(np.arange(44), 4)
+    nodes = np.stack([2 * c + r % 2, r], -1) * 25.0 + [40, 40]
+    text = rng.uniform([0, 340], [260, 380], size=(200, 2))
+    order = rng.permutation(244)
+    points = np.concatenate([nodes, text])[order]
+    sizes = np.concatenate([np.full(44, 100.0), rng.uniform(2, 20, 200)])[order]
+    lattice = grow_lattice(points, sizes)
+    assert set(np.flatnonzero(sizes == 100.0)) <= set(lattice.values())
+    assert len(grow_lattice(points)) < 44

@@ -13,6 +13,8 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Check, Chessboard, TagBoard, Target
+from realsim_calibration.fit.joint_solve import JointConfig
+from realsim_calibration.hand_eye import calibrate_hand_eye_report
 from realsim_calibration.planning.live_calibration import (
     LiveCalibration,
     LiveConfig,
@@ -23,7 +25,9 @@ from realsim_calibration.planning.next_view import (
     NextViewConfig,
     board_geometry,
     choose_next_views,
+    covariance_floor,
     displacement_metric,
+    estimated_terms,
     predicted_boards,
     rank_next_views,
     view_information,
@@ -31,6 +35,7 @@ from realsim_calibration.planning.next_view import (
 from realsim_calibration.planning.view_needs import roll_range_deg, second_turn_deg
 from realsim_calibration.planning.view_proposals import ViewLimits, describe_move, propose_views
 from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
+from realsim_calibration.screening import HandEyeConfig
 from realsim_calibration.views import BoardView, TargetDetection
 
 Array = NDArray[np.float64]
@@ -174,9 +179,10 @@ def report_of(
         intrinsics_covariance=camera_cov,
         board=BoardShape(scale=1 + theta[17], aspect=0.0, warp=np.zeros(3), sd=sd,
                          half_extent_m=max(BOARD.size_m) / 2),
-        robot_map=None, map_name="none", map_scores=(("none", held_out_px),), joint_offsets=None, sigma_px=SIGMA,
-        robot_ratio=RATIO, views=views, seen_px=0.2, held_out_px=held_out_px, held_out_mm=0.2,
-        held_out_deg=0.05, starts=(), mismatch_deg=0.1, screw_ratio=1.0, roll_range_deg=180.0,
+        robot_map=None, map_name="none", map_scores=(("none", held_out_px),), joint_offsets=None,
+        sigma_px=SIGMA, robot_ratio=RATIO, views=views, seen_px=0.2, held_out_px=held_out_px,
+        held_out_mm=0.2, held_out_deg=0.05, starts=(), mismatch_deg=0.1, screw_ratio=1.0,
+        roll_range_deg=180.0,
         checks=checks, information=information,
     )  # fmt: skip
 
@@ -223,22 +229,134 @@ def test_the_prediction_is_what_the_added_view_really_brings(few: HandEyeReport)
         assert expected.sigma_deg == pytest.approx(after.sigma_deg, rel=0.02)
 
 
-def test_a_view_never_increases_the_covariance(few: HandEyeReport) -> None:
+@pytest.fixture(scope="module")
+def reports(few: HandEyeReport, calibrated_arm: Any) -> dict[str, HandEyeReport]:
+    """Return calibrations that know X as well as their information, worse and better."""
     rng = np.random.default_rng(3)
-    # also where the reported covariance is not the inverse information (a jackknife)
     shake = rng.normal(size=(6, 6)) * np.sqrt(np.diag(few.X_covariance))[:, None]
-    wide = replace(few, X_covariance=3 * few.X_covariance + 0.3 * shake @ shake.T)
+    return {
+        "as informed": few,
+        "worse": replace(few, X_covariance=3 * few.X_covariance + 0.3 * shake @ shake.T),
+        "better": replace(few, X_covariance=0.4 * few.X_covariance),
+        "both": replace(few, X_covariance=0.6 * few.X_covariance + 0.3 * shake @ shake.T),
+        "arm with joints": calibrated_arm(with_joints=True),
+    }
+
+
+CASES = ["as informed", "worse", "better", "both", "arm with joints"]
+
+
+def plan_of(report: HandEyeReport, rng: np.random.Generator, n: int) -> Array:
+    """Return poses (n, 4, 4) around those of the report."""
+    captured = np.stack([v.T_base_ee for v in report.used])
+    spread = rng.normal(size=(n, 6)) * [0.15, 0.15, 0.15, 0.03, 0.03, 0.03]
+    return captured[rng.integers(len(captured), size=n)] @ se3.exp(spread)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_view_never_increases_the_covariance(
+    case: str, reports: dict[str, HandEyeReport]
+) -> None:
+    report, rng = reports[case], np.random.default_rng(3)
+    M = displacement_metric(report, NextViewConfig())
+    now = 1e3 * np.sqrt(np.trace(M @ report.X_covariance))
+    rows = rank_next_views(report, plan_of(report, rng, 40))
+    assert any(v.visible for v in rows)
+    assert all(v.rms_mm <= now * (1 + 1e-9) and v.gain >= -1e-9 for v in rows)
+    assert all(v.sigma_mm <= report.sigma_mm * (1 + 1e-9) for v in rows)
+    assert all(v.sigma_deg <= report.sigma_deg * (1 + 1e-9) for v in rows)
+    assert all(v.gain_nats >= -1e-9 for v in rows)
+    steps = choose_next_views(report, plan_of(report, rng, 20), 8)
+    assert len(steps) == 8 and np.all(np.diff([v.rms_mm for v in steps]) < 0)
+    assert np.all(np.diff([v.sigma_mm for v in steps]) <= 1e-12)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_pose_that_sees_nothing_leaves_what_the_report_says(
+    case: str, reports: dict[str, HandEyeReport]
+) -> None:
+    report = reports[case]
+    away = report.used[0].T_base_ee @ se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 0.0])
+    (row,) = rank_next_views(report, away[None])
+    assert not row.visible and row.gain == pytest.approx(0.0, abs=1e-12)
+    assert row.sigma_mm == pytest.approx(report.sigma_mm, rel=1e-9)
+    assert row.sigma_deg == pytest.approx(report.sigma_deg, rel=1e-9)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_no_views_lower_the_covariance_below_the_floor(
+    case: str, reports: dict[str, HandEyeReport]
+) -> None:
+    """Views that are nearly free of noise: what is left is the floor."""
+    report, rng = reports[case], np.random.default_rng(4)
+    F, M = covariance_floor(report), displacement_metric(report, NextViewConfig())
+    np.testing.assert_allclose(F, F.T, atol=1e-9 * np.abs(F).max())
+    assert np.linalg.eigvalsh(F)[0] >= -1e-12 * np.trace(F)
+    # the floor is a part of what the report says: no more than it in any direction
+    unit = 1 / np.sqrt(np.diag(report.X_covariance))
+    rest = (report.X_covariance - F) * np.outer(unit, unit)
+    assert np.linalg.eigvalsh(rest)[0] > -1e-9
+    least = 1e3 * np.sqrt(np.trace(M @ F))
+    least_mm = 1e3 * np.sqrt(np.linalg.eigvalsh(F[3:, 3:])[-1])
+    plan = plan_of(report, rng, 12)
+    for v in choose_next_views(report, plan, 6):
+        assert v.rms_mm >= least and v.sigma_mm >= least_mm
+    sharp = choose_next_views(replace(report, sigma_px=1e-4 * report.sigma_px), plan, 6)[-1]
+    now = 1e3 * np.sqrt(np.trace(M @ report.X_covariance))
+    assert least <= sharp.rms_mm <= least + 0.02 * now
+
+
+def test_the_floor_is_what_the_covariance_has_beyond_the_information(
+    reports: dict[str, HandEyeReport],
+) -> None:
+    few, rng = reports["as informed"], np.random.default_rng(5)
+    N = few.X_covariance  # this file's least squares: the inverse information
+    scale = np.sqrt(np.outer(np.diag(N), np.diag(N)))
+    np.testing.assert_allclose(covariance_floor(few) / scale, 0.0, atol=1e-9)
+    np.testing.assert_allclose(covariance_floor(reports["better"]) / scale, 0.0, atol=1e-9)
+    half = rng.normal(size=(6, 2)) * np.sqrt(np.diag(N))[:, None]
+    hidden = half @ half.T  # an error of the arm along two directions
+    more = replace(few, X_covariance=N + hidden)
+    np.testing.assert_allclose(covariance_floor(more) / scale, hidden / scale, atol=1e-9)
+    # and is added to what the view makes of the rest
+    (A,) = random_hands(rng, 1)[None]
+    after = report_of(np.concatenate([np.stack([v.T_base_ee for v in few.views]), A]))
     M = displacement_metric(few, NextViewConfig())
-    for report in (few, wide):
-        now = 1e3 * np.sqrt(np.trace(M @ report.X_covariance))
-        rows = rank_next_views(report, random_hands(rng, 40, tilt=80.0))
-        assert all(v.rms_mm <= now * (1 + 1e-9) and v.gain >= -1e-9 for v in rows)
-        assert all(v.sigma_mm <= report.sigma_mm * (1 + 1e-9) for v in rows)
-        assert all(v.sigma_deg <= report.sigma_deg * (1 + 1e-9) for v in rows)
-        assert all(v.gain_nats >= -1e-9 for v in rows)
-        steps = choose_next_views(report, random_hands(rng, 20), 8)
-        assert np.all(np.diff([v.rms_mm for v in steps]) < 0)
-        assert np.all(np.diff([v.sigma_mm for v in steps]) <= 1e-12)
+    (row,) = rank_next_views(more, A)
+    expected = 1e3 * np.sqrt(np.trace(M @ (after.X_covariance + hidden)))
+    assert row.rms_mm == pytest.approx(expected, rel=0.01)
+
+
+def test_an_arm_that_hides_errors_is_promised_no_more_than_it_can_give(
+    reports: dict[str, HandEyeReport],
+) -> None:
+    """The fit knows the arm's own errors as parameters: most of sigma is theirs."""
+    report = reports["arm with joints"]
+    M = displacement_metric(report, NextViewConfig())
+    floor, now = (np.trace(M @ C) for C in (covariance_floor(report), report.X_covariance))
+    assert 0.5 * now < floor < now
+    assert rank_next_views(report, propose_views(report))[0].gain < 0.1
+
+
+@pytest.mark.xfail(
+    strict=True, reason="the fit takes the median distance over exchanged rotations and places"
+)
+@pytest.mark.parametrize("ratio", [0.05, 1.0, 3.0])
+def test_information_is_that_of_the_solver(ratio: float, simulate: Any) -> None:
+    """The views' information, summed over the captured poses, is the joint fit's own."""
+    s = simulate(0, views=12, robot=(0.0, 0.0))
+    views = [v for v in s.views if len(v.detection) == len(s.board.points_board)]
+    config = HandEyeConfig(robot_map=False, joint=JointConfig(robot_ratio=ratio))
+    report = calibrate_hand_eye_report(views, s.board, s.intrinsics0, config)
+    hands = np.stack([v.T_base_ee for v in report.used])
+    total = view_information(report, hands, NextViewConfig(border_px=0.0)).sum(0)
+    free = estimated_terms(report)
+    np.testing.assert_array_equal(np.flatnonzero(~free), [21, 22, 23])  # k4 k5 k6 are held
+    assert not total[~free].any() and not total[:, ~free].any()
+    # X and Z have no prior; camera and board have one in their own block
+    unit = np.sqrt(np.outer(np.diag(total), np.diag(total)))[:12, free]
+    expected = report.information[:12, free] / unit
+    np.testing.assert_allclose(total[:12, free] / unit, expected, atol=0.01)
 
 
 def test_ranking_does_not_depend_on_the_base_frame(few: HandEyeReport) -> None:
@@ -405,6 +523,9 @@ def test_moves_are_told_in_words() -> None:
 # ---- live
 
 
+FEW_PROPOSALS = ViewLimits(tilts_deg=(0.0, 30.0), azimuths=4, rolls=4, distances_m=(0.4,))
+
+
 def solve(
     views: Sequence[BoardView], target: Target, intrinsics0: CameraIntrinsics, config: Any
 ) -> HandEyeReport:
@@ -464,7 +585,7 @@ def test_live_follows_its_advice_to_the_end() -> None:
 
 def test_live_never_stops_on_a_bad_check() -> None:
     bad = Check(name="board scale", verdict="bad", sentence="The board is 5 % off.", advice="Rule.")
-    easy = LiveConfig(sigma_mm=100.0, sigma_deg=10.0, min_views_to_stop=6)
+    easy = LiveConfig(sigma_mm=100.0, sigma_deg=10.0, min_views_to_stop=6, limits=FEW_PROPOSALS)
     hands = random_hands(np.random.default_rng(10), 12)
     good, spoiled = running(easy), running(easy, checks=(bad,))
     for k, A in enumerate(hands):
@@ -474,6 +595,49 @@ def test_live_never_stops_on_a_bad_check() -> None:
     assert "The board is 5 % off. Rule." in b.sentence
 
 
+@pytest.mark.parametrize("lacking", ["roll", "tilt"])
+def test_live_does_not_end_while_roll_or_the_second_tilt_lack(lacking: str) -> None:
+    """Sigma is reached, but not by a factor of two: errors may hide where nothing was turned."""
+    rng = np.random.default_rng(17)
+    hands: list[Array] = []
+    for k in range(12):
+        azimuth = 90.0 * k if lacking == "roll" else 180.0 * k
+        T = board_at(rng.uniform(20, 40), azimuth, 40.0 * k, rng.uniform(0.3, 0.55))
+        if lacking == "roll":
+            upright = [0, 0, -np.radians(board_geometry(T, BOARD).roll_deg)]
+            T = se3.from_rt(se3.exp_so3(upright), [0, 0, 0]) @ T
+        hands.append(hand_at(T))
+    views = [live_view(k, A) for k, A in enumerate(hands)]
+    reached = solve(views, BOARD, CAMERA, ())
+
+    def end(factor: float) -> Any:
+        config = LiveConfig(
+            sigma_mm=factor * reached.sigma_mm, sigma_deg=factor * reached.sigma_deg,
+            min_views=len(views), min_views_to_stop=6, stable_views=1,
+        )  # fmt: skip
+        live = running(config)
+        return [live.add(v) for v in views][-1]
+
+    almost, twice = end(1.9), end(2.1)
+    told = {"roll": "roll the hand by 60 deg", "tilt": "tilt about a second axis"}[lacking]
+    assert almost.state == "improving" and not almost.stop and almost.next_view is not None
+    assert f"Before the end: {told}" in almost.sentence
+    assert twice.stop and f"Still missing: {told}" in twice.sentence
+    assert told in almost.needs[0]
+
+
+def test_live_ends_without_a_word_where_nothing_lacks() -> None:
+    easy = LiveConfig(sigma_mm=100.0, sigma_deg=10.0, min_views_to_stop=6, limits=FEW_PROPOSALS)
+    live = running(easy)
+    rng, states = np.random.default_rng(18), list[str]()
+    for k in range(14):
+        T = board_at(rng.uniform(20, 40), 100.0 * k, 70.0 * k, 0.25 + 0.02 * k)
+        shift = se3.from_translation([0.07 * (k % 3 - 1), 0.04 * (k // 3 % 3 - 1), 0.0])
+        status = live.add(live_view(k, hand_at(shift @ T)))
+        states.append(status.state)
+    assert status.stop and not status.needs and "issing" not in status.sentence
+
+
 def test_live_does_not_stop_while_the_error_on_unseen_views_moves() -> None:
     """Sigmas are reached; the held-out error swings by more than is allowed, then is steady."""
     swing = iter([0.3, 0.5, 0.3, 0.5, 0.3, 0.31, 0.3, 0.3])
@@ -481,7 +645,9 @@ def test_live_does_not_stop_while_the_error_on_unseen_views_moves() -> None:
     def unsteady(*given: Any) -> HandEyeReport:
         return replace(solve(*given), held_out_px=next(swing))
 
-    config = LiveConfig(sigma_mm=100.0, sigma_deg=10.0, min_views_to_stop=6, least_gain=0.0)
+    config = LiveConfig(
+        sigma_mm=100.0, sigma_deg=10.0, min_views_to_stop=6, least_gain=0.0, limits=FEW_PROPOSALS
+    )
     live = LiveCalibration(BOARD, CAMERA, solve=unsteady, config=config)
     stops = [
         live.add(live_view(k, A)).stop

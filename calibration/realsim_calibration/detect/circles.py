@@ -107,7 +107,8 @@ def _of_one_shade(
 ) -> tuple[TargetDetection | None, str]:
     """Return the grid of dark dots, or why there is none."""
     middles, axes = find_blobs(gray, config.dots)
-    lattice = grow_lattice(middles)
+    sizes = np.abs(np.linalg.det(axes))
+    lattice = grow_lattice(middles, sizes)
     pattern, beyond = grid_nodes(grid)
     total = len(pattern)
     laid = lay_pattern(lattice, pattern, beyond)
@@ -120,7 +121,7 @@ def _of_one_shade(
         )
     laid = [one for one in laid if not one.larger]
     rest = np.setdiff1d(np.arange(len(middles)), laid[0].points)
-    second = lay_pattern(grow_lattice(middles[rest]), pattern, beyond)
+    second = lay_pattern(grow_lattice(middles[rest], sizes[rest]), pattern, beyond)
     if second and second[0].seen == total:
         return None, "two equal circle grids are in view: cover one"
     board = grid.points_board[:, :2]

@@ -21,14 +21,20 @@ LINE_SHARE = 0.6
 """Share of a further line that must be seen for the lattice to count as larger."""
 
 
-def grow_lattice(points: Array) -> dict[Node, int]:
-    """Return the largest lattice in points (n, 2): {(i, j): point}; steps i, j run clockwise."""
+def grow_lattice(points: Array, sizes: Array | None = None) -> dict[Node, int]:
+    """Return the largest lattice in points (n, 2): {(i, j): point}; steps i, j run clockwise.
+
+    It grows from points in the middle and, where sizes (n,) are given, from the largest ones: the
+    letters on a sheet outnumber its dots, but are smaller.
+    """
     best: dict[Node, int] = {}
     if len(points) < 5:
         return best
     taken = np.zeros(len(points), dtype=bool)
     # Seeds spread over the picture's points from their middle outwards.
     order = np.argsort(np.linalg.norm(points - np.median(points, axis=0), axis=-1))
+    if sizes is not None:
+        order = np.stack([order, np.argsort(-sizes)], -1).ravel()
     tried = 0
     for seed in order:
         if taken[seed] or tried >= SEEDS:

@@ -174,7 +174,7 @@ def _dots(gray: NDArray[np.uint8]) -> tuple[str, int]:
     best: dict[tuple[int, int], int] = {}
     for shade in (gray, 255 - gray):
         middles, axes = find_blobs(np.asarray(shade, dtype=np.uint8), DotConfig())
-        lattice = grow_lattice(middles)
+        lattice = grow_lattice(middles, np.abs(np.linalg.det(axes)))
         radius = np.sqrt(np.abs(np.linalg.det(axes[list(lattice.values())])))
         if len(radius) and np.median(np.abs(radius / np.median(radius) - 1)) > SIZE_SPREAD:
             continue

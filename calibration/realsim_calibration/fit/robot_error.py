@@ -38,6 +38,9 @@ class RobotErrorConfig:
     """Ridges that are tried: half a millimetre at the edge of the poses, times these."""
     map_gain: float = 1.0
     """A map must predict unseen views better than no map by so many standard errors ..."""
+    worth: float = 0.05
+    """... and by this share: with hundreds of views a gain of one percent is beyond chance and not
+    worth 72 more numbers, which tripled the error where the robot's errors were white."""
     arm_gain: float = 2.0
     """... and by so many better than the arm's own numbers, which cannot bend as freely."""
     arm_angle_sd: float = 2e-4

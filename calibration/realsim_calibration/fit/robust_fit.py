@@ -221,8 +221,10 @@ def _chosen(choices: list[_Choice], config: RobotErrorConfig) -> _Choice:
     arms = [c for c in choices if c.basis is not None and c.basis.kind == "arm"]
     maps = [c for c in choices if c.basis is not None and c.basis.kind != "arm"]
     best = min(maps, key=lambda c: c.fit.score) if maps else none
-    if best is not none and _gain_in_errors(none, best) < config.map_gain:
-        best = none
+    if best is not none:
+        worth_it = best.fit.score < (1 - config.worth) * none.fit.score
+        if not worth_it or _gain_in_errors(none, best) < config.map_gain:
+            best = none
     for arm in arms:
         if _gain_in_errors(arm, best) < config.arm_gain:
             best = arm

@@ -193,10 +193,16 @@ def view_information(
 ) -> Array:
     """Return what each planned view would add to `report.information` (n, 29, 29).
 
-    Terms with zero rows there have zero rows here; a pose that does not see the target adds
-    nothing.
+    Held terms have zero rows; a pose that does not see the target adds nothing.
     """
     return _Planned(report, Ts_planned, config or NextViewConfig()).informations
+
+
+def estimated_terms(report: HandEyeReport) -> Mask:
+    """Return which of the 29 terms (29,) are estimated; the information of held ones is filling."""
+    camera = np.diag(report.intrinsics_covariance) > 0
+    known = np.concatenate([np.ones(12, bool), camera, report.board.sd > 0])
+    return np.asarray(known & (np.diag(report.information) > 0), np.bool_)
 
 
 def covariance_floor(report: HandEyeReport) -> Array:
@@ -239,7 +245,7 @@ class _Knowledge:
     """The information so far, and what of X's covariance it can lower."""
 
     def __init__(self, report: HandEyeReport, metric: Array) -> None:
-        self._free = np.diag(report.information) > 0
+        self._free = estimated_terms(report)
         self._H = np.array(report.information[np.ix_(self._free, self._free)])
         if not np.all(self._free[:6]):
             raise DegenerateError(
@@ -352,7 +358,7 @@ class _Planned:
         keep = self.inside[seen][..., None, None]
         J = np.where(keep, J, 0.0).reshape(len(J), -1, SHARED) / r.sigma_px
         E = np.where(keep, E, 0.0).reshape(len(J), -1, 6) / r.sigma_px
-        J = J * (np.diag(r.information) > 0)
+        J = J * estimated_terms(r)
         H = np.swapaxes(J, 1, 2) @ J
         if r.robot_ratio > 0:
             JE = np.swapaxes(J, 1, 2) @ E
