@@ -61,13 +61,15 @@ class Size:
     corner_views: int
     """Pictures per target and level."""
     time_repeats: int
+    koch_plain: int
+    """Views of the pose set that are left out without joints as well."""
 
 
 FULL = Size(
     seeds=4, swapped_folds=5, trials=200, crb_trials=40, fault_trials=10, corner_views=6,
-    time_repeats=3,
+    time_repeats=3, koch_plain=20,
 )  # fmt: skip
 QUICK = Size(
     seeds=1, swapped_folds=2, trials=12, crb_trials=2, fault_trials=1, corner_views=1,
-    time_repeats=1,
+    time_repeats=1, koch_plain=0,
 )  # fmt: skip

@@ -9,7 +9,7 @@ from realsim_calibration.detect.homography import (
     fit_homography,
     seen_from_front,
 )
-from realsim_calibration.detect.lattice import grow_lattice, lay_pattern
+from realsim_calibration.detect.lattice import grow_lattice, grow_lattices, lay_pattern
 from realsim_calibration.detect.saddles import grid_arms, refine_saddles
 
 K = np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]])
@@ -95,15 +95,14 @@ def test_a_lattice_grows_among_specks_and_takes_the_pattern_in_any_basis():
     assert lay_pattern(lattice, np.stack([c, r + c % 2], -1), [])[0].seen < 42
 
 
-def test_a_lattice_of_large_points_is_found_beside_more_small_ones():
-    """A printed sheet: the middle of all points lies in its text."""
+def test_a_lattice_of_large_points_is_found_beside_a_larger_one_of_letters():
+    """A printed sheet: lines of letters at nearly even places below the dots."""
     rng = np.random.default_rng(4)
     r, c = np.divmod(np.arange(44), 4)
-    nodes = np.stack([2 * c + r % 2, r], -1) * 25.0 + [40, 40]
-    text = rng.uniform([0, 340], [260, 380], size=(200, 2))
-    order = rng.permutation(244)
-    points = np.concatenate([nodes, text])[order]
-    sizes = np.concatenate([np.full(44, 100.0), rng.uniform(2, 20, 200)])[order]
-    lattice = grow_lattice(points, sizes)
-    assert set(np.flatnonzero(sizes == 100.0)) <= set(lattice.values())
-    assert len(grow_lattice(points)) < 44
+    dots = np.stack([2 * c + r % 2, r], -1) * 25.0 + [40, 40]
+    line, place = np.divmod(np.arange(200), 50)
+    letters = np.stack([6.0 * place, 360 + 14.0 * line], -1) + rng.uniform(-1.5, 1.5, (200, 2))
+    points, sizes = np.concatenate([dots, letters]), np.repeat([100.0, 9.0], [44, 200])
+    lattices = grow_lattices(points, sizes)
+    assert len(lattices[0]) > 44 and min(lattices[0].values()) >= 44
+    assert any(sorted(one.values()) == list(range(44)) for one in lattices)

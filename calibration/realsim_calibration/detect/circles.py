@@ -18,7 +18,7 @@ from realsim_calibration.detect.ellipses import (
 )
 from realsim_calibration.detect.homography import apply_homography, fit_homography, seen_from_front
 from realsim_calibration.detect.images import gray_image, size_of
-from realsim_calibration.detect.lattice import Laid, grow_lattice, lay_pattern
+from realsim_calibration.detect.lattice import Laid, Node, grow_lattices, lay_pattern
 from realsim_calibration.views import TargetDetection
 
 Array = NDArray[np.float64]
@@ -108,10 +108,8 @@ def _of_one_shade(
     """Return the grid of dark dots, or why there is none."""
     middles, axes = find_blobs(gray, config.dots)
     sizes = np.abs(np.linalg.det(axes))
-    lattice = grow_lattice(middles, sizes)
-    pattern, beyond = grid_nodes(grid)
-    total = len(pattern)
-    laid = lay_pattern(lattice, pattern, beyond)
+    lattice, laid = _best_fit(grow_lattices(middles, sizes), grid)
+    total = grid.rows * grid.columns
     if not laid or laid[0].seen < total:
         return None, _partly(lattice, laid, grid)
     if all(one.larger for one in laid):
@@ -121,13 +119,13 @@ def _of_one_shade(
         )
     laid = [one for one in laid if not one.larger]
     rest = np.setdiff1d(np.arange(len(middles)), laid[0].points)
-    second = lay_pattern(grow_lattice(middles[rest], sizes[rest]), pattern, beyond)
+    _, second = _best_fit(grow_lattices(middles[rest], sizes[rest]), grid)
     if second and second[0].seen == total:
         return None, "two equal circle grids are in view: cover one"
     board = grid.points_board[:, :2]
     points, reason = _numbered(laid, middles, axes, board, (grid, config))
     if points is None:
-        mirror = lay_pattern(lattice, pattern, beyond, mirrored=True)
+        mirror = lay_pattern(lattice, *grid_nodes(grid), mirrored=True)
         if grid.large_origin and mirror and mirror[0].seen == total:
             other, _ = _numbered(mirror, middles, axes, board, (grid, config))
             if other is not None:
@@ -136,6 +134,20 @@ def _of_one_shade(
     middles, axes = middles[points], axes[points]
     dots = refine_dots(gray, middles, axes, _gaps(middles, axes), config.dots)
     return _measured(gray, dots, grid, config, intrinsics)
+
+
+def _best_fit(
+    lattices: list[dict[Node, int]], grid: CircleGrid
+) -> tuple[dict[Node, int], list[Laid]]:
+    """Return the largest lattice that holds the whole grid, or else the largest one, and how."""
+    total, nodes = grid.rows * grid.columns, grid_nodes(grid)
+    for lattice in lattices:
+        if len(lattice) < total:
+            break
+        laid = lay_pattern(lattice, *nodes)
+        if laid and laid[0].seen == total:
+            return lattice, laid
+    return (lattices[0], lay_pattern(lattices[0], *nodes)) if lattices else ({}, [])
 
 
 def _partly(lattice: dict[tuple[int, int], int], laid: list[Laid], grid: CircleGrid) -> str:

@@ -21,15 +21,16 @@ LINE_SHARE = 0.6
 """Share of a further line that must be seen for the lattice to count as larger."""
 
 
-def grow_lattice(points: Array, sizes: Array | None = None) -> dict[Node, int]:
-    """Return the largest lattice in points (n, 2): {(i, j): point}; steps i, j run clockwise.
+def grow_lattices(points: Array, sizes: Array | None = None) -> list[dict[Node, int]]:
+    """Return the lattices in points (n, 2), the largest first: {(i, j): point}.
 
-    It grows from points in the middle and, where sizes (n,) are given, from the largest ones: the
-    letters on a sheet outnumber its dots, but are smaller.
+    The steps i, j run clockwise. Lattices grow from points in the middle and, where sizes (n,) are
+    given, from the largest ones: the letters on a sheet outnumber its dots and, being loosely in
+    rows and columns, may make the larger lattice.
     """
-    best: dict[Node, int] = {}
+    found: list[dict[Node, int]] = []
     if len(points) < 5:
-        return best
+        return found
     taken = np.zeros(len(points), dtype=bool)
     # Seeds spread over the picture's points from their middle outwards.
     order = np.argsort(np.linalg.norm(points - np.median(points, axis=0), axis=-1))
@@ -45,11 +46,16 @@ def grow_lattice(points: Array, sizes: Array | None = None) -> dict[Node, int]:
         tried += 1
         lattice = _grown(points, int(seed), basis)
         taken[list(lattice.values())] = True
-        if len(lattice) > len(best):
-            best = lattice
-        if len(best) > 0.5 * len(points):
+        found.append(lattice)
+        if len(lattice) > 0.5 * len(points):
             break
-    return best
+    return sorted(found, key=len, reverse=True)
+
+
+def grow_lattice(points: Array) -> dict[Node, int]:
+    """Return the largest lattice in points (n, 2), empty where there is none."""
+    lattices = grow_lattices(points)
+    return lattices[0] if lattices else {}
 
 
 def _basis(points: Array, seed: int) -> tuple[Array, Array] | None:

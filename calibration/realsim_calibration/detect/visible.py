@@ -7,7 +7,7 @@ from realsim.records.targets import CharucoBoard, Chessboard, CircleGrid, TagBoa
 from realsim_calibration.detect.chessboard import largest_chessboard
 from realsim_calibration.detect.ellipses import DotConfig, find_blobs
 from realsim_calibration.detect.images import gray_image
-from realsim_calibration.detect.lattice import grow_lattice, unimodular
+from realsim_calibration.detect.lattice import grow_lattices, unimodular
 from realsim_calibration.detect.markers import (
     FAMILY_DICTIONARY,
     decode_markers,
@@ -174,11 +174,10 @@ def _dots(gray: NDArray[np.uint8]) -> tuple[str, int]:
     best: dict[tuple[int, int], int] = {}
     for shade in (gray, 255 - gray):
         middles, axes = find_blobs(np.asarray(shade, dtype=np.uint8), DotConfig())
-        lattice = grow_lattice(middles, np.abs(np.linalg.det(axes)))
-        radius = np.sqrt(np.abs(np.linalg.det(axes[list(lattice.values())])))
-        if len(radius) and np.median(np.abs(radius / np.median(radius) - 1)) > SIZE_SPREAD:
-            continue
-        best = max(best, lattice, key=len)
+        for lattice in grow_lattices(middles, np.abs(np.linalg.det(axes))):
+            radius = np.sqrt(np.abs(np.linalg.det(axes[list(lattice.values())])))
+            if np.median(np.abs(radius / np.median(radius) - 1)) <= SIZE_SPREAD:
+                best = max(best, lattice, key=len)
     if len(best) < MIN_DOTS:
         return "", 0
     nodes = np.array(list(best))
