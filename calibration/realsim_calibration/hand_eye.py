@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, HandEye, Target
-from realsim_calibration.checks import hand_eye_checks
+from realsim_calibration.checks import given_camera_check, hand_eye_checks
 from realsim_calibration.fit.joint_solve import Setup, ViewCorners, camera_of
 from realsim_calibration.fit.robust_fit import Solution, solve
 from realsim_calibration.fit.view_system import SHARED
@@ -142,6 +142,9 @@ def _report(
         information=solution.information,
     )
     checks = screened.checks + hand_eye_checks(report, config.checks)
+    if config.joint.focal_sd > 0:
+        given, fitted = (float(np.sqrt(c.fx * c.fy)) for c in (intrinsics0, report.intrinsics))
+        checks = (*checks, given_camera_check(given, fitted, config.checks))
     return replace(report, checks=checks)
 
 

@@ -78,9 +78,7 @@ def write_results(
     folder = store.folder / RESULTS
     depth = _depth_bias(report, seen, store, views_store)
     write_exports(report, folder / "exports", frames=FrameNames())
-    write_calibration_report(
-        report, folder / "report", images=views_store.rgb, depth_report=depth
-    )
+    write_calibration_report(report, folder / "report", images=views_store.rgb, depth_report=depth)
 
 
 def _depth_bias(

@@ -98,17 +98,17 @@ def upgrade(
 def board(
     what: str, out: Path, paper: str, preview: bool, cut_marks: bool, overwrite: bool
 ) -> None:
-    r"""Print a calibration target: a PDF at exact scale with a ruler, and its target file.
+    """Print a calibration target: a PDF at exact scale with a ruler, and its target file.
 
     TARGET is one line, or a target file:
 
     \b
       aprilgrid:6x4,tag=30mm,gap=10mm           AprilTags, 6 columns x 4 rows
       charuco:5x7,square=33mm,marker=20mm,dict=APRILTAG_36h11
-      chessboard:9x6,square=25mm                inner corners
-      circles:10x10,pitch=25.4mm,large-origin
+      chessboard:9x6,square=20mm                inner corners
+      circles:9x9,pitch=18mm,large-origin
       tag:7,size=80mm                           one AprilTag
-    """
+    """  # noqa: D301 - click's own mark for lines that stay as they are
     from realsim_calibration.sheets import make_board
 
     for path in make_board(

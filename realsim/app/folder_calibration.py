@@ -27,6 +27,7 @@ from realsim_calibration import (
     calibrate,
     calibrate_from_poses,
     calibrate_intrinsics,
+    diagnose,
     estimate_board_pose,
     find_target,
     prove_reading,
@@ -38,6 +39,13 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 MIN_POSE_POINTS = 6
 """Fewest points of a board pose that may speak for a reading."""
+MIN_DIAGNOSED = 6
+"""Fewer views do not tell a fault of the pairing from a wrong reading."""
+USUAL_READINGS = 2
+"""Readings under which faults are looked for where none fits; the commonest come first."""
+NAMED_FAULTS = ("shifted_pairing", "robot_unit", "board_size", "board_unit", "tool_change",
+                "board_moved", "camera_moved")  # fmt: skip
+"""Faults of a whole set that explain why no reading fits."""
 PROOF_VIEWS = 40
 """Views that decide on a reading: more do not change the verdict."""
 
@@ -104,7 +112,7 @@ def calibrate_folder(request: FolderRequest, console: Console) -> tuple[Calibrat
     arm = _arm(request.robot, views, console)
     with console.stage("calibrate", f"{len(views)} views"):
         result = calibrate(views, target, intrinsics0=camera, arm=arm, config=config)
-    return result, _write(result, request.out, folder.images, console)
+    return result, write_calibration(result, request.out, folder.images, console)
 
 
 def target_of(text: str) -> Target:
@@ -237,25 +245,52 @@ def _proven(
     candidates = [(str(r), poses.poses(r)) for r in poses.possible]
     proof = prove_reading(candidates, boards, target=target)
     if not proof.decisive:
+        usual = _fault_under_usual_readings(poses, boards, target, request)
+        if usual is not None:
+            console.warn(
+                f"no reading fits all views, and as {usual} only single views are at fault: the "
+                "poses are read so; give --reading to be sure."
+            )
+            return usual
         raise InputError(
             f"how the poses are to be read is not clear from the file, and the images do not "
             f"decide: {proof.sentence} Give --reading, such as --reading rotvec,m."
         )
     best = reading_from_text(proof.best)
-    same_place = proof.best_mode == request.mode
-    if not same_place:
+    if proof.best_mode != request.mode:
+        # The same equation with the poses the other way round: the user must say that they are.
         other = replace(best, inverted=not best.inverted)
-        known = {str(r) for r in poses.possible}
-        if str(other) not in known:
-            raise InputError(
-                f"the poses fit as {proof.best} with the camera {_place(proof.best_mode)}, not "
-                f"{_place(request.mode)}. {proof.sentence} Say --eye-to-hand if the camera stands "
-                "still."
-            )
-        # The same equation with the poses the other way round: the user says where the camera is.
-        best = other
+        remedy = "Leave --eye-to-hand out" if request.mode == "eye_to_hand" else "Say --eye-to-hand"
+        raise InputError(
+            f"the poses fit as {proof.best} with the camera {_place(proof.best_mode)}, not "
+            f"{_place(request.mode)}. {proof.sentence} {remedy}; or, if the file really holds the "
+            f"poses the other way round, say --reading {other}."
+        )
     console.say(f"poses read as the images prove: {best}. {proof.sentence}")
     return best
+
+
+def _fault_under_usual_readings(
+    poses: "RawPoses", boards: Array, target: Target | None, request: FolderRequest
+) -> "PoseReading | None":
+    """Return a usual reading under which only single views are at fault, None where none is.
+
+    Raises:
+        InputError: under a usual reading the whole set has a fault that explains everything, such
+            as a shifted pairing.
+    """
+    from realsim_calibration.faults.consequences import SINGLE_VIEWS, told
+
+    if len(boards) < MIN_DIAGNOSED:
+        return None
+    for reading in [r for r in poses.possible if not r.inverted][:USUAL_READINGS]:
+        Ts = poses.poses(reading)
+        found = diagnose(Ts, boards, labels=poses.where, target=target, mode=request.mode)
+        if found.fault in SINGLE_VIEWS:
+            return reading
+        if found.fault in NAMED_FAULTS:
+            raise InputError(f"with the poses read as {reading}: {told(found)}")
+    return None
 
 
 def _place(mode: str) -> str:
@@ -309,18 +344,27 @@ def _from_pose_files(
         report = calibrate_from_poses(
             Ts, boards, labels=labels, joints=joints, config=config.hand_eye, arm=arm
         )
+    console.warn(
+        "there are no images: figures in px are those of a nominal camera (f = 900 px) that looks "
+        "at the measured poses, and no lens is exported."
+    )
+    console.say(f"robot poses read as {reading}, board poses as {board_reading}")
     result = Calibration(hand_eye=report, lens=None)
-    return result, _write(result, request.out, (), console)
+    return result, write_calibration(result, request.out, (), console)
 
 
-def _write(result: Calibration, out: Path, images: Sequence[Path], console: Console) -> list[Path]:
+def write_calibration(
+    result: Calibration, out: Path, images: Sequence[Path], console: Console
+) -> list[Path]:
     """Write report, pictures and exports; return the paths, the page first."""
     from realsim_calibration.exports import FrameNames, write_exports
     from realsim_calibration.inputs import load_image
     from realsim_calibration.report import write_calibration_report
 
     with console.stage("report", str(out)):
-        exports = write_exports(result.hand_eye, out / "exports", frames=FrameNames())
+        exports = write_exports(
+            result.hand_eye, out / "exports", frames=FrameNames(), with_camera=bool(images)
+        )
         pages = write_calibration_report(
             result.hand_eye, out,
             images=(lambda k: load_image(images[k])) if images else None,

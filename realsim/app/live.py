@@ -2,10 +2,17 @@
 
 from pathlib import Path
 
+from realsim.app.calibrate import show_report
 from realsim.app.console import Console
-from realsim.app.folder_calibration import FolderRequest, target_of
+from realsim.app.folder_calibration import FolderRequest, target_of, write_calibration
 from realsim.errors import InputError
-from realsim_calibration import BoardView, CalibrationConfig, LiveCalibration, find_target
+from realsim_calibration import (
+    BoardView,
+    Calibration,
+    CalibrationConfig,
+    LiveCalibration,
+    find_target,
+)
 
 
 def run_live(request: FolderRequest, console: Console) -> bool:
@@ -39,9 +46,14 @@ def run_live(request: FolderRequest, console: Console) -> bool:
     live = LiveCalibration(target, camera, calibration=replace(config, mode=request.mode))
     console.say(f"watching {request.images}; Ctrl-C ends")
     done = False
+    report = None
     for status in watch_folder(request.images, live, read_view):
         console.say(status.sentence)
-        done = status.state == "done"
+        done, report = status.state == "done", status.report or report
         if done:
             break
+    if report is not None:
+        files = write_calibration(Calibration(hand_eye=report, lens=None), request.out, (), console)
+        show_report(report, report.checks, console)
+        console.say(f"report: {files[0]}")
     return done

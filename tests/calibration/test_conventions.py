@@ -134,20 +134,21 @@ def test_two_half_turns_are_none():
 # Faults
 
 
+@pytest.mark.parametrize("trial", [0, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("fault", sorted(faults.FAULTS))
-def test_every_fault_is_named(fault):
-    for trial in range(1 if fault == "degrees_as_radians" else 2):
-        rng = np.random.default_rng([100, trial])
-        s = faults.FAULTS[fault](faults.draw_session(rng, views=(12, 24)), rng)
-        d = faults.ask(s)
-        assert faults.named(s, d), (s.expected, s.views, d.fault, d.views, d.sentence)
-        assert d.sentence and d.advice
-        assert d.labels == tuple(str(k) for k in d.views)
+def test_every_fault_is_named(fault, trial):
+    rng = np.random.default_rng([100, trial])
+    s = faults.FAULTS[fault](faults.draw_session(rng, views=(12, 24)), rng)
+    d = faults.ask(s)
+    assert faults.named(s, d), (s.expected, s.views, d.fault, d.views, d.sentence)
+    assert d.sentence and d.advice
+    assert d.labels == tuple(str(k) for k in d.views)
 
 
+@pytest.mark.parametrize("seeds", [(0, 1), pytest.param((2, 3), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", sorted(faults.CLEAN))
-def test_clean_sessions_raise_no_alarm(kind):
-    for seed in range(4):
+def test_clean_sessions_raise_no_alarm(kind, seeds):
+    for seed in seeds:
         d = faults.ask(session(seed, **faults.CLEAN[kind]))
         assert d.fault == "none", d.sentence
         assert d.repaired_base_ee is None and not d.views
@@ -496,13 +497,19 @@ def test_millimetres_of_a_real_file_are_named(koch):
     assert d.fault == "robot_unit" and np.allclose(d.repaired_base_ee, A)
 
 
+NOT_OF_KOCH = {"flipped", "tool_left_active", "base_turned", "degrees_as_radians"}
+QUICK = {"board_moved", "camera_inverted", "duplicated", "robot_in_mm", "shifted", "swapped"}
+"""One fault of every kind but those of the rotation, which take seconds each."""
+
+
 @real
 @pytest.mark.real
 @pytest.mark.parametrize(
     "fault",
-    sorted(
-        faults.FAULTS.keys() - {"flipped", "tool_left_active", "base_turned", "degrees_as_radians"}
-    ),
+    [
+        pytest.param(fault, marks=() if fault in QUICK else pytest.mark.slow)
+        for fault in sorted(faults.FAULTS.keys() - NOT_OF_KOCH)
+    ],
 )
 def test_faults_in_real_poses_are_named(koch, fault):
     A, C, _ = koch

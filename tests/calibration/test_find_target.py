@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -40,6 +41,7 @@ TARGETS = {
 }  # fmt: skip
 
 
+@cache
 def page_of(target, border=1, turned=0):
     """Return the printed page (0 ink, 255 paper); the board's origin is at pixel edge MARGIN."""
     from cv2 import aruco
@@ -81,11 +83,14 @@ def page_of(target, border=1, turned=0):
         start = MARGIN - round(edge)
         page[start : start + drawn.shape[0], start : start + drawn.shape[1]] = drawn
     else:
-        y, x = np.mgrid[:h, :w]
         near = target.pitch_m * (np.sqrt(2) if target.asymmetric else 1.0)
         for k, (u, v, _) in enumerate(target.points_board * PER_M + MARGIN - 0.5):
             radius = 0.25 * near * PER_M * (1.6 if k == 0 and target.large_origin else 1.0)
-            page[(x - u) ** 2 + (y - v) ** 2 < radius**2] = 0
+            left, top = int(u - radius) - 1, int(v - radius) - 1
+            part = page[top : top + 2 * int(radius) + 4, left : left + 2 * int(radius) + 4]
+            y, x = np.indices(part.shape)
+            part[(x + left - u) ** 2 + (y + top - v) ** 2 < radius**2] = 0
+    page.setflags(write=False)
     return page
 
 

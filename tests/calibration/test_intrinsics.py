@@ -204,7 +204,7 @@ def test_an_image_twice_as_large_has_twice_the_focal_length():
 # --- statistics -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("warped", [False, True])
+@pytest.mark.parametrize("warped", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_covariance_says_how_large_errors_are(warped):
     rng = np.random.default_rng(8)
     truth, inside, whole = camera_vector(LENS), [], []

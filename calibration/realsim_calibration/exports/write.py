@@ -44,13 +44,17 @@ def npz_arrays(report: HandEyeReport, frames: FrameNames) -> dict[str, Array | N
     }
 
 
-def write_exports(report: HandEyeReport, folder: Path | str, *, frames: FrameNames) -> list[Path]:
+def write_exports(
+    report: HandEyeReport, folder: Path | str, *, frames: FrameNames, with_camera: bool = True
+) -> list[Path]:
     """Write the calibration in every format and return the files; each is whole or not there.
 
     Args:
         report: the calibration.
         folder: where to write; made where needed, files of the same names are replaced.
         frames: how the frames are called in the programs that will read it.
+        with_camera: False where there were no images: the camera is then a nominal one, and no
+            file that states a lens is written.
     """
     folder = Path(folder)
     texts: dict[str, Callable[[HandEyeReport, FrameNames], str]] = {
@@ -63,9 +67,14 @@ def write_exports(report: HandEyeReport, folder: Path | str, *, frames: FrameNam
         "camera_info.yaml": ros.camera_info_text,
         "opencv.yml": opencv_text,
     }
+    if not with_camera:
+        for name in ("camera_info.yaml", "opencv.yml"):
+            del texts[name]
     written = [write_calibration(report, folder / "calibration.json", frames=frames)]
     for name, text in texts.items():
         atomic.write_text(folder / name, text(report, frames))
         written.append(folder / name)
+    if not with_camera:
+        return written
     atomic.write_npz(folder / "calibration.npz", **npz_arrays(report, frames))
     return [*written, folder / "calibration.npz"]

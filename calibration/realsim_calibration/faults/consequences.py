@@ -16,8 +16,12 @@ from realsim_calibration.results import Mode
 from realsim_calibration.views import TargetDetection
 
 Array = NDArray[np.float64]
-SINGLE_VIEWS = ("mispaired_image", "swapped_images")
+SINGLE_VIEWS = (
+    "mispaired_image", "swapped_images", "frozen_pose", "repeated_image", "duplicated_views",
+)  # fmt: skip
 """Faults of single views: these are dropped and named, the others are sound."""
+RATIO_OFF = 0.01
+"""Lengths of hand and camera that differ by more than this are worth a word."""
 UNITS = ("robot_unit", "board_unit", "board_size")
 """Faults of a length."""
 SHOWN = 4
@@ -64,12 +68,19 @@ def check_of(found: Diagnosis | None, indices: Sequence[int]) -> Check:
             sentence="too few views to test conventions and pairing.",
             advice="Take 24 views.",
         )
-    good = found.fault in ("none", "tool_offset", "base_turned")
+    off = abs(found.length_ratio - 1)
+    good = found.fault in ("none", "tool_offset", "base_turned") and off <= RATIO_OFF
+    advice = found.advice
+    if off > RATIO_OFF and not advice:
+        advice = (
+            "Lengths differ: measure the target's squares, and check the camera's focal length "
+            "and that the poses are the controller's."
+        )
     return Check(
         name="conventions",
         verdict="good" if good else "warn",
         sentence=" ".join(part for part in (found.sentence, found.note) if part),
-        advice=found.advice,
+        advice=advice,
         value=found.evidence[0].rotation_mismatch_deg if found.evidence else float("nan"),
         unit="deg",
         views=tuple(indices[k] for k in found.views),
