@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Check, Target
 from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
@@ -19,6 +21,9 @@ class CalibrationConfig:
 
     hand_eye: HandEyeConfig = field(default_factory=HandEyeConfig)
     intrinsics: IntrinsicsConfig = field(default_factory=IntrinsicsConfig)
+    border_px: float = 5.0
+    """How far one sigma of a distortion term that the own lens calibration refused may move the
+    image's corner in the hand-eye fit [px]."""
     own_focal_sd: float = 0.1
     """Prior of the focal length in the hand-eye fit around an own calibration of the same views,
     relative: hardly any, since these views say it themselves."""
@@ -37,6 +42,30 @@ class Calibration:
         """Every check of both."""
         lens = () if self.lens is None else self.lens.checks
         return (*self.hand_eye.checks, *lens)
+
+
+DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+RADIAL_POWERS = {"k1": 3, "k2": 5, "k3": 7}
+"""Power of the radius with which a term moves a point."""
+
+
+def _determined(
+    sd: tuple[float, ...], lens: IntrinsicsReport, border_px: float
+) -> tuple[float, ...]:
+    """Return the priors of the distortion, tight for terms that the views do not determine.
+
+    Freed entirely, such terms bend the lens outside of the corners until it folds inside the image;
+    held, they leave what they could explain to the robot.
+    """
+    camera = lens.intrinsics
+    radius = 0.5 * float(np.hypot(camera.width / camera.fx, camera.height / camera.fy))
+    priors: list[float] = []
+    for name, prior in zip(DISTORTION, sd, strict=True):
+        limit = np.inf
+        if name not in lens.terms and name in RADIAL_POWERS:
+            limit = border_px / (camera.fx * radius ** RADIAL_POWERS[name])
+        priors.append(float(min(prior, limit)))
+    return tuple(priors)
 
 
 def calibrate(
@@ -73,6 +102,11 @@ def calibrate(
             detections, target, names=[v.label for v in ordered], config=config.intrinsics
         )
         camera = lens.intrinsics
-        hand_eye = replace(hand_eye, joint=replace(hand_eye.joint, focal_sd=config.own_focal_sd))
+        joint = replace(
+            hand_eye.joint,
+            focal_sd=config.own_focal_sd,
+            distortion_sd=_determined(hand_eye.joint.distortion_sd, lens, config.border_px),
+        )
+        hand_eye = replace(hand_eye, joint=joint)
     report = calibrate_hand_eye_report(views, target, camera, hand_eye, arm)
     return Calibration(hand_eye=report, lens=lens)

@@ -5,13 +5,14 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.camera import project
+from realsim.geometry.camera import project, undistort
 from realsim.geometry.dh import UR5_ARM, UR5E_ARM
 from realsim.records import Chessboard, HandEye
 from realsim_calibration import (
     BoardView,
     HandEyeConfig,
     TargetDetection,
+    calibrate,
     calibrate_from_poses,
     calibrate_hand_eye_report,
 )
@@ -120,3 +121,20 @@ def test_a_view_says_its_name_in_messages(simulate):
             [*views[:2], replace(views[2], detection=small), *views[3:]], sim.board, sim.intrinsics0
         )
     assert BoardView(index=3, T_base_ee=np.eye(4), detection=small).label == "3"
+
+
+def test_terms_that_the_lens_refused_cannot_fold_the_image(simulate):
+    # Freed in the hand-eye fit, k2 and k3 of a board seen in the image's middle folded the lens.
+    sim = simulate(2, views=12)
+    views = []
+    for v in sim.views:
+        near = np.linalg.norm(v.detection.uv - [640.0, 360.0], axis=1) < 260
+        d = v.detection
+        part = TargetDetection(point_ids=d.point_ids[near], uv=d.uv[near], image_size=d.image_size)
+        views.append(replace(v, detection=part))
+    result = calibrate(views, sim.board)
+    assert result.lens is not None and "k3" not in result.lens.terms
+    camera = result.hand_eye.intrinsics
+    corner = np.array([[0.0, 0.0], [1279.0, 0.0], [0.0, 719.0], [1279.0, 719.0]])
+    _, valid = undistort(camera, corner)
+    assert valid.all()
