@@ -70,6 +70,6 @@ FULL = Size(
     time_repeats=3, koch_plain=20,
 )  # fmt: skip
 QUICK = Size(
-    seeds=1, swapped_folds=2, trials=12, crb_trials=2, fault_trials=1, corner_views=1,
+    seeds=1, swapped_folds=1, trials=6, crb_trials=1, fault_trials=1, corner_views=1,
     time_repeats=1, koch_plain=0,
 )  # fmt: skip

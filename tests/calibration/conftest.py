@@ -1,6 +1,7 @@
 import dataclasses
 import math
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
 from functools import cache
 
 import numpy as np
@@ -154,6 +155,18 @@ class Simulation:
         inside = np.all((uv > 0) & (uv < np.array(size) - 1), axis=(1, 2))
         points = 4 * np.flatnonzero(inside)[:, None] + np.arange(4)
         return TargetDetection(point_ids=points.ravel(), uv=uv[inside], image_size=size)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Keep BLAS to one thread: on matrices of 30 rows two of them wait for each other for ages."""
+    from threadpoolctl import threadpool_limits
+
+    # Libraries that are loaded later read the environment.
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    with threadpool_limits(limits=1):
+        yield
 
 
 @pytest.fixture

@@ -180,7 +180,9 @@ def _sizes(twists: Array) -> Array:
     return np.array([float(np.sqrt(np.mean(half**2))) for half in halves])
 
 
-def unknown_arm_columns(linear: ErrorBasis, weights: Array, hidden_factor: float) -> Array:
+def unknown_arm_columns(
+    linear: ErrorBasis, weights: Array, spread: Array, hidden_factor: float
+) -> Array:
     """Return errors (views, 6, 78) that an unknown arm may have: what no joints can tell.
 
     Errors linear in the pose (72 columns), of the size that the views show, and a constant error in
@@ -189,10 +191,13 @@ def unknown_arm_columns(linear: ErrorBasis, weights: Array, hidden_factor: float
 
     Args:
         linear: a basis of linear errors.
-        weights: (72,) what the views say of its weights.
+        weights: (72,) what the views say of its weights: shrunken by the ridge, so that their
+            own size is too small ...
+        spread: (72, 72) ... by what their covariance says.
         hidden_factor: see RobotErrorConfig.
     """
-    shown = _sizes(linear.columns @ weights)
+    doubt = np.einsum("nrc,cd,nrd->nr", linear.columns, spread, linear.columns)
+    shown = _sizes(np.sqrt((linear.columns @ weights) ** 2 + np.maximum(doubt, 0.0)))
     prior = _sizes(np.sqrt(np.sum(linear.columns**2, -1)))
     share = np.repeat(np.minimum(shown / np.maximum(prior, 1e-15), 1.0), 3)
     constant = np.diag(hidden_factor * np.repeat(shown, 3))

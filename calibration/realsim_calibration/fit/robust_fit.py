@@ -245,8 +245,9 @@ def _hidden_errors(
     if known is not None:
         return known.columns
     scaled = estimate_scale(model, map_basis(Ts, "base", 1.0, 1e-4), none.ratio, sigma)
-    weights = model.fit(scaled, none.ratio, sigma).step[29:]
-    return unknown_arm_columns(scaled, weights, hidden)
+    fit = model.fit(scaled, none.ratio, sigma)
+    spread = np.asarray(np.linalg.inv(fit.information)[SHARED:, SHARED:], dtype=np.float64)
+    return unknown_arm_columns(scaled, fit.step[SHARED:], spread, hidden)
 
 
 def _covariance(
