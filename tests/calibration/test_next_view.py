@@ -338,9 +338,6 @@ def test_an_arm_that_hides_errors_is_promised_no_more_than_it_can_give(
     assert rank_next_views(report, propose_views(report))[0].gain < 0.1
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the fit takes the median distance over exchanged rotations and places"
-)
 @pytest.mark.parametrize("ratio", [0.05, 1.0, 3.0])
 def test_information_is_that_of_the_solver(ratio: float, simulate: Any) -> None:
     """The views' information, summed over the captured poses, is the joint fit's own."""

@@ -177,7 +177,7 @@ class JointProblem:
             T = se3.invert(state.X) @ A @ state.Z
         else:
             T = se3.invert(A @ state.X) @ state.Z
-        middle = se3.transform(T, self.setup.middle)
+        middle = se3.transform(T, self.setup.middle[None])[..., 0, :]
         distance = float(np.median(np.linalg.norm(middle, axis=-1)))
         return np.array([1.0] * 3 + [distance] * 3) / float(state.camera[:2].mean())
 
