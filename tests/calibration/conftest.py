@@ -159,7 +159,7 @@ class Simulation:
 
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> Iterator[None]:
-    """Keep BLAS to one thread: on matrices of 30 rows two of them wait for each other for ages."""
+    """Keep to one thread: on matrices of 30 rows two of them wait for each other for ages."""
     from threadpoolctl import threadpool_limits
 
     # Libraries that are loaded later read the environment.

@@ -135,7 +135,14 @@ def test_two_half_turns_are_none():
 
 
 @pytest.mark.parametrize("trial", [0, pytest.param(1, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("fault", sorted(faults.FAULTS))
+@pytest.mark.parametrize(
+    "fault",
+    [
+        # The numbers may be turns of any count: all of them are searched, which takes seconds.
+        pytest.param(f, marks=pytest.mark.slow if f == "degrees_as_radians" else ())
+        for f in sorted(faults.FAULTS)
+    ],
+)
 def test_every_fault_is_named(fault, trial):
     rng = np.random.default_rng([100, trial])
     s = faults.FAULTS[fault](faults.draw_session(rng, views=(12, 24)), rng)
@@ -145,7 +152,7 @@ def test_every_fault_is_named(fault, trial):
     assert d.labels == tuple(str(k) for k in d.views)
 
 
-@pytest.mark.parametrize("seeds", [(0, 1), pytest.param((2, 3), marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [(0,), pytest.param((1, 2, 3), marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", sorted(faults.CLEAN))
 def test_clean_sessions_raise_no_alarm(kind, seeds):
     for seed in seeds:
@@ -498,8 +505,8 @@ def test_millimetres_of_a_real_file_are_named(koch):
 
 
 NOT_OF_KOCH = {"flipped", "tool_left_active", "base_turned", "degrees_as_radians"}
-QUICK = {"board_moved", "camera_inverted", "duplicated", "robot_in_mm", "shifted", "swapped"}
-"""One fault of every kind but those of the rotation, which take seconds each."""
+QUICK = {"board_moved", "camera_inverted", "duplicated", "swapped"}
+"""Faults of place, convention, copies and pairs; those of the rotation take seconds each."""
 
 
 @real

@@ -399,6 +399,7 @@ def test_predicted_sigmas_weigh_the_corners():
     assert np.all(np.abs(vector(weighed)[:8] - truth) < 4 * weighed.sd[:8])
 
 
+@pytest.mark.slow
 def test_many_views_take_seconds():
     board = Chessboard(rows=10, columns=14, square_m=0.02)
     seen = see(24, views=256, board=board)

@@ -239,7 +239,7 @@ def reports(few: HandEyeReport, calibrated_arm: Any) -> dict[str, HandEyeReport]
         "worse": replace(few, X_covariance=3 * few.X_covariance + 0.3 * shake @ shake.T),
         "better": replace(few, X_covariance=0.4 * few.X_covariance),
         "both": replace(few, X_covariance=0.6 * few.X_covariance + 0.3 * shake @ shake.T),
-        "arm with joints": calibrated_arm(with_joints=True),
+        "arm with joints": calibrated_arm(12, with_joints=True),
     }
 
 

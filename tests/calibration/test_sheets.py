@@ -27,7 +27,7 @@ from realsim_calibration.targets.target_text import parse_target
 
 pdfium = pytest.importorskip("pypdfium2", reason="rasterising a PDF needs pypdfium2")
 
-DPI = 150
+DPI = 200
 WITHIN_MM = 0.05
 SHEETS = {
     "charuco:5x7,square=33mm,marker=20mm,dict=6X6_100": "A4",
