@@ -34,7 +34,7 @@ from realsim_calibration.fit.joint_solve import (
 )
 from realsim_calibration.fit.linear_model import LinearModel
 from realsim_calibration.fit.robust_fit import solve
-from realsim_capture_plans.kinematics import UR5E
+from realsim_capture_plans.arms.kinematics import UR5E
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator

@@ -22,13 +22,14 @@ from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, CaptureSession
 from realsim.store import SessionStore
-from realsim_capture_plans.capture import PLAN_FILE, capture
-from realsim_capture_plans.collision import interpolate
-from realsim_capture_plans.devices import ArmState, DeviceError, Frame
-from realsim_capture_plans.kinematics import UR5, JointLimits
-from realsim_capture_plans.plan import calibration_plan
-from realsim_capture_plans.plan_file import load_plan, save_plan
-from realsim_capture_plans.plan_record import CapturePlan, PlanConfig, default_mount
+from realsim_capture_plans.arms.kinematics import UR5, JointLimits
+from realsim_capture_plans.capturing.capture import PLAN_FILE, capture
+from realsim_capture_plans.collision.model import interpolate
+from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.devices.interfaces import ArmState, DeviceError, Frame
+from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
+from realsim_capture_plans.planning.make import calibration_plan
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 VIEWS = 10
 CAMERA = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
@@ -72,7 +73,7 @@ class TableCamera:
 
     def grab(self) -> Frame:
         time.sleep(self.seconds)
-        T = UR5.forward(self.arm.joints) @ default_mount()
+        T = UR5.forward(self.arm.joints) @ d405_mount().T_ee_cam
         rays = ray_table(CAMERA).reshape(-1, 3) @ T[:3, :3].T
         depth = np.where(rays[:, 2] < -1e-3, -T[2, 3] / np.minimum(rays[:, 2], -1e-3), 0.0)
         ground = T[:3, 3] + depth[:, None] * rays
@@ -86,7 +87,7 @@ class TableCamera:
 @lru_cache(maxsize=1)
 def plan() -> CapturePlan:
     rng = np.random.default_rng(3)
-    return calibration_plan(VIEWS, [0.375, 0.0, 0.0], default_mount(), PlanConfig(), rng)
+    return calibration_plan(VIEWS, [0.375, 0.0, 0.0], d405_mount(), PlanConfig(), rng)
 
 
 def new_store(folder: Path, plan_hash: str) -> SessionStore:
@@ -111,7 +112,7 @@ def test_every_view_of_the_plan_is_stored_once(tmp_path: Path, arm: KinematicArm
     for view in store.session.views:
         assert np.array_equal(view.joints, plan().joints[view.index])
         assert view.T_base_ee == pytest.approx(plan().Ts_base_ee[view.index], abs=1e-9)
-        expected = UR5.forward(plan().joints[view.index]) @ default_mount()
+        expected = UR5.forward(plan().joints[view.index]) @ d405_mount().T_ee_cam
         middle = store.depth_m(view.index)[23:25, 31:33].mean()
         assert middle == pytest.approx(-expected[2, 3] / expected[2, 2], abs=2e-3)
     assert load_plan_of(store).content_hash == plan().content_hash
@@ -236,7 +237,7 @@ def slow_capture(folder: Path) -> None:
 def test_the_table_camera_is_a_camera(arm: KinematicArm) -> None:
     # The generated images are consistent: a ground point has one colour from every view.
     frame = TableCamera(arm).grab()
-    T = UR5.forward(arm.joints) @ default_mount()
+    T = UR5.forward(arm.joints) @ d405_mount().T_ee_cam
     points = se3.transform(T, (ray_table(CAMERA) * frame.depth_m[..., None]).reshape(-1, 3))
     assert np.abs(points[:, 2]).max() < 1e-6
 

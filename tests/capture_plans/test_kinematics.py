@@ -7,13 +7,13 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_capture_plans.collision import (
+from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
+from realsim_capture_plans.collision.model import (
     Box,
     box_distance,
     segment_box_distance,
     segment_distance,
 )
-from realsim_capture_plans.kinematics import UR5, UR5E, DhChain
 
 
 def calibrated(chain: DhChain, seed: int) -> DhChain:

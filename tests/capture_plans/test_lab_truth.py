@@ -7,7 +7,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_capture_plans.kinematics import UR5
+from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.lab import LabConfig, SimulatedLab, load_truth
 from realsim_capture_plans.lab.truth import (
     T_EE_CAM_NOMINAL,

@@ -10,14 +10,16 @@ import pytest
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
-from realsim_capture_plans.collision import interpolate
-from realsim_capture_plans.kinematics import UR5
-from realsim_capture_plans.moves import detour
-from realsim_capture_plans.ordering import move_seconds, tour
-from realsim_capture_plans.plan import calibration_plan, hemisphere_plan
-from realsim_capture_plans.plan_file import load_plan, plan_picture, plan_to_json, save_plan
-from realsim_capture_plans.plan_record import CapturePlan, PlanConfig, default_mount
-from realsim_capture_plans.viewpoints import golden_cap
+from realsim_capture_plans.arms.kinematics import UR5
+from realsim_capture_plans.collision.model import CollisionModel, interpolate
+from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.pictures.coverage import plan_picture
+from realsim_capture_plans.plan_files.plan_json import load_plan, plan_to_json, save_plan
+from realsim_capture_plans.planning.make import calibration_plan, hemisphere_plan
+from realsim_capture_plans.planning.moves import detour
+from realsim_capture_plans.planning.ordering import move_seconds, tour
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.viewpoints import golden_cap
 
 CENTER = np.array([0.375, 0.0, 0.05])
 BOARD = np.array([0.375, 0.0, 0.0])
@@ -26,12 +28,12 @@ N = 24
 
 @pytest.fixture(scope="module")
 def scene_plan() -> CapturePlan:
-    return hemisphere_plan(N, CENTER, default_mount(), PlanConfig(), np.random.default_rng(1))
+    return hemisphere_plan(N, CENTER, d405_mount(), PlanConfig(), np.random.default_rng(1))
 
 
 @pytest.fixture(scope="module")
 def board_plan() -> CapturePlan:
-    return calibration_plan(N, BOARD, default_mount(), PlanConfig(), np.random.default_rng(1))
+    return calibration_plan(N, BOARD, d405_mount(), PlanConfig(), np.random.default_rng(1))
 
 
 @pytest.fixture(params=["scene_plan", "board_plan"])
@@ -119,9 +121,7 @@ def test_board_views_roll_all_round_and_vary_tilt_and_distance(board_plan: Captu
 
 def test_the_same_seed_gives_the_same_plan() -> None:
     def make(seed: int) -> CapturePlan:
-        return calibration_plan(
-            8, BOARD, default_mount(), PlanConfig(), np.random.default_rng(seed)
-        )
+        return calibration_plan(8, BOARD, d405_mount(), PlanConfig(), np.random.default_rng(seed))
 
     assert make(4).content_hash == make(4).content_hash
     assert make(4).content_hash != make(5).content_hash
@@ -157,9 +157,7 @@ def test_a_changed_file_and_a_newer_version_are_refused(
 
 def test_too_few_reachable_views_say_how_many_and_what_to_do() -> None:
     with pytest.raises(DegenerateError, match=r"only \d+ are reachable.*0\.30-0\.40"):
-        hemisphere_plan(
-            24, [1.25, 0.4, 0.05], default_mount(), PlanConfig(), np.random.default_rng(0)
-        )
+        hemisphere_plan(24, [1.25, 0.4, 0.05], d405_mount(), PlanConfig(), np.random.default_rng(0))
     with pytest.raises(InputError, match="millimetres"):
         PlanConfig(radius_m=(280.0, 420.0))
 
@@ -167,7 +165,9 @@ def test_too_few_reachable_views_say_how_many_and_what_to_do() -> None:
 def test_a_detour_is_found_round_the_keep_out_box(scene_plan: CapturePlan) -> None:
     # A box as high as the nearest views: straight moves across it collide.
     config = replace(scene_plan.config, keep_out_m=(0.16, 0.16, 0.26))
-    model = config.collision_model(UR5, default_mount(), CENTER, "hemisphere")
+    model = CollisionModel(
+        UR5, d405_mount(), config.work_cell(CENTER, "hemisphere"), config.clearance_m
+    )
     q = scene_plan.joints[model.free(scene_plan.joints)]
     a, b = np.triu_indices(len(q), 1)
     blocked = np.flatnonzero(~model.edges_free(q[a], q[b], config.edge_step_rad))
@@ -202,7 +202,7 @@ def test_the_picture_is_written(scene_plan: CapturePlan, tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_256_views() -> None:
-    plan = hemisphere_plan(256, CENTER, default_mount(), PlanConfig(), np.random.default_rng(0))
+    plan = hemisphere_plan(256, CENTER, d405_mount(), PlanConfig(), np.random.default_rng(0))
     assert len(plan) == 256
     assert plan.metrics["colliding_legs"] == 0
     assert plan.metrics["hole_deg"] < 10.0

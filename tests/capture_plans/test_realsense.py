@@ -11,8 +11,8 @@ import pytest
 
 from realsim.errors import InputError, MissingLibraryError
 from realsim.interop import import_pyrealsense2
-from realsim_capture_plans.devices import DeviceError
-from realsim_capture_plans.realsense import RealSenseCamera, intrinsics_of
+from realsim_capture_plans.devices.interfaces import DeviceError
+from realsim_capture_plans.devices.realsense import RealSenseCamera, intrinsics_of
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 320.0
 
@@ -117,7 +117,7 @@ def test_frames_are_pairs_of_one_number_in_metres(software: SoftwareD405) -> Non
 def test_no_frame_is_a_device_error(
     software: SoftwareD405, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("realsim_capture_plans.realsense.TIMEOUT_MS", 200)
+    monkeypatch.setattr("realsim_capture_plans.devices.realsense.TIMEOUT_MS", 200)
     camera = RealSenseCamera(width=WIDTH, height=HEIGHT, device=software.device)
     try:
         with pytest.raises(DeviceError, match="no frame within 200 ms"):

@@ -1,11 +1,13 @@
 """The simulated UR5: it goes where it is told and reports what its controller believes."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim_capture_plans.devices import ArmState
-from realsim_capture_plans.kinematics import JOINTS, UR5, DhChain, JointLimits
+from realsim_capture_plans.arms.kinematics import JOINTS, UR5, DhChain, JointLimits
+from realsim_capture_plans.devices.interfaces import ArmState
 
 Array = NDArray[np.float64]
 
@@ -18,7 +20,7 @@ class SimulatedArm:
 
     The reported pose is the nominal forward kinematics of the commanded joints. The true flange,
     which only the lab's truth knows, is elsewhere by the errors of the chain and the repeatability.
-    Time is simulated: a move lasts as long as its slowest joint.
+    Time is simulated: a move lasts as long as moveJ's trapezoid of its leading joint.
     """
 
     def __init__(self, chain: DhChain = UR5) -> None:
@@ -37,8 +39,16 @@ class SimulatedArm:
         """Limits of the joints."""
         return self._chain.limits
 
-    def move(self, joints: ArrayLike) -> None:
-        """Go to joints (6,) [rad].
+    @property
+    def description(self) -> dict[str, Any]:
+        """What is kept with the session."""
+        return {"model": self.name, "simulated": True}
+
+    def recover(self) -> None:
+        """Do nothing: this arm never stops by itself."""
+
+    def move(self, joints: ArrayLike, speed: float = 1.05, acceleration: float = 1.4) -> None:
+        """Go to joints (6,) [rad] at the speed [rad/s] and acceleration [rad/s^2] of moveJ.
 
         Raises:
             InputError: the goal is not 6 finite angles within the limits; the arm has not moved.
@@ -54,7 +64,11 @@ class SimulatedArm:
                 f"{np.degrees(self.limits.lower[bad]).round(1).tolist()} to "
                 f"{np.degrees(self.limits.upper[bad]).round(1).tolist()} deg; the arm stays."
             )
-        self._time_s += float(np.max(np.abs(goal - self._joints) / self.limits.speed))
+        d = float(np.max(np.abs(goal - self._joints)))
+        cruise = d >= speed**2 / acceleration
+        self._time_s += (
+            d / speed + speed / acceleration if cruise else 2 * (d / acceleration) ** 0.5
+        )
         self._joints = goal
 
     def state(self) -> ArmState:

@@ -6,13 +6,13 @@ The images are made by the true, distorted lens; the intrinsics it reports are t
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.records import CameraIntrinsics
-from realsim_capture_plans.devices import Arm, Frame
+from realsim_capture_plans.devices.interfaces import Arm, Frame
 from realsim_capture_plans.lab.truth import NOISE, LabConfig, LabTruth, factory_intrinsics, stream
 
 if TYPE_CHECKING:
@@ -69,6 +69,11 @@ class SimulatedDepthCamera:
     def depth_unit_m(self) -> float:
         """Metres per count of the sensor's own 16-bit depth."""
         return DEPTH_UNIT_M
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """What is kept with the session."""
+        return {"name": self.name, "simulated": True}
 
     def grab(self) -> Frame:
         """Return a frame of what is on the table.

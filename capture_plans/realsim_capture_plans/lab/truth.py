@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose
-from realsim_capture_plans.kinematics import UR5, DhChain
+from realsim_capture_plans.arms.kinematics import UR5, DhChain
 
 Array = NDArray[np.float64]
 

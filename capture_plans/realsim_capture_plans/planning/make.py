@@ -14,12 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
-from realsim_capture_plans.collision import CollisionModel
-from realsim_capture_plans.kinematics import UR5, DhChain
-from realsim_capture_plans.moves import NoFreeMoveError, connect
-from realsim_capture_plans.ordering import move_seconds
-from realsim_capture_plans.plan_record import CapturePlan, PlanConfig
-from realsim_capture_plans.viewpoints import (
+from realsim_capture_plans.arms.kinematics import UR5, DhChain
+from realsim_capture_plans.collision.model import CollisionModel
+from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
+from realsim_capture_plans.planning.moves import NoFreeMoveError, connect
+from realsim_capture_plans.planning.ordering import move_seconds
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.viewpoints import (
     Candidates,
     choose_home,
     golden_cap,
@@ -43,7 +45,8 @@ class _Task:
 
     kind: Kind
     center: Array
-    T_ee_cam: Array
+    mount: Mount
+    cell: WorkCell
     config: PlanConfig
     model: CollisionModel
 
@@ -51,32 +54,34 @@ class _Task:
 def hemisphere_plan(
     n: int,
     center_world: ArrayLike,
-    T_ee_cam_nominal: ArrayLike,
+    mount: Mount | ArrayLike,
     config: PlanConfig,
     rng: np.random.Generator,
     *,
     chain: DhChain = UR5,
+    obstacles: tuple[tuple[str, Box], ...] = (),
 ) -> CapturePlan:
     """Return n views that look at the scene from all over the reachable hemisphere.
 
     Args:
         n: number of views.
         center_world: (3,) what the camera looks at, in base [m].
-        T_ee_cam_nominal: (4, 4) the mount as designed; a few mm off does no harm.
+        mount: the camera on the flange, or (4, 4) T_ee_cam [m] of a D405; a few mm off do no harm.
         config: radii, elevations, clearances, speeds.
         rng: draws the turn of the spiral and, where a move collides, the via points.
         chain: the arm, nominal or calibrated.
+        obstacles: named boxes in base that the arm keeps its clearance to.
 
     Raises:
         InputError: n is not positive, or a given pose is not one.
         DegenerateError: fewer than n views are reachable, or one cannot be driven to.
     """
-    task = _task("hemisphere", n, center_world, T_ee_cam_nominal, config, chain)
+    task = _task("hemisphere", n, center_world, mount, config, chain, obstacles)
     spin = se3.exp_so3([0.0, 0.0, rng.uniform(0.0, 2 * np.pi)])
     tried = max(config.oversampling * n, config.least_directions)
     directions = golden_cap(tried, config.elevation_deg) @ spin.T
     poses, item = hemisphere_poses(task.center, directions, config)
-    found = reachable(poses, item, task.T_ee_cam, task.model, config.sigma_min)
+    found = reachable(poses, item, task.mount.T_ee_cam, task.model, config.sigma_min)
 
     def choose(ok: Ints) -> Ints:
         return ok[thin_directions(directions[ok], n)]
@@ -89,12 +94,13 @@ def hemisphere_plan(
 def calibration_plan(
     n: int,
     center_world: ArrayLike,
-    T_ee_cam_nominal: ArrayLike,
+    mount: Mount | ArrayLike,
     config: PlanConfig,
     rng: np.random.Generator,
     *,
     normal_world: ArrayLike = (0.0, 0.0, 1.0),
     chain: DhChain = UR5,
+    obstacles: tuple[tuple[str, Box], ...] = (),
 ) -> CapturePlan:
     """Return n views of a flat board: every roll, tilts, distances, the board all over the image.
 
@@ -104,24 +110,25 @@ def calibration_plan(
     Args:
         n: number of views.
         center_world: (3,) the board's centre in base [m].
-        T_ee_cam_nominal: (4, 4) the mount as designed.
+        mount: the camera on the flange, or (4, 4) T_ee_cam [m] of a D405.
         config: distances, tilt, aim jitter, clearances, speeds.
         rng: draws the poses.
         normal_world: (3,) the board's normal, to the side of the camera.
         chain: the arm, nominal or calibrated.
+        obstacles: named boxes in base that the arm keeps its clearance to.
 
     Raises:
         InputError: n is not positive, or a given pose is not one.
         DegenerateError: fewer than n views are reachable, or one cannot be driven to.
     """
-    task = _task("calibration", n, center_world, T_ee_cam_nominal, config, chain)
+    task = _task("calibration", n, center_world, mount, config, chain, obstacles)
     normal = np.asarray(normal_world, dtype=np.float64)
     length = float(np.linalg.norm(normal))
     if normal.shape != (3,) or not length > 0:
         raise InputError(f"the board's normal is {normal.tolist()}; a direction (3,) is needed.")
     tried = max(config.board_oversampling * n, config.least_directions)
     poses, features = _board_poses(tried, task, normal / length, rng)
-    found = reachable(poses, np.arange(tried), task.T_ee_cam, task.model, config.sigma_min)
+    found = reachable(poses, np.arange(tried), task.mount.T_ee_cam, task.model, config.sigma_min)
     roll = _board_roll(poses, _plane_axes(normal / length))
 
     def choose(ok: Ints) -> Ints:
@@ -135,9 +142,10 @@ def _task(
     kind: Kind,
     n: int,
     center: ArrayLike,
-    T_ee_cam: ArrayLike,
+    mount: Mount | ArrayLike,
     config: PlanConfig,
     chain: DhChain,
+    obstacles: tuple[tuple[str, Box], ...],
 ) -> _Task:
     """Check what was given and build the collision model."""
     if n < 1:
@@ -145,9 +153,10 @@ def _task(
     c = np.array(center, dtype=np.float64)
     if c.shape != (3,) or not np.all(np.isfinite(c)):
         raise InputError(f"the scene centre is {c.tolist()}; (x, y, z) in base [m] is needed.")
-    T = se3.check_rigid(T_ee_cam, "T_ee_cam_nominal")
-    model = config.collision_model(chain, T, c, kind)
-    return _Task(kind=kind, center=c, T_ee_cam=T, config=config, model=model)
+    carried = mount if isinstance(mount, Mount) else d405_mount(mount)
+    cell = config.work_cell(c, kind, obstacles)
+    model = CollisionModel(chain, carried, cell, config.clearance_m)
+    return _Task(kind=kind, center=c, mount=carried, cell=cell, config=config, model=model)
 
 
 def _too_few(task: _Task, n: int, reachable_count: int, tried: int) -> str:
@@ -282,16 +291,14 @@ def _plan_of(
 ) -> CapturePlan:
     """Return the record of a tour, with its metrics."""
     chain = task.model.chain
-    Ts_base_ee = chain.forward(joints)
-    Ts_base_cam = Ts_base_ee @ task.T_ee_cam
+    Ts_base_cam = chain.forward(joints) @ task.mount.T_ee_cam
     plan = CapturePlan(
         kind=task.kind,
-        robot=chain.name,
+        chain=chain,
+        mount=task.mount,
+        cell=task.cell,
         home=home,
         joints=joints,
-        Ts_base_ee=Ts_base_ee,
-        Ts_base_cam=Ts_base_cam,
-        T_ee_cam_nominal=task.T_ee_cam,
         center_world=task.center,
         vias=vias,
         reference_view=int(np.argmin(Ts_base_cam[:, 2, 2])),

@@ -12,7 +12,7 @@ import numpy as np
 from realsim.errors import InputError
 from realsim.interop import import_pyrealsense2
 from realsim.records import CameraIntrinsics
-from realsim_capture_plans.devices import DeviceError, Frame
+from realsim_capture_plans.devices.interfaces import DeviceError, Frame
 
 TIMEOUT_MS = 5000
 """Waited for one frame [ms]; a camera that starts up takes about 1 s."""

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import View
-from realsim_capture_plans.devices import Arm, ArmState, DepthCamera, DeviceError, Frame
-from realsim_capture_plans.plan_file import plan_to_json
-from realsim_capture_plans.plan_record import CapturePlan
+from realsim_capture_plans.devices.interfaces import Arm, ArmState, DepthCamera, DeviceError, Frame
+from realsim_capture_plans.plan_files.plan_json import plan_to_json
+from realsim_capture_plans.planning.record import CapturePlan
 
 if TYPE_CHECKING:
     from realsim.store import SessionStore

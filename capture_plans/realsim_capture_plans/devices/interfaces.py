@@ -1,7 +1,7 @@
 """What a capture needs of an arm and of a depth camera, whoever made them.
 
 Frames and units: joints in rad in the order of `kinematics.DhChain`; `T_base_ee` (4, 4) is the
-bare flange in the controller's `base` [m] (no tool offset may be configured); images follow
+bare flange in the controller's `base` [m], whatever tool offset is configured; images follow
 `CameraIntrinsics`, integer pixel = pixel centre; depth is float32 metres along z, 0 = none, and
 is aligned to the colour image pixel by pixel. Time stamps are seconds of one clock per device.
 
@@ -9,8 +9,8 @@ Every call blocks until it is done: `move` returns when the arm stands at its go
 a frame exposed after the call began. Whatever stops a device is a DeviceError.
 """
 
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,13 +18,26 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
-from realsim_capture_plans.kinematics import JOINTS, JointLimits
+from realsim_capture_plans.arms.kinematics import JOINTS, JointLimits
 
 Array = NDArray[np.float64]
 
 
+Stop = Literal["protective stop", "emergency stop", "connection lost", "not ready", "off goal"]
+"""What keeps an arm from moving; a person clears it, then `Arm.recover` goes on."""
+
+
 class DeviceError(RealsimError):
-    """A device cannot go on: protective stop, connection lost, no camera, no steady frame."""
+    """A device cannot go on: connection lost, no camera, no steady frame."""
+
+
+class ArmStoppedError(DeviceError):
+    """The arm stopped, and a person can clear the reason; `stop` says which kind it is."""
+
+    def __init__(self, message: str, stop: Stop) -> None:
+        """Keep what a person is to be told and the kind of stop."""
+        super().__init__(message)
+        self.stop: Stop = stop
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -37,6 +50,8 @@ class ArmState:
     """(4, 4) the controller's own (factory-calibrated) flange pose in its base [m]."""
     time_s: float
     """Time stamp of the reading [s]."""
+    T_ee_tcp: Array = field(default_factory=lambda: np.eye(4))
+    """(4, 4) tool offset that the controller has set [m]: its own TCP pose is T_base_ee @ this."""
 
     def __post_init__(self) -> None:
         """Check shapes and freeze the arrays."""
@@ -44,7 +59,8 @@ class ArmState:
         if joints.shape != (JOINTS,) or not np.all(np.isfinite(joints)):
             raise InputError(f"the arm's joints are {joints.tolist()}; 6 finite angles are needed.")
         T = se3.check_rigid(self.T_base_ee, "the arm's T_base_ee")
-        for name, value in (("joints", joints), ("T_base_ee", T)):
+        T_ee_tcp = se3.check_rigid(self.T_ee_tcp, "the arm's T_ee_tcp")
+        for name, value in (("joints", joints), ("T_base_ee", T), ("T_ee_tcp", T_ee_tcp)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
 
@@ -89,12 +105,25 @@ class Arm(Protocol):
         """Limits of the joints."""
         ...
 
-    def move(self, joints: ArrayLike) -> None:
+    def move(self, joints: ArrayLike, speed: float = 1.05, acceleration: float = 1.4) -> None:
         """Go to joints (6,) [rad] on the straight line in joint space; return when standing still.
+
+        Args:
+            joints: the goal.
+            speed: of the leading joint [rad/s].
+            acceleration: of the leading joint [rad/s^2].
 
         Raises:
             InputError: the goal is not 6 finite angles within the limits; the arm has not moved.
-            DeviceError: the arm stopped on its way (protective or emergency stop, connection).
+            ArmStoppedError: the arm stopped on its way (protective or emergency stop, connection).
+        """
+        ...
+
+    def recover(self) -> None:
+        """Make ready to move again after a person has cleared a stop; the arm stays where it is.
+
+        Raises:
+            ArmStoppedError: the stop is still there; the message says what to do at the robot.
         """
         ...
 
@@ -102,8 +131,13 @@ class Arm(Protocol):
         """Return where the arm is now.
 
         Raises:
-            DeviceError: the arm does not answer.
+            ArmStoppedError: the arm does not answer.
         """
+        ...
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Plain JSON values kept with the session: model, serial number, software, tool offset."""
         ...
 
 
@@ -123,6 +157,11 @@ class DepthCamera(Protocol):
     @property
     def depth_unit_m(self) -> float:
         """Metres per count of the sensor's own 16-bit depth."""
+        ...
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """Plain JSON values kept with the session: model, serial, firmware, factory intrinsics."""
         ...
 
     def grab(self) -> Frame:

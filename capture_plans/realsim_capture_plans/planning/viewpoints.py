@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.geometry import se3
-from realsim_capture_plans.collision import CollisionModel
-from realsim_capture_plans.kinematics import DhChain
-from realsim_capture_plans.plan_record import PlanConfig
+from realsim_capture_plans.arms.kinematics import DhChain
+from realsim_capture_plans.collision.model import CollisionModel
+from realsim_capture_plans.planning.record import PlanConfig
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]

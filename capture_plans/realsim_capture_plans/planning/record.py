@@ -1,24 +1,17 @@
 """What a capture plan is, and the numbers it is made with."""
 
-import hashlib
-import json
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim.geometry import se3
-from realsim_capture_plans.collision import Box, CollisionModel
-from realsim_capture_plans.kinematics import CHAINS, JOINTS, DhChain
+from realsim_capture_plans.arms.kinematics import JOINTS, DhChain
+from realsim_capture_plans.collision.model import CollisionModel
+from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
 
 Array = NDArray[np.float64]
-
-
-def default_mount() -> Array:
-    """Return the nominal T_ee_cam (4, 4): beside the flange, optical axis parallel to tool z."""
-    return se3.from_translation([0.0, -0.065, 0.035])
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -75,6 +68,9 @@ class PlanConfig:
     """Of the leading joint [rad/s] (ur_rtde's moveJ default)."""
     acceleration: float = 1.4
     """Of the leading joint [rad/s^2] (ur_rtde's moveJ default)."""
+    settle_s: float = 0.3
+    """Waited at least at every view before the exposure [s]: a UR5 with a light camera rings for
+    about 0.2 s after a stop."""
     tour_rounds: int = 8
     """Rounds of order and branch choice; they stop changing after three or four."""
 
@@ -96,10 +92,10 @@ class PlanConfig:
         if min(self.speed, self.acceleration, self.clearance_m, self.edge_step_rad) <= 0:
             raise InputError("PlanConfig: speed, acceleration, clearance, step must be positive.")
 
-    def collision_model(
-        self, chain: DhChain, T_ee_cam: ArrayLike, center: ArrayLike, kind: str
-    ) -> CollisionModel:
-        """Return the collision model of a plan of this kind about `center` (3,) in base [m]."""
+    def work_cell(
+        self, center: ArrayLike, kind: str, obstacles: tuple[tuple[str, Box], ...] = ()
+    ) -> WorkCell:
+        """Return table, keep-out box and obstacles of a plan of this kind about center (3,) [m]."""
         x0, x1, y0, y1 = self.table_rectangle_m
         top = self.table_height_m
         size = self.keep_out_m if kind == "hemisphere" else self.board_keep_out_m
@@ -109,7 +105,7 @@ class PlanConfig:
             lower=(x - size[0] / 2, y - size[1] / 2, -np.inf),
             upper=(x + size[0] / 2, y + size[1] / 2, top + size[2]),
         )
-        return CollisionModel(chain, T_ee_cam, table, keep_out, self.clearance_m)
+        return WorkCell(table=table, keep_out=keep_out, obstacles=obstacles)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -120,19 +116,17 @@ class CapturePlan:
     between home, the via points and the views have been checked for collision.
     """
 
-    kind: Literal["hemisphere", "calibration"]
-    robot: str
-    """Key of `kinematics.CHAINS`."""
+    kind: Literal["hemisphere", "calibration", "imported"]
+    chain: DhChain
+    """The arm that the plan was made for, with its controller's calibration where it is known."""
+    mount: Mount
+    """The camera mount that the plan was made for."""
+    cell: WorkCell
+    """What the moves were checked against."""
     home: Array
     """(6,) where the tour begins [rad]."""
     joints: Array
     """(N, 6) joints at each view [rad]."""
-    Ts_base_ee: Array
-    """(N, 4, 4) flange at each view [m]."""
-    Ts_base_cam: Array
-    """(N, 4, 4) camera at each view, if the mount is as nominal [m]."""
-    T_ee_cam_nominal: Array
-    """(4, 4) the mount that the plan was made for [m]."""
     center_world: Array
     """(3,) what the views look at [m]."""
     vias: tuple[tuple[int, Array], ...]
@@ -141,23 +135,22 @@ class CapturePlan:
     """The most top-down view."""
     config: PlanConfig
     metrics: dict[str, float] = field(default_factory=dict)
-    """How good the plan is; the keys are explained in the README."""
+    """How good the plan is; the keys are explained in the stage's README."""
+    Ts_base_ee: Array = field(init=False)
+    """(N, 4, 4) flange at each view [m], by the chain."""
+    Ts_base_cam: Array = field(init=False)
+    """(N, 4, 4) camera at each view, if the mount is as nominal [m]."""
 
     def __post_init__(self) -> None:
-        """Check shapes and freeze the arrays."""
+        """Check shapes, place the flange and the camera, and freeze the arrays."""
         n = len(self.joints)
-        shapes = {
-            "home": (JOINTS,), "joints": (n, JOINTS), "Ts_base_ee": (n, 4, 4),
-            "Ts_base_cam": (n, 4, 4), "T_ee_cam_nominal": (4, 4), "center_world": (3,),
-        }  # fmt: skip
+        shapes = {"home": (JOINTS,), "joints": (n, JOINTS), "center_world": (3,)}
         for name, shape in shapes.items():
             array = np.array(getattr(self, name), dtype=np.float64)
             if array.shape != shape or not np.all(np.isfinite(array)):
                 raise InputError(f"plan: {name} has shape {array.shape}; {shape} is needed.")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
-        if self.robot not in CHAINS:
-            raise InputError(f"robot '{self.robot}' is not known; there are {', '.join(CHAINS)}.")
         if n == 0 or not 0 <= self.reference_view < n:
             raise InputError(f"reference view {self.reference_view} is not one of {n} views.")
         vias: list[tuple[int, Array]] = []
@@ -168,26 +161,30 @@ class CapturePlan:
             q.setflags(write=False)
             vias.append((k, q))
         object.__setattr__(self, "vias", tuple(vias))
+        Ts_base_ee = self.chain.forward(self.joints)
+        for name, Ts in (
+            ("Ts_base_ee", Ts_base_ee),
+            ("Ts_base_cam", Ts_base_ee @ self.mount.T_ee_cam),
+        ):
+            Ts.setflags(write=False)
+            object.__setattr__(self, name, Ts)
 
     @property
-    def content(self) -> dict[str, Any]:
-        """The plan as plain JSON values, without schema and hash."""
-        arrays = ("home", "joints", "Ts_base_ee", "Ts_base_cam", "T_ee_cam_nominal", "center_world")
-        return {
-            "kind": self.kind,
-            "robot": self.robot,
-            **{name: getattr(self, name).tolist() for name in arrays},
-            "vias": [[k, q.tolist()] for k, q in self.vias],
-            "reference_view": self.reference_view,
-            "config": {k: list(v) if isinstance(v, tuple) else v for k, v in _fields(self.config)},
-            "metrics": self.metrics,
-        }
+    def robot(self) -> str:
+        """Name of the arm's model."""
+        return self.chain.name
+
+    @property
+    def T_ee_cam_nominal(self) -> Array:
+        """The (4, 4) mount that the plan was made for [m]."""
+        return self.mount.T_ee_cam
 
     @property
     def content_hash(self) -> str:
-        """The sha256 of the content, written as JSON with sorted keys and no spaces."""
-        text = json.dumps(self.content, sort_keys=True, separators=(",", ":"), allow_nan=False)
-        return hashlib.sha256(text.encode()).hexdigest()
+        """The sha256 of the plan's content, see `content.plan_content`."""
+        from realsim_capture_plans.planning.content import content_hash
+
+        return content_hash(self)
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -201,15 +198,9 @@ class CapturePlan:
 
     def collision_model(self) -> CollisionModel:
         """Return the model that the plan was checked with."""
-        return self.config.collision_model(
-            CHAINS[self.robot], self.T_ee_cam_nominal, self.center_world, self.kind
-        )
+        return CollisionModel(self.chain, self.mount, self.cell, self.config.clearance_m)
 
     def directions(self) -> Array:
         """Return the unit vectors (N, 3) from the centre to the cameras."""
         d = self.Ts_base_cam[:, :3, 3] - self.center_world
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True), dtype=np.float64)
-
-
-def _fields(config: PlanConfig) -> list[tuple[str, Any]]:
-    return list(asdict(config).items())

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
-from realsim_capture_plans.collision import CollisionModel
-from realsim_capture_plans.ordering import Edge, move_seconds, tour
-from realsim_capture_plans.plan_record import PlanConfig
+from realsim_capture_plans.collision.model import CollisionModel
+from realsim_capture_plans.planning.ordering import Edge, move_seconds, tour
+from realsim_capture_plans.planning.record import PlanConfig
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_capture_plans.kinematics import DhChain
+from realsim_capture_plans.arms.kinematics import DhChain
+from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
 
 Array = NDArray[np.float64]
 GROUPS = ("self", "table", "scene")
@@ -47,16 +48,6 @@ class Capsule:
     """[m] in the frame."""
     radius: float
     """[m]"""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Box:
-    """An axis-aligned box in base; infinite bounds make it a half-space."""
-
-    lower: tuple[float, float, float]
-    """Least corner [m]."""
-    upper: tuple[float, float, float]
-    """Greatest corner [m]."""
 
 
 def arm_capsules(chain: DhChain) -> list[Capsule]:
@@ -140,21 +131,18 @@ TABLE_EXEMPT = ("base", "shoulder", "root")
 class CollisionModel:
     """Clearances of one arm with one camera mount over one table and one keep-out box."""
 
-    def __init__(
-        self, chain: DhChain, T_ee_cam: ArrayLike, table: Box, keep_out: Box, clearance_m: float
-    ) -> None:
+    def __init__(self, chain: DhChain, mount: Mount, cell: WorkCell, clearance_m: float) -> None:
         """Build the model.
 
         Args:
             chain: the arm.
-            T_ee_cam: (4, 4) camera mount [m].
-            table: the table's volume in base, its top the upper z.
-            keep_out: the volume that only the objects may fill, in base.
+            mount: the camera on the flange.
+            cell: what stands round the arm.
             clearance_m: least distance that counts as free [m].
         """
         self.chain = chain
         self.clearance_m = clearance_m
-        capsules = arm_capsules(chain) + camera_capsules(T_ee_cam)
+        capsules = arm_capsules(chain) + camera_capsules(mount.T_ee_cam)
         parts = [c.part for c in capsules]
         self._frame = np.array([c.frame for c in capsules])
         self._start = np.array([c.start for c in capsules], dtype=np.float64)
@@ -168,7 +156,7 @@ class CollisionModel:
         ]
         self._pairs = np.array(pairs)
         self._free_parts = np.array([i for i, p in enumerate(parts) if p not in TABLE_EXEMPT])
-        self._boxes = {"table": table, "scene": keep_out}
+        self._boxes = {"table": cell.table, "scene": cell.keep_out}
 
     def clearance(self, joints: ArrayLike) -> dict[str, Array]:
         """Return the least distance (N,) [m] per group at joints (N, 6); negative = penetration.

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from realsim_capture_plans.plan_record import PlanConfig
+from realsim_capture_plans.planning.record import PlanConfig
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]

@@ -1,0 +1,1 @@
+"""The arm: kinematics both ways, limits, and the controller's own calibration."""

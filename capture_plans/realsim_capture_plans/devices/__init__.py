@@ -1,0 +1,1 @@
+"""Arms and depth cameras behind two interfaces, on the makers' own libraries."""

@@ -1,0 +1,1 @@
+"""Which views, in which order, by which moves; how good a plan is."""
