@@ -1,5 +1,6 @@
 """A session on disk: atomic, checksummed, resumable."""
 
+from realsim.store.atomic import StorageError
 from realsim.store.records_json import tag_board_from_json, tag_board_to_json
 from realsim.store.results import (
     load_board,
@@ -15,6 +16,7 @@ from realsim.store.session_store import SessionStore
 
 __all__ = [
     "SessionStore",
+    "StorageError",
     "load_board",
     "load_grasps",
     "load_hand_eye",

@@ -1,21 +1,57 @@
 """Files that are there whole or not at all.
 
 A file is written under a temporary name in the same folder, flushed to the disk, and renamed; a
-rename within one folder is atomic. What a killed process leaves behind is a temporary file that
-nobody reads; whoever owns the folder asks for `leftovers` and deletes them.
+rename within one folder is atomic. Then the folder is flushed, too: only that makes the new name
+outlive a power cut. So when a call returns, its file is on the disk, and what is written by the
+next call can never be there without it. What a killed process leaves behind is a temporary file
+that nobody reads; whoever owns the folder asks for `leftovers` and deletes them.
+
+A full disk is an OSError: the file, and the lines that were there, are as before the call.
 """
 
+import contextlib
+import errno
 import io
 import json
 import os
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from realsim.errors import RealsimError
+
 TEMPORARY_SUFFIX = ".part"
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What the system says when there is no room: disk, quota, size of one file."""
+BYTES_PER_MB = 1e6
+
+
+class StorageError(RealsimError):
+    """The disk is full or refuses to be written; what was stored before is as it was."""
+
+
+@contextlib.contextmanager
+def storing(folder: Path, what: str) -> Generator[None]:
+    """Turn the system's refusal to write into a StorageError that says what to do."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in FULL:
+            free = shutil.disk_usage(folder).free / BYTES_PER_MB
+            raise StorageError(
+                f"there is no room for {what} in {folder} ({error.strerror}; {free:.1f} MB free). "
+                "Everything stored before is intact. Make room, then run the same command again: "
+                "it goes on from here."
+            ) from error
+        raise StorageError(
+            f"{what} could not be written in {folder} ({error.strerror or error}). Everything "
+            "stored before is intact. Check that the disk is there and that the folder may be "
+            "written, then run the same command again: it goes on from here."
+        ) from error
 
 
 def _temporary(path: Path) -> Path:
@@ -23,8 +59,29 @@ def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}{TEMPORARY_SUFFIX}")
 
 
+def _sync_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder and those above it; each name is flushed to the disk."""
+    if folder.is_dir():
+        return
+    _make_folder(folder.parent)
+    folder.mkdir(exist_ok=True)
+    _sync_folder(folder.parent)
+
+
 def write_bytes(
-    path: Path | str, data: bytes, *, announce: Callable[[], None] | None = None
+    path: Path | str,
+    data: bytes,
+    *,
+    announce: Callable[[], None] | None = None,
+    flush: bool = True,
 ) -> None:
     """Write the file whole or not at all; folders are made as needed.
 
@@ -33,20 +90,25 @@ def write_bytes(
         data: its bytes.
         announce: called when the bytes are on the disk and the rename is next. Who keeps a list of
             files writes it here, and finishes the rename after a kill (see `leftovers`).
+        flush: False leaves it to the system when the bytes reach the disk: a kill still leaves
+            the file whole, a power cut may not. For what can be made again from other files.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(path.parent)
     temporary = _temporary(path)
     announced = False
     try:
         with temporary.open("wb") as file:
             file.write(data)
             file.flush()
-            os.fsync(file.fileno())
+            if flush:
+                os.fsync(file.fileno())
         if announce is not None:
             announce()
             announced = True
         os.replace(temporary, path)
+        if flush:
+            _sync_folder(path.parent)
     except BaseException:
         if not announced:
             temporary.unlink(missing_ok=True)
@@ -85,18 +147,29 @@ def write_npz(path: Path | str, **arrays: ArrayLike) -> None:
 
 
 def append_line(path: Path | str, line: str) -> None:
-    """Append one line in one write and flush it to the disk.
+    """Append one line in one write and flush it to the disk; all of it or, on an error, nothing.
 
     A kill can tear the line; `complete_lines` does not see it and `repair_lines` removes it.
     """
+    path = Path(path)
+    is_new = not path.exists()
     handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
     try:
-        data = memoryview((line + "\n").encode("utf-8"))
-        while data:
-            data = data[os.write(handle, data) :]
-        os.fsync(handle)
+        before = os.fstat(handle).st_size
+        try:
+            data = memoryview((line + "\n").encode("utf-8"))
+            while data:
+                data = data[os.write(handle, data) :]
+            os.fsync(handle)
+        except BaseException:
+            # The disk is full: half a line would spoil the one that is appended after it.
+            with contextlib.suppress(OSError):
+                os.ftruncate(handle, before)
+            raise
     finally:
         os.close(handle)
+    if is_new:
+        _sync_folder(path.parent)
 
 
 def complete_lines(path: Path | str) -> list[str]:

@@ -1,9 +1,9 @@
 """The list of a session's files with their checksums: `manifest.jsonl`.
 
-One line {"path", "sha256", "bytes"} is appended when a file's bytes are complete on the disk; the
-last line of a path wins. A line torn by a kill is cut off when the manifest is next opened. A file
-gets its name right after its line: a kill between the two leaves the bytes under a temporary name,
-and `finish_interrupted` gives them their name.
+One line {"path", "sha256", "bytes", "check"} is appended when a file's bytes are complete on the
+disk; the last line of a path wins. A line torn by a kill is cut off when the manifest is next
+opened. A file gets its name right after its line: a kill between the two leaves the bytes under a
+temporary name, and `finish_interrupted` gives them their name.
 """
 
 import hashlib
@@ -18,6 +18,11 @@ from realsim.errors import InputError
 from realsim.store import atomic
 
 NAME = "manifest.jsonl"
+CHECK = "check"
+CHECK_DIGITS = 16
+"""A damaged line of the list must not make a sound file look damaged: every line has a checksum."""
+SHOWN = 80
+"""Characters of a damaged line that a message shows."""
 REMOVED = -1
 """The size that a line gives when its file was taken away."""
 
@@ -47,12 +52,60 @@ def entry_of(path: str, data: bytes) -> Entry:
     return Entry(path=path, sha256=hashlib.sha256(data).hexdigest(), bytes=len(data))
 
 
+def line_of(entry: Entry) -> str:
+    """Return the manifest's line of an entry, with a checksum of the line itself."""
+    body = json.dumps({"path": entry.path, "sha256": entry.sha256, "bytes": entry.bytes})
+    return f'{body[:-1]}, "{CHECK}": "{_check_of(body)}"}}'
+
+
+def _check_of(body: str) -> str:
+    return hashlib.sha256(body.encode()).hexdigest()[:CHECK_DIGITS]
+
+
+def entry_from(line: str) -> Entry:
+    """Return the entry of a manifest's line.
+
+    Raises:
+        ValueError: it is none, or not the line that was written.
+    """
+    try:
+        record: dict[str, Any] = json.loads(line)
+        check = record.pop(CHECK, None)
+        entry = Entry(
+            path=str(record["path"]), sha256=str(record["sha256"]), bytes=int(record["bytes"])
+        )
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"is not a manifest entry ({line[:SHOWN]!r})") from error
+    if check is not None and check != _check_of(json.dumps(record)):
+        raise ValueError(f"has another checksum than was written ({line[:SHOWN]!r})")
+    return entry
+
+
+def fault_of(folder: Path, entry: Entry) -> Fault | None:
+    """Return what is wrong with a listed file; None if it has the bytes that were written."""
+    file = folder / entry.path
+    if not file.is_file():
+        return Fault(path=entry.path, kind="missing", found="no file")
+    data = file.read_bytes()
+    if entry_of(entry.path, data) == entry:
+        return None
+    found = f"{len(data)} bytes instead of {entry.bytes}"
+    if len(data) == entry.bytes:
+        found = f"{len(data)} bytes with another checksum"
+    return Fault(path=entry.path, kind="changed", found=found)
+
+
 class Manifest:
     """The manifest of one folder."""
 
     def __init__(self, folder: Path) -> None:
-        """Read the manifest of the folder and repair a torn last line."""
+        """Read the manifest of the folder and repair a torn last line.
+
+        Raises:
+            InputError: a line is no entry.
+        """
         self._folder = folder
+        self._due: list[Entry] = []
         self._file = folder / NAME
         atomic.repair_lines(self._file)
         self._entries: dict[str, Entry] = {}
@@ -65,14 +118,12 @@ class Manifest:
 
     def _parsed(self, line: str, number: int) -> Entry:
         try:
-            record: dict[str, Any] = json.loads(line)
-            return Entry(
-                path=str(record["path"]), sha256=str(record["sha256"]), bytes=int(record["bytes"])
-            )
-        except (ValueError, KeyError, TypeError) as error:
+            return entry_from(line)
+        except ValueError as error:
             raise InputError(
-                f"{self._file}, line {number} is not a manifest entry ({line[:80]!r}). Lines with "
-                "path, sha256 and bytes are expected; delete the line to go on without that check."
+                f"{self._file}, line {number} {error}. "
+                "`realsim check --repair` on the session takes the line out; its file is then "
+                "listed anew."
             ) from error
 
     @property
@@ -86,18 +137,27 @@ class Manifest:
 
     def add(self, entries: Iterable[Entry]) -> None:
         """Append entries of files that are complete, in one write."""
-        new = list(entries)
-        lines = [json.dumps({"path": e.path, "sha256": e.sha256, "bytes": e.bytes}) for e in new]
-        if lines:
-            atomic.append_line(self._file, "\n".join(lines))
+        new = [*self._due, *entries]
+        if new:
+            atomic.append_line(self._file, "\n".join(line_of(e) for e in new))
             self._entries.update({e.path: e for e in new})
+            self._due = []
+
+    def add_sealed(self, entries: Iterable[Entry]) -> None:
+        """Append entries of files that count already: what a full disk refuses now comes later."""
+        self._due = [*self._due, *entries]
+        self.add(())
 
     def remove(self, path: str) -> None:
         """Take a file away and off the list; one that is not there is no error."""
         (self._folder / path).unlink(missing_ok=True)
+        self.forget(path)
+
+    def forget(self, path: str) -> None:
+        """Take a path off the list; the file stays."""
         if path in self._entries:
-            line = json.dumps({"path": path, "sha256": "", "bytes": REMOVED})
-            atomic.append_line(self._file, line)
+            gone = Entry(path=path, sha256="", bytes=REMOVED)
+            atomic.append_line(self._file, line_of(gone))
             del self._entries[path]
 
     def write(self, path: str, data: bytes) -> None:
@@ -116,16 +176,5 @@ class Manifest:
 
     def verify(self) -> list[Fault]:
         """Return every listed file that is missing or has other bytes than were written."""
-        faults: list[Fault] = []
-        for path, entry in self._entries.items():
-            file = self._folder / path
-            if not file.is_file():
-                faults.append(Fault(path=path, kind="missing", found="no file"))
-                continue
-            data = file.read_bytes()
-            if entry_of(path, data) != entry:
-                found = f"{len(data)} bytes instead of {entry.bytes}"
-                if len(data) == entry.bytes:
-                    found = f"{len(data)} bytes with another checksum"
-                faults.append(Fault(path=path, kind="changed", found=found))
-        return faults
+        faults = (fault_of(self._folder, entry) for entry in self._entries.values())
+        return [fault for fault in faults if fault is not None]

@@ -7,18 +7,19 @@
       robot.jsonl             one line per view, appended after its images are on the disk
       manifest.jsonl          checksum of every file
 
-A view is complete when its line in robot.jsonl is whole. Killing the process at any moment loses at
-most the view in flight; opening the folder again cleans up and goes on.
+A view is complete when its line in robot.jsonl is whole. Killing the process at any moment, a power
+cut or a full disk loses at most the view in flight; opening the folder again cleans up and goes on.
+
+The order of `add_view`, each step on the disk before the next begins: the images' bytes, their
+names, the line in robot.jsonl (from here on the view counts), the lines in manifest.jsonl, and
+scene_camera.json, which only repeats what the others say. `open` does what a kill left undone.
 """
 
 import json
-import platform
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,26 +28,28 @@ from realsim.errors import InputError
 from realsim.formats import bop_units, images
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import atomic, records_json
+from realsim.store.atomic import storing
+from realsim.store.header import SESSION_FILE, checked_header, new_header
+from realsim.store.json_files import read_json_file
 from realsim.store.manifest import Fault, Manifest, entry_of
+from realsim.store.robot_lines import RobotLines, record_of
+from realsim.store.view_images import check_sizes, depth_path, rgb_path
+
+if TYPE_CHECKING:
+    from realsim.store.session_check import CheckReport
+    from realsim.store.session_repair import RepairReport
+
+__all__ = ["SESSION_FILE", "SessionStore", "depth_path", "read_json_file", "rgb_path"]
 
 Array = NDArray[np.float64]
 
-FORMAT = "realsim session"
-FORMAT_VERSION = 1
-SESSION_FILE = "session.json"
 CAMERA_FILE = "scene_camera.json"
 ROBOT_FILE = "robot.jsonl"
-VERSIONS_OF = ("realsim", "numpy", "opencv-python-headless")
-
-
-def rgb_path(index: int) -> str:
-    """Return where the colour image of a view is, relative to the session."""
-    return f"rgb/{index:06d}.png"
-
-
-def depth_path(index: int) -> str:
-    """Return where the depth image of a view is, relative to the session."""
-    return f"depth/{index:06d}.png"
+EAGER_VIEWS = 256
+"""Up to so many views scene_camera.json is written anew with each; beyond, ..."""
+LAZY_GROWTH = 1.1
+"""... when it has grown by this factor, so that a view costs the same however many there are. The
+rest is written by the next file, by `close`, or by the next `open`."""
 
 
 class SessionStore:
@@ -57,10 +60,13 @@ class SessionStore:
         self.folder = folder
         self._header: dict[str, Any] = header
         self._manifest = Manifest(folder)
-        self._robot = _read_robot_lines(folder / ROBOT_FILE)
+        self._lines = RobotLines(folder / ROBOT_FILE)
+        self._robot = self._lines.records
         self._session: CaptureSession | None = None
         self._views: dict[int, View] = {}
         self._camera_lines: dict[int, str] = {}
+        self._cameras_written = self._cameras_due = 0
+        self._intrinsics = records_json.intrinsics_from_json(header["camera"])
 
     # --- making and opening -------------------------------------------------------------------
 
@@ -89,22 +95,12 @@ class SessionStore:
                 f"session '{session.name}' brings {len(session.views)} views without images; "
                 "create it with views=() and give each view with add_view."
             )
-        header: dict[str, Any] = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "name": session.name,
-            "created": datetime.now(UTC).isoformat(timespec="seconds"),
-            "units": {"length": "m", "angle": "rad", "time": "s", "scene_camera.json": "mm"},
-            "camera": records_json.intrinsics_to_json(session.intrinsics),
-            "depth_unit_m": session.depth_unit_m,
-            "T_world_cam": {},
-            "versions": _versions(),
-            "extra": extra or {},
-        }
+        header = new_header(session, extra or {})
         folder.mkdir(parents=True, exist_ok=True)
         store = cls(folder, header)
-        store._write_header()
-        store._write_cameras()
+        with storing(folder, SESSION_FILE):
+            store._write_header()
+            store._write_cameras()
         return store
 
     @classmethod
@@ -112,7 +108,8 @@ class SessionStore:
         """Open a session, clean up after a kill, and list what a kill kept off the manifest.
 
         Raises:
-            InputError: no session there, or one of a newer format.
+            InputError: no session there, one of a newer format, or a damaged one.
+            StorageError: what a kill left undone cannot be written.
         """
         folder = Path(folder)
         path = folder / SESSION_FILE
@@ -121,37 +118,47 @@ class SessionStore:
                 f"{folder} holds no session: {SESSION_FILE} is not there. The folder of a capture "
                 "session is expected; a BOP dataset is read by realsim.formats.bop."
             )
-        header = _read_object(path)
-        if header.get("format") != FORMAT or not isinstance(header.get("format_version"), int):
-            raise InputError(
-                f"{path} is not the header of a '{FORMAT}': it says format "
-                f"{header.get('format')!r}, version {header.get('format_version')!r}."
-            )
-        if header["format_version"] > FORMAT_VERSION:
-            raise InputError(
-                f"{path} has format version {header['format_version']}; this realsim reads up to "
-                f"{FORMAT_VERSION}. Use a newer realsim."
-            )
-        Manifest(folder).finish_interrupted()
-        atomic.repair_lines(folder / ROBOT_FILE)
-        store = cls(folder, _read_object(path))
-        store._finish_interrupted()
+        header = checked_header(path)
+        with storing(folder, "what an interrupted run left undone"):
+            Manifest(folder).finish_interrupted()
+            atomic.repair_lines(folder / ROBOT_FILE)
+            if path.is_file():  # an interrupted write of the header has been finished by now
+                header = checked_header(path)
+            store = cls(folder, header)
+            store._finish_interrupted()
         return store
 
     def _finish_interrupted(self) -> None:
         """Do what a kill between a view's robot line and its manifest lines left undone."""
-        path = self.folder / ROBOT_FILE
-        lines = path.read_bytes() if path.is_file() else b""
-        listed = self._manifest.entries.get(ROBOT_FILE)
-        unlisted = lines[0 if listed is None else listed.bytes :]
-        if unlisted:
-            views = [int(json.loads(line)["index"]) for line in unlisted.splitlines()]
-            names = [p for i in views for p in self._files_of(i)] + [ROBOT_FILE]
+        listed, path = self._manifest.entries, self.folder / ROBOT_FILE
+        data = path.read_bytes() if path.is_file() else b""
+        known = listed.get(ROBOT_FILE)
+        start = 0 if known is None else known.bytes
+        # Only what was appended is listed: a file that was changed stays a fault of `verify`.
+        if known is None or entry_of(ROBOT_FILE, data[:start]) == known:
+            new = {int(record_of(line)["index"]) for line in data[start:].decode().splitlines()}
+            names = [
+                p for i in self._robot for p in self._files_of(i) if i in new or p not in listed
+            ]
+            names += [ROBOT_FILE] if new else []
             present = [p for p in names if (self.folder / p).is_file()]
             self._manifest.add(entry_of(p, (self.folder / p).read_bytes()) for p in present)
-        cameras = self.folder / CAMERA_FILE
-        if not cameras.is_file() or cameras.read_bytes() != self._camera_bytes():
+        self._camera_lines = {v.index: self._camera_line(v) for v in self.session.views}
+        cameras, data = self.folder / CAMERA_FILE, self._camera_bytes()
+        is_same = cameras.is_file() and cameras.read_bytes() == data
+        if not is_same or self._manifest.entries.get(CAMERA_FILE) != entry_of(CAMERA_FILE, data):
             self._write_cameras()
+        self._cameras_written = len(self._camera_lines)
+
+    def close(self) -> None:
+        """Write what `add_view` has put off; the store can still be used."""
+        self._write_due_cameras()
+
+    def __enter__(self) -> "SessionStore":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     # --- what is there ------------------------------------------------------------------------
 
@@ -161,7 +168,7 @@ class SessionStore:
         if self._session is None:
             self._session = CaptureSession(
                 name=str(self._header["name"]),
-                intrinsics=records_json.intrinsics_from_json(self._header["camera"]),
+                intrinsics=self._intrinsics,
                 views=tuple(self._view(i) for i in sorted(self.completed)),
                 depth_unit_m=float(self._header["depth_unit_m"]),
             )
@@ -170,9 +177,12 @@ class SessionStore:
     @property
     def completed(self) -> set[int]:
         """Numbers of the views whose robot line is whole and whose images are there."""
-        return {
-            i for i in self._robot if all((self.folder / p).is_file() for p in self._files_of(i))
-        }
+        return {i for i in self._robot if self._is_complete(i)}
+
+    def _is_complete(self, index: int) -> bool:
+        return index in self._robot and all(
+            (self.folder / p).is_file() for p in self._files_of(index)
+        )
 
     @property
     def extra(self) -> dict[str, Any]:
@@ -204,7 +214,12 @@ class SessionStore:
     # --- images -------------------------------------------------------------------------------
 
     def add_view(
-        self, view: View, rgb: NDArray[np.uint8], depth_m: NDArray[Any] | None = None
+        self,
+        view: View,
+        rgb: NDArray[np.uint8],
+        depth_m: NDArray[Any] | None = None,
+        *,
+        depth_counts: NDArray[np.uint16] | None = None,
     ) -> None:
         """Write one view: colour, then depth, then its robot line, then the checksums.
 
@@ -212,41 +227,45 @@ class SessionStore:
             view: number, robot state and time; its T_world_cam is kept where it is known.
             rgb: (H, W, 3) uint8.
             depth_m: (H, W) depth along z [m]; what does not fit into 16 bit becomes 0 = none.
+            depth_counts: (H, W) uint16 of the session's depth unit, instead of `depth_m`.
 
         Raises:
             InputError: the view is there already, or an image does not have the camera's size.
+            StorageError: the disk is full, or refuses; the views before are as they were.
         """
         if view.index < 0:
             raise InputError(f"view number {view.index}: a number of 0 or more is needed.")
-        if view.index in self.completed:
+        if self._is_complete(view.index):
             raise InputError(
                 f"view {view.index} is already in {self.folder}; skip what `completed` lists, or "
                 "start a new session."
             )
-        camera = self.session.intrinsics
-        size = (camera.height, camera.width)
-        found = rgb.shape[:2] if depth_m is None else (*rgb.shape[:2], *depth_m.shape)
-        if found not in (size, size + size) or rgb.ndim != 3:
-            raise InputError(
-                f"view {view.index}: colour {rgb.shape} and depth "
-                f"{None if depth_m is None else depth_m.shape} do not have the camera's size "
-                f"{size} (height, width)."
-            )
-        files = {rgb_path(view.index): images.png_bytes(rgb)}
+        size = (self._intrinsics.height, self._intrinsics.width)
+        check_sizes(view.index, size, rgb, depth_m, depth_counts)
+        counts = depth_counts
         if depth_m is not None:
-            counts = images.depth_counts(depth_m, self.session.depth_unit_m)
+            counts = images.depth_counts(depth_m, float(self._header["depth_unit_m"]))
+        files = {rgb_path(view.index): images.png_bytes(rgb)}
+        if counts is not None:
             files[depth_path(view.index)] = images.png_bytes(counts)
-        for path, data in files.items():
-            atomic.write_bytes(self.folder / path, data)
-        record = records_json.view_to_json(view) | {"depth": depth_m is not None}
-        atomic.append_line(self.folder / ROBOT_FILE, json.dumps(record, allow_nan=False))
-        self._robot[view.index] = record
-        self._session = None
-        self._views.pop(view.index, None)
-        self._camera_lines.pop(view.index, None)
-        files[ROBOT_FILE] = (self.folder / ROBOT_FILE).read_bytes()
-        self._manifest.add(entry_of(path, data) for path, data in files.items())
-        self._write_cameras()
+        entries = [entry_of(path, data) for path, data in files.items()]
+        record = records_json.view_to_json(view) | {"depth": counts is not None}
+        with storing(self.folder, f"view {view.index}"):
+            for path, data in files.items():
+                atomic.write_bytes(self.folder / path, data)
+            self._lines.append(record)
+            self._session = None
+            self._views.pop(view.index, None)
+            self._camera_lines[view.index] = self._camera_line(self._view(view.index))
+            self._cameras_due += 1
+            if len(self._camera_lines) <= max(EAGER_VIEWS, LAZY_GROWTH * self._cameras_written):
+                # Not flushed: `open` writes it again if a power cut loses it.
+                data = self._camera_bytes()
+                atomic.write_bytes(self.folder / CAMERA_FILE, data, flush=False)
+                entries.append(entry_of(CAMERA_FILE, data))
+                self._cameras_written, self._cameras_due = len(self._camera_lines), 0
+            # The list of views comes last: where its line is missing, a run was interrupted.
+            self._manifest.add_sealed([*entries, self._lines.entry(ROBOT_FILE)])
 
     def rgb(self, index: int) -> NDArray[np.uint8]:
         """Return the colour image (H, W, 3) uint8 of a view."""
@@ -294,27 +313,35 @@ class SessionStore:
             poses[str(index)] = None if checked is None else checked.tolist()
         camera = records_json.intrinsics_to_json(intrinsics)
         self._header = {**self._header, "camera": camera, "T_world_cam": poses}
+        self._intrinsics = intrinsics
         self._session = None
         self._views.clear()
-        self._camera_lines.clear()
+        self._cameras_due += 1
         self._write_header()
-        self._write_cameras()
+        self._write_due_cameras()
 
     def _write_header(self) -> None:
-        self.write_json(SESSION_FILE, self._header)
+        self._manifest.write(SESSION_FILE, atomic.json_bytes(self._header))
+
+    def _camera_line(self, view: View) -> str:
+        unit_m = float(self._header["depth_unit_m"])
+        entry = bop_units.camera_entry(self._intrinsics, unit_m, view.T_world_cam)
+        return f'"{view.index}": {json.dumps(entry, allow_nan=False)}'
 
     def _camera_bytes(self) -> bytes:
         """Return scene_camera.json, one line per image."""
-        camera, unit_m = self.session.intrinsics, self.session.depth_unit_m
-        for v in self.session.views:
-            if v.index not in self._camera_lines:
-                entry = bop_units.camera_entry(camera, unit_m, v.T_world_cam)
-                self._camera_lines[v.index] = f'"{v.index}": {json.dumps(entry, allow_nan=False)}'
-        lines = [self._camera_lines[v.index] for v in self.session.views]
+        lines = [self._camera_lines[i] for i in sorted(self._camera_lines)]
         return ("{\n" + ",\n".join(lines) + "\n}\n").encode("ascii")
 
     def _write_cameras(self) -> None:
-        self.write_bytes(CAMERA_FILE, self._camera_bytes())
+        self._camera_lines = {v.index: self._camera_line(v) for v in self.session.views}
+        self._manifest.write(CAMERA_FILE, self._camera_bytes())
+        self._cameras_written, self._cameras_due = len(self._camera_lines), 0
+
+    def _write_due_cameras(self) -> None:
+        if self._cameras_due:
+            with storing(self.folder, CAMERA_FILE):
+                self._write_cameras()
 
     # --- other files --------------------------------------------------------------------------
 
@@ -337,9 +364,15 @@ class SessionStore:
         return self.path(relative).is_file()
 
     def write_bytes(self, relative: str, data: bytes) -> None:
-        """Write a file whole or not at all, and list its checksum."""
+        """Write a file whole or not at all, and list its checksum.
+
+        Raises:
+            StorageError: the disk is full, or refuses; an earlier file of this name is as it was.
+        """
         self.path(relative)  # refuses a path that leads out of the session
-        self._manifest.write(PurePosixPath(relative).as_posix(), data)
+        self._write_due_cameras()
+        with storing(self.folder, relative):
+            self._manifest.write(PurePosixPath(relative).as_posix(), data)
 
     def write_json(self, relative: str, value: Any) -> None:
         """Write plain JSON values; NaN and infinity are refused."""
@@ -348,7 +381,9 @@ class SessionStore:
     def remove(self, relative: str) -> None:
         """Take a file away and off the manifest; one that is not there is no error."""
         self.path(relative)  # refuses a path that leads out of the session
-        self._manifest.remove(PurePosixPath(relative).as_posix())
+        with storing(self.folder, f"that {relative} is gone"):
+            self._manifest.remove(PurePosixPath(relative).as_posix())
+        self._session = None
 
     def read_json(self, relative: str) -> Any:
         """Return the values of a JSON file of the session.
@@ -374,52 +409,20 @@ class SessionStore:
         """Return every listed file that is missing or does not have the bytes that were written."""
         return self._manifest.verify()
 
+    def check(self) -> "CheckReport":
+        """Return what is sound, missing or damaged in the session's folder; nothing is changed."""
+        from realsim.store.session_check import check_session
 
-def read_json_file(path: Path | str) -> Any:
-    """Return the values of a JSON file.
+        return check_session(self.folder)
 
-    Raises:
-        InputError: it is missing or not JSON.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path} does not exist; has the step that writes it been run?")
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(
-            f"{path} is not valid JSON ({error}). Restore it, or delete it and run the step that "
-            "writes it again."
-        ) from error
+    def repair(self) -> "RepairReport":
+        """Take out what is damaged, and only that; damaged files move to `damaged/`.
 
+        A view with a damaged image counts as not captured from here on.
+        """
+        from realsim.store.session_repair import repair_session
 
-def _read_object(path: Path) -> dict[str, Any]:
-    value = read_json_file(path)
-    if not isinstance(value, dict):
-        raise InputError(f"{path} holds a {type(value).__name__}; an object is expected.")
-    return {str(key): item for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType]
-
-
-def _read_robot_lines(path: Path) -> dict[int, dict[str, Any]]:
-    """Return the whole lines of robot.jsonl by view number; the last line of a view wins."""
-    records: dict[int, dict[str, Any]] = {}
-    for number, line in enumerate(atomic.complete_lines(path), start=1):
-        try:
-            record: dict[str, Any] = json.loads(line)
-            records[int(record["index"])] = record | {"depth": bool(record["depth"])}
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"{path}, line {number} is not a view ({line[:80]!r}). Delete the line: its view "
-                "is then captured again."
-            ) from error
-    return records
-
-
-def _versions() -> dict[str, str]:
-    versions = {"python": platform.python_version()}
-    for name in VERSIONS_OF:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
+        report = repair_session(self.folder)
+        fresh = SessionStore.open(self.folder)
+        self.__dict__.update(fresh.__dict__)
+        return report

@@ -8,10 +8,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,17 +22,26 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, CaptureSession
-from realsim.store import SessionStore
-from realsim_capture_plans.arms.kinematics import UR5, JointLimits
-from realsim_capture_plans.capturing.capture import PLAN_FILE, capture
-from realsim_capture_plans.collision.model import interpolate
+from realsim.store import SessionStore, atomic
+from realsim_capture_plans.arms.kinematics import UR5, UR5E, JointLimits
+from realsim_capture_plans.capturing.capture import (
+    PLAN_FILE,
+    CaptureConfig,
+    CaptureJob,
+    capture,
+    dry_run,
+)
+from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
+from realsim_capture_plans.capturing.settle import SettleConfig
 from realsim_capture_plans.collision.mount import d405_mount
-from realsim_capture_plans.devices.interfaces import ArmState, DeviceError, Frame
+from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, DeviceError, Frame
+from realsim_capture_plans.lab.arm import HOME
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
-from realsim_capture_plans.planning.make import calibration_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 VIEWS = 10
+QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
+"""The arms of this file stand at once."""
 CAMERA = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
 
 
@@ -41,23 +51,29 @@ class KinematicArm:
 
     joints: NDArray[np.float64]
     path: list[NDArray[np.float64]] = field(default_factory=list)
-    drift_rad: list[float] = field(default_factory=list)
+    speeds: list[tuple[float, float]] = field(default_factory=list)
     clock_s: float = 0.0
     name: str = "UR5 of the test"
     limits: JointLimits = UR5.limits
+    description: dict[str, Any] = field(default_factory=dict)
 
-    def move(self, joints: ArrayLike) -> None:
+    def move(self, joints: ArrayLike, speed: float = 1.05, acceleration: float = 1.4) -> None:
         goal = np.array(joints, dtype=np.float64)
         if not self.limits.contains(goal):
             raise InputError(f"{goal.tolist()} is outside the limits.")
         self.path.append(goal)
+        self.speeds.append((speed, acceleration))
         self.joints = goal
+
+    def turn_wrist(self, angle_rad: float) -> None:
+        self.joints = self.joints + angle_rad * np.eye(6)[5]
 
     def state(self) -> ArmState:
         self.clock_s += 0.008
-        drift = self.drift_rad.pop(0) if self.drift_rad else 0.0
-        q = self.joints + drift * np.eye(6)[5]
-        return ArmState(joints=q, T_base_ee=UR5.forward(q), time_s=self.clock_s)
+        return ArmState(joints=self.joints, T_base_ee=UR5.forward(self.joints), time_s=self.clock_s)
+
+    def recover(self) -> None:
+        pass
 
 
 @dataclass
@@ -67,13 +83,17 @@ class TableCamera:
     arm: KinematicArm
     seconds: float = 0.0
     dark: int = 0
+    meanwhile: list[Callable[[], None]] = field(default_factory=list)
     name: str = "camera of the test"
     intrinsics: CameraIntrinsics = CAMERA
     depth_unit_m: float = 1e-4
+    description: dict[str, Any] = field(default_factory=dict)
 
     def grab(self) -> Frame:
         time.sleep(self.seconds)
         T = UR5.forward(self.arm.joints) @ d405_mount().T_ee_cam
+        if self.meanwhile:
+            self.meanwhile.pop(0)()
         rays = ray_table(CAMERA).reshape(-1, 3) @ T[:3, :3].T
         depth = np.where(rays[:, 2] < -1e-3, -T[2, 3] / np.minimum(rays[:, 2], -1e-3), 0.0)
         ground = T[:3, 3] + depth[:, None] * rays
@@ -83,11 +103,35 @@ class TableCamera:
             rgb = np.zeros_like(rgb)
         return Frame(rgb=rgb, depth_m=depth.reshape(48, 64).astype(np.float32), time_s=time.time())
 
+    def recover(self) -> None:
+        pass
+
 
 @lru_cache(maxsize=1)
 def plan() -> CapturePlan:
-    rng = np.random.default_rng(3)
-    return calibration_plan(VIEWS, [0.375, 0.0, 0.0], d405_mount(), PlanConfig(), rng)
+    """A ring of views that look down at the middle of the table, every third over a via point."""
+    center, config = np.array([0.40, 0.0, 0.0]), PlanConfig()
+    home = HOME + np.pi * np.eye(6)[0]  # turned to the side where the table is
+    joints: list[NDArray[np.float64]] = []
+    for turn in np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False):
+        eye = center + 0.32 * np.array([0.25 * np.cos(turn), 0.25 * np.sin(turn), 1.0])
+        z = (center - eye) / np.linalg.norm(center - eye)
+        y = UR5.forward(home)[:3, 1]  # turned about the optical axis as the home is
+        x = np.cross(y, z) / np.linalg.norm(np.cross(y, z))
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
+        q = UR5.inverse(T @ se3.invert(d405_mount().T_ee_cam))
+        near = joints[-1] if joints else home
+        joints.append(q[np.argmin(np.abs(q - near).max(-1))])
+    vias = tuple((k, (joints[k - 1] + joints[k])[None] / 2) for k in range(3, VIEWS, 3))
+    made = CapturePlan(
+        kind="calibration", chain=UR5, mount=d405_mount(),
+        cell=config.work_cell(center, "calibration"), home=home, joints=np.stack(joints),
+        center_world=center, vias=vias, reference_view=0, config=config,
+    )  # fmt: skip
+    corners = np.concatenate([made.move(k) for k in range(VIEWS)])
+    assert driven_clear(list(corners[1:]), corners[0], made)
+    return made
 
 
 def new_store(folder: Path, plan_hash: str) -> SessionStore:
@@ -107,6 +151,7 @@ def test_every_view_of_the_plan_is_stored_once(tmp_path: Path, arm: KinematicArm
         plan(), arm, TableCamera(arm), store, progress=lambda d, n: calls.append((d, n))
     )
     assert (summary.captured, summary.skipped, summary.rejected) == (VIEWS, 0, ())
+    assert summary.noted == summary.warnings == () and summary.complete
     assert calls == [(k, VIEWS) for k in range(VIEWS + 1)]
     store = SessionStore.open(tmp_path / "session")
     for view in store.session.views:
@@ -122,10 +167,13 @@ def load_plan_of(store: SessionStore) -> CapturePlan:
     return load_plan(store.path(PLAN_FILE))
 
 
-def driven_clear(path: list[NDArray[np.float64]], start: NDArray[np.float64]) -> bool:
+def driven_clear(
+    path: list[NDArray[np.float64]], start: NDArray[np.float64], of: CapturePlan | None = None
+) -> bool:
+    p = plan() if of is None else of
     corners = np.stack([start, *path])
-    samples, _ = interpolate(corners[:-1], corners[1:], plan().config.edge_step_rad)
-    return bool(np.all(plan().collision_model().free(samples)))
+    model = p.collision_model()
+    return bool(np.all(model.edges_free(corners[:-1], corners[1:], p.config.edge_step_rad)))
 
 
 @pytest.mark.parametrize("already", [{0, 1, 2}, {1, 4, 5, 9}, set(range(VIEWS)) - {6}])
@@ -133,13 +181,13 @@ def test_going_on_takes_only_what_is_missing_and_stays_clear(
     tmp_path: Path, arm: KinematicArm, already: set[int]
 ) -> None:
     full = new_store(tmp_path / "full", plan().content_hash)
-    capture(plan(), arm, TableCamera(arm), full)
+    capture(plan(), arm, TableCamera(arm), full, config=QUICK)
     part = new_store(tmp_path / "part", plan().content_hash)
     for k in already:
         part.add_view(full.session.view(k), full.rgb(k), full.depth_m(k))
     arm.path.clear()
     start = arm.joints
-    summary = capture(plan(), arm, TableCamera(arm), part)
+    summary = capture(plan(), arm, TableCamera(arm), part, config=QUICK)
     assert (summary.captured, summary.skipped) == (VIEWS - len(already), len(already))
     assert part.completed == set(range(VIEWS))
     assert driven_clear(arm.path, start)
@@ -166,9 +214,8 @@ def test_another_plan_is_refused(tmp_path: Path, arm: KinematicArm) -> None:
 
 def test_a_moving_arm_and_a_dark_frame_are_taken_again(tmp_path: Path, arm: KinematicArm) -> None:
     store = new_store(tmp_path / "s", plan().content_hash)
-    # States are read once to find the way, then twice a frame: 0.1 deg of wrist turn in the first.
-    arm.drift_rad = [0.0, 0.0, np.radians(0.1)]
-    summary = capture(plan(), arm, TableCamera(arm, dark=1), store)
+    camera = TableCamera(arm, meanwhile=[lambda: arm.turn_wrist(np.radians(0.1))])
+    summary = capture(plan(), arm, camera, store)
     assert summary.captured == VIEWS
     assert len(summary.rejected) == 1 and "moved" in summary.rejected[0][1]
     store = new_store(tmp_path / "dark", plan().content_hash)
@@ -186,9 +233,157 @@ def test_a_camera_that_stays_dark_stops_the_capture(tmp_path: Path, arm: Kinemat
 
 def test_an_arm_that_was_stopped_short_is_noticed(tmp_path: Path, arm: KinematicArm) -> None:
     store = new_store(tmp_path / "s", plan().content_hash)
-    arm.drift_rad = [0.0, 0.02, 0.02]
-    with pytest.raises(DeviceError, match="off its goal"):
-        capture(plan(), arm, TableCamera(arm), store)
+    camera = TableCamera(arm, meanwhile=[lambda: arm.turn_wrist(0.02)])
+    with pytest.raises(ArmStoppedError, match="off its goal") as stopped:
+        capture(plan(), arm, camera, store)
+    assert stopped.value.stop == "off goal" and store.completed == set()
+
+
+def test_the_arm_goes_at_the_plans_speed_or_a_share_of_it(tmp_path: Path) -> None:
+    for scale in (1.0, 0.25):
+        arm = KinematicArm(joints=plan().home.copy())
+        store = new_store(tmp_path / str(scale), plan().content_hash)
+        capture(plan(), arm, TableCamera(arm), store, config=replace(QUICK, speed_scale=scale))
+        expected = scale * plan().config.speed, scale * plan().config.acceleration
+        assert set(arm.speeds) == {expected}
+    with pytest.raises(InputError, match="at most 1 is accepted"):
+        CaptureConfig(speed_scale=1.5)
+
+
+def test_another_arm_is_told_by_its_name_or_by_where_its_flange_is(tmp_path: Path) -> None:
+    store = new_store(tmp_path / "s", plan().content_hash)
+    named = KinematicArm(joints=plan().home.copy(), name="UR5e")
+    with pytest.raises(InputError, match="made for a UR5, this arm is a UR5e"):
+        capture(plan(), named, TableCamera(named), store)
+
+    class OtherArm(KinematicArm):
+        def state(self) -> ArmState:
+            return replace(super().state(), T_base_ee=UR5E.forward(self.joints))
+
+    other = OtherArm(joints=plan().home.copy(), name="arm in the corner")
+    with pytest.raises(InputError, match="moves like a UR5e"):
+        capture(plan(), other, TableCamera(other), store)
+    assert named.path == other.path == []
+
+
+def test_a_calibration_left_out_is_warned_of_once_and_the_controllers_pose_kept(
+    tmp_path: Path,
+) -> None:
+    chain = replace(UR5, delta_d=np.array([1e-3, 0, 0, 2e-3, 0, 0]))
+
+    class CalibratedArm(KinematicArm):
+        def state(self) -> ArmState:
+            return replace(super().state(), T_base_ee=chain.forward(self.joints))
+
+    arm = CalibratedArm(joints=plan().home.copy())
+    store = new_store(tmp_path / "s", plan().content_hash)
+    summary = capture(plan(), arm, TableCamera(arm), store)
+    assert len(summary.warnings) == 1 and "calibration.conf" in summary.warnings[0]
+    for view in store.session.views:
+        assert np.allclose(view.T_base_ee, chain.forward(view.joints))
+    gaps = [e["pose_mm"] for e in CaptureLog(store).entries if e["event"] == "stored"]
+    expected = [1e3 * np.linalg.norm((UR5.forward(q) - chain.forward(q))[:3, 3])
+                for q in plan().joints]  # fmt: skip
+    assert gaps == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_tool_offset_that_changes_is_told(tmp_path: Path) -> None:
+    arm = KinematicArm(joints=plan().home.copy())
+    offset = se3.from_translation([0.0, 0.0, 0.1])
+
+    class ToolArm(KinematicArm):
+        def state(self) -> ArmState:
+            late = len(self.path) > 5
+            return replace(super().state(), T_ee_tcp=offset if late else np.eye(4))
+
+    arm = ToolArm(joints=plan().home.copy())
+    summary = capture(plan(), arm, TableCamera(arm), new_store(tmp_path / "s", plan().content_hash))
+    assert len(summary.warnings) == 1 and "tool offset changed by 100.0 mm" in summary.warnings[0]
+
+
+def test_a_dry_run_goes_everywhere_slowly_and_keeps_nothing(
+    tmp_path: Path, arm: KinematicArm
+) -> None:
+    camera = TableCamera(arm)
+    summary = dry_run(plan(), arm, camera, config=replace(QUICK, speed_scale=0.25))
+    assert summary.captured == VIEWS and summary.complete
+    visited = np.stack(arm.path)
+    assert all(np.any(np.all(visited == q, axis=1)) for q in plan().joints)
+    assert {s for s, _ in arm.speeds} == {0.25 * plan().config.speed}
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_views_asked_for_and_views_taken_again(tmp_path: Path, arm: KinematicArm) -> None:
+    store = new_store(tmp_path / "s", plan().content_hash)
+    camera = TableCamera(arm)
+    first = capture(plan(), arm, camera, store, config=QUICK, job=CaptureJob(views=(2, 7)))
+    assert store.completed == {2, 7} and first.complete
+    before = {k: (store.path(f"rgb/{k:06d}.png").read_bytes(), store.rgb(k)) for k in (2, 7)}
+    stamps = {v.index: v.time_s for v in store.session.views}
+    # The same place gives the same image; the time stamp tells the two apart.
+    again = capture(
+        plan(), arm, camera, store, config=QUICK, job=CaptureJob(views=(2,), retake=(7,))
+    )
+    assert (again.captured, again.skipped) == (1, 1)
+    store = SessionStore.open(store.folder)
+    assert store.completed == {2, 7} and store.verify() == []
+    assert store.session.view(7).time_s > stamps[7]
+    assert store.session.view(2).time_s == stamps[2]
+    assert store.path("retaken/000007_1_rgb.png").read_bytes() == before[7][0]
+    assert store.has("retaken/000007_1_depth.png")
+    assert store.read_json("retaken/000007_1.json")["time_s"] == stamps[7]
+    capture(plan(), arm, camera, store, config=QUICK, job=CaptureJob(retake=(7,), views=()))
+    assert store.has("retaken/000007_2_rgb.png") and store.has("retaken/000007_1_rgb.png")
+    with pytest.raises(InputError, match="views \\[99\\] are not in the plan"):
+        capture(plan(), arm, camera, store, config=QUICK, job=CaptureJob(views=(99,)))
+
+
+def test_a_kill_at_any_write_of_a_retake_loses_neither_view(
+    tmp_path: Path, arm: KinematicArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    camera = TableCamera(arm)
+    original = atomic.append_line
+    for fatal in range(12):
+        store = new_store(tmp_path / str(fatal), plan().content_hash)
+        capture(plan(), arm, camera, store, config=QUICK, job=CaptureJob(views=(0,)))
+        earlier = store.path("rgb/000000.png").read_bytes()
+        left = iter(range(fatal))
+
+        def torn(path: Path, line: str, left: Iterator[int] = left) -> None:
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            original(path, line)
+
+        monkeypatch.setattr(atomic, "append_line", torn)
+        try:
+            capture(plan(), arm, camera, store, config=QUICK, job=CaptureJob(retake=(0,), views=()))
+            ended = True
+        except KeyboardInterrupt:
+            ended = False
+        monkeypatch.setattr(atomic, "append_line", original)
+        store = SessionStore.open(store.folder)
+        kept = [store.path("rgb/000000.png"), store.path("retaken/000000_1_rgb.png")]
+        assert any(p.is_file() and p.read_bytes() == earlier for p in kept)
+        capture(plan(), arm, camera, store, config=QUICK, job=CaptureJob(views=(0,)))
+        assert store.completed == {0} and store.verify() == []
+        if ended:
+            return
+    pytest.fail("the retake never came to its end")
+
+
+def test_the_log_says_what_happened_and_is_listed(tmp_path: Path, arm: KinematicArm) -> None:
+    store = new_store(tmp_path / "s", plan().content_hash)
+    capture(plan(), arm, TableCamera(arm, dark=1), store)
+    store = SessionStore.open(store.folder)
+    entries = CaptureLog(store).entries
+    assert [e["event"] for e in entries] == ["begun", *["stored"] * VIEWS, "ended"]
+    first = entries[1]
+    assert first["view"] == 0 and first["attempts"] == 2 and "black" in first["retaken"][0]
+    assert first["measured"]["depth_fill"] == 1.0 and first["settle_s"] >= 0.05
+    assert store.verify() == []
+    size = store.path(LOG_FILE).stat().st_size
+    capture(plan(), arm, TableCamera(arm), store)  # nothing to do: nothing is written
+    assert store.path(LOG_FILE).stat().st_size == size
 
 
 def wait_for(condition: Callable[[], bool], seconds: float) -> None:

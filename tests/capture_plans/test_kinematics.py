@@ -8,12 +8,6 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
-from realsim_capture_plans.collision.model import (
-    Box,
-    box_distance,
-    segment_box_distance,
-    segment_distance,
-)
 
 
 def calibrated(chain: DhChain, seed: int) -> DhChain:
@@ -102,27 +96,3 @@ def test_a_calibration_given_as_nominal_numbers_is_refused() -> None:
     general = replace(UR5, alpha=UR5.alpha + np.array([0.01, 0.02, -0.015, 0.02, 0.01, 0.0]))
     with pytest.raises(InputError, match="delta_"):
         general.inverse(general.forward([0.1, -1.2, 1.3, -0.5, -1.4, 0.2]))
-
-
-def test_segment_distances_agree_with_dense_sampling() -> None:
-    rng = np.random.default_rng(7)
-    ends = rng.normal(size=(4, 200, 3))
-    ends[3, :20] = ends[2, :20] + (ends[1, :20] - ends[0, :20])  # parallel ones too
-    s = np.linspace(0, 1, 201)[:, None]
-    first = ends[0][:, None] + s * (ends[1] - ends[0])[:, None]
-    second = ends[2][:, None] + s * (ends[3] - ends[2])[:, None]
-    dense = np.stack(
-        [
-            np.linalg.norm(a[:, None] - b[None], axis=-1).min()
-            for a, b in zip(first, second, strict=True)
-        ]
-    )
-    exact = segment_distance(*ends)
-    assert np.all(exact <= dense + 1e-12)
-    assert np.abs(exact - dense).max() < 0.02
-    box = Box(lower=(-0.5, -0.4, -np.inf), upper=(0.5, 0.6, 0.1))
-    dense_box = box_distance(first, box).min(1)
-    found = segment_box_distance(ends[0], ends[1], box)
-    length = np.linalg.norm(ends[1] - ends[0], axis=-1)
-    assert np.abs(found - dense_box).max() < 0.01
-    assert np.all(found <= dense_box + 1e-3 * length)

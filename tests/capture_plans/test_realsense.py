@@ -1,20 +1,35 @@
-"""The RealSense driver against the SDK's own software device: pairing, units, refusals."""
+"""The RealSense driver against the SDK's own software device, recorder and player."""
 
+import json
+import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from realsim.errors import InputError, MissingLibraryError
+from realsim.geometry import se3
+from realsim.geometry.camera import ray_table
 from realsim.interop import import_pyrealsense2
-from realsim_capture_plans.devices.interfaces import DeviceError
-from realsim_capture_plans.devices.realsense import RealSenseCamera, intrinsics_of
+from realsim.records import CameraIntrinsics
+from realsim_capture_plans.devices.interfaces import DepthCamera, DeviceError
+from realsim_capture_plans.devices.realsense import (
+    EndOfRecordingError,
+    RealSenseCamera,
+    RealSenseConfig,
+    intrinsics_of,
+)
 
 WIDTH, HEIGHT, FOCAL = 640, 360, 320.0
+FRAME_MS = 1000 / 30
+DATA = Path(os.environ.get("REALSIM_DATA", "../shared/data"))
+FAST = RealSenseConfig(width=WIDTH, height=HEIGHT, settle_pairs=2, timeout_s=1.0)
 
 
 @pytest.fixture(scope="module")
@@ -25,112 +40,351 @@ def rs() -> Any:
         pytest.skip(str(error))
 
 
-def raw_intrinsics(rs: Any, model: Any, coefficients: list[float]) -> Any:
+def raw_intrinsics(rs: Any, model: Any, coefficients: list[float], focal: float = FOCAL) -> Any:
     raw = rs.intrinsics()
     raw.width, raw.height = WIDTH, HEIGHT
-    raw.fx, raw.fy, raw.ppx, raw.ppy = FOCAL, FOCAL + 1, 319.5, 179.5
+    raw.fx, raw.fy, raw.ppx, raw.ppy = focal, focal + 1, 319.5, 179.5
     raw.model, raw.coeffs = model, coefficients
     return raw
 
 
+def depth_of(number: int) -> NDArray[np.uint16]:
+    return np.random.default_rng(number).integers(3000, 3900, (HEIGHT, WIDTH)).astype(np.uint16)
+
+
+def color_of(number: int) -> NDArray[np.uint8]:
+    return np.full((HEIGHT, WIDTH, 3), number % 200, np.uint8)
+
+
 @dataclass
-class SoftwareD405:
-    """One sensor with depth and colour, as the D405 has; frame n is 3000 + n counts deep."""
+class Software:
+    """A camera of the SDK without hardware: one sensor as a D405 has, or two as a D435 has."""
 
     rs: Any
-    colour_lag: int = 0
-    _stop: threading.Event = field(default_factory=threading.Event)
+    model: str = "Software D405"
+    serial: str = "SW0001"
+    two_sensors: bool = False
+    color_focal: float = FOCAL
+    T_color_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    color_lag: int = 0
+    """Frames by which colour comes later than its depth."""
+    color_count: int = 0
+    """What colour's frame counter is ahead of depth's."""
+    color_delay_ms: float = 0.0
+    """What colour's time stamp is later than that of its depth."""
+    depth: Callable[[int], NDArray[np.uint16]] = depth_of
+    exposure_us: int = 8123
 
     def __post_init__(self) -> None:
         rs = self.rs
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.plugged = True
         self.device = rs.software_device()
-        self.device.register_info(rs.camera_info.name, "Software D405")
-        self.device.register_info(rs.camera_info.serial_number, "SW0001")
-        self.sensor = self.device.add_sensor("Stereo Module")
-        self.depth = self._stream(rs.stream.depth, 1, rs.format.z16, 2)
-        self.color = self._stream(rs.stream.color, 2, rs.format.rgb8, 3)
-        self.sensor.add_read_only_option(rs.option.depth_units, 1e-4)
-        self.depth.register_extrinsics_to(self.color, self.depth.get_extrinsics_to(self.depth))
-        self._thread = threading.Thread(target=self._feed)
+        infos = {
+            "name": self.model, "serial_number": self.serial, "firmware_version": "5.16.0.1",
+            "usb_type_descriptor": "3.2", "product_line": "D400",
+        }  # fmt: skip
+        for name, value in infos.items():
+            self.device.register_info(getattr(rs.camera_info, name), value)
+        self.stereo = self.device.add_sensor("Stereo Module")
+        self.color_sensor = (
+            self.device.add_sensor("RGB Camera") if self.two_sensors else self.stereo
+        )
+        self.depth_profile = self._stream(self.stereo, rs.stream.depth, 1, rs.format.z16, 2)
+        self.color_profile = self._stream(self.color_sensor, rs.stream.color, 2, rs.format.rgb8, 3)
+        self.stereo.add_read_only_option(rs.option.depth_units, 1e-4)
+        for sensor, longest in {self.stereo: 165_000, self.color_sensor: 10_000}.items():
+            if sensor is self.stereo or self.two_sensors:
+                sensor.add_option(rs.option.enable_auto_exposure, self._range(0, 1, 1), True)
+                sensor.add_option(rs.option.exposure, self._range(1, longest, 156), True)
+        between = rs.extrinsics()
+        between.rotation = self.T_color_depth[:3, :3].T.ravel().tolist()  # column-major
+        between.translation = self.T_color_depth[:3, 3].tolist()
+        self.depth_profile.register_extrinsics_to(self.color_profile, between)
 
-    def _stream(self, kind: Any, uid: int, pixel: Any, size: int) -> Any:
+    def _range(self, least: float, most: float, default: float) -> Any:
+        span = self.rs.option_range()
+        span.min, span.max, span.step, span.default = least, most, 1.0, default
+        return span
+
+    def _stream(self, sensor: Any, kind: Any, uid: int, pixel: Any, size: int) -> Any:
         stream = self.rs.video_stream()
         stream.type, stream.index, stream.uid = kind, 0, uid
         stream.width, stream.height, stream.fps = WIDTH, HEIGHT, 30
         stream.bpp, stream.fmt = size, pixel
-        stream.intrinsics = raw_intrinsics(self.rs, self.rs.distortion.brown_conrady, [0.0] * 5)
-        return self.sensor.add_video_stream(stream).as_video_stream_profile()
+        focal = self.color_focal if kind == self.rs.stream.color else FOCAL
+        brown = self.rs.distortion.brown_conrady
+        stream.intrinsics = raw_intrinsics(self.rs, brown, [0.0] * 5, focal)
+        return sensor.add_video_stream(stream).as_video_stream_profile()
 
-    def _send(self, profile: Any, pixels: Any, number: int, size: int) -> None:
+    def _send(self, sensor: Any, profile: Any, pixels: Any, number: int, time_ms: float) -> None:
+        size = 3 if pixels.ndim == 3 else 2
         frame = self.rs.software_video_frame()
         frame.pixels, frame.bpp, frame.stride = pixels, size, WIDTH * size
-        frame.timestamp, frame.frame_number = 33.0 * number, number
+        frame.timestamp, frame.frame_number = time_ms, number
         frame.domain, frame.profile = self.rs.timestamp_domain.hardware_clock, profile
-        self.sensor.on_video_frame(frame)
+        sensor.set_metadata(self.rs.frame_metadata_value.actual_exposure, self.exposure_us)
+        sensor.on_video_frame(frame)
+
+    def send_depth(self, number: int) -> None:
+        self._send(self.stereo, self.depth_profile, self.depth(number), number, FRAME_MS * number)
+
+    def send_color(self, number: int) -> None:
+        moment = FRAME_MS * number + self.color_delay_ms
+        self._send(
+            self.color_sensor, self.color_profile, color_of(number), number + self.color_count,
+            moment,
+        )  # fmt: skip
+
+    def send(self, number: int) -> None:
+        self.send_depth(number)
+        if number > self.color_lag:
+            self.send_color(number - self.color_lag)
 
     def _feed(self) -> None:
         number = 0
         while not self._stop.is_set():
             number += 1
-            colour = number - self.colour_lag
-            self._send(self.depth, np.full((HEIGHT, WIDTH), 3000 + number, np.uint16), number, 2)
-            if colour > 0:
-                grey = np.full((HEIGHT, WIDTH, 3), colour % 200, np.uint8)
-                self._send(self.color, grey, colour, 3)
-            time.sleep(0.01)
+            self.send(number)
+            time.sleep(0.005)
 
-    def start(self) -> None:
+    def run(self) -> None:
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._feed)
         self._thread.start()
 
-    def stop(self) -> None:
+    def halt(self) -> None:
         self._stop.set()
-        if self._thread.is_alive():
+        if self._thread is not None:
             self._thread.join()
+
+    def devices(self) -> list[Any]:
+        return [self.device] if self.plugged else []
+
+
+Make = Callable[..., Software]
 
 
 @pytest.fixture
-def software(rs: Any) -> Iterator[SoftwareD405]:
-    device = SoftwareD405(rs)
-    yield device
-    device.stop()
+def make(rs: Any) -> Iterator[Make]:
+    made: list[Software] = []
+
+    def new(**options: Any) -> Software:
+        made.append(Software(rs, **options))
+        return made[-1]
+
+    yield new
+    for software in made:
+        software.halt()
 
 
-def test_frames_are_pairs_of_one_number_in_metres(software: SoftwareD405) -> None:
-    camera = RealSenseCamera(width=WIDTH, height=HEIGHT, device=software.device)
-    software.start()
-    try:
-        assert camera.name == "Software D405 SW0001"
-        assert camera.depth_unit_m == 1e-4
-        assert (camera.intrinsics.fx, camera.intrinsics.cy) == (FOCAL, 179.5)
-        times: list[float] = []
-        for _ in range(4):
-            frame = camera.grab()
-            number = round(frame.time_s / 0.033)
-            assert np.all(frame.rgb == number % 200)
-            assert frame.depth_m == pytest.approx(np.float32(1e-4 * (3000 + number)), abs=1e-7)
-            times.append(frame.time_s)
-        assert np.all(np.diff(times) > 0)
-    finally:
+@pytest.fixture
+def opened() -> Iterator[Callable[..., RealSenseCamera]]:
+    cameras: list[RealSenseCamera] = []
+
+    def new(software: Software, config: RealSenseConfig = FAST, **options: Any) -> RealSenseCamera:
+        cameras.append(RealSenseCamera(config=config, devices=software.devices, **options))
+        return cameras[-1]
+
+    yield new
+    for camera in cameras:
         camera.close()
 
 
-def test_no_frame_is_a_device_error(
-    software: SoftwareD405, monkeypatch: pytest.MonkeyPatch
+Open = Callable[..., RealSenseCamera]
+TWO = {
+    "model": "Software D435", "two_sensors": True, "color_count": 41, "color_delay_ms": 7.0,
+}  # fmt: skip
+
+
+# --- live ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lag", [0, 1, 5])
+@pytest.mark.parametrize("sensors", [1, 2])
+def test_depth_and_colour_of_a_frame_are_of_one_exposure(
+    make: Make, opened: Open, sensors: int, lag: int
 ) -> None:
-    monkeypatch.setattr("realsim_capture_plans.devices.realsense.TIMEOUT_MS", 200)
-    camera = RealSenseCamera(width=WIDTH, height=HEIGHT, device=software.device)
+    software = make(color_lag=lag, **(TWO if sensors == 2 else {}))
+    camera: DepthCamera = opened(software)
+    software.run()
+    times: list[float] = []
+    for _ in range(4):
+        frame = camera.grab()
+        number = round((1e3 * frame.time_s - software.color_delay_ms) / FRAME_MS)
+        assert np.all(frame.rgb == number % 200)
+        assert np.array_equal(frame.depth_m, (depth_of(number) * 1e-4).astype(np.float32))
+        times.append(frame.time_s)
+    assert np.all(np.diff(times) > 0)
+
+
+def test_a_grab_is_not_answered_with_what_was_seen_before(make: Make, opened: Open) -> None:
+    software = make()
+    camera = opened(software)
+    software.run()
+    camera.grab()
+    software.halt()
+    time.sleep(0.05)
+    with pytest.raises(DeviceError, match="no frame within 1 s"):
+        camera.grab()
+
+
+def test_frames_half_a_frame_apart_are_no_pair(make: Make, opened: Open) -> None:
+    software = make(**(TWO | {"color_delay_ms": 16.0}))
+    camera = opened(software)
+    software.run()
+    frame = camera.grab()
+    number = round((1e3 * frame.time_s - 16.0) / FRAME_MS)
+    assert np.all(frame.rgb == number % 200)
+    assert np.array_equal(frame.depth_m, (depth_of(number) * 1e-4).astype(np.float32))
+
+
+def test_one_sensor_whose_counters_differ_is_refused(make: Make, opened: Open) -> None:
+    software = make(color_count=1000)
+    camera = opened(software)
+    software.run()
+    with pytest.raises(DeviceError, match=r"never had the same frame number .*depth frame \d+ at"):
+        camera.grab()
+
+
+def test_what_it_says_of_itself(make: Make, opened: Open) -> None:
+    T = se3.from_rt(se3.exp_so3([0.001, -0.02, 0.003]), [0.015, 1e-4, -2e-4])
+    camera = opened(make(**TWO, color_focal=300.0, T_color_depth=T))
+    assert (camera.name, camera.depth_unit_m) == ("Software D435 SW0001", 1e-4)
+    assert (camera.intrinsics.fx, camera.intrinsics.cy) == (300.0, 179.5)
+    told = json.loads(json.dumps(camera.description, allow_nan=False))
+    assert (told["serial"], told["firmware"], told["usb_type"]) == ("SW0001", "5.16.0.1", "3.2")
+    assert told["depth_unit_m"] == 1e-4 and told["pairs_by"] == "time stamp"
+    assert (told["factory"]["color"]["fx"], told["factory"]["depth"]["fx"]) == (300.0, FOCAL)
+    np.testing.assert_allclose(told["factory"]["T_color_depth"], T, atol=1e-7)
+    se3.check_rigid(np.array(told["factory"]["T_color_depth"]), "extrinsics")
+    assert told["options"]["Stereo Module"]["enable_auto_exposure"] == 1.0
+    assert told["depth_aligned_to_color"]
+
+
+def test_depth_of_a_turned_sensor_is_along_the_colour_cameras_axis(
+    make: Make, opened: Open
+) -> None:
+    # Turned by 1.5 degrees: depth left along its own axis would be 13 mm off at the border.
+    T = se3.from_rt(se3.exp_so3([0.004, 0.026, 0.002]), [0.015, 0.001, -0.002])
+    normal, distance = np.array([0.1, -0.05, 1.0]), 0.5  # n . p = d in depth coordinates
+    depth_lens = CameraIntrinsics(
+        width=WIDTH, height=HEIGHT, fx=FOCAL, fy=FOCAL + 1, cx=319.5, cy=179.5
+    )
+    counts = np.round(distance / (ray_table(depth_lens) @ normal) / 1e-4).astype(np.uint16)
+    software = make(**TWO, color_focal=310.0, T_color_depth=T, depth=lambda _: counts)
+    camera = opened(software)
+    software.run()
+    depth_m = camera.grab().depth_m
+    n = T[:3, :3] @ normal
+    expected = (distance + n @ T[:3, 3]) / (ray_table(camera.intrinsics) @ n)
+    seen = depth_m > 0
+    assert seen.mean() > 0.85
+    slope = np.abs(np.gradient(expected)).max()  # the SDK rounds to whole pixels
+    assert np.abs(depth_m - expected)[seen].max() < slope + 2e-4
+    assert abs(np.mean((depth_m - expected)[seen])) < 1e-4
+
+
+# --- exposure ------------------------------------------------------------------------------------
+
+
+def exposure_of(rs: Any, sensor: Any) -> tuple[float, float]:
+    options = rs.option
+    return sensor.get_option(options.enable_auto_exposure), sensor.get_option(options.exposure)
+
+
+def test_exposure_is_automatic_fixed_or_locked(rs: Any, make: Make, opened: Open) -> None:
+    def config(exposure: Any) -> RealSenseConfig:
+        return RealSenseConfig(
+            width=WIDTH, height=HEIGHT, exposure=exposure, settle_pairs=2, timeout_s=1.0
+        )
+
+    software = make(**TWO)
+    opened(software, config(5000.0)).close()
+    # A colour sensor of its own counts 100 us.
+    assert exposure_of(rs, software.stereo) == (0.0, 5000.0)
+    assert exposure_of(rs, software.color_sensor) == (0.0, 50.0)
+    opened(software, config("auto")).close()
+    assert exposure_of(rs, software.stereo)[0] == 1.0
+    camera = opened(software, config("locked"))
+    assert exposure_of(rs, software.stereo)[0] == 1.0
+    software.run()
+    camera.grab()
+    assert exposure_of(rs, software.stereo) == (0.0, 8123.0)
+    assert exposure_of(rs, software.color_sensor) == (0.0, 81.0)
+    assert camera.last_metadata["depth"]["exposure_us"] == 8123.0
+    assert camera.description["options"]["Stereo Module"]["exposure"] == 8123.0
+    software.halt()
+    with pytest.raises(InputError, match=r"takes 1 to 165000 us"):
+        opened(software, config(1e9))
+
+
+# --- trouble -------------------------------------------------------------------------------------
+
+
+def test_no_frame_is_a_device_error(make: Make, opened: Open) -> None:
+    camera = opened(make())
+    with pytest.raises(DeviceError, match="no frame within 1 s: neither depth nor colour came"):
+        camera.grab()
+
+
+def test_a_dead_colour_stream_is_named(make: Make, opened: Open) -> None:
+    software = make()
+    camera = opened(software)
+    software.send_depth(1)
+    with pytest.raises(DeviceError, match="only depth came"):
+        camera.grab()
+
+
+def test_an_unplugged_camera_is_named_and_goes_on_when_it_is_back(rs: Any, make: Make) -> None:
+    first, other = make(), make(serial="SW0002")
+    connected = [first, other]
+    camera = RealSenseCamera(
+        "SW0001", FAST, devices=lambda: [d for s in connected for d in s.devices()]
+    )
     try:
-        with pytest.raises(DeviceError, match="no frame within 200 ms"):
+        first.run()
+        before = camera.grab()
+        first.halt()
+        first.plugged = False
+        with pytest.raises(DeviceError, match=r"SW0001 .* not connected any more"):
             camera.grab()
+        assert camera.description["serial"] == "SW0001"
+        # The other camera on the bus is not taken in its place.
+        with pytest.raises(DeviceError, match=r"SW0001 is not connected \(connected: SW0002\)"):
+            camera.recover()
+        connected[0] = back = make()
+        camera.recover()
+        back.run()
+        after = camera.grab()
+        assert after.rgb.shape == before.rgb.shape
+        camera.recover()  # no error while it is well
+        camera.grab()
     finally:
         camera.close()
 
 
-def test_a_stream_that_the_device_lacks_is_named(software: SoftwareD405) -> None:
-    with pytest.raises(DeviceError, match=r"no stream .*1280, 720"):
-        RealSenseCamera(device=software.device)
+def test_a_stream_that_the_device_lacks_is_named(make: Make, opened: Open) -> None:
+    with pytest.raises(DeviceError, match=r"no stream .*1280, 720, 30; there is .*640x360 at 30"):
+        opened(make(), RealSenseConfig())
     with pytest.raises(InputError, match="16:9"):
-        RealSenseCamera(width=640, height=480, device=software.device)
+        opened(make(), RealSenseConfig(width=640, height=480))
+
+
+def test_one_of_several_cameras_must_be_named(make: Make) -> None:
+    a, b = make(), make(serial="SW0002")
+    with pytest.raises(DeviceError, match="2 RealSense cameras are connected"):
+        RealSenseCamera(config=FAST, devices=lambda: [a.device, b.device])
+    with pytest.raises(DeviceError, match="no RealSense camera SW9 is connected"):
+        RealSenseCamera("SW9", FAST, devices=lambda: [a.device, b.device])
+
+
+def test_without_a_camera_the_error_says_what_to_do(rs: Any) -> None:
+    if len(list(rs.context().query_devices())) > 0:
+        pytest.skip("a RealSense camera is connected")
+    with pytest.raises(DeviceError, match="no RealSense camera is connected"):
+        RealSenseCamera()
 
 
 def test_distortion_models(rs: Any) -> None:
@@ -144,8 +398,86 @@ def test_distortion_models(rs: Any) -> None:
         intrinsics_of(raw_intrinsics(rs, inverse, [0.1, 0.0, 0.0, 0.0, 0.0]))
 
 
-def test_without_a_camera_the_error_says_what_to_do(rs: Any) -> None:
-    if len(list(rs.context().query_devices())) > 0:
-        pytest.skip("a RealSense camera is connected")
-    with pytest.raises(DeviceError, match="no RealSense camera is connected"):
-        RealSenseCamera()
+# --- recordings ----------------------------------------------------------------------------------
+
+SENT = 40
+
+
+def record(rs: Any, software: Software, path: Path, numbers: list[int]) -> None:
+    """Record frames with the SDK's own recorder."""
+    recorder = rs.recorder(str(path), software.device)
+    sensors = recorder.query_sensors()
+    came: list[int] = []
+    for sensor in sensors:
+        sensor.open(sensor.get_stream_profiles())
+        sensor.start(lambda frame: came.append(frame.get_frame_number()))
+    expected = 0
+    for number in numbers:
+        software.send(number)
+        expected += 1 + (number > software.color_lag)
+        end = time.monotonic() + 10
+        while len(came) < expected and time.monotonic() < end:
+            time.sleep(0.001)
+    for sensor in sensors:
+        sensor.stop()
+        sensor.close()
+
+
+@pytest.mark.parametrize("lag", [0, 3])
+@pytest.mark.parametrize("sensors", [1, 2])
+def test_a_recording_gives_every_pair_once_and_bit_exact(
+    rs: Any, make: Make, tmp_path: Path, sensors: int, lag: int
+) -> None:
+    software = make(color_lag=lag, **(TWO if sensors == 2 else {}))
+    lost = {9, 10, 23}
+    record(rs, software, tmp_path / "r.db3", [n for n in range(1, SENT + 1) if n not in lost])
+    # Frame 9's depth was lost, and the colour that would have been sent then.
+    depths = set(range(1, SENT + 1)) - lost
+    colors = {n - lag for n in depths if n > lag}
+    camera = RealSenseCamera.from_recording(tmp_path / "r.db3")
+    try:
+        assert (camera.name, camera.depth_unit_m) == (f"{software.model} SW0001", 1e-4)
+        assert camera.description["recording"] == "r.db3"
+        for turn in range(2):
+            found: list[int] = []
+            with pytest.raises(EndOfRecordingError, match="no more pairs"):
+                while True:
+                    frame = camera.grab()
+                    number = round((1e3 * frame.time_s - software.color_delay_ms) / FRAME_MS)
+                    assert np.all(frame.rgb == number % 200)
+                    counts = np.round(frame.depth_m / 1e-4).astype(np.uint16)
+                    assert np.array_equal(counts, depth_of(number))
+                    assert camera.last_metadata["depth"]["exposure_us"] == 8123.0
+                    found.append(number)
+                    if turn == 1:  # a slow reader loses nothing either
+                        time.sleep(0.01)
+            assert found == sorted(depths & colors)
+            camera.reopen()
+    finally:
+        camera.close()
+
+
+def test_a_recording_that_is_none_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        RealSenseCamera.from_recording(tmp_path / "none.db3")
+    (tmp_path / "text.db3").write_text("not a recording")
+    with pytest.raises(InputError, match="not a recording that the RealSense SDK can play"):
+        RealSenseCamera.from_recording(tmp_path / "text.db3")
+
+
+@pytest.mark.real
+def test_a_real_d435_recording_without_a_pair_says_so() -> None:
+    path = DATA / "bags/single_depth_color_640x480.bag"
+    if not path.is_file():
+        pytest.skip(f"{path} is not there; set REALSIM_DATA")
+    camera = RealSenseCamera.from_recording(path)
+    try:
+        told = camera.description
+        assert told["model"] == "Intel RealSense D435" and told["depth_unit_m"] == 1e-3
+        assert told["factory"]["color"]["fx"] == pytest.approx(613.2037, abs=1e-3)
+        assert told["factory"]["depth"]["fx"] == pytest.approx(390.4315, abs=1e-3)
+        # Its two depth frames are 102 and 268 ms from its colour frame, at 6 frames per second.
+        with pytest.raises(EndOfRecordingError, match="no pair of depth and colour"):
+            camera.grab()
+    finally:
+        camera.close()

@@ -1,135 +1,44 @@
 """Does the arm, with the camera on its flange, keep its distance from itself, table and scene?
 
-Links are capsules (a segment with a radius) fixed in the DH frames, a little fatter than the
-published housings; the camera body is two capsules that cover its box, the bracket a third. The
-table and the objects' keep-out volume are axis-aligned boxes in base. Distances are exact for the
-capsules: closed form between segments, and a golden-section search for segment to box, whose
-distance is convex along the segment. Everything is vectorised over configurations. Unit: m.
+The bodies of arm, camera and bracket and the boxes of the work cell go into coal, the chain into
+pinocchio, both once; every question is then answered in C++. Distances are exact for the shapes
+(GJK and EPA, to 1e-6 m); negative means penetration. Unit: m.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import DhChain
-from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
+from realsim_capture_plans.arms.kinematics import JOINTS, DhChain
+from realsim_capture_plans.collision.arm_shapes import (
+    arm_shapes,
+    finite_box,
+    link_placements,
+    nominal_chain,
+)
+from realsim_capture_plans.collision.camera_bodies import camera_shape
+from realsim_capture_plans.collision.coal_geometry import Body, Geometry
+from realsim_capture_plans.collision.pairs import choose_pairs
+from realsim_capture_plans.collision.shapes import Mount, WorkCell
 
 Array = NDArray[np.float64]
-GROUPS = ("self", "table", "scene")
-GOLDEN_STEPS = 16
-"""Shrinks a 0.4 m link to 0.2 mm, the greatest error of a capsule-box distance."""
-ARM_OFFSETS_M = {"UR5": (0.13585, 0.01615), "UR5e": (0.138, 0.007)}
-"""Upper arm and forearm stand this far along the shoulder's axis (ur_description kinematics)."""
-CAMERA_HALF_M = (0.021, 0.021, 0.0115)
-"""Half the D405's body, 42 x 42 x 23 mm (datasheet)."""
-CAMERA_BODY_CENTER_M = (0.009, 0.0, -0.0078)
-"""Centre of the D405's body in `cam`: the frame sits in the left imager, 3.7 mm behind the glass
-(datasheet)."""
-CAMERA_CAPSULE_RADIUS_M = 0.020
-"""Covers a quarter of the body's face and its depth: sqrt(10.5^2 + 10.5^2 + 11.5^2) = 18.8 mm."""
-BRACKET_RADIUS_M = 0.012
-"""A bracket about 24 mm wide from the flange's centre to the camera."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Capsule:
-    """A segment with a radius, fixed in one DH frame."""
-
-    part: str
-    frame: int
-    """0 = base, i = DH frame i."""
-    start: tuple[float, float, float]
-    """[m] in the frame."""
-    end: tuple[float, float, float]
-    """[m] in the frame."""
-    radius: float
-    """[m]"""
-
-
-def arm_capsules(chain: DhChain) -> list[Capsule]:
-    """Return the arm's own capsules; radii from the housings' diameters, rounded up.
-
-    Raises:
-        InputError: the arm's link offsets are not known.
-    """
-    if chain.name not in ARM_OFFSETS_M:
-        raise InputError(
-            f"no collision model for '{chain.name}'; there is one for {', '.join(ARM_OFFSETS_M)}."
-        )
-    upper, fore = ARM_OFFSETS_M[chain.name]
-    a2, a3 = -chain.a[1], -chain.a[2]
-    d1, d4, d5, d6 = (float(chain.d[i]) for i in (0, 3, 4, 5))
-
-    def capsule(
-        part: str, frame: int, start: Sequence[float], end: Sequence[float], radius: float
-    ) -> Capsule:
-        (x0, y0, z0), (x1, y1, z1) = start, end
-        return Capsule(part=part, frame=frame, start=(x0, y0, z0), end=(x1, y1, z1), radius=radius)
-
-    return [
-        capsule("base", 0, (0, 0, 0), (0, 0, d1 - 0.02), 0.075),
-        capsule("shoulder", 1, (0, 0, 0), (0, 0, upper), 0.065),
-        # The root of the upper arm stands beside the table at a height that never changes.
-        capsule("root", 2, (a2, 0, upper), (a2 - 0.1, 0, upper), 0.065),
-        capsule("upper arm", 2, (a2 - 0.1, 0, upper), (0, 0, upper), 0.060),
-        capsule("elbow", 2, (0, 0, upper), (0, 0, fore), 0.060),
-        capsule("forearm", 3, (a3, 0, fore), (0.16, 0, fore), 0.055),
-        capsule("forearm end", 3, (0.16, 0, fore), (0, 0, fore), 0.047),
-        capsule("wrist 1", 4, (0, -(d4 - fore), 0), (0, 0, 0), 0.048),
-        capsule("wrist 2", 5, (0, d5, 0), (0, 0, 0), 0.048),
-        capsule("wrist 3", 6, (0, 0, -d6), (0, 0, -0.04), 0.040),
-    ]
-
-
-def camera_capsules(T_ee_cam: ArrayLike) -> list[Capsule]:
-    """Return the capsules of the camera body and its bracket for a mount (4, 4)."""
-    T = np.asarray(T_ee_cam, dtype=np.float64)
-    center = np.array(CAMERA_BODY_CENTER_M)
-    hx, hy = CAMERA_HALF_M[0] / 2, CAMERA_HALF_M[1] / 2
-
-    def ee(point: ArrayLike) -> tuple[float, float, float]:
-        x, y, z = se3.transform(T, np.asarray(point, dtype=np.float64)[None])[0].tolist()
-        return x, y, z
-
-    halves = [
-        Capsule(
-            part="camera",
-            frame=6,
-            start=ee(center + np.array([-hx, y, 0])),
-            end=ee(center + np.array([hx, y, 0])),
-            radius=CAMERA_CAPSULE_RADIUS_M,
-        )
-        for y in (-hy, hy)
-    ]
-    bracket = Capsule(
-        part="bracket", frame=6, start=(0, 0, 0), end=ee(center), radius=BRACKET_RADIUS_M
-    )
-    return [*halves, bracket]
-
-
-SELF_PAIRS = {
-    "base": ("forearm", "forearm end", "wrist 1", "wrist 2", "wrist 3", "camera", "bracket"),
-    "shoulder": ("forearm end", "wrist 1", "wrist 2", "wrist 3", "camera", "bracket"),
-    "root": ("wrist 1", "wrist 2", "wrist 3", "camera", "bracket"),
-    "upper arm": ("wrist 1", "wrist 2", "wrist 3", "camera", "bracket"),
-    "elbow": ("wrist 2", "wrist 3", "camera", "bracket"),
-    "forearm": ("wrist 3", "camera", "bracket"),
-    "forearm end": ("wrist 3", "camera", "bracket"),
-    "wrist 1": ("camera", "bracket"),
-    "wrist 2": ("camera",),
-}
-"""Parts that can meet. Left out: neighbours, and parts that turn about parallel axes at a distance
-that the design fixes (upper arm - forearm, forearm - wrist 2, wrist 1 - wrist 3)."""
-TABLE_EXEMPT = ("base", "shoulder", "root")
-"""Parts whose height above the table never changes: the arm stands on it."""
+GROUPS = ("self", "tool", "table", "scene")
+"""`self`: the arm's links among themselves; `tool`: camera and bracket against the links; `table`;
+`scene`: the keep-out box and the obstacles."""
+BOX_REACH_M = 5.0
+"""Infinite bounds of boxes end here: several times the reach of any arm."""
+LEAST_FIRST = ("table", "tool", "scene", "self")
+"""Order in which `free` asks: what is hit most often first."""
 
 
 class CollisionModel:
-    """Clearances of one arm with one camera mount over one table and one keep-out box."""
+    """Clearances of one arm with one camera mount in one work cell.
+
+    Answers do not depend on what was asked before. One model serves one thread.
+    """
 
     def __init__(self, chain: DhChain, mount: Mount, cell: WorkCell, clearance_m: float) -> None:
         """Build the model.
@@ -139,77 +48,104 @@ class CollisionModel:
             mount: the camera on the flange.
             cell: what stands round the arm.
             clearance_m: least distance that counts as free [m].
+
+        Raises:
+            InputError: no shapes for this arm or camera; a calibration that is another arm's; a
+                mount that runs into the wrist; a box round a part of the arm that cannot leave it.
         """
-        self.chain = chain
-        self.clearance_m = clearance_m
-        capsules = arm_capsules(chain) + camera_capsules(mount.T_ee_cam)
-        parts = [c.part for c in capsules]
-        self._frame = np.array([c.frame for c in capsules])
-        self._start = np.array([c.start for c in capsules], dtype=np.float64)
-        self._end = np.array([c.end for c in capsules], dtype=np.float64)
-        self._radius = np.array([c.radius for c in capsules])
-        pairs = [
-            (i, j)
-            for i, first in enumerate(parts)
-            for j, second in enumerate(parts)
-            if second in SELF_PAIRS.get(first, ())
-        ]
-        self._pairs = np.array(pairs)
-        self._free_parts = np.array([i for i, p in enumerate(parts) if p not in TABLE_EXEMPT])
-        self._boxes = {"table": cell.table, "scene": cell.keep_out}
+        if not (np.isfinite(clearance_m) and clearance_m >= 0):
+            raise InputError(f"clearance_m is {clearance_m}; a length of 0 m or more is needed.")
+        self.chain, self.mount, self.cell = chain, mount, cell
+        self.clearance_m = float(clearance_m)
+        self._bodies = bodies_of(chain, mount, cell)
+        placements = link_placements(chain)
+        geometry = Geometry(chain, placements, self._bodies)
+        # Which pairs the design keeps apart is seen on the nominal arm: the calibration's
+        # millimetres would make constant distances look as if they changed.
+        drawn = Geometry(nominal_chain(chain), np.tile(np.eye(4), (JOINTS + 1, 1, 1)), self._bodies)
+        chosen = choose_pairs(self._bodies, drawn, self.clearance_m)
+        order = sorted(
+            range(len(chosen.pairs)), key=lambda k: (LEAST_FIRST.index(chosen.groups[k]), k)
+        )
+        self._pairs = [chosen.pairs[k] for k in order]
+        self._groups = np.array([chosen.groups[k] for k in order])
+        self._mount_gap_m = chosen.mount_gap_m
+        self._distances = geometry.with_pairs(self._pairs)
+        self._hits = self._distances.collider(self.clearance_m)
+
+    @property
+    def mount_gap_m(self) -> float:
+        """Distance of the camera's body from wrist 3, which never changes [m]."""
+        return self._mount_gap_m
+
+    @property
+    def pairs(self) -> tuple[tuple[str, str, str], ...]:
+        """The pairs that are checked: group and the two parts."""
+        return tuple(
+            (str(group), self._bodies[i].part, self._bodies[j].part)
+            for group, (i, j) in zip(self._groups, self._pairs, strict=True)
+        )
 
     def clearance(self, joints: ArrayLike) -> dict[str, Array]:
         """Return the least distance (N,) [m] per group at joints (N, 6); negative = penetration.
 
-        Groups: `self` between parts of the arm, `table`, `scene` (the keep-out box).
+        The keys are `GROUPS`; a group without pairs that can meet is infinitely far.
         """
-        start, end = self._segments(np.asarray(joints, dtype=np.float64))
-        return {group: self._group(group, start, end) for group in GROUPS}
+        distance = self._distances(_checked_joints(joints))
+        return {
+            group: np.min(distance[:, self._groups == group], axis=1, initial=np.inf)
+            for group in GROUPS
+        }
 
     def free(self, joints: ArrayLike) -> NDArray[np.bool_]:
         """Return (N,) whether joints (N, 6) keep the clearance in every group."""
-        q = np.asarray(joints, dtype=np.float64)
-        start, end = self._segments(q)
-        alive = np.arange(len(q))
-        for group in ("table", "scene", "self"):
-            if len(alive):
-                distance = self._group(group, start[alive], end[alive])
-                alive = alive[distance >= self.clearance_m]
-        result = np.zeros(len(q), dtype=bool)
-        result[alive] = True
-        return result
+        hits = self._hits
+        return np.array([not hits(q) for q in _checked_joints(joints)], dtype=bool)
+
+    def nearest(self, q: ArrayLike) -> tuple[str, str, str, float]:
+        """Return group, the two parts and the distance [m] of the nearest pair at joints (6,)."""
+        distance = self._distances(_checked_joints(np.asarray(q, dtype=np.float64)[None]))[0]
+        k = int(np.argmin(distance))
+        i, j = self._pairs[k]
+        return str(self._groups[k]), self._bodies[i].part, self._bodies[j].part, float(distance[k])
 
     def edges_free(self, q_from: ArrayLike, q_to: ArrayLike, step_rad: float) -> NDArray[np.bool_]:
         """Return (E,) whether straight joint-space moves (E, 6) -> (E, 6) stay free.
+
+        The ends are checked first, then the middle, then the quarters, until the first hit: what
+        a move runs into is wide, so that a coarse look finds it.
 
         Args:
             q_from: (E, 6) starts [rad].
             q_to: (E, 6) goals [rad].
             step_rad: greatest joint step between the configurations that are checked [rad].
         """
-        samples, owner = interpolate(q_from, q_to, step_rad)
-        hits = np.bincount(
-            owner, weights=~self.free(samples), minlength=len(np.atleast_2d(np.asarray(q_from)))
-        )
-        return hits == 0
+        starts, ends = (_checked_joints(np.atleast_2d(np.asarray(q))) for q in (q_from, q_to))
+        if len(starts) != len(ends):
+            raise InputError(f"{len(starts)} starts and {len(ends)} goals do not make moves.")
+        counts = _counts(starts, ends, step_rad)
+        hits = self._hits
+        free = np.ones(len(starts), dtype=bool)
+        for e, (start, end, n) in enumerate(zip(starts, ends, counts.tolist(), strict=True)):
+            samples = start + _coarse_to_fine(n)[:, None] * (end - start)
+            free[e] = not any(hits(q) for q in samples)
+        return free
 
-    def _segments(self, q: Array) -> tuple[Array, Array]:
-        """Return the capsules' end points (N, C, 3) in base."""
-        frames = self.chain.link_frames(q)[:, self._frame]
-        R, t = frames[..., :3, :3], frames[..., :3, 3]
-        return (
-            np.einsum("ncij,cj->nci", R, self._start) + t,
-            np.einsum("ncij,cj->nci", R, self._end) + t,
-        )
 
-    def _group(self, group: str, start: Array, end: Array) -> Array:
-        if group == "self":
-            i, j = self._pairs.T
-            gap = segment_distance(start[:, i], end[:, i], start[:, j], end[:, j])
-            return np.min(gap - (self._radius[i] + self._radius[j]), axis=1)
-        parts = self._free_parts
-        gap = segment_box_distance(start[:, parts], end[:, parts], self._boxes[group])
-        return np.min(gap - self._radius[parts], axis=1)
+def bodies_of(chain: DhChain, mount: Mount, cell: WorkCell) -> tuple[Body, ...]:
+    """Return everything that the model knows: links, camera and bracket, the cell's boxes.
+
+    Raises:
+        InputError: no shapes for this arm or camera, or a box that is nowhere near.
+    """
+    links = [Body(shape, "link") for shape in arm_shapes(chain)]
+    carried = [Body(s, "mount", mount.cover_m) for s in (camera_shape(mount), *mount.bracket)]
+    table = [Body(finite_box("table", cell.table, BOX_REACH_M), "table")]
+    scene = [
+        Body(finite_box(name, box, BOX_REACH_M), "scene")
+        for name, box in (("keep-out box", cell.keep_out), *cell.obstacles)
+    ]
+    return (*links, *carried, *table, *scene)
 
 
 def interpolate(
@@ -217,56 +153,45 @@ def interpolate(
 ) -> tuple[Array, NDArray[np.intp]]:
     """Return configurations (M, 6) along straight moves, ends included, and each one's move."""
     a, b = np.atleast_2d(np.asarray(q_from, float)), np.atleast_2d(np.asarray(q_to, float))
-    counts = np.ceil(np.abs(b - a).max(-1) / step_rad).astype(np.intp) + 1
+    counts = _counts(a, b, step_rad)
     owner = np.repeat(np.arange(len(a)), counts + 1)
     first = np.repeat(np.cumsum(counts + 1) - (counts + 1), counts + 1)
     s = (np.arange(len(owner)) - first) / counts[owner]
     return a[owner] + s[:, None] * (b - a)[owner], owner
 
 
-def segment_distance(p1: Array, q1: Array, p2: Array, q2: Array) -> Array:
-    """Return the least distance (...) between segments p1-q1 and p2-q2 (..., 3).
+def _counts(a: Array, b: Array, step_rad: float) -> NDArray[np.intp]:
+    """Return (E,) how many equal steps each move has; one at least."""
+    return np.ceil(np.abs(b - a).max(-1) / step_rad).astype(np.intp) + 1
 
-    Closed form with clamping: Ericson, Real-Time Collision Detection (2005), section 5.1.9.
+
+@lru_cache(maxsize=1024)
+def _coarse_to_fine(steps: int) -> Array:
+    """Return the fractions k / steps, k = 0..steps, ends first and then by bisection."""
+    order: list[int] = [0, steps]
+    spans: Sequence[tuple[int, int]] = [(0, steps)]
+    while spans:
+        halves: list[tuple[int, int]] = []
+        for low, high in spans:
+            middle = (low + high) // 2
+            if low < middle < high:
+                order.append(middle)
+                halves += [(low, middle), (middle, high)]
+        spans = halves
+    fractions = np.array(order, dtype=np.float64) / steps
+    fractions.setflags(write=False)
+    return fractions
+
+
+def _checked_joints(joints: ArrayLike) -> Array:
+    """Return joints (N, 6), contiguous.
+
+    Raises:
+        InputError: another shape, or numbers that are not finite (which would count as free).
     """
-    d1, d2, r = q1 - p1, q2 - p2, p1 - p2
-    a, e = np.sum(d1 * d1, -1), np.sum(d2 * d2, -1)
-    b, c, f = np.sum(d1 * d2, -1), np.sum(d1 * r, -1), np.sum(d2 * r, -1)
-    tiny = 1e-15
-    denominator = a * e - b * b
-    parallel = denominator <= 1e-12 * np.maximum(a * e, tiny)
-    s = np.where(
-        parallel, 0.0, np.clip((b * f - c * e) / np.where(parallel, 1.0, denominator), 0.0, 1.0)
-    )
-    t = np.clip((b * s + f) / np.maximum(e, tiny), 0.0, 1.0)
-    s = np.clip((b * t - c) / np.maximum(a, tiny), 0.0, 1.0)
-    return np.linalg.norm(r + s[..., None] * d1 - t[..., None] * d2, axis=-1)
-
-
-def box_distance(points: Array, box: Box) -> Array:
-    """Return the signed distance (...) of points (..., 3) to a box; negative inside. Convex."""
-    outside = np.maximum(np.array(box.lower) - points, points - np.array(box.upper))
-    return np.linalg.norm(np.maximum(outside, 0.0), axis=-1) + np.minimum(outside.max(-1), 0.0)
-
-
-def segment_box_distance(start: Array, end: Array, box: Box) -> Array:
-    """Return the least signed distance (...) of segments (..., 3) to a box, to 0.2 mm."""
-    ratio = (np.sqrt(5.0) - 1.0) / 2.0
-    direction = end - start
-
-    def at(t: Array) -> Array:
-        return box_distance(start + t[..., None] * direction, box)
-
-    low, high = np.zeros(start.shape[:-1]), np.ones(start.shape[:-1])
-    left, right = high - ratio * (high - low), low + ratio * (high - low)
-    f_left, f_right = at(left), at(right)
-    best = np.minimum(np.minimum(at(low), at(high)), np.minimum(f_left, f_right))
-    for _ in range(GOLDEN_STEPS):
-        go_left = f_left < f_right
-        low, high = np.where(go_left, low, left), np.where(go_left, right, high)
-        probe = np.where(go_left, high - ratio * (high - low), low + ratio * (high - low))
-        f_probe = at(probe)
-        left, right = np.where(go_left, probe, right), np.where(go_left, left, probe)
-        f_left, f_right = np.where(go_left, f_probe, f_right), np.where(go_left, f_left, f_probe)
-        best = np.minimum(best, f_probe)
-    return best
+    q = np.ascontiguousarray(joints, dtype=np.float64)
+    if q.ndim != 2 or q.shape[1] != JOINTS:
+        raise InputError(f"joints have the shape {q.shape}; (N, {JOINTS}) is needed.")
+    if not np.all(np.isfinite(q)):
+        raise InputError("joints hold NaN or infinite numbers; nothing can be said about those.")
+    return q

@@ -171,3 +171,11 @@ class DepthCamera(Protocol):
             DeviceError: no frame came.
         """
         ...
+
+    def recover(self) -> None:
+        """Make ready to deliver frames again after one did not come; no error if it already is.
+
+        Raises:
+            DeviceError: the camera is not there; the message names it and says what to do.
+        """
+        ...

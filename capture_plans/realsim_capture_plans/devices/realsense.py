@@ -1,133 +1,256 @@
-"""A RealSense camera (D405 and kin) as a `DepthCamera`, on pyrealsense2.
+"""A RealSense camera (D405, D415, D435 and kin) as a `DepthCamera`, on pyrealsense2.
 
-What is handled here so that nobody else has to: the D405's colour comes from its depth sensor;
-a frameset may pair depth with the colour of another frame, so pairs are accepted by frame number
-alone; the depth unit is read from the device; depth is aligned to colour.
+What is handled here so that nobody else has to: a D405's colour comes from its depth sensor, that
+of the others from a sensor of its own; framesets may pair depth with the colour of another frame;
+the depth unit is the device's; depth is brought to the colour's pixels, and to its z axis, too. A
+recording (.db3, or an older .bag) is played back through the same code.
 """
 
-from typing import Any
+import contextlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.interop import import_pyrealsense2
 from realsim.records import CameraIntrinsics
+from realsim_capture_plans.devices import realsense_facts as facts
 from realsim_capture_plans.devices.interfaces import DeviceError, Frame
+from realsim_capture_plans.devices.realsense_align import Alignment
+from realsim_capture_plans.devices.realsense_facts import intrinsics_of
+from realsim_capture_plans.devices.realsense_pairs import COLOR, DEPTH, Pair, PairBuffer
 
-TIMEOUT_MS = 5000
-"""Waited for one frame [ms]; a camera that starts up takes about 1 s."""
-PAIR_ATTEMPTS = 30
-"""Framesets looked at for one whose depth and colour belong together."""
-STALE_FRAMES = 2
-"""Pairs dropped after the queue is empty: their exposure may have begun before `grab`."""
+__all__ = ["EndOfRecordingError", "RealSenseCamera", "RealSenseConfig", "intrinsics_of"]
+
+STALE_PAIRS = 2
+"""Pairs dropped after the buffer is empty: their exposure may have begun before `grab`."""
 MS = 1e-3
 
 
-def intrinsics_of(raw: Any) -> CameraIntrinsics:
-    """Return the record of a pyrealsense2 `intrinsics`.
+class EndOfRecordingError(DeviceError):
+    """Every pair of a recording has been given out."""
 
-    Brown-Conrady and its "modified" kin with zero coefficients are OpenCV's k1 k2 p1 p2 k3.
 
-    Raises:
-        InputError: a distortion model that OpenCV's coefficients cannot express.
-    """
-    coefficients = np.array(raw.coeffs, dtype=np.float64)
-    model = str(raw.model).rsplit(".", maxsplit=1)[-1]
-    if np.any(coefficients != 0) and model != "brown_conrady":
-        raise InputError(
-            f"the camera's distortion model is {model} with coefficients {coefficients.tolist()}; "
-            "only brown_conrady (OpenCV's k1 k2 p1 p2 k3) or zero coefficients can be used. "
-            "inverse_brown_conrady undistorts where OpenCV distorts: calibrate the camera instead."
-        )
-    return CameraIntrinsics(
-        width=raw.width, height=raw.height, fx=raw.fx, fy=raw.fy, cx=raw.ppx, cy=raw.ppy,
-        distortion=coefficients,
-    )  # fmt: skip
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RealSenseConfig:
+    """How the camera streams."""
+
+    width: int = 1280
+    """Of both streams [px]; the D405's full resolution, where its depth is best."""
+    height: int = 720
+    """Of both streams [px]."""
+    fps: int = 30
+    """Frames per second."""
+    exposure: Literal["auto", "locked"] | float = "auto"
+    """Auto exposure; locked: found by auto exposure in the first frames, then kept, so that all
+    views are equally bright; a number: fixed, in microseconds."""
+    settle_pairs: int = 15
+    """Pairs dropped after the start of a live camera: auto exposure takes about half a second."""
+    timeout_s: float = 5.0
+    """Waited for a pair [s]; a camera that starts up takes about 1 s."""
 
 
 class RealSenseCamera:
-    """One connected RealSense, streaming until `close`."""
+    """One connected RealSense, streaming until `close`; or a recording, see `from_recording`."""
 
     def __init__(
         self,
         serial: str | None = None,
+        config: RealSenseConfig | None = None,
         *,
-        width: int = 1280,
-        height: int = 720,
-        fps: int = 30,
-        device: Any = None,
+        devices: Callable[[], Sequence[Any]] | None = None,
     ) -> None:
         """Find the camera and start its depth and colour streams.
 
         Args:
             serial: serial number; may be left out where one camera is connected.
-            width: of both streams [px]. 16:9 only: the SDK misaligns the D405's 4:3 crop.
-            height: of both streams [px].
-            fps: frames per second.
-            device: a pyrealsense2 device, such as a recording; by default the connected one.
+            config: size, rate and exposure; None is `RealSenseConfig()`.
+            devices: returns the pyrealsense2 devices that are connected now; by default those of
+                the SDK's context. `recover` asks again.
 
         Raises:
-            InputError: the image is not 16:9, or its distortion model cannot be used.
+            InputError: a D405 is asked for 4:3 images, or its distortion model cannot be used.
             DeviceError: no such camera, several without a serial, or it does not start.
         """
-        if width * 9 != height * 16 and (width, height) != (848, 480):
-            raise InputError(
-                f"{width}x{height} is not 16:9; the SDK aligns depth wrongly to 4:3 colour crops. "
-                "Use 1280x720, 848x480 or 640x360."
-            )
-        rs = import_pyrealsense2()
-        if device is None:
-            device = _chosen(rs, list(rs.context().query_devices()), serial)
-        self._name = (
-            f"{device.get_info(rs.camera_info.name)} "
-            f"{device.get_info(rs.camera_info.serial_number)}"
-        )
-        wanted = [
-            (rs.stream.depth, rs.format.z16, width, height, fps),
-            (rs.stream.color, rs.format.rgb8, width, height, fps),
-        ]
-        streams = [self._stream(device, *stream) for stream in wanted]
-        color = streams[1][1].as_video_stream_profile()
-        self._intrinsics = intrinsics_of(color.get_intrinsics())
-        # The option is a float32: its shortest decimal is the unit that was meant (0.0001).
-        self._depth_unit_m = float(str(np.float32(streams[0][0].get_option(rs.option.depth_units))))
-        # Resampling costs the border: not done where depth is on the colour's pixels already.
-        depth = streams[0][1].as_video_stream_profile()
-        self._align = None if _same_pixels(depth, color) else rs.align(rs.stream.color)
-        self._pairs = rs.syncer()
-        # A D405 has both streams in one sensor, which opens them together; others have two.
-        together = streams[0][0].get_info(rs.camera_info.name) == streams[1][0].get_info(
-            rs.camera_info.name
-        )
-        groups = (
-            [(streams[0][0], [p for _, p in streams])]
-            if together
-            else [(sensor, [p]) for sensor, p in streams]
-        )
+        self._rs = import_pyrealsense2()
+        self._config = RealSenseConfig() if config is None else config
+        self._devices = self._connected if devices is None else devices
+        self._serial = serial
+        self._recording: Path | None = None
         self._sensors: list[Any] = []
-        for sensor, profiles in groups:
-            try:
-                sensor.open(profiles)
-                sensor.start(self._pairs)
-            except RuntimeError as error:
-                self.close()
-                raise DeviceError(
-                    f"{self._name} does not start {width}x{height} at {fps} per second ({error}). "
-                    "Is it on a USB 3 port, and is no other program using it?"
-                ) from error
-            self._sensors.append(sensor)
+        self._start(_chosen(self._rs, list(self._devices()), serial))
 
-    def _stream(self, device: Any, *wanted: Any) -> tuple[Any, Any]:
-        """Return the sensor and the profile of a stream (type, format, width, height, fps)."""
-        for sensor in device.query_sensors():
+    @classmethod
+    def from_recording(cls, path: Path | str) -> "RealSenseCamera":
+        """Play a recording: every `grab` gives its next pair, `EndOfRecordingError` ends it.
+
+        Args:
+            path: a .db3 written by the SDK's recorder (2.59 or later), or a .bag of an older one.
+
+        Raises:
+            InputError: no such file, or not a recording with depth and colour.
+        """
+        path = Path(path).resolve()
+        if not path.is_file():
+            raise InputError(f"{path} does not exist; a RealSense recording is expected.")
+        camera = cls.__new__(cls)
+        camera._rs = import_pyrealsense2()
+        camera._config = RealSenseConfig()
+        camera._devices = lambda: ()
+        camera._serial = None
+        camera._recording = path
+        camera._sensors = []
+        camera._start(camera._loaded())
+        return camera
+
+    def _connected(self) -> Sequence[Any]:
+        return list(self._rs.context().query_devices())
+
+    def _loaded(self) -> Any:
+        try:
+            playback = self._rs.context().load_device(str(self._recording))
+        except RuntimeError as error:
+            raise InputError(
+                f"{self._recording} is not a recording that the RealSense SDK can play ({error})."
+            ) from error
+        playback.set_real_time(False)
+        return playback
+
+    # --- starting -----------------------------------------------------------------------------
+
+    def _start(self, device: Any) -> None:
+        rs = self._rs
+        self._device = device
+        self._facts = facts.device_json(rs, device)
+        self._name = f"{self._facts.get('model', 'RealSense')} {self._facts.get('serial', '')}"
+        self._serial = self._facts.get("serial", self._serial)
+        self._check_size()
+        depth_sensor, depth = self._stream(rs.stream.depth, rs.format.z16)
+        color_sensor, color = self._stream(rs.stream.color, rs.format.rgb8)
+        self._lenses = (depth.get_intrinsics(), color.get_intrinsics())
+        self._intrinsics = intrinsics_of(self._lenses[COLOR])
+        units = facts.options_json(rs, depth_sensor).get("depth_units")
+        if not units:
+            raise DeviceError(
+                f"{self._name} does not tell its depth unit, and a guess would scale the world."
+            )
+        self._depth_unit_m = units
+        self._T_color_depth = facts.T_of(depth.get_extrinsics_to(color))
+        self._alignment = None
+        if not _same_pixels(*self._lenses, self._T_color_depth):
+            self._alignment = Alignment(rs, self._intrinsics, self._T_color_depth)
+        # A D405 has both streams in one sensor, which opens them together; others have two.
+        self._together = _name_of(rs, depth_sensor) == _name_of(rs, color_sensor)
+        self._pairs = PairBuffer(
+            "number" if self._together else "time",
+            half_frame_ms=500.0 / max(1, color.fps()),
+            lossless=self._recording is not None,
+        )
+        self._last: dict[str, Any] = {}
+        self._unsettled = self._recording is None
+        self._open(
+            [(depth_sensor, [depth, color])]
+            if self._together
+            else [(depth_sensor, [depth]), (color_sensor, [color])]
+        )
+
+    def _check_size(self) -> None:
+        width, height = self._config.width, self._config.height
+        four_to_three = width * 9 != height * 16 and (width, height) != (848, 480)
+        if self._recording is None and four_to_three and "D405" in self._name:
+            raise InputError(
+                f"{width}x{height} is not 16:9; the SDK aligns depth wrongly to a D405's 4:3 "
+                "colour crops. Use 1280x720, 848x480 or 640x360."
+            )
+
+    def _stream(self, kind: Any, pixels: Any) -> tuple[Any, Any]:
+        """Return the sensor and the video profile of a stream.
+
+        Raises:
+            DeviceError: a camera without it.
+            InputError: a recording without it.
+        """
+        c = self._config
+        there: list[str] = []
+        for sensor in self._device.query_sensors():
             for profile in sensor.get_stream_profiles():
                 if not profile.is_video_stream_profile():
                     continue
                 video = profile.as_video_stream_profile()
                 size = (video.width(), video.height(), video.fps())
-                if (video.stream_type(), video.format(), *size) == wanted:
-                    return sensor, profile
-        raise DeviceError(f"{self._name} has no stream {', '.join(map(str, wanted))}.")
+                is_wanted = video.stream_type() == kind and video.format() == pixels
+                if is_wanted and (self._recording or size == (c.width, c.height, c.fps)):
+                    return sensor, video
+                if video.stream_type() == kind:
+                    there.append(f"{video.format()} {size[0]}x{size[1]} at {size[2]}")
+        wanted = f"{kind}, {pixels}"
+        if self._recording:
+            raise InputError(
+                f"{self._recording} has no stream {wanted}; it has "
+                f"{', '.join(sorted(set(there))) or 'none of that kind'}."
+            )
+        raise DeviceError(
+            f"{self._name} has no stream {wanted}, {c.width}, {c.height}, {c.fps}; there is "
+            f"{', '.join(sorted(set(there))[:12]) or 'none of that kind'}. On a USB 2 port or "
+            "cable the larger sizes are missing."
+        )
+
+    def _open(self, groups: list[tuple[Any, list[Any]]]) -> None:
+        rs = self._rs
+        take = {
+            rs.stream.depth: self._pairs.taker(DEPTH),
+            rs.stream.color: self._pairs.taker(COLOR),
+        }
+
+        def sort(frame: Any) -> None:
+            take[frame.get_profile().stream_type()](frame)
+
+        if self._recording is not None:
+            self._device.set_status_changed_callback(self._on_status)
+        try:
+            for sensor, profiles in groups:
+                self._set_exposure(sensor, self._config.exposure)
+                sensor.open(profiles)
+                self._sensors.append(sensor)
+            for sensor, _ in groups:
+                sensor.start(sort)
+        except RuntimeError as error:
+            self.close()
+            c = self._config
+            raise DeviceError(
+                f"{self._name} does not start {c.width}x{c.height} at {c.fps} per second ({error})."
+                " Is it on a USB 3 port, and is no other program using it?"
+            ) from error
+
+    def _on_status(self, status: Any) -> None:
+        if status == self._rs.playback_status.stopped:
+            self._pairs.end()
+
+    def _set_exposure(self, sensor: Any, exposure: Literal["auto", "locked"] | float) -> None:
+        rs = self._rs
+        if self._recording is not None or not sensor.supports(rs.option.exposure):
+            return
+        automatic = isinstance(exposure, str)
+        if sensor.supports(rs.option.enable_auto_exposure):
+            sensor.set_option(rs.option.enable_auto_exposure, float(automatic))
+        if automatic:
+            return
+        unit = 1.0 if sensor.supports(rs.option.depth_units) else facts.COLOR_EXPOSURE_US
+        span = sensor.get_option_range(rs.option.exposure)
+        steps = np.round((exposure / unit - span.min) / span.step)
+        value = float(span.min + steps * span.step)
+        if not span.min <= value <= span.max:
+            raise InputError(
+                f"an exposure of {exposure:g} us was asked for; the {_name_of(rs, sensor)} of "
+                f"{self._name} takes {span.min * unit:g} to {span.max * unit:g} us."
+            )
+        sensor.set_option(rs.option.exposure, value)
+
+    # --- what it is ---------------------------------------------------------------------------
 
     @property
     def name(self) -> str:
@@ -144,54 +267,161 @@ class RealSenseCamera:
         """Metres per count, as the device says (0.0001 on a D405)."""
         return self._depth_unit_m
 
+    @property
+    def description(self) -> dict[str, Any]:
+        """Plain JSON values: who the camera is, its factory lenses, its options as they are now.
+
+        `T_color_depth` (4, 4) [m] maps depth camera coordinates into the colour camera.
+        """
+        options: dict[str, Any] = {}
+        with contextlib.suppress(RuntimeError):  # an unplugged camera has no options to tell
+            options = {
+                _name_of(self._rs, s): facts.options_json(self._rs, s) for s in self._sensors
+            }
+        return {
+            "name": self._name,
+            **self._facts,
+            "depth_unit_m": self._depth_unit_m,
+            "factory": {
+                "color": facts.raw_intrinsics_json(self._lenses[COLOR]),
+                "depth": facts.raw_intrinsics_json(self._lenses[DEPTH]),
+                "T_color_depth": self._T_color_depth.tolist(),
+            },
+            "pairs_by": "frame number" if self._together else "time stamp",
+            "depth_aligned_to_color": self._alignment is not None,
+            "exposure": self._config.exposure,
+            "options": options,
+            "recording": None if self._recording is None else self._recording.name,
+        }
+
+    @property
+    def last_metadata(self) -> dict[str, Any]:
+        """Frame number, clock, exposure [us] and gain of the last pair, "depth" and "color"."""
+        return self._last
+
+    # --- frames -------------------------------------------------------------------------------
+
     def grab(self) -> Frame:
-        """Return a frame exposed after this call.
+        """Return a frame exposed after this call; of a recording, the next one.
 
         Raises:
-            DeviceError: no frame came, or depth and colour never belonged together.
+            DeviceError: no pair of depth and colour came; the message says what did.
+            EndOfRecordingError: the recording has no more pairs.
         """
-        while self._pairs.poll_for_frames():
-            pass
-        seen: set[int] = set()
-        for _ in range(PAIR_ATTEMPTS):
-            try:
-                frames = self._pairs.wait_for_frames(TIMEOUT_MS)
-            except RuntimeError as error:
-                raise DeviceError(
-                    f"{self._name} gave no frame within {TIMEOUT_MS} ms ({error}). Check the cable."
-                ) from error
-            depth, color = frames.get_depth_frame(), frames.get_color_frame()
-            if not depth or not color or depth.get_frame_number() != color.get_frame_number():
-                continue
-            seen.add(int(depth.get_frame_number()))
-            if len(seen) > STALE_FRAMES:
-                return self._frame(frames)
-        raise DeviceError(
-            f"{self._name}: depth and colour had different frame numbers in {PAIR_ATTEMPTS} "
-            "framesets. Lower the frame rate or restart the camera."
+        if self._recording is not None:
+            return self._frame(self._next())
+        if self._unsettled:
+            self._settle()
+        self._pairs.clear()
+        for _ in range(STALE_PAIRS):
+            self._next()
+        return self._frame(self._next())
+
+    def _settle(self) -> None:
+        """Let auto exposure find its value, and keep that if it is to be locked."""
+        pair = self._next()
+        for _ in range(self._config.settle_pairs):
+            pair = self._next()
+        if self._config.exposure == "locked":
+            # A single sensor exposes both streams at once: the depth frame tells.
+            for sensor, frame in zip(self._sensors, (pair.depth, pair.color), strict=False):
+                found = facts.frame_json(self._rs, frame).get("exposure_us")
+                if found is not None:
+                    self._set_exposure(sensor, float(found))
+                elif sensor.supports(self._rs.option.enable_auto_exposure):
+                    sensor.set_option(self._rs.option.enable_auto_exposure, 0.0)
+        self._unsettled = False
+
+    def _next(self) -> Pair:
+        pair = self._pairs.next(self._config.timeout_s)
+        if pair is not None:
+            return pair
+        if self._pairs.ended:
+            if not self._last:
+                raise EndOfRecordingError(
+                    f"{self._recording} holds no pair of depth and colour: {self._pairs.why_none()}"
+                )
+            raise EndOfRecordingError(f"{self._recording} has no more pairs of depth and colour.")
+        raise DeviceError(self._trouble())
+
+    def _trouble(self) -> str:
+        """Return what is wrong with a camera that gives no pairs, and what to do."""
+        why = f"{self._name} gave no frame within {self._config.timeout_s:g} s: "
+        if self._recording is not None:
+            return why + f"{self._pairs.why_none()} from {self._recording}."
+        if self._serial not in _serials(self._rs, list(self._devices())):
+            return (
+                f"{why}it is not connected any more. Plug it in again (a screwed or clamped "
+                "USB 3 cable), then go on."
+            )
+        return (
+            f"{why}{self._pairs.why_none()}. Check cable and port (USB 3), close other "
+            "programs that use it, or unplug it and plug it in again."
         )
+
+    def _frame(self, pair: Pair) -> Frame:
+        self._last = {
+            "depth": facts.frame_json(self._rs, pair.depth),
+            "color": facts.frame_json(self._rs, pair.color),
+        }
+        if self._alignment is None:
+            counts = np.asanyarray(pair.depth.get_data())
+            depth_m = (counts * np.float64(self._depth_unit_m)).astype(np.float32)
+        else:
+            depth_m = self._alignment.depth_m(pair, self._depth_unit_m)
+        return Frame(
+            rgb=np.asanyarray(pair.color.get_data()),
+            depth_m=depth_m,
+            time_s=float(pair.color.get_timestamp()) * MS,
+        )
+
+    # --- stopping and going on ----------------------------------------------------------------
 
     def close(self) -> None:
-        """Stop the streams."""
+        """Stop the streams; a camera that is gone is no error."""
+        self._pairs.close()
         for sensor in self._sensors:
-            sensor.stop()
-            sensor.close()
+            for stop in (sensor.stop, sensor.close):
+                with contextlib.suppress(RuntimeError):
+                    stop()
         self._sensors = []
 
-    def _frame(self, frames: Any) -> Frame:
-        aligned = frames if self._align is None else self._align.process(frames)
-        color = aligned.get_color_frame()
-        counts = np.asanyarray(aligned.get_depth_frame().get_data())
-        return Frame(
-            rgb=np.asanyarray(color.get_data()),
-            depth_m=(counts * np.float64(self._depth_unit_m)).astype(np.float32),
-            time_s=float(color.get_timestamp()) * MS,
-        )
+    def reopen(self) -> None:
+        """Start the same camera (by serial number) again; a recording starts from its beginning.
+
+        Raises:
+            DeviceError: it is not connected, or it does not start.
+        """
+        self.close()
+        if self._recording is not None:
+            self._start(self._loaded())
+            return
+        devices = list(self._devices())
+        if self._serial not in _serials(self._rs, devices):
+            there = ", ".join(_serials(self._rs, devices)) or "no other"
+            raise DeviceError(
+                f"{self._name} is not connected (connected: {there}). Plug it in again; another "
+                "camera cannot go on in its place, its lens and mount are not the same."
+            )
+        self._start(_chosen(self._rs, devices, self._serial))
+
+    def recover(self) -> None:
+        """Make ready to deliver frames again after one did not come.
+
+        Raises:
+            DeviceError: the camera is not connected, or it does not start.
+        """
+        if self._recording is None:
+            self.reopen()
+
+
+def _serials(rs: Any, devices: Sequence[Any]) -> list[str]:
+    return [str(d.get_info(rs.camera_info.serial_number)) for d in devices]
 
 
 def _chosen(rs: Any, devices: list[Any], serial: str | None) -> Any:
     """Return the device with this serial number, or the only one."""
-    numbers = [d.get_info(rs.camera_info.serial_number) for d in devices]
+    numbers = _serials(rs, devices)
     if not devices:
         raise DeviceError(
             "no RealSense camera is connected. Plug it into a USB 3 port; on Linux the SDK's udev "
@@ -209,12 +439,12 @@ def _chosen(rs: Any, devices: list[Any], serial: str | None) -> Any:
     return devices[0 if serial is None else numbers.index(serial)]
 
 
-def _same_pixels(depth: Any, color: Any) -> bool:
-    """Return whether two video stream profiles share their pinhole and their place."""
-    a, b = depth.get_intrinsics(), color.get_intrinsics()
-    between = depth.get_extrinsics_to(color)
-    return (
-        (a.fx, a.fy, a.ppx, a.ppy, list(a.coeffs)) == (b.fx, b.fy, b.ppx, b.ppy, list(b.coeffs))
-        and np.allclose(between.rotation, np.eye(3).ravel())
-        and np.allclose(between.translation, 0.0)
-    )
+def _name_of(rs: Any, sensor: Any) -> str:
+    return str(sensor.get_info(rs.camera_info.name))
+
+
+def _same_pixels(depth: Any, color: Any, T_color_depth: NDArray[Any]) -> bool:
+    """Return whether two cameras share their pinhole and their place: resampling costs a border."""
+    a, b = facts.raw_intrinsics_json(depth), facts.raw_intrinsics_json(color)
+    lens = ("width", "height", "fx", "fy", "cx", "cy", "coefficients")
+    return all(a[key] == b[key] for key in lens) and np.allclose(T_color_depth, np.eye(4))

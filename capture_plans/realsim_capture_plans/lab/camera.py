@@ -95,6 +95,9 @@ class SimulatedDepthCamera:
             time_s=state.time_s + self._frames * FRAME_S,
         )
 
+    def recover(self) -> None:
+        """Do nothing: a simulated camera is always ready."""
+
     def _current_renderer(self) -> "PhotoRenderer":
         """Return the renderer of what is on the table now; built anew when that changes."""
         from realsim.rendering.photo import PhotoRenderer

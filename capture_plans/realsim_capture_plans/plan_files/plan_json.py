@@ -1,15 +1,47 @@
-"""A capture plan as a JSON file with a schema version and a hash of its content."""
+"""A capture plan as a JSON file with a schema version and a hash of its content.
+
+The file holds the content (what the plan is made of, under the hash), and beside it what follows
+from the content: expected flange and camera poses, and for every move all that a controller needs.
+Another program drives the plan from the file alone; on reading, what follows is compared with the
+chain, so that a plan of another robot or in other units is found before anything moves.
+"""
 
 import json
 from pathlib import Path
 from typing import Any
 
-from realsim.errors import InputError
-from realsim_capture_plans.planning.content import hash_of, plan_content, plan_of
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError, RealsimError, UnitError
+from realsim_capture_plans.arms.kinematics import CHAINS
+from realsim_capture_plans.plan_files.evidence import (
+    MILLIMETRES_FROM_M,
+    check_joint_unit,
+    why_poses_disagree,
+)
+from realsim_capture_plans.planning.content import (
+    expected_poses,
+    hash_of,
+    plan_content,
+    plan_of,
+    segments,
+)
 from realsim_capture_plans.planning.record import CapturePlan
 
+Array = NDArray[np.float64]
 SCHEMA = "realsim capture plan"
 SCHEMA_VERSION = 2
+LARGEST_BYTES = 64_000_000
+"""A plan of 256 views has 0.5 MB; a file beyond a hundred times that is something else."""
+POSE_M = 1e-5
+"""Expected positions may differ from the chain's by this [m]: what rounding to 5 digits does."""
+POSE_RAD = 1e-5
+"""The same for orientations [rad]."""
+SAME_JOINT_RAD = 1e-9
+"""Corners of the segments may differ from the content's joints by this [rad]."""
+NOMINAL = 1e-6
+"""A robot of a known name has that model's nominal numbers to this [m or rad]."""
 
 
 def plan_to_json(plan: CapturePlan) -> dict[str, Any]:
@@ -20,6 +52,8 @@ def plan_to_json(plan: CapturePlan) -> dict[str, Any]:
         "schema_version": SCHEMA_VERSION,
         "sha256": hash_of(content),
         "content": content,
+        "expected": expected_poses(plan),
+        "segments": segments(plan),
     }
 
 
@@ -31,7 +65,9 @@ def plan_from_json(data: Any, source: str = "the plan") -> CapturePlan:
         source: what the data is called in errors.
 
     Raises:
-        InputError: not a plan, a newer version, or a content that does not match its hash.
+        InputError: not a plan, another version, a content that does not match its hash, or poses
+            that do not follow from it.
+        UnitError: joints in degrees, lengths in millimetres.
     """
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise InputError(f"{source} is not a '{SCHEMA}': the key 'schema' does not say so.")
@@ -42,13 +78,20 @@ def plan_from_json(data: Any, source: str = "the plan") -> CapturePlan:
             f"{SCHEMA_VERSION}. Make the plan anew, or use the realsim that wrote it."
         )
     try:
-        plan = plan_of(data["content"])
-    except (KeyError, TypeError, ValueError) as error:
+        content: dict[str, Any] = data["content"]
+        _check_units(content, source)
+        plan = plan_of(content)
+        _check_model(plan, source)
+        _check_poses(plan, data["expected"], source)
+        _check_segments(plan, data["segments"], source)
+    except RealsimError as error:
+        raise type(error)(_named(str(error), source)) from error
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
             f"{source} is incomplete or has a field that is not known ({error}). Restore the file, "
             "or make the plan anew."
         ) from error
-    if (found := hash_of(data["content"])) != data.get("sha256"):
+    if (found := hash_of(content)) != data.get("sha256"):
         raise InputError(
             f"{source} was changed after it was checked: its content has the sha256 "
             f"{found[:12]}..., the file says {str(data.get('sha256'))[:12]}... A "
@@ -59,24 +102,152 @@ def plan_from_json(data: Any, source: str = "the plan") -> CapturePlan:
 
 def save_plan(plan: CapturePlan, path: Path | str) -> None:
     """Write the plan as JSON, whole or not at all."""
-    from realsim.store.atomic import write_json
+    from realsim.store.atomic import write_text
 
-    write_json(Path(path), plan_to_json(plan))
+    write_text(Path(path), readable_json(plan_to_json(plan)))
 
 
 def load_plan(path: Path | str) -> CapturePlan:
     """Return the plan of a file.
 
     Raises:
-        InputError: no such file, not JSON, or not an unchanged plan of this version.
+        InputError: no such file, too large, not JSON, or not an unchanged plan of this version.
+        UnitError: joints in degrees, lengths in millimetres.
     """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"there is no plan at {path}; make one with `realsim plan`.")
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    return plan_from_json(read_json(path, "a saved capture plan"), str(path))
+
+
+def read_json(path: Path, what: str) -> Any:
+    """Return the values of a JSON file of a reasonable size.
+
+    Raises:
+        InputError: too large, not JSON, not text, nested too deeply, or NaN in it.
+    """
+    if (size := path.stat().st_size) > LARGEST_BYTES:
         raise InputError(
-            f"{path} is not JSON ({error}); a saved capture plan is needed."
-        ) from error
-    return plan_from_json(data, str(path))
+            f"{path} has {size / 1e6:.0f} MB; {what} has less than {LARGEST_BYTES / 1e6:.0f} MB. "
+            "Is it the right file?"
+        )
+
+    def refuse(constant: str) -> float:
+        raise ValueError(f"it holds {constant}, which is no number")
+
+    try:
+        return json.loads(path.read_text(encoding="utf-8-sig"), parse_constant=refuse)
+    except RecursionError as error:
+        raise InputError(f"{path} is nested too deeply; {what} is needed.") from error
+    except ValueError as error:
+        raise InputError(f"{path} is not JSON ({error}); {what} is needed.") from error
+
+
+def readable_json(value: Any) -> str:
+    """Return JSON that people can read: one view, row or move per line, not one number per line.
+
+    Floats come back bit for bit: Python writes the shortest text that reads as the same number.
+    """
+    return _lines(value, 0, expand=True) + "\n"
+
+
+def _lines(value: Any, indent: int, *, expand: bool) -> str:
+    pad, end = " " * (indent + 1), " " * indent
+    if isinstance(value, dict) and value and expand:
+        rows = [
+            f"{pad}{json.dumps(k)}: {_lines(v, indent + 1, expand=True)}" for k, v in value.items()
+        ]
+        return "{\n" + ",\n".join(rows) + f"\n{end}}}"
+    if isinstance(value, list) and any(isinstance(v, list | dict) for v in value) and expand:
+        rows = [pad + _lines(v, indent + 1, expand=False) for v in value]
+        return "[\n" + ",\n".join(rows) + f"\n{end}]"
+    return json.dumps(value, allow_nan=False)
+
+
+def _named(message: str, source: str) -> str:
+    return message if source in message else f"{source}: {message}"
+
+
+def _check_units(content: dict[str, Any], source: str) -> None:
+    """Raise if joints look like degrees or lengths like millimetres."""
+    joints = np.array([content["home"], *content["joints"]], dtype=np.float64)
+    names = ["home", *(f"view {k}" for k in range(len(joints) - 1))]
+    check_joint_unit(joints, "rad", names, source)
+    lengths = {
+        "center_world": np.array(content["center_world"], dtype=np.float64),
+        "the mount's T_ee_cam": np.array(content["mount"]["T_ee_cam"], dtype=np.float64)[:3, 3],
+        "dh a": np.array(content["dh"]["a"], dtype=np.float64),
+        "dh d": np.array(content["dh"]["d"], dtype=np.float64),
+    }
+    for name, length in lengths.items():
+        if np.any(np.abs(length) > MILLIMETRES_FROM_M):
+            raise UnitError(
+                f"{source}: {name} is {length.tolist()} m, and a UR reaches no farther than 1.8 m. "
+                "These look like millimetres; write metres."
+            )
+
+
+def _check_model(plan: CapturePlan, source: str) -> None:
+    """Raise if the arm has the name of one model and the numbers of another."""
+    known = CHAINS.get(plan.robot)
+    if known is None:
+        return
+
+    def off(name: str) -> float:
+        arm = CHAINS[name]
+        parts = ("a", "d", "alpha", "theta")
+        return max(float(np.abs(getattr(plan.chain, p) - getattr(arm, p)).max()) for p in parts)
+
+    if off(plan.robot) > NOMINAL:
+        alike = [name for name in CHAINS if off(name) <= NOMINAL]
+        whose = f"those of a {alike[0]}" if alike else "of no known model"
+        raise InputError(
+            f"{source} says that its robot is a {plan.robot}, but its DH numbers are {whose}. "
+            "Make the plan anew for the robot that will drive it."
+        )
+
+
+def _check_poses(plan: CapturePlan, expected: dict[str, Any], source: str) -> None:
+    """Raise if the file's poses do not follow from its joints, with the likely cause."""
+    for name, what in (("Ts_base_ee", "flange"), ("Ts_base_cam", "camera")):
+        written = np.array(expected[name], dtype=np.float64)
+        own: Array = getattr(plan, name)
+        if written.shape != own.shape or not np.all(np.isfinite(written)):
+            raise InputError(
+                f"{source}: {name} has the shape {written.shape}; {own.shape} finite numbers are "
+                "needed, one pose per view."
+            )
+        gap = np.linalg.norm(written[:, :3, 3] - own[:, :3, 3], axis=-1)
+        turn = np.linalg.norm(written[:, :3, :3] - own[:, :3, :3], axis=(-2, -1)) / np.sqrt(2)
+        if gap.max() <= POSE_M and turn.max() <= POSE_RAD:
+            continue
+        if what == "camera":
+            why = f"the mount '{plan.mount.name}' is not the one that the poses were made with"
+            if np.abs(written[:, :3, 3]).max() > MILLIMETRES_FROM_M:
+                why = "the poses are in millimetres; metres are needed"
+        else:
+            why = why_poses_disagree(plan.joints, written, plan.chain)
+        k = int(np.argmax(gap))
+        raise InputError(
+            f"{source}: the {what} poses do not follow from the joints of its {plan.robot}: "
+            f"{1e3 * float(np.median(gap)):.4g} mm apart in the middle, most at view {k} "
+            f"({1e3 * float(gap[k]):.4g} mm). Likely cause: {why}. Make the plan anew for the "
+            "robot and the mount that will drive it."
+        )
+
+
+def _check_segments(plan: CapturePlan, written: list[dict[str, Any]], source: str) -> None:
+    """Raise if the moves for other programs are not those of the content."""
+    own = segments(plan)
+    if len(written) != len(own):
+        raise InputError(f"{source} has {len(written)} segments and {len(own)} views.")
+    for mine, row in zip(own, written, strict=True):
+        corners = np.array(row["corners"], dtype=np.float64)
+        needed = np.array(mine["corners"])
+        same = corners.shape == needed.shape and np.all(np.abs(corners - needed) <= SAME_JOINT_RAD)
+        numbers = ("view", "speed_rad_s", "acceleration_rad_s2", "settle_s")
+        if not same or any(row[key] != mine[key] for key in numbers):
+            raise InputError(
+                f"{source}: the segment of view {mine['view']} is not the move of the content: it "
+                "was changed after the plan was checked and may collide. Make the plan anew."
+            )

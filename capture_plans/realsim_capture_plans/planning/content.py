@@ -1,4 +1,9 @@
-"""A capture plan as plain JSON values, and the hash that names it."""
+"""A capture plan as plain JSON values, and the hash that names it.
+
+The content is what a plan is made of. What follows from it (flange and camera poses, corners and
+times of the moves) is written beside it for other programs, and compared with the chain when the
+file is read: it is no part of the hash, whose last bits it would make depend on the machine.
+"""
 
 import hashlib
 import json
@@ -13,7 +18,11 @@ from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 
 def plan_content(plan: CapturePlan) -> dict[str, Any]:
-    """Return the plan as plain JSON values, without schema and hash."""
+    """Return what the plan is made of as plain JSON values.
+
+    A change of these keys, or of the fields of `PlanConfig`, changes every hash: it needs a new
+    schema version of the file.
+    """
     chain = plan.chain
     numbers = [f.name for f in fields(DhChain) if f.name not in ("name", "limits")]
     return {
@@ -37,14 +46,44 @@ def plan_content(plan: CapturePlan) -> dict[str, Any]:
         "center_world": plan.center_world.tolist(),
         "reference_view": plan.reference_view,
         "joints": plan.joints.tolist(),
-        "Ts_base_ee": plan.Ts_base_ee.tolist(),
-        "Ts_base_cam": plan.Ts_base_cam.tolist(),
         "vias": [[k, q.tolist()] for k, q in plan.vias],
         "config": {
             k: list(v) if isinstance(v, tuple) else v for k, v in asdict(plan.config).items()
         },
         "metrics": plan.metrics,
     }
+
+
+def expected_poses(plan: CapturePlan) -> dict[str, Any]:
+    """Return the (N, 4, 4) poses of flange and nominal camera in base [m] as JSON values."""
+    return {"Ts_base_ee": plan.Ts_base_ee.tolist(), "Ts_base_cam": plan.Ts_base_cam.tolist()}
+
+
+def segments(plan: CapturePlan) -> list[dict[str, Any]]:
+    """Return all that a controller needs for each move, so that it needs nothing else.
+
+    `corners` are the joints [rad] from the move's start over its via points to the view; the arm
+    goes straight from one to the next in joint space and stops at each. `seconds` is the time of
+    the motion, the settling that follows not included.
+    """
+    from realsim_capture_plans.planning.ordering import move_seconds
+
+    c = plan.config
+    rows: list[dict[str, Any]] = []
+    for k in range(len(plan)):
+        corners = plan.move(k)
+        leading = np.abs(np.diff(corners, axis=0)).max(-1)
+        rows.append(
+            {
+                "view": k,
+                "seconds": round(float(np.sum(move_seconds(leading, c))), 6),
+                "speed_rad_s": c.speed,
+                "acceleration_rad_s2": c.acceleration,
+                "settle_s": c.settle_s,
+                "corners": corners.tolist(),
+            }
+        )
+    return rows
 
 
 def content_hash(plan: CapturePlan) -> str:

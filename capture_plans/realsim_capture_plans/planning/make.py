@@ -1,12 +1,14 @@
 """Make a capture plan: exactly n views that the arm reaches, in a short collision-free tour.
 
 Directions, radii and rolls give camera poses; every arm branch that reaches one and is free is a
-candidate; the reachable directions are thinned to n; order and branch are chosen together; every
-move is checked, and goes over via points where the straight line collides.
+candidate; the reachable directions are thinned to n, and these are tried more densely; order and
+candidates are chosen together; every move is checked, and goes over via points where the straight
+line collides.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -14,29 +16,53 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
+from realsim.geometry.camera import project
 from realsim_capture_plans.arms.kinematics import UR5, DhChain
 from realsim_capture_plans.collision.model import CollisionModel
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
+from realsim_capture_plans.planning.board_poses import (
+    board_poses,
+    board_roll,
+    plane_axes,
+    spread_rolls,
+)
+from realsim_capture_plans.planning.bounds import held_karp_bound, two_nearest_bound
+from realsim_capture_plans.planning.metrics import plan_metrics
 from realsim_capture_plans.planning.moves import NoFreeMoveError, connect
-from realsim_capture_plans.planning.ordering import move_seconds
+from realsim_capture_plans.planning.ordering import Clusters
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.view_quality import SENSORS, nearest_deg
 from realsim_capture_plans.planning.viewpoints import (
     Candidates,
+    better_elbow,
     choose_home,
     golden_cap,
     hemisphere_poses,
-    near_home,
+    look_at_poses,
     reachable,
-    same_elbow,
+    on_one_elbow,
     thin_directions,
+    well_seen,
+    with_turns,
 )
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 Kind = Literal["hemisphere", "calibration"]
-TARGET_CAP_POINTS = 4000
-"""Directions that the hole angle is measured with: 1.3 degrees apart."""
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, how much of it is done, and how much there is."""
+SCENE_GRID = 4
+"""Points per side that stand for the keep-out volume when views are judged by what they see."""
+GREATEST_CENTER_M = 3.0
+"""Farther than this from the base the centre must have been given in another unit [m]."""
+SECOND_TRY = 6
+"""Times as many poses are tried in directions that seemed out of reach."""
+ELBOW_WORTH = 1.15
+"""The other side of the elbow is used where the hole would be larger by this factor without it: the
+way there and back takes about 8 s."""
+MOST_MISSED = 0.25
+"""Where more than this share of the directions is missed, the scene stands badly: no second try."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -49,6 +75,15 @@ class _Task:
     cell: WorkCell
     config: PlanConfig
     model: CollisionModel
+    rng: np.random.Generator
+    progress: Progress
+
+    def reach(self, poses: Array, item: Ints, what: str) -> Candidates:
+        """Return the candidates of camera poses (P, 4, 4) for items (P,)."""
+        return reachable(
+            poses, item, self.mount.T_ee_cam, self.model, self.config.sigma_min,
+            lambda done, total: self.progress(what, done, total),
+        )  # fmt: skip
 
 
 def hemisphere_plan(
@@ -60,6 +95,7 @@ def hemisphere_plan(
     *,
     chain: DhChain = UR5,
     obstacles: tuple[tuple[str, Box], ...] = (),
+    progress: Progress | None = None,
 ) -> CapturePlan:
     """Return n views that look at the scene from all over the reachable hemisphere.
 
@@ -68,27 +104,80 @@ def hemisphere_plan(
         center_world: (3,) what the camera looks at, in base [m].
         mount: the camera on the flange, or (4, 4) T_ee_cam [m] of a D405; a few mm off do no harm.
         config: radii, elevations, clearances, speeds.
-        rng: draws the turn of the spiral and, where a move collides, the via points.
+        rng: draws the turn of the spiral, the search for the tour and, where a move collides, the
+            via points.
         chain: the arm, nominal or calibrated.
         obstacles: named boxes in base that the arm keeps its clearance to.
+        progress: told how far the work is.
 
     Raises:
         InputError: n is not positive, or a given pose is not one.
         DegenerateError: fewer than n views are reachable, or one cannot be driven to.
     """
-    task = _task("hemisphere", n, center_world, mount, config, chain, obstacles)
-    spin = se3.exp_so3([0.0, 0.0, rng.uniform(0.0, 2 * np.pi)])
-    tried = max(config.oversampling * n, config.least_directions)
-    directions = golden_cap(tried, config.elevation_deg) @ spin.T
-    poses, item = hemisphere_poses(task.center, directions, config)
-    found = reachable(poses, item, task.mount.T_ee_cam, task.model, config.sigma_min)
+    task = _task("hemisphere", n, center_world, mount, config, chain, obstacles, rng, progress)
+    directions, found = reachable_directions(task, n)
+    items = np.unique(found.item)
+    tried = len(directions)
+    home, one_side = _home(task, found, n, tried)
+    side = float(np.sign(np.sin(home[2])))
+    strict = one_side.where(np.sin(one_side.joints[:, 2]) * side > 0)
+    if _largest_hole(directions, items, strict, n) < ELBOW_WORTH * _largest_hole(
+        directions, items, one_side, n
+    ):
+        one_side = strict
+
+    def more(chosen: Ints) -> Candidates:
+        """Return the candidates of the chosen directions, tried more densely."""
+        poses, item = hemisphere_poses(
+            task.center, directions[chosen], config.radius_m, config.dense_poses, 0.5
+        )
+        dense = task.reach(poses, chosen[item], "more ways to the chosen views")
+        both = on_one_elbow(one_side.joined(dense), side)
+        return well_seen(both, _seen_share(both.Ts_base_cam, task), config.seen_share)
 
     def choose(ok: Ints) -> Ints:
         return ok[thin_directions(directions[ok], n)]
 
-    plan = _driven(task, found, n, tried, choose, rng)
-    coverage = _coverage(plan.directions(), config.elevation_deg)
-    return replace(plan, metrics=plan.metrics | coverage)
+    def between(direction: Ints, joints: Array) -> tuple[Array, Ints]:
+        """Return candidates (K, 6) near joints (N, 6), and the row that each belongs to."""
+        return _nearest_views(task, directions[direction], joints)
+
+    plan = _driven(task, one_side, home, n, choose, more, between)
+    found_here = {
+        "hole_reachable_deg": float(nearest_deg(plan.directions(), directions[items]).max()),
+        "reachable_share": len(items) / tried,
+    }
+    return replace(plan, metrics=plan.metrics | found_here)
+
+
+def _largest_hole(directions: Array, items: Ints, found: Candidates, n: int) -> float:
+    """Return the hole [deg] that n of the found items leave among all that are reachable."""
+    ok = np.unique(found.item)
+    if len(ok) < n:
+        return np.inf
+    chosen = directions[ok][thin_directions(directions[ok], n)]
+    return float(nearest_deg(chosen, directions[items]).max())
+
+
+def reachable_directions(task: "_Task", n: int) -> tuple[Array, Candidates]:
+    """Return the directions (D, 3) that are tried for n views, and what reaches them."""
+    config = task.config
+    spin = se3.exp_so3([0.0, 0.0, task.rng.uniform(0.0, 2 * np.pi)])
+    tried = max(config.oversampling * n, config.least_directions)
+    directions = golden_cap(tried, config.elevation_deg) @ spin.T
+    poses, item = hemisphere_poses(
+        task.center, directions, config.radius_m, config.poses_per_direction, 0.0
+    )
+    found = task.reach(poses, item, "which directions are reachable")
+    missed = np.setdiff1d(np.arange(tried), found.item)
+    if len(missed) and len(missed) < tried * MOST_MISSED:
+        # A direction may be reachable by a roll or a radius that was not tried.
+        poses, item = hemisphere_poses(
+            task.center, directions[missed], config.radius_m, SECOND_TRY * len(poses) // tried, 0.5
+        )
+        second = task.reach(poses, missed[item], "a second try at the rest")
+        found = found.joined(second)
+    return directions, found
 
 
 def calibration_plan(
@@ -101,6 +190,7 @@ def calibration_plan(
     normal_world: ArrayLike = (0.0, 0.0, 1.0),
     chain: DhChain = UR5,
     obstacles: tuple[tuple[str, Box], ...] = (),
+    progress: Progress | None = None,
 ) -> CapturePlan:
     """Return n views of a flat board: every roll, tilts, distances, the board all over the image.
 
@@ -112,30 +202,34 @@ def calibration_plan(
         center_world: (3,) the board's centre in base [m].
         mount: the camera on the flange, or (4, 4) T_ee_cam [m] of a D405.
         config: distances, tilt, aim jitter, clearances, speeds.
-        rng: draws the poses.
+        rng: draws the poses and the search for the tour.
         normal_world: (3,) the board's normal, to the side of the camera.
         chain: the arm, nominal or calibrated.
         obstacles: named boxes in base that the arm keeps its clearance to.
+        progress: told how far the work is.
 
     Raises:
         InputError: n is not positive, or a given pose is not one.
         DegenerateError: fewer than n views are reachable, or one cannot be driven to.
     """
-    task = _task("calibration", n, center_world, mount, config, chain, obstacles)
+    task = _task("calibration", n, center_world, mount, config, chain, obstacles, rng, progress)
     normal = np.asarray(normal_world, dtype=np.float64)
     length = float(np.linalg.norm(normal))
     if normal.shape != (3,) or not length > 0:
         raise InputError(f"the board's normal is {normal.tolist()}; a direction (3,) is needed.")
     tried = max(config.board_oversampling * n, config.least_directions)
-    poses, features = _board_poses(tried, task, normal / length, rng)
-    found = reachable(poses, np.arange(tried), task.mount.T_ee_cam, task.model, config.sigma_min)
-    roll = _board_roll(poses, _plane_axes(normal / length))
+    poses, features = board_poses(tried, task.center, normal / length, config, rng)
+    found = task.reach(poses, np.arange(tried), "which board views are reachable")
+    roll = board_roll(poses, plane_axes(normal / length))
+    home, one_side = _home(task, found, n, tried)
 
     def choose(ok: Ints) -> Ints:
-        return ok[_spread_rolls(features[ok], roll[ok], n)]
+        return ok[spread_rolls(features[ok], roll[ok], n)]
 
-    plan = _driven(task, found, n, tried, choose, rng)
-    return replace(plan, metrics=plan.metrics | _board_metrics(plan, normal / length))
+    plan = _driven(task, one_side, home, n, choose, lambda _: one_side)
+    board = plan_metrics(plan, task.model, board_normal=normal)
+    share = {"reachable_share": len(np.unique(found.item)) / tried}
+    return replace(plan, metrics=plan.metrics | board | share)
 
 
 def _task(
@@ -146,6 +240,8 @@ def _task(
     config: PlanConfig,
     chain: DhChain,
     obstacles: tuple[tuple[str, Box], ...],
+    rng: np.random.Generator,
+    progress: Progress | None,
 ) -> _Task:
     """Check what was given and build the collision model."""
     if n < 1:
@@ -153,10 +249,23 @@ def _task(
     c = np.array(center, dtype=np.float64)
     if c.shape != (3,) or not np.all(np.isfinite(c)):
         raise InputError(f"the scene centre is {c.tolist()}; (x, y, z) in base [m] is needed.")
+    if np.abs(c).max() > GREATEST_CENTER_M:
+        raise InputError(
+            f"the scene centre {c.tolist()} m is {np.abs(c).max():.0f} m from the base and the arm "
+            "reaches 0.85 m. Were millimetres given? Metres are needed."
+        )
     carried = mount if isinstance(mount, Mount) else d405_mount(mount)
     cell = config.work_cell(c, kind, obstacles)
-    model = CollisionModel(chain, carried, cell, config.clearance_m)
-    return _Task(kind=kind, center=c, mount=carried, cell=cell, config=config, model=model)
+    return _Task(
+        kind=kind,
+        center=c,
+        mount=carried,
+        cell=cell,
+        config=config,
+        model=CollisionModel(chain, carried, cell, config.clearance_m),
+        rng=rng,
+        progress=progress or (lambda what, done, total: None),
+    )
 
 
 def _too_few(task: _Task, n: int, reachable_count: int, tried: int) -> str:
@@ -174,112 +283,139 @@ def _too_few(task: _Task, n: int, reachable_count: int, tried: int) -> str:
     )
 
 
-def _board_poses(
-    tried: int, task: _Task, normal: Array, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Return camera poses (tried, 4, 4) over a board and what they should differ in (tried, 5).
+def _home(task: _Task, found: Candidates, n: int, tried: int) -> tuple[Array, Candidates]:
+    """Return where the tour begins, and the candidates on one side of the elbow where there are.
 
-    Additive recurrence in six dimensions (Roberts' R-sequence: steps 1/g^k with g^7 = g + 1)
-    spreads direction, roll, distance and aim point evenly for any number of poses.
+    Raises:
+        DegenerateError: fewer than n items are reachable.
     """
-    c = task.config
-    g = 1.5
-    for _ in range(50):
-        g = (1.0 + g) ** (1.0 / 7.0)
-    steps = g ** -np.arange(1.0, 7.0)
-    u = np.mod(rng.uniform(size=6) + np.arange(1, tried + 1)[:, None] * steps, 1.0)
-    cos_tilt = 1.0 - u[:, 0] * (1.0 - np.cos(np.radians(c.board_tilt_deg)))
-    sin_tilt = np.sqrt(1.0 - cos_tilt**2)
-    azimuth, roll = 2 * np.pi * u[:, 1], 2 * np.pi * u[:, 2]
-    distance = c.board_distance_m[0] + u[:, 3] * (c.board_distance_m[1] - c.board_distance_m[0])
-    axes = _plane_axes(normal)
-    aim = task.center + (2 * u[:, 4:6] - 1.0) * c.aim_jitter_m @ axes[:2]
-    direction = np.stack([np.cos(azimuth) * sin_tilt, np.sin(azimuth) * sin_tilt, cos_tilt], -1)
-    eye = aim + distance[:, None] * (direction @ axes)
-    poses = np.stack([se3.look_at(e, a, r) for e, a, r in zip(eye, aim, roll, strict=True)])
-    # About one unit per feature: direction over the cap, distance and aim point over their ranges.
-    sideways = direction[:, :2] / np.sin(np.radians(c.board_tilt_deg))
-    return poses, np.concatenate([sideways, 2 * u[:, 3:6] - 1.0], axis=1)
+    count = len(np.unique(found.item))
+    if count < n:
+        raise DegenerateError(_too_few(task, n, count, tried))
+    one_side = on_one_elbow(found, better_elbow(found))
+    return choose_home(one_side), one_side
 
 
-def _spread_rolls(features: Array, roll: Array, n: int) -> Ints:
-    """Return n row numbers: one of every n-th of the full turn, otherwise far from each other.
-
-    A sector in which nothing is reachable gives its view to the rows farthest from the others.
-    """
-    sector = np.floor(np.mod(roll, 2 * np.pi) / (2 * np.pi) * n).astype(np.intp) % n
-    nearest = np.full(len(features), np.inf)
-    chosen: list[int] = []
-    # The first round takes the sectors one by one, the second fills up from all rows.
-    for rows in [*(sector == s for s in range(n)), *([np.ones(len(roll), dtype=bool)] * n)]:
-        score = np.where(rows, nearest, -1.0)
-        score[chosen] = -1.0
-        best = int(np.argmax(score))
-        if len(chosen) < n and score[best] >= 0:
-            chosen.append(best)
-            distance = np.linalg.norm(features - features[best], axis=1)
-            nearest = np.minimum(nearest, distance)
-    return np.array(chosen, dtype=np.intp)
-
-
-def _plane_axes(normal: Array) -> Array:
-    """Return rows x, y, z = normal of a right-handed frame on the board."""
-    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    x = np.cross(helper, normal)
-    x = x / np.linalg.norm(x)
-    return np.stack([x, np.cross(normal, x), normal])
-
-
-def _board_roll(Ts_base_cam: Array, axes: Array) -> Array:
-    """Return the roll (N,) [rad] that the board is seen at: its own x axis in the image."""
-    x_cam = np.swapaxes(Ts_base_cam[:, :3, :3], -1, -2) @ axes[0]
-    return np.arctan2(x_cam[:, 1], x_cam[:, 0])
+def _seen_share(Ts_base_cam: Array, task: _Task) -> Array:
+    """Return (M,) which share of the keep-out volume is inside the image at each pose."""
+    camera = SENSORS[task.mount.camera].intrinsics if task.mount.camera in SENSORS else None
+    if camera is None:
+        return np.ones(len(Ts_base_cam))
+    low = np.array(task.cell.keep_out.lower)
+    low[2] = task.cell.table.upper[2]
+    steps = np.linspace(0.0, 1.0, SCENE_GRID)
+    grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
+    points = low + grid * (np.array(task.cell.keep_out.upper) - low)
+    points_cam = se3.transform(se3.invert(Ts_base_cam), points)
+    uv = project(camera, points_cam)
+    inside = np.all((uv >= 0) & (uv <= [camera.width - 1, camera.height - 1]), axis=-1)
+    return np.mean(inside & (points_cam[..., 2] > 0), axis=-1)
 
 
 def _driven(
     task: _Task,
     found: Candidates,
+    home: Array,
     n: int,
-    tried: int,
     choose: Callable[[Ints], Ints],
-    rng: np.random.Generator,
+    more: Callable[[Ints], Candidates],
+    between: Callable[[Ints, Array], tuple[Array, Ints]] | None = None,
 ) -> CapturePlan:
-    """Return the plan of n chosen items: an order, a branch of each, and free moves between them.
+    """Return the plan of n chosen items: an order, a candidate of each, and free moves between.
 
     An item that no free move leads to is left out, and the choice is made again.
 
     Args:
         task: arm, mount, what must stay free.
         found: what is reachable.
+        home: (6,) where the tour begins [rad].
         n: number of views.
-        tried: number of items that were tried.
         choose: returns n of the items it is given.
-        rng: drives the search for via points.
+        more: returns the candidates of chosen items.
+        between: returns candidates of items (N,) near joints (N, 6), and the row of each.
 
     Raises:
         DegenerateError: fewer than n items are left.
     """
     chain, config = task.model.chain, task.config
-    count = len(np.unique(found.item))
-    if count < n:
-        raise DegenerateError(_too_few(task, n, count, tried))
-    home = choose_home(found)
-    one_side = same_elbow(found, home)
-    if len(np.unique(one_side.item)) >= n:
-        found = one_side
     ok = np.unique(found.item)
     while True:
         chosen = choose(ok)
-        near = [near_home(found.joints[found.item == i], home, chain, config)[0] for i in chosen]
+        candidates = more(chosen)
+        order = np.argsort(candidates.item, kind="stable")
+        rows = np.split(
+            candidates.joints[order],
+            np.searchsorted(candidates.item[order], np.unique(candidates.item))[1:],
+        )
+        by_item = dict(zip(np.unique(candidates.item).tolist(), rows, strict=True))
+        near = [with_turns(by_item[i], home, chain, config) for i in chosen.tolist()]
+        task.progress("order and moves", 0, 1)
+        closer = None if between is None else partial(_closer, between, chosen, home)
         try:
-            joints, vias = connect(near, home, task.model, config, rng)
+            joints, vias, clusters = connect(near, home, task.model, config, task.rng, closer)
             break
         except NoFreeMoveError as error:
             ok = ok[ok != chosen[error.view]]
             if len(ok) < n:
                 raise
-    share = {"reachable_share": len(ok) / tried}
-    return _plan_of(task, home, joints, vias, share)
+    task.progress("order and moves", 1, 1)
+    return _plan_of(task, home, joints, vias, clusters)
+
+
+def _closer(
+    between: Callable[[Ints, Array], tuple[Array, Ints]],
+    chosen: Ints,
+    home: Array,
+    views: Ints,
+    joints: Array,
+) -> list[Array]:
+    """Return further candidates (Ki, 6) of every view: near the middle of its neighbours' joints.
+
+    Args:
+        between: returns candidates of items near joints.
+        chosen: (N,) item of every view.
+        home: (6,) where the tour begins [rad].
+        views: (N,) in tour order.
+        joints: (N, 6) of the views in that order [rad].
+    """
+    before = np.concatenate([home[None], joints[:-1]])
+    after = np.concatenate([joints[1:], joints[-1:]])
+    wanted = np.concatenate([(before + after) / 2, (before + joints + after) / 3, before, after])
+    of = np.tile(views, 4)
+    found, row = between(chosen[of], wanted)
+    return [found[of[row] == view] for view in range(len(chosen))]
+
+
+def _nearest_views(task: _Task, directions: Array, joints: Array) -> tuple[Array, Ints]:
+    """Return the views in directions (N, 3) that lie nearest to joints (N, 6), as far as free.
+
+    Radius and roll are those of the camera at these joints, as near as the direction allows; of the
+    arm's branches and turns the one nearest to these joints is taken.
+
+    Returns:
+        joints (K, 6) [rad] and the row (K,) that each belongs to.
+    """
+    config, chain = task.config, task.model.chain
+    Ts = chain.forward(joints) @ task.mount.T_ee_cam
+    radius = np.clip(
+        np.linalg.norm(Ts[:, :3, 3] - task.center, axis=-1), *config.radius_m
+    )
+    eyes = task.center + radius[:, None] * directions
+    upright = look_at_poses(eyes, task.center, np.zeros(len(eyes)))
+    turn = np.swapaxes(upright[:, :3, :3], -1, -2) @ Ts[:, :3, :3]
+    roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
+    poses = look_at_poses(eyes, task.center, roll)
+    good = np.flatnonzero(_seen_share(poses, task) >= config.seen_share)
+    q, of = chain.inverse_branches(poses[good] @ se3.invert(task.mount.T_ee_cam))
+    row = good[of]
+    q = joints[row] + np.remainder(q - joints[row] + np.pi, 2 * np.pi) - np.pi
+    gap = np.abs(q - joints[row]).max(-1)
+    order = np.lexsort([gap, row])
+    first = np.unique(row[order], return_index=True)[1]
+    q, row = q[order][first], row[order][first]
+    keep = chain.limits.contains(q) & (chain.sigma_min(q) >= config.sigma_min)
+    keep[keep] = task.model.free(q[keep])
+    return q[keep], row[keep]
 
 
 def _plan_of(
@@ -287,7 +423,7 @@ def _plan_of(
     home: Array,
     joints: Array,
     vias: tuple[tuple[int, Array], ...],
-    metrics: dict[str, float],
+    clusters: Clusters,
 ) -> CapturePlan:
     """Return the record of a tour, with its metrics."""
     chain = task.model.chain
@@ -304,60 +440,14 @@ def _plan_of(
         reference_view=int(np.argmin(Ts_base_cam[:, 2, 2])),
         config=task.config,
     )
-    return replace(plan, metrics=_motion_metrics(plan, task.model) | metrics)
-
-
-def _motion_metrics(plan: CapturePlan, model: CollisionModel) -> dict[str, float]:
-    """Return how far, how long and how near to trouble the arm goes."""
-    corners = [plan.move(k) for k in range(len(plan))]
-    legs = np.concatenate([np.abs(np.diff(c, axis=0)) for c in corners])
-    start = np.concatenate([c[:-1] for c in corners])
-    goal = np.concatenate([c[1:] for c in corners])
-    free = model.edges_free(start, goal, plan.config.edge_step_rad)
-    clearance = model.clearance(plan.joints)
-    sigma = model.chain.sigma_min(plan.joints)
-    return {
-        "views": float(len(plan)),
-        "moves_with_vias": float(len(plan.vias)),
-        "colliding_legs": float(np.sum(~free)),
-        "travel_leading_rad": float(legs.max(-1).sum()),
-        "travel_total_rad": float(legs.sum()),
-        "largest_step_rad": float(legs.max()),
-        "seconds": float(move_seconds(legs.max(-1), plan.config).sum()),
-        "sigma_min": float(sigma.min()),
-        "sigma_median": float(np.median(sigma)),
-        **{f"clearance_{group}_m": float(d.min()) for group, d in clearance.items()},
+    task.progress("how good it is", 0, 1)
+    metrics = plan_metrics(plan, task.model)
+    seconds = metrics["seconds"]
+    bounds = {
+        "tour_bound_s": held_karp_bound(clusters.least_s, seconds),
+        "tour_bound_two_nearest_s": two_nearest_bound(clusters.least_s),
     }
-
-
-def _coverage(directions: Array, elevation_deg: tuple[float, float]) -> dict[str, float]:
-    """Return the greatest hole and the spacing of unit vectors (N, 3) over a cap [deg]."""
-    target = golden_cap(TARGET_CAP_POINTS, elevation_deg)
-    nearest = np.max(target @ directions.T, axis=1)
-    hole = float(np.degrees(np.arccos(np.clip(nearest.min(), -1.0, 1.0))))
-    if len(directions) == 1:
-        return {"hole_deg": hole}
-    gram = directions @ directions.T - 3.0 * np.eye(len(directions))
-    spacing = np.degrees(np.arccos(np.clip(gram.max(axis=1), -1.0, 1.0)))
-    return {
-        "hole_deg": hole,
-        "spacing_min_deg": float(spacing.min()),
-        "spacing_median_deg": float(np.median(spacing)),
-    }
-
-
-def _board_metrics(plan: CapturePlan, normal: Array) -> dict[str, float]:
-    """Return how the board is seen: the widest gap between rolls, tilt and distance ranges."""
-    axes = _plane_axes(normal)
-    roll = np.sort(_board_roll(plan.Ts_base_cam, axes))
-    gaps = np.diff(np.concatenate([roll, roll[:1] + 2 * np.pi]))
-    tilt = np.degrees(np.arccos(np.clip(-plan.Ts_base_cam[:, :3, 2] @ normal, -1.0, 1.0)))
-    height = (plan.Ts_base_cam[:, :3, 3] - plan.center_world) @ normal
-    distance = height / np.cos(np.radians(tilt))
-    return {
-        "roll_gap_deg": float(np.degrees(gaps.max())),
-        "tilt_min_deg": float(tilt.min()),
-        "tilt_max_deg": float(tilt.max()),
-        "distance_min_m": float(distance.min()),
-        "distance_max_m": float(distance.max()),
-    }
+    task.progress("how good it is", 1, 1)
+    return replace(
+        plan, metrics=metrics | bounds | {"tour_over_bound": seconds / bounds["tour_bound_s"]}
+    )

@@ -4,8 +4,8 @@ Candidates are arrays, not objects: a pose list `Ts_base_cam` with an `item` num
 direction or which view a pose belongs to), and joint candidates with the pose they reach.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,12 +18,14 @@ from realsim_capture_plans.planning.record import PlanConfig
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+GOLDEN_RATIO = (np.sqrt(5.0) - 1.0) / 2.0
 BATCH = 4000
-"""Poses solved at a time: keeps the arrays of the collision check below 100 MB."""
+"""Poses solved at a time: keeps the arrays of the inverse below 100 MB."""
 HOME_COMPARISONS = 60
 """Items, evenly picked, that a home is judged by."""
-LLOYD_ROUNDS = 10
-"""Moves of the chosen views to the middle of their cells; the spacing settles in about six."""
+LLOYD_ROUNDS = 30
+"""Moves of the chosen views to the middle of their cells; most settle within fifteen."""
+Tick = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -36,6 +38,20 @@ class Candidates:
     """(M,) direction or view number."""
     Ts_base_cam: Array
     """(M, 4, 4) camera pose reached [m]."""
+
+    def where(self, keep: NDArray[np.bool_]) -> "Candidates":
+        """Return the candidates (M,) that are kept."""
+        return Candidates(
+            joints=self.joints[keep], item=self.item[keep], Ts_base_cam=self.Ts_base_cam[keep]
+        )
+
+    def joined(self, other: "Candidates") -> "Candidates":
+        """Return these candidates and the other ones."""
+        return Candidates(
+            joints=np.concatenate([self.joints, other.joints]),
+            item=np.concatenate([self.item, other.item]),
+            Ts_base_cam=np.concatenate([self.Ts_base_cam, other.Ts_base_cam]),
+        )
 
 
 def golden_cap(n: int, elevation_deg: tuple[float, float]) -> Array:
@@ -50,24 +66,59 @@ def golden_cap(n: int, elevation_deg: tuple[float, float]) -> Array:
     return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1)
 
 
+def look_at_poses(eyes: Array, targets: ArrayLike, rolls: Array) -> Array:
+    """Return camera poses (P, 4, 4) at eyes (P, 3) that look at targets (P, 3) or (3,).
+
+    The same as `se3.look_at` one by one; rolls (P,) [rad] turn about the optical axis.
+    """
+    z = np.asarray(targets, dtype=np.float64) - eyes
+    z = z / np.linalg.norm(z, axis=-1, keepdims=True)
+    x = np.stack([z[:, 1], -z[:, 0], np.zeros(len(z))], -1)
+    length = np.linalg.norm(x, axis=-1, keepdims=True)
+    x = np.where(length < 1e-9, [1.0, 0.0, 0.0], x / np.maximum(length, 1e-300))
+    y = np.cross(z, x)
+    c, s = np.cos(rolls)[:, None], np.sin(rolls)[:, None]
+    poses = np.zeros((len(eyes), 4, 4))
+    poses[:, :3, 0], poses[:, :3, 1] = c * x + s * y, c * y - s * x
+    poses[:, :3, 2], poses[:, :3, 3], poses[:, 3, 3] = z, eyes, 1.0
+    return poses
+
+
 def hemisphere_poses(
-    center: ArrayLike, directions: Array, config: PlanConfig
+    center: ArrayLike,
+    directions: Array,
+    radius_m: tuple[float, float],
+    per_direction: int,
+    phase: float,
 ) -> tuple[Array, Ints]:
-    """Return camera poses (P, 4, 4) for every direction, radius and roll, and their directions."""
-    c = np.asarray(center, dtype=np.float64)
-    radii = np.linspace(*config.radius_m, config.radii)
-    rolls = np.arange(config.rolls) * (2 * np.pi / config.rolls)
-    poses = [
-        se3.look_at(c + radius * direction, c, roll)
-        for direction in directions
-        for radius in radii
-        for roll in rolls
-    ]
-    return np.stack(poses), np.repeat(np.arange(len(directions)), len(radii) * len(rolls))
+    """Return camera poses (P, 4, 4) that look at the centre, and the direction (P,) of each.
+
+    Rolls go round in equal steps, with another beginning in every direction; radii follow the
+    golden ratio, evenly in between.
+
+    Args:
+        center: (3,) what is looked at [m].
+        directions: (D, 3) unit vectors from the centre to the cameras.
+        radius_m: least and greatest distance.
+        per_direction: poses per direction.
+        phase: shifts rolls and radii, so that another call gives other poses (0 to 1).
+    """
+    d = np.repeat(np.arange(len(directions)), per_direction)
+    k = np.tile(np.arange(per_direction), len(directions))
+    roll = (k + np.mod(d * GOLDEN_RATIO + phase, 1.0)) * (2 * np.pi / per_direction)
+    share = np.mod((k + 0.5) * GOLDEN_RATIO + d * (np.sqrt(2.0) - 1.0) + phase, 1.0)
+    radius = radius_m[0] + share * (radius_m[1] - radius_m[0])
+    eyes = np.asarray(center, dtype=np.float64) + radius[:, None] * directions[d]
+    return look_at_poses(eyes, center, roll), d
 
 
 def reachable(
-    Ts_base_cam: Array, item: Ints, T_ee_cam: ArrayLike, model: CollisionModel, sigma_min: float
+    Ts_base_cam: Array,
+    item: Ints,
+    T_ee_cam: ArrayLike,
+    model: CollisionModel,
+    sigma_min: float,
+    tick: Tick | None = None,
 ) -> Candidates:
     """Return every joint vector that reaches a pose, is free and is not singular.
 
@@ -77,18 +128,21 @@ def reachable(
         T_ee_cam: (4, 4) the mount [m].
         model: what must stay free; its chain is the arm.
         sigma_min: least singular value of the Jacobian.
+        tick: called with (poses tried, poses).
     """
     chain = model.chain
     T_cam_ee = se3.invert(T_ee_cam)
-    joints: list[Array] = []
-    pose: list[Ints] = []
+    joints: list[Array] = [np.zeros((0, 6))]
+    pose: list[Ints] = [np.zeros(0, dtype=np.intp)]
     for first in range(0, len(Ts_base_cam), BATCH):
         q, of = chain.inverse_branches(Ts_base_cam[first : first + BATCH] @ T_cam_ee)
         keep = chain.limits.contains(q)
-        keep[keep] = model.free(q[keep])
         keep[keep] = chain.sigma_min(q[keep]) >= sigma_min
+        keep[keep] = model.free(q[keep])
         joints.append(q[keep])
         pose.append(of[keep] + first)
+        if tick is not None:
+            tick(min(first + BATCH, len(Ts_base_cam)), len(Ts_base_cam))
     of_pose = np.concatenate(pose)
     return Candidates(
         joints=np.concatenate(joints), item=item[of_pose], Ts_base_cam=Ts_base_cam[of_pose]
@@ -109,11 +163,17 @@ def thin_directions(directions: Array, n: int) -> Ints:
     """Return n row numbers of unit vectors (M, 3) that cover them evenly.
 
     Farthest points from the topmost, then Lloyd's rounds restricted to the given directions: every
-    chosen one moves to the direction nearest the mean of its cell.
+    chosen one moves to the direction nearest the mean of its cell. The round with the smallest
+    hole counts.
     """
     chosen = farthest_points(directions, n, int(np.argmax(directions[:, 2])))
+    best, least_hole = chosen, np.inf
     for _ in range(LLOYD_ROUNDS):
-        cell = np.argmax(directions @ directions[chosen].T, axis=1)
+        likeness = directions @ directions[chosen].T
+        cell = np.argmax(likeness, axis=1)
+        hole = float(np.arccos(np.clip(likeness.max(axis=1).min(), -1.0, 1.0)))
+        if hole < least_hole:
+            best, least_hole = chosen, hole
         mean = np.zeros((n, 3))
         np.add.at(mean, cell, directions)
         # Within its own cell, so that two cells never choose the same direction.
@@ -122,31 +182,31 @@ def thin_directions(directions: Array, n: int) -> Ints:
         if np.array_equal(moved, chosen):
             break
         chosen = moved
-    return chosen
+    return best
 
 
-def near_home(joints: Array, home: Array, chain: DhChain, config: PlanConfig) -> tuple[Array, Ints]:
-    """Return whole-turn variants (K, 6) near home, the nearest first, and the row of each.
+def with_turns(
+    joints: Array, home: Array, chain: DhChain, config: PlanConfig
+) -> Array:
+    """Return joints (M, 6) with all their whole turns (K, 6) inside the limits and near home.
 
     At most `config.branch_limit` of them; every joint within `config.turn_reach_rad` of home.
     """
-    rows: list[Array] = []
-    origin: list[int] = []
     low = np.maximum(chain.limits.lower, home - config.turn_reach_rad)
     high = np.minimum(chain.limits.upper, home + config.turn_reach_rad)
-    for i, q in enumerate(joints):
-        choices = [
-            [v for v in (x - 2 * np.pi, x, x + 2 * np.pi) if a <= v <= b]
-            for x, a, b in zip(q, low, high, strict=True)
-        ]
-        for variant in product(*choices):
-            rows.append(np.array(variant))
-            origin.append(i)
-    if not rows:
-        return np.zeros((0, 6)), np.zeros(0, dtype=np.intp)
-    q = np.stack(rows)
-    best = np.argsort(np.abs(q - home).max(-1), kind="stable")[: config.branch_limit]
-    return q[best], np.array(origin, dtype=np.intp)[best]
+    # A joint that has not even one whole turn winds up no cables: all of its range counts.
+    short = chain.limits.upper - chain.limits.lower <= 2 * np.pi + 1e-9
+    low, high = np.where(short, chain.limits.lower, low), np.where(short, chain.limits.upper, high)
+    q = np.asarray(joints, dtype=np.float64)
+    for k in range(q.shape[1]):
+        turned = np.repeat(q[None], 3, axis=0)
+        turned[:, :, k] += np.array([-2 * np.pi, 0.0, 2 * np.pi])[:, None]
+        inside = (turned[:, :, k] >= low[k]) & (turned[:, :, k] <= high[k])
+        q = turned[inside]
+    q = q[np.argsort(np.abs(q - home).max(-1), kind="stable")]
+    if len(q) <= config.branch_limit:
+        return q
+    return q[np.linspace(0, len(q) - 1, config.branch_limit).astype(np.intp)]
 
 
 def choose_home(found: Candidates) -> Array:
@@ -160,12 +220,40 @@ def choose_home(found: Candidates) -> Array:
     return np.array(top[int(np.argmin(total))])
 
 
-def same_elbow(found: Candidates, home: Array) -> Candidates:
-    """Return the candidates whose elbow bends to the same side as at home.
+def on_one_elbow(found: Candidates, side: float) -> Candidates:
+    """Return the candidates whose elbow bends to one side, and all of items that have no such.
 
-    Changing sides leads through the stretched arm, and over a table there is seldom room for it.
+    Changing sides leads through the stretched arm and takes several seconds: it is for views that
+    cannot be had otherwise.
+
+    Args:
+        found: the candidates.
+        side: +1 or -1, the sign of the elbow's sine.
     """
-    keep = np.sin(found.joints[:, 2]) * np.sin(home[2]) > 0
-    return Candidates(
-        joints=found.joints[keep], item=found.item[keep], Ts_base_cam=found.Ts_base_cam[keep]
-    )
+    return _preferred(found, np.sin(found.joints[:, 2]) * side > 0)
+
+
+def better_elbow(found: Candidates) -> float:
+    """Return the side, +1 or -1, to which the elbow bends in candidates of more items."""
+    counts = [
+        len(np.unique(found.item[np.sin(found.joints[:, 2]) * side > 0])) for side in (1.0, -1.0)
+    ]
+    return 1.0 if counts[0] >= counts[1] else -1.0
+
+
+def well_seen(found: Candidates, seen: Array, least: float) -> Candidates:
+    """Return the candidates whose seen share (M,) is enough, and all of items that have no such.
+
+    Args:
+        found: the candidates.
+        seen: (M,) share of the scene's volume inside each one's image.
+        least: share that is enough.
+    """
+    return _preferred(found, seen >= least)
+
+
+def _preferred(found: Candidates, good: NDArray[np.bool_]) -> Candidates:
+    """Return the good candidates (M,), and all of items that have no good one."""
+    served = np.zeros(int(found.item.max(initial=0)) + 1, dtype=np.bool_)
+    served[found.item[good]] = True
+    return found.where(good | ~served[found.item])

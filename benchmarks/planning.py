@@ -1,0 +1,165 @@
+"""Benchmark of capture plans: 256 views with a UR5 and a D405, from nothing.
+
+    uv run python benchmarks/planning.py [--quick] [--json FILE] [--seeds N]
+
+Figures (keys of the JSON's "figures"), the worst of the seeds:
+  views_valid         views that are reached to 1e-6, inside the limits, free, not singular, of 256
+  hole_reachable_deg  from any reachable direction to the nearest view
+  hole_cap_deg        the same over the whole cap, elevation >= 15 deg, at the best placement
+  tour_over_bound     tour time over half the sum of the two nearest clusters (a lower bound)
+  tour_over_held_karp the same over the Held-Karp bound, which is higher
+  tour_over_greedy    tour time over ring by ring with the nearest free candidate, same views
+  colliding_edges     moves that meet the arm's own meshes, the table or the scene, every 0.02 rad
+  plan_cpu_s          of one whole plan, metrics included, compiled code warm
+  unsafe_share, overcautious_share   of our shapes against the meshes, random configurations
+The meshes are those of the example-robot-data wheel; without it the last three keys are left out.
+"""
+
+import os
+
+for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+import argparse
+import json
+import platform
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim_capture_plans import PlanConfig, d405_mount
+from realsim_capture_plans.arms.kinematics import UR5
+from realsim_capture_plans.collision.model import interpolate
+from realsim_capture_plans.planning.advise import advise
+from realsim_capture_plans.planning.make import hemisphere_plan
+from realsim_capture_plans.planning.ordering import move_seconds
+from realsim_capture_plans.planning.record import CapturePlan
+from realsim_capture_plans.planning.viewpoints import hemisphere_poses, reachable, with_turns
+
+Array = NDArray[np.float64]
+VIEWS = 256
+AIM_HEIGHT_M = 0.05
+RING_DEG = 10.0
+"""Width of the rings of the greedy order."""
+POSES = 60
+"""Camera poses per view that the greedy order chooses from: as many as the plan's own search."""
+REACHED_M = 1e-6
+MESH_STEP_RAD = 0.02
+
+
+def valid_views(plan: CapturePlan) -> int:
+    """Count the views that are what they claim to be, asked anew."""
+    chain = plan.chain
+    model = plan.collision_model()
+    looks = plan.center_world - plan.Ts_base_cam[:, :3, 3]
+    distance = np.linalg.norm(looks, axis=-1)
+    axis = plan.Ts_base_cam[:, :3, 2]
+    aimed = np.linalg.norm(np.cross(looks, axis), axis=-1) < REACHED_M
+    low, high = plan.config.radius_m
+    ok = aimed & (distance > low - REACHED_M) & (distance < high + REACHED_M)
+    ok &= chain.limits.contains(plan.joints) & model.free(plan.joints)
+    ok &= chain.sigma_min(plan.joints) >= plan.config.sigma_min - 1e-9
+    return int(ok.sum())
+
+
+def greedy_ring_seconds(plan: CapturePlan) -> float:
+    """Return the time of the usual order: rings from the top down, always the nearest candidate.
+
+    The rings are gone round in turns to and fro; collisions on the way are not even looked at.
+    """
+    directions = plan.directions()
+    elevation = np.degrees(np.arcsin(np.clip(directions[:, 2], -1, 1)))
+    ring = np.floor((90.0 - elevation) / RING_DEG).astype(int)
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    order = np.lexsort([np.where(ring % 2 == 0, azimuth, -azimuth), ring])
+    poses, item = hemisphere_poses(
+        plan.center_world, directions, plan.config.radius_m, POSES, 0.0
+    )
+    found = reachable(
+        poses, item, plan.mount.T_ee_cam, plan.collision_model(), plan.config.sigma_min
+    )
+    here, total = plan.home, 0.0
+    for view in order:
+        near = with_turns(found.joints[found.item == view], plan.home, plan.chain, plan.config)
+        near = np.concatenate([near, plan.joints[view][None]])
+        gaps = np.abs(near - here).max(-1)
+        total += float(move_seconds(gaps.min(), plan.config))
+        here = near[int(np.argmin(gaps))]
+    return total
+
+
+def mesh_figures(plan: CapturePlan, configurations: int) -> dict[str, float]:
+    """Return what the arm's own meshes say of the plan and of our shapes; nothing without them."""
+    from realsim_capture_plans.collision.mesh_referee import MeshReferee, referee_available
+
+    if not referee_available():
+        return {}
+    referee = MeshReferee(plan.chain, plan.mount, plan.cell)
+    corners = np.concatenate([plan.home[None], *(plan.move(k)[1:] for k in range(len(plan)))])
+    samples, owner = interpolate(corners[:-1], corners[1:], MESH_STEP_RAD)
+    hits = np.unique(owner[~referee.free(samples)])
+    shares = referee.compare(configurations, np.random.default_rng(0))
+    return {"colliding_edges": float(len(hits))} | shares
+
+
+def best_center(config: PlanConfig) -> tuple[float, float, float]:
+    """Return the placement that `realsim plan --advise` puts first, at the table's height."""
+    places = advise(UR5, d405_mount(), config, VIEWS, AIM_HEIGHT_M, lifts_m=(0.0,))
+    return places[0].center
+
+
+def run(seed: int, center: tuple[float, float, float], quick: bool) -> dict[str, float]:
+    """Make one plan and return its figures."""
+    config = PlanConfig()
+    began = time.process_time()
+    plan = hemisphere_plan(VIEWS, center, d405_mount(), config, np.random.default_rng(seed))
+    cpu_s = time.process_time() - began
+    seconds = plan.metrics["seconds"]
+    return {
+        "views_valid": float(valid_views(plan)),
+        "hole_reachable_deg": plan.metrics["hole_reachable_deg"],
+        "hole_cap_deg": plan.metrics["hole_cap_deg"],
+        "tour_s": seconds,
+        "tour_over_bound": seconds / plan.metrics["tour_bound_two_nearest_s"],
+        "tour_over_held_karp": plan.metrics["tour_over_bound"],
+        "tour_over_greedy": seconds / greedy_ring_seconds(plan),
+        "plan_cpu_s": cpu_s,
+        **mesh_figures(plan, 2000 if quick else 20000),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="one seed, fewer configurations")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    # Compiles what numba compiles.
+    hemisphere_plan(8, (0.35, 0.0, 0.05), d405_mount(), PlanConfig(), np.random.default_rng(0))
+    began = time.process_time()
+    center = best_center(PlanConfig())
+    advice_cpu_s = time.process_time() - began
+    runs = [run(seed, center, args.quick) for seed in range(1 if args.quick else args.seeds)]
+    figures = {
+        key: (min if key == "views_valid" else max)(r[key] for r in runs) for key in runs[0]
+    }
+    figures["advice_cpu_s"] = advice_cpu_s
+    figures["center_x_m"] = center[0]
+    for key, value in figures.items():
+        print(f"{key:<22} {value:.4g}")
+    if args.json:
+        document = {
+            "benchmark": "planning",
+            "figures": figures,
+            "runs": runs,
+            "python": platform.python_version(),
+            "versions": {name: version(name) for name in ("numpy", "eaik", "coal", "pin", "ompl")},
+        }
+        args.json.write_text(json.dumps(document, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""All views of a session on one picture, in the order in which they are taken."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim_capture_plans.capturing.log import CaptureLog
+
+if TYPE_CHECKING:
+    from realsim.store import SessionStore
+
+Image = NDArray[np.uint8]
+SHEET_FILE = "reports/contact_sheet.png"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SheetConfig:
+    """How the sheet is laid out."""
+
+    width_px: int = 2560
+    """Width of the sheet: 256 views are then 16 columns of 160 pixels, in which objects and
+    tags can be told apart."""
+    largest_cell_px: int = 320
+    """Widest cell: a dozen views need no more."""
+    frame_px: int = 4
+    """Width of a noted view's frame."""
+    head_px: int = 46
+    """Height of the head line."""
+
+
+PAPER, INK, PALE = (250, 250, 248), (30, 30, 30), (215, 215, 212)
+AMBER, BLUE, RED = (255, 170, 0), (30, 120, 255), (214, 40, 40)
+"""Noted, taken again, missing."""
+
+
+class Thumbnails:
+    """Small pictures of the views, kept while they are captured: nothing is read again."""
+
+    def __init__(self, cell: tuple[int, int]) -> None:
+        """Keep pictures of a cell's (width, height)."""
+        self.cell = cell
+        self.images: dict[int, Image] = {}
+
+    def add(self, k: int, rgb: Image) -> None:
+        """Keep view k (H, W, 3), reduced by area."""
+        import cv2
+
+        small = cv2.resize(rgb, self.cell, interpolation=cv2.INTER_AREA)
+        self.images[k] = np.asarray(small, dtype=np.uint8)
+
+
+def cell_size(n: int, image_size: tuple[int, int], config: SheetConfig) -> tuple[int, int, int]:
+    """Return (columns, cell width, cell height) for n views of (width, height) pixels."""
+    w, h = image_size
+    columns = max(1, int(np.ceil(np.sqrt(n))))
+    cell = min(config.largest_cell_px, config.width_px // columns)
+    return columns, cell, max(1, round(cell * h / w))
+
+
+def contact_sheet(
+    images: Mapping[int, Image],
+    entries: Mapping[int, Mapping[str, Any]],
+    n: int,
+    title: str,
+    image_size: tuple[int, int],
+    config: SheetConfig | None = None,
+) -> Image:
+    """Return the sheet (H, W, 3): view numbers, amber frames round noted views, blue corners on
+    those taken again, grey cells for those that are missing.
+
+    Args:
+        images: view -> thumbnail (h, w, 3) of the cell's size.
+        entries: view -> what the capture log says of it.
+        n: views of the plan.
+        title: the head line.
+        image_size: (width, height) of the camera's images.
+        config: the layout.
+    """  # noqa: D205 - the first sentence needs two lines
+    config = config or SheetConfig()
+    columns, w, h = cell_size(n, image_size, config)
+    rows = -(-n // columns)
+    sheet = np.full((config.head_px + rows * h, columns * w, 3), PAPER, dtype=np.uint8)
+    for k in range(n):
+        y, x = config.head_px + k // columns * h, k % columns * w
+        cell = sheet[y : y + h, x : x + w]
+        entry = entries.get(k, {})
+        _fill_cell(cell, k, images.get(k), entry, config)
+    noted = sum(bool(entries.get(k, {}).get("notes")) for k in images)
+    again = sum(bool(entries.get(k, {}).get("retaken")) for k in images)
+    parts = [
+        (title, INK),
+        (f"{len(images)} of {n} views", INK),
+        (f"{noted} noted", AMBER if noted else INK),
+        (f"{again} taken again", BLUE if again else INK),
+        (f"{n - len(images)} missing", RED if n > len(images) else INK),
+    ]
+    x = 10
+    for text, colour in parts:
+        x += _write(sheet, text, (x, config.head_px - 16), colour, 0.8) + 40
+    return sheet
+
+
+def _fill_cell(
+    cell: NDArray[np.uint8],
+    k: int,
+    image: Image | None,
+    entry: Mapping[str, Any],
+    config: SheetConfig,
+) -> None:
+    """Draw one view into its cell (h, w, 3)."""
+    h, w = cell.shape[:2]
+    scale = max(0.35, w / 400)
+    if image is None:
+        cell[1:-1, 1:-1] = PALE
+        said = "skipped" if entry.get("event") == "skipped" else "missing"
+        _write(cell, said, (w // 2 - round(70 * scale), h // 2 + 5), RED, scale)
+    else:
+        cell[:] = image
+        cell[0], cell[:, 0] = PAPER, PAPER
+        if entry.get("notes"):
+            f = config.frame_px
+            cell[:f], cell[-f:], cell[:, :f], cell[:, -f:] = AMBER, AMBER, AMBER, AMBER
+            _label(cell, _first_words(entry["notes"][0]), (f + 1, h - f - 3), AMBER, scale)
+        if entry.get("retaken") or entry.get("earlier"):
+            side = h // 5
+            corner = np.add.outer(np.arange(side), np.arange(side)) < side
+            cell[:side, w - side :][corner[:, ::-1]] = BLUE
+    _label(cell, str(k), (3, round(24 * scale) + 3), PAPER, scale)
+
+
+def _first_words(note: str) -> str:
+    """Return as much of a note as fits under a thumbnail."""
+    return note.split(":", maxsplit=1)[0].split(",", maxsplit=1)[0][:22]
+
+
+def _label(
+    image: NDArray[np.uint8],
+    text: str,
+    at: tuple[int, int],
+    colour: tuple[int, int, int],
+    scale: float,
+) -> None:
+    """Write with a dark outline: legible on every picture."""
+    _write(image, text, at, (0, 0, 0), scale, thickness=3)
+    _write(image, text, at, colour, scale)
+
+
+def _write(
+    image: NDArray[np.uint8],
+    text: str,
+    at: tuple[int, int],
+    colour: tuple[int, int, int],
+    scale: float,
+    thickness: int = 1,
+) -> int:
+    """Write ASCII text at its lower left corner (x, y); return its width [px]."""
+    import cv2
+
+    plain = text.encode("ascii", errors="replace").decode()
+    canvas = np.ascontiguousarray(image)
+    cv2.putText(canvas, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thickness, cv2.LINE_AA)
+    image[:] = canvas
+    return int(cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)[0][0])
+
+
+def write_contact_sheet(
+    store: "SessionStore", n: int, title: str, taken: Thumbnails | None = None
+) -> str:
+    """Write SESSION/reports/contact_sheet.png of n views and return its path in the session.
+
+    Args:
+        store: the session.
+        n: views of the plan.
+        title: the head line.
+        taken: pictures kept by the run; views of earlier runs are read from the session.
+    """
+    camera = store.session.intrinsics
+    size = (camera.width, camera.height)
+    _, w, h = cell_size(n, size, SheetConfig())
+    thumbnails = Thumbnails((w, h))
+    if taken is not None and taken.cell == (w, h):
+        thumbnails.images.update(taken.images)
+    there = store.completed
+    for k in sorted(there - set(thumbnails.images)):
+        thumbnails.add(k, store.rgb(k))
+    images = {k: v for k, v in thumbnails.images.items() if k in there and k < n}
+    sheet = contact_sheet(images, CaptureLog(store).views(), n, title, size)
+    store.write_image(SHEET_FILE, sheet)
+    return SHEET_FILE

@@ -1,0 +1,254 @@
+"""The mount file: a few lines of TOML that say where the camera sits and what holds it.
+
+name = "printed bracket, left"
+camera = "D405"
+translation_m = [0.0, -0.065, 0.035]          # the camera's frame in the flange, z out of it
+rotation_vector_rad = [0.0, 0.0, 0.0]         # or quaternion_xyzw, or matrix (3 rows of 3)
+cover_m = 0.005                               # round camera and bracket: cable, screws
+
+[[bracket]]                                   # without any, a plain bracket is assumed
+kind = "box"                                  # box, capsule, cylinder, sphere
+size_m = [0.04, 0.09, 0.006]
+position_m = [0.0, -0.03, 0.003]              # the piece's centre in the flange
+rotation_vector_rad = [0.0, 0.0, 0.0]
+
+[[bracket]]
+kind = "convex"                               # the convex hull of a mesh
+file = "bracket.stl"
+unit = "mm"
+"""
+
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError, UnitError
+from realsim.geometry import se3
+from realsim_capture_plans.collision.camera_bodies import FLANGE, camera_body
+from realsim_capture_plans.collision.shapes import SIZES, Kind, Mount, Shape
+from realsim_capture_plans.collision.toml_fields import Fields, read_toml
+
+Array = NDArray[np.float64]
+ROTATIONS = ("rotation_vector_rad", "quaternion_xyzw", "matrix")
+MOUNT_KEYS = ("name", "camera", "translation_m", *ROTATIONS, "cover_m", "bracket")
+PIECE_KEYS = ("kind", "size_m", "position_m", "rotation_vector_rad", "file", "unit")
+UNITS = {"mm": 1e-3, "m": 1.0}
+REACH_M = 0.5
+"""Nothing on a flange is farther out; larger numbers are millimetres."""
+COVER_LIMIT_M = 0.1
+"""A cover of more is a millimetre number."""
+QUATERNION_TOLERANCE = 1e-3
+"""How far from 1 a quaternion's length may be: four decimals written by hand."""
+
+
+def read_mount(path: Path | str) -> Mount:
+    """Return the mount of a file (see the module's text for the format).
+
+    Without [[bracket]] tables a plain bracket from the flange to the camera is assumed; write
+    `bracket = []` for none.
+
+    Raises:
+        InputError: no such file, unknown keys or camera, not exactly one rotation, a mesh that
+            cannot be read.
+        UnitError: lengths that can only be millimetres.
+    """
+    from realsim_capture_plans.collision.mount import plain_bracket
+
+    path = Path(path)
+    fields = Fields(read_toml(path), str(path), MOUNT_KEYS)
+    camera = fields.text("camera")
+    try:
+        camera_body(camera)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    T = se3.from_rt(_rotation(fields), _length_row(fields, "translation_m", 3))
+    cover = fields.number("cover_m", 0.0)
+    if not 0 <= cover <= COVER_LIMIT_M:
+        raise UnitError(
+            f"{path}: cover_m is {cover}; a thickness from 0 to {COVER_LIMIT_M} m is accepted. "
+            "Lengths are in metres."
+        )
+    pieces = tuple(
+        _piece(table, f"{path}, bracket {k}", path.parent)
+        for k, table in enumerate(fields.tables("bracket"), 1)
+    )
+    if "bracket" not in fields.values:
+        pieces = plain_bracket(T, camera)
+    return Mount(name=fields.text("name"), camera=camera, T_ee_cam=T, bracket=pieces, cover_m=cover)
+
+
+def write_mount(mount: Mount, path: Path | str) -> None:
+    """Write a mount file that `read_mount` reads back; corners of convex pieces as STL beside it.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written.
+    """
+    from realsim.store.atomic import write_text
+
+    path = Path(path)
+    lines = [
+        f"name = {_quoted(mount.name)}",
+        f"camera = {_quoted(mount.camera)}",
+        "# the colour camera's frame in the flange, z out of it",
+        f"translation_m = {_numbers(mount.T_ee_cam[:3, 3])}",
+        "matrix = [" + ", ".join(_numbers(row) for row in mount.T_ee_cam[:3, :3]) + "]",
+        f"cover_m = {float(mount.cover_m)!r}",
+    ]
+    if not mount.bracket:
+        lines.append("bracket = []")
+    try:
+        for k, piece in enumerate(mount.bracket, 1):
+            lines += ["", "[[bracket]]", f'kind = "{piece.kind}"']
+            if piece.kind == "convex":
+                file = path.with_name(f"{path.stem}_bracket_{k}.obj")
+                write_text(file, _hull_obj(piece))
+                lines += [f"file = {_quoted(file.name)}", 'unit = "m"']
+            else:
+                lines.append(f"size_m = {_numbers(np.array(piece.size_m))}")
+            at = piece.T_frame_shape
+            lines.append(f"position_m = {_numbers(at[:3, 3])}")
+            lines.append(f"rotation_vector_rad = {_numbers(se3.log_so3(at[:3, :3]))}")
+        write_text(path, "\n".join(lines) + "\n")
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error}.") from None
+
+
+def _rotation(fields: Fields) -> Array:
+    """Return R_ee_cam (3, 3) from whichever of the three is there."""
+    given = [key for key in ROTATIONS if key in fields.values]
+    if len(given) != 1:
+        raise InputError(
+            f"{fields.where}: {' and '.join(given) or 'no rotation'} given; exactly one of "
+            f"{', '.join(ROTATIONS)} is needed."
+        )
+    if given[0] == "rotation_vector_rad":
+        return _turn(fields, fields.finite_row("rotation_vector_rad", 3))
+    if given[0] == "quaternion_xyzw":
+        x, y, z, w = fields.finite_row("quaternion_xyzw", 4)
+        length = float(np.linalg.norm([x, y, z, w]))
+        if abs(length - 1) > QUATERNION_TOLERANCE:
+            raise InputError(
+                f"{fields.where}: quaternion_xyzw has the length {length:.4f}; 1 is needed. Write "
+                "all digits, in the order x y z w."
+            )
+        return se3.from_quaternion_wxyz(np.array([w, x, y, z]) / length)
+    rows = fields.values["matrix"]
+    table = {f"row {k}": row for k, row in enumerate(rows, 1)} if isinstance(rows, list) else {}
+    named = Fields(table, f"{fields.where}, matrix", ("row 1", "row 2", "row 3"))
+    R = np.array([named.finite_row(f"row {k}", 3) for k in (1, 2, 3)])
+    return se3.check_rigid(se3.from_rt(R, np.zeros(3)), f"{fields.where}: matrix")[:3, :3]
+
+
+def _turn(fields: Fields, vector: list[float]) -> Array:
+    """Return the rotation of a vector [rad].
+
+    Raises:
+        UnitError: more than a whole turn: degrees.
+    """
+    angle = float(np.linalg.norm(vector))
+    if angle > 2 * np.pi:
+        raise UnitError(
+            f"{fields.where}: rotation_vector_rad turns by {angle:.1f} rad, more than a whole turn."
+            " Were degrees given? Multiply by pi / 180."
+        )
+    return se3.exp_so3(vector)
+
+
+def _length_row(
+    fields: Fields, key: str, count: int, default: tuple[float, ...] | None = None
+) -> list[float]:
+    """Return lengths on a flange [m].
+
+    Raises:
+        UnitError: longer than anything on a flange: millimetres.
+    """
+    row = fields.finite_row(key, count, default)
+    size = float(np.linalg.norm(row))
+    if size > REACH_M:
+        raise UnitError(
+            f"{fields.where}: {key} is {row}, {size:.4g} m long; nothing on a flange is beyond "
+            f"{REACH_M} m. Were millimetres given? {size:.4g} mm are {size / 1e3:.4g} m."
+        )
+    return row
+
+
+def _piece(table: dict[str, Any], where: str, folder: Path) -> Shape:
+    """Return one piece of the bracket."""
+    fields = Fields(table, where, PIECE_KEYS)
+    kind = fields.text("kind")
+    if kind not in SIZES:
+        raise InputError(f"{where}: kind is '{kind}'; there are {', '.join(SIZES)}.")
+    needless = ("size_m",) if kind == "convex" else ("file", "unit")
+    if wrong := [key for key in needless if key in table]:
+        raise InputError(f"{where}: {' and '.join(wrong)} do not belong to a {kind} piece.")
+    T = se3.from_rt(
+        _turn(fields, fields.finite_row("rotation_vector_rad", 3, (0.0, 0.0, 0.0))),
+        _length_row(fields, "position_m", 3, (0.0, 0.0, 0.0)),
+    )
+    if kind == "convex":
+        points = _corners(fields, folder)
+        return Shape(
+            part="bracket", frame=FLANGE, kind="convex", size_m=(), T_frame_shape=T, points=points
+        )
+    size = tuple(_length_row(fields, "size_m", SIZES[kind]))
+    try:
+        return Shape(
+            part="bracket", frame=FLANGE, kind=cast(Kind, kind), size_m=size, T_frame_shape=T
+        )
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _corners(fields: Fields, folder: Path) -> Array:
+    """Return the corners (P, 3) [m] of the convex hull of a mesh file."""
+    import trimesh
+    from scipy.spatial import ConvexHull, QhullError
+
+    path = folder / fields.text("file")
+    unit = fields.values.get("unit")
+    if unit not in UNITS:
+        raise UnitError(
+            f"{fields.where}: unit is {unit!r}; a mesh file has no unit of its own, so that "
+            'unit = "mm" or unit = "m" is needed.'
+        )
+    if not path.is_file():
+        raise InputError(f"{fields.where}: the mesh {path} does not exist.")
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+        points = np.asarray(mesh.vertices, dtype=np.float64) * UNITS[unit]
+        hull = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError, OSError, KeyError, IndexError, AttributeError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(
+            f"{fields.where}: {path} holds no solid that a hull could be put round ({reason}). "
+            "STL and OBJ files are read."
+        ) from None
+    size = float(np.abs(hull).max())
+    if size > REACH_M:
+        raise UnitError(
+            f"{fields.where}: {path} reaches {size:.4g} m from its origin in the unit '{unit}'; "
+            f"nothing on a flange is beyond {REACH_M} m. Is the unit another?"
+        )
+    return hull
+
+
+def _hull_obj(piece: Shape) -> str:
+    """Return a convex piece as the text of an OBJ file [m]."""
+    from scipy.spatial import ConvexHull
+
+    assert piece.points is not None  # Shape checks it
+    corners = [f"v {x!r} {y!r} {z!r}" for x, y, z in piece.points.tolist()]
+    faces = [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in ConvexHull(piece.points).simplices]
+    return "\n".join([*corners, *faces]) + "\n"
+
+
+def _quoted(text: str) -> str:
+    """Return a TOML basic string."""
+    escapes = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r"}
+    return '"' + "".join(escapes.get(c, c) for c in text) + '"'
+
+
+def _numbers(row: Array) -> str:
+    return "[" + ", ".join(repr(float(v)) for v in row) + "]"

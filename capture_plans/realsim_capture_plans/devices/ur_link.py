@@ -1,0 +1,272 @@
+"""The way to a UR controller: ports probed first, then ur_rtde in a process with deadlines."""
+
+import contextlib
+import json
+import os
+import select
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from realsim_capture_plans.devices.interfaces import ArmStoppedError
+
+RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
+"""Fixed in the controller and in ur_rtde."""
+PORTS = {
+    RTDE_PORT: "readings (RTDE)",
+    SCRIPT_PORT: "programs",
+    DASHBOARD_PORT: "dashboard",
+}
+DEADLINE_SLACK_S = 1.0
+"""Waited beyond a request's own deadline for the process to say so [s]."""
+CLOSE_S = 3.0
+"""Longest wait for the process to end by itself [s]."""
+LAST_LINES = 4
+"""Lines of ur_rtde's own output quoted when its process ended."""
+_VERSION, _SETUP_OUTPUTS, _SETUP_INPUTS, _START, _PAUSE = 118, 79, 73, 83, 80
+_DATA, _PROTOCOL = 85, 86
+_COMMAND_REGISTER = b"input_int_register_0"
+_GLANCE = ("output_int_register_0", "runtime_state")
+
+
+class LinkError(Exception):
+    """A request to ur_rtde failed: `ended` says whether its process is gone with it."""
+
+    def __init__(self, message: str, *, ended: bool) -> None:
+        """Keep what ur_rtde said."""
+        super().__init__(message)
+        self.ended = ended
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Glance:
+    """What a controller says before anything is changed on it."""
+
+    version: tuple[int, ...]
+    """Controller software: major, minor, bugfix, build."""
+    script_register: int
+    """output_int_register_0: 1 or 2 while ur_rtde's script is up (ready, done)."""
+    runtime_state: int
+    """RTDE's runtime_state; 2 = a program is running."""
+    control_free: bool
+    """Whether no other connection holds the register that ur_rtde commands with."""
+
+
+class UrLink:
+    """ur_rtde in a process of its own; every call has a deadline, after which it is ended."""
+
+    def __init__(self) -> None:
+        """Start the process, without any connection."""
+        self._said = tempfile.TemporaryFile()
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", str(Path(__file__).with_name("ur_process.py"))],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._said,
+            start_new_session=True,  # Ctrl-C in the terminal is for the capture alone
+        )
+        self._unread = b""
+        self._asked = 0
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process still runs."""
+        return self._process.poll() is None
+
+    def ask(self, do: str, deadline_s: float, **arguments: Any) -> Any:
+        """Return the answer to one request.
+
+        Raises:
+            LinkError: it failed, or there was no answer within the deadline [s].
+        """
+        self._asked += 1
+        request = {"do": do, "with": arguments, "deadline_s": deadline_s, "number": self._asked}
+        assert self._process.stdin is not None
+        try:
+            self._process.stdin.write(json.dumps(request).encode() + b"\n")
+            self._process.stdin.flush()
+        except (BrokenPipeError, ValueError) as error:
+            raise LinkError(self._last_words(do, deadline_s), ended=True) from error
+        end = time.monotonic() + deadline_s + DEADLINE_SLACK_S
+        while line := self._line(end):
+            answer = json.loads(line)
+            if answer["number"] != self._asked:
+                continue  # of a request that Ctrl-C cut short
+            if "error" in answer:
+                raise LinkError(str(answer["error"]), ended=False)
+            return answer["value"]
+        message = self._last_words(do, deadline_s)
+        self.kill()
+        raise LinkError(message, ended=True)
+
+    def close(self) -> None:
+        """End the process; a move that is still under way is braked first."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(CLOSE_S)
+        self.kill()
+
+    def kill(self) -> None:
+        """End the process at once."""
+        self._process.kill()
+        self._process.wait()
+        for stream in (self._process.stdin, self._process.stdout):
+            if stream is not None:
+                with contextlib.suppress(OSError):
+                    stream.close()
+        self._said.close()
+
+    def _line(self, end: float) -> bytes:
+        """Return the next line, or nothing if none came before `end` or the process ended."""
+        assert self._process.stdout is not None
+        number = self._process.stdout.fileno()
+        while b"\n" not in self._unread:
+            left = end - time.monotonic()
+            if left <= 0 or not select.select([number], [], [], left)[0]:
+                return b""
+            piece = os.read(number, 65536)
+            if not piece:
+                return b""
+            self._unread += piece
+        line, self._unread = self._unread.split(b"\n", 1)
+        return line
+
+    def _last_words(self, do: str, deadline_s: float) -> str:
+        """Return why the process is gone, with what ur_rtde printed last."""
+        with contextlib.suppress(OSError, ValueError):
+            self._said.seek(0)
+            lines = self._said.read().decode(errors="replace").strip().splitlines()
+            if lines:
+                return f"'{do}' failed; ur_rtde said: {' | '.join(lines[-LAST_LINES:])}"
+        return f"'{do}' was not answered within {deadline_s:.1f} s"
+
+
+def probe(host: str, timeout_s: float) -> Glance:
+    """Return what a controller says of itself, after checking that it can be reached.
+
+    Args:
+        host: its address.
+        timeout_s: longest wait for a port, and for an answer on it [s].
+
+    Raises:
+        ArmStoppedError: "connection lost"; the message tells apart a name that is unknown, a host
+            that does not answer, a port that is closed and a port behind which is no controller.
+    """
+    for port in PORTS:
+        _connect(host, port, timeout_s).close()
+    _greeted(host, timeout_s)
+    with contextlib.closing(_connect(host, RTDE_PORT, timeout_s)) as link:
+        try:
+            return _glance(link)
+        except (OSError, struct.error) as error:
+            raise ArmStoppedError(
+                f"{host} answers on port {RTDE_PORT}, but not as a UR controller does "
+                f"({error or 'no answer'}). Is it the robot's address? If it is, the controller "
+                "hangs or is starting up: wait a minute, then switch it off and on.",
+                "connection lost",
+            ) from error
+
+
+def _connect(host: str, port: int, timeout_s: float) -> socket.socket:
+    """Return a connection.
+
+    Raises:
+        ArmStoppedError: there is none, and why.
+    """
+    what = f"the robot's port {port} for {PORTS[port]}"
+    try:
+        return socket.create_connection((host, port), timeout=timeout_s)
+    except socket.gaierror as error:
+        raise ArmStoppedError(
+            f"there is no host '{host}' ({error}). Give the robot's IP address: at the pendant "
+            "under Settings > System > Network (CB3: Setup Robot > Network).",
+            "connection lost",
+        ) from error
+    except ConnectionRefusedError as error:
+        raise ArmStoppedError(
+            f"{host} refuses {what}. Is this the robot's address, and has its controller started "
+            "up? On an e-Series, Settings > Security > Services must allow RTDE, the dashboard and "
+            "the secondary and real-time clients.",
+            "connection lost",
+        ) from error
+    except OSError as error:
+        raise ArmStoppedError(
+            f"{host} does not answer on {what} within {timeout_s:g} s ({error}). Check that the "
+            "robot is switched on, the network cable, the IP address, and that no firewall blocks "
+            f"ports {', '.join(map(str, PORTS))}.",
+            "connection lost",
+        ) from error
+
+
+def _greeted(host: str, timeout_s: float) -> None:
+    """Check that the dashboard says hello: ur_rtde waits for that.
+
+    Raises:
+        ArmStoppedError: it does not.
+    """
+    with contextlib.closing(_connect(host, DASHBOARD_PORT, timeout_s)) as link:
+        try:
+            hello = link.recv(256)
+        except OSError:
+            hello = b""
+    if b"Dashboard" not in hello:
+        raise ArmStoppedError(
+            f"{host} accepts port {DASHBOARD_PORT} but the dashboard there says nothing. Is it the "
+            "robot's address? If it is, the controller hangs: switch it off and on.",
+            "connection lost",
+        )
+
+
+def _glance(link: socket.socket) -> Glance:
+    _send(link, _PROTOCOL, struct.pack(">H", 2))
+    _answer(link, _PROTOCOL)
+    _send(link, _VERSION, b"")
+    version = struct.unpack(">4I", _answer(link, _VERSION)[:16])
+    names = ",".join(_GLANCE)
+    _send(link, _SETUP_OUTPUTS, struct.pack(">d", 125.0) + names.encode())
+    _answer(link, _SETUP_OUTPUTS)
+    _send(link, _START, b"")
+    _answer(link, _START)
+    register, runtime = struct.unpack(">iI", _answer(link, _DATA)[1:9])
+    _send(link, _PAUSE, b"")
+    _answer(link, _PAUSE)
+    _send(link, _SETUP_INPUTS, _COMMAND_REGISTER)
+    return Glance(
+        version=version,
+        script_register=register,
+        runtime_state=runtime,
+        control_free=b"IN_USE" not in _answer(link, _SETUP_INPUTS),
+    )
+
+
+def _send(link: socket.socket, kind: int, payload: bytes) -> None:
+    link.sendall(struct.pack(">HB", 3 + len(payload), kind) + payload)
+
+
+def _answer(link: socket.socket, kind: int) -> bytes:
+    """Return the payload of the next RTDE message of this kind; text messages are passed over."""
+    end = time.monotonic() + (link.gettimeout() or 0.0)
+    while time.monotonic() < end:
+        size, got = struct.unpack(">HB", _exactly(link, 3))
+        payload = _exactly(link, size - 3)
+        if got == kind:
+            return payload
+    raise TimeoutError("no RTDE answer")
+
+
+def _exactly(link: socket.socket, size: int) -> bytes:
+    data = b""
+    while len(data) < size:
+        piece = link.recv(size - len(data))
+        if not piece:
+            raise ConnectionError("the connection was closed")
+        data += piece
+    return data

@@ -1,0 +1,209 @@
+"""The arm at a few views: in space, from above and from the side."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics
+from realsim_capture_plans.collision.shapes import Box
+from realsim_capture_plans.pictures.arm_looks import arm_parts, part_frames
+from realsim_capture_plans.pictures.curves import PlanCurves
+from realsim_capture_plans.pictures.drawing import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PURPLE,
+    RED,
+    new_figure,
+    plain,
+)
+from realsim_capture_plans.planning.view_quality import scene_box
+from realsim_capture_plans.planning.viewpoints import farthest_points
+
+Array = NDArray[np.float64]
+ARMS_SHOWN = 3
+"""Arms drawn, those whose cameras are farthest apart; more hide each other."""
+ARM_COLORS = (BLUE, GREEN, PURPLE)
+LIGHT = np.array([0.3, -0.5, 0.81])
+"""Where the drawn bodies are lit from, in base; about a unit vector."""
+LONGEST_EDGE_M = 0.10
+"""Longer edges of drawn triangles are halved [m]."""
+FRUSTUM_M = 0.05
+"""Length of the drawn frustums of the views that arms are drawn at [m]."""
+SMALL_FRUSTUM_M = 0.018
+"""Length of all other views' frustums [m]."""
+DRAWN_REACH_M = 1.0
+"""The table is drawn no farther than this from the base [m]."""
+
+
+def arm_chart(curves: PlanCurves) -> Any:
+    """Return the figure: the arm, cameras, table and keep-out box, three ways."""
+    figure = new_figure(13.0, 7.6)
+    grid = figure.add_gridspec(2, 2, width_ratios=[1.55, 1])
+    draw_arm(figure.add_subplot(grid[:, 0], projection="3d"), curves)
+    _draw_flat(figure.add_subplot(grid[0, 1]), curves, (0, 1), "from above")
+    _draw_flat(figure.add_subplot(grid[1, 1]), curves, (0, 2), "from the side")
+    handles, labels = figure.axes[1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=9, frameon=False)
+    figure.suptitle(
+        f"{curves.plan.robot} at {len(_shown(curves))} of {len(curves.plan)} views, "
+        f"{curves.plan.mount.name}",
+        fontsize=12,
+    )
+    return figure
+
+
+def draw_arm(axes: Any, curves: PlanCurves) -> None:
+    """Draw the scene in space on a 3-D axes."""
+    from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+
+    plan = curves.plan
+    # The order is given: matplotlib would guess it, and draw the table over the arm.
+    axes.computed_zorder = False
+    for box, color in [(scene_box(plan), ORANGE), *((b, RED) for _, b in plan.cell.obstacles)]:
+        lines = Line3DCollection(box_edges(box), colors=color, linewidths=1.6, zorder=2)
+        axes.add_collection3d(lines)
+    small = _frustums(plan.Ts_base_cam, curves, SMALL_FRUSTUM_M)
+    axes.add_collection3d(Line3DCollection(small, colors="0.45", linewidths=0.5, zorder=1))
+    everything = [plan.Ts_base_cam[:, :3, 3], np.zeros((1, 3))]
+    triangles: list[Array] = []
+    colors: list[Array] = []
+    for k, color in zip(_shown(curves), ARM_COLORS, strict=False):
+        for vertices, faces in _posed(curves, k):
+            corner = _split(vertices[faces])
+            triangles.append(corner)
+            colors.append(_shaded(corner, color))
+            everything.append(vertices)
+        near = _frustums(plan.Ts_base_cam[k : k + 1], curves, FRUSTUM_M)
+        axes.add_collection3d(Line3DCollection(near, colors=color, linewidths=1.6, zorder=4))
+    # One collection, so that triangles are sorted among each other.
+    axes.add_collection3d(
+        Poly3DCollection(np.concatenate(triangles), facecolors=np.concatenate(colors), zorder=3)
+    )
+    points = np.concatenate(everything)
+    low, high = points.min(axis=0) - 0.03, points.max(axis=0) + 0.03
+    table = _table_corners(plan.cell.table, low, high)
+    if table is not None:
+        axes.add_collection3d(
+            Poly3DCollection([table], facecolors="0.92", edgecolors="0.6", zorder=0)
+        )
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.set_box_aspect(high - low, zoom=1.1)
+    axes.view_init(elev=24, azim=-55)
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    axes.tick_params(labelsize=8)
+
+
+def _draw_flat(axes: Any, curves: PlanCurves, plane: tuple[int, int], title: str) -> None:
+    """Draw the scene projected on two of base's axes."""
+    from matplotlib.collections import LineCollection, PolyCollection
+    from scipy.spatial import ConvexHull
+
+    plan, (a, b) = curves.plan, plane
+    reach = np.full(3, DRAWN_REACH_M)
+    table = _table_corners(plan.cell.table, -reach, reach)
+    if table is not None:
+        axes.fill(table[:, a], table[:, b], facecolor="0.93", edgecolor="0.6", label="table")
+    for k, color in zip(_shown(curves), ARM_COLORS, strict=False):
+        # A convex body's outline is the hull of its corners.
+        flat = [vertices[:, [a, b]] for vertices, _ in _posed(curves, k)]
+        outlines = [points[ConvexHull(points).vertices] for points in flat]
+        axes.add_collection(PolyCollection(outlines, facecolors=color, edgecolors="white",
+                            linewidths=0.4, alpha=0.75, label=f"arm at view {k}"))  # fmt: skip
+
+    def draw(lines: Array, color: str, width: float, label: str | None) -> None:
+        flat = list(lines[..., [a, b]])
+        axes.add_collection(LineCollection(flat, colors=color, linewidths=width, label=label))
+
+    small = _frustums(plan.Ts_base_cam, curves, SMALL_FRUSTUM_M)
+    draw(small, "0.3", 0.4, "every view's camera")
+    draw(box_edges(scene_box(plan)), ORANGE, 1.8, "keep-out box")
+    for k, (_, obstacle) in enumerate(plan.cell.obstacles):
+        draw(box_edges(obstacle), RED, 1.5, "obstacle" if k == 0 else None)
+    axes.autoscale_view()
+    axes.set_aspect("equal")
+    axes.set_xlabel(f"{'xyz'[a]} [m]")
+    axes.set_ylabel(f"{'xyz'[b]} [m]")
+    axes.set_title(title, fontsize=10)
+    plain(axes)
+
+
+def _shown(curves: PlanCurves) -> list[int]:
+    """Return the views that arms are drawn at: the topmost and those farthest from it."""
+    n = min(ARMS_SHOWN, len(curves.plan))
+    places = curves.plan.Ts_base_cam[:, :3, 3]
+    return sorted(int(k) for k in farthest_points(places, n, curves.plan.reference_view))
+
+
+def _posed(curves: PlanCurves, view: int) -> list[tuple[Array, NDArray[np.int64]]]:
+    """Return vertices (V, 3) in base [m] and triangles of every body of the arm at a view."""
+    frames = part_frames(curves.plan, curves.plan.joints[view])
+    return [(se3.transform(frames[p.frame], p.vertices), p.faces) for p in arm_parts(curves.plan)]
+
+
+def _split(triangles: Array) -> Array:
+    """Return triangles (F, 3, 3) halved at their longest edge until all edges are short.
+
+    Triangles are sorted by their middles; long ones would be drawn over what is before them.
+    """
+    done: list[Array] = []
+    while len(triangles):
+        edge = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=-1)
+        short = edge.max(axis=1) <= LONGEST_EDGE_M
+        done.append(triangles[short])
+        triangles, first = triangles[~short], edge[~short].argmax(axis=1)
+        # The longest edge goes from corner 0 to corner 1.
+        order = (first[:, None] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(np.take_along_axis(triangles, order[..., None], axis=1), 1, 0)
+        middle = (a + b) / 2
+        halves = [np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)]
+        triangles = np.concatenate(halves)
+    return np.concatenate(done)
+
+
+def _shaded(triangles: Array, color: str) -> Array:
+    """Return one colour (F, 4) per triangle (F, 3, 3), darker where it is turned from the light."""
+    from matplotlib.colors import to_rgb
+
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    toward = (normal / np.where(length > 0, length, 1.0)) @ LIGHT
+    rgb = (0.7 + 0.3 * toward)[:, None] * np.array(to_rgb(color)) * 0.85 + 0.12
+    return np.concatenate([np.clip(rgb, 0.0, 1.0), np.ones((len(rgb), 1))], axis=1)
+
+
+def _table_corners(box: Box, low: Array, high: Array) -> Array | None:
+    """Return the corners (4, 3) of the table's top inside bounds (3,); None = endless."""
+    top = box.upper[2]
+    if not np.isfinite(top):
+        return None
+    x = np.clip([box.lower[0], box.upper[0]], low[0], high[0])
+    y = np.clip([box.lower[1], box.upper[1]], low[1], high[1])
+    corners = [[x[0], y[0], top], [x[1], y[0], top], [x[1], y[1], top], [x[0], y[1], top]]
+    return np.array(corners, dtype=np.float64)
+
+
+def box_edges(box: Box) -> Array:
+    """Return the twelve edges (12, 2, 3) of a box, cut off far from the base."""
+    low, high = np.clip([box.lower, box.upper], -DRAWN_REACH_M, DRAWN_REACH_M)
+    bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
+    corners = np.where(bits == 1, high, low)
+    pairs = [(i, i | 1 << k) for i in range(8) for k in range(3) if not i & 1 << k]
+    return corners[np.array(pairs)]
+
+
+def _frustums(Ts_base_cam: Array, curves: PlanCurves, length_m: float) -> Array:
+    return frustum_lines(Ts_base_cam, curves.sensor.intrinsics, length_m)
+
+
+def frustum_lines(Ts_base_cam: Array, camera: CameraIntrinsics, length_m: float) -> Array:
+    """Return the lines (N * 8, 2, 3) of the pyramids of a length [m] that cameras (N, 4, 4) see."""
+    c = camera
+    x, y = c.width / 2 / c.fx * length_m, c.height / 2 / c.fy * length_m
+    z = length_m
+    points = np.array([[0, 0, 0], [-x, -y, z], [x, -y, z], [x, y, z], [-x, y, z]])
+    world = se3.transform(Ts_base_cam, points)
+    pairs = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+    return world[:, pairs].reshape(-1, 2, 3)

@@ -1,0 +1,161 @@
+"""Meshes of the arm, its camera and its mount, for drawing only: each fixed in one DH frame."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import MissingLibraryError
+from realsim.geometry import se3
+from realsim_capture_plans.arms.kinematics import JOINTS
+from realsim_capture_plans.collision.arm_shapes import (
+    LINK_NAMES,
+    arm_shapes,
+    link_placements,
+    nominal_chain,
+)
+from realsim_capture_plans.collision.camera_bodies import camera_shape
+from realsim_capture_plans.collision.shapes import Shape
+from realsim_capture_plans.collision.ur5_meshes import BASE_LINK_FROM_BASE, URDF, robots_folder
+from realsim_capture_plans.planning.record import CapturePlan
+
+Array = NDArray[np.float64]
+ROUND_SIDES = 24
+"""Sides that a drawn cylinder has."""
+ROUND_RINGS = 5
+"""Rings of vertices on each of a capsule's caps."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Part:
+    """One drawn piece of the arm."""
+
+    name: str
+    """What it is: 'forearm', 'camera'."""
+    frame: int
+    """The frame of `part_frames` that it is fixed in."""
+    vertices: Array
+    """(V, 3) in that frame [m]."""
+    faces: NDArray[np.int64]
+    """(F, 3) corners of triangles, counter-clockwise from outside."""
+
+
+def part_frames(plan: CapturePlan, joints: Array) -> Array:
+    """Return where the drawn links are (..., 7, 4, 4) [m] at joints (..., 6) [rad]."""
+    return plan.chain.link_frames(joints) @ link_placements(plan.chain)
+
+
+def arm_parts(plan: CapturePlan) -> list[Part]:
+    """Return the shapes that collisions are computed with: arm, camera, bracket.
+
+    Raises:
+        InputError: there are no shapes for this arm.
+    """
+    return [_part(shape) for shape in _shapes(plan)]
+
+
+def camera_parts(plan: CapturePlan) -> list[Part]:
+    """Return what is fixed to the flange: camera and bracket."""
+    return [_part(shape) for shape in (camera_shape(plan.mount), *plan.mount.bracket)]
+
+
+def _shapes(plan: CapturePlan) -> tuple[Shape, ...]:
+    return (*arm_shapes(plan.chain), camera_shape(plan.mount), *plan.mount.bracket)
+
+
+def _part(shape: Shape) -> Part:
+    vertices, faces = shape_mesh(shape)
+    return Part(
+        name=shape.part,
+        frame=shape.frame,
+        vertices=se3.transform(shape.T_frame_shape, vertices),
+        faces=faces,
+    )
+
+
+def shape_mesh(shape: Shape) -> tuple[Array, NDArray[np.int64]]:
+    """Return vertices (V, 3) [m] in the shape's own frame and triangles (F, 3).
+
+    Every shape is convex: its mesh is the hull of points on it. Round ones are drawn a little
+    inside themselves, by at most 1 % of their radius.
+    """
+    if shape.kind == "box":
+        bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
+        points = np.asarray((bits - 0.5) * np.array(shape.size_m), dtype=np.float64)
+    elif shape.points is not None:
+        points = np.asarray(shape.points)
+    else:
+        points = _round_points(shape)
+    return convex_mesh(points)
+
+
+def _round_points(shape: Shape) -> Array:
+    """Return points on a sphere, cylinder or capsule."""
+    radius = shape.size_m[0]
+    half = shape.size_m[1] / 2 if len(shape.size_m) > 1 else 0.0
+    around = np.arange(ROUND_SIDES) * (2 * np.pi / ROUND_SIDES)
+    circle = np.stack([np.cos(around), np.sin(around), np.zeros(ROUND_SIDES)], -1)
+    up = np.array([0.0, 0.0, 1.0])
+    if shape.kind == "cylinder":
+        return np.concatenate([radius * circle + half * up, radius * circle - half * up])
+    tilt = np.linspace(0.0, np.pi / 2, ROUND_RINGS)[:, None, None]
+    cap = (radius * (np.cos(tilt) * circle + np.sin(tilt) * up) + half * up).reshape(-1, 3)
+    return np.concatenate([cap, cap * [1.0, 1.0, -1.0]])
+
+
+def convex_mesh(points: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Return the vertices (V, 3) and outward triangles (F, 3) of the hull of points (P, 3)."""
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(points)
+    number = np.full(len(points), -1, dtype=np.int64)
+    number[hull.vertices] = np.arange(len(hull.vertices))
+    faces = number[hull.simplices]
+    vertices = points[hull.vertices]
+    corner = vertices[faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    inward = np.sum(normal * hull.equations[:, :3], axis=-1) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return vertices, faces
+
+
+def ur5_looks(plan: CapturePlan) -> list[Part] | None:
+    """Return the UR5's own outside for its collision shapes; None where it cannot be had.
+
+    The meshes stand in ROS's `base_link`, which is turned by 180 deg about z against the
+    controller's base; where each is in our links follows from both kinematics at zero.
+    """
+    if plan.chain.name != "UR5":
+        return None
+    try:
+        folder = robots_folder()
+    except MissingLibraryError:
+        return None
+    import pinocchio as pin  # pyright: ignore[reportMissingImports]
+    import trimesh
+
+    urdf = str(folder / URDF)
+    model = pin.buildModelFromUrdf(urdf)
+    visual = pin.buildGeomFromUrdf(
+        model, urdf, pin.GeometryType.VISUAL, package_dirs=[str(folder.parent.parent)]
+    )
+    data = model.createData()
+    pin.forwardKinematics(model, data, np.zeros(JOINTS))
+    # The nominal links are where the drawn links of a calibrated arm are, too.
+    T_link_base = se3.invert(nominal_chain(plan.chain).link_frames(np.zeros(JOINTS)))
+    parts: list[Part] = []
+    for one in visual.geometryObjects:
+        frame = int(one.parentJoint)
+        T_ros_mesh = (data.oMi[frame] * one.placement).homogeneous
+        mesh: Any = trimesh.load_mesh(one.meshPath)
+        T_link_mesh = T_link_base[frame] @ BASE_LINK_FROM_BASE @ T_ros_mesh
+        parts.append(
+            Part(
+                name=LINK_NAMES[frame],
+                frame=frame,
+                vertices=se3.transform(T_link_mesh, np.asarray(mesh.vertices, dtype=np.float64)),
+                faces=np.asarray(mesh.faces, dtype=np.int64),
+            )
+        )
+    return parts

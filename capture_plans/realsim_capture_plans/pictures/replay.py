@@ -1,0 +1,238 @@
+"""A plan driven in the browser: a time slider over the tour, the arm, and what it comes near to."""
+
+import contextlib
+import io
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.store.atomic import write_text
+from realsim_capture_plans.collision.model import CollisionModel
+from realsim_capture_plans.pictures import local_only
+from realsim_capture_plans.pictures.motion_charts import GROUP_LABELS
+from realsim_capture_plans.pictures.replay_scene import ReplayScene
+from realsim_capture_plans.planning.record import CapturePlan
+from realsim_capture_plans.planning.tour_time import TourTime
+from realsim_capture_plans.planning.view_quality import sensor_of
+
+Array = NDArray[np.float64]
+SPEEDS = {"1 x": 1.0, "2 x": 2.0, "5 x": 5.0, "10 x": 10.0, "30 x": 30.0}
+FRAME_S = 1 / 25
+"""Between two drawn positions while playing [s]."""
+SLIDER_STEP_S = 0.01
+"""The slider's step [s]: 1 cm of camera path at full speed."""
+FILE_FRAME_S = 1 / 20
+"""Between two recorded positions of a file [s]."""
+FILE_LONGEST_S = 90.0
+"""A file's replay takes no longer than this [s]: longer tours are driven faster."""
+FILE_SPEED = 3.0
+"""How many times faster than the arm a file's replay is, at least."""
+
+
+class PlanReplay:
+    """One plan's replay; it runs in threads of its own until `stop`."""
+
+    def __init__(
+        self,
+        plan: CapturePlan,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        allow_remote: bool = False,
+        looks: bool = True,
+    ) -> None:
+        """Listen, and build scene and panel; returns when both are there.
+
+        Args:
+            plan: what is shown.
+            host: where to listen.
+            port: the next free one is taken if it is in use, 0 = any.
+            allow_remote: whether other machines may reach it; there is no login.
+            looks: whether to draw the arm as it looks, where the extra `looks` is installed.
+
+        Raises:
+            InputError: the host is reachable from other machines without `allow_remote`, or the
+                plan's camera is not known.
+        """
+        import viser
+
+        self.plan = plan
+        self.tour = TourTime.of(plan)
+        self.model: CollisionModel = plan.collision_model()
+        sensor = sensor_of(plan)
+        self._host = local_only.check_host(host, allow_remote)
+        # Viser prints a banner with its address; the caller says what is to be said.
+        with local_only.origins_of(host), contextlib.redirect_stdout(io.StringIO()):
+            self.server = viser.ViserServer(
+                host=host, port=port, label="realsim plan", verbose=False
+            )
+        local_only.refuse_share(self.server)
+        self.scene = ReplayScene(self.server, plan, sensor, looks)
+        self.time_s = 0.0
+        self._stopping = threading.Event()
+        self._drawing = threading.RLock()
+        self._build_panel()
+        self.show(0.0)
+        self._player = threading.Thread(target=self._play, name="replay", daemon=True)
+        self._player.start()
+
+    @property
+    def url(self) -> str:
+        """The address to open in a browser."""
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        return f"http://{host}:{self.server.get_port()}"
+
+    def stop(self) -> None:
+        """Stop playing and listening."""
+        self._stopping.set()
+        self._player.join()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def show(self, time_s: float) -> None:
+        """Draw the arm where it is at a time of the tour [s], with its clearances."""
+        with self._drawing:
+            self.time_s = float(np.clip(time_s, 0.0, self.tour.total_s))
+            joints = self.tour.joints_at(self.time_s)
+            with self.server.atomic():
+                self.scene.pose(joints)
+                self.scene.mark(near_parts(self.model, joints))
+            self._slider.value = round(self.time_s / SLIDER_STEP_S) * SLIDER_STEP_S
+            self._view.value = int(self.tour.move[self.tour.leg_at(self.time_s)])
+            self._text.content = self.describe(self.time_s)
+
+    def show_view(self, view: int) -> None:
+        """Draw the arm at a view."""
+        self.show(float(self.tour.view_s[int(np.clip(view, 0, len(self.plan) - 1))]))
+
+    def describe(self, time_s: float) -> str:
+        """Return in Markdown where the arm is at a time [s] and what it is near to."""
+        tour, need = self.tour, self.model.clearance_m
+        move = int(tour.move[tour.leg_at(time_s)])
+        arrived = time_s >= tour.view_s[move]
+        where = f"**at view {move}**" if arrived else f"on the move to **view {move}**"
+        lines = [f"{time_s:.1f} of {tour.total_s:.1f} s, {where} of {len(self.plan)}", ""]
+        lines += ["| clearance | mm |", "|:--|--:|"]
+        joints = tour.joints_at(time_s)
+        found = self.model.clearance(joints[None])
+        for group, distance in found.items():
+            d = float(distance[0])
+            if np.isfinite(d):
+                text = f"{1000 * d:.1f}" if d >= need else f"**{1000 * d:.1f} TOO NEAR**"
+                lines.append(f"| {GROUP_LABELS.get(group, group).replace(chr(10), ' ')} | {text} |")
+        _, first, second, _ = self.model.nearest(joints)
+        lines.append(f"\nnearest: {first} and {second}  ")
+        lines.append(f"required: {1000 * need:g} mm; what is nearest is red where it is too near")
+        return "\n".join(lines)
+
+    # --- panel ------------------------------------------------------------------------------
+
+    def _build_panel(self) -> None:
+        gui = self.server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        self._text = gui.add_markdown("")
+        self._slider: Any = gui.add_slider(
+            "Time [s]", 0.0, float(np.ceil(self.tour.total_s)), SLIDER_STEP_S, 0.0
+        )
+        self._playing = gui.add_checkbox("Play", False)
+        self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="5 x")
+        self._view: Any = gui.add_number("View", 0, min=0, max=len(self.plan) - 1, step=1)
+        steps = gui.add_button_group("Step", ("previous view", "next view"))
+        first, last = "#440154", "#fde725"
+        gui.add_markdown(
+            f"{len(self.plan)} {self.plan.kind} views of a {self.plan.robot}, "
+            f"{self.plan.mount.name}. Small frustums: the views in their order, from "
+            f"<span style='color:{first}'>dark</span> to "
+            f"<span style='color:{last}'>yellow</span>. Orange box: only objects may be there."
+        )
+        self._slider.on_update(self._slider_moved)
+        self._view.on_update(self._view_typed)
+        steps.on_click(lambda event: self._step(1 if steps.value == "next view" else -1))
+
+    def _step(self, by: int) -> None:
+        """Go to the view before or after the place on the tour."""
+        arrived = np.searchsorted(self.tour.view_s, self.time_s + 1e-6, side="right") - 1
+        at_view = arrived >= 0 and self.time_s < self.tour.view_s[arrived] + 1e-3
+        self.show_view(int(arrived) + (by if by > 0 or at_view else 0))
+
+    def _slider_moved(self, event: Any) -> None:
+        if event.client is not None:  # moved by a person, not by `show`
+            self.show(float(self._slider.value))
+
+    def _view_typed(self, event: Any) -> None:
+        if event.client is not None:
+            self.show_view(int(self._view.value))
+
+    def _play(self) -> None:
+        """Go on with the time while the box is ticked; from the end, begin again."""
+        last = time.monotonic()
+        while not self._stopping.wait(FRAME_S):
+            now = time.monotonic()
+            passed, last = now - last, now
+            if not self._playing.value:
+                continue
+            at_end = self.time_s >= self.tour.total_s
+            self.show(0.0 if at_end else self.time_s + passed * SPEEDS[self._speed.value])
+
+
+def near_parts(model: CollisionModel, joints: Array) -> set[str]:
+    """Return the names of the nearest pair of parts, if it is nearer than the plan's clearance."""
+    _, first, second, distance = model.nearest(joints)
+    return {first, second} if distance < model.clearance_m else set()
+
+
+def serve_replay(
+    plan: CapturePlan,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    *,
+    allow_remote: bool = False,
+    looks: bool = True,
+) -> PlanReplay:
+    """Return the running replay of a plan; `url` is where to look, `stop` ends it.
+
+    Args:
+        plan: what is shown.
+        host: where to listen; only this machine can reach 127.0.0.1.
+        port: the next free one is taken if it is in use, 0 = any.
+        allow_remote: whether the host may be one that other machines reach; there is no login.
+        looks: whether to draw the arm as it looks, where the extra `looks` is installed.
+
+    Raises:
+        InputError: see `PlanReplay`.
+    """
+    return PlanReplay(plan, host=host, port=port, allow_remote=allow_remote, looks=looks)
+
+
+def write_replay(plan: CapturePlan, path: Path | str, *, looks: bool = True) -> Path:
+    """Write the replay as one HTML file that plays in any browser, without a server or a network.
+
+    It has no panel: viser's player has its own slider and speed. Tours are driven at least
+    `FILE_SPEED` times faster than the arm goes.
+
+    Args:
+        plan: what is shown.
+        path: the .html file; written whole or not at all.
+        looks: whether to draw the arm as it looks, where the extra `looks` is installed.
+
+    Raises:
+        InputError: the plan's camera is not known.
+    """
+    replay = PlanReplay(plan, port=0, looks=looks)
+    try:
+        serializer = replay.server.get_scene_serializer()
+        faster = max(FILE_SPEED, replay.tour.total_s / FILE_LONGEST_S)
+        for t in np.arange(0.0, replay.tour.total_s, FILE_FRAME_S * faster):
+            joints = replay.tour.joints_at(t)
+            replay.scene.pose(joints)
+            replay.scene.mark(near_parts(replay.model, joints))
+            serializer.insert_sleep(FILE_FRAME_S)
+        page = serializer.as_html()
+    finally:
+        replay.stop()
+    write_text(path, page)
+    return Path(path)

@@ -1,0 +1,107 @@
+"""A capture plan for other programs: a table (CSV) and a program for the controller (URScript)."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_capture_plans.arms.kinematics import JOINTS
+from realsim_capture_plans.plan_files.joint_paths import CAMERA_COLUMNS
+from realsim_capture_plans.planning.record import CapturePlan
+
+Array = NDArray[np.float64]
+AT_HOME_RAD = 0.05
+"""The script starts only with every joint this near to home [rad]: nothing else was checked."""
+JOINT_DIGITS = 15
+"""Decimals of a joint in the script; URScript numbers are written without exponents."""
+
+
+def export_csv(plan: CapturePlan, path: Path | str) -> None:
+    """Write one row per configuration in driving order; `import_plan` reads it back.
+
+    Columns: view (of a via point: the view that it leads to), via (1 = only passed; the first one
+    is home), q1_rad ... q6_rad, and at views the expected camera pose in base, cam_x_m ... cam_qz.
+    Numbers come back bit for bit.
+    """
+    from realsim.store.atomic import write_text
+
+    header = ["view", "via", *(f"q{j + 1}_rad" for j in range(JOINTS)), *CAMERA_COLUMNS]
+    quaternions = se3.quaternion_wxyz(plan.Ts_base_cam[:, :3, :3])
+    lines = [",".join(header)]
+
+    def row(view: int, via: bool, q: Array, camera: list[float]) -> None:
+        numbers = [repr(v) for v in q.tolist()]
+        pose = [repr(v) for v in camera] or [""] * len(CAMERA_COLUMNS)
+        lines.append(",".join([str(view), str(int(via)), *numbers, *pose]))
+
+    row(0, True, plan.home, [])
+    for k in range(len(plan)):
+        for q in plan.move(k)[1:-1]:
+            row(k, True, q, [])
+        row(
+            k, False, plan.joints[k],
+            [*plan.Ts_base_cam[k, :3, 3].tolist(), *quaternions[k].tolist()],
+        )  # fmt: skip
+    write_text(path, "\n".join(lines) + "\n")
+
+
+def urscript(plan: CapturePlan) -> str:
+    """Return a program that drives the plan: a stop at every corner, a message at every view.
+
+    It moves nothing unless the arm stands at the plan's home: only the moves from there on have
+    been checked. Nothing is blended, so the path is the straight one in joint space. Where moves
+    collide in the model (an imported plan's may), it says so and waits for the operator.
+    """
+    from realsim_capture_plans.plan_files.imported import colliding_legs
+
+    c = plan.config
+    how = f"a={c.acceleration:.6f}, v={c.speed:.6f}"
+    T = plan.mount.T_ee_cam
+    pose = ", ".join(f"{v:.6f}" for v in [*T[:3, 3].tolist(), *se3.log_so3(T[:3, :3]).tolist()])
+    legs = sum(len(plan.move(k)) - 1 for k in range(len(plan)))
+    colliding = colliding_legs(plan)
+    warning = f"{len(colliding)} moves of this plan collide in the model. Stop, or go on?"
+    names = {"robot": plan.robot, "mount": plan.mount.name, "camera": plan.mount.camera}
+    lines = [
+        "# Capture plan written by realsim. Joints in rad, in the order base to wrist 3.",
+        *(f"# {key}: {' '.join(value.split())}" for key, value in names.items()),
+        f"# camera in the flange [m, rotation vector]: {pose}",
+        f"# views: {len(plan)}, moves of the joints: {legs}",
+        f"# sha256 of the plan: {plan.content_hash}",
+        "# Checked for collisions with this mount and this table: the moves below, no others.",
+        *(f"# NOT FREE: {leg}" for leg in colliding),
+        "def realsim_plan():",
+        *([f'  popup("{warning}", "realsim", True, False, True)'] if colliding else []),
+        f"  home = {_list(plan.home)}",
+        "  here = get_actual_joint_positions()",
+        "  i = 0",
+        "  while i < 6:",
+        f"    if norm(here[i] - home[i]) > {AT_HOME_RAD}:",
+        '      popup("Bring the arm to the home of the plan first.", "realsim", False, True, True)',
+        "      halt",
+        "    end",
+        "    i = i + 1",
+        "  end",
+        f"  movej(home, {how})",
+    ]
+    for k in range(len(plan)):
+        for q in plan.move(k)[1:]:
+            lines.append(f"  movej({_list(q)}, {how})")
+        lines.append(f"  sleep({c.settle_s:.6f})")
+        lines.append(f'  textmsg("realsim view ", {k})')
+    return "\n".join([*lines, '  textmsg("realsim plan done")', "end", ""])
+
+
+def export_urscript(plan: CapturePlan, path: Path | str) -> None:
+    """Write the plan's program, see `urscript`."""
+    from realsim.store.atomic import write_text
+
+    write_text(path, urscript(plan))
+
+
+def _list(q: Array) -> str:
+    if not np.all(np.isfinite(q)):
+        raise InputError(f"joints {q.tolist()} are not finite; such a plan is not written.")
+    return "[" + ", ".join(f"{v:.{JOINT_DIGITS}f}" for v in q.tolist()) + "]"

@@ -1,0 +1,103 @@
+"""Camera poses as GraspNet-1Billion stores them: two npy files in a folder.
+
+`camera_poses.npy` (N, 4, 4) holds every camera in the FIRST camera's frame, `cam0_wrt_table.npy`
+(4, 4) the first camera in the table's frame, so that
+
+    T_table_cam[i] = cam0_wrt_table @ camera_poses[i]
+
+in metres, cameras as OpenCV's. The table's frame has its origin on the table's top straight below
+the scene centre; its axes are those of the robot's base. GraspNet has no place for joints: the plan
+itself lies beside the two files, so that a robot can drive it again.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_capture_plans.plan_files.plan_json import save_plan
+from realsim_capture_plans.planning.record import CapturePlan
+
+Array = NDArray[np.float64]
+POSES, FIRST, PLAN = "camera_poses.npy", "cam0_wrt_table.npy", "plan.json"
+GRASPNET_VIEWS = 256
+"""graspnetAPI reads scenes of exactly this many views."""
+LARGEST_VIEWS = 100_000
+"""A file with more is no camera poses."""
+
+
+def table_frame(plan: CapturePlan) -> Array:
+    """Return T_base_table (4, 4) [m]: on the table's top below the scene centre, axes of base.
+
+    Raises:
+        InputError: the plan's table has no top.
+    """
+    x, y, _ = plan.center_world.tolist()
+    top = float(plan.cell.table.upper[2])
+    if not np.isfinite(top):
+        raise InputError(
+            "this plan's table has no top, and GraspNet's poses are relative to the table. Make "
+            "the plan with --table-height."
+        )
+    return se3.from_translation([x, y, top])
+
+
+def export_graspnet(plan: CapturePlan, folder: Path | str) -> list[Path]:
+    """Write the poses, and the plan beside them; return the files.
+
+    The files appear one by one, each whole; camera_poses.npy is the last one.
+
+    Raises:
+        InputError: the plan's table has no top.
+    """
+    folder = Path(folder)
+    Ts_table_cam = se3.invert(table_frame(plan)) @ plan.Ts_base_cam
+    relative = se3.invert(Ts_table_cam[0]) @ Ts_table_cam
+    relative[0] = np.eye(4)
+    save_plan(plan, folder / PLAN)
+    _write_npy(folder / FIRST, Ts_table_cam[0])
+    _write_npy(folder / POSES, relative)
+    return [folder / PLAN, folder / FIRST, folder / POSES]
+
+
+def read_graspnet(folder: Path | str) -> Array:
+    """Return the camera poses T_table_cam (N, 4, 4) [m] of a GraspNet scene's camera folder.
+
+    Raises:
+        InputError: a file is missing, or is not what it should be.
+        NotRigidError: a matrix is not a rigid transform.
+    """
+    folder = Path(folder)
+    first = _read_npy(folder / FIRST)
+    relative = _read_npy(folder / POSES)
+    if first.shape != (4, 4) or relative.ndim != 3 or relative.shape[1:] != (4, 4):
+        raise InputError(
+            f"{folder}: {FIRST} has the shape {first.shape} and {POSES} {relative.shape}; (4, 4) "
+            "and (N, 4, 4) are needed."
+        )
+    if not 0 < len(relative) <= LARGEST_VIEWS:
+        raise InputError(f"{folder / POSES} holds {len(relative)} poses; at least one is needed.")
+    first = se3.check_rigid(first, str(folder / FIRST))
+    return first @ se3.check_rigid(relative, str(folder / POSES))
+
+
+def _write_npy(path: Path, array: Array) -> None:
+    import io
+
+    from realsim.store.atomic import write_bytes
+
+    buffer = io.BytesIO()
+    np.save(buffer, np.ascontiguousarray(array))
+    write_bytes(path, buffer.getvalue())
+
+
+def _read_npy(path: Path) -> Array:
+    if not path.is_file():
+        raise InputError(f"there is no {path}; a GraspNet camera folder holds {POSES} and {FIRST}.")
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        return np.array(array, dtype=np.float64)
+    except (ValueError, EOFError, TypeError) as error:
+        raise InputError(f"{path} is not a numpy array of numbers ({error}).") from error

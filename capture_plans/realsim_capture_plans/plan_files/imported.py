@@ -1,0 +1,236 @@
+"""A capture plan from other people's joint path: robot and units proven, every move checked.
+
+Nothing is dropped: moves that collide in the model stay in the plan, are counted in its metrics
+and named by `colliding_legs`.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import DegenerateError, InputError, UnitError
+from realsim.geometry import se3
+from realsim_capture_plans.arms.kinematics import CHAINS, DhChain
+from realsim_capture_plans.collision.model import interpolate
+from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
+from realsim_capture_plans.plan_files.evidence import FITS_M, MILLIMETRES_FROM_M, JointUnit
+from realsim_capture_plans.plan_files.joint_paths import JointPath, read_path
+from realsim_capture_plans.planning.metric_meanings import JOINT_NAMES, Meaning
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+Array = NDArray[np.float64]
+LEAST_AXIS_SPREAD = 0.02
+"""Least eigenvalue, relative to the number of views, of the system for the point that the optical
+axes meet at: axes within 8 degrees of each other do not determine it."""
+
+IMPORT_MEANINGS = {
+    "rows_after_last_view": Meaning(
+        text="rows of the file after its last view, left out", unit="", good="0", better="less"
+    ),
+    "tool_pose_gap_m": Meaning(
+        text="what is left between the file's tool poses and the arm's, middle row",
+        unit="m",
+        good="< 0.005 nominal, < 0.001 calibrated",
+        better="less",
+    ),
+    "tool_offset_m": Meaning(
+        text="length of the tool offset that the file's poses were of",
+        unit="m",
+        good="as configured then",
+        better="as asked",
+    ),
+}
+"""What the metrics say that only imported plans have."""
+
+
+def import_plan(
+    path: Path | str,
+    *,
+    mount: Mount,
+    chain: DhChain | None = None,
+    config: PlanConfig | None = None,
+    cell: WorkCell | None = None,
+    center: ArrayLike | None = None,
+    obstacles: tuple[tuple[str, Box], ...] = (),
+    joints_unit: JointUnit | None = None,
+) -> CapturePlan:
+    """Return the plan of kind "imported" of a joint path.
+
+    Rows with a via flag become via points of the move to the next view; the first one is home. What
+    comes after the last view is left out and counted (`rows_after_last_view`).
+
+    Args:
+        path: .json (joints, cart_pose, via_points) or .csv (q1_rad ... or q1_deg ..., via).
+        mount: the camera on the flange.
+        chain: the arm that will drive it; None takes what the file's tool poses prove.
+        config: clearances and speeds.
+        cell: what the moves are checked against; by default the config's table and keep-out box,
+            and the obstacles.
+        center: (3,) what the views look at, in base [m]; by default where the optical axes meet.
+        obstacles: named boxes in base, where no cell is given.
+        joints_unit: of joints that say no unit themselves.
+
+    Raises:
+        InputError: not a path, another robot's, or joints beyond the limits.
+        UnitError: joints or lengths in another unit.
+        DegenerateError: no centre is given and the optical axes meet nowhere.
+    """
+    found = read_path(path, chain, joints_unit)
+    if chain is None:
+        if found.reading is None:
+            raise InputError(
+                f"{path} does not say which robot it is for; choose --robot ({', '.join(CHAINS)})."
+            )
+        chain = found.reading.chain
+    return plan_of_path(
+        found,
+        chain=chain,
+        mount=mount,
+        config=config or PlanConfig(),
+        cell=cell,
+        center=center,
+        obstacles=obstacles,
+    )
+
+
+def plan_of_path(
+    path: JointPath,
+    *,
+    chain: DhChain,
+    mount: Mount,
+    config: PlanConfig,
+    cell: WorkCell | None = None,
+    center: ArrayLike | None = None,
+    obstacles: tuple[tuple[str, Box], ...] = (),
+) -> CapturePlan:
+    """Return the plan of a joint path that has been read, see `import_plan`."""
+    _check_limits(path, chain)
+    views = np.flatnonzero(~path.via)
+    if not len(views):
+        raise InputError(f"{path.source}: all of its {len(path.via)} rows are via points.")
+    joints = path.joints[views]
+    Ts_base_cam = chain.forward(joints) @ mount.T_ee_cam
+    _check_camera(path, views, Ts_base_cam)
+    aim = axes_meeting_point(Ts_base_cam) if center is None else checked_center(center)
+    starts = [1, *(views[:-1] + 1)]  # the first row is home, whatever it is
+    vias = tuple(
+        (k, path.joints[first:last])
+        for k, (first, last) in enumerate(zip(starts, views, strict=True))
+        if last > first
+    )
+    plan = CapturePlan(
+        kind="imported",
+        chain=chain,
+        mount=mount,
+        cell=config.work_cell(aim, "imported", obstacles) if cell is None else cell,
+        home=path.joints[0],
+        joints=joints,
+        center_world=aim,
+        vias=vias,
+        reference_view=int(np.argmin(Ts_base_cam[:, 2, 2])),
+        config=config,
+    )
+    metrics = {
+        "colliding_legs": float(len(colliding_legs(plan))),
+        "rows_after_last_view": float(len(path.joints) - 1 - views[-1]),
+    }
+    if path.reading is not None:
+        metrics["tool_pose_gap_m"] = path.reading.gap_m
+        metrics["tool_offset_m"] = float(np.linalg.norm(path.reading.T_ee_tcp[:3, 3]))
+    return replace(plan, metrics=metrics)
+
+
+def colliding_legs(plan: CapturePlan) -> tuple[str, ...]:
+    """Return one line for every straight piece of a move that does not keep the clearance."""
+    model = plan.collision_model()
+    corners = [plan.move(k) for k in range(len(plan))]
+    start = np.concatenate([c[:-1] for c in corners])
+    goal = np.concatenate([c[1:] for c in corners])
+    step = plan.config.edge_step_rad
+    named = [
+        ("home" if k == 0 else f"view {k - 1}", k, leg + 1, len(c) - 1)
+        for k, c in enumerate(corners)
+        for leg in range(len(c) - 1)
+    ]
+    lines: list[str] = []
+    for i in np.flatnonzero(~model.edges_free(start, goal, step)):
+        samples, _ = interpolate(start[i], goal[i], step)
+        least = np.min(np.stack(list(model.clearance(samples).values())), axis=0)
+        at = int(np.argmin(least))
+        _, part, other, distance = model.nearest(samples[at])
+        how = (
+            f"{-1e3 * distance:.0f} mm inside" if distance < 0 else f"{1e3 * distance:.0f} mm from"
+        )
+        source, k, leg, legs = named[i]
+        piece = "" if legs == 1 else f" (piece {leg} of {legs})"
+        share = at / max(len(samples) - 1, 1)
+        lines.append(f"{source} -> view {k}{piece}, {share:.0%} of the way: {part} {how} {other}")
+    return tuple(lines)
+
+
+def axes_meeting_point(Ts_base_cam: Array) -> Array:
+    """Return the point (3,) [m] nearest to the optical axes of cameras (N, 4, 4), least squares.
+
+    Raises:
+        DegenerateError: the axes are parallel, or nearly.
+    """
+    axis, eye = Ts_base_cam[:, :3, 2], Ts_base_cam[:, :3, 3]
+    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
+    total = across.sum(axis=0)
+    if float(np.linalg.eigvalsh(total)[0]) < LEAST_AXIS_SPREAD * len(axis):
+        raise DegenerateError(
+            "the cameras all look the same way, so what they look at cannot be found. Say it with "
+            "--center x,y,z [m]."
+        )
+    return np.linalg.solve(total, np.einsum("nij,nj->i", across, eye))
+
+
+def checked_center(center: ArrayLike) -> Array:
+    """Return a scene centre (3,) [m].
+
+    Raises:
+        UnitError: it cannot be in metres.
+    """
+    c = np.array(center, dtype=np.float64)
+    if c.shape != (3,) or not np.all(np.isfinite(c)):
+        raise InputError(f"the scene centre is {c.tolist()}; x,y,z in the robot's base [m].")
+    if np.any(np.abs(c) > MILLIMETRES_FROM_M):
+        raise UnitError(
+            f"the scene centre is {c.tolist()} m, and a UR5 reaches 0.85 m. These look like "
+            f"millimetres: {(c * 1e-3).tolist()} m?"
+        )
+    return c
+
+
+def _check_limits(path: JointPath, chain: DhChain) -> None:
+    """Raise if a row is beyond the joints' limits."""
+    low, high = chain.limits.lower, chain.limits.upper
+    beyond = np.argwhere((path.joints < low) | (path.joints > high))
+    if len(beyond):
+        i, j = beyond[0]
+        raise InputError(
+            f"{path.source}, {path.rows[i]}: the {JOINT_NAMES[j]} joint is "
+            f"{np.degrees(path.joints[i, j]):.1f} deg; a {chain.name} goes from "
+            f"{np.degrees(low[j]):.0f} to {np.degrees(high[j]):.0f} deg ({len(beyond)} such "
+            "values in all). Take out a whole turn, or the row."
+        )
+
+
+def _check_camera(path: JointPath, views: NDArray[np.intp], Ts_base_cam: Array) -> None:
+    """Raise if the camera poses that the file expects are not those of this arm and mount."""
+    if path.Ts_base_cam is None:
+        return
+    written = path.Ts_base_cam[views]
+    has = np.isfinite(written).all(axis=(-2, -1))
+    if not has.any():
+        return
+    offset = se3.invert(Ts_base_cam[has]) @ written[has]
+    gap = np.linalg.norm(offset[:, :3, 3], axis=-1)
+    if float(np.median(gap)) > FITS_M:
+        raise InputError(
+            f"{path.source}: its camera poses are {1e3 * float(np.median(gap)):.0f} mm from those "
+            "of this robot and this mount. Give the robot (--robot) and the mount (--mount) that "
+            "the file was written for, or take out the cam_ columns."
+        )

@@ -1,0 +1,338 @@
+"""Write a frame source into a session: one frame at a time, going on after a kill, checked.
+
+A frame that is in the session is whole. The same source goes on where it stopped, which a key of
+its content and the pixels of the last frame prove; another source is refused.
+"""
+
+import hashlib
+import json
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.console import Console, Tick
+from realsim.errors import InputError, UnitError
+from realsim.formats.frame_source import FrameSource, SourceFrame
+from realsim.records import CaptureSession, View
+from realsim.store import records_json
+from realsim.store.lock import only_run_in
+from realsim.store.session_store import SESSION_FILE, SessionStore
+from realsim_capture_plans.capturing.contact_sheet import (
+    SheetConfig,
+    Thumbnails,
+    cell_size,
+    write_contact_sheet,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+Array = NDArray[np.float64]
+KEY = "import"
+"""Entry of the session's extra under which the source is described."""
+KEY_IN_SOURCE = "content_key"
+"""Entry of a source's extra that stands for its content, wherever it lies."""
+NO_DEPTH_UNIT_M = 0.001
+"""Unit of a session without depth; nothing is stored in it, and the record wants a number."""
+LONGEST_REACH_M = 5.0
+"""A flange farther from its base than this is in millimetres: the largest arms reach 4.7 m."""
+FARTHEST_CAMERA_M = 1000.0
+"""A camera farther from the world's origin was written in millimetres or finer."""
+SAME_PLACE_M = 1e-3
+"""Cameras that all lie this close together and turn were divided by 1000 once too often."""
+TURN_RAD = 0.1
+"""From this turn on a camera in the hand moves noticeably."""
+MIN_FOR_UNIT = 3
+"""Fewer camera poses say nothing about the unit."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ImportSummary:
+    """What an import did and what the session holds."""
+
+    folder: Path
+    """The session."""
+    frames: int
+    """Frames in the session."""
+    imported: int
+    """Frames that this call wrote; the others were there."""
+    with_depth: int
+    with_joints: int
+    with_tool_pose: int
+    with_camera_pose: int
+    time_span_s: float
+    """From the first to the last time stamp [s]; frame numbers where the source has no clock."""
+    seconds: float
+    """Wall time [s]."""
+    notes: tuple[str, ...]
+    """The source's notes."""
+    contact_sheet: Path
+    """Picture of all frames."""
+
+
+def import_session(
+    source: FrameSource, folder: Path, console: Console, *, overwrite: bool = False
+) -> ImportSummary:
+    """Write a frame source into a session and say what it holds.
+
+    Args:
+        source: the recording or folder.
+        folder: the session; made if needed. An import of the same source goes on.
+        console: where progress, notes and the table go.
+        overwrite: replace a session that an earlier import made.
+
+    Raises:
+        InputError: the folder holds something else, a frame cannot be read or has another size, or
+            time stamps do not increase. What was imported until then stays.
+        UnitError: poses are not in metres.
+    """
+    started = time.perf_counter()
+    if not len(source):
+        raise InputError(f"{source.name} has no frames. {' '.join(source.notes)}")
+    key = content_key(source)
+    folder = Path(folder)
+    _make_room(folder, source, key, overwrite=overwrite)
+    folder.mkdir(parents=True, exist_ok=True)
+    for note in source.notes:
+        console.warn(_plain(note))
+    with only_run_in(folder):
+        store = _opened(folder, source, key)
+        done = len(store.completed)
+        if done:
+            console.say(f"{done} of {len(source)} frames are in {folder} already: going on.")
+        taken = _thumbnails(source)
+        try:
+            with console.stage("import", source.name) as tick:
+                _write_frames(source, store, done, tick, taken)
+            _warn_of_unit(store, console)
+            sheet = folder / write_contact_sheet(store, len(source), source.name, taken)
+        finally:
+            store.close()
+    summary = _summary(source, store, done, time.perf_counter() - started, sheet)
+    show_import(summary, console)
+    return summary
+
+
+def content_key(source: FrameSource) -> str:
+    """Return a digest that stands for a source's content, wherever it lies.
+
+    It is of the camera, the depth unit, the number of frames, and the source's own content key, or
+    of all that its extra says where it has none.
+    """
+    extra = source.extra
+    content: Any = extra.get(KEY_IN_SOURCE)
+    if content is None:
+        content = {k: v for k, v in extra.items() if k not in ("path", "source")}
+    values = {
+        "camera": records_json.intrinsics_to_json(source.intrinsics),
+        "depth_unit_m": source.depth_unit_m,
+        "frames": len(source),
+        "content": content,
+    }
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def _plain(note: str) -> str:
+    """Return a note whose square brackets are no markup."""
+    return note.replace("[", r"\[")
+
+
+def _make_room(folder: Path, source: FrameSource, key: str, *, overwrite: bool) -> None:
+    """Check that the folder may hold this import; take an earlier one away where that was said.
+
+    Raises:
+        InputError: it is a file, holds other things, or another session.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file; the folder of a session is expected.")
+    if not folder.is_dir() or not any(p for p in folder.iterdir()):
+        return
+    if not (folder / SESSION_FILE).is_file():
+        found = ", ".join(sorted(p.name for p in folder.iterdir())[:6])
+        raise InputError(
+            f"{folder} is not empty and holds no session ({found}). Choose a new folder, so that "
+            "nothing is mixed."
+        )
+    store = SessionStore.open(folder)
+    store.close()
+    imported: Any = store.extra.get(KEY)
+    if not isinstance(imported, dict):
+        raise InputError(
+            f"{folder} holds the session '{store.session.name}', which was captured and not "
+            "imported: it is never replaced. Choose another folder."
+        )
+    is_same = imported.get("key") == key
+    is_whole = len(store.completed) == len(source)
+    if is_same and not (overwrite and is_whole):
+        return
+    if not overwrite:
+        raise InputError(
+            f"{folder} holds the import of another source: '{store.session.name}' from "
+            f"{imported.get('path', 'elsewhere')}, {len(store.completed)} frames; "
+            f"'{source.name}' has {len(source)} frames, or its files, camera or options have "
+            "changed. Choose another folder, or replace that import with --overwrite."
+        )
+    with only_run_in(folder):
+        # Renamed first: what a kill leaves is not half a session under the session's name.
+        aside = folder.with_name(f".{folder.name}.replaced")
+        shutil.rmtree(aside, ignore_errors=True)
+        folder.rename(aside)
+        shutil.rmtree(aside)
+
+
+def _opened(folder: Path, source: FrameSource, key: str) -> SessionStore:
+    """Return the session to write into: the one that was begun, or a new one."""
+    if (folder / SESSION_FILE).is_file():
+        return SessionStore.open(folder)
+    session = CaptureSession(
+        name=source.name,
+        intrinsics=source.intrinsics,
+        views=(),
+        depth_unit_m=source.depth_unit_m or NO_DEPTH_UNIT_M,
+    )
+    described = {**source.extra, "key": key, "notes": list(source.notes)}
+    return SessionStore.create(folder, session, extra={KEY: described})
+
+
+def _thumbnails(source: FrameSource) -> Thumbnails:
+    """Return an empty set of small pictures for the contact sheet of so many frames."""
+    camera = source.intrinsics
+    _, w, h = cell_size(len(source), (camera.width, camera.height), SheetConfig())
+    return Thumbnails((w, h))
+
+
+def _write_frames(
+    source: FrameSource, store: SessionStore, done: int, tick: Tick, taken: Thumbnails
+) -> None:
+    """Write the frames that are missing; the last one that is there must be the source's own."""
+    if store.completed != set(range(done)):
+        gap = min(set(range(done)) - store.completed)
+        raise InputError(
+            f"view {gap} of {store.folder} is gone, and later ones are there: an import has no "
+            "gaps. Repair the session, or import again with --overwrite."
+        )
+    if done == len(source):
+        tick(done, len(source))
+        return
+    frames: Iterator[SourceFrame] = source.frames(max(done - 1, 0))
+    last_s = -np.inf
+    if done:
+        first = next(frames, None)
+        if first is None or not np.array_equal(first.rgb, store.rgb(done - 1)):
+            raise InputError(
+                f"frame {done - 1} of '{source.name}' is not the picture that {store.folder} holds "
+                "as its last: the source has changed since. Import again with --overwrite."
+            )
+        last_s = first.time_s
+    index = done
+    for frame in frames:
+        _check(frame, index, last_s, source)
+        _add(store, index, frame)
+        taken.add(index, frame.rgb)
+        last_s = frame.time_s
+        index += 1
+        tick(index, len(source))
+    if index != len(source):
+        raise InputError(
+            f"'{source.name}' announced {len(source)} frames and gave {index}: it is cut off or "
+            f"still being written. The {index} frames stay in {store.folder}."
+        )
+
+
+def _check(frame: SourceFrame, index: int, last_s: float, source: FrameSource) -> None:
+    """Raise if a frame cannot be of this session."""
+    where = f"frame {index} ({frame.name})"
+    size = (source.intrinsics.height, source.intrinsics.width)
+    if not np.isfinite(frame.time_s) or frame.time_s <= last_s:
+        raise InputError(
+            f"{where} has the time stamp {frame.time_s:.6f} s, the frame before it {last_s:.6f} s: "
+            "time stamps must increase. Was the clock set back, or are two recordings in one?"
+        )
+    counts = frame.depth_counts
+    if frame.rgb.shape != (*size, 3) or (counts is not None and counts.shape != size):
+        found = frame.rgb.shape if counts is None else (frame.rgb.shape, counts.shape)
+        raise InputError(
+            f"{where} has the shape {found}; the camera is of {size[1]}x{size[0]} px. Images of "
+            "another size belong to a session of their own."
+        )
+    if counts is not None and source.depth_unit_m is None:
+        raise InputError(f"{where} has depth, but what a count is has not been said.")
+    T = frame.T_base_ee
+    if T is not None and np.linalg.norm(T[:3, 3]) > LONGEST_REACH_M:
+        raise UnitError(
+            f"{where}: the flange would be {np.linalg.norm(T[:3, 3]):.4g} m from the robot's base, "
+            f"at most {LONGEST_REACH_M:g} m is accepted. Are the poses in millimetres? Say so, "
+            "such as --reading rotvec,mm."
+        )
+    T = frame.T_world_cam
+    if T is not None and np.linalg.norm(T[:3, 3]) > FARTHEST_CAMERA_M:
+        raise UnitError(
+            f"{where}: the camera would be {np.linalg.norm(T[:3, 3]):.4g} m from the world's "
+            f"origin, at most {FARTHEST_CAMERA_M:g} m is accepted. Are the poses in millimetres? "
+            "Divide the translations by 1000."
+        )
+
+
+def _add(store: SessionStore, index: int, frame: SourceFrame) -> None:
+    """Write one frame; its camera pose goes into the view's own record."""
+    view = View(
+        index=index, time_s=frame.time_s, joints=frame.joints,
+        T_base_ee=frame.T_base_ee, T_world_cam=frame.T_world_cam,
+    )  # fmt: skip
+    store.add_view(view, frame.rgb, depth_counts=frame.depth_counts)
+
+
+def _warn_of_unit(store: SessionStore, console: Console) -> None:
+    """Say it where the cameras turn but stand in one place: metres taken for millimetres."""
+    Ts = [v.T_world_cam for v in store.session.views if v.T_world_cam is not None]
+    if len(Ts) < MIN_FOR_UNIT:
+        return
+    stack = np.array(Ts)
+    extent = float(np.ptp(stack[:, :3, 3], axis=0).max())
+    cosine = (np.einsum("ij,nij->n", stack[0, :3, :3], stack[:, :3, :3]) - 1) / 2
+    turn = float(np.arccos(np.clip(cosine, -1, 1)).max())
+    if turn > TURN_RAD and extent < SAME_PLACE_M:
+        console.warn(
+            f"the cameras of {len(Ts)} views turn by up to {np.degrees(turn):.0f} deg but stand "
+            f"within {1e3 * extent:.3g} mm: are the positions metres in a file of millimetres?"
+        )
+
+
+def _summary(
+    source: FrameSource, store: SessionStore, done: int, seconds: float, sheet: Path
+) -> ImportSummary:
+    views = store.session.views
+    times = [v.time_s for v in views]
+    return ImportSummary(
+        folder=store.folder,
+        frames=len(views),
+        imported=len(views) - done,
+        with_depth=sum(store.has_depth(v.index) for v in views),
+        with_joints=sum(v.joints is not None for v in views),
+        with_tool_pose=sum(v.T_base_ee is not None for v in views),
+        with_camera_pose=sum(v.T_world_cam is not None for v in views),
+        time_span_s=max(times) - min(times),
+        seconds=seconds,
+        notes=tuple(source.notes),
+        contact_sheet=sheet,
+    )
+
+
+def show_import(summary: ImportSummary, console: Console) -> None:
+    """Print what the session holds, and what to do with it."""
+    rows: list[tuple[str, object]] = [
+        ("frames", f"{summary.frames} ({summary.imported} now)"),
+        ("with depth", summary.with_depth),
+        ("with joints", summary.with_joints),
+        ("with tool pose", summary.with_tool_pose),
+        ("with camera pose", summary.with_camera_pose),
+        ("first to last [s or frames]", f"{summary.time_span_s:.3f}"),
+        ("time [s]", f"{summary.seconds:.1f}"),
+        ("contact sheet", summary.contact_sheet.relative_to(summary.folder)),
+    ]
+    console.table(f"imported into {summary.folder}", ("", ""), rows)

@@ -1,0 +1,224 @@
+"""Which topics of a recording are the colour camera, its depth, and the arm."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from realsim.errors import InputError
+from realsim.formats.bags import camera_info as ci
+from realsim.formats.bags.choice import BagChoice
+from realsim.formats.bags.joints import prefixes
+from realsim.formats.bags.pixels import ImageKind, kind_of
+from realsim.formats.bags.recording import Recording
+from realsim.formats.bags.wire import image_of, joints_of
+
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+ALIGNED = ("aligned_depth", "depth_registered", "depth_to_rgb", "depth_to_color", "registered")
+"""Parts of topic names by which drivers say that depth is on the colour image's pixels."""
+JOINT_MESSAGES_LOOKED_AT = 60
+"""Grippers publish on the arm's topic: more than one message is needed to see all the names."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImageTopic:
+    """A topic of images, as its first message shows it."""
+
+    name: str
+    compressed: bool
+    image: ImageKind
+    frame_id: str
+    count: int
+
+    def __str__(self) -> str:
+        """Return name, kind, size and number of images, for a message to a person."""
+        i = self.image
+        return f"{self.name} ({i.kind}, {i.width}x{i.height} {i.encoding}, {self.count} images)"
+
+
+@dataclass(slots=True)
+class Topics:
+    """The topics that are used, and what a person should know of the choice."""
+
+    colour: ImageTopic
+    depth: ImageTopic | None = None
+    colour_info: str | None = None
+    depth_info: str | None = None
+    joints: str | None = None
+    joint_prefix: str = ""
+    tf: list[str] = field(default_factory=list[str])
+    notes: list[str] = field(default_factory=list[str])
+
+
+def choose(recording: Recording, choice: BagChoice) -> Topics:
+    """Return the topics to use.
+
+    Raises:
+        InputError: nothing fits, or several do; the message lists them and the option to choose.
+    """
+    images = [_image_topic(recording, t.name) for t in recording.of_type(IMAGE, COMPRESSED)]
+    if not images:
+        raise InputError(
+            f"{recording.path.name} has no images; its topics are {recording.listing()}. A "
+            "recording with sensor_msgs/Image or CompressedImage is needed."
+        )
+    topics = Topics(_colour(recording, images, choice))
+    topics.depth = _depth(recording, images, topics, choice)
+    infos = [t.name for t in recording.of_type(CAMERA_INFO)]
+    if choice.intrinsics is None:
+        topics.colour_info = _info(infos, topics.colour, choice.camera_info, "camera_info")
+    if topics.depth is not None:
+        wanted = choice.depth_camera_info
+        topics.depth_info = _info(infos, topics.depth, wanted, "depth_camera_info")
+    _joints(recording, topics, choice)
+    topics.tf = [t.name for t in recording.of_type(*TF_TYPES)]
+    return topics
+
+
+def _image_topic(recording: Recording, name: str) -> ImageTopic:
+    topic = recording.topics[name]
+    compressed = topic.msgtype == COMPRESSED
+    message = image_of(recording.first(name), recording.is_ros2, compressed)
+    kind = kind_of(message, compressed)
+    return ImageTopic(name, compressed, kind, message.frame_id.lstrip("/"), topic.count)
+
+
+def _listed(images: Sequence[ImageTopic]) -> str:
+    return "; ".join(str(i) for i in images)
+
+
+def _named(
+    images: Sequence[ImageTopic], name: str, option: str, kinds: Sequence[str]
+) -> ImageTopic:
+    """Return the image topic that a person named."""
+    fitting = [i for i in images if i.image.kind in kinds]
+    for image in fitting:
+        if image.name == name:
+            return image
+    raise InputError(
+        f"{option}={name} is not a topic of {kinds[0]} images; there are "
+        f"{_listed(fitting) or 'none'}. All image topics: {_listed(images)}."
+    )
+
+
+def _best(images: Sequence[ImageTopic], *scores: Callable[[ImageTopic], float]) -> list[ImageTopic]:
+    """Return those with the greatest scores, compared in order."""
+    if not images:
+        return []
+    top = max(tuple(s(i) for s in scores) for i in images)
+    return [i for i in images if tuple(s(i) for s in scores) == top]
+
+
+def _colour(recording: Recording, images: list[ImageTopic], choice: BagChoice) -> ImageTopic:
+    if choice.colour is not None:
+        return _named(images, choice.colour, "colour", ("colour", "grey"))
+    found = [i for i in images if i.image.kind == "colour"]
+    found = found or [i for i in images if i.image.kind == "grey"]
+    if not found:
+        kinds = {i.image.kind for i in images}
+        missing = (
+            "only depth images: a session needs the colour images, too"
+            if kinds == {"depth"}
+            else "no colour images that can be read"
+        )
+        raise InputError(f"{recording.path.name} has {missing}. Its images: {_listed(images)}.")
+    cameras = {ci.without_transport(i.name).rpartition("/")[0] for i in found}
+    if len(cameras) > 1:
+        raise InputError(
+            f"{recording.path.name} has {len(cameras)} cameras: {_listed(found)}. Choose one "
+            f"(for example colour={found[0].name})."
+        )
+    # Of one camera: as it was taken rather than rectified, demosaiced, not compressed.
+    best = _best(
+        found,
+        lambda i: not ci.is_rectified(i.name),
+        lambda i: "bayer" not in i.image.encoding,
+        lambda i: not i.compressed,
+    )
+    return best[0]
+
+
+def _depth(
+    recording: Recording, images: list[ImageTopic], topics: Topics, choice: BagChoice
+) -> ImageTopic | None:
+    if choice.without_depth:
+        return None
+    if choice.depth is not None:
+        return _named(images, choice.depth, "depth", ("depth",))
+    found = [i for i in images if i.image.kind == "depth"]
+    if not found:
+        topics.notes.append(
+            f"no depth images were recorded: colour alone. Topics: {_listed(images)}."
+        )
+        return None
+    colour = topics.colour.name.split("/")
+
+    def shared(i: ImageTopic) -> float:
+        parts = i.name.split("/")
+        same = [a == b for a, b in zip(parts, colour, strict=False)]
+        return same.index(False) if False in same else len(same)
+
+    best = _best(
+        found,
+        shared,
+        lambda i: any(word in i.name for word in ALIGNED),
+        lambda i: i.frame_id == topics.colour.frame_id,
+        lambda i: i.image.encoding != "32FC1",
+        lambda i: not i.compressed,
+    )
+    if len(best) > 1:
+        raise InputError(
+            f"{recording.path.name} has several depth topics for {topics.colour.name}: "
+            f"{_listed(best)}. Choose one (for example depth={best[0].name})."
+        )
+    return best[0]
+
+
+def _info(infos: list[str], image: ImageTopic, wanted: str | None, option: str) -> str | None:
+    if wanted is None:
+        return ci.info_topic(image.name, infos)
+    if wanted not in infos:
+        raise InputError(
+            f"{option}={wanted} is not a CameraInfo topic; there are {', '.join(infos) or 'none'}."
+        )
+    return wanted
+
+
+def _joints(recording: Recording, topics: Topics, choice: BagChoice) -> None:
+    """Find the topic and the prefix of the UR's six joints."""
+    found: list[tuple[str, str]] = []
+    seen: set[str] = set()
+    for topic in recording.of_type(JOINT_STATE):
+        if choice.joints in (None, topic.name):
+            names: set[str] = set()
+            for n, (_, _, data) in enumerate(recording.messages([topic.name])):
+                names.update(joints_of(data, recording.is_ros2).names)
+                if n >= JOINT_MESSAGES_LOOKED_AT:
+                    break
+            seen.update(names)
+            found += [(topic.name, p) for p in prefixes(names)]
+    if choice.joints is not None and not any(t == choice.joints for t, _ in found):
+        raise InputError(
+            f"joints={choice.joints} holds no UR joints (shoulder_pan_joint ... wrist_3_joint); "
+            f"names there: {', '.join(sorted(seen)) or 'none'}. JointState topics: "
+            f"{', '.join(t.name for t in recording.of_type(JOINT_STATE)) or 'none'}."
+        )
+    if choice.joint_prefix is not None:
+        found = [(t, p) for t, p in found if p == choice.joint_prefix]
+        if not found:
+            raise InputError(
+                f"joint_prefix={choice.joint_prefix!r}: no joint {choice.joint_prefix}"
+                f"shoulder_pan_joint and so on; names there: {', '.join(sorted(seen)) or 'none'}."
+            )
+    if len(found) > 1:
+        options = ", ".join(f"joints={t} joint_prefix={p!r}" for t, p in found)
+        raise InputError(
+            f"{recording.path.name} has the joints of several arms. Choose one: {options}."
+        )
+    if found:
+        topics.joints, topics.joint_prefix = found[0]
+    elif seen:
+        shown = ", ".join(sorted(seen)[:12])
+        topics.notes.append(f"joints were not imported: no UR arm's six are among {shown}.")

@@ -1,0 +1,186 @@
+"""A scene of a BOP dataset as a frame source, its conventions as in `realsim.formats.bop`."""
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats import images
+from realsim.formats.bop import BopScene, BopSceneRef, find_scenes, read_scene
+from realsim.formats.folders.depth_evidence import read_counts
+from realsim.formats.folders.listing import image_header, shown
+from realsim.formats.folders.source import file_digest, require_one_size
+from realsim.formats.frame_source import SourceFrame
+from realsim.records import CameraIntrinsics
+from realsim.store.session_store import CAMERA_FILE
+
+TYPICAL_DEPTHS = 3
+"""Depth images whose median distance is shown: enough to notice a wrong depth_scale."""
+
+
+class BopSource:
+    """One scene of a BOP dataset; made by `open_bop`."""
+
+    def __init__(self, scene: BopScene, indices: Sequence[int], notes: Sequence[str]) -> None:
+        """Take over a scene that was checked; see `open_bop`."""
+        self._scene, self._indices, self._notes = scene, tuple(indices), tuple(notes)
+        self._with_depth = any(scene.has_depth(i) for i in self._indices)
+
+    @property
+    def name(self) -> str:
+        """Split and scene, such as test-000050."""
+        ref = self._scene.ref
+        return f"{ref.split}-{ref.folder.name}"
+
+    @property
+    def intrinsics(self) -> CameraIntrinsics:
+        """The camera of all images of the scene."""
+        return self._scene.session.intrinsics
+
+    @property
+    def depth_unit_m(self) -> float | None:
+        """depth_scale / 1000; None where the scene has no depth."""
+        return self._scene.session.depth_unit_m if self._with_depth else None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was left out and what the scene lacks."""
+        return self._notes
+
+    @property
+    def extra(self) -> dict[str, Any]:
+        """Where it came from: scene, image numbers, content key."""
+        return {
+            "kind": "bop",
+            "path": str(self._scene.ref.folder),
+            "scene": self._scene.ref.scene_id,
+            "frames": [self._scene.color_files[i].name for i in self._indices],
+            "content_key": self._content_key(),
+        }
+
+    def _content_key(self) -> str:
+        scene = self._scene
+        digest = hashlib.sha256((scene.ref.folder / CAMERA_FILE).read_bytes())
+        for i in self._indices:
+            for path in (scene.color_files[i], scene.depth_files.get(i)):
+                if path is not None:
+                    digest.update(file_digest(path, path.name))
+        return digest.hexdigest()
+
+    def __len__(self) -> int:
+        """Return the number of images."""
+        return len(self._indices)
+
+    def frames(self, start: int = 0) -> Iterator[SourceFrame]:
+        """Yield the images from place `start` on, in the order of their numbers.
+
+        Raises:
+            InputError: an image cannot be read; the message names it.
+        """
+        scene = self._scene
+        for i in self._indices[start:]:
+            counts = read_counts(scene.depth_path(i)) if scene.has_depth(i) else None
+            yield SourceFrame(
+                name=f"image {i} of {scene.ref.folder}",
+                time_s=float(i),
+                rgb=images.read_rgb(scene.rgb_path(i)),
+                depth_counts=counts,
+                T_world_cam=scene.session.view(i).T_world_cam,
+            )
+
+
+def choose_scene(root: Path | str, number: int | None) -> BopSceneRef:
+    """Return the scene of a dataset that was asked for, or its only one.
+
+    Raises:
+        InputError: none, several of which none was chosen, or not that one; lists them.
+    """
+    scenes = find_scenes(root)
+    listed = shown([f"{s.scene_id} ({s.split}/{s.folder.name})" for s in scenes], 12)
+    chosen = scenes if number is None else [s for s in scenes if s.scene_id == number]
+    if not chosen:
+        raise InputError(f"{root} has no scene {number}; it has {listed}.")
+    if len(chosen) > 1:
+        what = "scenes" if number is None else f"scenes of number {number}"
+        raise InputError(
+            f"{root} has {len(chosen)} {what}: {listed}, and a session holds one. Choose with "
+            "--scene N, or give the folder of one scene."
+        )
+    return chosen[0]
+
+
+def open_bop(root: Path | str, *, scene: int | None = None, use_depth: bool = True) -> BopSource:
+    """Return a scene of a BOP dataset as a frame source.
+
+    Args:
+        root: dataset, split or scene.
+        scene: number of the scene, where there are several.
+        use_depth: whether depth is imported.
+
+    Raises:
+        InputError: no scene, several, cameras that change, sizes that differ, no depth_scale.
+    """
+    found = read_scene(choose_scene(root, scene))
+    if not use_depth:
+        found.depth_files.clear()
+    indices = sorted(found.color_files)
+    notes: list[str] = []
+    if found.missing_images:
+        listed = shown([str(i) for i in found.missing_images], 12)
+        notes.append(f"{CAMERA_FILE} lists images that are not there: {listed}.")
+    without = [i for i in indices if not found.has_depth(i)]
+    if 0 < len(without) < len(indices):
+        listed = shown([str(i) for i in without], 12)
+        notes.append(
+            f"{len(without)} of {len(indices)} images have no depth and were left out, their "
+            f"frames are not complete: {listed}."
+        )
+        indices = [i for i in indices if found.has_depth(i)]
+    _require_sizes(found, indices)
+    posed = sum(found.session.view(i).T_world_cam is not None for i in indices)
+    if posed < len(indices):
+        notes.append(
+            f"{len(indices) - posed} of {len(indices)} images have no camera pose (cam_R_w2c, "
+            "cam_t_w2c): these views cannot be registered together."
+        )
+    if found.ground_truth_file:
+        notes.append(
+            f"the annotations of {found.ground_truth_file} stay where they are: a session holds "
+            "what was captured."
+        )
+    median = _median_depth_m(found, indices)
+    if median is not None:
+        unit_m = found.session.depth_unit_m
+        notes.append(f"depth: median {median:.3g} m with {unit_m:g} m per count (depth_scale).")
+    return BopSource(found, indices, notes)
+
+
+def _require_sizes(scene: BopScene, indices: Sequence[int]) -> None:
+    """Raise if the images are not all of the camera's size."""
+    require_one_size(
+        [image_header(scene.color_files[i]) for i in indices], f"images of {scene.ref.folder}"
+    )
+    deep = [image_header(scene.depth_files[i]) for i in indices if scene.has_depth(i)]
+    if not deep:
+        return
+    size = require_one_size(deep, f"depth images of {scene.ref.folder}")
+    camera = scene.session.intrinsics
+    if size != (camera.width, camera.height):
+        raise InputError(
+            f"{scene.ref.folder}: depth is {size[0]}x{size[1]} px, colour "
+            f"{camera.width}x{camera.height} px: depth is not on the colour's pixels. Import the "
+            "colour alone with --no-depth."
+        )
+
+
+def _median_depth_m(scene: BopScene, indices: Sequence[int]) -> float | None:
+    deep = [i for i in indices if scene.has_depth(i)][:TYPICAL_DEPTHS]
+    counts: list[NDArray[np.uint16]] = [read_counts(scene.depth_path(i)) for i in deep]
+    values = [c[c > 0] for c in counts if np.any(c)]
+    if not values:
+        return None
+    return float(np.median(np.concatenate(values))) * scene.session.depth_unit_m

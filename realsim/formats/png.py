@@ -1,0 +1,129 @@
+"""PNG encoding, several times as fast as the usual encoders: one row filter, one deflate stream.
+
+The rows are filtered as a whole image in numpy and deflated by ISA-L. Files follow the PNG
+specification (ISO/IEC 15948): one IHDR, one IDAT, one IEND. The same image gives the same bytes.
+"""
+
+import struct
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+
+SIGNATURE = b"\x89PNG\r\n\x1a\n"
+RGB_CHANNELS = 3
+MASK_VALUE = 255
+GREY, COLOUR = 0, 2
+"""IHDR's colour types."""
+NONE, UP, AVERAGE = 0, 2, 3
+"""IHDR's row filters."""
+LONGEST_SIDE = 2**31 - 1
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Coding:
+    """How the rows of one kind of image are filtered and deflated."""
+
+    row_filter: int
+    """The filter of every row: what is left of the pixels should be small and repeat itself."""
+    window_bits: int
+    """Deflate looks back 2**window_bits bytes."""
+    level: int = 1
+    """ISA-L's level; those above cost more time and gain less than 1 %."""
+
+
+PHOTO = Coding(row_filter=AVERAGE, window_bits=9)
+"""Noise does not repeat itself: far matches are chance, cost more bits than literals, and time
+(a window of 512 bytes is 9 % smaller and 25 % faster than one of 32 kB)."""
+COUNTS = Coding(row_filter=UP, window_bits=15)
+"""16-bit depth: disparities are quantised, so that whole steps come again."""
+MASK = Coding(row_filter=NONE, window_bits=9)
+"""Long runs of two values: any filter makes more of them."""
+
+
+def encode_png(image: NDArray[Any]) -> bytes:
+    """Return an image as PNG: the pixels come back bit for bit from any reader.
+
+    Args:
+        image: (H, W, 3) uint8 RGB, (H, W) uint8 grey, (H, W) uint16, or (H, W) bool as 0 and 255.
+
+    Raises:
+        InputError: another shape or type, or an image without pixels.
+    """
+    from isal import isal_zlib
+
+    if image.dtype == np.bool_ and image.ndim == 2:
+        image = image.astype(np.uint8) * np.uint8(MASK_VALUE)
+    bits = 8 * image.dtype.itemsize if image.dtype.kind == "u" else 0
+    is_rgb = image.ndim == 3 and image.shape[2] == RGB_CHANNELS and bits == 8
+    if not is_rgb and not (image.ndim == 2 and bits in (8, 16)):
+        raise InputError(
+            f"an image of shape {image.shape} and type {image.dtype} was given; (H, W, 3) uint8 "
+            "RGB, (H, W) uint8 or bool, and (H, W) uint16 can be written."
+        )
+    height, width = image.shape[:2]
+    if not (1 <= height <= LONGEST_SIDE and 1 <= width <= LONGEST_SIDE):
+        raise InputError(f"an image of {width}x{height} pixels cannot be written as PNG.")
+    coding = _coding(image)
+    rows = _filtered(_bytes_of(image), _bytes_per_pixel(image), coding.row_filter)
+    deflate = isal_zlib.compressobj(coding.level, isal_zlib.DEFLATED, coding.window_bits)
+    data = deflate.compress(rows) + deflate.flush()
+    header = struct.pack(">IIBBBBB", width, height, bits, COLOUR if is_rgb else GREY, 0, 0, 0)
+    return b"".join(
+        (SIGNATURE, *_chunk(b"IHDR", header), *_chunk(b"IDAT", data), *_chunk(b"IEND", b""))
+    )
+
+
+def _coding(image: NDArray[Any]) -> Coding:
+    if image.dtype.itemsize == 2:
+        return COUNTS
+    if image.ndim == 2 and bool(np.all((image == 0) | (image == MASK_VALUE))):
+        return MASK
+    return PHOTO
+
+
+def _bytes_per_pixel(image: NDArray[Any]) -> int:
+    return image.dtype.itemsize * (RGB_CHANNELS if image.ndim == 3 else 1)
+
+
+def _bytes_of(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the image as the rows of bytes of the specification, big-endian: (H, bytes)."""
+    if image.dtype.itemsize == 2:
+        image = image.astype(">u2")
+    return np.ascontiguousarray(image).view(np.uint8).reshape(len(image), -1)
+
+
+def _filtered(rows: NDArray[np.uint8], step: int, row_filter: int) -> NDArray[np.uint8]:
+    """Return the rows (H, N) filtered, each after the byte that names the filter: (H, N + 1).
+
+    The arithmetic is modulo 256, as the specification asks; a byte outside the image is 0.
+    """
+    out = np.empty((rows.shape[0], rows.shape[1] + 1), np.uint8)
+    out[:, 0] = row_filter
+    body = out[:, 1:]
+    if row_filter == NONE:
+        body[:] = rows
+    elif row_filter == UP:
+        body[0] = rows[0]
+        np.subtract(rows[1:], rows[:-1], out=body[1:])
+    else:
+        left = np.zeros_like(rows)
+        left[:, step:] = rows[:, :-step]
+        # floor((a + b) / 2) without a ninth bit: the common bits and half of the others.
+        body[0] = rows[0] - (left[0] >> 1)
+        half = left[1:] ^ rows[:-1]
+        half >>= 1
+        left[1:] &= rows[:-1]
+        left[1:] += half
+        np.subtract(rows[1:], left[1:], out=body[1:])
+    return out
+
+
+def _chunk(name: bytes, data: bytes) -> tuple[bytes, bytes, bytes, bytes]:
+    from isal import isal_zlib
+
+    crc = isal_zlib.crc32(data, isal_zlib.crc32(name))
+    return struct.pack(">I", len(data)), name, data, struct.pack(">I", crc)

@@ -1,0 +1,203 @@
+"""`realsim capture`: sessions begun and gone on with, board views in their place, clear refusals."""
+
+import json
+import shutil
+import subprocess
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.store import SessionStore
+from realsim.store.session_store import read_json_file
+from realsim_capture_plans.arms.kinematics import UR5, UR5E
+from realsim_capture_plans.capturing.log import CaptureLog
+from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.lab.arm import HOME
+from realsim_capture_plans.plan_files.plan_json import save_plan
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+BOARD = "aprilgrid:7x5,tag=30mm,gap=10mm"
+"""What lies in the simulated lab."""
+Array = NDArray[np.float64]
+
+
+def look_at(eye: Array, center: Array, roll: float) -> Array:
+    z = (center - eye) / np.linalg.norm(center - eye)
+    y = np.array([np.sin(roll), np.cos(roll), 0.0])
+    x = np.cross(y, z) / np.linalg.norm(np.cross(y, z))
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
+    return T
+
+
+def made_plan(kind: str, n: int, chain=UR5) -> CapturePlan:
+    """Views round the middle of the lab's table, tilted and turned."""
+    center, config = np.array([0.45, 0.0, 0.01]), PlanConfig()
+    home = HOME + np.pi * np.eye(6)[0]
+    joints: list[Array] = []
+    for k, turn in enumerate(np.linspace(0.0, 2 * np.pi, n, endpoint=False)):
+        tilt = 0.35 if k % 3 else 0.1
+        eye = center + 0.34 * np.array([tilt * np.cos(turn), tilt * np.sin(turn), 1.0])
+        T = look_at(eye, center, np.pi + 1.2 * np.sin(2.4 * k))
+        q = chain.inverse(T @ se3.invert(d405_mount().T_ee_cam))
+        joints.append(q[np.argmin(np.abs(q - (joints[-1] if joints else home)).max(-1))])
+    return CapturePlan(
+        kind=kind, chain=chain, mount=d405_mount(), cell=config.work_cell(center, kind),
+        home=home, joints=np.stack(joints), center_world=center, vias=(), reference_view=0,
+        config=config,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("plans")
+    save_plan(made_plan("hemisphere", 4), folder / "plan.json")
+    save_plan(made_plan("hemisphere", 5), folder / "other.json")
+    save_plan(made_plan("calibration", 12), folder / "board_plan.json")
+    save_plan(made_plan("hemisphere", 4, UR5E), folder / "ur5e.json")
+    return folder
+
+
+def realsim(*args: object) -> subprocess.CompletedProcess[str]:
+    code = "from realsim.app.cli import main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, args)], capture_output=True, text=True, timeout=300
+    )
+
+
+@lru_cache(maxsize=1)
+def scene_session(plans: Path) -> Path:
+    out = plans / "session"
+    done = realsim("capture", out, "--plan", plans / "plan.json", "--simulated")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "4 of 4 views" in done.stderr and "contact sheet" in done.stdout
+    return out
+
+
+def test_a_session_has_plan_devices_log_and_sheet(plans: Path) -> None:
+    store = SessionStore.open(scene_session(plans))
+    assert store.completed == {0, 1, 2, 3} and store.verify() == []
+    assert store.extra["arm_description"]["simulated"] is True
+    assert store.extra["camera_description"]["name"] == store.extra["camera"]
+    assert store.extra["gravity_up_world"] == [0.0, 0.0, 1.0]
+    assert store.has("plan.json") and store.has("models/models_info.json")
+    sheet = store.read_image("reports/contact_sheet.png")
+    assert sheet.shape == (46 + 2 * 180, 2 * 320, 3)
+    # Every thumbnail is its own image: reduced, the session's photograph stands in the cell.
+    for k in range(4):
+        photo = store.rgb(k)[8::16, 8::16].astype(float)
+        y, x = 46 + k // 2 * 180, k % 2 * 320
+        cell = sheet[y : y + 180, x : x + 320][2::4, 2::4].astype(float)
+        inner = np.s_[10:-10, 10:-10]
+        assert np.corrcoef(photo[inner].ravel(), cell[inner].ravel())[0, 1] > 0.8
+
+
+def test_run_again_it_goes_on_and_takes_only_what_is_missing(plans: Path, tmp_path: Path) -> None:
+    out = tmp_path / "s"
+    some = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--views", "1,3")
+    assert some.returncode == 0, some.stderr
+    assert SessionStore.open(out).completed == {1, 3}
+    rest = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--no-input")
+    assert rest.returncode == 0 and "there already" in rest.stdout
+    store, reference = SessionStore.open(out), SessionStore.open(scene_session(plans))
+    assert store.completed == reference.completed and store.verify() == []
+    for k in range(4):
+        assert store.path(f"rgb/{k:06d}.png").read_bytes() == (
+            reference.path(f"rgb/{k:06d}.png").read_bytes()
+        )
+    again = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--retake", "2")
+    assert again.returncode == 0
+    store = SessionStore.open(out)
+    assert store.has("retaken/000002_1_rgb.png") and store.verify() == []
+
+
+def test_a_dry_run_leaves_nothing(plans: Path, tmp_path: Path) -> None:
+    out = tmp_path / "s"
+    done = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--dry-run",
+                   "--views", "0,2")  # fmt: skip
+    assert done.returncode == 0 and "nothing was stored" in done.stdout
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--plan", "plan.json"], "--simulated"),
+        (["--plan", "plan.json", "--simulated", "--robot-host", "1.2.3.4"], "--robot-host"),
+        (["--plan", "ur5e.json", "--simulated"], "made for a UR5e, this arm is a UR5"),
+        (["--plan", "none.json", "--simulated"], "none.json"),
+        (["--plan", "board_plan.json", "--simulated"], "--board does not say which"),
+        (["--plan", "plan.json", "--simulated", "--board", BOARD], "scene of objects"),
+        (["--plan", "board_plan.json", "--simulated", "--board", "chessboard:9x6,square=20mm"],
+         "has one board"),
+        (["--plan", "plan.json", "--simulated", "--speed", "2"], "at most 1"),
+        (["--plan", "plan.json", "--simulated", "--views", "9"], "views 0 to 3"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_used_is_named(
+    plans: Path, tmp_path: Path, options: list[str], says: str
+) -> None:
+    words = [str(plans / o) if o.endswith(".json") else o for o in options]
+    out = tmp_path / "s"
+    done = realsim("capture", out, *words)
+    assert done.returncode == 2 and says in done.stderr, done.stderr
+    assert "Traceback" not in done.stderr
+    assert not out.exists()
+
+
+def test_another_session_and_a_strangers_folder_are_left_alone(plans: Path, tmp_path: Path) -> None:
+    session = tmp_path / "s"
+    shutil.copytree(scene_session(plans), session)
+    before = sorted((p, p.stat().st_mtime_ns) for p in session.rglob("*"))
+    other = realsim("capture", session, "--plan", plans / "other.json", "--simulated")
+    assert other.returncode == 2 and "begun with the plan" in other.stderr
+    lab = realsim("capture", session, "--plan", plans / "plan.json", "--simulated", "--seed", "7")
+    assert lab.returncode == 2 and "--seed" in lab.stderr
+    assert sorted((p, p.stat().st_mtime_ns) for p in session.rglob("*")) == before
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis/thesis.tex").write_text("precious")
+    done = realsim("capture", tmp_path / "thesis", "--plan", plans / "plan.json", "--simulated")
+    assert done.returncode == 2 and "thesis.tex" in done.stderr
+    assert [p.name for p in (tmp_path / "thesis").iterdir()] == ["thesis.tex"]
+
+
+def test_a_robot_that_does_not_answer_ends_with_1(plans: Path, tmp_path: Path) -> None:
+    done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json",
+                   "--robot-host", "127.0.0.1", "--no-input")  # fmt: skip
+    assert done.returncode == 1 and "the same command goes on" in done.stdout
+    assert "Traceback" not in done.stderr and not (tmp_path / "s").exists()
+
+
+@pytest.mark.parametrize("order", ["board first", "scene first"])
+def test_board_views_lie_where_the_calibration_looks_for_them(
+    plans: Path, tmp_path: Path, order: str
+) -> None:
+    out = tmp_path / "s"
+    jobs = [
+        ["--plan", plans / "board_plan.json", "--board", BOARD],
+        ["--plan", plans / "plan.json", "--views", "0"],
+    ]
+    for job in jobs if order == "board first" else jobs[::-1]:
+        done = realsim("capture", out, "--simulated", "--no-input", *job)
+        assert done.returncode == 0, done.stderr
+    store, board = SessionStore.open(out), SessionStore.open(out / "calibration/capture")
+    assert store.completed == {0} and board.completed == set(range(12))
+    assert store.verify() == [] and board.verify() == []
+    again = realsim("capture", out, "--simulated", *jobs[0])
+    assert again.returncode == 0, again.stderr
+    listed = {json.loads(line)["path"] for line in (out / "manifest.jsonl").read_text().split("\n")
+              if line}  # fmt: skip
+    assert "calibration/board.json" in listed
+    kind = read_json_file(out / "calibration/board.json")
+    assert (kind["rows"], kind["columns"]) == (5, 7)
+    notes = [e["notes"] for e in CaptureLog(board).views().values()]
+    assert notes == [[]] * 12  # the board was seen in every view
+    if order == "board first":
+        done = realsim("calibrate", out, "--quiet")
+        assert "Traceback" not in done.stderr and done.returncode in (0, 1), done.stderr
+        assert SessionStore.open(out).session.view(0).T_world_cam is not None

@@ -1,0 +1,431 @@
+"""`realsim import`: what goes in comes out, going on after a kill, and nothing is guessed."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from realsim.app.console import Console
+from realsim.app.import_session import import_session
+from realsim.app.import_source import (
+    ImportRequest,
+    kinds_of,
+    list_source,
+    open_source,
+    option_names,
+    run_import,
+)
+from realsim.errors import InputError, UnitError
+from realsim.formats.frame_source import SourceFrame
+from realsim.geometry import se3
+from realsim.interop import rigid3d_from_T
+from realsim.records import CameraIntrinsics, CaptureSession
+from realsim.store import SessionStore
+
+DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+CAMERA = CameraIntrinsics(
+    width=40, height=30, fx=35.1, fy=35.2, cx=20.3, cy=14.7, distortion=np.array([0.1, -0.02])
+)
+QUIET = Console(quiet=True)
+
+
+def frame_of(k: int) -> SourceFrame:
+    rng = np.random.default_rng(k)
+    return SourceFrame(
+        name=f"f{k}",
+        time_s=1.7e9 + k / 30,
+        rgb=rng.integers(0, 256, (30, 40, 3), dtype=np.uint8),
+        depth_counts=rng.integers(0, 2**16, (30, 40)).astype(np.uint16),
+        joints=rng.uniform(-3, 3, 6),
+        T_base_ee=se3.random_transform(rng, spread=0.3),
+        T_world_cam=se3.look_at(rng.uniform(0.2, 0.5, 3), [0, 0, 0]),
+    )
+
+
+class Recording:
+    """A source in memory: what the importers give, with what can be wrong with it."""
+
+    def __init__(self, frames, *, camera=CAMERA, stop=None, content="a") -> None:
+        self.name, self.intrinsics, self.depth_unit_m = "recording", camera, 1e-4
+        self.notes = ("a note with [square] brackets.",)
+        self.extra = {"content_key": content, "path": "/somewhere"}
+        self.made, self.stop, self.read = list(frames), stop, []
+
+    def __len__(self) -> int:
+        return len(self.made)
+
+    def frames(self, start: int = 0):
+        for k in range(start, len(self.made)):
+            if k == self.stop:
+                raise InputError(f"frame {k} cannot be read.")
+            self.read.append(k)
+            yield self.made[k]
+
+
+def ten() -> list[SourceFrame]:
+    return [frame_of(k) for k in range(10)]
+
+
+def check_equal(folder: Path, frames) -> None:
+    store = SessionStore.open(folder)
+    assert store.verify() == [] and len(store.session.views) == len(frames)
+    for frame, view in zip(frames, store.session.views, strict=True):
+        assert view.time_s == frame.time_s
+        assert np.array_equal(store.rgb(view.index), frame.rgb)
+        metres = (frame.depth_counts * np.float64(1e-4)).astype(np.float32)
+        assert np.array_equal(store.depth_m(view.index), metres)
+        assert np.array_equal(view.joints, frame.joints)
+        np.testing.assert_allclose(view.T_base_ee, frame.T_base_ee, atol=1e-12)
+        np.testing.assert_allclose(view.T_world_cam, frame.T_world_cam, atol=1e-12)
+    store.close()
+
+
+def test_everything_of_every_frame_is_in_the_session(tmp_path):
+    summary = import_session(Recording(ten()), tmp_path / "s", QUIET)
+    assert (summary.frames, summary.imported, summary.with_depth) == (10, 10, 10)
+    assert (summary.with_joints, summary.with_tool_pose, summary.with_camera_pose) == (10, 10, 10)
+    assert summary.contact_sheet.is_file()
+    check_equal(tmp_path / "s", ten())
+    cameras = json.loads((tmp_path / "s/scene_camera.json").read_text())
+    assert len(cameras) == 10 and all("cam_R_w2c" in c for c in cameras.values())
+
+
+@pytest.mark.parametrize("stop", [0, 1, 5, 9])
+def test_an_import_goes_on_where_it_stopped(tmp_path, stop):
+    with pytest.raises(InputError, match=f"frame {stop} cannot"):
+        import_session(Recording(ten(), stop=stop), tmp_path / "s", QUIET)
+    again = Recording(ten())
+    summary = import_session(again, tmp_path / "s", QUIET)
+    assert summary.imported == 10 - stop
+    assert again.read == list(range(max(stop - 1, 0), 10))  # one frame more, to compare it
+    check_equal(tmp_path / "s", ten())
+    done = Recording(ten())
+    assert import_session(done, tmp_path / "s", QUIET).imported == 0 and done.read == []
+
+
+def test_another_source_is_refused_until_it_is_said(tmp_path):
+    folder = tmp_path / "s"
+    import_session(Recording(ten()), folder, QUIET)
+    others = [
+        Recording(ten(), content="b"),
+        Recording(ten()[:9]),
+        Recording(ten(), camera=replace(CAMERA, fx=36.0)),
+    ]
+    for other in others:
+        with pytest.raises(InputError, match=r"another source.*--overwrite"):
+            import_session(other, folder, QUIET)
+        check_equal(folder, ten())
+    import_session(Recording(ten()[:4], content="b"), folder, QUIET, overwrite=True)
+    check_equal(folder, ten()[:4])
+    assert [p.name for p in tmp_path.iterdir()] == ["s"]
+
+
+def test_a_source_that_changed_meanwhile_is_noticed(tmp_path):
+    with pytest.raises(InputError):
+        import_session(Recording(ten(), stop=5), tmp_path / "s", QUIET)
+    changed = ten()
+    changed[4] = replace(changed[4], rgb=changed[5].rgb)
+    with pytest.raises(InputError, match="source has changed"):
+        import_session(Recording(changed), tmp_path / "s", QUIET)
+
+
+def test_nobodys_folder_and_no_captured_session_is_touched(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a/thesis.tex").write_text("precious")
+    with pytest.raises(InputError, match=r"not empty.*thesis\.tex"):
+        import_session(Recording(ten()), tmp_path / "a", QUIET, overwrite=True)
+    captured = CaptureSession(name="real", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    SessionStore.create(tmp_path / "b", captured).close()
+    with pytest.raises(InputError, match="never replaced"):
+        import_session(Recording(ten()), tmp_path / "b", QUIET, overwrite=True)
+    with pytest.raises(InputError, match="is a file"):
+        import_session(Recording(ten()), tmp_path / "a/thesis.tex", QUIET)
+    with pytest.raises(InputError, match="no frames"):
+        import_session(Recording([]), tmp_path / "c", QUIET)
+    assert (tmp_path / "a/thesis.tex").read_text() == "precious" and not (tmp_path / "c").exists()
+
+
+def far(T: np.ndarray, scale: float) -> np.ndarray:
+    T = T.copy()
+    T[:3, 3] *= scale
+    return T
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        (lambda f: replace(f, time_s=f.time_s - 1), "time stamps must increase"),
+        (lambda f: replace(f, time_s=frame_of(4).time_s), "time stamps must increase"),
+        (lambda f: replace(f, rgb=f.rgb[:20]), r"camera is of 40x30"),
+        (lambda f: replace(f, depth_counts=f.depth_counts[:, :20]), r"camera is of 40x30"),
+        (lambda f: replace(f, T_base_ee=far(f.T_base_ee, 1e4)), "reading rotvec,mm"),
+        (lambda f: replace(f, T_world_cam=far(f.T_world_cam, 1e4)), "millimetres"),
+    ],
+)
+def test_a_frame_that_cannot_be_is_named_and_the_rest_stays(tmp_path, fault, message):
+    frames = ten()
+    frames[5] = fault(frames[5])
+    with pytest.raises(InputError, match=rf"frame 5 \(f5\).*{message}"):
+        import_session(Recording(frames), tmp_path / "s", QUIET)
+    check_equal(tmp_path / "s", ten()[:5])
+
+
+def test_cameras_that_turn_in_one_place_are_doubted(tmp_path, capsys):
+    frames = [replace(f, T_world_cam=far(f.T_world_cam, 1e-3)) for f in ten()]
+    import_session(Recording(frames), tmp_path / "s", QUIET)
+    assert "metres in a file of millimetres" in capsys.readouterr().err
+
+
+# --- round trips through other formats --------------------------------------------------------
+
+
+def views_match(a: Path, b: Path, tolerance: float) -> None:
+    one, two = SessionStore.open(a), SessionStore.open(b)
+    assert len(one.session.views) == len(two.session.views) and two.verify() == []
+    np.testing.assert_allclose(one.session.intrinsics.K, two.session.intrinsics.K, atol=tolerance)
+    np.testing.assert_allclose(
+        one.session.intrinsics.distortion, two.session.intrinsics.distortion, atol=tolerance
+    )
+    for v, w in zip(one.session.views, two.session.views, strict=True):
+        np.testing.assert_allclose(v.T_world_cam, w.T_world_cam, atol=tolerance)
+        assert np.array_equal(one.rgb(v.index), two.rgb(w.index))
+        if two.has_depth(w.index):
+            assert np.array_equal(one.depth_m(v.index), two.depth_m(w.index))
+
+
+def test_law_a_session_as_bop_scene_comes_back(tmp_path):
+    import_session(Recording(ten()), tmp_path / "s", QUIET)
+    scene = tmp_path / "data/test/000003"
+    shutil.copytree(tmp_path / "s", scene)
+    for name in ("session.json", "robot.jsonl", "manifest.jsonl"):
+        (scene / name).unlink()
+    run_import(ImportRequest(source=tmp_path / "data"), tmp_path / "t", QUIET)
+    views_match(tmp_path / "s", tmp_path / "t", 1e-9)
+    assert SessionStore.open(tmp_path / "t").has_depth(0)
+
+
+def test_law_a_session_as_colmap_model_comes_back(tmp_path):
+    import_session(Recording(ten()), tmp_path / "s", QUIET)
+    store = SessionStore.open(tmp_path / "s")
+    k1, k2, p1, p2 = CAMERA.distortion[:4]
+    params = [CAMERA.fx, CAMERA.fy, CAMERA.cx + 0.5, CAMERA.cy + 0.5, k1, k2, p1, p2]
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="OPENCV", width=40, height=30, params=params)
+    )
+    for v in store.session.views:
+        image = pycolmap.Image(image_id=v.index + 1, camera_id=1, name=f"{v.index:06d}.png")
+        model.add_image_with_trivial_frame(image, rigid3d_from_T(se3.invert(v.T_world_cam)))
+    (tmp_path / "p/sparse/0").mkdir(parents=True)
+    model.write_binary(str(tmp_path / "p/sparse/0"))
+    shutil.copytree(tmp_path / "s/rgb", tmp_path / "p/images")
+    run_import(ImportRequest(source=tmp_path / "p", scale=1.0), tmp_path / "t", QUIET)
+    views_match(tmp_path / "s", tmp_path / "t", 1e-9)
+
+
+# --- folders: camera and poses ----------------------------------------------------------------
+
+
+def make_folder(folder: Path, n: int = 6, size=(30, 40)) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = ["image x y z qx qy qz qw"]
+    for k in range(n):
+        frame = frame_of(k)
+        rgb = cv2.resize(frame.rgb, size[::-1], interpolation=cv2.INTER_NEAREST)
+        counts = np.full(size, 600 + 7 * k, dtype=np.uint16)
+        cv2.imwrite(str(folder / f"rgb_{k:03d}.png"), rgb[..., ::-1])
+        cv2.imwrite(str(folder / f"depth_{k:03d}.png"), counts)
+        t = frame.T_base_ee[:3, 3]
+        w, x, y, z = se3.quaternion_wxyz(frame.T_base_ee[:3, :3])
+        lines.append(f"rgb_{k:03d}.png " + " ".join(f"{v!r}" for v in map(float, [*t, x, y, z, w])))
+    (folder / "poses").mkdir(exist_ok=True)
+    (folder / "poses/robot.txt").write_text("\n".join([lines[0], *reversed(lines[1:])]) + "\n")
+    (folder / "K.txt").write_text("35 0 20\n0 35 15\n0 0 1\n")
+    return folder
+
+
+def test_a_folder_with_camera_and_poses(tmp_path):
+    """Poses stand in another order than the images, and beside their names."""
+    folder = make_folder(tmp_path / "in")
+    request = ImportRequest(source=folder, depth_unit=0.001, depth_coding="plain")
+    summary = run_import(request, tmp_path / "s", QUIET)
+    assert (summary.frames, summary.with_tool_pose, summary.with_depth) == (6, 6, 6)
+    for v in SessionStore.open(tmp_path / "s").session.views:
+        np.testing.assert_allclose(v.T_base_ee, frame_of(v.index).T_base_ee, atol=1e-9)
+    camera = replace(request, poses_of="camera")
+    run_import(camera, tmp_path / "c", QUIET)
+    view = SessionStore.open(tmp_path / "c").session.views[2]
+    assert view.T_base_ee is None
+    np.testing.assert_allclose(view.T_world_cam, frame_of(2).T_base_ee, atol=1e-9)
+
+
+def test_poses_are_read_as_said_or_not_at_all(tmp_path):
+    folder = make_folder(tmp_path / "in")
+    shutil.rmtree(folder / "poses")
+    rows = [f"{k} {300 + 10 * k} 20 400 0.1 {0.2 * k} 0.3" for k in range(6)]
+    (folder / "poses.txt").write_text("\n".join(rows) + "\n")
+    request = ImportRequest(source=folder, depth_unit=0.001, poses=folder / "poses.txt")
+    with pytest.raises(InputError, match=r"not clear.*--reading"):
+        open_source(request, QUIET)
+    with pytest.raises(UnitError):
+        open_source(replace(request, reading="rotvec,m"), QUIET)
+    source = open_source(replace(request, reading="rotvec,rad,mm"), QUIET)
+    T = next(source.frames(5)).T_base_ee
+    np.testing.assert_allclose(T[:3, 3], [0.35, 0.02, 0.4])
+    none = open_source(replace(request, poses=None, no_poses=True), QUIET)
+    assert next(none.frames()).T_base_ee is None
+
+
+def test_the_camera_is_found_named_or_asked_for(tmp_path):
+    folder = make_folder(tmp_path / "in")
+    request = ImportRequest(source=folder, depth_unit=0.001)
+    assert open_source(request, QUIET).intrinsics.fx == 35
+    bop = {"fx": 35.5, "fy": 35, "cx": 20, "cy": 15, "depth_scale": 1.0, "width": 40, "height": 30}
+    (folder / "camera.json").write_text(json.dumps(bop))
+    with pytest.raises(InputError, match=r"several cameras: K\.txt, camera\.json"):
+        open_source(request, QUIET)
+    (folder / "K.txt").unlink()
+    source = open_source(replace(request, depth_unit=None), QUIET)
+    assert source.depth_unit_m == 0.001 and source.intrinsics.fx == 35.5  # as its depth_scale says
+    (folder / "camera.json").unlink()
+    with pytest.raises(InputError, match=r"camera of the images \(40x30 px\)"):
+        open_source(request, QUIET)
+    other = tmp_path / "other.txt"
+    other.write_text("700 0 320\n0 700 240\n0 0 1\n")
+    with pytest.raises(InputError, match="another image size"):
+        open_source(replace(request, camera=other), QUIET)
+
+
+# --- what it is -------------------------------------------------------------------------------
+
+
+def test_the_kind_is_known_by_the_content(tmp_path):
+    (tmp_path / "recording").write_bytes(b"#ROSBAG V2.0\n")
+    assert [f.kind for f in kinds_of(tmp_path / "recording")] == ["bag"]
+    (tmp_path / "x.dat").write_bytes(b"\x89MCAP0\r\n...")
+    assert "MCAP" in kinds_of(tmp_path / "x.dat")[0].why
+    folder = make_folder(tmp_path / "in")
+    assert [f.kind for f in kinds_of(folder)] == ["folder"]
+    (folder / "scene_camera.json").write_text("{}")
+    (folder / "cameras.txt").write_text("")
+    (folder / "images.txt").write_text("")
+    with pytest.raises(InputError, match=r"several things \(bop: .*colmap: .*--kind"):
+        open_source(ImportRequest(source=folder), QUIET)
+    (tmp_path / "notes.txt").write_text("hello")
+    with pytest.raises(InputError, match="a file of no known kind"):
+        open_source(ImportRequest(source=tmp_path / "notes.txt"), QUIET)
+    with pytest.raises(InputError, match="does not exist"):
+        open_source(ImportRequest(source=tmp_path / "nowhere"), QUIET)
+    import_session(Recording(ten()), tmp_path / "s", QUIET)
+    with pytest.raises(InputError, match="is a session already"):
+        open_source(ImportRequest(source=tmp_path / "s"), QUIET)
+
+
+def test_an_option_that_says_nothing_is_refused(tmp_path):
+    request = ImportRequest(source=make_folder(tmp_path / "in"), scene=3, depth_unit=0.001)
+    with pytest.raises(InputError, match=r"--scene \(for bop\)"):
+        open_source(request, QUIET)
+
+
+def test_bag_messages_speak_of_options():
+    said = option_names("Give depth_unit_m=0.001, or the camera in a file (intrinsics=).")
+    assert said == "Give --depth-unit 0.001, or the camera in a file (--camera)."
+
+
+@pytest.mark.parametrize(
+    ("place", "needle"),
+    [
+        ("scenes/ycbv_mini", "54"),
+        ("scenes/apc_shelf_multiview/scene-0000", "0.522 m with 0.0001"),
+        ("handeye/rtde_ur5e/Hand-Eye-Data", "1024x768"),
+        ("bags/single_depth_color_640x480.bag", "Color"),
+    ],
+)
+def test_listing_says_what_is_inside(place, needle, capsys):
+    if not (DATA / place).exists():
+        pytest.skip(f"no data at {DATA / place}")
+    list_source(ImportRequest(source=DATA / place), QUIET)
+    assert needle in capsys.readouterr().out
+
+
+def test_a_real_bag_becomes_a_session(tmp_path):
+    bag = DATA / "bags/single_depth_color_640x480.bag"
+    if not bag.is_file():
+        pytest.skip(f"no recording at {bag}")
+    with pytest.raises(InputError, match=r"--max-pair-gap 0\.11\), or import colour.*--no-depth"):
+        open_source(ImportRequest(source=bag), QUIET)
+    summary = run_import(ImportRequest(source=bag, max_pair_gap=0.11), tmp_path / "s", QUIET)
+    store = SessionStore.open(tmp_path / "s")
+    assert summary.frames == len(store.session.views) >= 1 and store.verify() == []
+    assert store.rgb(0).shape == (480, 640, 3)
+
+
+# --- the command ------------------------------------------------------------------------------
+
+
+def realsim(*args: object) -> subprocess.CompletedProcess[str]:
+    code = "from realsim.app.cli import main; main()"
+    command = [sys.executable, "-c", code, *map(str, args)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def test_the_command_names_what_is_missing_and_then_imports(tmp_path):
+    folder = make_folder(tmp_path / "in")
+    first = realsim("import", folder, tmp_path / "s")
+    assert first.returncode == 2 and "Traceback" not in first.stderr
+    assert "--depth-coding" in first.stderr or "--depth-unit" in first.stderr
+    assert not (tmp_path / "s").exists()
+    done = realsim(
+        "import",
+        folder,
+        tmp_path / "s",
+        "--depth-unit",
+        0.001,
+        "--depth-coding",
+        "plain",
+        "--quiet",
+    )
+    assert done.returncode == 0, done.stderr
+    assert "6 (6 now)" in done.stdout and SessionStore.open(tmp_path / "s").verify() == []
+    assert realsim("import", folder).returncode == 2
+
+
+@pytest.mark.slow
+def test_a_killed_import_loses_nothing(tmp_path):
+    """The process is killed for real; the same command then gives the same session."""
+    folder = make_folder(tmp_path / "in", 30, size=(480, 640))
+    (folder / "K.txt").write_text("600 0 320\n0 600 240\n0 0 1\n")
+    out = tmp_path / "s"
+    options = ["--depth-unit", "0.001", "--depth-coding", "plain", "--quiet"]
+    code = "from realsim.app.cli import main; main()"
+    command = [sys.executable, "-c", code, "import", str(folder), str(out), *options]
+    seen = 0
+    for goal in (3, 17):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        limit = time.monotonic() + 60
+        while process.poll() is None and time.monotonic() < limit:
+            if len(list(out.glob("rgb/*.png"))) >= goal:
+                process.send_signal(signal.SIGKILL)
+                break
+            time.sleep(0.002)
+        process.wait()
+        store = SessionStore.open(out)
+        assert store.verify() == [] and len(store.completed) >= max(seen, goal - 1)
+        seen = len(store.completed)
+        store.close()
+    assert realsim("import", folder, out, *options).returncode == 0
+    request = ImportRequest(source=folder, depth_unit=0.001, depth_coding="plain")
+    run_import(request, tmp_path / "t", QUIET)
+    for path in sorted((tmp_path / "t").glob("*/0*.png")):
+        assert path.read_bytes() == (out / path.relative_to(tmp_path / "t")).read_bytes()
+    assert (out / "robot.jsonl").read_bytes() == (tmp_path / "t/robot.jsonl").read_bytes()

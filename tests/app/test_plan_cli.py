@@ -1,0 +1,229 @@
+"""`realsim plan`, `plan-show`, `plan-convert`: what they write, and what they refuse."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.app.cli import main
+from realsim.geometry import se3
+from realsim_capture_plans.arms.kinematics import UR5, UR5E
+from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.plan_files.graspnet import read_graspnet, table_frame
+from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+HOME = np.array([0.0, -1.9, 1.9, -1.57, -1.57, 0.0])
+CENTER = np.array([0.40, 0.1, 0.05])
+
+
+@dataclass(frozen=True)
+class Done:
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def realsim(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Callable[..., Done]:
+    """Run the command line in this process, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*args: object) -> Done:
+        monkeypatch.setattr(sys, "argv", ["realsim", *map(str, args)])
+        code = 0
+        try:
+            main()
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else 1
+        text = capsys.readouterr()
+        return Done(code, text.out, text.err)
+
+    return run
+
+
+def a_plan(n: int = 3) -> CapturePlan:
+    """A few views high above the table, free of everything."""
+    rng = np.random.default_rng(0)
+    config = PlanConfig()
+    plan = CapturePlan(
+        kind="hemisphere",
+        chain=UR5,
+        mount=d405_mount(),
+        cell=config.work_cell(CENTER, "hemisphere"),
+        home=HOME,
+        joints=HOME + rng.normal(0, 0.05, (n, 6)),
+        center_world=CENTER,
+        vias=(),
+        reference_view=0,
+        config=config,
+    )
+    assert np.all(plan.collision_model().free(plan.joints))
+    return plan
+
+
+def test_a_plan_is_made_and_written(realsim: Callable[..., Done]) -> None:
+    done = realsim(
+        "plan", "--views", 4, "--quiet", "--out", "a.json", "--robot", "ur5e", "--no-pictures"
+    )
+    assert done.code == 0, done.err
+    plan = load_plan("a.json")
+    assert len(plan) == 4 and plan.robot == "UR5e" and plan.kind == "hemisphere"
+    assert plan.center_world == pytest.approx([0.35, 0.0, 0.05])
+    assert plan.metrics["colliding_legs"] == 0
+    assert plan.content_hash[:12] in done.out and "good" in done.out
+    before = Path("a.json").read_bytes()
+    again = realsim("plan", "--views", 4, "--quiet", "--out", "a.json")
+    assert again.code == 2 and "--overwrite" in again.err
+    assert Path("a.json").read_bytes() == before
+
+
+def test_a_board_plan_lies_on_the_table(realsim: Callable[..., Done]) -> None:
+    done = realsim(
+        "plan", "--board", "--views", 3, "--no-pictures", "--quiet", "--table-height", -0.05,
+        "--radius", "0.25,0.35", "--keep-out", "0.2,0.2,0.01", "--seed", 3,
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    plan = load_plan("plan.json")
+    assert plan.kind == "calibration" and len(plan) == 3
+    assert plan.center_world[2] == -0.05 and plan.cell.table.upper[2] == -0.05
+    assert plan.config.board_distance_m == (0.25, 0.35)
+    assert plan.cell.keep_out.upper[0] - plan.cell.keep_out.lower[0] == pytest.approx(0.2)
+    assert not Path("plan_pictures").exists()
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["--views", "0"], "--views"),
+        (["--views", "-3"], "--views"),
+        (["--center", "350,0,50"], "'0.35,0,0.05'"),
+        (["--center", "0.35,0"], "3 numbers"),
+        (["--center", "a,b,c"], "3 numbers"),
+        (["--center", "nan,0,0"], "3 numbers"),
+        (["--keep-out", "300,300,120"], "--keep-out"),
+        (["--radius", "280,420"], "'0.28,0.42'"),
+        (["--radius", "0.4,0.3"], "radius_m"),
+        (["--table-height", "-300"], "millimetres"),
+        (["--elevation", "20,95"], "90"),
+        (["--board", "--elevation", "20,80"], "--elevation"),
+        (["--robot", "panda"], "panda"),
+        (["--calibration", "nowhere.conf"], "nowhere.conf"),
+        (["--mount", "nowhere.toml"], "nowhere.toml"),
+        (["--obstacles", "nowhere.toml"], "nowhere.toml"),
+        (["--out", "plan.txt"], ".json"),
+        (["--center", "1.3,0.5,0.05", "--views", "24"], "24 views were asked for"),
+    ],
+)
+def test_what_cannot_be_planned_is_one_paragraph(
+    args: list[str], says: str, realsim: Callable[..., Done], tmp_path: Path
+) -> None:
+    done = realsim("plan", "--quiet", *args)
+    assert done.code == 2 and says in done.err
+    assert "Traceback" not in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_plan_is_shown(realsim: Callable[..., Done], tmp_path: Path) -> None:
+    save_plan(a_plan(), "p.json")
+    done = realsim("plan-show", "p.json")
+    assert done.code == 0, done.err
+    assert a_plan().content_hash[:12] in done.out and "0, always" in done.out
+    pictures = sorted(p.name for p in (tmp_path / "p_pictures").iterdir())
+    assert len(pictures) >= 3 and all(p.endswith(".png") for p in pictures)
+    assert realsim("plan-show", "shipped:nowhere").code == 2
+    done = realsim("plan-show", "q.json")
+    assert done.code == 2 and "no plan at q.json" in done.err
+
+
+def test_a_plan_that_collides_ends_with_1_and_is_named(realsim: Callable[..., Done]) -> None:
+    plan = a_plan()
+    rows = np.stack([plan.home, plan.home + np.eye(6)[1], plan.home])
+    header = ",".join(f"q{j}_rad" for j in range(1, 7))
+    Path("p.csv").write_text("\n".join([header, *(",".join(map(repr, q)) for q in rows.tolist())]))
+    where = ("--robot", "UR5", "--center", "0.4,0.1,0.05")
+    done = realsim("plan-convert", "p.csv", "p.json", *where)
+    assert done.code == 1 and "view 0 -> view 1" in done.err and "table" in done.err
+    assert load_plan("p.json").metrics["colliding_legs"] == 2
+    done = realsim("plan-convert", "p.json", "p.script")
+    assert done.code == 1 and "NOT FREE: view 0 -> view 1" in Path("p.script").read_text()
+    assert 'popup("2 moves' in Path("p.script").read_text()
+    assert realsim("plan-show", "p.json", "--no-pictures").code == 1
+
+
+def test_a_plan_goes_out_and_comes_back(realsim: Callable[..., Done]) -> None:
+    plan = a_plan()
+    save_plan(plan, "p.json")
+    for dest in ("p.csv", "p.script", "folder", "copy.json"):
+        done = realsim("plan-convert", "p.json", dest)
+        assert done.code == 0 and dest in done.out, done.err
+        done = realsim("plan-convert", "p.json", dest)
+        assert done.code == 2 and "--overwrite" in done.err
+        assert realsim("plan-convert", "p.json", dest, "--overwrite").code == 0
+    assert load_plan("copy.json").content_hash == plan.content_hash
+    assert "def realsim_plan():" in Path("p.script").read_text()
+    Ts = table_frame(plan) @ read_graspnet("folder")
+    assert np.abs(Ts - plan.Ts_base_cam).max() < 1e-12
+    done = realsim("plan-convert", "p.csv", "back.json", "--robot", "UR5", "--center", "0.4,0.1,0")
+    assert done.code == 0, done.err
+    assert np.array_equal(load_plan("back.json").joints, plan.joints)
+    done = realsim("plan-convert", "p.csv", "b.json", "--robot", "UR5e", "--center", "0.4,0.1,0")
+    assert done.code == 2 and "of this robot" in done.err and not Path("b.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (["p.json", "p.xyz"], ".script"),
+        (["nowhere.json", "q.csv"], "no plan at nowhere.json"),
+        (["p.json", "q.csv", "--robot", "UR5e"], "cannot be changed"),
+        (["p.json", "q.csv", "--joints-unit", "deg"], "cannot be changed"),
+        (["bare.csv", "q.json", "--robot", "UR5"], "--joints-unit"),
+        (["bare.csv", "q.json", "--joints-unit", "rad"], "--robot"),
+        (["bare.csv", "q.json", "--robot", "UR5", "--joints-unit", "deg"], "look like radians"),
+        (["bare.csv", "q.json", "--calibration", "c.conf"], "needs --robot"),
+        (["degrees.csv", "q.json", "--robot", "UR5"], "look like degrees"),
+        (["other.json", "q.json", "--robot", "UR5"], "path of another robot"),
+    ],
+)
+def test_what_cannot_be_converted_is_one_paragraph(
+    args: list[str], says: str, realsim: Callable[..., Done]
+) -> None:
+    save_plan(a_plan(), "p.json")
+    row = ",".join(map(repr, HOME.tolist()))
+    Path("bare.csv").write_text(f"q1,q2,q3,q4,q5,q6\n{row}\n{row}\n")
+    names = ",".join(f"q{j}_rad" for j in range(1, 7))
+    Path("degrees.csv").write_text(
+        "\n".join([names, ",".join(map(repr, np.degrees(HOME).tolist()))])
+    )
+    q = HOME + np.random.default_rng(0).normal(0, 0.4, (9, 6))
+    T = UR5E.forward(q)
+    numbers = np.concatenate([T[:, :3, 3], se3.log_so3(T[:, :3, :3])], axis=1).tolist()
+    poses = [dict(zip("xyzabc", row, strict=True)) for row in numbers]
+    Path("other.json").write_text(json.dumps({"joints": q.tolist(), "cart_pose": poses}))
+    before = sorted(p.name for p in Path().iterdir())
+    done = realsim("plan-convert", *args)
+    assert done.code == 2 and says in done.err, done.err
+    assert sorted(p.name for p in Path().iterdir()) == before
+
+
+def test_help_is_quick_and_complete() -> None:
+    code = (
+        "import sys\n"
+        "from realsim.app import cli\n"
+        "for c in ('plan', 'plan-show', 'plan-convert'):\n"
+        "    try: cli.commands([c, '--help'], standalone_mode=False)\n"
+        "    except SystemExit: pass\n"
+        "print('numpy' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout.rstrip().endswith("False"), done.stdout + done.stderr
+    for option in ("--advise", "--keep-out", "--replay", "--joints-unit", "--overwrite"):
+        assert option in done.stdout

@@ -1,0 +1,113 @@
+"""The wait for a standing arm, and the checks' own numbers."""
+
+import numpy as np
+import pytest
+
+from realsim_capture_plans.arms.kinematics import UR5
+from realsim_capture_plans.capturing.checks import (
+    CheckConfig,
+    Measured,
+    check_depth,
+    check_exposure,
+    check_sharpness,
+    sharpness,
+)
+from realsim_capture_plans.capturing.settle import SettleConfig, until_still
+from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError
+from realsim_capture_plans.lab.arm import HOME, SimulatedArm
+
+
+class RingingArm(SimulatedArm):
+    """Swings at 8 Hz with an amplitude that dies away; its clock only goes on by waiting."""
+
+    def __init__(self, amplitude_rad: float, decay_s: float) -> None:
+        super().__init__()
+        self.amplitude_rad, self.decay_s, self.now_s = amplitude_rad, decay_s, 0.0
+
+    def state(self) -> ArmState:
+        swing = np.exp(-self.now_s / self.decay_s) * np.cos(2 * np.pi * 8.0 * self.now_s)
+        q = HOME + self.amplitude_rad * swing * np.eye(6)[1]
+        return ArmState(joints=q, T_base_ee=UR5.forward(q), time_s=self.now_s)
+
+    def wait(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+@pytest.mark.parametrize("amplitude", [0.0, 1e-3, 5e-3])
+def test_the_wait_ends_when_the_swing_is_below_the_tolerance(amplitude: float) -> None:
+    arm, config = RingingArm(amplitude, 0.1), SettleConfig()
+    state, waited = until_still(arm, config, clock=lambda: arm.now_s, sleep=arm.wait)
+    left = amplitude * np.exp(-arm.now_s / 0.1)
+    assert left <= config.tolerance_rad
+    assert np.abs(state.joints - HOME).max() <= config.tolerance_rad
+    # Not much later than needed either: the tolerance plus two windows.
+    needed = 0.1 * np.log(max(amplitude / (config.tolerance_rad / 2), 1.0))
+    assert config.window_s <= waited <= needed + 3 * config.window_s
+
+
+def test_an_arm_that_never_stands_is_named() -> None:
+    arm = RingingArm(5e-3, 1e9)
+    with pytest.raises(ArmStoppedError, match="does not come to rest") as stopped:
+        until_still(arm, SettleConfig(), clock=lambda: arm.now_s, sleep=arm.wait)
+    assert stopped.value.stop == "not ready"
+
+
+def scene(rng: np.random.Generator, contrast: float = 1.0) -> np.ndarray:
+    """Discs of all sizes on a textured ground."""
+    import cv2
+
+    image = np.full((360, 640, 3), 120, np.uint8)
+    for _ in range(60):
+        x, y, r = (int(rng.integers(0, n)) for n in (640, 360, 40))
+        grey = int(120 + contrast * rng.integers(-100, 100))
+        cv2.circle(image, (x, y), r + 3, (grey, grey, grey), -1, cv2.LINE_AA)
+    return np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sharpness_falls_with_every_blur_and_not_with_contrast(seed: int) -> None:
+    import cv2
+
+    rng = np.random.default_rng(seed)
+    image = scene(rng)
+    values = [sharpness(image)]
+    for sigma in (1.0, 1.5, 2.0, 3.0):
+        soft = cv2.GaussianBlur(image, (0, 0), sigma).astype(float)
+        noisy = np.clip(soft + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+        values.append(sharpness(noisy))
+    assert np.all(np.diff(values) < 0)
+    assert values[2] < CheckConfig().sharpness_of_median * values[0]
+    faint = np.clip(120 + 0.5 * (image.astype(float) - 120), 0, 255).astype(np.uint8)
+    assert sharpness(faint) == pytest.approx(values[0], rel=0.1)
+    assert sharpness(np.ascontiguousarray(image.transpose(1, 0, 2))) == pytest.approx(
+        values[0], rel=0.05
+    )
+    moved = cv2.filter2D(image, -1, np.full((1, 11), 1 / 11, np.float32))
+    assert sharpness(moved) < CheckConfig().sharpness_of_median * values[0]
+
+
+def numbers(**changed: float) -> Measured:
+    usual = {"sharpness": 0.5, "brightness": 120.0, "saturated": 0.0, "depth_share": 0.9,
+             "depth_fill": 0.9}  # fmt: skip
+    return Measured(**(usual | changed))
+
+
+def test_thresholds_are_where_they_are_said_to_be() -> None:
+    c = CheckConfig()
+    earlier = [numbers()] * c.least_history
+    for factor, mark in ((1.01, "good"), (0.99, "doubt")):
+        sharp = numbers(sharpness=factor * c.sharpness_of_median * 0.5)
+        assert check_sharpness(sharp, earlier, c).mark == mark
+        bright = numbers(brightness=factor * c.brightness_of_median * 120)
+        assert check_exposure(bright, earlier, c).mark == mark
+        bright = numbers(brightness=120 / (factor * c.brightness_of_median))
+        assert check_exposure(bright, earlier, c).mark == mark
+        deep = numbers(depth_fill=factor * c.depth_of_median * 0.9)
+        assert check_depth(deep, earlier, c).mark == mark
+        black = numbers(brightness=factor * c.least_brightness)
+        assert (check_exposure(black, [], c).mark == "fault") == (mark == "doubt")
+    # Too few views to compare with: nothing relative is judged.
+    poor = numbers(sharpness=0.01, depth_fill=0.05, brightness=10.0)
+    few = earlier[:-1]
+    assert check_sharpness(poor, few, c).mark == check_depth(poor, few, c).mark == "good"
+    assert check_exposure(poor, few, c).mark == "good"

@@ -1,0 +1,406 @@
+"""Devices that stop, frames that are wrong, and a person who clears, redoes, skips and pauses.
+
+Arm, camera and table are the simulated lab's; what goes wrong is added to them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.geometry import se3
+from realsim.records import CaptureSession
+from realsim.store import SessionStore
+from realsim_capture_plans.arms.kinematics import UR5
+from realsim_capture_plans.capturing.capture import (
+    CaptureConfig,
+    CaptureJob,
+    CaptureSummary,
+    capture,
+)
+from realsim_capture_plans.capturing.contact_sheet import SHEET_FILE, write_contact_sheet
+from realsim_capture_plans.capturing.log import CaptureLog
+from realsim_capture_plans.capturing.operator import CaptureStatus, Command, NoOperator
+from realsim_capture_plans.capturing.settle import SettleConfig
+from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError, Frame, Stop
+from realsim_capture_plans.lab import LabConfig, SimulatedLab
+from realsim_capture_plans.lab.arm import HOME, SimulatedArm
+from realsim_capture_plans.lab.camera import SimulatedDepthCamera
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+Array = NDArray[np.float64]
+VIEWS = 9
+RENDERED: dict[bytes, Frame] = {}
+CLOCK = count(1)
+QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
+
+
+@lru_cache(maxsize=1)
+def plan() -> CapturePlan:
+    """An arc of views round the lab's objects."""
+    center, config = np.array([0.45, 0.0, 0.03]), PlanConfig()
+    home = HOME + np.pi * np.eye(6)[0]
+    joints: list[Array] = []
+    for turn in np.linspace(0.0, np.pi, VIEWS):
+        eye = center + 0.36 * np.array([-0.3 * np.sin(turn), 0.3 * np.cos(turn), 0.95])
+        z = (center - eye) / np.linalg.norm(center - eye)
+        y = UR5.forward(home)[:3, 1]
+        x = np.cross(y, z) / np.linalg.norm(np.cross(y, z))
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
+        q = UR5.inverse(T @ se3.invert(d405_mount().T_ee_cam))
+        joints.append(q[np.argmin(np.abs(q - (joints[-1] if joints else home)).max(-1))])
+    return CapturePlan(
+        kind="hemisphere", chain=UR5, mount=d405_mount(),
+        cell=config.work_cell(center, "hemisphere"), home=home, joints=np.stack(joints),
+        center_world=center, vias=(), reference_view=0, config=config,
+    )  # fmt: skip
+
+
+class StoppingArm(SimulatedArm):
+    """Stops half way to the goals of some moves, until it is recovered."""
+
+    def __init__(self, stops: dict[int, Stop], *, patience: int = 0) -> None:
+        """Stop in the moves of these numbers; refuse the first `patience` recoveries."""
+        super().__init__()
+        self.stops, self.patience = stops, patience
+        self.moves, self.recovered = 0, 0
+        self.path: list[Array] = [self._joints.copy()]
+        self.stopped = False
+
+    def move(self, joints: ArrayLike, speed: float = 1.05, acceleration: float = 1.4) -> None:
+        assert not self.stopped, "an arm that is stopped was told to move"
+        self.moves += 1
+        goal = np.asarray(joints, dtype=np.float64)
+        stop = self.stops.pop(self.moves, None)
+        if stop is not None:
+            super().move((self._joints + goal) / 2, speed, acceleration)
+            self.path.append(self._joints.copy())
+            self.stopped = True
+            raise ArmStoppedError(f"{stop}: release it at the pendant.", stop)
+        super().move(goal, speed, acceleration)
+        self.path.append(self._joints.copy())
+
+    def recover(self) -> None:
+        if self.patience > 0:
+            self.patience -= 1
+            raise ArmStoppedError("the protective stop is still there.", "protective stop")
+        self.recovered += 1
+        self.stopped = False
+
+
+class SpoiltCamera:
+    """The lab's camera with frames that are spoilt: {number of the grab: what is done to it}."""
+
+    def __init__(
+        self,
+        camera: SimulatedDepthCamera,
+        spoil: dict[int, Callable[[Frame, Frame], Frame]] | None = None,
+    ) -> None:
+        """Spoil these grabs, counted from 1; each is given the frame and the one before."""
+        self._camera, self.spoil = camera, spoil or {}
+        self.grabs, self.recovered = 0, 0
+        self._last: Frame | None = None
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._camera, name)
+
+    def grab(self) -> Frame:
+        self.grabs += 1
+        frame = self._rendered()
+        before, spoil = self._last, self.spoil.get(self.grabs)
+        self._last = frame
+        return frame if spoil is None else spoil(frame, before or frame)
+
+    def _rendered(self) -> Frame:
+        """The lab gives the same frame at the same joints: each is rendered once for all tests."""
+        joints = self._camera._arm.state().joints.tobytes()
+        if joints not in RENDERED:
+            RENDERED[joints] = self._camera.grab()
+        return replace(RENDERED[joints], time_s=float(next(CLOCK)))
+
+    def recover(self) -> None:
+        self.recovered += 1
+
+
+def blurred(frame: Frame, before: Frame) -> Frame:
+    kernel = np.eye(11, dtype=np.float32) / 11  # 15 px of motion along the diagonal
+    return replace(frame, rgb=cv2.filter2D(frame.rgb, -1, kernel))
+
+
+def black(frame: Frame, before: Frame) -> Frame:
+    return replace(frame, rgb=np.zeros_like(frame.rgb))
+
+
+def frozen(frame: Frame, before: Frame) -> Frame:
+    return replace(before, time_s=frame.time_s)
+
+
+def stale(frame: Frame, before: Frame) -> Frame:
+    return replace(frame, time_s=before.time_s)
+
+
+def burnt_out(frame: Frame, before: Frame) -> Frame:
+    return replace(frame, rgb=np.minimum(frame.rgb.astype(np.int64) * 3, 255).astype(np.uint8))
+
+
+def half_lit(frame: Frame, before: Frame) -> Frame:
+    return replace(frame, rgb=frame.rgb // 2)
+
+
+def no_depth(frame: Frame, before: Frame) -> Frame:
+    return replace(frame, depth_m=np.zeros_like(frame.depth_m))
+
+
+def glare(frame: Frame, before: Frame) -> Frame:
+    depth = frame.depth_m.copy()
+    h, w = depth.shape
+    depth[h // 4 : 3 * h // 4, w // 3 : 2 * w // 3] = 0
+    return replace(frame, depth_m=depth)
+
+
+def unplugged(frame: Frame, before: Frame) -> Frame:
+    raise DeviceError("the camera does not answer: plug it in.")
+
+
+@dataclass
+class Person(NoOperator):
+    """Gives prepared answers and types prepared keys before the views."""
+
+    answers: list[Command] = field(default_factory=list)
+    keys: dict[int, list[Command]] = field(default_factory=dict)
+    told: list[str] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
+    statuses: list[CaptureStatus] = field(default_factory=list)
+    meanwhile: Callable[[], None] | None = None
+
+    def show(self, status: CaptureStatus) -> None:
+        self.statuses.append(status)
+
+    def tell(self, text: str, *, trouble: bool = False) -> None:
+        self.told.append(("! " if trouble else "") + text)
+
+    def commands(self) -> list[Command]:
+        stored = self.statuses[-1].stored if self.statuses else 0
+        return self.keys.pop(stored, [])
+
+    def ask(self, text: str, choices: Sequence[Command]) -> Command | None:
+        self.asked.append(text)
+        if self.meanwhile is not None:
+            self.meanwhile()
+        answer = self.answers.pop(0)
+        assert answer in choices
+        return answer
+
+
+@lru_cache(maxsize=1)
+def lab() -> SimulatedLab:
+    made = SimulatedLab(LabConfig(seed=3, n_objects=4, width=640, height=360))
+    made.place_objects()
+    return made
+
+
+@dataclass
+class Bench:
+    """An arm with a camera in the lab, and a session."""
+
+    arm: SimulatedArm
+    camera: SpoiltCamera
+    store: SessionStore
+
+    def capture(self, **job: Any) -> CaptureSummary:
+        work = CaptureJob(**job)
+        return capture(plan(), self.arm, self.camera, self.store, config=QUICK, job=work)
+
+
+def bench(
+    folder: Path,
+    spoil: dict[int, Callable[[Frame, Frame], Frame]] | None = None,
+    arm: SimulatedArm | None = None,
+) -> Bench:
+    a = arm or SimulatedArm()
+    there = lab()
+    camera = SimulatedDepthCamera(there.config, there.truth, a, lambda: there._on_table)
+    session = CaptureSession(
+        name="test", intrinsics=camera.intrinsics, views=(), depth_unit_m=camera.depth_unit_m
+    )
+    store = SessionStore.create(folder, session, {"plan_hash": plan().content_hash})
+    return Bench(arm=a, camera=SpoiltCamera(camera, spoil), store=store)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
+    """The session that nothing disturbed."""
+    b = bench(tmp_path_factory.mktemp("reference") / "s")
+    summary = b.capture()
+    assert summary.complete and summary.rejected == summary.noted == summary.warnings == ()
+    return b.store
+
+
+def assert_same_views(store: SessionStore, reference: SessionStore) -> None:
+    assert store.completed == reference.completed and store.verify() == []
+    for k in reference.completed:
+        assert store.path(f"rgb/{k:06d}.png").read_bytes() == (
+            reference.path(f"rgb/{k:06d}.png").read_bytes()
+        )
+        assert np.array_equal(store.depth_m(k), reference.depth_m(k))
+
+
+def clear(path: Sequence[Array]) -> bool:
+    corners = np.stack(path)
+    model = plan().collision_model()
+    return bool(np.all(model.edges_free(corners[:-1], corners[1:], plan().config.edge_step_rad)))
+
+
+@pytest.mark.parametrize("stop", ["protective stop", "emergency stop", "connection lost"])
+def test_a_stop_that_a_person_clears_costs_no_view(
+    tmp_path: Path, reference: SessionStore, stop: Stop
+) -> None:
+    arm = StoppingArm({4: stop, 7: stop}, patience=1)
+    b = bench(tmp_path / "s", arm=arm)
+    person = Person(answers=["go", "go", "go"])
+    summary = b.capture(operator=person)
+    assert summary.complete and arm.recovered == 2
+    assert len(person.asked) == 3  # one recovery was refused
+    assert sum("release it at the pendant" in t for t in person.told) == 2
+    assert clear(arm.path)
+    assert_same_views(b.store, reference)
+    events = [e["event"] for e in CaptureLog(b.store).entries]
+    assert events.count("trouble") == 3 and events.count("recovered") == 2
+
+
+def test_a_stop_without_a_person_ends_the_run_and_the_same_call_goes_on(
+    tmp_path: Path, reference: SessionStore
+) -> None:
+    arm = StoppingArm({5: "protective stop"})
+    b = bench(tmp_path / "s", arm=arm)
+    with pytest.raises(ArmStoppedError, match="release it"):
+        b.capture()
+    done = len(b.store.completed)
+    assert 0 < done < VIEWS
+    arm.recover()
+    b.store = SessionStore.open(b.store.folder)
+    summary = b.capture()
+    assert (summary.skipped, summary.captured) == (done, VIEWS - done)
+    assert clear(arm.path)
+    assert_same_views(b.store, reference)
+
+
+def test_an_arm_moved_by_hand_during_a_pause_is_led_back(
+    tmp_path: Path, reference: SessionStore
+) -> None:
+    arm = StoppingArm({})
+    b = bench(tmp_path / "s", arm=arm)
+    away = plan().home + 0.3 * np.eye(6)[0]
+
+    def by_hand() -> None:
+        SimulatedArm.move(arm, away)
+        arm.path.append(away)
+
+    person = Person(answers=["go"], keys={4: ["pause"]}, meanwhile=by_hand)
+    b.capture(operator=person)
+    assert "paused" in person.asked[0]
+    after = next(i for i, q in enumerate(arm.path) if np.array_equal(q, away))
+    assert clear(arm.path[after:])
+    assert_same_views(b.store, reference)
+
+
+def test_a_camera_that_is_gone_is_waited_for(tmp_path: Path, reference: SessionStore) -> None:
+    b = bench(tmp_path / "s", {3: unplugged})
+    person = Person(answers=["go"])
+    b.capture(operator=person)
+    assert b.camera.recovered == 1 and "! the camera does not answer: plug it in." in person.told
+    assert_same_views(b.store, reference)
+    b = bench(tmp_path / "nobody", {3: unplugged})
+    with pytest.raises(DeviceError, match="plug it in"):
+        b.capture()
+    assert b.store.completed == {0, 1}
+    assert b.capture().captured == VIEWS - 2
+    assert_same_views(b.store, reference)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (blurred, "blurred"),
+        (black, "black"),
+        (frozen, "frozen"),
+        (stale, "time stamp"),
+        (burnt_out, "saturated"),
+        (half_lit, "brightness"),
+        (no_depth, "pixels have depth"),
+        (glare, "depth fills"),
+    ],
+)
+def test_one_spoilt_frame_is_taken_again(
+    tmp_path: Path, reference: SessionStore, spoil: Callable[[Frame, Frame], Frame], reason: str
+) -> None:
+    b = bench(tmp_path / "s", {6: spoil})
+    summary = b.capture()
+    assert [k for k, _ in summary.rejected] == [5] and reason in summary.rejected[0][1]
+    assert summary.noted == () and summary.complete
+    assert_same_views(b.store, reference)
+    entry = CaptureLog(b.store).views()[5]
+    assert entry["attempts"] == 2 and reason in entry["retaken"][0] and entry["notes"] == []
+
+
+def test_a_doubt_that_stays_is_stored_with_a_note_and_three_in_a_row_are_asked_about(
+    tmp_path: Path,
+) -> None:
+    spoil = dict.fromkeys(range(6, 99), blurred)
+    b = bench(tmp_path / "s", spoil)
+    person = Person(answers=["stop"])
+    summary = b.capture(operator=person)
+    assert [k for k, _ in summary.noted] == [5, 6, 7] and not summary.complete
+    assert "3 views in a row: blurred" in person.asked[0]
+    sheet = b.store.read_image(write_contact_sheet(b.store, VIEWS, "test"))
+    assert b.store.has(SHEET_FILE) and b.store.verify() == []
+    # An amber frame round each of the three: 4 pixels wide on all sides of a 16:9 cell.
+    amber = int(np.all(sheet == (255, 170, 0), axis=-1).sum())
+    assert amber > 3 * 4 * 2 * (320 + 180) * 0.8
+    # Nobody there: the views are stored, noted, and the run goes on to its end.
+    b = bench(tmp_path / "nobody", spoil)
+    summary = b.capture()
+    assert summary.complete and [k for k, _ in summary.noted] == [5, 6, 7, 8]
+
+
+def test_what_earlier_runs_saw_is_what_later_ones_are_judged_by(tmp_path: Path) -> None:
+    b = bench(tmp_path / "s", {7: blurred})
+    b.capture(views=tuple(range(6)))
+    b.store = SessionStore.open(b.store.folder)
+    summary = b.capture()
+    assert [k for k, _ in summary.rejected] == [6] and "blurred" in summary.rejected[0][1]
+
+
+def test_skip_redo_and_stop(tmp_path: Path, reference: SessionStore) -> None:
+    b = bench(tmp_path / "s")
+    person = Person(keys={2: ["skip"], 5: ["redo"], 7: ["stop"]})
+    summary = b.capture(operator=person)
+    assert summary.left_out == (2,) and not summary.complete
+    assert b.store.completed == set(range(8)) - {2}
+    assert b.store.has("retaken/000005_1_rgb.png")  # the fifth one stored: number 2 was skipped
+    assert CaptureLog(b.store).views()[2]["event"] == "skipped"
+    summary = b.capture()
+    assert summary.captured == 2 and summary.complete
+    assert_same_views(b.store, reference)
+
+
+def test_a_board_that_is_not_seen_is_taken_again(tmp_path: Path) -> None:
+    b = bench(tmp_path / "s")
+    seen: list[tuple[int, ...]] = []
+
+    def check(rgb: NDArray[np.uint8]) -> str:
+        seen.append(rgb.shape)
+        return "" if len(seen) != 2 else "board: 0 of its 140 points are found"
+
+    summary = b.capture(board_check=check)
+    assert seen == [(360, 640, 3)] * (VIEWS + 1)
+    assert [k for k, _ in summary.rejected] == [1] and "board" in summary.rejected[0][1]

@@ -1,0 +1,278 @@
+"""Laws and known answers of the collision model."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
+from realsim_capture_plans.collision.arm_shapes import arm_shapes
+from realsim_capture_plans.collision.camera_bodies import camera_shape
+from realsim_capture_plans.collision.coal_geometry import pinocchio_model
+from realsim_capture_plans.collision.model import GROUPS, CollisionModel, interpolate
+from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.collision.shapes import Box, Mount, Shape, WorkCell
+
+INF = np.inf
+EVERYWHERE = Box(lower=(-INF, -INF, -INF), upper=(INF, INF, 0.0))
+TABLE = Box(lower=(-0.6, -0.8, -INF), upper=(1.0, 0.8, 0.0))
+KEEP_OUT = Box(lower=(0.225, -0.15, -INF), upper=(0.525, 0.15, 0.12))
+LAMP = Box(lower=(0.1, 0.5, 0.6), upper=(0.3, 0.9, 1.4))
+CELL = WorkCell(table=TABLE, keep_out=KEEP_OUT, obstacles=(("lamp", LAMP),))
+HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
+CHAINS = [UR5, UR5E]
+
+
+def joints(n: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-np.pi, np.pi, (n, 6))
+
+
+def model(chain: DhChain = UR5, mount: Mount | None = None, cell: WorkCell = CELL):
+    return CollisionModel(chain, mount or d405_mount(), cell, 0.01)
+
+
+def piece(kind: str, size: tuple[float, ...], at: list[float], points=None) -> Shape:
+    return Shape(
+        part="bracket", frame=6, kind=kind, size_m=size, points=points,
+        T_frame_shape=se3.from_translation(at),
+    )  # fmt: skip
+
+
+def calibrated(seed: int = 1) -> DhChain:
+    rng = np.random.default_rng(seed)
+    deltas = {f"delta_{n}": rng.normal(0, 5e-4, 6) for n in ("a", "d", "alpha", "theta")}
+    return replace(UR5, **deltas)
+
+
+@pytest.mark.parametrize("chain", [UR5, UR5E, calibrated()], ids=["UR5", "UR5e", "calibrated"])
+def test_pinocchio_walks_the_same_chain(chain: DhChain) -> None:
+    import pinocchio as pin
+
+    walker, frames = pinocchio_model(chain)
+    data = walker.createData()
+    for q in joints(50):
+        pin.forwardKinematics(walker, data, q)
+        for i, T in enumerate(chain.link_frames(q)):
+            assert np.abs(data.oMi[i].homogeneous @ frames[i] - T).max() < 1e-12
+
+
+@pytest.mark.parametrize("chain", CHAINS, ids=lambda c: c.name)
+def test_free_is_clearance_above_the_margin(chain: DhChain) -> None:
+    asked = model(chain)
+    q = joints(1500)
+    clearance = asked.clearance(q)
+    least = np.min([clearance[g] for g in GROUPS], axis=0)
+    free = asked.free(q)
+    unclear = np.abs(least - 0.01) < 1e-5
+    assert np.array_equal(free[~unclear], (least >= 0.01)[~unclear])
+    assert 0.1 < np.mean(free) < 0.4
+    assert unclear.sum() < 5
+
+
+def test_answers_do_not_depend_on_what_was_asked_before() -> None:
+    asked, q = model(), joints(300)
+    order = np.random.default_rng(1).permutation(len(q))
+    free, clearance = asked.free(q), asked.clearance(q)
+    assert np.array_equal(asked.free(q[order]), free[order])
+    again = asked.clearance(q[order])
+    fresh = model().clearance(q[order])
+    for group in GROUPS:
+        assert np.array_equal(again[group], clearance[group][order])
+        assert np.array_equal(fresh[group], clearance[group][order])
+
+
+def test_turning_arm_and_cell_together_changes_nothing() -> None:
+    quarter = se3.exp_so3([0.0, 0.0, np.pi / 2])
+
+    def turned(box: Box) -> Box:
+        ends = np.nan_to_num(np.array([box.lower, box.upper]), posinf=4, neginf=-4) @ quarter.T
+        return Box(lower=tuple(ends.min(0).tolist()), upper=tuple(ends.max(0).tolist()))
+
+    there = WorkCell(
+        table=turned(TABLE), keep_out=turned(KEEP_OUT), obstacles=(("lamp", turned(LAMP)),)
+    )
+    q = joints(200, 3)
+    before = model().clearance(q)
+    after = model(cell=there).clearance(q + np.eye(6)[0] * np.pi / 2)
+    whole = model().clearance(q + 2 * np.pi * np.array([1, -1, 0, 1, -1, 1]))
+    for group in GROUPS:
+        outside = before[group] > 0  # EPA's depth is exact to its own tolerance only
+        assert np.abs(before[group] - whole[group])[outside].max() < 1e-5
+        if group in ("table", "scene"):  # the foot with its cable does not turn along
+            assert np.abs(before[group] - after[group])[outside].max() < 1e-5
+            assert np.array_equal(before[group] > 0, after[group] > 0)
+
+
+def lowest(shape: Shape, T: np.ndarray) -> np.ndarray:
+    """Least z of a shape at poses (N, 4, 4) of its frame, by its support function."""
+    at = T @ shape.T_frame_shape
+    up, z = at[:, 2, :3], at[:, 2, 3]
+    if shape.kind == "box":
+        return z - np.abs(up) @ (np.array(shape.size_m) / 2)
+    radius, length = shape.size_m
+    across = np.sqrt(np.maximum(0, 1 - up[:, 2] ** 2))
+    return z - np.abs(up[:, 2]) * length / 2 - radius * (across if shape.kind == "cylinder" else 1)
+
+
+def test_height_above_a_table_is_the_lowest_point() -> None:
+    depth = 0.5
+    cell = WorkCell(
+        table=replace(EVERYWHERE, upper=(INF, INF, -depth)),
+        keep_out=Box(lower=(3, 3, 3), upper=(4, 4, 4)),
+    )
+    mount, q = d405_mount(), joints(400, 5)
+    frames = UR5.link_frames(q)
+    shapes = [s for s in arm_shapes(UR5) if s.frame >= 2] + [camera_shape(mount), *mount.bracket]
+    low = np.min([lowest(s, frames[:, s.frame]) for s in shapes], axis=0)
+    found = model(mount=mount, cell=cell).clearance(q)["table"]
+    hanging = (low < 0) & (low > -depth)  # else shoulder and base, which never change, are lowest
+    assert hanging.sum() > 50
+    assert np.abs(found - (low + depth))[hanging].max() < 1e-5
+
+
+def test_a_cover_is_so_much_less_room() -> None:
+    cover, depth = 0.013, 0.5
+    cell = WorkCell(
+        table=replace(EVERYWHERE, upper=(INF, INF, -depth)),
+        keep_out=Box(lower=(3, 3, 3), upper=(4, 4, 4)),
+    )
+    bare, q = d405_mount(), joints(600, 6)
+    thin, thick = model(mount=bare, cell=cell), model(mount=replace(bare, cover_m=cover), cell=cell)
+    change = thin.clearance(q)["table"] - thick.clearance(q)["table"]
+    frames = UR5.link_frames(q)
+    carried = [lowest(s, frames[:, 6]) for s in (camera_shape(bare), *bare.bracket)]
+    links = [lowest(s, frames[:, s.frame]) for s in arm_shapes(UR5)]
+    hanging = (np.min(carried, axis=0) < np.min(links, axis=0)) & (np.min(carried, axis=0) > -depth)
+    assert hanging.sum() > 15
+    assert np.abs(change[hanging] - cover).max() < 1e-5
+    assert np.all(change > -1e-5)
+
+
+def test_edges_are_free_where_every_step_is() -> None:
+    asked = model()
+    free = joints(600)[asked.free(joints(600))][:60]
+    start, end = free[:-1], free[1:]
+    samples, owner = interpolate(start, end, 0.05)
+    expected = np.bincount(owner, weights=~asked.free(samples), minlength=len(start)) == 0
+    found = asked.edges_free(start, end, 0.05)
+    assert np.array_equal(found, expected)
+    short = asked.edges_free(free, free + 0.002, 0.05)
+    assert short.sum() > 50
+    assert not found.all()
+    assert asked.edges_free(free[0], free[0], 0.05).tolist() == [True]
+    with pytest.raises(InputError, match="59 starts and 60 goals"):
+        asked.edges_free(start, free, 0.05)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros(6), np.zeros((2, 5)), np.full((1, 6), np.nan)])
+def test_joints_that_say_nothing_are_refused(wrong: np.ndarray) -> None:
+    for ask in (model().free, model().clearance):
+        with pytest.raises(InputError, match="joints"):
+            ask(wrong)
+
+
+def test_nearest_names_the_parts() -> None:
+    asked = model()
+    for q in joints(100, 8):
+        group, first, second, distance = asked.nearest(q)
+        clearance = asked.clearance(q[None])
+        assert min(float(v[0]) for v in clearance.values()) == clearance[group][0] == distance
+        assert (group, first, second) in asked.pairs
+    low = HOME.copy()
+    low[1] = np.radians(-20)
+    assert asked.nearest(low)[0] in ("table", "scene")
+
+
+def test_fixed_pairs_are_not_in_the_clearances() -> None:
+    pairs = {frozenset(p[1:]) for p in model().pairs}
+    kept_out = ["camera-wrist 3", "bracket-wrist 3", "shoulder-table", "base-table"]
+    kept_out += ["forearm-upper arm", "wrist 1-wrist 3"]
+    assert not [p for p in kept_out if frozenset(p.split("-")) in pairs]
+    needed = ["forearm-wrist 2", "forearm-camera", "upper arm-table", "base-wrist 1"]
+    needed += ["bracket-lamp", "camera-lamp"]
+    assert not [p for p in needed if frozenset(p.split("-")) not in pairs]
+    assert frozenset(("camera", "keep-out box")) in pairs
+    clearance = model().clearance(joints(500))
+    assert all(np.ptp(clearance[g]) > 0.05 for g in GROUPS)
+    # The camera's near corner is 44 mm off the axis and 15.7 mm before the flange; 38 mm radius.
+    assert model().mount_gap_m == pytest.approx(np.hypot(0.006, 0.0157), abs=2e-4)
+
+
+MOUNTS = {
+    "camera .* inside the wrist 3": d405_mount(se3.from_translation([0.0, 0.0, -0.02])),
+    "bracket .* inside the wrist 3.*flange's face": replace(
+        d405_mount(), bracket=(piece("box", (0.02, 0.02, 0.02), [0.0, 0.0, 0.0]),)
+    ),
+    "bracket .*convex.*split a ring": replace(
+        d405_mount(),
+        bracket=(
+            piece("convex", (), [0.0, 0.0, 0.0], 0.1 * np.array(list(np.ndindex(2, 2, 2))) - 0.05),
+        ),
+    ),
+    "bracket .* wrist 2 at every angle": replace(
+        d405_mount(),
+        bracket=tuple(
+            piece("box", size, at)
+            for side in (-0.0475, 0.0475)
+            for size, at in (
+                ((0.1, 0.006, 0.15), [0.0, side, -0.075]),
+                ((0.006, 0.1, 0.15), [side, 0.0, -0.075]),
+            )
+        ),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("says", MOUNTS)
+def test_a_mount_that_runs_into_the_wrist_is_named(says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        model(mount=MOUNTS[says])
+
+
+def test_a_table_through_the_shoulder_is_named() -> None:
+    high = replace(CELL, table=replace(EVERYWHERE, upper=(INF, INF, 0.06)))
+    with pytest.raises(InputError, match=r"'table' is inside the arm's shoulder.*by 36 mm"):
+        model(cell=high)
+    beside = replace(CELL, table=Box(lower=(0.3, -0.8, -INF), upper=(1.0, 0.8, 0.06)))
+    assert model(cell=beside).free(HOME[None])[0]
+
+
+def test_a_cell_in_millimetres_and_an_unknown_arm_are_named() -> None:
+    far = replace(CELL, obstacles=(("wall", Box(lower=(700, 0, 0), upper=(750, 900, 900))),))
+    with pytest.raises(InputError, match=r"'wall'.*millimetres"):
+        model(cell=far)
+    with pytest.raises(InputError, match="'UR16e'; there are shapes for UR5, UR5e"):
+        model(replace(UR5, name="UR16e"))
+    with pytest.raises(InputError, match="called 'UR5' but its nominal"):
+        model(replace(UR5E, name="UR5"))
+    with pytest.raises(InputError, match="camera 'D999'"):
+        model(mount=replace(d405_mount(), camera="D999", bracket=()))
+    with pytest.raises(InputError, match="clearance_m"):
+        CollisionModel(UR5, d405_mount(), CELL, -0.01)
+
+
+@pytest.mark.parametrize("chain", CHAINS, ids=lambda c: c.name)
+def test_the_usual_poses_are_free(chain: DhChain) -> None:
+    """Straight up, and looking down on the table in front."""
+    up = np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0])
+    assert model(chain).free(np.stack([HOME, up])).all()
+
+
+def test_folded_onto_itself_is_not_free() -> None:
+    folded = np.radians([0.0, -90.0, 175.0, 0.0, 0.0, 0.0])
+    asked = model()
+    assert not asked.free(folded[None])[0]
+    group, first, second, distance = asked.nearest(folded)
+    assert group in ("self", "tool") and distance < 0.01, (first, second)
+
+
+def test_interpolated_moves_keep_their_ends_and_the_step() -> None:
+    start, end = joints(20, 1), joints(20, 2)
+    q, owner = interpolate(start, end, 0.04)
+    for e in range(20):
+        part = q[owner == e]
+        assert np.array_equal(part[0], start[e])
+        assert np.abs(part[-1] - end[e]).max() < 1e-12
+        assert np.abs(np.diff(part, axis=0)).max() <= 0.04

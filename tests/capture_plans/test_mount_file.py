@@ -1,0 +1,231 @@
+"""Mount and work cell files: what is written is read back, what is wrong is named."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from realsim.errors import InputError, RealsimError, UnitError
+from realsim.geometry import se3
+from realsim_capture_plans.arms.kinematics import UR5
+from realsim_capture_plans.collision.model import CollisionModel
+from realsim_capture_plans.collision.mount import (
+    CAMERA_BODIES,
+    d405_mount,
+    plain_bracket,
+    read_mount,
+    write_mount,
+)
+from realsim_capture_plans.collision.shapes import Box, Mount, Shape, WorkCell
+from realsim_capture_plans.collision.work_cell_file import read_work_cell_obstacles
+
+CELL = WorkCell(
+    table=Box(lower=(-0.6, -0.8, -np.inf), upper=(1.0, 0.8, 0.0)),
+    keep_out=Box(lower=(0.225, -0.15, -np.inf), upper=(0.525, 0.15, 0.12)),
+)
+GOOD = """
+name = "left bracket"
+camera = "D405"
+translation_m = [0.0, -0.065, 0.035]
+rotation_vector_rad = [0.0, 0.0, 0.0]
+"""
+TETRAHEDRON = "\n".join(
+    ["v 0 0 0", "v 40 0 0", "v 0 40 0", "v 0 0 40", "f 1 3 2", "f 1 2 4", "f 1 4 3", "f 2 3 4"]
+)
+
+
+def written(folder: Path, text: str, name: str = "mount.toml") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def same(a: Mount, b: Mount) -> bool:
+    return (
+        (a.name, a.camera, a.cover_m, len(a.bracket))
+        == (b.name, b.camera, b.cover_m, len(b.bracket))
+        and np.abs(a.T_ee_cam - b.T_ee_cam).max() < 1e-12
+        and all(
+            (p.kind, p.part, p.frame) == (q.kind, q.part, q.frame)
+            and np.allclose(p.size_m, q.size_m, atol=1e-12)
+            and np.abs(p.T_frame_shape - q.T_frame_shape).max() < 1e-9
+            and (p.points is None or bool(np.allclose(np.sort(p.points, 0), np.sort(q.points, 0))))
+            for p, q in zip(a.bracket, b.bracket, strict=True)
+        )
+    )
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 10**6), name=st.text(min_size=1).filter(str.strip))
+def test_what_is_written_is_read_back(
+    seed: int, name: str, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    if any(not c.isprintable() for c in name):
+        name = repr(name)
+    rng = np.random.default_rng(seed)
+    kinds = {"box": 3, "capsule": 2, "cylinder": 2, "sphere": 1}
+    pieces = [
+        Shape(
+            part="bracket", frame=6, kind=kind, size_m=tuple(rng.uniform(0.01, 0.1, lengths)),
+            T_frame_shape=se3.random_transform(rng, spread=0.05),
+        )
+        for kind, lengths in kinds.items()
+    ]  # fmt: skip
+    pieces.append(
+        Shape(
+            part="bracket", frame=6, kind="convex", size_m=(), points=rng.normal(0, 0.02, (4, 3)),
+            T_frame_shape=se3.random_transform(rng, spread=0.05),
+        )
+    )  # fmt: skip
+    mount = Mount(
+        name=name,
+        camera=str(rng.choice(list(CAMERA_BODIES))),
+        T_ee_cam=se3.random_transform(rng, spread=0.05),
+        bracket=tuple(pieces[: rng.integers(0, 6)]),
+        cover_m=float(rng.choice([0.0, 0.004])),
+    )
+    path = tmp_path_factory.mktemp("mount") / "m.toml"
+    write_mount(mount, path)
+    assert same(read_mount(path), mount)
+
+
+def test_three_ways_to_say_the_same_rotation(tmp_path: Path) -> None:
+    R = se3.exp_so3([0.4, -0.2, 0.9])
+    w, x, y, z = se3.quaternion_wxyz(R)
+    ways = [
+        "rotation_vector_rad = [0.4, -0.2, 0.9]",
+        f"quaternion_xyzw = [{x:.5f}, {y:.5f}, {z:.5f}, {w:.5f}]",
+        f"matrix = {np.round(R, 12).tolist()}",
+    ]
+    for way in ways:
+        path = written(tmp_path, GOOD.replace("rotation_vector_rad = [0.0, 0.0, 0.0]", way))
+        assert np.abs(read_mount(path).T_ee_cam[:3, :3] - R).max() < 2e-5
+
+
+def test_without_a_bracket_a_plain_one_is_assumed(tmp_path: Path) -> None:
+    assert same(
+        read_mount(written(tmp_path, GOOD.replace("left bracket", d405_mount().name))), d405_mount()
+    )
+    assert read_mount(written(tmp_path, GOOD + "bracket = []\n")).bracket == ()
+
+
+def test_a_mesh_is_taken_in_its_unit_beside_the_file(tmp_path: Path) -> None:
+    written(tmp_path, TETRAHEDRON, "part.obj")
+    table = (
+        '[[bracket]]\nkind = "convex"\nfile = "part.obj"\nunit = "mm"\nposition_m = [0, 0, 0.01]'
+    )
+    mount = read_mount(written(tmp_path, GOOD + table))
+    (piece,) = mount.bracket
+    assert piece.points is not None
+    assert np.sort(piece.points, axis=0)[-1] == pytest.approx([0.04, 0.04, 0.04])
+    assert piece.T_frame_shape[2, 3] == 0.01
+    # The same lengths in metres are larger than anything on a flange.
+    with pytest.raises(UnitError, match=r"reaches 40 m.*unit"):
+        read_mount(written(tmp_path, GOOD + table.replace('"mm"', '"m"')))
+
+
+WRONG = {
+    "translation_m.*millimetres": GOOD.replace("[0.0, -0.065, 0.035]", "[0, -65, 35]"),
+    "'translaton_m' is not known. Was 'translation_m' meant": GOOD.replace(
+        "translation_m", "translaton_m"
+    ),
+    "'D450' is not known; there are D405": GOOD.replace('"D405"', '"D450"'),
+    "rotation_vector_rad and quaternion_xyzw given; exactly one": GOOD
+    + "quaternion_xyzw = [0, 0, 0, 1]",
+    "no rotation given": GOOD.replace("rotation_vector_rad = [0.0, 0.0, 0.0]", ""),
+    "length 2.0000; 1 is needed": GOOD.replace(
+        "rotation_vector_rad = [0.0, 0.0, 0.0]", "quaternion_xyzw = [0, 0, 0, 2]"
+    ),
+    "Were degrees given": GOOD.replace("rad = [0.0, 0.0, 0.0]", "rad = [0.0, 0.0, 90.0]"),
+    "mirrored": GOOD.replace(
+        "rotation_vector_rad = [0.0, 0.0, 0.0]", "matrix = [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]"
+    ),
+    "row 3 is missing": GOOD.replace(
+        "rotation_vector_rad = [0.0, 0.0, 0.0]", "matrix = [[-1, 0, 0], [0, 1, 0]]"
+    ),
+    "name is missing": GOOD.replace('name = "left bracket"', ""),
+    "is not TOML": GOOD + "cover_m = 5 mm",
+    "cover_m is 5": GOOD + "cover_m = 5",
+    "bracket 1: kind is 'bax'": GOOD + '[[bracket]]\nkind = "bax"',
+    "bracket 1: size_m is .* list of 3": GOOD + '[[bracket]]\nkind = "box"\nsize_m = [0.1, 0.1]',
+    "bracket 1: size_m.*millimetres": GOOD + '[[bracket]]\nkind = "box"\nsize_m = [40, 90, 6]',
+    "positive lengths": GOOD + '[[bracket]]\nkind = "sphere"\nsize_m = [-0.01]',
+    "file do not belong to a box": GOOD
+    + '[[bracket]]\nkind = "box"\nfile = "a.stl"\nsize_m = [0.1, 0.1, 0.1]',
+    'unit = "mm" or unit = "m" is needed': GOOD + '[[bracket]]\nkind = "convex"\nfile = "a.stl"',
+    "a.stl does not exist": GOOD + '[[bracket]]\nkind = "convex"\nfile = "a.stl"\nunit = "mm"',
+    "flat.obj holds no solid": GOOD + '[[bracket]]\nkind = "convex"\nfile = "flat.obj"\nunit = "m"',
+    "note.stl holds no solid": GOOD + '[[bracket]]\nkind = "convex"\nfile = "note.stl"\nunit = "m"',
+    "must be written as": GOOD + 'bracket = "box"',
+}
+
+
+@pytest.mark.parametrize("says", WRONG)
+def test_what_is_wrong_is_named(says: str, tmp_path: Path) -> None:
+    written(tmp_path, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "flat.obj")
+    written(tmp_path, "this is no mesh", "note.stl")
+    path = written(tmp_path, WRONG[says])
+    with pytest.raises(RealsimError, match=says) as caught:
+        read_mount(path)
+    assert "mount.toml" in str(caught.value)
+
+
+def test_no_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.toml does not exist"):
+        read_mount(tmp_path / "none.toml")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_mount(d405_mount(), written(tmp_path, "", "file") / "m.toml")
+
+
+PLACES = [
+    [0.0, -0.065, 0.035],
+    [0.08, 0.0, 0.05],
+    [0.0, 0.11, -0.02],
+    [0.0, 0.0, 0.08],
+    [-0.09, 0.09, 0.0],
+]
+
+
+@pytest.mark.parametrize("at", PLACES, ids=str)
+@pytest.mark.parametrize("camera", CAMERA_BODIES)
+def test_the_plain_bracket_joins_flange_and_camera(at: list[float], camera: str) -> None:
+    """It touches the flange's face and the camera, in one piece, without entering the wrist."""
+    import coal
+
+    from realsim_capture_plans.collision.camera_bodies import camera_shape
+    from realsim_capture_plans.collision.coal_geometry import coal_shape
+
+    T = se3.from_translation(at)
+    mount = Mount(name="m", camera=camera, T_ee_cam=T, bracket=plain_bracket(T, camera))
+    chain = [*mount.bracket, camera_shape(mount)]
+
+    def gap(a: Shape, b: Shape) -> float:
+        request, result = coal.DistanceRequest(), coal.DistanceResult()
+        places = [coal.Transform3s(s.T_frame_shape[:3, :3], s.T_frame_shape[:3, 3]) for s in (a, b)]
+        return coal.distance(coal_shape(a), places[0], coal_shape(b), places[1], request, result)
+
+    for a, b in pairwise(chain):
+        assert gap(a, b) <= 1e-6
+    model = CollisionModel(UR5, mount, CELL, 0.01)
+    assert model.mount_gap_m > 0
+
+
+def test_obstacles_are_read_and_wrong_ones_named(tmp_path: Path) -> None:
+    wall = '[[obstacles]]\nname = "wall"\nlower_m = [-2.0, 0.7, -inf]\nupper_m = [2.0, 0.75, inf]\n'
+    (name, box), *rest = read_work_cell_obstacles(written(tmp_path, wall))
+    assert (name, rest) == ("wall", [])
+    assert box.lower == (-2.0, 0.7, -np.inf)
+    assert box.upper == (2.0, 0.75, np.inf)
+    for wrong, says in {
+        wall + wall: "two obstacles are called 'wall'",
+        wall.replace("0.75", "0.65"): "'wall'.*below upper_m",
+        wall.replace("0.75", "750"): "Were millimetres",
+        wall.replace("lower_m", "lowr_m"): "'lowr_m' is not known. Was 'lower_m' meant",
+        "": "no \\[\\[obstacles\\]\\]",
+        wall.replace("0.75", "nan"): "NaN",
+    }.items():
+        with pytest.raises(InputError, match=says):
+            read_work_cell_obstacles(written(tmp_path, wrong))

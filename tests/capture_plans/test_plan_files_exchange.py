@@ -1,0 +1,337 @@
+"""Laws of importers and exporters: what is written can be read back; what is not said is proven."""
+
+import json
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import DegenerateError, InputError, UnitError
+from realsim.geometry import se3
+from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
+from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.collision.shapes import Box
+from realsim_capture_plans.plan_files.exported import export_csv, export_urscript
+from realsim_capture_plans.plan_files.graspnet import export_graspnet, read_graspnet, table_frame
+from realsim_capture_plans.plan_files.imported import (
+    axes_meeting_point,
+    colliding_legs,
+    import_plan,
+)
+from realsim_capture_plans.plan_files.joint_paths import read_path
+from realsim_capture_plans.plan_files.plan_json import load_plan
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+HOME = np.array([0.1, -1.6, 1.7, -1.7, -1.5, 0.3])
+CENTER = np.array([0.37, 0.02, 0.05])
+MOUNT = d405_mount()
+REAL = Path(os.environ.get("REALSIM_DATA", "../shared/data")) / "motion" / "koch_ur5_paths"
+
+
+def a_plan(chain: DhChain = UR5, n: int = 9) -> CapturePlan:
+    rng = np.random.default_rng(0)
+    config = PlanConfig(table_height_m=-0.02)
+    return CapturePlan(
+        kind="hemisphere",
+        chain=chain,
+        mount=MOUNT,
+        cell=config.work_cell(CENTER, "hemisphere"),
+        home=HOME,
+        joints=HOME + rng.normal(0, 0.3, (n, 6)),
+        center_world=CENTER,
+        vias=((0, HOME + rng.normal(0, 0.2, (2, 6))), (4, HOME + rng.normal(0, 0.2, (1, 6)))),
+        reference_view=3,
+        config=config,
+    )
+
+
+def write_path(
+    path: Path,
+    chain: DhChain,
+    *,
+    degrees: bool = True,
+    scale: float = 1.0,
+    tool: np.ndarray | None = None,
+    n: int = 12,
+    spread: float = 0.4,
+) -> np.ndarray:
+    """A path file with tool poses; returns its joints [rad]."""
+    q = HOME + np.random.default_rng(1).normal(0, spread, (n, 6))
+    T = chain.forward(q) @ (np.eye(4) if tool is None else tool)
+    poses = [
+        dict(zip("xyzabc", [*(scale * t[:3, 3]), *se3.log_so3(t[:3, :3])], strict=True)) for t in T
+    ]
+    flags = ["1", "1", *["0"] * (n - 3), "1"]
+    data = {
+        "joints": (np.degrees(q) if degrees else q).tolist(),
+        "cart_pose": poses,
+        "via_points": flags,
+    }
+    path.write_text(json.dumps(data))
+    return q
+
+
+# --- out and back ----------------------------------------------------------------------------
+
+
+def test_csv_comes_back_bit_for_bit(tmp_path: Path) -> None:
+    plan = a_plan()
+    export_csv(plan, tmp_path / "p.csv")
+    back = import_plan(
+        tmp_path / "p.csv", chain=UR5, mount=MOUNT, config=plan.config, cell=plan.cell,
+        center=plan.center_world,
+    )  # fmt: skip
+    assert back.kind == "imported"
+    for name in ("home", "joints", "Ts_base_cam"):
+        assert np.array_equal(getattr(back, name), getattr(plan, name)), name
+    for k in range(len(plan)):
+        assert np.array_equal(back.move(k), plan.move(k))
+    # The expected camera poses of the table itself.
+    found = read_path(tmp_path / "p.csv", UR5)
+    assert found.Ts_base_cam is not None
+    assert np.abs(found.Ts_base_cam[~found.via] - plan.Ts_base_cam).max() < 1e-12
+    assert np.all(np.isnan(found.Ts_base_cam[found.via]))
+
+
+def test_csv_of_another_robot_or_mount_is_named(tmp_path: Path) -> None:
+    export_csv(a_plan(), tmp_path / "p.csv")
+    with pytest.raises(InputError, match="mm from those of this robot"):
+        import_plan(tmp_path / "p.csv", chain=UR5E, mount=MOUNT)
+    with pytest.raises(InputError, match="mm from those of this robot"):
+        other = d405_mount(se3.from_translation([0.0, 0.065, 0.035]))
+        import_plan(tmp_path / "p.csv", chain=UR5, mount=other)
+    with pytest.raises(InputError, match="--robot"):
+        import_plan(tmp_path / "p.csv", mount=MOUNT)
+
+
+def test_urscript_drives_the_same_corners_and_nothing_else(tmp_path: Path) -> None:
+    plan = a_plan()
+    export_urscript(plan, tmp_path / "p.script")
+    text = (tmp_path / "p.script").read_text()
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    assert plan.content_hash in text and "UR5" in text and plan.mount.name in text
+    assert lines[0] == "def realsim_plan():" and lines[-1] == "end"
+    # Every block that is opened is closed.
+    opened = sum(bool(re.match(r"\s*(def|while|if)\b", line)) for line in lines)
+    assert opened == sum(line.strip() == "end" for line in lines)
+    moves = re.findall(r"movej\(\[(.*?)\], a=([\d.]+), v=([\d.]+)\)", text)
+    q = np.array([[float(v) for v in m[0].split(",")] for m in moves])
+    corners = np.concatenate([plan.move(k)[1:] for k in range(len(plan))])
+    assert q.shape == corners.shape and np.abs(q - corners).max() < 1e-12
+    assert {(float(a), float(v)) for _, a, v in moves} == {(1.4, 1.05)}
+    home = re.search(r"home = \[(.*?)\]", text)
+    assert home is not None
+    assert np.abs(np.array([float(v) for v in home[1].split(",")]) - plan.home).max() < 1e-12
+    # The motion stops at every view: settled, then announced, in order; nothing is blended.
+    views = re.findall(r'sleep\(([\d.]+)\)\n  textmsg\("realsim view ", (\d+)\)', text)
+    assert [int(k) for _, k in views] == list(range(len(plan)))
+    assert "r=" not in text and "e-" not in "".join(m[0] for m in moves)
+
+
+def test_graspnet_poses_come_back(tmp_path: Path) -> None:
+    plan = a_plan()
+    export_graspnet(plan, tmp_path / "g")
+    poses = np.load(tmp_path / "g" / "camera_poses.npy")
+    first = np.load(tmp_path / "g" / "cam0_wrt_table.npy")
+    # graspnetAPI's convention: relative to the first frame, which is relative to the table.
+    assert poses.shape == (len(plan), 4, 4) and first.shape == (4, 4)
+    assert np.array_equal(poses[0], np.eye(4))
+    T_base_table = table_frame(plan)
+    assert np.abs(T_base_table @ first @ poses - plan.Ts_base_cam).max() < 1e-12
+    assert np.abs(T_base_table @ read_graspnet(tmp_path / "g") - plan.Ts_base_cam).max() < 1e-12
+    assert np.array_equal(T_base_table, se3.from_translation([0.37, 0.02, -0.02]))
+    assert load_plan(tmp_path / "g" / "plan.json").content_hash == plan.content_hash
+
+
+def test_damaged_graspnet_folders_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cam0_wrt_table\.npy"):
+        read_graspnet(tmp_path)
+    export_graspnet(a_plan(), tmp_path)
+    (tmp_path / "camera_poses.npy").write_bytes(b"\x93NUMPY broken")
+    with pytest.raises(InputError, match=r"camera_poses\.npy"):
+        read_graspnet(tmp_path)
+    np.save(tmp_path / "camera_poses.npy", np.eye(4))
+    with pytest.raises(InputError, match=r"\(N, 4, 4\)"):
+        read_graspnet(tmp_path)
+
+
+# --- what a path does not say is proven from its poses ----------------------------------------
+
+
+@pytest.mark.parametrize("chain", [UR5, UR5E], ids=["UR5", "UR5e"])
+@pytest.mark.parametrize("degrees", [True, False])
+@pytest.mark.parametrize("scale", [1.0, 1000.0])
+def test_robot_units_and_tool_are_found(
+    chain: DhChain, degrees: bool, scale: float, tmp_path: Path
+) -> None:
+    tool = se3.exp([0.1, -0.2, 0.4, 0.01, 0.02, 0.2])
+    q = write_path(tmp_path / "p.json", chain, degrees=degrees, scale=scale, tool=tool)
+    found = read_path(tmp_path / "p.json", None).reading
+    assert found is not None
+    assert found.chain is chain and found.joint_unit == ("deg" if degrees else "rad")
+    assert found.length_unit == ("m" if scale == 1.0 else "mm")
+    assert np.abs(found.T_ee_tcp - tool).max() < 1e-9 and found.gap_m < 1e-9
+    plan = import_plan(tmp_path / "p.json", mount=MOUNT, center=CENTER)
+    assert plan.chain is chain and np.abs(plan.home - q[0]).max() < 1e-12
+    assert np.abs(plan.joints - q[2:-1]).max() < 1e-12
+    assert np.abs(plan.move(0) - q[:3]).max() < 1e-12
+    assert plan.metrics["rows_after_last_view"] == 1
+    assert plan.metrics["tool_offset_m"] == pytest.approx(np.linalg.norm(tool[:3, 3]))
+
+
+def test_a_path_for_the_other_robot_is_refused_with_both_fits(tmp_path: Path) -> None:
+    write_path(tmp_path / "p.json", UR5E)
+    with pytest.raises(InputError, match=r"fit a UR5e.*for a UR5 \d+ mm are left"):
+        import_plan(tmp_path / "p.json", chain=UR5, mount=MOUNT)
+
+
+def test_poses_that_decide_nothing_or_fit_nothing_are_named(tmp_path: Path) -> None:
+    write_path(tmp_path / "p.json", UR5, n=4, spread=1e-5)
+    with pytest.raises(InputError, match="do not tell which robot"):
+        import_plan(tmp_path / "p.json", mount=MOUNT, center=CENTER)
+    write_path(tmp_path / "p.json", UR5)
+    data = json.loads((tmp_path / "p.json").read_text())
+    data["cart_pose"] = data["cart_pose"][5:] + data["cart_pose"][:5]
+    (tmp_path / "p.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match="do not belong together"):
+        import_plan(tmp_path / "p.json", mount=MOUNT)
+
+
+def test_a_claim_against_the_evidence_is_refused(tmp_path: Path) -> None:
+    write_path(tmp_path / "p.json", UR5)
+    with pytest.raises(UnitError, match="joints in deg"):
+        read_path(tmp_path / "p.json", UR5, "rad")
+
+
+def test_without_poses_the_unit_has_to_be_said(tmp_path: Path) -> None:
+    q = write_path(tmp_path / "p.json", UR5)
+    data = json.loads((tmp_path / "p.json").read_text())
+    del data["cart_pose"]
+    (tmp_path / "p.json").write_text(json.dumps(data))
+    with pytest.raises(UnitError, match="--joints-unit"):
+        read_path(tmp_path / "p.json", UR5)
+    assert np.abs(read_path(tmp_path / "p.json", UR5, "deg").joints - q).max() < 1e-12
+    with pytest.raises(UnitError, match="look like degrees"):
+        read_path(tmp_path / "p.json", UR5, "rad")
+
+
+HEADER = ",".join(f"q{j}_{{u}}" for j in range(1, 7))
+ROWS_DEG = ["10,-90,90,-100,-85,0", "20,-80,95,-110,-80,5", "15,-85,92,-105,-82,170"]
+ROWS_RAD = ["0.1,-1.6,1.7,-1.7,-1.5,0.3", "0.2,-1.5,1.7,-1.7,-1.5,0.3"]
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "says"),
+    [
+        ("\n".join(ROWS_RAD), InputError, "header with the columns q1_rad"),
+        ("\n".join([HEADER.format(u="rad"), *ROWS_DEG]), UnitError, r"line 4, joint 6.* is 170"),
+        ("\n".join([HEADER.format(u="deg"), *ROWS_RAD]), UnitError, "look like radians"),
+        ("\n".join(["q1,q2,q3,q4,q5,q6", *ROWS_RAD]), UnitError, "do not say their unit"),
+        (
+            "\n".join(["q1_rad,q2_deg,q3_rad,q4_rad,q5_rad,q6_rad", *ROWS_RAD]), UnitError,
+            "all in rad or all in deg",
+        ),
+        ("\n".join([HEADER.format(u="rad"), "0,1,2"]), InputError, "line 2 has 3 values"),
+        ("\n".join([HEADER.format(u="rad"), "0,1,2,x,4,5"]), InputError, "line 2: q4_rad is 'x'"),
+        ("\n".join([HEADER.format(u="rad"), "0,1,2,nan,4,5"]), InputError, "not a number"),
+        (HEADER.format(u="rad"), InputError, "no rows"),
+        ("", InputError, "empty"),
+        ("\n".join(["via," + HEADER.format(u="deg"), "maybe," + ROWS_DEG[0]]), InputError, "maybe"),
+        ("\n".join(["via," + HEADER.format(u="deg"), "1," + ROWS_DEG[0]]), InputError, "all of"),
+        (
+            "\n".join([HEADER.format(u="deg"), "0,-90,190,0,0,0", "0,-90,90,0,0,0"]), InputError,
+            "elbow joint is 190.0 deg",
+        ),
+        (
+            "\n".join([HEADER.format(u="deg").replace(",", ";"), "0,5;1;2;3;4;5"]), InputError,
+            "Decimal commas",
+        ),
+    ],
+)  # fmt: skip
+def test_tables_that_cannot_be_right_are_named(
+    text: str, error: type[Exception], says: str, tmp_path: Path
+) -> None:
+    (tmp_path / "p.csv").write_text(text)
+    with pytest.raises(error, match=says) as caught:
+        import_plan(tmp_path / "p.csv", chain=UR5, mount=MOUNT, center=CENTER)
+    assert "p.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+@pytest.mark.parametrize("form", ["q{j}_deg", "Q{j} [deg]", "q{j}(degrees)"])
+def test_tables_of_other_programs_are_read(mark: str, form: str, tmp_path: Path) -> None:
+    header = mark.join(["name", *(form.format(j=j) for j in range(1, 7)), "via"])
+    rows = [mark.join(["a", *row.split(","), str(k % 2)]) for k, row in enumerate(ROWS_DEG)]
+    (tmp_path / "p.csv").write_text("\ufeff" + "\r\n".join(["# a comment", header, *rows, ""]))
+    found = read_path(tmp_path / "p.csv", UR5)
+    assert np.abs(np.degrees(found.joints[2]) - [15, -85, 92, -105, -82, 170]).max() < 1e-12
+    assert found.via.tolist() == [False, True, False] and found.rows[0] == "line 3"
+
+
+@pytest.mark.parametrize(
+    "text", ["[]", '{"joints": 3}', '{"joints": [[1]]}', '{"joints": [[0,0,0,0,0,0]]}', "{"]
+)
+def test_no_path_ends_in_a_traceback(text: str, tmp_path: Path) -> None:
+    (tmp_path / "p.json").write_text(text)
+    with pytest.raises(InputError, match=r"p\.json"):
+        import_plan(tmp_path / "p.json", chain=UR5, mount=MOUNT)
+
+
+# --- what is imported is checked ---------------------------------------------------------------
+
+
+def test_colliding_moves_are_named_and_stay(tmp_path: Path) -> None:
+    through = HOME + np.array([0.0, 0.9, -0.2, 0.0, 0.0, 0.0])  # the camera goes into the table
+    header = HEADER.format(u="rad")
+    rows = [",".join(map(repr, q.tolist())) for q in (HOME, through, HOME)]
+    (tmp_path / "p.csv").write_text("\n".join([header, *rows]))
+    plan = import_plan(tmp_path / "p.csv", chain=UR5, mount=MOUNT, center=CENTER)
+    assert len(plan) == 3 and plan.metrics["colliding_legs"] == 2
+    lines = colliding_legs(plan)
+    assert len(lines) == 2
+    assert "view 0 -> view 1" in lines[0] and "inside table" in lines[0]
+    # An obstacle in free air is found too.
+    air = plan.chain.forward(HOME)[:3, 3]
+    lamp = Box(lower=tuple(air - 0.05), upper=tuple(air + 0.05))
+    rows = [",".join(map(repr, q.tolist())) for q in (HOME, HOME + 0.01)]
+    (tmp_path / "p.csv").write_text("\n".join([header, *rows]))
+    for boxes, count in (((), 0), ((("lamp", lamp),), 2)):
+        plan = import_plan(
+            tmp_path / "p.csv", chain=UR5, mount=MOUNT, center=CENTER, obstacles=boxes
+        )
+        assert plan.metrics["colliding_legs"] == count
+
+
+def test_the_centre_is_where_the_axes_meet() -> None:
+    rng = np.random.default_rng(0)
+    eyes = CENTER + se3.exp_so3(rng.normal(0, 0.3, (20, 3))) @ [0, 0, 0.4]
+    Ts = np.stack([se3.look_at(e, CENTER, r) for r, e in enumerate(eyes)])
+    assert np.abs(axes_meeting_point(Ts) - CENTER).max() < 1e-9
+    with pytest.raises(DegenerateError, match="--center"):
+        axes_meeting_point(np.repeat(Ts[:1], 5, axis=0))
+
+
+def test_a_centre_in_millimetres_is_named(tmp_path: Path) -> None:
+    export_csv(a_plan(), tmp_path / "p.csv")
+    with pytest.raises(UnitError, match="millimetres"):
+        import_plan(tmp_path / "p.csv", chain=UR5, mount=MOUNT, center=[370, 20, 50])
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="REALSIM_DATA has no motion/koch_ur5_paths")
+@pytest.mark.parametrize("path", sorted(REAL.glob("*.json")), ids=lambda p: p.stem)
+def test_the_papers_own_paths_are_a_ur5_in_degrees(path: Path) -> None:
+    found = read_path(path, None)
+    assert found.reading is not None
+    assert found.reading.chain is UR5 and found.reading.joint_unit == "deg"
+    assert found.reading.base == "base" and found.reading.gap_m < 0.003
+    # Two of the files are in millimetres and of a tool 200 mm long.
+    long_tool = np.linalg.norm(found.reading.T_ee_tcp[:3, 3]) > 0.1
+    assert long_tool == (found.reading.length_unit == "mm")
+    with pytest.raises(InputError, match="of another robot"):
+        read_path(path, UR5E)
+    plan = import_plan(path, mount=MOUNT, center=[-0.1, -0.67, 0.1])
+    assert len(plan) + np.sum(found.via) == len(found.joints)
+    assert plan.kind == "imported" and np.all(UR5.limits.contains(plan.joints))
+    assert len(colliding_legs(plan)) == plan.metrics["colliding_legs"]

@@ -1,0 +1,335 @@
+"""Metrics of a plan: laws (turning, slowing down), then answers worked out by hand."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics
+from realsim_capture_plans.arms.kinematics import UR5
+from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
+from realsim_capture_plans.planning import view_quality
+from realsim_capture_plans.planning.make import calibration_plan
+from realsim_capture_plans.planning.metrics import METRIC_MEANINGS, plan_metrics
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.tour_time import TourTime
+from realsim_capture_plans.planning.view_quality import D405, SENSORS, hole_deg
+from realsim_capture_plans.planning.viewpoints import golden_cap
+
+CENTER = np.array([0.40, 0.05, 0.05])
+CONFIG = PlanConfig()
+LOOKING = np.array([0.0, -1.9, -1.6, -1.2, 1.57, 0.0])
+"""The arm bent over the table, the camera looking down."""
+
+
+def plan_of(
+    joints: np.ndarray,
+    *,
+    kind: Any = "hemisphere",
+    config: PlanConfig = CONFIG,
+    vias: Iterable[tuple[int, np.ndarray]] = (),
+    home: np.ndarray = LOOKING,
+    center: np.ndarray = CENTER,
+    mount: Mount | None = None,
+    cell: WorkCell | None = None,
+) -> CapturePlan:
+    return CapturePlan(
+        kind=kind,
+        chain=UR5,
+        mount=mount or d405_mount(),
+        cell=cell or config.work_cell(center, kind),
+        home=home,
+        joints=joints,
+        center_world=center,
+        vias=tuple(vias),
+        reference_view=0,
+        config=config,
+    )
+
+
+def many(n: int, seed: int = 0, spread: float = 0.35) -> np.ndarray:
+    return LOOKING + np.random.default_rng(seed).uniform(-spread, spread, (n, 6))
+
+
+def turned_base(angle: float) -> np.ndarray:
+    return LOOKING + angle * np.eye(6)[0]
+
+
+# --- laws -------------------------------------------------------------------------------------
+
+
+def turned(plan: CapturePlan, angle: float) -> CapturePlan:
+    """The same plan with everything turned about the base's axis."""
+    spin = se3.exp_so3([0.0, 0.0, angle])
+    by = angle * np.eye(6)[0]
+    return replace(
+        plan,
+        home=plan.home + by,
+        joints=plan.joints + by,
+        center_world=spin @ plan.center_world,
+        vias=tuple((k, via + by) for k, via in plan.vias),
+    )
+
+
+@pytest.mark.parametrize("angle", [0.3, -1.1, 2.0])
+def test_turning_everything_about_the_base_changes_no_coverage(angle: float) -> None:
+    plan = plan_of(many(60), vias=[(3, many(2, seed=5))])
+    before, after = plan_metrics(plan), plan_metrics(turned(plan, angle))
+    names = [n for n in before if n.startswith(("hole", "spacing", "radius", "parallax"))]
+    names += ["travel_total_rad", "seconds", "sigma_min", "yoshikawa_min", "depth_noise_max_m"]
+    assert len(names) >= 12
+    for name in names:
+        # Holes: the nearest view on the rim is looked up every quarter of a degree.
+        within = 0.02 if name.startswith("hole") else 1e-9
+        assert after[name] == pytest.approx(before[name], abs=within), name
+
+
+def test_a_quarter_turn_of_cell_and_all_changes_nothing_that_is_seen_or_touched() -> None:
+    plan = plan_of(many(20), center=np.array([0.4, 0.0, 0.05]))
+
+    def quarter(box: Box) -> Box:
+        (x0, y0, z0), (x1, y1, z1) = box.lower, box.upper
+        return Box(lower=(-y1, x0, z0), upper=(-y0, x1, z1))
+
+    cell = WorkCell(table=quarter(plan.cell.table), keep_out=quarter(plan.cell.keep_out))
+    after = plan_metrics(replace(turned(plan, np.pi / 2), cell=cell))
+    for name, value in plan_metrics(plan).items():
+        # The base itself does not turn: its plug stays where it is.
+        fixed = name.startswith(("limit_margin", "hole")) or name.endswith(("self_m", "tool_m"))
+        if not fixed:
+            assert after[name] == pytest.approx(value, abs=1e-6), name
+
+
+def test_where_the_speed_is_reached_time_goes_with_one_over_speed() -> None:
+    # Acceleration so great that only cruising counts.
+    slow = replace(CONFIG, speed=0.2, acceleration=2000.0)
+    fast = replace(slow, speed=0.8)
+    q = LOOKING + np.arange(1, 5)[:, None] * 0.4
+    ratio = (
+        plan_metrics(plan_of(q, config=slow))["seconds"]
+        / plan_metrics(plan_of(q, config=fast))["seconds"]
+    )
+    assert ratio == pytest.approx(4.0, rel=2e-3)
+
+
+def test_more_views_never_make_a_greater_hole() -> None:
+    directions = golden_cap(80, (20.0, 80.0))[np.random.default_rng(0).permutation(80)]
+    holes = [hole_deg(directions[:n], (20.0, 80.0)) for n in (1, 2, 3, 5, 10, 20, 40, 80)]
+    assert all(b <= a + 1e-9 for a, b in pairwise(holes))
+
+
+def test_the_hole_is_what_a_fine_grid_finds_and_never_less() -> None:
+    rng = np.random.default_rng(3)
+    for n in (1, 2, 3, 4, 30, 120):
+        d = golden_cap(400, (15.0, 90.0))[rng.choice(400, n, replace=False)]
+        grid = golden_cap(60_000, (15.0, 90.0))
+        sampled = view_quality.nearest_deg(d, grid).max()
+        assert sampled - 0.02 <= hole_deg(d, (15.0, 90.0)) <= sampled + 0.4
+
+
+def test_moving_the_sensor_away_makes_noise_grow_with_the_square() -> None:
+    z = np.array([0.1, 0.2, 0.4])
+    assert D405.depth_noise(2 * z) == pytest.approx(4 * D405.depth_noise(z))
+
+
+# --- answers known beforehand -----------------------------------------------------------------
+
+
+def test_time_and_travel_of_two_views_by_hand() -> None:
+    # Leg 1: 1.4 rad at 1.0 rad/s, 2.0 rad/s^2: 1.4 / 1 + 1 / 2 = 1.9 s. Legs over the via: 0.32 rad
+    # never reach the speed (v^2 / a = 0.5): 2 sqrt(0.32 / 2) = 0.8 s; 0.5 rad: 0.5 + 0.5 = 1.0 s.
+    config = replace(CONFIG, speed=1.0, acceleration=2.0, settle_s=0.25)
+    home = LOOKING
+    first = home + np.array([1.4, 0.1, -0.2, 0, 0, 0])
+    via = first + np.array([0, 0, 0, 0.32, 0.1, 0])
+    second = via + np.array([0, 0, 0, 0, -0.5, 0.5])
+    plan = plan_of(np.stack([first, second]), config=config, home=home, vias=[(1, via[None])])
+    m = plan_metrics(plan)
+    assert m["seconds"] == pytest.approx(1.9 + 0.8 + 1.0)
+    assert m["seconds_settling"] == pytest.approx(0.5)
+    assert m["seconds_total"] == pytest.approx(4.2)
+    assert m["travel_leading_rad"] == pytest.approx(1.4 + 0.32 + 0.5)
+    assert m["travel_total_rad"] == pytest.approx(1.7 + 0.42 + 1.0)
+    assert m["largest_step_rad"] == pytest.approx(1.4)
+    assert m["moves_with_vias"] == 1
+    assert m["turn_base_deg"] == pytest.approx(np.degrees(1.4))
+    assert m["turn_wrist_1_deg"] == pytest.approx(np.degrees(0.32))
+    corners = np.stack([home, first, via, second])
+    margin = np.minimum(corners - UR5.limits.lower, UR5.limits.upper - corners).min()
+    assert m["limit_margin_deg"] == pytest.approx(np.degrees(margin))
+
+
+def test_the_tour_s_clock_is_at_every_view_when_it_says_so() -> None:
+    config = replace(CONFIG, settle_s=0.25)
+    plan = plan_of(many(12), config=config, vias=[(4, many(2, seed=8)), (11, many(1, seed=9))])
+    tour = TourTime.of(plan)
+    assert tour.joints_at(tour.view_s) == pytest.approx(plan.joints, abs=1e-12)
+    assert tour.joints_at(tour.view_s + 0.2) == pytest.approx(plan.joints, abs=1e-12)
+    assert tour.joints_at(0.0) == pytest.approx(plan.home)
+    assert tour.joints_at(tour.total_s + 9.0) == pytest.approx(plan.joints[-1])
+    t = np.linspace(0.0, tour.total_s, 60_001)
+    q, speed = tour.joints_at(t), tour.speeds_at(t)
+    assert np.abs(speed).max() <= config.speed + 1e-12
+    step = t[1] - t[0]
+    assert np.abs(np.diff(speed, axis=0)).max() <= config.acceleration * step + 1e-9
+    # Speed is the derivative of place.
+    middle = (speed[1:] + speed[:-1]) / 2
+    assert np.diff(q, axis=0) / step == pytest.approx(middle, abs=config.acceleration * step)
+    # Samples are on the way when they say so, and no farther apart than asked.
+    s = tour.samples(0.05)
+    assert tour.joints_at(s.time_s) == pytest.approx(s.joints, abs=1e-6)
+    same = np.diff(s.leg) == 0
+    assert np.abs(np.diff(s.joints, axis=0))[same].max() <= 0.05 + 1e-12
+    assert np.all(np.diff(s.time_s) >= -1e-9)
+
+
+def test_a_view_from_each_end_of_an_octahedron_leaves_the_middles_of_its_faces() -> None:
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    assert hole_deg(axes, (1.0, 89.0)) == pytest.approx(np.degrees(np.arccos(1 / np.sqrt(3))))
+
+
+def test_a_single_view_from_above_leaves_the_whole_cap() -> None:
+    assert hole_deg(np.array([[0.0, 0.0, 1.0]]), (20.0, 90.0)) == pytest.approx(70.0)
+    # Two opposite views: the farthest place is on the rim, a quarter turn from both.
+    pair = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    assert hole_deg(pair, (5.0, 60.0)) == pytest.approx(90.0)
+
+
+def test_an_ideal_spiral_of_256_has_the_hole_that_is_known() -> None:
+    ideal = golden_cap(256, (15.0, 90.0))
+    # Evenly spread samples find 6.40 (4 000 of them), 7.27 (40 000), 7.59 deg (400 000).
+    assert hole_deg(ideal, (15.0, 90.0)) == pytest.approx(7.70, abs=0.01)
+    spacing = view_quality.spacing_deg(ideal)
+    assert 6.5 < spacing.min() <= np.median(spacing) < 7.6
+
+
+def test_depth_noise_is_that_of_the_formula() -> None:
+    # z^2 s / (f B) = 0.35^2 * 0.08 / (646 * 0.018)
+    assert D405.depth_noise(0.35) == pytest.approx(0.000843, abs=1e-6)
+    assert D405.depth_noise(0.20) == pytest.approx(0.000275, abs=1e-6)
+
+
+def looking_down(height_m: float, box_m: float = 0.1) -> CapturePlan:
+    """One view straight from above onto the middle of a flat box."""
+    q = LOOKING
+    camera = plan_of(q[None]).Ts_base_cam[0]
+    # The mount is turned so that the optical axis is exactly down.
+    down = se3.look_at(camera[:3, 3], camera[:3, 3] - [0.0, 0.0, 1.0], 0.0)
+    mount = replace(d405_mount(), T_ee_cam=se3.invert(UR5.forward(q)) @ down)
+    x, y, z = down[:3, 3].tolist()
+    h = box_m / 2
+    keep_out = Box(lower=(x - h, y - h, z - height_m), upper=(x + h, y + h, z - height_m + 1e-6))
+    table = Box(lower=(-1.0, -1.0, -np.inf), upper=(1.0, 1.0, z - height_m))
+    cell = WorkCell(table=table, keep_out=keep_out)
+    return plan_of(q[None], mount=mount, cell=cell, center=np.array([x, y, z - height_m]))
+
+
+def test_what_is_in_the_image_follows_from_the_focal_length() -> None:
+    # 1280 x 720 px at f = 1000 px and 1 m depth show 1.28 m x 0.72 m.
+    camera = CameraIntrinsics(width=1280, height=720, fx=1000, fy=1000, cx=639.5, cy=359.5)
+    sensor = replace(D405, intrinsics=camera)
+    m = plan_metrics(looking_down(0.4, box_m=0.28), sensor=sensor)
+    assert m["in_view_min"] == 1.0
+    assert m["nearest_depth_m"] == pytest.approx(0.4, abs=1e-5)
+    assert m["depth_noise_max_m"] == pytest.approx(float(D405.depth_noise(0.4)), rel=1e-4)
+    # The image shows 0.512 m x 0.288 m there. Of a box of 0.576 m, eight cells of 0.072 m each way,
+    # the middles of all are within its width and those of four within its height.
+    m = plan_metrics(looking_down(0.4, box_m=0.576), sensor=sensor)
+    assert m["in_view_min"] == pytest.approx(8 / 8 * 4 / 8)
+    assert m["seen_by_min"] == 0.0
+    assert m["seen_from_min_deg"] == 0.0
+    assert "overlap_min" not in m and "spacing_min_deg" not in m
+
+
+def test_a_place_between_two_cameras_is_seen_from_the_angle_between_them() -> None:
+    plan = plan_of(np.stack([LOOKING, turned_base(0.6)]))
+    at = plan.Ts_base_cam[:, :3, 3]
+    point = at.mean(axis=0) - [0.0, 0.0, 0.3]
+    rays = at - point
+    cosine = rays[0] @ rays[1] / np.prod(np.linalg.norm(rays, axis=1))
+    visible = np.array([[True, True, False], [True, False, False]])
+    spread = view_quality.direction_spread_deg(plan, np.tile(point, (3, 1)), visible)
+    assert spread == pytest.approx([np.degrees(np.arccos(cosine)), 0.0, 0.0], abs=1e-5)
+
+
+def test_manipulability_is_the_determinant_of_the_jacobian() -> None:
+    q = many(5)
+    m = plan_metrics(plan_of(q))
+    assert m["yoshikawa_min"] == pytest.approx(np.abs(np.linalg.det(UR5.jacobian(q))).min())
+    assert m["sigma_min"] == pytest.approx(UR5.sigma_min(q).min())
+
+
+def test_a_move_through_the_table_is_counted_and_its_depth_told() -> None:
+    q = np.stack([LOOKING, turned_base(0.5)])
+    dive = (LOOKING - 0.9 * np.eye(6)[1])[None]
+    plan = plan_of(q, vias=[(1, dive)])
+    m = plan_metrics(plan)
+    assert m["colliding_legs"] >= 1
+    assert m["clearance_moves_table_m"] < min(m["clearance_table_m"], plan.config.clearance_m)
+    straight = plan_metrics(plan_of(q))
+    assert straight["colliding_legs"] == 0
+    assert m["clearance_table_m"] == pytest.approx(straight["clearance_table_m"])
+
+
+def test_rolls_tilts_and_distances_of_a_board_by_hand() -> None:
+    plan = looking_down(0.3)
+    # The last wrist joint turns the camera about the flange; here only about its optical axis.
+    rolls = np.radians([0.0, 90.0, 200.0])
+    T_ee_cam = plan.mount.T_ee_cam
+    views = [plan.Ts_base_cam[0] @ se3.exp(np.array([0, 0, r, 0, 0, 0])) for r in rolls]
+    joints = np.concatenate(
+        [UR5.inverse_branches((T @ se3.invert(T_ee_cam))[None])[0][:1] for T in views]
+    )
+    board = replace(plan, kind="calibration", joints=joints)
+    m = plan_metrics(board)
+    assert m["roll_gap_deg"] == pytest.approx(160.0, abs=1e-5)
+    assert m["tilt_max_deg"] == pytest.approx(0.0, abs=1e-4)
+    assert m["distance_min_m"] == pytest.approx(0.3, abs=1e-6)
+    tipped = plan_metrics(board, board_normal=(0.0, np.sin(0.3), np.cos(0.3)))
+    assert tipped["tilt_min_deg"] == pytest.approx(np.degrees(0.3), abs=1e-4)
+    # The optical axis meets the board at the centre, however the board is tipped.
+    assert tipped["distance_max_m"] == pytest.approx(0.3, abs=1e-6)
+    assert "hole_deg" not in m
+    with pytest.raises(InputError, match="normal"):
+        plan_metrics(board, board_normal=(0.0, 0.0, 0.0))
+
+
+# --- the table of meanings --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["hemisphere", "calibration", "imported"])
+def test_every_metric_has_a_meaning_and_a_finite_value(kind: str) -> None:
+    m = plan_metrics(plan_of(many(6), kind=kind))
+    assert set(m) <= set(METRIC_MEANINGS)
+    assert all(isinstance(v, float) and np.isfinite(v) for v in m.values())
+    for meaning in METRIC_MEANINGS.values():
+        assert meaning.text and meaning.good
+
+
+def test_what_making_a_plan_adds_has_a_meaning_too() -> None:
+    rng = np.random.default_rng(0)
+    board = np.array([0.375, 0.0, 0.0])
+    made = calibration_plan(6, board, d405_mount(), PlanConfig(), rng)
+    assert set(made.metrics) <= set(METRIC_MEANINGS)
+    assert plan_metrics(made).items() <= made.metrics.items()
+
+
+def test_an_endless_keep_out_box_is_replaced_by_one_about_the_centre() -> None:
+    endless = Box(lower=(-np.inf,) * 3, upper=(np.inf, np.inf, -0.5))
+    cell = replace(CONFIG.work_cell(CENTER, "hemisphere"), keep_out=endless)
+    box = view_quality.scene_box(plan_of(many(2), cell=cell))
+    assert np.subtract(box.upper, box.lower) == pytest.approx(PlanConfig().keep_out_m)
+    assert np.add(box.upper, box.lower) / 2 == pytest.approx(CENTER)
+
+
+def test_an_unknown_camera_is_refused_by_name() -> None:
+    plan = plan_of(many(2))
+    with pytest.raises(InputError, match=r"'Kinect'.*D405"):
+        view_quality.sensor_of(replace(plan, mount=replace(plan.mount, camera="Kinect")))
+    assert view_quality.sensor_of(plan) is SENSORS["D405"]

@@ -1,0 +1,235 @@
+"""Pictures of plans: what they draw is what the plan says, and they can be read."""
+
+import sys
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realsim.geometry import se3
+from realsim_capture_plans.arms.kinematics import UR5
+from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.collision.shapes import Box, Shape
+from realsim_capture_plans.pictures.arm_chart import arm_chart
+from realsim_capture_plans.pictures.arm_looks import (
+    arm_parts,
+    part_frames,
+    shape_mesh,
+    ur5_looks,
+)
+from realsim_capture_plans.pictures.coverage_chart import coverage_chart
+from realsim_capture_plans.pictures.curves import PlanCurves
+from realsim_capture_plans.pictures.motion_charts import clearance_chart, joints_chart
+from realsim_capture_plans.pictures.plan_pictures import plan_picture, plan_pictures
+from realsim_capture_plans.pictures.quality_charts import board_chart, quality_chart
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+CENTER = np.array([0.40, 0.05, 0.05])
+LOOKING = np.array([0.0, -1.9, -1.6, -1.2, 1.57, 0.0])
+"""The arm bent over the table, the camera looking down."""
+N = 30
+
+
+def make(kind: Any = "hemisphere", n: int = N, config: PlanConfig | None = None) -> CapturePlan:
+    rng = np.random.default_rng(0)
+    config = config or PlanConfig()
+    lamp = Box(lower=(-1.0, -1.0, 0.0), upper=(-0.9, 1.0, 1.0))
+    return CapturePlan(
+        kind=kind,
+        chain=UR5,
+        mount=d405_mount(),
+        cell=config.work_cell(CENTER, kind, (("lamp", lamp),)),
+        home=LOOKING,
+        joints=LOOKING + rng.uniform(-0.35, 0.35, (n, 6)),
+        center_world=CENTER,
+        vias=((5, LOOKING + rng.uniform(-0.3, 0.3, (2, 6))),) if n > 5 else (),
+        reference_view=0,
+        config=config,
+    )
+
+
+@pytest.fixture(scope="module")
+def curves() -> PlanCurves:
+    return PlanCurves.of(make())
+
+
+def texts(figure: Any) -> str:
+    from matplotlib.text import Text
+
+    return "\n".join(t.get_text() for t in figure.findobj(Text))
+
+
+# --- the files --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "first"), [("hemisphere", "coverage"), ("calibration", "board")])
+def test_a_handful_of_pictures_is_written_and_nothing_else(
+    kind: str, first: str, tmp_path: Path
+) -> None:
+    from PIL import Image
+
+    pyplot: Any = sys.modules.get("matplotlib.pyplot")
+    before = pyplot.get_fignums() if pyplot else []
+    paths = plan_pictures(make(kind, n=8), tmp_path / "pictures")
+    names = [first, "arm", "joints", "clearance", "views"]
+    assert [p.stem for p in paths] == names
+    assert sorted(p.name for p in (tmp_path / "pictures").iterdir()) == sorted(
+        f"{name}.png" for name in names
+    )
+    for path in paths:
+        with Image.open(path) as image:
+            assert min(image.size) > 500
+            assert np.asarray(image.convert("L")).std() > 10  # something is drawn
+    pyplot = sys.modules.get("matplotlib.pyplot")
+    assert (pyplot.get_fignums() if pyplot else []) == before
+
+
+def test_a_plan_of_one_view_is_drawn_too(tmp_path: Path) -> None:
+    assert len(plan_pictures(make("imported", n=1), tmp_path)) == 5
+    plan_picture(make("calibration", n=1), tmp_path / "plan.png")
+    assert (tmp_path / "plan.png").read_bytes()[:4] == b"\x89PNG"
+
+
+# --- what they show ---------------------------------------------------------------------------
+
+
+def test_the_coverage_map_has_every_view_in_its_place(curves: PlanCurves) -> None:
+    figure = coverage_chart(curves)
+    axes = figure.axes[0]
+    dots = next(c for c in axes.collections if c.get_label() == "view")
+    azimuth, from_top = np.asarray(dots.get_offsets()).T
+    s = np.sin(np.radians(from_top))
+    back = np.stack([s * np.cos(azimuth), s * np.sin(azimuth), np.cos(np.radians(from_top))], -1)
+    assert back == pytest.approx(curves.plan.directions(), abs=1e-9)
+    hole = curves.metrics["hole_deg"]
+    assert f"greatest hole, {hole:.1f}°" in texts(figure)
+    # The cross is where the hole is: that far from every view, to the map's one degree.
+    cross = next(c for c in axes.collections if str(c.get_label()).startswith("greatest"))
+    a, r = np.asarray(cross.get_offsets())[0]
+    at = np.array([np.sin(np.radians(r)) * np.cos(a), np.sin(np.radians(r)) * np.sin(a),
+                   np.cos(np.radians(r))])  # fmt: skip
+    angle = np.degrees(np.arccos(curves.plan.directions() @ at)).min()
+    assert angle == pytest.approx(hole, abs=1.5)
+
+
+def test_the_clearance_picture_names_the_worst_spot_of_every_group(curves: PlanCurves) -> None:
+    shown = texts(clearance_chart(curves))
+    for distance in curves.clearance.values():
+        i = int(np.argmin(distance))
+        named = f"{1000 * distance[i]:.1f} mm on the move to view {curves.samples.move[i]}"
+        assert named in shown or 1000 * distance[i] > 100
+
+
+def test_a_plan_that_does_not_keep_its_clearance_is_said_not_to_be_driven() -> None:
+    plan = make()
+    dive = (LOOKING - 0.9 * np.eye(6)[1])[None]
+    broken = PlanCurves.of(replace(plan, vias=((3, dive),)))
+    shown = texts(clearance_chart(broken))
+    assert "NOT KEPT" in shown and "move to view 3" in shown
+    safe = PlanCurves.of(replace(plan, joints=LOOKING[None] + [[0.3, 0, 0, 0, 0, 0]], vias=()))
+    assert "kept everywhere" in texts(clearance_chart(safe))
+
+
+def test_labels_of_worst_spots_do_not_lie_on_each_other(curves: PlanCurves) -> None:
+    from matplotlib.text import Annotation
+
+    figure = clearance_chart(curves)
+    figure.canvas.draw()
+    boxes = [a.get_bbox_patch().get_window_extent() for a in figure.findobj(Annotation)]
+    assert len(boxes) >= 2
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+
+
+def test_the_joints_picture_draws_the_plan_s_joints(curves: PlanCurves) -> None:
+    figure = joints_chart(curves)
+    for j in range(6):
+        t, q = figure.axes[j].lines[0].get_data()
+        at_views = np.interp(curves.tour.view_s, t, q)
+        assert at_views == pytest.approx(np.degrees(curves.plan.joints[:, j]), abs=1.0)
+    elbow = curves.tour.samples(0.02).joints[:, 2]
+    margin = min((UR5.limits.upper[2] - elbow).min(), (elbow - UR5.limits.lower[2]).min())
+    assert f"margin\n{np.degrees(margin):.0f}°" in texts(figure)
+
+
+def test_histograms_count_every_view_once(curves: PlanCurves) -> None:
+    figure = quality_chart(curves)
+    for axes, count in zip(figure.axes, (N, N, N, N, N, N - 1), strict=True):
+        assert sum(bar.get_height() for bar in axes.patches) == count
+
+
+def test_the_board_picture_shows_rolls_tilts_and_places_in_the_image() -> None:
+    curves = PlanCurves.of(make("calibration", n=12))
+    figure = board_chart(curves)
+    roll, _ = np.asarray(figure.axes[0].collections[0].get_offsets()).T
+    gap = np.diff(np.sort(np.append(roll, roll.min() + 2 * np.pi))).max()
+    assert np.degrees(gap) == pytest.approx(curves.metrics["roll_gap_deg"])
+    assert f"{curves.metrics['roll_gap_deg']:.0f}°" in texts(figure)
+    assert "board's centre" in texts(figure)
+
+
+def test_the_arm_picture_has_the_arm_the_table_and_the_obstacles(curves: PlanCurves) -> None:
+    shown = texts(arm_chart(curves))
+    for word in ("table", "keep-out box", "obstacle", "arm at view 0", "every view's camera"):
+        assert word in shown
+
+
+# --- the bodies that are drawn ----------------------------------------------------------------
+
+
+def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Divergence theorem; positive where the triangles face outward."""
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    return float(np.sum(a * np.cross(b, c)) / 6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "expected"),
+    [
+        ("box", (0.1, 0.2, 0.3), 0.006),
+        ("sphere", (0.1,), 4 / 3 * np.pi * 1e-3),
+        ("cylinder", (0.1, 0.5), np.pi * 0.01 * 0.5),
+        ("capsule", (0.1, 0.5), np.pi * 0.01 * 0.5 + 4 / 3 * np.pi * 1e-3),
+    ],
+)
+def test_a_shape_s_mesh_is_closed_faces_outward_and_has_its_volume(
+    kind: Any, size: tuple[float, ...], expected: float
+) -> None:
+    vertices, faces = shape_mesh(
+        Shape(part="p", frame=0, kind=kind, size_m=size, T_frame_shape=np.eye(4))
+    )
+    assert volume(vertices, faces) == pytest.approx(expected, rel=0.05)
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    there = {tuple(e) for e in edges.tolist()}
+    assert len(there) == len(edges) and all((b, a) in there for a, b in there)
+
+
+def test_a_calibrated_arm_is_drawn_where_its_links_are() -> None:
+    # Deltas of a real controller file: links 2 and 3 have their DH frames 100 m away.
+    delta_d = np.array([5e-4, 11.198, -92.527, 81.328, 0.0, 0.0])
+    plan = replace(make(), chain=replace(UR5, delta_d=delta_d))
+    drawn, nominal = part_frames(plan, plan.joints), UR5.link_frames(plan.joints)
+    assert np.abs(drawn - nominal)[..., :3, 3].max() < 0.005
+
+
+def test_the_arm_s_looks_lie_in_its_collision_shapes() -> None:
+    plan = make()
+    outside, shapes = ur5_looks(plan), arm_parts(plan)
+    if outside is None:
+        pytest.skip("the extra 'looks' is not installed")
+    assert len(outside) == 7
+    for part in outside:
+        body = np.concatenate([s.vertices for s in shapes if s.frame == part.frame])
+        assert np.all(part.vertices.min(axis=0) > body.min(axis=0) - 0.002)
+        assert np.all(part.vertices.max(axis=0) < body.max(axis=0) + 0.002)
+    assert ur5_looks(replace(plan, chain=replace(UR5, name="UR5e"))) is None
+
+
+def test_the_camera_s_body_sits_about_the_camera_s_frame() -> None:
+    plan = make()
+    body = next(p for p in arm_parts(plan) if p.name == "camera")
+    in_camera = se3.transform(se3.invert(plan.mount.T_ee_cam), body.vertices)
+    assert np.all(in_camera.min(axis=0) < 0) and np.all(in_camera.max(axis=0) > 0)
+    assert np.ptp(in_camera, axis=0) == pytest.approx([0.042, 0.042, 0.023])

@@ -1,0 +1,411 @@
+"""The UR driver through the real ur_rtde, against a loopback controller in a process of its own."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.interop import T_from_rotation_vector_pose
+from realsim_capture_plans.arms.kinematics import CHAINS, UR5, UR5E
+from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError
+from realsim_capture_plans.devices.ur import UrArm, controller_gap_m, gap_advice
+from realsim_capture_plans.devices.ur_connection import UrConfig
+from realsim_capture_plans.devices.ur_loopback import LoopbackController
+
+HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
+TCP = [0.01, -0.02, 0.12, 0.1, 0.4, -1.2]
+CONFIG = UrConfig(stall_s=0.5, off_goal_s=0.3, probe_s=0.6)
+SPEEDUP = 15
+
+
+def options(robot: str) -> dict[str, Any]:
+    return {"robot": robot, "speedup": SPEEDUP, "tcp": ",".join(map(str, TCP))}
+
+
+@pytest.fixture(scope="module")
+def e_series() -> Iterator[LoopbackController]:
+    with LoopbackController.start(**options("UR5e")) as controller:
+        yield controller
+
+
+@pytest.fixture(scope="module")
+def cb3() -> Iterator[LoopbackController]:
+    with LoopbackController.start(**options("UR5")) as controller:
+        yield controller
+
+
+@pytest.fixture
+def controller(e_series: LoopbackController) -> LoopbackController:
+    e_series.clear()
+    e_series.place(HOME.tolist())
+    e_series.set_tcp(TCP)
+    return e_series
+
+
+@pytest.fixture
+def arm(controller: LoopbackController) -> Iterator[UrArm]:
+    with UrArm(controller.host, config=CONFIG) as arm:
+        yield arm
+
+
+def goals(n: int, seed: int = 0) -> np.ndarray:
+    return HOME + np.random.default_rng(seed).uniform(-0.8, 0.8, (n, 6))
+
+
+# --- where it is --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("robot", ["UR5", "UR5e"])
+def test_arrives_where_it_is_sent_whatever_the_tool(
+    robot: str, request: pytest.FixtureRequest
+) -> None:
+    controller = request.getfixturevalue("cb3" if robot == "UR5" else "e_series")
+    controller.clear()
+    times = [0.0]
+    with UrArm(controller.host, model=robot, config=CONFIG) as arm:
+        assert arm.name == robot
+        assert arm.description["tool_offset_xyz_rotvec"] == pytest.approx(TCP)
+        assert arm.description["polyscope"].startswith("3.15" if robot == "UR5" else "5.12")
+        assert (arm.description["serial_number"] is None) == (robot == "UR5")
+        for goal in goals(3):
+            arm.move(goal, speed=2.0, acceleration=3.0)
+            state = arm.state()
+            np.testing.assert_allclose(state.joints, goal, atol=1e-12)
+            np.testing.assert_allclose(state.T_base_ee, CHAINS[robot].forward(goal), atol=1e-12)
+            np.testing.assert_allclose(state.T_ee_tcp, T_from_rotation_vector_pose(TCP))
+            times.append(state.time_s)
+    assert np.all(np.diff(times) > 0)
+
+
+def test_flange_times_tool_is_the_pose_that_the_controller_reports(
+    arm: UrArm, controller: LoopbackController
+) -> None:
+    arm.move(goals(1)[0], acceleration=4.0)
+    state = arm.state()
+    reader = import_module("rtde_receive").RTDEReceiveInterface(controller.host, 125.0)
+    T_base_tcp = T_from_rotation_vector_pose(reader.getActualTCPPose())
+    np.testing.assert_allclose(state.T_base_ee @ state.T_ee_tcp, T_base_tcp, atol=1e-12)
+    assert np.linalg.norm(T_base_tcp[:3, 3] - state.T_base_ee[:3, 3]) > 0.1
+
+
+def test_a_move_lasts_as_long_as_its_trapezoid_and_until_the_arm_has_swung_out() -> None:
+    goal = HOME + np.array([0.3, -0.1, 0.2, 0.0, 0.1, 0.15])
+    with (
+        LoopbackController.start(robot="UR5e", speedup=2, swing=0.004) as controller,
+        UrArm(controller.host) as arm,
+    ):
+        before = arm.state().time_s
+        arm.move(goal)
+        seconds = arm.state().time_s - before
+        seen = np.stack([arm.state().joints for _ in range(5)])
+    ideal = 2 * np.sqrt(0.3 / 1.4)
+    assert ideal + 0.2 < seconds < ideal + 3.0  # 0.004 rad at 8 Hz need 0.3 s to fade
+    assert np.ptp(seen, axis=0).max() < 2e-4
+    assert np.abs(seen - goal).max() < 2e-4
+
+
+def test_a_calibrated_controller_is_told_from_the_nominal_arm() -> None:
+    delta = np.array([0.0, 0.003, -0.002, 0.0, 0.0, 0.0])
+    calibrated = replace(UR5E, delta_a=delta)
+    words = ",".join(map(str, delta))
+    with LoopbackController.start(robot="UR5e", speedup=SPEEDUP, delta_a=words) as controller:
+        with UrArm(controller.host) as arm:
+            q = arm.state().joints
+            expected = np.linalg.norm((calibrated.forward(q) - UR5E.forward(q))[:3, 3])
+            assert controller_gap_m(arm, UR5E) == pytest.approx(expected, abs=1e-9)
+            assert arm.description["controller_gap_mm"] == pytest.approx(1e3 * expected, abs=1e-3)
+            assert "calibration.conf" in gap_advice(controller_gap_m(arm, UR5E))
+            assert gap_advice(controller_gap_m(arm, calibrated)) == ""
+        with UrArm(controller.host, chain=calibrated) as arm:
+            assert arm.description["controller_gap_mm"] == 0.0
+
+
+# --- goals that are refused ---------------------------------------------------------------------
+
+
+def test_a_goal_or_a_speed_out_of_limits_is_refused_before_anything_moves(
+    arm: UrArm, controller: LoopbackController
+) -> None:
+    for goal, said in (
+        (HOME + 7.0 * np.eye(6)[0], "outside the limits"),
+        (HOME + 2.0 * np.eye(6)[2], r"joints \[2\]"),
+        (np.degrees(HOME), "degrees"),
+        ([0.0, 0.0, np.nan, 0.0, 0.0, 0.0], "finite"),
+        ([0.0] * 5, "6 finite"),
+    ):
+        with pytest.raises(InputError, match=said):
+            arm.move(goal)
+    for speed, acceleration in ((3.2, 1.4), (0.0, 1.4), (np.nan, 1.4), (1.0, 5.0), (1.0, -1.0)):
+        with pytest.raises(InputError, match="at most"):
+            arm.move(HOME + 0.1, speed=speed, acceleration=acceleration)
+    assert controller.joints() == pytest.approx(HOME.tolist(), abs=0)
+
+
+# --- stops --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("what", "stop", "said"),
+    [
+        ("protective_stop", "protective stop", "unlock the protective stop at the pendant"),
+        ("emergency_stop", "emergency stop", "red button"),
+        ("safeguard_stop", "not ready", "safeguard"),
+        ("power_off", "not ready", "switched off"),
+        ("brakes", "not ready", "brakes"),
+        ("program_stop", "not ready", "program was stopped"),
+        ("pause", "not ready", "paused"),
+        ("stall", "off goal", "no joint turned"),
+    ],
+)
+def test_a_stop_in_mid_move_is_named_within_two_seconds_and_gone_after_recovery(
+    what: str, stop: str, said: str, arm: UrArm, controller: LoopbackController
+) -> None:
+    goal = HOME + 0.8
+    controller.inject(what, at_progress=0.5)
+    began = time.monotonic()
+    with pytest.raises(ArmStoppedError, match=said) as caught:
+        arm.move(goal)
+    assert time.monotonic() - began < 2.0
+    assert caught.value.stop == stop
+    time.sleep(0.1)  # it may still have been braking
+    stands = np.array(controller.joints())
+    assert 0.35 < (stands - HOME).max() < 0.75
+    controller.clear()
+    time.sleep(0.1)
+    np.testing.assert_allclose(controller.joints(), stands)  # clearing moves nothing
+    arm.recover()
+    np.testing.assert_allclose(controller.joints(), stands)
+    arm.move(goal, acceleration=4.0)
+    np.testing.assert_allclose(arm.state().joints, goal, atol=1e-12)
+
+
+@pytest.mark.parametrize("what", ["protective_stop", "emergency_stop", "power_off", "local"])
+def test_recovery_before_the_stop_is_cleared_says_what_to_do(
+    what: str, arm: UrArm, controller: LoopbackController
+) -> None:
+    controller.inject(what)
+    with pytest.raises(ArmStoppedError):
+        arm.move(HOME + 0.1)
+    for _ in range(2):
+        with pytest.raises(ArmStoppedError, match=r"What to do: .* pendant"):
+            arm.recover()
+    assert arm.state().joints == pytest.approx(HOME)  # it can still be read
+    controller.clear()
+    arm.recover()
+    arm.move(HOME + 0.1, acceleration=4.0)
+
+
+def test_a_protective_stop_is_unlocked_only_when_asked(
+    arm: UrArm, controller: LoopbackController
+) -> None:
+    controller.inject("protective_stop")
+    with pytest.raises(ArmStoppedError, match="5 s"):
+        arm.unlock_protective_stop()
+    time.sleep(5.5 / SPEEDUP)
+    with pytest.raises(ArmStoppedError, match="protective stop"):
+        arm.recover()
+    arm.unlock_protective_stop()
+    arm.recover()
+    arm.move(HOME + 0.1, acceleration=4.0)
+
+
+def test_another_thread_can_stop_the_arm(arm: UrArm, controller: LoopbackController) -> None:
+    timer = threading.Timer(0.15, arm.stop)
+    timer.start()
+    with pytest.raises(ArmStoppedError, match=r"stop\(\) was called"):
+        arm.move(HOME + 1.5, speed=0.05)
+    timer.join()
+    first = controller.joints()
+    time.sleep(0.1)
+    assert controller.joints() == first
+    assert 0.01 < first[0] < 1.4
+
+
+def test_ctrl_c_stops_the_arm(arm: UrArm, controller: LoopbackController) -> None:
+    timer = threading.Timer(0.2, lambda: os.kill(os.getpid(), signal.SIGINT))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        arm.move(HOME + 1.5, speed=0.05)
+    first = controller.joints()
+    time.sleep(0.1)
+    assert controller.joints() == first
+    assert 0.01 < first[0] < 1.4
+    arm.move(HOME, acceleration=4.0)  # answers that were cut short confuse nothing
+
+
+# --- connections --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("how", ["drop", "hang"])
+def test_a_lost_connection_is_noticed_and_recovered(
+    how: str, arm: UrArm, controller: LoopbackController
+) -> None:
+    timer = threading.Timer(0.2, controller.inject, [how])
+    timer.start()
+    began = time.monotonic()
+    with pytest.raises(ArmStoppedError) as caught:
+        arm.move(HOME + 1.5, speed=0.05)
+    assert caught.value.stop == "connection lost"
+    assert time.monotonic() - began < 3.5
+    timer.join()
+    with pytest.raises(ArmStoppedError, match=r"refuses|switch it off"):
+        arm.recover()
+    with pytest.raises(ArmStoppedError, match="connection lost"):
+        arm.state()
+    controller.clear()
+    arm.recover()
+    arm.move(HOME, acceleration=4.0)
+
+
+def test_a_controller_that_dies_and_starts_again() -> None:
+    with LoopbackController.start(**options("UR5e")) as controller:
+        with UrArm(controller.host, config=CONFIG) as arm:
+            timer = threading.Timer(0.2, controller.kill)
+            timer.start()
+            with pytest.raises(ArmStoppedError, match="connection lost"):
+                arm.move(HOME + 1.5, speed=0.05)
+            timer.join()
+            with pytest.raises(ArmStoppedError, match="refuses"):
+                arm.recover()
+            controller.restart()
+            arm.recover()
+            arm.move(HOME + 0.1, acceleration=4.0)
+            np.testing.assert_allclose(arm.state().joints, HOME + 0.1, atol=1e-12)
+
+
+def test_the_end_of_ur_rtdes_process_is_a_lost_connection_not_a_crash(arm: UrArm) -> None:
+    (child,) = [int(p) for p in children(os.getpid()) if b"ur_process" in command_line(p)]
+    os.kill(child, signal.SIGKILL)
+    with pytest.raises(ArmStoppedError, match="connection lost"):
+        arm.state()
+    arm.recover()
+    assert arm.state().joints == pytest.approx(HOME)
+
+
+def test_after_a_killed_capture_the_arm_stands_and_the_next_one_goes_on(
+    controller: LoopbackController,
+) -> None:
+    code = (
+        "import sys, numpy as np\n"
+        "from realsim_capture_plans.devices.ur import UrArm\n"
+        "arm = UrArm(sys.argv[1]); print('moving', flush=True)\n"
+        "arm.move(arm.state().joints + 1.5, speed=0.05)\n"
+    )
+    capture = subprocess.Popen(
+        [sys.executable, "-c", code, controller.host], stdout=subprocess.PIPE
+    )
+    assert capture.stdout is not None and capture.stdout.readline() == b"moving\n"
+    time.sleep(0.3)
+    workers = children(capture.pid)
+    capture.kill()
+    capture.wait()
+    end = time.monotonic() + 3.0
+    while any(Path(f"/proc/{p}/cmdline").exists() and command_line(p) for p in workers):
+        assert time.monotonic() < end, "ur_rtde's process outlives its capture"
+        time.sleep(0.02)
+    stands = np.array(controller.joints())
+    assert 0.0 < (stands - HOME).max() < 1.4
+    time.sleep(0.1)
+    np.testing.assert_allclose(controller.joints(), stands)
+    with UrArm(controller.host, config=CONFIG) as arm:
+        arm.move(HOME, acceleration=4.0)
+
+
+def test_a_second_driver_is_refused_and_the_first_one_goes_on(
+    arm: UrArm, controller: LoopbackController
+) -> None:
+    with pytest.raises(ArmStoppedError, match="another program holds") as caught:
+        UrArm(controller.host, config=replace(CONFIG, release_s=0.2))
+    assert caught.value.stop == "not ready"
+    arm.move(HOME + 0.1, acceleration=4.0)
+
+
+def test_a_program_of_somebody_else_is_not_stopped(controller: LoopbackController) -> None:
+    controller.inject("foreign_program")
+    with pytest.raises(ArmStoppedError, match="another program is running"):
+        UrArm(controller.host)
+    dashboard = import_module("dashboard_client").DashboardClient(controller.host)
+    dashboard.connect(2000)
+    assert dashboard.running()
+    dashboard.disconnect()
+
+
+def test_local_control_is_named(controller: LoopbackController) -> None:
+    controller.inject("local")
+    with pytest.raises(ArmStoppedError, match="Remote Control"):
+        UrArm(controller.host)
+
+
+def test_wrong_addresses_are_told_apart(controller: LoopbackController) -> None:
+    with pytest.raises(ArmStoppedError, match=r"refuses.*port 30004") as caught:
+        UrArm("127.77.7.7")
+    assert caught.value.stop == "connection lost"
+    with pytest.raises(ArmStoppedError, match="no host"):
+        UrArm("no-such-robot.invalid")
+    controller.inject("hang")
+    began = time.monotonic()
+    with pytest.raises(ArmStoppedError, match=r"says nothing|not as a UR"):
+        UrArm(controller.host, config=CONFIG)
+    assert time.monotonic() - began < 3.0
+
+
+# --- which robot --------------------------------------------------------------------------------
+
+
+def test_another_model_than_expected_is_named_with_the_distance(
+    controller: LoopbackController, cb3: LoopbackController
+) -> None:
+    gap = 1e3 * np.linalg.norm((UR5.forward(HOME) - UR5E.forward(HOME))[:3, 3])
+    with pytest.raises(InputError, match=f"a UR5 is expected.*UR5e.*{gap:.1f} mm from a UR5's"):
+        UrArm(controller.host, model="UR5")
+    with pytest.raises(InputError, match=f"{gap:.1f} mm from a UR5's"):
+        UrArm(controller.host, chain=UR5)
+    with pytest.raises(InputError, match=r"a UR5e is expected.*says that it is a UR5,"):
+        UrArm(cb3.host, model="UR5e")
+    with pytest.raises(InputError, match="UR9 is not known"):
+        UrArm(controller.host, model="UR9")
+    with pytest.raises(InputError, match="give one"):
+        UrArm(controller.host, model="UR5e", chain=UR5)
+
+
+def test_a_tool_offset_that_changes_is_refused(arm: UrArm, controller: LoopbackController) -> None:
+    before = arm.state()
+    controller.set_tcp([0.0] * 6)
+    with pytest.raises(DeviceError, match=r"TCP.*\[10.00, -20.00, 120.00\] mm"):
+        arm.state()
+    with pytest.raises(DeviceError, match="TCP"):
+        arm.recover()
+    controller.set_tcp(TCP)
+    arm.recover()
+    moved = se3.invert(before.T_base_ee) @ arm.state().T_base_ee
+    np.testing.assert_allclose(moved, np.eye(4), atol=1e-12)
+
+
+def test_software_that_cannot_tell_the_tool_offset_is_refused() -> None:
+    with LoopbackController.start(robot="UR5", polyscope="3.5.4.10845") as controller:
+        with pytest.raises(InputError, match=r"PolyScope 3\.5, which cannot tell its tool offset"):
+            UrArm(controller.host)
+
+
+def children(pid: int) -> list[int]:
+    text = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(word) for word in text.split()]
+
+
+def command_line(pid: int) -> bytes:
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return b""

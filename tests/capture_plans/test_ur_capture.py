@@ -1,0 +1,98 @@
+"""A whole capture with the UR driver: real ur_rtde, loopback controller, the lab's own camera."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.geometry import se3
+from realsim.records import CaptureSession
+from realsim.store import SessionStore
+from realsim_capture_plans.arms.kinematics import UR5
+from realsim_capture_plans.capturing.capture import CaptureJob, capture
+from realsim_capture_plans.capturing.operator import Command, NoOperator
+from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.devices.interfaces import ArmStoppedError
+from realsim_capture_plans.devices.ur import UrArm
+from realsim_capture_plans.devices.ur_loopback import LoopbackController
+from realsim_capture_plans.lab.camera import SimulatedDepthCamera
+from realsim_capture_plans.lab.lab import LabConfig, SimulatedLab
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+VIEWS = 4
+TCP = [0.0, 0.0, 0.12, 0.0, 0.0, 0.5]
+HOME = np.radians([180.0, -90.0, 90.0, -90.0, -90.0, 0.0])
+
+
+def small_plan(center: np.ndarray) -> CapturePlan:
+    """Views on a narrow ring that look down at a point of the table."""
+    config, joints = PlanConfig(), [HOME]
+    for turn in np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False):
+        eye = center + 0.32 * np.array([0.25 * np.cos(turn), 0.25 * np.sin(turn), 1.0])
+        T = se3.look_at(eye, center)
+        candidates = np.concatenate(
+            [
+                UR5.inverse(T @ se3.from_rt(se3.exp_so3([0, 0, a]), np.zeros(3)) @ T_cam_ee())
+                for a in np.linspace(0, 2 * np.pi, 8, endpoint=False)
+            ]
+        )
+        joints.append(candidates[np.argmin(np.abs(candidates - joints[-1]).max(-1))])
+    return CapturePlan(
+        kind="calibration", chain=UR5, mount=d405_mount(),
+        cell=config.work_cell(center, "calibration"), home=HOME, joints=np.stack(joints[1:]),
+        center_world=center, vias=(), reference_view=0, config=config,
+    )  # fmt: skip
+
+
+def T_cam_ee() -> np.ndarray:
+    return se3.invert(d405_mount().T_ee_cam)
+
+
+class PersonAtThePendant(NoOperator):
+    """Clears whatever stopped the arm, then says go."""
+
+    def __init__(self, controller: LoopbackController) -> None:
+        self.controller = controller
+        self.told: list[str] = []
+        self.asked = 0
+
+    def tell(self, text: str, *, trouble: bool = False) -> None:
+        self.told.append(text)
+
+    def ask(self, text: str, choices: Sequence[Command]) -> Command | None:
+        self.asked += 1
+        self.controller.clear()
+        return "go"
+
+
+def test_a_capture_with_a_protective_stop_on_its_way_stores_every_view(tmp_path: Path) -> None:
+    lab = SimulatedLab(LabConfig(width=128, height=72, n_objects=1))
+    lab.place_board()
+    plan = small_plan(lab.scene_center)
+    words = {"tcp": ",".join(map(str, TCP)), "joints": ",".join(map(str, HOME))}
+    with LoopbackController.start(robot="UR5", speedup=10, **words) as controller:
+        with UrArm(controller.host, model="UR5") as arm:
+            camera = SimulatedDepthCamera(lab.config, lab.truth, arm, lambda: lab._on_table)
+            session = CaptureSession(
+                name="ur", intrinsics=camera.intrinsics, views=(), depth_unit_m=1e-4
+            )
+            store = SessionStore.create(
+                tmp_path / "session", session, extra={"plan_hash": plan.content_hash}
+            )
+            controller.inject("protective_stop", at_progress=0.4)
+            with pytest.raises(ArmStoppedError, match="protective stop"):
+                capture(plan, arm, camera, store)  # nobody can be asked
+            controller.clear()
+            arm.recover()
+            person = PersonAtThePendant(controller)
+            controller.inject("emergency_stop", at_progress=0.7)
+            summary = capture(plan, arm, camera, store, job=CaptureJob(operator=person))
+    assert summary.complete and person.asked == 1
+    assert any("emergency stop" in text and "red button" in text for text in person.told)
+    store = SessionStore.open(tmp_path / "session")
+    assert store.completed == set(range(VIEWS))
+    for view in store.session.views:
+        np.testing.assert_allclose(view.joints, plan.joints[view.index], atol=1e-9)
+        np.testing.assert_allclose(view.T_base_ee, plan.Ts_base_ee[view.index], atol=1e-9)
+        assert np.mean(store.depth_m(view.index) > 0) > 0.5

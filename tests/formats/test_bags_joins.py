@@ -1,0 +1,248 @@
+"""Joining what recordings hold: clocks, depth units, joints, tf, depth seen by another camera."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from realsim.errors import InputError, UnitError
+from realsim.formats.bags import clocks, depth_unit, wire
+from realsim.formats.bags.joints import UR_JOINTS, JointTrack, prefixes
+from realsim.formats.bags.reproject import depth_in_colour
+from realsim.formats.bags.tf_tree import T_BASE_BASELINK, TfTree, arm_frames
+from realsim.geometry import se3
+from realsim.geometry.camera import project
+from realsim.interop import quaternion_xyzw_from_R
+from realsim.records import CameraIntrinsics
+from realsim_capture_plans.arms.kinematics import UR5
+
+S = wire.NS_PER_S
+
+# --- clocks ---------------------------------------------------------------------------------------
+
+TIMES = st.lists(st.integers(0, 10**6), min_size=1, max_size=30, unique=True).map(sorted)
+
+
+@given(TIMES, TIMES, st.integers(0, 10**9))
+@settings(max_examples=60, deadline=None)
+def test_pairs_are_one_to_one_symmetric_and_shift_with_the_clock(
+    a: list[int], b: list[int], shift: int
+) -> None:
+    ta, tb = np.array(a), np.array(b)
+    found = clocks.pairs(ta, tb, 1e-4)
+    assert len(set(found[:, 0])) == len(set(found[:, 1])) == len(found)
+    assert np.all(np.abs(ta[found[:, 0]] - tb[found[:, 1]]) <= 1e5)
+    assert np.array_equal(clocks.pairs(ta + shift, tb + shift, 1e-4), found)
+    for i, j in found:  # nobody else is nearer to either
+        assert abs(ta[i] - tb[j]) == np.abs(ta[i] - tb).min() == np.abs(ta - tb[j]).min()
+    same = clocks.pairs(ta, ta, 1e-4)
+    assert np.array_equal(same, np.stack([np.arange(len(ta))] * 2, -1))
+
+
+def test_clocks_apart_are_named_with_both_ranges() -> None:
+    a = np.array([100, 110]) * S
+    with pytest.raises(InputError) as caught:
+        clocks.check_overlap("colour", a, "joints", a + 1000 * S, "header")
+    for part in ("100.000 .. 110.000", "1100.000 .. 1110.000", "+1000.000 s", "clock=receive"):
+        assert part in str(caught.value)
+    clocks.check_overlap("colour", a, "joints", a + 11 * S, "header")  # a second apart: one clock
+
+
+# --- depth unit -----------------------------------------------------------------------------------
+
+
+def test_depth_units() -> None:
+    depth = [np.full((4, 4), 400, np.uint16)]
+    assert depth_unit.unit_of(depth, "t", "16UC1", None, None)[0] == 1e-3
+    assert depth_unit.unit_of(depth, "t", "mono16", None, 2e-4)[0] == 2e-4
+    assert depth_unit.unit_of(depth, "t", "mono16", 5e-4, 2e-4)[0] == 5e-4
+    with pytest.raises(UnitError, match="has no unit"):
+        depth_unit.unit_of(depth, "t", "mono16", None, None)
+    for counts in (30, 50000):
+        with pytest.raises(UnitError, match="depth_unit_m="):
+            depth_unit.unit_of([np.full((4, 4), counts, np.uint16)], "t", "16UC1", None, None)
+    near, far = (np.full((4, 4), z, np.float32) for z in (0.5, 6.0))
+    assert depth_unit.unit_of([near], "t", "32FC1", None, None)[0] == 1e-4
+    assert depth_unit.unit_of([far], "t", "32FC1", None, None)[0] == 1e-3
+    with pytest.raises(UnitError):
+        depth_unit.unit_of([near * 1000], "t", "32FC1", None, None)
+
+
+# --- joints ---------------------------------------------------------------------------------------
+
+
+def track_of(times_s: Any, q: Any, dq: Any = None, prefix: str = "") -> JointTrack:
+    track = JointTrack(prefix)
+    order = [3, 0, 5, 1, 4, 2]
+    names = (*(prefix + UR_JOINTS[i] for i in order), "gripper")
+    for k, t in enumerate(times_s):
+        velocity = np.zeros(0) if dq is None else np.append(dq[k][order], 9.0)
+        position = np.append(q[k][order], 0.04)
+        track.add(wire.JointMessage(0, names, position, velocity), round(t * S))
+    track.finish()
+    return track
+
+
+def test_joints_are_joined_by_name_and_interpolated() -> None:
+    rng = np.random.default_rng(1)
+    a, b = rng.uniform(-3, 3, (2, 6))
+    track = track_of([1.0, 1.1], [a, b], prefix="left_")
+    found = track.at(round(1.025 * S), 0.25)
+    assert found is not None
+    assert np.allclose(found[0], 0.75 * a + 0.25 * b)
+    assert found[1] == pytest.approx(np.abs(b - a).max() / 0.1)
+    assert track.at(round(1.4 * S), 0.25) is None
+    assert track_of([1.0, 2.0], [a, b]).at(round(1.5 * S), 0.25) is None
+    gripper = wire.JointMessage(0, ("gripper",), np.zeros(1), np.zeros(0))
+    assert not track.add(gripper, 5)
+    assert prefixes(["x", *("left_" + n for n in UR_JOINTS), "wrist_1_joint"]) == ["left_"]
+
+
+def test_the_recorded_velocity_tells_standstill_and_zeros_do_not() -> None:
+    times = np.arange(20) * 0.008
+    q = np.outer(times, np.ones(6))  # 1 rad/s
+    at = round(0.08 * S)
+    moving = track_of(times, q).at(at, 0.25)
+    slow = track_of(times, q, np.full((20, 6), 0.003)).at(at, 0.25)
+    unset = track_of(times, q, np.zeros((20, 6))).at(at, 0.25)
+    assert moving is not None and slow is not None and unset is not None
+    assert (moving[1], slow[1], unset[1]) == pytest.approx((1.0, 0.003, 1.0))
+
+
+def test_degrees_are_refused() -> None:
+    with pytest.raises(InputError, match="degrees"):
+        track_of([0, 1], np.full((2, 6), 90.0)).check_radians("/joint_states")
+
+
+# --- tf -------------------------------------------------------------------------------------------
+
+
+def send(tree: TfTree, parent: str, child: str, T: Any, time_s: float, static: bool) -> None:
+    numbers = (*T[:3, 3], *quaternion_xyzw_from_R(T[:3, :3]))
+    tree.add(wire.TransformMessage(0, parent, child, numbers), round(time_s * S), static)
+
+
+def test_chains_are_composed_and_edges_follow_their_twist() -> None:
+    rng = np.random.default_rng(2)
+    T_ab, T_cb, T_dc = se3.random_transform(rng, 3)
+    xi = rng.normal(0, 0.3, 6)
+    tree = TfTree()
+    send(tree, "b", "a", se3.invert(T_ab), 0, True)
+    send(tree, "b", "c", se3.invert(T_cb), 1.0, False)
+    send(tree, "b", "c", se3.invert(T_cb) @ se3.exp(xi), 1.1, False)
+    send(tree, "c", "d", se3.invert(T_dc), 0, True)
+    tree.finish()
+    found = tree.lookup("a", "d", round(1.03 * S), 0.25)
+    expected = T_ab @ se3.invert(T_cb) @ se3.exp(0.3 * xi) @ se3.invert(T_dc)
+    assert found is not None
+    assert np.allclose(found, expected, atol=1e-12)
+    back = tree.lookup("d", "a", round(1.03 * S), 0.25)
+    assert back is not None
+    assert np.allclose(back @ found, np.eye(4), atol=1e-12)
+    assert tree.lookup("a", "d", 2 * S, 0.25) is None
+    assert tree.lookup("a", "nowhere", S, 0.25) is None
+    assert tree.times_ns("a", "d").tolist() == [S, round(1.1 * S)]
+
+
+def ur_tree(base: str, tool: str, T: Any, link: str | None = "wrist_3_link") -> TfTree:
+    tree = TfTree()
+    send(tree, base, link or "link6", T, 1.0, False)
+    send(tree, link or "link6", tool, np.eye(4), 0.0, True)
+    tree.finish()
+    return tree
+
+
+def test_base_link_of_a_ur_is_turned_into_the_controllers_base() -> None:
+    T = UR5.forward(np.array([0.3, -1.2, 1.5, -1.0, -1.5, 0.2]))
+    tree = ur_tree("base_link", "tool0", se3.invert(T_BASE_BASELINK) @ T)
+    found = arm_frames(tree, None, None, False)
+    assert found is not None
+    base, ee, turn, notes = found
+    pose = tree.lookup(base, ee, S, 0.25)
+    assert pose is not None
+    assert np.allclose(turn @ pose, T, atol=1e-12)
+    assert "180 deg" in notes[0]
+    other = arm_frames(ur_tree("base_link", "tool0", T, link=None), None, None, False)
+    assert other is not None
+    assert np.array_equal(other[2], np.eye(4))  # not known to be a UR: as it is
+
+
+def test_arm_frames_are_named_when_not_there_or_not_one() -> None:
+    tree = ur_tree("base", "tool0", np.eye(4))
+    send(tree, "elsewhere", "marker", np.eye(4), 0, True)
+    assert arm_frames(tree, None, None, False) is not None
+    with pytest.raises(InputError, match="no frame 'flange'"):
+        arm_frames(tree, None, "flange", False)
+    send(tree, "tool0", "gripper_base", np.eye(4), 0, True)
+    tree.finish()
+    found = arm_frames(tree, None, None, False)
+    assert found is not None
+    assert found[:2] == ("base", "tool0")  # the gripper's base is not the arm's
+    with pytest.raises(InputError, match="does not join"):
+        arm_frames(tree, "elsewhere", None, False)
+    send(tree, "right_base", "right_tool0", np.eye(4), 0, True)
+    tree.finish()
+    with pytest.raises(InputError, match="several arms"):
+        arm_frames(tree, None, None, False)
+    found = arm_frames(tree, None, "right_tool0", False)
+    assert found is not None
+    assert found[:2] == ("right_base", "right_tool0")
+    assert arm_frames(TfTree(), None, None, False) is None
+
+
+# --- reprojection ---------------------------------------------------------------------------------
+
+CAMERA = CameraIntrinsics(width=80, height=60, fx=70, fy=71, cx=39.2, cy=30.1)
+
+
+def test_equal_cameras_give_the_image_back() -> None:
+    rng = np.random.default_rng(3)
+    counts = rng.integers(0, 60000, (60, 80), dtype=np.uint16)
+    assert np.array_equal(depth_in_colour(counts, CAMERA, CAMERA, np.eye(4), 1e-4), counts)
+
+
+@pytest.mark.parametrize("roll", [0.0, 0.3])
+@pytest.mark.parametrize("zoom", [0.5, 1.0, 1.7])
+def test_a_plane_stays_a_plane_without_holes(zoom: float, roll: float) -> None:
+    normal, distance = np.array([0.2, -0.1, 1.0]), 0.6
+    rays = np.stack(np.meshgrid((np.arange(80) - CAMERA.cx) / CAMERA.fx,
+                                (np.arange(60) - CAMERA.cy) / CAMERA.fy), -1)  # fmt: skip
+    z = distance / (rays @ normal[:2] + normal[2])
+    counts = np.rint(z / 1e-4).astype(np.uint16)
+    R = se3.exp_so3(np.array([0.02, -0.03, roll]))
+    T = se3.from_rt(R, np.array([0.02, -0.01, 0.015]))
+    colour = CameraIntrinsics(
+        width=100, height=70, fx=70 * zoom, fy=72 * zoom, cx=50, cy=34,
+        distortion=np.array([0.05, -0.02, 1e-3, -1e-3, 0.0]),
+    )  # fmt: skip
+    found = depth_in_colour(counts, CAMERA, colour, T, 1e-4)
+    from realsim.geometry.camera import ray_table
+
+    n2 = R @ normal
+    d2 = distance + n2 @ T[:3, 3]
+    rays2 = ray_table(colour).astype(np.float64)
+    expected = d2 / (rays2 @ n2)
+    points = rays2 * expected[..., None]
+    back = project(CAMERA, se3.transform(se3.invert(T), points.reshape(-1, 3))).reshape(70, 100, 2)
+    margin = 2.0
+    inside = np.all((back > margin) & (back < [79 - margin, 59 - margin]), -1)
+    assert inside.sum() > 300
+    assert np.all(found[inside] > 0)  # no holes
+    error = found[inside] * 1e-4 - expected[inside]
+    # A sample is at most half a pixel of the coarser camera away from the centre it stands for.
+    slope = sum(np.abs(np.gradient(expected, axis=a)).max() for a in (0, 1))
+    assert np.abs(error).max() < 0.6 * max(zoom, 1.0) * slope + 1e-4
+    outside = ~np.all((back > -margin) & (back < [79 + margin, 59 + margin]), -1)
+    assert not np.any(found[outside])
+
+
+def test_the_nearer_surface_hides_the_farther() -> None:
+    counts = np.full((60, 80), 10000, np.uint16)
+    counts[20:40, 30:50] = 5000
+    T = se3.from_translation([0.05, 0, 0])
+    found = depth_in_colour(counts, CAMERA, CAMERA, T, 1e-4)
+    # 5 cm of baseline: 7 px at 0.5 m, 3.5 px at 1 m.
+    assert np.all(found[22:38, 38:56] == 5000)
+    assert np.all(found[22:38, 5:30] == 10000)

@@ -1,0 +1,293 @@
+"""Messages of recordings: their bytes, pixels and cameras."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from realsim.errors import InputError
+from realsim.formats.bags import camera_info, depth_unit, pixels, wire
+from realsim.geometry.camera import project
+
+ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
+TF = "tf2_msgs/msg/TFMessage"
+ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
+FORMS = ("ros1", "cdr", "cdr big endian")
+S = wire.NS_PER_S
+
+
+def serialised(message: Any, form: str) -> tuple[bytes, bool]:
+    kind = message.__msgtype__
+    if form == "ros1":
+        return bytes(ROS1.serialize_ros1(message, kind)), False
+    little = form == "cdr"
+    return bytes(ROS2.serialize_cdr(message, kind, little_endian=little)), True
+
+
+def header(form: str, stamp_ns: int, frame_id: str) -> Any:
+    t = (ROS1 if form == "ros1" else ROS2).types
+    stamp = t["builtin_interfaces/msg/Time"](stamp_ns // S, stamp_ns % S)
+    return t["std_msgs/msg/Header"](*((7,) if form == "ros1" else ()), stamp, frame_id)
+
+
+# --- bytes ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", FORMS)
+@given(
+    frame=st.text("abc_/é", max_size=9),
+    names=st.lists(st.text("joint_123", max_size=11), max_size=7),
+    stamp=st.integers(0, 2**31 * S - 1),
+)
+@settings(max_examples=30, deadline=None)
+def test_joint_states_are_read_as_the_full_deserialiser_reads_them(
+    form: str, frame: str, names: list[str], stamp: int
+) -> None:
+    t = (ROS1 if form == "ros1" else ROS2).types
+    q = np.linspace(-3, 3, len(names))
+    message = t["sensor_msgs/msg/JointState"](
+        header(form, stamp, frame), names, q, 2 * q, np.zeros(0)
+    )
+    found = wire.joints_of(*serialised(message, form))
+    assert (found.stamp_ns, found.names) == (stamp, tuple(names))
+    assert np.array_equal(found.position, q)
+    assert np.array_equal(found.velocity, 2 * q)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@given(frame=st.text("ab_", max_size=9), encoding=st.sampled_from(["rgb8", "16UC1", "x"]))
+@settings(max_examples=20, deadline=None)
+def test_images_are_views_with_all_their_fields(form: str, frame: str, encoding: str) -> None:
+    t = (ROS1 if form == "ros1" else ROS2).types
+    data = np.arange(24, dtype=np.uint8)
+    raw = t["sensor_msgs/msg/Image"](header(form, 5 * S + 3, frame), 4, 2, encoding, 1, 6, data)
+    content, is_ros2 = serialised(raw, form)
+    found = wire.image_of(content, is_ros2, compressed=False)
+    assert found._replace(pixels=data) == (5 * S + 3, frame, encoding, data, 2, 4, 6, True)
+    assert np.array_equal(found.pixels, data)
+    assert not found.pixels.flags.owndata
+    packed = t["sensor_msgs/msg/CompressedImage"](header(form, 9, frame), "jpeg", data)
+    found = wire.image_of(*serialised(packed, form), compressed=True)
+    assert (found.stamp_ns, found.frame_id, found.encoding) == (9, frame, "jpeg")
+    assert np.array_equal(found.pixels, data)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_transforms_are_read(form: str) -> None:
+    t = (ROS1 if form == "ros1" else ROS2).types
+    stamped = [
+        t["geometry_msgs/msg/TransformStamped"](
+            header(form, S + k, "/base"),
+            f"link{'x' * k}",
+            t["geometry_msgs/msg/Transform"](
+                t["geometry_msgs/msg/Vector3"](1.0 + k, 2.0, 3.0),
+                t["geometry_msgs/msg/Quaternion"](0.0, 0.6, 0.0, 0.8),
+            ),
+        )
+        for k in range(3)
+    ]
+    found = wire.transforms_of(*serialised(t[TF](stamped), form))
+    assert [f.child for f in found] == ["link", "linkx", "linkxx"]
+    assert found[2].parent == "base"  # ROS1's leading slash means nothing
+    assert found[2].numbers == (3.0, 2.0, 3.0, 0.0, 0.6, 0.0, 0.8)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_message_cut_anywhere_is_an_error_of_its_own(form: str) -> None:
+    t = (ROS1 if form == "ros1" else ROS2).types
+    q = np.arange(2.0)
+    joints = t["sensor_msgs/msg/JointState"](header(form, 7, "b"), ["x", "yy"], q, q, np.zeros(0))
+    data = np.arange(24, dtype=np.uint8)
+    image = t["sensor_msgs/msg/Image"](header(form, 7, "b"), 4, 2, "rgb8", 0, 6, data)
+    for message, read in (
+        (joints, wire.joints_of),
+        (image, lambda d, two: wire.image_of(d, two, False)),
+    ):
+        whole, is_ros2 = serialised(message, form)
+        # The last field of a joint state, the empty efforts, is not read.
+        for length in range(4 if is_ros2 else 0, len(whole) - 12):
+            with pytest.raises(wire.MessageError, match="damaged"):
+                read(whole[:length], is_ros2)
+
+
+def test_other_encapsulations_are_refused() -> None:
+    with pytest.raises(InputError, match="plain CDR"):
+        wire.header_of(b"\x00\x07\x00\x00" + bytes(40), True)
+
+
+# --- pixels ---------------------------------------------------------------------------------------
+
+
+def raw_image(image: Any, encoding: str, padding: int = 0, big: bool = False) -> wire.ImageMessage:
+    rows = np.ascontiguousarray(image).reshape(image.shape[0], -1).view(np.uint8)
+    padded = np.concatenate([rows, np.full((len(rows), padding), 99, np.uint8)], 1)
+    return wire.ImageMessage(
+        0, "cam", encoding, padded.ravel(), image.shape[1], image.shape[0], padded.shape[1], big
+    )
+
+
+RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+@pytest.mark.parametrize(
+    ("encoding", "sent"),
+    [
+        ("rgb8", RGB),
+        ("bgr8", RGB[..., ::-1]),
+        ("rgba8", np.dstack([RGB, RGB[..., :1]])),
+        ("bgra8", np.dstack([RGB[..., ::-1], RGB[..., :1]])),
+    ],
+)
+def test_colour_encodings(encoding: str, sent: Any, padding: int) -> None:
+    found = pixels.rgb_of(raw_image(sent, encoding, padding), False, "x")
+    assert np.array_equal(found, RGB)
+
+
+def test_grey_yuv_and_bayer() -> None:
+    grey = RGB[..., 0]
+    assert np.array_equal(
+        pixels.rgb_of(raw_image(grey, "mono8"), False, "x"), np.dstack([grey] * 3)
+    )
+    # A grey YUV image: Y between the neutral chroma of 128; full range of OpenCV is 16..235.
+    y = np.full((6, 8), 126, np.uint8)
+    neutral = np.full_like(y, 128)
+    for encoding, order in (("yuv422_yuy2", (y, neutral)), ("yuv422", (neutral, y))):
+        found = pixels.rgb_of(raw_image(np.dstack(order), encoding), False, "x")
+        assert found.shape == (6, 8, 3)
+        assert np.all(found == found[0, 0, 0])
+        assert found[0, 0, 0] == pytest.approx(round((126 - 16) * 255 / 219), abs=1)
+    red = np.zeros((8, 8), np.uint8)
+    red[::2, ::2] = 200  # only the red cells of RGGB see light
+    found = pixels.rgb_of(raw_image(red, "bayer_rggb8"), False, "x")
+    assert found[4, 4].tolist() == [200, 0, 0]
+
+
+def test_depth_encodings() -> None:
+    counts = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
+    for order, big in (("<u2", False), (">u2", True)):
+        message = raw_image(counts.astype(order), "16UC1", padding=4, big=big)
+        assert np.array_equal(pixels.depth_of(message, False, "x"), counts)
+    metres = np.array([[0.5, np.nan, np.inf], [0.0, -1.0, 7.0]], np.float32)
+    found = pixels.depth_of(raw_image(metres, "32FC1"), False, "x")
+    assert depth_unit.counts_of(found, 1e-4).tolist() == [[5000, 0, 0], [0, 0, 0]]
+    assert depth_unit.counts_of(found, 1e-3).tolist() == [[500, 0, 0], [0, 0, 7000]]
+
+
+def compressed(data: bytes, encoding: str) -> wire.ImageMessage:
+    return wire.ImageMessage(0, "cam", encoding, np.frombuffer(data, np.uint8))
+
+
+def test_compressed_images() -> None:
+    smooth = cv2.GaussianBlur(np.tile(RGB, (8, 8, 1)), (0, 0), 9)
+    png = cv2.imencode(".png", smooth[..., ::-1])[1].tobytes()
+    assert np.array_equal(pixels.rgb_of(compressed(png, "rgb8; png"), True, "x"), smooth)
+    jpeg = cv2.imencode(".jpg", smooth[..., ::-1])[1].tobytes()
+    found = pixels.rgb_of(compressed(jpeg, "bgr8; jpeg compressed bgr8"), True, "x")
+    assert np.abs(found.astype(int) - smooth).max() < 25
+    assert pixels.kind_of(compressed(jpeg, "jpeg"), True).kind == "colour"
+    counts = np.arange(48, dtype=np.uint16).reshape(6, 8) * 1000
+    png16 = cv2.imencode(".png", counts)[1].tobytes()
+    for message in (
+        compressed(bytes(12) + png16, "16UC1; compressedDepth png"),
+        compressed(png16, "16UC1; png compressed "),
+    ):
+        assert pixels.kind_of(message, True) == ("depth", 8, 6, "16UC1")
+        assert np.array_equal(pixels.depth_of(message, True, "x"), counts)
+
+
+@given(st.floats(0.3, 8.0))
+@settings(max_examples=20, deadline=None)
+def test_inverse_depth_is_undone_within_its_quantisation(z: float) -> None:
+    # As compressed_depth_image_transport quantises: A = q (q + 1), B = 1 - A / z_max.
+    q, z_max = 100.0, 10.0
+    a = q * (q + 1)
+    b = 1 - a / z_max
+    value = np.full((2, 2), round(a / z + b), np.uint16)
+    value[0, 0] = 0
+    head = np.array([0], "<i4").tobytes() + np.array([a, b], "<f4").tobytes()
+    data = head + cv2.imencode(".png", value)[1].tobytes()
+    found = pixels.depth_of(compressed(data, "32FC1; compressedDepth png"), True, "x")
+    assert found[0, 0] == 0
+    assert found[1, 1] == pytest.approx(z, abs=0.6 * z * z / a + 1e-5)
+
+
+def test_damaged_images_are_named() -> None:
+    short = raw_image(RGB, "rgb8")._replace(pixels=RGB.ravel()[:50])
+    with pytest.raises(InputError, match=r"frame 7.*50 bytes"):
+        pixels.rgb_of(short, False, "frame 7")
+    with pytest.raises(InputError, match="cannot be decoded"):
+        pixels.rgb_of(compressed(b"nonsense", "jpeg"), True, "frame 7")
+    with pytest.raises(InputError, match="not a colour one"):
+        pixels.rgb_of(raw_image(RGB, "rgb16"), False, "frame 7")
+
+
+# --- cameras --------------------------------------------------------------------------------------
+
+
+def info(**changes: Any) -> Any:
+    values: dict[str, Any] = dict(
+        width=64, height=48, distortion_model="plumb_bob", d=np.zeros(5),
+        k=np.array([50.0, 0, 31, 0, 52, 23, 0, 0, 1]), p=np.zeros(12), binning_x=0, binning_y=0,
+        roi=SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0),
+    )  # fmt: skip
+    return SimpleNamespace(**{**values, **changes})
+
+
+def test_distortion_models() -> None:
+    d = np.array([0.1, -0.2, 1e-3, 2e-3, 0.05])
+    assert camera_info.camera_of(info(d=d), "t", 64, 48, False).distortion[:5].tolist() == list(d)
+    d8 = np.arange(8) * 0.01
+    rational = info(d=d8, distortion_model="rational_polynomial")
+    assert camera_info.camera_of(rational, "t", 64, 48, False).distortion.tolist() == list(d8)
+    for model in ("equidistant", "Inverse Brown Conrady", ""):
+        with pytest.raises(InputError, match="plumb_bob"):
+            camera_info.camera_of(info(d=d, distortion_model=model), "t", 64, 48, False)
+        camera_info.camera_of(info(distortion_model=model), "t", 64, 48, False)  # all zero
+
+
+def test_rectified_images_have_p_and_no_distortion() -> None:
+    p = np.array([40.0, 0, 30, 0, 0, 41, 22, 0, 0, 0, 1, 0])
+    message = info(d=np.full(5, 0.1), p=p)
+    rectified = camera_info.camera_of(message, "t", 64, 48, True)
+    assert (rectified.fx, rectified.fy, rectified.cx, rectified.cy) == (40, 41, 30, 22)
+    assert not rectified.is_distorted
+    assert camera_info.camera_of(message, "t", 64, 48, False).fx == 50
+    assert camera_info.is_rectified("/cam/image_rect_color/compressed")
+    assert not camera_info.is_rectified("/rectified_cam/image_raw")
+
+
+def test_a_binned_region_sees_the_same_directions() -> None:
+    roi = SimpleNamespace(x_offset=8, y_offset=4, width=32, height=24)
+    part = camera_info.camera_of(info(roi=roi, binning_x=2, binning_y=2), "t", 16, 12, False)
+    whole = camera_info.camera_of(info(), "t", 64, 48, False)
+    point = np.array([0.1, -0.05, 1.0])
+    full, binned = project(whole, point), project(part, point)
+    # The binned pixel (0, 0) covers full pixels 8..9 and 4..5, so its centre is (8.5, 4.5).
+    assert np.allclose(full, [8.5, 4.5] + 2 * binned)
+
+
+def test_uncalibrated_and_wrong_size_are_refused() -> None:
+    with pytest.raises(InputError, match="no calibration"):
+        camera_info.camera_of(info(k=np.zeros(9)), "t", 64, 48, False)
+    with pytest.raises(InputError, match="64x48, but they are 32x24"):
+        camera_info.camera_of(info(), "t", 32, 24, False)
+
+
+@pytest.mark.parametrize(
+    ("image", "expected"),
+    [
+        ("/cam/color/image_raw", "/cam/color/camera_info"),
+        ("/cam/color/image_raw/compressed", "/cam/color/camera_info"),
+        ("/device_0/sensor_1/Color_0/image/data", "/device_0/sensor_1/Color_0/info/camera_info"),
+        ("/other/image", None),
+    ],
+)
+def test_camera_info_is_found_by_name(image: str, expected: str | None) -> None:
+    there = ["/cam/color/camera_info", "/device_0/sensor_1/Color_0/info/camera_info"]
+    assert camera_info.info_topic(image, there) == expected

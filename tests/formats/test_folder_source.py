@@ -1,0 +1,356 @@
+"""A folder of images: what belongs together is joined by name, whatever the order and the gaps."""
+
+import os
+import random
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from realsim.errors import InputError, UnitError
+from realsim.formats.folders import (
+    FolderChoice,
+    FrameState,
+    list_folder,
+    open_folder,
+    read_cam_info,
+)
+from realsim.formats.folders.depth_evidence import coding_of, decoded, depth_evidence, read_counts
+from realsim.formats.folders.joining import frame_key, join_names, join_states
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics
+
+DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+APC = DATA / "scenes/apc_shelf_multiview/scene-0000"
+RTDE = DATA / "handeye/rtde_ur5e/Hand-Eye-Data"
+CAMERA = CameraIntrinsics(width=40, height=30, fx=35, fy=35, cx=20, cy=15)
+MM = FolderChoice(depth_unit_m=0.001)
+
+
+def rgb_of(number: int, size=(30, 40)) -> np.ndarray:
+    return np.random.default_rng(number).integers(0, 256, (*size, 3), dtype=np.uint8)
+
+
+def depth_of(number: int, size=(30, 40)) -> np.ndarray:
+    return np.random.default_rng(number).integers(400, 900, size).astype(np.uint16)
+
+
+def write(folder: Path, name: str, image: np.ndarray) -> Path:
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image[..., ::-1] if image.ndim == 3 else image)
+    return path
+
+
+def make(folder: Path, numbers, colour="rgb_{:04d}.png", depth="depth_{:04d}.png") -> Path:
+    for k in numbers:
+        write(folder, colour.format(k), rgb_of(k))
+        write(folder, depth.format(k), depth_of(k))
+    return folder
+
+
+def number_of(frame) -> int:
+    """Return which frame's pixels these are, and check that all its parts are of that frame."""
+    k = next(k for k in range(40) if np.array_equal(frame.rgb, rgb_of(k)))
+    if frame.depth_counts is not None:
+        assert np.array_equal(frame.depth_counts, depth_of(k))
+    if frame.T_base_ee is not None:
+        assert frame.T_base_ee[0, 3] == k / 100
+    return k
+
+
+def states(numbers, name="{:04d}") -> list[FrameState]:
+    found = []
+    for k in numbers:
+        T = np.eye(4)
+        T[0, 3] = k / 100
+        found.append(FrameState(name=name.format(k) if name else "", where=f"row {k}", T_base_ee=T))
+    return found
+
+
+@pytest.mark.parametrize(
+    ("colour", "depth"),
+    [
+        ("rgb_{:04d}.png", "depth_{:04d}.png"),
+        ("frame-{:06d}.color.png", "frame-{:06d}.depth.png"),
+        ("{}.bmp", "{}.png"),
+        ("rgb/{:03d}.png", "depth/{:05d}.png"),
+        ("color/img7_{}.png", "depth/kinect_{:03d}.png"),
+    ],
+)
+def test_every_frame_gets_its_own_parts(tmp_path, colour, depth):
+    numbers = [0, 1, 2, 9, 10, 11]
+    make(tmp_path, numbers, colour, depth)
+    source = open_folder(tmp_path, CAMERA, [states(numbers)], choice=MM)
+    assert [number_of(f) for f in source.frames()] == numbers
+    assert [f.time_s for f in source.frames(3)] == [3, 4, 5]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_gaps_and_order_do_not_change_what_belongs_together(tmp_path, seed):
+    """Law: whatever files are taken away, each frame that is left is joined as before."""
+    rng = random.Random(seed)
+    numbers = range(12)
+    gone = [set(rng.sample(numbers, 2)) for _ in range(3)]
+    for k in numbers:
+        if k not in gone[0]:
+            write(tmp_path, f"rgb_{k}.png", rgb_of(k))
+        if k not in gone[1]:
+            write(tmp_path, f"depth_{k}.png", depth_of(k))
+    rows = [s for s in states(numbers) if int(s.name) not in gone[2]]
+    rng.shuffle(rows)
+    source = open_folder(tmp_path, CAMERA, [rows], choice=MM)
+    left = sorted(set(numbers) - set.union(*gone))
+    assert [number_of(f) for f in source.frames()] == left
+    said = " ".join(source.notes)
+    assert all(f"rgb_{k}.png (no " in said for k in (gone[1] | gone[2]) - gone[0])
+    assert len(source) == len(left)
+
+
+def test_incomplete_frames_are_named(tmp_path):
+    make(tmp_path, range(5))
+    (tmp_path / "depth_0002.png").unlink()
+    (tmp_path / "rgb_0004.png").unlink()
+    source = open_folder(tmp_path, CAMERA, [states([0, 1, 2])], choice=MM)
+    assert [number_of(f) for f in source.frames()] == [0, 1]
+    said = " ".join(source.notes)
+    assert "rgb_0002.png (no depth image)" in said and "rgb_0003.png (no pose)" in said
+    assert "depth_0004.png" in said
+
+
+def test_numbers_with_other_prefixes_are_never_shifted():
+    left, right = [f"img_{k}" for k in range(5)], [f"kinect_{k}" for k in range(5)]
+    assert join_names(left, right, "a", "b").pairs == {k: k for k in range(5)}
+    gapped = [right[k] for k in (4, 0, 2)]
+    assert join_names(left, gapped, "a", "b").pairs == {0: 1, 2: 2, 4: 0}
+    with pytest.raises(InputError, match=r"differ by -1"):
+        join_names(left, [f"kinect_{k + 1}" for k in range(5)], "a", "b")
+    with pytest.raises(InputError, match="no number is on both"):
+        join_names(left, ["kinect_17", "kinect_19"], "a", "b")
+    with pytest.raises(InputError, match="no single number"):
+        join_names(["12-30-05", "12-31-07"], ["12-30-06", "12-31-08"], "a", "b")
+
+
+def test_rows_without_names_count_only_without_gaps():
+    keys = ["0_10", "0_2", "0_1"] + [f"0_{k}" for k in range(3, 10)]
+    pairs = join_states(keys, states(range(1, 11), name="")).pairs
+    assert [pairs[k] for k in range(3)] == [9, 1, 0]
+    with pytest.raises(InputError, match="not numbered 0 to 8"):
+        join_states(keys[:-1], states(range(10), name="")[:-1])
+    with pytest.raises(InputError, match="names no image"):
+        join_states(keys, [*states([1]), *states([2], name="")])
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("frame-000007.color", "frame_7"),
+        ("rgb_0007", "7"),
+        ("depth0007", "7"),
+        ("Aligned_Depth_7", "7"),
+        ("IMG_0070", "70"),
+        ("0-10", "0_10"),
+    ],
+)
+def test_names_say_which_frame(name, key):
+    assert frame_key(name) == key
+
+
+# --- what is refused --------------------------------------------------------------------------
+
+
+def test_two_images_of_one_name(tmp_path):
+    make(tmp_path, [1])
+    write(tmp_path, "rgb_0001.jpg", rgb_of(1))
+    with pytest.raises(InputError, match=r"rgb_0001\.jpg and rgb_0001\.png are two images"):
+        open_folder(tmp_path, CAMERA, choice=MM)
+
+
+def test_several_sizes(tmp_path):
+    make(tmp_path, range(3))
+    write(tmp_path, "rgb_0001.png", rgb_of(1, (60, 80)))
+    with pytest.raises(InputError, match=r"rgb_0001\.png is 80x60"):
+        open_folder(tmp_path, CAMERA, choice=MM)
+
+
+def test_no_camera_and_another_camera(tmp_path):
+    make(tmp_path, range(2))
+    with pytest.raises(InputError, match=r"camera of the images \(40x30 px\) is not known"):
+        open_folder(tmp_path, None, choice=MM)
+    other = CameraIntrinsics(width=80, height=60, fx=70, fy=70, cx=40, cy=30)
+    with pytest.raises(InputError, match=r"80x60 px, the images are 40x30"):
+        open_folder(tmp_path, other, choice=MM)
+
+
+def test_empty_missing_file_and_below(tmp_path):
+    with pytest.raises(InputError, match="holds no images"):
+        list_folder(tmp_path)
+    with pytest.raises(InputError, match="does not exist"):
+        list_folder(tmp_path / "nowhere")
+    (tmp_path / "a.txt").write_text("x")
+    with pytest.raises(InputError, match="is a file"):
+        list_folder(tmp_path / "a.txt")
+    write(tmp_path / "scan", "1.png", rgb_of(1))
+    with pytest.raises(InputError, match="There are images in scan"):
+        list_folder(tmp_path)
+
+
+@pytest.mark.parametrize("damage", ["empty", "text", "cut"])
+def test_an_image_that_cannot_be_read_is_named(tmp_path, damage):
+    make(tmp_path, range(3), colour="rgb_{}.jpg", depth="depth_{}.png")
+    path = tmp_path / "rgb_1.jpg"
+    data = path.read_bytes()
+    path.write_bytes({"empty": b"", "text": b"hello", "cut": data[: len(data) // 2]}[damage])
+    with pytest.raises(InputError, match=r"rgb_1\.jpg is (not an image|truncated)"):
+        open_folder(tmp_path, CAMERA, choice=MM)
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg"])
+def test_an_image_marked_to_be_shown_turned_is_refused(tmp_path, ending):
+    make(tmp_path, range(2))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    (tmp_path / "rgb_0001.png").unlink()
+    Image.fromarray(rgb_of(1)).save(tmp_path / f"rgb_0001.{ending}", exif=exif)
+    with pytest.raises(InputError, match=rf"rgb_0001\.{ending} is marked to be shown turned"):
+        open_folder(tmp_path, CAMERA, choice=MM)
+
+
+def test_a_picture_of_the_depth_is_no_depth(tmp_path):
+    make(tmp_path, range(2))
+    write(tmp_path, "depth_0001.png", rgb_of(1))
+    with pytest.raises(InputError, match=r"depth_0001\.png has 8 bits"):
+        open_folder(tmp_path, CAMERA, choice=MM)
+
+
+def test_several_folders_of_colour(tmp_path):
+    write(tmp_path, "rgb/1.png", rgb_of(1))
+    write(tmp_path, "images/1.png", rgb_of(1))
+    with pytest.raises(InputError, match=r"images, rgb.*--images"):
+        list_folder(tmp_path)
+    assert len(list_folder(tmp_path, colour="rgb").colour) == 1
+
+
+def test_depth_on_other_pixels_needs_a_decision(tmp_path):
+    for k in range(3):
+        write(tmp_path, f"{k}.jpg", rgb_of(k))
+        write(tmp_path, f"{k}.png", depth_of(k, (24, 32)))
+    with pytest.raises(InputError, match=r"32x24 px, the colour images 40x30.*--no-depth"):
+        open_folder(tmp_path, CAMERA, choice=MM)
+    source = open_folder(tmp_path, CAMERA, choice=FolderChoice(use_depth=False))
+    assert source.depth_unit_m is None and len(source) == 3
+    assert all(f.depth_counts is None for f in source.frames())
+
+
+def test_the_depth_unit_is_asked_for_with_evidence(tmp_path):
+    make(tmp_path, range(3))
+    with pytest.raises(InputError, match=r"0\.65\d? m with 0\.001.*0\.06\d+ m with 0\.0001"):
+        open_folder(tmp_path, CAMERA)
+    with pytest.raises(UnitError, match=r"median depth is 0\.0065"):
+        open_folder(tmp_path, CAMERA, choice=FolderChoice(depth_unit_m=1e-5))
+
+
+# --- depth whose bits were turned -------------------------------------------------------------
+
+
+def turned(depth: np.ndarray) -> np.ndarray:
+    return ((depth << 3) | (depth >> 13)).astype(np.uint16)
+
+
+def test_turning_bits_is_undone_for_every_count():
+    every = np.arange(2**16, dtype=np.uint16)
+    assert np.array_equal(decoded(turned(every), "apc"), every)
+    assert np.array_equal(decoded(every, "plain"), every)
+
+
+def test_turned_bits_are_recognised_and_plain_ones_left(tmp_path):
+    y, x = np.mgrid[:30, :40]
+    near = (5000 + 100 * y + 30 * x).astype(np.uint16)  # 0.5 to 0.9 m, partly beyond 8192 counts
+    plain = [write(tmp_path, "p.png", near)]
+    apc = [write(tmp_path, "a.png", turned(near))]
+    assert coding_of(depth_evidence(plain), "auto", "x")[0] == "plain"
+    coding, why = coding_of(depth_evidence(apc), "auto", "x")
+    assert coding == "apc" and "steps" in why
+    assert np.array_equal(decoded(read_counts(apc[0]), coding), near)
+
+
+def test_counts_in_steps_of_eight_are_ambiguous(tmp_path):
+    flat = np.full((30, 40), 4800, dtype=np.uint16)
+    evidence = depth_evidence([write(tmp_path, "d.png", flat)])
+    with pytest.raises(InputError, match=r"4800 or of 600 counts.*--depth-coding"):
+        coding_of(evidence, "auto", "folder")
+    assert coding_of(evidence, "plain", "folder")[0] == "plain"
+    assert coding_of(evidence, "apc", "folder")[0] == "apc"
+
+
+# --- cam.info.txt -----------------------------------------------------------------------------
+
+
+def cam_info(folder: Path, scale: float = 1.0) -> Path:
+    T = se3.look_at([0.5, 0.1, 0.4], [0, 0, 0])
+    T[:3, 3] *= scale
+    rows = "\n".join("\t".join(f"{x:.12e}" for x in row) for row in T)
+    path = folder / "cam.info.txt"
+    path.write_text(
+        "# Environment: shelf\n\n# Color camera intrinsic matrix\n35 0 20\n0 35 15\n0 0 1\n\n"
+        f"# Camera-to-world extrinsic matrix (camera pose) for frame-000003\n{rows}\n"
+    )
+    return path
+
+
+def test_cam_info_poses_are_read_as_written(tmp_path):
+    info = read_cam_info(cam_info(tmp_path))
+    T = info.states[0].T_world_cam
+    assert info.states[0].name == "frame-000003" and T is not None
+    np.testing.assert_allclose(T, se3.look_at([0.5, 0.1, 0.4], [0, 0, 0]), atol=1e-9)
+    with pytest.raises(UnitError, match="millimetres"):
+        read_cam_info(cam_info(tmp_path, 1000.0))
+
+
+@pytest.mark.skipif(not APC.is_dir(), reason=f"no shelf scan at {APC}")
+def test_real_scan_with_turned_bits():
+    info = read_cam_info(APC / "cam.info.txt")
+    camera = CameraIntrinsics.from_K(info.K, 640, 480)
+    with pytest.raises(InputError, match=r"0\.5\d\d m with 0\.0001"):
+        open_folder(APC, camera, [info.states])
+    choice = FolderChoice(depth_unit_m=1e-4)
+    source = open_folder(APC, camera, [info.states], choice=choice)
+    assert len(source) == 15 and any("turned" in n for n in source.notes)
+    frame = next(source.frames(7))
+    assert frame.name == "frame-000007.color.png"
+    # An independent reading: the sensor's own depth, brought over by the file's own extrinsics.
+    assert _error_of_aligned_depth(frame.depth_counts, info.K) < 0.008
+
+
+def _error_of_aligned_depth(counts: np.ndarray, K: np.ndarray) -> float:
+    """Return the median difference [m] from raw/ projected into the colour camera."""
+    lines = (APC / "cam.info.txt").read_text().split("#")
+
+    def matrix(title: str, n: int) -> np.ndarray:
+        text = next(t for t in lines if title in t).split("\n", 1)[1]
+        return np.array([float(w) for w in text.split()]).reshape(n, n)
+
+    Kd, T = matrix("Depth camera intrinsic", 3), matrix("Depth-to-color", 4)
+    raw = cv2.imread(str(APC / "raw/frame-000007.depth.png"), cv2.IMREAD_UNCHANGED)
+    z = ((raw >> 3) | (raw << 13)).astype(np.uint16) * 1e-4
+    v, u = np.nonzero(z)
+    rays = np.linalg.inv(Kd) @ np.stack([u, v, np.ones_like(u)])
+    p = T[:3, :3] @ (rays * z[v, u]) + T[:3, 3:]
+    uv = np.rint((K @ p)[:2] / p[2]).astype(int)
+    inside = np.all((uv >= 0) & (uv < [[640], [480]]), axis=0)
+    aligned = counts[uv[1, inside], uv[0, inside]] * 1e-4
+    there = aligned > 0
+    assert there.mean() > 0.4
+    return float(np.median(np.abs(aligned[there] - p[2, inside][there])))
+
+
+@pytest.mark.skipif(not RTDE.is_dir(), reason=f"no hand-eye data at {RTDE}")
+def test_real_depth_of_another_size():
+    camera = CameraIntrinsics(width=1920, height=1080, fx=1358, fy=1367, cx=967, cy=577)
+    with pytest.raises(InputError, match=r"1024x768 px, the colour images 1920x1080"):
+        open_folder(RTDE, camera, choice=MM)
+    source = open_folder(RTDE, camera, choice=FolderChoice(use_depth=False))
+    names = [Path(f[0]).stem for f in source.extra["frames"]]
+    assert names == sorted(names, key=int) and len(names) == 24

@@ -1,0 +1,181 @@
+"""PNG files hold every pixel, for every reader, in few bytes."""
+
+import io
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from realsim.errors import InputError
+from realsim.formats.images import png_bytes, read_depth, read_image
+from realsim.formats.png import encode_png
+
+DATA = Path(os.environ.get("REALSIM_DATA", "../shared/data"))
+
+KINDS = ("rgb", "grey", "mask", "counts")
+
+
+def image_of(kind, height, width, texture, seed):
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width]
+    smooth = (37 * x + 91 * y + (x * y) // 7) % 65536
+    values = {
+        "noise": rng.integers(0, 65536, (height, width)),
+        "smooth": smooth,
+        "flat": np.full((height, width), int(rng.integers(0, 65536))),
+        "ends": rng.choice([0, 255, 256, 65535], (height, width)),
+    }[texture]
+    if kind == "counts":
+        return values.astype(np.uint16)
+    if kind == "mask":
+        return values % 2 == 1
+    grey = (values % 256).astype(np.uint8)
+    return grey if kind == "grey" else np.stack([grey, grey[::-1], 255 - grey], axis=-1)
+
+
+def strict(data):
+    """Decode by the specification, refusing what a strict reader may refuse."""
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    place, chunks = 8, []
+    while place < len(data):
+        (length,) = struct.unpack(">I", data[place : place + 4])
+        name, body = data[place + 4 : place + 8], data[place + 8 : place + 8 + length]
+        crc = data[place + 8 + length : place + 12 + length]
+        assert struct.unpack(">I", crc)[0] == zlib.crc32(name + body)
+        chunks.append((name, body))
+        place += 12 + length
+    assert place == len(data) and [n for n, _ in chunks] == [b"IHDR", b"IDAT", b"IEND"]
+    width, height, bits, colour, method, filters, interlace = struct.unpack(
+        ">IIBBBBB", chunks[0][1]
+    )
+    assert (method, filters, interlace) == (0, 0, 0)
+    step = {0: 1, 2: 3}[colour] * bits // 8
+    stream = chunks[1][1]
+    # A reader that trusts the header's window keeps no more than that of what it has decoded.
+    window = 8 + (stream[0] >> 4)
+    decoder, raw = zlib.decompressobj(window), b""
+    for k in range(0, len(stream), 61):
+        raw += decoder.decompress(stream[k : k + 61])
+    raw += decoder.flush()
+    assert decoder.eof and not decoder.unused_data
+    rows = np.frombuffer(raw, np.uint8).reshape(height, width * step + 1)
+    out = np.zeros((height, width * step + step), np.uint8)  # `step` bytes of 0 at the left
+    for k, row in enumerate(rows):
+        up = out[k - 1] if k else np.zeros_like(out[0])
+        for i in range(step, width * step + step):
+            value, a, b = int(row[i - step + 1]), int(out[k, i - step]), int(up[i])
+            out[k, i] = (value + {0: 0, 1: a, 2: b, 3: (a + b) // 2}[int(row[0])]) % 256
+    pixels = np.ascontiguousarray(out[:, step:])
+    if bits == 16:
+        return pixels.view(">u2").astype(np.uint16)
+    return pixels.reshape(height, width, 3) if colour == 2 else pixels
+
+
+@settings(max_examples=120, deadline=None)
+@given(
+    kind=st.sampled_from(KINDS),
+    height=st.integers(1, 40),
+    width=st.integers(1, 40),
+    texture=st.sampled_from(("noise", "smooth", "flat", "ends")),
+    seed=st.integers(0, 2**16),
+    view=st.sampled_from(("whole", "every other", "backwards", "transposed")),
+)
+def test_every_pixel_comes_back_from_every_reader(kind, height, width, texture, seed, view):
+    image = image_of(kind, height, width, texture, seed)
+    image = {
+        "whole": image,
+        "every other": image[::2, ::2],
+        "backwards": image[::-1, ::-1],
+        "transposed": image.swapaxes(0, 1),
+    }[view]
+    data = encode_png(image)
+    assert data == encode_png(image.copy())
+    expected = image.astype(np.uint8) * 255 if image.dtype == bool else image
+    assert np.array_equal(strict(data), expected)
+    read = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert read.dtype == expected.dtype
+    assert np.array_equal(read[..., ::-1] if read.ndim == 3 else read, expected)
+    with Image.open(io.BytesIO(data)) as opened:
+        opened.load()
+        assert opened.mode == {3: "RGB"}.get(
+            expected.ndim, "L" if expected.itemsize == 1 else "I;16"
+        )
+        assert np.array_equal(np.asarray(opened), expected)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_long_rows_and_high_columns(kind):
+    # More than any window, so that far matches and the stream's blocks come into play.
+    for height, width in ((1, 70_001), (70_001, 1), (211, 1_001)):
+        image = image_of(kind, height, width, "smooth", 0)
+        image[: height // 2] = image[: height // 2][:, ::-1]
+        read = cv2.imdecode(np.frombuffer(encode_png(image), np.uint8), cv2.IMREAD_UNCHANGED)
+        expected = image.astype(np.uint8) * 255 if image.dtype == bool else image
+        assert np.array_equal(read[..., ::-1] if read.ndim == 3 else read, expected)
+
+
+def test_big_endian_counts_keep_their_values(tmp_path):
+    counts = (np.arange(60).reshape(6, 10) * 1000).astype(">u2")
+    (tmp_path / "d.png").write_bytes(png_bytes(counts))
+    assert np.array_equal(read_image(tmp_path / "d.png"), counts.astype(np.uint16))
+    assert read_depth(tmp_path / "d.png", 1e-4)[5, 9] == pytest.approx(5.9)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((4, 4, 4), np.uint8),
+        np.zeros((4, 4, 3), np.uint16),
+        np.zeros((4, 4), np.float32),
+        np.zeros((4, 4, 3), bool),
+        np.zeros(4, np.uint8),
+        np.zeros((0, 4), np.uint8),
+        np.zeros((4, 0, 3), np.uint8),
+    ],
+)
+def test_what_png_cannot_hold_is_refused(image):
+    with pytest.raises(InputError, match=r"(can|cannot) be written"):
+        encode_png(image)
+
+
+def usual_size(image):
+    """Return the size that OpenCV's encoder gives at its fastest level."""
+    pixels = image[..., ::-1] if image.ndim == 3 else image
+    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    assert ok
+    return len(data)
+
+
+def test_a_noisy_photograph_is_not_larger_than_from_the_usual_encoder():
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:360, :640]
+    scene = 120 + 60 * np.sin(x / 40) * np.cos(y / 55) + 30 * (np.hypot(x - 300, y - 200) < 90)
+    rgb = np.clip(scene[..., None] + rng.normal(0, 1.5, (360, 640, 3)), 0, 255).astype(np.uint8)
+    assert len(encode_png(rgb)) < usual_size(rgb)
+
+
+@pytest.mark.real
+def test_sizes_of_real_images():
+    pictures = sorted((DATA / "scenes").rglob("*.png")) + sorted((DATA / "handeye").rglob("*.png"))
+    if not pictures:
+        pytest.skip(f"no images under {DATA}; set REALSIM_DATA")
+    ours: dict[int, int] = {}
+    usual: dict[int, int] = {}
+    for path in pictures[:: max(1, len(pictures) // 12)]:
+        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if image.ndim == 3:
+            image = np.ascontiguousarray(image[..., 2::-1])
+        data = encode_png(image)
+        read = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(read[..., ::-1] if read.ndim == 3 else read, image)
+        kind = image.dtype.itemsize * image.ndim
+        ours[kind] = ours.get(kind, 0) + len(data)
+        usual[kind] = usual.get(kind, 0) + usual_size(image)
+    assert sum(ours.values()) < 1.1 * sum(usual.values()), (ours, usual)

@@ -1,0 +1,332 @@
+"""A check finds every damage and no more; a repair takes out what is damaged and nothing else."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, CaptureSession, View
+from realsim.store import SessionStore
+from realsim.store.manifest import NAME as MANIFEST
+from realsim.store.manifest import Manifest
+from realsim.store.session_check import check_session
+from realsim.store.session_repair import repair_session
+
+CAMERA = CameraIntrinsics(
+    width=40, height=30, fx=38.1, fy=38.2, cx=19.7, cy=14.9, distortion=np.array([0.05, 0.01])
+)
+VIEWS = 6
+DEAD = 2**22 + 1
+"""A process number that no process has."""
+
+
+def images_of(index: int, take: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng([index, take])
+    rgb = rng.integers(0, 256, (30, 40, 3), dtype=np.uint8)
+    return rgb, rng.integers(3000, 4000, (30, 40)).astype(np.uint16)
+
+
+def view_of(index: int) -> View:
+    rng = np.random.default_rng(index)
+    return View(
+        index=index, T_base_ee=se3.random_transform(rng), joints=rng.normal(size=6),
+        time_s=100.0 + index,
+    )  # fmt: skip
+
+
+def add(store: SessionStore, index: int, take: int = 0) -> None:
+    rgb, counts = images_of(index, take)
+    store.add_view(view_of(index), rgb, depth_counts=counts)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sessions") / "whole"
+    session = CaptureSession(name="whole", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(folder, session, {"plan_hash": "p" * 64, "camera": "D405 17"})
+    store.write_json("plan.json", {"sha256": "p" * 64, "content": {"joints": [[0] * 6] * 8}})
+    for index in range(VIEWS):
+        add(store, index)
+    Ts = se3.random_transform(np.random.default_rng(5), VIEWS)
+    store.set_cameras(CAMERA, {k: Ts[k] for k in range(VIEWS)})
+    store.write_json("calibration/hand_eye.json", {"a": list(range(50))})
+    inner = SessionStore.create(folder / "calibration/capture", session, {"plan_hash": "q"})
+    for index in range(3):
+        add(inner, index)
+    return folder
+
+
+@pytest.fixture
+def session(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "s"))
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes()
+        for p in sorted(folder.rglob("*")) if p.is_file()
+    }  # fmt: skip
+
+
+def flip(path: Path, place: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[place] ^= 0x10
+    path.write_bytes(bytes(data))
+
+
+def test_a_sound_session_is_sound_and_looking_changes_nothing(session: Path) -> None:
+    before = bytes_of(session)
+    report = SessionStore.open(session).check()
+    assert report.sound and report.views == tuple(range(VIEWS)) and report.findings == ()
+    assert (report.planned, report.not_captured) == (8, (6, 7))
+    # 12 images, robot.jsonl, session.json, scene_camera.json, plan.json, hand_eye.json
+    assert (report.files_ok, report.unproven) == (17, 0)
+    assert [r.views for r in report.inner] == [(0, 1, 2)]
+    assert check_session(session, decode=True) == report
+    repaired = repair_session(session)
+    assert repaired.moved == repaired.dropped_views == repaired.notes == ()
+    assert bytes_of(session) == before
+
+
+def test_every_flipped_byte_is_found_and_only_its_view_is_lost(session: Path) -> None:
+    # Law: one bit anywhere is found, the repair makes the session sound, all other views and
+    # files stay bit for bit, and what was damaged is kept aside.
+    original = bytes_of(session)
+    rng = np.random.default_rng(0)
+    images = ("rgb/000000", "rgb/000003", "depth/000005")
+    for path in original:
+        if path.startswith("calibration/capture") or (
+            path.endswith(".png") and not path.startswith(images)
+        ):
+            continue
+        size = len(original[path])
+        for place in {0, size - 1, *rng.integers(0, size, 3).tolist()}:
+            if original[path][place : place + 1] == b"\n":
+                continue  # two lines in one, or a torn one: see the cut file below
+            flip(session / path, place)
+            assert not check_session(session).sound, (path, place)
+            expected = set(range(VIEWS))
+            if path.startswith(("rgb", "depth")):
+                expected -= {int(Path(path).stem)}
+            elif path == "robot.jsonl":
+                expected -= {original[path][:place].count(b"\n")}
+            repaired = repair_session(session)
+            assert repaired.after.sound, (path, place, repaired.after.findings)
+            store = SessionStore.open(session)
+            assert store.verify() == []
+            if path != "manifest.jsonl":
+                assert set(repaired.after.views) == expected == store.completed, (path, place)
+            else:
+                assert set(repaired.after.views) == set(range(VIEWS))
+            kept = bytes_of(session)
+            for index in expected:
+                for name in (f"rgb/{index:06d}.png", f"depth/{index:06d}.png"):
+                    assert kept[name] == original[name]
+                assert np.array_equal(store.session.view(index).joints, view_of(index).joints)
+                T = store.session.view(index).T_world_cam
+                assert T is not None
+            damaged = {p for p in kept if p.startswith("damaged/")}
+            assert any(p.startswith(f"damaged/{path}") for p in damaged), (path, place)
+            assert all(path in p or path == "robot.jsonl" or "0000" in path for p in damaged)
+            for index in set(range(VIEWS)) - expected:  # the same capture takes them again
+                add(store, index)
+                assert store.session.view(index).T_world_cam is None
+            assert store.completed == set(range(VIEWS)) and check_session(session).sound
+            shutil.rmtree(session)
+            for name, data in original.items():
+                (session / name).parent.mkdir(parents=True, exist_ok=True)
+                (session / name).write_bytes(data)
+
+
+@pytest.mark.parametrize("path", ["rgb/000002.png", "depth/000002.png"])
+def test_a_lost_image_costs_its_view(session: Path, path: str) -> None:
+    (session / path).unlink()
+    report = check_session(session)
+    assert report.missing == (path,) and report.damaged_views == (2,) and not report.sound
+    store = SessionStore.open(session)
+    repaired = store.repair()
+    assert repaired.dropped_views == (2,) and "captured" in repaired.notes[0]
+    assert store.completed == set(range(VIEWS)) - {2}
+    other = {"rgb": "depth", "depth": "rgb"}[path.split("/")[0]]
+    assert (session / f"damaged/{other}/000002.png").is_file()
+    add(store, 2, take=1)
+    assert check_session(session).sound
+
+
+def test_a_cut_robot_file_costs_the_views_whose_lines_are_gone(session: Path) -> None:
+    path = session / "robot.jsonl"
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 55 // 100])
+    report = check_session(session)
+    assert "robot.jsonl" in report.changed and report.torn == ("robot.jsonl",)
+    assert report.damaged_views == (3, 4, 5)
+    repaired = repair_session(session)
+    assert repaired.after.sound and repaired.after.views == (0, 1, 2)
+    assert (session / "damaged/rgb/000004.png").read_bytes()
+    assert not (session / "rgb/000004.png").exists()
+
+
+@pytest.mark.parametrize("damage", ["missing", "empty", "junk", "value"])
+def test_a_lost_header_is_made_anew_from_what_is_there(session: Path, damage: str) -> None:
+    before = SessionStore.open(session)
+    path = session / "session.json"
+    if damage == "missing":
+        path.unlink()
+    elif damage == "value":
+        header = json.loads(path.read_text())
+        header["camera"]["fx"] = 99.0
+        path.write_text(json.dumps(header))
+    else:
+        path.write_bytes(b"" if damage == "empty" else b"{]")
+    assert not check_session(session).sound
+    repaired = repair_session(session)
+    assert repaired.after.sound and "made anew" in repaired.notes[0]
+    after = SessionStore.open(session)
+    assert after.session.depth_unit_m == 1e-4 and after.extra["plan_hash"] == "p" * 64
+    assert np.array_equal(after.session.intrinsics.K, CAMERA.K)
+    assert np.array_equal(after.session.intrinsics.distortion, CAMERA.distortion)
+    for index in range(VIEWS):
+        np.testing.assert_allclose(
+            after.session.view(index).T_world_cam,
+            before.session.view(index).T_world_cam,
+            atol=1e-12,
+        )
+    assert after.extra.get("camera") == ("D405 17" if damage == "value" else None)
+
+
+def test_a_header_that_cannot_be_made_anew_is_left_alone(session: Path) -> None:
+    (session / "session.json").write_text("{]")
+    (session / "scene_camera.json").write_text("{]")
+    before = bytes_of(session)
+    with pytest.raises(InputError, match=r"Restore one of the two .* were not touched"):
+        repair_session(session)
+    assert bytes_of(session) == before
+
+
+def test_without_a_manifest_the_images_are_decoded(session: Path) -> None:
+    (session / MANIFEST).unlink()
+    flip(session / "rgb/000001.png", 3)
+    path = session / "depth/000004.png"
+    path.write_bytes((session / "rgb/000000.png").read_bytes())
+    report = check_session(session)
+    assert report.damaged_views == (1, 4)
+    repaired = repair_session(session)
+    assert repaired.after.sound and repaired.after.views == (0, 2, 3, 5)
+    assert any("nothing can tell" in note for note in repaired.notes)
+
+
+def test_what_a_kill_leaves_is_no_damage(session: Path) -> None:
+    robot, manifest = (session / "robot.jsonl").read_bytes(), (session / MANIFEST).read_bytes()
+    cameras = (session / "scene_camera.json").read_bytes()
+    add(SessionStore.open(session), 6)
+    new_robot = (session / "robot.jsonl").read_bytes()
+    new_manifest = (session / MANIFEST).read_bytes()
+    new_cameras = (session / "scene_camera.json").read_bytes()
+    (session / f"rgb/.000007.png.{DEAD}.part").write_bytes(b"half")
+    # In the order of the writes: the line (whole or torn), the cameras, the manifest.
+    for robot_bytes, camera_bytes, manifest_bytes, views in (
+        (robot, cameras, manifest, 6),
+        (new_robot[:-40], cameras, manifest, 6),
+        (new_robot, cameras, manifest, 7),
+        (new_robot, new_cameras, manifest, 7),
+        (new_robot, new_cameras, new_manifest[: len(manifest) + 100], 7),
+        (new_robot, new_cameras, new_manifest[: new_manifest[:-1].rfind(b"\n") + 1], 7),
+        (new_robot, new_cameras, new_manifest[:-70], 7),
+        (new_robot, new_cameras, new_manifest, 7),
+    ):
+        (session / "scene_camera.json").write_bytes(camera_bytes)
+        (session / "robot.jsonl").write_bytes(robot_bytes)
+        (session / MANIFEST).write_bytes(manifest_bytes)
+        report = check_session(session)
+        assert report.sound and len(report.views) == views, report.findings
+        assert report.leftovers == (f"rgb/.000007.png.{DEAD}.part",)
+        assert set(report.unlisted) == (
+            set() if views == 7 else {"rgb/000006.png", "depth/000006.png"}
+        )
+    opened = SessionStore.open(session)
+    assert opened.verify() == [] and check_session(session).findings == ()
+
+
+def test_a_view_taken_again_keeps_its_own_line(session: Path) -> None:
+    store = SessionStore.open(session)
+    for path in ("rgb/000001.png", "depth/000001.png"):
+        store.remove(path)
+    add(store, 1, take=1)
+    assert check_session(session).sound
+    # The newer line is damaged: the older one does not belong to these images.
+    flip(session / "robot.jsonl", (session / "robot.jsonl").stat().st_size - 120)
+    assert check_session(session).damaged_views == (1,)
+    assert repair_session(session).after.views == (0, 2, 3, 4, 5)
+
+
+def test_a_sub_session_is_repaired_too(session: Path) -> None:
+    flip(session / "calibration/capture/depth/000001.png", 60)
+    report = check_session(session)
+    assert not report.sound and report.findings == ()
+    assert report.inner[0].damaged_views == (1,)
+    repaired = repair_session(session)
+    assert repaired.after.sound and repaired.inner[0].dropped_views == (1,)
+    assert (session / "calibration/capture/damaged/depth/000001.png").is_file()
+
+
+def test_time_that_goes_back_is_noted(tmp_path: Path) -> None:
+    session = CaptureSession(name="t", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(tmp_path, session)
+    for index, time_s in enumerate((5.0, 6.0, 6.0, 2.0, 3.0)):
+        store.add_view(View(index=index, time_s=time_s), images_of(index)[0])
+    report = store.check()
+    assert report.sound and [f.kind for f in report.findings] == ["time"]
+    assert "view 3 at 2.000 s" in report.findings[0].found
+
+
+def test_a_damaged_line_says_how_to_go_on(session: Path) -> None:
+    flip(session / "robot.jsonl", 300)
+    with pytest.raises(InputError, match=r"robot\.jsonl, line 1 .*--repair"):
+        SessionStore.open(session)
+    path = session / MANIFEST
+    path.write_bytes(b"junk\n" + path.read_bytes())
+    with pytest.raises(InputError, match=r"line 1 .*--repair"):
+        Manifest(session)
+
+
+def test_depth_counts_are_stored_as_they_are(tmp_path: Path) -> None:
+    session = CaptureSession(name="c", intrinsics=CAMERA, views=(), depth_unit_m=2.5e-4)
+    store = SessionStore.create(tmp_path, session)
+    rgb, counts = images_of(0)
+    counts[0, :3] = [0, 1, 65535]
+    store.add_view(View(index=0), rgb, depth_counts=counts)
+    assert np.array_equal(store.read_image("depth/000000.png"), counts)
+    store.add_view(View(index=1), rgb, store.depth_m(0))
+    assert (tmp_path / "depth/000001.png").read_bytes() == (
+        tmp_path / "depth/000000.png"
+    ).read_bytes()
+    with pytest.raises(InputError, match="not both"):
+        store.add_view(View(index=2), rgb, store.depth_m(0), depth_counts=counts)
+    with pytest.raises(InputError, match="uint16"):
+        store.add_view(View(index=2), rgb, depth_counts=counts.astype(np.int32))
+    with pytest.raises(InputError, match="size"):
+        store.add_view(View(index=2), rgb, depth_counts=counts[:3])
+
+
+def test_many_views_are_listed_for_bop_when_the_store_is_closed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("realsim.store.session_store.EAGER_VIEWS", 16)
+    camera = CameraIntrinsics(width=2, height=2, fx=2, fy=2, cx=0.5, cy=0.5)
+    session = CaptureSession(name="m", intrinsics=camera, views=(), depth_unit_m=1e-4)
+    rgb = np.zeros((2, 2, 3), np.uint8)
+    with SessionStore.create(tmp_path, session) as store:
+        for index in range(48):
+            store.add_view(View(index=index), rgb)
+            listed = len(json.loads((tmp_path / "scene_camera.json").read_text()))
+            assert listed >= min(index + 1, 16) and listed >= (index + 1) / 1.2
+    assert len(json.loads((tmp_path / "scene_camera.json").read_text())) == 48
+    assert store.verify() == [] and store.check().sound
+    store.add_view(View(index=48), rgb)  # without a close, the next open does it
+    SessionStore.open(tmp_path)
+    assert len(json.loads((tmp_path / "scene_camera.json").read_text())) == 49
+    assert os.listdir(tmp_path / "rgb")
