@@ -30,6 +30,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.errors import MissingLibraryError
 from realsim_capture_plans import PlanConfig, d405_mount
 from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.collision.model import interpolate
@@ -93,15 +94,16 @@ def greedy_ring_seconds(plan: CapturePlan) -> float:
 
 def mesh_figures(plan: CapturePlan, configurations: int) -> dict[str, float]:
     """Return what the arm's own meshes say of the plan and of our shapes; nothing without them."""
-    from realsim_capture_plans.collision.mesh_referee import MeshReferee, referee_available
+    from realsim_capture_plans.collision.ur5_meshes import MeshModel, compare_with_meshes
 
-    if not referee_available():
+    try:
+        meshes = MeshModel(plan.mount, plan.cell)
+    except MissingLibraryError:
         return {}
-    referee = MeshReferee(plan.chain, plan.mount, plan.cell)
     corners = np.concatenate([plan.home[None], *(plan.move(k)[1:] for k in range(len(plan)))])
     samples, owner = interpolate(corners[:-1], corners[1:], MESH_STEP_RAD)
-    hits = np.unique(owner[~referee.free(samples)])
-    shares = referee.compare(configurations, np.random.default_rng(0))
+    hits = np.unique(owner[meshes.touches(samples)])
+    shares = compare_with_meshes(plan.mount, plan.cell, configurations, 0)
     return {"colliding_edges": float(len(hits))} | shares
 
 

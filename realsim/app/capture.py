@@ -23,6 +23,7 @@ from realsim_capture_plans.capturing.capture import (
     CaptureJob,
     CaptureSummary,
     capture,
+    check_views,
     dry_run,
 )
 from realsim_capture_plans.capturing.checks import CheckConfig
@@ -96,6 +97,8 @@ def run_capture(request: CaptureRequest, console: Console) -> bool:
 
     plan = resolve_plan(request.plan)
     target = _target(request, plan)
+    check_views(plan, [*request.views, *request.retake])
+    config = _config(request, plan)
     with ExitStack() as stack:
         stack.enter_context(threadpool_limits(limits=1))
         stack.enter_context(_ends_on_request())
@@ -103,10 +106,11 @@ def run_capture(request: CaptureRequest, console: Console) -> bool:
             arm, camera, lab = stack.enter_context(_devices(request, plan, target))
             check_arm(plan, arm, CheckConfig())
             if request.dry_run:
-                return _rehearse(request, plan, (arm, camera), target, console)
+                return _rehearse(request, plan, (arm, camera), (config, target), console)
             store = _session(request, plan, (arm, camera), target)
             stack.enter_context(only_run_in(store.folder))
-            return _carry_out(request, plan, (arm, camera), (store, target, lab), console)
+            work = (config, store, target, lab)
+            return _carry_out(request, plan, (arm, camera), work, console)
         except DeviceError as error:
             console.warn(str(error).replace("[", "\\["))
             console.say("stopped; what is stored is safe, and the same command goes on from here.")
@@ -117,12 +121,12 @@ def _carry_out(
     request: CaptureRequest,
     plan: CapturePlan,
     devices: tuple[Arm, DepthCamera],
-    session: tuple[SessionStore, Target | None, "SimulatedLab | None"],
+    work: tuple[CaptureConfig, SessionStore, Target | None, "SimulatedLab | None"],
     console: Console,
 ) -> bool:
     """Capture, and show what was captured however it ended."""
     arm, camera = devices
-    store, target, lab = session
+    config, store, target, lab = work
     intrinsics = camera.intrinsics
     size = (intrinsics.width, intrinsics.height)
     taken = Thumbnails(cell_size(len(plan), size, SheetConfig())[1:])
@@ -132,17 +136,18 @@ def _carry_out(
                 operator=operator, views=request.views or None, retake=request.retake,
                 on_view=taken.add, board_check=_board_check(target),
             )  # fmt: skip
-            config = _config(request, plan)
             summary = capture(plan, arm, camera, store, config=config, job=job)
         if lab is not None and target is None:
             _give_models(lab, store)
         show_summary(summary, console)
     finally:
-        if store.completed:
+        if taken.images:  # a run that was refused changes nothing
             title = f"{request.out.resolve().name}, {arm.name}, {camera.name}"
             sheet = write_contact_sheet(store, len(plan), title, taken)
             console.say(f"contact sheet  {store.folder / sheet}")
-        console.say(f"stored         {len(store.completed)} of {len(plan)} views, {store.folder}")
+            console.say(
+                f"stored         {len(store.completed)} of {len(plan)} views, {store.folder}"
+            )
     return summary.complete
 
 
@@ -150,15 +155,16 @@ def _rehearse(
     request: CaptureRequest,
     plan: CapturePlan,
     devices: tuple[Arm, DepthCamera],
-    target: Target | None,
+    work: tuple[CaptureConfig, Target | None],
     console: Console,
 ) -> bool:
     """Drive slowly and look; nothing is stored."""
+    config, target = work
     with _operator(request, f"{devices[0].name}, {devices[1].name}", console) as operator:
         job = CaptureJob(
             operator=operator, views=request.views or None, board_check=_board_check(target)
         )
-        summary = dry_run(plan, *devices, config=_config(request, plan), job=job)
+        summary = dry_run(plan, *devices, config=config, job=job)
     show_summary(summary, console, dry=True)
     return summary.complete
 

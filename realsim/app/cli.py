@@ -295,7 +295,7 @@ ROBOT = click.Choice(["UR5", "UR5e"], case_sensitive=False)
     help="The arm's own calibration: the controller's calibration.conf, or ROS's YAML.",
 )  # fmt: skip
 @click.option("--mount", type=FOLDER, default=None, help="Mount file.  [a D405 on a bracket]")
-@click.option("--center", default="", help="Scene centre x,y,z in base [m].  [0.35,0, 0.05 up]")
+@click.option("--center", default="", help="Scene centre x,y,z in base [m].  [0.40,0, 0.05 up]")
 @click.option("--table-height", type=float, default=None, help="z of the table's top [m].  [0]")
 @click.option("--keep-out", default="", help="Box of the objects x,y,z [m].  [0.3,0.3,0.12]")
 @click.option("--obstacles", type=FOLDER, default=None, help="TOML file of named boxes in base.")

@@ -92,9 +92,10 @@ def show_advice(
     request: PlanRequest, chain: DhChain, mount: Mount, config: PlanConfig, console: Console
 ) -> None:
     """Print where the scene's centre is best put."""
-    from realsim_capture_plans.planning.advise import advise
+    from realsim_capture_plans.planning.advise import advice, advise
 
-    x, _, z = request.center(config)
+    center = request.center(config)
+    z = center[2]
     n = request.count
     with console.stage("advise", "places for the scene") as tick:
         places = advise(chain, mount, config, n, z - config.table_height_m, tick=tick)
@@ -103,15 +104,19 @@ def show_advice(
             ",".join(f"{v:.3f}" for v in p.center),
             f"{p.table_height_m:.2f}",
             f"{100 * p.reachable_share:.1f} %",
-            f"{p.hole_deg:.1f} deg" if p.hole_deg < NO_PLAN_DEG else f"fewer than {n} views",
+            *(
+                f"{hole:.1f} deg" if hole < NO_PLAN_DEG else f"fewer than {n} views"
+                for hole in (p.hole_deg, p.one_elbow_hole_deg)
+            ),
         )
         for p in places
     ]
-    header = ("--center (in base, m)", "--table-height", "reachable", "largest hole")
+    header = ("--center (in base, m)", "--table-height", "reachable", "largest hole", "one elbow")
     console.table(f"Places for {n} views with a {chain.name}, best first", header, rows)
+    console.say(advice(places, center, config.table_height_m))
     console.say(
-        f"The base turns the arm to any side alike: only the distance ({x:.2f} m as asked) and the "
-        "heights matter. Obstacles and the table's edges are looked at by the plan itself."
+        "The base turns the arm to any side alike: only the distance from its axis and the heights "
+        "matter here. Obstacles and the table's edges are looked at by the plan itself."
     )
 
 

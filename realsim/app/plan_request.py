@@ -12,7 +12,7 @@ from realsim_capture_plans.collision.shapes import Box, Mount
 from realsim_capture_plans.planning.record import PlanConfig
 
 DEFAULT_VIEWS = {"hemisphere": 256, "calibration": 24}
-DEFAULT_CENTER_M = (0.35, 0.0, 0.05)
+DEFAULT_CENTER_M = (0.40, 0.0, 0.05)
 """Scene centre: 0.30-0.40 m in front of the base most views are reachable; z is above the table."""
 LONGEST_M = 3.0
 """Lengths on the command line beyond this are not metres."""

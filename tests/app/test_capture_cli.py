@@ -1,4 +1,4 @@
-"""`realsim capture`: sessions begun and gone on with, board views in their place, clear refusals."""
+"""`realsim capture`: sessions begun and gone on with, board views in place, clear refusals."""
 
 import json
 import shutil
@@ -97,6 +97,7 @@ def test_a_session_has_plan_devices_log_and_sheet(plans: Path) -> None:
         assert np.corrcoef(photo[inner].ravel(), cell[inner].ravel())[0, 1] > 0.8
 
 
+@pytest.mark.slow
 def test_run_again_it_goes_on_and_takes_only_what_is_missing(plans: Path, tmp_path: Path) -> None:
     out = tmp_path / "s"
     some = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--views", "1,3")
@@ -173,6 +174,7 @@ def test_a_robot_that_does_not_answer_ends_with_1(plans: Path, tmp_path: Path) -
     assert "Traceback" not in done.stderr and not (tmp_path / "s").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["board first", "scene first"])
 def test_board_views_lie_where_the_calibration_looks_for_them(
     plans: Path, tmp_path: Path, order: str

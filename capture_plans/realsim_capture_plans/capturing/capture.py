@@ -54,7 +54,7 @@ def capture(
     """
     settings = CaptureConfig(settle_s=settle_s) if config is None else config
     job = CaptureJob(progress=progress) if job is None else job
-    _check_views(plan, [*(job.views or ()), *job.retake])
+    check_views(plan, [*(job.views or ()), *job.retake])
     state = check_arm(plan, arm, settings.checks)
     _check_session(plan, camera, store)
     log = CaptureLog(store)
@@ -82,14 +82,18 @@ def dry_run(
         DeviceError: a device stopped, or a view gave no good frame, and nobody could be asked.
     """
     job = CaptureJob() if job is None else job
-    _check_views(plan, job.views or ())
+    check_views(plan, job.views or ())
     check_arm(plan, arm, config.checks)
     looker = Looker(plan, arm, camera, config, board_check=job.board_check)
     return Run(plan, arm, camera, config, looker, CaptureLog(None), job, None).carry_out()
 
 
-def _check_views(plan: CapturePlan, views: Sequence[int]) -> None:
-    """Refuse numbers that the plan does not have."""
+def check_views(plan: CapturePlan, views: Sequence[int]) -> None:
+    """Refuse numbers that the plan does not have.
+
+    Raises:
+        InputError: one is not a view of the plan.
+    """
     if wrong := sorted({k for k in views if not 0 <= k < len(plan)}):
         raise InputError(
             f"views {wrong} are not in the plan, which has the views 0 to {len(plan) - 1}."

@@ -17,6 +17,7 @@ from realsim_capture_plans.collision.shapes import Mount
 from realsim_capture_plans.planning.record import PlanConfig
 from realsim_capture_plans.planning.view_quality import hole_deg
 from realsim_capture_plans.planning.viewpoints import (
+    better_elbow,
     golden_cap,
     hemisphere_poses,
     reachable,
@@ -27,6 +28,10 @@ DISTANCES_M = (0.25, 0.30, 0.35, 0.40, 0.45, 0.50, 0.55, 0.60)
 """Distances of the scene's centre from the base's axis that are tried."""
 LIFTS_M = (-0.20, 0.0, 0.20)
 """Heights of the table that are tried, from the one that is planned for."""
+NO_PLAN_DEG = 180.0
+"""The hole where there are fewer reachable directions than views."""
+BASE_RADIUS_M = 0.12
+"""A table that is higher than the base begins this far in front of its axis [m]."""
 DIRECTIONS = 400
 """Directions tried per place: shares to 1 %, holes to 1 degree."""
 POSES = 16
@@ -45,6 +50,8 @@ class Placement:
     """Of the directions of the cap."""
     hole_deg: float
     """Greatest hole in the cap that n views leave [deg]; 180 where fewer than n are reachable."""
+    one_elbow_hole_deg: float
+    """The same without a change of the elbow's side, which takes seconds and much room."""
 
 
 def advise(
@@ -58,7 +65,7 @@ def advise(
     lifts_m: Sequence[float] = LIFTS_M,
     tick: Callable[[int, int], None] | None = None,
 ) -> list[Placement]:
-    """Return places for the scene, the best first: the smallest hole, then the largest share.
+    """Return places for the scene, the best first: the smallest hole with one side of the elbow.
 
     Args:
         chain: the arm.
@@ -81,7 +88,7 @@ def advise(
         found.append(_placement(chain, mount, config, n, (x, 0.0, height + aim_height_m), height))
         if tick is not None:
             tick(k + 1, len(places))
-    return sorted(found, key=lambda p: (round(p.hole_deg, 1), -p.reachable_share))
+    return sorted(found, key=lambda p: (round(p.one_elbow_hole_deg), p.hole_deg))
 
 
 def _placement(
@@ -93,19 +100,29 @@ def _placement(
     table_height_m: float,
 ) -> Placement:
     """Return what can be seen of a scene at one place."""
-    here = replace(config, table_height_m=table_height_m)
+    x0, *rest = config.table_rectangle_m
+    if table_height_m > 0:
+        # The base stands beside a table that is higher than it.
+        x0 = max(x0, BASE_RADIUS_M)
+    here = replace(
+        config, table_height_m=table_height_m, table_rectangle_m=(x0, rest[0], rest[1], rest[2])
+    )
     model = CollisionModel(chain, mount, here.work_cell(center, "hemisphere"), here.clearance_m)
     directions = golden_cap(max(DIRECTIONS, n), here.elevation_deg)
     poses, item = hemisphere_poses(center, directions, here.radius_m, POSES, 0.0)
-    ok = np.unique(reachable(poses, item, mount.T_ee_cam, model, here.sigma_min).item)
-    hole = 180.0
-    if len(ok) >= n:
-        hole = hole_deg(directions[ok][thin_directions(directions[ok], n)], here.elevation_deg)
+    found = reachable(poses, item, mount.T_ee_cam, model, here.sigma_min)
+    one_side = found.where(np.sin(found.joints[:, 2]) * better_elbow(found) > 0)
+    holes: list[float] = []
+    for ok in (np.unique(found.item), np.unique(one_side.item)):
+        few = len(ok) < n
+        chosen = directions[ok] if few else directions[ok][thin_directions(directions[ok], n)]
+        holes.append(NO_PLAN_DEG if few else hole_deg(chosen, here.elevation_deg))
     return Placement(
         center=center,
         table_height_m=table_height_m,
-        reachable_share=len(ok) / len(directions),
-        hole_deg=hole,
+        reachable_share=len(np.unique(found.item)) / len(directions),
+        hole_deg=holes[0],
+        one_elbow_hole_deg=holes[1],
     )
 
 
@@ -125,14 +142,15 @@ def advice(placements: Sequence[Placement], center: ArrayLike, table_height_m: f
     level = min(same_height, key=placements.index, default=best)
     text = (
         f"Put the scene's centre {level.center[0]:.2f} m from the base's axis: "
-        f"{100 * level.reachable_share:.0f} % of the cap is reachable and the greatest hole is "
-        f"{level.hole_deg:.1f} deg; where it is now ({now:.2f} m) it is "
-        f"{100 * here.reachable_share:.0f} % and {here.hole_deg:.1f} deg."
+        f"{100 * level.reachable_share:.0f} % of the cap is reachable and the largest hole is "
+        f"{level.one_elbow_hole_deg:.0f} deg; where it is now ({now:.2f} m) it is "
+        f"{100 * here.reachable_share:.0f} % and {here.one_elbow_hole_deg:.0f} deg (both without a "
+        "change of the elbow's side)."
     )
-    if best.hole_deg < level.hole_deg - 0.5:
+    if round(best.one_elbow_hole_deg) < round(level.one_elbow_hole_deg):
         lift = best.table_height_m - table_height_m
         text += (
             f" A table {abs(lift):.2f} m {'higher' if lift > 0 else 'lower'}, with the centre at "
-            f"{best.center[0]:.2f} m, would leave {best.hole_deg:.1f} deg."
+            f"{best.center[0]:.2f} m, would leave {best.one_elbow_hole_deg:.0f} deg."
         )
     return text

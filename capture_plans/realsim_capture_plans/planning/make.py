@@ -297,10 +297,11 @@ def _home(task: _Task, found: Candidates, n: int, tried: int) -> tuple[Array, Ca
 
 
 def _seen_share(Ts_base_cam: Array, task: _Task) -> Array:
-    """Return (M,) which share of the keep-out volume is inside the image at each pose."""
-    camera = SENSORS[task.mount.camera].intrinsics if task.mount.camera in SENSORS else None
-    if camera is None:
+    """Return (M,) which share of the keep-out volume each pose has in its image, not too near."""
+    if task.mount.camera not in SENSORS:
         return np.ones(len(Ts_base_cam))
+    sensor = SENSORS[task.mount.camera]
+    camera = sensor.intrinsics
     low = np.array(task.cell.keep_out.lower)
     low[2] = task.cell.table.upper[2]
     steps = np.linspace(0.0, 1.0, SCENE_GRID)
@@ -309,7 +310,7 @@ def _seen_share(Ts_base_cam: Array, task: _Task) -> Array:
     points_cam = se3.transform(se3.invert(Ts_base_cam), points)
     uv = project(camera, points_cam)
     inside = np.all((uv >= 0) & (uv <= [camera.width - 1, camera.height - 1]), axis=-1)
-    return np.mean(inside & (points_cam[..., 2] > 0), axis=-1)
+    return np.mean(inside & (points_cam[..., 2] >= sensor.nearest_m), axis=-1)
 
 
 def _driven(

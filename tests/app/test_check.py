@@ -1,0 +1,100 @@
+"""`realsim check`: exit codes, the table, JSON, and the repair, also beside a running capture."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app import cli
+from realsim.records import CameraIntrinsics, CaptureSession, View
+from realsim.store import SessionStore
+from realsim.store.lock import only_run_in
+
+CAMERA = CameraIntrinsics(width=40, height=30, fx=40, fy=40, cx=19.5, cy=14.5)
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    folder = tmp_path / "table"
+    record = CaptureSession(name="table", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    for place, views in ((folder, 4), (folder / "calibration/capture", 2)):
+        store = SessionStore.create(place, record)
+        store.write_json("plan.json", {"content": {"joints": [[0.0] * 6] * 5}})
+        for index in range(views):
+            rgb = np.random.default_rng(index).integers(0, 256, (30, 40, 3), dtype=np.uint8)
+            store.add_view(View(index=index), rgb, np.full((30, 40), 0.3, np.float32))
+    return folder
+
+
+def run(*arguments: str | Path) -> Result:
+    return CliRunner().invoke(cli.commands, ["check", *map(str, arguments)])
+
+
+def main(monkeypatch: pytest.MonkeyPatch, *arguments: str | Path) -> object:
+    monkeypatch.setattr("sys.argv", ["realsim", "check", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return end.value.code
+
+
+def test_a_sound_session_ends_with_0(session: Path) -> None:
+    result = run(session)
+    assert result.exit_code == 0, result.output
+    assert "4 of 5 planned" in result.output and "sound: every listed file" in result.output
+    told = json.loads(run(session, "--json").output)
+    assert told["sound"] and told["views_not_captured"] == [4]
+    assert [r["views"] for r in told["inner"]] == [2]
+
+
+def test_damage_ends_with_1_and_a_repair_takes_it_out(session: Path) -> None:
+    path = session / "calibration/capture/depth/000001.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    (session / "rgb/000002.png").unlink()
+    result = run(session)
+    assert result.exit_code == 1
+    assert "rgb/000002.png" in result.output and "depth/000001.png" in result.output
+    assert "--repair" in result.output
+    told = json.loads(run(session, "--json").output)
+    assert told["views_damaged"] == [2] and told["inner"][0]["views_damaged"] == [1]
+    repaired = run(session, "--repair")
+    assert repaired.exit_code == 0, repaired.output
+    assert "views 2 count as not captured" in repaired.output
+    assert "damaged/depth/000002.png" in repaired.output
+    assert run(session).exit_code == 0
+    again = json.loads(run(session, "--repair", "--json").output)
+    assert again["moved"] == [] and again["dropped_views"] == []
+    assert SessionStore.open(session).completed == {0, 1, 3}
+    assert run(session, "--decode").exit_code == 0
+
+
+def test_what_is_no_session_ends_with_2(
+    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(monkeypatch, session / "rgb") == 2
+    assert "is not a session" in capsys.readouterr().err
+    assert main(monkeypatch, session.parent) == 2
+    assert "Did you mean" in capsys.readouterr().err
+    assert main(monkeypatch, session / "nowhere") == 2
+    assert "is not a session" in capsys.readouterr().err
+
+
+def test_a_running_capture_is_not_repaired(
+    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with only_run_in(session):
+        assert main(monkeypatch, session, "--repair") == 2
+        assert "another run is working" in capsys.readouterr().err
+        assert run(session).exit_code == 0
+
+
+def test_what_cannot_be_repaired_is_said_and_left(
+    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("session.json", "scene_camera.json"):
+        (session / name).write_text("")
+    assert run(session).exit_code == 1
+    assert main(monkeypatch, session, "--repair") == 2
+    assert "Restore one of the two" in capsys.readouterr().err
+    assert (session / "rgb/000000.png").is_file() and not (session / "damaged").exists()
