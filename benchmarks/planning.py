@@ -76,9 +76,7 @@ def greedy_ring_seconds(plan: CapturePlan) -> float:
     ring = np.floor((90.0 - elevation) / RING_DEG).astype(int)
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
     order = np.lexsort([np.where(ring % 2 == 0, azimuth, -azimuth), ring])
-    poses, item = hemisphere_poses(
-        plan.center_world, directions, plan.config.radius_m, POSES, 0.0
-    )
+    poses, item = hemisphere_poses(plan.center_world, directions, plan.config.radius_m, POSES, 0.0)
     found = reachable(
         poses, item, plan.mount.T_ee_cam, plan.collision_model(), plan.config.sigma_min
     )
@@ -145,9 +143,7 @@ def main() -> None:
     center = best_center(PlanConfig())
     advice_cpu_s = time.process_time() - began
     runs = [run(seed, center, args.quick) for seed in range(1 if args.quick else args.seeds)]
-    figures = {
-        key: (min if key == "views_valid" else max)(r[key] for r in runs) for key in runs[0]
-    }
+    figures = {key: (min if key == "views_valid" else max)(r[key] for r in runs) for key in runs[0]}
     figures["advice_cpu_s"] = advice_cpu_s
     figures["center_x_m"] = center[0]
     for key, value in figures.items():

@@ -112,7 +112,7 @@ def run_capture(request: CaptureRequest, console: Console) -> bool:
             work = (config, store, target, lab)
             return _carry_out(request, plan, (arm, camera), work, console)
         except DeviceError as error:
-            console.warn(str(error).replace("[", "\\["))
+            sys.stderr.write(f"trouble: {error}\n")
             console.say("stopped; what is stored is safe, and the same command goes on from here.")
             return False
 
@@ -430,7 +430,9 @@ def show_summary(summary: CaptureSummary, console: Console, *, dry: bool = False
         ["seconds", f"{summary.seconds:.1f}", ""],
     ]
     rows = [row for row in rows if row[1] or row[0] in ("visited", "captured")]
-    console.table("Dry run: nothing was stored" if dry else "Capture", ["", "", "which"], rows)
+    console.table("Dry run" if dry else "Capture", ["", "", "which"], rows)
+    if dry:
+        console.say("nothing was stored.")
     for text in summary.warnings:
         console.warn(text.replace("[", "\\["))
     if summary.left_out:

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import viser
-from viser import _messages as viser_messages
 
+from realsim import local_pages
 from realsim.errors import InputError
 from realsim.formats.bop_models import load_models
 from realsim.records import ObjectPose, Scene
-from realsim.review import content, guard, journal
+from realsim.review import content, journal
 from realsim.review.journal import JOURNAL_FILE
 from realsim.review.scene_nodes import GraspFilter, SceneConfig, SceneNodes
 from realsim.store import SessionStore, load_grasps, load_scene
@@ -59,7 +59,7 @@ class ReviewServer:
             InputError: the host is reachable from other machines, the session is not registered,
                 or a model is missing.
         """
-        self._host = guard.check_host(host)
+        self._host = local_pages.check_host(host, "the review")
         self._port = port
         self._config = config or SceneConfig()
         self.store = store
@@ -144,11 +144,11 @@ class ReviewServer:
         if self._server is not None:
             return
         # Viser prints a banner with its address; the caller says what is to be said.
-        with guard.local_origins_only(), contextlib.redirect_stdout(io.StringIO()):
+        with local_pages.local_origins_only(), contextlib.redirect_stdout(io.StringIO()):
             server = viser.ViserServer(
                 host=self._host, port=self._port, label="realsim review", verbose=False
             )
-        guard.refuse_share(server, viser_messages.ShareUrlRequest)
+        local_pages.refuse_share(server)
         self._server = server
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self._build_scene(server)

@@ -12,7 +12,7 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -126,7 +126,7 @@ class Terminal:
 
 
 @contextmanager
-def terminal(folder: Path, failing: int = -1) -> Iterator[Terminal]:
+def terminal(folder: Path, failing: int = -1) -> Generator[Terminal]:
     t = Terminal(folder, failing)
     try:
         yield t

@@ -16,7 +16,8 @@ import pytest
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.geometry import se3
-from realsim.records import CaptureSession
+from realsim.records import CameraIntrinsics, CaptureSession, Mesh
+from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.store import SessionStore
 from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.capturing.capture import (
@@ -102,16 +103,30 @@ class SpoiltCamera:
 
     def __init__(
         self,
+        arm: SimulatedArm,
         camera: SimulatedDepthCamera,
         spoil: dict[int, Callable[[Frame, Frame], Frame]] | None = None,
     ) -> None:
         """Spoil these grabs, counted from 1; each is given the frame and the one before."""
-        self._camera, self.spoil = camera, spoil or {}
+        self._arm, self._camera, self.spoil = arm, camera, spoil or {}
         self.grabs, self.recovered = 0, 0
         self._last: Frame | None = None
 
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._camera, name)
+    @property
+    def name(self) -> str:
+        return self._camera.name
+
+    @property
+    def intrinsics(self) -> CameraIntrinsics:
+        return self._camera.intrinsics
+
+    @property
+    def depth_unit_m(self) -> float:
+        return self._camera.depth_unit_m
+
+    @property
+    def description(self) -> dict[str, Any]:
+        return self._camera.description
 
     def grab(self) -> Frame:
         self.grabs += 1
@@ -122,7 +137,7 @@ class SpoiltCamera:
 
     def _rendered(self) -> Frame:
         """The lab gives the same frame at the same joints: each is rendered once for all tests."""
-        joints = self._camera._arm.state().joints.tobytes()
+        joints = self._arm.state().joints.tobytes()
         if joints not in RENDERED:
             RENDERED[joints] = self._camera.grab()
         return replace(RENDERED[joints], time_s=float(next(CLOCK)))
@@ -202,10 +217,18 @@ class Person(NoOperator):
 
 
 @lru_cache(maxsize=1)
-def lab() -> SimulatedLab:
+def lab() -> tuple[SimulatedLab, Sequence[PlacedMesh]]:
+    """The lab, and its objects as they stand on a ground of two triangles."""
     made = SimulatedLab(LabConfig(seed=3, n_objects=4, width=640, height=360))
-    made.place_objects()
-    return made
+    x, y = np.array([[-0.5, -0.5], [1.5, -0.5], [1.5, 0.5], [-0.5, 0.5]]).T
+    ground = Mesh(
+        vertices=np.stack([x, y, np.zeros(4)], axis=1), faces=np.array([[0, 1, 2], [0, 2, 3]])
+    )
+    objects = [
+        PlacedMesh(o.instance, made.models[o.obj_id].mesh, o.T_world_obj)
+        for o in made.truth.objects
+    ]
+    return made, [PlacedMesh(BACKGROUND, ground, np.eye(4)), *objects]
 
 
 @dataclass
@@ -227,13 +250,13 @@ def bench(
     arm: SimulatedArm | None = None,
 ) -> Bench:
     a = arm or SimulatedArm()
-    there = lab()
-    camera = SimulatedDepthCamera(there.config, there.truth, a, lambda: there._on_table)
+    there, on_table = lab()
+    camera = SimulatedDepthCamera(there.config, there.truth, a, lambda: on_table)
     session = CaptureSession(
         name="test", intrinsics=camera.intrinsics, views=(), depth_unit_m=camera.depth_unit_m
     )
     store = SessionStore.create(folder, session, {"plan_hash": plan().content_hash})
-    return Bench(arm=a, camera=SpoiltCamera(camera, spoil), store=store)
+    return Bench(arm=a, camera=SpoiltCamera(a, camera, spoil), store=store)
 
 
 @pytest.fixture(scope="module")

@@ -147,12 +147,15 @@ def test_the_plan_turns_with_the_scene() -> None:
 
 
 def test_advice_prefers_the_places_that_reach_most() -> None:
-    places = advise(UR5, d405_mount(), PlanConfig(), 64, 0.05, distances_m=(0.35, 0.6), lifts_m=(0.0,))
-    assert [p.center[0] for p in places] == [0.35, 0.6]
+    places = advise(
+        UR5, d405_mount(), PlanConfig(), 64, 0.05, distances_m=(0.4, 0.6), lifts_m=(0.0,)
+    )
+    assert [p.center[0] for p in places] == [0.4, 0.6]
     assert places[0].reachable_share > places[1].reachable_share
-    assert places[0].hole_deg < places[1].hole_deg
+    assert places[0].one_elbow_hole_deg < places[1].one_elbow_hole_deg
+    assert all(p.hole_deg <= p.one_elbow_hole_deg + 1e-9 for p in places)
     text = advice(places, [0.0, 0.6, 0.05], 0.0)
-    assert "0.35 m from the base" in text and "now (0.60 m)" in text
+    assert "0.40 m from the base" in text and "now (0.60 m)" in text
 
 
 def test_too_few_reachable_views_say_how_many_and_what_to_do() -> None:

@@ -28,11 +28,12 @@ from realsim import (
     Scene,
     SupportPlane,
     View,
+    local_pages,
 )
 from realsim.formats.bop_models import save_models
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from realsim.review import ReviewServer, content, guard, journal
+from realsim.review import ReviewServer, content, journal
 from realsim.review.scene_nodes import GraspFilter
 from realsim.store import SessionStore, save_grasps, save_scene
 
@@ -201,7 +202,7 @@ def test_other_machines_are_refused(store: SessionStore, host: str) -> None:
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
 def test_loopback_is_accepted(host: str) -> None:
-    assert guard.check_host(host) == host
+    assert local_pages.check_host(host, "the review") == host
 
 
 def test_the_page_is_served(server: ReviewServer) -> None:
@@ -224,7 +225,7 @@ def test_other_servers_are_not_touched_by_the_guard() -> None:
     from websockets.asyncio import server as module
 
     before: Any = module.serve
-    with guard.local_origins_only():
+    with local_pages.local_origins_only():
         assert module.serve is not before
     assert module.serve is before
 

@@ -129,9 +129,9 @@ def measured(frame: Frame, config: CheckConfig) -> Measured:
 def sharpness(rgb: NDArray[np.uint8]) -> float:
     """Return how steep the steepest edges are: near 1 for a step, lower for every blur.
 
-    The steepest slopes of the image's middle three quarters are divided by those of the image reduced `COARSE` times:
-    contrast and content cancel, the width of the edges stays. The least of four directions
-    counts, because motion only blurs along itself.
+    The steepest slopes of the image's middle three quarters are divided by those of the same
+    part reduced `COARSE` times: contrast and content cancel, the width of the edges stays. The
+    least of four directions counts, because motion only blurs along itself.
 
     Args:
         rgb: (H, W, 3) uint8; its green channel is used, of which a sensor has most pixels. Of

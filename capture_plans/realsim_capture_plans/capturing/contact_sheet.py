@@ -31,7 +31,7 @@ class SheetConfig:
     """Height of the head line."""
 
 
-PAPER, INK, PALE = (250, 250, 248), (30, 30, 30), (215, 215, 212)
+PAPER, INK, PALE, STRIP = (250, 250, 248), (30, 30, 30), (215, 215, 212), (40, 40, 40)
 AMBER, BLUE, RED = (255, 170, 0), (30, 120, 255), (214, 40, 40)
 """Noted, taken again, missing."""
 
@@ -112,7 +112,7 @@ def _fill_cell(
 ) -> None:
     """Draw one view into its cell (h, w, 3)."""
     h, w = cell.shape[:2]
-    scale = max(0.35, w / 400)
+    scale = max(0.42, w / 400)
     if image is None:
         cell[1:-1, 1:-1] = PALE
         said = "skipped" if entry.get("event") == "skipped" else "missing"
@@ -143,8 +143,12 @@ def _label(
     colour: tuple[int, int, int],
     scale: float,
 ) -> None:
-    """Write with a dark outline: legible on every picture."""
-    _write(image, text, at, (0, 0, 0), scale, thickness=3)
+    """Write on a dark strip: legible on every picture."""
+    import cv2
+
+    (w, h), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    x, y = at
+    image[max(y - h - 3, 0) : y + below, max(x - 2, 0) : x + w + 3] = STRIP
     _write(image, text, at, colour, scale)
 
 
@@ -154,16 +158,15 @@ def _write(
     at: tuple[int, int],
     colour: tuple[int, int, int],
     scale: float,
-    thickness: int = 1,
 ) -> int:
     """Write ASCII text at its lower left corner (x, y); return its width [px]."""
     import cv2
 
     plain = text.encode("ascii", errors="replace").decode()
     canvas = np.ascontiguousarray(image)
-    cv2.putText(canvas, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thickness, cv2.LINE_AA)
+    cv2.putText(canvas, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
     image[:] = canvas
-    return int(cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)[0][0])
+    return int(cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0])
 
 
 def write_contact_sheet(

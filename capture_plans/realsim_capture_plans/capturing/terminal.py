@@ -37,6 +37,8 @@ POLL_S = 0.05
 """How often the key thread looks whether it is to end [s]."""
 DRAW_EVERY_S = 0.15
 """Least time between two drawings [s]: each costs 2-4 ms of CPU."""
+BAR_WIDTH = 64
+"""Characters: fits the narrowest terminal in use, 80 columns."""
 EVENTS = 6
 """Events kept in view."""
 
@@ -198,14 +200,15 @@ class TerminalOperator:
     def _picture(self) -> "RenderableType":
         from rich.console import Group
         from rich.panel import Panel
-        from rich.progress_bar import ProgressBar
         from rich.text import Text
 
         lines: list[RenderableType] = []
         s = self._status
         if s is not None:
-            lines += [ProgressBar(total=max(s.total, 1), completed=s.stored, width=50)]
-            lines += [Text(_progress_text(s)), _check_line(s)]
+            full = BAR_WIDTH * s.stored // max(s.total, 1)
+            bar = Text("━" * full, style="green")
+            bar.append("─" * (BAR_WIDTH - full), style="dim")
+            lines += [bar, Text(_progress_text(s)), _check_line(s)]
         lines += [
             Text(("! " if trouble else "  ") + text, style="yellow" if trouble else "dim")
             for text, trouble in self._events

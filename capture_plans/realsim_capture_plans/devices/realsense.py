@@ -27,7 +27,7 @@ from realsim_capture_plans.devices.realsense_pairs import COLOR, DEPTH, Pair, Pa
 __all__ = ["EndOfRecordingError", "RealSenseCamera", "RealSenseConfig", "intrinsics_of"]
 
 STALE_PAIRS = 2
-"""Pairs dropped after the buffer is empty: their exposure may have begun before `grab`."""
+"""Pairs dropped once the buffer is empty: exposed, perhaps, before `grab` was called."""
 MS = 1e-3
 
 
@@ -98,12 +98,9 @@ class RealSenseCamera:
         if not path.is_file():
             raise InputError(f"{path} does not exist; a RealSense recording is expected.")
         camera = cls.__new__(cls)
-        camera._rs = import_pyrealsense2()
-        camera._config = RealSenseConfig()
-        camera._devices = lambda: ()
-        camera._serial = None
-        camera._recording = path
-        camera._sensors = []
+        camera._rs, camera._config = import_pyrealsense2(), RealSenseConfig()
+        camera._devices, camera._serial = (lambda: ()), None
+        camera._recording, camera._sensors = path, []
         camera._start(camera._loaded())
         return camera
 
@@ -124,7 +121,7 @@ class RealSenseCamera:
 
     def _start(self, device: Any) -> None:
         rs = self._rs
-        self._device = device
+        self._device: Any = device
         self._facts = facts.device_json(rs, device)
         self._name = f"{self._facts.get('model', 'RealSense')} {self._facts.get('serial', '')}"
         self._serial = self._facts.get("serial", self._serial)
@@ -135,9 +132,7 @@ class RealSenseCamera:
         self._intrinsics = intrinsics_of(self._lenses[COLOR])
         units = facts.options_json(rs, depth_sensor).get("depth_units")
         if not units:
-            raise DeviceError(
-                f"{self._name} does not tell its depth unit, and a guess would scale the world."
-            )
+            raise DeviceError(f"{self._name} does not tell its depth unit; a guess is none.")
         self._depth_unit_m = units
         self._T_color_depth = facts.T_of(depth.get_extrinsics_to(color))
         self._alignment = None
@@ -209,8 +204,15 @@ class RealSenseCamera:
         def sort(frame: Any) -> None:
             take[frame.get_profile().stream_type()](frame)
 
+        # The SDK keeps these functions: they must not keep the camera, or nothing is ever freed.
+        pairs, over = self._pairs, rs.playback_status.stopped
+
+        def on_status(status: Any) -> None:
+            if status == over:
+                pairs.end()
+
         if self._recording is not None:
-            self._device.set_status_changed_callback(self._on_status)
+            self._device.set_status_changed_callback(on_status)
         try:
             for sensor, profiles in groups:
                 self._set_exposure(sensor, self._config.exposure)
@@ -225,10 +227,6 @@ class RealSenseCamera:
                 f"{self._name} does not start {c.width}x{c.height} at {c.fps} per second ({error})."
                 " Is it on a USB 3 port, and is no other program using it?"
             ) from error
-
-    def _on_status(self, status: Any) -> None:
-        if status == self._rs.playback_status.stopped:
-            self._pairs.end()
 
     def _set_exposure(self, sensor: Any, exposure: Literal["auto", "locked"] | float) -> None:
         rs = self._rs
@@ -385,6 +383,7 @@ class RealSenseCamera:
                 with contextlib.suppress(RuntimeError):
                     stop()
         self._sensors = []
+        self._device, self._alignment = None, None
 
     def reopen(self) -> None:
         """Start the same camera (by serial number) again; a recording starts from its beginning.

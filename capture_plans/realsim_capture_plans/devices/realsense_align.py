@@ -26,8 +26,13 @@ class Alignment:
         """
         self._align = rs.align(rs.stream.color)
         self._queue = rs.frame_queue(2)
-        self._color: Any = None
-        self._join = rs.processing_block(self._joined)
+        self._color: list[Any] = []
+        color_frame = self._color  # the SDK keeps the function, which must not keep this object
+
+        def join(depth: Any, source: Any) -> None:
+            source.frame_ready(source.allocate_composite_frame([depth, color_frame[0]]))
+
+        self._join = rs.processing_block(join)
         self._join.start(self._queue)
         # The SDK moves a pixel's depth to the colour's pixel but leaves it along the depth
         # camera's axis. With z_d = a . (z r - t), a = R's third column, r the colour pixel's ray:
@@ -36,15 +41,12 @@ class Alignment:
         self._scale = np.nan_to_num(1.0 / along, nan=0.0).astype(np.float32)
         self._offset = float(axis @ t)
 
-    def _joined(self, depth: Any, source: Any) -> None:
-        source.frame_ready(source.allocate_composite_frame([depth, self._color]))
-
     def depth_m(self, pair: Pair, unit_m: float) -> NDArray[np.float32]:
         """Return the depth (H, W) [m] on the colour image's pixels, along its z axis."""
-        self._color = pair.color
+        self._color[:] = [pair.color]
         self._join.invoke(pair.depth)
         frames = self._queue.wait_for_frame(ALIGN_MS).as_frameset()
-        self._color = None
+        self._color.clear()
         aligned = self._align.process(frames).get_depth_frame()
         depth = np.asanyarray(aligned.get_data()) * np.float64(unit_m)
         return np.where(depth > 0, (depth + self._offset) * self._scale, 0).astype(np.float32)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import local_pages
 from realsim.store.atomic import write_text
 from realsim_capture_plans.collision.model import CollisionModel
-from realsim_capture_plans.pictures import local_only
 from realsim_capture_plans.pictures.motion_charts import GROUP_LABELS
 from realsim_capture_plans.pictures.replay_scene import ReplayScene
 from realsim_capture_plans.planning.record import CapturePlan
@@ -42,7 +42,6 @@ class PlanReplay:
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
-        allow_remote: bool = False,
         looks: bool = True,
     ) -> None:
         """Listen, and build scene and panel; returns when both are there.
@@ -51,11 +50,10 @@ class PlanReplay:
             plan: what is shown.
             host: where to listen.
             port: the next free one is taken if it is in use, 0 = any.
-            allow_remote: whether other machines may reach it; there is no login.
             looks: whether to draw the arm as it looks, where the extra `looks` is installed.
 
         Raises:
-            InputError: the host is reachable from other machines without `allow_remote`, or the
+            InputError: the host is reachable from other machines, or the
                 plan's camera is not known.
         """
         import viser
@@ -64,13 +62,13 @@ class PlanReplay:
         self.tour = TourTime.of(plan)
         self.model: CollisionModel = plan.collision_model()
         sensor = sensor_of(plan)
-        self._host = local_only.check_host(host, allow_remote)
+        self._host = local_pages.check_host(host, "the replay")
         # Viser prints a banner with its address; the caller says what is to be said.
-        with local_only.origins_of(host), contextlib.redirect_stdout(io.StringIO()):
+        with local_pages.local_origins_only(), contextlib.redirect_stdout(io.StringIO()):
             self.server = viser.ViserServer(
                 host=host, port=port, label="realsim plan", verbose=False
             )
-        local_only.refuse_share(self.server)
+        local_pages.refuse_share(self.server)
         self.scene = ReplayScene(self.server, plan, sensor, looks)
         self.time_s = 0.0
         self._stopping = threading.Event()
@@ -190,7 +188,6 @@ def serve_replay(
     host: str = "127.0.0.1",
     port: int = 8080,
     *,
-    allow_remote: bool = False,
     looks: bool = True,
 ) -> PlanReplay:
     """Return the running replay of a plan; `url` is where to look, `stop` ends it.
@@ -199,13 +196,12 @@ def serve_replay(
         plan: what is shown.
         host: where to listen; only this machine can reach 127.0.0.1.
         port: the next free one is taken if it is in use, 0 = any.
-        allow_remote: whether the host may be one that other machines reach; there is no login.
         looks: whether to draw the arm as it looks, where the extra `looks` is installed.
 
     Raises:
         InputError: see `PlanReplay`.
     """
-    return PlanReplay(plan, host=host, port=port, allow_remote=allow_remote, looks=looks)
+    return PlanReplay(plan, host=host, port=port, looks=looks)
 
 
 def write_replay(plan: CapturePlan, path: Path | str, *, looks: bool = True) -> Path:

@@ -1,4 +1,4 @@
-"""Views of a flat board: poses that differ in everything a calibration lives on, and their choice."""
+"""Views of a flat board: poses that differ in all that a calibration lives on, and their choice."""
 
 import numpy as np
 from numpy.typing import NDArray

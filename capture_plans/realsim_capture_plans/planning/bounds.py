@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 ASCENT_STEPS = 400
 """Steps of the subgradient ascent; the bound grows by less than 0.1 % in the last hundred."""
+LEAST_GAP_S = 1e-6
+"""Least difference between tour and bound that sets a step [s]."""
 ASCENT_SHRINK = 0.9
 """The step length is shrunk by this every ten steps (Held, Wolfe and Crowder, 1974)."""
 
@@ -55,45 +57,41 @@ def _ascend(least: Array, upper: float) -> float:
     price = np.zeros(n)
     best, pace = 0.0, 2.0
     for step in range(ASCENT_STEPS):
-        inside = np.zeros(n, dtype=np.bool_)
-        reach = np.full(n, np.inf)
-        parent = np.zeros(n, dtype=np.intp)
-        degree = np.zeros(n)
-        reach[0] = 0.0
-        total = 0.0
-        for _ in range(n):
-            here = -1
-            for j in range(n):
-                if not inside[j] and (here < 0 or reach[j] < reach[here]):
-                    here = j
-            inside[here] = True
-            if here != 0:
-                total += reach[here]
-                degree[here] += 1
-                degree[parent[here]] += 1
-            for j in range(n):
-                if not inside[j]:
-                    t = least[here, j] + price[here] + price[j]
-                    if t < reach[j]:
-                        reach[j], parent[j] = t, here
-        # The stop that closes the path: one move to home, one to the cheapest view.
-        end = 1
-        for j in range(2, n):
-            if price[j] < price[end]:
-                end = j
-        total += price[0] + price[end]
-        degree[0] += 1
-        degree[end] += 1
+        total, degree = _one_tree(least, price)
         bound = total - 2.0 * price.sum()
         best = max(best, bound)
-        gap = 0.0
-        for j in range(n):
-            gap += (degree[j] - 2.0) ** 2
+        gap = ((degree - 2.0) ** 2).sum()
         if gap == 0.0:
             return best
-        length = pace * max(upper - bound, 1e-6) / gap
-        for j in range(n):
-            price[j] += length * (degree[j] - 2.0)
+        price += pace * max(upper - bound, LEAST_GAP_S) / gap * (degree - 2.0)
         if step % 10 == 9:
             pace *= ASCENT_SHRINK
     return best
+
+
+@njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _one_tree(least: Array, price: Array) -> tuple[float, Array]:
+    """Return the priced length of the least 1-tree, and the moves (N + 1,) at every stop."""
+    n = len(least)
+    inside = np.zeros(n, dtype=np.bool_)
+    reach = np.full(n, np.inf)
+    parent = np.zeros(n, dtype=np.intp)
+    degree = np.zeros(n)
+    reach[0] = 0.0
+    total = 0.0
+    for _ in range(n):
+        here = int(np.argmin(np.where(inside, np.inf, reach)))
+        inside[here] = True
+        if here != 0:
+            total += reach[here]
+            degree[here] += 1
+            degree[parent[here]] += 1
+        for j in range(n):
+            t = least[here, j] + price[here] + price[j]
+            if not inside[j] and t < reach[j]:
+                reach[j], parent[j] = t, here
+    # The stop that closes the path: one move to home, one to the cheapest view.
+    end = 1 + int(np.argmin(price[1:]))
+    degree[0] += 1
+    degree[end] += 1
+    return total + price[0] + price[end], degree

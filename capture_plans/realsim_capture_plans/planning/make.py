@@ -40,8 +40,8 @@ from realsim_capture_plans.planning.viewpoints import (
     golden_cap,
     hemisphere_poses,
     look_at_poses,
-    reachable,
     on_one_elbow,
+    reachable,
     thin_directions,
     well_seen,
     with_turns,
@@ -180,7 +180,7 @@ def reachable_directions(task: "_Task", n: int) -> tuple[Array, Candidates]:
     return directions, found
 
 
-def calibration_plan(
+def calibration_plan(  # noqa: PLR0913 - a plan's own facts, one by one
     n: int,
     center_world: ArrayLike,
     mount: Mount | ArrayLike,
@@ -232,7 +232,7 @@ def calibration_plan(
     return replace(plan, metrics=plan.metrics | board | share)
 
 
-def _task(
+def _task(  # noqa: PLR0913, PLR0917 - hands on what both kinds of plan are given
     kind: Kind,
     n: int,
     center: ArrayLike,
@@ -398,9 +398,7 @@ def _nearest_views(task: _Task, directions: Array, joints: Array) -> tuple[Array
     """
     config, chain = task.config, task.model.chain
     Ts = chain.forward(joints) @ task.mount.T_ee_cam
-    radius = np.clip(
-        np.linalg.norm(Ts[:, :3, 3] - task.center, axis=-1), *config.radius_m
-    )
+    radius = np.clip(np.linalg.norm(Ts[:, :3, 3] - task.center, axis=-1), *config.radius_m)
     eyes = task.center + radius[:, None] * directions
     upright = look_at_poses(eyes, task.center, np.zeros(len(eyes)))
     turn = np.swapaxes(upright[:, :3, :3], -1, -2) @ Ts[:, :3, :3]

@@ -1,6 +1,7 @@
 """Free moves between views: another way round where a straight move collides, else via points."""
 
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -99,9 +100,7 @@ def _free_tour(
     vain = 0
     steps = int(REROUTE_SHARE * config.tour_steps)
     for _ in range(REROUTES):
-        moves: list[tuple[int, int]] = list(
-            zip([0, *path[:-1].tolist()], path.tolist(), strict=True)
-        )
+        moves: list[tuple[int, int]] = list(pairwise([0, *path.tolist()]))
         unknown = [m for m in moves if m not in colliding and m not in known_free]
         if unknown:
             ends = np.array(unknown)
@@ -110,7 +109,7 @@ def _free_tour(
             )
             for move, is_free in zip(unknown, free.tolist(), strict=True):
                 # A straight line is as free backwards as it is forwards.
-                (known_free if is_free else colliding).update((move, move[::-1]))
+                (known_free if is_free else colliding).update((move, (move[1], move[0])))
         bad = [k for k, move in enumerate(moves) if move in colliding]
         total = tour_seconds(clusters, path, config, colliding)
         vain += 1
@@ -254,6 +253,9 @@ def _shortened(
         if len(path) <= 2:
             break
         i, j = np.sort(rng.choice(len(path), 2, replace=False))
-        if j - i > 1 and model.edges_free(path[i : i + 1], path[j : j + 1], config.edge_step_rad)[0]:
+        if (
+            j - i > 1
+            and model.edges_free(path[i : i + 1], path[j : j + 1], config.edge_step_rad)[0]
+        ):
             path = np.concatenate([path[: i + 1], path[j:]])
     return path

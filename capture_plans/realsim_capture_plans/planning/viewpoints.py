@@ -185,9 +185,7 @@ def thin_directions(directions: Array, n: int) -> Ints:
     return best
 
 
-def with_turns(
-    joints: Array, home: Array, chain: DhChain, config: PlanConfig
-) -> Array:
+def with_turns(joints: Array, home: Array, chain: DhChain, config: PlanConfig) -> Array:
     """Return joints (M, 6) with all their whole turns (K, 6) inside the limits and near home.
 
     At most `config.branch_limit` of them; every joint within `config.turn_reach_rad` of home.

@@ -1,4 +1,4 @@
-"""Who may look and press buttons: this machine only.
+"""Pages in the browser for this machine only: who may look and press buttons.
 
 Viser has no login: whoever can open its websocket sees the scene and can press every button. So
 the server listens on the loopback interface, refuses websockets that a foreign web page opened in
@@ -20,8 +20,12 @@ LOCAL_ORIGIN = re.compile(r"https?://(localhost|127(\.\d{1,3}){3}|\[::1\])(:\d{1
 _patching = threading.Lock()
 
 
-def check_host(host: str) -> str:
+def check_host(host: str, what: str) -> str:
     """Return the host to bind, which must be of the loopback interface.
+
+    Args:
+        host: the host that was asked for.
+        what: what is to be served, for the message: "the review".
 
     Raises:
         InputError: other machines could reach it.
@@ -32,8 +36,8 @@ def check_host(host: str) -> str:
         if ipaddress.ip_address(host).is_loopback:
             return host
     raise InputError(
-        f"the review may not listen on '{host}': it has no login, so anybody who reaches it could "
-        "see the session and accept or reject objects. Use 127.0.0.1, ::1 or localhost; from "
+        f"{what} may not listen on '{host}': it has no login, so anybody who reaches it could "
+        "watch it and press its buttons. Use 127.0.0.1, ::1 or localhost; from "
         "another machine, forward the port: ssh -L 8080:127.0.0.1:8080 THIS_MACHINE."
     )
 
@@ -58,13 +62,11 @@ def local_origins_only() -> Generator[None]:
             module.serve = serve
 
 
-def refuse_share(server: Any, request: type[Any]) -> None:
+def refuse_share(server: Any) -> None:
     """Make a viser server deaf to its clients' requests for a public tunnel.
 
     Hiding the button is not enough: any client can send the message.
-
-    Args:
-        server: the viser.ViserServer.
-        request: viser's message class of the request.
     """
-    server._websock_server.unregister_handler(request)
+    from viser import _messages as viser_messages
+
+    server._websock_server.unregister_handler(viser_messages.ShareUrlRequest)
