@@ -160,6 +160,10 @@ def run_kills(root: Path, kills: int, rng: np.random.Generator) -> dict[str, flo
         done += killed
         with_loss += killed and lost
         in_flight_max = max(in_flight_max, in_flight)
+        print(
+            f"{done} of {kills} kills, {with_loss} with loss, {len(sealed.lines)} views sealed",
+            file=sys.stderr,
+        )
         if len(sealed.lines) == VIEWS:
             faults = SessionStore.open(sealed.folder).verify()  # opening cleans up, loses nothing
             with_loss += bool(faults) or sealed.look()[0]

@@ -8,7 +8,9 @@ Figures (keys of the JSON's "figures"), the worst of the seeds:
   hole_cap_deg        the same over the whole cap, elevation >= 15 deg, at the best placement
   tour_over_bound     tour time over half the sum of the two nearest clusters (a lower bound)
   tour_over_held_karp the same over the Held-Karp bound, which is higher
-  tour_over_greedy    tour time over ring by ring with the nearest free candidate, same views
+  tour_over_greedy    tour time over ring by ring with the nearest free branch, roll and turn, same
+                      views and distances
+  tour_over_greedy_free   the same with as many distances and rolls to choose from as the plan had
   colliding_edges     moves that meet the arm's own meshes, the table or the scene, every 0.02 rad
   plan_cpu_s          of one whole plan, metrics included, compiled code warm
   unsafe_share, overcautious_share   of our shapes against the meshes, random configurations
@@ -38,15 +40,22 @@ from realsim_capture_plans.planning.advise import advise
 from realsim_capture_plans.planning.make import hemisphere_plan
 from realsim_capture_plans.planning.ordering import move_seconds
 from realsim_capture_plans.planning.record import CapturePlan
-from realsim_capture_plans.planning.viewpoints import hemisphere_poses, reachable, with_turns
+from realsim_capture_plans.planning.viewpoints import (
+    hemisphere_poses,
+    look_at_poses,
+    reachable,
+    with_turns,
+)
 
 Array = NDArray[np.float64]
 VIEWS = 256
 AIM_HEIGHT_M = 0.05
 RING_DEG = 10.0
 """Width of the rings of the greedy order."""
+ROLLS = 16
+"""Rolls per view that the greedy order chooses from."""
 POSES = 60
-"""Camera poses per view that the greedy order chooses from: as many as the plan's own search."""
+"""Camera poses per view that it chooses from with free distances: as many as the plan's search."""
 REACHED_M = 1e-6
 MESH_STEP_RAD = 0.02
 
@@ -66,17 +75,29 @@ def valid_views(plan: CapturePlan) -> int:
     return int(ok.sum())
 
 
-def greedy_ring_seconds(plan: CapturePlan) -> float:
+def greedy_ring_seconds(plan: CapturePlan, *, free_radius: bool) -> float:
     """Return the time of the usual order: rings from the top down, always the nearest candidate.
 
     The rings are gone round in turns to and fro; collisions on the way are not even looked at.
+
+    Args:
+        plan: its directions are used, and its distances unless they are free.
+        free_radius: whether the nearest is chosen among as many distances and rolls as the plan's
+            own search has, or among rolls alone.
     """
     directions = plan.directions()
     elevation = np.degrees(np.arcsin(np.clip(directions[:, 2], -1, 1)))
     ring = np.floor((90.0 - elevation) / RING_DEG).astype(int)
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
     order = np.lexsort([np.where(ring % 2 == 0, azimuth, -azimuth), ring])
-    poses, item = hemisphere_poses(plan.center_world, directions, plan.config.radius_m, POSES, 0.0)
+    if free_radius:
+        poses, item = hemisphere_poses(
+            plan.center_world, directions, plan.config.radius_m, POSES, 0.0
+        )
+    else:
+        item = np.repeat(np.arange(len(directions)), ROLLS)
+        rolls = np.tile(np.arange(ROLLS) * (2 * np.pi / ROLLS), len(directions))
+        poses = look_at_poses(plan.Ts_base_cam[item, :3, 3], plan.center_world, rolls)
     found = reachable(
         poses, item, plan.mount.T_ee_cam, plan.collision_model(), plan.config.sigma_min
     )
@@ -125,7 +146,8 @@ def run(seed: int, center: tuple[float, float, float], quick: bool) -> dict[str,
         "tour_s": seconds,
         "tour_over_bound": seconds / plan.metrics["tour_bound_two_nearest_s"],
         "tour_over_held_karp": plan.metrics["tour_over_bound"],
-        "tour_over_greedy": seconds / greedy_ring_seconds(plan),
+        "tour_over_greedy": seconds / greedy_ring_seconds(plan, free_radius=False),
+        "tour_over_greedy_free": seconds / greedy_ring_seconds(plan, free_radius=True),
         "plan_cpu_s": cpu_s,
         **mesh_figures(plan, 2000 if quick else 20000),
     }

@@ -76,7 +76,7 @@ def test_a_plan_is_made_and_written(realsim: Callable[..., Done]) -> None:
     assert done.code == 0, done.err
     plan = load_plan("a.json")
     assert len(plan) == 4 and plan.robot == "UR5e" and plan.kind == "hemisphere"
-    assert plan.center_world == pytest.approx([0.35, 0.0, 0.05])
+    assert plan.center_world == pytest.approx([0.40, 0.0, 0.05])
     assert plan.metrics["colliding_legs"] == 0
     assert plan.content_hash[:12] in done.out and "good" in done.out
     before = Path("a.json").read_bytes()

@@ -126,7 +126,7 @@ def tour(
         clusters.joints, clusters.first, owner, suspects, keys, config.speed, config.acceleration
     )
     path = nearest_neighbour(clusters.least_s, problem) if start is None else np.array(start)
-    path = best_candidates(path, problem)
+    path = best_candidates(path, clusters.least_s, problem)
     if n <= 2 or steps == 0:
         return path
     return ruin_and_recreate(path, clusters.least_s, steps, problem, rng)

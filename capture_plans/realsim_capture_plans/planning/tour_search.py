@@ -21,8 +21,10 @@ START_TEMPERATURE_S = 0.4
 """Worse tours are accepted with exp(-loss / temperature) at the beginning: one typical move [s]."""
 END_TEMPERATURE_S = 0.004
 """The same at the end: next to nothing worse is accepted."""
-VITERBI_EVERY = 400
+VITERBI_EVERY = 1000
 """Steps between two choices of all candidates at once."""
+PLACES = 12
+"""Places looked at when a view goes back, by the least that they can cost."""
 BLINK = 0.01
 """Probability with which a place is overlooked, so that equal views do not always go in alike."""
 
@@ -70,9 +72,11 @@ def lower_least(least: Array, joints: Array, first: Ints, new: Ints) -> None:
 @njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
 def _seconds(a: int, b: int, p: Problem) -> float:
     """Return the time of the move between two rows, with the charge if it collides."""
-    d = 0.0
-    for k in range(6):
-        d = max(d, abs(p.joints[a, k] - p.joints[b, k]))
+    q = p.joints
+    d = max(
+        max(abs(q[a, 0] - q[b, 0]), abs(q[a, 1] - q[b, 1]), abs(q[a, 2] - q[b, 2])),
+        max(abs(q[a, 3] - q[b, 3]), abs(q[a, 4] - q[b, 4]), abs(q[a, 5] - q[b, 5])),
+    )
     v, acc = p.speed, p.acceleration
     t = d / v + v / acc if d >= v * v / acc else 2.0 * np.sqrt(d / acc)
     if p.suspects[p.owner[a], p.owner[b]]:
@@ -117,7 +121,7 @@ def _length(path: Ints, p: Problem) -> float:
 
 
 @njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
-def best_candidates(path: Ints, p: Problem) -> Ints:
+def best_candidates(path: Ints, least: Array, p: Problem) -> Ints:
     """Return rows (N,) with the same order of views and the candidates that make it shortest."""
     n = len(path)
     widest = 0
@@ -131,11 +135,14 @@ def best_candidates(path: Ints, p: Problem) -> Ints:
         size = p.first[view + 1] - p.first[view]
         new = np.full(size, np.inf)
         base = p.first[previous]
+        cheapest = np.argsort(cost)
+        shortest = least[previous, view]
         for c in range(size):
             row = int(p.first[view]) + c
-            for before in range(len(cost)):
-                if cost[before] >= new[c]:
-                    continue
+            for j in range(len(cost)):
+                before = int(cheapest[j])
+                if cost[before] + shortest >= new[c]:
+                    break
                 t = cost[before] + _seconds(base + before, row, p)
                 if t < new[c]:
                     new[c] = t
@@ -189,7 +196,7 @@ def _put_back(
     best, best_place, best_row = np.inf, size, p.first[view]
     # The most promising places first: the others are then ruled out by their bound alone.
     order = np.argsort(gain)
-    for j in range(size + 1):
+    for j in range(min(PLACES, size + 1)):
         k = int(order[j])
         if gain[k] >= best:
             break
@@ -240,10 +247,10 @@ def ruin_and_recreate(
             _put_back(kept, size, view, least, p, rng)
             size += 1
         if step % VITERBI_EVERY == VITERBI_EVERY - 1:
-            kept = best_candidates(kept, p)
+            kept = best_candidates(kept, least, p)
         t = _length(kept, p)
         if t < now - temperature * np.log(1.0 - rng.random()):
             path, now = kept, t
         if now < best:
             best, best_path = now, path.copy()
-    return best_candidates(best_path, p)
+    return best_candidates(best_path, least, p)
