@@ -74,8 +74,12 @@ def _seconds(a: int, b: int, p: Problem) -> float:
     """Return the time of the move between two rows, with the charge if it collides."""
     q = p.joints
     d = max(
-        max(abs(q[a, 0] - q[b, 0]), abs(q[a, 1] - q[b, 1]), abs(q[a, 2] - q[b, 2])),
-        max(abs(q[a, 3] - q[b, 3]), abs(q[a, 4] - q[b, 4]), abs(q[a, 5] - q[b, 5])),
+        abs(q[a, 0] - q[b, 0]),
+        abs(q[a, 1] - q[b, 1]),
+        abs(q[a, 2] - q[b, 2]),
+        abs(q[a, 3] - q[b, 3]),
+        abs(q[a, 4] - q[b, 4]),
+        abs(q[a, 5] - q[b, 5]),
     )
     v, acc = p.speed, p.acceleration
     t = d / v + v / acc if d >= v * v / acc else 2.0 * np.sqrt(d / acc)
