@@ -214,7 +214,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--quick", action="store_true", help="6 kills, 3 full disks")
+    parser.add_argument("--quick", action="store_true", help="2 kills, 1 full disk")
     parser.add_argument("--kills", type=int, default=60)
     parser.add_argument("--enospc", type=int, default=10, help="full disks (needs root)")
     parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
@@ -222,7 +222,7 @@ def main() -> None:
     if args.child:
         child(args.child)
         return
-    kills, full = (6, 3) if args.quick else (args.kills, args.enospc)
+    kills, full = (2, 1) if args.quick else (args.kills, args.enospc)
     rng = np.random.default_rng(SEED)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)

@@ -48,11 +48,12 @@ PART_OF_ARC = np.pi
 
 
 class TimedCamera:
-    """The lab's camera; keeps what its frames cost, and gives them again after `RENDERED`."""
+    """The lab's camera; keeps what its frames cost, and gives them again after `rendered`."""
 
-    def __init__(self, lab: SimulatedLab) -> None:
+    def __init__(self, lab: SimulatedLab, rendered: int) -> None:
         """Take over the camera of a lab."""
         self._camera = lab.camera
+        self._rendered = rendered
         self._frames: list[Frame] = []
         self._count = 0
         self.cpu_s = 0.0
@@ -80,9 +81,9 @@ class TimedCamera:
     def grab(self) -> Frame:
         """Return a frame with a new time stamp, its cost noted."""
         began = time.process_time()
-        if len(self._frames) < RENDERED:
+        if len(self._frames) < self._rendered:
             self._frames.append(self._camera.grab())
-        frame = replace(self._frames[self._count % RENDERED], time_s=float(self._count))
+        frame = replace(self._frames[self._count % self._rendered], time_s=float(self._count))
         self._count += 1
         self.cpu_s += time.process_time() - began
         return frame
@@ -123,19 +124,19 @@ def arc_plan(views: int, center: np.ndarray[Any, Any]) -> CapturePlan:
     )  # fmt: skip
 
 
-def run(views: int, folder: Path) -> dict[str, float]:
+def run(views: int, rendered: int, folder: Path) -> dict[str, float]:
     """Capture once and return the figures."""
     lab = SimulatedLab(LabConfig(seed=0))
     lab.place_objects()
     plan = arc_plan(views, lab.scene_center)
-    camera = TimedCamera(lab)
+    camera = TimedCamera(lab, rendered)
     session = CaptureSession(
         name="benchmark", intrinsics=camera.intrinsics, views=(), depth_unit_m=camera.depth_unit_m
     )
     store = TimedStore.create(folder, session, {"plan_hash": plan.content_hash})
     warm = Thumbnails((160, 90))
     warm.add(0, camera.grab().rgb)  # loads and compiles what the first frame needs
-    camera = TimedCamera(lab)  # the first frame was seen from elsewhere
+    camera = TimedCamera(lab, rendered)  # the first frame was seen from elsewhere
     TimedStore.cpu_s = 0.0
     cpu, wall = time.process_time(), time.perf_counter()
     job = CaptureJob(on_view=Thumbnails((160, 90)).add)
@@ -158,12 +159,12 @@ def main() -> None:
     """Run, print, write JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--views", type=int, default=256)
-    parser.add_argument("--quick", action="store_true", help="32 views")
+    parser.add_argument("--quick", action="store_true", help="24 views, 6 rendered")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
-    views = 32 if args.quick else args.views
+    views, rendered = (24, 6) if args.quick else (args.views, RENDERED)
     with tempfile.TemporaryDirectory() as folder:
-        figures = run(views, Path(folder) / "session")
+        figures = run(views, rendered, Path(folder) / "session")
     for key, value in figures.items():
         print(f"{key:32} {value:10.3f}")
     if args.json:
