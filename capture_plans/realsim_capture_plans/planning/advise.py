@@ -18,6 +18,7 @@ from realsim_capture_plans.planning.record import PlanConfig
 from realsim_capture_plans.planning.view_quality import hole_deg
 from realsim_capture_plans.planning.viewpoints import (
     better_elbow,
+    cap_rim,
     golden_cap,
     hemisphere_poses,
     reachable,
@@ -108,14 +109,21 @@ def _placement(
         config, table_height_m=table_height_m, table_rectangle_m=(x0, rest[0], rest[1], rest[2])
     )
     model = CollisionModel(chain, mount, here.work_cell(center, "hemisphere"), here.clearance_m)
-    directions = golden_cap(max(DIRECTIONS, n), here.elevation_deg)
+    count = max(DIRECTIONS, n)
+    directions = np.concatenate(
+        [golden_cap(count, here.elevation_deg), cap_rim(count, here.elevation_deg)]
+    )
     poses, item = hemisphere_poses(center, directions, here.radius_m, POSES, 0.0)
     found = reachable(poses, item, mount.T_ee_cam, model, here.sigma_min)
     one_side = found.where(np.sin(found.joints[:, 2]) * better_elbow(found) > 0)
     holes: list[float] = []
     for ok in (np.unique(found.item), np.unique(one_side.item)):
         few = len(ok) < n
-        chosen = directions[ok] if few else directions[ok][thin_directions(directions[ok], n)]
+        chosen = (
+            directions[ok]
+            if few
+            else directions[ok][thin_directions(directions[ok], n, directions)]
+        )
         holes.append(NO_PLAN_DEG if few else hole_deg(chosen, here.elevation_deg))
     return Placement(
         center=center,

@@ -36,6 +36,7 @@ from realsim_capture_plans.planning.view_quality import SENSORS, nearest_deg
 from realsim_capture_plans.planning.viewpoints import (
     Candidates,
     better_elbow,
+    cap_rim,
     choose_home,
     golden_cap,
     hemisphere_poses,
@@ -136,7 +137,7 @@ def hemisphere_plan(
         return well_seen(both, _seen_share(both.Ts_base_cam, task), config.seen_share)
 
     def choose(ok: Ints) -> Ints:
-        return ok[thin_directions(directions[ok], n)]
+        return ok[thin_directions(directions[ok], n, directions)]
 
     def between(direction: Ints, joints: Array) -> tuple[Array, Ints]:
         """Return candidates (K, 6) near joints (N, 6), and the row that each belongs to."""
@@ -155,7 +156,7 @@ def _largest_hole(directions: Array, items: Ints, found: Candidates, n: int) -> 
     ok = np.unique(found.item)
     if len(ok) < n:
         return np.inf
-    chosen = directions[ok][thin_directions(directions[ok], n)]
+    chosen = directions[ok][thin_directions(directions[ok], n, directions)]
     return float(nearest_deg(chosen, directions[items]).max())
 
 
@@ -164,7 +165,10 @@ def reachable_directions(task: "_Task", n: int) -> tuple[Array, Candidates]:
     config = task.config
     spin = se3.exp_so3([0.0, 0.0, task.rng.uniform(0.0, 2 * np.pi)])
     tried = max(config.oversampling * n, config.least_directions)
-    directions = golden_cap(tried, config.elevation_deg) @ spin.T
+    cap = golden_cap(tried, config.elevation_deg)
+    # The spiral ends half a turn short of the rim, where the cells of its last views reach out.
+    directions = np.concatenate([cap, cap_rim(tried, config.elevation_deg)]) @ spin.T
+    tried = len(directions)
     poses, item = hemisphere_poses(
         task.center, directions, config.radius_m, config.poses_per_direction, 0.0
     )

@@ -25,6 +25,8 @@ HOME_COMPARISONS = 60
 """Items, evenly picked, that a home is judged by."""
 LLOYD_ROUNDS = 30
 """Moves of the chosen views to the middle of their cells; most settle within fifteen."""
+PATCHES = 200
+"""Views moved to the largest hole, at most; it stops shrinking after some ten."""
 Tick = Callable[[int, int], None]
 
 
@@ -64,6 +66,15 @@ def golden_cap(n: int, elevation_deg: tuple[float, float]) -> Array:
     azimuth = np.arange(n) * GOLDEN_ANGLE
     r = np.sqrt(1.0 - z * z)
     return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1)
+
+
+def cap_rim(n: int, elevation_deg: tuple[float, float]) -> Array:
+    """Return unit vectors (K, 3) on the lower rim, as far apart as n vectors over the whole cap."""
+    low, high = np.sin(np.radians(elevation_deg))
+    spacing = np.sqrt(2 * np.pi * (high - low) / n)
+    r = np.cos(np.radians(elevation_deg[0]))
+    azimuth = np.arange(0.0, 2 * np.pi, spacing / r)
+    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), np.full(len(azimuth), low)], -1)
 
 
 def look_at_poses(eyes: Array, targets: ArrayLike, rolls: Array) -> Array:
@@ -159,30 +170,67 @@ def farthest_points(points: Array, n: int, first: int) -> Ints:
     return np.array(chosen, dtype=np.intp)
 
 
-def thin_directions(directions: Array, n: int) -> Ints:
-    """Return n row numbers of unit vectors (M, 3) that cover them evenly.
+def thin_directions(directions: Array, n: int, wanted: Array | None = None) -> Ints:
+    """Return n row numbers of unit vectors (M, 3) that cover a cap evenly.
 
-    Farthest points from the topmost, then Lloyd's rounds restricted to the given directions: every
-    chosen one moves to the direction nearest the mean of its cell. The round with the smallest
-    hole counts.
+    Farthest points from the topmost, then Lloyd's rounds: every chosen one moves to that of its
+    cell's directions which is nearest the mean of the cell. Then the chosen one that is missed
+    least moves to where the hole is, as long as the hole shrinks.
+
+    Args:
+        directions: (M, 3) to choose from.
+        n: how many.
+        wanted: (W, 3) what is to be covered, reachable or not; by default the directions.
     """
+    target = directions if wanted is None else wanted
     chosen = farthest_points(directions, n, int(np.argmax(directions[:, 2])))
     best, least_hole = chosen, np.inf
     for _ in range(LLOYD_ROUNDS):
-        likeness = directions @ directions[chosen].T
+        likeness = target @ directions[chosen].T
         cell = np.argmax(likeness, axis=1)
         hole = float(np.arccos(np.clip(likeness.max(axis=1).min(), -1.0, 1.0)))
         if hole < least_hole:
             best, least_hole = chosen, hole
         mean = np.zeros((n, 3))
-        np.add.at(mean, cell, directions)
+        np.add.at(mean, cell, target)
         # Within its own cell, so that two cells never choose the same direction.
-        score = np.where(cell[:, None] == np.arange(n), directions @ mean.T, -np.inf)
+        own = np.argmax(directions @ directions[chosen].T, axis=1)
+        score = np.where(own[:, None] == np.arange(n), directions @ mean.T, -np.inf)
         moved = np.argmax(score, axis=0)
         if np.array_equal(moved, chosen):
             break
         chosen = moved
-    return best
+    return _patched(directions, best, target)
+
+
+def _patched(directions: Array, chosen: Ints, target: Array) -> Ints:
+    """Return the choice (n,) after moving views to the largest hole while that makes it smaller.
+
+    Args:
+        directions: (M, 3) to choose from.
+        chosen: (n,) rows of the choice.
+        target: (W, 3) what is to be covered.
+    """
+    chosen = chosen.copy()
+    likeness = target @ directions[chosen].T
+    for _ in range(PATCHES):
+        order = np.argsort(likeness, axis=1)
+        row = np.arange(len(target))
+        first, second = likeness[row, order[:, -1]], likeness[row, order[:, -2]]
+        hole = int(np.argmin(first))
+        filling = int(np.argmax(directions @ target[hole]))
+        if filling in chosen:
+            break
+        filled = target @ directions[filling]
+        # What would be worst covered if each view went: its own cell, seen from its second nearest.
+        without = np.full(len(chosen), 1.0)
+        np.minimum.at(without, order[:, -1], np.maximum(second, filled))
+        goes = int(np.argmax(without))
+        if min(without[goes], np.sort(np.maximum(first, filled))[0]) <= first[hole] + 1e-12:
+            break
+        chosen[goes] = filling
+        likeness[:, goes] = filled
+    return chosen
 
 
 def with_turns(joints: Array, home: Array, chain: DhChain, config: PlanConfig) -> Array:
