@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 
 PICTURES = "_pictures"
 """Added to a plan's name: the folder of its pictures beside it."""
+ODD_ROW_M = 0.010
+"""A tool pose that is farther than this from its joints' is named [m]; arms leave 1 to 3 mm."""
+ODD_ROW_TIMES = 5.0
+"""And that is this many times the median's distance."""
+LOOKING_BACK = -0.2
+"""Cosine between optical axis and tool z below which a camera looks back."""
 NO_PLAN_DEG = 180.0
 """The advice's hole where a place has fewer reachable views than were asked for [deg]."""
 NAMED_LEGS = 12
@@ -209,6 +215,13 @@ def _source_plan(
         tool = 1e3 * found.reading.T_ee_tcp[:3, 3]
         console.say(f"{source} fits {found.reading.text()} are left with one constant tool offset")
         console.say(f"tool offset: {', '.join(f'{v:.1f}' for v in tool)} mm in the flange")
+        if found.reading.worst_m > max(ODD_ROW_M, ODD_ROW_TIMES * found.reading.gap_m):
+            console.warn(
+                f"the tool pose of row {found.reading.worst} (counted from 0) is "
+                f"{1e3 * found.reading.worst_m:.0f} mm from where its joints put the tool, and the "
+                "worst of all rows. Its joints are driven all the same: look which of the two is "
+                "wrong before you drive it."
+            )
         chain = chain or found.reading.chain
     if chain is None:
         raise InputError(
@@ -261,6 +274,7 @@ def _metrics(plan: CapturePlan) -> dict[str, float]:
 def show_plan(plan: CapturePlan, metrics: dict[str, float], console: Console) -> None:
     """Print what the plan is for, and its metrics beside what is good."""
     from realsim_capture_plans.plan_files.imported import IMPORT_MEANINGS
+    from realsim_capture_plans.planning.metric_meanings import goal_of
     from realsim_capture_plans.planning.metrics import METRIC_MEANINGS
 
     meanings = METRIC_MEANINGS | IMPORT_MEANINGS
@@ -271,14 +285,34 @@ def show_plan(plan: CapturePlan, metrics: dict[str, float], console: Console) ->
         f"{plan.kind} plan: {len(plan)} views of ({x:.3f}, {y:.3f}, {z:.3f}) m; {arm}; "
         f"{plan.mount.name}; sha256 {plan.content_hash[:12]}"
     )
-    rows: list[tuple[str, str, str]] = []
+    rows: list[tuple[str, str, str, str]] = []
+    missed: list[str] = []
     for name in [*meanings, *sorted(set(metrics) - set(meanings))]:
         if name not in metrics:
             continue
-        meaning = meanings.get(name)
-        text, unit, good = (meaning.text, meaning.unit, meaning.good) if meaning else (name, "", "")
-        rows.append((text, f"{metrics[name]:.4g} {unit}".strip(), good))
-    console.table("How good it is", ("metric", "value", "good"), rows)
+        meaning, value = meanings.get(name), metrics[name]
+        if meaning is None:
+            rows.append((name, f"{value:.4g}", "", ""))
+            continue
+        goal = goal_of(name, meaning, value, plan)
+        rows.append(
+            (
+                meaning.text,
+                f"{value:.4g} {meaning.unit}".strip(),
+                goal.text,
+                {True: "", False: "MISSED", None: ""}[goal.met],
+            )
+        )
+        if goal.met is False:
+            missed.append(f"{meaning.text}: {value:.4g} {meaning.unit}, good is {goal.text}")
+    console.table("How good it is", ("metric", "value", "good", ""), rows)
+    for line in missed:
+        console.warn(line)
+    if plan.mount.T_ee_cam[2, 2] < LOOKING_BACK:
+        console.warn(
+            f"the camera of mount '{plan.mount.name}' looks back along the arm. If it looks away "
+            "from the flange as usual, the mount's rotation is wrong."
+        )
 
 
 def show_colliding(plan: CapturePlan, console: Console) -> bool:

@@ -110,7 +110,7 @@ def test_a_board_plan_lies_on_the_table(realsim: Callable[..., Done]) -> None:
         (["--center", "nan,0,0"], "3 numbers"),
         (["--keep-out", "300,300,120"], "--keep-out"),
         (["--radius", "280,420"], "'0.28,0.42'"),
-        (["--radius", "0.4,0.3"], "radius_m"),
+        (["--radius", "0.4,0.3"], "in this order"),
         (["--table-height", "-300"], "millimetres"),
         (["--elevation", "20,95"], "90"),
         (["--board", "--elevation", "20,80"], "--elevation"),
@@ -141,6 +141,13 @@ def test_a_plan_is_shown(realsim: Callable[..., Done], tmp_path: Path) -> None:
     assert realsim("plan-show", "shipped:nowhere").code == 2
     done = realsim("plan-show", "q.json")
     assert done.code == 2 and "no plan at q.json" in done.err
+
+
+def test_what_misses_its_goal_is_marked(realsim: Callable[..., Done]) -> None:
+    # Six views of a cap cannot leave holes as small as their number allows from one low ring.
+    done = realsim("plan", "--views", "6", "--elevation", "20,25", "--no-pictures", "--quiet")
+    assert done.code == 0
+    assert "MISSED" in done.out and "good is" in done.err
 
 
 def test_a_plan_that_collides_ends_with_1_and_is_named(realsim: Callable[..., Done]) -> None:

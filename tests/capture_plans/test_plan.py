@@ -144,6 +144,19 @@ def test_the_same_seed_gives_the_same_plan() -> None:
     assert make(4).content_hash != make(5).content_hash
 
 
+@pytest.mark.parametrize("n", [1, 2])
+def test_one_and_two_views_are_plans_too(n: int) -> None:
+    plan = hemisphere_plan(n, CENTER, d405_mount(), PlanConfig(), np.random.default_rng(0))
+    assert len(plan) == n and plan.metrics["colliding_legs"] == 0
+
+
+def test_units_of_angles_are_guarded() -> None:
+    with pytest.raises(InputError, match="radians"):
+        PlanConfig(elevation_deg=(0.3, 1.5))
+    with pytest.raises(InputError, match=r"radius m: \(0.45, 0.25\).*in this order"):
+        PlanConfig(radius_m=(0.45, 0.25))
+
+
 def test_a_centre_in_millimetres_is_named() -> None:
     with pytest.raises(InputError, match="millimetres"):
         hemisphere_plan(4, [350.0, 0, 50.0], d405_mount(), PlanConfig(), np.random.default_rng(0))

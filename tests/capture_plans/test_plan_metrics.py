@@ -16,6 +16,7 @@ from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.planning import view_quality
 from realsim_capture_plans.planning.make import calibration_plan
+from realsim_capture_plans.planning.metric_meanings import OF_FULL_PLANS, goal_of
 from realsim_capture_plans.planning.metrics import METRIC_MEANINGS, plan_metrics
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from realsim_capture_plans.planning.tour_time import TourTime
@@ -333,3 +334,30 @@ def test_an_unknown_camera_is_refused_by_name() -> None:
     with pytest.raises(InputError, match=r"'Kinect'.*D405"):
         view_quality.sensor_of(replace(plan, mount=replace(plan.mount, camera="Kinect")))
     assert view_quality.sensor_of(plan) is SENSORS["D405"]
+
+
+def test_goals_know_what_a_value_of_this_plan_should_be() -> None:
+    small = plan_of(np.stack([LOOKING, LOOKING + 0.1]))
+    assert goal_of("sigma_min", METRIC_MEANINGS["sigma_min"], 0.04, small).met is False
+    assert goal_of("sigma_min", METRIC_MEANINGS["sigma_min"], 0.05, small).met is True
+    assert goal_of("colliding_legs", METRIC_MEANINGS["colliding_legs"], 1.0, small).met is False
+    # Holes shrink with the root of the number of views: 8 deg of 256 are 91 deg of 2.
+    hole = METRIC_MEANINGS["hole_deg"]
+    assert goal_of("hole_deg", hole, 80.0, small).met is True
+    assert goal_of("hole_deg", hole, 95.0, small).met is False
+    assert "2 views" in goal_of("hole_deg", hole, 95.0, small).text
+    # What does not follow from the number of views is left open.
+    assert goal_of("seconds", METRIC_MEANINGS["seconds"], 500.0, small).met is None
+    clearance = METRIC_MEANINGS["clearance_table_m"]
+    assert goal_of("clearance_table_m", clearance, 0.009, small).met is False
+    assert goal_of("clearance_table_m", clearance, 0.011, small).met is True
+
+
+def test_every_goal_in_words_is_understood_or_is_no_limit() -> None:
+    plan = plan_of(np.stack([LOOKING, LOOKING + 0.1]))
+    open_ones = {
+        name for name, m in METRIC_MEANINGS.items() if goal_of(name, m, 0.0, plan).met is None
+    }
+    for name in open_ones:
+        good = METRIC_MEANINGS[name].good
+        assert name in OF_FULL_PLANS or not good.startswith(("<", ">")), (name, good)

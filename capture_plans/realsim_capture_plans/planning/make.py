@@ -57,6 +57,8 @@ SCENE_GRID = 4
 """Points per side that stand for the keep-out volume when views are judged by what they see."""
 GREATEST_CENTER_M = 3.0
 """Farther than this from the base the centre must have been given in another unit [m]."""
+TOO_NEAR = 0.5
+"""Worth of what a view sees that has part of the scene nearer than the sensor can measure."""
 SECOND_TRY = 6
 """Times as many poses are tried in directions that seemed out of reach."""
 ELBOW_WORTH = 1.15
@@ -314,7 +316,11 @@ def _seen_share(Ts_base_cam: Array, task: _Task) -> Array:
     points_cam = se3.transform(se3.invert(Ts_base_cam), points)
     uv = project(camera, points_cam)
     inside = np.all((uv >= 0) & (uv <= [camera.width - 1, camera.height - 1]), axis=-1)
-    return np.mean(inside & (points_cam[..., 2] >= sensor.nearest_m), axis=-1)
+    depth = points_cam[..., 2]
+    inside &= depth > 0
+    # A view that has something too near in its image counts as one that sees little.
+    near = np.any(inside & (depth < sensor.nearest_m), axis=-1)
+    return np.where(near, TOO_NEAR, 1.0) * np.mean(inside, axis=-1)
 
 
 def _driven(
@@ -452,5 +458,9 @@ def _plan_of(
     }
     task.progress("how good it is", 1, 1)
     return replace(
-        plan, metrics=metrics | bounds | {"tour_over_bound": seconds / bounds["tour_bound_s"]}
+        plan,
+        metrics=metrics
+        | bounds
+        # A single view at home has no way to go.
+        | ({"tour_over_bound": seconds / bounds["tour_bound_s"]} if seconds > 0 else {}),
     )

@@ -1,10 +1,25 @@
 """What every metric of a plan means, in which unit, and what is good."""
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
-from realsim_capture_plans.collision.model import GROUPS
+import numpy as np
 
+from realsim_capture_plans.collision.model import GROUPS
+from realsim_capture_plans.planning.record import CapturePlan
+
+FULL_VIEWS = 256
+"""Views of the plans that the goals are given for."""
+SCALED = ("hole_deg", "hole_cap_deg", "hole_reachable_deg")
+"""Goals that grow as the root of how many views fewer there are."""
+OF_FULL_PLANS = (
+    "parallax_max_deg", "travel_leading_rad", "travel_total_rad", "seconds", "seconds_total",
+    "tour_over_bound",
+)  # fmt: skip
+"""Goals that say nothing about smaller plans."""
+ROUNDING = 1e-4
+"""A value this near to its goal meets it."""
 JOINT_NAMES = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 
 
@@ -20,6 +35,51 @@ class Meaning:
     """What a plan of 256 views should have."""
     better: Literal["more", "less", "as asked"]
     """In which direction plans are better."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Goal:
+    """What a value of one plan should be."""
+
+    text: str
+    """As people read it."""
+    met: bool | None
+    """Whether the value is so; None where it cannot be said."""
+
+
+def goal_of(name: str, meaning: Meaning, value: float, plan: CapturePlan) -> Goal:
+    """Return what a metric of this plan should be, and whether it is.
+
+    What is good for 256 views is scaled where the number of views sets it (holes shrink with its
+    root), and left open where it does not follow from it.
+    """
+    n = len(plan)
+    limit, text = _limit(meaning.good, n, plan.config.clearance_m), meaning.good
+    if limit is None:
+        return Goal(text=text, met=None)
+    sign, bound = limit
+    if name in SCALED and abs(n - FULL_VIEWS) > FULL_VIEWS / 4:
+        bound *= np.sqrt(FULL_VIEWS / n)
+        text = f"{sign} {bound:.3g} (for {n} views)"
+    elif name in OF_FULL_PLANS and n < FULL_VIEWS * 3 // 4:
+        return Goal(text=f"{text} (256 views)", met=None)
+    met = value <= bound + ROUNDING if sign in ("<", "<=") else value >= bound - ROUNDING
+    return Goal(text=text, met=bool(met))
+
+
+def _limit(good: str, views: int, clearance_m: float) -> tuple[str, float] | None:
+    """Return sign and value of a goal in words, or None where it names none."""
+    words = {
+        "0, always": ("<=", 0.0),
+        ">= the plan's clearance": (">=", clearance_m),
+        "< 720 / views": ("<", 720.0 / views),
+        "> half of them": (">", 0.5 * views),
+        "> 0.9 of them": (">", 0.9 * views),
+    }
+    if good in words:
+        return words[good]
+    found = re.match(r"(<=|>=|<|>) ([0-9.]+)", good)
+    return None if found is None else (found[1], float(found[2]))
 
 
 def _meaning(

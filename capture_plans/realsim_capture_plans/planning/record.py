@@ -14,6 +14,10 @@ from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
 Array = NDArray[np.float64]
 
 
+LEAST_DEGREES = 2.0
+"""A cap that ends below this elevation was given in radians [deg]."""
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PlanConfig:
     """Where views may be, what must stay free, and how fast the arm goes."""
@@ -86,8 +90,14 @@ class PlanConfig:
             low, high = getattr(self, name)
             if not 0 < low <= high:
                 raise InputError(
-                    f"PlanConfig.{name} is ({low}, {high}); least, greatest, both > 0."
+                    f"{name.replace('_', ' ')}: ({low:g}, {high:g}) was given; the least and the "
+                    "greatest are needed, in this order, both above 0."
                 )
+        if self.elevation_deg[1] <= LEAST_DEGREES:
+            raise InputError(
+                f"the elevations {self.elevation_deg} deg end {self.elevation_deg[1]:g} degrees "
+                "above the table. Were radians given? Degrees are needed, such as 15,90."
+            )
         if self.elevation_deg[1] > 90 or not 0 < self.board_tilt_deg < 90:
             raise InputError("PlanConfig: elevations and tilts lie between 0 and 90 degrees.")
         if self.radius_m[1] > 2.0 or self.board_distance_m[1] > 2.0:

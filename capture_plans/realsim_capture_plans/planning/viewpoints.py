@@ -200,7 +200,7 @@ def thin_directions(directions: Array, n: int, wanted: Array | None = None) -> I
         if np.array_equal(moved, chosen):
             break
         chosen = moved
-    return _patched(directions, best, target)
+    return best if n == 1 else _patched(directions, best, target)
 
 
 def _patched(directions: Array, chosen: Ints, target: Array) -> Ints:
