@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from realsim.store import SessionStore
 
 PLAN_FILE = "plan.json"
+SHOWN = 4
+"""Images that a refusal names."""
 
 
 def capture(
@@ -104,11 +106,17 @@ def _check_session(plan: CapturePlan, camera: DepthCamera, store: "SessionStore"
     """Refuse a session of another plan or camera; put the plan into it the first time."""
     expected = store.extra.get("plan_hash")
     if expected != plan.content_hash:
+        if expected is None:
+            raise InputError(
+                f"'{store.folder}' was imported, not captured: it has no plan to go on with. "
+                "Choose a new folder."
+            )
         raise InputError(
             f"the session was begun with the plan {str(expected)[:12]}..., this plan is "
-            f"{plan.content_hash[:12]}... Go on with the plan in the session's {PLAN_FILE}, or "
-            'create a new session with extra={"plan_hash": plan.content_hash}.'
+            f"{plan.content_hash[:12]}... Choose a new folder, or go on with the plan in "
+            f"{store.folder / PLAN_FILE}."
         )
+    _check_stored(store)
     camera_now, camera_then = camera.intrinsics, store.session.intrinsics
     if (camera_now.width, camera_now.height) != (camera_then.width, camera_then.height):
         raise InputError(
@@ -122,3 +130,32 @@ def _check_session(plan: CapturePlan, camera: DepthCamera, store: "SessionStore"
         )
     if not store.has(PLAN_FILE):
         store.write_json(PLAN_FILE, plan_to_json(plan))
+
+
+def _check_stored(store: "SessionStore") -> None:
+    """Refuse to go on where stored images are not what they were, or the beginning is not known.
+
+    Raises:
+        InputError: an image is gone or of another size, or session.json was made anew without
+            knowing arm, camera and lab.
+    """
+    from realsim.store.begun import RECOVERED
+    from realsim.store.header import SESSION_FILE, repair_command
+
+    if faults := store.stored_faults():
+        named = "; ".join(f"{f.path}: {f.found}" for f in faults[:SHOWN])
+        more = f"; and {len(faults) - SHOWN} more" if len(faults) > SHOWN else ""
+        raise InputError(
+            f"stored views of '{store.folder}' are not what was written ({named}{more}). "
+            f"{repair_command(store.folder)} puts them aside; the same capture then takes them "
+            "again."
+        )
+    if store.extra.get(RECOVERED):
+        known = ", ".join(f"{k}: {v}" for k, v in store.extra.items() if k != RECOVERED)
+        raise InputError(
+            f"the {SESSION_FILE} of '{store.folder}' was made anew by a repair, and with which "
+            f"arm, camera and lab it was begun is not known for certain ({known}). Views of "
+            "another arm or camera would spoil it: capture into a new folder. If you know that "
+            f'all are the same, take "{RECOVERED}" out of "extra" in {SESSION_FILE}, and run '
+            f"{repair_command(store.folder)}."
+        )

@@ -1,6 +1,6 @@
 """All views of a session on one picture, in the order in which they are taken."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from realsim.store import SessionStore
 
 Image = NDArray[np.uint8]
+Colour = tuple[int, int, int]
 SHEET_FILE = "reports/contact_sheet.png"
 
 
@@ -27,13 +28,24 @@ class SheetConfig:
     """Widest cell: a dozen views need no more."""
     frame_px: int = 4
     """Width of a noted view's frame."""
+    least_width_px: int = 480
+    """Least width of the sheet: under it a head line of a few words does not fit."""
     head_px: int = 46
-    """Height of the head line."""
+    """Height of a head of one line."""
+    line_px: int = 30
+    """Height of each further line of the head."""
+    text_scale: float = 0.8
+    """Size of the head's letters (OpenCV's font scale)."""
+    least_text_scale: float = 0.5
+    """A title too long for a line is written smaller, down to this; then it is broken."""
 
 
 PAPER, INK, PALE, STRIP = (250, 250, 248), (30, 30, 30), (215, 215, 212), (40, 40, 40)
 AMBER, BLUE, RED = (255, 170, 0), (30, 120, 255), (214, 40, 40)
 """Noted, taken again, missing."""
+
+MARGIN, GAP = 10, 40
+"""Left and right of the head, and between its texts [px]."""
 
 
 class Thumbnails:
@@ -82,12 +94,6 @@ def contact_sheet(
     config = config or SheetConfig()
     columns, w, h = cell_size(n, image_size, config)
     rows = -(-n // columns)
-    sheet = np.full((config.head_px + rows * h, columns * w, 3), PAPER, dtype=np.uint8)
-    for k in range(n):
-        y, x = config.head_px + k // columns * h, k % columns * w
-        cell = sheet[y : y + h, x : x + w]
-        entry = entries.get(k, {})
-        _fill_cell(cell, k, images.get(k), entry, config)
     noted = sum(bool(entries.get(k, {}).get("notes")) for k in images)
     again = sum(bool(entries.get(k, {}).get("retaken")) for k in images)
     parts = [
@@ -97,10 +103,65 @@ def contact_sheet(
         (f"{again} taken again", BLUE if again else INK),
         (f"{n - len(images)} missing", RED if n > len(images) else INK),
     ]
-    x = 10
-    for text, colour in parts:
-        x += _write(sheet, text, (x, config.head_px - 16), colour, 0.8) + 40
+    width = max(columns * w, config.least_width_px)
+    lines = _head_lines(parts, width - 2 * MARGIN, config)
+    head = config.head_px + (len(lines) - 1) * config.line_px
+    sheet = np.full((head + rows * h, width, 3), PAPER, dtype=np.uint8)
+    for k in range(n):
+        y, x = head + k // columns * h, k % columns * w
+        cell = sheet[y : y + h, x : x + w]
+        entry = entries.get(k, {})
+        _fill_cell(cell, k, images.get(k), entry, config)
+    for i, line in enumerate(lines):
+        x = MARGIN
+        for text, colour, scale in line:
+            at = (x, config.head_px - 16 + i * config.line_px)
+            x += _write(sheet, text, at, colour, scale) + GAP
     return sheet
+
+
+def _head_lines(
+    parts: Sequence[tuple[str, Colour]], width: int, config: SheetConfig
+) -> list[list[tuple[str, Colour, float]]]:
+    """Return (text, colour, scale) of every line of a head of so many pixels; nothing is cut."""
+    lines: list[list[tuple[str, Colour, float]]] = [[]]
+    left = width
+    for whole, colour in parts:
+        scale = config.text_scale
+        if (size := _text_width(whole, scale)) > width:
+            scale = max(config.least_text_scale, scale * (width - 2) / size)
+        for text in _broken(whole, width, scale):
+            size = _text_width(text, scale)
+            if lines[-1] and size > left:
+                lines.append([])
+                left = width
+            lines[-1].append((text, colour, scale))
+            left -= size + GAP
+    return lines
+
+
+def _broken(text: str, width: int, scale: float) -> list[str]:
+    """Return a text in pieces that fit the width [px]."""
+    pieces: list[str] = []
+    while text:
+        n = len(text)
+        while n > 1 and _text_width(text[:n], scale) > width:
+            n -= 1
+        pieces.append(text[:n].strip())
+        text = text[n:]
+    return pieces
+
+
+def _text_width(text: str, scale: float) -> int:
+    """Return the width of a text [px]."""
+    import cv2
+
+    return int(cv2.getTextSize(_plain(text), cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0])
+
+
+def _plain(text: str) -> str:
+    """Return a text in the letters that OpenCV's font has."""
+    return text.encode("ascii", errors="replace").decode()
 
 
 def _fill_cell(
@@ -162,11 +223,11 @@ def _write(
     """Write ASCII text at its lower left corner (x, y); return its width [px]."""
     import cv2
 
-    plain = text.encode("ascii", errors="replace").decode()
+    plain = _plain(text)
     canvas = np.ascontiguousarray(image)
     cv2.putText(canvas, plain, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
     image[:] = canvas
-    return int(cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)[0][0])
+    return _text_width(plain, scale)
 
 
 def write_contact_sheet(

@@ -7,20 +7,16 @@ line collides.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
-from realsim.geometry.camera import project
 from realsim_capture_plans.arms.kinematics import UR5, DhChain
-from realsim_capture_plans.collision.model import CollisionModel
-from realsim_capture_plans.collision.mount import d405_mount
-from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
+from realsim_capture_plans.collision.shapes import Box, Mount
 from realsim_capture_plans.planning.board_poses import (
     board_poses,
     board_roll,
@@ -28,11 +24,13 @@ from realsim_capture_plans.planning.board_poses import (
     spread_rolls,
 )
 from realsim_capture_plans.planning.bounds import held_karp_bound, two_nearest_bound
+from realsim_capture_plans.planning.closer import closer_candidates, nearest_views
 from realsim_capture_plans.planning.metrics import plan_metrics
 from realsim_capture_plans.planning.moves import NoFreeMoveError, connect
 from realsim_capture_plans.planning.ordering import Clusters
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
-from realsim_capture_plans.planning.view_quality import SENSORS, nearest_deg
+from realsim_capture_plans.planning.task import PlanTask, Progress, plan_task, seen_share
+from realsim_capture_plans.planning.view_quality import nearest_deg
 from realsim_capture_plans.planning.viewpoints import (
     Candidates,
     better_elbow,
@@ -40,9 +38,7 @@ from realsim_capture_plans.planning.viewpoints import (
     choose_home,
     golden_cap,
     hemisphere_poses,
-    look_at_poses,
     on_one_elbow,
-    reachable,
     thin_directions,
     well_seen,
     with_turns,
@@ -50,15 +46,6 @@ from realsim_capture_plans.planning.viewpoints import (
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
-Kind = Literal["hemisphere", "calibration"]
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, how much of it is done, and how much there is."""
-SCENE_GRID = 4
-"""Points per side that stand for the keep-out volume when views are judged by what they see."""
-GREATEST_CENTER_M = 3.0
-"""Farther than this from the base the centre must have been given in another unit [m]."""
-TOO_NEAR = 0.5
-"""Worth of what a view sees that has part of the scene nearer than the sensor can measure."""
 SECOND_TRY = 6
 """Times as many poses are tried in directions that seemed out of reach."""
 ELBOW_WORTH = 1.15
@@ -66,27 +53,6 @@ ELBOW_WORTH = 1.15
 way there and back takes about 8 s."""
 MOST_MISSED = 0.25
 """Where more than this share of the directions is missed, the scene stands badly: no second try."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class _Task:
-    """What both kinds of plan hand from step to step."""
-
-    kind: Kind
-    center: Array
-    mount: Mount
-    cell: WorkCell
-    config: PlanConfig
-    model: CollisionModel
-    rng: np.random.Generator
-    progress: Progress
-
-    def reach(self, poses: Array, item: Ints, what: str) -> Candidates:
-        """Return the candidates of camera poses (P, 4, 4) for items (P,)."""
-        return reachable(
-            poses, item, self.mount.T_ee_cam, self.model, self.config.sigma_min,
-            lambda done, total: self.progress(what, done, total),
-        )  # fmt: skip
 
 
 def hemisphere_plan(
@@ -117,7 +83,7 @@ def hemisphere_plan(
         InputError: n is not positive, or a given pose is not one.
         DegenerateError: fewer than n views are reachable, or one cannot be driven to.
     """
-    task = _task("hemisphere", n, center_world, mount, config, chain, obstacles, rng, progress)
+    task = plan_task("hemisphere", n, center_world, mount, config, chain, obstacles, rng, progress)
     directions, found = reachable_directions(task, n)
     items = np.unique(found.item)
     tried = len(directions)
@@ -136,14 +102,14 @@ def hemisphere_plan(
         )
         dense = task.reach(poses, chosen[item], "more ways to the chosen views")
         both = on_one_elbow(one_side.joined(dense), side)
-        return well_seen(both, _seen_share(both.Ts_base_cam, task), config.seen_share)
+        return well_seen(both, seen_share(both.Ts_base_cam, task), config.seen_share)
 
     def choose(ok: Ints) -> Ints:
         return ok[thin_directions(directions[ok], n, directions)]
 
     def between(direction: Ints, joints: Array) -> tuple[Array, Ints]:
         """Return candidates (K, 6) near joints (N, 6), and the row that each belongs to."""
-        return _nearest_views(task, directions[direction], joints)
+        return nearest_views(task, directions[direction], joints)
 
     plan = _driven(task, one_side, home, n, choose, more, between)
     found_here = {
@@ -162,7 +128,7 @@ def _largest_hole(directions: Array, items: Ints, found: Candidates, n: int) -> 
     return float(nearest_deg(chosen, directions[items]).max())
 
 
-def reachable_directions(task: "_Task", n: int) -> tuple[Array, Candidates]:
+def reachable_directions(task: PlanTask, n: int) -> tuple[Array, Candidates]:
     """Return the directions (D, 3) that are tried for n views, and what reaches them."""
     config = task.config
     spin = se3.exp_so3([0.0, 0.0, task.rng.uniform(0.0, 2 * np.pi)])
@@ -218,7 +184,7 @@ def calibration_plan(  # noqa: PLR0913 - a plan's own facts, one by one
         InputError: n is not positive, or a given pose is not one.
         DegenerateError: fewer than n views are reachable, or one cannot be driven to.
     """
-    task = _task("calibration", n, center_world, mount, config, chain, obstacles, rng, progress)
+    task = plan_task("calibration", n, center_world, mount, config, chain, obstacles, rng, progress)
     normal = np.asarray(normal_world, dtype=np.float64)
     length = float(np.linalg.norm(normal))
     if normal.shape != (3,) or not length > 0:
@@ -238,43 +204,7 @@ def calibration_plan(  # noqa: PLR0913 - a plan's own facts, one by one
     return replace(plan, metrics=plan.metrics | board | share)
 
 
-def _task(  # noqa: PLR0913, PLR0917 - hands on what both kinds of plan are given
-    kind: Kind,
-    n: int,
-    center: ArrayLike,
-    mount: Mount | ArrayLike,
-    config: PlanConfig,
-    chain: DhChain,
-    obstacles: tuple[tuple[str, Box], ...],
-    rng: np.random.Generator,
-    progress: Progress | None,
-) -> _Task:
-    """Check what was given and build the collision model."""
-    if n < 1:
-        raise InputError(f"a plan of {n} views was asked for; at least 1 is needed.")
-    c = np.array(center, dtype=np.float64)
-    if c.shape != (3,) or not np.all(np.isfinite(c)):
-        raise InputError(f"the scene centre is {c.tolist()}; (x, y, z) in base [m] is needed.")
-    if np.abs(c).max() > GREATEST_CENTER_M:
-        raise InputError(
-            f"the scene centre {c.tolist()} m is {np.abs(c).max():.0f} m from the base and the arm "
-            "reaches 0.85 m. Were millimetres given? Metres are needed."
-        )
-    carried = mount if isinstance(mount, Mount) else d405_mount(mount)
-    cell = config.work_cell(c, kind, obstacles)
-    return _Task(
-        kind=kind,
-        center=c,
-        mount=carried,
-        cell=cell,
-        config=config,
-        model=CollisionModel(chain, carried, cell, config.clearance_m),
-        rng=rng,
-        progress=progress or (lambda what, done, total: None),
-    )
-
-
-def _too_few(task: _Task, n: int, reachable_count: int, tried: int) -> str:
+def _too_few(task: PlanTask, n: int, reachable_count: int, tried: int) -> str:
     c = task.config
     x, y, z = task.center.tolist()
     if task.kind == "hemisphere":
@@ -289,7 +219,7 @@ def _too_few(task: _Task, n: int, reachable_count: int, tried: int) -> str:
     )
 
 
-def _home(task: _Task, found: Candidates, n: int, tried: int) -> tuple[Array, Candidates]:
+def _home(task: PlanTask, found: Candidates, n: int, tried: int) -> tuple[Array, Candidates]:
     """Return where the tour begins, and the candidates on one side of the elbow where there are.
 
     Raises:
@@ -302,29 +232,8 @@ def _home(task: _Task, found: Candidates, n: int, tried: int) -> tuple[Array, Ca
     return choose_home(one_side), one_side
 
 
-def _seen_share(Ts_base_cam: Array, task: _Task) -> Array:
-    """Return (M,) which share of the keep-out volume each pose has in its image, not too near."""
-    if task.mount.camera not in SENSORS:
-        return np.ones(len(Ts_base_cam))
-    sensor = SENSORS[task.mount.camera]
-    camera = sensor.intrinsics
-    low = np.array(task.cell.keep_out.lower)
-    low[2] = task.cell.table.upper[2]
-    steps = np.linspace(0.0, 1.0, SCENE_GRID)
-    grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), -1).reshape(-1, 3)
-    points = low + grid * (np.array(task.cell.keep_out.upper) - low)
-    points_cam = se3.transform(se3.invert(Ts_base_cam), points)
-    uv = project(camera, points_cam)
-    inside = np.all((uv >= 0) & (uv <= [camera.width - 1, camera.height - 1]), axis=-1)
-    depth = points_cam[..., 2]
-    inside &= depth > 0
-    # A view that has something too near in its image counts as one that sees little.
-    near = np.any(inside & (depth < sensor.nearest_m), axis=-1)
-    return np.where(near, TOO_NEAR, 1.0) * np.mean(inside, axis=-1)
-
-
 def _driven(
-    task: _Task,
+    task: PlanTask,
     found: Candidates,
     home: Array,
     n: int,
@@ -361,7 +270,7 @@ def _driven(
         by_item = dict(zip(np.unique(candidates.item).tolist(), rows, strict=True))
         near = [with_turns(by_item[i], home, chain, config) for i in chosen.tolist()]
         task.progress("order and moves", 0, 1)
-        closer = None if between is None else partial(_closer, between, chosen, home)
+        closer = None if between is None else partial(closer_candidates, between, chosen, home)
         try:
             joints, vias, clusters = connect(near, home, task.model, config, task.rng, closer)
             break
@@ -373,62 +282,8 @@ def _driven(
     return _plan_of(task, home, joints, vias, clusters)
 
 
-def _closer(
-    between: Callable[[Ints, Array], tuple[Array, Ints]],
-    chosen: Ints,
-    home: Array,
-    views: Ints,
-    joints: Array,
-) -> list[Array]:
-    """Return further candidates (Ki, 6) of every view: near the middle of its neighbours' joints.
-
-    Args:
-        between: returns candidates of items near joints.
-        chosen: (N,) item of every view.
-        home: (6,) where the tour begins [rad].
-        views: (N,) in tour order.
-        joints: (N, 6) of the views in that order [rad].
-    """
-    before = np.concatenate([home[None], joints[:-1]])
-    after = np.concatenate([joints[1:], joints[-1:]])
-    wanted = np.concatenate([(before + after) / 2, (before + joints + after) / 3, before, after])
-    of = np.tile(views, 4)
-    found, row = between(chosen[of], wanted)
-    return [found[of[row] == view] for view in range(len(chosen))]
-
-
-def _nearest_views(task: _Task, directions: Array, joints: Array) -> tuple[Array, Ints]:
-    """Return the views in directions (N, 3) that lie nearest to joints (N, 6), as far as free.
-
-    Radius and roll are those of the camera at these joints, as near as the direction allows; of the
-    arm's branches and turns the one nearest to these joints is taken.
-
-    Returns:
-        joints (K, 6) [rad] and the row (K,) that each belongs to.
-    """
-    config, chain = task.config, task.model.chain
-    Ts = chain.forward(joints) @ task.mount.T_ee_cam
-    radius = np.clip(np.linalg.norm(Ts[:, :3, 3] - task.center, axis=-1), *config.radius_m)
-    eyes = task.center + radius[:, None] * directions
-    upright = look_at_poses(eyes, task.center, np.zeros(len(eyes)))
-    turn = np.swapaxes(upright[:, :3, :3], -1, -2) @ Ts[:, :3, :3]
-    roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
-    poses = look_at_poses(eyes, task.center, roll)
-    good = np.flatnonzero(_seen_share(poses, task) >= config.seen_share)
-    q, of = chain.inverse_branches(poses[good] @ se3.invert(task.mount.T_ee_cam))
-    row = good[of]
-    q = joints[row] + np.remainder(q - joints[row] + np.pi, 2 * np.pi) - np.pi
-    gap = np.abs(q - joints[row]).max(-1)
-    order = np.lexsort([gap, row])
-    first = np.unique(row[order], return_index=True)[1]
-    q, row = q[order][first], row[order][first]
-    keep = chain.limits.contains(q) & (chain.sigma_min(q) >= config.sigma_min)
-    keep[keep] = task.model.free(q[keep])
-    return q[keep], row[keep]
-
-
 def _plan_of(
-    task: _Task,
+    task: PlanTask,
     home: Array,
     joints: Array,
     vias: tuple[tuple[int, Array], ...],
