@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 VIEWS = 256
 AIM_HEIGHT_M = 0.05
 RING_DEG = 10.0
-"""Width of the rings of the greedy order."""
+"""Width of the rings of the greedy order: its best of 5, 7.5, 10 and 15 degrees."""
 ROLLS = 16
 """Rolls per view that the greedy order chooses from."""
 POSES = 60
@@ -104,7 +104,8 @@ def greedy_ring_seconds(plan: CapturePlan, *, free_radius: bool) -> float:
     here, total = plan.home, 0.0
     for view in order:
         near = with_turns(found.joints[found.item == view], plan.home, plan.chain, plan.config)
-        near = np.concatenate([near, plan.joints[view][None]])
+        if len(near) == 0:  # none of these rolls is free: what the plan found
+            near = plan.joints[view][None]
         gaps = np.abs(near - here).max(-1)
         total += float(move_seconds(gaps.min(), plan.config))
         here = near[int(np.argmin(gaps))]
