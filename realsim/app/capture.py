@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.board_views import BOARD_FILE
+from realsim.app.capture_devices import open_devices
 from realsim.app.console import Console
 from realsim.app.stages import BOARD_VIEWS, save_starts
 from realsim.errors import InputError
@@ -26,14 +27,13 @@ from realsim_capture_plans.capturing.capture import (
     check_views,
     dry_run,
 )
-from realsim_capture_plans.capturing.checks import CheckConfig
 from realsim_capture_plans.capturing.contact_sheet import (
     SheetConfig,
     Thumbnails,
     cell_size,
     write_contact_sheet,
 )
-from realsim_capture_plans.capturing.look import check_arm
+from realsim_capture_plans.capturing.drive import drive_only
 from realsim_capture_plans.capturing.operator import LineOperator, Operator
 from realsim_capture_plans.devices.interfaces import Arm, DepthCamera, DeviceError
 from realsim_capture_plans.planning.record import CapturePlan
@@ -103,18 +103,28 @@ def run_capture(request: CaptureRequest, console: Console) -> bool:
         stack.enter_context(threadpool_limits(limits=1))
         stack.enter_context(_ends_on_request())
         try:
-            arm, camera, lab = stack.enter_context(_devices(request, plan, target))
-            check_arm(plan, arm, CheckConfig())
+            arm, camera, lab = stack.enter_context(open_devices(request, plan, target))
             if request.dry_run:
                 return _rehearse(request, plan, (arm, camera), (config, target), console)
+            assert camera is not None  # only a rehearsal does without
             store = _session(request, plan, (arm, camera), target)
             stack.enter_context(only_run_in(store.folder))
             work = (config, store, target, lab)
             return _carry_out(request, plan, (arm, camera), work, console)
         except DeviceError as error:
             sys.stderr.write(f"trouble: {error}\n")
-            console.say("stopped; what is stored is safe, and the same command goes on from here.")
+            console.say(_how_it_stands(request, target))
             return False
+
+
+def _how_it_stands(request: CaptureRequest, target: Target | None) -> str:
+    """Return what a run that a device ended leaves behind."""
+    folder = request.out if target is None else request.out / BOARD_VIEWS
+    if request.dry_run:
+        return "stopped; a dry run stores nothing."
+    if not (folder / "session.json").is_file():
+        return "nothing was begun, and nothing is stored."
+    return "stopped; what is stored is safe, and the same command goes on from here."
 
 
 def _carry_out(
@@ -154,17 +164,24 @@ def _carry_out(
 def _rehearse(
     request: CaptureRequest,
     plan: CapturePlan,
-    devices: tuple[Arm, DepthCamera],
+    devices: tuple[Arm, DepthCamera | None],
     work: tuple[CaptureConfig, Target | None],
     console: Console,
 ) -> bool:
-    """Drive slowly and look; nothing is stored."""
+    """Drive slowly and look, where there is a camera; nothing is stored."""
     config, target = work
-    with _operator(request, f"{devices[0].name}, {devices[1].name}", console) as operator:
+    arm, camera = devices
+    if camera is None:
+        console.say("no RealSense camera is connected: the moves are driven, nothing is looked at.")
+        with _operator(request, f"{arm.name}, no camera", console) as operator:
+            summary = drive_only(plan, arm, config=config, operator=operator, views=request.views)
+        show_summary(summary, console, dry=True)
+        return summary.complete
+    with _operator(request, f"{arm.name}, {camera.name}", console) as operator:
         job = CaptureJob(
             operator=operator, views=request.views or None, board_check=_board_check(target)
         )
-        summary = dry_run(plan, *devices, config=config, job=job)
+        summary = dry_run(plan, arm, camera, config=config, job=job)
     show_summary(summary, console, dry=True)
     return summary.complete
 
@@ -202,51 +219,7 @@ def _target(request: CaptureRequest, plan: CapturePlan) -> Target | None:
     return target_of(request.board)
 
 
-# --- devices ----------------------------------------------------------------------------------
-
-
-@contextmanager
-def _devices(
-    request: CaptureRequest, plan: CapturePlan, target: Target | None
-) -> Generator[tuple[Arm, DepthCamera, "SimulatedLab | None"]]:
-    """Connect arm and camera; yields the lab, too, where they are simulated."""
-    if request.simulated == bool(request.robot_host):
-        raise InputError(
-            "say what to capture with: --robot-host IP (a UR5 or UR5e and a RealSense), or "
-            "--simulated (the simulated lab)."
-        )
-    if request.simulated:
-        from realsim_capture_plans.lab import LabConfig, SimulatedLab
-
-        lab = SimulatedLab(LabConfig(seed=request.seed, n_objects=request.objects))
-        if target is None:
-            lab.place_objects()
-        else:
-            _check_lab_board(lab, target)
-            lab.place_board()
-        yield lab.arm, lab.camera, lab
-        return
-    from realsim_capture_plans.devices.realsense import RealSenseCamera
-    from realsim_capture_plans.devices.ur import UrArm
-
-    with ExitStack() as stack:
-        camera = RealSenseCamera(request.camera)
-        stack.callback(camera.close)
-        arm = UrArm(request.robot_host, model=plan.robot, chain=plan.chain)
-        stack.callback(arm.close)
-        yield arm, camera, None
-
-
-def _check_lab_board(lab: "SimulatedLab", target: Target) -> None:
-    """Refuse a target that does not lie in the simulated lab."""
-    from realsim_calibration.targets.target_file import target_to_json
-
-    if target_to_json(target) != target_to_json(lab.board):
-        b = lab.board
-        raise InputError(
-            f"the simulated lab has one board: aprilgrid:{b.columns}x{b.rows},"
-            f"tag={1e3 * b.tag_size_m:g}mm,gap={1e3 * b.gap_m:g}mm. Give that line as --board."
-        )
+# --- who is told ------------------------------------------------------------------------------
 
 
 @contextmanager

@@ -12,6 +12,8 @@ from realsim.store.session_repair import RepairReport, repair_session
 
 SHOWN = 40
 """Rows of a table; the rest is counted (`--json` has all)."""
+NAMED = 6
+"""Names in a line; `--json` has all."""
 
 
 def run_check(folder: Path, *, repair: bool, decode: bool, as_json: bool) -> bool:
@@ -51,6 +53,11 @@ def show_check(report: CheckReport, console: Console) -> None:
     _show_tables(report, console)
     if report.sound:
         console.say("sound: every listed file has the bytes that were written")
+        if count := _unproven(report):
+            console.say(
+                f"{count} files of the session have no checksum: whether they are as they were "
+                "written, nothing can tell."
+            )
     else:
         console.say(
             "damaged: `realsim check --repair` takes out what is damaged, and only that; files "
@@ -68,7 +75,12 @@ def _show_tables(report: CheckReport, console: Console) -> None:
     if report.planned is not None and report.not_captured:
         rows.append(["views not captured", _numbers(report.not_captured)])
     rows.append(["files as written", f"{report.files_ok}"])
-    rows.append(["files without checksum", f"{report.unproven}"])
+    if report.unproven:
+        rows.append(["files without checksum", _names(report.unproven)])
+    if report.beside:
+        others = ", ".join(f"{name} {count}" for name, count in report.beside[:NAMED])
+        more = ", ..." if len(report.beside) > NAMED else ""
+        rows.append(["files beside it", f"{others}{more} (no checksum is kept of these)"])
     console.table(f"Session {report.folder}", ["", ""], rows)
     found = sorted(report.findings, key=lambda f: not f.is_damage)
     if found:
@@ -99,6 +111,15 @@ def show_repair(report: RepairReport, console: Console) -> None:
         show_repair(inner, console)
     if not report.after.sound:
         show_check(report.after, console)
+
+
+def _unproven(report: CheckReport) -> int:
+    return len(report.unproven) + sum(_unproven(inner) for inner in report.inner)
+
+
+def _names(paths: Sequence[str]) -> str:
+    """Return how many files, and the names of the first."""
+    return f"{len(paths)}: {', '.join(paths[:NAMED])}{', ...' if len(paths) > NAMED else ''}"
 
 
 def _numbers(views: Sequence[int]) -> str:

@@ -36,9 +36,6 @@ MOST_CAMERA_BYTES = 200_000
 """A larger file is no camera's."""
 POSE_PLACES = (".", "poses", "pose", "robot", "robot_poses", "tcp")
 """Where poses may be in a folder, if it was not said."""
-CENTRE_SHARE = 0.25
-"""A principal point farther from the image's centre than this share of its size is of another
-resolution: a matrix alone does not say for which size of image it holds."""
 SMALLEST_BOP_SCALE = 0.02
 """depth_scale in a camera.json is millimetres per count in BOP (0.1, 1) and metres per count in
 other programs (0.001): below this it is not BOP's, and is not taken."""
@@ -106,8 +103,8 @@ def open_image_folder(root: Path, request: FolderRequest) -> tuple[FolderSource,
 def camera_of_file(path: Path, size: tuple[int, int] | None) -> CameraIntrinsics:
     """Return the camera in a file, of any format that `realsim calibrate --camera` reads.
 
-    A text file of nine numbers is a camera matrix; it holds for images of `size` if its principal
-    point lies near their centre.
+    A text file of nine numbers is a camera matrix; it, or a file that names no image size, holds
+    for images of `size` if its principal point lies near their centre.
 
     Args:
         path: the file.
@@ -116,22 +113,16 @@ def camera_of_file(path: Path, size: tuple[int, int] | None) -> CameraIntrinsics
     Raises:
         InputError: no camera in it, or a matrix of another image size.
     """
-    from realsim_calibration.lens.camera_files import read_camera
+    from realsim_calibration.lens.camera_files import read_camera, require_centred
 
     K = _matrix_text(path)
     if K is None:
-        return read_camera(path)
+        return read_camera(path, size=size)
     if size is None:
         raise InputError(
             f"{path} holds a camera matrix without an image size; give a file that says it, too."
         )
-    off = [abs(K[k, 2] - size[k] / 2) / size[k] for k in (0, 1)]
-    if max(off) > CENTRE_SHARE:
-        raise InputError(
-            f"{path}: the principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) is far from the centre of "
-            f"the images ({size[0]}x{size[1]} px): the matrix is of another image size. Give the "
-            "camera of these images."
-        )
+    require_centred(K, size, path)
     return CameraIntrinsics.from_K(K, *size)
 
 

@@ -26,6 +26,12 @@ SQLITE_MAGIC = b"SQLite format 3\x00"
 MAGIC = ((ROS1_MAGIC, "a ROS1 bag"), (MCAP_MAGIC, "an MCAP file"), (SQLITE_MAGIC, "a sqlite3 bag"))
 """First bytes of recordings."""
 BAG_ENDINGS = (".bag", ".mcap", ".db3")
+HEAD_SHOWN = 16
+"""First bytes of a file that is no bag, shown to a person."""
+ACCEPTED = (
+    "accepted are a ROS1 .bag, a ROS2 .mcap or .db3 or its folder, a RealSense recording, a BOP "
+    "scene (scene_camera.json), a COLMAP project (cameras and images), a folder of images."
+)
 KINDS = ("auto", "bag", "folder", "bop", "colmap", "realsense")
 ONLY_FOR: dict[str, tuple[str, ...]] = {
     "depth_unit": ("folder", "bag"),
@@ -182,6 +188,25 @@ def _of_file(path: Path) -> list[KindFit]:
     ]
 
 
+def _check_bag_file(path: Path) -> None:
+    """Refuse a file that does not begin as a recording does.
+
+    Raises:
+        InputError: it is empty, or no bag by its first bytes.
+    """
+    if _of_file(path):
+        return
+    with path.open("rb") as file:
+        head = file.read(HEAD_SHOWN)
+    if not head:
+        raise InputError(f"{path} is empty; {ACCEPTED}")
+    begins = ", ".join(f"{magic!r} ({what})" for magic, what in MAGIC)
+    raise InputError(
+        f"{path} is no bag: its first bytes are {head!r}; a bag begins with {begins}. Is the copy "
+        "complete, and is it the recording itself?"
+    )
+
+
 def _images_below(path: Path) -> str:
     """Return an example of an image in a folder or one level below, "" where there is none."""
     for pattern in ("*", "*/*"):
@@ -203,6 +228,8 @@ def kind_of(request: ImportRequest, console: Console) -> str:
     if request.kind != "auto":
         if not path.exists():
             raise InputError(f"{path} does not exist.")
+        if request.kind in ("bag", "realsense") and path.is_file():
+            _check_bag_file(path)
         return "bag" if request.kind == "realsense" else request.kind
     fits = kinds_of(path)
     if path.is_dir() and (path / SESSION_FILE).is_file():
@@ -211,12 +238,12 @@ def kind_of(request: ImportRequest, console: Console) -> str:
             "and cameras as a BOP scene, say --kind bop."
         )
     if not fits:
+        if path.is_dir() and not any(path.iterdir()):
+            raise InputError(f"{path} is empty; {ACCEPTED}")
+        if path.is_file() and (path.suffix.lower() in BAG_ENDINGS or not path.stat().st_size):
+            _check_bag_file(path)
         what = "a file" if path.is_file() else "a folder"
-        raise InputError(
-            f"{path} is {what} of no known kind. Accepted: a ROS1 .bag, a ROS2 .mcap or .db3 or "
-            "its folder, a RealSense recording, a BOP scene (scene_camera.json), a COLMAP project "
-            "(cameras and images), a folder of images."
-        )
+        raise InputError(f"{path} is {what} of no known kind; {ACCEPTED}")
     if len(fits) > 1:
         listed = "; ".join(f"{f.kind}: {f.why}" for f in fits)
         raise InputError(f"{path} may be several things ({listed}). Say which: --kind KIND.")

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import socket
 import subprocess
 import sys
 from functools import lru_cache
@@ -11,14 +12,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from realsim.app.option_values import port_in_use
 from realsim.geometry import se3
+from realsim.interop import import_pyrealsense2
+from realsim.records import CaptureSession
 from realsim.store import SessionStore
 from realsim.store.session_store import read_json_file
 from realsim_capture_plans.arms.kinematics import UR5, UR5E
+from realsim_capture_plans.capturing.contact_sheet import SheetConfig, contact_sheet
 from realsim_capture_plans.capturing.log import CaptureLog
 from realsim_capture_plans.collision.mount import d405_mount
+from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from realsim_capture_plans.lab.arm import HOME
-from realsim_capture_plans.plan_files.plan_json import save_plan
+from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 BOARD = "aprilgrid:7x5,tag=30mm,gap=10mm"
@@ -87,11 +93,12 @@ def test_a_session_has_plan_devices_log_and_sheet(plans: Path) -> None:
     assert store.extra["gravity_up_world"] == [0.0, 0.0, 1.0]
     assert store.has("plan.json") and store.has("models/models_info.json")
     sheet = store.read_image("reports/contact_sheet.png")
-    assert sheet.shape == (46 + 2 * 180, 2 * 320, 3)
+    top = sheet.shape[0] - 2 * 180  # a head of several lines: nothing of it is cut
+    assert sheet.shape[1:] == (2 * 320, 3) and top in (46, 76, 106)
     # Every thumbnail is its own image: reduced, the session's photograph stands in the cell.
     for k in range(4):
         photo = store.rgb(k)[8::16, 8::16].astype(float)
-        y, x = 46 + k // 2 * 180, k % 2 * 320
+        y, x = top + k // 2 * 180, k % 2 * 320
         cell = sheet[y : y + 180, x : x + 320][2::4, 2::4].astype(float)
         inner = np.s_[10:-10, 10:-10]
         assert np.corrcoef(photo[inner].ravel(), cell[inner].ravel())[0, 1] > 0.8
@@ -100,7 +107,7 @@ def test_a_session_has_plan_devices_log_and_sheet(plans: Path) -> None:
 @pytest.mark.slow
 def test_run_again_it_goes_on_and_takes_only_what_is_missing(plans: Path, tmp_path: Path) -> None:
     out = tmp_path / "s"
-    some = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--views", "1,3")
+    some = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--views", "1,3-3")
     assert some.returncode == 0, some.stderr
     assert SessionStore.open(out).completed == {1, 3}
     rest = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--no-input")
@@ -138,6 +145,9 @@ def test_a_dry_run_leaves_nothing(plans: Path, tmp_path: Path) -> None:
          "has one board"),
         (["--plan", "plan.json", "--simulated", "--speed", "2"], "at most 1"),
         (["--plan", "plan.json", "--simulated", "--views", "9"], "views 0 to 3"),
+        (["--plan", "plan.json", "--simulated", "--views", "0-2,9-11"], "[9, 10, 11]"),
+        (["--plan", "plan.json", "--simulated", "--retake", "3-1"], "no range"),
+        (["--plan", "plan.json", "--simulated", "--retake", "1-x"], "such as 1-3,7"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_used_is_named(
@@ -157,6 +167,7 @@ def test_another_session_and_a_strangers_folder_are_left_alone(plans: Path, tmp_
     before = sorted((p, p.stat().st_mtime_ns) for p in session.rglob("*"))
     other = realsim("capture", session, "--plan", plans / "other.json", "--simulated")
     assert other.returncode == 2 and "begun with the plan" in other.stderr
+    assert f"Choose a new folder, or go on with the plan in {session}/plan.json" in other.stderr
     lab = realsim("capture", session, "--plan", plans / "plan.json", "--simulated", "--seed", "7")
     assert lab.returncode == 2 and "--seed" in lab.stderr
     assert sorted((p, p.stat().st_mtime_ns) for p in session.rglob("*")) == before
@@ -167,11 +178,116 @@ def test_another_session_and_a_strangers_folder_are_left_alone(plans: Path, tmp_
     assert [p.name for p in (tmp_path / "thesis").iterdir()] == ["thesis.tex"]
 
 
-def test_a_robot_that_does_not_answer_ends_with_1(plans: Path, tmp_path: Path) -> None:
+def test_a_target_file_that_is_not_there_is_named(plans: Path, tmp_path: Path) -> None:
+    done = realsim("capture", tmp_path / "s", "--plan", plans / "board_plan.json", "--simulated",
+                   "--board", "nope.json")  # fmt: skip
+    assert done.returncode == 2 and "no such file: 'nope.json'" in done.stderr
+
+
+def test_an_imported_session_is_not_gone_on_with(plans: Path, tmp_path: Path) -> None:
+    camera = SessionStore.open(scene_session(plans)).session.intrinsics
+    session = CaptureSession(name="bag", intrinsics=camera, views=(), depth_unit_m=1e-4)
+    SessionStore.create(tmp_path / "s", session, extra={"import": {"source": "a.bag"}}).close()
+    done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json", "--simulated")
+    assert done.returncode == 2 and "was imported, not captured" in done.stderr
+
+
+# --- a robot, or what answers like one --------------------------------------------------------
+
+
+def needs_no_camera() -> None:
+    """Skip where a RealSense is connected: these tests are of machines without."""
+    if list(import_pyrealsense2().context().query_devices()):
+        pytest.skip("a RealSense is connected")
+
+
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
+def test_a_robot_that_does_not_answer_ends_with_1(
+    plans: Path, tmp_path: Path, dry: list[str]
+) -> None:
+    needs_no_camera()
     done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json",
-                   "--robot-host", "127.0.0.1", "--no-input")  # fmt: skip
-    assert done.returncode == 1 and "the same command goes on" in done.stdout
+                   "--robot-host", "127.0.0.1", "--no-input", *dry)  # fmt: skip
+    assert done.returncode == 1 and "127.0.0.1 refuses the robot's port" in done.stderr
+    assert "the same command goes on" not in done.stdout + done.stderr
+    # A dry run does without a camera; otherwise both troubles are told.
+    assert ("no RealSense camera is connected" in done.stderr) is not bool(dry)
     assert "Traceback" not in done.stderr and not (tmp_path / "s").exists()
+
+
+def test_a_host_of_no_address_is_named(plans: Path, tmp_path: Path) -> None:
+    done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json",
+                   "--robot-host", "robot.invalid", "--no-input", "--dry-run")  # fmt: skip
+    assert done.returncode in (1, 2) and "robot.invalid" in done.stderr
+    assert "Traceback" not in done.stderr and "goes on" not in done.stdout
+
+
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
+def test_a_robot_of_another_model_is_named_without_a_camera(
+    plans: Path, tmp_path: Path, dry: list[str]
+) -> None:
+    needs_no_camera()
+    with LoopbackController.start(robot="UR5e", speedup=10) as controller:
+        done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json", "--robot-host",
+                       controller.host, "--no-input", *dry)  # fmt: skip
+    assert done.returncode == 2, done.stderr
+    assert "a UR5 is expected" in done.stderr and "UR5e" in done.stderr
+    assert ("no RealSense camera is connected" in done.stderr) is not bool(dry)
+    assert "goes on from here" not in done.stdout and not (tmp_path / "s").exists()
+
+
+def test_a_dry_run_drives_the_robot_without_a_camera(plans: Path, tmp_path: Path) -> None:
+    needs_no_camera()
+    plan = load_plan(plans / "plan.json")
+    words = {"joints": ",".join(map(repr, plan.home.tolist()))}
+    with LoopbackController.start(robot="UR5", speedup=20, **words) as controller:
+        command = ("capture", tmp_path / "s", "--plan", plans / "plan.json", "--robot-host",
+                   controller.host, "--no-input")  # fmt: skip
+        done = realsim(*command, "--dry-run", "--views", "0-2")
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "nothing is looked at" in done.stdout and "nothing was stored" in done.stdout
+        # The arm really went: it stands at the last view asked for.
+        np.testing.assert_allclose(controller.joints(), plan.joints[2], atol=1e-3)
+        real = realsim(*command)
+        assert real.returncode == 1 and "no RealSense camera" in real.stderr
+        assert "nothing was begun" in real.stdout
+        np.testing.assert_allclose(controller.joints(), plan.joints[2], atol=1e-3)
+        controller.inject("protective_stop", at_progress=0.5)
+        stopped = realsim(*command, "--dry-run", "--views", "0")
+        assert stopped.returncode == 1 and "protective stop" in stopped.stderr
+    assert not (tmp_path / "s").exists()
+
+
+@pytest.mark.parametrize("columns", [1, 2, 6])
+def test_the_head_of_a_contact_sheet_is_whole(columns: int) -> None:
+    """Everything that is written shows: as much ink as on a sheet wide enough for one line."""
+    title = "single_depth_color_640x480, D405 130322273305"
+    n = columns * columns
+    narrow = contact_sheet({}, {}, n, title, (640, 480), SheetConfig(largest_cell_px=80))
+    wide = contact_sheet({}, {}, n, title, (640, 480),
+                         SheetConfig(largest_cell_px=80, least_width_px=2000))  # fmt: skip
+    cells = columns * 60
+    head, one_line = narrow[:-cells], wide[:-cells]
+    assert one_line.shape[0] == 46 < head.shape[0] and head.shape[1] == 480
+    assert np.all(head[:, -4:] == head[0, 0]) and np.all(head[-4:] == head[0, 0])
+    ink = [float((h != h[0, 0]).any(axis=-1).sum()) for h in (head, one_line)]
+    assert 0.6 < ink[0] / ink[1] <= 1.01  # a shrunk title has less
+
+
+def test_ports_in_use_are_known() -> None:
+    with socket.socket() as listening:
+        listening.bind(("127.0.0.1", 0))
+        listening.listen()
+        port = listening.getsockname()[1]
+        assert port_in_use("127.0.0.1", port)
+    assert not port_in_use("127.0.0.1", port)
+
+
+def test_a_replay_file_is_not_replaced_unasked(plans: Path, tmp_path: Path) -> None:
+    (tmp_path / "replay.html").write_text("precious")
+    done = realsim("plan-show", plans / "plan.json", "--replay-file", tmp_path / "replay.html")
+    assert done.returncode == 2 and "--overwrite" in done.stderr
+    assert (tmp_path / "replay.html").read_text() == "precious"
 
 
 @pytest.mark.slow

@@ -331,6 +331,31 @@ def test_the_kind_is_known_by_the_content(tmp_path):
         open_source(ImportRequest(source=tmp_path / "s"), QUIET)
 
 
+def test_what_is_empty_or_no_bag_is_named(tmp_path):
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "none.bag").write_bytes(b"")
+    (tmp_path / "x.bag").write_text("a list of things to do")
+    for kind in ("auto", "bag"):
+        for name, says in (("none.bag", "is empty"), ("x.bag", "is no bag: its first bytes are")):
+            with pytest.raises(InputError, match=says):
+                open_source(ImportRequest(source=tmp_path / name, kind=kind), QUIET)
+    with pytest.raises(InputError, match=r"folder is empty; accepted are"):
+        open_source(ImportRequest(source=tmp_path / "folder"), QUIET)
+
+
+def test_a_camera_file_without_image_size_takes_that_of_the_images(tmp_path):
+    folder = make_folder(tmp_path / "in")
+    (folder / "K.txt").unlink()
+    camera = tmp_path / "cal.yaml"
+    camera.write_text("data: [{pose: a}]\nintrinsics:\n  fx: 35\n  fy: 36\n  cx: 20\n  cy: 15\n")
+    request = ImportRequest(source=folder, depth_unit=0.001, camera=camera)
+    K = open_source(request, QUIET).intrinsics.K
+    np.testing.assert_array_equal(K, [[35, 0, 20], [0, 36, 15], [0, 0, 1]])
+    camera.write_text("intrinsics: {fx: 550, fy: 550, cx: 320, cy: 240}\n")
+    with pytest.raises(InputError, match="another image size"):
+        open_source(request, QUIET)
+
+
 def test_an_option_that_says_nothing_is_refused(tmp_path):
     request = ImportRequest(source=make_folder(tmp_path / "in"), scene=3, depth_unit=0.001)
     with pytest.raises(InputError, match=r"--scene \(for bop\)"):

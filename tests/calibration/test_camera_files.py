@@ -210,9 +210,45 @@ def test_large_binary_and_missing_files_are_refused(tmp_path):
     (tmp_path / "large").write_bytes(b" " * 5_000_000)
     with pytest.raises(InputError, match=r"5\.0 MB"):
         read_camera(tmp_path / "large")
-    (tmp_path / "picture.png").write_bytes(b"\x89PNG\xff\xfe\x00")
+    for head, kind in (
+        (b"\x89PNG\xff\xfe\x00", "a picture"),
+        (b"MATLAB 5.0 MAT-file, Platform: PCWIN64\x00\x01", "a MATLAB file"),
+        (b"abc\x00\xff", "a binary file"),
+    ):
+        (tmp_path / "some.file").write_bytes(head)
+        with pytest.raises(InputError, match=f"is {kind}, no camera file.*Accepted are text files"):
+            read_camera(tmp_path / "some.file")
+    (tmp_path / "latin").write_bytes(b"fx: 3\xff")
     with pytest.raises(InputError, match="as text"):
-        read_camera(tmp_path / "picture.png")
+        read_camera(tmp_path / "latin")
+
+
+@pytest.mark.parametrize("key", ["intrinsics", "K", "camera_matrix"])
+def test_the_matrix_by_name(tmp_path, key):
+    text = f"{key}: {{fx: 550.5, fy: 551, cx: 320, cy: 240}}\ndistortion: [0.1, -0.2]\n"
+    path = given_file(tmp_path, "c.yaml", text + "image_size: [640, 480]\n")
+    camera = read_camera(path)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (550.5, 551, 320, 240)
+    assert (camera.width, camera.height) == (640, 480)
+    assert camera.distortion[:2].tolist() == [0.1, -0.2]
+    assert np.array_equal(read_camera(path, size=(320, 240)).K, camera.K)  # the file counts more
+    path = given_file(tmp_path, "d.yaml", text)
+    with pytest.raises(InputError, match="how large its images are"):
+        read_camera(path)
+    assert np.array_equal(read_camera(path, size=(640, 480)).K, camera.K)
+    with pytest.raises(InputError, match="another image size"):
+        read_camera(path, size=(1280, 960))
+    with pytest.raises(InputError, match="fx and fy are not among"):
+        read_camera(given_file(tmp_path, "e.yaml", f"{key}: {{f: 550, width: 4}}\n"))
+
+
+@pytest.mark.real
+def test_a_real_file_of_calibration_settings_has_a_camera():
+    path = ROOT / "handeye/rosi_circles/cal_data.yaml"
+    if not path.is_file():
+        pytest.skip(f"no real data at {path} (set REALSIM_DATA)")
+    camera = read_camera(path, size=(640, 480))
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (550, 550, 320, 240)
 
 
 def test_nothing_is_written_in_an_unknown_format_or_name(tmp_path):

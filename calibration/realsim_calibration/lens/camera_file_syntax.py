@@ -13,6 +13,23 @@ Fields = dict[str, Any]
 LARGEST_BYTES = 4_000_000
 """A camera file is a few kilobytes; one with hundreds of poses in it may have a megabyte."""
 
+BINARY_KINDS = (
+    (b"MATLAB ", "a MATLAB file"),
+    (b"\x89HDF", "an HDF5 file (MATLAB 7.3 writes them, too)"),
+    (b"\x93NUMPY", "a NumPy array"),
+    (b"PK\x03\x04", "a ZIP archive (.npz is one)"),
+    (b"\x89PNG", "a picture"),
+    (b"\xff\xd8", "a picture"),
+)
+"""First bytes of what people give for a camera file."""
+HEAD_BYTES = 1024
+"""Read of a file to see whether it is text: binary formats have a zero byte early on."""
+ACCEPTED = (
+    "Accepted are text files: JSON, YAML or OpenCV's XML with fx, fy, cx, cy or a camera matrix "
+    "and the image size; ROS's camera_info; COLMAP's cameras.txt. Write its numbers into one, "
+    'such as {"fx": 600, "fy": 600, "cx": 320, "cy": 240, "width": 640, "height": 480}.'
+)
+
 
 def read_text(path: Path) -> str:
     """Return a text file's contents.
@@ -28,6 +45,8 @@ def read_text(path: Path) -> str:
             f"the camera file {path} has {size / 1e6:.1f} MB; {LARGEST_BYTES / 1e6:.0f} MB are "
             "accepted. Is it a picture or a bag?"
         )
+    if what := _binary_kind(path):
+        raise InputError(f"{path} is {what}, no camera file. {ACCEPTED}")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (UnicodeDecodeError, OSError) as error:
@@ -35,6 +54,14 @@ def read_text(path: Path) -> str:
     if not text.strip():
         raise InputError(f"the camera file {path} is empty.")
     return text
+
+
+def _binary_kind(path: Path) -> str:
+    """Return what a file is that is no text, an empty text where it may be one."""
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    known = next((what for magic, what in BINARY_KINDS if head.startswith(magic)), "")
+    return known or ("a binary file" if b"\0" in head else "")
 
 
 def named_values(text: str, path: Path, camera_keys: tuple[str, ...]) -> Fields:

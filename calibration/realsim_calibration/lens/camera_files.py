@@ -6,6 +6,7 @@
 | ros | YAML with camera_matrix and distortion_model (camera_info) | yes |
 | opencv | FileStorage YAML, XML or JSON with a camera matrix | yes (YAML) |
 | matrix | json with `intrinsic` or `K`, `distortion`, `resolution` | |
+| mapping | fx fy cx cy (or ppx ppy) by name under `intrinsics` or `K` | |
 | bop | json with fx fy cx cy depth_scale | |
 | realsense | json with fx fy ppx ppy coeffs | |
 | colmap | cameras.txt | |
@@ -32,6 +33,10 @@ Array = NDArray[np.float64]
 Format = Literal["realsim", "ros", "opencv"]
 SMALLEST_SIDE = 8
 """An image this small is no image [px]."""
+CENTRE_SHARE = 0.15
+"""A principal point farther from the image's centre than this share of its size is of another
+resolution: a matrix alone does not say for which size of image it holds. A matrix of half the
+resolution is 0.25 off, of two thirds 0.17; lenses stay within 0.1."""
 ASPECT_RANGE = (0.5, 2.0)
 """fx / fy beyond this is no lens: pixels are square, or nearly, even in squeezed video."""
 MATRIX_KEYS = (
@@ -63,8 +68,13 @@ COLMAP_MODELS: dict[str, int] = {
 """COLMAP's camera models that the record holds, and their parameters."""
 
 
-def read_camera(path: Path | str) -> CameraIntrinsics:
+def read_camera(path: Path | str, *, size: tuple[int, int] | None = None) -> CameraIntrinsics:
     """Return the intrinsics in a file, whatever its format of those in the table above.
+
+    Args:
+        path: the file.
+        size: (width, height) [px] of the images, for a file that does not say it. The principal
+            point must lie near their centre then; what the file says counts more.
 
     Raises:
         InputError: there is no such file, it is too large or damaged, it holds no camera, several,
@@ -76,7 +86,7 @@ def read_camera(path: Path | str) -> CameraIntrinsics:
         return _checked(_colmap(text, path), path)
     fields = named_values(text, path, CAMERA_KEYS)
     try:
-        camera = _camera(fields, path)
+        camera = _camera(fields, path, size)
     except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"the camera file {path} is damaged: {first_line(error)}") from error
     return _checked(camera, path)
@@ -175,7 +185,34 @@ def _distortion(fields: Fields, path: Path) -> Array:
     return numbers
 
 
-def _camera(fields: Fields, path: Path) -> CameraIntrinsics:
+def _size_or(fields: Fields, path: Path, size: tuple[int, int] | None, K: Array) -> tuple[int, int]:
+    """Return the image size that the file says, else the images' own if K fits it.
+
+    Raises:
+        InputError: neither is known, or K is of images of another size.
+    """
+    stated = any(key in fields for key in (*WIDTH_KEYS, *HEIGHT_KEYS, *SIZE_KEYS))
+    if stated or size is None:
+        return _size(fields, path)
+    require_centred(K, size, path)
+    return size
+
+
+def require_centred(K: Array, size: tuple[int, int], path: Path) -> None:
+    """Refuse a matrix (3, 3) [px] whose principal point is far from the centre of (width, height).
+
+    Raises:
+        InputError: it is of another image size.
+    """
+    if max(abs(K[k, 2] - size[k] / 2) / size[k] for k in (0, 1)) > CENTRE_SHARE:
+        raise InputError(
+            f"{path}: the principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) is far from the centre of "
+            f"the images ({size[0]}x{size[1]} px): the matrix is of another image size. Give the "
+            "camera of these images."
+        )
+
+
+def _camera(fields: Fields, path: Path, size: tuple[int, int] | None = None) -> CameraIntrinsics:
     """Return the camera of named values.
 
     Raises:
@@ -200,8 +237,18 @@ def _camera(fields: Fields, path: Path) -> CameraIntrinsics:
                 f"{path} holds no camera: neither a camera matrix ({', '.join(MATRIX_KEYS[:3])}, "
                 f"...) nor fx and fy. It holds: {', '.join(list(fields)[:12]) or 'nothing'}."
             )
+        if isinstance(value, Mapping):
+            # fx fy cx cy by name; what stands beside them (size, distortion) belongs to them.
+            beside = {k: v for k, v in fields.items() if k not in MATRIX_KEYS}
+            named = {str(k): v for k, v in value.items()}
+            if not {"fx", "fy"} <= set(named):
+                raise InputError(
+                    f"{path}: the camera matrix is given by name, and fx and fy are not among the "
+                    f"names: {', '.join(list(named)[:12])}."
+                )
+            return _camera(beside | named, path, size)
         K = _matrix(value, path)
-    width, height = _size(fields, path)
+    width, height = _size_or(fields, path, size, K)
     return CameraIntrinsics.from_K(K, width, height, _distortion(fields, path))
 
 

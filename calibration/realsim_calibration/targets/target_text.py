@@ -38,6 +38,8 @@ UNITS_M: dict[str, Decimal] = {
 """Units of length and their size [m]."""
 LONGEST_TEXT = 400
 """Longest line [characters]; the longest target takes a third of it."""
+FILE_ENDINGS = (".json", ".yaml", ".yml")
+"""A line that ends so was meant as the name of a target file."""
 _LENGTH = re.compile(r"([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([a-zA-Zµ\"]*)")
 _COUNTS = re.compile(r"([0-9]{1,4})\s*[xX×]\s*([0-9]{1,4})")
 _NUMBER = re.compile(r"[0-9]{1,6}")
@@ -245,6 +247,11 @@ def parse_target(text: str) -> Target:
         )
     kind, colon, rest = text.partition(":")
     form = FORMS.get(kind.strip().lower())
+    if text.lower().endswith(FILE_ENDINGS):
+        raise InputError(
+            f"no such file: '{text}'. Give the target file that `realsim board` wrote, or one line:"
+            f"\n{target_usage()}"
+        )
     if form is None or not colon:
         raise InputError(
             f"'{kind}' in '{text}' is no kind of target. Accepted are lines like:\n"
