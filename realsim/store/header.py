@@ -1,6 +1,8 @@
 """`session.json`: who a session is, its camera, and where the camera stood."""
 
+import json
 import platform
+import shlex
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -9,12 +11,20 @@ from typing import Any
 from realsim.errors import InputError
 from realsim.records import CaptureSession
 from realsim.store import records_json
-from realsim.store.json_files import read_object
 
 SESSION_FILE = "session.json"
 FORMAT = "realsim session"
 FORMAT_VERSION = 1
 VERSIONS_OF = ("realsim", "numpy", "opencv-python-headless")
+
+
+class NewerFormatError(InputError):
+    """The session was written by a newer realsim."""
+
+
+def repair_command(folder: Path) -> str:
+    """Return the command that repairs the session in a folder, as it is typed."""
+    return f"`realsim check {shlex.quote(str(folder))} --repair`"
 
 
 def new_header(session: CaptureSession, extra: dict[str, Any]) -> dict[str, Any]:
@@ -37,21 +47,57 @@ def checked_header(path: Path) -> dict[str, Any]:
     """Return the content of session.json.
 
     Raises:
-        InputError: not JSON, not a session's header, incomplete, or of a newer format.
+        NewerFormatError: it was written by a newer realsim.
+        InputError: not JSON, not a session's header, or incomplete.
     """
-    header = read_object(path)
+    header = _read(path)
     if header.get("format") != FORMAT or not isinstance(header.get("format_version"), int):
         raise InputError(
             f"{path} is not the header of a '{FORMAT}': it says format "
             f"{header.get('format')!r}, version {header.get('format_version')!r}."
         )
     if header["format_version"] > FORMAT_VERSION:
-        raise InputError(
+        raise NewerFormatError(
             f"{path} has format version {header['format_version']}; this realsim reads up to "
             f"{FORMAT_VERSION}. Use a newer realsim."
         )
     records_json.need(header, ("name", "camera", "depth_unit_m", "T_world_cam"), str(path))
+    try:
+        records_json.intrinsics_from_json(header["camera"])
+        float(header["depth_unit_m"])
+        dict(header["T_world_cam"])
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path} has a camera, unit or pose that is none ({error}).") from error
     return header
+
+
+def header_to_open(path: Path) -> dict[str, Any]:
+    """Return the content of session.json; what is wrong with it is said with its remedy.
+
+    Raises:
+        InputError: see `checked_header`.
+    """
+    try:
+        return checked_header(path)
+    except NewerFormatError:
+        raise
+    except InputError as error:
+        raise InputError(
+            f"{error} {repair_command(path.parent)} makes it anew from what the session's other "
+            "files say; images and robot poses are not touched."
+        ) from error
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise InputError(f"{path} does not exist.")
+    try:
+        header: Any = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"{path} is not valid JSON ({error}).") from error
+    if not isinstance(header, dict):
+        raise InputError(f"{path} holds a {type(header).__name__}; an object is expected.")
+    return {str(key): item for key, item in header.items()}  # pyright: ignore[reportUnknownVariableType]
 
 
 def _versions() -> dict[str, str]:

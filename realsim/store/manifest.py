@@ -95,6 +95,18 @@ def fault_of(folder: Path, entry: Entry) -> Fault | None:
     return Fault(path=entry.path, kind="changed", found=found)
 
 
+def size_fault_of(folder: Path, entry: Entry) -> Fault | None:
+    """Return what existence and size alone show to be wrong with a listed file."""
+    try:
+        size = (folder / entry.path).stat().st_size
+    except OSError:
+        return Fault(path=entry.path, kind="missing", found="no file")
+    if size == entry.bytes:
+        return None
+    found = f"{size} bytes instead of {entry.bytes}"
+    return Fault(path=entry.path, kind="changed", found=found)
+
+
 class Manifest:
     """The manifest of one folder."""
 
@@ -149,9 +161,12 @@ class Manifest:
         self.add(())
 
     def remove(self, path: str) -> None:
-        """Take a file away and off the list; one that is not there is no error."""
-        (self._folder / path).unlink(missing_ok=True)
+        """Take a file off the list and away; one that is not there is no error.
+
+        In this order: after a kill in between, nothing that is listed is missing.
+        """
         self.forget(path)
+        (self._folder / path).unlink(missing_ok=True)
 
     def forget(self, path: str) -> None:
         """Take a path off the list; the file stays."""

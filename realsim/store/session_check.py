@@ -7,137 +7,36 @@ temporary name, images of the view in flight) is a note: opening the session cle
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from realsim.errors import RealsimError
 from realsim.formats import images
 from realsim.records import CameraIntrinsics
 from realsim.store import atomic, records_json
+from realsim.store.check_report import CheckReport, Finding, Kind, Lists
 from realsim.store.header import SESSION_FILE, checked_header
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import REMOVED, Entry, entry_from, entry_of, fault_of
 from realsim.store.robot_lines import record_of
+from realsim.store.session_notes import (
+    PLAN_FILE,
+    is_image,
+    note_orphans,
+    note_repeated,
+    note_times,
+    note_unproven,
+    without_checksum,
+)
 from realsim.store.session_store import CAMERA_FILE, ROBOT_FILE, depth_path, rgb_path
+
+__all__ = ["CheckReport", "Finding", "check_session", "inner_sessions", "is_session", "read_lists"]
 
 DAMAGED = "damaged"
 """Folder of a session that takes what a repair takes out."""
-PLAN_FILE = "plan.json"
+LISTED = re.compile(r'"path": "([^"]+)"')
 INDEX = re.compile(r'"index": (\d+)')
-IMAGE_FOLDERS = ("rgb", "depth")
-
-Kind = Literal["missing", "changed", "unreadable", "line", "torn", "leftover", "unlisted", "time"]
-DAMAGE: tuple[Kind, ...] = ("missing", "changed", "unreadable", "line")
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Finding:
-    """One thing that is not as it was written."""
-
-    path: str
-    """Relative to the session."""
-    kind: Kind
-    """missing, changed (other bytes than were written), unreadable, line (a damaged one): damage.
-    torn, leftover, unlisted (what an interrupted run leaves), time (a stamp goes back): notes."""
-    found: str
-    """What is there."""
-    view: int | None = None
-    """The view that it costs, if it costs one."""
-
-    @property
-    def is_damage(self) -> bool:
-        """Whether it is more than an interrupted run can leave."""
-        return self.kind in DAMAGE
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CheckReport:
-    """What a check found in one session, and in the sessions inside it."""
-
-    folder: str
-    views: tuple[int, ...]
-    """Numbers of the views that are whole and sound."""
-    damaged_views: tuple[int, ...]
-    """Numbers of views that were stored once and are not whole any more."""
-    planned: int | None
-    """Views of the plan that the session is captured by; None without a plan."""
-    files_ok: int
-    """Listed files that have the bytes that were written."""
-    unproven: int
-    """Files that no checksum covers: written beside the session, or by other tools."""
-    findings: tuple[Finding, ...] = ()
-    inner: tuple["CheckReport", ...] = ()
-    """Reports of the sessions inside, such as the board views in calibration/capture."""
-
-    def _paths(self, kind: Kind) -> tuple[str, ...]:
-        return tuple(f.path for f in self.findings if f.kind == kind)
-
-    @property
-    def missing(self) -> tuple[str, ...]:
-        """Listed files that are not there."""
-        return self._paths("missing")
-
-    @property
-    def changed(self) -> tuple[str, ...]:
-        """Listed files with other bytes than were written."""
-        return self._paths("changed")
-
-    @property
-    def torn(self) -> tuple[str, ...]:
-        """Lists whose last line is half: a run was interrupted."""
-        return self._paths("torn")
-
-    @property
-    def leftovers(self) -> tuple[str, ...]:
-        """Temporary files of runs that are over."""
-        return self._paths("leftover")
-
-    @property
-    def unlisted(self) -> tuple[str, ...]:
-        """Images and lines that no complete view has."""
-        return self._paths("unlisted")
-
-    @property
-    def not_captured(self) -> tuple[int, ...]:
-        """Views of the plan that are not there."""
-        have = set(self.views)
-        return tuple(k for k in range(self.planned or 0) if k not in have)
-
-    @property
-    def sound(self) -> bool:
-        """Whether nothing is damaged here and inside; notes do not count."""
-        return not any(f.is_damage for f in self.findings) and all(r.sound for r in self.inner)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the report as plain JSON values."""
-        return {
-            "folder": self.folder,
-            "sound": self.sound,
-            "views": len(self.views),
-            "views_planned": self.planned,
-            "views_damaged": list(self.damaged_views),
-            "views_not_captured": list(self.not_captured),
-            "files_ok": self.files_ok,
-            "files_without_checksum": self.unproven,
-            "findings": [
-                {"path": f.path, "kind": f.kind, "found": f.found, "view": f.view,
-                 "damage": f.is_damage}
-                for f in self.findings
-            ],
-            "inner": [r.to_json() for r in self.inner],
-        }  # fmt: skip
-
-
-@dataclass(kw_only=True, slots=True)
-class Lists:
-    """The two lists of a session, read without stopping at a damaged line."""
-
-    entries: dict[str, Entry]
-    """The manifest: the last sound entry of every path."""
-    records: dict[int, dict[str, Any]]
-    """The last sound robot line of every view, in the order of the file."""
-    findings: list[Finding] = field(default_factory=list[Finding])
 
 
 def is_session(folder: Path) -> bool:
@@ -178,8 +77,11 @@ def check_session(folder: Path | str, *, decode: bool = False) -> CheckReport:
     sound = set(_sound_views(folder, lists, camera, decode))
     lost = _views_of_lines(lists)
     lost |= {f.view for f in findings if f.view is not None and f.is_damage}
-    _note_times(lists)
-    _note_orphans(folder, lists, lost)
+    note_times(folder, lists)
+    note_repeated(folder, lists)
+    note_orphans(folder, lists, lost)
+    unproven, beside = without_checksum(_unlisted(folder, lists))
+    note_unproven(lists, unproven)
     views = tuple(sorted(sound - lost))
     return CheckReport(
         folder=str(folder),
@@ -187,7 +89,8 @@ def check_session(folder: Path | str, *, decode: bool = False) -> CheckReport:
         damaged_views=tuple(sorted((lost | set(lists.records)) - set(views))),
         planned=_planned(folder),
         files_ok=ok,
-        unproven=_unproven(folder, lists),
+        unproven=unproven,
+        beside=beside,
         findings=tuple(findings),
         inner=tuple(
             check_session(p, decode=decode) for p in inner_sessions(folder) if _is_next(folder, p)
@@ -210,6 +113,8 @@ def read_lists(folder: Path) -> Lists:
             if name == MANIFEST_FILE:
                 lists.findings.append(Finding(path=name, kind="missing", found="no file"))
             continue
+        if name == MANIFEST_FILE and not atomic.complete_lines(path):
+            lists.findings.append(Finding(path=name, kind="missing", found="no line in it"))
         for number, line in enumerate(atomic.complete_lines(path), start=1):
             try:
                 if name == MANIFEST_FILE:
@@ -217,21 +122,26 @@ def read_lists(folder: Path) -> Lists:
                 else:
                     record = record_of(line)
                     records_json.view_from_json(record)
-                    lists.records[record["index"]] = record
+                    index = int(record["index"])
+                    lists.records.pop(index, None)  # the order is that of the lines that count
+                    lists.records[index] = record
+                    lists.lines.setdefault(index, []).append((number, line))
             except (ValueError, RealsimError) as error:
-                index = INDEX.search(line) if name == ROBOT_FILE else None
+                named = INDEX.search(line) if name == ROBOT_FILE else None
                 lists.findings.append(
                     Finding(
                         path=name, kind="line", found=f"line {number} {error}",
-                        view=None if index is None else int(index[1]),
+                        view=None if named is None else int(named[1]),
                     )
                 )  # fmt: skip
         data = path.read_bytes()
         if data and not data.endswith(b"\n"):
             half = len(data) - data.rfind(b"\n") - 1
-            lists.findings.append(
-                Finding(path=name, kind="torn", found=f"half a line of {half} bytes at its end")
-            )
+            found = f"half a line of {half} bytes at its end"
+            tail = LISTED.search(data[-half:].decode(errors="replace"))
+            if name == MANIFEST_FILE and tail is not None:
+                found += f": the checksum of {tail[1]} is lost"
+            lists.findings.append(Finding(path=name, kind="torn", found=found))
     return lists
 
 
@@ -346,42 +256,12 @@ def _views_of_lines(lists: Lists) -> set[int]:
     damaged = [k for k, f in enumerate(lists.findings) if f.path == ROBOT_FILE and f.is_damage]
     if not damaged:
         return set()
-    lost = {int(Path(p).stem) for p in lists.entries if _is_image(p)} - set(lists.records)
+    lost = {int(Path(p).stem) for p in lists.entries if is_image(p)} - set(lists.records)
     for k in damaged:
         finding = lists.findings[k]
         if finding.view in lists.records and lost:
             lists.findings[k] = replace(finding, view=None)
     return lost
-
-
-def _is_image(path: str) -> bool:
-    folder, _, name = path.partition("/")
-    return folder in IMAGE_FOLDERS and bool(re.fullmatch(r"\d{6,}\.png", name))
-
-
-def _note_times(lists: Lists) -> None:
-    """Note a time stamp that is earlier than the one before it in the file."""
-    before: tuple[int, float] | None = None
-    for index, record in lists.records.items():
-        moment = float(record["time_s"])
-        if before is not None and moment < before[1]:
-            found = f"view {index} at {moment:.3f} s was stored after view {before[0]} at "
-            found += f"{before[1]:.3f} s; a camera that was restarted counts anew"
-            lists.findings.append(Finding(path=ROBOT_FILE, kind="time", found=found))
-            return  # one restart shifts all that follow: the first is what matters
-        before = (index, moment)
-
-
-def _note_orphans(folder: Path, lists: Lists, lost: set[int]) -> None:
-    """Note images that belong to no view."""
-    for name in IMAGE_FOLDERS:
-        for file in sorted((folder / name).glob("*.png")):
-            path = file.relative_to(folder).as_posix()
-            if not _is_image(path) or int(file.stem) in lists.records:
-                continue
-            if int(file.stem) not in lost:
-                found = "no line in robot.jsonl: the run ended before the view was complete"
-                lists.findings.append(Finding(path=path, kind="unlisted", found=found))
 
 
 def _planned(folder: Path) -> int | None:
@@ -393,13 +273,13 @@ def _planned(folder: Path) -> int | None:
         return None
 
 
-def _unproven(folder: Path, lists: Lists) -> int:
-    """Return how many files of the session no checksum covers."""
+def _unlisted(folder: Path, lists: Lists) -> list[str]:
+    """Return the files of the session that no checksum covers."""
     inner = [folder / DAMAGED, *inner_sessions(folder)]
-    return sum(
-        p.is_file()
-        and p.name != MANIFEST_FILE
-        and p.relative_to(folder).as_posix() not in lists.entries
+    temporary = {t for t, _ in atomic.leftovers(folder)}
+    paths = [
+        p for p in folder.rglob("*")
+        if p.is_file() and p != folder / MANIFEST_FILE and p not in temporary
         and not any(i in p.parents for i in inner)
-        for p in folder.rglob("*")
-    )
+    ]  # fmt: skip
+    return [p for p in (q.relative_to(folder).as_posix() for q in paths) if p not in lists.entries]

@@ -14,6 +14,7 @@ from realsim.errors import InputError, RealsimError
 from realsim.formats import bop_units, images
 from realsim.records import CaptureSession
 from realsim.store import atomic
+from realsim.store.begun import BEGUN_FILE, RECOVERED, read_begun
 from realsim.store.header import SESSION_FILE, checked_header, new_header
 from realsim.store.json_files import read_object
 from realsim.store.manifest import NAME as MANIFEST_FILE
@@ -21,10 +22,11 @@ from realsim.store.manifest import Manifest, entry_from, entry_of
 from realsim.store.robot_lines import CHECK, record_of
 from realsim.store.session_check import (
     DAMAGED,
-    PLAN_FILE,
     CheckReport,
     check_session,
+    read_lists,
 )
+from realsim.store.session_notes import PLAN_FILE, is_image, is_own, log_entries
 from realsim.store.session_store import (
     CAMERA_FILE,
     ROBOT_FILE,
@@ -33,8 +35,12 @@ from realsim.store.session_store import (
     rgb_path,
 )
 
+LENS = ("camera", "depth_unit_m")
+"""What a calibration changes after the beginning."""
 DERIVED = ("calibration/", "registration/", "grasps/", "annotations/", "mask/", "reports/")
 """Results: a step writes them again."""
+SHOWN = 8
+"""Names that a note gives."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -94,22 +100,34 @@ class _Repair:
             self.moved.append((path, target.relative_to(self.folder).as_posix()))
 
     def header(self) -> None:
-        """Make session.json anew from what BOP's file, an image and the plan say of it."""
-        header = _recovered_header(self.folder) | _still_told(self.folder)
+        """Make session.json anew from its copy of the beginning, BOP's file and an image."""
+        begun = read_begun(self.folder)
+        header = _recovered_header(self.folder, begun)
+        told = header | _still_told(self.folder) if begun is None else header
         self.move(SESSION_FILE)
-        atomic.write_json(self.folder / SESSION_FILE, header)
+        atomic.write_json(self.folder / SESSION_FILE, told)
+        if begun is not None:
+            self.notes.append(
+                f"{SESSION_FILE} was made anew: name, arm, camera, lab and plan from {BEGUN_FILE}, "
+                f"the lens and the camera poses from {CAMERA_FILE}."
+            )
+            return
         self.notes.append(
-            f"{SESSION_FILE} was made anew from {CAMERA_FILE}, an image and the plan: the camera, "
-            "the depth unit, camera poses and the plan's hash are what they were; the rest "
-            "(name, what the devices said of themselves) is what could still be read, or is lost. "
-            "Compare with a copy if there is one."
+            f"{SESSION_FILE} was made anew from {CAMERA_FILE}, an image, the plan and the capture "
+            "log: the lens, the depth unit, camera poses and the plan's hash are what they were; "
+            "the rest (name, arm, camera, lab) is what could still be read, or is lost. Compare "
+            "with a copy if there is one."
         )
+        if told["extra"].get(RECOVERED):
+            self.notes.append(
+                "which arm, camera and lab the session was begun with is not known for certain: "
+                "capture adds no views to it until somebody says so (it tells how)."
+            )
 
     def manifest(self) -> Manifest:
         """Take damaged lines out of the manifest."""
         path = self.folder / MANIFEST_FILE
-        if path.is_file():
-            lines = atomic.complete_lines(path)
+        if lines := atomic.complete_lines(path):
             sound = [line for line in lines if _is_entry(line)]
             if len(sound) < len(lines):
                 self.keep_copy(MANIFEST_FILE)
@@ -145,6 +163,27 @@ class _Repair:
                 )
         elif listed is not None:
             manifest.forget(ROBOT_FILE)
+
+    def list_anew(self, before: CheckReport) -> None:
+        """List the session's own files that no checksum covers, and say which they are."""
+        lost = any(f.path == MANIFEST_FILE and f.kind == "missing" for f in before.findings)
+        orphans = set(before.unlisted)
+        there = [
+            p for p in before.unproven
+            if is_own(p) and p not in orphans and (self.folder / p).is_file()
+        ]  # fmt: skip
+        manifest = Manifest(self.folder)
+        manifest.add(
+            entry_of(p, (self.folder / p).read_bytes())
+            for p in there
+            if p not in manifest.entries and not is_image(p)
+        )
+        if there and not lost:
+            named = ", ".join(there[:SHOWN]) + (", ..." if len(there) > SHOWN else "")
+            self.notes.append(
+                f"{len(there)} files had no checksum and are listed as they are now: {named}. "
+                "Whether they changed before, nothing can tell."
+            )
 
     def poses(self, dropped: set[int], manifest: Manifest) -> None:
         """Forget the calibrated poses of dropped views: the new ones will stand elsewhere."""
@@ -183,6 +222,7 @@ def repair_session(folder: Path | str) -> RepairReport:
                 manifest.forget(path)
             repair.poses(dropped, manifest)
         SessionStore.open(folder)
+        repair.list_anew(before)
         inner = tuple(repair_session(p.folder) for p in before.inner)
         _advise(repair, before, dropped, damaged)
         return RepairReport(
@@ -228,12 +268,18 @@ def _is_kept(line: str, dropped: set[int]) -> bool:
         return False
 
 
-def _recovered_header(folder: Path) -> dict[str, Any]:
+def _recovered_header(folder: Path, begun: dict[str, Any] | None) -> dict[str, Any]:
     """Return what can be known of a lost session.json.
+
+    Args:
+        folder: the session.
+        begun: the header that it was begun with, if that is known.
 
     Raises:
         InputError: nothing is left to make it from.
     """
+    if begun is not None and not read_lists(folder).records:
+        return begun | {"T_world_cam": {}}  # without views, nothing has changed since
     rgb = next(iter(sorted((folder / "rgb").glob("*.png"))), None)
     try:
         cameras = read_object(folder / CAMERA_FILE)
@@ -254,9 +300,17 @@ def _recovered_header(folder: Path) -> dict[str, Any]:
             f"anew, is of no use ({error}). Restore one of the two from a copy; images and "
             f"{ROBOT_FILE} were not touched."
         ) from error
-    header = new_header(session, {"recovered": True} | _plan_hash(folder))
+    header = new_header(session, {RECOVERED: True} | _plan_hash(folder) | _devices(folder))
+    if begun is not None:
+        header |= {key: value for key, value in begun.items() if key not in LENS}
     header["T_world_cam"] = {k: T.tolist() for k, T in Ts.items() if T is not None}
     return header
+
+
+def _devices(folder: Path) -> dict[str, Any]:
+    """Return what the capture log's first run says of arm and camera."""
+    begun = next((e for e in log_entries(folder) if e.get("event") == "begun"), {})
+    return {f"{key}_description": begun[key] for key in ("arm", "camera") if key in begun}
 
 
 def _still_told(folder: Path) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
     SESSION/
       session.json            camera, depth unit, calibrated camera poses, versions, extra
+      session.begun.json      what it was begun with, once more
       scene_camera.json       the same cameras in BOP's form, derived from session.json
       rgb/000000.png  depth/000000.png
       robot.jsonl             one line per view, appended after its images are on the disk
@@ -29,22 +30,29 @@ from realsim.formats import bop_units, images
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import atomic, records_json
 from realsim.store.atomic import storing
-from realsim.store.header import SESSION_FILE, checked_header, new_header
+from realsim.store.begun import BEGUN_FILE, begun_bytes
+from realsim.store.header import SESSION_FILE, header_to_open, new_header
 from realsim.store.json_files import read_json_file
 from realsim.store.manifest import Fault, Manifest, entry_of
+from realsim.store.opening import (
+    ROBOT_FILE,
+    keep_beginning,
+    require_free,
+    require_session,
+    stored_faults,
+)
 from realsim.store.robot_lines import RobotLines, record_of
-from realsim.store.view_images import check_sizes, depth_path, rgb_path
+from realsim.store.view_images import check_sizes, depth_path, is_whole, rgb_path
 
 if TYPE_CHECKING:
     from realsim.store.session_check import CheckReport
     from realsim.store.session_repair import RepairReport
 
-__all__ = ["SESSION_FILE", "SessionStore", "depth_path", "read_json_file", "rgb_path"]
+__all__ = ["ROBOT_FILE", "SESSION_FILE", "SessionStore", "depth_path", "read_json_file", "rgb_path"]
 
 Array = NDArray[np.float64]
 
 CAMERA_FILE = "scene_camera.json"
-ROBOT_FILE = "robot.jsonl"
 EAGER_VIEWS = 256
 """Up to so many views scene_camera.json is written anew with each; beyond, ..."""
 LAZY_GROWTH = 1.1
@@ -85,11 +93,7 @@ class SessionStore:
             InputError: there is a session already, or the record brings views without images.
         """
         folder = Path(folder)
-        if (folder / SESSION_FILE).exists():
-            raise InputError(
-                f"{folder} already holds a session. Open it to go on with it, or choose another "
-                "folder."
-            )
+        require_free(folder)
         if session.views:
             raise InputError(
                 f"session '{session.name}' brings {len(session.views)} views without images; "
@@ -100,6 +104,7 @@ class SessionStore:
         store = cls(folder, header)
         with storing(folder, SESSION_FILE):
             store._write_header()
+            store._manifest.write(BEGUN_FILE, begun_bytes(header))
             store._write_cameras()
         return store
 
@@ -113,17 +118,13 @@ class SessionStore:
         """
         folder = Path(folder)
         path = folder / SESSION_FILE
-        if not path.is_file():
-            raise InputError(
-                f"{folder} holds no session: {SESSION_FILE} is not there. The folder of a capture "
-                "session is expected; a BOP dataset is read by realsim.formats.bop."
-            )
-        header = checked_header(path)
+        require_session(folder)
+        header = header_to_open(path)
         with storing(folder, "what an interrupted run left undone"):
             Manifest(folder).finish_interrupted()
             atomic.repair_lines(folder / ROBOT_FILE)
             if path.is_file():  # an interrupted write of the header has been finished by now
-                header = checked_header(path)
+                header = header_to_open(path)
             store = cls(folder, header)
             store._finish_interrupted()
         return store
@@ -141,8 +142,10 @@ class SessionStore:
                 p for i in self._robot for p in self._files_of(i) if i in new or p not in listed
             ]
             names += [ROBOT_FILE] if new else []
-            present = [p for p in names if (self.folder / p).is_file()]
-            self._manifest.add(entry_of(p, (self.folder / p).read_bytes()) for p in present)
+            # An image without a checksum is only listed if it is whole: `check` names the others.
+            whole = [p for p in names if p == ROBOT_FILE or is_whole(self.folder / p)]
+            self._manifest.add(entry_of(p, (self.folder / p).read_bytes()) for p in whole)
+        keep_beginning(self.folder, self._header, self._manifest)
         self._camera_lines = {v.index: self._camera_line(v) for v in self.session.views}
         cameras, data = self.folder / CAMERA_FILE, self._camera_bytes()
         is_same = cameras.is_file() and cameras.read_bytes() == data
@@ -408,6 +411,14 @@ class SessionStore:
     def verify(self) -> list[Fault]:
         """Return every listed file that is missing or does not have the bytes that were written."""
         return self._manifest.verify()
+
+    def stored_faults(self) -> list[Fault]:
+        """Return the images of stored views that are gone or not of the size that was listed.
+
+        Only names and sizes are compared, which costs nothing; `verify` reads every byte.
+        """
+        paths = [p for i in sorted(self._robot) for p in self._files_of(i)]
+        return stored_faults(self.folder, paths, self._manifest.entries)
 
     def check(self) -> "CheckReport":
         """Return what is sound, missing or damaged in the session's folder; nothing is changed."""

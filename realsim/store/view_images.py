@@ -1,11 +1,13 @@
 """The images of a view: where they are, and what they must be."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.errors import InputError
+from realsim.errors import InputError, RealsimError
+from realsim.formats import images
 
 
 def rgb_path(index: int) -> str:
@@ -16,6 +18,15 @@ def rgb_path(index: int) -> str:
 def depth_path(index: int) -> str:
     """Return where the depth image of a view is, relative to the session."""
     return f"depth/{index:06d}.png"
+
+
+def is_whole(path: Path) -> bool:
+    """Return whether the file is there and can be decoded to its end."""
+    try:
+        images.read_image(path)
+    except (OSError, RealsimError):
+        return False
+    return True
 
 
 def check_sizes(

@@ -98,3 +98,23 @@ def test_what_cannot_be_repaired_is_said_and_left(
     assert main(monkeypatch, session, "--repair") == 2
     assert "Restore one of the two" in capsys.readouterr().err
     assert (session / "rgb/000000.png").is_file() and not (session / "damaged").exists()
+
+
+def test_files_without_a_checksum_are_named_and_those_of_others_explained(session: Path) -> None:
+    (session / "models").mkdir()
+    (session / "models/obj_000001.ply").write_text("ply")
+    path = session / "manifest.jsonl"
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if "rgb/000001" not in line))
+    result = run(session)
+    assert result.exit_code == 0
+    assert "1: rgb/000001.png" in result.output and "models/ 1 (no checksum" in result.output
+    assert "1 files of the session have no checksum" in result.output
+    told = json.loads(run(session, "--json").output)
+    assert told["files_without_checksum"] == ["rgb/000001.png"]
+    assert told["files_beside"] == {"models/": 1}
+    assert {f["path"]: f["kind"] for f in told["findings"]} == {"rgb/000001.png": "unproven"}
+    repaired = run(session, "--repair")
+    assert repaired.exit_code == 0 and "rgb/000001.png" in repaired.output
+    assert "nothing can tell" in repaired.output
+    assert json.loads(run(session, "--json").output)["files_without_checksum"] == []

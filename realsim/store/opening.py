@@ -1,0 +1,88 @@
+"""What must hold before a session's folder is gone on with."""
+
+import contextlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from realsim.errors import InputError
+from realsim.store import atomic
+from realsim.store.begun import BEGUN_FILE, RECOVERED, begun_bytes
+from realsim.store.header import SESSION_FILE, repair_command
+from realsim.store.manifest import NAME as MANIFEST_FILE
+from realsim.store.manifest import Entry, Fault, Manifest, entry_of, size_fault_of
+
+ROBOT_FILE = "robot.jsonl"
+
+
+def require_free(folder: Path) -> None:
+    """Refuse to begin a session where there is one.
+
+    Raises:
+        InputError: there is one, or what is left of one.
+    """
+    if (folder / SESSION_FILE).exists():
+        raise InputError(
+            f"{folder} already holds a session. Open it to go on with it, or choose another folder."
+        )
+    if (folder / ROBOT_FILE).exists():
+        raise InputError(
+            f"{folder} holds views of a session whose {SESSION_FILE} is lost. "
+            f"{repair_command(folder)} makes it anew; or choose another folder."
+        )
+
+
+def require_session(folder: Path) -> None:
+    """Refuse a folder without a session, and views without a manifest.
+
+    To list such views as they are now would call damage sound.
+
+    Raises:
+        InputError: no session.json, or views and no manifest; no kill takes that away.
+    """
+    views = atomic.complete_lines(folder / ROBOT_FILE)
+    if not (folder / SESSION_FILE).is_file():
+        if views:
+            raise InputError(
+                f"{folder} holds views, but its {SESSION_FILE} is lost. "
+                f"{repair_command(folder)} makes it anew."
+            )
+        raise InputError(
+            f"{folder} holds no session: {SESSION_FILE} is not there. The folder of a capture "
+            "session is expected; a BOP dataset is read by realsim.formats.bop."
+        )
+    if views and not atomic.complete_lines(folder / MANIFEST_FILE):
+        raise InputError(
+            f"{folder / MANIFEST_FILE} is lost, and the checksums of the session's views with it: "
+            f"which of them are sound is not known. {repair_command(folder)} looks at every "
+            "image, takes out what is broken, and lists the rest anew."
+        )
+
+
+def keep_beginning(folder: Path, header: dict[str, Any], manifest: Manifest) -> None:
+    """Write session.begun.json where it is not there and session.json is as it was written."""
+    extra: Any = header.get("extra")
+    if (folder / BEGUN_FILE).exists() or (isinstance(extra, dict) and RECOVERED in extra):
+        return
+    data = (folder / SESSION_FILE).read_bytes()
+    if manifest.entries.get(SESSION_FILE) == entry_of(SESSION_FILE, data):
+        with contextlib.suppress(OSError):  # a copy: a session that may only be read has none
+            manifest.write(BEGUN_FILE, begun_bytes(header))
+
+
+def stored_faults(folder: Path, paths: Iterable[str], listed: Mapping[str, Entry]) -> list[Fault]:
+    """Return which images of stored views are gone or not of the size that was listed.
+
+    An image that is neither there nor listed is no fault: a run ended while its view was taken
+    again.
+    """
+    faults: list[Fault] = []
+    for path in paths:
+        fault = None
+        if path in listed:
+            fault = size_fault_of(folder, listed[path])
+        elif (folder / path).is_file():
+            fault = Fault(path=path, kind="changed", found="not listed, and it cannot be read")
+        if fault is not None:
+            faults.append(fault)
+    return faults

@@ -1,0 +1,186 @@
+"""What a check notes: lost checksums, second lines, clocks that go back."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, CaptureSession, View
+from realsim.store import SessionStore
+from realsim.store.manifest import NAME as MANIFEST
+from realsim.store.session_check import check_session
+from realsim.store.session_repair import repair_session
+
+CAMERA = CameraIntrinsics(
+    width=40, height=30, fx=38.1, fy=38.2, cx=19.7, cy=14.9, distortion=np.array([0.05, 0.01])
+)
+VIEWS = 6
+
+
+def images_of(index: int, take: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng([index, take])
+    rgb = rng.integers(0, 256, (30, 40, 3), dtype=np.uint8)
+    return rgb, rng.integers(3000, 4000, (30, 40)).astype(np.uint16)
+
+
+def view_of(index: int) -> View:
+    rng = np.random.default_rng(index)
+    return View(
+        index=index, T_base_ee=se3.random_transform(rng), joints=rng.normal(size=6),
+        time_s=100.0 + index,
+    )  # fmt: skip
+
+
+def add(store: SessionStore, index: int, take: int = 0) -> None:
+    rgb, counts = images_of(index, take)
+    store.add_view(view_of(index), rgb, depth_counts=counts)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sessions") / "whole"
+    session = CaptureSession(name="whole", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(folder, session, {"plan_hash": "p" * 64, "camera": "D405 17"})
+    store.write_json("plan.json", {"sha256": "p" * 64, "content": {"joints": [[0] * 6] * 8}})
+    for index in range(VIEWS):
+        add(store, index)
+    Ts = se3.random_transform(np.random.default_rng(5), VIEWS)
+    store.set_cameras(CAMERA, {k: Ts[k] for k in range(VIEWS)})
+    store.write_json("calibration/hand_eye.json", {"a": list(range(50))})
+    inner = SessionStore.create(folder / "calibration/capture", session, {"plan_hash": "q"})
+    for index in range(3):
+        add(inner, index)
+    return folder
+
+
+@pytest.fixture
+def session(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "s"))
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes()
+        for p in sorted(folder.rglob("*")) if p.is_file()
+    }  # fmt: skip
+
+
+def flip(path: Path, place: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[place] ^= 0x10
+    path.write_bytes(bytes(data))
+
+
+@pytest.mark.parametrize("left", [None, b"", b'{"path": "half'])
+def test_views_without_a_manifest_are_not_taken_for_sound(
+    session: Path, left: bytes | None
+) -> None:
+    (session / MANIFEST).unlink()
+    if left is not None:
+        (session / MANIFEST).write_bytes(left)
+    path = session / "rgb/000001.png"
+    path.write_bytes(path.read_bytes()[:-300])
+    before = bytes_of(session)
+    with pytest.raises(InputError, match=r"manifest\.jsonl is lost.*--repair"):
+        SessionStore.open(session)
+    assert bytes_of(session) == before
+    report = check_session(session)
+    assert not report.sound and report.damaged_views == (1,)
+    assert len(report.unproven) == 17 and "calibration/" in dict(report.beside)
+    repaired = repair_session(session)
+    assert repaired.after.sound and repaired.dropped_views == (1,)
+    assert SessionStore.open(session).completed == set(range(VIEWS)) - {1}
+    assert repaired.after.unproven == ()
+
+
+def test_a_file_that_lost_its_checksum_is_named(session: Path) -> None:
+    add(SessionStore.open(session), 6)
+    path = session / MANIFEST
+    lines = path.read_bytes().splitlines(keepends=True)
+    at = next(k for k, line in enumerate(lines) if b"depth/000006" in line)
+    path.write_bytes(b"".join(lines[:at]) + lines[at][:60])
+    report = check_session(session)
+    assert report.sound and "depth/000006.png" in report.unproven
+    kinds = {f.path: f.kind for f in report.findings}
+    assert kinds["depth/000006.png"] == "unproven" and kinds[MANIFEST] == "torn"
+    assert "the checksum of depth/000006.png is lost" in report.findings[0].found
+    repaired = repair_session(session)
+    assert any("depth/000006.png" in n and "nothing can tell" in n for n in repaired.notes)
+    assert repaired.after.findings == () and repaired.after.unproven == ()
+    # What cannot be read is not listed by opening, and stays damage.
+    path.write_bytes(b"".join(lines[:at]))
+    image = session / "depth/000006.png"
+    image.write_bytes(image.read_bytes()[:-300])
+    assert check_session(session).damaged_views == (6,)
+    store = SessionStore.open(session)
+    assert [f.path for f in store.stored_faults()] == ["depth/000006.png"]
+    assert check_session(session).damaged_views == (6,)
+
+
+def test_files_of_others_are_counted_apart(session: Path) -> None:
+    (session / "models").mkdir()
+    for name in ("models/obj_000001.ply", "models/models_info.json", "notes.txt"):
+        (session / name).write_text("x")
+    report = check_session(session)
+    assert report.findings == () and report.unproven == ()
+    assert report.beside == (("models/", 2), ("notes.txt", 1))
+
+
+def test_a_second_line_of_a_view_is_noted_unless_it_was_retaken(session: Path) -> None:
+    path = session / "robot.jsonl"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join([*lines, lines[2]]))
+    report = check_session(session)
+    assert report.sound and len(report.views) == VIEWS
+    (note,) = [f for f in report.findings if f.kind == "repeated"]
+    assert "view 2 has 2 lines (3, 7)" in note.found and "1 of them repeat" in note.found
+    path.write_bytes(b"".join(lines))
+    store = SessionStore.open(session)
+    store.write_json("retaken/000003_1.json", {"index": 3})
+    for name in ("rgb/000003.png", "depth/000003.png"):
+        store.remove(name)
+    rgb, counts = images_of(3, 1)
+    store.add_view(View(index=3, time_s=200.0), rgb, depth_counts=counts)
+    assert check_session(session).findings == ()
+
+
+def test_time_that_goes_back_is_noted(tmp_path: Path) -> None:
+    session = CaptureSession(name="t", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(tmp_path, session)
+    for index, time_s in enumerate((5.0, 6.0, 6.0, 2.0, 3.0)):
+        store.add_view(View(index=index, time_s=time_s), images_of(index)[0])
+    report = store.check()
+    assert report.sound and [f.kind for f in report.findings] == ["time"]
+    assert "view 3 at 2.000 s" in report.findings[0].found
+
+
+def test_time_that_goes_back_where_a_run_began_is_no_note(tmp_path: Path) -> None:
+    session = CaptureSession(name="t", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(tmp_path, session)
+    for index, time_s in enumerate((5.0, 6.0, 2.0, 3.0)):
+        store.add_view(View(index=index, time_s=time_s), images_of(index)[0])
+
+    def log(*events: str | int) -> None:
+        lines = [
+            {"event": "stored", "view": e} if isinstance(e, int) else {"event": e} for e in events
+        ]
+        store.write_bytes(
+            "capture_log.jsonl", "".join(json.dumps(x) + "\n" for x in lines).encode()
+        )
+
+    for known in (("begun", 0, 1, "ended", "begun", 2, 3), ("begun", 0, 1, "recovered", 2, 3),
+                  ("begun", 0, "begun", 2, 3)):  # fmt: skip
+        log(*known)
+        assert check_session(tmp_path).findings == ()
+    log("begun", 0, 1, 2, 3)  # one run: its camera's clock went back
+    assert [f.kind for f in check_session(tmp_path).findings] == ["time"]
+    log("begun", 0, 1, "begun", 2, 3, "begun", 1)  # taken again, and stored last
+    for path in ("rgb/000001.png",):
+        store.remove(path)
+    store.write_json("retaken/000001_1.json", {"index": 1})
+    store.add_view(View(index=1, time_s=1.0), images_of(1, 1)[0])
+    assert check_session(tmp_path).findings == ()
