@@ -335,6 +335,13 @@ def _session(
 
 def _check_free(out: Path) -> None:
     """Refuse a folder that holds something else: nothing of anybody is mixed with a session."""
+    from realsim.store.session_check import is_session
+
+    if is_session(out) and not (out / "session.json").is_file():
+        raise InputError(
+            f"'{out}' holds a session whose session.json is gone. `realsim check {out} --repair` "
+            "makes it anew from what is left; then the same command goes on."
+        )
     known = {"session.json", "calibration", "plan.json", "reports"}
     other = sorted(p.name for p in out.iterdir() if p.name not in known) if out.is_dir() else []
     if other and not (out / "session.json").is_file():

@@ -319,3 +319,10 @@ def test_board_views_lie_where_the_calibration_looks_for_them(
         done = realsim("calibrate", out, "--quiet")
         assert "Traceback" not in done.stderr and done.returncode in (0, 1), done.stderr
         assert SessionStore.open(out).session.view(0).T_world_cam is not None
+
+
+def test_a_session_without_its_header_is_sent_to_the_repair(plans: Path, tmp_path: Path) -> None:
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / "manifest.jsonl").write_text("")
+    done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json", "--simulated")
+    assert done.returncode == 2 and "realsim check" in done.stderr and "--repair" in done.stderr
