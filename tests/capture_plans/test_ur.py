@@ -234,10 +234,16 @@ def test_another_thread_can_stop_the_arm(arm: UrArm, controller: LoopbackControl
 
 
 def test_ctrl_c_stops_the_arm(arm: UrArm, controller: LoopbackController) -> None:
+    # Tests that a shell runs in the background are born deaf to it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     timer = threading.Timer(0.2, lambda: os.kill(os.getpid(), signal.SIGINT))
     timer.start()
-    with pytest.raises(KeyboardInterrupt):
-        arm.move(HOME + 1.5, speed=0.05)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            arm.move(HOME + 1.5, speed=0.05)
+    finally:
+        timer.join()
+        signal.signal(signal.SIGINT, before)
     first = controller.joints()
     time.sleep(0.1)
     assert controller.joints() == first

@@ -7,6 +7,7 @@ closes, however the capture ends.
 import os
 import queue
 import select
+import signal
 import sys
 import termios
 import threading
@@ -133,6 +134,9 @@ class TerminalOperator:
         """Open the view and switch to single keys."""
         from rich.live import Live
 
+        if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+            # A shell that started us in the background left Ctrl-C deaf; a person must be heard.
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         self._keys.open()
         try:
             self._live = Live(
