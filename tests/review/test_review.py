@@ -357,7 +357,9 @@ class Page:
 def test_in_chromium_the_panel_decides(server: ReviewServer, tmp_path: Path) -> None:
     page = Page(tmp_path / "profile", server.url)
     try:
-        shown = page.wait_for("Your name")
+        page.wait_for("Your name")
+        page.wait_for("3 flat")
+        shown = page.wait_for("0 tall")
         assert shown.index("3 flat") < shown.index("0 tall")  # worst first
         page.run(
             "[...document.querySelectorAll('button')].find(b => b.innerText == 'Accept').click()"
