@@ -33,7 +33,6 @@ from realsim_capture_plans.capturing.contact_sheet import (
     cell_size,
     write_contact_sheet,
 )
-from realsim_capture_plans.capturing.drive import drive_only
 from realsim_capture_plans.capturing.operator import LineOperator, Operator
 from realsim_capture_plans.devices.interfaces import Arm, DepthCamera, DeviceError
 from realsim_capture_plans.planning.record import CapturePlan
@@ -173,11 +172,8 @@ def _rehearse(
     arm, camera = devices
     if camera is None:
         console.say("no RealSense camera is connected: the moves are driven, nothing is looked at.")
-        with _operator(request, f"{arm.name}, no camera", console) as operator:
-            summary = drive_only(plan, arm, config=config, operator=operator, views=request.views)
-        show_summary(summary, console, dry=True)
-        return summary.complete
-    with _operator(request, f"{arm.name}, {camera.name}", console) as operator:
+    name = "no camera" if camera is None else camera.name
+    with _operator(request, f"{arm.name}, {name}", console) as operator:
         job = CaptureJob(
             operator=operator, views=request.views or None, board_check=_board_check(target)
         )

@@ -231,6 +231,7 @@ def test_law_a_session_as_colmap_model_comes_back(tmp_path):
     shutil.copytree(tmp_path / "s/rgb", tmp_path / "p/images")
     run_import(ImportRequest(source=tmp_path / "p", scale=1.0), tmp_path / "t", QUIET)
     views_match(tmp_path / "s", tmp_path / "t", 1e-9)
+    assert not SessionStore.open(tmp_path / "t").has_depth(0)  # COLMAP knows no depth
 
 
 # --- folders: camera and poses ----------------------------------------------------------------

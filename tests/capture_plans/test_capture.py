@@ -313,6 +313,16 @@ def test_a_dry_run_goes_everywhere_slowly_and_keeps_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_dry_run_without_a_camera_drives_the_same_moves() -> None:
+    driven = []
+    for seeing in (True, False):
+        arm = KinematicArm(joints=plan().home.copy())
+        summary = dry_run(plan(), arm, TableCamera(arm) if seeing else None, config=QUICK)
+        assert summary.captured == VIEWS and summary.complete
+        driven.append(np.stack(arm.path))
+    assert np.array_equal(*driven)
+
+
 def test_views_asked_for_and_views_taken_again(tmp_path: Path, arm: KinematicArm) -> None:
     store = new_store(tmp_path / "s", plan().content_hash)
     camera = TableCamera(arm)

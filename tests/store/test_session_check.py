@@ -9,74 +9,16 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import SessionStore
 from realsim.store.manifest import NAME as MANIFEST
 from realsim.store.manifest import Manifest
 from realsim.store.session_check import check_session
 from realsim.store.session_repair import repair_session
+from stored_sessions import CAMERA, VIEWS, add, bytes_of, flip, images_of, view_of
 
-CAMERA = CameraIntrinsics(
-    width=40, height=30, fx=38.1, fy=38.2, cx=19.7, cy=14.9, distortion=np.array([0.05, 0.01])
-)
-VIEWS = 6
 DEAD = 2**22 + 1
 """A process number that no process has."""
-
-
-def images_of(index: int, take: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng([index, take])
-    rgb = rng.integers(0, 256, (30, 40, 3), dtype=np.uint8)
-    return rgb, rng.integers(3000, 4000, (30, 40)).astype(np.uint16)
-
-
-def view_of(index: int) -> View:
-    rng = np.random.default_rng(index)
-    return View(
-        index=index, T_base_ee=se3.random_transform(rng), joints=rng.normal(size=6),
-        time_s=100.0 + index,
-    )  # fmt: skip
-
-
-def add(store: SessionStore, index: int, take: int = 0) -> None:
-    rgb, counts = images_of(index, take)
-    store.add_view(view_of(index), rgb, depth_counts=counts)
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("sessions") / "whole"
-    session = CaptureSession(name="whole", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session, {"plan_hash": "p" * 64, "camera": "D405 17"})
-    store.write_json("plan.json", {"sha256": "p" * 64, "content": {"joints": [[0] * 6] * 8}})
-    for index in range(VIEWS):
-        add(store, index)
-    Ts = se3.random_transform(np.random.default_rng(5), VIEWS)
-    store.set_cameras(CAMERA, {k: Ts[k] for k in range(VIEWS)})
-    store.write_json("calibration/hand_eye.json", {"a": list(range(50))})
-    inner = SessionStore.create(folder / "calibration/capture", session, {"plan_hash": "q"})
-    for index in range(3):
-        add(inner, index)
-    return folder
-
-
-@pytest.fixture
-def session(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / "s"))
-
-
-def bytes_of(folder: Path) -> dict[str, bytes]:
-    return {
-        p.relative_to(folder).as_posix(): p.read_bytes()
-        for p in sorted(folder.rglob("*")) if p.is_file()
-    }  # fmt: skip
-
-
-def flip(path: Path, place: int) -> None:
-    data = bytearray(path.read_bytes())
-    data[place] ^= 0x10
-    path.write_bytes(bytes(data))
 
 
 def test_a_sound_session_is_sound_and_looking_changes_nothing(session: Path) -> None:

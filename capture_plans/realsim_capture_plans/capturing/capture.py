@@ -72,12 +72,14 @@ def capture(
 def dry_run(
     plan: CapturePlan,
     arm: Arm,
-    camera: DepthCamera,
+    camera: DepthCamera | None,
     *,
     config: CaptureConfig,
     job: CaptureJob | None = None,
 ) -> CaptureSummary:
     """Drive the plan (slowly: `config.speed_scale`) and judge the frames; store nothing.
+
+    Without a camera the moves alone are driven: the rehearsal of a new plan.
 
     Raises:
         InputError: the plan was made for another arm.

@@ -97,7 +97,7 @@ class Looker:
         self,
         plan: CapturePlan,
         arm: Arm,
-        camera: DepthCamera,
+        camera: DepthCamera | None,
         config: CaptureConfig,
         *,
         board_check: BoardCheck | None = None,
@@ -109,7 +109,7 @@ class Looker:
         Args:
             plan: where the views are.
             arm: the arm.
-            camera: the camera on its flange.
+            camera: the camera on its flange; without one there is `stand` only.
             config: when a frame counts.
             board_check: whether the calibration target is seen.
             earlier: what the capture log says of the views stored before.
@@ -155,16 +155,23 @@ class Looker:
             "The views before it are stored; run the capture again to go on."
         )
 
-    def _attempt(self, k: int, seen: Seen) -> Shot:
+    def stand(self, k: int, seen: Seen) -> tuple[ArmState, float]:
+        """Return the arm's state at view k once it is still, and the seconds waited.
+
+        Raises:
+            ArmStoppedError: the arm is not where it was sent, or does not come to rest.
+        """
         seen("settling", ())
         began = time.monotonic()
         if self._config.settle_s > 0:
             time.sleep(self._config.settle_s)
-        before, _ = until_still(self._arm, self._config.still)
-        waited = time.monotonic() - began
-        frame = self._camera.grab()
-        after = self._arm.state()
-        off = float(np.abs(after.joints - self._plan.joints[k]).max())
+        state, _ = until_still(self._arm, self._config.still)
+        self._require_goal(k, state)
+        self._warn_once(state)
+        return state, time.monotonic() - began
+
+    def _require_goal(self, k: int, state: ArmState) -> None:
+        off = float(np.abs(state.joints - self._plan.joints[k]).max())
         if off > self._config.arrival_rad:
             raise ArmStoppedError(
                 f"view {k}: {self._arm.name} stands {off:.4f} rad off its goal (at most "
@@ -172,8 +179,15 @@ class Looker:
                 "the capture again; it goes on from here.",
                 "off goal",
             )
-        self._warn_once(after)
-        found, numbers = self._judged(before, after, frame)
+
+    def _attempt(self, k: int, seen: Seen) -> Shot:
+        assert self._camera is not None  # without one there is `stand` only
+        before, waited = self.stand(k, seen)
+        frame = self._camera.grab()
+        after = self._arm.state()
+        self._require_goal(k, after)
+        intrinsics = self._camera.intrinsics
+        found, numbers = self._judged(before, after, frame, (intrinsics.height, intrinsics.width))
         gap_mm, _ = checks.pose_gap(after, self._plan.chain.forward(after.joints))
         return Shot(
             state=after, frame=frame, numbers=numbers, checks=found, waited_s=waited,
@@ -181,11 +195,11 @@ class Looker:
         )  # fmt: skip
 
     def _judged(
-        self, before: ArmState, after: ArmState, frame: Frame
+        self, before: ArmState, after: ArmState, frame: Frame, image_size: tuple[int, int]
     ) -> tuple[tuple[Check, ...], Measured]:
         """Return every check of a frame, faults of the devices first, and its numbers."""
-        limits, camera = self._config.checks, self._camera.intrinsics
-        size = checks.check_size(frame, (camera.height, camera.width))
+        limits = self._config.checks
+        size = checks.check_size(frame, image_size)
         numbers = checks.measured(frame, limits)
         found = [
             size,

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -81,13 +82,13 @@ def _now() -> str:
 
 
 class Run:
-    """One run over the views of a plan; with a store of None nothing is kept."""
+    """One run over the views of a plan; without a store nothing is kept, without a camera seen."""
 
     def __init__(
         self,
         plan: CapturePlan,
         arm: Arm,
-        camera: DepthCamera,
+        camera: DepthCamera | None,
         config: CaptureConfig,
         looker: Looker,
         log: CaptureLog,
@@ -160,7 +161,8 @@ class Run:
         """Write down with what this run works."""
         self._log.add(
             "begun", at=_now(), plan_hash=self._plan.content_hash, arm=self._arm.description,
-            camera=self._camera.description, T_ee_tcp=self._arm.state().T_ee_tcp.tolist(),
+            camera=None if self._camera is None else self._camera.description,
+            T_ee_tcp=self._arm.state().T_ee_tcp.tolist(),
             settle_s=self._config.settle_s, speed_scale=self._config.speed_scale,
         )  # fmt: skip
 
@@ -174,8 +176,14 @@ class Run:
                 self._poll(k)
                 if self._skip or self._stop:
                     return "skipped" if self._skip else "stopped"
+                show = partial(self._show, k)
+                if self._camera is None:
+                    self._looker.stand(k, show)
+                    self._tell_warnings()
+                    self._count(k)
+                    return "stored"
                 rejected = len(self._looker.rejected)
-                shot = self._looker.take(k, lambda doing, found: self._show(k, doing, found))
+                shot = self._looker.take(k, show)
                 self._poll(k)
                 if self._skip:
                     return "skipped"
@@ -205,10 +213,7 @@ class Run:
 
     def _keep(self, k: int, shot: Shot, rejected: Sequence[tuple[int, str]]) -> None:
         """Put a frame on the disk and say so."""
-        for text in self._looker.warnings[self._told_warnings :]:
-            self._operator.tell(text, trouble=True)
-            self._log.add("warning", at=_now(), text=text)
-        self._told_warnings = len(self._looker.warnings)
+        self._tell_warnings()
         aside = ""
         if self._store is not None:
             state, frame = shot.state, shot.frame
@@ -220,9 +225,7 @@ class Run:
                 self._operator.tell(f"view {k} taken again; the earlier one is {aside}_rgb.png")
             else:
                 self._store.add_view(view, frame.rgb, frame.depth_m)
-        self._done.add(k)
-        self._captured += 1
-        self._last = k
+        self._count(k)
         reasons = [reason for _, reason in rejected]
         self._log.add(
             "stored", view=k, at=_now(), attempts=len(reasons) + 1, retaken=reasons,
@@ -233,6 +236,17 @@ class Run:
             self._operator.tell(f"view {k} taken again: {reason}", trouble=True)
         self._note(k, shot.notes)
         self._show(k, "stored", shot.checks)
+
+    def _count(self, k: int) -> None:
+        self._done.add(k)
+        self._captured += 1
+        self._last = k
+
+    def _tell_warnings(self) -> None:
+        for text in self._looker.warnings[self._told_warnings :]:
+            self._operator.tell(text, trouble=True)
+            self._log.add("warning", at=_now(), text=text)
+        self._told_warnings = len(self._looker.warnings)
 
     def _note(self, k: int, notes: list[str]) -> None:
         """Report a doubtful view; ask where several in a row have the same doubt."""
@@ -334,7 +348,7 @@ class Run:
         """Make the device that stopped ready again."""
         if isinstance(error, NoGoodFrameError | NoWayError):
             return  # no device has stopped: a person has changed something
-        if isinstance(error, ArmStoppedError):
+        if isinstance(error, ArmStoppedError) or self._camera is None:
             self._arm.recover()
         else:
             self._camera.recover()
