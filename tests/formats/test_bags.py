@@ -1,186 +1,33 @@
 """Whole recordings, written by rosbags in three containers and read back."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from realsim.errors import InputError, RealsimError, UnitError
+from realsim.errors import RealsimError
 from realsim.formats.bags import BagChoice, BagSource, open_bag
 from realsim.formats.bags import stored as stored_module
-from realsim.formats.bags.joints import UR_JOINTS
 from realsim.formats.bags.tf_tree import T_BASE_BASELINK
 from realsim.formats.frame_source import FrameSource
 from realsim.geometry import se3
-from realsim.interop import quaternion_xyzw_from_R
-from realsim.records import CameraIntrinsics
 from realsim_capture_plans.arms.kinematics import UR5
-
-S = 10**9
-T0 = 1_700_000_000 * S
-WIDTH, HEIGHT = 32, 24
-KINDS = ("ros1", "sqlite3", "mcap")
-COLOUR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
-FRAME = "camera_color_optical_frame"
-PERIOD_S = 0.1
-TF = "tf2_msgs/msg/TFMessage"
-
-
-class Bag:
-    """Messages to be written, then a file."""
-
-    def __init__(self, path: Path, kind: str = "ros1") -> None:
-        self.kind, self.is_ros1 = kind, kind == "ros1"
-        self.path = path / ("recording.bag" if self.is_ros1 else "recording")
-        self.store = get_typestore(Stores.ROS1_NOETIC if self.is_ros1 else Stores.ROS2_HUMBLE)
-        if self.is_ros1:
-            self.store.register(
-                get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF)
-            )
-        self.t = self.store.types
-        self.messages: list[tuple[int, str, Any]] = []
-
-    def write(self) -> Path:
-        writer: Any
-        if self.is_ros1:
-            from rosbags.rosbag1 import Writer
-
-            writer = Writer(self.path)
-        else:
-            from rosbags.rosbag2 import StoragePlugin
-            from rosbags.rosbag2 import Writer as Writer2
-
-            plugin = StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
-            writer = Writer2(self.path, version=9, storage_plugin=plugin)
-        serialize = self.store.serialize_ros1 if self.is_ros1 else self.store.serialize_cdr
-        with writer:
-            connections: dict[str, Any] = {}
-            for receive_ns, topic, message in sorted(self.messages, key=lambda m: m[0]):
-                kind = message.__msgtype__
-                if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, kind, typestore=self.store)
-                writer.write(connections[topic], receive_ns, serialize(message, kind))
-        return self.path
-
-    def header(self, t: int, frame_id: str = FRAME) -> Any:
-        stamp = self.t["builtin_interfaces/msg/Time"](t // S, t % S)
-        return self.t["std_msgs/msg/Header"](*((0,) if self.is_ros1 else ()), stamp, frame_id)
-
-    def image(
-        self, topic: str, pixels: Any, encoding: str, t: int,
-        receive: int | None = None, frame_id: str = FRAME,
-    ) -> None:  # fmt: skip
-        flat = np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)
-        h, w = pixels.shape[:2]
-        message = self.t["sensor_msgs/msg/Image"](
-            self.header(t, frame_id), h, w, encoding, 0, flat.size // h, flat
-        )
-        self.messages.append((t if receive is None else receive, topic, message))
-
-    def packed(self, topic: str, data: bytes, form: str, t: int, frame_id: str = FRAME) -> None:
-        message = self.t["sensor_msgs/msg/CompressedImage"](
-            self.header(t, frame_id), form, np.frombuffer(data, np.uint8)
-        )
-        self.messages.append((t, topic, message))
-
-    def info(
-        self, topic: str, t: int = T0, *, model: str = "plumb_bob", d: Any = (0.0,) * 5,
-        f: float = 30.0, frame_id: str = FRAME,
-    ) -> None:  # fmt: skip
-        K = np.array([f, 0, 15.5, 0, f + 1, 11.5, 0, 0, 1])
-        roi = self.t["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        message = self.t["sensor_msgs/msg/CameraInfo"](
-            self.header(t, frame_id), HEIGHT, WIDTH, model, np.array(d, float), K,
-            np.eye(3).ravel(), np.zeros(12), 0, 0, roi,
-        )  # fmt: skip
-        self.messages.append((t, topic, message))
-
-    def joints(self, q: Any, t: int, dq: Any = None, prefix: str = "", receive: int = 0) -> None:
-        order = sorted(range(6), key=lambda i: UR_JOINTS[i])  # as the driver: by the alphabet
-        names = [prefix + UR_JOINTS[i] for i in order]
-        velocity = np.zeros(0) if dq is None else np.asarray(dq, float)[order]
-        message = self.t["sensor_msgs/msg/JointState"](
-            self.header(t, ""), names, np.asarray(q, float)[order], velocity, np.zeros(0)
-        )
-        self.messages.append((receive or t, "/joint_states", message))
-
-    def tf(self, parent: str, child: str, T: Any, t: int, static: bool = False) -> None:
-        x, y, z, w = (float(v) for v in quaternion_xyzw_from_R(T[:3, :3]))
-        transform = self.t["geometry_msgs/msg/Transform"](
-            self.t["geometry_msgs/msg/Vector3"](*(float(v) for v in T[:3, 3])),
-            self.t["geometry_msgs/msg/Quaternion"](x, y, z, w),
-        )
-        stamped = self.t["geometry_msgs/msg/TransformStamped"](
-            self.header(0 if static else t, parent), child, transform
-        )
-        topic = "/tf_static" if static else "/tf"
-        self.messages.append((t, topic, self.t[TF]([stamped])))
-
-
-@dataclass
-class Sent:
-    """What went into a recording."""
-
-    bag: Bag
-    rgb: list[Any] = field(default_factory=list)
-    depth: list[Any] = field(default_factory=list)
-    q: list[Any] = field(default_factory=list)
-    path: Path = Path()
-
-
-def stamp(k: int) -> int:
-    return T0 + round(k * PERIOD_S * S)
-
-
-def pictures(k: int) -> tuple[Any, Any]:
-    rng = np.random.default_rng(k)
-    rgb = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-    return rgb, rng.integers(300, 900, (HEIGHT, WIDTH), dtype=np.uint16)
-
-
-def recorded(
-    folder: Path, kind: str = "ros1", n: int = 6, *, joints: bool = True,
-    without: Sequence[int] = (), jitter_s: float = 0.004,
-    change: Callable[[Bag], None] | None = None, write: bool = True,
-) -> Sent:  # fmt: skip
-    """Record n frames of colour, depth (a little later) and joints; `without` have no depth."""
-    bag = Bag(folder, kind)
-    sent = Sent(bag)
-    bag.info("/camera/color/camera_info")
-    bag.info("/camera/aligned_depth_to_color/camera_info")
-    rng = np.random.default_rng(5)
-    for k in range(n):
-        rgb, depth = pictures(k)
-        sent.rgb.append(rgb)
-        sent.depth.append(depth)
-        bag.image(COLOUR, rgb, "rgb8", stamp(k))
-        if k not in without:
-            bag.image(DEPTH, depth, "16UC1", stamp(k) + round(jitter_s * S))
-        sent.q.append(rng.uniform(-3, 3, 6))
-        if joints:
-            for d in (-5, 5):  # standing still around the frame
-                bag.joints(sent.q[k], stamp(k) + d * 10**6, np.full(6, 1e-3))
-    if change is not None:
-        change(bag)
-    if write:
-        sent.path = bag.write()
-    return sent
-
-
-def refused(
-    path: Path, choice: BagChoice | None = None, kind: type[RealsimError] = InputError
-) -> str:
-    with pytest.raises(kind) as caught:
-        source = open_bag(path, choice)
-        list(source.frames())
-    assert "\n" not in str(caught.value).strip()
-    return str(caught.value)
-
+from written_bags import (
+    COLOUR,
+    DEPTH,
+    FRAME,
+    HEIGHT,
+    KINDS,
+    T0,
+    WIDTH,
+    Bag,
+    S,
+    pictures,
+    recorded,
+    refused,
+    stamp,
+)
 
 # --- what was sent is what comes ------------------------------------------------------------------
 
@@ -426,110 +273,6 @@ def test_depth_that_cannot_be_aligned_is_refused_with_the_choices(tmp_path: Path
     colour_alone = open_bag(path, BagChoice(without_depth=True))
     assert colour_alone.depth_unit_m is None
     assert [f.depth_counts for f in colour_alone.frames()] == [None, None]
-
-
-# --- topics ---------------------------------------------------------------------------------------
-
-
-def test_two_cameras_are_listed_and_one_can_be_chosen(tmp_path: Path) -> None:
-    bag = Bag(tmp_path, "mcap")
-    for c, cam in enumerate(("/left", "/right")):
-        for stream in ("color", "aligned_depth_to_color"):
-            bag.info(f"{cam}/{stream}/camera_info", f=30.0 + c)
-        for k in range(3):
-            rgb, depth = pictures(10 * c + k)
-            bag.image(f"{cam}/color/image_raw", rgb, "rgb8", stamp(k))
-            bag.image(f"{cam}/aligned_depth_to_color/image_raw", depth, "16UC1", stamp(k))
-    path = bag.write()
-    message = refused(path)
-    assert "2 cameras" in message and "colour=/left/color/image_raw" in message
-    source = open_bag(path, BagChoice(colour="/right/color/image_raw"))
-    assert source.intrinsics.fx == 31.0
-    for k, frame in enumerate(source.frames()):
-        assert np.array_equal(frame.rgb, pictures(10 + k)[0])
-        assert frame.depth_counts is not None
-        assert np.array_equal(frame.depth_counts, pictures(10 + k)[1])
-    assert "is not a topic of colour images" in refused(path, BagChoice(colour="/up"))
-    assert "is not a topic of depth images" in refused(
-        path, BagChoice(colour="/left/color/image_raw", depth="/left/color/image_raw")
-    )
-
-
-def test_raw_is_preferred_to_compressed_and_compressed_is_read(tmp_path: Path) -> None:
-    bag = Bag(tmp_path)
-    bag.info("/camera/color/camera_info")
-    bag.info("/camera/aligned_depth_to_color/camera_info")
-    for k in range(3):
-        rgb, depth = pictures(k)
-        png = cv2.imencode(".png", rgb[..., ::-1])[1].tobytes()
-        png16 = cv2.imencode(".png", depth)[1].tobytes()
-        bag.packed(COLOUR + "/compressed", png, "rgb8; png compressed bgr8", stamp(k))
-        head = bytes(12)
-        form = "16UC1; compressedDepth png"
-        bag.packed(DEPTH + "/compressedDepth", head + png16, form, stamp(k))
-    source = open_bag(bag.write())
-    assert source.depth_unit_m == 1e-3
-    for k, frame in enumerate(source.frames()):
-        assert np.array_equal(frame.rgb, pictures(k)[0])
-        assert frame.depth_counts is not None
-        assert np.array_equal(frame.depth_counts, pictures(k)[1])
-    both = tmp_path / "both"
-    both.mkdir()
-    png = cv2.imencode(".png", pictures(0)[0])[1].tobytes()
-    path = recorded(
-        both, change=lambda b: b.packed(COLOUR + "/compressed", png, "png", stamp(0))
-    ).path
-    assert open_bag(path).extra["topics"]["colour"] == COLOUR
-
-
-def test_colour_alone_is_imported_and_depth_alone_is_not(tmp_path: Path) -> None:
-    bag = Bag(tmp_path)
-    bag.info("/camera/color/camera_info")
-    bag.image(COLOUR, pictures(0)[0], "bgr8", stamp(0))
-    source = open_bag(bag.write())
-    assert source.depth_unit_m is None
-    assert np.array_equal(next(iter(source.frames())).rgb, pictures(0)[0][..., ::-1])
-    assert any("no depth images" in n for n in source.notes)
-    other = tmp_path / "other"
-    other.mkdir()
-    bag = Bag(other)
-    bag.image(DEPTH, pictures(0)[1], "16UC1", stamp(0))
-    assert "only depth images" in refused(bag.write())
-
-
-def test_without_camera_info_the_camera_can_be_given(tmp_path: Path) -> None:
-    bag = Bag(tmp_path)
-    bag.image(COLOUR, pictures(0)[0], "rgb8", stamp(0))
-    path = bag.write()
-    message = refused(path)
-    assert "no CameraInfo" in message and "intrinsics=" in message
-    camera = CameraIntrinsics(width=WIDTH, height=HEIGHT, fx=30, fy=30, cx=16, cy=12)
-    assert open_bag(path, BagChoice(intrinsics=camera)).intrinsics is camera
-    wrong = CameraIntrinsics(width=64, height=48, fx=30, fy=30, cx=16, cy=12)
-    assert "64x48" in refused(path, BagChoice(intrinsics=wrong))
-
-
-def test_bad_cameras_are_refused(tmp_path: Path) -> None:
-    def other_mode(bag: Bag) -> None:
-        bag.info("/camera/color/camera_info", stamp(3), f=55.0)
-
-    assert "changes during the recording" in refused(recorded(tmp_path, change=other_mode).path)
-    bag = Bag(tmp_path / "fisheye.bag")
-    bag.path = tmp_path / "fisheye.bag"
-    bag.info("/camera/color/camera_info", model="equidistant", d=(0.1, 0.1, 0.0, 0.0))
-    bag.image(COLOUR, pictures(0)[0], "rgb8", stamp(0))
-    assert "fisheye" in refused(bag.write())
-
-
-def test_an_unknown_depth_unit_is_asked_for(tmp_path: Path) -> None:
-    bag = Bag(tmp_path)
-    bag.info("/camera/color/camera_info")
-    bag.info("/camera/aligned_depth_to_color/camera_info")
-    bag.image(COLOUR, pictures(0)[0], "rgb8", stamp(0))
-    bag.image(DEPTH, pictures(0)[1], "mono16", stamp(0))
-    path = bag.write()
-    assert "depth_unit_m=0.001" in refused(path, kind=UnitError)
-    assert open_bag(path, BagChoice(depth_unit_m=1e-4 * 5)).depth_unit_m == 5e-4
 
 
 # --- damaged files --------------------------------------------------------------------------------

@@ -1,0 +1,175 @@
+"""Recordings written by rosbags in three containers: colour, depth, joints, tf."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from realsim.errors import InputError, RealsimError
+from realsim.formats.bags import BagChoice, open_bag
+from realsim.formats.bags.joints import UR_JOINTS
+from realsim.interop import quaternion_xyzw_from_R
+
+S = 10**9
+T0 = 1_700_000_000 * S
+WIDTH, HEIGHT = 32, 24
+KINDS = ("ros1", "sqlite3", "mcap")
+COLOUR, DEPTH = "/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"
+FRAME = "camera_color_optical_frame"
+PERIOD_S = 0.1
+TF = "tf2_msgs/msg/TFMessage"
+
+
+class Bag:
+    """Messages to be written, then a file."""
+
+    def __init__(self, path: Path, kind: str = "ros1") -> None:
+        self.kind, self.is_ros1 = kind, kind == "ros1"
+        self.path = path / ("recording.bag" if self.is_ros1 else "recording")
+        self.store = get_typestore(Stores.ROS1_NOETIC if self.is_ros1 else Stores.ROS2_HUMBLE)
+        if self.is_ros1:
+            self.store.register(
+                get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF)
+            )
+        self.t = self.store.types
+        self.messages: list[tuple[int, str, Any]] = []
+
+    def write(self) -> Path:
+        writer: Any
+        if self.is_ros1:
+            from rosbags.rosbag1 import Writer
+
+            writer = Writer(self.path)
+        else:
+            from rosbags.rosbag2 import StoragePlugin
+            from rosbags.rosbag2 import Writer as Writer2
+
+            plugin = StoragePlugin.MCAP if self.kind == "mcap" else StoragePlugin.SQLITE3
+            writer = Writer2(self.path, version=9, storage_plugin=plugin)
+        serialize = self.store.serialize_ros1 if self.is_ros1 else self.store.serialize_cdr
+        with writer:
+            connections: dict[str, Any] = {}
+            for receive_ns, topic, message in sorted(self.messages, key=lambda m: m[0]):
+                kind = message.__msgtype__
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, kind, typestore=self.store)
+                writer.write(connections[topic], receive_ns, serialize(message, kind))
+        return self.path
+
+    def header(self, t: int, frame_id: str = FRAME) -> Any:
+        stamp = self.t["builtin_interfaces/msg/Time"](t // S, t % S)
+        return self.t["std_msgs/msg/Header"](*((0,) if self.is_ros1 else ()), stamp, frame_id)
+
+    def image(
+        self, topic: str, pixels: Any, encoding: str, t: int,
+        receive: int | None = None, frame_id: str = FRAME,
+    ) -> None:  # fmt: skip
+        flat = np.ascontiguousarray(pixels).reshape(-1).view(np.uint8)
+        h, w = pixels.shape[:2]
+        message = self.t["sensor_msgs/msg/Image"](
+            self.header(t, frame_id), h, w, encoding, 0, flat.size // h, flat
+        )
+        self.messages.append((t if receive is None else receive, topic, message))
+
+    def packed(self, topic: str, data: bytes, form: str, t: int, frame_id: str = FRAME) -> None:
+        message = self.t["sensor_msgs/msg/CompressedImage"](
+            self.header(t, frame_id), form, np.frombuffer(data, np.uint8)
+        )
+        self.messages.append((t, topic, message))
+
+    def info(
+        self, topic: str, t: int = T0, *, model: str = "plumb_bob", d: Any = (0.0,) * 5,
+        f: float = 30.0, frame_id: str = FRAME,
+    ) -> None:  # fmt: skip
+        K = np.array([f, 0, 15.5, 0, f + 1, 11.5, 0, 0, 1])
+        roi = self.t["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        message = self.t["sensor_msgs/msg/CameraInfo"](
+            self.header(t, frame_id), HEIGHT, WIDTH, model, np.array(d, float), K,
+            np.eye(3).ravel(), np.zeros(12), 0, 0, roi,
+        )  # fmt: skip
+        self.messages.append((t, topic, message))
+
+    def joints(self, q: Any, t: int, dq: Any = None, prefix: str = "", receive: int = 0) -> None:
+        order = sorted(range(6), key=lambda i: UR_JOINTS[i])  # as the driver: by the alphabet
+        names = [prefix + UR_JOINTS[i] for i in order]
+        velocity = np.zeros(0) if dq is None else np.asarray(dq, float)[order]
+        message = self.t["sensor_msgs/msg/JointState"](
+            self.header(t, ""), names, np.asarray(q, float)[order], velocity, np.zeros(0)
+        )
+        self.messages.append((receive or t, "/joint_states", message))
+
+    def tf(self, parent: str, child: str, T: Any, t: int, static: bool = False) -> None:
+        x, y, z, w = (float(v) for v in quaternion_xyzw_from_R(T[:3, :3]))
+        transform = self.t["geometry_msgs/msg/Transform"](
+            self.t["geometry_msgs/msg/Vector3"](*(float(v) for v in T[:3, 3])),
+            self.t["geometry_msgs/msg/Quaternion"](x, y, z, w),
+        )
+        stamped = self.t["geometry_msgs/msg/TransformStamped"](
+            self.header(0 if static else t, parent), child, transform
+        )
+        topic = "/tf_static" if static else "/tf"
+        self.messages.append((t, topic, self.t[TF]([stamped])))
+
+
+@dataclass
+class Sent:
+    """What went into a recording."""
+
+    bag: Bag
+    rgb: list[Any] = field(default_factory=list)
+    depth: list[Any] = field(default_factory=list)
+    q: list[Any] = field(default_factory=list)
+    path: Path = Path()
+
+
+def stamp(k: int) -> int:
+    return T0 + round(k * PERIOD_S * S)
+
+
+def pictures(k: int) -> tuple[Any, Any]:
+    rng = np.random.default_rng(k)
+    rgb = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    return rgb, rng.integers(300, 900, (HEIGHT, WIDTH), dtype=np.uint16)
+
+
+def recorded(
+    folder: Path, kind: str = "ros1", n: int = 6, *, joints: bool = True,
+    without: Sequence[int] = (), jitter_s: float = 0.004,
+    change: Callable[[Bag], None] | None = None, write: bool = True,
+) -> Sent:  # fmt: skip
+    """Record n frames of colour, depth (a little later) and joints; `without` have no depth."""
+    bag = Bag(folder, kind)
+    sent = Sent(bag)
+    bag.info("/camera/color/camera_info")
+    bag.info("/camera/aligned_depth_to_color/camera_info")
+    rng = np.random.default_rng(5)
+    for k in range(n):
+        rgb, depth = pictures(k)
+        sent.rgb.append(rgb)
+        sent.depth.append(depth)
+        bag.image(COLOUR, rgb, "rgb8", stamp(k))
+        if k not in without:
+            bag.image(DEPTH, depth, "16UC1", stamp(k) + round(jitter_s * S))
+        sent.q.append(rng.uniform(-3, 3, 6))
+        if joints:
+            for d in (-5, 5):  # standing still around the frame
+                bag.joints(sent.q[k], stamp(k) + d * 10**6, np.full(6, 1e-3))
+    if change is not None:
+        change(bag)
+    if write:
+        sent.path = bag.write()
+    return sent
+
+
+def refused(
+    path: Path, choice: BagChoice | None = None, kind: type[RealsimError] = InputError
+) -> str:
+    with pytest.raises(kind) as caught:
+        source = open_bag(path, choice)
+        list(source.frames())
+    assert "\n" not in str(caught.value).strip()
+    return str(caught.value)
