@@ -1,0 +1,1 @@
+"""Object models: meshes read, judged and repaired; symmetries, convex parts, mass; the library."""

@@ -1,0 +1,1 @@
+"""The metric scale of a mesh from the depth images of a capture session."""

@@ -1,0 +1,207 @@
+"""Depth views of one object alone on a table, with the errors of a real lab and a known truth.
+
+What a scan can be worth is found out here before anyone holds a camera: the same views with the
+same errors serve the tests, the benchmark, and whoever asks which accuracy a shape allows.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.geometry.mesh import transformed
+from realsim.records import CameraIntrinsics, Mesh
+from realsim.registration.evidence import DepthFrame
+from realsim.rendering.depth_sensor import DepthSensorModel
+
+Array = NDArray[np.float64]
+T_EE_CAM = se3.from_translation([0.0, -0.065, 0.035])
+"""(4, 4) the camera on the hand as drawn [m]."""
+LOWEST_DEG = 25.0
+"""Least elevation of a view over the table [deg]."""
+DISC_M = 0.04
+"""The object stands up to this far from the middle of the views [m]."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ScanLabConfig:
+    """Views and errors of a simulated scan."""
+
+    views: int = 24
+    """Views on a hemisphere; the first looks straight down."""
+    distance_m: tuple[float, float] = (0.25, 0.45)
+    """Least and greatest distance of the camera from the middle [m]."""
+    width: int = 1280
+    """[px]."""
+    height: int = 720
+    """[px]."""
+    focal_px: float = 648.0
+    """[px]; the D405's at 1280 px of width."""
+    hand_eye_mm: float = 0.5
+    """Constant error of the hand-eye [mm], in a random direction."""
+    hand_eye_deg: float = 0.1
+    """Constant error of the hand-eye [deg], about a random axis."""
+    arm_mm: float = 0.2
+    """Error of every robot pose along each axis, 1-sigma [mm]."""
+    arm_deg: float = 0.03
+    """Error of every robot pose about each axis, 1-sigma [deg]."""
+    sensor: DepthSensorModel = field(default_factory=DepthSensorModel)
+    """The depth camera."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ScanViews:
+    """What the lab reports, and what is true."""
+
+    intrinsics: CameraIntrinsics
+    frames: tuple[DepthFrame, ...]
+    """Depth images with the camera poses that forward kinematics and hand-eye claim."""
+    Ts_world_cam: Array
+    """(F, 4, 4) where the camera really was [m]."""
+    T_world_obj: Array
+    """(4, 4) where the object really stands; its mesh is in metres."""
+
+
+def scan_views(
+    mesh: Mesh, T_world_obj: Array, config: ScanLabConfig, rng: np.random.Generator
+) -> ScanViews:
+    """Return depth views of a mesh [m] that stands on the table z = 0 of the world.
+
+    Args:
+        mesh: the object as it really is, at its real size [m].
+        T_world_obj: (4, 4) where it stands.
+        config: views and errors.
+        rng: of the views, the errors and the sensor's noise.
+    """
+    from realsim.geometry.camera import ray_table
+    from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene, rotated
+
+    camera = CameraIntrinsics(
+        width=config.width, height=config.height, fx=config.focal_px, fy=config.focal_px,
+        cx=(config.width - 1) / 2, cy=(config.height - 1) / 2,
+    )  # fmt: skip
+    placed = transformed(mesh, T_world_obj)
+    middle = placed.bounds.mean(0)
+    true = _hemisphere(middle, config, rng)
+    hand_eye = _offset(rng, config.hand_eye_mm / 1e3, np.radians(config.hand_eye_deg))
+    T_ee_cam_true = T_EE_CAM @ hand_eye
+    scene = RayScene([
+        PlacedMesh(0, mesh, T_world_obj),
+        PlacedMesh(BACKGROUND, _table(placed.bounds.mean(0)[:2]), np.eye(4)),
+    ])  # fmt: skip
+    rays = ray_table(camera)
+    frames: list[DepthFrame] = []
+    for index, T_world_cam in enumerate(true):
+        directions = rotated(rays, T_world_cam[:3, :3]).reshape(-1, 3)
+        t, _ = scene.first_hits(T_world_cam[:3, 3], directions)
+        exact = np.where(np.isfinite(t), t, 0).reshape(camera.height, camera.width)
+        xi = np.concatenate([
+            np.radians(config.arm_deg) * rng.standard_normal(3),
+            config.arm_mm / 1e3 * rng.standard_normal(3),
+        ])  # fmt: skip
+        T_base_ee = T_world_cam @ se3.invert(T_ee_cam_true) @ se3.exp(xi)
+        frames.append(
+            DepthFrame(
+                index=index,
+                depth_m=config.sensor.measure(exact, camera, rng),
+                T_world_cam=T_base_ee @ T_EE_CAM,
+            )
+        )
+    return ScanViews(
+        intrinsics=camera, frames=tuple(frames), Ts_world_cam=true, T_world_obj=T_world_obj.copy()
+    )
+
+
+def standing(mesh: Mesh, R: Array, rng: np.random.Generator) -> Array:
+    """Return T_world_obj (4, 4) of a mesh turned by R (3, 3), then by any yaw, put on z = 0."""
+    yaw = se3.exp_so3([0.0, 0.0, rng.uniform(0, 2 * np.pi)])
+    turned = mesh.vertices @ (yaw @ R).T
+    low, high = turned.min(0), turned.max(0)
+    foot = np.array([*(low + high)[:2] / 2, low[2]])
+    place = np.array([*rng.uniform(-DISC_M, DISC_M, 2), 0.0])
+    return se3.from_rt(yaw @ R, place - foot)
+
+
+def distorted(mesh: Mesh, amplitude: float, rng: np.random.Generator, waves: int = 6) -> Mesh:
+    """Return the mesh with a smooth random shape error that is not a change of scale or pose.
+
+    The displacement is a sum of `waves` random plane waves per axis, half to one and a half waves
+    along the object; what of it is a shift, a turn or a change of scale is projected out, weighted
+    by area, and the rest is scaled to the wanted size.
+
+    Args:
+        mesh: the true shape.
+        amplitude: RMS displacement as a share of the largest extent (0.02 = 2 %).
+        rng: of the waves.
+        waves: plane waves per axis.
+    """
+    from dataclasses import replace
+
+    from realsim.geometry.mesh import sample_surface
+
+    length = float(mesh.extent.max())
+    k = rng.standard_normal((waves, 3, 3))
+    k *= rng.uniform(0.5, 1.5, (waves, 3, 1)) / np.linalg.norm(k, axis=2, keepdims=True)
+    phase = rng.uniform(0, 2 * np.pi, (waves, 3))
+    gain = rng.standard_normal((waves, 3))
+
+    def field_at(points: Array) -> Array:
+        angle = 2 * np.pi / length * np.einsum("nc,wac->nwa", points, k) + phase
+        return np.einsum("nwa,wa->na", np.sin(angle), gain)
+
+    points, _ = sample_surface(mesh, 4000, np.random.default_rng(0))
+    center = points.mean(0)
+
+    def modes(p: Array) -> Array:
+        q = p - center
+        columns = [np.tile(e, (len(q), 1)) for e in np.eye(3)]
+        columns += [np.cross(e, q) for e in np.eye(3)] + [q]
+        return np.stack(columns, -1)
+
+    d = field_at(points)
+    A = modes(points).reshape(-1, 7)
+    x, *_ = np.linalg.lstsq(A, d.ravel(), rcond=None)
+    rest = d - (A @ x).reshape(-1, 3)
+    factor = amplitude * length / np.sqrt(np.mean(np.sum(np.square(rest), axis=1)))
+    moved = field_at(mesh.vertices) - (modes(mesh.vertices).reshape(-1, 7) @ x).reshape(-1, 3)
+    return replace(mesh, vertices=mesh.vertices + factor * moved)
+
+
+def _hemisphere(middle: Array, config: ScanLabConfig, rng: np.random.Generator) -> Array:
+    """Return camera poses (F, 4, 4) that look at the middle; a spiral, jittered, the first down."""
+    n = config.views
+    k = np.arange(n)
+    lowest = np.sin(np.radians(LOWEST_DEG))
+    height = 1 - (1 - lowest) * k / max(n - 1, 1)
+    around = k * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi)
+    out = np.sqrt(np.clip(1 - height**2, 0, None))
+    directions = np.stack([out * np.cos(around), out * np.sin(around), height], -1)
+    near, far = config.distance_m
+    distances = rng.uniform(near, far, n)
+    distances[0] = far
+    poses: list[Array] = []
+    for direction, distance in zip(directions, distances, strict=True):
+        z = -direction
+        x = np.cross(np.array([0.0, 0.0, 1.0]), z)
+        x = np.array([1.0, 0, 0]) if np.linalg.norm(x) < 1e-6 else x / np.linalg.norm(x)
+        R = np.stack([x, np.cross(z, x), z], -1) @ se3.exp_so3([0, 0, rng.uniform(-0.3, 0.3)])
+        aim = middle + rng.uniform(-0.01, 0.01, 3)
+        poses.append(se3.from_rt(R, aim + distance * direction))
+    return np.stack(poses)
+
+
+def _offset(rng: np.random.Generator, distance_m: float, angle_rad: float) -> Array:
+    """Return a transform (4, 4) of this distance and angle in random directions."""
+    axes = rng.standard_normal((2, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return se3.from_rt(se3.exp_so3(angle_rad * axes[0]), distance_m * axes[1])
+
+
+def _table(at: Sequence[float] | Array) -> Mesh:
+    """Return a square of the plane z = 0, 1.2 m wide, about a point (2,)."""
+    x, y = float(at[0]), float(at[1])
+    corners = np.array([[-0.6, -0.6], [0.6, -0.6], [0.6, 0.6], [-0.6, 0.6]]) + [x, y]
+    vertices = np.concatenate([corners, np.zeros((4, 1))], axis=1)
+    return Mesh(vertices=vertices, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
