@@ -10,6 +10,7 @@ import click
 
 from realsim import __version__
 from realsim.app.cli_capture import CAPTURE_COMMANDS
+from realsim.app.cli_scan import SCAN
 from realsim.app.option_values import numbers_of
 from realsim.errors import RealsimError
 
@@ -145,8 +146,9 @@ def calibrate(source: Path, quiet: bool, live: bool, **options: object) -> None:
 
 @commands.command()
 @click.argument("session", type=FOLDER)
+@click.option("--library", type=FOLDER, default=None, help="Models the session has not: see scan.")
 @click.option("--quiet", is_flag=True)
-def register(session: Path, quiet: bool) -> None:
+def register(session: Path, library: Path | None, quiet: bool) -> None:
     """Find the pose of every object from SESSION/registration/starts.json."""
     from realsim.app.console import Console
     from realsim.app.show import show_scene
@@ -154,7 +156,7 @@ def register(session: Path, quiet: bool) -> None:
 
     console = Console(quiet=quiet)
     store = open_session(session)
-    show_scene(store, register_session(store, console), console)
+    show_scene(store, register_session(store, console, library), console)
 
 
 @commands.command()
@@ -228,6 +230,7 @@ def review(session: Path, host: str, port: int) -> None:
 
 for _command in CAPTURE_COMMANDS:
     commands.add_command(_command)
+commands.add_command(SCAN)
 
 
 def main() -> None:

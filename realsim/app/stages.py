@@ -179,8 +179,27 @@ def session_models(store: SessionStore) -> dict[int, ObjectModel]:
     return load_models(store.folder / "models")
 
 
-def register_session(store: SessionStore, console: Console) -> Scene:
+def take_models(store: SessionStore, library: Path, obj_ids: Sequence[int]) -> tuple[int, ...]:
+    """Copy the models that a session needs and has not out of a library; return which.
+
+    The session then has everything it needs in its own folder, whatever becomes of the library.
+
+    Raises:
+        InputError: no library there, or it has not all of them.
+    """
+    from realsim.models.library_reading import LibraryReader
+    from realsim.models.library_session import copy_models
+
+    return copy_models(LibraryReader.open(library), obj_ids, store.folder / "models")
+
+
+def register_session(store: SessionStore, console: Console, library: Path | None = None) -> Scene:
     """Register every object from its rough start in the views of a session.
+
+    Args:
+        store: the session.
+        console: where progress is shown.
+        library: model library; models that the starts name and the session has not are copied.
 
     Raises:
         InputError: no calibrated camera poses, no starts, or an object without a mesh.
@@ -189,7 +208,12 @@ def register_session(store: SessionStore, console: Console) -> Scene:
     from realsim.store import load_scene, save_scene
 
     require_sound(store)
-    starts, models = load_starts(store), session_models(store)
+    starts = load_starts(store)
+    if library is not None:
+        copied = take_models(store, library, [s.obj_id for s in starts])
+        if copied:
+            console.say(f"models {', '.join(map(str, copied))} copied from {library}")
+    models = session_models(store)
     config = _registration_config(store)
     views = [v for v in store.session.views if v.T_world_cam is not None]
     if not views:
@@ -300,18 +324,26 @@ def school_session(
 ) -> list[GraspSet]:
     """Try grasps on every registered object in the Robot School and keep them in the session.
 
+    Models that came from a library bring their convex parts, mass, centre of mass and inertia; they
+    are taken as long as the session's mesh is the one they were computed of. Of other models the
+    School makes the parts itself, and takes the mass from the mesh and its density.
+
     Raises:
         InputError: the session has not been registered, or has no supporting plane.
     """
+    from realsim.models.library_session import known_solids
     from realsim.store import save_grasps
     from realsim_sim_bridge.school import SchoolConfig, run_school
 
     scene, models = judged_scene(store), session_models(store)
+    solids, unknown = known_solids(store.folder / "models", [o.obj_id for o in scene.objects])
+    for obj_id, why in unknown.items():
+        console.warn(f"object {obj_id}: its convex parts are made again: {why}.")
     config = SchoolConfig(max_candidates=grasps_per_object, seed=seed)
     with console.stage("school", f"up to {grasps_per_object} grasps an object") as tick:
         sets = run_school(
             scene, models, config, workers=workers, cache=store.folder / "grasps/cache",
-            progress=tick,
+            progress=tick, solids=solids,
         )  # fmt: skip
         stems = {save_grasps(store, grasp_set).stem for grasp_set in sets}
         for file in (store.folder / "grasps").glob("*.*"):

@@ -44,18 +44,25 @@ def save_models(folder: Path | str, models: Mapping[int, ObjectModel]) -> None:
         model = models[obj_id]
         if model.obj_id != obj_id:
             raise InputError(f"model '{model.name}' has the id {model.obj_id}, not {obj_id}.")
-        texture_file = ""
-        if model.mesh.texture is not None:
-            texture_file = Path(model_file(obj_id)).with_suffix(".png").name
-            atomic.write_bytes(folder / texture_file, images.png_bytes(model.mesh.texture))
-        data = ply_bytes(model.mesh, "mm", texture_file=texture_file)
-        atomic.write_bytes(folder / model_file(obj_id), data)
-        info[str(obj_id)] = _info_of(model)
+        for name, data in model_files(model).items():
+            atomic.write_bytes(folder / name, data)
+        info[str(obj_id)] = info_of(model)
     # Last: a folder with models_info.json is complete.
     atomic.write_json(folder / INFO_FILE, info)
 
 
-def _info_of(model: ObjectModel) -> dict[str, Any]:
+def model_files(model: ObjectModel) -> dict[str, bytes]:
+    """Return the files of a model in a models folder: its texture, where it has one, and mesh."""
+    mesh_file, files = model_file(model.obj_id), dict[str, bytes]()
+    texture_file = ""
+    if model.mesh.texture is not None:
+        texture_file = Path(mesh_file).with_suffix(".png").name
+        files[texture_file] = images.png_bytes(model.mesh.texture)
+    return files | {mesh_file: ply_bytes(model.mesh, "mm", texture_file=texture_file)}
+
+
+def info_of(model: ObjectModel) -> dict[str, Any]:
+    """Return the entry of a model in models_info.json."""
     low_mm = model.mesh.bounds[0] * MM_PER_M
     size_mm = model.mesh.extent * MM_PER_M
     info: dict[str, Any] = {"diameter": diameter(model.mesh) * MM_PER_M}

@@ -8,7 +8,7 @@ from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
 
 Array = NDArray[np.float64]
-SECOND_DIFFERENCE_STEP_PX = 4
+SECOND_DIFFERENCE_STEP_PX = 8
 """Stereo noise is correlated over a few pixels; differences of neighbours would not see it."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution whose median absolute deviation is 1."""

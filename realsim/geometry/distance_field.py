@@ -7,6 +7,7 @@ point of the box plus the distance to it: an upper bound that points the right w
 """
 
 import hashlib
+import os
 from collections import OrderedDict
 from dataclasses import dataclass
 from pathlib import Path
@@ -205,7 +206,7 @@ def _signed_distance(scene: Any, points: Array) -> NDArray[np.float32]:
 def _save(folder: Path, key: str, field: DistanceField) -> None:
     """Write a field under its key; the name appears only when the file is complete."""
     folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f"{key}.part.npz"
+    part = folder / f".{key}.{os.getpid()}.npz"  # two processes may want the same field
     np.savez_compressed(part, grid=field.grid, origin=field.origin, cell=field.cell)
     part.replace(folder / f"{key}.npz")
 

@@ -1,4 +1,4 @@
-"""What is known of an object model besides its mesh: condition, symmetries, matter, convex parts."""
+"""What is known of a model besides its mesh: condition, symmetries, matter, convex parts."""
 
 from dataclasses import dataclass, field
 from typing import Literal

@@ -15,8 +15,8 @@ from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, CaptureSession, Mesh, ObjectPose, View
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore, load_scene
+from realsim.store.arrays_on_disk import is_whole, write_arrays
 from realsim.store.lock import only_run_in
-from realsim_sim_bridge.school.arrays_on_disk import is_whole, write_arrays
 
 CAMERA = CameraIntrinsics(width=240, height=180, fx=220.0, fy=220.0, cx=120.0, cy=90.0)
 QUIET = Console(quiet=True)

@@ -5,7 +5,6 @@ import numpy as np
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim_sim_bridge.school.candidates import CandidateConfig, Surroundings, sample_candidates
-from realsim_sim_bridge.school.convex import ConvexConfig, convex_parts
 from realsim_sim_bridge.school.hand import HandGeometry
 from realsim_sim_bridge.school.hand_free import boxes_free, lowest_corner
 
@@ -105,17 +104,3 @@ def test_boxes_free_agrees_with_looking_at_each_point():
     expected = ~inside.all(axis=-1).any(axis=(1, 2))
     assert np.array_equal(boxes_free(boxes, Ts, points, 1e-3), expected)
     assert 0 < expected.sum() < 40
-
-
-def test_a_convex_mesh_is_its_hull_and_a_ring_is_cut(tmp_path):
-    import trimesh
-
-    whole = convex_parts(box(), ConvexConfig(), tmp_path)
-    assert whole.method == "hull" and len(whole.parts) == 1
-    assert abs(whole.volume_ratio - 1) < 1e-9
-    ring = solid(trimesh.creation.annulus(0.02, 0.03, 0.03, sections=24))
-    cut = convex_parts(ring, ConvexConfig(), tmp_path)
-    assert cut.method == "coacd" and len(cut.parts) > 3 and 0.9 < cut.volume_ratio < 1.2
-    again = convex_parts(ring, ConvexConfig(), tmp_path)
-    assert all(np.array_equal(a, b) for a, b in zip(cut.parts, again.parts, strict=True))
-    assert len(list(tmp_path.glob("convex_*.npz"))) == 2

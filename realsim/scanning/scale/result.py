@@ -1,4 +1,4 @@
-"""What a scale fit gives: scale and pose with their covariance, what was checked, what limits it."""
+"""What a scale fit gives: scale and pose with covariance, what was checked, what limits it."""
 
 from dataclasses import dataclass, field
 from typing import Any

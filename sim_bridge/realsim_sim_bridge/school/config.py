@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from realsim.models.convex import ConvexConfig
 from realsim_sim_bridge.school.candidates import CandidateConfig
-from realsim_sim_bridge.school.convex import ConvexConfig
 from realsim_sim_bridge.school.hand import HandGeometry
 from realsim_sim_bridge.school.reach import ReachConfig
 from realsim_sim_bridge.school.score import ScoreLimits

@@ -6,7 +6,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from realsim.records import GraspSet
-from realsim_sim_bridge.school.arrays_on_disk import read_arrays, write_arrays
+from realsim.store.arrays_on_disk import read_arrays, write_arrays
 
 _ARRAYS = (
     "Ts_obj_grasp",

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.mesh import mass_properties, sample_surface
+from realsim.geometry.mesh import MassProperties, mass_properties, sample_surface
+from realsim.models.convex import convex_parts
+from realsim.models.library_records import KnownSolid
 from realsim.records import Mesh
+from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
 from realsim_sim_bridge.school import panda
-from realsim_sim_bridge.school.arrays_on_disk import is_whole, read_arrays, write_arrays
 from realsim_sim_bridge.school.candidates import Surroundings, sample_candidates
 from realsim_sim_bridge.school.config import SchoolConfig
-from realsim_sim_bridge.school.convex import convex_parts
 from realsim_sim_bridge.school.reach import ReachTask, check_reach
 from realsim_sim_bridge.school.slip_world import SlipBody
 
@@ -50,6 +51,8 @@ class ObjectTask:
     """Middle of the scene on the table [m]."""
     config: SchoolConfig
     cache: Path | None
+    solid: KnownSolid | None = None
+    """Convex parts and matter, where a model library knows them."""
 
     def key(self) -> str:
         """Return a hash of everything the result depends on."""
@@ -63,6 +66,12 @@ class ObjectTask:
             np.array([self.density, *self.middle_xy]),
         ):
             digest.update(np.ascontiguousarray(array).tobytes())
+        if self.solid is not None:
+            matter = self.solid.matter
+            for array in (matter.mass_kg, matter.center_of_mass, matter.inertia):
+                digest.update(np.ascontiguousarray(array).tobytes())
+            for part in self.solid.parts.parts:
+                digest.update(part.tobytes())
         notes = [RESULTS_VERSION, version("pybullet"), self.obj_id, self.instance]
         digest.update(json.dumps([*notes, asdict(self.config)], sort_keys=True).encode())
         return digest.hexdigest()[:24]
@@ -182,15 +191,17 @@ def surface_points(mesh: Mesh, T_table_obj: Array, instance: int, count: int) ->
 
 def _body(task: ObjectTask, notes: dict[str, Any]) -> tuple[SlipBody | None, str]:
     """Return the object for the engine, or None and why it is not tried."""
-    config = task.config
+    config, known = task.config, task.solid
     try:
-        mass = mass_properties(task.mesh, task.density)
+        mass = known.matter if known else mass_properties(task.mesh, task.density)
     except InputError as error:
         return None, str(error)
     notes |= {
         "mass_kg": mass.mass_kg,
         "center_of_mass_m": mass.center_of_mass.tolist(),
-        "watertight": mass.is_watertight,
+        "watertight": (
+            mass.is_watertight if isinstance(mass, MassProperties) else mass.volume_of == "mesh"
+        ),
     }
     if not config.least_mass_kg <= mass.mass_kg <= config.greatest_mass_kg:
         return None, (
@@ -201,13 +212,14 @@ def _body(task: ObjectTask, notes: dict[str, Any]) -> tuple[SlipBody | None, str
     if notes["counts"]["kept"] == 0:
         return None, "no candidate is left; the counts say what each filter took"
     try:
-        convex = convex_parts(task.mesh, config.convex, task.cache)
+        convex = known.parts if known else convex_parts(task.mesh, config.convex, task.cache)
     except InputError as error:
         return None, str(error)
     notes["convex"] = {
         "parts": len(convex.parts),
         "volume_ratio": convex.volume_ratio,
         "method": convex.method,
+        "from": "library" if known else "mesh",
     }
     body = SlipBody(
         parts=convex.parts,

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.models.library_records import KnownSolid
 from realsim.records import GraspSet, Mesh, ObjectModel, Scene, names_of
-from realsim_sim_bridge.school.arrays_on_disk import is_whole
+from realsim.store.arrays_on_disk import is_whole
 from realsim_sim_bridge.school.candidates import Surroundings
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.kept_sets import read_grasp_set, write_grasp_set
@@ -32,6 +33,7 @@ def run_school(
     workers: int = 2,
     cache: Path | None = None,
     progress: Progress | None = None,
+    solids: Mapping[int, KnownSolid] | None = None,
 ) -> list[GraspSet]:
     """Return the scored grasps of every object whose pose was not rejected.
 
@@ -47,11 +49,13 @@ def run_school(
             `if __name__ == "__main__"`.
         cache: folder for results, or None to keep nothing.
         progress: called with (grasps judged, grasps expected).
+        solids: convex parts and matter by object id, as a model library knows them; of other
+            objects they are computed from the mesh.
 
     Raises:
         InputError: the scene has no plane, or an object without a model.
     """
-    tasks = object_tasks(scene, models, config or SchoolConfig(), cache)
+    tasks = object_tasks(scene, models, config or SchoolConfig(), cache, solids)
     pupils = [_Pupil(task) for task in tasks]
     with executor(workers) as pool:
         _Day(pool, pupils, progress).run()
@@ -59,7 +63,11 @@ def run_school(
 
 
 def object_tasks(
-    scene: Scene, models: Mapping[int, ObjectModel], config: SchoolConfig, cache: Path | None
+    scene: Scene,
+    models: Mapping[int, ObjectModel],
+    config: SchoolConfig,
+    cache: Path | None,
+    solids: Mapping[int, KnownSolid] | None = None,
 ) -> list[ObjectTask]:
     """Return the task of every object that is tried.
 
@@ -102,6 +110,7 @@ def object_tasks(
                 middle_xy=(float(middle[0]), float(middle[1])),
                 config=config,
                 cache=cache,
+                solid=(solids or {}).get(obj.obj_id),
             )
         )
     return tasks

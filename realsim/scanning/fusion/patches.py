@@ -1,0 +1,257 @@
+"""What each view says about small patches of the object's surface and of the table.
+
+A patch is a cell of the surface with one direction. The mean distance of a view's points in it to
+the fused surface, along the normal, is one observation; averaging first makes a million points
+some ten thousand numbers, and their noise known.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.geometry.camera import ray_table
+from realsim.geometry.distance_field import DistanceField
+from realsim.records import CameraIntrinsics
+from realsim.scanning.fusion.crops import Crops
+from realsim.scanning.fusion.result import FusionConfig
+from realsim.scanning.fusion.volume import Volume, smoothed
+
+Array = NDArray[np.float64]
+STRIDE_PX = 2
+"""Every how many pixels one is used; stereo noise is correlated over more."""
+PATCH_M = 0.004
+"""Edge of a patch of the object [m]: flat enough where the radius is above 10 mm, and some 50
+pixels, as many as the noise is correlated over..."""
+PATCH_PX = 6.0
+"""...but at least this many pixels wide."""
+TABLE_PATCH_M = 0.010
+"""Edge of a patch of the table [m]."""
+CORRELATED_PX = 50.0
+"""Pixels that are worth one: 4 pi r^2 for noise correlated over a Gaussian radius of r = 2 px."""
+PATCH_FLOOR_M = 0.00015
+"""Error of a patch besides noise [m]: curvature, voxels."""
+TABLE_FLOOR_M = 0.0005
+"""Tables are not flatter than this over the neighbourhood of an object [m]."""
+TABLE_STEP = 3
+"""The table has points enough: every third of them along rows and columns is used."""
+NEAR_SHARE = 0.9
+"""Beyond this share of the truncation the fused distance is cut off."""
+FLATNESS = 0.92
+"""Largest eigenvalue of the mean square of the normals in a cell below which there is an edge
+(5 deg of noise: 0.985, a radius of one cell: 0.92, a right angle: 0.5). There every view sees another part of a rounded
+corner, and what they differ by is not their poses."""
+LEAST_ALONG = 0.15
+"""Least cosine between ray and normal at which the ray is followed to the surface."""
+LEAST_SLOPE = 0.5
+"""Gradient of the fused distance below which the place is cut off or between two surfaces."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Observations:
+    """Mean distances of views to patches; rows of a linear system in the views' twists."""
+
+    patch: NDArray[np.int64]
+    """(N,) number of the patch."""
+    view: NDArray[np.int64]
+    """(N,) number of the view in the list of frames."""
+    residual: Array
+    """(N,) mean distance to the surface along its normal [m]."""
+    jacobian: Array
+    """(N, 6) its derivative by the view's right twist, rotation first [m/rad, 1]."""
+    sigma: Array
+    """(N,) 1-sigma [m]."""
+    place: Array
+    """(N, 2) mean x, y in the table's frame [m]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ViewPoints:
+    """The trusted points of one view in its camera's frame."""
+
+    on_object: Array
+    """(N, 3) inside the volume and above the cut [m]."""
+    object_sigma: Array
+    """(N,) sigma_z [m]."""
+    on_table: Array
+    """(M, 3) near the plane [m]."""
+    table_sigma: Array
+    """(M,) sigma_z [m]."""
+    pitch: float
+    """Width of a pixel where most points are [m]; 0 without points."""
+
+
+def view_points(
+    intrinsics: CameraIntrinsics,
+    crops: Crops,
+    Ts_table_cam: Array,
+    box: tuple[Array, Array],
+    heights: tuple[float, float],
+) -> list[ViewPoints]:
+    """Return per view the points of the object and of the table.
+
+    Args:
+        intrinsics: the camera.
+        crops: the depth of a region that is wider than the object.
+        Ts_table_cam: (F, 4, 4) cameras in the table's frame.
+        box: least and greatest corner (3,) of the volume [m].
+        heights: above the first, within the box, a point is the object's; outside the box and
+            nearer to the plane than the second (and two sigmas) it is the table's [m].
+    """
+    rays = ray_table(intrinsics)
+    low, high = box
+    out: list[ViewPoints] = []
+    for depth, corner, T in zip(crops.depths, crops.corners, Ts_table_cam, strict=True):
+        v, u = np.nonzero(depth[::STRIDE_PX, ::STRIDE_PX] > 0)
+        v, u = v * STRIDE_PX, u * STRIDE_PX
+        z = depth[v, u].astype(np.float64)
+        local = rays[v + corner[1], u + corner[0]] * z[:, None]
+        sigma = np.maximum(crops.noise[1], crops.noise[0] * z * z)
+        p = se3.transform(T, local)
+        beside = np.any((p[:, :2] < low[:2]) | (p[:, :2] > high[:2]), axis=1)
+        mine = ~beside & (p[:, 2] > heights[0]) & (p[:, 2] < high[2])
+        table = beside & (np.abs(p[:, 2]) < heights[1] + 2 * sigma)
+        table &= (v % (STRIDE_PX * TABLE_STEP) == 0) & (u % (STRIDE_PX * TABLE_STEP) == 0)
+        out.append(
+            ViewPoints(
+                on_object=local[mine], object_sigma=sigma[mine],
+                on_table=local[table], table_sigma=sigma[table],
+                pitch=float(np.median(z)) / intrinsics.fx if len(z) else 0.0,
+            )
+        )  # fmt: skip
+    return out
+
+
+def observed_object(
+    points: list[ViewPoints], Ts_table_cam: Array, volume: Volume, config: FusionConfig
+) -> tuple[Observations, Array]:
+    """Return the views' distances to patches of the fused surface, and each view's matches.
+
+    Returns:
+        The observations, and the share (F,) of every view's points on the object that lie near
+        the fused surface (NaN without points).
+    """
+    # Smoothing moves the surface, but for all views alike, which a patch's offset takes up; without
+    # it the normals of a noisy surface are as noisy, and every cell looks like an edge.
+    field = DistanceField(grid=smoothed(volume.distance), origin=volume.origin, cell=volume.cell)
+    end = volume.origin + volume.cell * (np.array(volume.distance.shape) - 1)
+    rows: list[tuple[Array, ...]] = []
+    matched = np.full(len(points), np.nan)
+    for number, (view, T) in enumerate(zip(points, Ts_table_cam, strict=True)):
+        p = se3.transform(T, view.on_object)
+        index = np.flatnonzero(np.all((p > volume.origin) & (p < end), axis=1))
+        d, g = field.distance_gradient(p[index])
+        slope = np.linalg.norm(g, axis=1)
+        with np.errstate(invalid="ignore"):
+            near = (np.abs(d) < NEAR_SHARE * config.truncation_m) & (slope > LEAST_SLOPE)
+        import os
+        MC=float(os.environ.get("MC","0"))
+        if MC:
+            with np.errstate(invalid="ignore"):
+                mm = (g/slope[:,None]) @ T[:3,:3]; lo=view.on_object[index]
+                cc = -np.sum(mm*lo,1)/np.linalg.norm(lo,axis=1)
+                near &= cc>MC
+        if len(p):
+            matched[number] = np.count_nonzero(near) / len(p)
+        index = index[near]
+        n = g[near] / slope[near, None]
+        rows.append(
+            (
+                *_rows(number, T, (p[index], view.on_object[index]), n, d[near] / slope[near]),
+                view.object_sigma[index],
+            )
+        )
+    pitch = float(np.median([v.pitch for v in points]))
+    return _averaged(rows, max(PATCH_M, PATCH_PX * pitch), STRIDE_PX, PATCH_FLOOR_M), matched
+
+
+def observed_table(points: list[ViewPoints], Ts_table_cam: Array) -> Observations:
+    """Return the views' heights of patches of the table over the plane z = 0."""
+    rows: list[tuple[Array, ...]] = []
+    for number, (view, T) in enumerate(zip(points, Ts_table_cam, strict=True)):
+        p = se3.transform(T, view.on_table)
+        up = np.tile([0.0, 0.0, 1.0], (len(p), 1))
+        rows.append((*_rows(number, T, (p, view.on_table), up, p[:, 2]), view.table_sigma))
+    return _averaged(rows, TABLE_PATCH_M, STRIDE_PX * TABLE_STEP, TABLE_FLOOR_M)
+
+
+def _rows(
+    number: int, T: Array, points: tuple[Array, Array], n: Array, r: Array
+) -> tuple[Array, ...]:
+    """Return view, place, side, Jacobian, cosine, normal and residual of a view's points.
+
+    With T <- T exp(xi) a point moves by R (omega x p_cam + v), so that the distance along n
+    changes by (p_cam x R'n) . omega + R'n . v. The noise of a point is in its residual and must not
+    be in its derivative too, or what is weakly seen is pulled by their product: the derivative is
+    taken where the viewing ray meets the surface.
+
+    Args:
+        number: of the view.
+        T: (4, 4) camera in the table's frame.
+        points: (N, 3) in the table's frame and in the camera's [m].
+        n: (N, 3) unit normals of the surface in the table's frame.
+        r: (N,) distances to the surface along them [m].
+    """
+    p, local = points
+    m = n @ T[:3, :3]
+    along = np.sum(m * local, axis=1)
+    ray = np.linalg.norm(local, axis=1)
+    cosine = np.abs(along) / np.where(ray > 0, ray, 1.0)
+    steep = cosine > LEAST_ALONG
+    factor = 1.0 - np.where(steep, r / np.where(steep, along, 1.0), 0.0)
+    jacobian = np.concatenate([np.cross(factor[:, None] * local, m), m], axis=1)
+    axis = np.argmax(np.abs(n), axis=1)
+    side = 2 * axis + (n[np.arange(len(n)), axis] > 0)
+    return np.full(len(p), float(number)), p, side.astype(np.float64), jacobian, cosine, n, r
+
+
+def _averaged(
+    rows: list[tuple[Array, ...]], size: float, stride: int, floor_m: float
+) -> Observations:
+    """Return the observations: means over every patch and view."""
+    view, p, side, jacobian, cosine, normal, residual, sigma = (
+        np.concatenate([r[k] for r in rows]) for k in range(8)
+    )
+    view = view.astype(np.int64)
+    cells = np.floor(p / size).astype(np.int64)
+    cells -= cells.min(0) if len(cells) else 0
+    shape = (*(cells.max(0) + 1 if len(cells) else (1, 1, 1)), 6)
+    flat = _flat((cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2], normal)
+    key = np.ravel_multi_index((*cells.T, side.astype(np.int64)), shape)
+    key, view, p, jacobian = key[flat], view[flat], p[flat], jacobian[flat]
+    cosine, residual, sigma = cosine[flat], residual[flat], sigma[flat]
+    views = int(view.max()) + 1 if len(view) else 1
+    pair, inverse = np.unique(key * views + view, return_inverse=True)
+    count = np.bincount(inverse, minlength=len(pair)).astype(np.float64)
+
+    def mean(values: Array) -> Array:
+        return np.bincount(inverse, values, minlength=len(pair)) / count
+
+    # Noise is correlated: so many pixels are worth one, and two if they are just as many.
+    independent = 1.0 + count * stride**2 / CORRELATED_PX
+    noise = mean(sigma * cosine) / np.sqrt(independent)
+    enough = count * stride**2 >= CORRELATED_PX / 2
+    _, patch = np.unique(pair[enough] // views, return_inverse=True)
+    return Observations(
+        patch=patch,
+        view=(pair % views)[enough],
+        residual=mean(residual)[enough],
+        jacobian=np.stack([mean(jacobian[:, k]) for k in range(6)], -1)[enough],
+        sigma=np.hypot(noise, floor_m)[enough],
+        place=np.stack([mean(p[:, k]) for k in range(2)], -1)[enough],
+    )
+
+
+def _flat(cell: NDArray[np.int64], normal: Array) -> NDArray[np.bool_]:
+    """Return which points (N,) lie in cells without an edge.
+
+    Judged by the largest eigenvalue of the mean of n n': the two sides of a wall are no edge.
+    """
+    _, inverse, count = np.unique(cell, return_inverse=True, return_counts=True)
+    squares = np.empty((len(count), 3, 3))
+    for i in range(3):
+        for j in range(3):
+            products = normal[:, i] * normal[:, j]
+            squares[:, i, j] = np.bincount(inverse, products, len(count)) / np.maximum(count, 1)
+    return (np.linalg.eigvalsh(squares)[:, 2] > FLATNESS)[inverse]

@@ -1,0 +1,281 @@
+"""What the depth images of a scan say: points of the object and of the table, and the outlines.
+
+Every view keeps its own points in its own camera's axes, because the cameras are not quite where
+they are said to be and the fit moves them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.geometry.camera import project, ray_table
+from realsim.geometry.clouds import voxel_mean
+from realsim.geometry.depth import edge_mask
+from realsim.records import CameraIntrinsics, SupportPlane
+from realsim.registration.evidence import Cloud, DepthFrame, DepthNoise
+from realsim.scanning.scale.config import ScaleConfig
+from realsim.scanning.scale.table import Footprint
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+EDGE_M = 0.006
+"""Depth span within 3 px beyond which pixels may be flying [m]; plus slope and noise."""
+VOXEL_SHARE = 1 / 50
+"""Voxel of the cloud of all views as a share of the object's size."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Rim:
+    """Signed distance to the outline of the object in one image, where it was measured."""
+
+    distance_px: Array32
+    """(H, W) of the crop, negative inside [px]."""
+    gap_px: Array32
+    """(H, W) width of the unknown band at the nearest place of the outline [px]; 1 = none."""
+    left: int
+    """Column of the crop's first pixel in the image."""
+    top: int
+    """Row likewise."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ScanView:
+    """What one view measured."""
+
+    index: int
+    T_world_cam: Array
+    """(4, 4) where the camera is said to be [m]."""
+    points: Array
+    """(N, 3) measured points of the object in camera axes [m]."""
+    point_area_px: float
+    """Pixels that each of them stands for."""
+    table: Array
+    """(M, 3) measured points of the table in camera axes [m]."""
+    table_area_px: float
+    rim: Rim
+    rays: Array32
+    """(R, 3) rays of z = 1 by which hypotheses are compared, camera axes."""
+    depth: Array
+    """(R,) measured depth along them [m]; 0 = none, or at a depth edge."""
+    is_object: Mask
+    """(R,) whether the object was measured there."""
+    ray_area_px: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ScanEvidence:
+    """What all views measured."""
+
+    intrinsics: CameraIntrinsics
+    views: tuple[ScanView, ...]
+    plane: SupportPlane
+    noise: DepthNoise
+    footprint: Footprint
+    cloud: Cloud
+    """The object's points of all views averaged on a voxel grid, in world, as the cameras claim."""
+    size_m: float
+    """Greatest side of the box of the object's points [m]."""
+    unseen: tuple[int, ...]
+    """Numbers of the views that do not see the object."""
+
+
+def gather_scan(
+    intrinsics: CameraIntrinsics,
+    frames: Sequence[DepthFrame],
+    surface: tuple[SupportPlane, Footprint],
+    noise: DepthNoise,
+    config: ScaleConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> ScanEvidence:
+    """Return what the frames say about the object of the footprint."""
+    plane, footprint = surface
+    views: list[ScanView] = []
+    unseen: list[int] = []
+    for n, frame in enumerate(frames):
+        crop = _crop(intrinsics, frame, plane, footprint, noise)
+        view = None if crop is None else _view(crop, frame, footprint, config)
+        if view is None:
+            unseen.append(frame.index)
+        else:
+            views.append(view)
+        if progress is not None:
+            progress(n + 1, len(frames))
+    size = float(np.max(footprint.box[1] - footprint.box[0]))
+    return ScanEvidence(
+        intrinsics=intrinsics, views=tuple(views), plane=plane, noise=noise, footprint=footprint,
+        cloud=_cloud(views, noise, size * VOXEL_SHARE), size_m=size, unseen=tuple(unseen),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Crop:
+    """The part of one image that shows the object and the table around it."""
+
+    left: int
+    top: int
+    rays: Array32
+    """(H, W, 3)."""
+    depth: Array32
+    """(H, W) [m]; 0 = none."""
+    trusted: Mask
+    """(H, W) measured and not at a depth edge."""
+    height: Array32
+    """(H, W) above the table [m]."""
+    on_object: Mask
+    """(H, W) trusted pixels of the object."""
+    on_table: Mask
+    """(H, W) trusted pixels of the table or of anything behind the object."""
+    far_table: Mask
+    """(H, W) trusted pixels of the table that are used to find it."""
+    near: Mask
+    """(H, W) pixels around the object, in which hypotheses are compared."""
+
+
+def _crop(
+    intrinsics: CameraIntrinsics,
+    frame: DepthFrame,
+    plane: SupportPlane,
+    footprint: Footprint,
+    noise: DepthNoise,
+) -> _Crop | None:
+    """Return the part of a frame around the object, None where it is not in the image."""
+    T_table_cam = se3.invert(plane.T_world_table) @ frame.T_world_cam
+    box = _image_box(intrinsics, T_table_cam, footprint)
+    if box is None:
+        return None
+    left, top, right, bottom = box
+    rays = ray_table(intrinsics)[top:bottom, left:right]
+    z = np.ascontiguousarray(frame.depth_m[top:bottom, left:right], dtype=np.float32)
+    known = (z > 0) & np.isfinite(z) & np.isfinite(rays[..., 0])
+    z = np.where(known, z, np.float32(0))
+    R, t = T_table_cam[:3, :3].astype(np.float32), T_table_cam[:3, 3].astype(np.float32)
+    sigma = noise.sigma(z).astype(np.float32)
+    jump = EDGE_M + 8.0 * z / min(intrinsics.fx, intrinsics.fy) + 6.0 * sigma
+    trusted = known & ~edge_mask(z, jump)
+    xyz = np.empty((*z.shape, 3), np.float32)
+    for k in range(3):
+        xyz[..., k] = z * (rays @ R[k]) + t[k]
+    least = 0.003 + 3.0 * sigma
+    height = xyz[..., 2]
+    xy = xyz[..., :2].astype(np.float64)
+    near = footprint.inside(footprint.near, xy)
+    close = footprint.inside(footprint.close, xy)
+    on_object = trusted & near & (height > least)
+    on_table = trusted & ~on_object & (height < least)
+    far_table = trusted & (np.abs(height) < 2 * least) & footprint.inside(footprint.around, xy)
+    # A pixel is compared where its ray may meet the object: its table point or what it measured.
+    return _Crop(left, top, rays, z, trusted, height, on_object, on_table, far_table, near | close)
+
+
+def _image_box(
+    intrinsics: CameraIntrinsics, T_table_cam: Array, footprint: Footprint
+) -> tuple[int, int, int, int] | None:
+    """Return the image box (left, top, right, bottom) of the object and some table around it."""
+    low, high = footprint.box
+    margin = np.array([0.07, 0.07, 0.0])
+    low, high = low - margin, high + margin + [0, 0, 0.01]
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    corners_cam = se3.transform(se3.invert(T_table_cam), low + corners * (high - low))
+    width, height = intrinsics.width, intrinsics.height
+    if corners_cam[:, 2].max() <= 0:
+        return None
+    if corners_cam[:, 2].min() < 0.02:
+        return 0, 0, width, height
+    uv = project(intrinsics, corners_cam)
+    left, top = np.floor(uv.min(0)).astype(int)
+    right, bottom = np.ceil(uv.max(0)).astype(int) + 1
+    box = np.clip([left, top, right, bottom], 0, [width, height, width, height])
+    if box[2] - box[0] < 8 or box[3] - box[1] < 8:
+        return None
+    return int(box[0]), int(box[1]), int(box[2]), int(box[3])
+
+
+def _view(
+    crop: _Crop, frame: DepthFrame, footprint: Footprint, config: ScaleConfig
+) -> ScanView | None:
+    """Return the samples of one view, None where it measured nothing of the object."""
+    del footprint
+    samples = config.samples
+    area = int(np.count_nonzero(crop.on_object))
+    if area < config.table.least_points:
+        return None
+    points, point_area = _sampled(crop, crop.on_object, samples.object_points)
+    table, table_area = _sampled(crop, crop.far_table, samples.table_points)
+    rim = _rim(crop)
+    compared = rim.distance_px < np.float32(0.35 * np.sqrt(area) + 6)
+    stride = max(1, int(np.sqrt(np.count_nonzero(compared) / samples.rays)))
+    rows, columns = np.nonzero(compared[::stride, ::stride])
+    rows, columns = rows * stride, columns * stride
+    ok = np.isfinite(crop.rays[rows, columns, 0])
+    rows, columns = rows[ok], columns[ok]
+    depth = np.where(crop.trusted, crop.depth, np.float32(0))[rows, columns]
+    return ScanView(
+        index=frame.index, T_world_cam=np.array(frame.T_world_cam, dtype=np.float64),
+        points=points, point_area_px=point_area, table=table, table_area_px=table_area, rim=rim,
+        rays=np.ascontiguousarray(crop.rays[rows, columns]), depth=depth.astype(np.float64),
+        is_object=crop.on_object[rows, columns], ray_area_px=float(stride**2),
+    )  # fmt: skip
+
+
+def _sampled(crop: _Crop, mask: Mask, wanted: int) -> tuple[Array, float]:
+    """Return about `wanted` points of the mask on a grid of pixels, and the area of each [px]."""
+    stride = max(1, int(np.sqrt(np.count_nonzero(mask) / wanted)))
+    rows, columns = np.nonzero(mask[::stride, ::stride])
+    rows, columns = rows * stride, columns * stride
+    rays = crop.rays[rows, columns].astype(np.float64)
+    return rays * crop.depth[rows, columns, None].astype(np.float64), float(stride**2)
+
+
+def _rim(crop: _Crop) -> Rim:
+    """Return the signed distance to the outline: midway between object and table pixels."""
+    import cv2
+
+    inside = crop.on_object.astype(np.uint8)
+    outside = crop.on_table.astype(np.uint8)
+    to_object = cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
+    to_table = cv2.distanceTransform(1 - outside, cv2.DIST_L2, 5)
+    body = (to_object < to_table).astype(np.uint8)
+    if not body.any() or body.all():
+        far = np.full(body.shape, 1e3, np.float32)
+        return Rim(distance_px=far, gap_px=far.copy(), left=crop.left, top=crop.top)
+    out = cv2.distanceTransform(1 - body, cv2.DIST_L2, 5)
+    into = cv2.distanceTransform(body, cv2.DIST_L2, 5)
+    distance = np.where(body > 0, np.float32(0.5) - into, out - np.float32(0.5))
+    # The unknown band at the outline's nearest pixel, looked up by the label of that pixel.
+    edge = (body > 0) & (into < 1.5)
+    _, labels = cv2.distanceTransformWithLabels(
+        1 - edge.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    width = (to_object + to_table)[edge]
+    gaps = np.zeros(int(labels.max()) + 1, np.float32)
+    gaps[labels[edge]] = width
+    return Rim(
+        distance_px=np.asarray(distance, np.float32), gap_px=gaps[labels], left=crop.left,
+        top=crop.top,
+    )  # fmt: skip
+
+
+def _cloud(views: Sequence[ScanView], noise: DepthNoise, voxel: float) -> Cloud:
+    """Return the object's points of all views in world, averaged per voxel and viewing octant."""
+    points = [se3.transform(v.T_world_cam, v.points) for v in views]
+    towards = [
+        _unit(v.T_world_cam[:3, 3] - p) for v, p in zip(views, points, strict=True)
+    ]  # fmt: skip
+    if not points:
+        nothing = np.zeros((0, 3))
+        return Cloud(points=nothing, towards=nothing, sigmas=np.zeros(0))
+    p, d = np.concatenate(points), np.concatenate(towards)
+    sigmas = noise.sigma(np.concatenate([v.points[:, 2] for v in views]))
+    octant = (d > 0) @ np.array([1, 2, 4], dtype=np.int64)
+    means = voxel_mean(p, voxel, 1.0 / np.square(sigmas), d, octant)
+    return Cloud(
+        points=means.points, towards=_unit(means.attributes), sigmas=1.0 / np.sqrt(means.weights)
+    )
+
+
+def _unit(v: Array) -> Array:
+    return v / np.linalg.norm(v, axis=1, keepdims=True)

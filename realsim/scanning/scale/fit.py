@@ -1,0 +1,246 @@
+"""Scale and pose of a mesh from the depth images of a session.
+
+1. Evidence: the table, the one object on it, its points and outlines in every view.
+2. Search: from a rough start or from none, to the few scales and poses that explain the images.
+3. Joint fit of the best: scale, pose, cameras, table, biases and the error of the mesh's shape.
+4. Views that speak against all others are left out, and the fit is done again.
+5. Verdict without ground truth, and what limits the scale.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.records import CameraIntrinsics, Mesh, SupportPlane
+from realsim.registration.evidence import DepthFrame, check_frames, measure_noise
+from realsim.scanning.scale.agreement import Explained, explain
+from realsim.scanning.scale.config import ScaleConfig
+from realsim.scanning.scale.evidence import ScanEvidence, gather_scan
+from realsim.scanning.scale.joint import Outlook, joint_fit
+from realsim.scanning.scale.limits import limits_of, sigma_log
+from realsim.scanning.scale.residuals import residual_per_vertex
+from realsim.scanning.scale.result import ScaleFit, Similarity, ViewAgreement
+from realsim.scanning.scale.search import Hypothesis, hypotheses, to_given
+from realsim.scanning.scale.shape import ScanShape, make_shape
+from realsim.scanning.scale.state import State, priors_of
+from realsim.scanning.scale.table import find_object, find_table
+from realsim.scanning.scale.verdict import Judged, judge
+
+__all__ = ["DepthFrame", "ScaleConfig", "ScaleFit", "Similarity", "fit_scale"]
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+LEAST_VIEWS = 3
+"""Fewer views leave the scale to the shape of one side."""
+
+
+def fit_scale(
+    mesh: Mesh,
+    intrinsics: CameraIntrinsics,
+    frames: Sequence[DepthFrame],
+    config: ScaleConfig | None = None,
+    *,
+    start: Similarity | None = None,
+    plane: SupportPlane | None = None,
+    at: tuple[float, float] | None = None,
+    progress: Progress | None = None,
+) -> ScaleFit:
+    """Return the metric scale of a mesh, its pose, and whether they may be trusted.
+
+    Args:
+        mesh: the object in any unit and attitude; its shape may be off by some per cent.
+        intrinsics: the camera of all frames.
+        frames: depth images [m] with camera poses; three or more, from all around.
+        config: see there.
+        start: rough scale and pose (15 %, 10 mm, 10 deg); None = found from nothing.
+        plane: the table, where it is known already; None = found.
+        at: (x, y) in world [m] near the object, where several stand on the table.
+        progress: called with (steps done, steps).
+
+    Raises:
+        InputError: fewer than three frames, images that are not the camera's, several objects.
+        DegenerateError: no table, nothing on it, or a mesh without a body.
+    """
+    began = time.process_time()
+    config = config or ScaleConfig()
+    ordered = check_frames(frames, intrinsics)
+    _require_views(len(ordered), "given")
+    ticks = _Ticks(progress, len(ordered) + 4)
+    evidence = _evidence(intrinsics, ordered, config, (plane, at), ticks)
+    shape = make_shape(mesh, config)
+    ticks.step()
+    found = hypotheses(shape, evidence, start, config)
+    ticks.step()
+    state, look, seen, dropped = _joint(shape, evidence, found[0].state, config)
+    ticks.step()
+    rivals = _rivals(shape, seen, (state, found[1:]), config)
+    explained = explain(shape, seen, state)
+    sigma = sigma_log(look, config)
+    judged = judge(shape, seen, (state, look, explained), rivals, (sigma, config))
+    ticks.step()
+    best = to_given(shape, state, explained.gain, found[0].source)
+    return ScaleFit(
+        scale=best.scale, sigma=best.scale * sigma, T_world_obj=best.T_world_obj,
+        covariance=_covariance(look, sigma), verdict=judged.verdict, reasons=judged.reasons,
+        checks=judged.checks, limits=limits_of(look, seen, (state, sigma), config),
+        views=_views(seen, (state, look, explained), dropped),
+        residual_mm=residual_per_vertex(mesh, shape, state, look),
+        plane=SupportPlane(
+            T_world_table=state.T_world_table, rms_m=seen.plane.rms_m, inliers=seen.plane.inliers
+        ),
+        extent_mm=1e3 * best.scale * mesh.extent,
+        candidates=tuple(
+            to_given(shape, h.state, h.gain, h.source) for h in found[: config.search.compared]
+        ),
+        history=tuple(dict(h) for h in look.history), cpu_s=time.process_time() - began,
+        notes=_notes(evidence, dropped, judged),
+    )  # fmt: skip
+
+
+class _Ticks:
+    """Counts the steps for the progress callback."""
+
+    def __init__(self, progress: Progress | None, total: int) -> None:
+        self._progress, self._done, self._total = progress, 0, total
+
+    def step(self) -> None:
+        """One more step is done."""
+        self._done += 1
+        if self._progress is not None:
+            self._progress(min(self._done, self._total), self._total)
+
+    def view(self, done: int, total: int) -> None:
+        """One more view has been read."""
+        del done, total
+        self.step()
+
+
+def _require_views(n: int, what: str) -> None:
+    if n < LEAST_VIEWS:
+        raise InputError(
+            f"{n} views with depth and a camera pose were {what}; at least {LEAST_VIEWS} from "
+            "different sides are needed for a scale, 12 or more all around are advised."
+        )
+
+
+def _evidence(
+    intrinsics: CameraIntrinsics,
+    frames: Sequence[DepthFrame],
+    config: ScaleConfig,
+    given: tuple[SupportPlane | None, tuple[float, float] | None],
+    ticks: _Ticks,
+) -> ScanEvidence:
+    """Return what the frames measured of the object."""
+    noise = measure_noise(frames, config.noise)
+    plane = given[0] or find_table(intrinsics, frames, config.table, config.seed)
+    footprint = find_object(intrinsics, frames, plane, noise, config.table, given[1])
+    evidence = gather_scan(
+        intrinsics, frames, (plane, footprint), noise, config, ticks.view
+    )  # fmt: skip
+    _require_views(len(evidence.views), f"left of {len(frames)}: the others do not see the object")
+    return evidence
+
+
+def _joint(
+    shape: ScanShape, evidence: ScanEvidence, start: State, config: ScaleConfig
+) -> tuple[State, Outlook, ScanEvidence, tuple[int, ...]]:
+    """Return the joint fit, the evidence it used, and the numbers of the views left out."""
+    state, look = joint_fit(shape, evidence, start, config)
+    bad = _against_all(shape, evidence, state, config)
+    if not bad.any() or np.count_nonzero(~bad) < LEAST_VIEWS:
+        return state, look, evidence, ()
+    dropped = tuple(v.index for v, b in zip(evidence.views, bad, strict=True) if b)
+    kept = tuple(v for v, b in zip(evidence.views, bad, strict=True) if not b)
+    fewer = replace(evidence, views=kept)
+    again = replace(
+        start, views=np.zeros((len(kept), 6)), hand_eye=np.zeros(6)
+    )  # fmt: skip
+    state, look = joint_fit(shape, fewer, again, config)
+    return state, look, fewer, dropped
+
+
+def _against_all(
+    shape: ScanShape, evidence: ScanEvidence, state: State, config: ScaleConfig
+) -> NDArray[np.bool_]:
+    """Return which views (V,) are out of line: their camera, or what they see of the object."""
+    v = config.verdict
+    twist = np.sqrt(np.mean(np.square(state.views / priors_of(config).arm), axis=1))
+    iou = explain(shape, evidence, state, every=2).view_iou
+    usual = float(np.median(iou))
+    return (twist > v.view_sigmas) | (iou < v.view_share * usual)
+
+
+def _rivals(
+    shape: ScanShape,
+    evidence: ScanEvidence,
+    found: tuple[State, Sequence[Hypothesis]],
+    config: ScaleConfig,
+) -> list[tuple[float, float]]:
+    """Return scale and gain of the best other solutions whose scale differs, fitted likewise."""
+    best, others = found
+    out: list[tuple[float, float]] = []
+    for h in others:
+        if len(out) >= config.search.rivals:
+            break
+        if abs(np.log(h.state.s / best.s)) < config.verdict.rival_change:
+            continue
+        start = replace(h.state, views=np.zeros((len(evidence.views), 6)))
+        state, _ = joint_fit(shape, evidence, start, config)
+        out.append((state.s * shape.unit, explain(shape, evidence, state).gain))
+    return out
+
+
+def _covariance(look: Outlook, sigma: float) -> Array:
+    """Return the covariance (7, 7) of pose and log scale, the latter's sigma as reported."""
+    C = look.covariance[:7, :7].copy()
+    factor = sigma / np.sqrt(C[6, 6])
+    # Pose and scale share their errors: all of it grows alike.
+    return C * factor**2
+
+
+def _views(
+    evidence: ScanEvidence,
+    fit: tuple[State, Outlook, Explained],
+    dropped: Sequence[int],
+) -> tuple[ViewAgreement, ...]:
+    """Return how every view agrees, in the order of their numbers."""
+    state, look, explained = fit
+    rows: list[ViewAgreement] = []
+    for k, view in enumerate(evidence.views):
+        mine = (look.view_of == k) & (look.kernels > 0)
+        r = look.residuals[mine]
+        twist = state.hand_eye + state.views[k]
+        rows.append(
+            ViewAgreement(
+                index=view.index, points=int(np.count_nonzero(mine)),
+                agree=float(explained.view_agree[k]), iou=float(explained.view_iou[k]),
+                rms_mm=float(1e3 * np.sqrt(np.mean(np.square(r)))) if len(r) else float("nan"),
+                shift_mm=float(1e3 * np.linalg.norm(twist[3:])),
+                turn_deg=float(np.degrees(np.linalg.norm(twist[:3]))),
+            )
+        )  # fmt: skip
+    nothing: dict[str, Any] = dict(
+        points=0, agree=float("nan"), iou=float("nan"), rms_mm=float("nan"),
+        shift_mm=float("nan"), turn_deg=float("nan"), used=False,
+    )  # fmt: skip
+    rows += [ViewAgreement(index=i, **nothing) for i in (*dropped, *evidence.unseen)]
+    return tuple(sorted(rows, key=lambda r: r.index))
+
+
+def _notes(evidence: ScanEvidence, dropped: Sequence[int], judged: Judged) -> tuple[str, ...]:
+    """Return what a user should know besides."""
+    notes = list(judged.notes)
+    if dropped:
+        named = ", ".join(map(str, dropped))
+        notes.append(
+            f"view {named} speaks against the others and was left out: its robot pose or its "
+            "images are not what they should be."
+        )
+    if evidence.unseen:
+        notes.append(f"view {', '.join(map(str, evidence.unseen))} does not see the object.")
+    return tuple(notes)

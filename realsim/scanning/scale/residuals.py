@@ -1,0 +1,41 @@
+"""The residual map: where the real surface lies outside or inside of the scaled mesh."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import Mesh
+from realsim.scanning.scale.joint import Outlook
+from realsim.scanning.scale.shape import INNER_EXTENT, ScanShape
+from realsim.scanning.scale.state import State
+
+Array = NDArray[np.float64]
+REACH = 0.03
+"""Points within this share of the size speak for a vertex."""
+NEIGHBOURS = 12
+"""At most so many of them."""
+FEWEST = 3
+"""Fewer do not make a median."""
+
+
+def residual_per_vertex(mesh: Mesh, shape: ScanShape, state: State, look: Outlook) -> Array:
+    """Return the signed distance (V,) of the real surface at each vertex of the given mesh [mm].
+
+    The median of the measured points around the vertex, positive outside; NaN where fewer than
+    three were measured.
+    """
+    from scipy.spatial import cKDTree
+
+    del state
+    vertices = (mesh.vertices - shape.center) * shape.unit
+    used = look.kernels > 0
+    out = np.full(len(vertices), np.nan)
+    if np.count_nonzero(used) < FEWEST:
+        return out
+    tree = cKDTree(look.local[used])
+    residuals = np.append(look.residuals[used], np.nan)
+    distance, index = tree.query(vertices, k=NEIGHBOURS, distance_upper_bound=REACH * INNER_EXTENT)
+    near = np.isfinite(distance)
+    enough = near.sum(axis=1) >= FEWEST
+    values = np.where(near, residuals[np.minimum(index, len(residuals) - 1)], np.nan)
+    out[enough] = 1e3 * np.nanmedian(values[enough], axis=1)
+    return out

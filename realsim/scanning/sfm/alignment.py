@@ -1,0 +1,299 @@
+"""The similarity between a reconstruction and the robot, from camera centres and orientations.
+
+p_robot = s R p_sfm + t. Each registered view gives six equations,
+
+    e_i = log( (P_i exp(xi))^-1 S(T_i) ),    S(T) = [R R_T, s R c_T + t],
+
+with P_i the robot's camera pose, T_i the reconstructed one, and xi the constant error of the
+hand-eye, which has a prior and is solved for together with the similarity. So the sigma of the
+scale holds what a hand-eye error does to it: nothing sideways; along the optical axis error / r,
+where all views look at one point from the same distance r, and less where the distances differ.
+
+A start comes from pairs of views (their centres give s, one orientation gives R); the best one is
+refined by re-weighted Gauss-Newton with Cauchy's loss. The jackknife over the views is the check
+of the formal sigma: it asks the data, not the noise model.
+"""
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import DegenerateError, InputError
+from realsim.geometry import se3
+from realsim.geometry.depth import MAD_TO_SIGMA
+from realsim.scanning.sfm.bundle import hand_eye_sigmas, prior_sigmas
+from realsim.scanning.sfm.config import AlignmentConfig
+from realsim.scanning.sfm.result import Alignment, ViewResidual
+
+Array = NDArray[np.float64]
+STEPS = 30
+"""Gauss-Newton steps at most; four are usual."""
+CONVERGED = 1e-7
+"""Length of the last step [rad, m, log scale]."""
+JACKKNIFE_STEPS = 4
+"""Steps from the solution of all views to that without one."""
+CAUCHY = 3.0
+"""Sigmas at which a view has half of its weight."""
+DIFFERENCE = 1e-6
+"""Step of the numeric derivatives [rad, m, log scale]."""
+TRUNCATE = 6.0
+"""A view's square in the score of a start is cut at this many sigmas."""
+SFM_MM, SFM_DEG = 1.0, 0.2
+"""Errors that a reconstructed camera is allowed in the score of the starts [mm, deg]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Problem:
+    """Both sets of cameras and the sigmas of their differences."""
+
+    found: Array
+    """(V, 4, 4) reconstructed, centres about their mean."""
+    robot: Array
+    """(V, 4, 4) [m]."""
+    sigmas: Array
+    """(6,) [rad, m]"""
+    hand_eye: Array
+    """(6,) [rad, m]"""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _State:
+    """A similarity about the mean of the reconstructed centres, and the hand-eye's correction."""
+
+    log_scale: float
+    R: Array
+    t: Array
+    twist: Array
+
+    def moved(self, step: Array) -> "_State":
+        """Return the state after a step [w, t, log s, xi]."""
+        return _State(
+            log_scale=self.log_scale + float(step[6]), R=se3.exp_so3(step[:3]) @ self.R,
+            t=self.t + step[3:6], twist=self.twist + step[7:],
+        )  # fmt: skip
+
+
+def align_to_robot(
+    names: tuple[str, ...],
+    found: Array,
+    robot: Array,
+    config: AlignmentConfig,
+    rng: np.random.Generator,
+) -> Alignment:
+    """Return the similarity from the reconstruction to the robot's camera poses.
+
+    Args:
+        names: of the views.
+        found: (V, 4, 4) reconstructed cameras, in any unit.
+        robot: (V, 4, 4) the same cameras by the robot [m].
+        config: noise, thresholds.
+        rng: picks the pairs of views for the start where there are many.
+
+    Raises:
+        InputError: the lists differ in length.
+        DegenerateError: fewer than 3 views, or no motion on either side.
+    """
+    if not len(names) == len(found) == len(robot):
+        raise InputError(
+            f"{len(names)} names, {len(found)} reconstructed and {len(robot)} robot poses: one of "
+            "each per view is expected."
+        )
+    _require_motion(found, robot, config)
+    mean = found[:, :3, 3].mean(0)
+    centred = found.copy()
+    centred[:, :3, 3] -= mean
+    problem = _Problem(
+        found=centred, robot=robot, sigmas=prior_sigmas(config.noise),
+        hand_eye=hand_eye_sigmas(config.noise),
+    )  # fmt: skip
+    state, weights = _refined(problem, _robust_start(problem, config, rng))
+    scale = float(np.exp(state.log_scale))
+    covariance, formal, noise_only = _covariance(problem, state, weights)
+    knife = _jackknife(problem, state)
+    hand_eye = float(np.sqrt(max(formal**2 - noise_only**2, 0.0)))
+    arm = config.noise.arm_scale_percent / 100
+    sigma = float(np.sqrt(max(noise_only, knife) ** 2 + hand_eye**2 + arm**2))
+    return Alignment(
+        scale=scale,
+        sigma=scale * sigma,
+        R=state.R,
+        t=state.t - scale * state.R @ mean,
+        hand_eye_twist=state.twist,
+        covariance=covariance[:7, :7],
+        views=_residuals(names, problem, state, weights, config),
+        parts_percent={
+            "noise": 100 * noise_only, "jackknife": 100 * knife, "hand_eye": 100 * hand_eye,
+            "arm": 100 * arm,
+        },
+    )  # fmt: skip
+
+
+def baseline_m(Ts_world_cam: Array) -> Array:
+    """Return the spreads (3,) of the camera centres along their principal axes, greatest first."""
+    centres = Ts_world_cam[:, :3, 3] - Ts_world_cam[:, :3, 3].mean(0)
+    return np.linalg.svd(centres, compute_uv=False)[:3] / np.sqrt(len(centres))
+
+
+def _require_motion(found: Array, robot: Array, config: AlignmentConfig) -> None:
+    """Raise if there are too few views, or if either side stands still."""
+    if len(found) < config.min_views:
+        raise DegenerateError(
+            f"{len(found)} registered view(s) have a robot pose; {config.min_views} are the least "
+            "for a metric scale. Take more views, nearer to one another (15 degrees)."
+        )
+    moved = float(baseline_m(robot)[0])
+    if moved < 2 * config.noise.position_mm / 1e3:
+        raise DegenerateError(
+            f"the robot's camera centres lie within {1e3 * moved:.2f} mm of one another: the "
+            "camera turned on the spot, or one pose was written for all views. A scale needs "
+            "views from different places, a tenth of the distance to the object apart or more."
+        )
+    if not float(baseline_m(found)[0]) > 0:
+        raise DegenerateError(
+            "the reconstructed cameras all stand at one point: there is no scale."
+        )
+
+
+def _predicted(problem: _Problem, state: _State) -> Array:
+    """Return S(T_i) (V, 4, 4)."""
+    scale = np.exp(state.log_scale)
+    R = state.R @ problem.found[:, :3, :3]
+    return se3.from_rt(R, scale * problem.found[:, :3, 3] @ state.R.T + state.t)
+
+
+def _errors(problem: _Problem, state: _State) -> Array:
+    """Return e_i (V, 6) [rad, m]."""
+    hand = problem.robot @ se3.exp(state.twist)
+    return se3.log(se3.invert(hand) @ _predicted(problem, state))
+
+
+def _jacobian(problem: _Problem, state: _State) -> Array:
+    """Return d e / d [w, t, log s, xi] (V, 6, 13) by central differences."""
+    columns: list[Array] = []
+    for step in DIFFERENCE * np.eye(13):
+        columns.append(_errors(problem, state.moved(step)) - _errors(problem, state.moved(-step)))
+    return np.stack(columns, -1) / (2 * DIFFERENCE)
+
+
+def _robust_start(problem: _Problem, config: AlignmentConfig, rng: np.random.Generator) -> _State:
+    """Return the similarity of the pair of views that most others agree with."""
+    count = len(problem.found)
+    pairs = list(combinations(range(count), 2))
+    if len(pairs) > config.samples:
+        chosen = np.sort(rng.choice(len(pairs), config.samples, replace=False))
+        pairs = [pairs[k] for k in chosen]
+    allowed = problem.sigmas + np.repeat([np.radians(SFM_DEG), SFM_MM / 1e3], 3)
+    c, p = problem.found[:, :3, 3], problem.robot[:, :3, 3]
+    best, best_cost = None, np.inf
+    for i, j in pairs:
+        length = float(np.linalg.norm(c[i] - c[j]))
+        metric = float(np.linalg.norm(p[i] - p[j]))
+        if length < 1e-9 or metric < 1e-6:
+            continue
+        scale = metric / length
+        turns = problem.robot[[i, j], :3, :3] @ np.swapaxes(problem.found[[i, j], :3, :3], 1, 2)
+        R = se3.mean_rotation(turns)
+        t = p[[i, j]].mean(0) - scale * R @ c[[i, j]].mean(0)
+        state = _State(log_scale=float(np.log(scale)), R=R, t=t, twist=np.zeros(6))
+        squares = np.square(_errors(problem, state) / allowed).mean(-1)
+        cost = float(np.minimum(squares, TRUNCATE**2).sum())
+        if cost < best_cost:
+            best, best_cost = state, cost
+    if best is None:
+        raise DegenerateError(
+            "no two views stand at different places on both sides: there is no scale."
+        )
+    return best
+
+
+def _spread(problem: _Problem, errors: Array) -> Array:
+    """Return sigmas (6,): the robot's, raised to the robust spread of the views [rad, m]."""
+    # 13 unknowns are fitted to 6 V numbers: what is left is that much too small.
+    few = np.sqrt(len(errors) * 6 / max(len(errors) * 6 - 13, 1))
+    robust = [MAD_TO_SIGMA * few * np.median(np.abs(errors[:, h])) for h in _HALVES]
+    return np.maximum(problem.sigmas, np.repeat(robust, 3))
+
+
+_HALVES = (slice(0, 3), slice(3, 6))
+
+
+def _weights(errors: Array, sigmas: Array) -> Array:
+    """Return Cauchy's weight of each view (V,)."""
+    return 1 / (1 + np.square(errors / sigmas).mean(-1) / CAUCHY**2)
+
+
+def _normal(problem: _Problem, state: _State, sigmas: Array, weights: Array) -> tuple[Array, Array]:
+    """Return the information (13, 13) and the gradient (13,)."""
+    J = _jacobian(problem, state) / sigmas[:, None]
+    e = _errors(problem, state) / sigmas
+    H = np.einsum("v,vai,vaj->ij", weights, J, J)
+    g = np.einsum("v,vai,va->i", weights, J, e)
+    H[7:, 7:] += np.diag(1 / problem.hand_eye**2)
+    g[7:] += state.twist / problem.hand_eye**2
+    return H, g
+
+
+def _refined(problem: _Problem, state: _State, steps: int = STEPS) -> tuple[_State, Array]:
+    """Return the re-weighted least squares solution and the views' weights."""
+    weights = np.ones(len(problem.found))
+    for _ in range(steps):
+        errors = _errors(problem, state)
+        sigmas = _spread(problem, errors)
+        weights = _weights(errors, sigmas)
+        H, g = _normal(problem, state, sigmas, weights)
+        step = -np.linalg.lstsq(H, g, rcond=None)[0].astype(np.float64)
+        state = state.moved(step)
+        if float(np.abs(step).max()) < CONVERGED:
+            break
+    return state, weights
+
+
+def _covariance(problem: _Problem, state: _State, weights: Array) -> tuple[Array, float, float]:
+    """Return the covariance (13, 13), the sigma of log s, and that with the hand-eye known."""
+    H, _ = _normal(problem, state, _spread(problem, _errors(problem, state)), weights)
+    full: Array = np.linalg.pinv(H, hermitian=True).astype(np.float64)
+    known = np.linalg.pinv(H[:7, :7], hermitian=True)
+    return full, float(np.sqrt(full[6, 6])), float(np.sqrt(known[6, 6]))
+
+
+def _jackknife(problem: _Problem, state: _State) -> float:
+    """Return the jackknife's sigma of log s over the views; NaN-free: 0 with the fewest views."""
+    count = len(problem.found)
+    if count < 4:
+        return 0.0
+    values = np.empty(count)
+    for k in range(count):
+        rest = np.arange(count) != k
+        part = _Problem(
+            found=problem.found[rest], robot=problem.robot[rest], sigmas=problem.sigmas,
+            hand_eye=problem.hand_eye,
+        )  # fmt: skip
+        values[k] = _refined(part, state, JACKKNIFE_STEPS)[0].log_scale
+    return float(np.sqrt((count - 1) / count * np.square(values - values.mean()).sum()))
+
+
+def _residuals(
+    names: tuple[str, ...],
+    problem: _Problem,
+    state: _State,
+    weights: Array,
+    config: AlignmentConfig,
+) -> tuple[ViewResidual, ...]:
+    """Return every view's distance from the robot, those far from the others marked."""
+    errors = _errors(problem, state)
+    mm = 1e3 * np.linalg.norm(errors[:, 3:], axis=1)
+    deg = np.degrees(np.linalg.norm(errors[:, :3], axis=1))
+
+    def far(values: Array, least: float) -> NDArray[np.bool_]:
+        # The median length of a normal 3-vector is 1.54 sigmas.
+        return values > max(least, config.outlier_sigmas * float(np.median(values)) / 1.54)
+
+    outlier = far(mm, config.outlier_mm) | far(deg, config.outlier_deg)
+    return tuple(
+        ViewResidual(
+            name=n, offset_mm=float(a), turn_deg=float(b), weight=float(w), outlier=bool(o)
+        )
+        for n, a, b, w, o in zip(names, mm, deg, weights, outlier, strict=True)
+    )

@@ -1,0 +1,196 @@
+"""The verdict over a reconstruction, and the reasons for it."""
+
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+
+from realsim.geometry import se3
+from realsim.records import Verdict
+from realsim.scanning.sfm.alignment import baseline_m
+from realsim.scanning.sfm.config import AlignmentConfig, SfmConfig, TrustConfig
+from realsim.scanning.sfm.result import DepthScale, SfmResult
+
+Finding = tuple[Literal["doubtful", "rejected"], str]
+UNIT_FACTORS = (1e-4, 1e-3, 1e-2, 0.1, 10.0, 100.0, 1e3, 1e4)
+UNIT_MARGIN = 0.05
+"""A ratio this near to a power of ten is a wrong unit."""
+FEW_MATCHES = 30
+"""A view with fewer verified matches in its best pair is called weak."""
+
+
+def judge(result: SfmResult, config: SfmConfig) -> tuple[Verdict, tuple[str, ...]]:
+    """Return the verdict and why it is not 'accepted'."""
+    findings = [
+        *_registration(result, config.trust),
+        *_scale(result, config),
+        *_geometry(result, config.alignment),
+        *_depth(result.depth, config.trust),
+    ]
+    levels = {level for level, _ in findings}
+    verdict: Verdict = (
+        "rejected" if "rejected" in levels else "doubtful" if "doubtful" in levels else "accepted"
+    )
+    return verdict, tuple(text for _, text in findings)
+
+
+def weak_views(result: SfmResult) -> tuple[str, ...]:
+    """Return the images whose best pair has few verified matches."""
+    best = dict.fromkeys(range(len(result.matching.names)), 0)
+    for i, j, _, verified in result.matching.pairs:
+        best[i], best[j] = max(best[i], verified), max(best[j], verified)
+    return tuple(n for k, n in enumerate(result.matching.names) if best[k] < FEW_MATCHES)
+
+
+def shown(names: tuple[str, ...], most: int = 6) -> str:
+    """Return a list of names for a sentence."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _registration(result: SfmResult, trust: TrustConfig) -> Iterator[Finding]:
+    """Look at how many views and points there are, and how well they fit."""
+    total, registered = len(result.matching.names), len(result.geometry.names)
+    share, points = registered / total, len(result.geometry.points)
+    if share < trust.registered_share:
+        level = "rejected" if share < trust.least_share else "doubtful"
+        weak = weak_views(result)
+        why = f" Few matches: {shown(weak)}." if weak else ""
+        yield (
+            level,
+            (
+                f"only {registered} of {total} views found a place; missing: "
+                f"{shown(result.unregistered)}.{why} Put newspaper or the tag board under the "
+                "object, or take views nearer to one another (15 deg)."
+            ),
+        )
+    rest = tuple(n for n in result.models[1:] if n >= 3)
+    if rest:
+        yield (
+            "doubtful",
+            (
+                f"the views fall into {1 + len(rest)} parts of {result.models[0]}, "
+                f"{', '.join(map(str, rest))} views that share too few matches; the first is used. "
+                "Views between the parts would join them."
+            ),
+        )
+    if points < trust.min_points:
+        yield (
+            "rejected",
+            (
+                f"only {points} points were found ({trust.min_points} are the least): the surface "
+                "has too little texture, or the poses do not agree with the pictures."
+            ),
+        )
+    if result.reprojection_px > trust.reprojection_px:
+        yield (
+            "doubtful",
+            (
+                f"the median reprojection error is {result.reprojection_px:.2f} px (at most "
+                f"{trust.reprojection_px} px is good): blurred pictures, wrong intrinsics"
+                + (", or wrong robot poses." if result.poses != "unknown" else ".")
+            ),
+        )
+
+
+def _scale(result: SfmResult, config: SfmConfig) -> Iterator[Finding]:
+    """Look at the metric scale and at the robot's agreement."""
+    trust = config.trust
+    if not result.is_metric:
+        yield (
+            "doubtful",
+            (
+                "there is no metric scale: no robot poses were given, so the unit is COLMAP's own. "
+                "Give a calibrated session, or scale the model by `realsim scan scale`."
+            ),
+        )
+        return
+    if not result.sigma_percent <= trust.sigma_percent:
+        level = "rejected" if not result.sigma_percent <= 4 * trust.sigma_percent else "doubtful"
+        yield (
+            level,
+            (
+                f"the scale is known to {result.sigma_percent:.2f} % only (1 sigma; "
+                f"{trust.sigma_percent} % is good): more views, farther apart, would help."
+            ),
+        )
+    if result.alignment is None:
+        return
+    views = result.alignment.views
+    share = len(result.outliers) / len(views)
+    if result.outliers:
+        level = "rejected" if share >= 0.5 else "doubtful"
+        told = tuple(
+            f"{v.name} ({v.offset_mm:.1f} mm, {v.turn_deg:.2f} deg)" for v in views if v.outlier
+        )
+        if share > trust.outlier_share or level == "rejected":
+            yield (
+                level,
+                (
+                    f"{len(told)} of {len(views)} views speak against their robot pose: "
+                    f"{shown(told)}. A slipped mount, images paired with the poses of other "
+                    "views, or a wrong hand-eye."
+                ),
+            )
+        else:
+            yield (
+                "doubtful",
+                (f"left out, because the robot pose does not fit the pictures: {shown(told)}."),
+            )
+    middle = float(np.median([v.offset_mm for v in views]))
+    if middle > trust.residual_mm:
+        yield (
+            "doubtful",
+            (
+                f"the cameras lie {middle:.1f} mm from the robot's in the median view (at most "
+                f"{trust.residual_mm} mm is good): the poses or the reconstruction are bent."
+            ),
+        )
+
+
+def _geometry(result: SfmResult, config: AlignmentConfig) -> Iterator[Finding]:
+    """Name arrangements of the cameras that leave something open."""
+    g = result.geometry
+    spread = baseline_m(g.Ts_world_cam)
+    local = se3.transform(se3.invert(g.Ts_world_cam), g.points)[..., 2]
+    distance = float(np.median(np.abs(local))) if len(g.points) else float("nan")
+    if spread[0] < config.min_baseline_ratio * distance:
+        yield (
+            "doubtful",
+            (
+                f"the cameras' spread is {spread[0] / distance:.1%} of the distance to the scene: "
+                f"nearly a turn on the spot. {config.min_baseline_ratio:.0%} is the least."
+            ),
+        )
+    elif len(spread) > 1 and spread[1] < config.min_line_ratio * spread[0]:
+        yield (
+            "doubtful",
+            (
+                "all cameras stand on a line: how the scene is turned about it rests on the "
+                "robot's orientations alone. Add views off the line."
+            ),
+        )
+
+
+def _depth(depth: DepthScale | None, trust: TrustConfig) -> Iterator[Finding]:
+    """Compare the two metres."""
+    if depth is None or abs(depth.ratio - 1) <= trust.depth_sigmas * depth.sigma:
+        return
+    factor = next((f for f in UNIT_FACTORS if abs(depth.ratio / f - 1) < UNIT_MARGIN), None)
+    told = f"measured depth is {depth.ratio:.4g} +- {depth.sigma:.2g} times the reconstruction's"
+    if factor is not None:
+        yield (
+            "rejected",
+            (
+                f"{told}, a factor of {factor:g}: the depth unit or the unit of the robot's poses "
+                "is wrong. Set the session's depth unit (0.001 = millimetres, 0.0001 = a D405)."
+            ),
+        )
+        return
+    level = "doubtful" if abs(depth.ratio - 1) < 0.05 else "rejected"
+    yield (
+        level,
+        (
+            f"{told}, {abs(depth.ratio - 1) / depth.sigma:.0f} sigmas from 1: a bias of the depth "
+            "camera, wrong intrinsics, depth not aligned with colour, or wrong robot poses."
+        ),
+    )

@@ -1,0 +1,160 @@
+"""What structure from motion gives: metric cameras and points, and how far to trust them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import CameraIntrinsics, Verdict
+
+Array = NDArray[np.float64]
+Poses = Literal["unknown", "known", "refined"]
+"""How the robot's poses are used: only for the scale; held as they are; as a start with a prior."""
+Progress = Callable[[str, int, int], None]
+"""Called with (step, done, total)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Geometry:
+    """Cameras, points and what was seen of them, in one world."""
+
+    intrinsics: CameraIntrinsics
+    """Of all images."""
+    names: tuple[str, ...]
+    """(V,) registered images."""
+    Ts_world_cam: Array
+    """(V, 4, 4)"""
+    points: Array
+    """(P, 3)"""
+    colors: NDArray[np.uint8]
+    """(P, 3) RGB."""
+    cameras_of: NDArray[np.int64]
+    """(K,) camera of each observation, as its place in `names`."""
+    points_of: NDArray[np.int64]
+    """(K,) point of each observation."""
+    uv_px: Array
+    """(K, 2) where it was seen; integers are pixel centres."""
+    point_ids: NDArray[np.int64]
+    """(P,) numbers of the points in the COLMAP model."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ViewResidual:
+    """How one camera of the reconstruction stands to the robot's pose."""
+
+    name: str
+    offset_mm: float
+    """Distance of the centres [mm], the constant hand-eye correction taken out."""
+    turn_deg: float
+    """Angle between the rotations [deg]."""
+    weight: float
+    """Share with which the view counts in the scale."""
+    outlier: bool
+    """Whether it speaks against the others."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Alignment:
+    """The similarity p_robot = scale * R @ p_sfm + t, and how well it is known."""
+
+    scale: float
+    """Metres per unit of the reconstruction."""
+    sigma: float
+    """1-sigma of the scale, in its unit: the greater of the formal and the jackknife's, and the
+    arm's own metre."""
+    R: Array
+    """(3, 3)"""
+    t: Array
+    """(3,) [m]"""
+    hand_eye_twist: Array
+    """(6,) constant correction right of the robot's camera poses [rad, m], within its prior."""
+    covariance: Array
+    """(7, 7) of [rotation rad, translation m, log scale] about the middle of the centres."""
+    views: tuple[ViewResidual, ...]
+    parts_percent: dict[str, float]
+    """What the sigma is made of [% of the scale]: formal, jackknife, hand_eye, arm."""
+
+    @property
+    def sigma_percent(self) -> float:
+        """1-sigma of the scale as a percentage of it."""
+        return 100.0 * self.sigma / self.scale
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DepthScale:
+    """A second scale, from measured depth at the sparse points: measured / reconstructed."""
+
+    ratio: float
+    """1 = the depth camera and the robot agree on the metre."""
+    sigma: float
+    """1-sigma of the ratio: its spread over the views, and the sensor's systematic part."""
+    pairs: int
+    """Observations compared."""
+    views: int
+    """Views with enough of them."""
+    spread_mm: float
+    """Robust 1-sigma of the single differences [mm]."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Matching:
+    """What was found in the images before any geometry."""
+
+    names: tuple[str, ...]
+    """All images."""
+    features: tuple[int, ...]
+    """Features of each."""
+    pairs: tuple[tuple[int, int, int, int], ...]
+    """(image, image, matches, verified matches) of every pair that was matched, by place."""
+    peak_threshold: float
+    """SIFT's contrast threshold that was used."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SfmResult:
+    """Metric cameras and sparse points of a set of photographs."""
+
+    poses: Poses
+    geometry: Geometry
+    """In metres and in the robot's world if `is_metric`; else in COLMAP's own unit."""
+    is_metric: bool
+    unregistered: tuple[str, ...]
+    """Images that found no place."""
+    models: tuple[int, ...]
+    """Views of every model that mapping made, the one used first: more than one is fragmented."""
+    scale: float
+    """Metres per unit of the free reconstruction; 1 where the poses were given. NaN: unknown."""
+    sigma_percent: float
+    """1-sigma of the metric scale [%]; NaN where there is none."""
+    alignment: Alignment | None
+    """To the robot's poses."""
+    depth: DepthScale | None
+    """From the depth images."""
+    camera_covariance: Array | None
+    """(V, 6, 6) of the right perturbation of each camera [rad, m], from the refinement; else
+    None."""
+    point_error_px: Array
+    """(P,) RMS reprojection error of each point."""
+    point_sigma_mm: Array
+    """(P,) 1-sigma of each point along its worst direction [mm], cameras taken as right."""
+    track_lengths: NDArray[np.int64]
+    """(P,) views that see each point."""
+    reprojection_px: float
+    """Median reprojection error."""
+    view_reprojection_px: Array
+    """(V,) median reprojection error of each camera."""
+    matching: Matching
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    """Why the verdict is not 'accepted'."""
+    notes: tuple[str, ...]
+    """What a user should know besides."""
+    cpu_s: float
+
+    @property
+    def outliers(self) -> tuple[str, ...]:
+        """Views whose robot pose disagrees with the pictures."""
+        found = () if self.alignment is None else self.alignment.views
+        return tuple(v.name for v in found if v.outlier)

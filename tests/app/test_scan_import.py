@@ -1,0 +1,162 @@
+"""`realsim scan`: what a user sees, which exit code ends it, and what is on the disk afterwards."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.app import cli
+from realsim.formats.bop_models import load_models, save_models
+from realsim.geometry.mesh import save_ply
+from realsim.geometry.parts import part
+from realsim.models.library import ModelLibrary
+
+
+@pytest.fixture(scope="module")
+def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Mesh files of every kind."""
+    folder = tmp_path_factory.mktemp("meshes")
+    wedge = part("wedge").mesh
+    save_ply(folder / "wedge.ply", wedge, "mm")
+    save_ply(folder / "box.ply", part("box").mesh, "mm")
+    save_ply(folder / "open.ply", replace(wedge, faces=wedge.faces[:-2]), "mm")
+    save_ply(folder / "wrong side.ply", replace(wedge, faces=wedge.faces[:, ::-1]), "mm")
+    flat = replace(wedge, vertices=wedge.vertices * [1, 1, 0])
+    save_ply(folder / "flat.ply", flat, "mm")
+    (folder / "empty.stl").write_bytes(b"")
+    (folder / "broken.obj").write_text("v 0 0 zero\nf 1 2 3\n")
+    (folder / "points.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+        "property float z\nend_header\n0 0 0\n"
+    )
+    (folder / "notes.txt").write_text("no mesh")
+    return folder
+
+
+@pytest.fixture
+def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    """Run a command line; return its exit code and what it printed on stdout and stderr."""
+
+    def call(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["realsim", *map(str, words)])
+        code = 0
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = int(stop.code or 0)
+        out = capfd.readouterr()
+        return code, " ".join(out.out.split()), " ".join(out.err.split())
+
+    return call
+
+
+def scan_import(run, meshes: Path, library: Path, *words: object):
+    files = [meshes / w if isinstance(w, str) and "." in w and w[0] != "-" else w for w in words]
+    return run("scan", "import", *files, "--library", library, "--no-parts", "--quiet")
+
+
+def test_a_mesh_is_imported_listed_shown_and_checked(run, meshes: Path, tmp_path: Path):
+    library = tmp_path / "models"
+    code, out, _ = scan_import(run, meshes, library, "wedge.ply", "--unit", "mm", "--mass", 0.2)
+    assert code == 0
+    for said in ("wedge (object 1): accepted", "200 (weighed)", "watertight", "principal inertia"):
+        assert said in out
+    assert (library / "pictures/wedge.png").is_file()
+    model = load_models(library)[1]
+    assert np.allclose(model.mesh.extent, part("wedge").mesh.extent, rtol=1e-6)
+    code, out, _ = run("scan", "list", library)
+    assert code == 0 and "wedge" in out and "accepted" in out and "200" in out
+    (library / "pictures/wedge.png").unlink()
+    code, out, _ = run("scan", "show", library, "wedge")
+    assert code == 0 and "wedge.png" in out and (library / "pictures/wedge.png").is_file()
+    assert run("scan", "check", library)[0] == 0
+    (library / "obj_000001.ply").write_bytes(b"gone")
+    code, out, _ = run("scan", "check", library, "--json")
+    assert code == 1 and json.loads(out)["findings"][0]["kind"] == "changed"
+
+
+def test_what_a_person_should_look_at_ends_with_1(run, meshes: Path, tmp_path: Path):
+    code, out, _ = scan_import(run, meshes, tmp_path / "m", "open.ply", "--unit", "mm")
+    assert code == 1 and "open (object 1): doubtful" in out and "LOOK: open:" in out
+    code, out, _ = scan_import(run, meshes, tmp_path / "m", "wrong side.ply", "--unit", "mm")
+    assert code == 0 and "wrong_side (object 2): accepted" in out and "repaired:" in out
+
+
+def test_a_mesh_without_scale_waits_for_one(run, meshes: Path, tmp_path: Path):
+    library = tmp_path / "m"
+    code, out, _ = scan_import(run, meshes, library, "wedge.ply", "--unit", "none")
+    assert code == 0 and "realsim scan scale wedge SESSION" in out
+    assert json.loads((library / "models_info.json").read_text()) == {}
+    assert sorted(p.name for p in (library / "unscaled/wedge").iterdir()) == [
+        "mesh.ply", "picture.png", "report.json",
+    ]  # fmt: skip
+    assert "unscaled" in run("scan", "list", library)[1]
+    assert run("scan", "show", library, "wedge")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["wedge.ply"], "does not state its unit"),
+        (["wedge.ply", "--unit", "m"], "as mm"),
+        (["nothing.ply", "--unit", "mm"], "does not exist"),
+        (["notes.txt", "--unit", "mm"], "not a mesh format"),
+        (["empty.stl", "--unit", "mm"], "empty"),
+        (["broken.obj", "--unit", "mm"], "broken.obj"),
+        (["points.ply", "--unit", "mm"], "no triangles"),
+        (["flat.ply", "--unit", "mm"], "flat"),
+        (["wedge.ply", "--unit", "mm", "--mass", "0"], "--mass is 0"),
+        (["wedge.ply", "--unit", "mm", "--mass", "nan"], "--mass is nan"),
+        (["wedge.ply", "--unit", "mm", "--density", "-3"], "--density is -3"),
+        (["wedge.ply", "--unit", "mm", "--mass", "1", "--density", "1"], "both given"),
+        (["wedge.ply", "--unit", "mm", "--id", "0"], "the id 0"),
+        (["wedge.ply", "--unit", "mm", "--name", "a/b"], "cannot be the name"),
+        (["wedge.ply", "--unit", "none", "--mass", "1"], "metric scale"),
+        (["wedge.ply", "box.ply", "--unit", "mm", "--name", "x"], "of one model"),
+    ],
+)
+def test_bad_input_is_named_and_leaves_nothing(run, meshes, tmp_path, words, said: str):
+    code, out, err = scan_import(run, meshes, tmp_path / "m", *words)
+    assert code == 2 and said in err and out == ""
+    assert not (tmp_path / "m/models_info.json").exists() or not load_entries(tmp_path / "m")
+
+
+def load_entries(library: Path) -> list[str]:
+    return [e.name for e in ModelLibrary.open(library).entries()]
+
+
+def test_one_bad_mesh_does_not_keep_the_others_out(run, meshes: Path, tmp_path: Path):
+    library = tmp_path / "m"
+    code, out, err = scan_import(run, meshes, library, "wedge.ply", "flat.ply", "--unit", "mm")
+    assert code == 2 and "flat.ply: not imported" in err and "unusable" in out
+    assert load_entries(library) == ["wedge"]
+
+
+def test_nothing_is_replaced_unasked(run, meshes: Path, tmp_path: Path):
+    library = tmp_path / "m"
+    scan_import(run, meshes, library, "wedge.ply", "--unit", "mm")
+    before = (library / "obj_000001.ply").read_bytes()
+    code, _, err = scan_import(run, meshes, library, "box.ply", "--unit", "mm", "--name", "wedge")
+    assert code == 2 and "--overwrite" in err
+    assert (library / "obj_000001.ply").read_bytes() == before
+    words = ("box.ply", "--unit", "mm", "--name", "wedge", "--overwrite")
+    assert scan_import(run, meshes, library, *words)[0] == 0
+    assert load_entries(library) == ["wedge"]
+    assert (library / "obj_000001.ply").read_bytes() != before
+
+
+def test_a_bop_folder_is_completed(run, tmp_path: Path):
+    save_models(tmp_path / "bop/models", {1: part("box"), 8: part("wedge")})
+    code, out, _ = run("scan", "list", tmp_path / "bop/models")
+    assert code == 0 and "scan complete" in out
+    code, _, err = run("scan", "list", tmp_path / "bop")
+    assert code == 2 and "Did you mean" in err
+    words = ("wedge", "--mass", 0.1, "--quiet")
+    code, out, _ = run("scan", "complete", tmp_path / "bop/models", *words)
+    assert code == 0 and "wedge" in out
+    code, out, _ = run("scan", "show", tmp_path / "bop/models", "wedge")
+    assert code == 0 and "100 (weighed)" in out
+    shutil.rmtree(tmp_path / "bop")

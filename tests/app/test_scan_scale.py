@@ -1,0 +1,425 @@
+"""`realsim scan scale`: what it refuses, what it writes, and what it says first."""
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.app.console import Console
+from realsim.app.scan_scale import (
+    Place,
+    model_files,
+    run_scale,
+    view_poses,
+    with_rough_size,
+    write_result,
+)
+from realsim.app.scan_scale_cli import point_of, request_of, scale
+from realsim.app.scan_scale_inputs import (
+    NamedMesh,
+    ScaleRequest,
+    fit_config,
+    inputs_of,
+    mesh_hash,
+    read_mesh,
+    usable_views,
+)
+from realsim.app.scan_scale_show import limit_rows, show_fit, view_rows
+from realsim.errors import InputError, UnitError
+from realsim.geometry.mesh import load_mesh, save_ply
+from realsim.records import CaptureSession, View
+from realsim.scanning.scale.files import ScaleRecord, installed_versions, load_record
+from realsim.scanning.scale.measured import length_of, parse_measurement
+from realsim.store import SessionStore
+from scale_fits import UNIT_M, fit_of, known_scan
+
+CONSOLE = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def known():
+    return known_scan("mug", 2)
+
+
+@pytest.fixture(scope="module")
+def fit(known):
+    return fit_of(known)
+
+
+def session_of(known, folder: Path, *, depth=True, posed=True) -> SessionStore:
+    """A captured session of the known views."""
+    camera = known.views.intrinsics
+    store = SessionStore.create(
+        folder, CaptureSession(name="mugs", intrinsics=camera, views=(), depth_unit_m=1e-4)
+    )
+    for f in known.views.frames:
+        rgb = np.full((camera.height, camera.width, 3), 40 * f.index % 200, np.uint8)
+        store.add_view(View(index=f.index), rgb, f.depth_m if depth else None)
+    if posed:
+        store.set_cameras(camera, {f.index: f.T_world_cam for f in known.views.frames})
+    store.close()
+    return store
+
+
+@pytest.fixture
+def session(known, tmp_path):
+    return session_of(known, tmp_path / "session")
+
+
+def named_of(known) -> NamedMesh:
+    mesh = known.scan
+    return NamedMesh(mesh=mesh, name="mug", origin="file", where="mug.ply", sha256=mesh_hash(mesh))
+
+
+def record_of(known, fit, inputs) -> ScaleRecord:
+    return ScaleRecord(fit=fit, inputs=inputs, versions=installed_versions())
+
+
+def typed(**changes):
+    """The options as click gives them."""
+    return {
+        "library": None, "name": "", "up": None, "start": None, "size": "", "at": "",
+        "measured": (), "between": (), "views": "", "out": None, "json_file": None,
+        "overwrite": False, "accept_doubtful": False, "obj_id": None, "density": None,
+        "mass": None,
+    } | changes  # fmt: skip
+
+
+# --- what is refused --------------------------------------------------------------------------
+
+
+def test_a_session_without_depth_is_named(known, tmp_path):
+    store = session_of(known, tmp_path / "s", depth=False)
+    with pytest.raises(InputError, match=r"none with depth.*--measured"):
+        usable_views(store, ())
+
+
+def test_a_session_that_is_not_calibrated_is_named(known, tmp_path):
+    store = session_of(known, tmp_path / "s", posed=False)
+    with pytest.raises(InputError, match=r"not calibrated.*realsim calibrate"):
+        usable_views(store, ())
+
+
+def test_too_few_views_are_named(session):
+    with pytest.raises(InputError, match=r"2 of 2 views .*\(1-2\); at least 3"):
+        usable_views(session, (1, 2))
+
+
+def test_unknown_views_are_named(session):
+    with pytest.raises(InputError, match=r"no view 7, 9; its views are 0-5"):
+        usable_views(session, (1, 2, 7, 3, 9))
+    assert [v.index for v in usable_views(session, (5, 1, 3))] == [1, 3, 5]
+    assert len(usable_views(session, ())) == 6
+
+
+def test_what_is_no_session_is_named(known, tmp_path):
+    with pytest.raises(InputError, match=r"session\.json"):
+        run_scale(ScaleRequest(mesh="mug.ply", session=tmp_path), CONSOLE)
+
+
+def test_a_damaged_depth_image_is_named(known, session, tmp_path):
+    pytest.importorskip("realsim.models.reading")
+    save_ply(tmp_path / "mug.ply", known.scan, "m")
+    path = session.path("depth/000002.png")
+    path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(InputError, match="000002"):
+        run_scale(ScaleRequest(mesh=str(tmp_path / "mug.ply"), session=session.folder), CONSOLE)
+
+
+def test_a_mesh_that_is_nowhere_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"is no mesh file.*--library"):
+        read_mesh(ScaleRequest(mesh="nothing.glb", library=tmp_path / "models"))
+    with pytest.raises(InputError, match="is a folder"):
+        read_mesh(ScaleRequest(mesh=str(tmp_path)))
+
+
+def test_a_mesh_without_anything_that_knows_metres_is_refused():
+    with pytest.raises(InputError, match=r"SESSION.*--measured"):
+        run_scale(ScaleRequest(mesh="mug.ply"), CONSOLE)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "said"),
+    [
+        ({"size": "90"}, UnitError, "no unit"),
+        ({"size": "90 parsec"}, UnitError, "parsec"),
+        ({"measured": ("longest=12",)}, UnitError, "no unit"),
+        ({"between": ("0,0,0=95mm",)}, InputError, "two different"),
+        ({"at": "0.4"}, InputError, "x,y in metres"),
+        ({"at": "400,-50"}, InputError, "millimetres"),
+        ({"start": Path("none.json")}, InputError, "does not exist"),
+    ],
+)
+def test_what_cannot_be_read_is_named(options, error, said):
+    with pytest.raises(error, match=said):
+        request_of("mug.ply", None, typed(**options))
+
+
+def test_options_of_a_session_need_one(tmp_path):
+    m = (parse_measurement("longest=120mm"),)
+    with pytest.raises(InputError, match="--at speaks of a session"):
+        run_scale(ScaleRequest(mesh="mug.ply", measured=m, at=(0.4, 0.0)), CONSOLE)
+
+
+# --- what is asked for ------------------------------------------------------------------------
+
+
+def test_the_request_is_what_was_typed(tmp_path):
+    request = request_of(
+        "mug.glb", tmp_path,
+        typed(size="9cm", at="0.4,-.05", measured=("x=95mm+-0.3mm",), between=("0,0,0 0,1,0=5cm",),
+              views="1-3,7"),
+    )  # fmt: skip
+    assert request.size_m == pytest.approx(0.09) and request.at == (0.4, -0.05)
+    assert [m.kind for m in request.measured] == ["x", "between"]
+    assert request.views == (1, 2, 3, 7) and request.session == tmp_path
+    assert point_of("") is None
+
+
+def test_help_names_every_option(capsys):
+    with pytest.raises(SystemExit):
+        scale.main(["--help"], prog_name="scale")
+    text = capsys.readouterr().out
+    for option in ("--library", "--start", "--size", "--at", "--measured", "--between", "--views",
+                   "--accept-doubtful", "--overwrite", "--json"):  # fmt: skip
+        assert option in text
+
+
+def test_bad_input_ends_with_exit_code_2_and_one_paragraph(tmp_path):
+    code = "from realsim.app.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "scan", "scale", "none.glb", "--library", str(tmp_path)],
+        capture_output=True, text=True, timeout=120, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "--measured" in done.stderr and list(tmp_path.iterdir()) == []
+
+
+# --- the hash of the inputs -------------------------------------------------------------------
+
+
+def key_of(known, session, **changes):
+    request = ScaleRequest(mesh="mug.ply", **changes)
+    views = usable_views(session, request.views)
+    return inputs_of(request, named_of(known), session, views, fit_config(session))["key"]
+
+
+def test_the_key_changes_with_every_input_and_with_nothing_else(known, session):
+    key = key_of(known, session)
+    assert key == key_of(known, session, overwrite=True, out=Path("elsewhere"))
+    m = parse_measurement("longest=120mm")
+    others = [
+        key_of(known, session, at=(0.1, 0.0)),
+        key_of(known, session, size_m=0.1),
+        key_of(known, session, views=(0, 1, 2)),
+        key_of(known, session, measured=(m,)),
+        key_of(known, session, measured=(replace(m, sigma_m=2e-3),)),
+    ]
+    session.set_cameras(known.views.intrinsics, {0: known.views.frames[1].T_world_cam})
+    others.append(key_of(known, session))
+    assert len({key, *others}) == len(others) + 1
+
+
+# --- what is written --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def written(known, fit, tmp_path_factory):
+    """A result in its session, as a fit leaves it; nobody changes it."""
+    session = session_of(known, tmp_path_factory.mktemp("written") / "session")
+    request = ScaleRequest(mesh="mug.ply")
+    views = usable_views(session, ())
+    inputs = inputs_of(request, named_of(known), session, views, fit_config(session))
+    place = Place(session, session.folder / "scans/mug")
+    record = replace(record_of(known, fit, inputs), poses=view_poses(fit, views))
+    write_result(place, record, named_of(known), session)
+    return place, record, session
+
+
+def test_every_file_is_there_and_listed_in_the_session(written):
+    place, record, session = written
+    names = {p.name for p in place.folder.iterdir()}
+    assert {"scale.json", "scale.html", "residuals.png", "views.png", "overlays.png",
+            "candidates.png", "model.ply"} <= names  # fmt: skip
+    assert session.verify() == []
+    path = place.folder / "scale.json"
+    whole = path.read_bytes()
+    try:
+        path.write_text("{}")
+        assert [f.path for f in session.verify()] == ["scans/mug/scale.json"]
+        assert place.record(record.inputs["key"]) is None
+    finally:
+        path.write_bytes(whole)
+
+
+def test_the_result_is_found_by_its_inputs_alone(written):
+    place, record, _ = written
+    found = place.record(record.inputs["key"])
+    assert found is not None and found.fit.scale == record.fit.scale
+    assert place.record("another") is None
+
+
+def test_the_model_is_metric(written, known):
+    place, record, _ = written
+    mesh = load_mesh(place.folder / "model.ply", "mm")
+    np.testing.assert_allclose(mesh.extent, UNIT_M * known.scan.extent, rtol=1e-5)
+    np.testing.assert_allclose(1e3 * mesh.extent, record.fit.extent_mm, rtol=1e-5)
+
+
+def test_a_texture_lies_beside_the_model(known):
+    v = known.scan.vertices
+    textured = replace(
+        known.scan, colors=None, uv=np.zeros((len(v), 2)), texture=np.full((4, 4, 3), 9, np.uint8)
+    )
+    files = model_files(textured, 2.0)
+    assert (
+        set(files) == {"model.ply", "model.png"} and b"TextureFile model.png" in files["model.ply"]
+    )
+
+
+def test_the_poses_put_the_model_where_the_camera_saw_it(written, known):
+    _, record, _ = written
+    rows = json.loads(json.dumps(record.poses))
+    for row in rows:
+        T = np.array(row["T_world_cam"]) @ np.array(row["T_cam_obj"])
+        np.testing.assert_allclose(T, record.fit.T_world_obj, atol=1e-12)
+
+
+def test_the_page_begins_with_the_verdict_and_needs_nothing_else(written):
+    place, record, _ = written
+    text = (place.folder / "scale.html").read_text()
+    body = text.split("<body>")[1]
+    assert body.index(record.fit.verdict.upper()) < body.index("<table>")
+    assert text.count("data:image/png;base64,") == 4
+    assert not re.search(r'(src|href)="(?!data:)', text) and "@media print" in text
+    for limit in record.fit.limits:
+        assert limit.text in text
+
+
+def test_a_place_outside_of_the_session_is_written_too(known, fit, session, tmp_path):
+    place = Place(session, tmp_path / "elsewhere")
+    write_result(place, record_of(known, fit, {"key": "k"}), named_of(known), session)
+    assert load_record(tmp_path / "elsewhere/scale.json").inputs["key"] == "k"
+    assert session.verify() == []
+
+
+# --- what is said -----------------------------------------------------------------------------
+
+
+def test_the_verdict_comes_first_and_reasons_follow(fit, capsys):
+    doubtful = replace(fit, verdict="doubtful", reasons=("the shape allows two scales.",))
+    show_fit("mug", doubtful, (), Console(quiet=True))
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("DOUBTFUL: mug") and "two scales" in lines[1]
+    text = "\n".join(lines)
+    for word in ("95 % interval", "size along x, y, z", "CPU", "LEFT OUT", "median"):
+        assert word in text
+
+
+def test_limits_and_views_are_worst_first(fit):
+    percents = [float(row[1].split()[0]) for row in limit_rows(fit)]
+    assert percents == sorted(percents, reverse=True)
+    rows = view_rows(fit)
+    assert rows[0][0] == "median" and rows[1][1] == "LEFT OUT"
+    agree = [float(r[2]) for r in rows[2:]]
+    assert agree == sorted(agree)
+    assert len(view_rows(fit, worst=None)) == len(fit.views) + 1
+
+
+def test_a_rough_size_that_contradicts_makes_it_doubtful(known, fit):
+    longest = UNIT_M * length_of(known.scan, parse_measurement("longest=1m"))
+    good = replace(fit, verdict="accepted", reasons=())
+    assert with_rough_size(good, known.scan, None) is good
+    assert with_rough_size(good, known.scan, 1.2 * longest) is good
+    wrong = with_rough_size(good, known.scan, 10 * longest)
+    assert wrong.verdict == "doubtful" and "cm" in wrong.reasons[-1]
+    assert with_rough_size(replace(fit, verdict="rejected"), known.scan, 1.0).verdict == "rejected"
+
+
+# --- whole runs -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def mesh_file(known, tmp_path):
+    pytest.importorskip("realsim.models.reading")
+    path = tmp_path / "mug.ply"
+    save_ply(path, known.scan, "m")
+    return path
+
+
+def test_the_scale_by_a_caliper_alone_is_unchecked(known, mesh_file, tmp_path, capsys):
+    longest = UNIT_M * length_of(known.scan, parse_measurement("longest=1m"))
+    with pytest.raises(SystemExit) as stop:
+        scale.main(
+            [str(mesh_file), "--measured", f"longest={1e3 * longest}mm", "--out",
+             str(tmp_path / "out"), "--json", str(tmp_path / "s.json"), "--quiet"],
+            standalone_mode=False,
+        )  # fmt: skip
+    assert stop.value.code == 1
+    assert capsys.readouterr().out.startswith("UNCHECKED: mug")
+    data = json.loads((tmp_path / "s.json").read_text())
+    assert data["verdict"] == "unchecked" and data["scale"] == pytest.approx(UNIT_M, rel=1e-4)
+    assert data == json.loads((tmp_path / "out/scale.json").read_text())
+    mesh = load_mesh(tmp_path / "out/model.ply", "mm")
+    np.testing.assert_allclose(mesh.extent.max(), UNIT_M * known.scan.extent.max(), rtol=1e-3)
+
+
+def test_a_second_run_finds_the_first(known, fit, session, mesh_file, capsys):
+    request = ScaleRequest(mesh=str(mesh_file), session=session.folder)
+    named = read_mesh(request)
+    views = usable_views(session, ())
+    inputs = inputs_of(request, named, session, views, fit_config(session))
+    # As stored by PLY, in float32: the residuals are of these vertices.
+    record = record_of(known, replace(fit, verdict="accepted", reasons=()), inputs)
+    write_result(Place(session, session.folder / "scans/mug"), record, named, session)
+    before = (session.folder / "scans/mug/scale.json").stat().st_mtime_ns
+    assert run_scale(request, CONSOLE)
+    assert "nothing has changed" in capsys.readouterr().out
+    assert (session.folder / "scans/mug/scale.json").stat().st_mtime_ns == before
+
+
+def test_the_real_fit_from_the_command_line(known, session, mesh_file, capsys):
+    pytest.importorskip("realsim.scanning.scale.fit")
+    longest = UNIT_M * length_of(known.scan, parse_measurement("longest=1m"))
+    request = ScaleRequest(
+        mesh=str(mesh_file), session=session.folder,
+        measured=(parse_measurement(f"longest={1e3 * longest}mm"),),
+    )  # fmt: skip
+    accepted = run_scale(request, CONSOLE)
+    first = capsys.readouterr().out
+    record = load_record(session.folder / "scans/mug/scale.json")
+    assert accepted == (record.fit.verdict == "accepted")
+    assert first.startswith(record.fit.verdict.upper())
+    assert record.fit.scale == pytest.approx(UNIT_M, rel=0.05)
+    assert run_scale(request, CONSOLE) == accepted
+    assert "nothing has changed" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_an_accepted_scale_goes_into_the_library(known, fit, session, mesh_file, tmp_path, capsys):
+    library = pytest.importorskip("realsim.models.library")
+    request = ScaleRequest(mesh=str(mesh_file), session=session.folder, library=tmp_path / "models")
+    named = read_mesh(request)
+    inputs = inputs_of(request, named, session, usable_views(session, ()), fit_config(session))
+    place = Place(session, session.folder / "scans/mug")
+    doubtful = replace(fit, verdict="doubtful", reasons=("two scales.",))
+    write_result(place, record_of(known, doubtful, inputs), named, session)
+    assert not run_scale(request, CONSOLE)
+    assert not (tmp_path / "models").exists()
+    assert not run_scale(replace(request, accept_doubtful=True), CONSOLE)
+    kept = library.ModelLibrary.open(tmp_path / "models").load("mug")
+    assert kept.scale is not None and kept.scale.verdict == "doubtful"
+    assert kept.scale.scale == fit.scale and kept.scale.session == "mugs"
+    np.testing.assert_allclose(np.sort(kept.model.mesh.extent), np.sort(UNIT_M * known.scan.extent),
+                               rtol=1e-3)  # fmt: skip
+    capsys.readouterr()
+    assert not run_scale(replace(request, accept_doubtful=True), CONSOLE)
+    assert "is there already" in capsys.readouterr().out
+    with pytest.raises(InputError, match=r"neither a file nor a model.*mug"):
+        read_mesh(ScaleRequest(mesh="mugg", library=tmp_path / "models"))
+    assert read_mesh(ScaleRequest(mesh="mug", library=tmp_path / "models")).origin == "model"

@@ -1,0 +1,281 @@
+"""Convex parts: they fill the mesh and not its hollows, in bounded time; and their file."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry.mesh import hull_vertices
+from realsim.geometry.parts import part
+from realsim.models.convex import (
+    ConvexConfig,
+    collision_obj,
+    convex_parts,
+    parts_from_collision_obj,
+    thinned,
+)
+from realsim.models.convex_hulls import hull_triangles, hull_volume
+from realsim.records import Mesh
+
+QUICK = ConvexConfig(thresholds=(0.1, 0.05), mcts_iterations=10, mcts_depth=1)
+
+
+def solid(shape):
+    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
+
+
+def box():
+    import trimesh
+
+    return solid(trimesh.creation.box((0.05, 0.05, 0.05)))
+
+
+def annulus(sections=24):
+    import trimesh
+
+    return solid(trimesh.creation.annulus(0.02, 0.03, 0.03, sections=sections))
+
+
+def inside(parts, points):
+    """Whether each point lies in one of the parts."""
+    from scipy.spatial import ConvexHull
+
+    within = np.zeros(len(points), dtype=bool)
+    for p in parts:
+        eq = ConvexHull(p).equations
+        within |= np.all(points @ eq[:, :3].T + eq[:, 3] <= 0, axis=1)
+    return within
+
+
+# --- the parts ----------------------------------------------------------------------------------
+
+
+def test_a_convex_mesh_is_its_hull():
+    whole = convex_parts(box(), ConvexConfig())
+    assert whole.method == "hull" and len(whole.parts) == 1 and whole.notes == ()
+    assert abs(whole.volume_ratio - 1) < 1e-9
+
+
+def test_a_ring_is_cut_kept_and_found_again(tmp_path):
+    ring = annulus()
+    cut = convex_parts(ring, QUICK, tmp_path)
+    assert cut.method == "coacd" and len(cut.parts) > 3 and 0.9 <= cut.volume_ratio <= 1.1
+    assert cut.volume_ratio * 1.0 == pytest.approx(
+        sum(hull_volume(p) for p in cut.parts) / solid_volume(ring)
+    )
+    around = 0.025 * np.stack([np.cos(np.arange(12)), np.sin(np.arange(12)), np.zeros(12)], -1)
+    assert inside(cut.parts, around).mean() > 0.9 and not inside(cut.parts, np.zeros((1, 3)))[0]
+    before = time.process_time()
+    again = convex_parts(ring, QUICK, tmp_path)
+    assert time.process_time() - before < 0.5
+    assert all(np.array_equal(a, b) for a, b in zip(cut.parts, again.parts, strict=True))
+    assert (again.method, again.seconds, again.notes) == (cut.method, cut.seconds, cut.notes)
+    assert len(list(tmp_path.glob("convex_*.npz"))) == 1
+    # Another content or another wish is another entry.
+    convex_parts(ring, replace(QUICK, hull_ratio=9.0), tmp_path)
+    assert len(list(tmp_path.glob("convex_*.npz"))) == 2
+
+
+def solid_volume(mesh):
+    from realsim.geometry.mesh import mass_properties
+
+    return mass_properties(mesh, 1.0).volume_m3
+
+
+def test_faces_that_look_inwards_make_no_difference():
+    bracket = part("l_bracket").mesh
+    flipped = replace(bracket, faces=bracket.faces[:, ::-1])
+    a, b = convex_parts(bracket, QUICK), convex_parts(flipped, QUICK)
+    assert a.volume_ratio == pytest.approx(1.0, abs=0.02)
+    assert b.volume_ratio == pytest.approx(a.volume_ratio, abs=0.02)
+
+
+@pytest.mark.slow
+def test_an_open_mesh_is_cut_and_says_so():
+    ring = annulus()
+    cut = convex_parts(replace(ring, faces=ring.faces[1:]), QUICK)
+    assert cut.method == "coacd" and "not closed" in cut.notes[0]
+    assert not inside(cut.parts, np.zeros((1, 3)))[0]
+
+
+@pytest.mark.slow
+def test_a_mug_keeps_its_hollow():
+    mug = part("mug").mesh
+    cut = convex_parts(mug, ConvexConfig())
+    assert cut.method == "coacd" and len(cut.parts) <= ConvexConfig().max_parts
+    z = np.linspace(mug.bounds[0, 2] + 0.02, mug.bounds[1, 2] - 0.002, 30)
+    t = np.linspace(0, 2 * np.pi, 24)
+    hollow = np.array([[0.02 * np.cos(a), 0.02 * np.sin(a), h] for a in t for h in z])
+    assert inside(cut.parts, hollow).mean() < 0.01
+
+
+# --- bounded time -------------------------------------------------------------------------------
+
+
+def test_a_decomposition_out_of_time_gives_the_hull_and_says_so(tmp_path):
+    flange = part("flange").mesh
+    before = os.times()
+    cut = convex_parts(flange, ConvexConfig(time_limit_s=1.0), tmp_path)
+    after = os.times()
+    spent = sum(after[k] - before[k] for k in range(4))
+    assert cut.method == "hull (out of time)" and len(cut.parts) == 1
+    assert "1 CPU-s was over" in cut.notes[0] and "no hollow" in cut.notes[1]
+    assert cut.volume_ratio > 1.5 and 0 < cut.seconds < 3 and spent < 5
+    again = convex_parts(flange, ConvexConfig(time_limit_s=1.0), tmp_path)
+    assert (again.method, again.notes) == (cut.method, cut.notes)
+
+
+@pytest.mark.slow
+def test_what_was_found_in_time_is_taken():
+    # The ring passes at no threshold, so that the fine one runs into the limit.
+    config = ConvexConfig(
+        thresholds=(0.3, 0.01), mcts_iterations=60, mcts_nodes=30, time_limit_s=2.0,
+        fat_ratio=1.0001, thin_ratio=0.9999, max_parts=1000,
+    )  # fmt: skip
+    cut = convex_parts(annulus(160), config)
+    assert cut.method == "coacd" and "stopped" in cut.notes[0] and "at best" in cut.notes[1]
+    assert len(cut.parts) >= 2
+
+
+SCRIPT = """
+from realsim.geometry.parts import part
+from realsim.models.convex import ConvexConfig, convex_parts
+print("begun", flush=True)
+convex_parts(part("flange").mesh, ConvexConfig(thresholds=(0.02,), mcts_iterations=150))
+"""
+
+
+def children_of(pid):
+    found = []
+    for line in subprocess.run(
+        ["ps", "-eo", "pid=,ppid=,stat="], capture_output=True, text=True, check=True
+    ).stdout.splitlines():
+        child, parent, state = line.split()
+        if int(parent) == pid and not state.startswith("Z"):
+            found.append(int(child))
+    return found
+
+
+def is_running(pid):
+    said = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True)
+    return said.stdout.strip() not in ("", "Z", "Z+")
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_no_process_is_left_behind(how, tmp_path):
+    # A script without `if __name__ == "__main__"`, as a user writes it.
+    script = tmp_path / "cut.py"
+    script.write_text(SCRIPT)
+    process = subprocess.Popen(
+        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    )
+    try:
+        workers, end = [], time.monotonic() + 120
+        while not workers and time.monotonic() < end and process.poll() is None:
+            time.sleep(0.1)
+            workers = children_of(process.pid)
+        assert workers
+        time.sleep(1.0)
+        process.send_signal(how)
+        process.wait(60)
+        end = time.monotonic() + 60
+        while any(map(is_running, workers)) and time.monotonic() < end:
+            time.sleep(0.1)
+        assert not any(map(is_running, workers))
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_a_frozen_program_cuts_in_its_own_process(monkeypatch):
+    monkeypatch.setattr(sys, "frozen", True, raising=False)
+    cut = convex_parts(annulus(), QUICK)
+    assert cut.method == "coacd" and len(cut.parts) > 3
+
+
+def test_a_thinned_mesh_is_closed_and_as_large():
+    mug = part("mug").mesh
+    thin = thinned(mug, 3000)
+    assert len(thin.faces) <= 3000
+    assert solid_volume(thin) == pytest.approx(solid_volume(mug), rel=0.02)
+    assert thinned(thin, 10**6) is thin
+
+
+def test_settings_that_bound_nothing_are_refused():
+    for wrong in ({"time_limit_s": 0.0}, {"thresholds": ()}, {"thresholds": (2.0,)},
+                  {"max_parts": 0}):  # fmt: skip
+        with pytest.raises(InputError):
+            ConvexConfig(**wrong)
+    with pytest.raises(InputError, match="flat"):
+        convex_parts(Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]])), QUICK)
+
+
+# --- the file -----------------------------------------------------------------------------------
+
+
+def some_parts(rng=None):
+    rng = rng or np.random.default_rng(2)
+    return tuple(hull_vertices(0.02 * rng.normal(size=(20, 3)) + [0.1 * k, 0, 0]) for k in range(4))
+
+
+def test_the_obj_gives_the_same_corners_back_bit_for_bit():
+    parts = some_parts()
+    back = parts_from_collision_obj(collision_obj(parts))
+    assert len(back) == len(parts)
+    for a, b in zip(parts, back, strict=True):
+        assert np.array_equal(a[np.lexsort(a.T)], b[np.lexsort(b.T)])
+    assert collision_obj(back) == collision_obj(parts)
+
+
+def test_every_face_of_the_obj_looks_outwards():
+    for p in some_parts():
+        corners, faces = hull_triangles(p)
+        a, b, c = np.moveaxis(corners[faces], 1, 0)
+        n = np.cross(b - a, c - a)
+        assert np.all(np.einsum("ij,ij->i", n, a - corners.mean(axis=0)) > 0)
+        volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+        assert volume == pytest.approx(hull_volume(p))
+
+
+def test_the_engine_loads_one_shape_per_part(tmp_path):
+    import pybullet
+
+    parts = some_parts()
+    path = tmp_path / "collision.obj"
+    path.write_bytes(collision_obj(parts))
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_MESH, fileName=str(path), physicsClientId=client
+        )
+        body = pybullet.createMultiBody(1.0, shape, physicsClientId=client)
+        # A compound tells its pieces by what a ray meets: each part, and nothing between them.
+        for k in range(4):
+            for x in (0.1 * k, 0.1 * k + 0.05):
+                met = pybullet.rayTest([x, 0, 1], [x, 0, -1], physicsClientId=client)[0][0]
+                inside_any = inside(
+                    parts, np.array([[x, 0, z] for z in np.linspace(-0.1, 0.1, 99)])
+                )
+                assert (met == body) == bool(inside_any.any()), x
+    finally:
+        pybullet.disconnect(client)
+    import trimesh
+
+    pieces = trimesh.load(path, process=False).split(only_watertight=True)
+    assert len(pieces) == 4 and all(piece.volume > 0 for piece in pieces)
+
+
+def test_bad_parts_and_other_files_are_refused():
+    with pytest.raises(InputError, match="no convex parts"):
+        collision_obj(())
+    with pytest.raises(InputError, match=r"part 1 of 2 .* is flat"):
+        collision_obj((some_parts()[0], np.eye(3)))
+    for text in (b"", b"o part_000\n", b"v 0 0 0\n", b"o part_000\nv 0 x 0\n", b"\xff\xfe"):
+        with pytest.raises(InputError, match="collision OBJ"):
+            parts_from_collision_obj(text)

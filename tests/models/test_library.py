@@ -1,0 +1,389 @@
+"""The model library: what goes in comes out, and nothing that happens on the way loses a model."""
+
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.formats.bop_models import load_models, save_models
+from realsim.geometry.mesh import mass_properties
+from realsim.geometry.parts import part
+from realsim.models import library_commit
+from realsim.models.library import ModelLibrary
+from realsim.models.library_check import check_library
+from realsim.models.library_complete import complete
+from realsim.models.library_files import properties_bytes, read_properties
+from realsim.models.library_prepare import (
+    Matter,
+    PrepareConfig,
+    PreparedModel,
+    prepare_mesh,
+)
+from realsim.models.library_records import ModelProperties, ScaleNote, from_json, to_json
+from realsim.records import Mesh
+from realsim.store.lock import only_run_in
+
+CONFIG = PrepareConfig()
+BARE = PrepareConfig(with_parts=False)
+MADE: dict[str, PreparedModel] = {}
+
+
+def made(name: str) -> PreparedModel:
+    """A prepared part; made once."""
+    if name not in MADE:
+        MADE[name] = prepare_mesh(part(name).mesh, CONFIG)
+    return MADE[name]
+
+
+def textured() -> Mesh:
+    mesh = part("wedge").mesh
+    image = np.random.default_rng(3).integers(0, 255, (16, 8, 3), dtype=np.uint8)
+    uv = (mesh.vertices[:, :2] - mesh.bounds[0, :2]) / mesh.extent[:2]
+    return replace(mesh, colors=None, uv=uv, texture=image)
+
+
+@pytest.fixture
+def library(tmp_path: Path) -> ModelLibrary:
+    return ModelLibrary.create(tmp_path / "models")
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+# --- what goes in comes out -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["box", "wedge", "tube"])
+def test_a_model_comes_back_as_it_went_in(library: ModelLibrary, name: str):
+    given = made(name)
+    library.add(given, name, picture=b"a picture")
+    back = ModelLibrary.open(library.folder).load(name)
+    assert np.allclose(back.model.mesh.vertices, given.mesh.vertices, rtol=0, atol=1e-8)
+    assert np.array_equal(back.model.mesh.faces, given.mesh.faces)
+    assert np.array_equal(back.model.mesh.colors, given.mesh.colors)
+    assert back.properties is not None and back.parts is not None and given.parts is not None
+    symmetries = given.properties.symmetries
+    assert symmetries is not None
+    assert np.allclose(back.model.symmetries, symmetries.discrete, atol=1e-12)
+    assert np.shape(back.model.symmetry_axes) == np.shape(symmetries.axes)
+    assert np.allclose(back.model.symmetry_axes, symmetries.axes, rtol=0, atol=1e-15)
+    assert len(back.parts.parts) == len(given.parts.parts)
+    for a, b in zip(back.parts.parts, given.parts.parts, strict=True):
+        assert np.allclose(np.sort(a, axis=0), np.sort(b, axis=0), rtol=0, atol=1e-8)
+    expected = replace(given.properties, name=name, obj_id=1, files=back.properties.files)
+    assert to_json(back.properties) == json.loads(json.dumps(to_json(expected)))
+    assert (library.folder / f"pictures/{name}.png").read_bytes() == b"a picture"
+    assert check_library(library) == []
+
+
+def test_a_texture_comes_back_bit_for_bit(library: ModelLibrary):
+    mesh = textured()
+    library.add(prepare_mesh(mesh, CONFIG), "painted")
+    back = library.load("painted").model.mesh
+    assert np.array_equal(back.texture, mesh.texture)
+    # The repair may order vertices anew: every corner keeps its place on the texture.
+    assert back.uv is not None and mesh.uv is not None
+    a = np.concatenate(
+        [back.vertices[back.faces].reshape(-1, 3), back.uv[back.faces].reshape(-1, 2)], 1
+    )
+    b = np.concatenate(
+        [mesh.vertices[mesh.faces].reshape(-1, 3), mesh.uv[mesh.faces].reshape(-1, 2)], 1
+    )
+    assert np.allclose(a[np.lexsort(np.round(a, 5).T)], b[np.lexsort(np.round(b, 5).T)], atol=1e-6)
+
+
+def test_the_same_mesh_gives_the_same_bytes(tmp_path: Path):
+    for k in (1, 2):
+        ModelLibrary.create(tmp_path / str(k)).add(
+            prepare_mesh(part("wedge").mesh, CONFIG), "wedge"
+        )
+    assert content(tmp_path / "1") == content(tmp_path / "2")
+
+
+def test_properties_are_the_same_after_json():
+    p = replace(made("tube").properties, name="tube", obj_id=9)
+    p = replace(p, scale=ScaleNote(scale=0.8, sigma_percent=0.2, verdict="accepted", how="fit"))
+    back = from_json(ModelProperties, json.loads(properties_bytes(p)), "x")
+    assert to_json(back) == to_json(p)
+    assert back.matter is not None and p.matter is not None
+    assert np.array_equal(back.matter.inertia, p.matter.inertia)
+
+
+def test_any_bop_reader_reads_the_library(library: ModelLibrary):
+    library.add(made("tube"), "tube", obj_id=7)
+    library.add(made("box"), "box")
+    models = load_models(library.folder)
+    assert {i: m.name for i, m in models.items()} == {7: "tube", 8: "box"}
+    info = json.loads((library.folder / "models_info.json").read_text())
+    assert list(info) == ["7", "8"]
+    assert info["7"]["diameter"] == pytest.approx(1e3 * 0.0843, rel=0.5)
+    assert len(info["7"]["symmetries_continuous"]) == 1
+
+
+# --- mass -------------------------------------------------------------------------------------
+
+
+def open_box() -> Mesh:
+    """A box without its top: no hole that a repair may close."""
+    x, y, z = 0.03, 0.04, 0.05
+    v = np.array([[a, b, c] for a in (-x, x) for b in (-y, y) for c in (-z, z)])
+    f = [[0, 2, 6], [0, 6, 4], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 1, 3], [0, 3, 2],
+         [4, 6, 7], [4, 7, 5]]  # fmt: skip
+    return Mesh(vertices=v, faces=np.array(f))
+
+
+@pytest.mark.parametrize("mesh", [part("wedge").mesh, open_box()])
+def test_every_stage_gets_the_weighed_mass(library: ModelLibrary, mesh: Mesh):
+    # The search for the parts of an open box takes long, and any parts will do.
+    quick = replace(CONFIG, convex=replace(CONFIG.convex, time_limit_s=1.0))
+    given = prepare_mesh(mesh, quick, Matter(mass_kg=0.321))
+    model = library.add(given, "weighed").model
+    stage = mass_properties(model.mesh, model.density)
+    assert stage.mass_kg == pytest.approx(0.321, rel=1e-5)
+    solid, why = library.solid(1)
+    assert solid is not None and why == "" and solid.matter.mass_kg == pytest.approx(0.321)
+
+
+def test_an_open_mesh_is_doubtful_and_a_closed_one_is_not():
+    assert made("wedge").properties.verdict == "accepted"
+    p = prepare_mesh(open_box(), BARE).properties
+    assert p.verdict == "doubtful" and any("open" in r for r in p.reasons)
+
+
+# --- names and ids ----------------------------------------------------------------------------
+
+
+def test_ids_are_given_once_and_never_changed(library: ModelLibrary):
+    assert library.add(made("box"), "box").model.obj_id == 1
+    assert library.add(made("wedge"), "wedge", obj_id=5).model.obj_id == 5
+    assert library.next_id() == 6
+    before = content(library.folder)
+    with pytest.raises(InputError, match=r"object 1 .* is 'box'.*--overwrite"):
+        library.add(made("wedge"), "box")
+    with pytest.raises(InputError, match=r"object 5 .* is 'wedge'"):
+        library.add(made("box"), "other", obj_id=5)
+    with pytest.raises(InputError, match="not renumbered to 9"):
+        library.add(made("box"), "box", obj_id=9, overwrite=True)
+    assert content(library.folder) == before
+    assert library.add(made("wedge"), "box", overwrite=True).model.obj_id == 1
+    assert [e.name for e in library.entries()] == ["box", "wedge"]
+
+
+def test_replacing_leaves_nothing_of_the_old_model(library: ModelLibrary):
+    library.add(prepare_mesh(textured(), CONFIG), "old", picture=b"old")
+    assert (library.folder / "obj_000001.png").is_file()
+    plain = prepare_mesh(part("box").mesh, replace(CONFIG, with_parts=False))
+    library.add(plain, "new", obj_id=1, overwrite=True)
+    assert sorted(content(library.folder)) == [
+        "models_info.json", "obj_000001.ply", "properties/obj_000001.json",
+    ]  # fmt: skip
+    assert check_library(library) == []
+
+
+def test_a_model_is_found_by_name_id_and_file(library: ModelLibrary):
+    library.add(made("box"), "obj_thing")
+    library.add(made("wedge"), "wedge")
+    for wanted in ("wedge", 2, "2", "obj_000002", "models/obj_000002.ply"):
+        assert library.find(wanted) == 2
+    with pytest.raises(InputError, match=r"'cup'.*obj_thing \(1\), wedge \(2\)"):
+        library.find("cup")
+
+
+@pytest.mark.parametrize("name", ["", "12", "a/b", "..", "a b", ".hidden", "x" * 90, "mug."])
+def test_names_that_cannot_be_files_are_refused(library: ModelLibrary, name: str):
+    with pytest.raises(InputError, match="cannot be the name"):
+        library.add(made("box"), name)
+
+
+def test_other_folders_are_no_libraries(tmp_path: Path):
+    (tmp_path / "home").mkdir()
+    (tmp_path / "home/thesis.tex").write_text("x")
+    with pytest.raises(InputError, match=r"thesis\.tex"):
+        ModelLibrary.create(tmp_path / "home")
+    with pytest.raises(InputError, match=r"no models_info\.json"):
+        ModelLibrary.open(tmp_path / "home")
+    save_models(tmp_path / "bop/models", {1: part("box")})
+    with pytest.raises(InputError, match="Did you mean"):
+        ModelLibrary.open(tmp_path / "bop")
+
+
+# --- kills, other writers, damage -------------------------------------------------------------
+
+
+def killed_at(step: int, library: ModelLibrary, given: PreparedModel, name: str) -> bool:
+    """Add in a child that is killed before its `step`-th rename; return whether it was killed."""
+    child = os.fork()
+    if child == 0:
+        replaced, count = os.replace, 0
+
+        def dying(a: object, b: object) -> None:
+            nonlocal count
+            if count == step:
+                os.kill(os.getpid(), signal.SIGKILL)
+            count += 1
+            replaced(a, b)  # pyright: ignore[reportArgumentType]
+
+        os.replace = dying  # pyright: ignore[reportAttributeAccessIssue]
+        try:
+            library.add(given, name, overwrite=True, picture=b"new")
+            os._exit(0)
+        finally:
+            os._exit(1)
+    _, status = os.waitpid(child, 0)
+    assert os.WIFSIGNALED(status) or os.WEXITSTATUS(status) == 0
+    return os.WIFSIGNALED(status)
+
+
+@pytest.mark.parametrize("name", ["box", "another"])
+def test_a_kill_leaves_the_library_old_or_new(tmp_path: Path, name: str):
+    ModelLibrary.create(tmp_path / "old").add(made("box"), "box", picture=b"old")
+    ModelLibrary.create(tmp_path / "new").add(made("box"), "box", picture=b"old")
+    new_id = ModelLibrary(tmp_path / "new").add(
+        made("wedge"), name, overwrite=True, picture=b"new"
+    ).model.obj_id  # fmt: skip
+    old, new = content(tmp_path / "old"), content(tmp_path / "new")
+    outcomes: set[str] = set()
+    for step in range(100):
+        folder = tmp_path / f"killed_{step}"
+        library = ModelLibrary.create(folder)
+        library.add(made("box"), "box", picture=b"old")
+        was_killed = killed_at(step, library, made("wedge"), name)
+        # A BOP reader that knows nothing of the change in flight reads it all the same.
+        assert 1 in load_models(folder)
+        library = ModelLibrary.open(folder)
+        assert all(f.is_harmless for f in check_library(library))
+        now = {k: v for k, v in content(folder).items() if not k.startswith(".adding")}
+        assert now in (old, new)
+        outcomes.add("old" if now == old else "new")
+        # The next writer goes on as if nothing had been.
+        library.add(made("wedge"), name, overwrite=True, picture=b"new")
+        assert content(folder) == new
+        if not was_killed:
+            break
+    assert step > 6 and outcomes == {"old", "new"} and new_id in (1, 2)
+
+
+def test_writers_wait_for_each_other(library: ModelLibrary):
+    names = [[f"a{k}" for k in range(4)], [f"b{k}" for k in range(4)]]
+    children: list[int] = []
+    given = made("box")
+    for mine in names:
+        child = os.fork()
+        if child == 0:
+            try:
+                for name in mine:
+                    library.add(given, name)
+                os._exit(0)
+            finally:
+                os._exit(1)
+        children.append(child)
+    assert [os.waitstatus_to_exitcode(os.waitpid(c, 0)[1]) for c in children] == [0, 0]
+    entries = library.entries()
+    assert sorted(e.name for e in entries) == sorted(names[0] + names[1])
+    assert [e.obj_id for e in entries] == list(range(1, 9))
+    assert check_library(library) == []
+
+
+def test_a_writer_that_never_ends_is_named(library: ModelLibrary, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(library_commit, "WAIT_S", 0.1)
+    with only_run_in(library.folder), pytest.raises(InputError, match="another run"):
+        library.add(made("box"), "box")
+    assert library.entries() == []
+
+
+def test_a_full_disk_leaves_the_library_as_it_was(
+    library: ModelLibrary, monkeypatch: pytest.MonkeyPatch
+):
+    library.add(made("box"), "box")
+    before = content(library.folder)
+    import resource
+
+    child = os.fork()
+    if child == 0:
+        # No file may be larger than 1 kB: the system's own refusal.
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))
+        try:
+            library.add(made("tube"), "tube")
+        except Exception as error:
+            os._exit(3 if "no room" in str(error) else 4)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 3
+    assert content(library.folder) == before
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (lambda text: text[: len(text) // 2], "not valid JSON"),
+        (
+            lambda text: text.replace('"doubtful"', '"fine"').replace('"accepted"', '"fine"'),
+            "one of",
+        ),
+        (lambda text: text.replace('"format": 1', '"format": 99'), "format 99"),
+        (lambda text: json.dumps({**json.loads(text), "matter": 3}), "matter is '3'"),
+        (lambda text: "[]", "an object is expected"),
+    ],
+)
+def test_damaged_properties_cost_only_the_properties(library: ModelLibrary, damage, said: str):
+    library.add(made("box"), "box")
+    path = library.folder / "properties/obj_000001.json"
+    path.write_text(damage(path.read_text()))
+    with pytest.raises(InputError, match=said):
+        read_properties(path)
+    back = library.load("box")
+    assert back.properties is None and back.parts is None and said in back.notes[0]
+    findings = check_library(library)
+    assert [(f.kind, f.path) for f in findings] == [("damaged", "properties/obj_000001.json")]
+
+
+def test_what_was_changed_missing_or_left_over_is_found(library: ModelLibrary):
+    for name in ("box", "wedge"):
+        library.add(made(name), name)
+    folder = library.folder
+    ply = folder / "obj_000001.ply"
+    ply.write_bytes(ply.read_bytes() + b"\0")
+    (folder / "collision/obj_000002.obj").unlink()
+    (folder / "obj_000009.ply").write_bytes(b"ply")
+    (folder / "properties/obj_000009.json").write_text("{}")
+    (folder / "unscaled/half").mkdir(parents=True)
+    kinds = {f.path: f.kind for f in check_library(library)}
+    assert kinds == {
+        "obj_000001.ply": "changed",
+        "collision/obj_000002.obj": "missing",
+        "obj_000009.ply": "orphan",
+        "properties/obj_000009.json": "orphan",
+        "unscaled/half": "orphan",
+    }
+    assert library.solid(1)[0] is None and "changed" in library.solid(1)[1]
+    assert library.solid(2)[0] is None and "missing" in library.solid(2)[1]
+    # The number of an orphan is not given to another model.
+    assert library.next_id() == 10
+
+
+# --- other programs' folders ------------------------------------------------------------------
+
+
+def test_a_foreign_models_folder_is_a_library(tmp_path: Path):
+    models = {3: replace(part("box"), obj_id=3), 4: replace(part("tube"), obj_id=4)}
+    save_models(tmp_path, models)
+    before = content(tmp_path)
+    library = ModelLibrary.open(tmp_path)
+    back = library.load("box")
+    assert back.properties is None and back.parts is None and "not imported" in back.notes[0]
+    assert [f.kind for f in check_library(library)] == ["foreign", "foreign"]
+    found = complete(library, 3, CONFIG)
+    assert found.properties is not None and found.parts is not None and found.notes == ()
+    assert np.array_equal(found.properties.symmetries.discrete, models[3].symmetries)
+    after = content(tmp_path)
+    assert {k: after[k] for k in before} == before
+    assert set(after) - set(before) == {
+        "collision/obj_000003.obj", "pictures/box.png", "properties/obj_000003.json",
+    }  # fmt: skip
+    assert [f.kind for f in check_library(library)] == ["foreign"]

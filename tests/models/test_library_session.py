@@ -1,0 +1,121 @@
+"""Models without metric scale become models with one; sessions get what they need of a library."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.formats.bop_models import load_models, save_models
+from realsim.geometry.parts import part
+from realsim.models.library import ModelLibrary
+from realsim.models.library_prepare import PrepareConfig, prepare_mesh, prepare_unscaled
+from realsim.models.library_records import ScaleNote, to_json
+from realsim.models.library_session import copy_models, known_solids
+from realsim.records import Mesh
+
+BARE = PrepareConfig(with_parts=False)
+
+
+def textured() -> Mesh:
+    mesh = part("wedge").mesh
+    image = np.random.default_rng(3).integers(0, 255, (16, 8, 3), dtype=np.uint8)
+    uv = (mesh.vertices[:, :2] - mesh.bounds[0, :2]) / mesh.extent[:2]
+    return replace(mesh, colors=None, uv=uv, texture=image)
+
+
+@pytest.fixture
+def library(tmp_path: Path) -> ModelLibrary:
+    return ModelLibrary.create(tmp_path / "models")
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+# --- without metric scale ---------------------------------------------------------------------
+
+
+def test_promoting_equals_importing_at_that_size(library: ModelLibrary):
+    scale = 0.37
+    mesh = textured()
+    raw = replace(mesh, vertices=mesh.vertices / scale)
+    library.add_unscaled(prepare_unscaled(raw, BARE), "scan", picture=b"p")
+    with pytest.raises(InputError, match="without metric scale: `realsim scan scale scan"):
+        library.find("scan")
+    held = library.load_unscaled("scan")
+    assert np.allclose(held.mesh.extent, raw.extent, rtol=1e-6)
+    assert np.array_equal(held.mesh.texture, raw.texture)
+    note = ScaleNote(scale=scale, sigma_percent=0.3, verdict="accepted", session="s1", how="fit")
+    up = library.promote("scan", note, BARE)
+    same = prepare_mesh(mesh, BARE)
+    assert up.properties is not None and up.properties.matter is not None
+    assert same.properties.matter is not None
+    assert np.allclose(up.model.mesh.extent, mesh.extent, rtol=1e-5)
+    assert up.properties.matter.mass_kg == pytest.approx(same.properties.matter.mass_kg, rel=1e-4)
+    assert up.scale is not None and to_json(up.scale) == to_json(note)
+    assert len(up.model.symmetries) == len(same.properties.symmetries.discrete)
+    # It can be promoted again, by a better session, only if that is asked for.
+    with pytest.raises(InputError, match="--overwrite"):
+        library.promote("scan", note, BARE)
+    better = library.promote("scan", replace(note, scale=1.01 * scale), BARE, overwrite=True)
+    assert better.model.obj_id == up.model.obj_id
+    assert np.allclose(better.model.mesh.extent, 1.01 * mesh.extent, rtol=1e-5)
+
+
+def test_a_doubtful_scale_makes_a_doubtful_model(library: ModelLibrary):
+    library.add_unscaled(prepare_unscaled(part("wedge").mesh, BARE), "scan")
+    note = ScaleNote(scale=1.0, verdict="doubtful", reasons=("seen from one side only",))
+    up = library.promote("scan", note, BARE)
+    assert up.properties is not None and up.properties.verdict == "doubtful"
+    assert "seen from one side only" in up.properties.reasons[0]
+
+
+def test_a_model_without_scale_is_no_bop_model(library: ModelLibrary):
+    raw = prepare_unscaled(part("wedge").mesh, BARE)
+    with pytest.raises(InputError, match="no metric scale"):
+        library.add(raw, "scan")
+    library.add_unscaled(raw, "scan")
+    with pytest.raises(InputError, match="already in"):
+        library.add_unscaled(raw, "scan")
+    with pytest.raises(InputError, match="there are: scan"):
+        library.load_unscaled("cup")
+
+
+@pytest.mark.parametrize("bad", [{"scale": 0.0}, {"scale": float("nan")}, {"scale": -1.0}])
+def test_nonsense_scales_are_refused(bad: dict[str, float]):
+    with pytest.raises(InputError, match="positive"):
+        ScaleNote(**bad)
+
+
+# --- into a session ---------------------------------------------------------------------------
+
+
+def test_a_session_gets_what_it_needs_and_no_more(library: ModelLibrary, tmp_path: Path):
+    made = prepare_mesh(part("wedge").mesh, PrepareConfig())
+    for name in ("box", "wedge", "tube"):
+        library.add(made, name)
+    session = tmp_path / "session/models"
+    with pytest.raises(InputError, match=r"object 8, 9 is not in .*box \(1\), wedge \(2\)"):
+        copy_models(library, [1, 8, 9], session)
+    assert not session.exists()
+    assert copy_models(library, [3, 1, 1], session) == (1, 3)
+    assert sorted(load_models(session)) == [1, 3]
+    taken = content(session)
+    assert {k: v for k, v in content(library.folder).items() if k in taken and "info" not in k} == {
+        k: v for k, v in taken.items() if "info" not in k
+    }
+    solids, unknown = known_solids(session, [1, 3])
+    assert sorted(solids) == [1, 3] and unknown == {}
+    library.add(prepare_mesh(part("box").mesh, BARE), "box", overwrite=True)
+    assert copy_models(library, [1, 2, 3], session) == (2,)
+    assert load_models(session)[1].mesh.extent == pytest.approx(part("wedge").mesh.extent, rel=1e-6)
+    (session / "obj_000003.ply").write_bytes((session / "obj_000001.ply").read_bytes() + b"x")
+    solids, unknown = known_solids(session, [1, 3])
+    assert sorted(solids) == [1] and "changed" in unknown[3]
+
+
+def test_a_lab_session_knows_nothing_and_says_nothing(tmp_path: Path):
+    save_models(tmp_path, {1: part("box")})
+    assert known_solids(tmp_path, [1]) == ({}, {})

@@ -1,0 +1,113 @@
+"""The sheet of a model shows what it should: the same at every size, open rims, parts, axes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.geometry import se3
+from realsim.geometry.parts import part
+from realsim.models.library_prepare import PrepareConfig, prepare_unscaled
+from realsim.models.library_records import ModelProperties
+from realsim.models.model_picture_lines import rim_layer, rotation_axes
+from realsim.models.model_picture_views import drawn_size, parts_mesh, rendered, view_of
+from realsim.models.model_records import ConvexParts
+from realsim.models.pictures import PANEL, figure_lines, model_sheet
+from realsim.records import Mesh
+
+UNKNOWN = ModelProperties(name="thing", verdict="accepted")
+SIZE = (160, 120)
+RIM = np.array([224, 27, 36])
+
+
+def near(image: np.ndarray, color: np.ndarray) -> int:
+    return int(np.sum(np.all(np.abs(image.astype(int) - color) < 12, axis=-1)))
+
+
+def test_a_sheet_does_not_depend_on_the_unit():
+    mesh = part("l_bracket").mesh
+    small, large = (
+        model_sheet(replace(mesh, vertices=mesh.vertices * k), UNKNOWN) for k in (1.0, 1000.0)
+    )
+    assert small.shape == large.shape and small.shape[1] == 3 * PANEL[0]
+    # Words differ (the size), pictures do not: two panels without labels of lengths in them.
+    top = small.shape[0] - 2 * PANEL[1]
+    a, b = (s[top + 40 : top + PANEL[1] - 60, PANEL[0] : 2 * PANEL[0]] for s in (small, large))
+    assert np.mean(np.any(np.abs(a.astype(int) - b) > 8, axis=-1)) < 0.002
+    assert a.std() > 10
+
+
+def test_open_rims_are_red_and_closed_meshes_have_none():
+    mesh = part("tube").mesh
+    assert rim_layer(mesh, 1.0).lines == ()
+    cut = replace(mesh, faces=mesh.faces[np.arange(len(mesh.faces)) % 40 != 0])
+    assert len(rim_layer(cut, 1.0).lines) > 30
+    closed, opened = (model_sheet(m, UNKNOWN) for m in (mesh, cut))
+    assert near(closed, RIM) == 0 and near(opened, RIM) > 200
+
+
+def test_every_part_has_its_colour():
+    left, right = part("cube").mesh.vertices, part("cube").mesh.vertices + np.array([0.05, 0, 0])
+    mesh = Mesh(
+        vertices=np.concatenate([left, right]),
+        faces=np.concatenate([part("cube").mesh.faces, part("cube").mesh.faces + len(left)]),
+    )
+    parts = ConvexParts(parts=(left, right), volume_ratio=1.0, method="hull")
+    sheet = model_sheet(mesh, UNKNOWN, parts)
+    panel = sheet[: sheet.shape[0] // 2, 2 * PANEL[0] :].astype(int)
+    blue = np.sum((panel[..., 2] - panel[..., 0] > 60) & (panel[..., 1] > 60))
+    orange = np.sum((panel[..., 0] - panel[..., 2] > 60) & (panel[..., 1] > 60))
+    assert blue > 2000 and orange > 2000
+
+
+def test_the_whole_object_is_in_the_picture_and_fills_it():
+    for name in ("stepped_shaft", "bowl", "l_bracket"):
+        drawn, _ = drawn_size(part(name).mesh)
+        for direction in ((1.0, 0.2, 0.1), (0.3, -1.0, 0.6), (0.1, 0.1, 1.0)):
+            _, depth = rendered([drawn], view_of(drawn.vertices, direction, SIZE))
+            seen = depth > 0
+            assert not (seen[0].any() or seen[-1].any() or seen[:, 0].any() or seen[:, -1].any())
+            rows, columns = np.nonzero(seen)
+            share = max(np.ptp(rows) / SIZE[1], np.ptp(columns) / SIZE[0])
+            assert 0.6 < share < 0.8
+
+
+def test_a_pixel_is_as_wide_as_the_scale_bar_says():
+    drawn, factor = drawn_size(part("cube").mesh)
+    view = view_of(drawn.vertices, (0.0, -1.0, 0.0), SIZE)
+    _, depth = rendered([drawn], view)
+    wide_px = np.ptp(np.nonzero(depth > 0)[1]) + 1
+    # Perspective: the front face is nearer than the middle, for which the bar holds.
+    nearer = view.T_obj_cam[1, 3] / (view.T_obj_cam[1, 3] + 0.025 * factor)
+    assert wide_px / (view.px_per_m * factor) == pytest.approx(0.05 * nearer, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "orders"), [("cube", {4: 3, 3: 4, 2: 6}), ("hex_nut", {6: 1, 2: 6}), ("wedge", {})]
+)
+def test_the_axes_of_known_shapes(name: str, orders: dict[int, int]):
+    symmetries = part(name).symmetries
+    found = [order for order, _, _ in rotation_axes(symmetries)]
+    assert {n: found.count(n) for n in set(found)} == orders
+    # Equivariance: where the object is put, its axes go along.
+    T = se3.from_rt(se3.exp_so3([0.4, -0.9, 0.3]), [0.2, -0.1, 0.5])
+    moved = rotation_axes(T @ symmetries @ se3.invert(T))
+    for order, direction, point in moved:
+        S = se3.from_rt(R := se3.exp_so3(2 * np.pi / order * direction), point - R @ point)
+        assert min(np.abs(T @ A @ se3.invert(T) - S).max() for A in symmetries) < 1e-6
+
+
+def test_parts_are_drawn_closed_and_outward():
+    mesh = parts_mesh(part("cube").mesh.vertices, (1, 2, 3))
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+    assert volume == pytest.approx((0.985 * 0.05) ** 3, rel=1e-6)
+
+
+def test_problems_are_written_on_the_sheet():
+    reason = "open: 24 boundary edges in 2 holes"
+    p = prepare_unscaled(part("wedge").mesh, PrepareConfig()).properties
+    p = replace(p, verdict="doubtful", reasons=(reason,))
+    lines = figure_lines(part("wedge").mesh, p)
+    assert ("look", reason) in lines
+    assert any("no metric scale" in text for _, text in lines)

@@ -1,0 +1,371 @@
+"""Mesh files of every format come back as the same surface, in metres, z up, with their colours."""
+
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError, UnitError
+from realsim.geometry.mesh import mass_properties, ply_bytes, sample_surface, save_ply
+from realsim.geometry.parts import part
+from realsim.models.inspect import inspect_mesh
+from realsim.models.mesh_atlas import one_mesh
+from realsim.models.mesh_pieces import Piece, transformed_uv
+from realsim.models.reading import METRES, ROTATIONS, read_scan
+from realsim.models.simplify import colors_at, deviation
+from realsim.records import Mesh
+from written_meshes import (
+    as_trimesh,
+    colorful_texture,
+    textured_box,
+    write_textured_obj,
+    write_usd,
+)
+
+Y_UP = np.array(ROTATIONS["y"], dtype=float)
+
+
+def turned(mesh, R):
+    return replace(mesh, vertices=mesh.vertices @ np.asarray(R, dtype=float).T)
+
+
+def colour_agreement(a, b, n=2000):
+    """Return the share of points of a at which a and b have the same colour (within 3 levels)."""
+    points, _ = sample_surface(a, n, np.random.default_rng(1))
+    near = np.abs(colors_at(a, points).astype(int) - colors_at(b, points).astype(int))
+    return float(np.mean(near.max(axis=1) <= 3))
+
+
+# --- every format brings the surface back --------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", ["glb", "gltf", "obj", "ply", "stl", "off"])
+def test_a_part_comes_back_from_every_format(tmp_path, suffix):
+    mug = replace(part("mug").mesh, colors=None)
+    path = tmp_path / f"mug.{suffix}"
+    written = as_trimesh(mug)
+    if suffix == "gltf":
+        for name, data in written.export(file_type="gltf").items():
+            (tmp_path / (path.name if name.endswith(".gltf") else name)).write_bytes(data)
+    else:
+        written.export(path)
+    scan = read_scan(path, "m", up="z")
+    assert scan.unit == "m" and scan.factor == 1.0 and scan.declared["format"] == suffix
+    assert len(scan.mesh.faces) == len(mug.faces)
+    assert deviation(scan.mesh, mug, samples=500) < 1e-6
+    volume = mass_properties(mug, 1.0).volume_m3
+    assert mass_properties(scan.mesh, 1.0).volume_m3 == pytest.approx(volume, rel=1e-5)
+    report = inspect_mesh(scan.mesh)
+    assert report.is_watertight and report.is_outward and report.problems == ()
+
+
+@pytest.mark.parametrize("suffix", ["usda", "usdc"])
+def test_a_part_comes_back_from_usd(tmp_path, suffix):
+    mug = replace(part("mug").mesh, colors=None)
+    path = tmp_path / f"mug.{suffix}"
+    write_usd(path, mug)
+    scan = read_scan(path, None)
+    assert scan.unit == "m" and scan.declared["unit"] == "metersPerUnit 1"
+    np.testing.assert_allclose(scan.mesh.vertices, mug.vertices, atol=1e-7)
+    np.testing.assert_array_equal(scan.mesh.faces, mug.faces)
+
+
+def test_textures_come_back_from_every_format(tmp_path):
+    box = textured_box()
+    as_trimesh(box).export(tmp_path / "box.glb")
+    write_textured_obj(tmp_path / "box.obj", box)
+    save_ply(tmp_path / "box.ply", box, "m")
+    for name in ("box.glb", "box.obj", "box.ply"):
+        scan = read_scan(tmp_path / name, "m", up="z")
+        assert colour_agreement(box, scan.mesh) > 0.99, name
+        np.testing.assert_array_equal(scan.mesh.texture, box.texture)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_textures_come_back_from_usd(tmp_path, packed):
+    box = textured_box()
+    path = tmp_path / "box.usda"
+    write_usd(path, box)
+    if packed:
+        from pxr import UsdUtils
+
+        UsdUtils.CreateNewUsdzPackage(str(path), str(tmp_path / "box.usdz"))
+        path = tmp_path / "box.usdz"
+    scan = read_scan(path, None)
+    assert colour_agreement(box, scan.mesh) > 0.99
+
+
+def test_colours_of_vertices_come_back(tmp_path):
+    mug = part("mug").mesh
+    for name in ("mug.glb", "mug.ply"):
+        as_trimesh(mug).export(tmp_path / name)
+        scan = read_scan(tmp_path / name, "m", up="z")
+        np.testing.assert_array_equal(scan.mesh.colors, mug.colors)
+
+
+# --- several parts -------------------------------------------------------------------------------
+
+
+def test_several_textures_become_one_with_all_colours(tmp_path):
+    import trimesh
+
+    first = textured_box(seed=1)
+    second = turned(textured_box((0.03, 0.03, 0.09), seed=2), np.eye(3))
+    second = replace(second, vertices=second.vertices + np.array([0.12, 0.02, 0.0]))
+    plain = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
+    plain.apply_translation([0, 0.1, 0])
+    scene = trimesh.Scene([as_trimesh(first), as_trimesh(second), plain])
+    scene.export(tmp_path / "scene.glb")
+    scan = read_scan(tmp_path / "scene.glb", "m", up="z")
+    assert len(scan.mesh.faces) == len(first.faces) + len(second.faces) + len(plain.faces)
+    assert colour_agreement(first, scan.mesh) > 0.99
+    assert colour_agreement(second, scan.mesh) > 0.99
+    assert any("laid into one" in note for note in scan.notes)
+
+
+def test_a_repeated_texture_keeps_its_pattern_in_an_atlas():
+    grid = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    uv = np.array([[-1.25, 0.5], [1.25, 0.5], [1.25, 2.0], [-1.25, 2.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    image = colorful_texture()
+    tiled = Piece(name="a", vertices=grid, faces=faces, uv=uv, image=image, image_key="a")
+    other = Piece(
+        name="b",
+        vertices=grid + np.array([0, 0, 1]),
+        faces=faces,
+        uv=grid[:, :2],
+        image=colorful_texture(seed=5),
+        image_key="b",
+    )
+    alone, notes = one_mesh([tiled])
+    assert any("repeats" in note for note in notes)
+    np.testing.assert_array_equal(alone.uv, uv)
+    atlas, _ = one_mesh([tiled, other])
+    assert atlas.uv.min() >= 0 and atlas.uv.max() <= 1
+    assert colour_agreement(alone, atlas) > 0.99
+    assert colour_agreement(one_mesh([other])[0], atlas) > 0.99
+
+
+def test_painted_and_plain_pieces_keep_their_colours_beside_a_texture():
+    box = textured_box()
+    skin = Piece(
+        name="a", vertices=box.vertices, faces=box.faces, uv=box.uv, image=box.texture, image_key=1
+    )
+    mug = part("mug").mesh
+    painted = Piece(
+        name="b", vertices=mug.vertices + np.array([0.2, 0, 0]), faces=mug.faces, colors=mug.colors
+    )
+    plain = Piece(
+        name="c", vertices=box.vertices - [0.2, 0, 0], faces=box.faces, color=(9, 99, 200)
+    )
+    mesh, notes = one_mesh([skin, painted, plain])
+    assert colour_agreement(box, mesh) > 0.99
+    of_mug = replace(mug, vertices=painted.vertices)
+    assert colour_agreement(of_mug, mesh) > 0.9  # one colour per face, where two meet within one
+    points = sample_surface(replace(box, vertices=plain.vertices), 50, np.random.default_rng(0))[0]
+    np.testing.assert_array_equal(colors_at(mesh, points), np.tile([9, 99, 200], (50, 1)))
+    assert any("per face" in note for note in notes)
+
+
+def test_nodes_are_placed_and_mirrored_ones_stay_outward(tmp_path):
+    import trimesh
+
+    solid = as_trimesh(replace(part("l_bracket").mesh, colors=None))
+    scene = trimesh.Scene()
+    T = trimesh.transformations.rotation_matrix(0.7, [1, 2, 3], [0.0, 0.1, 0.0])
+    scene.add_geometry(solid, node_name="straight", geom_name="part", transform=T)
+    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+    mirror[0, 3] = -0.3
+    scene.add_geometry(solid, node_name="flipped", geom_name="part", transform=mirror)
+    scene.export(tmp_path / "two.glb")
+    header = json.loads(
+        (tmp_path / "two.glb")
+        .read_bytes()[20:]
+        .split(b"\x00")[0]
+        .split(b"BIN")[0][: struct.unpack("<I", (tmp_path / "two.glb").read_bytes()[12:16])[0]]
+    )
+    assert len(header["nodes"]) >= 2  # the transforms are in the file, not in the vertices
+    scan = read_scan(tmp_path / "two.glb", "m", up="z")
+    expected = np.concatenate([solid.vertices @ m[:3, :3].T + m[:3, 3] for m in (T, mirror)])
+    np.testing.assert_allclose(
+        np.sort(scan.mesh.vertices, axis=0), np.sort(expected, axis=0), atol=1e-6
+    )
+    assert inspect_mesh(scan.mesh).is_outward
+    assert sum("'flipped' is mirrored" in n for n in scan.notes) == 1
+    assert mass_properties(scan.mesh, 1.0).volume_m3 == pytest.approx(2 * solid.volume, rel=1e-5)
+
+
+def test_usd_transforms_instances_and_mirrors(tmp_path):
+    pytest.importorskip("pxr", reason="the extra realsim[usd] is not installed")
+    from pxr import Gf, Usd, UsdGeom
+
+    bracket = replace(part("l_bracket").mesh, colors=None)
+    write_usd(tmp_path / "part.usda", bracket)
+    stage = Usd.Stage.CreateNew(str(tmp_path / "scene.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    UsdGeom.Xform.Define(stage, "/root")
+    shifts = 0.3 * np.eye(3)
+    for i, shift in enumerate(shifts):
+        at = UsdGeom.Xform.Define(stage, f"/root/at{i}")
+        at.AddTranslateOp().Set(Gf.Vec3d(*map(float, shift)))
+        if i == 2:
+            at.AddScaleOp().Set(Gf.Vec3f(1, -1, 1))
+        copy = stage.DefinePrim(f"/root/at{i}/copy")
+        copy.GetReferences().AddReference("./part.usda", "/thing")
+        copy.SetInstanceable(i < 2)
+    points = UsdGeom.PointInstancer.Define(stage, "/root/many")
+    stage.DefinePrim("/root/many/kind").GetReferences().AddReference("./part.usda", "/thing")
+    points.CreatePrototypesRel().SetTargets(["/root/many/kind"])
+    points.CreateProtoIndicesAttr([0, 0])
+    points.CreatePositionsAttr([Gf.Vec3f(-0.3, 0, 0), Gf.Vec3f(0, -0.3, 0)])
+    hidden = UsdGeom.Cube.Define(stage, "/root/cube")
+    assert hidden
+    stage.GetRootLayer().Save()
+
+    scan = read_scan(tmp_path / "scene.usda", None)
+    n = len(bracket.vertices)
+    assert len(scan.mesh.faces) == 5 * len(bracket.faces)
+    centers = scan.mesh.vertices.reshape(5, n, 3).mean(axis=1)
+    own = bracket.vertices.mean(axis=0)
+    expected = [own + s for s in shifts[:2]] + [own * [1, -1, 1] + shifts[2]]
+    expected += [own - s for s in shifts[:2]]
+    np.testing.assert_allclose(
+        centers[np.lexsort(centers.round(5).T)],
+        np.array(expected)[np.lexsort(np.array(expected).round(5).T)],
+        atol=1e-6,
+    )
+    assert inspect_mesh(scan.mesh).is_outward
+    assert any("mirrored" in note for note in scan.notes)
+    assert any("Cube" in note for note in scan.notes)
+
+
+def test_usd_left_handed_winding_is_turned(tmp_path):
+    bracket = replace(part("l_bracket").mesh, colors=None)
+    inside_out = replace(bracket, faces=bracket.faces[:, ::-1])
+    stage = write_usd(tmp_path / "a.usda", inside_out)
+    from pxr import UsdGeom
+
+    UsdGeom.Mesh(stage.GetPrimAtPath("/thing/shape")).CreateOrientationAttr("leftHanded")
+    stage.GetRootLayer().Save()
+    scan = read_scan(tmp_path / "a.usda", None)
+    assert inspect_mesh(scan.mesh).is_outward and any("left-handed" in n for n in scan.notes)
+
+
+# --- unit and axes -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("unit", list(METRES))
+def test_units_are_converted_exactly(tmp_path, unit):
+    numbers = np.array([[0.0, 0, 0], [5, 0, 0], [0, 4, 0], [0, 0, 3]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    scale = 0.02 if unit == "m" else 1.0
+    mesh = Mesh(vertices=numbers * scale, faces=faces)
+    (tmp_path / "t.off").write_text(as_trimesh(mesh).export(file_type="off"))
+    scan = read_scan(tmp_path / "t.off", unit)
+    factor = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}[unit]
+    assert scan.factor == factor
+    np.testing.assert_allclose(scan.mesh.vertices, numbers * scale * factor, rtol=1e-12)
+    none = read_scan(tmp_path / "t.off", "none")
+    np.testing.assert_allclose(none.mesh.vertices, numbers * scale, rtol=1e-12)
+    assert none.unit == "none" and none.factor == 1.0
+
+
+def test_without_a_unit_the_message_says_what_each_would_be(tmp_path):
+    mesh = as_trimesh(turned(textured_box((0.98, 0.5, 0.3)), np.eye(3)))
+    mesh.export(tmp_path / "a.stl")
+    with pytest.raises(
+        InputError, match=r"980 mm as m, 9\.8 mm as cm, 0\.98 mm as mm.*--unit none"
+    ):
+        read_scan(tmp_path / "a.stl", None)
+
+
+def test_gltf_is_taken_in_metres_only_where_it_cannot_be_a_generated_mesh(tmp_path):
+    for largest, accepted in (
+        (0.98, False),
+        (0.1, True),
+        (100.0, False),
+        (0.29, True),
+        (2.0, False),
+    ):
+        as_trimesh(textured_box((largest, 0.4 * largest, 0.3 * largest))).export(tmp_path / "a.glb")
+        if accepted:
+            assert read_scan(tmp_path / "a.glb", None).unit == "m"
+        else:
+            with pytest.raises(InputError, match="--unit none"):
+                read_scan(tmp_path / "a.glb", None)
+
+
+def test_impossible_sizes_are_refused(tmp_path):
+    as_trimesh(textured_box((0.1, 0.06, 0.04))).export(tmp_path / "a.stl")
+    with pytest.raises(UnitError, match=r"0\.1 mm large"):
+        read_scan(tmp_path / "a.stl", "mm")
+    as_trimesh(textured_box((100.0, 60, 40))).export(tmp_path / "a.stl")
+    with pytest.raises(UnitError, match="100 m large"):
+        read_scan(tmp_path / "a.stl", "m")
+    with pytest.raises(UnitError, match="not known"):
+        read_scan(tmp_path / "a.stl", "feet")
+
+
+def test_usd_states_its_unit_and_a_contradiction_names_both(tmp_path):
+    box = textured_box((100.0, 60.0, 40.0))
+    write_usd(tmp_path / "a.usda", box, metres=0.001)
+    scan = read_scan(tmp_path / "a.usda", None)
+    assert scan.unit == "mm" and scan.mesh.extent.max() == pytest.approx(0.1)
+    assert read_scan(tmp_path / "a.usda", "mm").factor == 0.001
+    assert read_scan(tmp_path / "a.usda", "none").unit == "none"
+    with pytest.raises(UnitError, match="states its unit as mm, but --unit cm"):
+        read_scan(tmp_path / "a.usda", "cm")
+    write_usd(tmp_path / "b.usda", box, metres=None)
+    with pytest.raises(InputError, match="does not state its unit"):
+        read_scan(tmp_path / "b.usda", None)
+    write_usd(tmp_path / "c.usda", box, metres=0.3048)
+    with pytest.raises(InputError, match=r"metersPerUnit 0\.3048"):
+        read_scan(tmp_path / "c.usda", None)
+
+
+@pytest.mark.parametrize("up", list(ROTATIONS))
+def test_up_axes_are_turned_by_proper_rotations(tmp_path, up):
+    R = np.array(ROTATIONS[up], dtype=float)
+    np.testing.assert_array_equal(R @ R.T, np.eye(3))
+    assert np.linalg.det(R) == pytest.approx(1.0)
+    axis = {"x": 0, "y": 1, "z": 2}[up[-1]]
+    e = np.zeros(3)
+    e[axis] = -1.0 if up.startswith("-") else 1.0
+    np.testing.assert_array_equal(R @ e, [0, 0, 1])
+    bracket = replace(part("l_bracket").mesh, colors=None)
+    (tmp_path / "a.ply").write_bytes(ply_bytes(turned(bracket, R.T), "m"))
+    scan = read_scan(tmp_path / "a.ply", "m", up=up)
+    np.testing.assert_array_equal(scan.R_up, R)
+    np.testing.assert_allclose(scan.mesh.vertices, bracket.vertices, atol=1e-7)
+
+
+def test_gltf_and_usd_say_which_axis_is_up(tmp_path):
+    bracket = replace(part("l_bracket").mesh, colors=None)
+    as_trimesh(turned(bracket, Y_UP.T)).export(tmp_path / "a.glb")
+    scan = read_scan(tmp_path / "a.glb", "m")
+    np.testing.assert_allclose(scan.mesh.vertices, bracket.vertices, atol=1e-7)
+    np.testing.assert_array_equal(scan.R_up, Y_UP)
+    as_trimesh(bracket).export(tmp_path / "a.stl")
+    kept = read_scan(tmp_path / "a.stl", "m")
+    np.testing.assert_array_equal(kept.R_up, np.eye(3))
+    assert any("axes are kept" in note for note in kept.notes)
+    write_usd(tmp_path / "a.usda", turned(bracket, Y_UP.T), up="Y")
+    np.testing.assert_allclose(
+        read_scan(tmp_path / "a.usda", None).mesh.vertices, bracket.vertices, atol=1e-7
+    )
+
+
+def test_texture_transforms_of_gltf_and_usd():
+    uv = np.array([[0.2, 0.7], [0.4, 0.1]])
+    same = transformed_uv(uv, (0, 0), 0.0, (1, 1), v_down=True)
+    np.testing.assert_allclose(same, uv)
+    # glTF's own example: offset (0, 1) and rotation pi/2 turn the picture by 90 degrees.
+    turned_uv = transformed_uv(uv, (0.0, 1.0), np.pi / 2, (0.5, 0.5), v_down=True)
+    down = np.stack([uv[:, 0], 1 - uv[:, 1]], -1)
+    expected = np.stack([0.5 * down[:, 1], 1 - 0.5 * down[:, 0]], -1)
+    np.testing.assert_allclose(turned_uv, np.stack([expected[:, 0], 1 - expected[:, 1]], -1))
+    up = transformed_uv(uv, (0.1, 0.0), np.pi / 2, (2.0, 1.0), v_down=False)
+    np.testing.assert_allclose(up, np.stack([0.1 - uv[:, 1], 2 * uv[:, 0]], -1), atol=1e-12)

@@ -1,0 +1,149 @@
+"""Simplified meshes stay closed, keep their colours, and how far they are off is measured."""
+
+import os
+import resource
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry.mesh import ply_bytes, vertex_colors
+from realsim.geometry.parts import object_model, part
+from realsim.models.inspect import inspect_mesh
+from realsim.models.reading import read_scan
+from realsim.models.repair import RepairConfig, repaired
+from realsim.models.simplify import colors_at, deviation, simplified
+from realsim.records import Mesh
+
+DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+
+
+def ball(radius=0.05, subdivisions=4):
+    import trimesh
+
+    b = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    return Mesh(vertices=b.vertices, faces=b.faces)
+
+
+def bent_torus(faces):
+    """A closed surface of about so many faces with bumps."""
+    n = int(np.sqrt(faces / 2))
+    u, v = (x.ravel() for x in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+    a, b = 2 * np.pi * u / n, 2 * np.pi * v / n
+    r = 0.03 * (1 + 0.05 * np.sin(5 * a) * np.cos(7 * b))
+    w = 0.1 + r * np.cos(b)
+    p, q = (u + 1) % n, (v + 1) % n
+    i, j, k, m = u * n + v, p * n + v, p * n + q, u * n + q
+    return Mesh(
+        vertices=np.stack([w * np.cos(a), w * np.sin(a), r * np.sin(b)], -1),
+        faces=np.concatenate([np.stack([i, j, k], -1), np.stack([i, k, m], -1)]),
+    )
+
+
+@pytest.mark.parametrize("name", ["mug", "gear", "l_bracket", "elbow", "bunny", "duck"])
+def test_a_closed_surface_stays_closed(name):
+    mesh = replace(object_model(name).mesh, colors=None, uv=None, texture=None)
+    for share in (2, 5):
+        small = simplified(mesh, max(len(mesh.faces) // share, 4))
+        report = inspect_mesh(small)
+        assert report.is_watertight and report.is_outward
+        assert len(small.faces) <= 2.5 * len(mesh.faces) / share
+
+
+def test_the_deviation_grows_as_faces_go_and_is_small_at_first():
+    mesh = ball()
+    sizes = [len(mesh.faces) // k for k in (1, 2, 8, 32)]
+    off = [deviation(mesh, simplified(mesh, n)) for n in sizes]
+    assert off[0] < 1e-8 and off == sorted(off)
+    assert off[1] < 3e-4 and off[3] < 5e-3
+    assert simplified(mesh, len(mesh.faces)) is mesh
+
+
+def test_the_deviation_of_two_balls_is_the_difference_of_their_radii():
+    a, b = ball(0.05, 5), ball(0.052, 5)
+    assert deviation(a, b) == pytest.approx(0.002, abs=3e-5)
+    assert deviation(a, b) == pytest.approx(deviation(b, a), abs=3e-5)
+    assert deviation(a, a) < 1e-8
+    assert deviation(a, b, quantile=0.95) <= deviation(a, b)
+
+
+def test_the_deviation_sees_what_one_surface_has_and_the_other_has_not():
+    whole = ball(0.05, 4)
+    half = replace(whole, faces=whole.faces[whole.vertices[whole.faces].mean(axis=1)[:, 2] < 0])
+    expected = np.sqrt(2) * 0.05  # from the pole to the rim
+    assert deviation(whole, half) == pytest.approx(expected, rel=0.03)
+    assert deviation(half, whole) == pytest.approx(expected, rel=0.03)
+
+
+def test_colours_are_carried_over():
+    mesh = ball(0.05, 5)
+    rgb = np.clip(255 * (mesh.vertices / 0.1 + 0.5), 0, 255).astype(np.uint8)
+    small = simplified(replace(mesh, colors=rgb), 2000)
+    expected = np.clip(255 * (small.vertices / 0.1 + 0.5), 0, 255)
+    assert np.abs(small.colors - expected).max() < 4
+
+
+def test_a_texture_becomes_colours_of_the_closest_points():
+    duck = object_model("duck").mesh
+    assert duck.texture is not None or duck.colors is not None
+    small = simplified(duck, 1500)
+    assert small.texture is None and small.colors is not None
+    np.testing.assert_array_equal(small.colors, colors_at(duck, small.vertices))
+
+
+def test_colours_at_the_vertices_are_the_vertices_own():
+    mesh = part("mug").mesh
+    rows = np.unique(mesh.faces)[::7]
+    near = colors_at(mesh, mesh.vertices[rows]).astype(int) - vertex_colors(mesh)[rows]
+    assert np.mean(np.abs(near).max(axis=1) <= 2) > 0.9  # seams of colour: either is right
+
+
+def test_the_result_does_not_depend_on_the_unit():
+    mesh = part("elbow").mesh
+    small = simplified(mesh, 1000)
+    large = simplified(replace(mesh, vertices=mesh.vertices * 1024.0), 1000)
+    np.testing.assert_array_equal(large.faces, small.faces)
+    np.testing.assert_allclose(large.vertices / 1024.0, small.vertices, atol=1e-12)
+
+
+def test_nonsense_is_refused():
+    with pytest.raises(InputError, match="3 faces"):
+        simplified(ball(), 3)
+    with pytest.raises(InputError, match="quantile"):
+        deviation(ball(), ball(), quantile=0.0)
+
+
+def test_a_mesh_of_too_many_faces_is_simplified_by_its_repair():
+    mesh = bent_torus(20_000)
+    repair = repaired(mesh, RepairConfig(max_faces=5_000))
+    assert 3_000 < len(repair.mesh.faces) <= 5_000
+    assert repair.after.is_watertight and "simplified from" in repair.actions[-1]
+    assert deviation(repair.mesh, mesh) < 5e-4
+    assert repaired(repair.mesh, RepairConfig(max_faces=5_000)).actions == ()
+
+
+@pytest.mark.slow
+def test_five_million_faces_are_read_and_inspected_in_a_minute(tmp_path):
+    mesh = bent_torus(5_000_000)
+    (tmp_path / "a.ply").write_bytes(ply_bytes(mesh, "m"))
+    del mesh
+    start = time.process_time()
+    scan = read_scan(tmp_path / "a.ply", "m")
+    report = inspect_mesh(scan.mesh)
+    seconds = time.process_time() - start
+    assert report.faces > 4_990_000 and report.is_watertight and report.is_outward
+    assert [p.kind for p in report.problems] == ["gigantic"]
+    assert seconds < 60.0
+    peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    assert peak_gb < 3.5  # the process's peak, with what other tests of it took
+
+
+@pytest.mark.skipif(not (DATA / "school").is_dir(), reason=f"no data at {DATA}")
+def test_real_scans_are_read_inspected_and_repaired():
+    cup = read_scan(DATA / "school/graspit_assets/cup.stl", "m")
+    repair = repaired(cup.mesh)
+    assert repair.after.is_outward and len(repair.after.problems) <= len(repair.before.problems)
+    assert repaired(repair.mesh).actions == ()

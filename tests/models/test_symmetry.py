@@ -1,0 +1,268 @@
+"""Symmetries: laws of the group, exact shapes, scans with shape error, and what breaks them."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.mesh import diameter, symmetry_transforms, transformed
+from realsim.geometry.parts import object_model, part, part_names
+from realsim.models.symmetry import SymmetryConfig, find_symmetries
+from realsim.models.symmetry_groups import closed, group, turn
+from realsim.records import Mesh, ObjectModel
+from realsim.scanning.simulated import distorted
+
+PHI = (1 + math.sqrt(5)) / 2
+SLOW = ("cube", "cylinder_can", "flange", "elbow", "mug", "bottle", "pulley")
+
+
+def solid(shape):
+    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
+
+
+def hull(points, size_m=0.05):
+    import trimesh
+
+    return solid(trimesh.convex.convex_hull(size_m * np.asarray(points, dtype=float)))
+
+
+def ring(n, z, twist=0.0):
+    t = 2 * np.pi * np.arange(n) / n + twist
+    return np.stack([np.cos(t), np.sin(t), np.full(n, z)], -1)
+
+
+QUICK = ("icosahedron", "tetrahedron", "12 chiral corners", "twisted prism")
+
+
+def scaled(mesh, factor):
+    return replace(mesh, vertices=factor * mesh.vertices)
+
+
+def subdivided(mesh, rng, times, noise_m):
+    """Return the same surface with more, unequal triangles and moved vertices."""
+    import trimesh
+
+    shape = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    for _ in range(times):
+        some = rng.permutation(len(shape.faces))[: len(shape.faces) * 2 // 3]
+        shape = shape.subdivide(some)
+    shape.merge_vertices()
+    shape.vertices = shape.vertices + rng.normal(0, noise_m, shape.vertices.shape)
+    return solid(shape)
+
+
+def same_motions(A, B, mesh, share=0.01):
+    """Whether each motion of A is one of B, judged by where it puts the mesh's vertices."""
+    v = mesh.vertices[:: max(1, len(mesh.vertices) // 40)]
+    a, b = se3.transform(A, v), se3.transform(B, v)
+    gaps = np.linalg.norm(a[:, None] - b[None], axis=-1).max(-1)
+    return np.all(gaps.min(1) <= share * diameter(mesh))
+
+
+def as_model(mesh, found):
+    return ObjectModel(
+        obj_id=1, name="x", mesh=mesh, symmetries=found.discrete, symmetry_axes=found.axes
+    )
+
+
+# --- known answers ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", part_names())
+def test_the_symmetries_of_every_shipped_part_are_found(name):
+    model = part(name)
+    found = find_symmetries(model.mesh)
+    assert len(found.discrete) == len(model.symmetries)
+    assert len(found.axes) == len(model.symmetry_axes)
+    assert found.worst_m < 1e-4
+    # The whole set, discrete times steps, not only its size; a flip about x is one about any
+    # line across a continuous axis, so that the steps are compared at 2 degrees.
+    known = symmetry_transforms(model, math.radians(2))
+    ours = symmetry_transforms(as_model(model.mesh, found), math.radians(2))
+    assert len(ours) == len(known)
+    allowed = 0.02 if found.axes else 1e-3
+    assert same_motions(known, ours, model.mesh, allowed)
+    assert same_motions(ours, known, model.mesh, allowed)
+    for axis, point in found.axes:
+        assert np.allclose(axis, [0, 0, 1], atol=1e-3)
+        assert np.allclose(np.asarray(point)[:2], 0, atol=5e-5)
+
+
+SHAPES = {
+    # name: points of a hull, discrete elements, continuous axes, equals its mirror image
+    "icosahedron": (
+        [np.roll((0, a, b * PHI), k) for a in (1, -1) for b in (1, -1) for k in range(3)],
+        60, 0, True,
+    ),
+    "octahedron": (np.concatenate([np.eye(3), -np.eye(3)]), 24, 0, True),
+    "tetrahedron": ([(1, 1, 1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1)], 12, 0, True),
+    "12 chiral corners": (group("tetrahedral") @ [1.0, 0.45, 0.15], 12, 0, False),
+    "triangular prism": (np.concatenate([ring(3, 0.5), ring(3, -0.5)]), 6, 0, True),
+    "twelve-sided prism": (np.concatenate([ring(12, 0.3), ring(12, -0.3)]), 24, 0, True),
+    "twisted prism": (np.concatenate([ring(5, 0.6), ring(5, -0.6, 0.25)]), 10, 0, False),
+    "square antiprism": (np.concatenate([ring(4, 0.6), ring(4, -0.6, np.pi / 4)]), 8, 0, True),
+    "pyramid": (np.concatenate([ring(7, 0.0), [[0, 0, 1.2]]]), 7, 0, True),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in SHAPES]
+)
+def test_point_groups_are_found_wherever_the_shape_lies(name):
+    points, discrete, axes, mirror = SHAPES[name]
+    T = se3.random_transform(np.random.default_rng(1), 1)[0]
+    found = find_symmetries(transformed(hull(points), T))
+    assert (len(found.discrete), len(found.axes)) == (discrete, axes)
+    assert found.is_mirror_symmetric is mirror
+    assert found.worst_m < 1e-4
+
+
+def test_a_sphere_has_three_axes_as_bop_has_no_other_form():
+    import trimesh
+
+    ball = transformed(
+        solid(trimesh.creation.icosphere(3, 0.04)), se3.from_translation([0.3, 0, 0.1])
+    )
+    found = find_symmetries(ball)
+    assert len(found.discrete) == 1 and len(found.axes) == 3
+    directions = np.array([axis for axis, _ in found.axes])
+    assert np.allclose(directions @ directions.T, np.eye(3), atol=1e-9)
+    assert np.allclose([point for _, point in found.axes], [0.3, 0, 0.1], atol=2e-4)
+    assert found.is_mirror_symmetric
+
+
+def test_a_random_hull_has_no_symmetry():
+    found = find_symmetries(hull(np.random.default_rng(3).normal(size=(12, 3))))
+    assert np.array_equal(found.discrete, np.eye(4)[None])
+    assert found.axes == () and found.worst_m == 0 and not found.is_mirror_symmetric
+
+
+# --- laws ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["cube", "knob", "t_profile"])
+def test_the_discrete_symmetries_are_a_group(name):
+    S = find_symmetries(part(name).mesh).discrete
+    assert np.array_equal(S[0], np.eye(4))
+    products = (S[:, None] @ S[None]).reshape(-1, 4, 4)
+    for T in np.concatenate([products, np.linalg.inv(S)]):
+        assert np.abs(S - T).max(axis=(1, 2)).min() < 1e-9
+    gaps = np.abs(S[:, None] - S[None]).max(axis=(2, 3)) + np.eye(len(S))
+    assert gaps.min() > 0.01
+
+
+@pytest.mark.parametrize("name", ["hex_nut", "cone"])
+def test_symmetries_move_with_the_mesh_and_grow_with_it(name):
+    mesh = part(name).mesh
+    T = se3.from_rt(se3.random_rotation(np.random.default_rng(5)), [4.0, -2.0, 1.0])
+    plain, moved = find_symmetries(mesh), find_symmetries(transformed(scaled(mesh, 3.0), T))
+    assert len(moved.discrete) == len(plain.discrete)
+    assert len(moved.axes) == len(plain.axes)
+    assert moved.is_mirror_symmetric == plain.is_mirror_symmetric
+    grown = plain.discrete.copy()
+    grown[:, :3, 3] *= 3.0
+    if not plain.axes:
+        expected = T @ grown @ se3.invert(T)
+        big = transformed(scaled(mesh, 3.0), T)
+        assert same_motions(expected, moved.discrete, big, 1e-3)
+    for (a, p), (b, q) in zip(plain.axes, moved.axes, strict=True):
+        direction, point = T[:3, :3] @ a, se3.transform(T, 3.0 * np.array([p]))[0]
+        assert abs(direction @ b) > math.cos(math.radians(0.1))
+        assert np.linalg.norm(np.cross(q - point, direction)) < 1e-3
+
+
+@pytest.mark.parametrize("order", [2, 3, 7, 24])
+def test_groups_have_as_many_elements_as_the_books_say(order):
+    assert len(group("cyclic", order)) == order
+    assert len(group("dihedral", order)) == 2 * order
+    sizes = {"tetrahedral": 12, "octahedral": 24, "icosahedral": 60}
+    assert {name: len(group(name)) for name in sizes} == sizes
+    with pytest.raises(Exception, match="more than 240"):
+        closed([turn((0, 0, 1), 1.0), turn((1, 0, 0), 0.7)])
+
+
+# --- scans --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["gear", *(pytest.param(n, marks=pytest.mark.slow) for n in SLOW)])
+def test_one_percent_of_shape_error_hides_no_symmetry(name):
+    model = part(name)
+    mesh = distorted(model.mesh, 0.01, np.random.default_rng(21))
+    found = find_symmetries(mesh)
+    assert len(found.discrete) == len(model.symmetries)
+    assert len(found.axes) == len(model.symmetry_axes)
+    # It is the axis of the true shape, within what the distortion leaves of it.
+    known = symmetry_transforms(model, math.radians(2))
+    ours = symmetry_transforms(as_model(mesh, found), math.radians(2))
+    assert same_motions(known, ours, mesh, 0.06)
+
+
+@pytest.mark.parametrize("name", ["box", pytest.param("hex_nut", marks=pytest.mark.slow), "wedge"])
+def test_uneven_triangles_and_noise_change_nothing(name):
+    model = part(name)
+    noisy = subdivided(model.mesh, np.random.default_rng(4), 3, 0.0003)
+    found = find_symmetries(noisy)
+    assert len(found.discrete) == len(model.symmetries) and found.axes == ()
+    # Half a degree and half a millimetre, although nothing but the surface tells the axes.
+    assert same_motions(model.symmetries, found.discrete, model.mesh, 0.01)
+
+
+def test_a_hole_in_the_mesh_is_no_obstacle():
+    mesh = part("bowl").mesh
+    centers = mesh.vertices[mesh.faces].mean(axis=1)
+    seen = np.linalg.norm(centers - centers[200], axis=1) > 0.005
+    found = find_symmetries(replace(mesh, faces=mesh.faces[seen]))
+    assert len(found.axes) == 1 and len(found.discrete) == 1
+
+
+def test_a_feature_that_breaks_a_symmetry_is_seen_and_the_near_symmetry_named():
+    mug = find_symmetries(part("mug").mesh)
+    assert len(mug.discrete) == 1 and mug.axes == () and mug.is_mirror_symmetric
+    assert any("about the axis (" in text and "% of the surface" in text for text in mug.near)
+    # A can with a bump of 5 mm on one side: no turn is left, and all are nearly one.
+    can = part("cylinder_can").mesh
+    v = can.vertices.copy()
+    near = np.linalg.norm(v - v[np.argmax(v[:, 0])], axis=1) < 0.012
+    v[near, 0] += 0.006
+    bumped = find_symmetries(replace(can, vertices=v))
+    assert bumped.axes == () and len(bumped.near) > 0
+    assert find_symmetries(can).near == ()
+
+
+def test_tolerances_decide_and_grams_of_millimetres_are_refused():
+    square = hull(np.array(list(np.ndindex(2, 2, 2))) * [1.0, 1.02, 2.0] - 0.5)
+    assert len(find_symmetries(square).discrete) == 8
+    strict = SymmetryConfig(tolerance=0.002, greatest_tolerance=0.002)
+    found = find_symmetries(square, strict)
+    assert len(found.discrete) == 4 and "turn by 1/4" in " ".join(found.near)
+    with pytest.raises(InputError, match="shares of the diameter"):
+        SymmetryConfig(tolerance=1.3)
+
+
+# --- appearance ---------------------------------------------------------------------------------
+
+
+def test_a_texture_that_breaks_a_symmetry_is_told():
+    assert not find_symmetries(part("cylinder_can").mesh).texture_breaks  # bands, both ends alike
+    assert find_symmetries(part("capsule").mesh).texture_breaks  # two colours
+    bare = replace(part("capsule").mesh, colors=None)
+    assert not find_symmetries(bare).texture_breaks
+    # The same box, with a texture whose every texel is red on one half of the height.
+    box = part("box").mesh
+    height = (box.vertices[:, 2] - box.vertices[:, 2].min()) / np.ptp(box.vertices[:, 2])
+    uv = np.stack([np.full(len(height), 0.5), 0.02 + 0.96 * height], -1)
+    texture = np.full((64, 4, 3), 200, dtype=np.uint8)
+    texture[32:] = (200, 20, 20)
+    painted = Mesh(vertices=box.vertices, faces=box.faces, uv=uv, texture=texture)
+    assert find_symmetries(painted).texture_breaks
+    plain = replace(painted, texture=np.full((64, 4, 3), 200, dtype=np.uint8))
+    assert not find_symmetries(plain).texture_breaks
+
+
+def test_a_shape_that_differs_from_its_mirror_image_is_told():
+    duck = find_symmetries(object_model("duck").mesh)
+    assert not duck.is_mirror_symmetric and len(duck.discrete) == 1
+    assert find_symmetries(part("wedge").mesh).is_mirror_symmetric

@@ -1,0 +1,155 @@
+"""scale.json: what is written comes back bit for bit, and nothing is ever half there."""
+
+import json
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError, NotRigidError
+from realsim.scanning.scale.files import (
+    ScaleRecord,
+    fit_from_json,
+    fit_to_json,
+    installed_versions,
+    json_lines,
+    load_record,
+    load_start,
+    record_bytes,
+    record_from_json,
+    record_to_json,
+    save_record,
+)
+from realsim.scanning.scale.measured import parse_measurement
+from realsim.scanning.scale.measured_check import with_measurements
+from scale_fits import fit_of, known_scan
+
+
+@pytest.fixture(scope="module")
+def known():
+    return known_scan("wedge", 1)
+
+
+@pytest.fixture(scope="module")
+def record(known):
+    lengths = [parse_measurement("longest=500mm"), parse_measurement("between 0,0,0 0,0,1=3m")]
+    fit, checks = with_measurements(fit_of(known), known.scan, lengths)
+    inputs = {"key": "abc", "mesh": {"name": "wedge"}, "at": [0.1, 0.2]}
+    poses = ({"index": 0, "T_world_cam": np.eye(4).tolist()},)
+    return ScaleRecord(
+        fit=fit, inputs=inputs, config={"field_cells": 96}, measured=checks, poses=poses,
+        versions=installed_versions(),
+    )  # fmt: skip
+
+
+def same(a, b) -> bool:
+    """Whether two values are the same to the last bit; NaN is the same as NaN."""
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and a.tobytes() == b.tobytes()
+    if hasattr(a, "__dataclass_fields__"):
+        return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
+    if isinstance(a, tuple | list):
+        return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    return a == b or (a != a and b != b)
+
+
+def test_a_fit_comes_back_bit_for_bit(record):
+    assert np.isnan(record.fit.residual_mm).any() and np.isnan(record.fit.checks["noise"])
+    text = json.dumps(fit_to_json(record.fit), allow_nan=False)
+    assert same(fit_from_json(json.loads(text)), record.fit)
+
+
+def test_a_record_comes_back_and_is_written_the_same_again(record, tmp_path):
+    path = tmp_path / "scans/wedge/scale.json"
+    save_record(path, record)
+    loaded = load_record(path)
+    assert same(loaded, record)
+    assert record_bytes(loaded) == path.read_bytes()
+
+
+def test_one_line_holds_all_residuals(record):
+    lines = record_bytes(record).decode().splitlines()
+    assert len(lines) < 400
+    assert sum('"residual_mm": [' in line for line in lines) == 1
+    assert json.loads("\n".join(lines)) == record_to_json(record)
+
+
+@pytest.mark.parametrize(
+    "value", [{}, [], {"a": []}, {"a": {}}, [[1, 2], [3]], {"a": [{"b": None}, 1.5]}, "x", 3]
+)
+def test_lines_are_json(value):
+    assert json.loads(json_lines(value)) == value
+
+
+def test_a_failed_write_leaves_what_was_there(record, tmp_path):
+    path = tmp_path / "scale.json"
+    save_record(path, record)
+    before = path.read_bytes()
+    with pytest.raises(TypeError, match="JSON"):
+        save_record(path, replace(record, inputs={"bad": object()}))
+    assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda d: d.pop("format"), "format"),
+        (lambda d: d.update(format="something"), "something"),
+        (lambda d: d.update(format_version=99), "Update realsim"),
+        (lambda d: d["fit"].pop("sigma"), "sigma"),
+        (lambda d: d["fit"].update(verdict="fine"), "fine"),
+        (lambda d: d["fit"].update(covariance=[[1]]), "covariance"),
+        (lambda d: d["fit"].update(residual_mm=["a"]), "damaged"),
+        (lambda d: d["fit"].update(limits=[{"name": "x"}]), "damaged"),
+        (lambda d: d["fit"].update(views=[{"index": 1}]), "a view"),
+    ],
+)
+def test_damage_is_named(record, change, said):
+    data = record_to_json(record)
+    change(data)
+    with pytest.raises(InputError, match=said):
+        record_from_json(data)
+
+
+def test_a_file_that_is_no_json_is_named(tmp_path):
+    (tmp_path / "scale.json").write_text('{"format": "realsim sc')
+    with pytest.raises(InputError, match="not valid JSON"):
+        load_record(tmp_path / "scale.json")
+    with pytest.raises(InputError, match="does not exist"):
+        load_record(tmp_path / "none.json")
+
+
+# --- starts -----------------------------------------------------------------------------------
+
+
+def test_a_result_is_a_start(record, tmp_path):
+    save_record(tmp_path / "scale.json", record)
+    start = load_start(tmp_path / "scale.json")
+    assert start.scale == record.fit.scale
+    np.testing.assert_array_equal(start.T_world_obj, record.fit.T_world_obj)
+
+
+def written(tmp_path, **values):
+    path = tmp_path / "start.json"
+    path.write_text(json.dumps(values))
+    return path
+
+
+def test_a_start_is_two_values(tmp_path):
+    start = load_start(written(tmp_path, scale=0.1, T_world_obj=np.eye(4).tolist()))
+    assert start.scale == 0.1 and start.source == "given"
+
+
+def test_a_start_that_is_none_is_named(tmp_path):
+    scaled = np.diag([2.0, 2, 2, 1]).tolist()
+    with pytest.raises(NotRigidError, match="never inside"):
+        load_start(written(tmp_path, scale=2.0, T_world_obj=scaled))
+    for scale in (-1, 0, "big", None, True):
+        with pytest.raises(InputError, match="scale"):
+            load_start(written(tmp_path, scale=scale, T_world_obj=np.eye(4).tolist()))
+    with pytest.raises(InputError, match="shape"):
+        load_start(written(tmp_path, scale=1.0, T_world_obj=[1, 2, 3]))
+    with pytest.raises(InputError, match="lacks T_world_obj"):
+        load_start(written(tmp_path, scale=1.0))

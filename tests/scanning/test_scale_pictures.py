@@ -1,0 +1,239 @@
+"""Pictures of a scale fit: colours mean what they say, and every case can be drawn."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry.camera import project
+from realsim.geometry.se3 import invert, transform
+from realsim.records import Mesh
+from realsim.rendering.rays import PlacedMesh, RayScene
+from realsim.scanning.scale.picture_overlays import (
+    OverlayConfig,
+    Photograph,
+    chosen_views,
+    object_window,
+    overlays_png,
+    rendered_depth,
+    worst_views,
+)
+from realsim.scanning.scale.picture_shading import (
+    UNSEEN,
+    ShadingConfig,
+    diverging,
+    half_width,
+    shaded_view,
+)
+from realsim.scanning.scale.pictures import (
+    ROUND_MM,
+    candidates_png,
+    headline,
+    residual_range_mm,
+    residuals_png,
+    views_png,
+)
+from scale_fits import fit_of, known_scan
+
+SMALL = ShadingConfig(size_px=120)
+
+
+@pytest.fixture(scope="module")
+def known():
+    return known_scan("mug", 1)
+
+
+@pytest.fixture(scope="module")
+def fit(known):
+    return fit_of(known)
+
+
+def decoded(png: bytes) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return image[..., ::-1].astype(int)
+
+
+def reddish(image: np.ndarray) -> int:
+    return int(np.sum(image[..., 0] - image[..., 2] > 40))
+
+
+def bluish(image: np.ndarray) -> int:
+    return int(np.sum(image[..., 2] - image[..., 0] > 40))
+
+
+# --- colours ----------------------------------------------------------------------------------
+
+
+def test_red_is_outside_blue_is_inside_grey_is_unseen():
+    red, white, blue, grey = diverging(np.array([1.0, 0.0, -1.0, np.nan]), 1.0)
+    assert red[0] > red[2] + 50 and blue[2] > blue[0] + 50
+    assert np.all(white > 240) and tuple(grey) == UNSEEN
+    np.testing.assert_array_equal(*diverging(np.array([7.0, 1.0]), 1.0))
+
+
+@pytest.mark.parametrize(("value", "count"), [(1.0, reddish), (-1.0, bluish)])
+def test_a_mesh_has_the_colour_of_its_residual(known, value, count):
+    mesh = known.real
+    picture = shaded_view(
+        mesh, np.full(len(mesh.vertices), value), 1.0, 30.0, half_width(mesh, SMALL), SMALL
+    )
+    drawn = np.any(picture != 255, axis=-1)
+    assert 0.1 < drawn.mean() < 0.9
+    assert count(picture.astype(int)) > 0.9 * drawn.sum()
+
+
+def test_what_was_not_measured_is_grey(known):
+    mesh = known.real
+    half_m = half_width(mesh, SMALL)
+    unseen = shaded_view(mesh, np.full(len(mesh.vertices), np.nan), 1.0, 30.0, half_m, SMALL)
+    pixels = unseen[np.any(unseen != 255, axis=-1)].astype(int)
+    assert np.all(np.ptp(pixels, axis=-1) < 15)
+    half = np.where(mesh.vertices[:, 2] > mesh.bounds.mean(0)[2], 1.0, np.nan)
+    picture = shaded_view(mesh, half, 1.0, 30.0, half_m, SMALL).astype(int)
+    upper, lower = reddish(picture[:50]), reddish(picture[70:])
+    assert upper > 100 and lower < 0.1 * upper
+
+
+def test_the_whole_mesh_is_in_the_picture_from_every_side(known):
+    mesh = known.real
+    for azimuth in SMALL.azimuths_deg:
+        picture = shaded_view(
+            mesh, np.zeros(len(mesh.vertices)), 1.0, azimuth, half_width(mesh, SMALL), SMALL
+        )
+        rim = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+        assert np.all(rim == 255)
+
+
+def test_a_scale_that_is_too_great_is_blue_and_one_too_small_is_red():
+    solid = known_scan("bottle", 1)  # without an inside, whose residuals have the other sign
+    great, small = (
+        decoded(residuals_png(solid.scan, fit_of(solid, f), SMALL)) for f in (1.08, 0.92)
+    )
+    head, bar = 60, 150  # neither the coloured title nor the colour bar
+    great, small = great[head:, :-bar], small[head:, :-bar]
+    assert bluish(great) > 3 * reddish(great)
+    assert reddish(small) > 3 * bluish(small)
+
+
+def test_the_range_is_round_and_not_ruled_by_outliers(fit):
+    residual = np.concatenate([np.linspace(-0.9, 0.9, 1000), [40.0, np.nan]])
+    assert residual_range_mm(replace(fit, residual_mm=residual)) == 1.0
+    assert residual_range_mm(replace(fit, residual_mm=np.zeros(10))) in ROUND_MM
+    assert residual_range_mm(replace(fit, residual_mm=np.full(10, np.nan))) in ROUND_MM
+
+
+# --- figures ----------------------------------------------------------------------------------
+
+
+def test_every_verdict_is_written(known, fit):
+    for verdict in ("accepted", "doubtful", "rejected", "unchecked"):
+        assert headline(replace(fit, verdict=verdict)).startswith(verdict.upper())
+
+
+def test_the_same_fit_gives_the_same_bytes(known, fit):
+    assert residuals_png(known.scan, fit, SMALL) == residuals_png(known.scan, fit, SMALL)
+    assert views_png(fit) == views_png(fit)
+
+
+def test_a_view_that_was_left_out_is_marked(fit):
+    kept = replace(fit, views=tuple(replace(v, used=True) for v in fit.views))
+    assert reddish(decoded(views_png(fit))) > reddish(decoded(views_png(kept))) + 500
+
+
+def test_views_without_figures_are_drawn(fit):
+    blank = replace(
+        fit.views[0], agree=np.nan, iou=np.nan, rms_mm=np.nan, shift_mm=np.nan, turn_deg=np.nan
+    )
+    decoded(views_png(replace(fit, views=(blank, *fit.views[1:]))))
+    many = tuple(replace(fit.views[0], index=k) for k in range(100))
+    decoded(views_png(replace(fit, views=many)))
+
+
+def test_rivals_are_drawn(fit):
+    alone = replace(fit, candidates=fit.candidates[:2])
+    assert reddish(decoded(candidates_png(fit))) > reddish(decoded(candidates_png(alone))) + 30
+    far = tuple(replace(c, scale=c.scale * 10**k) for k, c in enumerate(fit.candidates))
+    decoded(candidates_png(replace(fit, candidates=far)))
+
+
+def test_what_cannot_be_drawn_is_named(known, fit):
+    with pytest.raises(InputError, match="not of each other"):
+        residuals_png(known.scan, replace(fit, residual_mm=np.zeros(3)))
+    with pytest.raises(InputError, match="no views"):
+        views_png(replace(fit, views=()))
+    with pytest.raises(InputError, match="no candidates"):
+        candidates_png(replace(fit, candidates=()))
+    with pytest.raises(InputError, match="no photographs"):
+        overlays_png(known.scan, fit, known.views.intrinsics, ())
+
+
+# --- overlays ---------------------------------------------------------------------------------
+
+
+def scene_of(known, fit) -> RayScene:
+    scaled = Mesh(vertices=fit.scale * known.scan.vertices, faces=known.scan.faces)
+    return RayScene([PlacedMesh(0, scaled, fit.T_world_obj)])
+
+
+def test_the_model_is_rendered_where_the_object_was_seen(known, fit):
+    camera = known.views.intrinsics
+    frame, T_true = known.views.frames[2], known.views.Ts_world_cam[2]
+    whole = (slice(0, camera.height), slice(0, camera.width))
+    depth = rendered_depth(scene_of(known, fit), camera, T_true, whole)
+    both = np.isfinite(depth) & (frame.depth_m > 0)
+    miss = np.abs(frame.depth_m[both] - depth[both])
+    assert both.sum() > 500 and np.median(miss) < 0.002
+    wrong = rendered_depth(scene_of(known, fit_of(known, 1.15)), camera, T_true, whole)
+    both = np.isfinite(wrong) & (frame.depth_m > 0)
+    assert np.median(np.abs(frame.depth_m[both] - wrong[both])) > 2 * np.median(miss)
+
+
+def test_a_window_renders_as_the_whole_picture_does(known, fit):
+    camera, frame = known.views.intrinsics, known.views.frames[3]
+    world = transform(fit.T_world_obj, fit.scale * known.scan.vertices)
+    window = object_window(world, camera, frame.T_world_cam, OverlayConfig())
+    uv = project(camera, transform(invert(frame.T_world_cam), world))
+    rows, columns = window
+    assert columns.start <= max(uv[:, 0].min(), 0) and rows.start <= max(uv[:, 1].min(), 0)
+    assert columns.stop > min(uv[:, 0].max(), camera.width - 1)
+    whole = (slice(0, camera.height), slice(0, camera.width))
+    scene = scene_of(known, fit)
+    part = rendered_depth(scene, camera, frame.T_world_cam, window)
+    np.testing.assert_array_equal(
+        part, rendered_depth(scene, camera, frame.T_world_cam, whole)[window]
+    )
+
+
+def test_an_object_out_of_sight_shows_the_whole_picture(known):
+    camera, T = known.views.intrinsics, known.views.Ts_world_cam[0]
+    behind = T[:3, 3] - T[:3, 2] + np.zeros((4, 3))
+    window = object_window(behind, camera, T, OverlayConfig())
+    assert window == (slice(0, camera.height), slice(0, camera.width))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_overlays_are_drawn(known, fit, count):
+    camera = known.views.intrinsics
+    photographs = [
+        Photograph(
+            index=f.index, rgb=np.full((camera.height, camera.width, 3), 90, np.uint8),
+            depth_m=f.depth_m, T_world_cam=f.T_world_cam,
+        )
+        for f in known.views.frames[:count]
+    ]  # fmt: skip
+    image = decoded(overlays_png(known.scan, fit, camera, photographs))
+    yellow = (image[..., 0] > 200) & (image[..., 1] > 150) & (image[..., 2] < 90)
+    assert yellow.sum() > 100 * count
+
+
+def test_the_worst_views_are_among_those_shown(fit):
+    many = tuple(
+        replace(fit.views[0], index=k, agree=0.9 - 0.3 * (k == 17), used=k != 5) for k in range(30)
+    )
+    shown = chosen_views(replace(fit, views=many))
+    assert {5, 17} <= set(shown) and len(shown) == 6 and list(shown) == sorted(shown)
+    assert [v.index for v in worst_views(replace(fit, views=many))][:2] == [5, 17]
+    assert chosen_views(fit) == tuple(v.index for v in fit.views)
