@@ -2,80 +2,24 @@
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.app.console import Console, Tick
-from realsim.errors import InputError, RealsimError
-from realsim.records import CameraIntrinsics
+from realsim.app.scan_sfm_dense import mesh_from_depth
+from realsim.app.scan_sfm_inputs import SfmInputs, SfmRequest, sfm_inputs, sfm_masks
+from realsim.errors import InputError
 from realsim.scanning.sfm.config import SfmConfig
-from realsim.scanning.sfm.result import Poses, SfmResult
-from realsim.store import SessionStore
+from realsim.scanning.sfm.result import SfmResult
 
-if TYPE_CHECKING:
-    from realsim.scanning.fusion.result import FusedObject
-
-Array = NDArray[np.float64]
+__all__ = ["SfmRequest", "run_scan_sfm", "show_sfm"]
 PLACE = "scans/sfm"
 """Where in a session the result lies."""
-POSES: dict[str, Poses] = {"unknown": "unknown", "known": "known", "refined": "refined"}
 STEPS = {"features": "features", "matches": "matches", "mapping": "cameras and points"}
 """Steps of the reconstruction as they are shown."""
 WORST_VIEWS = 8
 """Views listed in the table, the farthest from the robot first."""
-MESH, FUSION = "dense.ply", "dense.json"
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SfmRequest:
-    """What the command was told."""
-
-    images: Path
-    """A session or a folder of photographs."""
-    out: Path | None = None
-    """Where to write; None: SESSION/scans/sfm, or IMAGES/sfm."""
-    poses: str | None = None
-    """'unknown', 'known', 'refined'; None: 'refined' where the session has poses."""
-    camera: Path | None = None
-    """File with the intrinsics of a plain folder."""
-    masks: Path | None = None
-    """Folder of masks, one for each photograph."""
-    dense: bool | None = None
-    """Whether depth is fused; None: if there is any."""
-    text: bool = False
-    """Whether the COLMAP model is written as text, too."""
-    seed: int = 0
-    """Of every random choice."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class SfmInputs:
-    """Photographs with what is known of them."""
-
-    paths: tuple[Path, ...]
-    intrinsics: CameraIntrinsics | None
-    Ts_world_cam: tuple[Array | None, ...]
-    poses: Poses
-    store: SessionStore | None
-    """The session, None for a plain folder."""
-    notes: tuple[str, ...]
-
-    def depth_of(self, name: str) -> NDArray[np.float32] | None:
-        """Return the depth image of a photograph of the session, None where there is none."""
-        index = int(Path(name).stem)
-        if self.store is None or not self.store.has_depth(index):
-            return None
-        return self.store.depth_m(index)
-
-    @property
-    def has_depth(self) -> bool:
-        """Whether any view has depth."""
-        store = self.store
-        return store is not None and any(store.has_depth(v.index) for v in store.session.views)
 
 
 def run_scan_sfm(request: SfmRequest, console: Console) -> bool:
@@ -113,7 +57,7 @@ def run_scan_sfm(request: SfmRequest, console: Console) -> bool:
         if request.text:
             _write_text_model(out)
         show_sfm(result, console)
-        dense_good = _dense(request, inputs, result, out, console)
+        dense_good = mesh_from_depth(request.dense, inputs, result, out, console)
     console.say(f"cameras   {out / 'cameras.json'}")
     console.say(f"points    {out / 'sparse.ply'}")
     console.say(f"model     {out / 'model'} (COLMAP)")
@@ -122,93 +66,8 @@ def run_scan_sfm(request: SfmRequest, console: Console) -> bool:
     return result.verdict == "accepted" and dense_good
 
 
-def sfm_inputs(request: SfmRequest) -> SfmInputs:
-    """Return what the command works on.
-
-    Raises:
-        InputError: no images, or a session whose poses are needed and missing.
-    """
-    from realsim.scanning.sfm.photographs import photographs_in
-
-    if (request.images / "session.json").is_file():
-        return _session_inputs(request)
-    paths = tuple(photographs_in(request.images))
-    if request.poses in ("known", "refined"):
-        raise InputError(
-            f"--poses {request.poses} needs the robot's camera poses, and '{request.images}' is a "
-            "plain folder. `realsim import` makes a session of images and poses; or leave --poses "
-            "out."
-        )
-    intrinsics = None
-    if request.camera is not None:
-        from realsim.app.import_folder import camera_of_file
-        from realsim.formats.images import image_size
-
-        intrinsics = camera_of_file(request.camera, image_size(paths[0]))
-    return SfmInputs(
-        paths=paths, intrinsics=intrinsics, Ts_world_cam=(None,) * len(paths), poses="unknown",
-        store=None, notes=("a folder of photographs: no robot poses, so no metric scale.",),
-    )  # fmt: skip
-
-
-def _session_inputs(request: SfmRequest) -> SfmInputs:
-    """Return a session's photographs, camera and poses."""
-    from realsim.app.stages import open_session
-    from realsim.store.session_store import rgb_path
-
-    store = open_session(request.images)
-    if request.camera is not None:
-        raise InputError("a session has its own camera; --camera is for a folder of photographs.")
-    views = store.session.views
-    posed = sum(v.T_world_cam is not None for v in views)
-    poses: Poses = "refined" if posed == len(views) else "unknown"
-    notes: list[str] = []
-    if request.poses is not None:
-        poses = POSES[request.poses]
-    if not posed and poses != "unknown":
-        raise InputError(
-            f"session '{request.images}' is not calibrated: none of its {len(views)} views has a "
-            "camera pose. `realsim calibrate SESSION` finds them; --poses unknown maps without, "
-            "and without a metric scale."
-        )
-    if not posed:
-        notes.append(
-            "the session is not calibrated: no camera poses, so no metric scale. `realsim "
-            "calibrate SESSION` gives both."
-        )
-    elif posed < len(views) and request.poses is None:
-        notes.append(f"{len(views) - posed} views have no camera pose, so poses are 'unknown'.")
-    if not any(store.has_depth(v.index) for v in views):
-        notes.append("the session has no depth images: no second scale, and no mesh.")
-    return SfmInputs(
-        paths=tuple(store.path(rgb_path(v.index)) for v in views),
-        intrinsics=store.session.intrinsics,
-        Ts_world_cam=tuple(v.T_world_cam for v in views),
-        poses=poses, store=store, notes=tuple(notes),
-    )  # fmt: skip
-
-
 def _default_out(request: SfmRequest, inputs: SfmInputs) -> Path:
     return request.images / (PLACE if inputs.store is not None else "sfm")
-
-
-def _masks(request: SfmRequest, inputs: SfmInputs) -> dict[str, NDArray[np.bool_]] | None:
-    """Return the masks by the photographs' names."""
-    from realsim.formats.images import read_grey
-
-    if request.masks is None:
-        return None
-    found: dict[str, NDArray[np.bool_]] = {}
-    for path in inputs.paths:
-        places = [request.masks / f"{stem}.png" for stem in (path.stem, path.name)]
-        mask = next((p for p in places if p.is_file()), None)
-        if mask is None:
-            raise InputError(
-                f"'{request.masks}' has no mask for {path.name}: {path.stem}.png is expected, "
-                "white where features may lie."
-            )
-        found[path.name] = read_grey(mask) > 0
-    return found
 
 
 @contextmanager
@@ -241,7 +100,7 @@ def _reconstructed(
     with _steps(console) as progress:
         result = reconstruct(
             inputs.paths, inputs.intrinsics, config, poses=inputs.poses,
-            Ts_world_cam=inputs.Ts_world_cam, masks=_masks(request, inputs), folder=out,
+            Ts_world_cam=inputs.Ts_world_cam, masks=sfm_masks(request, inputs), folder=out,
             progress=progress,
         )  # fmt: skip
     return with_depth(result, inputs.depth_of, config) if inputs.has_depth else result
@@ -253,75 +112,6 @@ def _write_text_model(out: Path) -> None:
     from realsim.scanning.sfm.mapping import save_model
 
     save_model(pycolmap.Reconstruction(str(out / "model")), out / "model_text", text=True)
-
-
-# --- dense ------------------------------------------------------------------------------------
-
-
-def _dense(
-    request: SfmRequest, inputs: SfmInputs, result: SfmResult, out: Path, console: Console
-) -> bool:
-    """Fuse the depth images at the reconstructed cameras; return whether nothing speaks against."""
-    wanted = inputs.has_depth if request.dense is None else request.dense
-    if not wanted:
-        return True
-    if not result.is_metric or result.verdict == "rejected":
-        console.warn("no mesh: depth is fused at metric cameras that were not rejected.")
-        return request.dense is None
-    try:
-        with console.stage("sfm", "mesh from depth") as tick:
-            tick(0, 1)
-            fused = _fused(inputs, result)
-    except RealsimError as error:
-        if request.dense:
-            raise
-        console.warn(f"no mesh: {error}")
-        return True
-    _write_dense(fused, out)
-    _show_dense(fused, console)
-    console.say(f"mesh      {out / MESH}")
-    return fused.verdict == "accepted"
-
-
-def _fused(inputs: SfmInputs, result: SfmResult) -> "FusedObject":
-    from realsim.scanning.fusion.fuse import fuse_object
-    from realsim.scanning.fusion.result import FusionConfig, FusionFrame
-
-    store = inputs.store
-    assert store is not None
-    wrong = set(result.outliers) if result.poses == "unknown" else set[str]()
-    cameras = dict(zip(result.geometry.names, result.geometry.Ts_world_cam, strict=True))
-    if result.poses != "unknown":
-        # A view of bare table has no features, but the robot knows where it was taken.
-        for path, T in zip(inputs.paths, inputs.Ts_world_cam, strict=True):
-            if T is not None:
-                cameras.setdefault(path.name, T)
-    frames: list[FusionFrame] = []
-    for name, T in sorted(cameras.items()):
-        depth = inputs.depth_of(name)
-        if depth is None or name in wrong:
-            continue
-        index = int(Path(name).stem)
-        frames.append(FusionFrame(index=index, depth_m=depth, T_world_cam=T, rgb=store.rgb(index)))
-    return fuse_object(result.geometry.intrinsics, frames, None, FusionConfig())
-
-
-def _write_dense(fused: "FusedObject", out: Path) -> None:
-    """Write the mesh [m] in world, its report and its picture."""
-    from realsim.geometry.mesh import ply_bytes
-    from realsim.scanning.fusion.picture import fusion_picture
-    from realsim.store.atomic import write_bytes, write_json
-
-    write_bytes(out / MESH, ply_bytes(fused.mesh, "m"))
-    write_bytes(out / "dense.png", fusion_picture(fused))
-    document: dict[str, Any] = {
-        "verdict": fused.verdict, "reasons": list(fused.reasons), "notes": list(fused.notes),
-        "report": fused.report,
-    }  # fmt: skip
-    write_json(out / FUSION, document)
-
-
-# --- shown ------------------------------------------------------------------------------------
 
 
 def show_sfm(result: SfmResult, console: Console) -> None:
@@ -369,21 +159,3 @@ def _figures(result: SfmResult) -> list[list[str]]:
     rows.append(["point sigma, median", f"{np.median(result.point_sigma_mm):.2f} mm"])
     told = "no depth" if d is None else f"{d.ratio:.4f} +- {d.sigma:.4f}"
     return [*rows, ["measured depth / reconstructed", told]]
-
-
-def _show_dense(fused: "FusedObject", console: Console) -> None:
-    extent = 1e3 * fused.mesh.extent
-    c = fused.coverage
-    console.table(
-        "Mesh from depth", ["figure", "value"],
-        [
-            ["size (world axes)", " x ".join(f"{x:.1f}" for x in extent) + " mm"],
-            ["faces", str(len(fused.mesh.faces))],
-            ["surface measured", f"{c.measured:.0%}, above the table's edge "
-                                 f"{c.measured_above_cut:.0%}"],
-            ["sigma along the normal, median", f"{1e3 * np.nanmedian(fused.sigma_m):.2f} mm"],
-            ["verdict", fused.verdict],
-        ],
-    )  # fmt: skip
-    for text in (*fused.notes, *fused.reasons):
-        console.say(f"          {text}")

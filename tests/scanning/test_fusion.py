@@ -146,7 +146,9 @@ def test_a_distorted_lens_changes_nothing() -> None:
     radii = np.linalg.norm(fused.mesh.vertices[fused.measured] - [0, 0, RADIUS], axis=1)
     assert np.median(radii) == pytest.approx(RADIUS, abs=1e-4)
     # Taken for a pinhole's, the same images give another size: the lens does matter.
-    wrong = fuse_object(CAMERA, exact_frames((ball(),), BARREL), None, AS_GIVEN)
+    # (It bends the table, too, so that its far corners look like things: the ball is named.)
+    at = replace(AS_GIVEN, at_m=(0.0, 0.0))
+    wrong = fuse_object(CAMERA, exact_frames((ball(),), BARREL), None, at)
     radii = np.linalg.norm(wrong.mesh.vertices[wrong.measured] - [0, 0, RADIUS], axis=1)
     assert abs(np.median(radii) - RADIUS) > 3e-4
 

@@ -21,6 +21,8 @@ from realsim.scanning.fusion.volume import Volume, smoothed
 Array = NDArray[np.float64]
 STRIDE_PX = 2
 """Every how many pixels one is used; stereo noise is correlated over more."""
+SOUND_PX = 2
+"""Poses rest on pixels whose neighbours so far away are trusted too [px]."""
 PATCH_M = 0.004
 """Edge of a patch of the object [m]: flat enough where the radius is above 10 mm, and some 50
 pixels, as many as the noise is correlated over..."""
@@ -42,8 +44,12 @@ FLATNESS = 0.92
 """Largest eigenvalue of the mean square of the normals in a cell below which there is an edge
 (5 deg of noise: 0.985, a radius of one cell: 0.92, a right angle: 0.5). There every view sees another part of a rounded
 corner, and what they differ by is not their poses."""
-LEAST_ALONG = 0.15
+LEAST_ALONG = 0.25
 """Least cosine between ray and normal at which the ray is followed to the surface."""
+NEWTON_STEPS = 5
+"""Steps along the ray to the zero level."""
+ZERO_CELLS = 0.1
+"""The zero level was reached if the distance left is below this [cells]."""
 LEAST_SLOPE = 0.5
 """Gradient of the fused distance below which the place is cut off or between two surfaces."""
 
@@ -99,11 +105,17 @@ def view_points(
         heights: above the first, within the box, a point is the object's; outside the box and
             nearer to the plane than the second (and two sigmas) it is the table's [m].
     """
+    import cv2
+
     rays = ray_table(intrinsics)
     low, high = box
+    kernel = np.ones((2 * SOUND_PX + 1, 2 * SOUND_PX + 1), np.uint8)
     out: list[ViewPoints] = []
     for depth, corner, T in zip(crops.depths, crops.corners, Ts_table_cam, strict=True):
-        v, u = np.nonzero(depth[::STRIDE_PX, ::STRIDE_PX] > 0)
+        # Beside holes and edges pixels are off by more than their noise, always towards the other
+        # side: grazing views would see the surface deeper than frontal ones do.
+        sound = cv2.erode((depth > 0).astype(np.uint8), kernel)
+        v, u = np.nonzero(sound[::STRIDE_PX, ::STRIDE_PX])
         v, u = v * STRIDE_PX, u * STRIDE_PX
         z = depth[v, u].astype(np.float64)
         local = rays[v + corner[1], u + corner[0]] * z[:, None]
@@ -132,38 +144,66 @@ def observed_object(
         The observations, and the share (F,) of every view's points on the object that lie near
         the fused surface (NaN without points).
     """
-    # Smoothing moves the surface, but for all views alike, which a patch's offset takes up; without
-    # it the normals of a noisy surface are as noisy, and every cell looks like an edge.
-    field = DistanceField(grid=smoothed(volume.distance), origin=volume.origin, cell=volume.cell)
-    end = volume.origin + volume.cell * (np.array(volume.distance.shape) - 1)
+    field = DistanceField(grid=volume.distance, origin=volume.origin, cell=volume.cell)
+    smooth = DistanceField(grid=smoothed(volume.distance), origin=volume.origin, cell=volume.cell)
     rows: list[tuple[Array, ...]] = []
     matched = np.full(len(points), np.nan)
     for number, (view, T) in enumerate(zip(points, Ts_table_cam, strict=True)):
         p = se3.transform(T, view.on_object)
-        index = np.flatnonzero(np.all((p > volume.origin) & (p < end), axis=1))
-        d, g = field.distance_gradient(p[index])
-        slope = np.linalg.norm(g, axis=1)
-        with np.errstate(invalid="ignore"):
-            near = (np.abs(d) < NEAR_SHARE * config.truncation_m) & (slope > LEAST_SLOPE)
-        import os
-        MC=float(os.environ.get("MC","0"))
-        if MC:
-            with np.errstate(invalid="ignore"):
-                mm = (g/slope[:,None]) @ T[:3,:3]; lo=view.on_object[index]
-                cc = -np.sum(mm*lo,1)/np.linalg.norm(lo,axis=1)
-                near &= cc>MC
+        r, n = _to_surface((field, smooth), p, T[:3, 3], config.truncation_m)
+        near = np.abs(r) < NEAR_SHARE * config.truncation_m
         if len(p):
             matched[number] = np.count_nonzero(near) / len(p)
-        index = index[near]
-        n = g[near] / slope[near, None]
         rows.append(
             (
-                *_rows(number, T, (p[index], view.on_object[index]), n, d[near] / slope[near]),
-                view.object_sigma[index],
+                *_rows(number, T, view.on_object[near], n[near], r[near]),
+                view.object_sigma[near],
             )
         )
     pitch = float(np.median([v.pitch for v in points]))
     return _averaged(rows, max(PATCH_M, PATCH_PX * pitch), STRIDE_PX, PATCH_FLOOR_M), matched
+
+
+def _to_surface(
+    fields: tuple[DistanceField, DistanceField], p: Array, center: Array, truncation: float
+) -> tuple[Array, Array]:
+    """Return the distances (N,) [m] of points to the zero level their rays meet, and normals there.
+
+    Neither is read off where the noisy point lies: away from its zero the fused distance is not a
+    distance, and next to edges the normal hangs on the side to which the noise went. Both go
+    with the residual and pull the cameras along their axes. So the viewing ray is followed to the
+    zero level, in Newton's steps; a point so far behind that nothing is known starts nearer.
+
+    Args:
+        fields: the fused distances, and smoothed ones for the normals: those of a noisy surface
+            are as noisy, and every cell looks like an edge; the zero level, though, would be
+            moved where one side of it is not known.
+        p: (N, 3) points.
+        center: (3,) of the camera that measured them.
+        truncation: of the distances [m].
+
+    Returns:
+        The distances along the normals, NaN where no surface was found, and the normals.
+    """
+    field, smooth = fields
+    end = field.origin + field.cell * (np.array(field.grid.shape) - 1)
+    ray = p - center
+    ray /= np.maximum(np.linalg.norm(ray, axis=1), 1e-9)[:, None]
+    behind = np.isnan(field.distance_gradient(p)[0])
+    t = np.where(behind, -0.5 * truncation, 0.0)
+    d, g = field.distance_gradient(p + t[:, None] * ray)
+    for _ in range(NEWTON_STEPS):
+        fall = np.minimum(np.sum(g * ray, axis=1), -LEAST_ALONG * LEAST_SLOPE)
+        t = t - np.clip(d / fall, -truncation, truncation)
+        d, g = field.distance_gradient(p + t[:, None] * ray)
+    x = p + t[:, None] * ray
+    _, g = smooth.distance_gradient(x)
+    slope = np.linalg.norm(g, axis=1)
+    found = np.all((x > field.origin) & (x < end), axis=1)
+    found &= (slope > LEAST_SLOPE) & (np.abs(d) < ZERO_CELLS * field.cell)
+    n = g / np.where(found, slope, 1.0)[:, None]
+    cosine = -np.sum(n * ray, axis=1)
+    return np.where(found & (cosine > LEAST_ALONG), t * cosine, np.nan), n
 
 
 def observed_table(points: list[ViewPoints], Ts_table_cam: Array) -> Observations:
@@ -172,14 +212,14 @@ def observed_table(points: list[ViewPoints], Ts_table_cam: Array) -> Observation
     for number, (view, T) in enumerate(zip(points, Ts_table_cam, strict=True)):
         p = se3.transform(T, view.on_table)
         up = np.tile([0.0, 0.0, 1.0], (len(p), 1))
-        rows.append((*_rows(number, T, (p, view.on_table), up, p[:, 2]), view.table_sigma))
+        rows.append((*_rows(number, T, view.on_table, up, p[:, 2]), view.table_sigma))
     return _averaged(rows, TABLE_PATCH_M, STRIDE_PX * TABLE_STEP, TABLE_FLOOR_M)
 
 
 def _rows(
-    number: int, T: Array, points: tuple[Array, Array], n: Array, r: Array
+    number: int, T: Array, local: Array, n: Array, r: Array
 ) -> tuple[Array, ...]:
-    """Return view, place, side, Jacobian, cosine, normal and residual of a view's points.
+    """Return view, place on the surface, side, Jacobian, cosine, normal and residual of points.
 
     With T <- T exp(xi) a point moves by R (omega x p_cam + v), so that the distance along n
     changes by (p_cam x R'n) . omega + R'n . v. The noise of a point is in its residual and must not
@@ -189,21 +229,22 @@ def _rows(
     Args:
         number: of the view.
         T: (4, 4) camera in the table's frame.
-        points: (N, 3) in the table's frame and in the camera's [m].
+        local: (N, 3) points in the camera's frame [m].
         n: (N, 3) unit normals of the surface in the table's frame.
         r: (N,) distances to the surface along them [m].
     """
-    p, local = points
     m = n @ T[:3, :3]
     along = np.sum(m * local, axis=1)
     ray = np.linalg.norm(local, axis=1)
     cosine = np.abs(along) / np.where(ray > 0, ray, 1.0)
     steep = cosine > LEAST_ALONG
     factor = 1.0 - np.where(steep, r / np.where(steep, along, 1.0), 0.0)
-    jacobian = np.concatenate([np.cross(factor[:, None] * local, m), m], axis=1)
+    met = factor[:, None] * local
+    jacobian = np.concatenate([np.cross(met, m), m], axis=1)
     axis = np.argmax(np.abs(n), axis=1)
     side = 2 * axis + (n[np.arange(len(n)), axis] > 0)
-    return np.full(len(p), float(number)), p, side.astype(np.float64), jacobian, cosine, n, r
+    place = se3.transform(T, met)
+    return np.full(len(met), float(number)), place, side.astype(np.float64), jacobian, cosine, n, r
 
 
 def _averaged(

@@ -92,10 +92,8 @@ def refined_twists(
     scale = 1.0
     for _ in range(SWEEPS):
         H, b = prior.copy(), -prior @ x
-        import os
-        _add_patches(H, b, seen, weights[0]*float(os.environ.get("OW","1")))
-        import os
-        _add_table(H, b, table, weights[1]*float(os.environ.get("TW","1")))
+        _add_patches(H, b, seen, weights[0])
+        _add_table(H, b, table, weights[1])
         step = np.asarray(np.linalg.solve(H, b), dtype=np.float64)
         offsets = _patch_residuals(seen, step, weights[0])
         weights, scale = _weights(seen, offsets, table, _table_residuals(table, step))

@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 SMOOTH_STEPS = 12
 """Steps of Laplacian smoothing of invented patches, whose raw shape is the staircase of voxels."""
+BAND_LAYERS = 2
+"""The band below the cut is no wider than any of so many layers above it."""
 LEAST_TRIANGLES = 50
 """A surface of fewer triangles is noise, not an object."""
 
@@ -77,6 +79,8 @@ def _extended(
     field = np.where(unknown, inside, volume.distance)
     z = volume.origin[2] + volume.cell * np.arange(field.shape[2])
     first = min(int(np.searchsorted(z, cut_m)), field.shape[2] - 1)
+    # The lowest layers flare where few rays pass between the object and the table.
+    field[:, :, first] = np.max(field[:, :, first : first + BAND_LAYERS], axis=2)
     field[:, :, :first] = field[:, :, first : first + 1]
     field = np.maximum(field, (-z).astype(np.float32))
     # The box ends where nothing of the object is left: outside.

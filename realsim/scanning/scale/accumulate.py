@@ -10,8 +10,8 @@ Camera: p = T exp(xi) p_cam, h the residual's gradient in camera axes:
 Bias: dz = c z^2 along the ray, dr/dc = h.ray z^2.
 Table: r = n.(p - o) - height, with n tilted about two axes of the plane through o.
 Outline: r = (D(u) - b) z / f, D the signed distance to the measured outline in pixels.
-Shape: the real surface lies outside of the mesh by delta_k in patch k of the surface; then a surface
-point has r - delta_k and an outline point r + delta_k.
+Shape: the real surface lies outside of the mesh by delta_k in patch k of the surface; then a
+surface point has r - delta_k and an outline point r + delta_k.
 """
 
 import numba
@@ -76,7 +76,7 @@ def _facing(
 
 
 @numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
-def add_surface(
+def add_surface(  # noqa: PLR0915 - one pass over the points, in compiled code
     lattice: tuple[NDArray[np.float32], Array, float],
     pose: tuple[float, Array, Array],
     cameras: Array,
@@ -223,7 +223,7 @@ def add_table(
 
 
 @numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
-def add_outline(
+def add_outline(  # noqa: PLR0915 - one pass over the points, in compiled code
     pose: tuple[float, Array, Array],
     T_world_cam: Array,
     camera: Array,

@@ -6,7 +6,9 @@ they are said to be and the fit moves them.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +26,8 @@ Array32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 EDGE_M = 0.006
 """Depth span within 3 px beyond which pixels may be flying [m]; plus slope and noise."""
+LEAST_HEIGHT_M = 0.003
+"""What stands this far above the table, plus three sigma of the depth, is no table [m]."""
 VOXEL_SHARE = 1 / 50
 """Voxel of the cloud of all views as a share of the object's size."""
 
@@ -97,7 +101,7 @@ def gather_scan(
     unseen: list[int] = []
     for n, frame in enumerate(frames):
         crop = _crop(intrinsics, frame, plane, footprint, noise)
-        view = None if crop is None else _view(crop, frame, footprint, config)
+        view = None if crop is None else _view(crop, frame, config)
         if view is None:
             unseen.append(frame.index)
         else:
@@ -123,16 +127,60 @@ class _Crop:
     """(H, W) [m]; 0 = none."""
     trusted: Mask
     """(H, W) measured and not at a depth edge."""
-    height: Array32
-    """(H, W) above the table [m]."""
     on_object: Mask
     """(H, W) trusted pixels of the object."""
     on_table: Mask
-    """(H, W) trusted pixels of the table or of anything behind the object."""
+    """(H, W) trusted pixels of the table, or of anything else that is not the object."""
     far_table: Mask
     """(H, W) trusted pixels of the table that are used to find it."""
-    near: Mask
-    """(H, W) pixels around the object, in which hypotheses are compared."""
+
+
+OBJECT, GROUND, TABLE = 1, 2, 4
+"""Marks of a pixel: of the object; of what is not the object; of the table around it."""
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _marks(
+    rays: Array32,
+    depth: Array32,
+    trusted: Mask,
+    T: Array32,
+    cells: tuple[Mask, Mask, Array32, float],
+    limits: tuple[float, float, float],
+) -> NDArray[np.uint8]:
+    """Return the marks (H, W) of every pixel.
+
+    Args:
+        rays: (H, W, 3) of z = 1.
+        depth: (H, W) [m].
+        trusted: (H, W); others get no mark.
+        T: (4, 4) camera in the table's frame.
+        cells: those of the object, those around it, and their origin (2,) and size [m].
+        limits: least height of the object [m], the depth's sigma per m^2 and its least [m].
+    """
+    near, around, origin, size = cells
+    height_m, per_m, floor_m = limits
+    out = np.zeros(depth.shape, np.uint8)
+    for i in range(depth.shape[0]):
+        for j in range(depth.shape[1]):
+            if not trusted[i, j]:
+                continue
+            z = depth[i, j]
+            x, y, w = rays[i, j, 0] * z, rays[i, j, 1] * z, rays[i, j, 2] * z
+            px = T[0, 0] * x + T[0, 1] * y + T[0, 2] * w + T[0, 3]
+            py = T[1, 0] * x + T[1, 1] * y + T[1, 2] * w + T[1, 3]
+            height = T[2, 0] * x + T[2, 1] * y + T[2, 2] * w + T[2, 3]
+            least = height_m + 3.0 * max(floor_m, per_m * z * z)
+            a, b = int(np.floor((px - origin[0]) / size)), int(np.floor((py - origin[1]) / size))
+            inside = 0 <= a < near.shape[0] and 0 <= b < near.shape[1]
+            if height > least:
+                if inside and near[a, b]:
+                    out[i, j] = OBJECT
+            else:
+                out[i, j] = GROUND
+                if inside and around[a, b] and height > -2.0 * least:
+                    out[i, j] |= TABLE
+    return out
 
 
 def _crop(
@@ -148,27 +196,23 @@ def _crop(
     if box is None:
         return None
     left, top, right, bottom = box
-    rays = ray_table(intrinsics)[top:bottom, left:right]
+    rays = np.ascontiguousarray(ray_table(intrinsics)[top:bottom, left:right])
     z = np.ascontiguousarray(frame.depth_m[top:bottom, left:right], dtype=np.float32)
     known = (z > 0) & np.isfinite(z) & np.isfinite(rays[..., 0])
     z = np.where(known, z, np.float32(0))
-    R, t = T_table_cam[:3, :3].astype(np.float32), T_table_cam[:3, 3].astype(np.float32)
-    sigma = noise.sigma(z).astype(np.float32)
-    jump = EDGE_M + 8.0 * z / min(intrinsics.fx, intrinsics.fy) + 6.0 * sigma
+    # Constants in float32: a double would make every image one.
+    slope = np.float32(8.0 / min(intrinsics.fx, intrinsics.fy))
+    sigma = np.maximum(np.float32(noise.floor_m), np.float32(noise.per_m) * z * z)
+    jump = np.float32(EDGE_M) + slope * z + np.float32(6.0) * sigma
     trusted = known & ~edge_mask(z, jump)
-    xyz = np.empty((*z.shape, 3), np.float32)
-    for k in range(3):
-        xyz[..., k] = z * (rays @ R[k]) + t[k]
-    least = 0.003 + 3.0 * sigma
-    height = xyz[..., 2]
-    xy = xyz[..., :2].astype(np.float64)
-    near = footprint.inside(footprint.near, xy)
-    close = footprint.inside(footprint.close, xy)
-    on_object = trusted & near & (height > least)
-    on_table = trusted & ~on_object & (height < least)
-    far_table = trusted & (np.abs(height) < 2 * least) & footprint.inside(footprint.around, xy)
-    # A pixel is compared where its ray may meet the object: its table point or what it measured.
-    return _Crop(left, top, rays, z, trusted, height, on_object, on_table, far_table, near | close)
+    marks = _marks(
+        rays, z, trusted, T_table_cam.astype(np.float32),
+        (footprint.near, footprint.around, footprint.origin.astype(np.float32), footprint.cell_m),
+        (LEAST_HEIGHT_M, noise.per_m, noise.floor_m),
+    )  # fmt: skip
+    return _Crop(
+        left, top, rays, z, trusted, marks == OBJECT, (marks & GROUND) > 0, (marks & TABLE) > 0
+    )
 
 
 def _image_box(
@@ -194,11 +238,8 @@ def _image_box(
     return int(box[0]), int(box[1]), int(box[2]), int(box[3])
 
 
-def _view(
-    crop: _Crop, frame: DepthFrame, footprint: Footprint, config: ScaleConfig
-) -> ScanView | None:
+def _view(crop: _Crop, frame: DepthFrame, config: ScaleConfig) -> ScanView | None:
     """Return the samples of one view, None where it measured nothing of the object."""
-    del footprint
     samples = config.samples
     area = int(np.count_nonzero(crop.on_object))
     if area < config.table.least_points:
@@ -247,9 +288,10 @@ def _rim(crop: _Crop) -> Rim:
     distance = np.where(body > 0, np.float32(0.5) - into, out - np.float32(0.5))
     # The unknown band at the outline's nearest pixel, looked up by the label of that pixel.
     edge = (body > 0) & (into < 1.5)
-    _, labels = cv2.distanceTransformWithLabels(
+    found: Any = cv2.distanceTransformWithLabels(
         1 - edge.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
+    labels = np.asarray(found[1], dtype=np.int64)
     width = (to_object + to_table)[edge]
     gaps = np.zeros(int(labels.max()) + 1, np.float32)
     gaps[labels[edge]] = width

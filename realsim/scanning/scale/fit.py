@@ -77,19 +77,26 @@ def fit_scale(
     found = hypotheses(shape, evidence, start, config)
     ticks.step()
     state, look, seen, dropped = _joint(shape, evidence, found[0].state, config)
-    ticks.step()
-    rivals = _rivals(shape, seen, (state, found[1:]), config)
     explained = explain(shape, seen, state)
+    ticks.step()
+    source, rivals = found[0].source, list[tuple[float, float]]()
+    for h, other in _others(shape, seen, (state, found[1:]), config):
+        theirs = explain(shape, seen, other[0])
+        if theirs.gain > explained.gain:
+            rivals.append((state.s * shape.unit, explained.gain))
+            (state, look), explained, source = other, theirs, h.source
+        else:
+            rivals.append((other[0].s * shape.unit, theirs.gain))
     sigma = sigma_log(look, config)
     judged = judge(shape, seen, (state, look, explained), rivals, (sigma, config))
     ticks.step()
-    best = to_given(shape, state, explained.gain, found[0].source)
+    best = to_given(shape, state, explained.gain, source)
     return ScaleFit(
         scale=best.scale, sigma=best.scale * sigma, T_world_obj=best.T_world_obj,
         covariance=_covariance(look, sigma), verdict=judged.verdict, reasons=judged.reasons,
-        checks=judged.checks, limits=limits_of(look, seen, (state, sigma), config),
+        checks=judged.checks, limits=limits_of(look, seen, state, config),
         views=_views(seen, (state, look, explained), dropped),
-        residual_mm=residual_per_vertex(mesh, shape, state, look),
+        residual_mm=residual_per_vertex(mesh, shape, look),
         plane=SupportPlane(
             T_world_table=state.T_world_table, rms_m=seen.plane.rms_m, inliers=seen.plane.inliers
         ),
@@ -175,32 +182,26 @@ def _against_all(
     return (twist > v.view_sigmas) | (iou < v.view_share * usual)
 
 
-def _rivals(
+def _others(
     shape: ScanShape,
     evidence: ScanEvidence,
     found: tuple[State, Sequence[Hypothesis]],
     config: ScaleConfig,
-) -> list[tuple[float, float]]:
-    """Return scale and gain of the best other solutions whose scale differs, fitted likewise."""
+) -> list[tuple[Hypothesis, tuple[State, Outlook]]]:
+    """Return the best other hypotheses of another scale, fitted to the end likewise."""
     best, others = found
-    out: list[tuple[float, float]] = []
-    for h in others:
-        if len(out) >= config.search.rivals:
-            break
-        if abs(np.log(h.state.s / best.s)) < config.verdict.rival_change:
-            continue
+    far = [h for h in others if abs(np.log(h.state.s / best.s)) > config.verdict.rival_change]
+    out: list[tuple[Hypothesis, tuple[State, Outlook]]] = []
+    for h in far[: config.search.rivals]:
         start = replace(h.state, views=np.zeros((len(evidence.views), 6)))
-        state, _ = joint_fit(shape, evidence, start, config)
-        out.append((state.s * shape.unit, explain(shape, evidence, state).gain))
+        out.append((h, joint_fit(shape, evidence, start, config)))
     return out
 
 
 def _covariance(look: Outlook, sigma: float) -> Array:
-    """Return the covariance (7, 7) of pose and log scale, the latter's sigma as reported."""
-    C = look.covariance[:7, :7].copy()
-    factor = sigma / np.sqrt(C[6, 6])
-    # Pose and scale share their errors: all of it grows alike.
-    return C * factor**2
+    """Return the covariance (7, 7) of pose and log scale; all of it grows as the scale's part."""
+    C = look.covariance[:7, :7]
+    return np.asarray(C * (sigma**2 / C[6, 6]), dtype=np.float64)
 
 
 def _views(

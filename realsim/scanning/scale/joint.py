@@ -147,13 +147,13 @@ class _System:
 
     def rest(self, offsets: Array) -> Array:
         """Return the step (n,) of everything else, given the offsets (K,)."""
-        return np.linalg.solve(self.G, self.g - self.Gd @ offsets)
+        return np.asarray(np.linalg.solve(self.G, self.g - self.Gd @ offsets), dtype=np.float64)
 
     def covariance(self, offset_covariance: Array) -> Array:
         """Return the covariance (n, n) of everything else, given that of the offsets (K, K)."""
         inverse = np.linalg.inv(self.G)
         A = inverse @ self.Gd
-        return inverse + A @ offset_covariance @ A.T
+        return np.asarray(inverse + A @ offset_covariance @ A.T, dtype=np.float64)
 
 
 def joint_fit(
@@ -166,6 +166,7 @@ def joint_fit(
     models: list[ShapeModel] = []
     seen: tuple[Array, Array] = (np.zeros(0), np.zeros(0))
     history: list[dict[str, float]] = []
+    surface, rims = _surface(shape, evidence, state, config), _Rims([], [], [])
     for cut in CUTS:
         surface = _surface(shape, evidence, state, config)
         rims = _outlines(shape, evidence, state, config)
@@ -232,18 +233,15 @@ def _outlook(
     best = posterior(information, offered, models[0].covariance)[1]
     look = Outlook(
         covariance=covariance[:VIEWS, :VIEWS],
-        without=_without(system, best, state, config),
+        without=_without(system, best),
         residuals=residuals, kernels=kernels, view_of=surface.view_of, local=np.zeros((0, 3)),
         offsets=offsets, offset_sigmas=np.sqrt(spread), shape=models[0],
     )  # fmt: skip
     return look, mean
 
 
-def _without(
-    system: _System, offset_covariance: Array, state: State, config: ScaleConfig
-) -> dict[str, float]:
+def _without(system: _System, offset_covariance: Array) -> dict[str, float]:
     """Return the variance of the log scale if each source of error were known exactly."""
-    del state, config
     # Noise alone: nothing but the object unknown.
     out = {
         "shape": float(np.linalg.inv(system.G)[6, 6]),

@@ -9,14 +9,13 @@ from realsim.scanning.scale.result import Limit
 from realsim.scanning.scale.state import State
 
 OFFSET_M = 0.0002
-"""An offset of the surface that nothing in a session shows [m]: gloss, translucency, print lines."""
+"""An offset of the surface that nothing in a session shows [m]: gloss, translucency, powder."""
 
 
 def sigma_log(look: Outlook, config: ScaleConfig) -> float:
     """Return the 1-sigma of the log scale.
 
-    The part that the shape's error contributes is multiplied by `shape.trust`: patches with
-    constant offsets describe it only roughly.
+    The part that the shape's error contributes is multiplied by `shape.trust`.
     """
     total = float(look.covariance[6, 6])
     shape = max(total - look.without["shape"], 0.0)
@@ -26,11 +25,10 @@ def sigma_log(look: Outlook, config: ScaleConfig) -> float:
 def limits_of(
     look: Outlook,
     evidence: ScanEvidence,
-    fit: tuple[State, float],
+    state: State,
     config: ScaleConfig,
 ) -> tuple[Limit, ...]:
     """Return what limits the scale, worst first."""
-    state, _ = fit
     total = float(look.covariance[6, 6])
 
     def share(name: str) -> float:
@@ -45,8 +43,9 @@ def limits_of(
     rows = [
         Limit(
             name="shape", percent=config.shape.trust * share("shape"),
-            text=f"the mesh's shape is off by about {shape_mm:.2f} mm ({100 * shape_mm / size_mm:.1f} "
-            "% of its size); a better mesh would help, more views would not.",
+            text=f"the mesh's shape is off by about {shape_mm:.2f} mm, "
+            f"{100 * shape_mm / size_mm:.1f} % of its size; a better mesh would help, more views "
+            "would not.",
         ),
         Limit(
             name="hand-eye", percent=share("hand-eye"),

@@ -1,12 +1,13 @@
 """The residual map: where the real surface lies outside or inside of the scaled mesh."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.records import Mesh
 from realsim.scanning.scale.joint import Outlook
 from realsim.scanning.scale.shape import INNER_EXTENT, ScanShape
-from realsim.scanning.scale.state import State
 
 Array = NDArray[np.float64]
 REACH = 0.03
@@ -17,21 +18,20 @@ FEWEST = 3
 """Fewer do not make a median."""
 
 
-def residual_per_vertex(mesh: Mesh, shape: ScanShape, state: State, look: Outlook) -> Array:
+def residual_per_vertex(mesh: Mesh, shape: ScanShape, look: Outlook) -> Array:
     """Return the signed distance (V,) of the real surface at each vertex of the given mesh [mm].
 
     The median of the measured points around the vertex, positive outside; NaN where fewer than
     three were measured.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    del state
     vertices = (mesh.vertices - shape.center) * shape.unit
     used = look.kernels > 0
     out = np.full(len(vertices), np.nan)
     if np.count_nonzero(used) < FEWEST:
         return out
-    tree = cKDTree(look.local[used])
+    tree: Any = KDTree(look.local[used])
     residuals = np.append(look.residuals[used], np.nan)
     distance, index = tree.query(vertices, k=NEIGHBOURS, distance_upper_bound=REACH * INNER_EXTENT)
     near = np.isfinite(distance)

@@ -3,7 +3,8 @@
 The true surface is the mesh displaced by a random vector field d, independent in every axis and
 correlated over a length l. Of it a depth camera sees the normal part, delta_k = n_k . d_k in patch
 k of the surface, so
-    cov(delta_i, delta_j) = s^2 rho(|x_i - x_j|) n_i . n_j,    rho(r) = (1 + a) exp(-a), a = sqrt(3) r / l (Matern 3/2):
+    cov(delta_i, delta_j) = s^2 rho(|x_i - x_j|) n_i . n_j,
+    rho(r) = (1 + a) exp(-a), a = sqrt(3) r / l    (Matern 3/2):
 the two sides of a thin wall move together. What of the field is a shift, a turn or a change of
 size is no error of the shape but the pose and the scale themselves: the covariance is conditioned
 on the area-weighted sums of d . u over the whole surface being zero for the seven such u. With this
@@ -16,6 +17,7 @@ result: the estimates of all (s, l) are averaged by their probability.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,11 +46,13 @@ class SurfacePatches:
 
     def of(self, points: Array, normals: Array) -> NDArray[np.int64]:
         """Return the patch (N,) of points (N, 3) with the normals (N, 3) of their surface."""
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         if len(points) == 0:
             return np.zeros(0, dtype=np.int64)
-        tree = cKDTree(np.concatenate([self.middles, self.normal_weight * self.normals], axis=1))
+        tree: Any = KDTree(
+            np.concatenate([self.middles, self.normal_weight * self.normals], axis=1)
+        )
         both = np.concatenate([points, self.normal_weight * normals], axis=1)
         return np.asarray(tree.query(both)[1], dtype=np.int64)
 

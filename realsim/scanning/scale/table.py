@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,19 +31,10 @@ class Footprint:
     cell_m: float
     near: NDArray[np.bool_]
     """(X, Y) cells of the object and around it, where measured points above the table are its."""
-    close: NDArray[np.bool_]
-    """(X, Y) cells in which points at the table's height may be the object's foot."""
     around: NDArray[np.bool_]
     """(X, Y) cells whose table is used."""
     box: Array
     """(2, 3) box of the object's points in the table's frame [m]."""
-
-    def inside(self, cells: NDArray[np.bool_], xy: Array) -> NDArray[np.bool_]:
-        """Return which points (..., 2) of the table's frame lie in the marked cells."""
-        index = np.floor((xy - self.origin) / self.cell_m).astype(np.int64)
-        ok = np.all((index >= 0) & (index < cells.shape), axis=-1)
-        index = np.clip(index, 0, np.array(cells.shape) - 1)
-        return ok & cells[index[..., 0], index[..., 1]]
 
 
 def find_table(
@@ -158,13 +150,14 @@ def _one_object(
     counts = np.zeros(shape, dtype=np.int64)
     np.add.at(counts, (index[:, 0], index[:, 1]), 1)
     bridge = round(0.5 * config.bridge_m / cell)
-    joined = ndimage.binary_dilation(counts > 1, _disc(bridge))
-    labels, n = ndimage.label(joined, np.ones((3, 3)))
+    joined = _grown(counts > 1, bridge)
+    found: Any = ndimage.label(joined, np.ones((3, 3)))
+    labels, n = found
     sizes = ndimage.sum_labels(counts, labels, np.arange(1, n + 1)) if n else np.zeros(0)
     large = [k + 1 for k in range(n) if sizes[k] >= config.speck_share * sizes.max()]
     middles = [_middle(points[labels[index[:, 0], index[:, 1]] == k], plane) for k in large]
     if at is not None:
-        gaps = [float(np.linalg.norm(m[:2] - at)) for m in middles]
+        gaps = [float(np.hypot(m[0] - at[0], m[1] - at[1])) for m in middles]
         large = [large[int(np.argmin(gaps))]]
     if len(large) != 1:
         named = "; ".join(
@@ -178,14 +171,12 @@ def _one_object(
     own = points[mine[index[:, 0], index[:, 1]]]
     box = np.stack([np.quantile(own, 0.002, axis=0), np.quantile(own, 0.998, axis=0)])
     box[0, 2] = 0.0
-    near = ndimage.binary_dilation(mine, _disc(bridge))
+    near = _grown(mine, bridge)
     others = joined & ~mine
-    close = ndimage.binary_dilation(mine, _disc(round(config.clear_m / cell)))
-    around = ndimage.binary_dilation(mine, _disc(round(config.margin_m / cell)))
-    around &= ~close & ~ndimage.binary_dilation(others, _disc(bridge + 1))
-    return Footprint(
-        origin=origin, cell_m=cell, near=near & ~others, close=close, around=around, box=box
-    )
+    close = _grown(mine, round(config.clear_m / cell))
+    around = _grown(mine, round(config.margin_m / cell))
+    around &= ~close & ~_grown(others, bridge + 1)
+    return Footprint(origin=origin, cell_m=cell, near=near & ~others, around=around, box=box)
 
 
 def _middle(points: Array, plane: SupportPlane) -> tuple[float, float, float]:
@@ -195,7 +186,10 @@ def _middle(points: Array, plane: SupportPlane) -> tuple[float, float, float]:
     return float(x), float(y), height
 
 
-def _disc(radius: int) -> NDArray[np.bool_]:
-    """Return a disc of cells (2 r + 1, 2 r + 1)."""
+def _grown(cells: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+    """Return the cells (X, Y) and all within `radius` of them."""
+    import cv2
+
     k = np.arange(-radius, radius + 1)
-    return k[:, None] ** 2 + k[None] ** 2 <= radius**2 + 0.5
+    disc = (k[:, None] ** 2 + k[None] ** 2 <= radius**2 + 0.5).astype(np.uint8)
+    return np.asarray(cv2.dilate(cells.astype(np.uint8), disc) > 0, dtype=np.bool_)

@@ -47,7 +47,13 @@ def judge(
     v = config.verdict
     offsets = look.offsets[look.offset_sigmas < 2.0 * np.median(look.offset_sigmas)]
     shape_share = float(np.sqrt(np.mean(np.square(offsets))) / evidence.size_m)
-    contrast = min((seen.gain - gain for _, gain in rivals), default=1.0)
+    # A rival that ended at the same scale is none.
+    others = [
+        (scale, gain)
+        for scale, gain in rivals
+        if abs(np.log(scale / (state.s * shape.unit))) > v.rival_change
+    ]
+    contrast = min((seen.gain - gain for _, gain in others), default=1.0)
     checks = {
         "gain": seen.gain, "agree": seen.agree, "cover": seen.cover, "iou": seen.iou,
         "contrast": contrast, "shape_mm": 1e3 * look.shape.sigma_m, "shape_share": shape_share,
@@ -81,7 +87,7 @@ def judge(
             f"the scale is known to {100 * sigma:.1f} % only; {100 * v.doubtful_sigma:.1f} % and "
             "less are trusted. More views from other sides help."
         )
-    for scale, gain in rivals:
+    for scale, gain in others:
         if gain > seen.gain - v.rival_gain:
             change = 100 * (scale / (state.s * shape.unit) - 1)
             doubts.append(
