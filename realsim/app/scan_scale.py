@@ -109,7 +109,7 @@ def _fitted(
     with console.stage("scale", f"{named.name}, {len(frames)} views") as tick:
         fit = fit_scale(
             named.mesh, store.session.intrinsics, frames, config,
-            start=request.start, at=request.at, progress=tick,
+            start=request.start, at=request.at, size_m=request.size_m, progress=tick,
         )  # fmt: skip
     fit = with_rough_size(fit, named.mesh, request.size_m)
     fit, checks = with_measurements(fit, named.mesh, request.measured)

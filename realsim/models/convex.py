@@ -26,9 +26,9 @@ from realsim.errors import InputError
 from realsim.geometry.mesh import hull_vertices, mass_properties, welded_mesh
 from realsim.interop import import_open3d
 from realsim.models.convex_config import ConvexConfig
-from realsim.models.convex_hulls import hull_volume, outermost
+from realsim.models.convex_hulls import hull_volume
 from realsim.models.convex_obj import collision_obj, parts_from_collision_obj
-from realsim.models.convex_worker import decompose, passes, step_path
+from realsim.models.convex_worker import decompose, light, passes, step_path
 from realsim.models.model_records import ConvexParts
 from realsim.records import Mesh
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 __all__ = ["ConvexConfig", "collision_obj", "convex_parts", "parts_from_collision_obj"]
 
-RESULTS_VERSION = 2
+RESULTS_VERSION = 3
 """Raised whenever the same mesh gives other parts, so that old cache files are not used."""
 SAME_VOLUME = 0.02
 """A thinned mesh whose volume differs by more is not used [share of the volume]."""
@@ -78,7 +78,7 @@ def _hull(
     mesh: Mesh, volume_m3: float, config: ConvexConfig, method: str, notes: tuple[str, ...]
 ) -> ConvexParts:
     """Return the hull as the only part."""
-    part = outermost(hull_vertices(mesh.vertices), config.max_vertices)
+    part = light(hull_vertices(mesh.vertices), config)
     ratio = hull_volume(part) / volume_m3
     return ConvexParts(parts=(part,), volume_ratio=ratio, method=method, notes=notes)
 
@@ -121,7 +121,7 @@ def _decomposed(mesh: Mesh, closed: bool, volume_m3: float, config: ConvexConfig
         return replace(hull, seconds=seconds, notes=tuple(notes))
     chosen, said = _chosen(found, config, closed)
     ratio = float(said["ratio"])
-    if closed and not passes(ratio, config, closed):
+    if closed and not passes(ratio, config, closed, int(said["step"])):
         notes.append(
             f"the parts are {ratio:.2f} times the mesh's volume at best (threshold "
             f"{said['threshold']:g}); {config.thin_ratio:g} to {config.fat_ratio:g} was wanted."
@@ -140,7 +140,7 @@ def _chosen(
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     """Return the coarsest result that passes the gate, else the one nearest to the volume."""
     for result in found:
-        if passes(result[1]["ratio"], config, closed):
+        if passes(result[1]["ratio"], config, closed, int(result[1]["step"])):
             return result
     return min(found, key=lambda result: abs(math.log(max(result[1]["ratio"], 1e-9))))
 

@@ -32,6 +32,24 @@ def outermost(vertices: Array, count: int) -> Array:
     return kept if hull_volume(kept) > 0 else vertices
 
 
+def fewest(vertices: Array, count: int, most: int, loss: float) -> Array:
+    """Return the outermost vertices: `count`, doubled until the hull keeps its volume.
+
+    Args:
+        vertices: (V, 3) corners of a hull.
+        count: tried first.
+        most: kept in any case at most.
+        loss: share of the hull's volume that may be missing; 64 corners of a capsule of 2000 lose
+            8 % of it.
+    """
+    full = hull_volume(vertices)
+    while True:
+        kept = outermost(vertices, min(count, most))
+        if count >= most or hull_volume(kept) >= (1.0 - loss) * full:
+            return kept
+        count *= 2
+
+
 def hull_triangles(vertices: Array) -> tuple[Array, NDArray[np.int64]]:
     """Return the corners (H, 3) of the hull, in the order given, and its outward faces (F, 3).
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry.mesh_shape import hull_vertices
 from realsim.models.convex_config import ConvexConfig
-from realsim.models.convex_hulls import hull_volume, outermost
+from realsim.models.convex_hulls import fewest, hull_volume
 from realsim.store.arrays_on_disk import read_arrays, write_arrays
 
 Array = NDArray[np.float64]
@@ -30,12 +30,22 @@ def step_path(folder: Path, step: int) -> Path:
     return folder / f"step_{step}.npz"
 
 
-def passes(ratio: float, config: ConvexConfig, closed: bool) -> bool:
+def passes(ratio: float, config: ConvexConfig, closed: bool, step: int) -> bool:
     """Return whether parts of this volume / the mesh's volume are good enough.
 
     The volume of an open mesh is its hull's: parts that keep its hollows are smaller.
+
+    Args:
+        ratio: volume of the parts / volume of the mesh.
+        config: what is accepted.
+        closed: whether the mesh is.
+        step: which of the thresholds gave the parts.
     """
-    return (not closed or config.thin_ratio <= ratio) and ratio <= config.fat_ratio
+    if not closed:
+        return ratio <= config.fat_ratio
+    if step == 0 and len(config.thresholds) > 1:
+        return 2.0 - config.coarse_ratio <= ratio <= config.coarse_ratio
+    return config.thin_ratio <= ratio <= config.fat_ratio
 
 
 def decompose(job: Path, folder: Path) -> None:
@@ -46,7 +56,7 @@ def decompose(job: Path, folder: Path) -> None:
     config = ConvexConfig(thresholds=thresholds, **settings)
     for step, threshold in enumerate(config.thresholds):
         pieces = _coacd(arrays["vertices"], arrays["faces"], notes["is_closed"], threshold, config)
-        parts = [outermost(hull_vertices(piece), config.max_vertices) for piece in pieces]
+        parts = [light(hull_vertices(piece), config) for piece in pieces]
         parts = [part for part in parts if hull_volume(part) > 0]
         ratio = sum(hull_volume(part) for part in parts) / notes["volume_m3"]
         counts = np.array([len(part) for part in parts], dtype=np.int64)
@@ -54,10 +64,15 @@ def decompose(job: Path, folder: Path) -> None:
         write_arrays(
             step_path(folder, step),
             {"vertices": vertices, "counts": counts},
-            {"ratio": ratio, "threshold": threshold},
+            {"ratio": ratio, "threshold": threshold, "step": step},
         )
-        if passes(ratio, config, notes["is_closed"]):
+        if passes(ratio, config, notes["is_closed"], step):
             break
+
+
+def light(corners: Array, config: ConvexConfig) -> Array:
+    """Return the corners of a part that are kept."""
+    return fewest(corners, config.max_vertices, config.most_vertices, config.vertex_loss)
 
 
 def _coacd(

@@ -10,6 +10,11 @@ A can is one axis with the identity and one half turn about a line across it. A 
 axes at right angles: BOP knows no other form, and the union of the turns about them, which its
 tools form, is not every rotation of a sphere.
 
+What misses by less than a sensor sees is symmetric, and so is what only a small part of the
+surface breaks (`outliers`): a bowl with a hole of 8 mm through its foot keeps its axis, a mug with
+its handle has none. BOP's own rule is wider, max(15 mm, 10 % of the diameter); a grasp a handle's
+width off is no grasp.
+
 The group is that of the SHAPE. In BOP the symmetries of a textured model are those of its
 appearance: `texture_breaks` tells where the two differ, and who cares for appearance drops them.
 """

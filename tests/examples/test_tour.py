@@ -24,13 +24,29 @@ def snippets(document: Path) -> list[str]:
 
 
 def commands_of(text: str) -> list[tuple[str, list[str]]]:
-    """Return every `realsim COMMAND --option ...` that stands in code."""
+    """Return every `realsim COMMAND --option ...` that stands in code.
+
+    A command of a group comes with the group's name before it: `scan import`.
+    """
     code = "\n".join(CODE.findall(text))
-    return [(name, re.findall(r"--[a-z-]+", rest)) for name, rest in COMMAND.findall(code)]
+    found: list[tuple[str, list[str]]] = []
+    for name, rest in COMMAND.findall(code):
+        first = (rest.split() or [""])[0]
+        if isinstance(commands.commands.get(name), click.Group) and re.match(r"[a-z]", first):
+            name = f"{name} {first}"
+        found.append((name, re.findall(r"--[a-z-]+", rest)))
+    return found
 
 
-def options_of(name: str) -> set[str]:
-    command = commands.commands[name]
+def command_of(name: str) -> click.Command | None:
+    """Return a command by its name, that of its group first; None if there is none."""
+    command: click.Command | None = commands
+    for word in name.split():
+        command = command.commands.get(word) if isinstance(command, click.Group) else None
+    return command
+
+
+def options_of(command: click.Command) -> set[str]:
     return {flag for p in command.params if isinstance(p, click.Option) for flag in p.opts}
 
 
@@ -40,11 +56,22 @@ def test_commands_are_found_in_code_only() -> None:
     )
     assert commands_of(text) == [("demo", ["--out"]), ("fly", ["--high"])]
     assert commands_of("    from realsim import View\n") == []
+    assert commands_of("`realsim scan import MESH --unit m`") == [("scan import", ["--unit"])]
+    assert command_of("scan fly") is None and command_of("demo fly") is None
 
 
 def test_there_is_a_chapter_for_every_stage() -> None:
     names = " ".join(p.stem for p in CHAPTERS)
-    for stage in ("plan", "capture", "calibrate", "register", "school", "annotate", "review"):
+    for stage in (
+        "plan",
+        "capture",
+        "calibrate",
+        "register",
+        "school",
+        "annotate",
+        "review",
+        "models",
+    ):
         assert stage in names
     assert sum(len(snippets(p)) for p in CHAPTERS) >= 7
 
@@ -64,8 +91,9 @@ def test_snippets_compile_and_import_what_exists(chapter: Path) -> None:
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
 def test_named_commands_and_options_exist(document: Path) -> None:
     for name, options in commands_of(document.read_text(encoding="utf-8")):
-        assert name in commands.commands, f"`realsim {name}` is not a command"
-        unknown = set(options) - options_of(name)
+        command = command_of(name)
+        assert command is not None, f"`realsim {name}` is not a command"
+        unknown = set(options) - options_of(command)
         assert not unknown, f"`realsim {name}` has no {sorted(unknown)}"
 
 

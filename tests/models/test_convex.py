@@ -20,7 +20,7 @@ from realsim.models.convex import (
     parts_from_collision_obj,
     thinned,
 )
-from realsim.models.convex_hulls import hull_triangles, hull_volume
+from realsim.models.convex_hulls import fewest, hull_triangles, hull_volume, outermost
 from realsim.records import Mesh
 
 QUICK = ConvexConfig(thresholds=(0.1, 0.05), mcts_iterations=10, mcts_depth=1)
@@ -113,6 +113,7 @@ def test_a_mug_keeps_its_hollow():
     t = np.linspace(0, 2 * np.pi, 24)
     hollow = np.array([[0.02 * np.cos(a), 0.02 * np.sin(a), h] for a in t for h in z])
     assert inside(cut.parts, hollow).mean() < 0.01
+    assert cut.volume_ratio <= 1.10 and cut.notes == () and cut.seconds < 60
 
 
 # --- bounded time -------------------------------------------------------------------------------
@@ -133,12 +134,13 @@ def test_a_decomposition_out_of_time_gives_the_hull_and_says_so(tmp_path):
 
 @pytest.mark.slow
 def test_what_was_found_in_time_is_taken():
-    # The ring passes at no threshold, so that the fine one runs into the limit.
+    # The mug passes at no threshold, so that the fine one runs into the limit: the coarse one takes
+    # 2 CPU-s with one cut looked ahead, the fine one 15 and more.
     config = ConvexConfig(
-        thresholds=(0.3, 0.01), mcts_iterations=60, mcts_nodes=30, time_limit_s=2.0,
-        fat_ratio=1.0001, thin_ratio=0.9999, max_parts=1000,
+        thresholds=(0.3, 0.01), mcts_depth=1, time_limit_s=8.0,
+        coarse_ratio=1.0001, fat_ratio=1.0001, thin_ratio=0.9999, max_parts=1000,
     )  # fmt: skip
-    cut = convex_parts(annulus(160), config)
+    cut = convex_parts(part("mug").mesh, config)
     assert cut.method == "coacd" and "stopped" in cut.notes[0] and "at best" in cut.notes[1]
     assert len(cut.parts) >= 2
 
@@ -207,9 +209,27 @@ def test_a_thinned_mesh_is_closed_and_as_large():
     assert thinned(thin, 10**6) is thin
 
 
+def test_a_round_part_keeps_its_volume_with_more_corners():
+    capsule = part("capsule").mesh
+    cut = convex_parts(capsule, ConvexConfig())
+    assert cut.method == "hull" and abs(cut.volume_ratio - 1) <= 0.03
+    assert 64 < len(cut.parts[0]) <= 256
+    coarse = convex_parts(capsule, ConvexConfig(most_vertices=64))
+    assert len(coarse.parts[0]) <= 64 and coarse.volume_ratio < 0.95
+    # What 64 corners describe well enough gets no more.
+    corners = hull_vertices(0.05 * np.random.default_rng(0).normal(size=(90, 3)))
+    assert np.array_equal(fewest(corners, 64, 256, 0.03), outermost(corners, 64))
+
+
+@pytest.mark.slow
+def test_a_stepped_shaft_keeps_its_steps():
+    cut = convex_parts(part("stepped_shaft").mesh, ConvexConfig())
+    assert len(cut.parts) > 1 and abs(cut.volume_ratio - 1) < 0.05
+
+
 def test_settings_that_bound_nothing_are_refused():
     for wrong in ({"time_limit_s": 0.0}, {"thresholds": ()}, {"thresholds": (2.0,)},
-                  {"max_parts": 0}):  # fmt: skip
+                  {"max_parts": 0}, {"max_vertices": 300}, {"vertex_loss": 1.0}):  # fmt: skip
         with pytest.raises(InputError):
             ConvexConfig(**wrong)
     with pytest.raises(InputError, match="flat"):

@@ -1,6 +1,7 @@
 """Simplified meshes stay closed, keep their colours, and how far they are off is measured."""
 
 import os
+import re
 import resource
 import time
 from dataclasses import replace
@@ -10,9 +11,11 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.geometry.mesh import ply_bytes, vertex_colors
+from realsim.geometry.mesh import mass_properties, ply_bytes, vertex_colors
 from realsim.geometry.parts import object_model, part
 from realsim.models.inspect import inspect_mesh
+from realsim.models.mesh_clustering import clustered
+from realsim.models.mesh_topology import topology
 from realsim.models.reading import read_scan
 from realsim.models.repair import RepairConfig, repaired
 from realsim.models.simplify import colors_at, deviation, simplified
@@ -41,6 +44,14 @@ def bent_torus(faces):
         vertices=np.stack([w * np.cos(a), w * np.sin(a), r * np.sin(b)], -1),
         faces=np.concatenate([np.stack([i, j, k], -1), np.stack([i, k, m], -1)]),
     )
+
+
+def halved(mesh):
+    """Return the same surface with four faces for each."""
+    import trimesh
+
+    v, f = trimesh.remesh.subdivide(mesh.vertices, mesh.faces)
+    return Mesh(vertices=v, faces=f)
 
 
 @pytest.mark.parametrize("name", ["mug", "gear", "l_bracket", "elbow", "bunny", "duck"])
@@ -139,6 +150,51 @@ def test_five_million_faces_are_read_and_inspected_in_a_minute(tmp_path):
     assert seconds < 60.0
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     assert peak_gb < 3.5  # the process's peak, with what other tests of it took
+
+
+@pytest.mark.slow
+def test_five_million_faces_are_repaired_in_a_minute():
+    mesh = bent_torus(5_000_000)
+    rgb = np.clip(255 * (mesh.vertices / 0.3 + 0.5), 0, 255).astype(np.uint8)
+    mesh = replace(mesh, colors=rgb)
+    start = time.process_time()
+    repair = repaired(mesh)
+    assert time.process_time() - start < 60.0
+    assert 900_000 < len(repair.mesh.faces) <= 1_000_000
+    assert repair.after.is_watertight and repair.after.is_outward
+    off = float(re.search(r"by at most ([\d.e-]+) % of the extent", repair.actions[-1])[1])
+    assert off < 0.2
+    expected = np.clip(255 * (repair.mesh.vertices / 0.3 + 0.5), 0, 255)
+    assert np.abs(repair.mesh.colors - expected).max() < 4
+    peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    assert peak_gb < 3.5  # the process's peak, with what other tests of it took
+
+
+@pytest.mark.parametrize("name", ["duck", "bunny"])
+def test_clustering_keeps_a_closed_surface_closed_and_where_it_is(name):
+    mesh = replace(object_model(name).mesh, colors=None, uv=None, texture=None)
+    fine = mesh
+    for _ in range(2):
+        fine = halved(fine)
+    topo = topology(fine)
+    coarse = clustered(topo, len(fine.faces) // 3, 0.05)
+    assert coarse is not None and topology(coarse).is_watertight
+    assert 0.2 * len(fine.faces) < len(coarse.faces) < 0.9 * len(fine.faces)
+    assert mass_properties(coarse, 1.0).volume_m3 == pytest.approx(
+        mass_properties(mesh, 1.0).volume_m3, rel=0.02
+    )
+    assert deviation(fine, coarse, samples=2000) < 0.02 * topo.size
+
+
+def test_sheets_nearer_than_a_cell_are_clustered_closed_or_not_at_all():
+    import trimesh
+
+    sheet = trimesh.creation.box((0.1, 0.1, 0.00015))
+    v, f = trimesh.remesh.subdivide_to_size(sheet.vertices, sheet.faces, 0.002)
+    topo = topology(Mesh(vertices=v, faces=f))
+    assert topo.is_watertight
+    coarse = clustered(topo, len(f) // 4, 0.05)
+    assert coarse is None or topology(coarse).is_watertight
 
 
 @pytest.mark.skipif(not (DATA / "school").is_dir(), reason=f"no data at {DATA}")

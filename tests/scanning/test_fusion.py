@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.geometry.mesh import to_trimesh, transformed
-from realsim.geometry.parts import part
+from realsim.geometry.parts import object_model
 from realsim.records import CameraIntrinsics, Mesh, SupportPlane
 from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene, rotated
 from realsim.scanning.fusion.fuse import FusedObject, FusionConfig, FusionFrame, fuse_object
@@ -24,8 +24,9 @@ TABLE = Mesh(
     vertices=np.array([[-0.6, -0.6, 0], [0.6, -0.6, 0], [0.6, 0.6, 0], [-0.6, 0.6, 0]]),
     faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32),
 )
-AS_GIVEN = FusionConfig(refine=False, rounds=2)
+AS_GIVEN = FusionConfig(refine=False, rounds=2, voxel_m=0.0015)
 RADIUS = 0.045
+RED = np.array([200, 30, 40], np.uint8)
 
 
 def ball() -> Mesh:
@@ -50,13 +51,13 @@ def exact_frames(
 ) -> list[FusionFrame]:
     """Exact depth of meshes on the table from `count` places around, the first straight above.
 
-    The others look from 30 and 55 degrees in turn, so that every side is seen by two.
+    The others look from 20 and 55 degrees in turn, so that every side is seen by two.
     """
     scene = RayScene([PlacedMesh(BACKGROUND, m, np.eye(4)) for m in (*meshes, TABLE)])
     rays = ray_table(camera)
     frames: list[FusionFrame] = []
     for k in range(count):
-        around, above = 2.4 * k, np.radians(88 if k == 0 else 30 + 25 * (k % 2))
+        around, above = 2.4 * k, np.radians(88 if k == 0 else 20 + 35 * (k % 2))
         eye = [np.cos(above) * np.cos(around), np.cos(above) * np.sin(around), np.sin(above)]
         T = se3.look_at(0.35 * np.array(eye) + [0, 0, 0.03], [0, 0, 0.03])
         t, _ = scene.first_hits(T[:3, 3], rotated(rays, T[:3, :3]).reshape(-1, 3))
@@ -67,8 +68,9 @@ def exact_frames(
 
 @cache
 def ball_frames() -> tuple[FusionFrame, ...]:
-    """Exact frames of the ball."""
-    return tuple(exact_frames((ball(),)))
+    """Exact frames of the ball in one colour."""
+    red = np.full((CAMERA.height, CAMERA.width, 3), RED, np.uint8)
+    return tuple(replace(f, rgb=red) for f in exact_frames((ball(),)))
 
 
 @cache
@@ -79,10 +81,11 @@ def fused_ball() -> FusedObject:
 
 @cache
 def lab_scan(views: int = 12):
-    """A mug in the simulated lab: mesh in world, camera, frames, true camera poses."""
-    mesh = part("mug").mesh
+    """A bunny in the simulated lab: mesh in world, camera, frames, true camera poses."""
+    raw = object_model("bunny").mesh
+    mesh = replace(raw, vertices=raw.vertices * (0.12 / float(raw.extent.max())))
     rng = np.random.default_rng(3)
-    T = standing(mesh, np.eye(3), rng)
+    T = standing(mesh, se3.exp_so3([np.pi / 2, 0, 0]), rng)
     scan = scan_views(mesh, T, ScanLabConfig(views=views, width=640, height=360, focal_px=324), rng)
     frames = tuple(
         FusionFrame(index=f.index, depth_m=f.depth_m, T_world_cam=f.T_world_cam)
@@ -92,8 +95,8 @@ def lab_scan(views: int = 12):
 
 
 @cache
-def fused_mug() -> FusedObject:
-    """The mug of the lab, with refined poses."""
+def fused_bunny() -> FusedObject:
+    """The bunny of the lab, with refined poses."""
     _, camera, frames, _ = lab_scan()
     return fuse_object(camera, frames, None, FusionConfig())
 
@@ -125,7 +128,12 @@ def test_a_sphere_has_its_radius_and_is_closed() -> None:
 def test_a_box_has_its_size() -> None:
     fused = fuse_object(CAMERA, exact_frames((brick(),)), None, AS_GIVEN)
     local = fused.mesh.vertices @ se3.exp_so3([0, 0, 0.4])
-    assert np.ptp(local, axis=0) == pytest.approx([0.10, 0.06, 0.05], abs=6e-4)
+    # Every end face is more than 4 % of the measured area: these percentiles lie on them.
+    low, high = np.percentile(local[fused.measured][:, :2], [2, 98], axis=0)
+    assert high - low == pytest.approx([0.10, 0.06], abs=6e-4)
+    assert np.ptp(local, axis=0)[2] == pytest.approx(0.05, abs=6e-4)
+    # The band that was on the table is invented and may flare at the corners.
+    assert np.ptp(local, axis=0) == pytest.approx([0.10, 0.06, 0.05], abs=3e-3)
     assert np.median(np.abs(errors_mm(fused, brick()))) < 0.1
     assert to_trimesh(fused.mesh).volume == pytest.approx(0.10 * 0.06 * 0.05, rel=0.01)
 
@@ -142,15 +150,15 @@ def test_what_was_on_the_table_is_invented_and_flat() -> None:
 
 
 def test_a_distorted_lens_changes_nothing() -> None:
-    fused = fuse_object(BARREL, exact_frames((ball(),), BARREL), None, AS_GIVEN)
+    frames = exact_frames((ball(),), BARREL)
+    fused = fuse_object(BARREL, frames, None, AS_GIVEN)
     radii = np.linalg.norm(fused.mesh.vertices[fused.measured] - [0, 0, RADIUS], axis=1)
     assert np.median(radii) == pytest.approx(RADIUS, abs=1e-4)
-    # Taken for a pinhole's, the same images give another size: the lens does matter.
-    # (It bends the table, too, so that its far corners look like things: the ball is named.)
+    # Taken for a pinhole's, the same images bend the table: the lens does matter. (Its far corners
+    # look like things, so the ball is named.)
     at = replace(AS_GIVEN, at_m=(0.0, 0.0))
-    wrong = fuse_object(CAMERA, exact_frames((ball(),), BARREL), None, at)
-    radii = np.linalg.norm(wrong.mesh.vertices[wrong.measured] - [0, 0, RADIUS], axis=1)
-    assert abs(np.median(radii) - RADIUS) > 3e-4
+    wrong = fuse_object(CAMERA, frames, None, at)
+    assert wrong.plane.rms_m > 3 * fused.plane.rms_m
 
 
 def test_the_mesh_moves_with_the_world() -> None:
@@ -180,7 +188,7 @@ def test_a_given_plane_is_used() -> None:
 
 def test_refined_poses_are_nearer_to_the_truth_than_the_robots() -> None:
     truth, _, frames, true = lab_scan()
-    fused = fused_mug()
+    fused = fused_bunny()
 
     def off(Ts: Array) -> tuple[float, float]:
         gap = se3.log(se3.invert(true) @ Ts)
@@ -199,32 +207,30 @@ def test_refined_poses_are_nearer_to_the_truth_than_the_robots() -> None:
     assert 0.80 < np.mean(error < 2e3 * fused.sigma_m[fused.measured]) <= 1.0
 
 
+@pytest.mark.slow
 def test_more_views_do_not_make_it_worse() -> None:
     truth, camera, frames, _ = lab_scan()
     few = fuse_object(camera, frames[::2], None, FusionConfig())
     error_few = np.median(np.abs(errors_mm(few, truth)))
-    error_all = np.median(np.abs(errors_mm(fused_mug(), truth)))
+    error_all = np.median(np.abs(errors_mm(fused_bunny(), truth)))
     assert error_all < error_few + 0.05
-    assert fused_mug().coverage.views_per_vertex > few.coverage.views_per_vertex
+    assert fused_bunny().coverage.views_per_vertex > few.coverage.views_per_vertex
 
 
 def test_a_view_with_a_wrong_pose_is_left_out_by_name() -> None:
     truth, camera, frames, _ = lab_scan()
     off = se3.from_rt(se3.exp_so3([0.0, 0.03, 0.0]), [0.012, 0.0, 0.004])
     wrong = [replace(f, T_world_cam=f.T_world_cam @ off) if f.index == 7 else f for f in frames]
-    fused = fuse_object(camera, wrong, None, FusionConfig())
+    fused = fuse_object(camera, wrong, None, FusionConfig(rounds=2))
     assert [c.index for c in fused.corrections if not c.used] == [7]
     assert any("view 7 was left out" in note for note in fused.notes)
     assert np.median(np.abs(errors_mm(fused, truth))) < 0.6
 
 
 def test_colours_are_those_of_the_pictures() -> None:
-    red = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8)
-    red[:] = (200, 30, 40)
-    frames = [replace(f, rgb=red) for f in ball_frames()]
-    fused = fuse_object(CAMERA, frames, None, AS_GIVEN)
+    fused = fused_ball()
     assert fused.mesh.colors is not None
-    assert np.all(fused.mesh.colors[fused.measured] == (200, 30, 40))
+    assert np.all(fused.mesh.colors[fused.measured] == RED)
 
 
 def test_the_picture_shows_the_mesh() -> None:

@@ -49,7 +49,7 @@ class PoseState:
     plane: Array
     """(3,) height [m] and slopes along x and y of the table, against the frame it was seen in."""
     rms_m: Array
-    """(F,) RMS of the views' residuals on patches of the object that they share [m]; NaN without."""
+    """(F,) RMS of the views' residuals on patches of the object that they share [m], or NaN."""
     misfit: Array
     """(F,) the same in sigmas of the patches."""
     support: Array

@@ -28,6 +28,14 @@ LEAST_VIEWS_OF_CELL = 3
 """A cell belongs to a thing if so many views have a point in it: flying pixels do not agree."""
 LEAST_PLANE_SHARE = 0.15
 """A plane with a smaller share of the points is a side of something, not a table."""
+CLEAR_RMS = 3.0
+"""Points further from the plane than so many times its RMS are above or below it."""
+TOP_BELOW = 0.5
+"""With more of the points below, the plane is the top of something..."""
+TOP_SOME_BELOW = 0.1
+"""...and with more than this below..."""
+TOP_ABOVE = 0.05
+"""...if those above are fewer than this share of them."""
 HOLES_SHARE = 0.05
 """From this share of pixels without depth the message on an empty table mentions transparency."""
 
@@ -95,11 +103,13 @@ def _found_plane(
             "is seen around it; or give the plane."
         )
     height = se3.transform(se3.invert(plane.T_world_table), points[around])[:, 2]
-    below = float(np.mean(height < -0.02))
-    if below > 0.5:
+    clear = CLEAR_RMS * max(plane.rms_m, config.plane_tolerance_m)
+    below, above = float(np.mean(height < -clear)), float(np.mean(height > clear))
+    if below > TOP_BELOW or (below > TOP_SOME_BELOW and above < TOP_ABOVE * below):
         raise DegenerateError(
-            f"the largest flat surface has {100 * below:.0f} % of the points below it: it is the "
-            "top of something, not the table. Give the plane."
+            f"no table was found in the depth: {100 * below:.0f} % of the points lie below the "
+            f"largest flat surface and {100 * above:.0f} % above it: it is the top of something. "
+            "An object must stand on a flat surface that is seen around it; or give the plane."
         )
     return plane
 

@@ -55,7 +55,7 @@ def _one_view(  # noqa: PLR0911 - seven ways to see nothing, in a row
     normal: tuple[float, float, float, float],
     limits: tuple[float, float, float],
 ) -> tuple[float, float, bool]:
-    """Return the distance of a node along the normal that one view sees, its weight, and if at edges.
+    """Return the distance of a node along the normal one view sees, its weight, and if at edges.
 
     A weight of 0 says nothing.
 
@@ -83,7 +83,7 @@ def _one_view(  # noqa: PLR0911 - seven ways to see nothing, in a row
     d = depth[v, u]
     if d == 0.0:
         return 0.0, 0.0, False
-    edge = d < 0.0
+    edge = bool(d < 0.0)
     d = abs(d)
     # Along the ray: a difference along z is longer by the ray's own angle to the axis.
     ray = np.sqrt(cx * cx + cy * cy + cz * cz)

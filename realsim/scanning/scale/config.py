@@ -121,6 +121,11 @@ class SearchConfig:
     """Points of the surface by which two of them are told apart."""
     same_share: float = 0.02
     """Two are one if no point differs by more than this share of the size."""
+    size_factor: float = 1.5
+    """Starts are of the size that was said if they differ by less than this factor: people guess
+    to a quarter, and the longest side of a turned box is up to 1.2 times that of a straight one."""
+    mirror_gain: float = 0.1
+    """The mirror image must explain so much more for the mesh to be called mirrored."""
     rivals: int = 1
     """Other solutions of another scale that are fitted to the end."""
 

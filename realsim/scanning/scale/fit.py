@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.records import CameraIntrinsics, Mesh, SupportPlane
+from realsim.records import CameraIntrinsics, Mesh, SupportPlane, Verdict
 from realsim.registration.evidence import DepthFrame, check_frames, measure_noise
 from realsim.scanning.scale.agreement import Explained, explain
 from realsim.scanning.scale.config import ScaleConfig
@@ -39,7 +39,7 @@ LEAST_VIEWS = 3
 """Fewer views leave the scale to the shape of one side."""
 
 
-def fit_scale(
+def fit_scale(  # noqa: PLR0913 - keywords, each with a meaning of its own
     mesh: Mesh,
     intrinsics: CameraIntrinsics,
     frames: Sequence[DepthFrame],
@@ -48,6 +48,7 @@ def fit_scale(
     start: Similarity | None = None,
     plane: SupportPlane | None = None,
     at: tuple[float, float] | None = None,
+    size_m: float | None = None,
     progress: Progress | None = None,
 ) -> ScaleFit:
     """Return the metric scale of a mesh, its pose, and whether they may be trusted.
@@ -60,6 +61,8 @@ def fit_scale(
         start: rough scale and pose (15 %, 10 mm, 10 deg); None = found from nothing.
         plane: the table, where it is known already; None = found.
         at: (x, y) in world [m] near the object, where several stand on the table.
+        size_m: rough longest side of the object [m]; where several scales explain the images it
+            says which is looked at.
         progress: called with (steps done, steps).
 
     Raises:
@@ -74,7 +77,7 @@ def fit_scale(
     evidence = _evidence(intrinsics, ordered, config, (plane, at), ticks)
     shape = make_shape(mesh, config)
     ticks.step()
-    found = hypotheses(shape, evidence, start, config)
+    found = hypotheses(shape, evidence, start, config, size_m)
     ticks.step()
     state, look, seen, dropped = _joint(shape, evidence, found[0].state, config)
     explained = explain(shape, seen, state)
@@ -89,6 +92,8 @@ def fit_scale(
             rivals.append((other[0].s * shape.unit, theirs.gain))
     sigma = sigma_log(look, config)
     judged = judge(shape, seen, (state, look, explained), rivals, (sigma, config))
+    if judged.verdict != "accepted":
+        judged = _if_mirrored(mesh, seen, judged, config)
     ticks.step()
     best = to_given(shape, state, explained.gain, source)
     return ScaleFit(
@@ -196,6 +201,24 @@ def _others(
         start = replace(h.state, views=np.zeros((len(evidence.views), 6)))
         out.append((h, joint_fit(shape, evidence, start, config)))
     return out
+
+
+def _if_mirrored(mesh: Mesh, evidence: ScanEvidence, judged: Judged, config: ScaleConfig) -> Judged:
+    """Return the verdict with the reason that the mesh is mirrored, if its mirror image fits."""
+    mirrored = Mesh(vertices=mesh.vertices * [-1.0, 1.0, 1.0], faces=mesh.faces[:, ::-1])
+    other = hypotheses(make_shape(mirrored, config), evidence, None, config)
+    gain = other[0].gain if other else 0.0
+    checks = judged.checks | {"mirrored_gain": gain}
+    least = max(config.verdict.least_gain, judged.checks["gain"] + config.search.mirror_gain)
+    if gain < least:
+        return replace(judged, checks=checks)
+    reason = (
+        f"its mirror image explains {100 * gain:.0f} % of the object, the mesh itself "
+        f"{100 * judged.checks['gain']:.0f} %: the mesh is mirrored. Mirror it back (negate one "
+        "coordinate and turn the faces over) and fit again."
+    )
+    verdict: Verdict = "rejected"
+    return replace(judged, verdict=verdict, reasons=(reason, *judged.reasons), checks=checks)
 
 
 def _covariance(look: Outlook, sigma: float) -> Array:

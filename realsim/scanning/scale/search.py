@@ -11,7 +11,7 @@ from realsim.scanning.scale.coarse import coarse_fit
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.evidence import ScanEvidence
 from realsim.scanning.scale.result import Similarity
-from realsim.scanning.scale.shape import ScanShape
+from realsim.scanning.scale.shape import INNER_EXTENT, ScanShape
 from realsim.scanning.scale.starts import StartsConfig, find_starts, starts_near
 from realsim.scanning.scale.state import State, first_state
 
@@ -50,11 +50,13 @@ def hypotheses(
     evidence: ScanEvidence,
     start: Similarity | None,
     config: ScaleConfig,
+    size_m: float | None = None,
 ) -> list[Hypothesis]:
     """Return distinct scales and poses after the coarse fit, best first.
 
     A given start is tried first, with its scale varied; where that explains too little, or nothing
-    was given, all resting poses and attitudes of the mesh are searched.
+    was given, all resting poses and attitudes of the mesh are searched. Of a rough longest side
+    [m] only starts of about that size are taken, where there are any.
     """
     rng = np.random.default_rng(config.seed)
     found: list[Hypothesis] = []
@@ -69,6 +71,10 @@ def hypotheses(
             )
     if not found or found[0].gain < config.search.least_gain:
         anew = find_starts(shape.mesh, evidence.cloud, evidence.plane, StartsConfig(), rng)
+        if size_m is not None:
+            reach = np.log(config.search.size_factor)
+            like = [a for a in anew if abs(np.log(a.scale * INNER_EXTENT / size_m)) < reach]
+            anew = like or anew
         anew = anew[: config.search.starts]
         if len(anew) < config.search.few_starts:
             anew += [s for a in anew for s in starts_near(a, shape.mesh, StartsConfig(), rng)[1:3]]

@@ -26,6 +26,7 @@ from realsim.geometry.depth import MAD_TO_SIGMA
 from realsim.scanning.sfm.bundle import hand_eye_sigmas, prior_sigmas
 from realsim.scanning.sfm.config import AlignmentConfig
 from realsim.scanning.sfm.result import Alignment, ViewResidual
+from realsim.scanning.sfm.uncertainty import view_residuals
 
 Array = NDArray[np.float64]
 STEPS = 30
@@ -283,17 +284,5 @@ def _residuals(
 ) -> tuple[ViewResidual, ...]:
     """Return every view's distance from the robot, those far from the others marked."""
     errors = _errors(problem, state)
-    mm = 1e3 * np.linalg.norm(errors[:, 3:], axis=1)
-    deg = np.degrees(np.linalg.norm(errors[:, :3], axis=1))
-
-    def far(values: Array, least: float) -> NDArray[np.bool_]:
-        # The median length of a normal 3-vector is 1.54 sigmas.
-        return values > max(least, config.outlier_sigmas * float(np.median(values)) / 1.54)
-
-    outlier = far(mm, config.outlier_mm) | far(deg, config.outlier_deg)
-    return tuple(
-        ViewResidual(
-            name=n, offset_mm=float(a), turn_deg=float(b), weight=float(w), outlier=bool(o)
-        )
-        for n, a, b, w, o in zip(names, mm, deg, weights, outlier, strict=True)
-    )
+    total = np.tile(np.diag(_spread(problem, errors) ** 2), (len(names), 1, 1))
+    return view_residuals(names, errors, total, weights, config)

@@ -20,6 +20,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project, projection_jacobian
 from realsim.geometry.depth import MAD_TO_SIGMA
 from realsim.scanning.sfm.config import MappingConfig, RobotNoise
+from realsim.scanning.sfm.independence import variance_inflation
 from realsim.scanning.sfm.result import Geometry
 
 Array = NDArray[np.float64]
@@ -45,7 +46,8 @@ class Bundle:
     covariance: Array
     """(6 V + 6, 6 V + 6) of the cameras' right perturbations, then of the hand-eye's."""
     sigma_px: float
-    """Robust 1-sigma of the reprojection errors along each axis."""
+    """Robust 1-sigma of the reprojection errors along each axis, raised for what was fitted and for
+    neighbours that err alike."""
     prior_factor: float
     """By how much the robot's sigmas were raised, 1 or more."""
 
@@ -91,6 +93,19 @@ def adjust(geometry: Geometry, priors: Array, noise: RobotNoise, config: Mapping
         sigma_px=weights[2],
         prior_factor=factor,
     )
+
+
+def picture_information(geometry: Geometry, config: MappingConfig) -> Array:
+    """Return what the pictures alone say of the cameras (6 V, 6 V), the points eliminated.
+
+    Args:
+        geometry: cameras, points and observations at their best fit.
+        config: loss.
+    """
+    priors, twist, noise = geometry.Ts_world_cam, np.zeros(6), RobotNoise()
+    w_obs, w_prior, sigma, factor = _weights(geometry, priors, twist, noise, config)
+    weights = (w_obs, np.zeros_like(w_prior), sigma, factor)
+    return _schur(_system(geometry, priors, twist, noise, weights), 0.0)[0][:-6, :-6]
 
 
 def reprojection_errors(geometry: Geometry) -> Array:
@@ -154,7 +169,10 @@ def _weights(
     r = reprojection_errors(geometry)
     sigma = robust_sigma(r)
     square = np.square(np.nan_to_num(r, nan=1e3)).sum(-1)
-    w_obs = 1 / (1 + square / max(config.robust_px, sigma) ** 2) / sigma**2
+    robust = 1 / (1 + square / max(config.robust_px, sigma) ** 2)
+    # Fitted and correlated residuals count for less than their number says.
+    sigma *= float(np.sqrt(variance_inflation(geometry, r, robust)))
+    w_obs = robust / sigma**2
     e = _prior_residuals(geometry, priors, twist, noise)
     factor = max(1.0, MAD_TO_SIGMA * float(np.median(np.abs(e))))
     w_prior = 1 / (1 + np.square(e / factor).mean(-1) / CAUCHY**2) / factor**2

@@ -56,6 +56,10 @@ class MappingConfig:
     poses that are worse than that show up in few points."""
     refine_rounds: int = 3
     """Triangulation and refinement alternate so often; later rounds win points back."""
+    least_reliability: float = 0.7
+    """Cameras are moved from the robot's poses only if two halves of the scene move them alike: of
+    what moves them, this share must be signal. At 0.5 a refinement wins nothing; what both halves
+    get wrong together (the lens) is not seen, hence more."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -86,14 +90,9 @@ class AlignmentConfig:
     """Prior errors of the robot's poses."""
     samples: int = 300
     """Minimal samples of the robust start; with a third of the views wrong, 20 would do."""
-    outlier_sigmas: float = 5.0
-    """A view this far from the others, in robust sigmas of the centre or of the rotation, is
-    named; at least `outlier_mm` or `outlier_deg`."""
-    outlier_mm: float = 5.0
-    """A camera centre nearer than this to the robot's is not an outlier [mm]: SfM on weak texture
-    errs by 1 mm, in views at the end of a chain by 4."""
-    outlier_deg: float = 1.0
-    """The same for the rotation [deg]."""
+    outlier_probability: float = 0.01
+    """Chance of naming any view of a faultless set: each one is held against chi^2 of its six
+    errors in their own covariance (pictures and robot), raised where the median view disagrees."""
     min_views: int = 3
     """Registered views that a similarity needs."""
     min_line_ratio: float = 0.05

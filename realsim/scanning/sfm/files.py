@@ -116,6 +116,7 @@ def result_json(result: SfmResult, config: SfmConfig) -> dict[str, Any]:
         "is_metric": result.is_metric,
         "scale_m_per_unit": number_to_json(result.scale),
         "scale_sigma_percent": number_to_json(result.sigma_percent),
+        "refinement_reliability": number_to_json(result.reliability),
         "alignment": None if result.alignment is None else _alignment_json(result.alignment),
         "depth": None if d is None else {
             "ratio": d.ratio, "sigma": d.sigma, "pairs": d.pairs, "views": d.views,

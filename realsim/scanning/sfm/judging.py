@@ -126,7 +126,7 @@ def _scale(result: SfmResult, config: SfmConfig) -> Iterator[Finding]:
             yield (
                 level,
                 (
-                    f"{len(told)} of {len(views)} views speak against their robot pose: "
+                    f"{len(told)} of {len(views)} views disagree with their robot pose: "
                     f"{shown(told)}. A slipped mount, images paired with the poses of other "
                     "views, or a wrong hand-eye."
                 ),
@@ -134,7 +134,10 @@ def _scale(result: SfmResult, config: SfmConfig) -> Iterator[Finding]:
         else:
             yield (
                 "doubtful",
-                (f"left out, because the robot pose does not fit the pictures: {shown(told)}."),
+                (
+                    "the robot's pose and the pictures disagree beyond both their errors: "
+                    f"{shown(told)}."
+                ),
             )
     middle = float(np.median([v.offset_mm for v in views]))
     if middle > trust.residual_mm:

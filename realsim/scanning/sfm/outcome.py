@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from realsim.errors import DegenerateError
 from realsim.scanning.sfm.bundle import (
-    Bundle,
     point_covariances,
     reprojection_errors,
     robust_sigma,
@@ -70,7 +69,8 @@ def outcome(
         sigma_percent=mapped.sigma_percent,
         alignment=mapped.alignment,
         depth=None,
-        camera_covariance=_camera_covariance(mapped.bundle, geometry),
+        reliability=mapped.reliability,
+        camera_covariance=_camera_covariance(mapped, geometry),
         point_error_px=np.sqrt(squares / np.maximum(seen, 1)),
         point_sigma_mm=unit * np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[:, -1], 0)),
         track_lengths=seen.astype(np.int64),
@@ -88,13 +88,10 @@ def outcome(
     return replace(result, verdict=verdict, reasons=reasons)
 
 
-def _camera_covariance(bundle: Bundle | None, geometry: Geometry) -> Array | None:
-    """Return the cameras' own blocks (V, 6, 6) of the refinement's covariance."""
-    if bundle is None:
-        return None
-    place = {n: k for k, n in enumerate(bundle.geometry.names)}
-    rows = [6 * place[n] for n in geometry.names]
-    return np.stack([bundle.covariance[r : r + 6, r : r + 6] for r in rows])
+def _camera_covariance(mapped: Mapped, geometry: Geometry) -> Array | None:
+    """Return the cameras' own blocks (V, 6, 6) of the covariance."""
+    own = mapped.covariances
+    return None if own is None else np.stack([own[n] for n in geometry.names])
 
 
 def _notes(
@@ -115,6 +112,12 @@ def _notes(
         )
     if dropped:
         notes.append(f"seen by fewer than {LEAST_IN_VIEW} points: {shown(dropped)}.")
+    if mapped.reliability < job.config.mapping.least_reliability:
+        notes.append(
+            "the cameras stay at the robot's poses: two halves of the scene would move them "
+            f"differently (share of signal {mapped.reliability:.2f}, "
+            f"{job.config.mapping.least_reliability:g} is needed)."
+        )
     if mapped.bundle is not None and mapped.bundle.prior_factor > 1.5:
         notes.append(
             f"the robot's poses disagree {mapped.bundle.prior_factor:.1f} times as much as their "

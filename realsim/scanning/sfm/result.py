@@ -51,6 +51,8 @@ class ViewResidual:
     """Angle between the rotations [deg]."""
     weight: float
     """Share with which the view counts in the scale."""
+    chi2: float
+    """Square of the six errors in their covariance; 6 is the mean of a faultless view."""
     outlier: bool
     """Whether it speaks against the others."""
 
@@ -132,9 +134,12 @@ class SfmResult:
     """To the robot's poses."""
     depth: DepthScale | None
     """From the depth images."""
+    reliability: float
+    """Share of signal in what two halves of the scene do to the robot's poses, 0 to 1; below
+    `least_reliability` a refinement leaves the cameras where they were. NaN: nothing refined."""
     camera_covariance: Array | None
-    """(V, 6, 6) of the right perturbation of each camera [rad, m], from the refinement; else
-    None."""
+    """(V, 6, 6) of the right perturbation of each camera [rad, m]; of a free reconstruction about
+    the best similarity. None at the robot's own poses."""
     point_error_px: Array
     """(P,) RMS reprojection error of each point."""
     point_sigma_mm: Array

@@ -1,7 +1,7 @@
 """Two ways from matches to metric cameras and points: free mapping, and mapping at given poses."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import DegenerateError
+from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.scanning.sfm.alignment import align_to_robot
-from realsim.scanning.sfm.bundle import Bundle, adjust
+from realsim.scanning.sfm.bundle import Bundle, adjust, prior_sigmas
 from realsim.scanning.sfm.config import SfmConfig
 from realsim.scanning.sfm.database import MatchDatabase
+from realsim.scanning.sfm.independence import halves, reliability
 from realsim.scanning.sfm.mapping import (
     geometry_of,
     map_freely,
@@ -24,6 +26,7 @@ from realsim.scanning.sfm.mapping import (
 )
 from realsim.scanning.sfm.photographs import Photographs
 from realsim.scanning.sfm.result import Alignment, Poses, Progress
+from realsim.scanning.sfm.uncertainty import tested_freely, tested_refined
 
 Array = NDArray[np.float64]
 MODEL = "model"
@@ -45,6 +48,10 @@ class Mapped:
     alignment: Alignment | None
     bundle: Bundle | None
     is_metric: bool
+    covariances: dict[str, Array] | None = None
+    """(6, 6) of each camera's right perturbation [rad, m], by name."""
+    reliability: float = float("nan")
+    """Share of signal in what two halves of the scene do to the cameras; NaN: not refined."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -84,55 +91,106 @@ def map_free(job: Job, database: MatchDatabase) -> Mapped:
         job.config.alignment, np.random.default_rng(job.config.seed),
     )  # fmt: skip
     scaled(model, alignment.scale, alignment.R, alignment.t)
+    metric = geometry_of(model, job.folder / MODEL)
+    alignment, own = tested_freely(
+        alignment, metric, job.robot, job.config.alignment, job.config.mapping
+    )
     return Mapped(
         model=model, models=sizes, scale=alignment.scale, sigma_percent=alignment.sigma_percent,
         alignment=alignment, bundle=None, is_metric=True,
+        covariances=dict(zip(metric.names, own, strict=True)),
     )  # fmt: skip
 
 
 def map_at_poses(job: Job, database: MatchDatabase, Ts: Array, poses: Poses) -> Mapped:
     """Triangulate at the robot's poses; where asked for, refine both."""
-    m, work, tick = job.config.mapping, job.folder / WORK, job.tick("mapping")
-    rounds = m.refine_rounds if poses == "refined" else 1
-    model, bundle = model_at_poses(database, Ts), None
-    names = np.array(database.photographs.names)
-    for k in range(rounds):
-        limit = m.known_error_px if k == 0 else m.reprojection_px
-        model = triangulated(model, database, job.config, limit, work)
-        if len(model.points3D) < LEAST_IN_VIEW:
-            raise DegenerateError(
-                f"only {len(model.points3D)} points fit the robot's camera poses within {limit:g} "
-                "px: the poses do not belong to these pictures (other order, other frame, wrong "
-                "hand-eye, millimetres), or the views share nothing. Run it with the poses "
-                "unknown: the residuals then say which views disagree."
-            )
-        tick(2 * k + 1, 2 * rounds)
-        if poses == "refined":
-            found = geometry_of(model, job.folder / MODEL)
-            order = [int(np.flatnonzero(names == n)[0]) for n in found.names]
-            bundle = adjust(found, Ts[order], job.config.alignment.noise, m)
-            set_geometry(model, bundle.geometry)
-        tick(2 * k + 2, 2 * rounds)
-    _drop_far(model, m.reprojection_px if bundle else m.known_error_px, m.min_angle_deg)
-    return _judged_against_robot(job, model, Ts, bundle)
+    m, limit = job.config.mapping, job.config.mapping.known_error_px
+    model = _with_points(job, database, model_at_poses(database, Ts), limit)
+    if poses == "known":
+        job.progress("mapping", 1, 1)
+        _drop_far(model, limit, m.min_angle_deg)
+        return _known(job, model, Ts)
+    model, bundle, robot = _refined(job, database, model)
+    found = bundle.geometry
+    alignment, share = _compared(job, bundle, robot)
+    if share < m.least_reliability:
+        model = _with_points(job, database, model_at_poses(database, Ts), m.reprojection_px)
+        known = _known(job, model, Ts)
+        return replace(known, alignment=alignment, reliability=share)
+    _drop_far(model, m.reprojection_px, m.min_angle_deg)
+    arm = job.config.alignment.noise.arm_scale_percent
+    places = range(0, 6 * len(found.names), 6)
+    return Mapped(
+        model=model, models=(len(Ts),), scale=1.0,
+        sigma_percent=float(np.hypot(100 * scale_sigma(bundle), arm)), alignment=alignment,
+        bundle=bundle, is_metric=True, reliability=share,
+        covariances={
+            n: bundle.covariance[k : k + 6, k : k + 6]
+            for n, k in zip(found.names, places, strict=True)
+        },
+    )  # fmt: skip
 
 
-def _judged_against_robot(job: Job, model: Any, Ts: Array, bundle: Bundle | None) -> Mapped:
-    """Return the model with the scale's sigma, and each camera's distance from the robot's pose."""
+def _refined(job: Job, database: MatchDatabase, model: Any) -> tuple[Any, Bundle, Array]:
+    """Adjust and triangulate in turn; return the model, the adjustment and the robot's poses."""
+    m, tick = job.config.mapping, job.tick("mapping")
+    done = 0
+    while True:
+        tick(2 * done + 1, 2 * m.refine_rounds)
+        found = geometry_of(model, job.folder / MODEL)
+        robot = np.stack([job.robot[n] for n in found.names])
+        bundle = adjust(found, robot, job.config.alignment.noise, m)
+        set_geometry(model, bundle.geometry)
+        done += 1
+        tick(2 * done, 2 * m.refine_rounds)
+        if done >= m.refine_rounds:
+            return model, bundle, robot
+        model = _with_points(job, database, model, m.reprojection_px)
+
+
+def _with_points(job: Job, database: MatchDatabase, model: Any, limit_px: float) -> Any:
+    """Return the model with points triangulated at its cameras."""
+    model = triangulated(model, database, job.config, limit_px, job.folder / WORK)
+    if len(model.points3D) < LEAST_IN_VIEW:
+        raise DegenerateError(
+            f"only {len(model.points3D)} points fit the robot's camera poses within {limit_px:g} "
+            "px: the poses do not belong to these pictures (other order, other frame, wrong "
+            "hand-eye, millimetres), or the views share nothing. Run it with the poses "
+            "unknown: the residuals then say which views disagree."
+        )
+    return model
+
+
+def _known(job: Job, model: Any, Ts: Array) -> Mapped:
+    """Return the model at the robot's poses, with the sigma of their scale."""
     found = geometry_of(model, job.folder / MODEL)
     robot = np.stack([job.robot[n] for n in found.names])
     alignment = align_to_robot(
         found.names, found.Ts_world_cam, robot, job.config.alignment,
         np.random.default_rng(job.config.seed),
     )  # fmt: skip
-    sigma = alignment.sigma_percent
-    if bundle is not None:
-        arm = job.config.alignment.noise.arm_scale_percent
-        sigma = float(np.hypot(100 * scale_sigma(bundle), arm))
     return Mapped(
-        model=model, models=(len(Ts),), scale=1.0, sigma_percent=sigma,
-        alignment=None if bundle is None else alignment, bundle=bundle, is_metric=True,
+        model=model, models=(len(Ts),), scale=1.0, sigma_percent=alignment.sigma_percent,
+        alignment=None, bundle=None, is_metric=True,
     )  # fmt: skip
+
+
+def _compared(job: Job, bundle: Bundle, robot: Array) -> tuple[Alignment, float]:
+    """Return the refined cameras against the robot's, and how repeatable their difference is."""
+    config, found = job.config.alignment, bundle.geometry
+    alignment = align_to_robot(
+        found.names, found.Ts_world_cam, robot, config, np.random.default_rng(job.config.seed)
+    )
+    alignment = tested_refined(alignment, bundle, robot, config)
+    seen = np.bincount(found.cameras_of, minlength=len(found.names)) >= LEAST_IN_VIEW
+    use = seen & ~np.array([v.outlier for v in alignment.views])
+    parts: list[Array] = []
+    for half in halves(found):
+        moved = adjust(half, robot, config.noise, job.config.mapping).geometry.Ts_world_cam[use]
+        shift = se3.log(se3.invert(robot[use]) @ moved) / prior_sigmas(config.noise)
+        # What all views share is the hand-eye's; its prior is wide, and it is one number of many.
+        parts.append(shift - shift.mean(0))
+    return alignment, reliability(*parts) if int(use.sum()) >= config.min_views else 0.0
 
 
 def scale_sigma(bundle: Bundle) -> float:

@@ -1,0 +1,212 @@
+"""What the depth images say: points, outlines and rays, against the rendered truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scanned_objects import (
+    TRUE,
+    Scanned,
+    evidence_of,
+    gathered,
+    scanned,
+    scanned_mesh,
+    LAB,
+    block,
+    shape_of,
+    true_state,
+)
+
+from realsim.geometry import se3
+from realsim.geometry.camera import project
+from realsim.geometry.distance_field import DistanceField
+from realsim.scanning.scale.config import SampleConfig, ScaleConfig
+from realsim.scanning.scale.evidence import ScanView
+from realsim.scanning.scale.shape import outline
+from realsim.scanning.scale.state import metre_per_px
+
+Array = NDArray[np.float64]
+
+
+def outline_px(name: str, lab: str) -> list[tuple[ScanView, Array, Array]]:
+    """Return per view the true outline's pixels (N, 2) and its heights over the table (N,) [m]."""
+    known, shape, evidence = scanned(name, lab), shape_of(name), evidence_of(name, lab)
+    state = true_state(known, shape, evidence)
+    rows = []
+    for view, T in zip(evidence.views, known.views.Ts_world_cam, strict=True):
+        points = outline(shape, state.pose, T, evidence.intrinsics.fx, 400).points
+        world = state.s * points @ state.R.T + state.t
+        uv = project(evidence.intrinsics, se3.transform(se3.invert(T), world))
+        rows.append((view, uv, world[:, 2]))
+    return rows
+
+
+def looked_up(image: Array, view: ScanView, uv: Array) -> Array:
+    """Return the values (N,) of a crop's image at pixels (N, 2) of the whole, bilinear."""
+    from scipy.ndimage import map_coordinates
+
+    at = (uv - [view.rim.left, view.rim.top])[:, ::-1].T
+    return map_coordinates(image, at, order=1, mode="nearest")
+
+
+@pytest.mark.parametrize("name", ["bunny", "mug", "block"])
+def test_the_signed_distance_is_zero_at_the_true_outline_within_a_pixel(name: str):
+    off: list[Array] = []
+    for view, uv, height in outline_px(name, "exact"):
+        # What lies low over the table has no depth edge: the foot's outline is not measured.
+        d = looked_up(view.rim.distance_px, view, uv[height > 0.015])
+        off.append(d)
+    d = np.concatenate(off)
+    assert len(d) > 500
+    assert abs(np.median(d)) < 0.5
+    assert np.mean(np.abs(d) < 1.0) > 0.9
+
+
+def test_with_noise_the_outline_is_still_within_two_pixels():
+    d = np.concatenate([
+        looked_up(v.rim.distance_px, v, uv[h > 0.02]) for v, uv, h in outline_px("bunny", "lab")
+    ])  # fmt: skip
+    assert np.mean(np.abs(d) < 2.0) > 0.9
+
+
+def test_the_distance_is_negative_inside_and_grows_by_one_per_pixel():
+    for view in evidence_of("bunny", "exact").views:
+        D = view.rim.distance_px
+        assert D.min() < -5 and D.max() > 5
+        assert D.dtype == np.float32
+        away = np.abs(D) > 2
+        gv, gu = np.gradient(D)
+        slope = np.hypot(gu, gv)[away]
+        assert np.median(slope) == pytest.approx(1.0, abs=0.05)
+        assert np.all(view.rim.gap_px >= 1.0)
+
+
+def test_without_noise_points_lie_on_the_object_and_on_the_table():
+    known = scanned("bunny", "exact")
+    field = DistanceField.from_mesh(known.real, 96)
+    for view in evidence_of("bunny", "exact").views:
+        world = se3.transform(view.T_world_cam, view.points)
+        d = field.distance(se3.transform(se3.invert(known.T_world_obj), world))
+        assert len(view.points) > 100
+        assert np.abs(d).max() < 0.0015
+        table = se3.transform(view.T_world_cam, view.table)
+        # The object's foot, up to the height at which it is told from the table, is kept off.
+        assert np.abs(table[:, 2]).max() < 1e-4
+        assert len(view.table) > 100
+
+
+def test_no_point_of_a_noisy_view_floats_between_object_and_table():
+    known = scanned("bunny")
+    field = DistanceField.from_mesh(known.real, 96)
+    off: list[Array] = []
+    for view, T in zip(evidence_of("bunny").views, known.views.Ts_world_cam, strict=True):
+        world = se3.transform(T, view.points)
+        off.append(field.distance(se3.transform(se3.invert(known.T_world_obj), world)))
+    d = np.concatenate(off)
+    assert np.mean(np.abs(d) < 0.006) > 0.99
+    assert abs(np.median(d)) < 0.0004
+
+
+def test_rays_carry_the_measured_depth_and_who_was_met():
+    known = scanned("block", "exact")
+    field = DistanceField.from_mesh(known.real, 96)
+    for view in evidence_of("block", "exact").views:
+        assert view.rays.shape == (len(view.depth), 3)
+        np.testing.assert_allclose(view.rays[:, 2], 1.0)
+        on = view.is_object
+        assert 50 < np.count_nonzero(on) < len(on)
+        assert np.all(view.depth[on] > 0)
+        world = se3.transform(view.T_world_cam, view.rays[on] * view.depth[on, None])
+        d = field.distance(se3.transform(se3.invert(known.T_world_obj), world))
+        assert np.abs(d).max() < 0.0015
+
+
+def test_sampling_keeps_about_as_many_as_wanted_and_says_what_each_stands_for():
+    known = scanned("block")
+    for wanted in (60, 250, 900):
+        samples = SampleConfig(object_points=wanted, table_points=wanted, rays=wanted)
+        evidence = gathered(known, ScaleConfig(samples=samples))
+        for view in evidence.views:
+            full = 0.5 * np.count_nonzero(view.rim.distance_px < 0)
+            assert len(view.points) > min(0.5 * wanted, 0.5 * full)
+            assert len(view.points) < 5 * wanted
+            inside = np.count_nonzero(view.rim.distance_px < 0)
+            assert len(view.points) * view.point_area_px == pytest.approx(inside, rel=0.45)
+
+
+def test_a_view_that_does_not_see_the_object_is_named():
+    known = scanned("block")
+    away = replace(known.frames[3], T_world_cam=known.frames[3].T_world_cam
+                   @ se3.from_rt(se3.exp_so3([0, np.pi, 0]), [0, 0, 0]))  # fmt: skip
+    blind = replace(known.frames[5], depth_m=np.zeros_like(known.frames[5].depth_m))
+    frames = (*known.frames[:3], away, known.frames[4], blind, *known.frames[6:])
+    evidence = gathered(Scanned(known.real, known.scan, replace(known.views, frames=frames)))
+    assert evidence.unseen == (3, 5)
+    assert [v.index for v in evidence.views] == [0, 1, 2, 4, 6, 7, 8, 9]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -0.3])
+def test_invalid_depth_is_no_depth(value: float):
+    known = scanned("block")
+    spoiled = []
+    for f in known.frames:
+        z = f.depth_m.copy()
+        z[::17, ::13] = value
+        spoiled.append(replace(f, depth_m=z))
+    views = replace(known.views, frames=tuple(spoiled))
+    evidence = gathered(Scanned(known.real, known.scan, views))
+    assert np.isfinite(evidence.noise.per_m)
+    for v in evidence.views:
+        assert np.all(np.isfinite(v.points)) and np.all(v.points[:, 2] > 0)
+        assert np.all(np.isfinite(v.table)) and np.all(np.isfinite(v.depth))
+
+
+def test_the_size_is_the_objects_and_a_pixel_has_the_right_one():
+    evidence = evidence_of("block", "exact")
+    diagonal = float(np.hypot(0.08, 0.05))
+    assert 0.05 < evidence.size_m < 1.05 * diagonal
+    for view in evidence.views:
+        z = np.median(view.points[:, 2])
+        assert metre_per_px(evidence, view.T_world_cam) == pytest.approx(z / 324.0, rel=0.15)
+
+
+def test_the_cloud_lies_on_the_object_and_looks_at_the_cameras():
+    known, evidence = scanned("bunny", "exact"), evidence_of("bunny", "exact")
+    field = DistanceField.from_mesh(known.real, 96)
+    d = field.distance(se3.transform(se3.invert(known.T_world_obj), evidence.cloud.points))
+    assert np.median(np.abs(d)) < 3e-4
+    np.testing.assert_allclose(np.linalg.norm(evidence.cloud.towards, axis=1), 1.0, atol=1e-9)
+    assert np.all(evidence.cloud.sigmas > 0)
+    assert np.mean(evidence.cloud.towards[:, 2] > 0) > 0.99
+
+
+def test_progress_counts_the_views():
+    from realsim.registration.evidence import measure_noise
+    from realsim.scanning.scale.evidence import gather_scan
+
+    known, before, config = scanned("block"), evidence_of("block"), ScaleConfig()
+    ticks: list[tuple[int, int]] = []
+    gather_scan(
+        known.views.intrinsics, known.frames, (before.plane, before.footprint),
+        measure_noise(known.frames, config.noise), config, lambda a, b: ticks.append((a, b)),
+    )  # fmt: skip
+    assert ticks == [(k + 1, 10) for k in range(10)]
+
+
+def test_an_object_cut_by_the_image_border_keeps_what_is_seen():
+    """The border is no outline: nothing beyond it is known to be empty."""
+    near = replace(LAB, **TRUE, focal_px=900.0, views=6)
+    known = scanned_mesh(block((0.16, 0.05, 0.06)), near, seed=2)
+    evidence = gathered(known)
+    cut = 0
+    for view in evidence.views:
+        uv = project(evidence.intrinsics, view.points)
+        assert np.all((uv > -1) & (uv < [640, 360]))
+        D = view.rim.distance_px
+        left = view.rim.left == 0 and (D[:, 0] < 0).any()
+        right = view.rim.left + D.shape[1] == 640 and (D[:, -1] < 0).any()
+        top = view.rim.top == 0 and (D[0] < 0).any()
+        low = view.rim.top + D.shape[0] == 360 and (D[-1] < 0).any()
+        cut += left or right or top or low
+    assert cut >= 2

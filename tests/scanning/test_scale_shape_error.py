@@ -1,0 +1,225 @@
+"""The error of the mesh's shape: patches, their covariance, and how probable each size of it is."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scanned_objects import shape_of
+
+from realsim.scanning.scale.config import ShapeConfig
+from realsim.scanning.scale.shape import INNER_EXTENT
+from realsim.scanning.scale.shape_error import (
+    SurfacePatches,
+    covariance_of,
+    make_patches,
+    posterior,
+    shape_models,
+    within_share,
+)
+
+Array = NDArray[np.float64]
+CONFIG = ShapeConfig()
+NAMES = ["block", "mug", "bunny", "elbow"]
+
+
+def sphere(n: int = 4000, radius: float = 0.05) -> tuple[Array, Array]:
+    """Return points spread evenly over a sphere, and their normals."""
+    k = np.arange(n) + 0.5
+    z, turn = 1 - 2 * k / n, k * np.pi * (3 - np.sqrt(5))
+    n_out = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], -1)
+    return radius * n_out, n_out
+
+
+def patches_of(name: str) -> SurfacePatches:
+    return shape_of(name).patches
+
+
+def unconditioned(patches: SurfacePatches, length: float) -> Array:
+    r = np.sqrt(3) * np.linalg.norm(patches.middles[:, None] - patches.middles, axis=2) / length
+    return (1 + r) * np.exp(-r) * (patches.normals @ patches.normals.T)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_patches_cover_all_samples_and_their_areas_are_shares(name: str):
+    shape = shape_of(name)
+    patches = shape.patches
+    ids = patches.of(shape.samples, shape.normals)
+    assert patches.areas.sum() == pytest.approx(1.0, abs=1e-12)
+    assert np.all(patches.areas > 0)
+    assert len(patches.areas) <= CONFIG.patches
+    assert ids.min() >= 0 and ids.max() < len(patches.areas)
+    assert len(np.unique(ids)) == len(patches.areas)
+    # What is asked later gives about the shares that were counted when they were made.
+    counted = np.bincount(ids, minlength=len(patches.areas)) / len(ids)
+    assert np.abs(counted - patches.areas).sum() < 0.5
+    assert np.all(np.linalg.norm(patches.normals, axis=1) <= 1 + 1e-12)
+    assert np.linalg.norm(shape.samples - patches.middles[ids], axis=1).max() < 0.5 * INNER_EXTENT
+    assert len(patches.of(np.zeros((0, 3)), np.zeros((0, 3)))) == 0
+
+
+def test_the_two_sides_of_a_thin_wall_are_two_patches():
+    rng = np.random.default_rng(0)
+    flat = np.concatenate([rng.uniform(-0.05, 0.05, (3000, 2)), np.zeros((3000, 1))], axis=1)
+    side = np.where(np.arange(3000) < 1500, 1.0, -1.0)
+    normals = np.zeros((3000, 3))
+    normals[:, 2] = side
+    points = flat + 0.0005 * normals
+    patches = make_patches(points, normals, 40, CONFIG.normal_share * INNER_EXTENT)
+    ids = patches.of(points, normals)
+    np.testing.assert_array_equal(np.sign(patches.normals[ids, 2]), side)
+    np.testing.assert_allclose(np.abs(patches.normals[:, 2]), 1.0, atol=1e-9)
+    # ... which move together, one outward and one inward.
+    C = unconditioned(patches, 0.05)
+    k = int(np.argmax(patches.normals[:, 2]))
+    back = np.flatnonzero(patches.normals[:, 2] < 0)
+    near = back[np.argmin(np.linalg.norm(patches.middles[back] - patches.middles[k], axis=1))]
+    assert C[k, near] < -0.8
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("length", [0.005, 0.02, 0.1])
+def test_covariances_are_positive_and_conditioning_takes_variance_away(name: str, length: float):
+    patches = patches_of(name)
+    S = covariance_of(patches, length)
+    np.testing.assert_array_equal(S, S.T)
+    assert np.linalg.eigvalsh(S).min() > -1e-9
+    gone = unconditioned(patches, length) - S
+    assert np.linalg.eigvalsh(gone).min() > -1e-9
+    assert np.linalg.matrix_rank(gone, tol=1e-9) <= 7
+    assert np.all(np.diag(S) <= 1 + 1e-9)
+
+
+def modes_of(middles: Array, areas: Array) -> Array:
+    """Return shift, turn and growth (7, K, 3) about the surface's middle, by hand."""
+    q = middles - areas @ middles
+    turns = [np.cross(e, q) for e in np.eye(3)]
+    return np.stack([*(np.tile(e, (len(q), 1)) for e in np.eye(3)), *turns, q])
+
+
+def test_on_a_sphere_no_offsets_are_left_that_shift_or_grow_it():
+    """There the normal part of the field holds these sums alone: they must vanish.
+
+    A turn has no normal part on a sphere.
+    """
+    patches = make_patches(*sphere(), 60, CONFIG.normal_share * INNER_EXTENT)
+    for length in (0.01, 0.03, 0.1):
+        S = covariance_of(patches, length)
+        before = unconditioned(patches, length)
+        modes = modes_of(patches.middles, patches.areas)
+        normal = np.einsum("mkc,kc->mk", modes, patches.normals) * patches.areas
+        for m in (0, 1, 2, 6):
+            u = normal[m] / np.linalg.norm(normal[m])
+            # A vector field's tangential part may compensate: most is gone, not all.
+            assert u @ S @ u < 0.75 * (u @ before @ u)
+        for m in (3, 4, 5):
+            assert np.linalg.norm(normal[m]) < 0.02 * np.linalg.norm(normal[6] / 0.05)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_area_weighted_sums_of_the_seven_modes_are_zero(name: str):
+    """Drawn fields are conditioned by hand (Matheron's rule); their normal parts have this law."""
+    patches, length = patches_of(name), 0.03
+    x, n, a = patches.middles, patches.normals, patches.areas
+    k = len(x)
+    r = np.sqrt(3) * np.linalg.norm(x[:, None] - x, axis=2) / length
+    rho = (1 + r) * np.exp(-r)
+    full = np.kron(rho, np.eye(3))
+    W = (modes_of(x, a) * a[:, None]).reshape(7, -1)
+    conditioned = full - full @ W.T @ np.linalg.solve(W @ full @ W.T, W @ full)
+    # All seven sums are zero in every draw ...
+    np.testing.assert_allclose(W @ conditioned @ W.T, 0.0, atol=1e-12)
+    # ... and what a camera sees of such a field is what the patches' covariance says.
+    N = np.zeros((k, 3 * k))
+    N[np.repeat(np.arange(k), 3), np.arange(3 * k)] = n.ravel()
+    np.testing.assert_allclose(covariance_of(patches, length), N @ conditioned @ N.T, atol=1e-8)
+
+
+def test_covariances_do_not_depend_on_the_attitude_nor_on_the_unit():
+    from realsim.geometry import se3
+
+    patches = patches_of("bunny")
+    R = se3.random_rotation(np.random.default_rng(1))
+    turned = SurfacePatches(
+        middles=patches.middles @ R.T + [0.3, -1, 2], normals=patches.normals @ R.T,
+        areas=patches.areas, normal_weight=patches.normal_weight, radius=patches.radius,
+    )  # fmt: skip
+    larger = SurfacePatches(
+        middles=25.4 * patches.middles, normals=patches.normals, areas=patches.areas,
+        normal_weight=25.4 * patches.normal_weight, radius=25.4 * patches.radius,
+    )  # fmt: skip
+    S = covariance_of(patches, 0.02)
+    np.testing.assert_allclose(covariance_of(turned, 0.02), S, atol=1e-8)
+    np.testing.assert_allclose(covariance_of(larger, 25.4 * 0.02), S, atol=1e-8)
+
+
+def drawn(name: str, sigma: float, noise: float, seed: int) -> tuple[Array, Array]:
+    """Return information and right side of offsets drawn with 1-sigma, seen with noise [m]."""
+    patches = patches_of(name)
+    length = CONFIG.lengths[0] * INNER_EXTENT
+    S = covariance_of(patches, length)
+    S += CONFIG.nugget * within_share(patches, length) ** 2 * np.eye(len(S))
+    rng = np.random.default_rng(seed)
+    w, V = np.linalg.eigh(S)
+    offsets = sigma * V @ (np.sqrt(np.clip(w, 0, None)) * rng.standard_normal(len(w)))
+    seen = offsets + noise * rng.standard_normal(len(w))
+    return np.eye(len(w)) / noise**2, seen / noise**2
+
+
+@pytest.mark.parametrize("name", ["mug", "bunny"])
+def test_probabilities_sum_to_one_and_the_best_comes_first(name: str):
+    models = shape_models(
+        patches_of(name), *drawn(name, 1e-3, 1e-4, 0), (1.0, INNER_EXTENT), CONFIG
+    )
+    p = np.array([m.probability for m in models])
+    assert p.sum() == pytest.approx(1.0, abs=1e-12)
+    assert np.all(np.diff(p) <= 0)
+    assert len(models) == len(CONFIG.amplitudes) * len(CONFIG.lengths)
+    for m in models:
+        assert np.linalg.eigvalsh(m.covariance).min() > 0
+        assert m.sigma_m >= CONFIG.floor_m
+
+
+def test_a_larger_distortion_gives_a_larger_sigma_of_the_right_size():
+    means: list[float] = []
+    for sigma in (1.5e-4, 4e-4, 1.3e-3, 3.5e-3):
+        found = [
+            sum(m.probability * m.sigma_m for m in shape_models(
+                patches_of("bunny"), *drawn("bunny", sigma, 1e-4, seed), (1.0, INNER_EXTENT), CONFIG
+            ))
+            for seed in range(8)
+        ]  # fmt: skip
+        means.append(float(np.mean(found)))
+        assert 0.6 * sigma < means[-1] < 1.7 * sigma
+    assert np.all(np.diff(means) > 0)
+
+
+def test_log_probabilities_are_those_of_the_measured_offsets():
+    """log p is that of y ~ N(0, S + noise^2) but for a constant."""
+    noise, patches = 3e-4, patches_of("block")
+    information, offered = drawn("block", 1e-3, noise, 3)
+    y = offered * noise**2
+    models = shape_models(patches, information, offered, (1.0, INNER_EXTENT), CONFIG)
+    log_p = []
+    for m in models:
+        C = m.covariance + noise**2 * np.eye(len(y))
+        log_p.append(-0.5 * np.linalg.slogdet(C)[1] - 0.5 * y @ np.linalg.solve(C, y))
+    p = np.exp(np.array(log_p) - max(log_p))
+    np.testing.assert_allclose([m.probability for m in models], p / p.sum(), atol=1e-9)
+
+
+def test_the_posterior_is_between_the_measurement_and_nothing():
+    information, offered = drawn("bunny", 1e-3, 2e-4, 5)
+    S = 1e-6 * (covariance_of(patches_of("bunny"), 0.02) + 0.01 * np.eye(len(offered)))
+    d, C = posterior(information, offered, S)
+    direct = np.linalg.inv(np.linalg.inv(S) + information)
+    np.testing.assert_allclose(C, direct, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(d, direct @ offered, rtol=1e-6, atol=1e-12)
+    # Unseen, nothing is known but what was assumed.
+    d, C = posterior(np.zeros_like(S), np.zeros(len(S)), S)
+    np.testing.assert_allclose(C, S, rtol=1e-9)
+    assert not d.any()
+
+
+def test_a_field_longer_than_a_patch_hardly_varies_inside_it():
+    patches = patches_of("bunny")
+    assert within_share(patches, patches.radius / 3) == 1.0
+    assert within_share(patches, 10 * patches.radius) == pytest.approx(0.1)

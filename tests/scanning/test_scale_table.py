@@ -1,0 +1,196 @@
+"""The table under the object, and which object is meant."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scanned_objects import (
+    LAB,
+    Scanned,
+    block,
+    joined,
+    real_mesh,
+    scanned,
+    scanned_mesh,
+)
+
+from realsim.errors import DegenerateError, InputError
+from realsim.geometry import se3
+from realsim.records import Mesh, SupportPlane
+from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
+from realsim.scanning.scale.config import TableConfig
+from realsim.scanning.scale.table import Footprint, find_object, find_table
+
+Array = NDArray[np.float64]
+CONFIG = TableConfig()
+SMALL = replace(LAB, views=6, width=320, height=180, focal_px=162.0)
+
+
+def placed(mesh: Mesh, x: float, y: float = 0.0) -> Mesh:
+    """Return the mesh moved on the table, its lowest point at z = 0."""
+    low = mesh.vertices[:, 2].min()
+    return replace(mesh, vertices=mesh.vertices + [x, y, -low])
+
+
+@lru_cache(maxsize=1)
+def two_things() -> Scanned:
+    """Return a block of 60 mm and a can of 105 mm, 130 mm apart along the mesh's x."""
+    return scanned_mesh(joined(placed(block(), -0.06), placed(real_mesh("cylinder_can"), 0.07)), SMALL)
+
+
+@lru_cache(maxsize=1)
+def one_thing() -> Scanned:
+    return scanned_mesh(block(), SMALL)
+
+
+def table_of(known: Scanned, frames: tuple[DepthFrame, ...] | None = None) -> SupportPlane:
+    return find_table(known.views.intrinsics, frames or known.frames, CONFIG, 0)
+
+
+def object_of(
+    known: Scanned,
+    frames: tuple[DepthFrame, ...] | None = None,
+    at: tuple[float, float] | None = None,
+) -> Footprint:
+    frames = frames or known.frames
+    noise = measure_noise(frames, EvidenceConfig())
+    plane = table_of(known, frames)
+    return find_object(known.views.intrinsics, frames, plane, noise, CONFIG, at)
+
+
+def in_world(frames: tuple[DepthFrame, ...], T: Array) -> tuple[DepthFrame, ...]:
+    return tuple(replace(f, T_world_cam=T @ f.T_world_cam) for f in frames)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_plane_is_found_whatever_the_world_is(seed: int):
+    rng = np.random.default_rng(seed)
+    T = se3.from_rt(se3.random_rotation(rng), rng.uniform(-2, 2, 3))
+    known = one_thing()
+    plane = table_of(known, in_world(known.frames, T))
+    normal, at = plane.T_world_table[:3, 2], plane.T_world_table[:3, 3]
+    assert np.degrees(np.arccos(np.clip(normal @ T[:3, 2], -1, 1))) < 0.3
+    assert abs(T[:3, 2] @ (at - T[:3, 3])) < 0.001
+    np.testing.assert_allclose(
+        plane.T_world_table[:3, :3].T @ plane.T_world_table[:3, :3], np.eye(3), atol=1e-12
+    )
+    assert np.linalg.det(plane.T_world_table[:3, :3]) > 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_footprint_moves_with_the_world(seed: int):
+    rng = np.random.default_rng(seed)
+    T = se3.from_rt(se3.random_rotation(rng), rng.uniform(-2, 2, 3))
+    known = one_thing()
+    frames = in_world(known.frames, T)
+    plane, found = table_of(known, frames), object_of(known, frames)
+    middle = se3.transform(plane.T_world_table, found.box.mean(0))[0]
+    truth = se3.transform(T @ known.T_world_obj, known.real.bounds.mean(0))[0]
+    assert np.linalg.norm(middle - truth) < 0.006
+    assert found.box[1, 2] == pytest.approx(0.06, abs=0.008)
+    assert found.box[0, 2] == 0.0
+
+
+def test_the_cells_of_the_object_hold_it_and_those_of_the_table_do_not():
+    known = one_thing()
+    plane, found = table_of(known), object_of(known)
+    corners = se3.transform(se3.invert(plane.T_world_table) @ known.T_world_obj, known.real.vertices)
+    cells = np.floor((corners[:, :2] - found.origin) / found.cell_m).astype(int)
+    assert np.all(found.near[cells[:, 0], cells[:, 1]])
+    assert not np.any(found.around[cells[:, 0], cells[:, 1]])
+    assert np.count_nonzero(found.around) > 4 * np.count_nonzero(found.near & ~found.around)
+
+
+def test_several_objects_are_named_with_their_places_and_heights():
+    known = two_things()
+    with pytest.raises(InputError) as caught:
+        object_of(known)
+    message = str(caught.value)
+    assert "2 objects stand on the table" in message
+    assert "--at x,y" in message and "alone" in message
+    for where in places(known):
+        assert near_in(message, where)
+    assert "mm tall" in message
+
+
+def places(known: Scanned) -> Array:
+    """Return x, y (2, 2) in world of block and can."""
+    return se3.transform(known.T_world_obj, np.array([[-0.06, 0, 0], [0.07, 0, 0]]))[:, :2]
+
+
+def near_in(message: str, where: Array) -> bool:
+    """Return whether a place within 15 mm is named."""
+    import re
+
+    named = np.array(re.findall(r"x=(-?[\d.]+), y=(-?[\d.]+)", message), dtype=float)
+    return bool(np.linalg.norm(named - where, axis=1).min() < 0.015)
+
+
+@pytest.mark.parametrize(("which", "tall"), [(0, 0.06), (1, 0.105)])
+def test_at_picks_one_of_them_and_nothing_of_the_other(which: int, tall: float):
+    known = two_things()
+    here, there = places(known)[which], places(known)[1 - which]
+    found = object_of(known, at=(float(here[0] + 0.01), float(here[1] - 0.01)))
+    plane = table_of(known)
+    middle = se3.transform(plane.T_world_table, found.box.mean(0))[0]
+    assert np.linalg.norm(middle[:2] - here) < 0.012
+    assert found.box[1, 2] == pytest.approx(tall, abs=0.010)
+    cell = np.floor(
+        (se3.transform(se3.invert(plane.T_world_table), np.array([*there, 0.0]))[0, :2]
+         - found.origin) / found.cell_m
+    ).astype(int)  # fmt: skip
+    if np.all((cell >= 0) & (cell < found.near.shape)):
+        assert not found.near[tuple(cell)] and not found.around[tuple(cell)]
+
+
+def test_nothing_on_the_table_is_said():
+    empty = replace(LAB, views=6, width=320, height=180, focal_px=162.0)
+    known = scanned_mesh(block((0.04, 0.04, 0.0005)), empty)
+    with pytest.raises(DegenerateError, match="nothing stands on the table"):
+        object_of(known)
+
+
+def test_specks_are_no_objects():
+    known = one_thing()
+    z = known.frames[0].depth_m.copy()
+    z[10:14, 12:16] *= np.float32(0.9)  # a few pixels, three centimetres above the table
+    frames = (replace(known.frames[0], depth_m=z), *known.frames[1:])
+    with_speck, without = object_of(known, frames), object_of(known)
+    np.testing.assert_allclose(with_speck.box, without.box, atol=1e-3)
+
+
+def test_without_a_plane_no_table_is_claimed():
+    known = one_thing()
+    rng = np.random.default_rng(0)
+    frames = tuple(
+        replace(f, depth_m=rng.uniform(0.1, 1.0, f.depth_m.shape).astype(np.float32))
+        for f in known.frames
+    )
+    with pytest.raises(DegenerateError, match=r"largest plane carries \d+ %.*flat table"):
+        table_of(known, frames)
+
+
+def test_an_object_out_of_the_views_reach_is_not_meant():
+    """A box at the far end of the table is in some pictures; the views look elsewhere."""
+    far = scanned_mesh(joined(placed(block(), 0.0), placed(block(), 0.42)), SMALL, seed=3)
+    here = scanned_mesh(block(), SMALL, seed=3)
+    with pytest.raises((InputError, DegenerateError)):
+        object_of(far)
+    assert object_of(here).box[1, 2] == pytest.approx(0.06, abs=0.008)
+
+
+def test_the_same_frames_give_the_same_bytes():
+    known = one_thing()
+    a, b = table_of(known), table_of(known)
+    assert a.T_world_table.tobytes() == b.T_world_table.tobytes()
+    assert object_of(known).near.tobytes() == object_of(known).near.tobytes()
+
+
+def test_the_laboratory_scans_stand_at_height_zero():
+    known = scanned("bunny")
+    plane = find_table(known.views.intrinsics, known.frames, CONFIG, 0)
+    assert abs(plane.T_world_table[2, 3]) < 0.001
+    assert plane.T_world_table[2, 2] > np.cos(np.radians(0.3))
+    assert plane.rms_m < CONFIG.tolerance_m
