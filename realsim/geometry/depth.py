@@ -9,7 +9,7 @@ from realsim.records import CameraIntrinsics
 
 Array = NDArray[np.float64]
 SECOND_DIFFERENCE_STEP_PX = 8
-"""Stereo noise is correlated over a few pixels; differences of neighbours would not see it."""
+"""Stereo noise is correlated over a few pixels: at 4 px differences still missed three tenths."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution whose median absolute deviation is 1."""
 
@@ -109,9 +109,10 @@ def edge_mask(
 def depth_noise_per_m(depths_m: list[NDArray[np.float32]]) -> float:
     """Return k of the stereo noise model sigma_z = k z^2 [1/m], measured from the images.
 
-    On a smooth surface the second difference z(u-s) - 2 z(u) + z(u+s) is noise of variance
-    6 sigma_z^2 (s = 4 px, so that the correlation of a matching window does not hide it); the
-    median absolute value over all pixels is blind to edges.
+    Of a plane, however it lies, the inverse depth w = 1 / z is linear in the pixel, so the second
+    difference w(u-s) - 2 w(u) + w(u+s) is noise of variance 6 sigma_w^2, and sigma_w = sigma_z /
+    z^2 = k (s = 8 px, so that the correlation of a matching window does not hide it). The median
+    absolute value over all pixels is blind to edges.
 
     Args:
         depths_m: depth images (H, W) [m]; 0 = none.
@@ -125,7 +126,7 @@ def depth_noise_per_m(depths_m: list[NDArray[np.float32]]) -> float:
         z = depth[::s].astype(np.float64)
         a, b, c = z[:, : -2 * s], z[:, s:-s], z[:, 2 * s :]
         known = (a > 0) & (b > 0) & (c > 0)
-        samples.append((np.abs(a - 2 * b + c)[known]) / np.square(b[known]))
+        samples.append(np.abs(1 / a[known] - 2 / b[known] + 1 / c[known]))
     values = np.concatenate(samples) if samples else np.zeros(0)
     if len(values) < 100:
         raise InputError(

@@ -78,7 +78,7 @@ def _hull(
     mesh: Mesh, volume_m3: float, config: ConvexConfig, method: str, notes: tuple[str, ...]
 ) -> ConvexParts:
     """Return the hull as the only part."""
-    part = light(hull_vertices(mesh.vertices), config)
+    part = light([hull_vertices(mesh.vertices)], volume_m3, config)[0]
     ratio = hull_volume(part) / volume_m3
     return ConvexParts(parts=(part,), volume_ratio=ratio, method=method, notes=notes)
 
@@ -123,7 +123,7 @@ def _decomposed(mesh: Mesh, closed: bool, volume_m3: float, config: ConvexConfig
     ratio = float(said["ratio"])
     if closed and not passes(ratio, config, closed, int(said["step"])):
         notes.append(
-            f"the parts are {ratio:.2f} times the mesh's volume at best (threshold "
+            f"the parts are {ratio:.3f} times the mesh's volume at best (threshold "
             f"{said['threshold']:g}); {config.thin_ratio:g} to {config.fat_ratio:g} was wanted."
         )
     return ConvexParts(

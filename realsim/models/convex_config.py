@@ -38,10 +38,10 @@ class ConvexConfig:
     max_vertices: int = 64
     """Vertices kept per part: those farthest out in so many evenly spread directions..."""
     most_vertices: int = 256
-    """...and up to so many where the part would lose more than `vertex_loss` of its volume."""
+    """...and up to so many where the parts would be smaller than the mesh by `vertex_loss`."""
     vertex_loss: float = 0.03
-    """Share of a part's volume that leaving vertices out may cost [-]: 0.3 mm of a 6 cm can's
-    radius. 64 vertices of a capsule lose 8 %."""
+    """Share of the volume that leaving vertices out may cost [-]: 0.5 mm of a 6 cm can's radius.
+    64 vertices of a capsule lose 8 %."""
     time_limit_s: float = 60.0
     """CPU time for all thresholds together [s]; then the best parts found so far are taken.
     A flange with seven bores takes 30."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry.mesh_shape import hull_vertices
 from realsim.models.convex_config import ConvexConfig
-from realsim.models.convex_hulls import fewest, hull_volume
+from realsim.models.convex_hulls import fewest, hull_volume, outermost
 from realsim.store.arrays_on_disk import read_arrays, write_arrays
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ def decompose(job: Path, folder: Path) -> None:
     config = ConvexConfig(thresholds=thresholds, **settings)
     for step, threshold in enumerate(config.thresholds):
         pieces = _coacd(arrays["vertices"], arrays["faces"], notes["is_closed"], threshold, config)
-        parts = [light(hull_vertices(piece), config) for piece in pieces]
+        parts = light([hull_vertices(piece) for piece in pieces], notes["volume_m3"], config)
         parts = [part for part in parts if hull_volume(part) > 0]
         ratio = sum(hull_volume(part) for part in parts) / notes["volume_m3"]
         counts = np.array([len(part) for part in parts], dtype=np.int64)
@@ -70,9 +70,20 @@ def decompose(job: Path, folder: Path) -> None:
             break
 
 
-def light(corners: Array, config: ConvexConfig) -> Array:
-    """Return the corners of a part that are kept."""
-    return fewest(corners, config.max_vertices, config.most_vertices, config.vertex_loss)
+def light(hulls: list[Array], volume_m3: float, config: ConvexConfig) -> list[Array]:
+    """Return the corners that are kept of parts: few, unless the parts as a whole get too thin.
+
+    Args:
+        hulls: corners of each part.
+        volume_m3: of the mesh; parts that are larger may lose what they have too much.
+        config: how many corners, and what may be lost.
+    """
+    few = [outermost(hull, config.max_vertices) for hull in hulls]
+    full = sum(hull_volume(hull) for hull in hulls)
+    if sum(hull_volume(part) for part in few) >= (1.0 - config.vertex_loss) * min(full, volume_m3):
+        return few
+    counts = (config.max_vertices, config.most_vertices)
+    return [fewest(hull, *counts, config.vertex_loss) for hull in hulls]
 
 
 def _coacd(

@@ -42,7 +42,9 @@ def command_of(name: str) -> click.Command | None:
     """Return a command by its name, that of its group first; None if there is none."""
     command: click.Command | None = commands
     for word in name.split():
-        command = command.commands.get(word) if isinstance(command, click.Group) else None
+        if not isinstance(command, click.Group):
+            return None
+        command = command.get_command(click.Context(command), word)  # some are loaded by name only
     return command
 
 

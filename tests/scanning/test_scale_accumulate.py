@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scanned_objects import evidence_of, scanned, shape_of, true_state
 
 from realsim.geometry import se3
 from realsim.scanning.scale.accumulate import BLOCK, add_outline, add_surface, add_table
@@ -19,11 +18,11 @@ from realsim.scanning.scale.state import (
     TABLE,
     State,
     all_points,
-    camera_numbers,
     moved_all,
     symmetric,
     table_points,
 )
+from scanned_objects import evidence_of, scanned, shape_of, true_state
 
 Array = NDArray[np.float64]
 STEP = 1e-6

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scanned_objects import evidence_of, scanned, shape_of, true_state
 
 from realsim.geometry import se3
 from realsim.scanning.scale.agreement import explain, tolerance
 from realsim.scanning.scale.state import State
+from scanned_objects import evidence_of, scanned, shape_of, true_state
 
 NAMES = ["bunny", "mug", "block", "scalene", "bowl"]
 

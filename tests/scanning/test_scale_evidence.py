@@ -5,18 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scanned_objects import (
-    TRUE,
-    Scanned,
-    evidence_of,
-    gathered,
-    scanned,
-    scanned_mesh,
-    LAB,
-    block,
-    shape_of,
-    true_state,
-)
 
 from realsim.geometry import se3
 from realsim.geometry.camera import project
@@ -25,6 +13,18 @@ from realsim.scanning.scale.config import SampleConfig, ScaleConfig
 from realsim.scanning.scale.evidence import ScanView
 from realsim.scanning.scale.shape import outline
 from realsim.scanning.scale.state import metre_per_px
+from scanned_objects import (
+    LAB,
+    TRUE,
+    Scanned,
+    block,
+    evidence_of,
+    gathered,
+    scanned,
+    scanned_mesh,
+    shape_of,
+    true_state,
+)
 
 Array = NDArray[np.float64]
 

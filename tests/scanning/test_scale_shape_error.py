@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scanned_objects import shape_of
 
 from realsim.scanning.scale.config import ShapeConfig
 from realsim.scanning.scale.shape import INNER_EXTENT
@@ -15,6 +14,7 @@ from realsim.scanning.scale.shape_error import (
     shape_models,
     within_share,
 )
+from scanned_objects import shape_of
 
 Array = NDArray[np.float64]
 CONFIG = ShapeConfig()

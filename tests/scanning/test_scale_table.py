@@ -6,6 +6,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
+from realsim.errors import DegenerateError, InputError
+from realsim.geometry import se3
+from realsim.records import Mesh, SupportPlane
+from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
+from realsim.scanning.scale.config import TableConfig
+from realsim.scanning.scale.table import Footprint, find_object, find_table
 from scanned_objects import (
     LAB,
     Scanned,
@@ -15,13 +22,6 @@ from scanned_objects import (
     scanned,
     scanned_mesh,
 )
-
-from realsim.errors import DegenerateError, InputError
-from realsim.geometry import se3
-from realsim.records import Mesh, SupportPlane
-from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
-from realsim.scanning.scale.config import TableConfig
-from realsim.scanning.scale.table import Footprint, find_object, find_table
 
 Array = NDArray[np.float64]
 CONFIG = TableConfig()

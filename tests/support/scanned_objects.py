@@ -176,12 +176,14 @@ def block(size: tuple[float, float, float] = (0.08, 0.05, 0.06)) -> Mesh:
     return Mesh(vertices=corners * size, faces=np.array(faces, dtype=np.int32))
 
 
+def shifted(mesh: Mesh, x: float, y: float, z: float) -> Mesh:
+    return replace(mesh, vertices=mesh.vertices + np.array([x, y, z]))
+
+
 def scalene() -> Mesh:
     """Return a body without any symmetry, mirror or turn: a block with two unlike posts [m]."""
-    tall = replace(block((0.02, 0.025, 0.07)), vertices=block((0.02, 0.025, 0.07)).vertices
-                   + [0.035, -0.012, 0.045])  # fmt: skip
-    low = replace(block((0.03, 0.02, 0.04)), vertices=block((0.03, 0.02, 0.04)).vertices
-                  + [-0.025, 0.018, 0.03])  # fmt: skip
+    tall = shifted(block((0.02, 0.025, 0.07)), 0.035, -0.012, 0.045)
+    low = shifted(block((0.03, 0.02, 0.04)), -0.025, 0.018, 0.03)
     return joined(block((0.1, 0.065, 0.03)), tall, low)
 
 

@@ -42,8 +42,8 @@ NEAR_SHARE = 0.9
 """Beyond this share of the truncation the fused distance is cut off."""
 FLATNESS = 0.92
 """Largest eigenvalue of the mean square of the normals in a cell below which there is an edge
-(5 deg of noise: 0.985, a radius of one cell: 0.92, a right angle: 0.5). There every view sees another part of a
-rounded corner, and what they differ by is not their poses."""
+(5 deg of noise: 0.985, a radius of one cell: 0.92, a right angle: 0.5).
+There every view sees another part of a rounded corner; what they differ by is not their poses."""
 LEAST_ALONG = 0.25
 """Least cosine between ray and normal at which the ray is followed to the surface."""
 NEWTON_STEPS = 5

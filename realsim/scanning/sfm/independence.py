@@ -34,7 +34,7 @@ def variance_inflation(geometry: Geometry, residuals_px: Array, weights: Array) 
         residuals_px: (K, 2) of the adjusted geometry [px].
         weights: (K,) robust weights.
     """
-    use = np.isfinite(residuals_px).all(-1)
+    use = np.isfinite(residuals_px[:, 0]) & np.isfinite(residuals_px[:, 1])
     numbers = 2 * int(use.sum())
     unknowns = 3 * len(np.unique(geometry.points_of[use])) + 6 * len(geometry.names)
     freedom = max(1 - unknowns / max(numbers, 1), LEAST_FREEDOM)

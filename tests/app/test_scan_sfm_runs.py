@@ -1,0 +1,165 @@
+"""`realsim scan sfm` to the end with the real COLMAP: scale, masks, no poses, parts, kill, resume."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realsim.app.console import Console
+from realsim.app.scan_sfm import SfmRequest, run_scan_sfm
+from realsim.formats.images import png_bytes
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, CaptureSession, View
+from realsim.scanning.sfm.files import read_cameras
+from realsim.store import SessionStore
+
+CAMERA = CameraIntrinsics(width=400, height=300, fx=330.0, fy=330.0, cx=199.5, cy=149.5)
+VIEWS = 6
+LEVELS_M = (0.0, 0.03)
+"""Heights of the two printed squares; the upper one is smaller and lies in the middle."""
+SIDES_M = (0.4, 0.14)
+
+
+def print_of(seed: int, side_px: int) -> np.ndarray:
+    """Return a square of random boxes of all sizes."""
+    rng = np.random.default_rng(seed)
+    image = np.full((side_px, side_px, 3), 200, np.uint8)
+    for size in (100, 50, 25, 12):
+        for _ in range(12 * (100 // size) ** 2):
+            x, y = rng.integers(0, side_px, 2)
+            w, h = rng.integers(size // 3 + 1, size + 1, 2)
+            image[y : y + h, x : x + w] = rng.integers(10, 250, 3)
+    return image
+
+
+def photo(T_world_cam: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Return the picture of the two squares: each is seen through a homography."""
+    import cv2
+
+    K = np.array([[CAMERA.fx, 0, CAMERA.cx], [0, CAMERA.fy, CAMERA.cy], [0, 0, 1.0]])
+    T = se3.invert(T_world_cam)
+    seen = np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8)
+    for k, (z, side) in enumerate(zip(LEVELS_M, SIDES_M, strict=True)):
+        texture = print_of(2 * seed + k, round(1500 * side))
+        s = side / len(texture)
+        plane = np.array([[s, 0, -side / 2], [0, s, -side / 2], [0, 0, z], [0, 0, 1]])
+        H = K @ (T[:3] @ plane)
+        size = (CAMERA.width, CAMERA.height)
+        warped = cv2.warpPerspective(texture, H, size, flags=cv2.INTER_AREA)
+        cover = cv2.warpPerspective(np.full(texture.shape[:2], 255, np.uint8), H, size)
+        seen[cover > 127] = warped[cover > 127]
+    return seen
+
+
+def cameras(count: int = VIEWS) -> np.ndarray:
+    """Return cameras (V, 4, 4) on an arc over the squares."""
+    turn = np.linspace(0.0, 1.2, count)
+    eyes = np.stack([0.2 * np.cos(turn), 0.2 * np.sin(turn), 0.30 + 0.04 * np.sin(5 * turn)], -1)
+    return np.stack([se3.look_at(eye, np.zeros(3)) for eye in eyes])
+
+
+def session(folder: Path, Ts: np.ndarray, *, posed: bool = True, second: int = 0) -> SessionStore:
+    """Store a session; the last `second` views are of another scene."""
+    about = CaptureSession(name="prints", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(folder, about, {"plan_hash": "p" * 64})
+    for k, T in enumerate(Ts):
+        view = View(index=k, T_base_ee=T, joints=np.zeros(6), time_s=float(k))
+        store.add_view(view, photo(T, seed=int(k >= len(Ts) - second)))
+    if posed:
+        store.set_cameras(CAMERA, dict(enumerate(Ts)))
+    return store
+
+
+def report(folder: Path, **options: object) -> dict[str, Any]:
+    """Run the command; return its report."""
+    run_scan_sfm(SfmRequest(images=folder, **options), Console(quiet=True))  # pyright: ignore[reportArgumentType]
+    return json.loads((folder / "scans/sfm/sfm.json").read_text())
+
+
+def test_free_mapping_has_the_robots_metre(tmp_path: Path) -> None:
+    Ts = cameras()
+    session(tmp_path / "s", Ts)
+    told = report(tmp_path / "s", poses="unknown")
+    names, found = read_cameras(tmp_path / "s/scans/sfm/cameras.json")
+    assert len(names) == VIEWS and told["verdict"] == "accepted", told["reasons"]
+    apart = np.linalg.norm(found[:, :3, 3] - Ts[:, :3, 3], axis=1)
+    assert 1e3 * apart.max() < 2.0
+    size = np.linalg.norm(found[0, :3, 3] - found[-1, :3, 3])
+    true = np.linalg.norm(Ts[0, :3, 3] - Ts[-1, :3, 3])
+    assert size / true == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.slow
+def test_refinement_mends_poses_that_are_wrong_and_spares_right_ones(tmp_path: Path) -> None:
+    Ts = cameras(8)
+    rng = np.random.default_rng(1)
+    s = np.repeat([np.radians(0.3), 2e-3], 3)
+    wrong = Ts @ se3.exp(s * rng.standard_normal((len(Ts), 6)))
+
+    def between(found: np.ndarray) -> float:
+        """Return the error of the poses relative to the first one [mm], median."""
+        a, b = (se3.invert(T[:1]) @ T[1:] for T in (found, Ts))
+        return 1e3 * float(np.median(np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)))
+
+    for name, robot in (("right", Ts), ("wrong", wrong)):
+        store = session(tmp_path / name, Ts)
+        store.set_cameras(CAMERA, dict(enumerate(robot)))
+        report(tmp_path / name, poses="refined")
+        _, found = read_cameras(tmp_path / name / "scans/sfm/cameras.json")
+        assert between(found) <= max(0.5 * between(robot), 0.3)
+
+
+def test_masks_uncalibrated_and_two_scenes(tmp_path: Path) -> None:
+    Ts = cameras()
+    session(tmp_path / "s", Ts, posed=False)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    half = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
+    half[:, :250] = 255
+    for k in range(VIEWS):
+        (masks / f"{k:06d}.png").write_bytes(png_bytes(half))
+    free = report(tmp_path / "s")
+    assert not free["is_metric"] and any("no metric scale" in r for r in free["reasons"])
+    masked = report(tmp_path / "s", masks=masks)
+    assert sum(masked["features"].values()) < 0.9 * sum(free["features"].values())
+
+    both = np.concatenate([Ts, Ts])
+    session(tmp_path / "two", both, second=VIEWS)
+    told = report(tmp_path / "two", poses="unknown")
+    assert told["verdict"] != "accepted"
+    assert told["views"]["models"] == [VIEWS, VIEWS]
+    assert any("fall into 2 parts" in r for r in told["reasons"])
+
+
+@pytest.mark.slow
+def test_a_killed_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
+    Ts = cameras(10)
+    for name in ("whole", "killed"):
+        session(tmp_path / name, Ts)
+    whole = report(tmp_path / "whole", poses="unknown")
+    code = (
+        "import sys; from pathlib import Path; from realsim.app.console import Console\n"
+        "from realsim.app.scan_sfm import SfmRequest, run_scan_sfm\n"
+        "run_scan_sfm(SfmRequest(images=Path(sys.argv[1]), poses='unknown'), Console(quiet=True))"
+    )
+    out = tmp_path / "killed/scans/sfm"
+    run = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "killed")])
+    begun = time.monotonic()
+    while not (out / "pairs.txt").is_file() and run.poll() is None:
+        assert time.monotonic() - begun < 120
+        time.sleep(0.01)
+    os.kill(run.pid, signal.SIGKILL)
+    assert run.wait() == -signal.SIGKILL
+    assert not (out / "sfm.json").exists()
+    again = report(tmp_path / "killed", poses="unknown")
+    for key in ("scale_m_per_unit", "scale_sigma_percent", "points", "views", "verdict"):
+        assert again[key] == whole[key]
+    first, second = (tmp_path / n / "scans/sfm/cameras.json" for n in ("whole", "killed"))
+    assert first.read_bytes() == second.read_bytes()

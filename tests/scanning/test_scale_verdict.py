@@ -1,0 +1,117 @@
+"""The verdict without ground truth: every threshold has two sides."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from realsim.scanning.scale.agreement import Explained, explain
+from realsim.scanning.scale.config import ScaleConfig
+from realsim.scanning.scale.joint import Outlook, joint_fit
+from realsim.scanning.scale.state import State
+from realsim.scanning.scale.verdict import Judged, judge
+from scanned_objects import evidence_of, fit_of, scanned, shape_of, true_state
+
+CONFIG = ScaleConfig()
+V = CONFIG.verdict
+
+
+@lru_cache(maxsize=1)
+def right() -> tuple[State, Outlook, Explained]:
+    shape, evidence = shape_of("bunny"), evidence_of("bunny", "exact")
+    state = true_state(scanned("bunny", "exact"), shape, evidence)
+    state, look = joint_fit(shape, evidence, state, CONFIG)
+    return state, look, explain(shape, evidence, state)
+
+
+def judged(
+    sigma: float = 0.002,
+    rivals: tuple[tuple[float, float], ...] = (),
+    offsets: float | None = None,
+    **seen: float,
+) -> Judged:
+    """Return the verdict on a right fit in which some figures are other ones."""
+    state, look, explained = right()
+    if offsets is not None:
+        size = evidence_of("bunny", "exact").size_m
+        look = replace(look, offsets=np.full_like(look.offsets, offsets * size))
+    fit = (state, look, replace(explained, **seen))
+    return judge(shape_of("bunny"), evidence_of("bunny", "exact"), fit, rivals, (sigma, CONFIG))
+
+
+def given_scale(factor: float) -> float:
+    return right()[0].s * shape_of("bunny").unit * factor
+
+
+def test_a_right_fit_is_accepted_without_reasons():
+    j = judged()
+    assert j.verdict == "accepted" and j.reasons == ()
+    names = {"gain", "agree", "cover", "iou", "contrast", "shape_mm", "sigma_percent"}
+    assert names <= set(j.checks)
+    assert all(np.isfinite(v) for v in j.checks.values())
+    assert j.checks["sigma_percent"] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("good", "bad", "verdict", "said"),
+    [
+        ({"gain": V.least_gain + 0.01}, {"gain": V.least_gain - 0.01}, "doubtful", "explains 59 %"),
+        ({"gain": V.least_gain + 0.01}, {"gain": V.reject_gain - 0.01}, "rejected", "mirrored"),
+        ({"gain": V.least_gain + 0.01}, {"gain": -0.5}, "rejected", "not this object"),
+        ({"iou": V.least_iou + 0.01}, {"iou": V.least_iou - 0.01}, "doubtful", "outline overlaps"),
+        ({"sigma": V.doubtful_sigma - 1e-4}, {"sigma": V.doubtful_sigma + 1e-4}, "doubtful",
+         "More views from other sides"),
+        ({"offsets": V.worst_shape - 1e-3}, {"offsets": V.worst_shape + 1e-3}, "doubtful",
+         "surfaces differ by 4.1 %"),
+        ({"offsets": -V.worst_shape + 1e-3}, {"offsets": -V.worst_shape - 1e-3}, "doubtful",
+         "surfaces differ"),
+    ],
+)  # fmt: skip
+def test_every_threshold_has_two_sides(good, bad, verdict: str, said: str):
+    assert judged(**good).verdict == "accepted"
+    j = judged(**bad)
+    assert j.verdict == verdict
+    assert any(said in r for r in j.reasons), j.reasons
+
+
+def test_a_rival_of_another_scale_that_explains_as_much_raises_doubt():
+    gain = right()[2].gain
+    for scale, theirs, doubt in (
+        (1.2, gain - 0.01, True), (0.8, gain + 0.01, True), (1.2, gain - 0.1, False),
+    ):  # fmt: skip
+        j = judged(rivals=((given_scale(scale), theirs),))
+        assert (j.verdict == "doubtful") == doubt
+        assert j.checks["contrast"] == pytest.approx(gain - theirs)
+        if doubt:
+            assert f"{100 * (scale - 1):+.1f} %" in j.reasons[0]
+            assert "measured length" in j.reasons[0]
+    assert judged().checks["contrast"] == 1.0
+
+
+def test_what_is_wrong_comes_before_what_is_doubtful():
+    j = judged(gain=0.1, iou=0.3, sigma=0.2)
+    assert j.verdict == "rejected"
+    assert len(j.reasons) == 3 and "not this object" in j.reasons[0]
+
+
+def test_patches_that_were_hardly_seen_do_not_speak_for_another_object():
+    state, look, explained = right()
+    unseen = look.offset_sigmas > 1.5 * np.median(look.offset_sigmas)
+    sigmas = np.where(unseen, 10 * np.median(look.offset_sigmas), look.offset_sigmas)
+    sigmas[0] = 10 * np.median(look.offset_sigmas)
+    offsets = look.offsets.copy()
+    offsets[sigmas > 5 * np.median(look.offset_sigmas)] = 0.2
+    spoiled = replace(look, offsets=offsets, offset_sigmas=sigmas)
+    j = judge(
+        shape_of("bunny"), evidence_of("bunny", "exact"), (state, spoiled, explained), (),
+        (0.002, CONFIG),
+    )  # fmt: skip
+    assert j.verdict == "accepted"
+
+
+def test_a_fit_that_is_not_accepted_says_why():
+    known = scanned("scalene")
+    fit = fit_of(known, shape_of("mug").mesh, start=None)
+    assert fit.verdict != "accepted" and fit.reasons
+    assert all(len(r) > 20 for r in fit.reasons)
