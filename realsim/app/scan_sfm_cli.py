@@ -28,9 +28,10 @@ def sfm(images: Path, quiet: bool, **options: Any) -> None:
     """Structure from motion at metric scale, and a mesh from the depth images.
 
     IMAGES is a session folder, or a folder of photographs. A session's camera poses bring the
-    result to metres: 'refined' starts at them and adjusts them to the pictures, 'known' keeps
-    them, 'unknown' maps without them and aligns the result, which shows whether robot and
-    pictures agree. Photographs alone have no metric scale.
+    result to metres: 'refined' starts at them and adjusts them to the pictures, unless two halves
+    of the scene would do so differently; 'known' keeps them; 'unknown' maps without them and
+    aligns the result, which shows whether robot and pictures agree. Photographs alone have no
+    metric scale.
 
     \b
     Exit codes: 0 accepted, 1 done but doubtful or rejected, 2 something given cannot be used.

@@ -1,4 +1,4 @@
-"""`realsim scan sfm` to the end with the real COLMAP: scale, masks, no poses, parts, kill, resume."""
+"""`realsim scan sfm` to the end with the real COLMAP: scale, masks, no poses, parts, a kill."""
 
 import json
 import os

@@ -257,19 +257,19 @@ def table_row(state: State, T: Array, p_cam: Array, pivot_table: Array) -> Row:
 
 
 def test_table_derivatives_are_the_differences_of_the_height():
+    pivot = np.array([0.03, -0.02, 0.0])
     for seed in range(10):
         rng = np.random.default_rng(seed)
         state = posed(rng)
         W = state.T_world_table
-        pivot = np.array([0.03, -0.02, 0.0])
         on_table = se3.transform(W, np.array([*rng.uniform(-0.1, 0.1, 2), 0.0]))[0]
         T = camera_at(on_table + 0.3 * W[:3, 2] + 0.1 * W[:3, 0], -W[:3, 2], rng)
         p_cam = se3.transform(se3.invert(T), on_table)[0]
         row = table_row(state, T, p_cam, pivot)
         assert abs(row.r) < 1e-12
         at = se3.transform(W, pivot)[0]
-        for k in (*range(7, 17),):
-            numeric = difference(lambda s: table_row(s, T, p_cam, pivot).r, state, at, k)
+        for k in range(7, 17):
+            numeric = difference(lambda s, T=T, p=p_cam: table_row(s, T, p, pivot).r, state, at, k)
             assert row.J[k] == pytest.approx(numeric, abs=1e-7), k
         assert not row.J[:7].any() and row.J[17] == 0
         # Noise along the ray changes neither the camera's derivatives nor the bias's.
@@ -323,7 +323,10 @@ def test_outline_derivatives_are_the_differences_of_the_distance(lens: float):
         assert abs(row.r) < 1e-7
         for k in (*range(13), 17):
             numeric = difference(
-                lambda s: outline_row(s, T, point, image, distortion).r, state, np.zeros(3), k
+                lambda s, T=T, p=point, i=image: outline_row(s, T, p, i, distortion).r,
+                state,
+                np.zeros(3),
+                k,
             )
             size = np.linalg.norm(row.J[k // 3 * 3 : k // 3 * 3 + 3]) if k < 13 else 0
             assert row.J[k] == pytest.approx(numeric, abs=1e-4 + share * max(size, 0.05)), k
@@ -346,7 +349,9 @@ def test_an_outline_point_counts_only_outside_where_told_so():
         assert (D[0] > 0) == counts
 
 
-def noisy_step(seed: int, name: str, noise: float = 1.0, flat_m: float = 1e-5) -> tuple[Array, Array, Array]:
+def noisy_step(
+    seed: int, name: str, noise: float = 1.0, flat_m: float = 1e-5
+) -> tuple[Array, Array, Array]:
     """Return the step of everything at the truth, its sigmas, and the Fisher share of them.
 
     Points are exact but for white noise along their rays, of the size that the weights say.

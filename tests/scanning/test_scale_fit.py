@@ -49,7 +49,7 @@ def placed_vertices(fit: ScaleFit, mesh: Mesh) -> Array:
     return se3.transform(fit.T_world_obj, fit.scale * mesh.vertices)
 
 
-@pytest.mark.parametrize("name", ["bunny", "mug", "scalene", "box"])
+@pytest.mark.parametrize("name", ["bunny", "mug", "scalene"])
 def test_without_errors_the_scale_is_right_to_a_tenth_of_a_per_cent(name: str):
     fit = fitted(name, "exact")
     assert fit.scale == pytest.approx(UNIT_M, rel=1e-3)
@@ -58,7 +58,7 @@ def test_without_errors_the_scale_is_right_to_a_tenth_of_a_per_cent(name: str):
     assert abs(z_of(fit)) < 1.0
 
 
-@pytest.mark.parametrize("name", ["bunny", "mug", "scalene", "l_bracket"])
+@pytest.mark.parametrize("name", ["bunny", "mug", "scalene"])
 def test_with_a_labs_errors_scale_and_pose_are_as_good_as_the_result_says(name: str):
     fit, known = fitted(name), scanned(name)
     assert fit.scale == pytest.approx(UNIT_M, rel=0.005)
@@ -69,9 +69,9 @@ def test_with_a_labs_errors_scale_and_pose_are_as_good_as_the_result_says(name: 
     np.testing.assert_allclose(fit.extent_mm, 1e3 * known.real.extent, rtol=0.005)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_the_result_moves_with_the_world(seed: int):
-    known = scanned("l_bracket")
+    known = scanned("scalene")
     rng = np.random.default_rng(seed)
     W = se3.from_rt(se3.random_rotation(rng), rng.uniform(-2, 2, 3))
     start = rough_start(known)
@@ -79,14 +79,14 @@ def test_the_result_moves_with_the_world(seed: int):
         known, frames=in_world(known.frames, W),
         start=replace(start, T_world_obj=W @ start.T_world_obj),
     )  # fmt: skip
-    plain = fitted("l_bracket")
+    plain = fitted("scalene")
     assert abs(moved.scale - plain.scale) < 0.25 * plain.sigma
     assert moved.sigma == pytest.approx(plain.sigma, rel=0.05)
     gap = placed_vertices(moved, known.scan) - se3.transform(W, placed_vertices(plain, known.scan))
     assert 1e3 * np.linalg.norm(gap, axis=1).max() < 0.15
 
 
-@pytest.mark.parametrize("cold", [False, True])
+@pytest.mark.parametrize("cold", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_result_does_not_depend_on_the_meshs_unit_and_axes(cold: bool):
     known, unit = scanned("bunny"), 25.4
     rng = np.random.default_rng(7)
@@ -123,7 +123,7 @@ def test_the_same_input_gives_the_same_bytes():
     assert a.checks == b.checks and a.verdict == b.verdict and a.history == b.history
 
 
-@pytest.mark.parametrize("name", ["scalene", "mug", "bunny"])
+@pytest.mark.parametrize("name", ["scalene", pytest.param("mug", marks=pytest.mark.slow)])
 def test_a_start_and_none_lead_to_the_same(name: str):
     given, cold = fitted(name), fit_of(scanned(name), start=None)
     assert abs(given.scale - cold.scale) < 0.2 * given.sigma
@@ -131,6 +131,7 @@ def test_a_start_and_none_lead_to_the_same(name: str):
     assert cold.verdict == "accepted"
 
 
+@pytest.mark.slow
 def test_two_starts_lead_to_the_same():
     known = scanned("scalene")
     fits = [fit_of(known, start=rough_start(known, seed)) for seed in (1, 2)]
@@ -138,7 +139,7 @@ def test_two_starts_lead_to_the_same():
 
 
 def test_errors_are_of_the_size_that_sigma_says():
-    z = np.array([z_of(fitted(n, "lab", s)) for n in ("block", "bunny") for s in (0, 1, 2)])
+    z = np.array([z_of(fitted(n, "lab", s)) for n in ("block", "bunny") for s in (0, 1)])
     assert np.all(np.abs(z) < 3.5), z.round(2)
     assert np.sqrt(np.mean(np.square(z))) < 1.7, z.round(2)
 
@@ -156,7 +157,7 @@ def test_intervals_hold_the_truth_over_many_seeds(amplitude: float):
     assert np.mean(np.abs(z) < 3.5) > 0.95, np.round(z, 1)
 
 
-@pytest.mark.parametrize("name", ["block", "bunny"])
+@pytest.mark.parametrize("name", [pytest.param("block", marks=pytest.mark.slow), "bunny"])
 def test_noise_of_the_depth_leaves_bias_and_hand_eye_alone(name: str):
     """Errors in variables, in the whole joint fit: exact cameras, white noise along every ray.
 
@@ -189,7 +190,7 @@ def test_noise_of_the_depth_leaves_bias_and_hand_eye_alone(name: str):
     assert np.sqrt(np.mean(np.square(z))) < 1.5
 
 
-@pytest.mark.parametrize("name", ["bunny", "scalene"])
+@pytest.mark.parametrize("name", ["bunny", pytest.param("scalene", marks=pytest.mark.slow)])
 def test_a_slipped_view_is_left_out_and_named(name: str):
     known = scanned(name)
     slip = se3.from_rt(se3.exp_so3([np.radians(2.0), 0, 0]), [0, 0.006, 0])
@@ -202,7 +203,7 @@ def test_a_slipped_view_is_left_out_and_named(name: str):
     assert fit.scale == pytest.approx(UNIT_M, rel=0.005)
 
 
-@pytest.mark.parametrize("name", ["bunny", "mug", "bowl"])
+@pytest.mark.parametrize("name", ["mug", pytest.param("bowl", marks=pytest.mark.slow)])
 def test_no_right_view_is_left_out(name: str):
     fit = fitted(name, "true cameras")
     assert all(v.used for v in fit.views), fit.notes
@@ -234,7 +235,7 @@ def test_view_numbers_are_those_of_the_session():
     assert fit.scale == fitted("bunny").scale
 
 
-@pytest.mark.parametrize("height_mm", [2.0, -2.0])
+@pytest.mark.parametrize("height_mm", [2.0, pytest.param(-2.0, marks=pytest.mark.slow)])
 def test_the_residual_map_shows_a_bump_with_sign_and_size(height_mm: float):
     """The real block carries a plate on its top that the mesh does not know, or the other way."""
     plate = block((0.03, 0.03, 0.02 + 2 * abs(height_mm) / 1e3))
@@ -261,12 +262,13 @@ def test_sigma_grows_with_the_distortion():
     known = scanned("bunny")
     sigmas = [
         fit_of(known, scaled(wrong(known.real, a, seed=1), 1 / UNIT_M)).sigma_percent
-        for a in (0.0025, 0.012, 0.03)
+        for a in (0.0025, 0.03)
     ]
     assert np.all(np.diff(sigmas) > 0), sigmas
     assert sigmas[-1] > 2 * sigmas[0]
 
 
+@pytest.mark.slow
 def test_more_views_know_the_scale_better():
     few, many = fitted("bunny", "lab", 0, 5), fitted("bunny", "lab", 0, 20)
     assert many.sigma < few.sigma
@@ -295,6 +297,7 @@ def test_progress_goes_up_to_the_end():
     assert len(ticks) == 14
 
 
+@pytest.mark.slow
 def test_a_point_picks_the_object():
     a = shifted(block(), -0.06, 0, 0.03)
     tall = block((0.04, 0.035, 0.08))
@@ -328,12 +331,11 @@ def test_limits_name_what_limits_worst_first():
             assert limit.percent >= 0 and limit.text
             if limit.name != "surface offset":
                 assert limit.percent <= 1.01 * fit.sigma_percent
-    distorted = fit_of(
-        scanned("bunny"), scaled(wrong(scanned("bunny").real, 0.02, 2), 1 / UNIT_M)
-    )
+    distorted = fit_of(scanned("bunny"), scaled(wrong(scanned("bunny").real, 0.02, 2), 1 / UNIT_M))
     assert distorted.limits[0].name == "shape"
 
 
+@pytest.mark.slow
 def test_known_cameras_say_more_than_unknown_ones():
     known = scanned("block", "true cameras")
     sharp = ScaleConfig(

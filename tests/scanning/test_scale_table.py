@@ -21,6 +21,7 @@ from scanned_objects import (
     real_mesh,
     scanned,
     scanned_mesh,
+    shifted,
 )
 
 Array = NDArray[np.float64]
@@ -31,13 +32,14 @@ SMALL = replace(LAB, views=6, width=320, height=180, focal_px=162.0)
 def placed(mesh: Mesh, x: float, y: float = 0.0) -> Mesh:
     """Return the mesh moved on the table, its lowest point at z = 0."""
     low = mesh.vertices[:, 2].min()
-    return replace(mesh, vertices=mesh.vertices + [x, y, -low])
+    return shifted(mesh, x, y, -float(low))
 
 
 @lru_cache(maxsize=1)
 def two_things() -> Scanned:
     """Return a block of 60 mm and a can of 105 mm, 130 mm apart along the mesh's x."""
-    return scanned_mesh(joined(placed(block(), -0.06), placed(real_mesh("cylinder_can"), 0.07)), SMALL)
+    can = placed(real_mesh("cylinder_can"), 0.07)
+    return scanned_mesh(joined(placed(block(), -0.06), can), SMALL)
 
 
 @lru_cache(maxsize=1)
@@ -96,7 +98,8 @@ def test_the_footprint_moves_with_the_world(seed: int):
 def test_the_cells_of_the_object_hold_it_and_those_of_the_table_do_not():
     known = one_thing()
     plane, found = table_of(known), object_of(known)
-    corners = se3.transform(se3.invert(plane.T_world_table) @ known.T_world_obj, known.real.vertices)
+    T_table_obj = se3.invert(plane.T_world_table) @ known.T_world_obj
+    corners = se3.transform(T_table_obj, known.real.vertices)
     cells = np.floor((corners[:, :2] - found.origin) / found.cell_m).astype(int)
     assert np.all(found.near[cells[:, 0], cells[:, 1]])
     assert not np.any(found.around[cells[:, 0], cells[:, 1]])

@@ -9,6 +9,7 @@ from realsim.records import CameraIntrinsics
 from realsim.scanning.sfm.bundle import adjust, point_covariances, reprojection_errors
 from realsim.scanning.sfm.config import FeatureConfig, MappingConfig, RobotNoise, TrustConfig
 from realsim.scanning.sfm.depth_scale import depth_scale
+from realsim.scanning.sfm.independence import halves, reliability, variance_inflation
 from realsim.scanning.sfm.pairs import pairs_to_match
 from realsim.scanning.sfm.result import Geometry
 
@@ -121,3 +122,30 @@ def test_pairs_are_near_ones_and_no_view_is_left_out() -> None:
     away = true.Ts_world_cam.copy()
     away[7] = away[7] @ se3.exp([np.pi, 0, 0, 0, 0, 0])
     assert any(7 in p for p in pairs_to_match(60, away, FeatureConfig()))
+
+
+def test_neighbours_that_err_alike_count_for_less() -> None:
+    rng = np.random.default_rng(6)
+    g = scene(rng)
+    ones = np.ones(len(g.uv_px))
+    alone = variance_inflation(g, rng.standard_normal(g.uv_px.shape), ones)
+    # 4000 numbers, 660 unknowns, and no correlation.
+    assert alone == pytest.approx(4000 / 3340, rel=0.1)
+    cell = (g.cameras_of * 8 + g.uv_px[:, 0] // 80).astype(int) * 8 + (g.uv_px[:, 1] // 80)
+    of = np.unique(cell, return_inverse=True)[1]
+    alike = rng.standard_normal((of.max() + 1, 2))[of]
+    size = np.bincount(of)
+    told = variance_inflation(g, alike, ones) * 3340 / 4000
+    assert told == pytest.approx((size**2).sum() / size.sum(), rel=0.3)
+
+
+def test_halves_share_no_point_and_reliability_is_that_of_signal_in_noise() -> None:
+    rng = np.random.default_rng(7)
+    g = scene(rng)
+    a, b = halves(g)
+    assert sorted([*a.point_ids, *b.point_ids]) == list(g.point_ids)
+    assert abs(len(a.points) - len(b.points)) <= 8
+    s, e, f = rng.standard_normal((3, 4000, 6))
+    assert reliability(s + e, s + f) == pytest.approx(1 / 1.5, abs=0.03)
+    assert reliability(e, f) < 0.05
+    assert reliability(s, s) == 1.0

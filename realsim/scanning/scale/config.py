@@ -17,7 +17,7 @@ class TableConfig:
     """Cells of the map of heights from which the object is cut out [m]."""
     height_m: float = 0.003
     """What stands this far above the plane is no table [m]; plus three sigma of the depth."""
-    bridge_m: float = 0.012
+    bridge_m: float = 0.008
     """Parts of an object nearer than this are one object: depth has holes [m]."""
     least_points: int = 200
     """Fewer measured points than this are a speck, no object."""
@@ -140,6 +140,10 @@ class VerdictConfig:
     """One that explains less than this is doubtful."""
     least_iou: float = 0.86
     """Least overlap of the model's outline with the measured one."""
+    part_agree: float = 0.8
+    """A mesh that agrees wherever it is seen..."""
+    part_cover: float = 0.7
+    """... but covers less than this of what was measured is of a part of what stands there."""
     rival_change: float = 0.04
     """A rival solution counts if its scale differs by more than this [share of the scale]."""
     rival_gain: float = 0.02

@@ -75,4 +75,5 @@ def limits_of(
             f"translucency) changes the scale by 2 x {1e3 * OFFSET_M:.1f} mm / {size_mm:.0f} mm.",
         ),
     ]  # fmt: skip
-    return tuple(sorted(rows, key=lambda r: -r.percent))
+    # What is not in the sigma comes last, however large.
+    return (*sorted(rows[:-1], key=lambda r: -r.percent), rows[-1])

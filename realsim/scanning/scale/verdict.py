@@ -77,6 +77,12 @@ def judge(
             f"its outline overlaps the measured one by {100 * seen.iou:.0f} %; "
             f"{100 * v.least_iou:.0f} % and more are trusted."
         )
+    if seen.agree > v.part_agree and seen.cover < v.part_cover:
+        doubts.append(
+            f"the mesh agrees where it is seen ({100 * seen.agree:.0f} %) but covers "
+            f"{100 * seen.cover:.0f} % of what stands there: another object touches it, or the "
+            "mesh is of a part only. Capture the object alone."
+        )
     if shape_share > v.worst_shape:
         doubts.append(
             f"the surfaces differ by {100 * shape_share:.1f} % of the size; meshes of the same "
