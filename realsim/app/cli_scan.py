@@ -146,9 +146,10 @@ def complete_command(
     """Compute properties, convex parts and pictures for models of another program.
 
     NAMES are those without properties by default. Meshes and models_info.json are not changed.
+    Convex parts take up to a minute of CPU time for each model.
     """
     from realsim.app.console import Console
-    from realsim.app.scan_library import run_complete
+    from realsim.app.scan_complete import run_complete
 
     if not run_complete(library, names, Console(quiet=quiet), mass_kg=mass, density=density):
         sys.exit(1)

@@ -1,4 +1,4 @@
-"""What is said on the command line as text: lists of numbers, and whether a port is free."""
+"""What is said on the command line as text: lists of numbers, points, and whether a port is free."""
 
 import errno
 import re
@@ -41,3 +41,27 @@ def port_in_use(host: str, port: int) -> bool:
     except OSError as error:  # whatever else is wrong is named by who listens
         return error.errno == errno.EADDRINUSE
     return False
+
+
+def point_of(text: str) -> tuple[float, float] | None:
+    """Return x,y [m] of a text, None for an empty one.
+
+    Raises:
+        InputError: it is no point on a table.
+    """
+    from realsim.errors import InputError
+
+    if not text:
+        return None
+    number = r"\s*([-+]?(?:\d+\.?\d*|\.\d+))\s*"
+    found = re.fullmatch(f"{number},{number}", text)
+    if found is None:
+        raise InputError(f"--at '{text}' is no point; x,y in metres, such as 0.40,-0.05, is one.")
+    x, y = float(found[1]), float(found[2])
+    # An arm that grasps reaches no further than this: beyond, millimetres were typed.
+    if max(abs(x), abs(y)) > 3.0:
+        raise InputError(
+            f"--at {text} lies {max(abs(x), abs(y)):g} m from the robot; at most 3 m is accepted. "
+            "Were millimetres typed? Metres are expected."
+        )
+    return x, y

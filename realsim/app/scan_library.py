@@ -1,78 +1,94 @@
-"""`realsim scan list`, `show`, `check` and `complete`: what a model library holds."""
+"""`realsim scan list`, `show` and `check`: what a model library holds."""
 
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from realsim.app.console import Console
-from realsim.errors import InputError, RealsimError
 from realsim.models.library_records import ModelProperties
 from realsim.records import Mesh
+
+if TYPE_CHECKING:
+    from realsim.models.library_reading import LibraryEntry
 
 SHOWN = 40
 """Findings of a check that are listed; the rest is counted (`--json` has all)."""
 NEAR_SHOWN = 2
 """Refused symmetries that are listed; they come in families."""
 NONE = "-"
+KEPT = "(*)"
+"""Mark of a model whose mesh without scale is kept."""
 
 
 def list_library(folder: Path, console: Console) -> None:
-    """Print a table of all models.
+    """Print a table of all models; the mesh that a model was scaled from is a mark, not a row.
 
     Raises:
         InputError: the folder is no library.
     """
-    from realsim.models.library_reading import LibraryEntry, LibraryReader
-
-    def row(e: LibraryEntry) -> tuple[str, ...]:
-        p = e.properties
-        size = _info_size(e.info)
-        if p is None:
-            return (
-                e.name,
-                str(e.obj_id),
-                size,
-                NONE,
-                _info_symmetries(e.info),
-                NONE,
-                NONE,
-                "not known",
-            )
-        scale = NONE if p.scale is None else "not known"
-        if p.scale is not None and p.scale.sigma_percent is not None:
-            scale = f"{p.scale.sigma_percent:.2g} %"
-        mass = NONE if p.matter is None else f"{1e3 * p.matter.mass_kg:.4g}"
-        return (
-            e.name, NONE if e.obj_id is None else str(e.obj_id), size, mass,
-            _symmetries(p), NONE if p.convex is None else str(p.convex.parts),
-            scale if e.obj_id is not None else "unscaled", p.verdict,
-        )  # fmt: skip
+    from realsim.models.library_files import UNSCALED
+    from realsim.models.library_reading import LibraryReader, unscaled_sources
 
     entries = LibraryReader.open(folder).entries()
     if not entries:
         console.say(f"{folder} holds no models yet; `realsim scan import MESH --library {folder}`.")
         return
-    header = (
-        "name",
-        "id",
-        "size [mm]",
-        "mass [g]",
-        "symmetries",
-        "parts",
-        "scale sigma",
-        "verdict",
-    )
-    console.table(f"{len(entries)} models in {folder}", header, [row(e) for e in entries])
-    unknown = [e for e in entries if e.properties is None]
+    sources = unscaled_sources(entries)
+    shown = [e for e in entries if e.obj_id is not None or e.name not in sources]
+    header = ("name", "id", "size [mm]", "mass [g]", "symmetries", "parts", "scale sigma",
+              "verdict")  # fmt: skip
+    rows = [_entry_row(e, has_source=e.name in sources) for e in shown]
+    console.table(f"{_counted(shown)} in {folder}", header, rows)
+    if sources:
+        console.say(
+            f"{KEPT} {len(sources)} kept without scale, too, in {folder / UNSCALED}: `realsim scan "
+            f"scale NAME SESSION --library {folder} --overwrite` scales it anew."
+        )
+    doubtful = [e.name for e in entries if e.properties and e.properties.verdict == "doubtful"]
+    for name in doubtful[:NEAR_SHOWN]:
+        console.say(f"{name} is doubtful: `realsim scan show {folder} {name}` says why.")
+    if len(doubtful) > NEAR_SHOWN:
+        console.say(f"... and so are {len(doubtful) - NEAR_SHOWN} more.")
+    unknown = [e for e in entries if e.properties is None and e.obj_id is not None]
     if unknown:
         console.say(
             f"{len(unknown)} of them have no properties (not imported by realsim): "
             f"`realsim scan complete {folder}` computes them."
         )
+
+
+def _entry_row(e: "LibraryEntry", *, has_source: bool) -> tuple[str, ...]:
+    """Return the row of a model in the list."""
+    from realsim.models.pictures import verdict_text
+
+    p = e.properties
+    name = f"{e.name} {KEPT}" if has_source else e.name
+    if p is None:
+        if e.obj_id is None:
+            return (name, NONE, NONE, NONE, NONE, NONE, "unscaled", "not known")
+        symmetries = _info_symmetries(e.info)
+        return (name, str(e.obj_id), _info_size(e.info), NONE, symmetries, NONE, NONE, "not known")
+    scale = NONE if p.scale is None else "not known"
+    if p.scale is not None and p.scale.sigma_percent is not None:
+        scale = f"{p.scale.sigma_percent:.2g} %"
+    mass = NONE if p.matter is None else f"{1e3 * p.matter.mass_kg:.4g}"
+    return (
+        name, NONE if e.obj_id is None else str(e.obj_id), _info_size(e.info), mass,
+        _symmetries(p), NONE if p.convex is None else str(p.convex.parts),
+        scale if e.obj_id is not None else "unscaled", verdict_text(p),
+    )  # fmt: skip
+
+
+def _counted(entries: "Sequence[LibraryEntry]") -> str:
+    """Return how many models there are, and how many meshes without scale."""
+    models = sum(e.obj_id is not None for e in entries)
+    bare = len(entries) - models
+    text = f"{models} model{'' if models == 1 else 's'}"
+    return f"{text} and {bare} unscaled mesh{'' if bare == 1 else 'es'}" if bare else text
 
 
 def _info_size(info: Any) -> str:
@@ -154,58 +170,9 @@ def run_library_check(folder: Path, console: Console, *, as_json: bool) -> bool:
         console.say(f"{f.kind:<9} {f.path}: {f.text}")
     if len(findings) > SHOWN:
         console.say(f"... and {len(findings) - SHOWN} more; --json has all.")
-    count = len(library.entries())
-    console.say(f"{count} models in {folder}: {'sound' if sound else 'not sound'}")
+    counted = _counted(library.entries())
+    console.say(f"{counted} in {folder}: {'sound' if sound else 'not sound'}")
     return sound
-
-
-def run_complete(
-    folder: Path,
-    names: Sequence[str],
-    console: Console,
-    *,
-    mass_kg: float | None,
-    density: float | None,
-) -> bool:
-    """Compute what is not known of models; return whether no person needs to look at any.
-
-    Raises:
-        InputError: no library, no such model, or a mass for several models.
-    """
-    from realsim.models.library_complete import complete
-    from realsim.models.library_prepare import Matter
-    from realsim.models.library_reading import LibraryReader
-
-    library = LibraryReader.open(folder)
-    wanted = list(names)
-    if not wanted:
-        wanted = [str(e.obj_id) for e in library.entries() if e.obj_id and e.properties is None]
-    if mass_kg is not None and len(wanted) != 1:
-        raise InputError(f"--mass is of one model, but {len(wanted)} are completed.")
-    matter = None
-    if mass_kg is not None or density is not None:
-        matter = Matter(density=density, mass_kg=mass_kg)
-    fine, rows = True, list[tuple[str, ...]]()
-    with console.stage("complete", f"{len(wanted)} models") as tick:
-        for k, name in enumerate(wanted):
-            tick(k, len(wanted))
-            try:
-                found = complete(library, name, matter=matter)
-            except RealsimError as error:
-                if len(wanted) == 1:
-                    raise
-                console.say(f"{name}: {error}")
-                fine = False
-                continue
-            p = found.properties
-            if p is not None:
-                rows.append(verdict_row(found.model.name, found.model.obj_id, p))
-                fine = fine and p.verdict == "accepted"
-                for reason in p.reasons:
-                    console.say(f"{found.model.name}: look: {reason}")
-    header = ("model", "id", "size [mm]", "mass [g]", "parts", "verdict")
-    console.table(f"{len(rows)} models completed in {folder}", header, rows)
-    return fine
 
 
 # --- how one model is shown -------------------------------------------------------------------
@@ -213,19 +180,24 @@ def run_complete(
 
 def verdict_row(name: str, obj_id: int | None, p: ModelProperties) -> tuple[str, ...]:
     """Return a model's row: name, id, size, mass, parts, verdict."""
+    from realsim.models.pictures import verdict_text
+
     m = p.matter
     size = "no scale" if m is None else " x ".join(f"{1e3 * x:.1f}" for x in m.extent_m)
     mass = NONE if m is None else f"{1e3 * m.mass_kg:.4g}"
     parts = NONE if p.convex is None else str(p.convex.parts)
-    return (name, NONE if obj_id is None else str(obj_id), size, mass, parts, p.verdict)
+    said = verdict_text(p)
+    return (name, NONE if obj_id is None else str(obj_id), size, mass, parts, said)
 
 
 def say_model(
     console: Console, folder: Path, name: str, obj_id: int | None, mesh: Mesh, p: ModelProperties
 ) -> None:
     """Print every figure of a model, then every problem, then where it lies."""
+    from realsim.models.pictures import verdict_text
+
     title = f"{name}" if obj_id is None else f"{name} (object {obj_id})"
-    console.table(f"{title}: {p.verdict}", ("figure", "value"), _figures(mesh, p))
+    console.table(f"{title}: {verdict_text(p)}", ("figure", "value"), _figures(mesh, p))
     said = [("repaired", a) for a in p.actions] + [("note", n) for n in p.notes]
     if p.symmetries is not None:
         near = p.symmetries.near
@@ -235,12 +207,13 @@ def say_model(
             said.append(("nearly symmetric", more))
     for kind, text in [*said, *(("LOOK", r) for r in p.reasons)]:
         console.say(f"{kind}: {text}")
-    where = folder / ("unscaled" if obj_id is None else "pictures")
-    console.say(str(where / (name if obj_id is None else f"{name}.png")))
-    if obj_id is None:
-        console.say(
-            f"no metric scale yet: `realsim scan scale {name} SESSION --library {folder}` finds it."
-        )
+    if obj_id is not None:
+        console.say(str(folder / "pictures" / f"{name}.png"))
+        return
+    console.say(f"kept as '{name}', in {folder / 'unscaled' / name}")
+    console.say(
+        f"no metric scale yet: `realsim scan scale {name} SESSION --library {folder}` finds it."
+    )
 
 
 def _figures(mesh: Mesh, p: ModelProperties) -> list[tuple[str, str]]:

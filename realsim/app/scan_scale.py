@@ -3,7 +3,7 @@
 The result lies in SESSION/scans/NAME: scale.json is written last, so where it is, everything is.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,16 @@ from typing import Any
 import numpy as np
 
 from realsim.app.console import Console
+from realsim.app.scan_scale_box import box_mm_of
+from realsim.app.scan_scale_files import (
+    FILE,
+    MODEL_FILE,
+    Place,
+    model_files,
+    result_bytes,
+    write_file,
+    write_result,
+)
 from realsim.app.scan_scale_inputs import (
     NamedMesh,
     ScaleRequest,
@@ -20,25 +30,20 @@ from realsim.app.scan_scale_inputs import (
     usable_views,
 )
 from realsim.app.scan_scale_library import FoundScale, promote
-from realsim.app.scan_scale_show import show_fit, show_measured
+from realsim.app.scan_scale_show import CALIPER, model_lines, show_fit, show_measured
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records import Mesh, View
+from realsim.records import Mesh, Verdict, View
 from realsim.scanning.scale.files import (
     ScaleRecord,
     installed_versions,
     json_lines,
-    load_record,
-    record_bytes,
 )
 from realsim.scanning.scale.result import ScaleFit
-from realsim.store import SessionStore, atomic
+from realsim.store import SessionStore
 
 FOLDER = "scans"
 """Where in a session the results lie."""
-FILE = "scale.json"
-MODEL_FILE = "model.ply"
-"""The mesh at metric scale, in millimetres as every model file (BOP)."""
 ROUGH = 0.3
 """A rough size may be off by this share; beyond, one of both is wrong."""
 MEASURED_FORMAT = "realsim scale by measurement"
@@ -65,22 +70,30 @@ def run_scale(request: ScaleRequest, console: Console) -> bool:
     record = known or _fitted(request, named, store, views, inputs, console)
     if known is None:
         write_result(place, record, named, store)
+    fit, box_mm = record.fit, box_mm_of(named.mesh, record.fit.scale)
+    show_fit(named.name, fit, record.measured, box_mm, console)
     for note in named.notes:
         console.say(f"note: {note}")
-    show_fit(named.name, record.fit, record.measured, console)
-    _say_of_model(named, record.fit, console)
+    _say_of_model(named, fit, console)
     if known is not None:
         console.say(f"nothing has changed since {place.folder / FILE} was written; --overwrite "
                     "does it again.")  # fmt: skip
     console.say(f"result    {place.folder}")
     if request.json is not None:
-        _write_file(request.json, record_bytes(record))
-    fit = record.fit
+        write_file(request.json, result_bytes(record, box_mm))
+    _say_where(request, named, place.folder / MODEL_FILE, fit.verdict, console)
     found = FoundScale(
         scale=fit.scale, sigma_percent=fit.sigma_percent, verdict=fit.verdict, reasons=fit.reasons,
         session=store.session.name, how="fit and measured" if record.measured else "fit",
     )  # fmt: skip
     promote(request, named, found, console)
+    if is_accepted(fit) and not record.measured:
+        console.say(CALIPER)
+    return is_accepted(fit)
+
+
+def is_accepted(fit: ScaleFit) -> bool:
+    """Whether the scale can be used as it is."""
     return fit.verdict == "accepted"
 
 
@@ -163,87 +176,13 @@ def _say_of_model(named: NamedMesh, fit: ScaleFit, console: Console) -> None:
     )
 
 
-# --- files ------------------------------------------------------------------------------------
-
-
-class Place:
-    """The folder of a result: in the session, where its checksums are kept, or anywhere."""
-
-    def __init__(self, store: SessionStore, folder: Path) -> None:
-        """Name the folder; it is made by the first file."""
-        self._store, self.folder = store, folder
-        root, here = store.folder.resolve(), folder.resolve()
-        self._inside = here.relative_to(root).as_posix() if here.is_relative_to(root) else None
-
-    def record(self, key: str) -> ScaleRecord | None:
-        """Return the result that is there if it was made from these inputs."""
-        path = self.folder / FILE
-        if not path.is_file():
-            return None
-        try:
-            record = load_record(path)
-        except InputError:
-            return None  # a damaged result is none: it is made again
-        return record if record.inputs.get("key") == key else None
-
-    def write(self, name: str, data: bytes) -> None:
-        """Write one file whole or not at all."""
-        if self._inside is not None:
-            self._store.write_bytes(f"{self._inside}/{name}", data)
-        else:
-            _write_file(self.folder / name, data)
-
-
-def _write_file(path: Path, data: bytes) -> None:
-    with atomic.storing(path.parent, path.name):
-        atomic.write_bytes(path, data)
-
-
-def write_result(place: Place, record: ScaleRecord, named: NamedMesh, store: SessionStore) -> None:
-    """Write the scaled model, the pictures, the page and, last, scale.json."""
-    from realsim.app.scan_scale_page import page_bytes
-
-    for name, data in model_files(named.mesh, record.fit.scale).items():
-        place.write(name, data)
-    pictures = _pictures(record.fit, named.mesh, store)
-    for name, data in pictures.items():
-        place.write(name, data)
-    place.write("scale.html", page_bytes(record, pictures, place.folder))
-    place.write(FILE, record_bytes(record))
-
-
-def model_files(mesh: Mesh, scale: float) -> dict[str, bytes]:
-    """Return the mesh at metric scale as PLY [mm], and its texture beside it."""
-    from realsim.formats import images
-    from realsim.geometry.mesh import ply_bytes
-
-    texture = Path(MODEL_FILE).with_suffix(".png").name if mesh.texture is not None else ""
-    scaled = replace(mesh, vertices=scale * mesh.vertices)
-    files = {} if mesh.texture is None else {texture: images.png_bytes(mesh.texture)}
-    return files | {MODEL_FILE: ply_bytes(scaled, "mm", texture_file=texture)}
-
-
-def _pictures(fit: ScaleFit, mesh: Mesh, store: SessionStore) -> dict[str, bytes]:
-    """Return every picture that can be drawn of the fit."""
-    from realsim.scanning.scale.picture_overlays import Photograph, chosen_views, overlays_png
-    from realsim.scanning.scale.pictures import candidates_png, residuals_png, views_png
-
-    made: dict[str, Callable[[], bytes]] = {"residuals.png": lambda: residuals_png(mesh, fit)}
-    if fit.views:
-        made["views.png"] = lambda: views_png(fit)
-    if any(np.isfinite(c.score) for c in fit.candidates):
-        made["candidates.png"] = lambda: candidates_png(fit)
-    photographs = [
-        Photograph(index=v.index, rgb=store.rgb(v.index), depth_m=store.depth_m(v.index),
-                   T_world_cam=v.T_world_cam)
-        for v in (store.session.view(k) for k in chosen_views(fit))
-        if v.T_world_cam is not None
-    ]  # fmt: skip
-    if photographs:
-        made["overlays.png"] = lambda: overlays_png(
-            mesh, fit, store.session.intrinsics, photographs
-        )
-    return {name: draw() for name, draw in made.items()}
+def _say_where(
+    request: ScaleRequest, named: NamedMesh, model: Path | None, verdict: Verdict, console: Console
+) -> None:
+    """Say where the scaled model lies, and how it gets into a library if it does not."""
+    stored = request.library is not None or named.origin == "model"
+    for line in model_lines(named, model, verdict, is_stored=stored):
+        console.say(line)
 
 
 # --- without a session ------------------------------------------------------------------------
@@ -265,12 +204,16 @@ def _by_measurement(request: ScaleRequest, console: Console) -> bool:
     named = read_mesh(request)
     scale, sigma, each = scale_from(named.mesh, request.measured)
     size_mm = [1e3 * scale * float(e) for e in named.mesh.extent]
-    show_measured(named.name, scale, sigma, each, size_mm, console)
+    box_mm = [float(side) for side in box_mm_of(named.mesh, scale)]
+    show_measured(named.name, (scale, sigma), each, (box_mm, size_mm), console)
+    for note in named.notes:
+        console.say(f"note: {note}")
     reason = "the scale rests on a length measured by hand; no session has checked it."
     values: dict[str, Any] = {
         "format": MEASURED_FORMAT, "format_version": 1, "verdict": "unchecked",
         "reasons": [reason], "scale": scale, "sigma": sigma,
         "interval_95": [scale - 1.96 * sigma, scale + 1.96 * sigma], "extent_mm": size_mm,
+        "smallest_box_mm": box_mm,
         "measured": [asdict(e) | {"text": e.measurement.text} for e in each],
         "mesh": {"name": named.name, "where": named.where, "sha256": named.sha256},
         "versions": installed_versions(),
@@ -280,11 +223,13 @@ def _by_measurement(request: ScaleRequest, console: Console) -> bool:
         if (request.out / FILE).exists() and not request.overwrite:
             raise InputError(f"{request.out / FILE} exists; --overwrite replaces it.")
         for name, data in model_files(named.mesh, scale).items():
-            _write_file(request.out / name, data)
-        _write_file(request.out / FILE, text)
+            write_file(request.out / name, data)
+        write_file(request.out / FILE, text)
         console.say(f"result    {request.out}")
     if request.json is not None:
-        _write_file(request.json, text)
+        write_file(request.json, text)
+    model = None if request.out is None else request.out / MODEL_FILE
+    _say_where(request, named, model, "unchecked", console)
     found = FoundScale(
         scale=scale, sigma_percent=100 * sigma / scale, verdict="unchecked", reasons=(reason,),
         session="", how="measured",

@@ -1,13 +1,12 @@
 """`realsim scan scale`: its options."""
 
-import re
 import sys
 from pathlib import Path
 from typing import Any
 
 import click
 
-from realsim.app.option_values import numbers_of
+from realsim.app.option_values import numbers_of, point_of
 
 FOLDER = click.Path(path_type=Path)
 UP = click.Choice(["x", "y", "z", "-x", "-y", "-z"])
@@ -16,7 +15,7 @@ UP = click.Choice(["x", "y", "z", "-x", "-y", "-z"])
 @click.command()
 @click.argument("mesh")
 @click.argument("session", type=FOLDER, required=False)
-@click.option("--library", type=FOLDER, default=None, help="Put the scaled model there.")
+@click.option("--library", type=FOLDER, default=None, help="Put the scaled model there.  [nowhere]")
 @click.option("--name", default="", help="Name of the result.  [that of the mesh]")
 @click.option("--up", type=UP, default=None, help="The file's axis that points up.")
 @click.option("--start", type=FOLDER, default=None, help="JSON with scale and T_world_obj.")
@@ -37,8 +36,9 @@ def scale(mesh: str, session: Path | None, quiet: bool, **options: Any) -> None:
     """Find the metric scale of MESH in the depth images of SESSION.
 
     \b
-    MESH     a mesh file of any unit, unscaled/NAME of the library, or the name of a
-             model of it, whose scale is then checked
+    MESH     a mesh file of any unit, a mesh of the library without scale (NAME, or
+             LIBRARY/unscaled/NAME), or the name or id of a model at metric scale,
+             which is then checked
     SESSION  a calibrated session with depth; without one, --measured gives the scale
 
     \b
@@ -86,27 +86,3 @@ def request_of(mesh: str, session: Path | None, options: dict[str, Any]) -> Any:
         density=options["density"],
         mass=options["mass"],
     )
-
-
-def point_of(text: str) -> tuple[float, float] | None:
-    """Return x,y [m] of a text, None for an empty one.
-
-    Raises:
-        InputError: it is no point on a table.
-    """
-    from realsim.errors import InputError
-
-    if not text:
-        return None
-    number = r"\s*([-+]?(?:\d+\.?\d*|\.\d+))\s*"
-    found = re.fullmatch(f"{number},{number}", text)
-    if found is None:
-        raise InputError(f"--at '{text}' is no point; x,y in metres, such as 0.40,-0.05, is one.")
-    x, y = float(found[1]), float(found[2])
-    # An arm that grasps reaches no further than this: beyond, millimetres were typed.
-    if max(abs(x), abs(y)) > 3.0:
-        raise InputError(
-            f"--at {text} lies {max(abs(x), abs(y)):g} m from the robot; at most 3 m is accepted. "
-            "Were millimetres typed? Metres are expected."
-        )
-    return x, y

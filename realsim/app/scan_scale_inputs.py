@@ -12,6 +12,7 @@ import numpy as np
 from realsim import __version__
 from realsim.app.stages import content_key
 from realsim.errors import InputError
+from realsim.formats.bop_models import INFO_FILE
 from realsim.records import Mesh, View
 from realsim.scanning.scale.measured import Measurement
 from realsim.scanning.scale.result import Similarity
@@ -80,7 +81,9 @@ class NamedMesh:
     sha256: str
     """Of vertices and faces."""
     entry: str = ""
-    """Its name in the library; empty for a file."""
+    """Its own name in the library; empty for a file."""
+    library: Path | None = None
+    """The library that it was read from; None for a file."""
     source: "ScanSource | None" = None
     """What the library keeps of the file."""
     notes: tuple[str, ...] = ()
@@ -113,11 +116,28 @@ def read_mesh(request: ScaleRequest) -> NamedMesh:
         InputError: it is neither; the library's models are named.
     """
     path = Path(request.mesh)
+    place = _unscaled_place(path)
+    if place is not None:
+        folder, entry = place
+        return _unscaled(folder, entry, request)
     if path.is_dir():
-        raise InputError(f"'{path}' is a folder; a mesh file, or a model's name, is expected.")
+        raise InputError(
+            f"'{path}' is a folder; a mesh file, a model's name or LIBRARY/unscaled/NAME is "
+            "expected."
+        )
     if path.is_file():
         return _from_file(path, request)
     return _from_library(request.mesh, request)
+
+
+def _unscaled_place(path: Path) -> tuple[Path, str] | None:
+    """Return library and name where a path is LIBRARY/unscaled/NAME or the mesh in it."""
+    from realsim.models import library_files as files
+
+    folder = path.parent if path.name == files.UNSCALED_MESH and path.is_file() else path
+    library = folder.parent.parent
+    is_entry = folder.parent.name == files.UNSCALED and (folder / files.UNSCALED_REPORT).is_file()
+    return (library, folder.name) if is_entry and (library / INFO_FILE).is_file() else None
 
 
 def _from_file(path: Path, request: ScaleRequest) -> NamedMesh:
@@ -138,7 +158,7 @@ def _from_library(wanted: str, request: ScaleRequest) -> NamedMesh:
     from realsim.models.library import ModelLibrary
 
     folder = request.library or LIBRARY
-    if not (folder / "models_info.json").is_file():
+    if not (folder / INFO_FILE).is_file():
         raise InputError(
             f"'{wanted}' is no mesh file, and '{folder}' is no model library in which it could be "
             "the name of a model. Give a .glb, .obj, .ply, .stl or .usd file, or name the library "
@@ -147,23 +167,40 @@ def _from_library(wanted: str, request: ScaleRequest) -> NamedMesh:
     library = ModelLibrary.open(folder)
     entries = library.entries()
     plain = wanted.removeprefix("unscaled/")
-    name = name_of(request, plain)
-    where = f"{plain} in {folder}"
+    scaled_ids = {e.name: e.obj_id for e in entries if e.obj_id is not None}
     if any(e.obj_id is None and e.name == plain for e in entries):
-        mesh = library.load_unscaled(plain).mesh
-        return NamedMesh(
-            mesh=mesh, name=name, origin="unscaled", where=f"unscaled/{where}",
-            sha256=mesh_hash(mesh), entry=plain,
-        )  # fmt: skip
-    if any(e.obj_id is not None and wanted in (e.name, str(e.obj_id)) for e in entries):
-        mesh = library.load(wanted).model.mesh
-        return NamedMesh(mesh=mesh, name=name, origin="model", where=where, sha256=mesh_hash(mesh))
+        named = _unscaled(folder, plain, request)
+        if wanted not in scaled_ids:
+            return named
+        note = (
+            f"{folder} has '{wanted}' without scale and at metric scale; the one without is "
+            f"scaled. `realsim scan scale {scaled_ids[wanted]} SESSION` checks the other."
+        )
+        return replace(named, notes=(*named.notes, note))
+    for name, obj_id in scaled_ids.items():
+        if wanted in (name, str(obj_id)):
+            mesh = library.load(wanted).model.mesh
+            return NamedMesh(
+                mesh=mesh, name=name_of(request, name), origin="model",
+                where=f"{name} in {folder}", sha256=mesh_hash(mesh), entry=name, library=folder,
+            )  # fmt: skip
     unscaled = [f"unscaled/{e.name}" for e in entries if e.obj_id is None]
-    scaled = [e.name for e in entries if e.obj_id is not None]
     raise InputError(
         f"'{wanted}' is neither a file nor a model of the library '{folder}', which has: "
-        f"{', '.join([*unscaled, *scaled]) or 'nothing yet'}."
+        f"{', '.join([*unscaled, *scaled_ids]) or 'nothing yet'}."
     )
+
+
+def _unscaled(folder: Path, entry: str, request: ScaleRequest) -> NamedMesh:
+    """Read a mesh that waits in a library for its scale."""
+    from realsim.models.library import ModelLibrary
+
+    raw = ModelLibrary.open(folder).load_unscaled(entry)
+    return NamedMesh(
+        mesh=raw.mesh, name=name_of(request, entry), origin="unscaled",
+        where=f"unscaled/{entry} in {folder}", sha256=mesh_hash(raw.mesh), entry=entry,
+        library=folder, source=raw.properties.source,
+    )  # fmt: skip
 
 
 def usable_views(store: SessionStore, wanted: Sequence[int]) -> list[View]:

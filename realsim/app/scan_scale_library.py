@@ -67,7 +67,8 @@ def _added(
     from realsim.models.pictures import sheet_png
 
     matter = Matter(density=request.density, mass_kg=request.mass)
-    if named.origin == "unscaled" and named.entry == named.name:
+    waits_here = named.library is not None and named.library.resolve() == library.folder.resolve()
+    if named.origin == "unscaled" and waits_here and named.entry == named.name:
         return library.promote(
             named.name, note, matter=matter, obj_id=request.obj_id, overwrite=request.overwrite
         )

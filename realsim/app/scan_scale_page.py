@@ -12,7 +12,9 @@ from realsim.app.scan_scale_show import (
     MEANING,
     MEASURED_HEADER,
     VIEW_HEADER,
+    Array,
     limit_rows,
+    limits_title,
     measured_rows,
     scale_rows,
     view_rows,
@@ -53,24 +55,27 @@ CAPTIONS: dict[str, tuple[str, str]] = {
 """Title and caption of every picture, in the order of the page."""
 
 
-def page_bytes(record: ScaleRecord, pictures: Mapping[str, bytes], folder: Path) -> bytes:
+def page_bytes(
+    record: ScaleRecord, pictures: Mapping[str, bytes], folder: Path, box_mm: Array
+) -> bytes:
     """Return the page.
 
     Args:
         record: what was found.
         pictures: file name -> PNG; those that are missing are left out.
         folder: where the pictures lie.
+        box_mm: (3,) the smallest box around the scaled mesh [mm].
     """
     fit = record.fit
     name = str(record.inputs.get("mesh", {}).get("name", "mesh"))
     session = str(record.inputs.get("session", {}).get("name", ""))
     page = Page(parts=[STYLE, _banner(record)])
     page.section("The scale")
-    page.table(["figure", "value"], scale_rows(fit))
+    page.table(["figure", "value"], scale_rows(fit, box_mm))
     for note in fit.notes:
         page.parts.append(f'<p class="note">{html.escape(note)}</p>')
     if fit.limits:
-        page.section("What limits it", "Each alone, as a 1-sigma of the scale; worst first.")
+        page.section(limits_title(fit), "Each alone, as a 1-sigma of the scale.")
         page.table(["limit", "alone", "why"], limit_rows(fit))
     if record.measured:
         page.section("Measured by hand", "Against the fit without them.")

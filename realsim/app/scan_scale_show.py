@@ -1,10 +1,14 @@
 """A scale in words: the verdict first, then the figures, what limits them, and the worst views."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from realsim.app.console import Console
+from realsim.app.scan_scale_inputs import LIBRARY, NamedMesh
+from realsim.records import Verdict
 from realsim.scanning.scale.measured import LengthScale
 from realsim.scanning.scale.measured_check import MeasuredCheck
 from realsim.scanning.scale.picture_overlays import worst_views
@@ -18,6 +22,13 @@ MEANING = {
     "rejected": "do not use this scale.",
     "unchecked": "nothing but the measurement says so; nobody has checked it.",
 }
+NOT_IN_SIGMA = "surface offset"
+"""The limit that nothing in a session can tell: it is said, and not counted."""
+CALIPER = (
+    "check     nothing outside of this session has confirmed the scale: one length by caliper is "
+    "the one independent check. Add --measured longest=...mm."
+)
+Array = NDArray[np.float64]
 Rows = list[list[str]]
 
 
@@ -26,24 +37,38 @@ def verdict_line(name: str, fit: ScaleFit) -> str:
     return f"{fit.verdict.upper()}: {name}: {MEANING[fit.verdict]}"
 
 
-def scale_rows(fit: ScaleFit) -> Rows:
-    """Return the figures of a fit."""
+def size_rows(box_mm: Sequence[float] | Array, size_mm: Sequence[float] | Array) -> Rows:
+    """Return the size: the smallest box first, which does not depend on the mesh's axes."""
+    x, y, z = (f"{v:.1f}" for v in size_mm)
+    return [
+        ["smallest box", " x ".join(f"{v:.1f}" for v in box_mm) + " mm"],
+        ["along the mesh's own x, y, z", f"{x}, {y}, {z} mm"],
+    ]
+
+
+def scale_rows(fit: ScaleFit, box_mm: Array) -> Rows:
+    """Return the figures of a fit, with the smallest box (3,) around the scaled mesh [mm]."""
     low, high = fit.interval
-    x, y, z = fit.extent_mm
     return [
         ["verdict", fit.verdict],
         ["scale", f"{fit.scale:.6g} m per unit of the mesh"],
         ["1 sigma", f"{fit.sigma_percent:.3f} %"],
         ["95 % interval", f"{low:.6g} to {high:.6g} m per unit"],
-        ["size along x, y, z", f"{x:.2f}, {y:.2f}, {z:.2f} mm"],
+        *size_rows(box_mm, fit.extent_mm),
         ["CPU time of the fit", "-" if np.isnan(fit.cpu_s) else f"{fit.cpu_s:.1f} s"],
     ]
 
 
 def limit_rows(fit: ScaleFit) -> Rows:
-    """Return what limits the scale, worst first."""
-    ordered = sorted(fit.limits, key=lambda k: -k.percent)
+    """Return what limits the scale, worst first, and then what is not in the sigma."""
+    ordered = sorted(fit.limits, key=lambda k: (k.name == NOT_IN_SIGMA, -k.percent))
     return [[k.name, f"{k.percent:.3f} %", k.text] for k in ordered]
+
+
+def limits_title(fit: ScaleFit) -> str:
+    """Return what stands above the limits."""
+    is_there = any(k.name == NOT_IN_SIGMA for k in fit.limits)
+    return "What limits it, worst first" + ("; the last is not in the sigma" if is_there else "")
 
 
 VIEW_HEADER = ["view", "used", "agree", "IoU", "RMS [mm]", "moved [mm]", "turned [deg]"]
@@ -87,14 +112,16 @@ def measured_rows(checks: Sequence[MeasuredCheck]) -> Rows:
     ]
 
 
-def show_fit(name: str, fit: ScaleFit, checks: Sequence[MeasuredCheck], console: Console) -> None:
-    """Print everything about a fit, its verdict first."""
+def show_fit(
+    name: str, fit: ScaleFit, checks: Sequence[MeasuredCheck], box_mm: Array, console: Console
+) -> None:
+    """Print everything about a fit, its verdict first; box_mm (3,) is the smallest box [mm]."""
     console.say(verdict_line(name, fit))
     for reason in fit.reasons:
         console.say(f"  - {reason}")
-    console.table(f"Scale of {name}", ["figure", "value"], scale_rows(fit))
+    console.table(f"Scale of {name}", ["figure", "value"], scale_rows(fit, box_mm))
     if fit.limits:
-        console.table("What limits it, worst first", ["limit", "alone", "why"], limit_rows(fit))
+        console.table(limits_title(fit), ["limit", "alone", "why"], limit_rows(fit))
     if checks:
         console.table("Measured by hand", MEASURED_HEADER, measured_rows(checks))
         for check in checks:
@@ -106,11 +133,54 @@ def show_fit(name: str, fit: ScaleFit, checks: Sequence[MeasuredCheck], console:
         console.say(f"note: {note}")
 
 
+def model_lines(
+    named: NamedMesh, model: Path | None, verdict: Verdict, *, is_stored: bool
+) -> list[str]:
+    """Return where the scaled model lies, and how it gets into a library.
+
+    Args:
+        named: the mesh.
+        model: the scaled model's file [mm]; None where it was not written.
+        verdict: on its scale.
+        is_stored: whether the library is spoken of elsewhere: one was named, or it has the model.
+    """
+    lines = [] if model is None else [f"model     {model} in mm (its --unit is mm)"]
+    if is_stored:
+        return lines
+    option = f"--library {named.library or LIBRARY}"
+    if verdict != "accepted":
+        option += " --accept-doubtful"
+    text = f"library   none: {option}, added to this command, puts the model there"
+    if verdict != "accepted":
+        text += f" although its scale is {verdict}"
+    if model is None:
+        return [f"{text}; --out FOLDER writes it as a file. So far nothing was written."]
+    lines.append(f"{text}; nothing is computed twice.")
+    if verdict == "accepted":
+        lines.append(
+            f"          `realsim scan import {model} --unit mm --name {named.name} --library "
+            f"{named.library or LIBRARY}` does, too, without the scale's sigma."
+        )
+    return lines
+
+
 def show_measured(
-    name: str, scale: float, sigma: float, each: Sequence[LengthScale], size_mm: Sequence[float],
+    name: str,
+    found: tuple[float, float],
+    each: Sequence[LengthScale],
+    sizes_mm: tuple[Sequence[float], Sequence[float]],
     console: Console,
-) -> None:  # fmt: skip
-    """Print a scale that rests on measured lengths alone."""
+) -> None:
+    """Print a scale that rests on measured lengths alone.
+
+    Args:
+        name: of the model.
+        found: scale and its 1-sigma [m per unit].
+        each: the scale by every length.
+        sizes_mm: the smallest box, and the extents along the mesh's axes [mm].
+        console: where.
+    """
+    scale, sigma = found
     console.say(f"UNCHECKED: {name}: {MEANING['unchecked']}")
     console.say("  - No session was given, so that no depth image speaks for this scale.")
     console.say("  - A mesh whose shape is off by 2 % makes it wrong by as much; sigma says only "
@@ -121,7 +191,7 @@ def show_measured(
         ["scale", f"{scale:.6g} m per unit of the mesh"],
         ["1 sigma", f"{100 * sigma / scale:.3f} %, of the measurement alone"],
         ["95 % interval", f"{low:.6g} to {high:.6g} m per unit"],
-        ["size along x, y, z", ", ".join(f"{v:.2f}" for v in size_mm) + " mm"],
+        *size_rows(*sizes_mm),
     ]
     rows += [[e.measurement.text, f"{e.scale:.6g} m per unit"] for e in each]
     console.table(f"Scale of {name}", ["figure", "value"], rows)

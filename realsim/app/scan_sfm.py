@@ -57,7 +57,7 @@ def run_scan_sfm(request: SfmRequest, console: Console) -> bool:
         if request.text:
             _write_text_model(out)
         show_sfm(result, console)
-        dense_good = mesh_from_depth(request.dense, inputs, result, out, console)
+        dense_good = mesh_from_depth(request, inputs, result, out, console)
     console.say(f"cameras   {out / 'cameras.json'}")
     console.say(f"points    {out / 'sparse.ply'}")
     console.say(f"model     {out / 'model'} (COLMAP)")

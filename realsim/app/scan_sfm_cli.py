@@ -21,6 +21,7 @@ FOLDER = click.Path(path_type=Path)
 @click.option("--camera", type=FOLDER, default=None, help="File with known intrinsics.")
 @click.option("--masks", type=FOLDER, default=None, help="Folder of masks, white = use.")
 @click.option("--dense/--no-dense", default=None, help="Fuse depth into a mesh.  [if there is any]")
+@click.option("--at", default="", help="The object whose mesh is wanted: x,y in world [m].")
 @click.option("--text", is_flag=True, help="The COLMAP model as text, too.")
 @click.option("--seed", default=0, show_default=True, help="Of every random choice.")
 @click.option("--quiet", is_flag=True, help="No progress bars.")
@@ -37,7 +38,9 @@ def sfm(images: Path, quiet: bool, **options: Any) -> None:
     Exit codes: 0 accepted, 1 done but doubtful or rejected, 2 something given cannot be used.
     """  # noqa: D301 - click's own mark for lines that stay as they are
     from realsim.app.console import Console
+    from realsim.app.option_values import point_of
     from realsim.app.scan_sfm import SfmRequest, run_scan_sfm
 
-    if not run_scan_sfm(SfmRequest(images=images, **options), Console(quiet=quiet)):
+    at = point_of(options.pop("at"))
+    if not run_scan_sfm(SfmRequest(images=images, at=at, **options), Console(quiet=quiet)):
         sys.exit(1)

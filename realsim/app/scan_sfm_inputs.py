@@ -31,6 +31,8 @@ class SfmRequest:
     """Folder of masks, one for each photograph."""
     dense: bool | None = None
     """Whether depth is fused; None: if there is any."""
+    at: tuple[float, float] | None = None
+    """(x, y) in world [m] near the object whose mesh is wanted; None: there is only one."""
     text: bool = False
     """Whether the COLMAP model is written as text, too."""
     seed: int = 0

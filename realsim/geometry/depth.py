@@ -3,13 +3,17 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from realsim.errors import InputError
+from realsim.errors import InputError, UnitError
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
 
 Array = NDArray[np.float64]
 SECOND_DIFFERENCE_STEP_PX = 8
 """Stereo noise is correlated over a few pixels: at 4 px differences still missed three tenths."""
+FARTHEST_M = 20.0
+"""Half of a depth image beyond this is in another unit: no hand camera sees so far."""
+UNIT_STRIDE = 16
+"""Every so many rows and columns tell the unit."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution whose median absolute deviation is 1."""
 
@@ -18,7 +22,8 @@ def check_depth(depth_m: NDArray[np.float32], intrinsics: CameraIntrinsics) -> N
     """Check that a depth image belongs to the camera and is in metres.
 
     Raises:
-        InputError: its size is not the camera's, or its values cannot be metres.
+        InputError: its size or type is not what is expected.
+        UnitError: its values cannot be metres.
     """
     wanted = (intrinsics.height, intrinsics.width)
     if depth_m.shape != wanted:
@@ -29,6 +34,15 @@ def check_depth(depth_m: NDArray[np.float32], intrinsics: CameraIntrinsics) -> N
         raise InputError(
             f"the depth image has type {depth_m.dtype}; float32 metres are expected. "
             "Multiply the raw counts by the depth unit."
+        )
+    some = depth_m[::UNIT_STRIDE, ::UNIT_STRIDE]
+    some = some[np.isfinite(some) & (some > 0)]
+    if len(some) and float(np.median(some)) > FARTHEST_M:
+        middle = float(np.median(some))
+        raise UnitError(
+            f"half of the depth image lies beyond {middle:.4g} m; at most {FARTHEST_M:g} m is "
+            f"accepted. In millimetres it would be {middle / 1e3:.4g} m: multiply it by the depth "
+            "unit."
         )
 
 

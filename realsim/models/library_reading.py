@@ -4,7 +4,7 @@ A models folder of any BOP dataset reads as a library, too: its models have no p
 their notes say so.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -36,6 +36,20 @@ class LibraryEntry:
     properties: ModelProperties | None
     problem: str = ""
     """Why there are no properties."""
+
+
+def unscaled_sources(entries: Sequence[LibraryEntry]) -> set[str]:
+    """Return the names of the models whose mesh without scale is kept in unscaled/.
+
+    A model that has its scale from its file has no such source, whatever its name.
+    """
+    waiting = {e.name for e in entries if e.obj_id is None}
+    scaled = {
+        e.name
+        for e in entries
+        if e.obj_id is not None and e.properties is not None and e.properties.scale is not None
+    }
+    return waiting & scaled
 
 
 class LibraryReader:

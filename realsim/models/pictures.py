@@ -129,9 +129,10 @@ def _title(figure: Any, properties: ModelProperties, name: str, obj_id: int | No
     at = 1 - 0.5 * TITLE_IN / height
     label = name if obj_id is None else f"{name}  ({obj_id})"
     figure.text(0.009, at, label, fontsize=16, weight="bold", color=INK, va="center")
-    color = VERDICT_COLORS.get(properties.verdict, MUTED)
+    is_plain = properties.matter is None and properties.verdict == "accepted"
+    color = MUTED if is_plain else VERDICT_COLORS.get(properties.verdict, MUTED)
     figure.text(
-        0.991, at, properties.verdict, fontsize=12, weight="bold", color=color, va="center",
+        0.991, at, verdict_text(properties), fontsize=12, weight="bold", color=color, va="center",
         ha="right",
     )  # fmt: skip
 
@@ -219,6 +220,14 @@ def _mass_from(properties: ModelProperties) -> str:
     if m.mass_from == "weighed":
         return f"weighed: {m.density:.4g} kg/m³"
     return f"at {m.density:.4g} kg/m³, not weighed"
+
+
+def verdict_text(properties: ModelProperties) -> str:
+    """Return the verdict in words: a mesh of no size is not accepted, however sound it is."""
+    if properties.matter is not None:
+        return properties.verdict
+    mesh = "" if properties.verdict == "accepted" else f", {properties.verdict} mesh"
+    return f"no scale yet{mesh}"
 
 
 def symmetry_text(properties: ModelProperties) -> str:

@@ -208,7 +208,7 @@ def _chosen(
     elif len(things) > 1:
         raise InputError(
             f"{len(things)} things stand on the table: {'; '.join(names)}. Scan one at a time, or "
-            "say which by a point (x, y) in world [m] (at_m)."
+            "say which by a point x,y in world [m] (--at, at_m)."
         )
     else:
         best = 0
@@ -218,7 +218,7 @@ def _chosen(
         raise InputError(
             f"what stands on the plane is {names[best]}: more than "
             f"{1e3 * config.greatest_size_m:.0f} mm. That is no object on a table but a wall, a "
-            "shelf or a bin around it; give the plane and the place of the object (at_m), or "
+            "shelf or a bin around it; give the plane and the place of the object (--at, at_m), or "
             "scan it on a free table."
         )
     rest = [n for i, n in enumerate(names) if i != best]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from realsim.records import SupportPlane
 from realsim.registration.plane import table_depth
 from realsim.rendering.rays import rotated
-from realsim.scanning.scale.evidence import ScanEvidence, ScanView
+from realsim.scanning.scale.evidence import LEAST_HEIGHT_M, ScanEvidence, ScanView
 from realsim.scanning.scale.shape import ScanShape
 from realsim.scanning.scale.state import State
 
@@ -108,6 +108,10 @@ def _one_view(
     plane = SupportPlane(T_world_table=state.T_world_table)
     table = np.minimum(table_depth(plane, T, rays.astype(np.float64)), 1e3)
     model = hit < table
+    # So near to the table measured points are not told from it: an open vessel's floor.
+    origin = state.T_world_table[:3, 3]
+    up = state.T_world_table[:3, 2]
+    height = (T[:3, 3] - origin) @ up + np.where(model, hit, 0.0) * (directions @ up)
     z = np.minimum(hit, table)
     known = depth > 0
     m = depth * (1.0 + state.bias * depth)
@@ -115,6 +119,7 @@ def _one_view(
     new = np.maximum(-1.0, 1.0 - 2.0 * np.square((m - z) / tau))
     old = np.maximum(-1.0, 1.0 - 2.0 * np.square((m - table) / tau))
     agrees = np.abs(m - z) < tau
+    tall = model & (height > LEAST_HEIGHT_M + 3.0 * evidence.noise.sigma(np.where(known, m, 0.0)))
     area = seen.ray_area_px * every
     best = known & on_object
     return tuple(
@@ -127,6 +132,6 @@ def _one_view(
             np.count_nonzero(best & agrees & model),
             np.count_nonzero(best),
             np.count_nonzero(best & model),
-            np.count_nonzero(known & (model | on_object)),
+            np.count_nonzero(known & (tall | on_object)),
         )
     )

@@ -103,6 +103,8 @@ class SearchConfig:
 
     near_first: int = 3
     """Of a given start: it and two other scales, before its turns are tried."""
+    half_turns: int = 3
+    """Half turns about the box axes, the last of the starts near a given one."""
     enough_gain: float = 0.75
     """A given start that explains this much is not turned about."""
     least_gain: float = 0.5
@@ -124,8 +126,11 @@ class SearchConfig:
     size_factor: float = 1.5
     """Starts are of the size that was said if they differ by less than this factor: people guess
     to a quarter, and the longest side of a turned box is up to 1.2 times that of a straight one."""
-    mirror_gain: float = 0.1
+    mirror_gain: float = 0.05
     """The mirror image must explain so much more for the mesh to be called mirrored."""
+    sure_gain: float = 0.93
+    """A mesh that explains this much is not asked whether it is mirrored: exact ones explain 0.96
+    and more."""
     rivals: int = 1
     """Other solutions of another scale that are fitted to the end."""
 

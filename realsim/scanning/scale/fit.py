@@ -25,7 +25,7 @@ from realsim.scanning.scale.joint import Outlook, joint_fit
 from realsim.scanning.scale.limits import limits_of, sigma_log
 from realsim.scanning.scale.residuals import residual_per_vertex
 from realsim.scanning.scale.result import ScaleFit, Similarity, ViewAgreement
-from realsim.scanning.scale.search import Hypothesis, hypotheses, to_given
+from realsim.scanning.scale.search import Hypothesis, hypotheses, mirror_gain, to_given
 from realsim.scanning.scale.shape import ScanShape, make_shape
 from realsim.scanning.scale.state import State, priors_of
 from realsim.scanning.scale.table import find_object, find_table
@@ -92,8 +92,7 @@ def fit_scale(  # noqa: PLR0913 - keywords, each with a meaning of its own
             rivals.append((other[0].s * shape.unit, theirs.gain))
     sigma = sigma_log(look, config)
     judged = judge(shape, seen, (state, look, explained), rivals, (sigma, config))
-    if judged.verdict != "accepted":
-        judged = _if_mirrored(mesh, seen, judged, config)
+    judged = _if_mirrored(shape, seen, (state, found[0].gain), judged, config)
     ticks.step()
     best = to_given(shape, state, explained.gain, source)
     return ScaleFit(
@@ -203,21 +202,35 @@ def _others(
     return out
 
 
-def _if_mirrored(mesh: Mesh, evidence: ScanEvidence, judged: Judged, config: ScaleConfig) -> Judged:
-    """Return the verdict with the reason that the mesh is mirrored, if its mirror image fits."""
-    mirrored = Mesh(vertices=mesh.vertices * [-1.0, 1.0, 1.0], faces=mesh.faces[:, ::-1])
-    other = hypotheses(make_shape(mirrored, config), evidence, None, config)
-    gain = other[0].gain if other else 0.0
-    checks = judged.checks | {"mirrored_gain": gain}
-    least = max(config.verdict.least_gain, judged.checks["gain"] + config.search.mirror_gain)
-    if gain < least:
+def _if_mirrored(
+    shape: ScanShape,
+    evidence: ScanEvidence,
+    fit: tuple[State, float],
+    judged: Judged,
+    config: ScaleConfig,
+) -> Judged:
+    """Return the verdict with the reason that the mesh is mirrored, if its mirror image fits.
+
+    Args:
+        shape: the mesh.
+        evidence: what was measured.
+        fit: the state, and how much the mesh explained after the coarse fit, as its mirror image's.
+        judged: the verdict so far.
+        config: see there.
+    """
+    (state, gain), c = fit, config.search
+    if gain > c.sure_gain:
+        return judged
+    other = mirror_gain(shape, evidence, state, config)
+    checks = judged.checks | {"mirrored_gain": other}
+    if other < max(config.verdict.reject_gain, gain + c.mirror_gain):
         return replace(judged, checks=checks)
     reason = (
-        f"its mirror image explains {100 * gain:.0f} % of the object, the mesh itself "
-        f"{100 * judged.checks['gain']:.0f} %: the mesh is mirrored. Mirror it back (negate one "
-        "coordinate and turn the faces over) and fit again."
+        f"its mirror image explains {100 * other:.0f} % of the object, the mesh itself "
+        f"{100 * gain:.0f} %: the mesh is mirrored. Mirror it back (negate one coordinate and turn "
+        "the faces over) and fit again."
     )
-    verdict: Verdict = "rejected"
+    verdict: Verdict = "doubtful" if judged.verdict == "accepted" else judged.verdict
     return replace(judged, verdict=verdict, reasons=(reason, *judged.reasons), checks=checks)
 
 

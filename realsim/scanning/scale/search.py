@@ -11,7 +11,7 @@ from realsim.scanning.scale.coarse import coarse_fit
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.evidence import ScanEvidence
 from realsim.scanning.scale.result import Similarity
-from realsim.scanning.scale.shape import INNER_EXTENT, ScanShape
+from realsim.scanning.scale.shape import INNER_EXTENT, ScanShape, mirrored
 from realsim.scanning.scale.starts import StartsConfig, find_starts, starts_near
 from realsim.scanning.scale.state import State, first_state
 
@@ -63,12 +63,12 @@ def hypotheses(
     if start is not None:
         inner = from_given(shape, start)
         near = starts_near(inner, shape.mesh, StartsConfig(), rng)
-        few = config.search.near_first
-        found = _fitted(shape, evidence, near[:few], config)
+        few, half = config.search.near_first, config.search.half_turns
+        # Half turns always: a mug with its handle on the wrong side explains much.
+        found = _fitted(shape, evidence, [*near[:few], *near[-half:]], config)
         if not found or found[0].gain < config.search.enough_gain:
-            found = _distinct(
-                [*found, *_fitted(shape, evidence, near[few:], config)], shape, config
-            )
+            more = _fitted(shape, evidence, near[few:-half], config)
+            found = _distinct([*found, *more], shape, config)
     if not found or found[0].gain < config.search.least_gain:
         anew = find_starts(shape.mesh, evidence.cloud, evidence.plane, StartsConfig(), rng)
         if size_m is not None:
@@ -80,6 +80,29 @@ def hypotheses(
             anew += [s for a in anew for s in starts_near(a, shape.mesh, StartsConfig(), rng)[1:3]]
         found = _distinct([*found, *_fitted(shape, evidence, anew, config)], shape, config)
     return found
+
+
+def mirror_gain(
+    shape: ScanShape, evidence: ScanEvidence, state: State, config: ScaleConfig
+) -> float:
+    """Return how much the mirror image of the mesh explains, placed as the mesh is.
+
+    A mirror image placed at a pose is the mesh reflected in a plane there: m -> (I - 2 a a^T) m =
+    (I - 2 a a^T) D (D m), D the mirror; the three planes of the mesh's box are tried.
+    """
+    other = mirrored(shape)
+    D = np.diag([-1.0, 1.0, 1.0])
+    c = config.search
+    best = -np.inf
+    for axis in np.eye(3):
+        R = state.R @ (np.eye(3) - 2.0 * np.outer(axis, axis)) @ D
+        start = first_state(evidence, state.s, R, state.t)
+        placed = coarse_fit(other, evidence, start)
+        seen = explain(other, evidence, placed, views=c.rough_views, every=c.rough_every)
+        if seen.gain > best - 0.05:
+            seen = explain(other, evidence, placed, every=2)
+            best = max(best, seen.gain)
+    return float(best)
 
 
 def _fitted(

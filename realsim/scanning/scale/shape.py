@@ -109,7 +109,32 @@ def _welded(mesh: Mesh, center: Array, unit: float) -> Mesh:
     from realsim.geometry.mesh_shape import welded_mesh
 
     bare = welded_mesh(mesh)
-    return replace(bare, vertices=(bare.vertices - center) * unit)
+    # Faces that are there twice would leave their edges out of every outline.
+    _, first = np.unique(np.sort(bare.faces, axis=1), axis=0, return_index=True)
+    faces = bare.faces[np.sort(first)]
+    return Mesh(vertices=(bare.vertices - center) * unit, faces=faces)
+
+
+def mirrored(shape: ScanShape) -> ScanShape:
+    """Return the shape of the mirror image (x negated), about the same centre."""
+    flip = np.array([-1.0, 1.0, 1.0])
+    mesh = Mesh(vertices=shape.vertices * flip, faces=shape.mesh.faces[:, ::-1])
+    field = shape.field
+    end = field.origin[0] + field.cell * (field.grid.shape[0] - 1)
+    return replace(
+        shape,
+        mesh=mesh,
+        field=DistanceField(
+            grid=np.ascontiguousarray(field.grid[::-1]),
+            origin=np.array([-end, field.origin[1], field.origin[2]]),
+            cell=field.cell,
+        ),
+        ray_scene=raycasting_scene(mesh),
+        samples=shape.samples * flip,
+        normals=shape.normals * flip,
+        edge_normals=shape.edge_normals * flip,
+        hull=shape.hull * flip,
+    )
 
 
 def _lighter(mesh: Mesh, faces: int) -> Mesh:
@@ -120,7 +145,8 @@ def _lighter(mesh: Mesh, faces: int) -> Mesh:
 
     o3d = import_open3d()
     heavy = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh.vertices), o3d.utility.Vector3iVector(mesh.faces)
+        o3d.utility.Vector3dVector(np.array(mesh.vertices)),
+        o3d.utility.Vector3iVector(np.array(mesh.faces)),
     )
     light = heavy.simplify_quadric_decimation(faces)
     return Mesh(

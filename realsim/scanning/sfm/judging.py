@@ -127,8 +127,9 @@ def _scale(result: SfmResult, config: SfmConfig) -> Iterator[Finding]:
                 level,
                 (
                     f"{len(told)} of {len(views)} views disagree with their robot pose: "
-                    f"{shown(told)}. A slipped mount, images paired with the poses of other "
-                    "views, or a wrong hand-eye."
+                    f"{shown(told)}. Either the pictures hold too little to place them, or "
+                    "the mount slipped, the images are paired with other views' poses, or the "
+                    "hand-eye is wrong."
                 ),
             )
         else:
