@@ -45,7 +45,7 @@ from scale_shapes import SHAPES
 from realsim.app.console import Console
 
 PACKAGES = ("numpy", "scipy", "numba", "open3d-cpu", "opencv-python-headless", "pycolmap")
-QUICK_NAMES = ("bunny", "cup", "disc", "banana")
+QUICK_NAMES = ("bunny", "disc")
 QUICK_WIDTH = 640
 """Images of a quick run [px]: a quarter of the pixels, twice the depth noise."""
 

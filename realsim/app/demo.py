@@ -167,6 +167,9 @@ def _capture_all(
         capture(plans[1], lab.arm, lab.camera, board, progress=tick)
     with console.stage("capture", f"{config.objects} objects, {config.views} views") as tick:
         lab.place_objects()
+        # As an operator would between two captures: from the last board view there may be no
+        # free straight way to the first view of the scene.
+        lab.arm.move(plans[0].home)
         capture(plans[0], lab.arm, lab.camera, store, progress=tick)
     save_models(store.folder / "models", lab.models)
     starts = lab.operator_starts(np.random.default_rng([config.seed, 2]))

@@ -1,4 +1,4 @@
-"""What is said on the command line as text: lists of numbers, points, and whether a port is free."""
+"""What the command line says as text: lists of numbers, points, whether a port is free."""
 
 import errno
 import re

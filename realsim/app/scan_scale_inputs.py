@@ -84,6 +84,8 @@ class NamedMesh:
     """Its own name in the library; empty for a file."""
     library: Path | None = None
     """The library that it was read from; None for a file."""
+    scaled_id: int | None = None
+    """Id of the model of this name that the library has at metric scale."""
     source: "ScanSource | None" = None
     """What the library keeps of the file."""
     notes: tuple[str, ...] = ()
@@ -176,7 +178,7 @@ def _from_library(wanted: str, request: ScaleRequest) -> NamedMesh:
             f"{folder} has '{wanted}' without scale and at metric scale; the one without is "
             f"scaled. `realsim scan scale {scaled_ids[wanted]} SESSION` checks the other."
         )
-        return replace(named, notes=(*named.notes, note))
+        return replace(named, notes=(*named.notes, note), scaled_id=scaled_ids[wanted])
     for name, obj_id in scaled_ids.items():
         if wanted in (name, str(obj_id)):
             mesh = library.load(wanted).model.mesh

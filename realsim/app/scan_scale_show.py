@@ -151,12 +151,18 @@ def model_lines(
     if verdict != "accepted":
         option += " --accept-doubtful"
     text = f"library   none: {option}, added to this command, puts the model there"
+    if named.scaled_id is not None and named.entry == named.name:
+        text = (
+            f"library   {named.library}: {named.name} ({named.scaled_id}) was not changed; "
+            f"{option} --overwrite, added to this command, replaces it"
+        )
     if verdict != "accepted":
         text += f" although its scale is {verdict}"
     if model is None:
         return [f"{text}; --out FOLDER writes it as a file. So far nothing was written."]
-    lines.append(f"{text}; nothing is computed twice.")
-    if verdict == "accepted":
+    # With --overwrite the scale, too, is fitted again.
+    lines.append(f"{text}; nothing is computed twice." if named.scaled_id is None else f"{text}.")
+    if verdict == "accepted" and named.scaled_id is None:
         lines.append(
             f"          `realsim scan import {model} --unit mm --name {named.name} --library "
             f"{named.library or LIBRARY}` does, too, without the scale's sigma."

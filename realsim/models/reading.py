@@ -2,9 +2,8 @@
 
 What a file can and cannot tell:
 
-- Unit. USD states it. glTF prescribes metres, but generators write a unit cube all the same; a
-  glTF file is taken at its word only where it is the size of something a gripper grasps
-  (`GLTF_METRES`), which no normalised mesh is. All other formats hold bare numbers.
+- Unit. USD states it. glTF prescribes metres, but generators write meshes of any size in it, so
+  that it states nothing. All other formats hold bare numbers.
 - Up axis. glTF prescribes y, USD states it. All other formats hold bare axes, which are kept.
 - Handedness. A node that is mirrored by its transform shows in the transform; its faces are turned
   so that the outside stays outside, and a note says so. USD also states a left-handed winding,
@@ -35,12 +34,8 @@ Array = NDArray[np.float64]
 SCAN_FORMATS = (*TRIMESH_FORMATS, *USD_FORMATS)
 METRES: dict[ScanUnit, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 """Length of each unit [m]."""
-SMALLEST_M, LARGEST_M = 0.0005, 3.0
+SMALLEST_M, LARGEST_M = 0.004, 3.0
 """Largest extents outside of this are no object on a table: the unit is wrong [m]."""
-GLTF_METRES = (0.01, 0.3)
-"""A glTF file whose largest extent lies between is taken to be in metres, as the format
-prescribes [m]. Normalised meshes have extents of about 1 or 2; numbers of 0.01 .. 0.3 in any other
-unit would make an object of less than 8 mm."""
 ROTATIONS: dict[UpAxis, tuple[tuple[int, int, int], ...]] = {
     "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
@@ -189,16 +184,11 @@ def _scale(
         )
     chosen = unit or stated
     if chosen is None and content.format_unit is not None:
-        low, high = GLTF_METRES
-        if not low <= extent * METRES[content.format_unit] <= high:
-            raise InputError(
-                f"{path}: {content.declared['format']} prescribes metres, but generators write "
-                f"meshes without scale in it; {_readings(extent)}. Without --unit, "
-                f"{_length(low)} to {_length(high)} is accepted. Give --unit "
-                f"{' or '.join(METRES)}; a generated mesh has no scale: --unit none."
-            )
-        chosen = content.format_unit
-        notes.append(f"unit {chosen}, as the format prescribes; the size agrees with it.")
+        raise InputError(
+            f"{path}: {content.declared['format']} prescribes metres, but generators write meshes "
+            f"without scale in it; {_readings(extent)}. Give --unit {' or '.join(METRES)}; a "
+            "generated mesh has no scale: --unit none."
+        )
     if chosen is None:
         raise InputError(
             f"{path} does not state its unit; {_readings(extent)}. Give --unit "

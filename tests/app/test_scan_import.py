@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +15,8 @@ from realsim.formats.bop_models import load_models, save_models
 from realsim.geometry.mesh import save_ply
 from realsim.geometry.parts import part
 from realsim.models.library import ModelLibrary
+from realsim.models.library_prepare import PrepareConfig
+from realsim.models.library_records import ScaleNote
 
 
 @pytest.fixture(scope="module")
@@ -93,8 +97,38 @@ def test_a_mesh_without_scale_waits_for_one(run, meshes: Path, tmp_path: Path):
     assert sorted(p.name for p in (library / "unscaled/wedge").iterdir()) == [
         "mesh.ply", "picture.png", "report.json",
     ]  # fmt: skip
-    assert "unscaled" in run("scan", "list", library)[1]
+    listed = run("scan", "list", library)[1]
+    assert "0 models and 1 unscaled mesh in" in listed and "no scale yet" in listed
+    assert "accepted" not in listed and "accepted" not in out
+    assert f"kept as 'wedge', in {library / 'unscaled/wedge'}" in out
     assert run("scan", "show", library, "wedge")[0] == 0
+
+
+def test_a_scaled_model_is_one_row_with_the_mark_of_its_source(run, meshes: Path, tmp_path: Path):
+    library = tmp_path / "m"
+    scan_import(run, meshes, library, "wedge.ply", "--unit", "none")
+    note = ScaleNote(scale=1e-3, sigma_percent=0.3, verdict="doubtful", reasons=("two scales.",))
+    ModelLibrary.open(library).promote("wedge", note, PrepareConfig(with_parts=False))
+    scan_import(run, meshes, library, "box.ply", "--unit", "mm")
+    scan_import(run, meshes, library, "box.ply", "--unit", "none")
+    listed = run("scan", "list", library)[1]
+    # The box has its scale from its file: the box without one is another mesh.
+    assert "2 models and 1 unscaled mesh in" in listed and "wedge (*)" in listed
+    assert "(*) 1 kept without scale" in listed and "box (*)" not in listed
+    assert f"wedge is doubtful: `realsim scan show {library} wedge` says why" in listed
+    assert "two scales" in run("scan", "show", library, "wedge")[1]
+    assert "2 models and 2 unscaled meshes in" in run("scan", "check", library)[1]
+
+
+def test_help_loads_nothing_heavy():
+    code = (
+        "import sys; sys.argv = ['realsim', 'scan', '--help']\n"
+        "from realsim.app.cli import main\n"
+        "try: main()\n"
+        "finally: print(sorted({'numpy', 'scipy', 'trimesh', 'rich'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "scale" in done.stdout and done.stdout.splitlines()[-1] == "[]"
 
 
 @pytest.mark.parametrize(
@@ -156,7 +190,17 @@ def test_a_bop_folder_is_completed(run, tmp_path: Path):
     assert code == 2 and "Did you mean" in err
     words = ("wedge", "--mass", 0.1, "--quiet")
     code, out, _ = run("scan", "complete", tmp_path / "bop/models", *words)
-    assert code == 0 and "wedge" in out
+    assert code == 0 and "up to 60 s of CPU time" in out
+    assert "1/1 wedge: symmetries" in out and "1 of 1 completed" in out
     code, out, _ = run("scan", "show", tmp_path / "bop/models", "wedge")
     assert code == 0 and "100 (weighed)" in out
     shutil.rmtree(tmp_path / "bop")
+
+
+def test_what_is_doubtful_of_a_completed_model_is_said(run, tmp_path: Path):
+    wedge = part("wedge")
+    open_one = replace(wedge, mesh=replace(wedge.mesh, faces=wedge.mesh.faces[:-2]))
+    save_models(tmp_path / "models", {open_one.obj_id: open_one})
+    code, out, _ = run("scan", "complete", tmp_path / "models", "--quiet")
+    assert code == 1 and "LOOK: wedge is doubtful: open" in out
+    assert "nothing to complete" in run("scan", "complete", tmp_path / "models", "--quiet")[1]

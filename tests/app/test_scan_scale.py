@@ -11,15 +11,10 @@ import numpy as np
 import pytest
 
 from realsim.app.console import Console
-from realsim.app.scan_scale import (
-    Place,
-    model_files,
-    run_scale,
-    view_poses,
-    with_rough_size,
-    write_result,
-)
+from realsim.app.scan_scale import run_scale, view_poses, with_rough_size
+from realsim.app.scan_scale_box import box_mm_of, smallest_box
 from realsim.app.scan_scale_cli import point_of, request_of, scale
+from realsim.app.scan_scale_files import Place, model_files, write_result
 from realsim.app.scan_scale_inputs import (
     NamedMesh,
     ScaleRequest,
@@ -29,12 +24,18 @@ from realsim.app.scan_scale_inputs import (
     read_mesh,
     usable_views,
 )
-from realsim.app.scan_scale_show import limit_rows, show_fit, view_rows
+from realsim.app.scan_scale_show import limit_rows, limits_title, model_lines, show_fit, view_rows
 from realsim.errors import InputError, UnitError
+from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh, save_ply
+from realsim.geometry.parts import object_model
+from realsim.models.library import ModelLibrary
+from realsim.models.library_prepare import PrepareConfig, prepare_unscaled
+from realsim.models.library_records import ScaleNote
 from realsim.records import CaptureSession, View
 from realsim.scanning.scale.files import ScaleRecord, installed_versions, load_record
 from realsim.scanning.scale.measured import length_of, parse_measurement
+from realsim.scanning.scale.result import Limit
 from realsim.store import SessionStore
 from scale_fits import UNIT_M, fit_of, known_scan
 
@@ -123,7 +124,6 @@ def test_what_is_no_session_is_named(known, tmp_path):
 
 
 def test_a_damaged_depth_image_is_named(known, session, tmp_path):
-    pytest.importorskip("realsim.models.reading")
     save_ply(tmp_path / "mug.ply", known.scan, "m")
     path = session.path("depth/000002.png")
     path.write_bytes(path.read_bytes()[:-20])
@@ -164,6 +164,83 @@ def test_options_of_a_session_need_one(tmp_path):
     m = (parse_measurement("longest=120mm"),)
     with pytest.raises(InputError, match="--at speaks of a session"):
         run_scale(ScaleRequest(mesh="mug.ply", measured=m, at=(0.4, 0.0)), CONSOLE)
+
+
+# --- a mesh of the library --------------------------------------------------------------------
+
+
+@pytest.fixture
+def library(tmp_path):
+    """A library with a box that waits for its scale."""
+    box = object_model("box").mesh
+    made = prepare_unscaled(replace(box, vertices=box.vertices / UNIT_M), PrepareConfig())
+    library = ModelLibrary.create(tmp_path / "models")
+    library.add_unscaled(made, "box")
+    return library
+
+
+@pytest.mark.parametrize("typed_path", ["unscaled/box", "unscaled/box/", "unscaled/box/mesh.ply"])
+def test_the_folder_that_an_import_names_is_a_mesh(library, typed_path):
+    by_name = read_mesh(ScaleRequest(mesh="box", library=library.folder))
+    named = read_mesh(ScaleRequest(mesh=f"{library.folder}/{typed_path}"))
+    assert (named.name, named.origin, named.library) == ("box", "unscaled", library.folder)
+    assert (named.where, named.sha256) == (by_name.where, by_name.sha256)
+    with pytest.raises(InputError, match=r"is a folder.*LIBRARY/unscaled/NAME"):
+        read_mesh(ScaleRequest(mesh=str(library.folder / "unscaled")))
+
+
+def test_a_name_in_both_is_the_mesh_without_scale_and_the_id_is_the_model(library):
+    note = ScaleNote(scale=UNIT_M, sigma_percent=0.3, verdict="accepted")
+    obj_id = library.promote("box", note, PrepareConfig(with_parts=False)).model.obj_id
+    request = ScaleRequest(mesh="box", library=library.folder)
+    named = read_mesh(request)
+    assert named.origin == "unscaled" and named.scaled_id == obj_id
+    assert f"scan scale {obj_id} SESSION" in named.notes[-1]
+    said = model_lines(named, Path("model.ply"), "accepted", is_stored=False)[1]
+    assert f"box ({obj_id}) was not changed" in said and "--overwrite" in said
+    assert read_mesh(replace(request, mesh="unscaled/box")).notes == ()
+    model = read_mesh(replace(request, mesh=str(obj_id)))
+    assert (model.origin, model.name) == ("model", "box")
+    np.testing.assert_allclose(model.mesh.extent, UNIT_M * named.mesh.extent, rtol=1e-5)
+
+
+def test_a_mesh_of_one_library_goes_into_another(library, tmp_path):
+    sides = np.sort(object_model("box").mesh.extent)[::-1]
+    request = ScaleRequest(
+        mesh=str(library.folder / "unscaled/box"), library=tmp_path / "other",
+        measured=(parse_measurement(f"longest={1e3 * sides[0]}mm"),), accept_doubtful=True,
+    )  # fmt: skip
+    assert not run_scale(request, CONSOLE)
+    model = ModelLibrary.open(tmp_path / "other").load("box").model
+    np.testing.assert_allclose(smallest_box(model.mesh), sides, rtol=1e-4)
+    assert [e.obj_id for e in library.entries()] == [None]
+
+
+# --- the smallest box -------------------------------------------------------------------------
+
+
+def test_the_smallest_box_does_not_depend_on_the_axes():
+    rng = np.random.default_rng(3)
+    real = object_model("box").mesh
+    sides = np.sort(real.extent)[::-1]
+    for _ in range(5):
+        T = se3.from_rt(se3.random_rotation(rng), rng.normal(size=3))
+        turned = replace(real, vertices=se3.transform(T, real.vertices) / UNIT_M)
+        np.testing.assert_allclose(UNIT_M * smallest_box(turned), sides, rtol=1e-4)
+        np.testing.assert_allclose(box_mm_of(turned, UNIT_M), 1e3 * sides, rtol=1e-4)
+
+
+def test_the_smallest_box_is_what_longest_measures(known):
+    longest = length_of(known.scan, parse_measurement("longest=1m"))
+    assert smallest_box(known.scan)[0] == pytest.approx(longest, rel=1e-12)
+
+
+def test_a_flat_mesh_has_a_box_without_height():
+    real = object_model("box").mesh
+    flat = replace(real, vertices=real.vertices * [1, 1, 0])
+    T = se3.from_rt(se3.random_rotation(np.random.default_rng(1)), np.ones(3))
+    box = smallest_box(replace(flat, vertices=se3.transform(T, flat.vertices)))
+    assert box[2] < 1e-9 < box[1] <= box[0]
 
 
 # --- what is asked for ------------------------------------------------------------------------
@@ -313,17 +390,23 @@ def test_a_place_outside_of_the_session_is_written_too(known, fit, session, tmp_
 
 def test_the_verdict_comes_first_and_reasons_follow(fit, capsys):
     doubtful = replace(fit, verdict="doubtful", reasons=("the shape allows two scales.",))
-    show_fit("mug", doubtful, (), Console(quiet=True))
+    show_fit("mug", doubtful, (), np.array([120.0, 95.0, 80.0]), Console(quiet=True))
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("DOUBTFUL: mug") and "two scales" in lines[1]
     text = "\n".join(lines)
-    for word in ("95 % interval", "size along x, y, z", "CPU", "LEFT OUT", "median"):
+    for word in ("95 % interval", "120.0 x 95.0 x 80.0 mm", "CPU", "LEFT OUT", "median"):
         assert word in text
+    assert text.index("smallest box") < text.index("the mesh's own x, y, z")
 
 
 def test_limits_and_views_are_worst_first(fit):
     percents = [float(row[1].split()[0]) for row in limit_rows(fit)]
     assert percents == sorted(percents, reverse=True)
+    assert limits_title(fit) == "What limits it, worst first"
+    offset = Limit(name="surface offset", percent=9.0, text="not in the sigma: gloss.")
+    more = replace(fit, limits=(offset, *fit.limits[::-1]))
+    assert [row[0] for row in limit_rows(more)] == ["hand-eye", "shape", "surface offset"]
+    assert limits_title(more).endswith("the last is not in the sigma")
     rows = view_rows(fit)
     assert rows[0][0] == "median" and rows[1][1] == "LEFT OUT"
     agree = [float(r[2]) for r in rows[2:]]
@@ -346,7 +429,6 @@ def test_a_rough_size_that_contradicts_makes_it_doubtful(known, fit):
 
 @pytest.fixture
 def mesh_file(known, tmp_path):
-    pytest.importorskip("realsim.models.reading")
     path = tmp_path / "mug.ply"
     save_ply(path, known.scan, "m")
     return path
@@ -361,10 +443,13 @@ def test_the_scale_by_a_caliper_alone_is_unchecked(known, mesh_file, tmp_path, c
             standalone_mode=False,
         )  # fmt: skip
     assert stop.value.code == 1
-    assert capsys.readouterr().out.startswith("UNCHECKED: mug")
+    said = capsys.readouterr().out
+    assert said.startswith("UNCHECKED: mug") and "model.ply in mm" in said
+    assert "--library models --accept-doubtful" in said
     data = json.loads((tmp_path / "s.json").read_text())
     assert data["verdict"] == "unchecked" and data["scale"] == pytest.approx(UNIT_M, rel=1e-4)
     assert data == json.loads((tmp_path / "out/scale.json").read_text())
+    assert data["smallest_box_mm"][0] == pytest.approx(1e3 * longest, rel=1e-4)
     mesh = load_mesh(tmp_path / "out/model.ply", "mm")
     np.testing.assert_allclose(mesh.extent.max(), UNIT_M * known.scan.extent.max(), rtol=1e-3)
 
@@ -379,12 +464,19 @@ def test_a_second_run_finds_the_first(known, fit, session, mesh_file, capsys):
     write_result(Place(session, session.folder / "scans/mug"), record, named, session)
     before = (session.folder / "scans/mug/scale.json").stat().st_mtime_ns
     assert run_scale(request, CONSOLE)
-    assert "nothing has changed" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "nothing has changed" in said
     assert (session.folder / "scans/mug/scale.json").stat().st_mtime_ns == before
+    # Nothing went into a library, and no caliper was asked: both are said, the caliper last.
+    assert f"model     {session.folder / 'scans/mug/model.ply'} in mm" in said
+    assert "library   none: --library models" in said and "--unit mm --name mug" in said
+    assert "--measured longest=...mm" in said.splitlines()[-1]
+    stored = json.loads((session.folder / "scans/mug/scale.json").read_text())["fit"]
+    np.testing.assert_allclose(stored["smallest_box_mm"], box_mm_of(named.mesh, fit.scale))
+    assert list(stored).index("smallest_box_mm") == list(stored).index("extent_mm") + 1
 
 
 def test_the_real_fit_from_the_command_line(known, session, mesh_file, capsys):
-    pytest.importorskip("realsim.scanning.scale.fit")
     longest = UNIT_M * length_of(known.scan, parse_measurement("longest=1m"))
     request = ScaleRequest(
         mesh=str(mesh_file), session=session.folder,
@@ -402,7 +494,6 @@ def test_the_real_fit_from_the_command_line(known, session, mesh_file, capsys):
 
 @pytest.mark.slow
 def test_an_accepted_scale_goes_into_the_library(known, fit, session, mesh_file, tmp_path, capsys):
-    library = pytest.importorskip("realsim.models.library")
     request = ScaleRequest(mesh=str(mesh_file), session=session.folder, library=tmp_path / "models")
     named = read_mesh(request)
     inputs = inputs_of(request, named, session, usable_views(session, ()), fit_config(session))
@@ -412,7 +503,7 @@ def test_an_accepted_scale_goes_into_the_library(known, fit, session, mesh_file,
     assert not run_scale(request, CONSOLE)
     assert not (tmp_path / "models").exists()
     assert not run_scale(replace(request, accept_doubtful=True), CONSOLE)
-    kept = library.ModelLibrary.open(tmp_path / "models").load("mug")
+    kept = ModelLibrary.open(tmp_path / "models").load("mug")
     assert kept.scale is not None and kept.scale.verdict == "doubtful"
     assert kept.scale.scale == fit.scale and kept.scale.session == "mugs"
     np.testing.assert_allclose(np.sort(kept.model.mesh.extent), np.sort(UNIT_M * known.scan.extent),

@@ -10,7 +10,11 @@ from realsim.scanning.scale.agreement import explain, tolerance
 from realsim.scanning.scale.state import State
 from scanned_objects import evidence_of, scanned, shape_of, true_state
 
-NAMES = ["bunny", "mug", "scalene"]
+NAMES = [
+    "mug",
+    pytest.param("bunny", marks=pytest.mark.slow),
+    pytest.param("scalene", marks=pytest.mark.slow),
+]
 
 
 def truth(name: str, lab: str = "exact"):

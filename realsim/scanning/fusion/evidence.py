@@ -69,7 +69,7 @@ def _check_frame(frame: FusionFrame, intrinsics: CameraIntrinsics) -> None:
     try:
         check_depth(frame.depth_m, intrinsics)
     except InputError as error:
-        raise InputError(f"view {frame.index}: {error}") from error
+        raise type(error)(f"view {frame.index}: {error}") from error
     se3.check_rigid(frame.T_world_cam, f"T_world_cam of view {frame.index}")
     if frame.rgb is not None and frame.rgb.shape != (*frame.depth_m.shape, 3):
         raise InputError(

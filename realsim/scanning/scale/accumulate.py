@@ -33,6 +33,8 @@ DEEP_CELLS = 1.5
 """Cells inside of the surface at which the direction of the face is looked up."""
 EDGE_COS = 0.9
 """Cosine between the directions outside and inside below which a point lies beyond an edge."""
+WALL_COS = 0.2
+"""... unless it is below this."""
 LEAST_ALONG = 0.15
 """Least cosine between ray and normal at which the ray is followed to the surface."""
 GATE = 0.05
@@ -70,7 +72,9 @@ def _facing(
             z + t * v[2] - deep * gz,
         )  # fmt: skip
         size = ix * ix + iy * iy + iz * iz
-        if size > KINK and gx * ix + gy * iy + gz * iz < EDGE_COS * np.sqrt(size):
+        # The other side of a thin wall points the other way: that is no edge.
+        along = (gx * ix + gy * iy + gz * iz) / np.sqrt(max(size, 1e-12))
+        if size > KINK and WALL_COS < along < EDGE_COS:
             return r - t * facing, gx, gy, gz, False
     return r - t * facing, gx, gy, gz, facing > GATE
 

@@ -105,6 +105,8 @@ class SearchConfig:
     """Of a given start: it and two other scales, before its turns are tried."""
     half_turns: int = 3
     """Half turns about the box axes, the last of the starts near a given one."""
+    turn_gain: float = 0.02
+    """A half turn must explain so much more than the given start to be taken."""
     enough_gain: float = 0.75
     """A given start that explains this much is not turned about."""
     least_gain: float = 0.5
@@ -141,7 +143,7 @@ class VerdictConfig:
 
     reject_gain: float = 0.3
     """A mesh that explains less of the object than this is rejected."""
-    least_gain: float = 0.6
+    least_gain: float = 0.5
     """One that explains less than this is doubtful."""
     least_iou: float = 0.86
     """Least overlap of the model's outline with the measured one."""
@@ -157,6 +159,10 @@ class VerdictConfig:
     """A 1-sigma above this share of the scale is no metric scale."""
     worst_shape: float = 0.04
     """A mesh whose surface is off by more than this share of its size is another object."""
+    far_share: float = 0.06
+    """A measured point further than this share of the size from the mesh is not of it..."""
+    most_far: float = 0.01
+    """...and more than this share of such points make the result doubtful: a handle elsewhere."""
     view_sigmas: float = 4.0
     """A view whose camera must be moved by so many sigma is left out."""
     view_share: float = 0.7

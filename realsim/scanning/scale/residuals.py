@@ -27,12 +27,15 @@ def residual_per_vertex(mesh: Mesh, shape: ScanShape, look: Outlook) -> Array:
     from scipy.spatial import KDTree
 
     vertices = (mesh.vertices - shape.center) * shape.unit
-    used = look.kernels > 0
+    # Points far off are not fitted to, but they are there to be seen.
+    known = np.isfinite(look.residuals)
     out = np.full(len(vertices), np.nan)
-    if np.count_nonzero(used) < FEWEST:
+    if np.count_nonzero(known) < FEWEST:
         return out
-    tree: Any = KDTree(look.local[used])
-    residuals = np.append(look.residuals[used], np.nan)
+    distance, gradient = shape.field.distance_gradient(look.local[known])
+    # A point speaks for the place of the surface that it is nearest to.
+    tree: Any = KDTree(look.local[known] - distance[:, None] * gradient)
+    residuals = np.append(look.residuals[known], np.nan)
     distance, index = tree.query(vertices, k=NEIGHBOURS, distance_upper_bound=REACH * INNER_EXTENT)
     near = np.isfinite(distance)
     enough = near.sum(axis=1) >= FEWEST

@@ -64,8 +64,13 @@ def hypotheses(
         inner = from_given(shape, start)
         near = starts_near(inner, shape.mesh, StartsConfig(), rng)
         few, half = config.search.near_first, config.search.half_turns
-        # Half turns always: a mug with its handle on the wrong side explains much.
-        found = _fitted(shape, evidence, [*near[:few], *near[-half:]], config)
+        # Half turns always: a mug with its handle on the wrong side explains much. But a box stays
+        # as it was given, and does not turn over for a little noise.
+        found = _fitted(shape, evidence, near[:few], config)
+        turned = _fitted(shape, evidence, near[-half:], config)
+        least = found[0].gain + config.search.turn_gain
+        better = [h for h in turned if h.gain > least]
+        found = [*better, *found, *(h for h in turned if h.gain <= least)]
         if not found or found[0].gain < config.search.enough_gain:
             more = _fitted(shape, evidence, near[few:-half], config)
             found = _distinct([*found, *more], shape, config)

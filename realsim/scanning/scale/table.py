@@ -18,6 +18,8 @@ from realsim.scanning.scale.config import TableConfig
 Array = NDArray[np.float64]
 COARSE_STRIDE = 8
 """Every eighth row and column finds a table and what stands on it."""
+NEAR_AT_M = 0.1
+"""An object whose middle is further than this from where it is said to be is another [m]."""
 PLANE_POINTS = 20_000
 """Points of the random search; the refinement uses four times as many."""
 
@@ -158,14 +160,17 @@ def _one_object(
     middles = [_middle(points[labels[index[:, 0], index[:, 1]] == k], plane) for k in large]
     if at is not None:
         gaps = [float(np.hypot(m[0] - at[0], m[1] - at[1])) for m in middles]
+        if min(gaps) > NEAR_AT_M:
+            raise InputError(
+                f"nothing stands at x={at[0]:.3f}, y={at[1]:.3f} m: the nearest object is "
+                f"{1e3 * min(gaps):.0f} mm away; {1e3 * NEAR_AT_M:.0f} mm are accepted. Objects "
+                f"stand {_places(middles)}."
+            )
         large = [large[int(np.argmin(gaps))]]
     if len(large) != 1:
-        named = "; ".join(
-            f"at x={m[0]:.3f}, y={m[1]:.3f} m ({1e3 * m[2]:.0f} mm tall)" for m in middles
-        )
         raise InputError(
-            f"{len(large)} objects stand on the table: {named}. Say which one is meant by --at x,y "
-            "(in world), or capture it alone."
+            f"{len(large)} objects stand on the table: {_places(middles)}. Say which "
+            "one is meant by --at x,y (in world), or capture it alone."
         )
     mine = labels == large[0]
     own = points[mine[index[:, 0], index[:, 1]]]
@@ -177,6 +182,11 @@ def _one_object(
     around = _grown(mine, round(config.margin_m / cell))
     around &= ~close & ~_grown(others, bridge + 1)
     return Footprint(origin=origin, cell_m=cell, near=near & ~others, around=around, box=box)
+
+
+def _places(middles: Sequence[tuple[float, float, float]]) -> str:
+    """Return where objects stand, for a message."""
+    return "; ".join(f"at x={m[0]:.3f}, y={m[1]:.3f} m ({1e3 * m[2]:.0f} mm tall)" for m in middles)
 
 
 def _middle(points: Array, plane: SupportPlane) -> tuple[float, float, float]:

@@ -54,8 +54,10 @@ def judge(
         if abs(np.log(scale / (state.s * shape.unit))) > v.rival_change
     ]
     contrast = min((seen.gain - gain for _, gain in others), default=1.0)
+    known = np.abs(look.residuals[np.isfinite(look.residuals)])
+    far = float(np.mean(known > v.far_share * evidence.size_m)) if len(known) else 1.0
     checks = {
-        "gain": seen.gain, "agree": seen.agree, "cover": seen.cover, "iou": seen.iou,
+        "far": far, "gain": seen.gain, "agree": seen.agree, "cover": seen.cover, "iou": seen.iou,
         "contrast": contrast, "shape_mm": 1e3 * look.shape.sigma_m, "shape_share": shape_share,
         "sigma_percent": 100 * sigma, "rim_px": state.rim, "bias_per_m": state.bias,
     }  # fmt: skip
@@ -82,6 +84,13 @@ def judge(
             f"the mesh agrees where it is seen ({100 * seen.agree:.0f} %) but covers "
             f"{100 * seen.cover:.0f} % of what stands there: another object touches it, or the "
             "mesh is of a part only. Capture the object alone."
+        )
+    if far > v.most_far:
+        doubts.append(
+            f"{100 * far:.1f} % of the measured points lie more than "
+            f"{1e3 * v.far_share * evidence.size_m:.0f} mm from the mesh; of the same object at "
+            f"most {100 * v.most_far:.0f} % do. A part of it is elsewhere: another object of its "
+            "kind?"
         )
     if shape_share > v.worst_shape:
         doubts.append(
