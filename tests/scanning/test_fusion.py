@@ -149,6 +149,7 @@ def test_what_was_on_the_table_is_invented_and_flat() -> None:
     assert any("underside" in note for note in fused.notes)
 
 
+@pytest.mark.slow
 def test_a_distorted_lens_changes_nothing() -> None:
     frames = exact_frames((ball(),), BARREL)
     fused = fuse_object(BARREL, frames, None, AS_GIVEN)
@@ -186,6 +187,7 @@ def test_a_given_plane_is_used() -> None:
     assert fused.mesh.vertices[:, 2].min() == pytest.approx(0.002, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_refined_poses_are_nearer_to_the_truth_than_the_robots() -> None:
     truth, _, frames, true = lab_scan()
     fused = fused_bunny()

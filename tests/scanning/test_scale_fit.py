@@ -138,6 +138,7 @@ def test_two_starts_lead_to_the_same():
     assert abs(fits[0].scale - fits[1].scale) < 0.2 * fits[0].sigma
 
 
+@pytest.mark.slow
 def test_errors_are_of_the_size_that_sigma_says():
     z = np.array([z_of(fitted(n, "lab", s)) for n in ("block", "bunny") for s in (0, 1)])
     assert np.all(np.abs(z) < 3.5), z.round(2)
@@ -258,6 +259,7 @@ def test_the_residual_map_shows_a_bump_with_sign_and_size(height_mm: float):
     assert fit.scale == pytest.approx(UNIT_M, rel=0.02)
 
 
+@pytest.mark.slow
 def test_sigma_grows_with_the_distortion():
     known = scanned("bunny")
     sigmas = [
@@ -276,6 +278,7 @@ def test_more_views_know_the_scale_better():
         assert fit.scale == pytest.approx(UNIT_M, rel=0.008)
 
 
+@pytest.mark.slow
 def test_views_from_one_side_only_know_the_scale_less_well():
     known = scanned("bunny", "lab", 0, 20)
     eyes = np.stack([f.T_world_cam[:3, 3] for f in known.frames]) - known.T_world_obj[:3, 3]

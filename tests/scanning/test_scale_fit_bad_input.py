@@ -176,6 +176,7 @@ def test_the_mirror_image_of_a_symmetric_object_is_the_object():
     assert abs(fit.scale - fitted("bunny").scale) < 0.3 * fit.sigma
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bunny", pytest.param("block", marks=pytest.mark.slow)])
 def test_an_inside_out_mesh_gives_the_same(name: str):
     known = scanned(name)
@@ -187,6 +188,7 @@ def test_an_inside_out_mesh_gives_the_same(name: str):
     assert np.nanmedian(np.abs(difference)) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [pytest.param(1e6, marks=pytest.mark.slow), 1e-6])
 def test_huge_and_tiny_units(unit: float):
     known = scanned("bunny")
@@ -209,6 +211,7 @@ def test_an_open_mesh_is_fitted_too(name: str):
     assert abs(fit.scale - UNIT_M) < 3.5 * fit.sigma
 
 
+@pytest.mark.slow
 def test_a_heavy_mesh_is_fitted_in_reasonable_time():
     known = scanned("bunny")
     heavy = subdivided(known.scan, 200_000)
@@ -220,6 +223,7 @@ def test_a_heavy_mesh_is_fitted_in_reasonable_time():
     assert len(fit.residual_mm) == len(heavy.vertices)
 
 
+@pytest.mark.slow
 def test_faces_without_area_do_no_harm():
     known = scanned("block")
     empty = np.array([[0, 0, 1], [2, 2, 2]], dtype=np.int32)
@@ -290,6 +294,7 @@ def test_a_start_that_is_turned_over_is_put_right_or_not_accepted():
     assert fit.verdict != "accepted" or surface_gap_mm(fit, known) < 5.0
 
 
+@pytest.mark.slow
 def test_a_start_that_is_nowhere_near_is_forgotten():
     known = scanned("scalene")
     rng = np.random.default_rng(3)
