@@ -90,7 +90,7 @@ class ShapeConfig:
     """Variance of a patch's mean that is its own, as a share of the field's variance inside it."""
     pieces: float = 4.0
     """Independent values of the field inside a patch: what a patch's many points are worth."""
-    trust: float = 2.2
+    trust: float = 2.6
     """By this the shape's part of the scale's sigma is multiplied: measured on 2 % distortions,
     whose effect patches with constant offsets describe only roughly."""
     rim_sigma_m: float = 0.0003
