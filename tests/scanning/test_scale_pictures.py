@@ -147,9 +147,13 @@ def test_views_without_figures_are_drawn(fit):
     blank = replace(
         fit.views[0], agree=np.nan, iou=np.nan, rms_mm=np.nan, shift_mm=np.nan, turn_deg=np.nan
     )
-    decoded(views_png(replace(fit, views=(blank, *fit.views[1:]))))
+    full, gap = (
+        decoded(views_png(fit)),
+        decoded(views_png(replace(fit, views=(blank, *fit.views[1:])))),
+    )
+    assert not np.array_equal(full, gap)  # the blank view has no bars
     many = tuple(replace(fit.views[0], index=k) for k in range(100))
-    decoded(views_png(replace(fit, views=many)))
+    assert decoded(views_png(replace(fit, views=many))).std() > 0
 
 
 def test_rivals_are_drawn(fit):

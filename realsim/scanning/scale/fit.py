@@ -9,7 +9,7 @@
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -80,21 +80,16 @@ def fit_scale(  # noqa: PLR0913 - keywords, each with a meaning of its own
     found = hypotheses(shape, evidence, start, config, size_m)
     ticks.step()
     state, look, seen, dropped = _joint(shape, evidence, found[0].state, config)
-    explained = explain(shape, seen, state)
     ticks.step()
-    source, rivals = found[0].source, list[tuple[float, float]]()
-    for h, other in _others(shape, seen, (state, found[1:]), config):
-        theirs = explain(shape, seen, other[0])
-        if theirs.gain > explained.gain:
-            rivals.append((state.s * shape.unit, explained.gain))
-            (state, look), explained, source = other, theirs, h.source
-        else:
-            rivals.append((other[0].s * shape.unit, theirs.gain))
+    first = _Fitted(found[0], state, look, explain(shape, seen, state))
+    won, *others = _ranked(shape, seen, first, found[1:], config)
+    state, look, explained = won.state, won.look, won.explained
     sigma = sigma_log(look, config)
+    rivals = [(o.state.s * shape.unit, o.explained.gain) for o in others]
     judged = judge(shape, seen, (state, look, explained), rivals, (sigma, config))
-    judged = _if_mirrored(shape, seen, (state, found[0].gain), judged, config)
+    judged = _if_mirrored(shape, seen, (state, won.found.gain), judged, config)
     ticks.step()
-    best = to_given(shape, state, explained.gain, source)
+    best = to_given(shape, state, explained.gain, won.found.source)
     return ScaleFit(
         scale=best.scale, sigma=best.scale * sigma, T_world_obj=best.T_world_obj,
         covariance=_covariance(look, sigma), verdict=judged.verdict, reasons=judged.reasons,
@@ -111,6 +106,16 @@ def fit_scale(  # noqa: PLR0913 - keywords, each with a meaning of its own
         history=tuple(dict(h) for h in look.history), cpu_s=time.process_time() - began,
         notes=_notes(evidence, dropped, judged),
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Fitted:
+    """A hypothesis fitted to the end."""
+
+    found: Hypothesis
+    state: State
+    look: Outlook
+    explained: Explained
 
 
 class _Ticks:
@@ -186,20 +191,25 @@ def _against_all(
     return (twist > v.view_sigmas) | (iou < v.view_share * usual)
 
 
-def _others(
+def _ranked(
     shape: ScanShape,
     evidence: ScanEvidence,
-    found: tuple[State, Sequence[Hypothesis]],
+    first: _Fitted,
+    others: Sequence[Hypothesis],
     config: ScaleConfig,
-) -> list[tuple[Hypothesis, tuple[State, Outlook]]]:
-    """Return the best other hypotheses of another scale, fitted to the end likewise."""
-    best, others = found
-    far = [h for h in others if abs(np.log(h.state.s / best.s)) > config.verdict.rival_change]
-    out: list[tuple[Hypothesis, tuple[State, Outlook]]] = []
+) -> list[_Fitted]:
+    """Return the first and the best other hypotheses of another scale, the best explanation first.
+
+    The others are fitted to the end likewise: what looked worse before may be better then.
+    """
+    change = config.verdict.rival_change
+    far = [h for h in others if abs(np.log(h.state.s / first.state.s)) > change]
+    fitted = [first]
     for h in far[: config.search.rivals]:
         start = replace(h.state, views=np.zeros((len(evidence.views), 6)))
-        out.append((h, joint_fit(shape, evidence, start, config)))
-    return out
+        state, look = joint_fit(shape, evidence, start, config)
+        fitted.append(_Fitted(h, state, look, explain(shape, evidence, state)))
+    return sorted(fitted, key=lambda f: -f.explained.gain)
 
 
 def _if_mirrored(
