@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.scanning.scale.accumulate import BLOCK, add_outline, add_surface, add_table
 from realsim.scanning.scale.config import PriorConfig
-from realsim.scanning.scale.joint import TABLE_SIGMA_M
+from realsim.scanning.scale.equations import TABLE_SIGMA_M
 from realsim.scanning.scale.shape import ScanShape
 from realsim.scanning.scale.state import (
     BIAS,

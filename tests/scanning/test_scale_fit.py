@@ -239,13 +239,15 @@ def test_view_numbers_are_those_of_the_session():
 @pytest.mark.parametrize("height_mm", [2.0, pytest.param(-2.0, marks=pytest.mark.slow)])
 def test_the_residual_map_shows_a_bump_with_sign_and_size(height_mm: float):
     """The real block carries a plate on its top that the mesh does not know, or the other way."""
-    plate = block((0.03, 0.03, 0.02 + 2 * abs(height_mm) / 1e3))
-    base = block((0.09, 0.06, 0.05))
-    low = shifted(plate, 0.02, 0.01, 0.015)
-    bumped, plain = joined(base, low), base
-    real, given = (bumped, plain) if height_mm > 0 else (plain, bumped)
+    # The knob tells top from bottom: with the plate hidden below, the depth would fit as well.
+    base = joined(block((0.09, 0.06, 0.05)), shifted(block((0.02, 0.03, 0.02)), -0.05, 0, -0.015))
+    plain = subdivided(base, 5000)
+    raised = plain.vertices.copy()
+    plate = np.all(np.abs(raised[:, :2] - [0.02, 0.01]) < 0.015, axis=1) & (raised[:, 2] > 0.0249)
+    raised[plate, 2] += abs(height_mm) / 1e3
+    bumped = Mesh(vertices=raised, faces=plain.faces)
+    real, fine = (bumped, plain) if height_mm > 0 else (plain, bumped)
     known = scanned_mesh(real, LAB, seed=1)
-    fine = subdivided(given, 5000)
     fit = fit_of(known, scaled(fine, 1 / UNIT_M))
     v = fine.vertices
     on_plate = np.all(np.abs(v[:, :2] - [0.02, 0.01]) < 0.009, axis=1) & (v[:, 2] > 0.024)

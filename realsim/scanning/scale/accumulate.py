@@ -42,6 +42,49 @@ GATE = 0.05
 
 
 @numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _turned(M: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return the vector turned by the rotation of M."""
+    return (
+        M[0, 0] * x + M[0, 1] * y + M[0, 2] * z,
+        M[1, 0] * x + M[1, 1] * y + M[1, 2] * z,
+        M[2, 0] * x + M[2, 1] * y + M[2, 2] * z,
+    )
+
+
+@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _turned_back(M: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return the vector turned by the inverse of the rotation of M."""
+    return (
+        M[0, 0] * x + M[1, 0] * y + M[2, 0] * z,
+        M[0, 1] * x + M[1, 1] * y + M[2, 1] * z,
+        M[0, 2] * x + M[1, 2] * y + M[2, 2] * z,
+    )
+
+
+@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _camera_terms(
+    J: Array, a: tuple[float, float, float], h: tuple[float, float, float], r: float
+) -> None:
+    """Fill in the derivatives by the camera and the depth's bias of a measured point's residual.
+
+    The noise of a point is in its residual and must not be in its derivative too: the derivative
+    is taken where the ray meets the surface.
+
+    Args:
+        J: (18,) filled in.
+        a: the point in camera axes [m].
+        h: the residual's gradient there.
+        r: the residual [m].
+    """
+    along = (h[0] * a[0] + h[1] * a[1] + h[2] * a[2]) / a[2]
+    f = 1.0 - r / (along * a[2]) if abs(along) > LEAST_ALONG else 1.0
+    x, y, z = f * a[0], f * a[1], f * a[2]
+    J[7], J[8], J[9] = y * h[2] - z * h[1], z * h[0] - x * h[2], x * h[1] - y * h[0]
+    J[10], J[11], J[12] = h
+    J[16] = along * z * z
+
+
+@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
 def _facing(
     lattice: tuple[NDArray[np.float32], Array, float],
     m: tuple[float, float, float],
@@ -80,7 +123,7 @@ def _facing(
 
 
 @numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
-def add_surface(  # noqa: PLR0915 - one pass over the points, in compiled code
+def add_surface(
     lattice: tuple[NDArray[np.float32], Array, float],
     pose: tuple[float, Array, Array],
     cameras: Array,
@@ -112,19 +155,14 @@ def add_surface(  # noqa: PLR0915 - one pass over the points, in compiled code
     for i in range(len(points)):
         k = views[i]
         C = cameras[k]
-        a0, a1, a2 = points[i, 0], points[i, 1], points[i, 2]
-        p0 = C[0, 0] * a0 + C[0, 1] * a1 + C[0, 2] * a2 + C[0, 3] - t[0]
-        p1 = C[1, 0] * a0 + C[1, 1] * a1 + C[1, 2] * a2 + C[1, 3] - t[1]
-        p2 = C[2, 0] * a0 + C[2, 1] * a1 + C[2, 2] * a2 + C[2, 3] - t[2]
-        m0 = (R[0, 0] * p0 + R[1, 0] * p1 + R[2, 0] * p2) / s
-        m1 = (R[0, 1] * p0 + R[1, 1] * p1 + R[2, 1] * p2) / s
-        m2 = (R[0, 2] * p0 + R[1, 2] * p1 + R[2, 2] * p2) / s
-        q0, q1, q2 = C[0, 3] - t[0] - p0, C[1, 3] - t[1] - p1, C[2, 3] - t[2] - p2
+        a = points[i, 0], points[i, 1], points[i, 2]
+        # From the object's centre to the camera and to the point, and from the point to the camera.
+        c0, c1, c2 = C[0, 3] - t[0], C[1, 3] - t[1], C[2, 3] - t[2]
+        q0, q1, q2 = _turned(C, a[0], a[1], a[2])
         far = np.sqrt(q0 * q0 + q1 * q1 + q2 * q2)
-        v0 = (R[0, 0] * q0 + R[1, 0] * q1 + R[2, 0] * q2) / far
-        v1 = (R[0, 1] * q0 + R[1, 1] * q1 + R[2, 1] * q2) / far
-        v2 = (R[0, 2] * q0 + R[1, 2] * q1 + R[2, 2] * q2) / far
-        r, gx, gy, gz, ok = _facing(lattice, (m0, m1, m2), (v0, v1, v2))
+        m0, m1, m2 = _turned_back(R, (c0 + q0) / s, (c1 + q1) / s, (c2 + q2) / s)
+        v = _turned_back(R, -q0 / far, -q1 / far, -q2 / far)
+        r, gx, gy, gz, ok = _facing(lattice, (m0, m1, m2), v)
         r *= s
         residuals[i], kernels[i] = np.nan, 0.0
         if not ok:
@@ -144,20 +182,8 @@ def add_surface(  # noqa: PLR0915 - one pass over the points, in compiled code
         )
         J[3], J[4], J[5] = -gx, -gy, -gz
         J[6] = r - s * (gx * m0 + gy * m1 + gz * m2)
-        w0 = R[0, 0] * gx + R[0, 1] * gy + R[0, 2] * gz
-        w1 = R[1, 0] * gx + R[1, 1] * gy + R[1, 2] * gz
-        w2 = R[2, 0] * gx + R[2, 1] * gy + R[2, 2] * gz
-        h0 = C[0, 0] * w0 + C[1, 0] * w1 + C[2, 0] * w2
-        h1 = C[0, 1] * w0 + C[1, 1] * w1 + C[2, 1] * w2
-        h2 = C[0, 2] * w0 + C[1, 2] * w1 + C[2, 2] * w2
-        # The noise of a point is in its residual and must not be in its derivative too: the
-        # derivative is taken where the ray meets the surface.
-        along = (h0 * a0 + h1 * a1 + h2 * a2) / a2
-        f = 1.0 - r / (along * a2) if abs(along) > LEAST_ALONG else 1.0
-        a0, a1, a2 = f * a0, f * a1, f * a2
-        J[7], J[8], J[9] = a1 * h2 - a2 * h1, a2 * h0 - a0 * h2, a0 * h1 - a1 * h0
-        J[10], J[11], J[12] = h0, h1, h2
-        J[16] = along * a2 * a2
+        w0, w1, w2 = _turned(R, gx, gy, gz)
+        _camera_terms(J, a, _turned_back(C, w0, w1, w2), r)
         D[n] += w
         e[n] += w * r
         for c in range(17):
@@ -195,29 +221,19 @@ def add_table(
     for i in range(len(points)):
         k = views[i]
         C = cameras[k]
-        a0, a1, a2 = points[i, 0], points[i, 1], points[i, 2]
-        p0 = C[0, 0] * a0 + C[0, 1] * a1 + C[0, 2] * a2 + C[0, 3] - o[0]
-        p1 = C[1, 0] * a0 + C[1, 1] * a1 + C[1, 2] * a2 + C[1, 3] - o[1]
-        p2 = C[2, 0] * a0 + C[2, 1] * a1 + C[2, 2] * a2 + C[2, 3] - o[2]
+        a = points[i, 0], points[i, 1], points[i, 2]
+        p0, p1, p2 = _turned(C, a[0], a[1], a[2])
+        p0, p1, p2 = p0 + C[0, 3] - o[0], p1 + C[1, 3] - o[1], p2 + C[2, 3] - o[2]
         r = normal[0] * p0 + normal[1] * p1 + normal[2] * p2
         q = r * r / (cut * cut * variance[i])
         if q >= 1.0:
             continue
         w = (1.0 - q) ** 2 / variance[i]
-        h0 = C[0, 0] * normal[0] + C[1, 0] * normal[1] + C[2, 0] * normal[2]
-        h1 = C[0, 1] * normal[0] + C[1, 1] * normal[1] + C[2, 1] * normal[2]
-        h2 = C[0, 2] * normal[0] + C[1, 2] * normal[1] + C[2, 2] * normal[2]
-        # The noise of a point is in its residual and must not be in its derivative too: the
-        # derivative is taken where the ray meets the surface.
-        along = (h0 * a0 + h1 * a1 + h2 * a2) / a2
-        f = 1.0 - r / (along * a2) if abs(along) > LEAST_ALONG else 1.0
-        a0, a1, a2 = f * a0, f * a1, f * a2
+        h = _turned_back(C, normal[0], normal[1], normal[2])
         J[13] = e1[0] * p0 + e1[1] * p1 + e1[2] * p2
         J[14] = e2[0] * p0 + e2[1] * p1 + e2[2] * p2
         J[15] = -1.0
-        J[7], J[8], J[9] = a1 * h2 - a2 * h1, a2 * h0 - a0 * h2, a0 * h1 - a1 * h0
-        J[10], J[11], J[12] = h0, h1, h2
-        J[16] = along * a2 * a2
+        _camera_terms(J, a, h, r)
         for c in range(7, 17):
             b[k, c] -= w * J[c] * r
             for d in range(c, 17):
@@ -265,12 +281,8 @@ def add_outline(  # noqa: PLR0915 - one pass over the points, in compiled code
     J = np.zeros(BLOCK)
     for i in range(len(points)):
         m0, m1, m2 = s * points[i, 0], s * points[i, 1], s * points[i, 2]
-        p0 = R[0, 0] * m0 + R[0, 1] * m1 + R[0, 2] * m2 + t[0] - C[0, 3]
-        p1 = R[1, 0] * m0 + R[1, 1] * m1 + R[1, 2] * m2 + t[1] - C[1, 3]
-        p2 = R[2, 0] * m0 + R[2, 1] * m1 + R[2, 2] * m2 + t[2] - C[2, 3]
-        a0 = C[0, 0] * p0 + C[1, 0] * p1 + C[2, 0] * p2
-        a1 = C[0, 1] * p0 + C[1, 1] * p1 + C[2, 1] * p2
-        a2 = C[0, 2] * p0 + C[1, 2] * p1 + C[2, 2] * p2
+        p0, p1, p2 = _turned(R, m0, m1, m2)
+        a0, a1, a2 = _turned_back(C, p0 + t[0] - C[0, 3], p1 + t[1] - C[1, 3], p2 + t[2] - C[2, 3])
         if a2 <= 0.02:
             continue
         x, y = a0 / a2, a1 / a2
@@ -308,12 +320,8 @@ def add_outline(  # noqa: PLR0915 - one pass over the points, in compiled code
         h0 = gu * fx / f
         h1 = gv * fy / f
         h2 = -(h0 * x + h1 * y)
-        w0 = C[0, 0] * h0 + C[0, 1] * h1 + C[0, 2] * h2
-        w1 = C[1, 0] * h0 + C[1, 1] * h1 + C[1, 2] * h2
-        w2 = C[2, 0] * h0 + C[2, 1] * h1 + C[2, 2] * h2
-        g0 = R[0, 0] * w0 + R[1, 0] * w1 + R[2, 0] * w2
-        g1 = R[0, 1] * w0 + R[1, 1] * w1 + R[2, 1] * w2
-        g2 = R[0, 2] * w0 + R[1, 2] * w1 + R[2, 2] * w2
+        w0, w1, w2 = _turned(C, h0, h1, h2)
+        g0, g1, g2 = _turned_back(R, w0, w1, w2)
         J[0], J[1], J[2] = m1 * g2 - m2 * g1, m2 * g0 - m0 * g2, m0 * g1 - m1 * g0
         J[3], J[4], J[5] = g0, g1, g2
         J[6] = g0 * m0 + g1 * m1 + g2 * m2
