@@ -1,0 +1,1 @@
+"""Whether a pose can be trusted, told without ground truth."""

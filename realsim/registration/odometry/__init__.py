@@ -1,0 +1,1 @@
+"""Camera motion from the depth images alone: a check of the robot's, or a substitute for it."""

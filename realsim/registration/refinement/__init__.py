@@ -1,0 +1,1 @@
+"""Objects, cameras, table and depth bias fitted together, with their covariance."""

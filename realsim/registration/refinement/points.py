@@ -1,0 +1,218 @@
+"""Which measured point belongs to which object, or to the table."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.geometry.distance_field import sample
+from realsim.registration.body import Body
+from realsim.registration.evidence import DepthNoise
+from realsim.registration.refinement.config import PointConfig
+from realsim.registration.refinement.state import State
+from realsim.registration.views import ViewPoints
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+Ints = NDArray[np.int32]
+NOBODY, TABLE = -1, -2
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class AllPoints:
+    """The points of all views in one piece."""
+
+    points: Array32
+    """(N, 3) in their camera's axes, as measured [m]."""
+    views: Ints
+    """(N,) which view (its place in the list)."""
+    area_px: Array
+    """(V,) pixels that each point of a view stands for."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Owned:
+    """The points of one body that take part."""
+
+    points: Array
+    """(N, 3) in their camera's axes, as measured [m]."""
+    views: Ints
+    """(N,)."""
+    area_px: Array
+    """(N,) pixels that each stands for, those left out for it included."""
+
+
+def joined(views: Sequence[ViewPoints]) -> AllPoints:
+    """Return the points of all views in one piece."""
+    return AllPoints(
+        points=np.concatenate([v.points for v in views]),
+        views=np.repeat(np.arange(len(views), dtype=np.int32), [len(v.points) for v in views]),
+        area_px=np.array([v.area_px for v in views]),
+    )
+
+
+@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _square_gap(p: Array32, q: Array) -> float:
+    """Return the square of the distance of two points (3,)."""
+    x, y, z = p[0] - q[0], p[1] - q[1], p[2] - q[2]
+    return x * x + y * y + z * z
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _sorted_in(
+    points: Array32,
+    views: Ints,
+    cameras: Array,
+    bias: tuple[float, float],
+    spheres: tuple[Array, Array, Array],
+) -> tuple[Array32, NDArray[np.bool_], Ints, NDArray[np.int64]]:
+    """Return points in world, which are around a body, and each body's candidates.
+
+    Args:
+        points: (N, 3) as measured, in camera axes.
+        views: (N,).
+        cameras: (V, 4, 4).
+        bias: scale and offset of the inverse depth.
+        spheres: centres (K, 3), square of the reach (K,), and square of the table's (K,).
+
+    Returns:
+        Corrected points (N, 3) in world, flags (N,), and the candidates' numbers body after body
+        with where each body's begin (K + 1,).
+    """
+    scale, offset = bias
+    centers, reach, margin = spheres
+    bodies = len(centers)
+    out = np.empty((len(points), 3), np.float32)
+    around = np.zeros(len(points), np.bool_)
+    begin = np.zeros(bodies + 1, np.int64)
+    for i in range(len(points)):
+        C = cameras[views[i]]
+        f = 1.0 / (scale + offset * points[i, 2])
+        a, b, c = f * points[i, 0], f * points[i, 1], f * points[i, 2]
+        for k in range(3):
+            out[i, k] = C[k, 0] * a + C[k, 1] * b + C[k, 2] * c + C[k, 3]
+        for k in range(bodies):
+            x, y, z = (
+                out[i, 0] - centers[k, 0],
+                out[i, 1] - centers[k, 1],
+                out[i, 2] - centers[k, 2],
+            )
+            d = x * x + y * y + z * z
+            if d < reach[k]:
+                begin[k + 1] += 1
+            if d < margin[k]:
+                around[i] = True
+    for k in range(bodies):
+        begin[k + 1] += begin[k]
+    at = begin[:-1].copy()
+    index = np.empty(begin[-1], np.int32)
+    for i in range(len(points)):
+        if not around[i]:
+            continue
+        for k in range(bodies):
+            x, y, z = (
+                out[i, 0] - centers[k, 0],
+                out[i, 1] - centers[k, 1],
+                out[i, 2] - centers[k, 2],
+            )
+            if x * x + y * y + z * z < reach[k]:
+                index[at[k]] = i
+                at[k] += 1
+    return out, around, index, begin
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _claim(
+    lattice: tuple[NDArray[np.float32], Array, float],
+    world: Array32,
+    index: Ints,
+    T_obj_world: Array,
+    number: int,
+    nearest: tuple[Array32, Ints],
+) -> None:
+    """Give a body the points that are nearer to it than to those before.
+
+    Args:
+        lattice: grid, origin and cell of its distance field.
+        world: (N, 3).
+        index: which of them are asked.
+        T_obj_world: (4, 4).
+        number: of the body.
+        nearest: distance (N,) and owner (N,) so far; both are changed.
+    """
+    grid, origin, cell = lattice
+    distance, owner = nearest
+    T = T_obj_world
+    for i in index:
+        p, q, r = world[i, 0], world[i, 1], world[i, 2]
+        d, _, _, _ = sample(
+            grid, origin, cell,
+            T[0, 0] * p + T[0, 1] * q + T[0, 2] * r + T[0, 3],
+            T[1, 0] * p + T[1, 1] * q + T[1, 2] * r + T[1, 3],
+            T[2, 0] * p + T[2, 1] * q + T[2, 2] * r + T[2, 3],
+        )  # fmt: skip
+        if abs(d) < distance[i]:
+            distance[i], owner[i] = abs(d), number
+
+
+def assigned(
+    points: AllPoints,
+    noise: DepthNoise,
+    bodies: Sequence[Body],
+    state: State,
+    cameras: Array,
+    config: PointConfig,
+    share: float = 1.0,
+) -> tuple[list[Owned], Owned]:
+    """Return the points of every body and those of the table.
+
+    Args:
+        points: of all views.
+        noise: of the depth.
+        bodies: the objects.
+        state: where they, the table and the depth's bias stand.
+        cameras: (V, 4, 4) as they stand now.
+        config: see there.
+        share: of the points that the configuration allows.
+    """
+    poses, T_world_table = list(state.poses), state.T_world_table
+    bias = (float(state.bias[0]), float(state.bias[1]))
+    centers = np.array([b.center(T) for b, T in zip(bodies, poses, strict=True)]).reshape(-1, 3)
+    radii = np.array([b.radius_m for b in bodies])
+    spheres = (
+        centers, np.square(radii + config.reach_m), np.square(radii + config.table_margin_m)
+    )  # fmt: skip
+    world, around, index, begin = _sorted_in(points.points, points.views, cameras, bias, spheres)
+    distance = np.full(len(world), config.reach_m, np.float32)
+    owner = np.full(len(world), NOBODY, np.int32)
+    for k, (body, T) in enumerate(zip(bodies, poses, strict=True)):
+        f, mine = body.field, index[begin[k] : begin[k + 1]]
+        _claim((f.grid, f.origin, f.cell), world, mine, se3.invert(T), k, (distance, owner))
+    table = np.zeros(len(world), dtype=bool)
+    if T_world_table is not None:
+        row = se3.invert(T_world_table)[2].astype(np.float32)
+        some = np.flatnonzero(around)
+        height = np.abs(world[some] @ row[:3] + row[3])
+        slack = 3.0 * noise.sigma(points.points[some, 2])
+        free = owner[some] == NOBODY
+        table[some[free & (height < config.table_reach_m + slack)]] = True
+        owner[some[height < config.foot_m]] = NOBODY
+    most = int(share * config.points_per_object)
+    own = [_thinned(points, owner == k, most) for k in range(len(bodies))]
+    most = int(share * config.table_points_per_view * len(cameras))
+    return own, _thinned(points, table, most)
+
+
+def _thinned(points: AllPoints, mine: NDArray[np.bool_], most: int) -> Owned:
+    """Return the points where `mine`, every so many of them."""
+    index = np.flatnonzero(mine)
+    every = max(1, -(-len(index) // most))
+    index = index[::every]
+    views = points.views[index]
+    return Owned(
+        points=points.points[index].astype(np.float64), views=views,
+        area_px=every * points.area_px[views],
+    )  # fmt: skip

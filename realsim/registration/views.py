@@ -1,0 +1,148 @@
+"""What every view measured, thinned out and freed of depth edges, in its own camera's axes.
+
+All steps after this one work on these points: 256 images of 1280x720 pixels become 60 MB.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.geometry.camera import ray_table
+from realsim.records import CameraIntrinsics
+from realsim.registration.evidence import Cloud, DepthFrame, DepthNoise
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SampleConfig:
+    """How a depth image is thinned out."""
+
+    stride: int = 4
+    """Every how many rows and columns a pixel is used: stereo noise is correlated over as many."""
+    edge_reach_px: int = 3
+    """Pixels around one that are looked at for a depth edge."""
+    edge_jump_m: float = 0.010
+    """Span of depth around a pixel beyond which it may be flying [m]; plus slope and noise."""
+    edge_slope: float = 8.0
+    """Plus so many pixel pitches: what a surface seen at 75 degrees spans over the reach."""
+    edge_sigmas: float = 6.0
+    """Plus so many sigma_z."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ViewPoints:
+    """The trusted points of one view."""
+
+    index: int
+    """Number of the view."""
+    T_world_cam: Array
+    """(4, 4) where the camera is said to be [m]."""
+    points: Array32
+    """(N, 3) in camera axes [m]."""
+    pixels: NDArray[np.int32]
+    """(N, 2) their column and row."""
+    area_px: float
+    """Pixels that each of them stands for."""
+    measured_share: float
+    """Share of the sampled pixels that hold any depth, trusted or not."""
+
+    def world(self, T_world_cam: Array | None = None) -> Array:
+        """Return the points (N, 3) in world, of the claimed camera or of another."""
+        T = self.T_world_cam if T_world_cam is None else T_world_cam
+        return se3.transform(T, self.points.astype(np.float64))
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _trusted_pixels(
+    depth: Array32, stride: int, reach: int, limits: tuple[float, float, float, float, float]
+) -> tuple[NDArray[np.int32], int]:
+    """Return the columns and rows (N, 2) of trusted sampled pixels, and how many hold depth.
+
+    Args:
+        depth: (H, W) [m]; 0 or not finite = none.
+        stride: of the sampling.
+        reach: pixels around one that are looked at.
+        limits: jump [m], slope per metre of depth, sigmas, noise per m and its floor.
+    """
+    jump, slope, sigmas, per_m, floor = limits
+    height, width = depth.shape
+    out = np.empty((((height - 1) // stride + 1) * ((width - 1) // stride + 1), 2), np.int32)
+    n, measured = 0, 0
+    for i in range(0, height, stride):
+        for j in range(0, width, stride):
+            z = depth[i, j]
+            if not (z > 0.0 and z < np.inf):
+                continue
+            measured += 1
+            allowed = jump + slope * z + sigmas * max(floor, per_m * z * z)
+            low, high = z, z
+            good = True
+            for a in range(max(0, i - reach), min(height, i + reach + 1)):
+                for b in range(max(0, j - reach), min(width, j + reach + 1)):
+                    y = depth[a, b]
+                    if y > 0.0 and y < np.inf:
+                        low, high = min(low, y), max(high, y)
+                if high - low > allowed:
+                    good = False
+                    break
+            if good:
+                out[n, 0], out[n, 1] = j, i
+                n += 1
+    return out[:n].copy(), measured
+
+
+def sample_view(
+    intrinsics: CameraIntrinsics, frame: DepthFrame, noise: DepthNoise, config: SampleConfig
+) -> ViewPoints:
+    """Return the trusted points of one frame."""
+    depth = np.ascontiguousarray(frame.depth_m, dtype=np.float32)
+    pitch = config.edge_slope / min(intrinsics.fx, intrinsics.fy)
+    pixels, measured = _trusted_pixels(
+        depth, config.stride, config.edge_reach_px,
+        (config.edge_jump_m, pitch, config.edge_sigmas, noise.per_m, noise.floor_m),
+    )  # fmt: skip
+    u, v = pixels[:, 0], pixels[:, 1]
+    rays = ray_table(intrinsics)[v, u]
+    known = np.isfinite(rays[:, 0])
+    u, v, rays = u[known], v[known], rays[known]
+    sampled = -(-depth.shape[0] // config.stride) * -(-depth.shape[1] // config.stride)
+    return ViewPoints(
+        index=frame.index,
+        T_world_cam=frame.T_world_cam,
+        points=(rays * depth[v, u, None]).astype(np.float32),
+        pixels=pixels[known],
+        area_px=float(config.stride**2),
+        measured_share=measured / max(sampled, 1),
+    )
+
+
+def sample_views(
+    intrinsics: CameraIntrinsics,
+    frames: Sequence[DepthFrame],
+    noise: DepthNoise,
+    config: SampleConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[ViewPoints, ...]:
+    """Return the trusted points of every frame; each image is looked at once."""
+    views: list[ViewPoints] = []
+    for n, frame in enumerate(frames):
+        views.append(sample_view(intrinsics, frame, noise, config))
+        if progress is not None:
+            progress(n + 1, len(frames))
+    return tuple(views)
+
+
+def world_cloud(views: Sequence[ViewPoints], noise: DepthNoise) -> Cloud:
+    """Return the points of all views in world, where the cameras are said to be."""
+    points = np.concatenate([v.world() for v in views])
+    eyes = np.concatenate([np.tile(v.T_world_cam[:3, 3], (len(v.points), 1)) for v in views])
+    towards = eyes - points
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    z = np.concatenate([v.points[:, 2] for v in views])
+    return Cloud(points=points, towards=towards, sigmas=noise.sigma(z))
