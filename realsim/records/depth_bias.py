@@ -65,6 +65,11 @@ class DepthBias:
         """
         return cls(covariance=np.diag([scale_sd**2, offset_sd_per_m**2]), separable=False)
 
+    @property
+    def is_none(self) -> bool:
+        """Whether depth is taken as it is; what is known of the bias may still be uncertain."""
+        return self.scale == 1.0 and self.offset_per_m == 0.0
+
     def corrected(self, depth_m: ArrayLike) -> NDArray[np.floating]:
         """Return the true depth of measured depth, any shape [m]; 0 and NaN stay what they are.
 

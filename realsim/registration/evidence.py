@@ -11,6 +11,7 @@ from realsim.geometry import se3
 from realsim.geometry.clouds import voxel_mean
 from realsim.geometry.depth import check_depth, depth_noise_per_m, edge_mask, points_from_depth
 from realsim.records import CameraIntrinsics, SupportPlane
+from realsim.records.depth_bias import DepthBias
 from realsim.registration.body import Body
 
 Array = NDArray[np.float64]
@@ -26,6 +27,38 @@ class DepthFrame:
     """(H, W) depth along z [m]; 0 = none."""
     T_world_cam: Array
     """(4, 4) camera in world [m]."""
+
+
+class LazyFrame(DepthFrame):
+    """A frame whose image is read every time it is asked for: 256 of them are a gigabyte."""
+
+    __slots__ = ("_read",)
+
+    def __init__(
+        self, index: int, T_world_cam: Array, read: Callable[[], NDArray[np.float32]]
+    ) -> None:
+        """Keep how the image is read; nothing is read."""
+        object.__setattr__(self, "index", index)
+        object.__setattr__(self, "T_world_cam", T_world_cam)
+        object.__setattr__(self, "_read", read)
+
+    @property
+    def depth_m(self) -> NDArray[np.float32]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """(H, W) depth along z [m]; 0 = none."""
+        read: Callable[[], NDArray[np.float32]] = object.__getattribute__(self, "_read")
+        return read()
+
+
+def corrected_frame(frame: DepthFrame, T_world_cam: Array, bias: DepthBias) -> DepthFrame:
+    """Return the frame with another camera pose and the depth's bias taken out; read when asked."""
+    return LazyFrame(
+        frame.index, T_world_cam, lambda: bias.corrected(frame.depth_m).astype(np.float32)
+    )
+
+
+def held(frame: DepthFrame) -> DepthFrame:
+    """Return the frame with its image in memory."""
+    return DepthFrame(index=frame.index, depth_m=frame.depth_m, T_world_cam=frame.T_world_cam)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,16 +1,15 @@
-"""Register a scene: from rough starts to the pose of every object, checked without ground truth.
+"""Register a scene: the pose of every object in every view, checked without ground truth.
 
-1. Evidence: every frame's measured points near each object; the support plane around them.
-2. Search: many starts around the given one, each fitted; rendered in several frames; best kept.
-3. Joint fit: all objects together on all frames, each point to the model it is nearest to.
+1. Intake: every image thinned out once; the table; views that do not belong are left out.
+2. Search: every object near its start, near a hint, or anywhere; known by name or not.
+3. Fit: four and more views: objects, cameras, table and depth bias together. Fewer: the objects
+   alone, with the cameras at their word.
 4. What the points do not determine is set back to the start's value.
-5. Covariance, verification, and the same for the single-view baseline.
-With one frame it is the same code with one frame.
+5. Covariance, checks, probability, verdict; the same for the paper's way, ICP in one view.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,41 +17,30 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
-from realsim.records import (
-    CameraIntrinsics,
-    ObjectModel,
-    ObjectPose,
-    Scene,
-    SupportPlane,
-    names_of,
-)
-from realsim.registration.blind import BlindConfig, Kept, keep_start
+from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene, names_of
 from realsim.registration.body import Body, make_body
-from realsim.registration.compare import CompareConfig, Comparer, make_comparer, spread_frames
-from realsim.registration.covariance import CovarianceConfig, Uncertainty, uncertainty
-from realsim.registration.evidence import (
-    Cloud,
-    DepthFrame,
-    Evidence,
-    EvidenceConfig,
-    averaged,
-    check_frames,
-    gather,
-    without_table,
+from realsim.registration.compare import Comparer
+from realsim.registration.config import METHODS, RegistrationConfig
+from realsim.registration.covariance import uncertainty
+from realsim.registration.evidence import DepthFrame
+from realsim.registration.few_views import begin, register_few, search_near
+from realsim.registration.intake import Intake, take_in
+from realsim.registration.judge import Judged, Poses, judged
+from realsim.registration.judging.unit_checks import unit_errors
+from realsim.registration.many_views import comparer_on, register_many
+from realsim.registration.refinement.uncertainty import SeenPose
+from realsim.registration.reports import (
+    camera_report,
+    common_report,
+    object_report,
+    plane_report,
+    search_report,
 )
-from realsim.registration.hypotheses import Found, SearchConfig, search
-from realsim.registration.joint import JointConfig, joint_fit
-from realsim.registration.plane import PlaneConfig, find_support_plane
-from realsim.registration.single_view import SingleViewConfig, fit_single_view, reference_frame
-from realsim.registration.solver import FreeSpace, SolverConfig
-from realsim.registration.verify import (
-    OffsetConfig,
-    SinkingConfig,
-    VerifyConfig,
-    common_offset,
-    common_sinking,
-    verify_objects,
-)
+from realsim.registration.result import Registration
+from realsim.registration.search.find import find_objects
+from realsim.registration.search.records import NotPlaced, Placed, Region, SearchResult, Wanted
+from realsim.registration.single_view import fit_single_view, reference_frame
+from realsim.registration.verify import verify_objects
 
 __all__ = ["DepthFrame", "Registration", "RegistrationConfig", "register_scene"]
 
@@ -60,54 +48,12 @@ Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class RegistrationConfig:
-    """All constants of a registration."""
-
-    field_cells: int = 96
-    """Cells of a distance field along the object's longest side; 56 doubled the scale error."""
-    samples: int = 600
-    """Surface samples per object for free space and penetration."""
-    free_space: bool = True
-    """Whether models are kept out of space the cameras looked through."""
-    field_folder: Path | None = None
-    """Where distance fields are kept between runs; None = in memory only."""
-    with_single_view: bool = True
-    """Whether the single-view baseline is computed as well."""
-    regather_m: float = 0.012
-    """If an object moved further than this, its points are collected again around its new pose."""
-    evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
-    plane: PlaneConfig = field(default_factory=PlaneConfig)
-    compare: CompareConfig = field(default_factory=CompareConfig)
-    search: SearchConfig = field(default_factory=SearchConfig)
-    solver: SolverConfig = field(default_factory=SolverConfig)
-    joint: JointConfig = field(default_factory=JointConfig)
-    blind: BlindConfig = field(default_factory=BlindConfig)
-    covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
-    verify: VerifyConfig = field(default_factory=VerifyConfig)
-    offset: OffsetConfig = field(default_factory=OffsetConfig)
-    sinking: SinkingConfig = field(default_factory=SinkingConfig)
-    single_view: SingleViewConfig = field(default_factory=SingleViewConfig)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Registration:
-    """A registered scene, its baseline, and how it came about."""
-
-    scene: Scene
-    """The joint fit: poses with covariance, checks, verdict, reasons; and the support plane."""
-    single_view: Scene
-    """The baseline: robust ICP in one reference frame, checked in the same way."""
-    report: dict[str, Any]
-    """Plain JSON values: per object the search, the residuals, what was rejected."""
-
-
 def register_scene(
     name: str,
     intrinsics: CameraIntrinsics,
     frames: Sequence[DepthFrame],
     models: Mapping[int, ObjectModel],
-    starts: Sequence[ObjectPose],
+    wanted: Sequence[ObjectPose] | Sequence[Wanted] | None,
     config: RegistrationConfig | None = None,
     *,
     gravity_up_world: ArrayLike | None = None,
@@ -120,55 +66,32 @@ def register_scene(
         intrinsics: the camera of all frames.
         frames: depth images with camera poses; one is enough. Their order does not matter.
         models: known objects by obj_id.
-        starts: rough poses, right to about 30 mm and 20 deg.
+        wanted: rough poses, right to about 30 mm and 20 deg; or objects with a hint or none where
+            they are; None = find out which of the models are there.
         config: see there.
         gravity_up_world: (3,) up; helps to tell the table from a wall.
         progress: called with (steps done, steps).
 
     Raises:
-        InputError: a start names an unknown model, numbers repeat, or images do not fit the camera.
+        InputError: an object names an unknown model, numbers repeat, images do not fit the camera,
+            nothing is wanted, or no view can be used.
     """
     config = config or RegistrationConfig()
-    ordered = check_frames(frames, intrinsics)
-    tick = _Ticker(progress, len(ordered) + 2 * len(starts) + 3)
-    bodies = _bodies(models, starts, config)
-    evidence = gather(intrinsics, ordered, bodies, config.evidence, tick.each)
-    plane, no_plane = _plane(ordered, bodies, evidence, config, gravity_up_world)
-    tick()
-
-    work = _Work(intrinsics, ordered, plane, evidence, config)
-    found = [
-        _search_one(work, body, near, tick)
-        for body, near in zip(bodies, evidence.near, strict=True)
-    ]
-    kept, clouds, history = _joint(work, bodies, found)
-    tick()
-    fits = [k.fit for k in kept]
-    poses = [f.T_world_obj for f in fits]
-    uncertain = [
-        uncertainty(b, f, evidence.stride, config.covariance)
-        for b, f in zip(bodies, fits, strict=True)
-    ]
-    comparer = work.comparer(_middle(bodies, poses), config.verify.frames, config.verify.rays)
-    objects = _objects(bodies, poses, clouds, uncertain, comparer, config.verify)
-    single, single_report = _single_view(work, bodies, clouds, comparer)
-    tick()
-    report = {
-        "frames": [f.index for f in ordered],
-        "plane": _plane_report(plane, no_plane),
-        **_common_report(work, bodies, objects),
-        "joint": history,
-        "single_view": single_report,
-        "objects": [
-            _object_report(b, o, k, s.report, u)
-            for b, o, k, s, u in zip(bodies, objects, kept, found, uncertain, strict=True)
-        ],
-    }
-    return Registration(
-        scene=Scene(name=name, objects=tuple(objects), plane=plane),
-        single_view=Scene(name=f"{name} (single view)", objects=tuple(single), plane=plane),
-        report=report,
-    )
+    if config.method not in METHODS:
+        raise InputError(f"the method is '{config.method}'; {' or '.join(METHODS)} is accepted.")
+    asked = _asked(models, wanted, config)
+    tick = _Ticker(progress, len(frames) + 2 * max(len(asked or ()), 1) + config.refine.rounds + 3)
+    up = None if gravity_up_world is None else np.asarray(gravity_up_world, dtype=np.float64)
+    intake = take_in(intrinsics, frames, config, up, tick)
+    asked, refused = _in_units(models, asked, intake, config)
+    work = _Work(name, intake, models, config, up, tick)
+    found = _found(work, asked)
+    missing = (*refused, *found.not_placed)
+    if not found.bodies:
+        return _nothing(work, found, missing)
+    if len(intake.frames) >= config.refine_from and config.refine_cameras:
+        return _with_many(work, found, missing)
+    return _with_few(work, found, missing)
 
 
 class _Ticker:
@@ -192,226 +115,335 @@ class _Ticker:
 class _Work:
     """What every step of one registration needs."""
 
-    intrinsics: CameraIntrinsics
-    frames: list[DepthFrame]
-    plane: SupportPlane | None
-    evidence: Evidence
+    name: str
+    intake: Intake
+    models: Mapping[int, ObjectModel]
     config: RegistrationConfig
-
-    def comparer(self, center: Array, n: int, rays: int) -> Comparer:
-        """Return a comparer on n frames spread around `center`."""
-        chosen = spread_frames(self.frames, center, n)
-        config = replace(self.config.compare, rays=rays)
-        return make_comparer(self.intrinsics, chosen, self.evidence.noise, self.plane, config)
-
-    def free_space(self, frames: Sequence[DepthFrame]) -> FreeSpace | None:
-        """Return the images that models may not stand in front of."""
-        if not self.config.free_space:
-            return None
-        i, noise = self.intrinsics, self.evidence.noise
-        return FreeSpace(
-            depths=np.stack([f.depth_m for f in frames]).astype(np.float32),
-            Ts_cam_world=np.stack([se3.invert(f.T_world_cam) for f in frames]),
-            camera=np.concatenate([[i.fx, i.fy, i.cx, i.cy], i.distortion]),
-            noise=(noise.per_m, noise.floor_m),
-        )
+    up: Array | None
+    tick: _Ticker
 
 
-def _bodies(
-    models: Mapping[int, ObjectModel], starts: Sequence[ObjectPose], config: RegistrationConfig
-) -> list[Body]:
-    """Return the bodies of the starts, each checked against the models."""
-    if not starts:
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Found:
+    """What the search found."""
+
+    bodies: list[Body]
+    """At the poses that were found."""
+    claimed: list[Array | None]
+    """(4, 4) what somebody claimed of each."""
+    contrasts: list[float | None]
+    reports: list[dict[str, Any]]
+    not_placed: tuple[NotPlaced, ...]
+    report: dict[str, Any]
+
+
+def _asked(
+    models: Mapping[int, ObjectModel],
+    wanted: Sequence[ObjectPose] | Sequence[Wanted] | None,
+    config: RegistrationConfig,
+) -> list[Wanted] | None:
+    """Return what is wanted, each checked against the models.
+
+    Raises:
+        InputError: nothing is wanted, an unknown model, or a number twice.
+    """
+    if not models:
+        raise InputError("no object models were given; registration needs the objects' meshes.")
+    if wanted is None:
+        return None
+    if not wanted:
         raise InputError("no start poses were given; give one per object instance.")
-    if len({s.instance for s in starts}) != len(starts):
+    if len({s.instance for s in wanted}) != len(wanted):
         raise InputError("two start poses have the same instance number.")
-    bodies: list[Body] = []
-    for start in starts:
-        model = models.get(start.obj_id)
+    asked: list[Wanted] = []
+    for w in wanted:
+        model = models.get(w.obj_id)
         if model is None:
             raise InputError(
-                f"instance {start.instance} is of object {start.obj_id}, which is not among the "
+                f"instance {w.instance} is of object {w.obj_id}, which is not among the "
                 f"models: {names_of(list(models.values()))}."
             )
-        bodies.append(
-            make_body(start, model, config.field_cells, config.samples, config.field_folder)
-        )
-    return bodies
+        if isinstance(w, ObjectPose):
+            T = w.T_world_obj
+            region = Region(
+                center_world=se3.transform(T, model.mesh.bounds.mean(0)[None])[0],
+                radius_m=config.start_radius_m, R_world_obj=T[:3, :3],
+                turn_deg=config.start_turn_deg,
+            )  # fmt: skip
+            w = Wanted(obj_id=w.obj_id, instance=w.instance, region=region, T_start=T)  # noqa: PLW2901
+        asked.append(w)
+    return asked
 
 
-def _plane(
-    frames: Sequence[DepthFrame],
-    bodies: Sequence[Body],
-    evidence: Evidence,
+def _in_units(
+    models: Mapping[int, ObjectModel],
+    asked: list[Wanted] | None,
+    intake: Intake,
     config: RegistrationConfig,
-    gravity_up_world: ArrayLike | None,
-) -> tuple[SupportPlane | None, str]:
-    """Return the support plane around the objects, or None and why."""
-    centers = np.stack([b.center(b.T_start) for b in bodies])
-    cameras = np.stack([f.T_world_cam[:3, 3] for f in frames])
-    distance = float(np.median(np.linalg.norm(cameras - centers.mean(0), axis=1)))
-    noise = float(evidence.noise.sigma(np.array([distance]))[0])
-    return find_support_plane(
-        evidence.support, centers, cameras, config.plane, noise, gravity_up_world
-    )
-
-
-def _search_one(work: _Work, body: Body, near: Cloud, tick: Callable[[], None]) -> Found:
-    """Return the best hypothesis of one object, its neighbours not yet considered."""
-    config = work.config
-    center = body.center(body.T_start)
-    comparer = work.comparer(center, config.compare.frames, config.compare.rays)
-    free_space = work.free_space(comparer.frames)
-    above = without_table(near, work.plane, config.joint.drop_height(body, work.plane))
-    coarse = averaged(above, body.T_start, config.joint.coarse_voxel(body))
-    fine = averaged(above, body.T_start, config.joint.fine_voxel(body))
-    found = search(body, coarse, fine, comparer, free_space, (config.search, config.solver))
-    tick()
-    return found
-
-
-def _joint(
-    work: _Work, bodies: Sequence[Body], found: Sequence[Found]
-) -> tuple[list[Kept], list[Cloud], list[dict[str, Any]]]:
-    """Return the fits of all objects together, the points of each, and the sweeps' history.
-
-    What the points of an object do not determine is as it was at its start.
-    """
-    config = work.config
-    poses = [f.fit.T_world_obj for f in found]
-    moved = [
-        np.linalg.norm(b.center(T) - b.center(b.T_start))
-        for b, T in zip(bodies, poses, strict=True)
-    ]
-    near = work.evidence.near
-    if max(moved) > config.regather_m:
-        there = [
-            replace(b, start=replace(b.start, T_world_obj=T))
-            for b, T in zip(bodies, poses, strict=True)
-        ]
-        near = gather(work.intrinsics, work.frames, there, config.evidence).near
-    clouds = [
-        averaged(
-            without_table(cloud, work.plane, config.joint.drop_height(body, work.plane)),
-            body.T_start,
-            config.joint.fine_voxel(body),
-        )
-        for body, cloud in zip(bodies, near, strict=True)
-    ]
-    comparers = [
-        work.comparer(b.center(T), config.compare.frames, config.compare.rays)
-        for b, T in zip(bodies, poses, strict=True)
-    ]
-    spaces = [work.free_space(c.frames) for c in comparers]
-    fits, own, history = joint_fit(
-        bodies, poses, clouds, (comparers, spaces), (config.joint, config.solver)
-    )
-    constants = (config.blind, config.covariance, config.solver)
-    kept = [
-        keep_start(body, fit, data, constants)
-        for body, fit, data in zip(
-            bodies, fits, zip(own, comparers, spaces, strict=True), strict=True
-        )
-    ]
-    return kept, own, history
-
-
-def _objects(
-    bodies: Sequence[Body],
-    poses: Sequence[Array],
-    clouds: Sequence[Cloud],
-    uncertain: Sequence[Uncertainty | None],
-    comparer: Comparer,
-    config: VerifyConfig,
-) -> list[ObjectPose]:
-    """Return the object poses with their checks and verdicts."""
-    checked = verify_objects(bodies, poses, clouds, comparer, config)
-    return [
+) -> tuple[list[Wanted] | None, list[NotPlaced]]:
+    """Return what can be sought, and what is off by a factor of a thousand."""
+    depths = [np.median(v.points[:, 2]) for v in intake.views if len(v.points)]
+    if asked is None or not depths:
+        return asked, []
+    eyes = intake.cameras[:, :3, 3]
+    starts = [
         ObjectPose(
-            obj_id=b.start.obj_id,
-            instance=b.start.instance,
-            T_world_obj=T,
-            covariance=None if u is None else u.covariance,
-            checks=c.checks if u is None else c.checks | {"blind_axes": float(len(u.unobservable))},
-            verdict=c.verdict,
-            reasons=c.reasons,
+            obj_id=w.obj_id, instance=w.instance,
+            T_world_obj=_middle_pose(intake) if w.T_start is None else w.T_start,
         )
-        for b, T, c, u in zip(bodies, poses, checked, uncertain, strict=True)
+        for w in asked
+    ]  # fmt: skip
+    errors = unit_errors(models, starts, eyes, float(np.median(depths)), config.judging.units)
+    refused = [
+        NotPlaced(obj_id=w.obj_id, instance=w.instance, reason=str(errors[w.instance]))
+        for w in asked if w.instance in errors
+    ]  # fmt: skip
+    return [w for w in asked if w.instance not in errors], refused
+
+
+def _middle_pose(intake: Intake) -> Array:
+    """Return a pose (4, 4) in front of the first camera, for objects of which nothing is said."""
+    view = next(v for v in intake.views if len(v.points))
+    return se3.from_translation(np.median(view.world(), axis=0))
+
+
+def _found(work: _Work, asked: list[Wanted] | None) -> _Found:
+    """Return the objects near their final poses, whatever was known of them before."""
+    intake, config = work.intake, work.config
+    near_only = asked is not None and all(w.T_start is not None for w in asked)
+    few = len(intake.frames) < config.refine_from
+    if asked is not None and not asked:
+        return _Found(bodies=[], claimed=[], contrasts=[], reports=[], not_placed=(), report={})
+    if config.method == "top-down" or (near_only and (few or intake.plane is None)):
+        return _found_near(work, asked or [])
+    if intake.plane is None:
+        lost = [w for w in asked or () if w.T_start is None]
+        reason = (
+            f"no table was found ({intake.no_plane}), so it can be anywhere; give a rough pose "
+            "(30 mm, 20 deg)."
+        )
+        missing = [NotPlaced(obj_id=w.obj_id, instance=w.instance, reason=reason) for w in lost]
+        near = [w for w in asked or () if w.T_start is not None]
+        if asked is None:
+            raise DegenerateError(
+                f"no table was found: {intake.no_plane} Without one, objects can only be "
+                "registered from rough poses; name them with their poses."
+            )
+        found = _found_near(work, near)
+        return replace(found, not_placed=(*found.not_placed, *missing))
+    result = find_objects(
+        intake.intrinsics, intake.frames, intake.views, intake.plane, intake.noise, work.models,
+        asked, config.find, field_folder=config.field_folder, progress=work.tick.each,
+    )  # fmt: skip
+    return _as_found(work, result, asked)
+
+
+def _as_found(work: _Work, result: SearchResult, asked: list[Wanted] | None) -> _Found:
+    """Return what a search placed as bodies."""
+    claims = {w.instance: w.T_start for w in asked or ()}
+    placed: list[Placed] = sorted(result.placed, key=lambda p: p.instance)
+    return _Found(
+        bodies=[_body(work, p.obj_id, p.instance, p.T_world_obj) for p in placed],
+        claimed=[claims.get(p.instance) for p in placed],
+        contrasts=[p.contrast for p in placed],
+        reports=[search_report(p) for p in placed],
+        not_placed=result.not_placed, report=dict(result.report),
+    )  # fmt: skip
+
+
+def _found_near(work: _Work, asked: list[Wanted]) -> _Found:
+    """Return the objects at their claimed starts; where there are few views the fit searches."""
+    T_starts = [w.T_start for w in asked]
+    bodies = [
+        _body(work, w.obj_id, w.instance, T)
+        for w, T in zip(asked, T_starts, strict=True) if T is not None
+    ]  # fmt: skip
+    reports: list[dict[str, Any]] = [{} for _ in bodies]
+    many = len(work.intake.frames) >= work.config.refine_from and work.config.refine_cameras
+    if many and bodies and work.config.method == "joint":
+        started = begin(work.intake, bodies, work.config, work.up)
+        found = search_near(started, bodies, work.tick)
+        reports = [f.report for f in found]
+        bodies = [
+            replace(b, start=replace(b.start, T_world_obj=f.fit.T_world_obj))
+            for b, f in zip(bodies, found, strict=True)
+        ]
+    return _Found(
+        bodies=bodies, claimed=list(T_starts), contrasts=[None] * len(bodies), reports=reports,
+        not_placed=(), report={},
+    )  # fmt: skip
+
+
+def _body(work: _Work, obj_id: int, instance: int, T: Array) -> Body:
+    """Return the body of an instance at a pose."""
+    c = work.config
+    start = ObjectPose(obj_id=obj_id, instance=instance, T_world_obj=T)
+    return make_body(start, work.models[obj_id], c.field_cells, c.samples, c.field_folder)
+
+
+def _claimed_bodies(found: _Found) -> list[Body]:
+    """Return the bodies with the starts that somebody claimed, where somebody did."""
+    return [
+        b if T is None else replace(b, start=replace(b.start, T_world_obj=T))
+        for b, T in zip(found.bodies, found.claimed, strict=True)
     ]
+
+
+def _with_many(work: _Work, found: _Found, missing: tuple[NotPlaced, ...]) -> Registration:
+    """Return the registration with everything refined together."""
+    intake, config = work.intake, work.config
+    claimed = _claimed_bodies(found)
+    starts = [b if T is not None else None for b, T in zip(claimed, found.claimed, strict=True)]
+    many = register_many(intake, found.bodies, starts, intake.plane, config, work.tick.each)
+    comparer = comparer_on(intake, many.frames, many.plane, claimed, many.poses, config)
+    uncertain = [
+        uncertainty(b, k.fit, 1, config.covariance) for b, k in zip(claimed, many.kept, strict=True)
+    ]
+    given = Poses(
+        bodies=claimed, poses=many.poses, clouds=many.clouds, covariances=list(many.covariances),
+        blind=[len(u.unobservable) for u in uncertain], contrasts=found.contrasts,
+        cameras=many.refined.cameras, plane=many.plane,
+        with_starts=all(T is not None for T in found.claimed),
+    )  # fmt: skip
+    result = judged(intake, given, comparer, config)
+    work.tick()
+    numbers = [f.index for f in intake.frames]
+    instances = [b.start.instance for b in claimed]
+    seen = {
+        number: {i: of[v] for i, of in zip(instances, many.seen, strict=True)}
+        for v, number in enumerate(numbers)
+    }
+    extra = {"refinement": camera_report(many, numbers)}
+    reports = [
+        object_report(b, o, k, r, u)
+        for b, o, k, r, u in zip(
+            claimed, result.objects, many.kept, found.reports, uncertain, strict=True
+        )
+    ]
+    cameras = dict(zip(numbers, many.refined.cameras, strict=True))
+    return _registration(
+        work, (found, missing), (given, result, comparer), (cameras, seen), (extra, reports)
+    )
+
+
+def _with_few(work: _Work, found: _Found, missing: tuple[NotPlaced, ...]) -> Registration:
+    """Return the registration with the cameras at their word."""
+    intake, config = work.intake, work.config
+    few = register_few(intake, found.bodies, config, work.up, work.tick)
+    claimed = _claimed_bodies(found)
+    plane = few.plane if few.plane is not None else intake.plane
+    poses = [k.fit.T_world_obj for k in few.kept]
+    comparer = comparer_on(intake, intake.frames, plane, claimed, poses, config)
+    uncertain = [
+        uncertainty(b, k.fit, few.stride, config.covariance)
+        for b, k in zip(claimed, few.kept, strict=True)
+    ]
+    given = Poses(
+        bodies=claimed, poses=poses, clouds=few.clouds,
+        covariances=[u.covariance for u in uncertain],
+        blind=[len(u.unobservable) for u in uncertain], contrasts=found.contrasts,
+        cameras=intake.cameras, plane=plane,
+        with_starts=all(T is not None for T in found.claimed),
+    )  # fmt: skip
+    result = judged(intake, given, comparer, config)
+    work.tick()
+    reports = [
+        object_report(b, o, k, {**r, **f.report}, u)
+        for b, o, k, r, f, u in zip(
+            claimed, result.objects, few.kept, found.reports, few.found, uncertain, strict=True
+        )
+    ]
+    cameras = {f.index: f.T_world_cam for f in intake.frames}
+    extra: dict[str, Any] = {"joint": few.history}
+    return _registration(
+        work, (found, missing), (given, result, comparer), (cameras, {}), (extra, reports)
+    )
+
+
+def _nothing(work: _Work, found: _Found, missing: tuple[NotPlaced, ...]) -> Registration:
+    """Return the registration of a scene in which nothing was found."""
+    scene = Scene(name=work.name, objects=(), plane=work.intake.plane)
+    return Registration(
+        scene=scene, single_view=scene,
+        cameras={f.index: f.T_world_cam for f in work.intake.frames}, seen={},
+        not_placed=missing, findings=work.intake.findings,
+        report={"frames": [f.index for f in work.intake.frames], "objects": [],
+                "plane": plane_report(work.intake.plane, work.intake.no_plane),
+                "search": found.report},
+    )  # fmt: skip
+
+
+def _registration(
+    work: _Work,
+    search: tuple[_Found, tuple[NotPlaced, ...]],
+    results: tuple[Poses, Judged, Comparer],
+    views: tuple[dict[int, Array], dict[int, dict[int, SeenPose]]],
+    reports: tuple[dict[str, Any], list[dict[str, Any]]],
+) -> Registration:
+    """Return all parts together, with the paper's way beside them."""
+    (found, missing), (given, result, comparer) = search, results
+    intake, config = work.intake, work.config
+    single, single_report = _single_view(work, given, comparer)
+    work.tick()
+    objects = tuple(result.objects)
+    baseline = Scene(name=f"{work.name} (single view)", objects=tuple(single), plane=given.plane)
+    if config.method == "top-down":
+        scene = replace(baseline, name=work.name)
+    else:
+        scene = Scene(name=work.name, objects=objects, plane=given.plane)
+    report = {
+        "method": config.method,
+        "frames": [f.index for f in intake.frames],
+        "stride_px": round(float(np.sqrt(intake.views[0].area_px))),
+        "noise_per_m": intake.noise.per_m,
+        "plane": plane_report(given.plane, intake.no_plane),
+        **common_report(given, objects, config),
+        "search": found.report,
+        "single_view": single_report,
+        "not_placed": [
+            {"obj_id": n.obj_id, "instance": n.instance, "reason": n.reason} for n in missing
+        ],
+        "findings": [
+            {"kind": f.kind, "words": f.words} for f in (*intake.findings, *result.findings)
+        ],
+        **reports[0],
+        "objects": reports[1],
+    }
+    return Registration(
+        scene=scene, single_view=baseline, cameras=views[0], seen=views[1], not_placed=missing,
+        findings=(*intake.findings, *result.findings), report=report,
+    )  # fmt: skip
 
 
 def _single_view(
-    work: _Work, bodies: Sequence[Body], clouds: Sequence[Cloud], comparer: Comparer
+    work: _Work, given: Poses, comparer: Comparer
 ) -> tuple[list[ObjectPose], dict[str, Any]]:
     """Return the baseline's poses and which frame it used; objects it cannot see are left out."""
-    if not work.config.with_single_view:
+    config, intake = work.config, work.intake
+    if not (config.with_single_view or config.method == "top-down"):
         return [], {"frame": None, "not_fitted": []}
-    center = _middle(bodies, [b.T_start for b in bodies])
-    frame = reference_frame(work.frames, work.plane, center)
+    center = np.mean([b.center(b.T_start) for b in given.bodies], axis=0)
+    frame = reference_frame(intake.frames, given.plane, center)
     kept: list[int] = []
     poses: list[Array] = []
     missing: list[str] = []
-    for i, body in enumerate(bodies):
+    for i, body in enumerate(given.bodies):
         try:
-            T = fit_single_view(body, work.intrinsics, frame, work.config.single_view)
+            T = fit_single_view(body, intake.intrinsics, frame, config.single_view)
         except DegenerateError as error:
             missing.append(f"instance {body.start.instance}: {error}")
             continue
         kept.append(i)
         poses.append(T)
-    objects = _objects(
-        [bodies[i] for i in kept], poses, [clouds[i] for i in kept], [None] * len(kept), comparer,
-        work.config.verify,
+    checked = verify_objects(
+        [given.bodies[i] for i in kept], poses, [given.clouds[i] for i in kept], comparer,
+        config.verify,
     )  # fmt: skip
+    objects = [
+        ObjectPose(
+            obj_id=given.bodies[i].start.obj_id, instance=given.bodies[i].start.instance,
+            T_world_obj=T, checks=c.checks, verdict=c.verdict, reasons=c.reasons,
+        )
+        for i, T, c in zip(kept, poses, checked, strict=True)
+    ]  # fmt: skip
     return objects, {"frame": frame.index, "not_fitted": missing}
-
-
-def _middle(bodies: Sequence[Body], poses: Sequence[Array]) -> Array:
-    """Return the mean (3,) of the objects' centres in world [m]."""
-    return np.mean([b.center(T) for b, T in zip(bodies, poses, strict=True)], axis=0)
-
-
-def _plane_report(plane: SupportPlane | None, reason: str) -> dict[str, Any]:
-    """Return the plane's quality, or why there is none."""
-    if plane is None:
-        return {"found": False, "reason": reason}
-    return {"found": True, "rms_mm": 1e3 * plane.rms_m, "inliers": plane.inliers}
-
-
-def _common_report(
-    work: _Work, bodies: Sequence[Body], objects: Sequence[ObjectPose]
-) -> dict[str, Any]:
-    """Return what holds for all objects together, as JSON values."""
-    config, evidence = work.config, work.evidence
-    poses = [o.T_world_obj for o in objects]
-    good = [o.verdict != "rejected" for o in objects]
-    return {
-        "stride_px": evidence.stride,
-        "noise_per_m": evidence.noise.per_m,
-        "common_offset_mm": common_offset(bodies, poses, good, config.offset),
-        "common_sinking": common_sinking(bodies, poses, good, work.plane, config.sinking),
-    }
-
-
-def _object_report(
-    body: Body, pose: ObjectPose, kept: Kept, search_report: dict[str, Any], u: Uncertainty
-) -> dict[str, Any]:
-    """Return what happened to one object, as JSON values."""
-    fit = kept.fit
-    T, T0 = pose.T_world_obj, body.T_start
-    return {
-        "instance": pose.instance,
-        "obj_id": pose.obj_id,
-        "name": body.model.name,
-        "verdict": pose.verdict,
-        "moved_mm": float(1e3 * np.linalg.norm(body.center(T) - body.center(T0))),
-        "turned_deg": float(np.degrees(se3.angle(T0[:3, :3].T @ T[:3, :3]))),
-        "points_used": fit.points,
-        "points_offered": fit.offered,
-        "residual_rms_mm": list(fit.history_mm),
-        "variance_of_unit_weight": fit.variance,
-        "unobservable": list(u.unobservable),
-        "blind": kept.report,
-        "sensitivities": list(u.sensitivities),
-        "search": search_report,
-    }

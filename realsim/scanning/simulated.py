@@ -4,7 +4,6 @@ What a scan can be worth is found out here before anyone holds a camera: the sam
 same errors serve the tests, the benchmark, and whoever asks which accuracy a shape allows.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,13 +13,21 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import transformed
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.registration.evidence import DepthFrame
+from realsim.registration.simulated_lab import (
+    LOWEST_DEG,
+    T_EE_CAM,
+    arm_error,
+    hemisphere,
+    offset,
+    table_square,
+)
 from realsim.rendering.depth_sensor import DepthSensorModel
 
 Array = NDArray[np.float64]
-T_EE_CAM = se3.from_translation([0.0, -0.065, 0.035])
-"""(4, 4) the camera on the hand as drawn [m]."""
-LOWEST_DEG = 25.0
-"""Least elevation of a view over the table [deg]."""
+__all__ = [
+    "DISC_M", "EDGES_PER_LENGTH", "FIELD_POINTS", "LOWEST_DEG", "T_EE_CAM", "ScanLabConfig",
+    "ScanViews", "distorted", "scan_views", "standing",
+]  # fmt: skip
 DISC_M = 0.04
 """The object stands up to this far from the middle of the views [m]."""
 FIELD_POINTS = 20_000
@@ -88,12 +95,12 @@ def scan_views(
     )  # fmt: skip
     placed = transformed(mesh, T_world_obj)
     middle = placed.bounds.mean(0)
-    true = _hemisphere(middle, config, rng)
-    hand_eye = _offset(rng, config.hand_eye_mm / 1e3, np.radians(config.hand_eye_deg))
+    true = hemisphere(middle, config.views, config.distance_m, config.distance_m[1], rng)
+    hand_eye = offset(rng, config.hand_eye_mm / 1e3, np.radians(config.hand_eye_deg))
     T_ee_cam_true = T_EE_CAM @ hand_eye
     scene = RayScene([
         PlacedMesh(0, mesh, T_world_obj),
-        PlacedMesh(BACKGROUND, _table(placed.bounds.mean(0)[:2]), np.eye(4)),
+        PlacedMesh(BACKGROUND, table_square(placed.bounds.mean(0)[:2]), np.eye(4)),
     ])  # fmt: skip
     rays = ray_table(camera)
     frames: list[DepthFrame] = []
@@ -101,10 +108,7 @@ def scan_views(
         directions = rotated(rays, T_world_cam[:3, :3]).reshape(-1, 3)
         t, _ = scene.first_hits(T_world_cam[:3, 3], directions)
         exact = np.where(np.isfinite(t), t, 0).reshape(camera.height, camera.width)
-        xi = np.concatenate([
-            np.radians(config.arm_deg) * rng.standard_normal(3),
-            config.arm_mm / 1e3 * rng.standard_normal(3),
-        ])  # fmt: skip
+        xi = arm_error(rng, config.arm_mm, config.arm_deg)
         T_base_ee = T_world_cam @ se3.invert(T_ee_cam_true) @ se3.exp(xi)
         frames.append(
             DepthFrame(
@@ -226,41 +230,3 @@ def _halved(faces: NDArray[np.int64], middle: NDArray[np.int64]) -> NDArray[np.i
         pick(three, a, ab, ca), pick(three, ab, b, bc), pick(three, ca, bc, c),
         pick(three, ab, bc, ca),
     ])  # fmt: skip
-
-
-def _hemisphere(middle: Array, config: ScanLabConfig, rng: np.random.Generator) -> Array:
-    """Return camera poses (F, 4, 4) that look at the middle; a spiral, jittered, the first down."""
-    n = config.views
-    k = np.arange(n)
-    lowest = np.sin(np.radians(LOWEST_DEG))
-    height = 1 - (1 - lowest) * k / max(n - 1, 1)
-    around = k * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi)
-    out = np.sqrt(np.clip(1 - height**2, 0, None))
-    directions = np.stack([out * np.cos(around), out * np.sin(around), height], -1)
-    near, far = config.distance_m
-    distances = rng.uniform(near, far, n)
-    distances[0] = far
-    poses: list[Array] = []
-    for direction, distance in zip(directions, distances, strict=True):
-        z = -direction
-        x = np.cross(np.array([0.0, 0.0, 1.0]), z)
-        x = np.array([1.0, 0, 0]) if np.linalg.norm(x) < 1e-6 else x / np.linalg.norm(x)
-        R = np.stack([x, np.cross(z, x), z], -1) @ se3.exp_so3([0, 0, rng.uniform(-0.3, 0.3)])
-        aim = middle + rng.uniform(-0.01, 0.01, 3)
-        poses.append(se3.from_rt(R, aim + distance * direction))
-    return np.stack(poses)
-
-
-def _offset(rng: np.random.Generator, distance_m: float, angle_rad: float) -> Array:
-    """Return a transform (4, 4) of this distance and angle in random directions."""
-    axes = rng.standard_normal((2, 3))
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    return se3.from_rt(se3.exp_so3(angle_rad * axes[0]), distance_m * axes[1])
-
-
-def _table(at: Sequence[float] | Array) -> Mesh:
-    """Return a square of the plane z = 0, 1.2 m wide, about a point (2,)."""
-    x, y = float(at[0]), float(at[1])
-    corners = [[-0.6, -0.6, 0.0], [0.6, -0.6, 0.0], [0.6, 0.6, 0.0], [-0.6, 0.6, 0.0]]
-    vertices = np.array(corners) + np.array([x, y, 0.0])
-    return Mesh(vertices=vertices, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))

@@ -1,0 +1,100 @@
+"""All constants of a registration, by part."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from realsim.records.depth_bias import DepthBias
+from realsim.registration.blind import BlindConfig
+from realsim.registration.compare import CompareConfig
+from realsim.registration.covariance import CovarianceConfig
+from realsim.registration.evidence import EvidenceConfig
+from realsim.registration.find_table import TableSearchConfig
+from realsim.registration.hypotheses import SearchConfig
+from realsim.registration.joint import JointConfig
+from realsim.registration.judging.held_out import HeldOutConfig
+from realsim.registration.judging.scene_checks import SceneCheckConfig
+from realsim.registration.judging.surface_residuals import ResidualConfig
+from realsim.registration.judging.unit_checks import UnitConfig
+from realsim.registration.judging.verdict import VerdictConfig
+from realsim.registration.plane import PlaneConfig
+from realsim.registration.refinement.config import RefineConfig
+from realsim.registration.search.find import FindConfig
+from realsim.registration.single_view import SingleViewConfig
+from realsim.registration.solver import SolverConfig
+from realsim.registration.verify import OffsetConfig, SinkingConfig, VerifyConfig
+from realsim.registration.view_findings import ViewCheckConfig
+from realsim.registration.views import SampleConfig
+
+Method = Literal["joint", "top-down"]
+METHODS: tuple[Method, ...] = ("joint", "top-down")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class JudgingConfig:
+    """How poses are judged without ground truth."""
+
+    residuals: ResidualConfig = field(default_factory=ResidualConfig)
+    held_out: HeldOutConfig = field(default_factory=HeldOutConfig)
+    verdict: VerdictConfig = field(default_factory=VerdictConfig)
+    scene: SceneCheckConfig = field(default_factory=SceneCheckConfig)
+    units: UnitConfig = field(default_factory=UnitConfig)
+    views: ViewCheckConfig = field(default_factory=ViewCheckConfig)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RegistrationConfig:
+    """All constants of a registration."""
+
+    method: Method = "joint"
+    """'joint': all views, objects and cameras together. 'top-down': the paper's way, ICP in the one
+    view that looks down, carried to the others by the claimed cameras."""
+    refine_cameras: bool = True
+    """Whether cameras are refined with the objects; else they are taken at their word."""
+    refine_from: int = 4
+    """Least views for that: of fewer, an error of a camera is one of the object."""
+    field_cells: int = 96
+    """Cells of a distance field along the object's longest side; 56 doubled the scale error."""
+    samples: int = 600
+    """Surface samples per object for free space and penetration."""
+    free_space: bool = True
+    """Whether models are kept out of space the cameras looked through (few views)."""
+    field_folder: Path | None = None
+    """Where what is derived from meshes is kept between runs; None = in memory only."""
+    with_single_view: bool = True
+    """Whether the single-view baseline is computed as well."""
+    start_radius_m: float = 0.045
+    """How far an object may be from a start pose: 1.5 times what a start may be off by."""
+    start_turn_deg: float = 38.0
+    """How far it may be turned from there, likewise."""
+    regather_m: float = 0.012
+    """If an object moved further than this, its points are collected again around its new pose."""
+    dense_views: int = 48
+    """With more views, every second point is enough: neighbours share their noise."""
+    hand_eye_sigma_mm: float | None = None
+    """1-sigma of the hand-eye [mm], from its calibration; None = the refinement's own prior."""
+    hand_eye_sigma_deg: float | None = None
+    """Likewise [deg]."""
+    arm_sigma_mm: float | None = None
+    """1-sigma of each robot pose [mm]; None likewise."""
+    arm_sigma_deg: float | None = None
+    """Likewise [deg]."""
+    bias: DepthBias = field(default_factory=DepthBias.none)
+    """Of the depth camera, from its calibration; the images are given as measured."""
+    evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+    sample: SampleConfig = field(default_factory=SampleConfig)
+    table: TableSearchConfig = field(default_factory=TableSearchConfig)
+    plane: PlaneConfig = field(default_factory=PlaneConfig)
+    compare: CompareConfig = field(default_factory=CompareConfig)
+    find: FindConfig = field(default_factory=FindConfig)
+    search: SearchConfig = field(default_factory=SearchConfig)
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    joint: JointConfig = field(default_factory=JointConfig)
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    blind: BlindConfig = field(default_factory=BlindConfig)
+    covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
+    verify: VerifyConfig = field(default_factory=VerifyConfig)
+    judging: JudgingConfig = field(default_factory=JudgingConfig)
+    offset: OffsetConfig = field(default_factory=OffsetConfig)
+    sinking: SinkingConfig = field(default_factory=SinkingConfig)
+    single_view: SingleViewConfig = field(default_factory=SingleViewConfig)

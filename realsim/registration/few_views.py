@@ -1,0 +1,187 @@
+"""Registration from one to three views: cameras are taken at their word.
+
+Many starts around the given pose, each fitted, rendered and compared; then all objects together,
+each point with the model it is nearest to. Free space keeps models out of what the cameras looked
+through, because so few views leave much unseen.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.records import SupportPlane
+from realsim.registration.blind import Kept, keep_start
+from realsim.registration.body import Body
+from realsim.registration.compare import Comparer, make_comparer, spread_frames
+from realsim.registration.config import RegistrationConfig
+from realsim.registration.evidence import (
+    Cloud,
+    DepthFrame,
+    Evidence,
+    averaged,
+    gather,
+    held,
+    without_table,
+)
+from realsim.registration.hypotheses import Found, search
+from realsim.registration.intake import Intake
+from realsim.registration.joint import joint_fit
+from realsim.registration.plane import find_support_plane
+from realsim.registration.solver import FreeSpace
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Work:
+    """What every step needs."""
+
+    intake: Intake
+    plane: SupportPlane | None
+    no_plane: str
+    evidence: Evidence
+    config: RegistrationConfig
+
+    def comparer(self, center: Array, n: int, rays: int) -> Comparer:
+        """Return a comparer on n frames spread around `center`."""
+        chosen = [held(f) for f in spread_frames(self.intake.frames, center, n)]
+        config = replace(self.config.compare, rays=rays)
+        return make_comparer(
+            self.intake.intrinsics, chosen, self.evidence.noise, self.plane, config
+        )
+
+    def free_space(self, frames: Sequence[DepthFrame]) -> FreeSpace | None:
+        """Return the images that models may not stand in front of."""
+        if not self.config.free_space:
+            return None
+        i, noise = self.intake.intrinsics, self.evidence.noise
+        return FreeSpace(
+            depths=np.stack([f.depth_m for f in frames]).astype(np.float32),
+            Ts_cam_world=np.stack([se3.invert(f.T_world_cam) for f in frames]),
+            camera=np.concatenate([[i.fx, i.fy, i.cx, i.cy], i.distortion]),
+            noise=(noise.per_m, noise.floor_m),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FewViews:
+    """What came of it."""
+
+    kept: list[Kept]
+    clouds: list[Cloud]
+    """Each object's own points."""
+    found: list[Found]
+    history: list[dict[str, Any]]
+    plane: SupportPlane | None
+    no_plane: str
+    stride: int
+
+
+def begin(
+    intake: Intake, bodies: Sequence[Body], config: RegistrationConfig, up: Array | None
+) -> Work:
+    """Return the points near the bodies' starts, and the plane under them."""
+    evidence = gather(intake.intrinsics, intake.frames, bodies, config.evidence)
+    centers = np.stack([b.center(b.T_start) for b in bodies])
+    cameras = intake.cameras[:, :3, 3]
+    distance = float(np.median(np.linalg.norm(cameras - centers.mean(0), axis=1)))
+    sigma = float(evidence.noise.sigma(np.array([distance]))[0])
+    plane, why = find_support_plane(evidence.support, centers, cameras, config.plane, sigma, up)
+    return Work(intake, plane, why, evidence, config)
+
+
+def search_near(work: Work, bodies: Sequence[Body], tick: Callable[[], None]) -> list[Found]:
+    """Return of every body the pose near its start that explains the images best."""
+    return [
+        _search_one(work, body, near, tick)
+        for body, near in zip(bodies, work.evidence.near, strict=True)
+    ]
+
+
+def register_few(
+    intake: Intake,
+    bodies: Sequence[Body],
+    config: RegistrationConfig,
+    up: Array | None,
+    tick: Callable[[], None],
+) -> FewViews:
+    """Return the poses of bodies from their starts.
+
+    Args:
+        intake: the frames.
+        bodies: the objects at their starts.
+        config: see there.
+        up: (3,) direction up in world, or None.
+        tick: called after each object.
+    """
+    work = begin(intake, bodies, config, up)
+    found = search_near(work, bodies, tick)
+    kept, clouds, history = _joint(work, bodies, found)
+    return FewViews(
+        kept=kept, clouds=clouds, found=found, history=history, plane=work.plane,
+        no_plane=work.no_plane, stride=work.evidence.stride,
+    )  # fmt: skip
+
+
+def _search_one(work: Work, body: Body, near: Cloud, tick: Callable[[], None]) -> Found:
+    """Return the best hypothesis of one object, its neighbours not yet considered."""
+    config = work.config
+    center = body.center(body.T_start)
+    comparer = work.comparer(center, config.compare.frames, config.compare.rays)
+    free_space = work.free_space(comparer.frames)
+    above = without_table(near, work.plane, config.joint.drop_height(body, work.plane))
+    coarse = averaged(above, body.T_start, config.joint.coarse_voxel(body))
+    fine = averaged(above, body.T_start, config.joint.fine_voxel(body))
+    found = search(body, coarse, fine, comparer, free_space, (config.search, config.solver))
+    tick()
+    return found
+
+
+def _joint(
+    work: Work, bodies: Sequence[Body], found: Sequence[Found]
+) -> tuple[list[Kept], list[Cloud], list[dict[str, Any]]]:
+    """Return the fits of all objects together, the points of each, and the sweeps' history.
+
+    What the points of an object do not determine is as it was at its start.
+    """
+    config = work.config
+    poses = [f.fit.T_world_obj for f in found]
+    moved = [
+        np.linalg.norm(b.center(T) - b.center(b.T_start))
+        for b, T in zip(bodies, poses, strict=True)
+    ]
+    near = work.evidence.near
+    if max(moved) > config.regather_m:
+        there = [
+            replace(b, start=replace(b.start, T_world_obj=T))
+            for b, T in zip(bodies, poses, strict=True)
+        ]
+        near = gather(work.intake.intrinsics, work.intake.frames, there, config.evidence).near
+    clouds = [
+        averaged(
+            without_table(cloud, work.plane, config.joint.drop_height(body, work.plane)),
+            body.T_start,
+            config.joint.fine_voxel(body),
+        )
+        for body, cloud in zip(bodies, near, strict=True)
+    ]
+    comparers = [
+        work.comparer(b.center(T), config.compare.frames, config.compare.rays)
+        for b, T in zip(bodies, poses, strict=True)
+    ]
+    spaces = [work.free_space(c.frames) for c in comparers]
+    fits, own, history = joint_fit(
+        bodies, poses, clouds, (comparers, spaces), (config.joint, config.solver)
+    )
+    constants = (config.blind, config.covariance, config.solver)
+    kept = [
+        keep_start(body, fit, data, constants)
+        for body, fit, data in zip(
+            bodies, fits, zip(own, comparers, spaces, strict=True), strict=True
+        )
+    ]
+    return kept, own, history

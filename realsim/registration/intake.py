@@ -1,0 +1,135 @@
+"""From depth images to what a registration works with: points, noise, table, sound views."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.geometry.depth import check_depth
+from realsim.records import CameraIntrinsics, SupportPlane
+from realsim.registration.config import RegistrationConfig
+from realsim.registration.evidence import (
+    Cloud,
+    DepthFrame,
+    DepthNoise,
+    averaged,
+    corrected_frame,
+    held,
+    measure_noise,
+    without_table,
+)
+from realsim.registration.find_table import find_table
+from realsim.registration.view_checks import check_views
+from realsim.registration.view_findings import ViewFinding
+from realsim.registration.views import SampleConfig, ViewPoints, sample_view, world_cloud
+
+Array = NDArray[np.float64]
+SCENE_POINTS = 400_000
+"""Points of all views that are averaged into the scene's cloud at most."""
+SCENE_VOXEL_M = 0.003
+"""Its voxels [m]."""
+ABOVE_M = 0.003
+"""Lower points are the table's [m]."""
+FULL_WIDTH = 1280
+"""Image width that the strides are for [px]; narrower images are thinned out less."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Intake:
+    """What all steps of a registration start from."""
+
+    intrinsics: CameraIntrinsics
+    frames: tuple[DepthFrame, ...]
+    """Sound frames in the order of their numbers, their depth's known bias taken out."""
+    views: tuple[ViewPoints, ...]
+    """Their trusted points."""
+    noise: DepthNoise
+    plane: SupportPlane | None
+    no_plane: str
+    """Why there is no plane."""
+    findings: tuple[ViewFinding, ...]
+
+    @property
+    def cameras(self) -> Array:
+        """(F, 4, 4) where the cameras are said to be [m]."""
+        return np.stack([f.T_world_cam for f in self.frames])
+
+
+def sampling(intrinsics: CameraIntrinsics, frames: int, config: RegistrationConfig) -> SampleConfig:
+    """Return how images of this size and number are thinned out."""
+    share = min(1.0, intrinsics.width / FULL_WIDTH)
+    full = config.sample.stride * (2 if frames > config.dense_views else 1)
+    return replace(
+        config.sample,
+        stride=max(1, round(full * share)),
+        edge_reach_px=max(1, round(config.sample.edge_reach_px * share + 0.49)),
+    )
+
+
+def take_in(
+    intrinsics: CameraIntrinsics,
+    frames: Sequence[DepthFrame],
+    config: RegistrationConfig,
+    gravity_up_world: ArrayLike | None = None,
+    progress: Callable[[], None] | None = None,
+) -> Intake:
+    """Return what the frames hold; every image is read once.
+
+    Raises:
+        InputError: there is no frame, two have the same number, an image is not the camera's, or
+            no view is left.
+    """
+    if not frames:
+        raise InputError("no depth frames were given; registration needs at least one.")
+    ordered = sorted(frames, key=lambda f: f.index)
+    if len({f.index for f in ordered}) != len(ordered):
+        raise InputError("two depth frames have the same number; view numbers must be unique.")
+    if not config.bias.is_none:
+        ordered = [corrected_frame(f, f.T_world_cam, config.bias) for f in ordered]
+    check_depth(ordered[0].depth_m, intrinsics)
+    noise = measure_noise(ordered, config.evidence)
+    sample = sampling(intrinsics, len(ordered), config)
+    views: list[ViewPoints] = []
+    for frame in ordered:
+        image = held(frame)
+        check_depth(image.depth_m, intrinsics)
+        views.append(sample_view(intrinsics, image, noise, sample))
+        if progress is not None:
+            progress()
+    first = find_table(views, noise, config.table, gravity_up_world=gravity_up_world)
+    findings = check_views(views, first.plane, noise, config.judging.views)
+    bad = {f.index for f in findings if f.exclude}
+    keep = [k for k, v in enumerate(views) if v.index not in bad]
+    if not keep:
+        words = " ".join(f.words for f in findings if f.exclude)
+        raise InputError(f"none of the {len(views)} views can be used. {words}")
+    table = first
+    if bad and first.plane is not None:
+        kept = [views[k] for k in keep]
+        table = find_table(kept, noise, config.table, gravity_up_world=gravity_up_world)
+    return Intake(
+        intrinsics=intrinsics, frames=tuple(ordered[k] for k in keep),
+        views=tuple(views[k] for k in keep), noise=noise, plane=table.plane,
+        no_plane=table.reason, findings=tuple(findings),
+    )  # fmt: skip
+
+
+def scene_cloud(intake: Intake, cameras: Array, plane: SupportPlane | None) -> Cloud:
+    """Return what stands on the table, all views together, averaged on voxels.
+
+    Args:
+        intake: the frames.
+        cameras: (V, 4, 4) where the cameras are.
+        plane: the table, whose own points are left out; or None.
+    """
+    total = sum(len(v.points) for v in intake.views)
+    every = max(1, -(-total // SCENE_POINTS))
+    moved = [
+        replace(v, points=v.points[::every], T_world_cam=T)
+        for v, T in zip(intake.views, cameras, strict=True)
+    ]
+    cloud = without_table(world_cloud(moved, intake.noise), plane, ABOVE_M)
+    T = np.eye(4) if plane is None else plane.T_world_table
+    return averaged(cloud, T, SCENE_VOXEL_M)

@@ -1,0 +1,142 @@
+"""Every check of a registration without ground truth, and the verdict of each object."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import ObjectPose, SupportPlane
+from realsim.registration.body import Body
+from realsim.registration.compare import Comparer
+from realsim.registration.config import RegistrationConfig
+from realsim.registration.evidence import Cloud
+from realsim.registration.intake import Intake, scene_cloud
+from realsim.registration.judging.held_out import half_fit, held_out, owned_points
+from realsim.registration.judging.probability import probability_right
+from realsim.registration.judging.residual_checks import error_level_m, residual_checks
+from realsim.registration.judging.scene_checks import Finding, scene_findings
+from realsim.registration.judging.support import support_checks
+from realsim.registration.judging.surface_residuals import surface_residuals
+from realsim.registration.judging.verdict import verdict_of
+from realsim.registration.verify import Checked, verify_objects
+
+Array = NDArray[np.float64]
+ONE_VIEW_CHECKS = ("residual_bound_mm",)
+"""What the surface residuals of a single view are good for."""
+WORST = ("accepted", "doubtful", "rejected")
+"""Verdicts, better first."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Poses:
+    """What is judged."""
+
+    bodies: list[Body]
+    poses: list[Array]
+    clouds: list[Cloud]
+    covariances: list[Array | None]
+    blind: list[int]
+    """Axes that nothing determines, per object."""
+    contrasts: list[float | None]
+    """Against the best near-symmetric rival, per object."""
+    cameras: Array
+    """(V, 4, 4) of all views, refined if they were."""
+    plane: SupportPlane | None
+    with_starts: bool
+    """Whether the bodies' starts were claimed by somebody."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Judged:
+    """The judged objects and what is wrong with the scene."""
+
+    objects: list[ObjectPose]
+    findings: list[Finding]
+
+
+def judged(intake: Intake, given: Poses, comparer: Comparer, config: RegistrationConfig) -> Judged:
+    """Return the objects with checks, probability, verdict and reasons."""
+    checked = verify_objects(given.bodies, given.poses, given.clouds, comparer, config.verify)
+    features = _features(intake, given, checked, config)
+    probabilities = [probability_right(f) for f in features]
+    findings = scene_findings(
+        given.bodies, given.poses, probabilities, scene_cloud(intake, given.cameras, given.plane),
+        comparer, config.judging.scene,
+        given.with_starts,
+    )  # fmt: skip
+    objects = [
+        _object(given, k, checked[k], features[k], probabilities[k], findings, config)
+        for k in range(len(given.bodies))
+    ]
+    return Judged(objects=objects, findings=findings)
+
+
+def _features(
+    intake: Intake, given: Poses, checked: Sequence[Checked], config: RegistrationConfig
+) -> list[dict[str, float | None]]:
+    """Return everything that is known of every object, by name."""
+    j = config.judging
+    residuals = surface_residuals(
+        given.bodies, given.poses, intake.intrinsics, intake.views, given.cameras, intake.noise,
+        given.plane, j.residuals,
+    )  # fmt: skip
+    level = error_level_m(residuals, j.residuals)
+    held = support_checks(given.bodies, given.poses, given.plane)
+    halves: list[dict[str, float]] = [{} for _ in given.bodies]
+    if len(intake.views) >= config.refine_from and given.bodies:
+        owned = owned_points(
+            given.bodies, given.poses, intake.intrinsics, intake.views, given.cameras,
+            intake.noise, given.plane, j.held_out,
+        )  # fmt: skip
+        fit = half_fit(given.bodies, given.poses, owned, j.held_out)
+        found = held_out(given.bodies, owned, len(intake.views), fit, j.held_out)
+        halves = [h.checks() for h in found]
+    surfaces = [residual_checks(r, level, j.residuals) for r in residuals]
+    if len(intake.views) == 1:
+        # One view shows too little of a surface for its patches to say anything.
+        surfaces = [{name: s[name] for name in ONE_VIEW_CHECKS} for s in surfaces]
+    return [
+        {
+            **c.checks, **r, **s, **h,
+            "contrast": contrast, "views": float(len(intake.views)),
+        }
+        for c, r, s, h, contrast in zip(
+            checked, surfaces, held, halves, given.contrasts, strict=True
+        )
+    ]  # fmt: skip
+
+
+def _object(
+    given: Poses,
+    k: int,
+    checked: Checked,
+    features: Mapping[str, float | None],
+    probability: float,
+    findings: Sequence[Finding],
+    config: RegistrationConfig,
+) -> ObjectPose:
+    """Return one object with its verdict: the worse of the bounds' and the probability's."""
+    body = given.bodies[k]
+    verdict, reasons = verdict_of(probability, features, config.judging.verdict)
+    if WORST.index(checked.verdict) > WORST.index(verdict):
+        verdict, reasons = checked.verdict, (*checked.reasons, *reasons)
+    mine = [f for f in findings if body.start.instance in f.instances]
+    if mine:
+        reasons = (*reasons, *(f.words for f in mine))
+        if verdict == "accepted":
+            verdict = "doubtful"
+    checks: dict[str, float] = {
+        name: float(value) for name, value in features.items() if value is not None
+    }
+    checks |= {"probability": probability, "blind_axes": float(given.blind[k])}
+    return ObjectPose(
+        obj_id=body.start.obj_id, instance=body.start.instance, T_world_obj=given.poses[k],
+        covariance=given.covariances[k], checks=_finite(checks), verdict=verdict, reasons=reasons,
+    )  # fmt: skip
+
+
+def _finite(checks: Mapping[str, float]) -> dict[str, Any]:
+    """Return the checks that have a value."""
+    return {name: value for name, value in checks.items() if np.isfinite(value)}

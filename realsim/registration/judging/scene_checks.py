@@ -1,0 +1,265 @@
+"""What is wrong with a scene as a whole, each finding in words.
+
+All objects shifted alike (the camera poses or the starts are another frame's), all sunk alike (the
+depth or the models have another scale), two ids swapped, a model that is not there.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.records import SupportPlane
+from realsim.registration.body import Body
+from realsim.registration.compare import Comparer
+from realsim.registration.evidence import Cloud
+from realsim.registration.solver import SolverConfig, solve_pose
+from realsim.registration.verify import (
+    OffsetConfig,
+    SinkingConfig,
+    common_offset,
+    common_sinking,
+)
+
+Array = NDArray[np.float64]
+FindingKind = Literal["common shift", "common sinking", "swapped ids", "not in the scene", "unit"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Finding:
+    """One thing that is wrong with a scene."""
+
+    kind: FindingKind
+    words: str
+    """What was found, with its numbers, and what to do."""
+    instances: tuple[int, ...]
+    """The objects it concerns."""
+    numbers: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    """Plain JSON values."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SwapConfig:
+    """When two objects may have been taken for each other."""
+
+    similar: float = 1.35
+    """Greatest ratio of the sorted sides of the two boxes: nobody mistakes a cup for a nut."""
+    gain: float = 0.5
+    """Objects that gain this much per pixel at their own place are not suspected: right ones gain
+    0.6 or more over the bare table."""
+    better: float = 0.1
+    """Share of its gain that the other model must gain more at either place."""
+    margin_m: float = 0.01
+    """Points this far beyond a model's bounding sphere are fitted too [m]."""
+    turns: int = 4
+    """Quarter turns about the vertical that are tried, for each of the six sides up."""
+    finalists: int = 4
+    """Of the fitted turns so many are rendered."""
+    points: int = 1500
+    """Points that fit a turn."""
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    """The Gauss-Newton fit."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneCheckConfig:
+    """Constants of the findings."""
+
+    offset: OffsetConfig = field(default_factory=OffsetConfig)
+    sinking: SinkingConfig = field(default_factory=SinkingConfig)
+    swap: SwapConfig = field(default_factory=SwapConfig)
+    absent_gain: float = 0.15
+    """A model whose best pose explains its pixels by less than this each better than the bare table
+    is not in the scene."""
+    absent_probability: float = 0.1
+    """And whose pose is right with less than this."""
+    good: float = 0.5
+    """Objects of this probability or more count for what all have in common."""
+
+
+def scene_findings(
+    bodies: Sequence[Body],
+    poses: Sequence[Array],
+    probabilities: Sequence[float],
+    cloud: Cloud,
+    comparer: Comparer,
+    config: SceneCheckConfig,
+    with_starts: bool = True,
+) -> list[Finding]:
+    """Return what is wrong with the scene.
+
+    Args:
+        bodies: the objects at their starts.
+        poses: T_world_obj (4, 4) where they were found.
+        probabilities: that each is right.
+        cloud: the scene's measured points, averaged on voxels of 2 or 3 mm, the table's left out.
+        comparer: frames, noise and table.
+        config: see there.
+        with_starts: whether the starts were given by someone; else no common shift is looked for.
+    """
+    use = [p >= config.good for p in probabilities]
+    findings: list[Finding] = []
+    if with_starts:
+        findings += shift_findings(bodies, poses, use, config.offset)
+    findings += sinking_findings(bodies, poses, use, comparer.plane, config.sinking)
+    gains = [comparer.gain(b, T, comparer.stride_of(b, T))
+             for b, T in zip(bodies, poses, strict=True)]  # fmt: skip
+    swaps = swap_findings(bodies, poses, gains, cloud, comparer, config.swap)
+    swapped = {i for f in swaps for i in f.instances}
+    findings += swaps
+    for body, (_, gain), p in zip(bodies, gains, probabilities, strict=True):
+        absent = gain < config.absent_gain and p < config.absent_probability
+        if absent and body.start.instance not in swapped:
+            findings.append(
+                Finding(
+                    kind="not in the scene",
+                    words=f"{_named(body)} seems not to be in the scene: its best pose explains "
+                    f"the depth by {gain:.2f} per pixel better than the bare table does (0.6 or "
+                    "more is usual). Remove it from the list, or check that its model is the "
+                    "object's.",
+                    instances=(body.start.instance,),
+                    numbers={"gain_per_pixel": gain, "probability": p},
+                )
+            )
+    return findings
+
+
+def shift_findings(
+    bodies: Sequence[Body], poses: Sequence[Array], use: Sequence[bool], config: OffsetConfig
+) -> list[Finding]:
+    """Return the finding that all objects stand off their starts by one vector, if they do."""
+    found = common_offset(bodies, poses, use, config)
+    if not found["consistent"]:
+        return []
+    offset = np.array(found["offset_mm"], dtype=np.float64)
+    words = (
+        f"all {found['objects']} objects were found {np.linalg.norm(offset):.1f} mm from their "
+        f"starts in one direction (x {offset[0]:.1f}, y {offset[1]:.1f}, z {offset[2]:.1f} mm, "
+        f"spread {found['spread_mm']:.1f} mm): the camera poses or the given poses are another "
+        "frame's or another calibration's. Check which camera pose they were made with."
+    )
+    instances = tuple(b.start.instance for b, u in zip(bodies, use, strict=True) if u)
+    return [Finding(kind="common shift", words=words, instances=instances, numbers=found)]
+
+
+def sinking_findings(
+    bodies: Sequence[Body],
+    poses: Sequence[Array],
+    use: Sequence[bool],
+    plane: SupportPlane | None,
+    config: SinkingConfig,
+) -> list[Finding]:
+    """Return the finding that all objects sink or float by one share of their height, if so."""
+    found = common_sinking(bodies, poses, use, plane, config)
+    if not found["consistent"]:
+        return []
+    share = float(np.array(found["share_of_height"]))
+    does = "sink into the table" if share < 0 else "float over the table"
+    reason = ("the depth reads short, or the models are too large" if share < 0
+              else "the depth reads long, or the models are too small")  # fmt: skip
+    words = (
+        f"all {found['objects']} objects {does} by {100 * abs(share):.1f} % of their height (rest "
+        f"{found['rest_mm']:.1f} mm): {reason}. Check the depth scale against a tag board and "
+        "one model against a ruler."
+    )
+    instances = tuple(b.start.instance for b, u in zip(bodies, use, strict=True) if u)
+    return [Finding(kind="common sinking", words=words, instances=instances, numbers=found)]
+
+
+def swap_findings(
+    bodies: Sequence[Body],
+    poses: Sequence[Array],
+    gains: Sequence[tuple[float, float]],
+    cloud: Cloud,
+    comparer: Comparer,
+    config: SwapConfig,
+) -> list[Finding]:
+    """Return the pairs of objects that explain each other's place better than their own.
+
+    Args:
+        bodies: the objects.
+        poses: where they were found.
+        gains: of each there, over the bare table: in all and per pixel.
+        cloud: the scene's measured points, the table's left out.
+        comparer: frames, noise and table.
+        config: see there.
+    """
+    pairs: list[tuple[float, int, int, float, float]] = []
+    for i, a in enumerate(bodies):
+        for j in range(i + 1, len(bodies)):
+            b = bodies[j]
+            suspected = (
+                a.start.obj_id != b.start.obj_id and min(gains[i][1], gains[j][1]) <= config.gain
+            )
+            if not (suspected and _similar(a, b, config.similar)):
+                continue
+            there = _gain_at(a, b.center(poses[j]), cloud, comparer, config)
+            here = _gain_at(b, a.center(poses[i]), cloud, comparer, config)
+            # Both places must be explained better, by all pixels together: per pixel a small model
+            # within a large object is as good. One wrong object makes no swap.
+            more = min(there - gains[j][0], here - gains[i][0])
+            if more >= config.better * max(there, here, 1.0):
+                pairs.append((more, i, j, here, there))
+    findings: list[Finding] = []
+    taken: set[int] = set()
+    for _, i, j, here, there in sorted(pairs, reverse=True):
+        if {i, j} & taken:
+            continue
+        taken |= {i, j}
+        a, b = bodies[i], bodies[j]
+        words = (
+            f"{_named(a)} and {_named(b)} seem to be swapped: at each other's place they explain "
+            f"{there:.0f} and {here:.0f} pixels better than the bare table does, at their own "
+            f"{gains[i][0]:.0f} and {gains[j][0]:.0f}. Swap the two ids."
+        )
+        findings.append(
+            Finding(
+                kind="swapped ids",
+                words=words,
+                instances=(a.start.instance, b.start.instance),
+                numbers={"own": [gains[i][0], gains[j][0]], "swapped": [there, here]},
+            )
+        )
+    return findings
+
+
+def _named(body: Body) -> str:
+    """Return how a finding calls an object."""
+    return f"{body.model.name} (id {body.start.obj_id}, instance {body.start.instance})"
+
+
+def _similar(a: Body, b: Body, ratio: float) -> bool:
+    """Return whether two boxes have about the same sides."""
+    sides = np.sort(a.model.mesh.extent) / np.sort(b.model.mesh.extent)
+    return bool(np.all((sides < ratio) & (sides > 1 / ratio)))
+
+
+def _gain_at(
+    body: Body, center_world: Array, cloud: Cloud, comparer: Comparer, config: SwapConfig
+) -> float:
+    """Return the best gain of a body at a place, in pixels, over its turns, each fitted."""
+    away = np.linalg.norm(cloud.points - center_world, axis=1)
+    near = cloud.select(away < body.radius_m + config.margin_m)
+    every = max(1, len(near.points) // config.points)
+    few = near.select(np.arange(len(near.points)) % every == 0)
+    found: list[tuple[float, Array]] = []
+    for R in _turns(config.turns):
+        T = se3.from_rt(R, center_world - R @ body.center_obj)
+        fit = solve_pose(body, few, T, config.solver.coarse, config.solver)
+        # The mean residual alone would reward models that lie on few points.
+        found.append((fit.points / max(fit.offered, 1) / max(fit.variance, 1.0), fit.T_world_obj))
+    found.sort(key=lambda f: -f[0])
+    best = found[: config.finalists]
+    return max(comparer.gain(body, T, comparer.stride_of(body, T))[0] for _, T in best)
+
+
+def _turns(yaws: int) -> list[Array]:
+    """Return rotations (3, 3): each of the six sides up, turned about the vertical."""
+    quarter = np.pi / 2
+    sides = [[0, 0, 0], [quarter, 0, 0], [-quarter, 0, 0], [2 * quarter, 0, 0], [0, quarter, 0],
+             [0, -quarter, 0]]  # fmt: skip
+    around = [se3.exp_so3([0.0, 0.0, 2 * np.pi * k / yaws]) for k in range(yaws)]
+    return [Z @ se3.exp_so3(s) for Z in around for s in sides]

@@ -1,0 +1,264 @@
+"""Where on an object the measured surface is not the model's, averaged over all views.
+
+One pixel says no more than its noise, 0.6 mm at 30 cm; the mean of hundreds of views over a patch
+of 4 mm says 0.05 mm. A gear that is turned by half a tooth agrees with 97 of 100 pixels within
+3 mm and yet differs by 1 to 2 mm on patches that lie where its teeth are.
+
+Of a patch: m = sum(w r) / sum(w), w = 1 / sigma^2, se^2 = k / sum(w) + floor^2. It is wrong if
+|m| > bound and |m| > 3 se. The bound is 1 mm, or 2.5 times the level of error that all objects of
+the session share (the median of their robust patch RMS): a camera at 1 m and hand-made meshes
+are off by 2 mm everywhere, which speaks against none of the poses.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, SupportPlane
+from realsim.registration.body import Body
+from realsim.registration.evidence import DepthNoise
+from realsim.registration.judging.ownership import Claims, make_claims, owners
+from realsim.registration.judging.patches import (
+    Patches,
+    add_to_patches,
+    look_at_patches,
+    make_patches,
+)
+from realsim.registration.views import ViewPoints
+
+Array = NDArray[np.float64]
+MAD = 1.4826
+"""Standard deviation of a normal distribution per median absolute deviation."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ResidualConfig:
+    """How the surface is cut and when a patch is wrong."""
+
+    patch_m: float = 0.004
+    """Edge of a patch [m]: the teeth of a fine gear are as wide."""
+    samples_per_patch: float = 8.0
+    """Surface samples per patch by which areas are measured."""
+    reach_m: float = 0.008
+    """Points further from every surface belong to none of the objects [m]."""
+    points_per_object: int = 30_000
+    """About so many points are used of each object: 30 or more of a patch."""
+    least_points: int = 4
+    """A patch with fewer is not measured."""
+    variance_factor: float = 2.0
+    """k: neighbouring pixels are not independent, and the noise model is good to a third."""
+    floor_m: float = 0.0001
+    """Part of se that does not average out: the field's grid and the cameras' poses [m]."""
+    wrong_m: float = 0.001
+    """Least mean residual of a wrong patch [m]."""
+    wrong_sigmas: float = 3.0
+    """And so many standard errors."""
+    level_factor: float = 2.5
+    """And so many times the session's level of error."""
+    level_m: tuple[float, float] = (0.0002, 0.002)
+    """Least and greatest level [m]: beyond, poses are wrong, not meshes and cameras."""
+    level_per_m: float = 0.003
+    """The level where it cannot be measured: this times z^2 [1/m], 0.3 mm at 30 cm, 3 mm at 1 m."""
+    level_objects: int = 4
+    """Of fewer objects the level is not measured: one wrong pose would excuse itself."""
+    looks: int = 48
+    """Views, evenly picked, in which patches are looked at for free space."""
+    look_cos: float = 0.35
+    """Least cosine at which a patch is looked at: flatter, the next pixel is millimetres off."""
+    through_m: float = 0.0035
+    """So much farther than the patch must the measurement be to have gone through it [m]."""
+    through_sigmas: float = 2.0
+    """Plus so many sigma_z, plus `level_per_m` z^2: a camera at 1 m is 3 mm off."""
+    through_looks: int = 2
+    """Fewer looks through do not count where there are more views than two."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SurfaceResiduals:
+    """What all views say of every patch of one object."""
+
+    patches: Patches
+    mean_m: Array
+    """(P,) mean residual, positive = the real surface is outside [m]; NaN = not measured."""
+    sigma_m: Array
+    """(P,) its standard error [m]."""
+    counts: Array
+    """(P,) points."""
+    looks: NDArray[np.int32]
+    """(P, 3) views that saw the patch, looked through it, saw something in front of it."""
+    depth_m: float
+    """Median depth at which the object was seen [m]; NaN = never."""
+    views: int
+    """How many views there were."""
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(P,) whether a patch has a mean."""
+        return np.isfinite(self.mean_m)
+
+
+def surface_residuals(
+    bodies: Sequence[Body],
+    poses: Sequence[Array],
+    intrinsics: CameraIntrinsics,
+    views: Sequence[ViewPoints],
+    Ts_world_cam: Array,
+    noise: DepthNoise,
+    plane: SupportPlane | None,
+    config: ResidualConfig,
+) -> list[SurfaceResiduals]:
+    """Return the mean residual of every patch of every object, all views together.
+
+    Every point counts for the surface it is nearest to: an object's, or the table's.
+
+    Args:
+        bodies: the objects.
+        poses: their T_world_obj (4, 4).
+        intrinsics: the camera.
+        views: what each view measured.
+        Ts_world_cam: (V, 4, 4) the corrected cameras.
+        noise: of the depth.
+        plane: the table; its points belong to no object.
+        config: see there.
+
+    Raises:
+        InputError: there are not as many cameras as views.
+    """
+    Ts = np.asarray(Ts_world_cam, dtype=np.float64)
+    if Ts.shape != (len(views), 4, 4):
+        raise InputError(f"cameras of shape {Ts.shape} for {len(views)} views; give (V, 4, 4).")
+    pieces = [make_patches(b, config.patch_m, config.samples_per_patch) for b in bodies]
+    sums = [np.zeros((len(p.centers), 4)) for p in pieces]
+    looks = [np.zeros((len(p.centers), 3), dtype=np.int32) for p in pieces]
+    depths = [
+        np.sum((b.center(T) - Ts[:, :3, 3]) * Ts[:, :3, 2], axis=1)
+        for b, T in zip(bodies, poses, strict=True)
+    ]
+    claims = make_claims(bodies, poses, plane, config.reach_m)
+    step = thinning(bodies, poses, (intrinsics, views, Ts), config.points_per_object)
+    every = max(1, len(views) // config.looks)
+    for v, (view, T) in enumerate(zip(views, Ts, strict=True)):
+        _add_view(claims, pieces, (view, T, v % step, step), noise, sums)
+        if v % every == 0:
+            _look(poses, pieces, intrinsics, view, T, noise, looks, config)
+    return [
+        _finished(p, s, seen, depth, len(views), config)
+        for p, s, seen, depth in zip(pieces, sums, looks, depths, strict=True)
+    ]
+
+
+def thinning(
+    bodies: Sequence[Body],
+    poses: Sequence[Array],
+    seen: tuple[CameraIntrinsics, Sequence[ViewPoints], Array],
+    wanted: int,
+) -> int:
+    """Return every how many points one is enough for the smallest object to have `wanted`.
+
+    Args:
+        bodies: the objects.
+        poses: their T_world_obj (4, 4).
+        seen: the camera, the views and their poses (V, 4, 4).
+        wanted: points of an object over all views.
+    """
+    intrinsics, views, Ts_world_cam = seen
+    fewest = np.inf
+    area_px = np.array([v.area_px for v in views])
+    for body, T in zip(bodies, poses, strict=True):
+        z = np.linalg.norm(Ts_world_cam[:, :3, 3] - body.center(T), axis=1)
+        # A disc of half the bounding radius stands for the silhouette.
+        disc = np.pi * np.square(0.5 * body.radius_m * intrinsics.fx / z)
+        fewest = min(fewest, float(np.sum(disc / area_px)))
+    return max(1, int(fewest / wanted)) if np.isfinite(fewest) else 1
+
+
+def _add_view(
+    claims: Claims,
+    pieces: Sequence[Patches],
+    seen: tuple[ViewPoints, Array, int, int],
+    noise: DepthNoise,
+    sums: Sequence[Array],
+) -> None:
+    """Add one view's points to the sums of the patches they lie on.
+
+    Args:
+        claims: of the objects and the table.
+        pieces: patches of each object.
+        seen: the view, its camera, the first point used, and every how many.
+        noise: of the depth.
+        sums: (P, 4) per object; added to.
+    """
+    view, T_world_cam, first, step = seen
+    points_cam = view.points[first::step].astype(np.float64)
+    points, sigmas = se3.transform(T_world_cam, points_cam), noise.sigma(points_cam[:, 2])
+    owner = owners(claims, points)
+    for k, patches in enumerate(pieces):
+        lattice, T_obj_world, _, _ = claims.objects[k]
+        mine = np.flatnonzero(owner == k)
+        eye = T_obj_world[:3, :3] @ T_world_cam[:3, 3] + T_obj_world[:3, 3]
+        add_to_patches(
+            (points[mine], sigmas[mine]),
+            lattice,
+            (T_obj_world, eye),
+            (patches.index, patches.origin, patches.size_m),
+            sums[k],
+        )
+
+
+def _look(
+    poses: Sequence[Array],
+    pieces: Sequence[Patches],
+    intrinsics: CameraIntrinsics,
+    view: ViewPoints,
+    T_world_cam: Array,
+    noise: DepthNoise,
+    looks: Sequence[NDArray[np.int32]],
+    config: ResidualConfig,
+) -> None:
+    """Count which patches one view saw, looked through, or was hidden from."""
+    stride = max(1, round(float(np.sqrt(view.area_px))))
+    shape = (-(-intrinsics.height // stride), -(-intrinsics.width // stride))
+    depth = np.zeros(shape, dtype=np.float32)
+    depth[view.pixels[:, 1] // stride, view.pixels[:, 0] // stride] = view.points[:, 2]
+    own = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy)
+    camera = np.concatenate([own, intrinsics.distortion])
+    limits = (config.look_cos, config.through_m, config.through_sigmas, config.level_per_m)
+    for k, patches in enumerate(pieces):
+        look_at_patches(
+            (patches.centers, patches.normals),
+            se3.invert(T_world_cam) @ poses[k],
+            camera,
+            (depth, stride),
+            (*limits, noise.per_m, noise.floor_m),
+            looks[k],
+        )
+
+
+def _finished(
+    patches: Patches,
+    sums: Array,
+    looks: NDArray[np.int32],
+    depths: Array,
+    views: int,
+    config: ResidualConfig,
+) -> SurfaceResiduals:
+    """Return the means of the sums."""
+    count, weight, first, _ = sums.T
+    enough = count >= config.least_points
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean = np.where(enough, first / weight, np.nan)
+        variance = config.variance_factor / weight + config.floor_m**2
+        sigma = np.where(enough, np.sqrt(variance), np.nan)
+    return SurfaceResiduals(
+        patches=patches,
+        mean_m=mean,
+        sigma_m=sigma,
+        counts=count,
+        looks=looks,
+        depth_m=float(np.median(depths)) if len(depths) else float("nan"),
+        views=views,
+    )

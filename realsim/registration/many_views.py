@@ -1,0 +1,272 @@
+"""Registration from four and more views: objects, cameras, table and depth bias together."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.records import SupportPlane
+from realsim.records.depth_bias import DepthBias
+from realsim.registration.blind import Kept, keep_start, nearest_to_start
+from realsim.registration.body import Body
+from realsim.registration.compare import Comparer, make_comparer, spread_frames
+from realsim.registration.config import RegistrationConfig
+from realsim.registration.evidence import (
+    Cloud,
+    DepthFrame,
+    averaged,
+    corrected_frame,
+    held,
+    without_table,
+)
+from realsim.registration.intake import Intake
+from realsim.registration.joint import assigned
+from realsim.registration.refinement.config import RefineConfig
+from realsim.registration.refinement.refine import Refined, refine
+from realsim.registration.refinement.state import State
+from realsim.registration.refinement.uncertainty import SeenPose, object_covariance, seen_poses
+from realsim.registration.solver import solve_pose
+from realsim.registration.views import ViewPoints
+
+Array = NDArray[np.float64]
+CLOUD_POINTS = 400_000
+"""Points of all views that are averaged into the objects' clouds at most."""
+AGAIN_DEG = 3.0
+"""An object that was turned back further than this about a fitted axis is refined again [deg]."""
+AGAIN_ROUNDS = 2
+"""...in so many rounds."""
+LEAST_SIGMA_MM, LEAST_SIGMA_DEG = 0.05, 0.01
+"""What a calibration says of itself is not believed below this."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ManyViews:
+    """What came of it."""
+
+    refined: Refined
+    poses: list[Array]
+    kept: list[Kept]
+    """Fits to the averaged cloud at the final poses, blind turns set back to the start's."""
+    clouds: list[Cloud]
+    """Each object's own points, corrected."""
+    covariances: list[Array]
+    """(6, 6) of each T_world_obj, right perturbation."""
+    seen: list[list[SeenPose]]
+    """Per object, its pose in every view."""
+    frames: tuple[DepthFrame, ...]
+    """With the refined cameras and the depth's bias taken out; read when asked."""
+    plane: SupportPlane | None
+
+
+def refine_config(config: RegistrationConfig) -> RefineConfig:
+    """Return the constants of the refinement with what calibrations say of their sigmas."""
+    p = config.refine.prior
+    prior = replace(
+        p,
+        hand_eye_mm=_at_least(config.hand_eye_sigma_mm, LEAST_SIGMA_MM, p.hand_eye_mm),
+        hand_eye_deg=_at_least(config.hand_eye_sigma_deg, LEAST_SIGMA_DEG, p.hand_eye_deg),
+        view_mm=_at_least(config.arm_sigma_mm, LEAST_SIGMA_MM, p.view_mm),
+        view_deg=_at_least(config.arm_sigma_deg, LEAST_SIGMA_DEG, p.view_deg),
+    )
+    # What is known of the bias has been taken out of the images; how sure it is remains.
+    bias = DepthBias(covariance=config.bias.covariance)
+    return replace(config.refine, prior=prior, bias=bias)
+
+
+def _at_least(said: float | None, least: float, otherwise: float) -> float:
+    """Return what was said, but never less than `least`; `otherwise` if nothing was said."""
+    return otherwise if said is None else max(said, least)
+
+
+def register_many(
+    intake: Intake,
+    bodies: Sequence[Body],
+    claimed: Sequence[Body | None],
+    plane: SupportPlane | None,
+    config: RegistrationConfig,
+    progress: Callable[[int, int], None] | None = None,
+) -> ManyViews:
+    """Return everything refined together.
+
+    Args:
+        intake: the frames.
+        bodies: the objects; their start poses are right to a few millimetres.
+        claimed: the same at the starts that somebody claimed, None = nobody did: turns that the
+            points do not show stay as they were claimed.
+        plane: the table, or None.
+        config: see there.
+        progress: called with (rounds done, rounds).
+
+    Raises:
+        DegenerateError: no point lies on any object or on the table.
+    """
+    rough = [b.T_start for b in bodies]
+    constants = refine_config(config)
+    refined, frames, clouds, kept = _refined(
+        intake, bodies, (rough, claimed), plane, constants, config, progress
+    )
+    turned = [_turn_deg(T, k.fit.T_world_obj) for T, k in zip(refined.poses, kept, strict=True)]
+    unsure = [any(not a.declared for a in k.axes) for k in kept]
+    if any(u and t > AGAIN_DEG for u, t in zip(unsure, turned, strict=True)):
+        # An axis that was fitted is a little off, and so is what is turned far about it.
+        rough = [k.fit.T_world_obj for k in kept]
+        constants = replace(constants, rounds=AGAIN_ROUNDS)
+        refined, frames, clouds, kept = _refined(
+            intake, bodies, (rough, claimed), plane, constants, config, None
+        )
+    back = [se3.invert(T) @ k.fit.T_world_obj for T, k in zip(refined.poses, kept, strict=True)]
+    covariances = [
+        _turned(object_covariance(refined, b, k), S) + _misfit_covariance(b, refined.misfit_m[k])
+        for k, (b, S) in enumerate(zip(bodies, back, strict=True))
+    ]
+    seen = [
+        [
+            replace(p, T_cam_obj=p.T_cam_obj @ S, covariance=_turned(p.covariance, S))
+            for p in of
+        ]
+        for of, S in zip(seen_poses(refined, bodies, intake.intrinsics), back, strict=True)
+    ]  # fmt: skip
+    return ManyViews(
+        refined=refined, poses=[k.fit.T_world_obj for k in kept], kept=kept, clouds=clouds,
+        covariances=covariances, seen=seen, frames=frames, plane=refined.plane,
+    )  # fmt: skip
+
+
+def _refined(
+    intake: Intake,
+    bodies: Sequence[Body],
+    poses: tuple[Sequence[Array], Sequence[Body | None]],
+    plane: SupportPlane | None,
+    constants: RefineConfig,
+    config: RegistrationConfig,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[Refined, tuple[DepthFrame, ...], list[Cloud], list[Kept]]:
+    """Return one refinement from rough poses, corrected frames and clouds, and the final poses."""
+    rough, claimed = poses
+    refined = refine(
+        intake.intrinsics, intake.views, bodies, rough, plane, intake.noise, constants, progress
+    )
+    bias = DepthBias(scale=float(refined.state.bias[0]), offset_per_m=float(refined.state.bias[1]))
+    frames = tuple(
+        corrected_frame(f, T, bias) for f, T in zip(intake.frames, refined.cameras, strict=True)
+    )
+    clouds = _clouds(intake, bodies, refined, config)
+    comparer = comparer_on(intake, frames, refined.plane, bodies, refined.poses, config)
+    kept = [
+        _kept(body, start, T, (cloud, comparer), config)
+        for body, start, T, cloud in zip(bodies, claimed, refined.poses, clouds, strict=True)
+    ]
+    return refined, frames, clouds, kept
+
+
+def _kept(
+    body: Body,
+    claimed: Body | None,
+    T: Array,
+    data: tuple[Cloud, Comparer],
+    config: RegistrationConfig,
+) -> Kept:
+    """Return the refined pose with its blind turns as they were claimed."""
+    cloud, comparer = data
+    still = solve_pose(body, cloud, T, config.solver.fine[-1:], config.solver).at(T)
+    if claimed is None:
+        return Kept(fit=still, axes=(), report={})
+    constants = (config.blind, config.covariance, config.solver)
+    kept = keep_start(claimed, still, (cloud, comparer, None), constants)
+    if kept.report.get("start_kept"):
+        axes = list(kept.axes)
+        T = nearest_to_start(T, claimed.T_start, body.center_obj, axes, config.blind)
+    return replace(kept, fit=still.at(T))
+
+
+def _turn_deg(T_a: Array, T_b: Array) -> float:
+    """Return the angle between two poses [deg]."""
+    return float(np.degrees(se3.angle(T_a[:3, :3].T @ T_b[:3, :3])))
+
+
+def _turned(C: Array, S: Array) -> Array:
+    """Return the covariance (6, 6) of T S from that of T: right perturbations."""
+    Ad = se3.adjoint(se3.invert(S))
+    return Ad @ C @ Ad.T
+
+
+def comparer_on(
+    intake: Intake,
+    frames: Sequence[DepthFrame],
+    plane: SupportPlane | None,
+    bodies: Sequence[Body],
+    poses: Sequence[Array] | Array,
+    config: RegistrationConfig,
+) -> Comparer:
+    """Return a comparer on the frames that look at the objects from directions far apart."""
+    if len(bodies):
+        center = np.mean([b.center(T) for b, T in zip(bodies, poses, strict=True)], axis=0)
+    else:
+        center = np.zeros(3) if plane is None else plane.T_world_table[:3, 3]
+    chosen = [held(f) for f in spread_frames(frames, center, config.verify.frames)]
+    compare = replace(config.compare, rays=config.verify.rays)
+    return make_comparer(intake.intrinsics, chosen, intake.noise, plane, compare)
+
+
+def _misfit_covariance(body: Body, misfit_m: float) -> Array:
+    """Return what a mesh that is off by `misfit_m` everywhere, in a few large pieces, adds.
+
+    A wrong shape is wrong in the same way in all views: its error does not average out over points,
+    only over the dozen or so independent pieces of a surface.
+    """
+    shift = misfit_m / np.sqrt(SHAPE_PIECES)
+    turn = shift / max(body.radius_m, 1e-3)
+    C = np.diag([turn**2] * 3 + [shift**2] * 3)
+    Ad = se3.adjoint(se3.from_translation(body.center_obj))
+    return Ad @ C @ Ad.T
+
+
+SHAPE_PIECES = 12.0
+"""Independent pieces of a mesh's error."""
+
+
+def _clouds(
+    intake: Intake, bodies: Sequence[Body], refined: Refined, config: RegistrationConfig
+) -> list[Cloud]:
+    """Return each object's averaged points, cameras and depth as refined."""
+    total = sum(len(v.points) for v in intake.views)
+    every = max(1, -(-total // CLOUD_POINTS))
+    parts = [
+        _points_near(v, T, refined.state, (bodies, refined.poses), every, config)
+        for v, T in zip(intake.views, refined.cameras, strict=True)
+    ]
+    near: list[Cloud] = []
+    for k, (body, T) in enumerate(zip(bodies, refined.poses, strict=True)):
+        cloud = _joined([p[k] for p in parts], intake)
+        above = without_table(cloud, refined.plane, config.joint.drop_height(body, refined.plane))
+        near.append(averaged(above, T, config.joint.fine_voxel(body)))
+    return assigned(bodies, list(refined.poses), near, config.joint)
+
+
+def _points_near(
+    view: ViewPoints,
+    T_world_cam: Array,
+    state: State,
+    objects: tuple[Sequence[Body], Array],
+    every: int,
+    config: RegistrationConfig,
+) -> list[tuple[Array, Array, Array]]:
+    """Return of one view, per object, points near it in world, directions to the camera, depths."""
+    p = state.corrected(view.points[::every].astype(np.float64))
+    world = se3.transform(T_world_cam, p)
+    reach = config.joint.assign_m
+    out: list[tuple[Array, Array, Array]] = []
+    for body, T in zip(*objects, strict=True):
+        close = np.linalg.norm(world - body.center(T), axis=1) < body.radius_m + reach
+        some = world[close]
+        towards = T_world_cam[:3, 3] - some
+        out.append((some, towards / np.linalg.norm(towards, axis=1, keepdims=True), p[close, 2]))
+    return out
+
+
+def _joined(parts: Sequence[tuple[Array, Array, Array]], intake: Intake) -> Cloud:
+    """Return the points of all views as one cloud."""
+    points, towards, z = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Cloud(points=points, towards=towards, sigmas=intake.noise.sigma(z))

@@ -1,0 +1,322 @@
+"""Whether the depth images agree with the robot about where the camera was.
+
+Pairs of neighbouring views are aligned by KISS-ICP and by the table, and compared with what forward
+kinematics say. It names what is grossly wrong: a view taken while moving, a mount that slipped,
+images that belong to other poses. It cannot verify a good robot: a pair is measured to about 0.5 mm
+and 0.1 degrees, which is what a hand-eye calibration leaves.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import SupportPlane
+from realsim.registration.odometry.above_table import AboveTableConfig, ViewCloud, view_cloud
+from realsim.registration.odometry.faults import (
+    FaultConfig,
+    PoseFault,
+    differences,
+    find_faults,
+    noise_of,
+)
+from realsim.registration.odometry.mismatch import (
+    Mismatch,
+    MismatchConfig,
+    failed,
+    find_mismatches,
+)
+from realsim.registration.odometry.pairs import (
+    Edge,
+    PairConfig,
+    PairMeter,
+    further_pairs,
+    neighbour_pairs,
+    relative,
+    view_angles,
+)
+from realsim.registration.odometry.words import fault_words, mismatch_words, unmatched_words
+from realsim.registration.views import ViewPoints
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CheckConfig:
+    """How the robot's poses are checked."""
+
+    clouds: AboveTableConfig = field(default_factory=AboveTableConfig)
+    pairs: PairConfig = field(default_factory=PairConfig)
+    mismatch: MismatchConfig = field(default_factory=MismatchConfig)
+    faults: FaultConfig = field(default_factory=FaultConfig)
+    further: int = 2
+    """More pairs for a view that a pair makes suspect."""
+    further_share: float = 0.35
+    """Unless more than this share of the views is suspect: then there are pairs enough."""
+    seed: int = 0
+    """Of the random search for a table that is not where it should be."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ViewDifference:
+    """How far one view's depth is from its robot pose."""
+
+    index: int
+    """Number of the view."""
+    mm: float
+    """Shift of the camera [mm]; of a view after a change, the change included; NaN = unknown."""
+    deg: float
+    """Turn [deg]; likewise."""
+    pairs: int
+    """Pairs it was measured from."""
+    overlap: float
+    """Median overlap of those."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Fault:
+    """Something grossly wrong, by view number."""
+
+    kind: str
+    """view, mount, world, swapped, other, shifted, unmatched."""
+    view: int
+    """The view, or the first one after the change."""
+    other: int | None
+    """The view whose pose it fits; of a shift, how many poses ahead."""
+    mm: float
+    """Size [mm]; NaN where images and poses are mixed up."""
+    deg: float
+    """Size [deg]; likewise."""
+    words: str
+    """A sentence."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class KinematicsCheck:
+    """What the depth images say about the robot's poses."""
+
+    views: tuple[ViewDifference, ...]
+    faults: tuple[Fault, ...]
+    noise_mm: float
+    """Median difference of a pair [mm], faults left aside."""
+    noise_deg: float
+    """Likewise [deg]."""
+    pairs: int
+    """Pairs that were aligned."""
+    unchecked: tuple[tuple[int, str], ...]
+    """Views that could not be checked, and why."""
+    cpu_s: float
+    """CPU time [s]."""
+
+    @property
+    def good(self) -> bool:
+        """Whether nothing grossly wrong was found."""
+        return not self.faults
+
+    def words(self) -> tuple[str, ...]:
+        """Return sentences for a person."""
+        checked = len(self.views) - len(self.unchecked)
+        said = [
+            f"depth agrees with the robot's poses within {self.noise_mm:.1f} mm and "
+            f"{self.noise_deg:.2f} deg from view to view ({checked} of {len(self.views)} views, "
+            f"{self.pairs} pairs); smaller errors cannot be seen this way."
+        ]
+        said += [f.words for f in self.faults]
+        said += [f"view {k} could not be checked: {why}" for k, why in self.unchecked]
+        return tuple(said)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return everything as numbers, strings and lists; NaN becomes None."""
+        return {
+            "good": self.good,
+            "noise_mm": self.noise_mm,
+            "noise_deg": self.noise_deg,
+            "pairs": self.pairs,
+            "cpu_s": self.cpu_s,
+            "views": [_plain(asdict(v)) for v in self.views],
+            "faults": [_plain(asdict(f)) for f in self.faults],
+            "unchecked": [{"index": k, "reason": why} for k, why in self.unchecked],
+            "words": list(self.words()),
+        }
+
+
+def check_kinematics(
+    views: Sequence[ViewPoints], plane: SupportPlane | None, config: CheckConfig
+) -> KinematicsCheck:
+    """Return how far the depth images are from the robot's poses, and what is grossly wrong.
+
+    Args:
+        views: in the order in which they were captured, at the poses that forward kinematics claim.
+        plane: the table in world; None = the largest plane of each view.
+        config: see there.
+
+    Raises:
+        InputError: fewer than two views hold anything above the table.
+    """
+    began = time.process_time()
+    rng = np.random.default_rng(config.seed)
+    clouds = [view_cloud(v, plane, config.clouds, rng) for v in views]
+    use = [k for k, c in enumerate(clouds) if len(c.source) >= config.clouds.least_points]
+    if len(use) < 2:
+        raise InputError(
+            f"{len(use)} of {len(views)} views hold at least {config.clouds.least_points} averaged "
+            "points above the table; the robot's poses can be checked from two on. Is anything on "
+            "the table, and is the table's height right?"
+        )
+    empty = set(range(len(views))) - set(use)
+    claimed = np.stack([views[k].T_world_cam for k in use])
+    found = _examined([clouds[k] for k in use], claimed, config)
+    numbers = [views[k].index for k in use]
+    faults = [
+        Fault(kind=m.kind, view=numbers[m.place],
+              other=m.other if m.kind == "shifted" else numbers[m.other], mm=np.nan, deg=np.nan,
+              words=mismatch_words(m, numbers))
+        for m in found.mismatches
+    ]  # fmt: skip
+    faults += [
+        Fault(kind=f.kind, view=numbers[f.place], other=None, mm=f.mm, deg=f.deg,
+              words=fault_words(f, numbers))
+        for f in found.faults
+    ]  # fmt: skip
+    faults += [
+        Fault(kind="unmatched", view=numbers[k], other=None, mm=np.nan, deg=np.nan,
+              words=unmatched_words(numbers[k]))
+        for k in found.unmatched
+    ]  # fmt: skip
+    by_place = dict(zip(use, found.differences, strict=True))
+    unknown = ViewDifference(index=-1, mm=np.nan, deg=np.nan, pairs=0, overlap=0.0)
+    return KinematicsCheck(
+        views=tuple(
+            _numbered(by_place.get(k, unknown), view.index) for k, view in enumerate(views)
+        ),
+        faults=tuple(faults),
+        noise_mm=found.noise_mm,
+        noise_deg=found.noise_deg,
+        pairs=found.pairs,
+        unchecked=tuple(
+            (views[k].index, f"only {len(clouds[k].source)} averaged points above the table")
+            for k in sorted(empty)
+        ) + tuple((numbers[k], "no pose is left for its image") for k in found.poseless),
+        cpu_s=time.process_time() - began,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Found:
+    """What was found, in places of the usable views."""
+
+    mismatches: tuple[Mismatch, ...]
+    faults: tuple[PoseFault, ...]
+    unmatched: tuple[int, ...]
+    poseless: tuple[int, ...]
+    differences: tuple[ViewDifference, ...]
+    noise_mm: float
+    noise_deg: float
+    pairs: int
+
+
+def _examined(clouds: Sequence[ViewCloud], claimed: Array, config: CheckConfig) -> _Found:
+    """Return mismatches first, then the faults of the poses that the images do belong to."""
+    meter = PairMeter(clouds, config.pairs)
+    aim = _middle(clouds, claimed)
+    angles = view_angles(claimed, aim, config.pairs.zoom_deg)
+    everyone = list(range(len(claimed)))
+    edges = _measured(meter, claimed, angles, everyone, config)
+    mismatches, poses = find_mismatches(meter, claimed, edges, angles, config.mismatch)
+    Ts = claimed[np.maximum(poses, 0)]
+    kept = [k for k in everyone if poses[k] >= 0]
+    if mismatches:
+        angles = view_angles(Ts, aim, config.pairs.zoom_deg)
+        edges = _measured(meter, Ts, angles, kept, config)
+    trusted = [e for e in edges if not failed(e, config.mismatch)]
+    faults, mended = find_faults(Ts, trusted, aim, config.faults)
+    noise = noise_of(differences(mended, trusted), config.faults)
+    paired = {k for e in trusted for k in (e.first, e.second)}
+    unmatched = [k for k in kept if k not in paired]
+    # Where a pose was skipped, the image before the shift has none; it is not a fault of its own.
+    # Which of two neighbours it is cannot be told where it fits neither pose.
+    back = [m for m in mismatches if m.kind == "shifted" and m.other < 0]
+    skipped = {m.place - n for m in back for n in range(1 - m.other)}
+    odd = {f.place for f in faults if f.kind == "view"} | set(unmatched)
+    poseless = sorted({k for k in everyone if poses[k] < 0} | (skipped & odd))
+    faults = tuple(f for f in faults if f.kind != "view" or f.place not in skipped)
+    return _Found(
+        mismatches=mismatches,
+        faults=faults,
+        unmatched=tuple(k for k in unmatched if k not in skipped),
+        poseless=tuple(poseless),
+        differences=tuple(_difference(k, Ts, mended, trusted) for k in everyone),
+        noise_mm=noise.mm,
+        noise_deg=noise.deg,
+        pairs=len(edges),
+    )
+
+
+def _measured(
+    meter: PairMeter, Ts: Array, angles: Array, kept: Sequence[int], config: CheckConfig
+) -> list[Edge]:
+    """Return the pairs of neighbours, and more of those that a pair makes suspect."""
+    inner = angles[np.ix_(kept, kept)]
+    pairs = [(kept[i], kept[j]) for i, j in neighbour_pairs(inner, config.pairs)]
+    edges = [meter.measure(i, j, relative(Ts, i, j)) for i, j in pairs]
+    r = differences(Ts, edges)
+    large = (1e3 * np.linalg.norm(r[:, 3:], axis=1) > config.faults.least_mm) | (
+        np.degrees(np.linalg.norm(r[:, :3], axis=1)) > config.faults.least_deg
+    )
+    odd = [e for e, big in zip(edges, large, strict=True) if big or failed(e, config.mismatch)]
+    doubted = sorted({k for e in odd for k in (e.first, e.second)})
+    if len(doubted) > config.further_share * len(kept):
+        return edges
+    outside = np.full(angles.shape, np.inf)
+    outside[np.ix_(kept, kept)] = inner
+    more = further_pairs(outside, pairs, doubted, config.further, config.pairs)
+    return edges + [meter.measure(i, j, relative(Ts, i, j)) for i, j in more]
+
+
+def _middle(clouds: Sequence[ViewCloud], Ts: Array) -> Array:
+    """Return the middle (3,) of what stands on the table, by the claimed poses [m]."""
+    centers = [se3.transform(T, c.source).mean(0) for T, c in zip(Ts, clouds, strict=True)]
+    return np.median(centers, axis=0)
+
+
+def _difference(k: int, Ts: Array, mended: Array, edges: Sequence[Edge]) -> ViewDifference:
+    """Return what view k's pairs say about its pose, its neighbours' faults taken out."""
+    twists: list[Array] = []
+    overlaps: list[float] = []
+    for e in edges:
+        if k not in (e.first, e.second):
+            continue
+        other, Z = (e.first, e.T_first_second) if e.second == k else (
+            e.second, se3.invert(e.T_first_second)
+        )  # fmt: skip
+        twists.append(se3.log(se3.invert(Ts[k]) @ mended[other] @ Z))
+        overlaps.append(e.overlap)
+    if not twists:
+        return ViewDifference(index=-1, mm=np.nan, deg=np.nan, pairs=0, overlap=0.0)
+    x = np.median(twists, axis=0)
+    return ViewDifference(
+        index=-1,
+        mm=float(1e3 * np.linalg.norm(x[3:])),
+        deg=float(np.degrees(np.linalg.norm(x[:3]))),
+        pairs=len(twists),
+        overlap=float(np.median(overlaps)),
+    )
+
+
+def _numbered(difference: ViewDifference, index: int) -> ViewDifference:
+    """Return the difference with the view's number."""
+    from dataclasses import replace
+
+    return replace(difference, index=index)
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values with None for NaN, which JSON does not know."""
+    return {
+        k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in values.items()
+    }

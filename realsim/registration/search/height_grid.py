@@ -1,0 +1,188 @@
+"""What all views show from above: the height of the top surface over every cell of the table.
+
+The table's own points count: where only they were measured the height is 0, the space above was
+seen free, and nothing can stand there. Where nothing was measured the height is unknown.
+"""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import DegenerateError
+from realsim.geometry import se3
+from realsim.records import SupportPlane
+from realsim.registration.evidence import Cloud
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GridConfig:
+    """How a cloud becomes a grid of heights."""
+
+    cell_m: float = 0.003
+    """Edge of a cell [m]: a depth camera resolves 1-2 mm at working distance, and objects of 3 cm
+    still have 100 cells."""
+    low_m: float = -0.02
+    """Points further below the plane are of other furniture or wrong [m]."""
+    high_m: float = 0.5
+    """Points higher above the plane are of other furniture or wrong [m]."""
+    reach_m: float = 0.75
+    """Cells lie at most so far from the middle of the points, along each axis [m]: the arm reaches
+    no further, and far walls must not make the grid large."""
+    border_share: float = 0.0005
+    """Share of the points at either end of an axis that do not widen the grid: stray ones."""
+    percentile: float = 85.0
+    """Of the heights in a cell: walls put lower points into it, flying pixels higher ones."""
+    jump_m: float = 0.010
+    """If the top point of a cell is so much above the next one it is left out as flying [m]."""
+    layer_m: float = 0.004
+    """The height is the mean of the points within this of the percentile [m]: of the noisy points
+    of a flat surface the percentile alone is one sigma too high."""
+
+    def __post_init__(self) -> None:
+        """Check the ranges."""
+        if not (0 < self.cell_m <= self.reach_m and self.low_m < self.high_m):
+            raise DegenerateError(
+                f"cell_m {self.cell_m}, reach_m {self.reach_m}, low_m {self.low_m}, high_m "
+                f"{self.high_m}; needed are 0 < cell <= reach and low < high, in metres."
+            )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class HeightGrid:
+    """Heights of the top surface over the table."""
+
+    heights: Array32
+    """(X, Y) over the plane [m]; NaN = never measured."""
+    origin: Array
+    """(2,) corner of cell (0, 0) in the table's frame [m]."""
+    cell_m: float
+    """Edge of a cell [m]."""
+
+    def cells(self, xy: Array) -> NDArray[np.int64]:
+        """Return the cells (..., 2) in which points (..., 2) of the table's frame [m] lie."""
+        return np.floor((xy - self.origin) / self.cell_m).astype(np.int64)
+
+    def centers(self) -> Array:
+        """Return the middles (X, Y, 2) of the cells in the table's frame [m]."""
+        index = np.moveaxis(np.indices(self.heights.shape), 0, -1)
+        return self.origin + (index + 0.5) * self.cell_m
+
+
+def height_grid(cloud: Cloud, plane: SupportPlane, config: GridConfig) -> HeightGrid:
+    """Return the heights over the plane of all views' points, the table's among them.
+
+    Args:
+        cloud: in world; raw points or averaged ones.
+        plane: what the objects stand on.
+        config: see there.
+
+    Raises:
+        DegenerateError: no point lies over the plane.
+    """
+    T = se3.invert(plane.T_world_table)
+    p = _table_points(np.ascontiguousarray(cloud.points), T, config.low_m, config.high_m)
+    if len(p) == 0:
+        raise DegenerateError(
+            f"none of {len(cloud.points)} points lies between {config.low_m:g} m and "
+            f"{config.high_m:g} m over the plane. Is its normal up, and is it the objects' table?"
+        )
+    low, high = _bounds(p, config)
+    shape = np.maximum(np.ceil((high - low) / config.cell_m).astype(np.int64), 1)
+    heights = _heights(
+        p, low, (int(shape[0]), int(shape[1])), config.cell_m,
+        (config.percentile / 100, config.jump_m, config.layer_m),
+    )  # fmt: skip
+    heights.setflags(write=False)
+    return HeightGrid(heights=heights, origin=low, cell_m=config.cell_m)
+
+
+def _bounds(p: Array, config: GridConfig) -> tuple[Array, Array]:
+    """Return the corners (2,), (2,) of the area that points (N, 3) cover, stray ones left out."""
+    rank = int(config.border_share * len(p))
+    low, high, middle = np.empty(2), np.empty(2), np.empty(2)
+    for k in range(2):
+        part = np.partition(p[:, k], [rank, len(p) // 2, len(p) - 1 - rank])
+        low[k], middle[k], high[k] = part[rank], part[len(p) // 2], part[len(p) - 1 - rank]
+    low = np.maximum(low - config.cell_m, middle - config.reach_m)
+    return low, np.minimum(high + config.cell_m, middle + config.reach_m)
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _table_points(points: Array, T: Array, low: float, high: float) -> Array:
+    """Return the points (N, 3), moved by T, whose z lies in [low, high]."""
+    out = np.empty((len(points), 3))
+    n = 0
+    for k in range(len(points)):
+        a, b, c = points[k, 0], points[k, 1], points[k, 2]
+        z = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3]
+        if low <= z <= high:
+            out[n, 0] = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]
+            out[n, 1] = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]
+            out[n, 2] = z
+            n += 1
+    return out[:n]
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _heights(
+    p: Array,
+    origin: Array,
+    shape: tuple[int, int],
+    cell: float,
+    rule: tuple[float, float, float],
+) -> Array32:
+    """Return the heights (X, Y) of points (N, 3); NaN where there is none.
+
+    The points are sorted into their cells by counting.
+
+    Args:
+        p: (N, 3) in the table's frame [m].
+        origin: (2,) corner of cell (0, 0) [m].
+        shape: of the grid.
+        cell: edge of a cell [m].
+        rule: percentile / 100, jump [m], thickness of the layer [m].
+    """
+    columns = shape[1]
+    cells = shape[0] * columns
+    keys = np.empty(len(p), np.int64)
+    first = np.zeros(cells + 1, np.int64)
+    for k in range(len(p)):
+        i = int(np.floor((p[k, 0] - origin[0]) / cell))
+        j = int(np.floor((p[k, 1] - origin[1]) / cell))
+        keys[k] = i * columns + j if 0 <= i < shape[0] and 0 <= j < columns else -1
+        if keys[k] >= 0:
+            first[keys[k] + 1] += 1
+    for c in range(cells):
+        first[c + 1] += first[c]
+    filled = first[:-1].copy()
+    sorted_z = np.empty(first[cells], np.float32)
+    for k in range(len(p)):
+        if keys[k] >= 0:
+            sorted_z[filled[keys[k]]] = p[k, 2]
+            filled[keys[k]] += 1
+    out = np.full(cells, np.nan, np.float32)
+    for c in range(cells):
+        if first[c + 1] > first[c]:
+            out[c] = _top(np.sort(sorted_z[first[c] : first[c + 1]]), rule)
+    return out.reshape(shape)
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _top(z: Array32, rule: tuple[float, float, float]) -> float:
+    """Return the height that the ascending heights (N,) of one cell stand for."""
+    n = len(z)
+    share, jump, layer = rule
+    if n > 2 and z[n - 1] - z[n - 2] > jump:
+        n -= 1
+    top = z[max(0, int(np.ceil(share * n)) - 1)]
+    total, count = 0.0, 0
+    for k in range(n):
+        if abs(z[k] - top) <= layer:
+            total += z[k]
+            count += 1
+    return total / count

@@ -1,0 +1,148 @@
+"""What is left when the sure objects are taken away: starts for those that are not placed yet.
+
+Objects in piles lean and lie on each other; no resting pose fits them. What is measured but
+explained by no object falls into clusters; at each of them an object is tried in random turns.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.registration.evidence import Cloud
+from realsim.registration.search.height_grid import HeightGrid
+from realsim.registration.search.polish import NOBODY, owners
+from realsim.registration.search.refine import Candidate, Sought
+from realsim.registration.search.scoring import Score
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PeelConfig:
+    """Which objects are unsure, and how they are sought again."""
+
+    sure_agree: float = 0.965
+    """An object with a smaller share of agreeing pixels is sought again: right ones have more, and
+    wrong ones in piles reach 0.96."""
+    explained_m: float = 0.006
+    """Points this near to a sure object are explained [m]."""
+    least_height_m: float = 0.007
+    """Unexplained points lower than this over the table are the table's noise [m]."""
+    cell_m: float = 0.006
+    """Points in neighbouring cells of this edge are one cluster [m]."""
+    least_points: int = 40
+    """Smaller clusters are left-overs at the edges of sure objects."""
+    most_clusters: int = 12
+    """So many clusters are looked at, the largest first."""
+    rounds: int = 3
+    """Times that unsure objects are sought in what is left."""
+    rotations: int = 24
+    """Random turns tried at each place of a cluster for each object."""
+    most_starts: int = 160
+    """So many starts of one object and round at most, of all places alike: 3 ms each."""
+    least_extent: float = 0.25
+    """A cluster smaller than this share of the object's size is not it..."""
+    greatest_extent: float = 2.5
+    """...and one larger than this may hold it, but is searched around several of its points."""
+
+
+def taken_cells(
+    grid: HeightGrid, T_table_world: Array, cloud: Cloud, explained: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Return the cells (X, Y) of the grid whose top point is explained by sure objects."""
+    p = se3.transform(T_table_world, cloud.points)
+    cells = grid.cells(p[:, :2])
+    inside = np.all((cells >= 0) & (cells < grid.heights.shape), axis=1)
+    top = np.zeros(len(p), dtype=bool)
+    with np.errstate(invalid="ignore"):
+        height = grid.heights[cells[inside, 0], cells[inside, 1]]
+        top[inside] = p[inside, 2] > height - grid.cell_m
+    taken = np.zeros(grid.heights.shape, dtype=bool)
+    free = np.zeros(grid.heights.shape, dtype=bool)
+    taken[tuple(cells[top & explained].T)] = True
+    free[tuple(cells[top & ~explained].T)] = True
+    return taken & ~free
+
+
+def explained_points(
+    cloud: Cloud, placed: Sequence[tuple[Sought, Candidate]], config: PeelConfig
+) -> NDArray[np.bool_]:
+    """Return which points (N,) lie on one of these objects."""
+    Ts = [c.T_world_obj for _, c in placed]
+    return owners(cloud, [s for s, _ in placed], Ts, config.explained_m) != NOBODY
+
+
+def is_sure(score: Score | None, config: PeelConfig) -> bool:
+    """Return whether an object need not be sought again."""
+    return score is not None and score.agree >= config.sure_agree
+
+
+def clusters(points: Array, T_table_world: Array, config: PeelConfig) -> list[Array]:
+    """Return the connected groups (K, 3) of points (N, 3) above the table, the largest first."""
+    from scipy.ndimage import label
+
+    points = points[se3.transform(T_table_world, points)[:, 2] > config.least_height_m]
+    if len(points) == 0:
+        return []
+    cells = np.floor((points - points.min(0)) / config.cell_m).astype(np.int64)
+    filled = np.zeros(cells.max(0) + 1, dtype=bool)
+    filled[tuple(cells.T)] = True
+    numbered: Any = label(filled, structure=np.ones((3, 3, 3)))
+    of_point = numbered[0][tuple(cells.T)]
+    numbers, counts = np.unique(of_point, return_counts=True)
+    order = np.argsort(-counts, kind="stable")
+    keep = [k for k in order if counts[k] >= config.least_points][: config.most_clusters]
+    return [points[of_point == numbers[k]] for k in keep]
+
+
+def residual_starts(
+    sought: Sought,
+    groups: Sequence[Array],
+    up_world: Array,
+    rng: np.random.Generator,
+    config: PeelConfig,
+) -> list[tuple[Array, str]]:
+    """Return poses (4, 4) of an object at clusters of unexplained points, and their names.
+
+    The middle of the box is put where the cluster's points would be its upper surface: under
+    their mean by the half of the object's thickness along the way up.
+
+    Args:
+        sought: the model.
+        groups: clusters of points.
+        up_world: (3,) the table's normal.
+        rng: of the turns.
+        config: see there.
+    """
+    body = sought.body
+    half = 0.5 * np.asarray(body.model.mesh.extent)
+    starts: list[tuple[Array, str]] = []
+    for n, points in enumerate(groups):
+        size = float(np.linalg.norm(np.ptp(points, axis=0)))
+        if size < config.least_extent * 2 * body.radius_m:
+            continue
+        for anchor in _anchors(points, size, body.radius_m, rng, config):
+            turns = np.asarray(se3.random_rotation(rng, config.rotations))
+            for k, R in enumerate(turns):
+                thickness = float(np.abs(R.T @ up_world) @ half)
+                center = anchor - 0.5 * thickness * up_world
+                T = se3.from_rt(R, center - R @ body.center_obj)
+                starts.append((T, f"residual {n}, turn {k}"))
+    few = rng.permutation(len(starts))[: config.most_starts]
+    return [starts[k] for k in sorted(few)]
+
+
+def _anchors(
+    points: Array, size: float, radius: float, rng: np.random.Generator, config: PeelConfig
+) -> Array:
+    """Return the points (K, 3) about which an object is put: one, or several of a large group."""
+    if size <= config.greatest_extent * radius:
+        return points.mean(0)[None]
+    count = int(np.ceil(size / radius))
+    seeds = points[rng.integers(0, len(points), count)]
+    near = np.linalg.norm(points[:, None] - seeds, axis=-1) < radius
+    return np.stack([points[near[:, k]].mean(0) for k in range(count)])

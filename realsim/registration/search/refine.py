@@ -1,0 +1,255 @@
+"""From hypotheses to poses: every one fitted to the points near it, alike ones kept once."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.geometry.distance_field import sample
+from realsim.records import SupportPlane
+from realsim.registration.body import Body
+from realsim.registration.evidence import Cloud, DepthNoise, averaged, without_table
+from realsim.registration.search.quick_fit import quick_fit
+from realsim.registration.search.sameness import Sameness, distinct
+from realsim.registration.search.scoring import Array32, Canvas, Render, Score, render, score
+from realsim.registration.solver import SolverConfig, Stage
+from realsim.registration.views import ViewPoints, world_cloud
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RefineConfig:
+    """How hypotheses are fitted."""
+
+    coarse_voxel_m: float = 0.003
+    """Edge of the voxels on which all hypotheses are fitted [m]."""
+    fine_voxel_m: float = 0.002
+    """Edge of the voxels on which the best are refined [m]."""
+    above_table_m: float = 0.002
+    """Points lower than this over the table are the table's [m]."""
+    coarse_margin_m: float = 0.010
+    """Points within this of the hypothesis are fitted [m]: matching is right to a cell or two."""
+    fine_margin_m: float = 0.006
+    """The same for the refinement [m]."""
+    coarse_points: int = 1500
+    """At most so many points fit a hypothesis: the cost is 60 ns each and step."""
+    fine_points: int = 6000
+    """At most so many points refine one."""
+    same_m: float = 0.002
+    """Poses nearer than this, modulo symmetry, are one hypothesis [m]."""
+    refined: int = 5
+    """So many of the best hypotheses of an object are refined on the fine points."""
+    solver: SolverConfig = field(default_factory=SolverConfig)
+    """The Gauss-Newton fit."""
+    coarse: tuple[Stage, ...] = (
+        Stage(kernel=25.0, cap_m=0.015, steps=8, gated=False),
+        Stage(kernel=12.0, cap_m=0.0072, steps=8, gated=True),
+        Stage(kernel=6.0, cap_m=0.0036, steps=8, gated=True),
+    )
+    """From a hypothesis."""
+    fine: tuple[Stage, ...] = (
+        Stage(kernel=6.0, cap_m=0.005, steps=8, gated=True),
+        Stage(kernel=4.0, cap_m=0.003, steps=8, gated=True),
+    )
+    """From a fitted pose."""
+    converged_m: float = 1e-5
+    """A step that moves no point of the object further ends a stage of a fit [m]: the joint
+    refinement comes later."""
+
+    def fit(
+        self, sought: "Sought", cloud: Cloud, T_world_obj: Array, stages: tuple[Stage, ...]
+    ) -> Array:
+        """Return the pose (4, 4) of a model fitted to points from a start (4, 4)."""
+        return se3.check_rigid(
+            quick_fit(sought.body, cloud, T_world_obj, stages, self.solver, self.converged_m),
+            "the fitted pose",
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sought:
+    """A model with everything that is derived from it."""
+
+    body: Body
+    sameness: Sameness
+
+    @property
+    def obj_id(self) -> int:
+        """The model's id."""
+        return self.body.model.obj_id
+
+    @cached_property
+    def reach_m(self) -> float:
+        """Radius of the ball about the box centre that holds the body [m]."""
+        vertices = self.body.model.mesh.vertices
+        return float(np.sqrt(np.max(np.sum(np.square(vertices - self.body.center_obj), 1))))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Fused:
+    """The points of all views above the table, averaged."""
+
+    coarse: Cloud
+    fine: Cloud
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Candidate:
+    """A fitted pose, rendered once."""
+
+    obj_id: int
+    T_world_obj: Array
+    """(4, 4)."""
+    rendered: Render
+    alone: Score
+    """What it gains over the bare table, or over the objects that were sure when it was made."""
+    source: str
+    fine: bool = False
+    """Whether it was refined on the fine points."""
+
+
+def fuse(
+    views: Sequence[ViewPoints], noise: DepthNoise, plane: SupportPlane, config: RefineConfig
+) -> Fused:
+    """Return the views' points above the table, averaged on voxels of the table's frame."""
+    above = [without_table(world_cloud([v], noise), plane, config.above_table_m) for v in views]
+    cloud = Cloud(
+        points=np.concatenate([c.points for c in above]),
+        towards=np.concatenate([c.towards for c in above]),
+        sigmas=np.concatenate([c.sigmas for c in above]),
+    )
+    T = plane.T_world_table
+    fine = averaged(cloud, T, config.fine_voxel_m)
+    return Fused(coarse=averaged(fine, T, config.coarse_voxel_m), fine=fine)
+
+
+def nearby(cloud: Cloud, sought: Sought, T_world_obj: Array, margin_m: float, most: int) -> Cloud:
+    """Return the points within `margin_m` of a body's surface, evenly thinned to about `most`."""
+    body = sought.body
+    limit = (sought.reach_m + margin_m, margin_m)
+    lattice = (body.field.grid, body.field.origin, body.field.cell)
+    where = _near(cloud.points, T_world_obj, body.center(T_world_obj), limit, lattice)
+    if len(where) > most:
+        where = where[np.linspace(0, len(where) - 1, most).astype(np.int64)]
+    return Cloud(
+        points=cloud.points[where], towards=cloud.towards[where], sigmas=cloud.sigmas[where]
+    )
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _near(
+    points: Array,
+    T: Array,
+    center: Array,
+    limit: tuple[float, float],
+    lattice: tuple[NDArray[np.float32], Array, float],
+) -> NDArray[np.int64]:
+    """Return the indices of points within the radius of the centre and near the surface."""
+    grid, origin, cell = lattice
+    radius, margin = limit
+    out = np.empty(len(points), np.int64)
+    n = 0
+    for m in range(len(points)):
+        a, b, c = points[m, 0] - center[0], points[m, 1] - center[1], points[m, 2] - center[2]
+        if a * a + b * b + c * c > radius * radius:
+            continue
+        a, b, c = points[m, 0] - T[0, 3], points[m, 1] - T[1, 3], points[m, 2] - T[2, 3]
+        x = T[0, 0] * a + T[1, 0] * b + T[2, 0] * c
+        y = T[0, 1] * a + T[1, 1] * b + T[2, 1] * c
+        z = T[0, 2] * a + T[1, 2] * b + T[2, 2] * c
+        if abs(sample(grid, origin, cell, x, y, z)[0]) < margin:
+            out[n] = m
+            n += 1
+    return out[:n].copy()
+
+
+def fitted(
+    sought: Sought, cloud: Cloud, T_world_obj: Array, fine: bool, config: RefineConfig
+) -> Array:
+    """Return the pose (4, 4) after a coarse or a fine fit to the points near it."""
+    margin = config.fine_margin_m if fine else config.coarse_margin_m
+    most = config.fine_points if fine else config.coarse_points
+    points = nearby(cloud, sought, T_world_obj, margin, most)
+    stages = config.fine if fine else config.coarse
+    return config.fit(sought, points, T_world_obj, stages)
+
+
+def candidate(
+    sought: Sought,
+    canvas: Canvas,
+    T_world_obj: Array,
+    source: str,
+    fine: bool,
+    buffer: Array32 | None = None,
+) -> Candidate:
+    """Return a pose rendered and scored against a buffer; None = the bare table."""
+    rendered = render(canvas, sought.body, T_world_obj)
+    return Candidate(
+        obj_id=sought.obj_id,
+        T_world_obj=T_world_obj,
+        rendered=rendered,
+        alone=score(canvas, rendered, canvas.table if buffer is None else buffer),
+        source=source,
+        fine=fine,
+    )
+
+
+def candidates(
+    sought: Sought,
+    fused: Fused,
+    canvas: Canvas,
+    starts: Sequence[tuple[Array, str]],
+    config: RefineConfig,
+    buffer: Array32 | None = None,
+) -> list[Candidate]:
+    """Return the distinct poses that the starts lead to, the best first.
+
+    Args:
+        sought: the model.
+        fused: the measured points.
+        canvas: where poses are rendered.
+        starts: poses (4, 4) and where they come from.
+        config: see there.
+        buffer: what is there already; None = the bare table.
+    """
+    Ts = [fitted(sought, fused.coarse, T, False, config) for T, _ in starts]
+    made = [
+        candidate(sought, canvas, Ts[n], starts[n][1], False, buffer)
+        for n in distinct(sought.sameness, Ts, config.same_m)
+    ]
+    made.sort(key=lambda c: -c.alone.gain)
+    best = [refined(sought, fused, canvas, c, config, buffer) for c in made[: config.refined]]
+    made = sorted([*best, *made[config.refined :]], key=lambda c: -c.alone.gain)
+    kept = distinct(sought.sameness, [c.T_world_obj for c in made], config.same_m)
+    return [made[n] for n in kept]
+
+
+def refined(
+    sought: Sought,
+    fused: Fused,
+    canvas: Canvas,
+    start: Candidate,
+    config: RefineConfig,
+    buffer: Array32 | None = None,
+) -> Candidate:
+    """Return a candidate refined on the fine points, or as it was if that explains less."""
+    T = fitted(sought, fused.fine, start.T_world_obj, True, config)
+    finer = candidate(sought, canvas, T, start.source, True, buffer)
+    return finer if finer.alone.gain >= start.alone.gain else start
+
+
+def inside_share(a: Sought, T_a: Array, b: Sought, T_b: Array, depth_m: float) -> float:
+    """Return the share of either object's surface that lies deeper than this in the other."""
+    off = np.linalg.norm(a.body.center(T_a) - b.body.center(T_b))
+    if off > a.reach_m + b.reach_m - depth_m:
+        return 0.0
+    shares = [
+        np.mean(two.body.field.distance(one.body.samples, se3.invert(T_two) @ T_one) < -depth_m)
+        for one, T_one, two, T_two in ((a, T_a, b, T_b), (b, T_b, a, T_a))
+    ]
+    return float(max(shares))

@@ -1,0 +1,168 @@
+"""Camera motion from depth alone, and what it says about the robot's poses."""
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import SupportPlane
+from realsim.registration.evidence import DepthNoise
+from realsim.registration.odometry.above_table import on_plane, without_plane
+from realsim.registration.odometry.cross_check import CheckConfig, check_kinematics
+from realsim.registration.odometry.kiss import OdometryConfig, odometry, thinned
+from realsim.registration.odometry.pairs import PairConfig, neighbour_pairs
+from realsim.registration.views import SampleConfig, ViewPoints, sample_views
+from table_scenes import small_scene
+
+PLANE = SupportPlane(T_world_table=np.eye(4))
+NOISE = DepthNoise(per_m=0.0069, floor_m=2e-4)
+VIEWS = 32
+
+
+@lru_cache(maxsize=4)
+def views_of(seed: int) -> tuple[ViewPoints, ...]:
+    scene = small_scene(seed, objects=6, views=VIEWS)
+    return sample_views(scene.intrinsics, scene.frames, NOISE, SampleConfig(stride=1))
+
+
+def posed(views, Ts) -> list[ViewPoints]:
+    """Return the views in a new order of capture, at these poses."""
+    return [
+        replace(v, T_world_cam=T, index=k) for k, (v, T) in enumerate(zip(views, Ts, strict=False))
+    ]
+
+
+def poses_of(views) -> np.ndarray:
+    return np.stack([v.T_world_cam for v in views])
+
+
+def off(mm: float, deg: float, seed: int = 0) -> np.ndarray:
+    a = np.random.default_rng(seed).normal(size=(2, 3))
+    a /= np.linalg.norm(a, axis=1, keepdims=True)
+    return se3.from_rt(se3.exp_so3(np.radians(deg) * a[0]), 1e-3 * mm * a[1])
+
+
+def bumpy(rng: np.random.Generator) -> np.ndarray:
+    """Points (N, 3) on a surface with relief in all directions, 35 cm before a camera."""
+    xy = rng.uniform(-0.1, 0.1, (6000, 2))
+    z = 0.35 + 0.02 * np.sin(60 * xy[:, 0]) * np.cos(45 * xy[:, 1]) + 0.3 * xy[:, 0] * xy[:, 1]
+    return np.column_stack([xy, z])
+
+
+def test_known_motion_is_found():
+    rng = np.random.default_rng(1)
+    points = bumpy(rng)
+    step = se3.exp([0.01, -0.02, 0.015, 0.003, -0.002, 0.001])
+    true = [np.linalg.matrix_power(step, k) for k in range(5)]
+    clouds = [se3.transform(se3.invert(T), points) for T in true]
+    found = odometry(clouds, OdometryConfig())
+    error = se3.log(se3.invert(np.stack(true)) @ found.Ts_first_cam)
+    assert np.degrees(np.abs(error[:, :3])).max() < 0.15
+    assert 1e3 * np.abs(error[:, 3:]).max() < 1.0
+    assert found.overlaps.min() > 0.9
+    assert found.Ts_first_cam[0] == pytest.approx(np.eye(4))
+
+
+def test_odometry_is_repeatable_and_names_small_clouds():
+    rng = np.random.default_rng(2)
+    clouds = [bumpy(rng), bumpy(rng)]
+    one, two = (odometry(clouds, OdometryConfig()) for _ in range(2))
+    assert one.Ts_first_cam.tobytes() == two.Ts_first_cam.tobytes()
+    with pytest.raises(InputError, match="cloud 1 has 3 points"):
+        odometry([clouds[0], clouds[1][:3]], OdometryConfig())
+    with pytest.raises(InputError, match="no clouds"):
+        odometry([], OdometryConfig())
+    with pytest.raises(InputError, match="1 guesses were given for 2"):
+        odometry(clouds, OdometryConfig(), guesses=[np.eye(4)])
+
+
+def test_without_plane_keeps_what_is_above():
+    rng = np.random.default_rng(3)
+    T = se3.look_at([0.1, 0.2, 0.4], [0, 0, 0])
+    world = rng.uniform([-0.2, -0.2, 0], [0.2, 0.2, 0.1], (500, 3))
+    kept = without_plane(se3.transform(se3.invert(T), world), T, PLANE, 0.02)
+    assert se3.transform(T, kept) == pytest.approx(world[world[:, 2] > 0.02])
+
+
+def test_on_plane_brings_one_plane_onto_the_other():
+    rng = np.random.default_rng(4)
+    a, b = (se3.look_at(p, [0, 0, 0]) for p in ([0.1, 0.2, 0.4], [0.2, 0.1, 0.35]))
+    planes = [(T[2, :3], -T[2, 3]) for T in (a, b)]
+    true = se3.invert(a) @ b
+    about = rng.normal(size=3)
+    assert on_plane(true, *planes, about) == pytest.approx(true, abs=1e-12)
+    mended = on_plane(true @ se3.exp(0.02 * rng.normal(size=6)), *planes, about)
+    assert mended[:3, :3] @ planes[1][0] == pytest.approx(planes[0][0], abs=1e-9)
+    on_b = planes[1][0] * planes[1][1]
+    assert planes[0][0] @ se3.transform(mended, on_b[None])[0] == pytest.approx(planes[0][1])
+
+
+def test_pairs_join_all_views():
+    rng = np.random.default_rng(5)
+    u = rng.normal(size=(40, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    angles = np.degrees(np.arccos(np.clip(u @ u.T, -1, 1)))
+    pairs = neighbour_pairs(angles, PairConfig())
+    group = np.arange(40)
+    for _ in range(40):
+        for i, j in pairs:
+            group[[i, j]] = min(group[i], group[j])
+    assert set(group.tolist()) == {0}
+    assert len(pairs) == len(set(pairs)) and all(i < j for i, j in pairs)
+    assert thinned(np.zeros((5, 3)), 0.004).shape == (1, 3)
+
+
+def test_a_clean_capture_raises_no_alarm():
+    check = check_kinematics(views_of(1), PLANE, CheckConfig())
+    assert check.good, check.words()
+    assert check.noise_mm < 1.6 and check.noise_deg < 0.25
+    assert [v.index for v in check.views] == list(range(VIEWS))
+    assert json.loads(json.dumps(check.as_json(), allow_nan=False))["good"] is True
+
+
+def test_one_wrong_view_is_named():
+    views = views_of(1)
+    Ts = poses_of(views)
+    Ts[17] = Ts[17] @ off(6, 1.2)
+    check = check_kinematics(posed(views, Ts), PLANE, CheckConfig())
+    assert [(f.kind, f.view) for f in check.faults] == [("view", 17)]
+    assert check.faults[0].mm == pytest.approx(6, abs=2)
+    assert check.faults[0].deg == pytest.approx(1.2, abs=0.4)
+    assert "view 17: its depth disagrees with its robot pose" in check.words()[1]
+
+
+def test_a_slipped_mount_is_named():
+    views = views_of(1)
+    Ts = poses_of(views)
+    Ts[18:] = Ts[18:] @ off(5, 1.0, 3)
+    check = check_kinematics(posed(views, Ts), PLANE, CheckConfig())
+    assert [(f.kind, f.view) for f in check.faults] == [("mount", 18)]
+    assert check.faults[0].mm == pytest.approx(5, abs=2)
+
+
+def test_swapped_images_are_named():
+    views = views_of(1)
+    order = np.arange(VIEWS)
+    order[[9, 20]] = order[[20, 9]]
+    check = check_kinematics(
+        posed([views[k] for k in order], poses_of(views)), PLANE, CheckConfig()
+    )
+    assert [(f.kind, f.view, f.other) for f in check.faults] == [("swapped", 9, 20)]
+
+
+def test_a_skipped_image_is_named():
+    views = views_of(1)
+    kept = np.delete(np.arange(VIEWS), 11)
+    check = check_kinematics(posed([views[k] for k in kept], poses_of(views)), PLANE, CheckConfig())
+    assert [(f.kind, f.view, f.other) for f in check.faults] == [("shifted", 11, 1)]
+    assert "from view 11 on" in check.words()[1]
+
+
+def test_an_empty_table_is_an_error():
+    views = [replace(v, points=v.points[:0], pixels=v.pixels[:0]) for v in views_of(1)[:3]]
+    with pytest.raises(InputError, match="0 of 3 views"):
+        check_kinematics(views, PLANE, CheckConfig())

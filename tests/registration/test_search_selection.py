@@ -1,0 +1,117 @@
+"""The joint choice: known answers on a real scene's images, with right and wrong poses mixed."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from realsim.geometry import se3
+from realsim.records import ObjectPose, SupportPlane
+from realsim.registration.body import make_body
+from realsim.registration.evidence import DepthNoise
+from realsim.registration.search.refine import Candidate, Sought, candidate
+from realsim.registration.search.sameness import make_sameness
+from realsim.registration.search.scoring import Canvas, ScoreConfig, compose, make_canvas, score
+from realsim.registration.search.selection import (
+    SelectionConfig,
+    Slot,
+    select,
+    select_any,
+)
+from table_scenes import named_scene
+
+NAMES = ("mug", "wedge", "gear", "wedge")
+NOISE = DepthNoise(per_m=0.08 / (648 * 0.018), floor_m=2e-4)
+PLANE = SupportPlane(T_world_table=np.eye(4), rms_m=1e-3, inliers=1000)
+CONFIG = SelectionConfig()
+
+
+@lru_cache(maxsize=1)
+def material() -> tuple[Canvas, list[Candidate], list[int]]:
+    """The canvas, a pool with the right poses first, and which object each pose is of."""
+    scene = named_scene(1, NAMES)
+    rng = np.random.default_rng(0)
+    canvas = make_canvas(
+        scene.intrinsics, scene.frames[:8], NOISE, PLANE, ScoreConfig(columns=80, frames=8)
+    )
+    right: list[Candidate] = []
+    wrong: list[Candidate] = []
+    for p in scene.truth:
+        start = ObjectPose(obj_id=p.obj_id, instance=0, T_world_obj=np.eye(4))
+        model = scene.models[p.obj_id]
+        body = make_body(start, model, 24, 50)
+        sought = Sought(body=body, sameness=make_sameness(model))
+        right.append(candidate(sought, canvas, p.T_world_obj, "right", True))
+        for q in scene.truth:  # everywhere else, turned at random
+            shift = q.T_world_obj[:3, 3] - p.T_world_obj[:3, 3]
+            turn = se3.from_rt(se3.random_rotation(rng), np.zeros(3))
+            T = se3.from_translation(shift + 0.004 * rng.normal(size=3)) @ p.T_world_obj @ turn
+            wrong.append(candidate(sought, canvas, T, "wrong", False))
+    pool = right + wrong
+    return canvas, pool, [c.obj_id for c in pool]
+
+
+def slots() -> list[Slot]:
+    """One per object; the two wedges share theirs."""
+    _, pool, ids = material()
+    return [
+        Slot(choices=frozenset(n for n, i in enumerate(ids) if i == pool[k].obj_id))
+        for k in range(len(NAMES))
+    ]
+
+
+def test_the_right_poses_are_chosen():
+    canvas, pool, _ = material()
+    got = select(canvas, pool, slots(), CONFIG)
+    assert {c for c in got.chosen} == {0, 1, 2, 3}
+    assert got.chosen[0] == 0
+    assert got.chosen[2] == 2
+    for s in got.scores:
+        assert s is not None
+        assert s.agree > 0.9
+
+
+def test_two_of_one_model_never_share_a_pose():
+    canvas, pool, _ = material()
+    only = [Slot(choices=frozenset([1])), Slot(choices=frozenset([1]))]
+    got = select(canvas, pool, only, CONFIG)
+    assert sorted(map(str, got.chosen)) == ["1", "None"]
+
+
+def test_from_all_poses_those_of_the_objects_that_are_there():
+    canvas, pool, _ = material()
+    got = select_any(canvas, pool, CONFIG)
+    assert sorted(c for c in got.chosen if c is not None) == [0, 1, 2, 3]
+
+
+def test_a_bad_first_choice_is_mended():
+    canvas, pool, ids = material()
+    bad = [n for n in range(len(pool)) if n >= 4 and ids[n] == pool[0].obj_id][1]
+    got = select(canvas, pool, slots(), CONFIG, [bad, None, None, None])
+    assert got.chosen[0] == 0
+
+
+def test_wrong_poses_alone_are_refused():
+    canvas, pool, _ = material()
+    got = select_any(canvas, pool[4:], CONFIG)
+    assert all(s is not None and s.per_cell >= CONFIG.least_per_cell_unknown for s in got.scores)
+    empty = select(canvas, pool, [Slot(choices=frozenset())], CONFIG)
+    assert empty.chosen == (None,)
+    assert empty.scores == (None,)
+
+
+def test_the_order_of_the_pool_does_not_matter():
+    canvas, pool, _ = material()
+    order = np.random.default_rng(3).permutation(len(pool))
+    got = select_any(canvas, [pool[i] for i in order], CONFIG)
+    assert sorted(int(order[c]) for c in got.chosen if c is not None) == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("n", range(4))
+def test_scores_are_those_with_all_others_in_place(n: int):
+    canvas, pool, _ = material()
+    got = select(canvas, pool, slots(), CONFIG)
+    others = [pool[c].rendered for k, c in enumerate(got.chosen) if c is not None and k != n]
+    at = got.chosen[n]
+    assert at is not None
+    assert got.scores[n] == score(canvas, pool[at].rendered, compose(canvas.table, others))
