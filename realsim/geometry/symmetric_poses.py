@@ -164,8 +164,7 @@ def _meeting_point(lines: list[tuple[Array, Array]]) -> Array:
     """Return the point (3,) nearest to all lines: sum (I - a a') (x - p) = 0."""
     across = [np.eye(3) - np.outer(a, a) for a, _ in lines]
     right = sum(P @ p for P, (_, p) in zip(across, lines, strict=True))
-    point: Array = np.linalg.solve(sum(across, np.zeros((3, 3))), right)
-    return point
+    return np.asarray(np.linalg.solve(sum(across, np.zeros((3, 3))), right), np.float64)
 
 
 def _best_turn(M: Array, v: Array, S: Array, direction: Array, point: Array) -> Array:
@@ -185,7 +184,7 @@ def _best_turn(M: Array, v: Array, S: Array, direction: Array, point: Array) -> 
     # Where all sinusoids together are least: the least-squares angle is screened with the others.
     least_squares = float(np.arctan2(c.sum(), b.sum()))
     step = 2 * np.pi / SCREENED_ANGLES
-    angles: Array = least_squares + step * np.arange(SCREENED_ANGLES)
+    angles = np.asarray(least_squares + step * np.arange(SCREENED_ANGLES), np.float64)
     f = worst(angles)
     is_low = (f <= np.roll(f, 1)) & (f <= np.roll(f, -1))
     starts = angles[is_low][np.argsort(f[is_low], kind="stable")[:SEARCHED_MINIMA]]

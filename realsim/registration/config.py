@@ -17,6 +17,7 @@ from realsim.registration.judging.scene_checks import SceneCheckConfig
 from realsim.registration.judging.surface_residuals import ResidualConfig
 from realsim.registration.judging.unit_checks import UnitConfig
 from realsim.registration.judging.verdict import VerdictConfig
+from realsim.registration.near_rivals import RivalConfig
 from realsim.registration.plane import PlaneConfig
 from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.search.find import FindConfig
@@ -94,6 +95,7 @@ class RegistrationConfig:
     blind: BlindConfig = field(default_factory=BlindConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     verify: VerifyConfig = field(default_factory=VerifyConfig)
+    rivals: RivalConfig = field(default_factory=RivalConfig)
     judging: JudgingConfig = field(default_factory=JudgingConfig)
     offset: OffsetConfig = field(default_factory=OffsetConfig)
     sinking: SinkingConfig = field(default_factory=SinkingConfig)

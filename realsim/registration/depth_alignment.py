@@ -7,77 +7,24 @@ apart: an outline must fall on an edge of its own direction.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry.depth import MAD_TO_SIGMA
 from realsim.records import CameraIntrinsics
+from realsim.registration.outlines import AlignmentConfig, edge_distance, outlines_of, scores_of
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
+LEAST_VOTES = 3
+"""Two views may agree by chance."""
+__all__ = ["AlignmentConfig", "AlignmentFinding", "check_alignment", "pooled_alignment"]
+
 Kind = Literal["aligned", "not_aligned", "unknown", "other_size"]
-
-
-def _stretches() -> tuple[float, ...]:
-    """Return the factors that depth is stretched by: about +-2 % apart, from 0.7 to 1.45."""
-    return tuple(float(s) for s in np.exp(np.arange(-18, 19) * 0.02))
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class AlignmentConfig:
-    """How outlines are compared with edges. Pixels are those of an image `work_width_px` wide."""
-
-    work_width_px: int = 640
-    """Images are reduced to about this width: finer edges are noise."""
-    jump_m: float = 0.015
-    """Depth differences beyond this are outlines [m]; plus `jump_share` of the depth."""
-    jump_share: float = 0.02
-    """Noise and slopes grow with depth."""
-    gap_px: int = 12
-    """Depth that is missing over less than this beside an outline is the stereo camera's shadow:
-    the nearer side of the gap is the outline."""
-    run_px: int = 8
-    """Outlines are at least so long."""
-    reach_px: int = 24
-    """Shifts up to this are tried, along both axes."""
-    step_px: int = 3
-    """Steps of the shifts while stretches are tried, too."""
-    stretches: tuple[float, ...] = field(default_factory=_stretches)
-    """Factors that depth is stretched by about the middle, along each axis: a colour lens of 69
-    deg against a depth lens of 87 deg is 0.72."""
-    near_px: float = 1.5
-    """An outline counts exp(-d^2 / 2 near^2) at distance d from an edge."""
-    wide_px: float = 3.0
-    """The same while stretches are tried, in coarser steps."""
-    edge_share: float = 0.08
-    """The strongest edges of the colour image, so large a share of its pixels, are used."""
-    points: int = 1200
-    """Outline pixels used at most; a third of them while stretches are tried."""
-    least_points: int = 150
-    """With fewer outlines nothing is said: an empty table has none."""
-    confidence: float = 5.0
-    """The best shift stands out by at least so many robust standard deviations of all shifts."""
-    stretch_confidence: float = 8.0
-    """The same of the best stretch: a thousand times more are tried."""
-    aligned_px: float = 4.0
-    """A best shift up to this is aligned: published, aligned data lies up to 2.7 px off (YCB-Video
-    by 2.5 px along y, GraspNet's Kinect by 2.5 px)."""
-    wrong_px: float = 5.0
-    """Outlines this far off, in the mean over the image, are said to be not aligned."""
-    stretch_gain: float = 1.15
-    """A stretch is believed if it is so many times better than the best shift without one."""
-    agree_share: float = 0.75
-    """A view agrees with all of them if their best is worth this share of its own best."""
-    gain: float = 1.3
-    """A stretch or shift is believed if outlines lie on edges so many times as often beyond chance
-    as they do unmoved."""
-    seed: int = 0
-    """Of the choice of outline pixels."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -135,7 +82,7 @@ def check_alignment(
     if rgb.shape[:2] != wanted or depth_m.shape != wanted:
         return AlignmentFinding(kind="other_size", words=_size_words(rgb, depth_m, intrinsics))
     factor = max(1, round(intrinsics.width / config.work_width_px))
-    outlines = _outlines(depth_m[::factor, ::factor], config)
+    outlines = outlines_of(depth_m[::factor, ::factor], config)
     radius = 0.125 * (wanted[0] + wanted[1]) / factor
     if len(outlines) < config.least_points:
         words = (
@@ -145,10 +92,10 @@ def check_alignment(
         return AlignmentFinding(kind="unknown", words=words, outlines=len(outlines))
     rng = np.random.default_rng(config.seed)
     outlines = outlines[np.sort(rng.permutation(len(outlines))[: config.points])]
-    distance = _edge_distance(rgb, factor, config)
+    distance = edge_distance(rgb, factor, config)
     middle = np.array([intrinsics.cx, intrinsics.cy]) / factor
     one = np.ones(1)
-    shifts = _scores(distance, config.near_px, outlines, middle, one, config.reach_px, 1)
+    shifts = scores_of(distance, config.near_px, outlines, middle, one, config.reach_px, 1)
     first = _finding(
         _Scores(shifts[0, 0].astype(np.float64), None, len(outlines), factor, radius), config
     )
@@ -156,7 +103,7 @@ def check_alignment(
         return first
     stretches = np.array(config.stretches)
     few = outlines[:: max(1, len(outlines) // (config.points // 3))]
-    cube = _scores(
+    cube = scores_of(
         distance, config.wide_px, few, middle, stretches, config.reach_px, config.step_px
     )
     return _finding(
@@ -210,26 +157,35 @@ def _finding(
     spread = MAD_TO_SIGMA * float(np.median(np.abs(s - np.median(s)))) + 1e-9
     row, column = np.unravel_index(int(np.argmax(s)), s.shape)
     moved = np.array([_peak(s[row], int(column)), _peak(s[:, column], int(row))]) - reach
-    sure = float((s[row, column] - np.median(s)) / spread)
+    confidence = float((s[row, column] - np.median(s)) / spread)
+    sure = confidence > config.confidence
     kind: Kind = "unknown"
     stretch = np.ones(2)
     off = float(np.hypot(moved[0], moved[1]))
     unmoved = float(s[reach - 1 : reach + 2, reach - 1 : reach + 2].max())
-    if sure > config.confidence and off <= config.aligned_px:
+    near = [
+        v for v in votes
+        if np.hypot(*(np.array(v.shift_px) / v.px_factor + moved)) < config.vote_px
+        and v.stretch == (1.0, 1.0)
+    ]  # fmt: skip
+    sure = sure or len(near) >= max(LEAST_VOTES, config.vote_share * len(votes))
+    if sure and off <= config.aligned_px:
         kind = "aligned"
-    elif sure > config.confidence and off > config.wrong_px and s.max() > config.gain * unmoved:
+    elif sure and off > config.wrong_px and s.max() > config.gain * unmoved:
         kind = "not_aligned"
     at: tuple[Any, ...] = (slice(None), slice(None), int(row), int(column))
     if kind != "aligned" and scores.cube is not None:
         best = _best_stretch(scores, config)
         if best is not None:
-            kind, stretch, moved, sure, at = "not_aligned", *best
+            kind, stretch, moved, confidence, at = "not_aligned", *best
     shift = -moved * scores.px_factor
     agreeing = sum(_agrees(v, at, config) for v in votes) if votes else 1
+    if 2 * agreeing < len(votes):
+        kind = "unknown"
     words = _words(kind, shift, stretch, (agreeing, views))
     return AlignmentFinding(
         kind=kind, words=words, shift_px=(float(shift[0]), float(shift[1])),
-        stretch=(float(stretch[0]), float(stretch[1])), confidence=sure,
+        stretch=(float(stretch[0]), float(stretch[1])), confidence=confidence,
         outlines=scores.outlines, agreeing=agreeing, views=views, px_factor=scores.px_factor,
         radius_px=scores.radius_px, shift_scores=s, stretch_scores=scores.cube,
     )  # fmt: skip
@@ -326,108 +282,3 @@ def _size_words(
         "Use the depth stream aligned to colour, or register it with the depth-to-colour "
         "extrinsics; resizing does not align it."
     )
-
-
-def _outlines(depth_m: NDArray[np.float32], config: AlignmentConfig) -> Array32:
-    """Return outline points (N, 3): x, y, and 0 where depth jumps along x, 1 along y."""
-    import cv2
-
-    found: list[NDArray[np.float32]] = []
-    full = _without_pinholes(np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0))
-    for axis, z in ((0, full), (1, full.T)):
-        columns = np.arange(z.shape[1])
-        # Column of the last measured pixel before each one: gaps are stepped over.
-        last = np.maximum.accumulate(np.where(z > 0, columns, -1), axis=1)
-        before = np.concatenate([np.full((len(z), 1), -1), last[:, :-1]], axis=1)
-        i, j = np.nonzero((z > 0) & (before >= 0) & (columns - before <= config.gap_px))
-        b = before[i, j]
-        here, there = z[i, j], z[i, b]
-        jump = np.abs(here - there)
-        keep = jump > config.jump_m + config.jump_share * np.minimum(here, there)
-        i, j, b = i[keep], j[keep], b[keep]
-        # The border of the nearer of the two, half a pixel outside of it.
-        x = np.where(here[keep] < there[keep], j - 0.5, b + 0.5)
-        mask = np.zeros(z.shape, np.uint8)
-        mask[i, np.ceil(x).astype(np.int64)] = 1
-        _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-        # Noise jumps here and there, outlines run on.
-        long = stats[:, cv2.CC_STAT_HEIGHT] >= config.run_px
-        keep = long[labels[i, np.ceil(x).astype(np.int64)]]
-        i, x = i[keep], x[keep]
-        xy = (x, i) if axis == 0 else (i, x)
-        found.append(np.stack([*xy, np.full(len(x), axis)], axis=1).astype(np.float32))
-    return np.concatenate(found)
-
-
-def _without_pinholes(depth_m: NDArray[np.float32]) -> Array:
-    """Return the depth (H, W) with holes of a pixel filled: depth mapped onto a larger image."""
-    z = depth_m.astype(np.float64)
-    for axis in (1, 0):
-        a, b = np.roll(z, 1, axis), np.roll(z, -1, axis)
-        z = np.where((z == 0) & (a > 0) & (b > 0), np.maximum(a, b), z)
-    return z
-
-
-def _edge_distance(rgb: NDArray[np.uint8], factor: int, config: AlignmentConfig) -> Array32:
-    """Return the distance (2, H, W) to the nearest colour edge along x and along y [px]."""
-    import cv2
-
-    size = (-(-rgb.shape[1] // factor), -(-rgb.shape[0] // factor))
-    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA) if factor > 1 else rgb
-    smooth = cv2.GaussianBlur(small, (0, 0), 1.0).astype(np.float32)
-    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0)
-    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1)
-    # Of the three colours the one that changes most.
-    most = np.argmax(gx**2 + gy**2, axis=2)[..., None]
-    gx = np.take_along_axis(gx, most, 2)[..., 0]
-    gy = np.take_along_axis(gy, most, 2)[..., 0]
-    out = np.empty((2, *gx.shape), np.float32)
-    for axis, g in ((0, np.abs(gx)), (1, np.abs(gy))):
-        a, b = np.roll(g, 1, axis=1 - axis), np.roll(g, -1, axis=1 - axis)
-        crest = (g >= a) & (g > b)
-        values = g[crest]
-        n = int(0.5 * config.edge_share * g.size)
-        least = np.partition(values, -n)[-n] if n < len(values) else 0.0
-        edges = crest & (g >= max(float(least), 1.0))
-        out[axis] = cv2.distanceTransform((~edges).astype(np.uint8), cv2.DIST_L2, 3)
-    return out
-
-
-def _scores(
-    distance: Array32, width_px: float, outlines: Array32, middle: Array, stretches: Array,
-    reach: int, step: int,
-) -> Array32:  # fmt: skip
-    """Return (S, S, Y, X) the share of outlines on edges beyond chance per stretch and shift."""
-    near = np.exp(-0.5 * np.square(distance / np.float32(width_px))).astype(np.float32)
-    chance = near.reshape(2, -1).mean(1)
-    raw = _sum_near(near, chance, outlines, middle, stretches, (reach // step, step))
-    mean = float(np.mean(chance[outlines[:, 2].astype(np.int64)]))
-    return ((raw / len(outlines) - mean) / (1.0 - mean)).astype(np.float32)
-
-
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
-def _sum_near(
-    near: Array32, chance: Array32, outlines: Array32, middle: Array, stretches: Array,
-    shifts: tuple[int, int],
-) -> Array:  # fmt: skip
-    """Return (S, S, Y, X) the sum of closeness over outlines (N, 3); outside it is chance."""
-    count, step = shifts
-    size = 2 * count + 1
-    _, height, width = near.shape
-    out = np.zeros((len(stretches), len(stretches), size, size))
-    for sx in range(len(stretches)):
-        for sy in range(len(stretches)):
-            for n in range(len(outlines)):
-                axis = int(outlines[n, 2])
-                x0 = middle[0] + stretches[sx] * (outlines[n, 0] - middle[0])
-                y0 = middle[1] + stretches[sy] * (outlines[n, 1] - middle[1])
-                j0, i0 = int(np.floor(x0 + 0.5)), int(np.floor(y0 + 0.5))
-                for a in range(size):
-                    i = i0 + (a - count) * step
-                    for b in range(size):
-                        j = j0 + (b - count) * step
-                        if 0 <= i < height and 0 <= j < width:
-                            out[sx, sy, a, b] += near[axis, i, j]
-                        else:
-                            out[sx, sy, a, b] += chance[axis]
-    return out

@@ -26,8 +26,10 @@ from realsim.registration.evidence import DepthFrame
 from realsim.registration.few_views import begin, register_few, search_near
 from realsim.registration.intake import Intake, take_in
 from realsim.registration.judge import Judged, Poses, judged
+from realsim.registration.judging.probability import CONTRAST_DECIDED
 from realsim.registration.judging.unit_checks import unit_errors
-from realsim.registration.many_views import comparer_on, register_many
+from realsim.registration.many_views import ManyViews, comparer_on, register_many
+from realsim.registration.near_rivals import Duel, duels
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.reports import (
     camera_report,
@@ -132,6 +134,8 @@ class _Found:
     claimed: list[Array | None]
     """(4, 4) what somebody claimed of each."""
     contrasts: list[float | None]
+    rivals: list[Array | None]
+    """(4, 4) the best near-symmetric rival of each pose."""
     reports: list[dict[str, Any]]
     not_placed: tuple[NotPlaced, ...]
     report: dict[str, Any]
@@ -213,7 +217,9 @@ def _found(work: _Work, asked: list[Wanted] | None) -> _Found:
     near_only = asked is not None and all(w.T_start is not None for w in asked)
     few = len(intake.frames) < config.refine_from
     if asked is not None and not asked:
-        return _Found(bodies=[], claimed=[], contrasts=[], reports=[], not_placed=(), report={})
+        return _Found(
+            bodies=[], claimed=[], contrasts=[], rivals=[], reports=[], not_placed=(), report={}
+        )
     if config.method == "top-down" or (near_only and (few or intake.plane is None)):
         return _found_near(work, asked or [])
     if intake.plane is None:
@@ -246,6 +252,7 @@ def _as_found(work: _Work, result: SearchResult, asked: list[Wanted] | None) -> 
         bodies=[_body(work, p.obj_id, p.instance, p.T_world_obj) for p in placed],
         claimed=[claims.get(p.instance) for p in placed],
         contrasts=[p.contrast for p in placed],
+        rivals=[p.T_rival for p in placed],
         reports=[search_report(p) for p in placed],
         not_placed=result.not_placed, report=dict(result.report),
     )  # fmt: skip
@@ -269,7 +276,8 @@ def _found_near(work: _Work, asked: list[Wanted]) -> _Found:
             for b, f in zip(bodies, found, strict=True)
         ]
     return _Found(
-        bodies=bodies, claimed=list(T_starts), contrasts=[None] * len(bodies), reports=reports,
+        bodies=bodies, claimed=list(T_starts), contrasts=[None] * len(bodies),
+        rivals=[None] * len(bodies), reports=reports,
         not_placed=(), report={},
     )  # fmt: skip
 
@@ -295,13 +303,31 @@ def _with_many(work: _Work, found: _Found, missing: tuple[NotPlaced, ...]) -> Re
     claimed = _claimed_bodies(found)
     starts = [b if T is not None else None for b, T in zip(claimed, found.claimed, strict=True)]
     many = register_many(intake, found.bodies, starts, intake.plane, config, work.tick.each)
+    fought = _fought(found, many, config)
+    lost = [_is_lost(d) for d in fought]
+    if any(lost):
+        bodies = [
+            b if d is None or not gone
+            else replace(b, start=replace(b.start, T_world_obj=d.T_rival))
+            for b, d, gone in zip(found.bodies, fought, lost, strict=True)
+        ]  # fmt: skip
+        rivals = [
+            b.T_start if gone else R
+            for b, R, gone in zip(found.bodies, found.rivals, lost, strict=True)
+        ]
+        found = replace(found, bodies=bodies, rivals=rivals)
+        many = register_many(intake, bodies, starts, intake.plane, config)
+        fought = _fought(found, many, config)
+    contrasts = [
+        c if d is None else d.contrast for c, d in zip(found.contrasts, fought, strict=True)
+    ]
     comparer = comparer_on(intake, many.frames, many.plane, claimed, many.poses, config)
     uncertain = [
         uncertainty(b, k.fit, 1, config.covariance) for b, k in zip(claimed, many.kept, strict=True)
     ]
     given = Poses(
         bodies=claimed, poses=many.poses, clouds=many.clouds, covariances=list(many.covariances),
-        blind=[len(u.unobservable) for u in uncertain], contrasts=found.contrasts,
+        blind=[len(u.unobservable) for u in uncertain], contrasts=contrasts,
         cameras=many.refined.cameras, plane=many.plane,
         with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
@@ -324,6 +350,22 @@ def _with_many(work: _Work, found: _Found, missing: tuple[NotPlaced, ...]) -> Re
     return _registration(
         work, (found, missing), (given, result, comparer), (cameras, seen), (extra, reports)
     )
+
+
+def _is_lost(fought: Duel | None) -> bool:
+    """Return whether the rival is clearly the better pose."""
+    contrast = None if fought is None else fought.contrast
+    return contrast is not None and contrast < -CONTRAST_DECIDED
+
+
+def _fought(found: _Found, many: ManyViews, config: RegistrationConfig) -> list[Duel | None]:
+    """Return how every pose compares with its near-symmetric rival, cameras refined."""
+    rivals = [
+        None if R is None else T @ se3.invert(b.T_start) @ R
+        for b, T, R in zip(found.bodies, many.refined.poses, found.rivals, strict=True)
+    ]
+    poses, misfits = list(many.refined.poses), list(many.refined.misfit_m[:-1])
+    return duels(found.bodies, poses, rivals, many.clouds, misfits, config.rivals)
 
 
 def _with_few(work: _Work, found: _Found, missing: tuple[NotPlaced, ...]) -> Registration:

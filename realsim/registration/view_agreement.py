@@ -97,9 +97,7 @@ def make_maps(views: Sequence[ViewPoints], noise: DepthNoise) -> ViewMaps:
         z = np.ascontiguousarray(v.points[:, 2], dtype=np.float32)
         _fill(v.pixels, z, cell, low[k], high[k])
     Ts = np.stack([v.T_world_cam for v in views])
-    return ViewMaps(
-        pinhole=pinhole, cell_px=cell, low=low, high=high, Ts_world_cam=Ts, noise=noise
-    )
+    return ViewMaps(pinhole=pinhole, cell_px=cell, low=low, high=high, Ts_world_cam=Ts, noise=noise)
 
 
 def _pinhole(views: Sequence[ViewPoints]) -> Array:
@@ -155,9 +153,7 @@ def partners(Ts_world_cam: Array, near: int, spread: int) -> NDArray[np.int64]:
 
 
 @numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
-def _fill(
-    pixels: NDArray[np.int32], z: Array32, cell: float, low: Array32, high: Array32
-) -> None:
+def _fill(pixels: NDArray[np.int32], z: Array32, cell: float, low: Array32, high: Array32) -> None:
     """Enter the depths (N,) [m] into the cells of one view's maps."""
     for n in range(len(z)):
         i, j = int(pixels[n, 1] / cell), int(pixels[n, 0] / cell)

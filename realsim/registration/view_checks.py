@@ -89,7 +89,9 @@ def check_views(
     if bodies and plane is not None:
         named = {f.index for f in found}
         rest = [v for v in left if v.index not in named]
-        found += _check_objects(rest, plane, noise, config, list(zip(bodies, Ts_world_obj)))
+        found += _check_objects(
+            rest, plane, noise, config, list(zip(bodies, Ts_world_obj, strict=True))
+        )
     return tuple(sorted(found, key=lambda f: -1 if f.index is None else f.index))
 
 

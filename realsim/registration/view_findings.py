@@ -1,6 +1,6 @@
 """What can be wrong with a view, and when it is said to be."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from realsim.registration.find_table import TableSearchConfig
@@ -15,7 +15,7 @@ Kind = Literal[
 class ViewCheckConfig:
     """When a view is said to be wrong. Measured on simulated and real scenes: see the tests."""
 
-    table: TableSearchConfig = TableSearchConfig()
+    table: TableSearchConfig = field(default_factory=TableSearchConfig)
     """How a view's own table is found."""
     least_view_points: int = 50
     """Views with fewer trusted points are left out."""

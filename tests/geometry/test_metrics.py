@@ -13,7 +13,6 @@ from realsim.geometry.parts import part, part_names
 from realsim.geometry.symmetric_poses import nearest_symmetry
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel
 
-AXIAL = [name for name in part_names() if part(name).symmetry_axes]
 FINE_RAD = np.radians(0.01)
 CAMERA = CameraIntrinsics(width=640, height=360, fx=324.0, fy=324.0, cx=319.5, cy=179.5)
 
@@ -22,7 +21,7 @@ def ring(radius: float, height: float, sides: int = 720) -> np.ndarray:
     """Return the rims of a cylinder about z (2 sides, 3)."""
     angles = 2 * np.pi * np.arange(sides) / sides
     rim = np.stack([radius * np.cos(angles), radius * np.sin(angles), 0 * angles], -1)
-    return np.concatenate([rim - [0, 0, height / 2], rim + [0, 0, height / 2]])
+    return np.concatenate([rim - np.array([0, 0, height / 2]), rim + np.array([0, 0, height / 2])])
 
 
 def ball(radius: float, center: np.ndarray) -> ObjectModel:
@@ -103,7 +102,7 @@ def test_known_answers_of_a_cylinder():
     assert near.distance_m == pytest.approx(2 * np.sin(a / 2) * np.hypot(0.05, 0.03), rel=1e-5)
     # Upside down it is another object, unless it flips.
     flip = se3.from_rt(se3.exp_so3([np.pi, 0, 0]), np.zeros(3))
-    upright = v + [0, 0, 0.02]
+    upright = v + np.array([0, 0, 0.02])
     assert nearest_symmetry(np.eye(4), flip, upright, None, axis).distance_m > 0.039
     both = np.stack([np.eye(4), flip])
     assert nearest_symmetry(np.eye(4), turned @ flip, v, both, axis).distance_m == pytest.approx(

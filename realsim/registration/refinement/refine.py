@@ -247,7 +247,10 @@ def _blocks(
     weight = 1.0 / (variance * crowding + misfit[0] ** 2)
     reach = noise.cut_sigmas**2 * (variance + misfit[0] ** 2)
     kernels = np.empty(len(p))
-    add_blocks((places, distances, normals), mine.views, frame, (weight, reach), (H, b), kernels)
+    axes = np.ascontiguousarray(Ms[:, :3, 2])
+    add_blocks(
+        (places, distances, normals), mine.views, (*frame, axes), (weight, reach), (H, b), kernels
+    )
     H = H + np.swapaxes(np.triu(H, 1), 1, 2)
     seen = _misfit(distances, variance, noise)
     return Blocks(H=H, b=b, Ms=Ms), min(seen, noise.widest_m), int(np.count_nonzero(kernels))

@@ -25,6 +25,8 @@ from realsim.registration.views import ViewPoints
 
 Array = NDArray[np.float64]
 MAD_TO_SIGMA = 1.4826
+GAPS = 3.0
+"""A partner may be so many spacings of its surface's points away."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -34,17 +36,19 @@ class ViewsConfig:
     reach_m: tuple[float, float] = (0.020, 0.004)
     """A partner is sought this near, in the first and the last round [m]: cameras of a real arm
     were off by 4 mm and 0.7 deg, which is 10 mm at half a metre."""
-    rounds: int = 10
+    rounds: int = 14
     """Searches for partners, each followed by one step."""
     points_per_view: int = 3000
-    """At most so many points of a view are compared with the others."""
+    """At most so many points of a view are compared with the others..."""
+    surface_points: int = 15_000
+    """...which are surfaces of at most so many: partners must be near, or curvature is an error."""
     partners: int = 10
     """Views with which each is compared: those whose cameras are nearest and that look the same
     way."""
     look_cos: float = 0.5
     """Least cosine between the axes of two cameras that are compared: beyond 60 deg they see
     different sides."""
-    neighbours: int = 16
+    neighbours: int = 60
     """Points from which a normal is estimated."""
     roughness: float = 0.03
     """Greatest share of the smallest axis in the spread of these points; more is no surface."""
@@ -74,7 +78,7 @@ class RefinedViews:
     """(V,) number of views each was compared with; 0 = it kept the robot's word but for the
     hand-eye."""
     misfit_m: float
-    """What residuals show beyond the noise [m]."""
+    """What residuals of a typical pair of views show beyond the noise [m]."""
     history: tuple[dict[str, float], ...]
 
 
@@ -89,7 +93,11 @@ class _Surface:
     sigmas: Array
     """(N,) 1-sigma along the normal [m]."""
     tree: Any
-    """KD-tree of the points."""
+    """KD-tree of the points; None = there are none."""
+    few: NDArray[np.int64]
+    """Those that are compared with other views."""
+    spacing_m: float
+    """Typical distance of neighbours [m]."""
     crowding: float
     """How many of them are one independent measurement."""
 
@@ -140,7 +148,6 @@ def refine_views(
     twists, hand = np.zeros((len(views), 6)), np.zeros(6)
     p = config.prior
     sigmas = np.array([np.radians(p.view_deg), p.view_mm / 1e3])
-    misfit = config.noise.widest_m
     covariances = np.zeros((len(views), 6, 6))
     overlaps = np.zeros(len(views), np.int64)
     history: list[dict[str, float]] = []
@@ -149,9 +156,9 @@ def refine_views(
         found = [_match(surfaces, cameras, i, j, reach, config) for i, j in pairs]
         matches = [m for m in found if m is not None]
         overlaps = np.bincount([k for m in matches for k in (m.i, m.j)], minlength=len(views))
-        misfit = _misfit(matches, config.noise)
+        misfits = [_misfit(m, config.noise) for m in matches]
         A, b = _prior(twists, hand, sigmas, p)
-        for m in matches:
+        for m, misfit in zip(matches, misfits, strict=True):
             _add(A, b, m, misfit, config.noise)
         inverse = np.linalg.inv(A)
         step = inverse @ b
@@ -161,13 +168,14 @@ def refine_views(
         covariances = np.stack([inverse[k : k + 6, k : k + 6] for k in range(0, n, 6)])
         if p.learn_views and len(views) >= p.learn_from:
             sigmas = _learned(twists - hand, inverse[n:, n:], covariances, p)
-        history.append(_row(matches, step, misfit, sigmas))
+        median = float(np.median(misfits)) if misfits else config.noise.widest_m
+        history.append(_row(matches, step, median, sigmas))
         if progress is not None:
             progress(round_ + 1, config.rounds)
     return RefinedViews(
         cameras=claimed @ se3.exp(twists), hand_eye=hand, covariances=covariances,
         view_sigma=(float(np.degrees(sigmas[0])), 1e3 * float(sigmas[1])), overlaps=overlaps,
-        misfit_m=misfit, history=tuple(history),
+        misfit_m=history[-1]["misfit_mm"] / 1e3, history=tuple(history),
     )  # fmt: skip
 
 
@@ -175,22 +183,30 @@ def _surface(view: ViewPoints, noise: DepthNoise, area_px: float, config: ViewsC
     """Return a view's points with the normals of the surface around them."""
     from scipy.spatial import cKDTree
 
-    every = max(1, -(-len(view.points) // config.points_per_view))
     dense = view.points.astype(np.float64)
+    every = max(1, -(-len(dense) // config.surface_points))
     p = dense[::every]
     if len(p) < config.neighbours:
-        return _Surface(p[:0], p[:0], np.zeros(0), None, 1.0)
+        return _Surface(p[:0], p[:0], np.zeros(0), None, p[:0, 0].astype(np.int64), 0.0, 1.0)
     near = dense[cKDTree(dense).query(p, config.neighbours)[1]]
-    off = near - near.mean(axis=1, keepdims=True)
+    middle = near.mean(axis=1)
+    off = near - middle[:, None]
     values, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
     n = axes[:, :, 0]
     n = n * -np.sign(np.sum(n * p, axis=1, keepdims=True))
+    # Points are moved onto the plane of their neighbours, in all views alike: else the noise of a
+    # point would be in its residual and in its derivative, which pulls (errors in variables).
+    p = p + np.sum((middle - p) * n, axis=1, keepdims=True) * n
     smooth = values[:, 0] < config.roughness * values.sum(axis=1)
     p, n = p[smooth], n[smooth]
     cosine = np.abs(np.sum(n * p, axis=1)) / np.linalg.norm(p, axis=1)
     sigma = noise.sigma(p[:, 2]) * np.clip(cosine, config.noise.oblique, None)
-    crowding = max(1.0, area_px / (view.area_px * every))
-    return _Surface(p, n, np.maximum(sigma, config.noise.floor_m), cKDTree(p), crowding)
+    few = np.arange(0, len(p), max(1, -(-len(p) // config.points_per_view)))
+    tree = cKDTree(p)
+    spacing = float(np.median(tree.query(p[few], 2)[0][:, 1]))
+    crowding = max(1.0, area_px * len(few) / (view.area_px * every * len(p)))
+    sigma = np.maximum(sigma, config.noise.floor_m)
+    return _Surface(p, n, sigma, tree, few, spacing, crowding)
 
 
 def _pairs(cameras: Array, config: ViewsConfig) -> list[tuple[int, int]]:
@@ -213,43 +229,37 @@ def _match(
 ) -> _Match | None:
     """Return the points of view i that lie on the surface of view j; None = too few."""
     a, b = surfaces[i], surfaces[j]
-    if a.tree is None or b.tree is None or min(len(a.points), len(b.points)) == 0:
+    if a.tree is None or b.tree is None:
         return None
     M = se3.invert(cameras[j]) @ cameras[i]
-    moved = se3.transform(M, a.points)
+    moved = se3.transform(M, a.points[a.few])
     # Sampling leaves gaps along the surface; only the distance along the normal must be small.
-    far, at = b.tree.query(moved, distance_upper_bound=max(reach, 3 * _spacing(b)))
+    far, at = b.tree.query(moved, distance_upper_bound=max(reach, GAPS * b.spacing_m))
     close = np.isfinite(far)
-    k, at = np.flatnonzero(close), at[close]
+    k, at, moved = a.few[close], at[close], moved[close]
     n_j = b.normals[at]
-    n_i = a.normals[k] @ M[:3, :3].T
-    r = np.sum(n_j * (moved[k] - b.points[at]), axis=1)
-    good = (np.sum(n_i * n_j, axis=1) > config.facing) & (np.abs(r) < reach)
+    r = np.sum(n_j * (moved - b.points[at]), axis=1)
+    good = np.sum((a.normals[k] @ M[:3, :3].T) * n_j, axis=1) > config.facing
+    good &= np.abs(r) < reach
     if np.count_nonzero(good) < config.least_matches:
         return None
-    k, at, n_j, r = k[good], at[good], n_j[good], r[good]
-    n_in_i = n_j @ M[:3, :3]
-    J_i = np.concatenate([np.cross(a.points[k], n_in_i), n_in_i], axis=1)
-    J_j = -np.concatenate([np.cross(moved[k], n_j), n_j], axis=1)
+    k, at, moved, n_j, r = k[good], at[good], moved[good], n_j[good], r[good]
+    n_i = n_j @ M[:3, :3]
+    J_i = np.concatenate([np.cross(a.points[k], n_i), n_i], axis=1)
+    J_j = -np.concatenate([np.cross(moved, n_j), n_j], axis=1)
     variances = np.square(a.sigmas[k]) + np.square(b.sigmas[at])
-    return _Match(i, j, r, variances, (J_i, J_j), max(a.crowding, b.crowding))
+    return _Match(i, j, r, variances, (J_i, J_j), a.crowding)
 
 
-def _spacing(surface: _Surface) -> float:
-    """Return the typical distance of a surface's points [m]."""
-    few = surface.points[:: max(1, len(surface.points) // 200)]
-    return float(np.median(surface.tree.query(few, 2)[0][:, 1]))
+def _misfit(match: _Match, noise: NoiseConfig) -> float:
+    """Return by how much residuals are wider than their noise [m], robustly.
 
-
-def _misfit(matches: Sequence[_Match], noise: NoiseConfig) -> float:
-    """Return by how much residuals are wider than their noise [m], robustly."""
-    if not matches:
-        return noise.widest_m
-    r = np.concatenate([m.residuals for m in matches])
-    variance = float(np.median(np.concatenate([m.variances for m in matches])))
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(r)))
-    return float(np.clip(np.sqrt(max(spread**2 - variance, 0.0)), noise.least_misfit_m,
-                         noise.widest_m))  # fmt: skip
+    Of every pair on its own: a depth camera's distortions are alike in views from nearby, so these
+    agree better than views from far apart, and say more.
+    """
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(match.residuals)))
+    beyond = np.sqrt(max(spread**2 - float(np.median(match.variances)), 0.0))
+    return float(np.clip(beyond, noise.least_misfit_m, noise.widest_m))
 
 
 def _prior(twists: Array, hand: Array, sigmas: Array, prior: CameraPrior) -> tuple[Array, Array]:

@@ -1,0 +1,424 @@
+"""Derivatives against finite differences; normal equations against dense ones and GTSAM's."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.geometry.parts import part
+from realsim.records import ObjectPose
+from realsim.registration.body import Body, make_body
+from realsim.registration.refinement.blocks import BLOCK, add_blocks
+from realsim.registration.refinement.equations import (
+    BIAS,
+    HAND_EYE,
+    OBJECTS,
+    TABLE,
+    TABLE_ROWS,
+    Blocks,
+    System,
+    assembled,
+    covariances,
+    solved,
+)
+from realsim.registration.refinement.residuals import exact_residuals, field_residuals, thin_share
+from realsim.registration.refinement.state import State, centred, moved
+
+Array = NDArray[np.float64]
+TINY_M = 1e-9
+"""A residual so small that the ray meets the surface at the point itself."""
+STEP = 1e-5
+
+
+@pytest.fixture(scope="module")
+def box() -> Body:
+    pose = ObjectPose(obj_id=1, instance=0, T_world_obj=np.eye(4))
+    return make_body(pose, part("box"), 64, 200)
+
+
+# --- derivatives ---------------------------------------------------------------------------------
+
+
+@dataclass
+class OnePoint:
+    """One measured point, the plane it lies on, and where everything stands."""
+
+    state: State
+    claimed: Array
+    point_cam: Array
+    on: Array
+    normal: Array
+    bodies: list[Body]
+
+    @property
+    def of_table(self) -> bool:
+        return not self.bodies
+
+    def T_world_body(self, state: State) -> Array:
+        if not self.of_table:
+            return state.poses[0]
+        assert state.T_world_table is not None
+        return state.T_world_table
+
+    def residual(self, state: State) -> float:
+        """r = g . (M p - s) in the body's frame, as `refine` sees it."""
+        M = se3.invert(self.T_world_body(state)) @ state.cameras(self.claimed)[0]
+        p = se3.transform(M, state.corrected(self.point_cam[None]))[0]
+        return float(self.normal @ (p - self.on))
+
+    def row(self) -> tuple[Array, Array]:
+        """dr / d(shared), dr / d(view), from the code's blocks."""
+        T = self.T_world_body(self.state)
+        M = se3.invert(T) @ self.state.cameras(self.claimed)
+        place = se3.transform(M[0], self.state.corrected(self.point_cam[None]))
+        center = np.zeros(3) if self.of_table else self.bodies[0].center_obj
+        H, b = np.zeros((1, BLOCK, BLOCK)), np.zeros((1, BLOCK))
+        kernels = np.zeros(1)
+        add_blocks(
+            (place, np.array([TINY_M]), self.normal[None]), np.zeros(1, np.int32),
+            (center, *seen_from(M)), (np.ones(1), np.ones(1)), (H, b), kernels,
+        )  # fmt: skip
+        assert kernels[0] == pytest.approx(1.0)
+        H = H + np.swapaxes(np.triu(H, 1), 1, 2)
+        blocks = Blocks(H=H, b=b, Ms=se3.from_translation(-center) @ M)
+        system = assembled([], blocks) if self.of_table else assembled([blocks], None)
+        return -system.a / TINY_M, -system.d[0] / TINY_M
+
+
+def some_point(rng: np.random.Generator, body: Body | None, bias=(1.0, 0.0)) -> OnePoint:
+    T_world_cam = se3.look_at(rng.uniform([-0.2, -0.2, 0.25], [0.2, 0.2, 0.4]), [0, 0, 0.02])
+    point_cam = np.append(rng.uniform(-0.25, 0.25, 2), 1.0) * rng.uniform(0.25, 0.4)
+    T = se3.random_transform(rng, spread=0.1)
+    state = State(
+        poses=T[None] if body is not None else np.zeros((0, 4, 4)),
+        T_world_table=T, hand_eye=np.zeros(6), views=np.zeros((1, 6)), bias=np.array(bias),
+    )  # fmt: skip
+    normal = np.array([0.0, 0.0, 1.0])
+    if body is not None:
+        normal = rng.normal(size=3)
+        normal /= np.linalg.norm(normal)
+    point = OnePoint(
+        state, T_world_cam[None], point_cam, np.zeros(3), normal, [] if body is None else [body]
+    )
+    # A point whose ray is nearly in the surface says nothing of the depth: look at it from above.
+    M = se3.invert(T) @ T_world_cam
+    ray = M[:3, :3] @ point_cam
+    cosine = abs(ray @ normal) / np.linalg.norm(ray)
+    return point if cosine > 0.2 else some_point(rng, body, bias)
+
+
+def seen_from(Ms: Array) -> tuple[Array, Array]:
+    """Where the cameras (V, 4, 4) are, and in which direction they look."""
+    return np.ascontiguousarray(Ms[:, :3, 3]), np.ascontiguousarray(Ms[:, :3, 2])
+
+
+def numeric(point: OnePoint, unknowns: int, apply: Callable[[Array], State]) -> Array:
+    """Central differences of the residual over a step of `unknowns` numbers."""
+    out = np.zeros(unknowns)
+    for k in range(unknowns):
+        x = np.zeros(unknowns)
+        x[k] = STEP
+        out[k] = (point.residual(apply(x)) - point.residual(apply(-x))) / (2 * STEP)
+    return out
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_derivatives_of_an_object_are_those_of_the_residual(box: Body, seed: int):
+    point = some_point(np.random.default_rng(seed), box)
+    shared, view = point.row()
+    n = OBJECTS + 6
+    no_view, nothing = np.zeros((1, 6)), np.zeros(n)
+    expected = numeric(point, n, lambda x: moved(point.state, point.bodies, x, no_view))
+    np.testing.assert_allclose(shared, expected, atol=1e-6)
+    assert np.linalg.norm(expected[OBJECTS:]) > 0.5
+    expected = numeric(point, 6, lambda x: moved(point.state, point.bodies, nothing, x[None]))
+    np.testing.assert_allclose(view, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_derivatives_of_the_table_are_those_of_the_residual(seed: int):
+    point = some_point(np.random.default_rng(100 + seed), None)
+    shared, view = point.row()
+    no_view, nothing = np.zeros((1, 6)), np.zeros(OBJECTS)
+    expected = numeric(point, OBJECTS, lambda x: moved(point.state, [], x, no_view))
+    np.testing.assert_allclose(shared, expected, atol=1e-6)
+    assert shared[TABLE][2] == pytest.approx(-1.0)
+    expected = numeric(point, 6, lambda x: moved(point.state, [], nothing, x[None]))
+    np.testing.assert_allclose(view, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_derivatives_hold_to_a_percent_where_a_refinement_ends(box: Body, seed: int):
+    # Off by a per cent in the depth and by twice a usual hand-eye's error.
+    rng = np.random.default_rng(200 + seed)
+    point = some_point(rng, box, bias=(1.01, -0.01))
+    xi = se3.log(se3.from_rt(se3.exp_so3([0.003, -0.002, 0.001]), [1e-3, 0, -1e-3]))
+    point.state = State(
+        poses=point.state.poses, T_world_table=None, hand_eye=xi, views=0.2 * xi[None],
+        bias=point.state.bias,
+    )  # fmt: skip
+    shared, _ = point.row()
+    no_view = np.zeros((1, 6))
+    expected = numeric(
+        point, OBJECTS + 6, lambda x: moved(point.state, point.bodies, x, no_view)
+    )
+    for part_ in (HAND_EYE, BIAS, slice(OBJECTS, OBJECTS + 6)):
+        off = np.linalg.norm(shared[part_] - expected[part_])
+        assert off < 0.02 * np.linalg.norm(expected[part_])
+
+
+def test_noise_of_a_point_is_not_in_its_derivative(box: Body):
+    # The same ray with another depth: its residual changes, where it meets the surface does not.
+    T_world_cam = se3.look_at([0.2, 0.1, 0.3], [0, 0, 0])
+    eye = T_world_cam[:3, 3]
+    foot, normal = np.array([0.01, -0.02, 0.0]), np.array([0.0, 0.0, 1.0])
+    rows: list[Array] = []
+    for beyond in (-3e-3, -1e-9, 3e-3):
+        place = foot + beyond * (foot - eye) / np.linalg.norm(foot - eye)
+        r = float(normal @ (place - foot))
+        H, b = np.zeros((1, BLOCK, BLOCK)), np.zeros((1, BLOCK))
+        add_blocks(
+            (place[None], np.array([r]), normal[None]), np.zeros(1, np.int32),
+            (np.array([0.0, 0.0, -0.02]), *seen_from(T_world_cam[None])), (np.ones(1), np.full(1, 1e6)),
+            (H, b), np.zeros(1),
+        )  # fmt: skip
+        rows.append(-b[0] / r)
+    np.testing.assert_allclose(rows[0], rows[2], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(rows[0], rows[1], rtol=1e-4, atol=1e-6)
+
+
+def test_kernel_weighs_as_tukey_and_drops_what_is_beyond():
+    distances = np.array([0.0, 1e-3, 2e-3, 3e-3, np.nan])
+    n = len(distances)
+    places = np.tile([0.01, 0.0, 0.0], (n, 1))
+    normals = np.tile([0.0, 0.0, 1.0], (n, 1))
+    T = se3.look_at([0.0, 0.1, 0.4], [0, 0, 0])
+    kernels, weight = np.full(n, 7.0), np.full(n, 100.0)
+    H, b = np.zeros((1, BLOCK, BLOCK)), np.zeros((1, BLOCK))
+    total = add_blocks(
+        (places, distances, normals), np.zeros(n, np.int32), (np.zeros(3), *seen_from(T[None])),
+        (weight, np.full(n, (2e-3) ** 2)), (H, b), kernels,
+    )  # fmt: skip
+    np.testing.assert_allclose(kernels, [1.0, (1 - 0.25) ** 2, 0.0, 0.0, 0.0])
+    assert total == pytest.approx(100.0 * (1 - 0.25) ** 2 * 1e-6)
+    assert H[0, 5, 5] == pytest.approx(100.0 * (1 + 0.5625))
+    assert b[0, 5] == pytest.approx(-100.0 * 0.5625 * 1e-3)
+
+
+# --- residuals -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_residual_is_the_distance_along_the_normal(box: Body, exact: bool):
+    rng = np.random.default_rng(1)
+    T_obj_cam = se3.look_at([0.15, 0.2, 0.3], box.center_obj)
+    inner = np.abs(box.samples - box.center_obj) < 0.5 * box.model.mesh.extent - 0.006
+    towards = T_obj_cam[:3, 3] - box.samples
+    seen = (np.sum(towards * box.normals, axis=1) > 0.1) & (inner.sum(1) == 2)
+    assert seen.sum() > 20
+    beyond = rng.uniform(-2e-3, 2e-3, seen.sum())
+    points_obj = box.samples[seen] + beyond[:, None] * box.normals[seen]
+    points_cam = se3.transform(se3.invert(T_obj_cam), points_obj)
+    views = np.zeros(len(points_cam), np.int32)
+    Ms, eyes = T_obj_cam[None], np.ascontiguousarray(T_obj_cam[None, :3, 3])
+    if exact:
+        places, distances, normals = exact_residuals(box, points_cam, views, Ms, eyes)
+    else:
+        lattice = (box.field.grid, box.field.origin, box.field.cell)
+        places, distances, normals = field_residuals(lattice, points_cam, views, Ms, eyes)
+    np.testing.assert_allclose(places, points_obj, atol=1e-12)
+    np.testing.assert_allclose(distances, beyond, atol=2e-5 if not exact else 1e-6)
+    np.testing.assert_allclose(normals, box.normals[seen], atol=0.02 if not exact else 1e-5)
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_point_behind_a_thin_wall_belongs_to_the_side_that_was_seen(exact: bool):
+    pose = ObjectPose(obj_id=part("mug").obj_id, instance=0, T_world_obj=np.eye(4))
+    mug = make_body(pose, part("mug"), 64, 4000)
+    assert thin_share(mug, 3.0) > 0.2 > thin_share(mug, 0.5)
+    # Outer wall, seen from outside; the points lie a little more than the wall behind it.
+    radial = mug.samples[:, :2] / np.linalg.norm(mug.samples[:, :2], axis=1, keepdims=True)
+    outside = np.sum(radial * mug.normals[:, :2], axis=1) > 0.99
+    middle = np.abs(mug.samples[:, 2] - mug.center_obj[2]) < 0.02
+    away = mug.samples[:, 0] < -0.02  # the handle is elsewhere
+    some = np.flatnonzero(outside & middle & away)[:40]
+    assert len(some) > 5
+    eye = np.array([-0.4, 0.0, mug.center_obj[2]])
+    T_obj_cam = se3.look_at(eye, mug.center_obj)
+    facing = (eye - mug.samples[some]) @ np.array([-1.0, 0, 0]) > 0
+    assert facing.all()
+    depth = 0.0025
+    points = mug.samples[some] - depth * mug.normals[some]
+    points_cam = se3.transform(se3.invert(T_obj_cam), points)
+    views = np.zeros(len(some), np.int32)
+    Ms, eyes = T_obj_cam[None], eye[None]
+    if exact:
+        _, distances, normals = exact_residuals(mug, points_cam, views, Ms, eyes)
+    else:
+        lattice = (mug.field.grid, mug.field.origin, mug.field.cell)
+        _, distances, normals = field_residuals(lattice, points_cam, views, Ms, eyes)
+    cosine = np.sum(normals * mug.normals[some], axis=1)
+    assert np.median(cosine) > 0.98
+    assert np.median(distances) == pytest.approx(-depth, abs=4e-4 if not exact else 1e-4)
+
+
+def test_a_box_is_not_thin_walled(box: Body):
+    assert thin_share(box, 3.0) < 0.02
+
+
+# --- normal equations ----------------------------------------------------------------------------
+
+
+@dataclass
+class Rows:
+    """Random rows of blocks, with what a graph of factors needs of each."""
+
+    system: System
+    rows: list[tuple[int, int, Array, float]]
+    """Body (-1 = table), view, row (8,), residual."""
+    Ms: Array
+    """(bodies + 1, V, 4, 4); the table's is last."""
+    objects: int
+    views: int
+    sigmas: dict[str, float]
+
+
+def random_rows(seed: int, objects: int = 2, views: int = 4, each: int = 15) -> Rows:
+    rng = np.random.default_rng(seed)
+    Ms = se3.random_transform(rng, (objects + 1) * views).reshape(objects + 1, views, 4, 4)
+    rows: list[tuple[int, int, Array, float]] = []
+    parts: list[Blocks] = []
+    for k in range(objects + 1):
+        H, b = np.zeros((views, 8, 8)), np.zeros((views, 8))
+        for v in range(views):
+            for _ in range(each):
+                A, r = rng.normal(size=8), float(rng.normal())
+                if k == objects:
+                    A[[2, 3, 4]] = 0.0  # what does not move a plane
+                H[v] += np.outer(A, A)
+                b[v] -= A * r
+                rows.append((k if k < objects else -1, v, A, r))
+        parts.append(Blocks(H=H, b=b, Ms=Ms[k]))
+    system = assembled(parts[:-1], parts[-1])
+    sigmas = {"hand": 0.7, "bias": 0.3, "view": 0.5, "weak": 10.0}
+    n = OBJECTS + 6 * objects
+    add = np.full(n, sigmas["weak"] ** -2)
+    add[HAND_EYE], add[BIAS] = sigmas["hand"] ** -2, sigmas["bias"] ** -2
+    system.A[np.arange(n), np.arange(n)] += add
+    system.D[:] += np.eye(6) * sigmas["view"] ** -2
+    return Rows(system, rows, Ms, objects, views, sigmas)
+
+
+def dense(system: System) -> tuple[Array, Array]:
+    S, V = len(system.A), len(system.D)
+    N, n = np.zeros((S + 6 * V, S + 6 * V)), np.zeros(S + 6 * V)
+    N[:S, :S], n[:S] = system.A, system.a
+    for v in range(V):
+        at = slice(S + 6 * v, S + 6 * v + 6)
+        N[:S, at], N[at, :S] = system.B[v], system.B[v].T
+        N[at, at], n[at] = system.D[v], system.d[v]
+    return N, n
+
+
+@pytest.mark.parametrize("objects", [0, 1, 4])
+def test_elimination_of_views_is_the_dense_solution(objects: int):
+    system = random_rows(3, objects, 5).system
+    N, n = dense(system)
+    np.testing.assert_allclose(N, N.T, atol=1e-9)
+    S = len(system.A)
+    shared, views = solved(system)
+    x = np.linalg.solve(N, n)
+    np.testing.assert_allclose(np.concatenate([shared, views.ravel()]), x, rtol=1e-8, atol=1e-10)
+    C, found = np.linalg.inv(N), covariances(system)
+    np.testing.assert_allclose(found.shared, C[:S, :S], rtol=1e-8, atol=1e-10)
+    for v in range(len(system.D)):
+        at = slice(S + 6 * v, S + 6 * v + 6)
+        np.testing.assert_allclose(found.cross[v], C[:S, at], rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(found.views[v], C[at, at], rtol=1e-8, atol=1e-10)
+
+
+def test_unknowns_of_very_different_units_are_solved_as_well():
+    system = random_rows(4).system
+    S = len(system.A)
+    scale = 10.0 ** np.random.default_rng(0).uniform(-5, 5, S)
+    scaled = System(
+        A=system.A * np.outer(scale, scale), a=system.a * scale,
+        B=system.B * scale[None, :, None], D=system.D, d=system.d,
+    )  # fmt: skip
+    x, views = solved(system)
+    y, views_scaled = solved(scaled)
+    np.testing.assert_allclose(y * scale, x, rtol=1e-8)
+    np.testing.assert_allclose(views_scaled, views, rtol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_step_and_covariance_are_those_of_gtsam(seed: int):
+    import gtsam
+    from gtsam.symbol_shorthand import C, O, T, V  # noqa: E741
+
+    data = random_rows(10 + seed)
+    graph = gtsam.GaussianFactorGraph()
+    unit = gtsam.noiseModel.Unit.Create(1)
+    for k, v, A, r in data.rows:
+        twist, bias = A[None, :6], A[None, 6:]
+        camera = twist @ se3.adjoint(data.Ms[k, v])
+        own = (T(0), -twist[:, list(TABLE_ROWS)]) if k < 0 else (O(k), -twist)
+        # Hand-eye and bias are one variable: GTSAM's Python factors have three at most.
+        graph.add(
+            gtsam.JacobianFactor(
+                C(0), np.hstack([camera, bias]), *own, V(v), camera, np.array([-r]), unit
+            )
+        )
+    s = data.sigmas
+    common = np.r_[np.full(6, s["hand"]), np.full(2, s["bias"])]
+    priors = [(C(0), common), (T(0), np.full(3, s["weak"]))]
+    priors += [(O(k), np.full(6, s["weak"])) for k in range(data.objects)]
+    priors += [(V(v), np.full(6, s["view"])) for v in range(data.views)]
+    for key, sigma in priors:
+        model = gtsam.noiseModel.Unit.Create(len(sigma))
+        graph.add(gtsam.JacobianFactor(key, np.diag(1 / sigma), np.zeros(len(sigma)), model))
+
+    step = graph.optimize()
+    shared, views = solved(data.system)
+    C_own = covariances(data.system)
+    marginals = gtsam.Marginals(graph, step)
+    places = [(C(0), slice(0, 8)), (T(0), TABLE)]
+    places += [(O(k), slice(OBJECTS + 6 * k, OBJECTS + 6 * k + 6)) for k in range(data.objects)]
+    for key, at in places:
+        np.testing.assert_allclose(shared[at], step.at(key), atol=1e-8)
+        np.testing.assert_allclose(C_own.shared[at, at], marginals.marginalCovariance(key), atol=1e-8)
+    for v in range(data.views):
+        np.testing.assert_allclose(views[v], step.at(V(v)), atol=1e-8)
+        np.testing.assert_allclose(C_own.views[v], marginals.marginalCovariance(V(v)), atol=1e-8)
+    both = gtsam.KeyVector([O(1), V(2)])
+    together = marginals.jointMarginalCovariance(both)
+    cross = together.at(O(1), V(2))
+    np.testing.assert_allclose(C_own.cross[2][OBJECTS + 6 : OBJECTS + 12], cross, atol=1e-8)
+
+
+# --- state ---------------------------------------------------------------------------------------
+
+
+def test_an_object_turns_about_its_centre_and_cameras_about_themselves(box: Body):
+    rng = np.random.default_rng(5)
+    T = se3.random_transform(rng)
+    state = State(
+        poses=T[None], T_world_table=None, hand_eye=np.zeros(6), views=np.zeros((2, 6)),
+        bias=np.array([1.0, 0.0]),
+    )  # fmt: skip
+    shared = np.zeros(OBJECTS + 6)
+    shared[OBJECTS : OBJECTS + 3] = [0.1, -0.2, 0.05]
+    after = moved(state, [box], shared, np.zeros((2, 6)))
+    np.testing.assert_allclose(box.center(after.poses[0]), box.center(T), atol=1e-12)
+    np.testing.assert_allclose(
+        centred(box, after.poses[0]), centred(box, T) @ se3.exp(shared[OBJECTS:]), atol=1e-12
+    )
+    xi = rng.normal(size=6)
+    claimed = se3.random_transform(rng, 2)
+    held = moved(state, [box], np.r_[xi, np.zeros(OBJECTS)], np.stack([-xi, np.zeros(6)]))
+    cameras = held.cameras(claimed)
+    np.testing.assert_allclose(cameras[0], claimed[0], atol=1e-12)
+    np.testing.assert_allclose(cameras[1], claimed[1] @ se3.exp(xi), atol=1e-12)

@@ -1,0 +1,372 @@
+"""The simulated table: what it calls true is true, its errors are those asked for, faults are."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.camera import ray_table
+from realsim.geometry.depth import points_from_depth
+from realsim.geometry.distance_field import raycasting_scene
+from realsim.geometry.mesh import to_trimesh
+from realsim.geometry.metrics import mssd_symmetric
+from realsim.geometry.parts import part, part_names
+from realsim.interop import import_open3d
+from realsim.records import Mesh, ObjectPose
+from realsim.registration.simulated import (
+    DEPTH_UNIT_M,
+    Scattered,
+    TableLabConfig,
+    TableScene,
+    full_size,
+    resized,
+    scatter_objects,
+    seen_instances,
+    table_scene,
+)
+from realsim.registration.simulated_faults import (
+    foreign,
+    shifted_depth,
+    shifted_view,
+    swapped,
+    without_any_depth,
+    without_depth_on,
+)
+from realsim.registration.simulated_lab import camera_of, sensor_of
+from realsim.rendering.depth_sensor import DepthSensorModel
+from table_scenes import named_scene, part_models, small_scene, with_found_symmetries
+
+NO_ERRORS = {"hand_eye_mm": 0.0, "hand_eye_deg": 0.0, "arm_mm": 0.0, "arm_deg": 0.0}
+TINY = resized(TableLabConfig(sensor=DepthSensorModel.noiseless()), 64)
+"""Images that cost nothing: poses do not depend on them."""
+
+
+def mug_alone(config: TableLabConfig, seed: int) -> TableScene:
+    rng = np.random.default_rng(seed)
+    model = part("mug")
+    placed = scatter_objects({model.obj_id: model.mesh}, [model.obj_id], config, rng)
+    return table_scene({model.obj_id: model}, placed.objects, config, rng)
+
+
+def distances(surface: Any, points: np.ndarray) -> np.ndarray:
+    """Return the distances (N,) of points to the surface of a ray-casting scene."""
+    core: Any = import_open3d().core
+    return surface.compute_distance(core.Tensor(points.astype(np.float32)), 1).numpy()
+
+
+# --- layout --------------------------------------------------------------------------------------
+
+
+def scattered(
+    seed: int, n: int = 14
+) -> tuple[dict[int, Mesh], list[int], TableLabConfig, Scattered]:
+    rng = np.random.default_rng(seed)
+    meshes = {i: m.mesh for i, m in part_models().items()}
+    wanted = [int(i) for i in rng.choice(sorted(meshes), n, replace=False)]
+    config = TableLabConfig()
+    return meshes, wanted, config, scatter_objects(meshes, wanted, config, rng)
+
+
+def test_objects_stand_on_the_table_in_the_disc_and_do_not_touch():
+    meshes, wanted, config, result = scattered(5)
+    assert len(result.objects) + len(result.left_out) == len(wanted)
+    assert len(result.objects) >= 13
+    placed = [se3.transform(o.T_world_obj, meshes[o.obj_id].vertices) for o in result.objects]
+    from scipy.spatial import ConvexHull, KDTree
+
+    for v in placed:
+        assert abs(v[:, 2].min()) < 1e-9
+        assert np.linalg.norm((v.min(0) + v.max(0))[:2] / 2) <= config.disc_m + 1e-9
+    # Footprints as polygons, their distance by brute force over finely sampled edges.
+    t = np.linspace(0, 1, 30)[:, None, None]
+    outlines: list[Any] = []
+    for v in placed:
+        p = v[ConvexHull(v[:, :2]).vertices, :2]
+        outlines.append(((1 - t) * p + t * np.roll(p, -1, axis=0)).reshape(-1, 2))
+    nearest = [KDTree(a).query(b)[0].min() for i, a in enumerate(outlines) for b in outlines[:i]]
+    assert min(nearest) >= config.gap_m - 1e-9
+    # Tight: some pairs are nearer to each other than 6 mm.
+    assert np.sum(np.array(nearest) < 0.006) >= 2
+
+
+def test_resting_objects_are_stable():
+    """The centre of mass is over the support polygon: it would not tip."""
+    from scipy.spatial import ConvexHull
+
+    meshes, _, _, result = scattered(6)
+    for o in result.objects:
+        v = se3.transform(o.T_world_obj, meshes[o.obj_id].vertices)
+        mass = se3.transform(o.T_world_obj, to_trimesh(meshes[o.obj_id]).center_mass[None])[0]
+        foot = v[v[:, 2] < 1e-3, :2]
+        hull = ConvexHull(foot)
+        beyond = hull.equations[:, :2] @ mass[:2] + hull.equations[:, 2]
+        assert beyond.max() < 1e-3, part_models()[o.obj_id].name
+
+
+def test_the_likely_way_to_rest_comes_more_often():
+    """A box 3:2:1 lies on its largest face most of the time, as its resting poses say."""
+    from realsim.models.resting import resting_orientations
+
+    mesh, config = part("box").mesh, TableLabConfig()
+    rng = np.random.default_rng(0)
+    heights = []
+    for _ in range(300):
+        (o,) = scatter_objects({1: mesh}, [1], config, rng).objects
+        heights.append(np.ptp(se3.transform(o.T_world_obj, mesh.vertices)[:, 2]))
+    resting = resting_orientations(mesh)
+    lowest = min(r.height for r in resting)
+    p = sum(r.probability for r in resting if r.height < lowest + 1e-4)
+    p /= sum(r.probability for r in resting if r.probability >= 0.01)
+    share = np.mean(np.array(heights) < lowest + 1e-4)
+    assert share == pytest.approx(p, abs=4 * np.sqrt(p * (1 - p) / 300))
+
+
+def test_a_seed_gives_a_layout_and_what_finds_no_room_is_named():
+    _, _, _, a = scattered(7)
+    _, _, _, b = scattered(7)
+    for x, y in zip(a.objects, b.objects, strict=True):
+        np.testing.assert_array_equal(x.T_world_obj, y.T_world_obj)
+    small = replace(TableLabConfig(), disc_m=0.02)
+    mesh = part("bowl").mesh
+    result = scatter_objects({12: mesh}, [12, 12, 12], small, np.random.default_rng(0))
+    assert [o.instance for o in result.objects] == [0]
+    assert [(o.obj_id, o.instance) for o in result.left_out] == [(12, 1), (12, 2)]
+    with pytest.raises(InputError, match=r"ids \[99\]"):
+        scatter_objects({12: mesh}, [99], small, np.random.default_rng(0))
+
+
+# --- cameras -------------------------------------------------------------------------------------
+
+
+def test_without_errors_the_claimed_cameras_are_true():
+    scene = mug_alone(replace(TINY, **NO_ERRORS), 1)
+    claimed = np.stack([f.T_world_cam for f in scene.frames])
+    np.testing.assert_allclose(claimed, scene.Ts_world_cam, atol=1e-12)
+    np.testing.assert_allclose(scene.T_ee_cam, scene.T_ee_cam_true, atol=1e-15)
+
+
+def test_the_errors_are_those_asked_for_and_stored_consistently():
+    scene = mug_alone(replace(TINY, views=600), 3)
+    np.testing.assert_allclose(
+        np.stack([f.T_world_cam for f in scene.frames]), scene.Ts_base_ee @ scene.T_ee_cam
+    )
+    np.testing.assert_allclose(
+        scene.Ts_base_ee_true @ scene.T_ee_cam_true, scene.Ts_world_cam, atol=1e-12
+    )
+    hand_eye = se3.invert(scene.T_ee_cam) @ scene.T_ee_cam_true
+    assert np.linalg.norm(hand_eye[:3, 3]) == pytest.approx(0.5e-3)
+    assert np.degrees(se3.angle(hand_eye[:3, :3])) == pytest.approx(0.1)
+    xi = se3.log(se3.invert(scene.Ts_base_ee_true) @ scene.Ts_base_ee)
+    spread = 4 / np.sqrt(2 * 1800)
+    assert np.degrees(xi[:, :3].std()) == pytest.approx(0.03, rel=spread)
+    assert 1e3 * xi[:, 3:].std() == pytest.approx(0.2, rel=spread)
+    assert np.abs(np.corrcoef(xi.T) - np.eye(6)).max() < 4.5 / np.sqrt(600)
+
+
+def test_views_are_where_they_are_said_to_be_and_keep_clear_of_objects():
+    scene = small_scene(0)
+    top = scene.Ts_world_cam[0]
+    assert top[2, 2] < -0.999
+    assert top[2, 3] == pytest.approx(0.45 + 0.03, abs=0.011)
+    surfaces = [
+        (raycasting_scene(scene.models[p.obj_id].mesh), se3.invert(p.T_world_obj))
+        for p in scene.truth
+    ]
+    for T in scene.Ts_world_cam:
+        for surface, T_obj_world in surfaces:
+            eye = se3.transform(T_obj_world, T[:3, 3][None])
+            assert (
+                distances(surface, eye)[0] > 0.10 - 0.01
+            )  # points are sampled: a centimetre apart
+
+
+# --- depth ---------------------------------------------------------------------------------------
+
+
+def test_exact_depth_lies_on_the_true_surfaces():
+    config = replace(resized(TINY, 320), views=3, **NO_ERRORS)
+    rng = np.random.default_rng(2)
+    ids = [part(n).obj_id for n in ("mug", "l_bracket", "capsule")]
+    models = {i: part_models()[i] for i in ids}
+    placed = scatter_objects({i: m.mesh for i, m in models.items()}, ids, config, rng).objects
+    scene = table_scene(models, placed, config, rng)
+    seen = seen_instances(scene, range(3))
+    for k, frame in enumerate(scene.frames):
+        points, pixels = points_from_depth(frame.depth_m, scene.intrinsics, 1)
+        world = se3.transform(frame.T_world_cam, points)
+        which = seen[k][frame.depth_m > 0]
+        assert len(points) == len(which), pixels
+        for p in placed:
+            q = se3.transform(se3.invert(p.T_world_obj), world[which == p.instance])
+            assert len(q) > 100
+            surface = raycasting_scene(models[p.obj_id].mesh)
+            assert distances(surface, q).max() < 1e-4  # rounded to 0.1 mm along the ray
+        assert np.abs(world[which < 0, 2]).max() < 1e-4
+
+
+def test_depth_is_in_tenths_of_a_millimetre_as_stored():
+    depth = small_scene(0).frames[0].depth_m.astype(np.float64)
+    np.testing.assert_allclose(depth / DEPTH_UNIT_M, np.round(depth / DEPTH_UNIT_M), atol=1e-3)
+    assert 0.9 < np.mean(depth > 0) < 1
+
+
+@pytest.mark.parametrize("width", [320, 640, 1280])
+def test_every_image_size_has_the_same_noise_and_the_same_information(width: int):
+    """Depth of a plane: sigma_z is the D405's, and so is that of the mean over a patch."""
+    config = resized(TableLabConfig(), width)
+    camera, sensor = camera_of(config), sensor_of(config)
+    sensor = replace(sensor, blobs_per_megapixel=0.0, occlusion=False, grazing_from_deg=90.0)
+    rng = np.random.default_rng(0)
+    flat = np.full((camera.height, camera.width), 0.4, np.float32)
+    dz = np.concatenate([
+        (sensor.measure(flat, camera, rng) - 0.4)[: camera.height // 12 * 12] for _ in range(3)
+    ])  # fmt: skip
+    sigma = 0.4**2 * 0.08 / (648 * 0.018)
+    assert dz.std() == pytest.approx(sigma, rel=0.03)
+    n = width // 32  # 40 px of the full image, 20 sigma of the correlation
+    tiles = dz[: len(dz) // n * n, : width // n * n].reshape(len(dz) // n, n, -1, n)
+    means = tiles.mean(axis=(1, 3))
+    # A tile of a Gaussian-correlated field has pixels / (4 pi correlation^2) independent values.
+    independent = 40**2 / (4 * np.pi * 2.0**2)
+    assert means.std() == pytest.approx(sigma / np.sqrt(independent), rel=0.15)
+
+
+def test_full_size_is_the_d405_and_a_bias_is_the_same_error_of_depth():
+    full = full_size(TableLabConfig(bias_px=0.02))
+    assert (full.width, full.height, full.focal_px) == (1280, 720, 648.0)
+    assert sensor_of(full).disparity_noise_px == pytest.approx(0.08)
+    half = replace(TableLabConfig(), bias_px=0.02)
+    assert sensor_of(half).disparity_noise_px == pytest.approx(0.04)
+    for config in (full, half):
+        noiseless = replace(config, sensor=DepthSensorModel.noiseless())
+        camera = camera_of(noiseless)
+        flat = np.full((camera.height, camera.width), 0.4, np.float32)
+        z = sensor_of(noiseless).measure(flat, camera, np.random.default_rng(0))
+        expected = 1 / (1 / 0.4 + 0.02 / (648 * 0.018))
+        assert float(np.median(z)) == pytest.approx(expected, abs=1e-7)
+
+
+def test_a_seed_gives_the_same_bytes_whether_images_are_kept_or_made(tmp_path: Path):
+    config = replace(resized(TableLabConfig(), 160), views=3)
+    model = part("mug")
+    pose = ObjectPose(obj_id=10, instance=4, T_world_obj=np.eye(4))
+
+    def made(seed: int, keep: Path | None = None, lab: TableLabConfig = config):
+        rng = np.random.default_rng(seed)
+        return table_scene({10: model}, [pose], lab, rng, keep), rng.random()
+
+    (a, x), (b, y), (c, z) = made(1), made(1, tmp_path), made(1, tmp_path)
+    assert x == y == z and len(list(tmp_path.iterdir())) == 1
+    for f, g, h in zip(a.frames, b.frames, c.frames, strict=True):
+        assert f.depth_m.tobytes() == g.depth_m.tobytes() == h.depth_m.tobytes()
+        np.testing.assert_array_equal(f.T_world_cam, h.T_world_cam)
+    made(2, tmp_path)
+    made(1, tmp_path, replace(config, bias_px=0.01))
+    files = sorted(tmp_path.iterdir())
+    assert len(files) == 3
+    for file in files:
+        file.write_bytes(file.read_bytes()[:1000])
+    d, _ = made(1, tmp_path)
+    assert d.frames[0].depth_m.tobytes() == a.frames[0].depth_m.tobytes()
+
+
+def test_what_is_no_scene_is_refused():
+    rng = np.random.default_rng(0)
+    pose = ObjectPose(obj_id=10, instance=0, T_world_obj=np.eye(4))
+    with pytest.raises(InputError, match="at least one object"):
+        table_scene({10: part("mug")}, [], TINY, rng)
+    with pytest.raises(InputError, match=r"ids \[10\]; there are: box"):
+        table_scene({1: part("box")}, [pose], TINY, rng)
+    with pytest.raises(InputError, match="same instance"):
+        table_scene({10: part("mug")}, [pose, pose], TINY, rng)
+    with pytest.raises(InputError, match="make no lab"):
+        TableLabConfig(views=0)
+    with pytest.raises(InputError, match="instance 7 is not"):
+        small_scene(0).true_pose(7)
+
+
+# --- faults --------------------------------------------------------------------------------------
+
+
+def test_a_black_object_has_no_depth_and_nothing_else_changes():
+    scene = small_scene(0)
+    one = scene.truth[1].instance
+    before = [f.depth_m.copy() for f in scene.frames]
+    for k, frame in enumerate(without_depth_on(scene, one)):
+        on = seen_instances(scene, [k])[0] == one
+        assert np.all(frame.depth_m[on] == 0)
+        changed = frame.depth_m != before[k]
+        near = np.asarray(on)
+        for axis in (0, 1):
+            near = near | np.roll(near, 1, axis) | np.roll(near, -1, axis)
+        assert not np.any(changed & ~near)
+        np.testing.assert_array_equal(scene.frames[k].depth_m, before[k])
+    with pytest.raises(InputError, match="instance 99"):
+        without_depth_on(scene, 99)
+
+
+def test_through_a_transparent_object_the_table_is_seen():
+    scene = small_scene(0)
+    one = scene.truth[1].instance
+    for k, frame in enumerate(without_depth_on(scene, one, "transparent")):
+        on = (seen_instances(scene, [k])[0] == one) & (frame.depth_m > 0)
+        rays = ray_table(scene.intrinsics)[on].astype(np.float64)
+        world = se3.transform(scene.Ts_world_cam[k], rays * frame.depth_m[on, None])
+        assert np.abs(world[:, 2]).max() < 1e-5
+
+
+def test_faults_of_single_views_do_what_they_say():
+    scene, other = small_scene(0), small_scene(1)
+    f = scene.frames[3]
+    xi = np.array([0.01, 0, 0.02, 0.003, 0, 0.001])
+    moved = shifted_view(f, xi)
+    np.testing.assert_allclose(
+        se3.log(se3.invert(f.T_world_cam) @ moved.T_world_cam), xi, atol=1e-12
+    )
+    assert moved.depth_m is f.depth_m
+    spoilt = swapped(scene.frames, 2, 5)
+    assert spoilt[2].depth_m is scene.frames[5].depth_m
+    assert spoilt[5].depth_m is scene.frames[2].depth_m
+    assert [s.index for s in spoilt] == [s.index for s in scene.frames]
+    assert spoilt[2].T_world_cam is scene.frames[2].T_world_cam
+    again = swapped(spoilt, 2, 5)
+    assert all(a.depth_m is b.depth_m for a, b in zip(again, scene.frames, strict=True))
+    assert foreign(f, other.frames[0]).depth_m is other.frames[0].depth_m
+    assert not without_any_depth(f).depth_m.any()
+    with pytest.raises(InputError, match="no view 77"):
+        swapped(scene.frames, 2, 77)
+
+
+@pytest.mark.parametrize("right, down", [(12, 0), (-7, 3), (0, -9), (500, 0)])
+def test_shifted_depth_moves_the_image(right: int, down: int):
+    f = small_scene(0).frames[3]
+    moved = shifted_depth(f, (right, down)).depth_m
+    height, width = f.depth_m.shape
+    for y, x in np.random.default_rng(0).integers((0, 0), (height, width), (200, 2)):
+        inside = 0 <= y - down < height and 0 <= x - right < width
+        assert moved[y, x] == (f.depth_m[y - down, x - right] if inside else 0)
+
+
+# --- scenes for tests ----------------------------------------------------------------------------
+
+
+def test_scenes_for_tests_are_made_once_and_differ_by_seed():
+    assert small_scene(0) is small_scene(0)
+    assert {p.obj_id for p in small_scene(0).truth} != {p.obj_id for p in small_scene(1).truth}
+    twice = named_scene(0, ("mug", "mug"), 2)
+    assert [(p.obj_id, p.instance) for p in twice.truth] == [(10, 0), (10, 1)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", part_names())
+def test_parts_declare_the_symmetries_that_their_meshes_have(name: str):
+    model = part(name)
+    found = with_found_symmetries(model)
+    assert len(found.symmetry_axes) == len(model.symmetry_axes)
+    assert len(found.symmetries) == len(model.symmetries)
+    for S in found.symmetries:
+        assert mssd_symmetric(np.eye(4), S, model) < 1e-3
