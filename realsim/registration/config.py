@@ -18,6 +18,7 @@ from realsim.registration.judging.surface_residuals import ResidualConfig
 from realsim.registration.judging.unit_checks import UnitConfig
 from realsim.registration.judging.verdict import VerdictConfig
 from realsim.registration.near_rivals import RivalConfig
+from realsim.registration.odometry.cross_check import CheckConfig
 from realsim.registration.plane import PlaneConfig
 from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.search.find import FindConfig
@@ -87,6 +88,11 @@ class RegistrationConfig:
     table: TableSearchConfig = field(default_factory=TableSearchConfig)
     plane: PlaneConfig = field(default_factory=PlaneConfig)
     compare: CompareConfig = field(default_factory=CompareConfig)
+    odometry: bool = False
+    """Whether the claimed camera poses are checked by odometry from depth (KISS-ICP): 0.03 CPU-s a
+    view, and it names a mount that slipped or images that belong to other poses."""
+    kinematics: CheckConfig = field(default_factory=CheckConfig)
+    """How."""
     find: FindConfig = field(default_factory=FindConfig)
     search: SearchConfig = field(default_factory=SearchConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)

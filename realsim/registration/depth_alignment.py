@@ -18,13 +18,13 @@ from realsim.geometry.depth import MAD_TO_SIGMA
 from realsim.records import CameraIntrinsics
 from realsim.registration.outlines import AlignmentConfig, edge_distance, outlines_of, scores_of
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-LEAST_VOTES = 3
-"""Two views may agree by chance."""
 __all__ = ["AlignmentConfig", "AlignmentFinding", "check_alignment", "pooled_alignment"]
 
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
 Kind = Literal["aligned", "not_aligned", "unknown", "other_size"]
+LEAST_VOTES = 3
+"""Two views may agree by chance."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -21,9 +21,16 @@ from realsim.registration.evidence import (
     without_table,
 )
 from realsim.registration.find_table import find_table
+from realsim.registration.odometry.cross_check import KinematicsCheck, check_kinematics
 from realsim.registration.view_checks import check_views
 from realsim.registration.view_findings import ViewFinding
-from realsim.registration.views import SampleConfig, ViewPoints, sample_view, world_cloud
+from realsim.registration.views import (
+    SampleConfig,
+    ViewPoints,
+    sample_view,
+    sample_views,
+    world_cloud,
+)
 
 Array = NDArray[np.float64]
 SCENE_POINTS = 400_000
@@ -114,6 +121,15 @@ def take_in(
         views=tuple(views[k] for k in keep), noise=noise, plane=table.plane,
         no_plane=table.reason, findings=tuple(findings),
     )  # fmt: skip
+
+
+def check_odometry(intake: Intake, config: RegistrationConfig) -> KinematicsCheck:
+    """Return what the depth images alone say of the claimed camera poses."""
+    fine = sampling(intake.intrinsics, 1, config)
+    views = intake.views
+    if views[0].area_px > fine.stride**2:
+        views = sample_views(intake.intrinsics, intake.frames, intake.noise, fine)
+    return check_kinematics(views, intake.plane, config.kinematics)
 
 
 def scene_cloud(intake: Intake, cameras: Array, plane: SupportPlane | None) -> Cloud:

@@ -1,4 +1,4 @@
-"""Outlines in a depth image, edges in a colour image, and how often the first fall on the second."""
+"""Outlines in a depth image, edges in a colour image, and how often these fall on those."""
 
 from dataclasses import dataclass, field
 
@@ -95,8 +95,8 @@ def outlines_of(depth_m: NDArray[np.float32], config: AlignmentConfig) -> Array3
         mask[i, np.ceil(x).astype(np.int64)] = 1
         _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
         # Noise jumps here and there, outlines run on.
-        long = stats[:, cv2.CC_STAT_HEIGHT] >= config.run_px
-        keep = long[labels[i, np.ceil(x).astype(np.int64)]]
+        long = np.asarray(stats)[:, cv2.CC_STAT_HEIGHT] >= config.run_px
+        keep = long[np.asarray(labels, dtype=np.int64)[i, np.ceil(x).astype(np.int64)]]
         i, x = i[keep], x[keep]
         xy = (x, i) if axis == 0 else (i, x)
         found.append(np.stack([*xy, np.full(len(x), axis)], axis=1).astype(np.float32))

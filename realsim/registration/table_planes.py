@@ -1,5 +1,6 @@
 """Planes among measured points, and which of them a scene stands on."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,0 +1,226 @@
+"""From what is wanted to objects near their final poses, whatever was known of them before."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import DegenerateError, InputError
+from realsim.geometry import se3
+from realsim.records import ObjectModel, ObjectPose, names_of
+from realsim.registration.body import Body, make_body
+from realsim.registration.config import RegistrationConfig
+from realsim.registration.few_views import begin, search_near
+from realsim.registration.intake import Intake
+from realsim.registration.judging.unit_checks import unit_errors
+from realsim.registration.odometry.cross_check import KinematicsCheck
+from realsim.registration.reports import search_report
+from realsim.registration.search.find import find_objects
+from realsim.registration.search.records import NotPlaced, Placed, Region, SearchResult, Wanted
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+
+class Ticker:
+    """Counts steps for the progress callback."""
+
+    def __init__(self, progress: Progress | None, total: int) -> None:
+        self._progress, self._done, self._total = progress, 0, total
+
+    def __call__(self) -> None:
+        """One more step is done."""
+        self._done += 1
+        if self._progress is not None:
+            self._progress(min(self._done, self._total), self._total)
+
+    def each(self, done: int, total: int) -> None:
+        """One more step of an inner loop is done."""
+        self()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Work:
+    """What every step of one registration needs."""
+
+    name: str
+    intake: Intake
+    models: Mapping[int, ObjectModel]
+    config: RegistrationConfig
+    up: Array | None
+    tick: Ticker
+    kinematics: KinematicsCheck | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Found:
+    """What the search found."""
+
+    bodies: list[Body]
+    """At the poses that were found."""
+    claimed: list[Array | None]
+    """(4, 4) what somebody claimed of each."""
+    contrasts: list[float | None]
+    rivals: list[Array | None]
+    """(4, 4) the best near-symmetric rival of each pose."""
+    reports: list[dict[str, Any]]
+    not_placed: tuple[NotPlaced, ...]
+    report: dict[str, Any]
+
+
+def wanted_objects(
+    models: Mapping[int, ObjectModel],
+    wanted: Sequence[ObjectPose] | Sequence[Wanted] | None,
+    config: RegistrationConfig,
+) -> list[Wanted] | None:
+    """Return what is wanted, each checked against the models.
+
+    Raises:
+        InputError: nothing is wanted, an unknown model, or a number twice.
+    """
+    if not models:
+        raise InputError("no object models were given; registration needs the objects' meshes.")
+    if wanted is None:
+        return None
+    if not wanted:
+        raise InputError("no start poses were given; give one per object instance.")
+    if len({s.instance for s in wanted}) != len(wanted):
+        raise InputError("two start poses have the same instance number.")
+    asked: list[Wanted] = []
+    for w in wanted:
+        model = models.get(w.obj_id)
+        if model is None:
+            raise InputError(
+                f"instance {w.instance} is of object {w.obj_id}, which is not among the "
+                f"models: {names_of(list(models.values()))}."
+            )
+        if isinstance(w, ObjectPose):
+            T = w.T_world_obj
+            region = Region(
+                center_world=se3.transform(T, model.mesh.bounds.mean(0)[None])[0],
+                radius_m=config.start_radius_m, R_world_obj=T[:3, :3],
+                turn_deg=config.start_turn_deg,
+            )  # fmt: skip
+            w = Wanted(obj_id=w.obj_id, instance=w.instance, region=region, T_start=T)  # noqa: PLW2901
+        asked.append(w)
+    return asked
+
+
+def in_units(
+    models: Mapping[int, ObjectModel],
+    asked: list[Wanted] | None,
+    intake: Intake,
+    config: RegistrationConfig,
+) -> tuple[list[Wanted] | None, list[NotPlaced]]:
+    """Return what can be sought, and what is off by a factor of a thousand."""
+    depths = [np.median(v.points[:, 2]) for v in intake.views if len(v.points)]
+    if asked is None or not depths:
+        return asked, []
+    eyes = intake.cameras[:, :3, 3]
+    starts = [
+        ObjectPose(
+            obj_id=w.obj_id, instance=w.instance,
+            T_world_obj=_middle_pose(intake) if w.T_start is None else w.T_start,
+        )
+        for w in asked
+    ]  # fmt: skip
+    errors = unit_errors(models, starts, eyes, float(np.median(depths)), config.judging.units)
+    refused = [
+        NotPlaced(obj_id=w.obj_id, instance=w.instance, reason=str(errors[w.instance]))
+        for w in asked if w.instance in errors
+    ]  # fmt: skip
+    return [w for w in asked if w.instance not in errors], refused
+
+
+def _middle_pose(intake: Intake) -> Array:
+    """Return a pose (4, 4) in front of the first camera, for objects of which nothing is said."""
+    view = next(v for v in intake.views if len(v.points))
+    return se3.from_translation(np.median(view.world(), axis=0))
+
+
+def found_objects(work: Work, asked: list[Wanted] | None) -> Found:
+    """Return the objects near their final poses, whatever was known of them before."""
+    intake, config = work.intake, work.config
+    near_only = asked is not None and all(w.T_start is not None for w in asked)
+    few = len(intake.frames) < config.refine_from
+    if asked is not None and not asked:
+        return Found(
+            bodies=[], claimed=[], contrasts=[], rivals=[], reports=[], not_placed=(), report={}
+        )
+    if config.method == "top-down" or (near_only and (few or intake.plane is None)):
+        return _found_near(work, asked or [])
+    if intake.plane is None:
+        lost = [w for w in asked or () if w.T_start is None]
+        reason = (
+            f"no table was found ({intake.no_plane}), so it can be anywhere; give a rough pose "
+            "(30 mm, 20 deg)."
+        )
+        missing = [NotPlaced(obj_id=w.obj_id, instance=w.instance, reason=reason) for w in lost]
+        near = [w for w in asked or () if w.T_start is not None]
+        if asked is None:
+            raise DegenerateError(
+                f"no table was found: {intake.no_plane} Without one, objects can only be "
+                "registered from rough poses; name them with their poses."
+            )
+        found = _found_near(work, near)
+        return replace(found, not_placed=(*found.not_placed, *missing))
+    result = find_objects(
+        intake.intrinsics, intake.frames, intake.views, intake.plane, intake.noise, work.models,
+        asked, config.find, field_folder=config.field_folder, progress=work.tick.each,
+    )  # fmt: skip
+    return _as_found(work, result, asked)
+
+
+def _as_found(work: Work, result: SearchResult, asked: list[Wanted] | None) -> Found:
+    """Return what a search placed as bodies."""
+    claims = {w.instance: w.T_start for w in asked or ()}
+    placed: list[Placed] = sorted(result.placed, key=lambda p: p.instance)
+    return Found(
+        bodies=[_body(work, p.obj_id, p.instance, p.T_world_obj) for p in placed],
+        claimed=[claims.get(p.instance) for p in placed],
+        contrasts=[p.contrast for p in placed],
+        rivals=[p.T_rival for p in placed],
+        reports=[search_report(p) for p in placed],
+        not_placed=result.not_placed, report=dict(result.report),
+    )  # fmt: skip
+
+
+def _found_near(work: Work, asked: list[Wanted]) -> Found:
+    """Return the objects at their claimed starts; where there are few views the fit searches."""
+    T_starts = [w.T_start for w in asked]
+    bodies = [
+        _body(work, w.obj_id, w.instance, T)
+        for w, T in zip(asked, T_starts, strict=True) if T is not None
+    ]  # fmt: skip
+    reports: list[dict[str, Any]] = [{} for _ in bodies]
+    many = len(work.intake.frames) >= work.config.refine_from and work.config.refine_cameras
+    if many and bodies and work.config.method == "joint":
+        started = begin(work.intake, bodies, work.config, work.up)
+        found = search_near(started, bodies, work.tick)
+        reports = [f.report for f in found]
+        bodies = [
+            replace(b, start=replace(b.start, T_world_obj=f.fit.T_world_obj))
+            for b, f in zip(bodies, found, strict=True)
+        ]
+    return Found(
+        bodies=bodies, claimed=list(T_starts), contrasts=[None] * len(bodies),
+        rivals=[None] * len(bodies), reports=reports,
+        not_placed=(), report={},
+    )  # fmt: skip
+
+
+def _body(work: Work, obj_id: int, instance: int, T: Array) -> Body:
+    """Return the body of an instance at a pose."""
+    c = work.config
+    start = ObjectPose(obj_id=obj_id, instance=instance, T_world_obj=T)
+    return make_body(start, work.models[obj_id], c.field_cells, c.samples, c.field_folder)
+
+
+def claimed_bodies(found: Found) -> list[Body]:
+    """Return the bodies with the starts that somebody claimed, where somebody did."""
+    return [
+        b if T is None else replace(b, start=replace(b.start, T_world_obj=T))
+        for b, T in zip(found.bodies, found.claimed, strict=True)
+    ]
