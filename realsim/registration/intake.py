@@ -107,6 +107,9 @@ def take_in(
             progress()
     first = find_table(views, noise, config.table, gravity_up_world=gravity_up_world)
     findings = check_views(views, first.plane, noise, config.judging.views)
+    for f in findings:
+        if f.kind == "all_disagree" and len(views) >= config.refine_from:
+            raise InputError(f"{f.words} Nothing was registered.")
     bad = {f.index for f in findings if f.exclude}
     keep = [k for k, v in enumerate(views) if v.index not in bad]
     if not keep:

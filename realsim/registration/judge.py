@@ -16,10 +16,12 @@ from realsim.registration.intake import Intake, scene_cloud
 from realsim.registration.judging.held_out import half_fit, held_out, owned_points
 from realsim.registration.judging.probability import probability_right
 from realsim.registration.judging.residual_checks import error_level_m, residual_checks
-from realsim.registration.judging.scene_checks import Finding, scene_findings
+from realsim.registration.judging.scene_checks import Finding as SceneFinding
+from realsim.registration.judging.scene_checks import scene_findings
 from realsim.registration.judging.support import support_checks
 from realsim.registration.judging.surface_residuals import surface_residuals
 from realsim.registration.judging.verdict import verdict_of
+from realsim.registration.result import Finding
 from realsim.registration.verify import Checked, verify_objects
 
 Array = NDArray[np.float64]
@@ -53,7 +55,7 @@ class Judged:
     """The judged objects and what is wrong with the scene."""
 
     objects: list[ObjectPose]
-    findings: list[Finding]
+    findings: Sequence[Finding]
 
 
 def judged(intake: Intake, given: Poses, comparer: Comparer, config: RegistrationConfig) -> Judged:
@@ -114,7 +116,7 @@ def _object(
     checked: Checked,
     features: Mapping[str, float | None],
     probability: float,
-    findings: Sequence[Finding],
+    findings: Sequence[SceneFinding],
     config: RegistrationConfig,
 ) -> ObjectPose:
     """Return one object with its verdict: the worse of the bounds' and the probability's."""

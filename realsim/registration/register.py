@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene
+from realsim.registration.body import Body
 from realsim.registration.compare import Comparer
 from realsim.registration.config import METHODS, RegistrationConfig
 from realsim.registration.covariance import uncertainty
@@ -33,7 +34,7 @@ from realsim.registration.finding import (
     in_units,
     wanted_objects,
 )
-from realsim.registration.intake import check_odometry, take_in
+from realsim.registration.intake import Intake, check_odometry, take_in
 from realsim.registration.judge import Judged, Poses, judged
 from realsim.registration.judging.probability import CONTRAST_DECIDED
 from realsim.registration.many_views import ManyViews, comparer_on, register_many
@@ -45,10 +46,11 @@ from realsim.registration.reports import (
     object_report,
     plane_report,
 )
-from realsim.registration.result import Registration
+from realsim.registration.result import Finding, Registration
 from realsim.registration.search.records import NotPlaced, Wanted
 from realsim.registration.single_view import fit_single_view, reference_frame
 from realsim.registration.verify import verify_objects
+from realsim.registration.view_checks import check_views
 
 __all__ = ["DepthFrame", "Registration", "RegistrationConfig", "register_scene"]
 
@@ -139,6 +141,8 @@ def _with_many(work: Work, found: Found, missing: tuple[NotPlaced, ...]) -> Regi
         with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
     result = judged(intake, given, comparer, config)
+    off = _views_off(intake, many, claimed, config)
+    result = replace(result, findings=[*off, *result.findings])
     work.tick()
     numbers = [f.index for f in intake.frames]
     instances = [b.start.instance for b in claimed]
@@ -157,6 +161,21 @@ def _with_many(work: Work, found: Found, missing: tuple[NotPlaced, ...]) -> Regi
     return _registration(
         work, (found, missing), (given, result, comparer), (cameras, seen), (extra, reports)
     )
+
+
+def _views_off(
+    intake: Intake, many: ManyViews, bodies: Sequence[Body], config: RegistrationConfig
+) -> list[Finding]:
+    """Return the views that do not fit the registered objects, their cameras refined."""
+    views = [
+        replace(v, T_world_cam=T) for v, T in zip(intake.views, many.refined.cameras, strict=True)
+    ]
+    found = check_views(
+        views, many.plane, intake.noise, config.judging.views, bodies=bodies,
+        Ts_world_obj=many.poses,
+    )  # fmt: skip
+    known = {f.index for f in intake.findings}
+    return [f for f in found if f.kind == "objects_off" and f.index not in known]
 
 
 def _is_lost(fought: Duel | None) -> bool:
