@@ -35,12 +35,26 @@ class LazyFrame(DepthFrame):
     __slots__ = ("_read",)
 
     def __init__(
-        self, index: int, T_world_cam: Array, read: Callable[[], NDArray[np.float32]]
+        self,
+        index: int,
+        T_world_cam: Array,
+        read: Callable[[], NDArray[np.float32]] | None = None,
+        *,
+        depth_m: NDArray[np.float32] | None = None,
     ) -> None:
-        """Keep how the image is read; nothing is read."""
+        """Keep how the image is read; nothing is read.
+
+        Args:
+            index: number of the view.
+            T_world_cam: (4, 4) camera in world [m].
+            read: returns the image; None = it is `depth_m`.
+            depth_m: the image itself, as `dataclasses.replace` gives it.
+        """
+        if read is None and depth_m is None:
+            raise InputError(f"view {index} has neither an image nor a way to read it; give one.")
         object.__setattr__(self, "index", index)
         object.__setattr__(self, "T_world_cam", T_world_cam)
-        object.__setattr__(self, "_read", read)
+        object.__setattr__(self, "_read", read or (lambda: depth_m))
 
     @property
     def depth_m(self) -> NDArray[np.float32]:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -22,6 +22,8 @@ from realsim.registration.search.records import NotPlaced, Placed, Region, Searc
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
+NO_INSTANCE = -1
+"""Number of what was not asked for by number."""
 
 
 class Ticker:
@@ -134,6 +136,24 @@ def in_units(
     return [w for w in asked if w.instance not in errors], refused
 
 
+def models_in_units(
+    models: Mapping[int, ObjectModel], intake: Intake, config: RegistrationConfig
+) -> tuple[Mapping[int, ObjectModel], list[NotPlaced]]:
+    """Return the models that are sought if nothing is named, and those off by a thousand.
+
+    A model of a hundred metres would not only not be found: its hypotheses fill the memory.
+
+    Raises:
+        InputError: no model is left.
+    """
+    all_ = [Wanted(obj_id=i, instance=i) for i in models]
+    kept, refused = in_units(models, all_, intake, config)
+    if not kept:
+        raise InputError(f"none of the {len(models)} models can be sought: {refused[0].reason}")
+    left = {w.obj_id: models[w.obj_id] for w in kept or ()}
+    return left, [replace(n, instance=NO_INSTANCE) for n in refused]
+
+
 def _middle_pose(intake: Intake) -> Array:
     """Return a pose (4, 4) in front of the first camera, for objects of which nothing is said."""
     view = next(v for v in intake.views if len(v.points))
@@ -148,6 +168,11 @@ def found_objects(work: Work, asked: list[Wanted] | None) -> Found:
     if asked is not None and not asked:
         return Found(
             bodies=[], claimed=[], contrasts=[], rivals=[], reports=[], not_placed=(), report={}
+        )
+    if config.method == "top-down" and asked is None:
+        raise InputError(
+            "method 'top-down' fits objects from rough poses and none were given; give one per "
+            "object, or use method 'joint'."
         )
     if config.method == "top-down" or (near_only and (few or intake.plane is None)):
         return _found_near(work, asked or [])
@@ -189,11 +214,15 @@ def _as_found(work: Work, result: SearchResult, asked: list[Wanted] | None) -> F
 
 def _found_near(work: Work, asked: list[Wanted]) -> Found:
     """Return the objects at their claimed starts; where there are few views the fit searches."""
-    T_starts = [w.T_start for w in asked]
-    bodies = [
-        _body(work, w.obj_id, w.instance, T)
-        for w, T in zip(asked, T_starts, strict=True) if T is not None
+    T_starts = [w.T_start for w in asked if w.T_start is not None]
+    missing = [
+        NotPlaced(
+            obj_id=w.obj_id, instance=w.instance,
+            reason=f"method '{work.config.method}' fits from rough poses only, and it has none.",
+        )
+        for w in asked if w.T_start is None
     ]  # fmt: skip
+    bodies = [_body(work, w.obj_id, w.instance, w.T_start) for w in asked if w.T_start is not None]
     reports: list[dict[str, Any]] = [{} for _ in bodies]
     many = len(work.intake.frames) >= work.config.refine_from and work.config.refine_cameras
     if many and bodies and work.config.method == "joint":
@@ -206,8 +235,7 @@ def _found_near(work: Work, asked: list[Wanted]) -> Found:
         ]
     return Found(
         bodies=bodies, claimed=list(T_starts), contrasts=[None] * len(bodies),
-        rivals=[None] * len(bodies), reports=reports,
-        not_placed=(), report={},
+        rivals=[None] * len(bodies), reports=reports, not_placed=tuple(missing), report={},
     )  # fmt: skip
 
 

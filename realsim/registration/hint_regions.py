@@ -200,35 +200,45 @@ def _from_depth(
     rows, columns = np.nonzero(measured)
     rays = ray_table(scene.intrinsics)[rows, columns].astype(np.float64)
     z = frame.depth_m[rows, columns].astype(np.float64)
-    points = se3.transform(frame.T_world_cam, rays * z[:, None])
-    known = np.isfinite(points[:, 0])
-    points, z = points[known], z[known]
+    known = np.isfinite(rays[:, 0])
+    p, z = (rays * z[:, None])[known], z[known]
     half, radius = _half_size(model)
+    spread = 0.0
     if isinstance(where, Click):
-        surface = points[np.argsort(z, kind="stable")[len(points) // 2]]
+        surface = p[np.argsort(z, kind="stable")[len(p) // 2]]
     else:
-        surface = _middle_of(points, radius, scene.plane, config)
-    eye = frame.T_world_cam[:3, 3]
-    behind = (surface - eye) / np.linalg.norm(surface - eye)
-    center = _raised(surface + half * behind, half, scene.plane)
-    return Region(center_world=center, radius_m=float(np.hypot(radius, half)) + config.slack_m)
+        T_cam_table = None
+        if scene.plane is not None:
+            T_cam_table = se3.invert(frame.T_world_cam) @ scene.plane.T_world_table
+        surface, near, far = _middle_of(p, radius, T_cam_table, config)
+        # A box holds what stands before and behind the object as well.
+        spread = 0.5 * (far - near) if isinstance(where, Box) else 0.0
+    behind = surface / np.linalg.norm(surface)
+    center = se3.transform(frame.T_world_cam, surface + half * behind)[0]
+    return Region(
+        center_world=_raised(center, half, scene.plane),
+        radius_m=float(np.hypot(radius, half)) + spread + config.slack_m,
+    )
 
 
 def _middle_of(
-    points: Array, radius: float, plane: SupportPlane | None, config: HintConfig
-) -> Array:
-    """Return the middle (3,) of those of the points (N, 3) that may be the object's.
+    points: Array, radius: float, T_cam_table: Array | None, config: HintConfig
+) -> tuple[Array, float, float]:
+    """Return the middle (3,) of those points (N, 3) that may be the object's, and their depths.
 
     Boxes and rough masks hold table, and other things before and behind: the table is left out,
-    and of the rest only what lies within reach of its median counts.
+    and of the rest only what lies within reach of its median counts. The depths are those that a
+    tenth of the points is nearer and farther than [m]. All in camera axes.
     """
-    if plane is not None:
-        height = se3.transform(se3.invert(plane.T_world_table), points)[:, 2]
+    if T_cam_table is not None:
+        height = se3.transform(se3.invert(T_cam_table), points)[:, 2]
         above = points[height > config.above_m]
         points = above if len(above) >= config.least_points else points
     middle = np.median(points, axis=0)
     near = points[np.linalg.norm(points - middle, axis=1) < 2.0 * radius]
-    return np.median(near, axis=0) if len(near) else middle
+    near = near if len(near) else points
+    first, last = np.quantile(near[:, 2], [0.1, 0.9])
+    return np.median(near, axis=0), float(first), float(last)
 
 
 def _from_table(

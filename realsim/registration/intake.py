@@ -96,7 +96,7 @@ def take_in(
     if not config.bias.is_none:
         ordered = [corrected_frame(f, f.T_world_cam, config.bias) for f in ordered]
     check_depth(ordered[0].depth_m, intrinsics)
-    noise = measure_noise(ordered, config.evidence)
+    noise = _noise(ordered, config)
     sample = sampling(intrinsics, len(ordered), config)
     views: list[ViewPoints] = []
     for frame in ordered:
@@ -133,6 +133,15 @@ def check_odometry(intake: Intake, config: RegistrationConfig) -> KinematicsChec
     if views[0].area_px > fine.stride**2:
         views = sample_views(intake.intrinsics, intake.frames, intake.noise, fine)
     return check_kinematics(views, intake.plane, config.kinematics)
+
+
+def _noise(frames: Sequence[DepthFrame], config: RegistrationConfig) -> DepthNoise:
+    """Return the noise of some frames; if these are empty, of all that are not."""
+    try:
+        return measure_noise(frames, config.evidence)
+    except InputError:
+        whole = [f for f in frames if np.any(f.depth_m > 0)]
+        return measure_noise(whole or frames, config.evidence)
 
 
 def scene_cloud(intake: Intake, cameras: Array, plane: SupportPlane | None) -> Cloud:

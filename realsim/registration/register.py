@@ -32,6 +32,7 @@ from realsim.registration.finding import (
     claimed_bodies,
     found_objects,
     in_units,
+    models_in_units,
     wanted_objects,
 )
 from realsim.registration.intake import Intake, check_odometry, take_in
@@ -93,6 +94,8 @@ def register_scene(
     up = None if gravity_up_world is None else np.asarray(gravity_up_world, dtype=np.float64)
     intake = take_in(intrinsics, frames, config, up, tick)
     asked, refused = in_units(models, asked, intake, config)
+    if asked is None:
+        models, refused = models_in_units(models, intake, config)
     kinematics = None
     if config.odometry and len(intake.frames) > 1:
         kinematics = check_odometry(intake, config)
@@ -257,6 +260,9 @@ def _registration(
     baseline = Scene(name=f"{work.name} (single view)", objects=tuple(single), plane=given.plane)
     if config.method == "top-down":
         scene = replace(baseline, name=work.name)
+        # The paper carries its poses to the other views by the cameras as they are claimed.
+        views = {f.index: f.T_world_cam for f in intake.frames}, {}
+        missing = (*missing, *_not_seen(given, single, single_report))
     else:
         scene = Scene(name=work.name, objects=objects, plane=given.plane)
     gross = () if work.kinematics is None else work.kinematics.faults
@@ -282,6 +288,18 @@ def _registration(
         scene=scene, single_view=baseline, cameras=views[0], seen=views[1], not_placed=missing,
         findings=findings, report=report,
     )  # fmt: skip
+
+
+def _not_seen(
+    given: Poses, single: Sequence[ObjectPose], report: Mapping[str, Any]
+) -> list[NotPlaced]:
+    """Return the objects that the single view could not be fitted to."""
+    fitted = {o.instance for o in single}
+    starts = [b.start for b in given.bodies if b.start.instance not in fitted]
+    return [
+        NotPlaced(obj_id=s.obj_id, instance=s.instance, reason=f"in view {report['frame']}: {why}")
+        for s, why in zip(starts, report["not_fitted"], strict=True)
+    ]
 
 
 def _single_view(

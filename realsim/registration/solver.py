@@ -116,7 +116,7 @@ class Fit:
 
 
 @numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
-def _accumulate_points(
+def accumulate_points(
     lattice: tuple[NDArray[np.float32], Array, float],
     T: Array,
     cloud: tuple[Array, Array, Array],
@@ -321,7 +321,7 @@ def _linearised(
     """Return the sums at pose T, and the upper normal matrix (6, 6) and right side (6,)."""
     H, b = np.zeros((6, 6)), np.zeros(6)
     gate = config.gate_cos if stage.gated else -2.0
-    weight, square, kernels, used = _accumulate_points(
+    weight, square, kernels, used = accumulate_points(
         (body.field.grid, body.field.origin, body.field.cell),
         T,
         cloud,

@@ -12,6 +12,7 @@ from realsim.records import SupportPlane, Verdict
 from realsim.registration.body import Body, footprint
 from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud, DepthFrame
+from realsim.registration.judging.support import support_checks
 from realsim.registration.plane import lowest_height
 
 Array = NDArray[np.float64]
@@ -98,6 +99,7 @@ def verify_objects(
             seen, _seen_in(frame, edges, bodies, poses, comparer, stride), strict=True
         ):
             into.append(part)
+    supports = support_checks(bodies, poses, comparer.plane)
     results: list[Checked] = []
     for i, body in enumerate(bodies):
         checks = _image_checks(seen[i], clouds[i], comparer, config)
@@ -109,7 +111,9 @@ def verify_objects(
         checks["residual_median_mm"] = float(1e3 * np.median(d)) if len(d) else float("nan")
         if comparer.plane is not None:
             height = lowest_height(comparer.plane, body.model.mesh.vertices, poses[i])
-            checks["plane_gap_mm"] = 1e3 * height
+            # What leans on a neighbour does not float.
+            floats = supports[i].get("floating_mm", 0.0)
+            checks["plane_gap_mm"] = floats if height > 0 else 1e3 * height
         checks["penetration_mm"] = _penetration_mm(i, bodies, poses)
         results.append(_judged(checks, stride, slack, config))
     return _without_doubles(results, bodies, poses)
@@ -280,6 +284,9 @@ class OffsetConfig:
     """A smaller offset is within what annotations are off by."""
     spread_share: float = 0.5
     """The median deviation from the common offset must stay below this share of its length."""
+    standard_errors: float = 4.0
+    """The offset must be so many times its standard error: the starts of a few objects, each off by
+    10 mm on its own, may point the same way by chance."""
 
 
 def common_offset(
@@ -312,6 +319,7 @@ def common_offset(
         len(moves) >= config.least_objects
         and length >= config.least_mm
         and spread <= config.spread_share * length
+        and length >= config.standard_errors * spread / np.sqrt(len(moves))
     )
     return {
         "offset_mm": [float(v) for v in middle],

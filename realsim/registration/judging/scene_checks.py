@@ -88,6 +88,7 @@ def scene_findings(
     comparer: Comparer,
     config: SceneCheckConfig,
     with_starts: bool = True,
+    usable: Sequence[bool] | None = None,
 ) -> list[Finding]:
     """Return what is wrong with the scene.
 
@@ -99,8 +100,9 @@ def scene_findings(
         comparer: frames, noise and table.
         config: see there.
         with_starts: whether the starts were given by someone; else no common shift is looked for.
+        usable: which objects count for what all have in common; None = those of `config.good`.
     """
-    use = [p >= config.good for p in probabilities]
+    use = [p >= config.good for p in probabilities] if usable is None else list(usable)
     findings: list[Finding] = []
     if with_starts:
         findings += shift_findings(bodies, poses, use, config.offset)

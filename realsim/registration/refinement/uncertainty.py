@@ -68,6 +68,7 @@ def _seen(refined: Refined, body: Body, k: int, intrinsics: CameraIntrinsics) ->
     joint[:, 12:, 12:] = C.views
     centre = J @ joint @ np.swapaxes(J, 1, 2)
     back = se3.adjoint(se3.from_translation(body.center_obj))
+    axes = [(np.asarray(a), np.asarray(p) - body.center_obj) for a, p in body.model.symmetry_axes]
     every = max(1, len(body.samples) // PIXEL_SAMPLES)
     q = body.samples[::every] - body.center_obj
     out: list[SeenPose] = []
@@ -76,10 +77,27 @@ def _seen(refined: Refined, body: Body, k: int, intrinsics: CameraIntrinsics) ->
             SeenPose(
                 T_cam_obj=se3.invert(refined.cameras[v]) @ refined.poses[k],
                 covariance=_symmetric(back @ centre[v] @ back.T),
-                sigma_px=_sigma_px(se3.invert(Ms[v]), centre[v], q, intrinsics),
+                sigma_px=_sigma_px(
+                    se3.invert(Ms[v]), _without_turns(centre[v], axes, q), q, intrinsics
+                ),
             )
         )
     return out
+
+
+def _without_turns(C: Array, axes: list[tuple[Array, Array]], q: Array) -> Array:
+    """Return a covariance (6, 6) without turns about axes of continuous symmetry.
+
+    Nothing is seen of such a turn s. Of a twist x the part P x is left that moves the points
+    q (N, 3) least: P = I - s s^T M / (s^T M s), M the mean of the points' squared motion.
+    """
+    G = np.concatenate([-se3.hat(q), np.tile(np.eye(3), (len(q), 1, 1))], axis=2)
+    M = np.mean(np.swapaxes(G, 1, 2) @ G, axis=0)
+    for axis, place in axes:
+        turn = np.concatenate([axis, -np.cross(axis, place)])
+        P = np.eye(6) - np.outer(turn, turn @ M) / (turn @ M @ turn)
+        C = P @ C @ P.T
+    return C
 
 
 def _sigma_px(T_cam_centre: Array, C: Array, q: Array, intrinsics: CameraIntrinsics) -> float:

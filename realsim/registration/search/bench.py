@@ -19,7 +19,7 @@ from realsim.registration.search.contrast import ContrastConfig
 from realsim.registration.search.height_grid import GridConfig, HeightGrid, height_grid
 from realsim.registration.search.matching import MatchConfig, matched
 from realsim.registration.search.near_symmetry import NearSymmetryConfig, near_symmetries
-from realsim.registration.search.peel import PeelConfig
+from realsim.registration.search.peel import ExchangeConfig, PeelConfig
 from realsim.registration.search.polish import PolishConfig
 from realsim.registration.search.records import Region, Wanted
 from realsim.registration.search.refine import (
@@ -93,6 +93,8 @@ class FindConfig:
     """The joint choice."""
     peel: PeelConfig = field(default_factory=PeelConfig)
     """What is unsure is sought again."""
+    exchange: ExchangeConfig = field(default_factory=ExchangeConfig)
+    """Objects in each other's places."""
     polish: PolishConfig = field(default_factory=PolishConfig)
     """Every point belongs to one object."""
     contrast: ContrastConfig = field(default_factory=ContrastConfig)
@@ -130,6 +132,8 @@ class Bench:
     templates: Mapping[int, ModelTemplates]
     near: Mapping[int, Array]
     """Near-symmetries (N, 4, 4) per model."""
+    looked_at: Region
+    """What the views look at: no object is sought beyond it."""
     watch: Stopwatch
 
 
@@ -207,6 +211,7 @@ def make_bench(
     return Bench(
         config=config, plane=plane, fused=fused, grid=grid, canvas=canvas, close=close,
         sought=sought, templates=templates, near=near, watch=watch,
+        looked_at=Region(center_world=middle, radius_m=config.area * radius),
     )  # fmt: skip
 
 
@@ -286,7 +291,8 @@ def fitted_candidates(
     fused, buffer = left or (bench.fused, bench.canvas.table)
     found = candidates(sought, fused, bench.canvas, starts, bench.config.refine, buffer)
     bench.watch.lap("fit and render")
-    return [c for c in found if region is None or within(bench, sought, c.T_world_obj, region)]
+    where = bench.looked_at if region is None else region
+    return [c for c in found if within(bench, sought, c.T_world_obj, where)]
 
 
 def within(bench: Bench, sought: Sought, T_world_obj: Array, region: Region) -> bool:

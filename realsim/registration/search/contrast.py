@@ -41,7 +41,7 @@ class ContrastConfig:
     """Frames in which all rivals are compared first."""
     finalists: int = 4
     """Rivals that are compared in all frames."""
-    points: int = 1500
+    points: int = 800
     """Points that fit a rival."""
     margin_m: float = 0.006
     """Points within this of a rival are fitted [m]."""
@@ -50,8 +50,11 @@ class ContrastConfig:
         Stage(kernel=4.0, cap_m=0.003, steps=6, gated=True),
     )
     """Of that fit: the pose is right but for the near-symmetry."""
-    same_m: float = 0.001
-    """Poses nearer than this, modulo symmetry, are no rivals [m]."""
+    same_m: float = 0.003
+    """Poses nearer than this, modulo symmetry, are no rivals [m]..."""
+    same_share: float = 0.04
+    """...nor those nearer than this share of the object's size: fits of one and the same pose that
+    ended a little apart make a right pose look undecided."""
     differ_m: float = 0.0005
     """Rendered depths that differ by more than this belong to differing pixels [m]."""
     offset: float = 20.0
@@ -93,7 +96,8 @@ def decided(
     """
     canvas, cloud, near = evidence
     Ts = [T_world_obj, *_rivals(sought, T_world_obj, cloud, near, config, refine)]
-    Ts = [Ts[n] for n in distinct(sought.sameness, Ts, config.same_m)]
+    apart = max(config.same_m, config.same_share * 2.0 * sought.body.radius_m)
+    Ts = [Ts[n] for n in distinct(sought.sameness, Ts, apart)]
     if len(Ts) == 1:
         return Decision(T_world_obj=T_world_obj, contrast=None, T_rival=None, changed=False)
     few = first_frames(canvas, config.first_frames)

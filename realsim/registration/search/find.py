@@ -5,24 +5,22 @@ hypotheses per model     height templates over the table; starts that someone cl
 fit, compare, render     alike poses kept once
 choose jointly           one pose per object, all z-buffers together
 peel                     what is unsure is sought again in what the sure ones leave over
+exchange                 ... and in the places of others
 polish                   every point belongs to one object
 contrast                 near-symmetric poses against each other
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, SupportPlane
 from realsim.registration.evidence import DepthFrame, DepthNoise
-from realsim.registration.search import peel
+from realsim.registration.search.again import peeled
 from realsim.registration.search.bench import (
-    Bench,
     FindConfig,
     claimed_starts,
     fitted_candidates,
@@ -31,87 +29,18 @@ from realsim.registration.search.bench import (
     within,
 )
 from realsim.registration.search.contrast import Decision, decided
+from realsim.registration.search.exchange import exchanged
 from realsim.registration.search.polish import polished
-from realsim.registration.search.records import (
-    NotPlaced,
-    Placed,
-    Region,
-    SearchResult,
-    Wanted,
-)
-from realsim.registration.search.refine import Candidate, Fused, candidate, inside_share
+from realsim.registration.search.records import NotPlaced, Placed, SearchResult, Wanted
+from realsim.registration.search.refine import Candidate, candidate
 from realsim.registration.search.scoring import compose, render, score
-from realsim.registration.search.selection import Selection, Slot, select, select_any
+from realsim.registration.search.selection import Selection
+from realsim.registration.search.state import Search
 from realsim.registration.views import ViewPoints
 
 __all__ = ["FindConfig", "find_objects"]
 
 Array = NDArray[np.float64]
-
-
-@dataclass(eq=False, kw_only=True)
-class _Search:
-    """The state of a search."""
-
-    bench: Bench
-    wanted: tuple[Wanted, ...] | None
-    """None = whatever is there."""
-    pool: list[Candidate] = field(default_factory=list[Candidate])
-    choices: list[set[int]] = field(default_factory=list[set[int]])
-    """Per wanted object its poses in the pool."""
-
-    def choose(self, first: Sequence[int | None] | None = None) -> Selection:
-        """Return the joint choice; `first` is what was chosen before."""
-        canvas, config = self.bench.canvas, self.bench.config.selection
-        if self.wanted is None:
-            before = [c for c in first or () if c is not None]
-            chosen = select_any(canvas, self.pool, config, before, self._clash)
-        else:
-            slots = [Slot(choices=frozenset(c)) for c in self.choices]
-            chosen = select(canvas, self.pool, slots, config, first)
-        self.bench.watch.lap("select")
-        return chosen
-
-    def _clash(self, n: int, k: int) -> bool:
-        """Return whether two poses of the pool cannot both be."""
-        config = self.bench.config.selection
-        a, b = self.pool[n], self.pool[k]
-        sought = self.bench.sought
-        share = inside_share(
-            sought[a.obj_id], a.T_world_obj, sought[b.obj_id], b.T_world_obj, config.clash_depth_m
-        )
-        return share > config.clash_share
-
-    def add(self, found: Sequence[Candidate], places: Sequence[int]) -> None:
-        """Put poses into the pool, for wanted objects at these places; known ones are left out."""
-        for c in found:
-            same = self.bench.sought[c.obj_id].sameness
-            known = [n for n, k in enumerate(self.pool) if k.obj_id == c.obj_id]
-            Ts = np.array([self.pool[n].T_world_obj for n in known]).reshape(-1, 4, 4)
-            apart = same.distances(c.T_world_obj, Ts)
-            if known and apart.min() < 0.5 * self.bench.config.refine.same_m:
-                at = known[int(np.argmin(apart))]
-                if c.alone.gain > self.pool[at].alone.gain:
-                    self.pool[at] = c
-            else:
-                at = len(self.pool)
-                self.pool.append(c)
-            for n in places:
-                self.choices[n].add(at)
-
-    def groups(self, places: Sequence[int]) -> list[tuple[int, Region | None, list[int]]]:
-        """Return what is sought at once: id, region, and the wanted objects at these places."""
-        if self.wanted is None:
-            return [(obj_id, None, []) for obj_id in self.bench.sought]
-        free: dict[int, list[int]] = {}
-        out: list[tuple[int, Region | None, list[int]]] = []
-        for n in places:
-            w = self.wanted[n]
-            if w.region is not None:
-                out.append((w.obj_id, w.region, [n]))
-            else:
-                free.setdefault(w.obj_id, []).append(n)
-        return out + [(obj_id, None, ns) for obj_id, ns in free.items()]
 
 
 def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
@@ -151,7 +80,7 @@ def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
         intrinsics, frames, views, (plane, noise), {i: models[i] for i in used}, config,
         field_folder,
     )  # fmt: skip
-    search = _Search(bench=bench, wanted=sensible)
+    search = Search(bench=bench, wanted=sensible)
     search.choices = [set() for _ in sensible or ()]
     groups = search.groups(range(len(sensible or ())))
     for n, (obj_id, region, places) in enumerate(groups):
@@ -162,7 +91,7 @@ def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
             progress(n + 1, len(groups))
     selection = search.choose()
     first = len(search.pool)
-    selection = _peeled(search, selection)
+    selection = exchanged(search, peeled(search, selection))
     final, decisions = _finished(search, selection)
     report = {
         "cpu_s": {k: round(v, 3) for k, v in bench.watch.seconds.items()},
@@ -198,46 +127,8 @@ def _checked(
     return tuple(w for w in wanted if w.obj_id in models), missing
 
 
-def _peeled(search: _Search, selection: Selection) -> Selection:
-    """Return the choice after what is unsure was sought again where the sure ones are not."""
-    bench, config = search.bench, search.bench.config.peel
-    rng = np.random.default_rng(bench.config.seed)
-    T_table_world = se3.invert(bench.plane.T_world_table)
-    for round_ in range(1 + config.rounds):
-        unsure = [n for n, s in enumerate(selection.scores) if not peel.is_sure(s, config)]
-        sure = [
-            (bench.sought[search.pool[c].obj_id], search.pool[c])
-            for n, c in enumerate(selection.chosen)
-            if c is not None and n not in unsure
-        ]
-        if search.wanted is not None and not unsure:
-            break
-        known = peel.explained_points(bench.fused.coarse, sure, config)
-        rest = bench.fused.coarse.select(~known)
-        groups = peel.clusters(rest.points, T_table_world, config)
-        if not groups:
-            break
-        fine = peel.explained_points(bench.fused.fine, sure, config)
-        left = Fused(coarse=rest, fine=bench.fused.fine.select(~fine))
-        buffer = compose(bench.canvas.table, [c.rendered for _, c in sure])
-        taken = peel.taken_cells(bench.grid, T_table_world, bench.fused.coarse, known)
-        bench.watch.lap("peel")
-        for obj_id, region, places in search.groups(unsure):
-            starts = (
-                resting_starts(bench, obj_id, region, taken)
-                if round_ == 0
-                else peel.residual_starts(
-                    bench.sought[obj_id], groups, bench.plane.T_world_table[:3, 2], rng, config
-                )
-            )
-            found = fitted_candidates(bench, obj_id, starts, region, (left, buffer))
-            search.add(found, places)
-        selection = search.choose(selection.chosen)
-    return selection
-
-
 def _finished(
-    search: _Search, selection: Selection
+    search: Search, selection: Selection
 ) -> tuple[list[Candidate | None], list[Decision | None]]:
     """Return the chosen poses, polished and set against their near-symmetric rivals."""
     bench = search.bench
@@ -275,7 +166,7 @@ def _finished(
     return final, of
 
 
-def _near(search: _Search, n: int, pose: Candidate) -> Array:
+def _near(search: Search, n: int, pose: Candidate) -> Array:
     """Return the near-symmetries (N, 4, 4) of a pose that lead to where its object may be."""
     bench = search.bench
     near = bench.near[pose.obj_id]
@@ -287,7 +178,7 @@ def _near(search: _Search, n: int, pose: Candidate) -> Array:
 
 
 def _results(
-    search: _Search, final: Sequence[Candidate | None], decisions: Sequence[Decision | None]
+    search: Search, final: Sequence[Candidate | None], decisions: Sequence[Decision | None]
 ) -> tuple[tuple[Placed, ...], tuple[NotPlaced, ...]]:
     """Return what was found, and what was not and why."""
     canvas = search.bench.canvas
@@ -319,7 +210,7 @@ def _results(
     return tuple(placed), tuple(missing)
 
 
-def _not_placed(search: _Search, final: Sequence[Candidate | None], n: int) -> NotPlaced:
+def _not_placed(search: Search, final: Sequence[Candidate | None], n: int) -> NotPlaced:
     """Return why a wanted object has no pose."""
     assert search.wanted is not None
     wanted, canvas = search.wanted[n], search.bench.canvas

@@ -8,7 +8,7 @@ judged by rendering them.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +52,11 @@ class MatchConfig:
     """...and from this height on it counts fully [m]."""
     standing_m: float = 0.006
     """Something stands where the surface is so high over the plane [m]: far and slanted views of
-    the table are noisy."""
+    the table are noisy..."""
+    standing_share: float = 0.6
+    """...or so high as this share of the height of a lying object, if that is less..."""
+    standing_low_m: float = 0.0015
+    """...but at least this [m]: the noise of a table that many views see."""
     inner_share: float = 0.45
     """Positions are skipped where the nearest thing is further off than this share of the
     template's points are: (1 - s) - s < `least_score`."""
@@ -150,7 +154,8 @@ def matched(
             f"the mask of taken cells is {taken.shape}, the grid {grid.heights.shape}; they must "
             "have the same shape."
         )
-    maps = maps_of(grid, templates.reach_m, taken, config)
+    standing = replace(config, standing_m=_standing_m(templates, config))
+    maps = maps_of(grid, templates.reach_m, taken, standing)
     found = _searched(maps, templates, config, region, plane)
     best = np.argsort(-found.score, kind="stable")[: config.refined]
     found = _refined(maps, templates, found.select(best), config)
@@ -169,6 +174,13 @@ def matched(
         )
         for k in _distinct(Ts, order[allowed[order]], templates, config, most)
     ]
+
+
+def _standing_m(templates: ModelTemplates, config: MatchConfig) -> float:
+    """Return from which height on something stands that may be this object [m]."""
+    flattest = float(np.median(templates.points[..., 2], axis=1).min())
+    least = max(config.standing_low_m, config.standing_share * flattest)
+    return min(config.standing_m, least)
 
 
 def _source(found: _Candidates, k: int) -> str:

@@ -43,7 +43,12 @@ class NearSymmetryConfig:
     near_share_of_size: float = 0.025
     """...or within this share of the longest side, if that is more."""
     least_share: float = 0.7
-    """Share of the surface for which that must hold."""
+    """Share of the surface for which that must hold..."""
+    far_least_share: float = 0.6
+    """...or this share, if the motion is far from every symmetry: a knob turned by half a lobe. A
+    small tilt fits so much, too, but a fit to images turns it back..."""
+    far_share: float = 0.25
+    """...far being so much of the longest side."""
     true_m: float = 0.00125
     """If all of the surface lies within this, it is a true symmetry [m]: no camera sees it..."""
     true_share_of_size: float = 0.01
@@ -167,7 +172,9 @@ def _computed(model: ObjectModel, config: NearSymmetryConfig) -> Array:
     true = min(config.true_m, config.true_share_of_size * shape.size)
     share = np.mean(distances <= near, axis=1)
     worst = np.quantile(distances, 1 - config.outliers, axis=1)
-    good = np.flatnonzero((share >= config.least_share) & (worst > true))
+    far = shape.gaps(Ts) > config.far_share * shape.size
+    least = np.where(far, config.far_least_share, config.least_share)
+    good = np.flatnonzero((share >= least) & (worst > true))
     return Ts[good[np.argsort(-share[good], kind="stable")][: config.most]]
 
 

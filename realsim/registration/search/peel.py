@@ -28,6 +28,12 @@ class PeelConfig:
     sure_agree: float = 0.965
     """An object with a smaller share of agreeing pixels is sought again: right ones have more, and
     wrong ones in piles reach 0.96."""
+    beside_share: float = 0.25
+    """In the end an object is suspect, too, if so many points about it are explained by nothing, as
+    a share of its own: of a pipe in the wrong turn inside a pile all agrees that shows, but half of
+    its true place is left over."""
+    most_suspects: int = 3
+    """So many of these at most, those with the greatest share first."""
     explained_m: float = 0.006
     """Points this near to a sure object are explained [m]."""
     least_height_m: float = 0.007
@@ -48,6 +54,22 @@ class PeelConfig:
     """A cluster smaller than this share of the object's size is not it..."""
     greatest_extent: float = 2.5
     """...and one larger than this may hold it, but is searched around several of its points."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ExchangeConfig:
+    """Which objects may stand in each other's places."""
+
+    size_ratio: float = 1.7
+    """Objects whose radii differ by more do not explain each other's points."""
+    turns: int = 40
+    """Random turns tried in the other's place, 45 deg apart: a fit converges from 30."""
+    beside_m: float = 0.025
+    """Resting poses are sought so near to the other's middle [m]."""
+    most_pairs: int = 8
+    """Pairs tried at most, those of the least sure objects first: 0.3 s each."""
+    seed: int = 1
+    """Of the random turns."""
 
 
 def taken_cells(
@@ -79,6 +101,33 @@ def explained_points(
 def is_sure(score: Score | None, config: PeelConfig) -> bool:
     """Return whether an object need not be sought again."""
     return score is not None and score.agree >= config.sure_agree
+
+
+def suspects(
+    cloud: Cloud, left: Sequence[Array], placed: Sequence[tuple[Sought, Candidate]],
+    config: PeelConfig,
+) -> list[int]:  # fmt: skip
+    """Return the places of objects about which much is explained by nothing, the worst first.
+
+    Args:
+        cloud: measured points above the table.
+        left: clusters (K, 3) of those that no object explains [m].
+        placed: all objects.
+        config: see there.
+    """
+    if not left:
+        return []
+    rest = np.concatenate(left)
+    Ts = [c.T_world_obj for _, c in placed]
+    owner = owners(cloud, [s for s, _ in placed], Ts, config.explained_m)
+    found: list[tuple[float, int]] = []
+    for n, (sought, c) in enumerate(placed):
+        off = np.linalg.norm(rest - sought.body.center(c.T_world_obj), axis=1)
+        near = int(np.count_nonzero(off < sought.body.radius_m))
+        own = max(1, int(np.count_nonzero(owner == n)))
+        if near >= max(config.least_points, config.beside_share * own):
+            found.append((-near / own, n))
+    return [n for _, n in sorted(found)[: config.most_suspects]]
 
 
 def clusters(points: Array, T_table_world: Array, config: PeelConfig) -> list[Array]:

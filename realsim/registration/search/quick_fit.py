@@ -14,7 +14,7 @@ from realsim.registration.solver import (
     LEAST_POINTS,
     SolverConfig,
     Stage,
-    _accumulate_points,  # pyright: ignore[reportPrivateUsage]
+    accumulate_points,
 )
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ def _fit(
     for k in range(len(rules)):
         for _ in range(int(rules[k, 3])):
             H, b = np.zeros((6, 6)), np.zeros(6)
-            weight, _square, _kernels, used = _accumulate_points(
+            weight, _square, _kernels, used = accumulate_points(
                 lattice, T, cloud, (rules[k, 0], rules[k, 1], rules[k, 2]), center, (H, b)
             )
             if used < LEAST_POINTS:

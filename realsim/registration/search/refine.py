@@ -36,8 +36,9 @@ class RefineConfig:
     """Points within this of the hypothesis are fitted [m]: matching is right to a cell or two."""
     fine_margin_m: float = 0.006
     """The same for the refinement [m]."""
-    coarse_points: int = 1500
-    """At most so many points fit a hypothesis: the cost is 60 ns each and step."""
+    coarse_points: int = 700
+    """At most so many points fit a hypothesis: the cost is 60 ns each and step, and
+    1500 find nothing more."""
     fine_points: int = 6000
     """At most so many points refine one."""
     same_m: float = 0.002

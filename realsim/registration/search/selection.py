@@ -43,6 +43,9 @@ class SelectionConfig:
     """...makes two poses impossible together if it is more than this share."""
     better: float = 1.0
     """Cells by which another pose must gain more to replace a chosen one: ends the ascent."""
+    pair_shortlist: int = 6
+    """Where two objects are chosen together, so many best poses of one are tried with all of the
+    other."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -204,3 +207,53 @@ def _scores(
         None if c is None else score(canvas, pool[c].rendered, buffer_of(canvas, pool, chosen, n))
         for n, c in enumerate(chosen)
     )
+
+
+def select_pair(
+    canvas: Canvas,
+    pool: Sequence[Candidate],
+    slots: tuple[Slot, Slot],
+    chosen: tuple[int | None, int | None],
+    buffer: Array32,
+    config: SelectionConfig,
+) -> tuple[int, int] | None:
+    """Return poses for two objects that explain more together than those they have, or None.
+
+    One at a time neither of two objects that stand in each other's places can leave it.
+
+    Args:
+        canvas: where the poses were rendered.
+        pool: poses of all objects.
+        slots: of the two objects.
+        chosen: what they have; at most one of them may have none.
+        buffer: holds all other objects.
+        config: see there.
+    """
+    now, filled = config.better, buffer
+    for c in chosen:
+        if c is not None:
+            now += score(canvas, pool[c].rendered, filled).gain
+            filled = compose(filled, [pool[c].rendered])
+    best: tuple[int, int] | None = None
+    for first in (0, 1):
+        ranked = _ranked(canvas, pool, slots[first].choices, buffer, config)
+        for gain, n in ranked[: config.pair_shortlist]:
+            with_it = compose(buffer, [pool[n].rendered])
+            others = slots[1 - first].choices - {n}
+            for more, k in _ranked(canvas, pool, others, with_it, config)[:1]:
+                if gain + more > now:
+                    now, best = gain + more, (n, k) if first == 0 else (k, n)
+    return best
+
+
+def _ranked(
+    canvas: Canvas,
+    pool: Sequence[Candidate],
+    choices: Iterable[int],
+    buffer: Array32,
+    config: SelectionConfig,
+) -> list[tuple[float, int]]:
+    """Return the gain and the place in the pool of acceptable poses, the best first."""
+    scored = [(score(canvas, pool[n].rendered, buffer), n) for n in sorted(choices)]
+    good = [(s.gain, n) for s, n in scored if _accepted(s, pool[n], config.least_per_cell, config)]
+    return sorted(good, key=lambda g: (-g[0], g[1]))
