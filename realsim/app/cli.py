@@ -12,6 +12,7 @@ from realsim import __version__
 from realsim.app.cli_capture import CAPTURE_COMMANDS
 from realsim.app.cli_scan import SCAN
 from realsim.app.option_values import numbers_of
+from realsim.app.register_cli import register_command
 from realsim.errors import RealsimError
 
 FOLDER = click.Path(path_type=Path)
@@ -146,21 +147,6 @@ def calibrate(source: Path, quiet: bool, live: bool, **options: object) -> None:
 
 @commands.command()
 @click.argument("session", type=FOLDER)
-@click.option("--library", type=FOLDER, default=None, help="Models the session has not: see scan.")
-@click.option("--quiet", is_flag=True)
-def register(session: Path, library: Path | None, quiet: bool) -> None:
-    """Find the pose of every object from SESSION/registration/starts.json."""
-    from realsim.app.console import Console
-    from realsim.app.show import show_scene
-    from realsim.app.stages import open_session, register_session
-
-    console = Console(quiet=quiet)
-    store = open_session(session)
-    show_scene(store, register_session(store, console, library), console)
-
-
-@commands.command()
-@click.argument("session", type=FOLDER)
 @click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000))
 @click.option("--seed", default=0, show_default=True)
 @click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 64))
@@ -231,6 +217,7 @@ def review(session: Path, host: str, port: int) -> None:
 for _command in CAPTURE_COMMANDS:
     commands.add_command(_command)
 commands.add_command(SCAN)
+commands.add_command(register_command)
 
 
 def main() -> None:

@@ -14,12 +14,12 @@ import numpy as np
 
 from realsim.app.calibrate import show_hand_eye
 from realsim.app.console import Console, StageTime
+from realsim.app.register import register_session
 from realsim.app.show import show_grasps, show_scene
 from realsim.app.stages import (
     BOARD_VIEWS,
     annotate_session,
     calibrate_session,
-    register_session,
     save_starts,
     school_session,
 )

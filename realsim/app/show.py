@@ -1,6 +1,7 @@
 """What the stages found, as tables and notes on the console."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,21 +12,17 @@ from realsim.store import SessionStore
 
 
 def show_scene(store: SessionStore, scene: Scene, console: Console) -> None:
-    """Print what was registered, worst first, with the reasons for any doubt."""
-    models = session_models(store)
-    order = {"rejected": 0, "doubtful": 1, "unchecked": 2, "accepted": 3}
-    rows: list[list[str]] = []
-    for o in sorted(scene.objects, key=lambda o: (order[o.verdict], o.checks.get("agree", 0.0))):
-        sigma = "-"
-        if o.covariance is not None:
-            sigma = f"{1e3 * np.sqrt(np.linalg.eigvalsh(o.covariance[3:, 3:])[-1]):.2f}"
-        agree = o.checks.get("agree", float("nan"))
-        rows.append([f"{o.instance} {models[o.obj_id].name}", o.verdict, f"{agree:.3f}", sigma,
-                     "; ".join(o.reasons)])  # fmt: skip
-    console.table(
-        f"Objects of {scene.name}",
-        ["object", "verdict", "agrees with depth", "sigma [mm]", "why"], rows,
-    )  # fmt: skip
+    """Print what was registered, worst first, what was not, and what to do next.
+
+    What only the session knows (pixels, cameras, findings) is left out where its scene is another.
+    """
+    from realsim.app.register_results import REPORT_FILE, load_registered, stand_alone
+    from realsim.app.register_tables import show_registered
+
+    stored = load_registered(store) if store.has(REPORT_FILE) else None
+    known = stored is not None and stored.scene.name == scene.name
+    result = replace(stored, scene=scene) if stored is not None and known else stand_alone(scene)
+    show_registered(store.folder, result, session_models(store), console)
 
 
 def show_grasps(store: SessionStore, sets: Sequence[GraspSet], console: Console) -> None:

@@ -7,28 +7,21 @@ stages can be run one by one, by the demo, or again after an interruption.
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from realsim.app.console import Console
-from realsim.errors import InputError, UnitError
-from realsim.records import GraspSet, HandEye, ObjectModel, ObjectPose, Scene, View
+from realsim.errors import InputError
+from realsim.records import GraspSet, HandEye, ObjectModel, ObjectPose, Scene
 from realsim.store import SessionStore
 
 if TYPE_CHECKING:
-    from realsim.registration.register import RegistrationConfig
     from realsim_sim_bridge.transfer import TransferSummary
 
 BOARD_VIEWS = "calibration/capture"
 """Where in a session the views of the tag board lie: a session of their own."""
-FARTHEST_START_M = 4.0
-"""Objects lie nearer to the cameras than this; millimetres would make it a thousand times more."""
-REGISTRATION_VIEWS = 48
-"""At most so many views enter the registration, spread evenly: more cost memory, not accuracy,
-as long as a constant hand-eye error limits the result (facts: 0.40 mm at 32, 0.29 mm at 256)."""
 
 
 def open_session(folder: Path) -> SessionStore:
@@ -133,13 +126,18 @@ def calibrate_session(store: SessionStore, console: Console) -> HandEye:
 
 
 def place_cameras(store: SessionStore, hand_eye: HandEye) -> None:
-    """Write T_world_cam for every view that has a robot pose, robot errors corrected."""
+    """Write T_world_cam for every view that has a robot pose, robot errors corrected.
+
+    Cameras that a registration has refined stay refined where the calibration says the same again.
+    """
+    from realsim.app.register_results import keep_refined
+
     cameras = {
         v.index: hand_eye.camera_poses(v.T_base_ee, v.joints)
         for v in store.session.views
         if v.T_base_ee is not None
     }
-    store.set_cameras(hand_eye.intrinsics, cameras)
+    store.set_cameras(hand_eye.intrinsics, keep_refined(store, cameras))
 
 
 def save_starts(store: SessionStore, starts: Sequence[ObjectPose], source: str) -> None:
@@ -191,109 +189,6 @@ def take_models(store: SessionStore, library: Path, obj_ids: Sequence[int]) -> t
     from realsim.models.library_session import copy_models
 
     return copy_models(LibraryReader.open(library), obj_ids, store.folder / "models")
-
-
-def register_session(store: SessionStore, console: Console, library: Path | None = None) -> Scene:
-    """Register every object from its rough start in the views of a session.
-
-    Args:
-        store: the session.
-        console: where progress is shown.
-        library: model library; models that the starts name and the session has not are copied.
-
-    Raises:
-        InputError: no calibrated camera poses, no starts, or an object without a mesh.
-    """
-    from realsim.registration.register import DepthFrame, register_scene
-    from realsim.store import load_scene, save_scene
-
-    require_sound(store)
-    starts = load_starts(store)
-    if library is not None:
-        copied = take_models(store, library, [s.obj_id for s in starts])
-        if copied:
-            console.say(f"models {', '.join(map(str, copied))} copied from {library}")
-    models = session_models(store)
-    config = _registration_config(store)
-    views = [v for v in store.session.views if v.T_world_cam is not None]
-    if not views:
-        raise InputError(
-            f"no view of session '{store.folder}' has a camera pose yet: run "
-            f"`realsim calibrate {store.folder}` first."
-        )
-    _check_distances(starts, views)
-    pick = np.unique(np.linspace(0, len(views) - 1, REGISTRATION_VIEWS).round().astype(int))
-    chosen = [views[k] for k in pick]
-    key = content_key(
-        store.folder / "scene_camera.json", store.folder / "registration/starts.json",
-        *sorted((store.folder / "models").iterdir()), asdict(config), [v.index for v in chosen],
-        store.folder / "robot.jsonl",
-    )  # fmt: skip
-    with console.stage("register", f"{len(starts)} objects, {len(chosen)} views") as tick:
-        if is_current(store, "register", key):
-            return load_scene(store)
-        frames = [
-            DepthFrame(index=v.index, depth_m=store.depth_m(v.index), T_world_cam=v.T_world_cam)
-            for v in chosen
-            if v.T_world_cam is not None
-        ]
-        up = store.extra.get("gravity_up_world")
-        result = register_scene(
-            store.session.name, store.session.intrinsics, frames, models, starts,
-            config,
-            gravity_up_world=None if up is None else np.array(up), progress=tick,
-        )  # fmt: skip
-        store.write_json("registration/report.json", _finite(result.report))
-        save_scene(store, result.single_view, "registration/single_view.json")
-        save_scene(store, result.scene)
-        mark_current(store, "register", key)
-    return result.scene
-
-
-def _check_distances(starts: Sequence[ObjectPose], views: Sequence[View]) -> None:
-    """Raise if a start lies further from the cameras than any table-top: other units, likely."""
-    cameras = np.stack([v.T_world_cam[:3, 3] for v in views if v.T_world_cam is not None])
-    for s in starts:
-        distance = float(np.min(np.linalg.norm(cameras - s.T_world_obj[:3, 3], axis=1)))
-        if distance > FARTHEST_START_M:
-            raise UnitError(
-                f"the start of instance {s.instance} lies {distance:.3g} m from the nearest "
-                f"camera; at most {FARTHEST_START_M:g} m is accepted. Metres are expected in "
-                "registration/starts.json and in the camera poses: were millimetres given?"
-            )
-
-
-def _finite(value: Any) -> Any:
-    """Return JSON values with NaN and infinity, which JSON has not, as null."""
-    if isinstance(value, dict):
-        return {str(k): _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
-
-
-def _registration_config(store: SessionStore) -> "RegistrationConfig":
-    """Return the defaults, with the hand-eye's own uncertainty in the objects' covariance.
-
-    An error of the hand-eye moves every object alike; the depth of one session cannot show it.
-    """
-    from realsim.registration.register import RegistrationConfig
-    from realsim.store import load_hand_eye
-
-    config = RegistrationConfig()
-    if not store.has("calibration/hand_eye.json"):
-        return config
-    hand_eye, c = load_hand_eye(store), config.covariance
-    covariance = replace(
-        c,
-        systematic_translation_m=float(
-            np.hypot(c.systematic_translation_m, hand_eye.sigma_mm / 1e3)
-        ),
-        systematic_rotation_deg=float(np.hypot(c.systematic_rotation_deg, hand_eye.sigma_deg)),
-    )
-    return replace(config, covariance=covariance)
 
 
 def judged_scene(store: SessionStore) -> Scene:

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.console import Console
+from realsim.app.register import register_session
 from realsim.app.show import why_no_grasp
 from realsim.app.stages import (
     annotate_session,
-    register_session,
     save_starts,
     school_session,
     session_models,

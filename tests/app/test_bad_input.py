@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 from realsim.app import cli, stages
 from realsim.app.console import Console
+from realsim.app.register import register_session
 from realsim.errors import RealsimError
 from realsim.formats.bop_models import save_models
 from realsim.geometry import se3
@@ -223,10 +224,10 @@ def _changed_mesh_is_registered_anew(store: SessionStore) -> None:
     """The same inputs are not computed again; another mesh under the same name is."""
     console = Console(quiet=True)
     noted = store.path("stages/register.json").read_bytes()
-    stages.register_session(store, console)
+    register_session(store, console)
     assert store.path("stages/register.json").read_bytes() == noted
     file = store.folder / "models/obj_000008.ply"
     mesh = load_mesh(file, "mm")
     save_ply(file, Mesh(vertices=mesh.vertices * 1.0001, faces=mesh.faces), "mm")
-    stages.register_session(store, console)
+    register_session(store, console)
     assert store.path("stages/register.json").read_bytes() != noted

@@ -8,6 +8,7 @@ import pytest
 
 from realsim.app import stages
 from realsim.app.console import Console
+from realsim.app.register import register_session
 from realsim.errors import InputError, UnitError
 from realsim.formats.bop_models import save_models
 from realsim.geometry import se3
@@ -51,7 +52,7 @@ def starts_of(store: SessionStore) -> list[ObjectPose]:
 def test_a_changed_capture_is_refused_even_after_it_was_registered(
     store: SessionStore, spoil: str
 ) -> None:
-    stages.register_session(store, QUIET)
+    register_session(store, QUIET)
     if spoil == "zero depth":
         store.path("depth/000002.png").write_bytes(store.path("depth/000001.png").read_bytes())
     elif spoil == "cut list":
@@ -60,39 +61,42 @@ def test_a_changed_capture_is_refused_even_after_it_was_registered(
     else:
         store.path("rgb/000003.png").unlink()
     again = SessionStore.open(store.folder)
-    for stage in (stages.register_session, stages.annotate_session):
+    for stage in (register_session, stages.annotate_session):
         with pytest.raises(InputError, match="not as it was captured"):
             stage(again, QUIET)
 
 
 def test_a_damaged_note_is_no_note(store: SessionStore) -> None:
-    stages.register_session(store, QUIET)
+    register_session(store, QUIET)
     store.path("stages/register.json").write_text('{"key": "abc')
-    scene = stages.register_session(store, QUIET)
+    scene = register_session(store, QUIET)
     assert scene.objects[0].verdict == "accepted"
     assert "key" in json.loads(store.path("stages/register.json").read_text())
 
 
-def test_an_object_out_of_every_view_is_rejected_and_all_files_are_written(
+def test_an_object_out_of_every_view_is_not_placed_and_all_files_are_written(
     store: SessionStore,
 ) -> None:
     (start,) = starts_of(store)
     away = se3.from_translation([2.0, 0.0, 0.0]) @ start.T_world_obj
     far = ObjectPose(obj_id=start.obj_id, instance=1, T_world_obj=away)
     stages.save_starts(store, [start, far], "test")
-    scene = stages.register_session(store, QUIET)
-    assert [o.verdict for o in scene.objects] == ["accepted", "rejected"]
-    assert len(store.read_json("registration/report.json")["objects"]) == 2
-    assert [o.verdict for o in load_scene(store).objects] == ["accepted", "rejected"]
+    scene = register_session(store, QUIET)
+    assert [(o.instance, o.verdict) for o in scene.objects] == [(0, "accepted")]
+    report = store.read_json("registration/report.json")
+    assert [n["instance"] for n in report["not_placed"]] == [1]
+    assert len(report["not_placed"][0]["reason"]) > 20
+    assert [o.verdict for o in load_scene(store).objects] == ["accepted"]
 
 
 def test_one_thing_named_twice_is_counted_once(store: SessionStore) -> None:
     (start,) = starts_of(store)
     double = ObjectPose(obj_id=start.obj_id, instance=9, T_world_obj=start.T_world_obj)
     stages.save_starts(store, [start, double], "test")
-    scene = stages.register_session(store, QUIET)
-    assert [o.verdict for o in scene.objects] == ["accepted", "rejected"]
-    assert "named twice" in scene.objects[1].reasons[-1]
+    scene = register_session(store, QUIET)
+    assert [o.verdict for o in scene.objects] == ["accepted"]
+    report = store.read_json("registration/report.json")
+    assert len(report["not_placed"]) == 1
 
 
 def test_starts_in_millimetres_are_found_out(store: SessionStore) -> None:
@@ -102,7 +106,7 @@ def test_starts_in_millimetres_are_found_out(store: SessionStore) -> None:
     wrong = ObjectPose(obj_id=start.obj_id, instance=0, T_world_obj=T)
     stages.save_starts(store, [wrong], "test")
     with pytest.raises(UnitError, match="millimetres"):
-        stages.register_session(store, QUIET)
+        register_session(store, QUIET)
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:

@@ -1,0 +1,235 @@
+"""A registration as it lies in SESSION/registration, read again; see `register_files`."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import ObjectModel, Scene, SupportPlane, View
+from realsim.registration.refinement.uncertainty import SeenPose
+from realsim.registration.search.records import NotPlaced
+from realsim.store import SessionStore, load_scene, records_json
+from realsim.store.records_json import number_from_json
+
+Array = NDArray[np.float64]
+Json = dict[str, Any]
+FOLDER = "registration"
+SCENE_FILE = f"{FOLDER}/scene.json"
+TABLE_FILE = f"{FOLDER}/scene_table.json"
+VIEWS_FILE = f"{FOLDER}/views.json"
+CAMERAS_FILE = f"{FOLDER}/cameras.json"
+SINGLE_FILE = f"{FOLDER}/single_view.json"
+REPORT_FILE = f"{FOLDER}/report.json"
+NEXT_FILE = f"{FOLDER}/next.json"
+PAGE_FILE = f"{FOLDER}/register.html"
+PICTURES = f"{FOLDER}/pictures"
+STAGE_FILE = "stages/register.json"
+FORMAT_VERSION = 1
+SAME = 1e-11
+"""Camera poses that differ by less are the same [m, rad]: making a rotation orthonormal twice
+changes the last bit."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class CameraChange:
+    """Cameras before and after a registration."""
+
+    claimed: dict[int, Array]
+    """View -> (4, 4) T_world_cam as robot and calibration say [m]; all views that have one."""
+    refined: dict[int, Array]
+    """View -> (4, 4) as the registration found it [m]; only the views that took part."""
+
+    @property
+    def session(self) -> dict[int, Array]:
+        """View -> (4, 4) what the session's views have from now on."""
+        return self.claimed | self.refined
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Remark:
+    """Something that is wrong with a view, or with the scene."""
+
+    view: int | None
+    """Number of the view; None = of no one view."""
+    kind: str
+    words: str
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Registered:
+    """A registration as it lies in a session."""
+
+    scene: Scene
+    single_view: Scene
+    """The baseline."""
+    cameras: CameraChange
+    seen: dict[int, dict[int, SeenPose]]
+    """View -> instance -> its pose there; NaN where an uncertainty is not known."""
+    not_placed: tuple[NotPlaced, ...]
+    remarks: tuple[Remark, ...]
+    report: Json
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether anything was placed that is not rejected."""
+        return any(o.verdict != "rejected" for o in self.scene.objects)
+
+
+# --- reading ----------------------------------------------------------------------------------
+
+
+def cameras_now(store: SessionStore) -> dict[int, Array]:
+    """Return T_world_cam of every view that has one."""
+    views = store.session.views
+    return {v.index: v.T_world_cam for v in views if v.T_world_cam is not None}
+
+
+def is_same_pose(a: Array, b: Array) -> bool:
+    """Whether two poses are the same but for rounding."""
+    return bool(np.allclose(a, b, rtol=0.0, atol=SAME))
+
+
+def is_same_cameras(a: Mapping[int, Array], b: Mapping[int, Array]) -> bool:
+    """Whether two sets of cameras are of the same views and the same but for rounding."""
+    return set(a) == set(b) and all(is_same_pose(a[k], b[k]) for k in a)
+
+
+def load_cameras(store: SessionStore) -> CameraChange | None:
+    """Return the cameras before and after the registration; None if there was none."""
+    return cameras_from_json(store.read_json(CAMERAS_FILE)) if store.has(CAMERAS_FILE) else None
+
+
+def claimed_cameras(store: SessionStore) -> dict[int, Array]:
+    """Return where the cameras are claimed to be, view by view.
+
+    A view whose camera is the one that a registration set was claimed to be where the record says;
+    any other has been calibrated since, and is its own claim.
+    """
+    now, record = cameras_now(store), load_cameras(store)
+    if record is None:
+        return now
+    return {
+        k: record.claimed[k]
+        if k in record.refined and k in record.claimed and is_same_pose(T, record.refined[k])
+        else T
+        for k, T in now.items()
+    }
+
+
+def keep_refined(store: SessionStore, claimed: Mapping[int, Array]) -> dict[int, Array]:
+    """Return cameras that are about to be claimed, refined where that has been done of the same.
+
+    A calibration that is run again and finds the same must not undo what the objects are placed by.
+    """
+    record = load_cameras(store)
+    if record is None:
+        return dict(claimed)
+    out: dict[int, Array] = {}
+    for k, T in claimed.items():
+        stored = View(index=k, T_world_cam=T).T_world_cam
+        known = stored is not None and k in record.claimed
+        same = known and k in record.refined and is_same_pose(np.asarray(stored), record.claimed[k])
+        out[k] = record.refined[k] if same else T
+    return out
+
+
+def load_seen(store: SessionStore) -> dict[int, dict[int, SeenPose]]:
+    """Return view -> instance -> its pose there with covariance and pixel uncertainty."""
+    if not store.has(VIEWS_FILE):
+        return {}
+    views: Json = store.read_json(VIEWS_FILE)["views"]
+    return {
+        int(index): {
+            int(instance): SeenPose(
+                T_cam_obj=records_json.array_from_json(row["T_cam_obj"]),
+                covariance=records_json.array_from_json(row["covariance"], (6, 6)),
+                sigma_px=number_from_json(row["sigma_px"]),
+            )
+            for instance, row in rows.items()
+        }
+        for index, rows in views.items()
+    }
+
+
+def load_table_scene(store: SessionStore) -> Scene:
+    """Return the scene in the table's frame: its world is the table, z up out of it."""
+    value: Json = store.read_json(TABLE_FILE)
+    rows = [row | {"T_world_obj": row["T_table_obj"]} for row in value["objects"]]
+    plane = None
+    if value["frame"] == "table":
+        plane = SupportPlane(
+            T_world_table=np.eye(4), rms_m=number_from_json(value["rms_m"]),
+            inliers=int(value["inliers"]),
+        )  # fmt: skip
+    objects = tuple(records_json.object_pose_from_json(row) for row in rows)
+    return Scene(name=str(value["name"]), objects=objects, plane=plane)
+
+
+def load_registered(store: SessionStore) -> Registered:
+    """Return the registration of a session.
+
+    Raises:
+        InputError: there is none, or a file of it is missing.
+    """
+    report: Json = store.read_json(REPORT_FILE)
+    scene = load_scene(store)
+    single = (
+        load_scene(store, SINGLE_FILE) if store.has(SINGLE_FILE) else replace(scene, objects=())
+    )
+    cameras = load_cameras(store)
+    missing: Sequence[Json] = report.get("not_placed", ())
+    findings: Sequence[Json] = report.get("findings", ())
+    return Registered(
+        scene=scene, single_view=single,
+        cameras=cameras or CameraChange(claimed=cameras_now(store), refined={}),
+        seen=load_seen(store),
+        not_placed=tuple(
+            NotPlaced(obj_id=m["obj_id"], instance=m["instance"], reason=m["reason"])
+            for m in missing
+        ),
+        remarks=tuple(
+            Remark(view=f.get("view"), kind=f["kind"], words=f["words"]) for f in findings
+        ),
+        report=report,
+    )  # fmt: skip
+
+
+def stand_alone(scene: Scene) -> Registered:
+    """Return a scene of which nothing else is known."""
+    return Registered(
+        scene=scene, single_view=replace(scene, objects=()),
+        cameras=CameraChange(claimed={}, refined={}), seen={}, not_placed=(), remarks=(),
+        report={},
+    )  # fmt: skip
+
+
+def cameras_from_json(value: Json) -> CameraChange:
+    """Return the cameras of `cameras.json`."""
+    return CameraChange(
+        claimed=poses_from_json(value["claimed"]), refined=poses_from_json(value["refined"])
+    )
+
+
+def poses_from_json(value: Json) -> dict[int, Array]:
+    """Return poses by view."""
+    return {int(k): np.array(T, dtype=np.float64) for k, T in value.items()}
+
+
+def sigmas_of(covariance: Array | None, model: ObjectModel | None = None) -> tuple[float, float]:
+    """Return the largest 1-sigma along and about any axis [mm, deg]; NaN = unknown.
+
+    Args:
+        covariance: (6, 6) of the right perturbation, rotation first [rad, m].
+        model: whose continuous symmetries are left out: a turn about them changes nothing.
+    """
+    if covariance is None or not np.all(np.isfinite(covariance)):
+        return float("nan"), float("nan")
+    turns = covariance[:3, :3]
+    for axis, _ in () if model is None else model.symmetry_axes:
+        unit = np.asarray(axis) / np.linalg.norm(axis)
+        P = np.eye(3) - np.outer(unit, unit)
+        turns = P @ turns @ P
+    shift, turn = (float(np.linalg.eigvalsh(C)[-1]) for C in (covariance[3:, 3:], turns))
+    return 1e3 * float(np.sqrt(max(shift, 0.0))), float(np.degrees(np.sqrt(max(turn, 0.0))))

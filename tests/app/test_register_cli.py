@@ -1,0 +1,228 @@
+"""`realsim register`: what it asks for, what it does not do twice, and its exit codes."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app import stages
+from realsim.app.cli import commands
+from realsim.app.console import Console
+from realsim.app.register import register_session
+from realsim.app.register_config import RegisterRequest, config_of, load_depth_bias
+from realsim.app.register_inputs import read_inputs
+from realsim.app.register_results import cameras_now, claimed_cameras, load_registered
+from realsim.errors import InputError
+from realsim.formats.bop_models import save_models
+from realsim.geometry import se3
+from realsim.geometry.parts import part
+from realsim.records import ObjectPose
+from realsim.records.depth_bias import DepthBias
+from realsim.registration.odometry.hand_held import HandHeldConfig, hand_held_poses
+from realsim.store import SessionStore
+from registered_sessions import models_of, table_session, true_poses
+
+QUIET = Console(quiet=True)
+
+
+def run(*args: object) -> Result:
+    """Run the command in this process."""
+    return CliRunner().invoke(commands, ["register", *map(str, args), "--quiet"])
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session of eight views, with nothing said of its objects."""
+    return table_session(tmp_path_factory.mktemp("pristine") / "s").folder
+
+
+@pytest.fixture(scope="module")
+def registered(pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    """The same session registered from rough starts, and what the command said."""
+    folder = tmp_path_factory.mktemp("registered") / "s"
+    shutil.copytree(pristine, folder)
+    store = SessionStore.open(folder)
+    off = se3.exp(np.array([0.1, -0.1, 0.15, 0.006, -0.004, 0.005]))
+    starts = [
+        ObjectPose(obj_id=o.obj_id, instance=o.instance, T_world_obj=o.T_world_obj @ off)
+        for o in true_poses()
+    ]
+    stages.save_starts(store, starts, "test")
+    return folder, run(folder)
+
+
+@pytest.fixture
+def session(pristine: Path, tmp_path: Path) -> Path:
+    """A copy of the session for one test."""
+    return Path(shutil.copytree(pristine, tmp_path / "s"))
+
+
+def test_objects_are_found_and_everything_is_written(registered: tuple[Path, Result]) -> None:
+    folder, result = registered
+    assert result.exit_code == 0, result.output
+    store = SessionStore.open(folder)
+    found = load_registered(store)
+    models = models_of()
+    for o, true in zip(found.scene.objects, true_poses(), strict=True):
+        corners = models[o.obj_id].mesh.vertices
+        gap = se3.transform(o.T_world_obj, corners) - se3.transform(true.T_world_obj, corners)
+        assert np.linalg.norm(gap, axis=1).max() < 2e-3
+        assert o.covariance is not None and o.verdict != "rejected"
+    assert set(found.seen) == set(range(8)) == set(found.cameras.refined)
+    for name in ("scene_table", "views", "cameras", "scene_gt", "scene_camera", "report"):
+        assert store.has(f"registration/{name}.json"), name
+    assert len(list((folder / "registration/pictures").iterdir())) == 4
+    assert store.path("registration/register.html").stat().st_size > 50_000
+    assert store.verify() == []
+    for words in ("mug", "wedge", "together (hand-eye)", "table: RMS", "next "):
+        assert words in result.output
+
+
+def test_a_second_run_computes_nothing_and_starts_from_the_claimed_cameras(
+    registered: tuple[Path, Result], pristine: Path
+) -> None:
+    folder, first = registered
+    store = SessionStore.open(folder)
+    claimed = cameras_now(SessionStore.open(pristine))
+    assert all(np.array_equal(claimed_cameras(store)[k], claimed[k]) for k in claimed)
+    refined = cameras_now(store)
+    assert not np.array_equal(refined[0], claimed[0])
+    before = {p: p.stat().st_mtime_ns for p in folder.rglob("*.json")}
+    again = run(folder)
+    assert again.output == first.output
+    assert {p: p.stat().st_mtime_ns for p in folder.rglob("*.json")} == before
+    # A calibration that sets the same claims again does not undo the refinement.
+    store.set_cameras(store.session.intrinsics, claimed)
+    register_session(SessionStore.open(folder), QUIET)
+    now = cameras_now(SessionStore.open(folder))
+    assert all(np.allclose(now[k], refined[k], rtol=0, atol=1e-14) for k in refined)
+
+
+def test_json_is_all_that_is_on_stdout(registered: tuple[Path, Result]) -> None:
+    folder, _ = registered
+    result = CliRunner().invoke(commands, ["register", str(folder), "--json"])
+    value = json.loads(result.stdout)
+    assert value["usable"] and {o["name"] for o in value["objects"]} == {"mug", "wedge"}
+    assert value["views"] == list(range(8)) and value["not_placed"] == []
+
+
+def test_nothing_said_names_the_three_ways(session: Path) -> None:
+    error = run(session).exception
+    assert isinstance(error, InputError)
+    for way in ("--object", "starts.json", "--find-all"):
+        assert way in str(error)
+    assert not (session / "registration").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--find-all", "--object", "mug"], "one of both"),
+        (["--object", "teapot"], "teapot"),
+        (["--object", "mug", "--hand-held"], "--hand-held"),
+        (["--object", "mug", "--depth-bias", "nowhere.json"], "nowhere.json"),
+    ],
+)
+def test_what_cannot_be_used_is_named(session: Path, options: list[str], words: str) -> None:
+    error = run(session, *options).exception
+    assert isinstance(error, InputError) and words in str(error)
+
+
+@pytest.mark.parametrize("views", ["0", "-3", "some", "1.5"])
+def test_a_wrong_number_of_views_is_refused(session: Path, views: str) -> None:
+    result = run(session, "--object", "mug", "--views", views)
+    assert result.exit_code == 2 and views in result.output
+
+
+@pytest.mark.slow
+def test_an_object_that_is_not_there_ends_with_code_one(session: Path) -> None:
+    store = SessionStore.open(session)
+    save_models(store.folder / "models", models_of() | {part("bottle").obj_id: part("bottle")})
+    start = ObjectPose(
+        obj_id=part("bottle").obj_id, instance=0,
+        T_world_obj=se3.from_translation([0.0, -0.35, 0.1]),
+    )  # fmt: skip
+    stages.save_starts(store, [start], "test")
+    result = run(session)
+    assert result.exit_code == 1, result.output
+    assert "bottle" in result.output and "next " in result.output
+    assert not load_registered(SessionStore.open(session)).is_usable
+
+
+def test_views_and_models_that_take_part_are_chosen(session: Path) -> None:
+    store = SessionStore.open(session)
+    inputs = read_inputs(store, RegisterRequest(objects=("mug",), views=3))
+    assert inputs.views == (0, 4, 7) and list(inputs.models) == [part("mug").obj_id]
+    frames = inputs.frames(store)
+    for frame in frames:
+        assert np.array_equal(frame.depth_m, store.depth_m(frame.index))
+        assert frame.depth_m is not frame.depth_m  # read anew, not kept
+    both = read_inputs(store, RegisterRequest(find_all=True))
+    assert both.wanted is None and len(both.models) == 2 and len(both.views) == 8
+
+
+def test_the_key_changes_with_everything_that_matters(session: Path) -> None:
+    store = SessionStore.open(session)
+    base = RegisterRequest(objects=("mug",))
+    key = read_inputs(store, base).key
+    assert read_inputs(SessionStore.open(session), base).key == key
+    others = [
+        RegisterRequest(objects=("mug", "wedge")), RegisterRequest(find_all=True),
+        RegisterRequest(objects=("mug",), views=4),
+        RegisterRequest(objects=("mug",), method="top-down"),
+        RegisterRequest(objects=("mug",), refine_cameras=False),
+        RegisterRequest(objects=("mug",), depth_bias="off"),
+    ]  # fmt: skip
+    keys = {read_inputs(store, other).key for other in others}
+    assert len(keys) == len(others) and key not in keys
+    store.set_cameras(
+        store.session.intrinsics, {0: cameras_now(store)[0] @ se3.from_translation([1e-4, 0, 0])}
+    )
+    assert read_inputs(store, base).key != key
+
+
+def test_the_depth_bias_is_that_of_the_calibration_unless_it_is_off(session: Path) -> None:
+    store = SessionStore.open(session)
+    C = [[1e-6, -2e-7], [-2e-7, 3e-6]]
+    known = {
+        "known": True, "scale": 1.002, "offset_per_m": -0.004, "covariance": C,
+        "noise_per_m": None, "range_m": [0.2, "inf"], "separable": True,
+    }  # fmt: skip
+    store.write_json("calibration/depth_bias.json", known)
+    config = config_of(store, RegisterRequest())
+    assert (config.bias.scale, config.bias.offset_per_m) == (1.002, -0.004)
+    assert np.array_equal(config.bias.covariance, C) and config.bias.range_m[1] == float("inf")
+    off = config_of(store, RegisterRequest(depth_bias="off"))
+    assert off.bias.is_none and not off.refine.fit_bias and config.refine.fit_bias
+    store.write_json("calibration/depth_bias.json", {"known": False, "why": "one distance"})
+    assert config_of(store, RegisterRequest()).bias.is_none
+    other = session / "other.json"
+    other.write_text(json.dumps(known | {"scale": 0.999}))
+    assert config_of(store, RegisterRequest(depth_bias=str(other))).bias.scale == 0.999
+    assert isinstance(load_depth_bias(other), DepthBias)
+    other.write_text('{"scale": 1.0}')
+    with pytest.raises(InputError, match="no depth bias"):
+        load_depth_bias(other)
+
+
+def test_a_session_without_cameras_names_both_remedies(tmp_path: Path) -> None:
+    store = table_session(tmp_path / "s", views=2, posed=False)
+    with pytest.raises(InputError, match="calibrate") as error:
+        read_inputs(store, RegisterRequest(objects=("mug",)))
+    assert "--hand-held" in str(error.value)
+
+
+def test_hand_held_cameras_are_found_once_and_kept(tmp_path: Path) -> None:
+    store = table_session(tmp_path / "s", views=10, posed=False)
+    request = RegisterRequest(objects=("mug", "wedge"), hand_held=True)
+    inputs = read_inputs(store, request)
+    depths = [store.depth_m(k) for k in range(10)]
+    found = hand_held_poses(store.session.intrinsics, depths, HandHeldConfig())
+    for k, T in enumerate(found.Ts_world_cam):
+        np.testing.assert_allclose(inputs.claimed[k], T, atol=1e-12)
+    again = SessionStore.open(store.folder)
+    assert read_inputs(again, request).key == inputs.key
+    assert set(cameras_now(again)) == set(range(10))

@@ -1,0 +1,271 @@
+"""Files of a registration: what is written is read, and a kill leaves the old or the new state."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import ArrayLike
+
+from realsim.app.register_files import documents, finish_interrupted, write_result
+from realsim.app.register_results import (
+    CAMERAS_FILE,
+    NEXT_FILE,
+    SCENE_FILE,
+    Registered,
+    cameras_now,
+    claimed_cameras,
+    is_same_cameras,
+    keep_refined,
+    load_registered,
+    load_seen,
+    load_table_scene,
+    sigmas_of,
+)
+from realsim.formats import bop_units
+from realsim.geometry import se3
+from realsim.geometry.parts import part
+from realsim.records import CameraIntrinsics, ObjectPose
+from realsim.store import SessionStore, load_scene
+from registered_sessions import models_of, registered_by_hand, table_session
+
+MODELS = models_of()
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> SessionStore:
+    """A session of four views whose cameras are a little off."""
+    return table_session(tmp_path / "s", views=4)
+
+
+def moved(result: Registered, by_m: float) -> Registered:
+    """Return the same registration with everything elsewhere."""
+    T = se3.from_translation([by_m, 0.0, 0.0])
+    objects = tuple(replace(o, T_world_obj=T @ o.T_world_obj) for o in result.scene.objects)
+    refined = {k: T @ c for k, c in result.cameras.refined.items()}
+    return replace(
+        result, scene=replace(result.scene, objects=objects),
+        cameras=replace(result.cameras, refined=refined),
+    )  # fmt: skip
+
+
+def test_what_is_written_is_read_bit_for_bit(store: SessionStore) -> None:
+    result = registered_by_hand(store)
+    write_result(store, result, MODELS, {"registration/pictures/a.jpg": b"picture"})
+    read = load_registered(SessionStore.open(store.folder))
+    for a, b in zip(read.scene.objects, result.scene.objects, strict=True):
+        assert np.array_equal(a.T_world_obj, b.T_world_obj)
+        assert a.covariance is not None and b.covariance is not None
+        assert np.array_equal(a.covariance, b.covariance)
+        assert (a.verdict, a.reasons, a.checks) == (b.verdict, b.reasons, b.checks)
+    for k, poses in result.seen.items():
+        for i, pose in poses.items():
+            assert np.array_equal(read.seen[k][i].covariance, pose.covariance)
+            assert np.array_equal(read.seen[k][i].T_cam_obj, pose.T_cam_obj)
+            assert read.seen[k][i].sigma_px == pose.sigma_px
+    assert [n.reason for n in read.not_placed] == [n.reason for n in result.not_placed]
+    assert read.remarks == result.remarks
+    assert is_same_cameras(read.cameras.claimed, result.cameras.claimed)
+    assert not store.has(NEXT_FILE)
+    assert store.verify() == []
+
+
+def test_the_session_has_the_refined_cameras_and_a_rerun_the_claimed_ones(
+    store: SessionStore,
+) -> None:
+    before = cameras_now(store)
+    result = registered_by_hand(store, left_out=3)
+    write_result(store, result, MODELS, {})
+    now = cameras_now(SessionStore.open(store.folder))
+    for k in (0, 1, 2):
+        np.testing.assert_allclose(now[k], result.cameras.refined[k], atol=1e-15)
+    assert np.array_equal(now[3], before[3])  # it took no part
+    claimed = claimed_cameras(store)
+    assert set(claimed) == set(before)
+    assert all(np.array_equal(claimed[k], before[k]) for k in before)
+    # And once more: a second result does not make the first one's cameras the claim.
+    write_result(store, moved(result, 1e-3), MODELS, {})
+    assert all(np.array_equal(claimed_cameras(store)[k], before[k]) for k in before)
+
+
+def test_a_view_that_is_refined_no_more_is_where_it_was_claimed(store: SessionStore) -> None:
+    before = cameras_now(store)
+    write_result(store, registered_by_hand(store), MODELS, {})
+    again = registered_by_hand(store, left_out=1)
+    again = replace(again, cameras=replace(again.cameras, claimed=claimed_cameras(store)))
+    write_result(store, again, MODELS, {})
+    assert np.array_equal(cameras_now(store)[1], before[1])
+    assert not np.array_equal(cameras_now(store)[0], before[0])
+
+
+def test_cameras_that_were_calibrated_anew_are_the_claim(store: SessionStore) -> None:
+    before = cameras_now(store)
+    write_result(store, registered_by_hand(store), MODELS, {})
+    other = {2: before[2] @ se3.from_translation([0.0, 0.001, 0.0])}
+    store.set_cameras(store.session.intrinsics, other)
+    claimed = claimed_cameras(store)
+    np.testing.assert_allclose(claimed[2], other[2], atol=1e-15)
+    assert np.array_equal(claimed[1], before[1])
+
+
+def test_the_same_calibration_again_keeps_the_refined_cameras(store: SessionStore) -> None:
+    before = cameras_now(store)
+    write_result(store, registered_by_hand(store), MODELS, {})
+    now = cameras_now(store)
+    kept = keep_refined(store, before)
+    assert all(np.array_equal(kept[k], now[k]) for k in now)
+    other = {k: T @ se3.from_translation([1e-4, 0.0, 0.0]) for k, T in before.items()}
+    assert all(np.array_equal(keep_refined(store, other)[k], other[k]) for k in other)
+
+
+class Killed(BaseException):
+    """The process ends here."""
+
+
+class MortalStore(SessionStore):
+    """A session whose process dies when it is about to write its n-th file."""
+
+    left = 0
+
+    def _live(self) -> None:
+        if self.left == 0:
+            raise Killed
+        self.left -= 1
+
+    def write_bytes(self, relative: str, data: bytes) -> None:
+        """Write, or die before it."""
+        self._live()
+        super().write_bytes(relative, data)
+
+    def set_cameras(
+        self, intrinsics: CameraIntrinsics, Ts_world_cam: Mapping[int, ArrayLike]
+    ) -> None:
+        """Set, or die before it."""
+        self._live()
+        super().set_cameras(intrinsics, Ts_world_cam)
+
+
+def state_of(store: SessionStore, paths: list[str]) -> dict[str, bytes]:
+    """Return everything that a registration writes, cameras included."""
+    files = {p: store.path(p).read_bytes() for p in paths}
+    return files | {"cameras": repr(store.session.views).encode()}
+
+
+def test_a_kill_between_any_two_files_leaves_the_old_or_the_new_state(tmp_path: Path) -> None:
+    states: list[dict[str, bytes]] = []
+    seen: set[int] = set()
+    for n in range(40):
+        folder = tmp_path / str(n)
+        store = table_session(folder, views=4)
+        old = registered_by_hand(store)
+        new = moved(old, 0.01)
+        paths = list(documents(old, store, MODELS))
+        write_result(store, old, MODELS, {})
+        if not states:
+            states.append(state_of(store, paths))
+            write_result(store, new, MODELS, {})
+            states.append(state_of(store, paths))
+            write_result(store, old, MODELS, {})
+            assert state_of(store, paths) == states[0] != states[1]
+        mortal = MortalStore.open(folder)
+        assert isinstance(mortal, MortalStore)
+        mortal.left = n
+        try:
+            write_result(mortal, new, MODELS, {})
+        except Killed:
+            again = SessionStore.open(folder)
+            finish_interrupted(again)
+            seen.add(states.index(state_of(SessionStore.open(folder), paths)))
+            assert again.verify() == [] and not again.has(NEXT_FILE)
+            continue
+        assert state_of(SessionStore.open(folder), paths) == states[1]
+        break
+    else:
+        pytest.fail("the writing never came to its end")
+    assert seen == {0, 1}
+
+
+def test_an_interrupted_result_of_other_cameras_is_thrown_away(store: SessionStore) -> None:
+    result = registered_by_hand(store)
+    write_result(store, result, MODELS, {})
+    scene = store.path(SCENE_FILE).read_bytes()
+    mortal = MortalStore.open(store.folder)
+    assert isinstance(mortal, MortalStore)
+    mortal.left = 1
+    with pytest.raises(Killed):
+        write_result(mortal, moved(result, 0.02), MODELS, {})
+    again = SessionStore.open(store.folder)
+    shift = se3.from_translation([0.0, 0.002, 0.0])
+    calibrated = {k: T @ shift for k, T in result.cameras.claimed.items()}
+    again.set_cameras(again.session.intrinsics, calibrated)
+    assert not finish_interrupted(again)
+    assert not again.has(NEXT_FILE) and again.path(SCENE_FILE).read_bytes() == scene
+    np.testing.assert_allclose(cameras_now(again)[0], calibrated[0], atol=1e-15)
+
+
+def test_bop_files_are_in_millimetres_and_leave_rejected_objects_out(store: SessionStore) -> None:
+    result = registered_by_hand(store, left_out=3)
+    first, second = result.scene.objects
+    scene = replace(result.scene, objects=(first, replace(second, verdict="rejected")))
+    write_result(store, replace(result, scene=scene), MODELS, {})
+    gt = store.read_json("registration/scene_gt.json")
+    cameras = store.read_json("registration/scene_camera.json")
+    assert set(gt) == set(cameras) == {"0", "1", "2"}
+    for k, rows in gt.items():
+        assert [row["obj_id"] for row in rows] == [first.obj_id]
+        T_cam_obj = bop_units.object_in_camera(rows[0]["cam_R_m2c"], rows[0]["cam_t_m2c"], k)
+        T_world_cam = bop_units.T_world_cam_of(cameras[k], k)
+        assert T_world_cam is not None
+        np.testing.assert_allclose(T_world_cam @ T_cam_obj, first.T_world_obj, atol=1e-12)
+
+
+def test_the_table_frame_is_the_world_seen_from_the_table(store: SessionStore) -> None:
+    result = registered_by_hand(store)
+    rng = np.random.default_rng(3)
+    T_world_table = se3.exp(rng.normal(size=6) * 0.4)
+    assert result.scene.plane is not None
+    plane = replace(result.scene.plane, T_world_table=T_world_table)
+    write_result(store, replace(result, scene=replace(result.scene, plane=plane)), MODELS, {})
+    table = load_table_scene(store)
+    assert table.plane is not None and np.array_equal(table.plane.T_world_table, np.eye(4))
+    for there, here in zip(table.objects, load_scene(store).objects, strict=True):
+        np.testing.assert_allclose(T_world_table @ there.T_world_obj, here.T_world_obj, atol=1e-12)
+        assert there.covariance is not None and here.covariance is not None
+        assert np.array_equal(there.covariance, here.covariance)
+        assert there.verdict == here.verdict
+    names = [o["name"] for o in store.read_json("registration/scene_table.json")["objects"]]
+    assert names == ["mug", "wedge"]
+
+
+def test_unknown_uncertainties_are_null_and_come_back_as_nan(store: SessionStore) -> None:
+    result = registered_by_hand(store)
+    pose = replace(result.seen[0][0], sigma_px=float("nan"), covariance=np.full((6, 6), np.nan))
+    seen = result.seen | {0: result.seen[0] | {0: pose}}
+    bare = ObjectPose(obj_id=MODELS[min(MODELS)].obj_id, instance=5, T_world_obj=np.eye(4))
+    scene = replace(result.scene, objects=(*result.scene.objects, bare), plane=None)
+    write_result(store, replace(result, seen=seen, scene=scene), MODELS, {})
+    read = load_seen(store)[0][0]
+    assert np.isnan(read.sigma_px) and np.isnan(read.covariance).all()
+    assert store.read_json("registration/views.json")["views"]["0"]["0"]["sigma_mm"] is None
+    assert store.read_json("registration/scene_table.json")["frame"] == "world"
+
+
+def test_a_turn_about_an_axis_of_symmetry_is_no_uncertainty() -> None:
+    C = np.diag([1e-3, 2e-3, 0.5, 1e-4, 2e-4, 3e-4]) ** 2
+    tube = part("tube")
+    assert tube.symmetry_axes and np.allclose(np.abs(tube.symmetry_axes[0][0]), [0, 0, 1])
+    mm, deg = sigmas_of(C, tube)
+    assert mm == pytest.approx(0.3) and deg == pytest.approx(np.degrees(2e-3))
+    assert sigmas_of(C)[1] == pytest.approx(np.degrees(0.5))
+
+
+def test_cameras_json_names_what_was_claimed(store: SessionStore) -> None:
+    result = registered_by_hand(store, left_out=0)
+    write_result(store, result, MODELS, {})
+    value = store.read_json(CAMERAS_FILE)
+    assert set(value["claimed"]) == {"0", "1", "2", "3"} and set(value["refined"]) == {
+        "1",
+        "2",
+        "3",
+    }

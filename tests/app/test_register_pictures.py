@@ -1,0 +1,212 @@
+"""Pictures of a registration: their geometry by laws, and that all of them are drawn."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from realsim.app.first_surfaces import FirstSurfaces
+from realsim.app.register import pixel_sigma, without_free_turns
+from realsim.app.register_gain import camera_shifts_px, gain_picture, zoomed_camera
+from realsim.app.register_map import footprint_mm, place_covariance_mm2
+from realsim.app.register_page import page_bytes
+from realsim.app.register_pictures import (
+    PictureConfig,
+    bias_of,
+    draw_pictures,
+    placed_objects,
+    window_of,
+)
+from realsim.app.register_results import CameraChange, Registered
+from realsim.app.register_tables import object_rows, worst_first
+from realsim.geometry import camera, se3
+from realsim.geometry.parts import part
+from realsim.records import CameraIntrinsics, ObjectPose
+from realsim.records.depth_bias import DepthBias
+from realsim.rendering.labels import LabelRenderer
+from realsim.store import SessionStore
+from registered_sessions import CAMERA, models_of, registered_by_hand, table_session
+
+MODELS = models_of()
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
+    """A session of four views whose cameras are a little off."""
+    return table_session(tmp_path_factory.mktemp("pictures") / "s", views=4)
+
+
+@pytest.fixture(scope="module")
+def result(store: SessionStore) -> Registered:
+    """Its registration."""
+    return registered_by_hand(store)
+
+
+def size_of(data: bytes) -> tuple[int, int]:
+    """Return width and height of a picture that can be read."""
+    with Image.open(io.BytesIO(data)) as picture:
+        picture.load()
+        return picture.size
+
+
+def test_every_picture_is_drawn_and_stands_on_the_page(
+    store: SessionStore, result: Registered
+) -> None:
+    pictures = draw_pictures(store, result, MODELS)
+    assert set(pictures) == {"overlay.jpg", "cameras.jpg", "residuals.jpg", "map.png"}
+    assert all(min(size_of(data)) > 400 for data in pictures.values())
+    again = draw_pictures(store, result, MODELS)
+    assert again == pictures
+    page = page_bytes(store, result, MODELS, pictures).decode()
+    assert page.count("data:image/jpeg;base64,") == 3 and page.count("data:image/png") == 1
+    assert "half of it is hidden." in page and "nothing there looks like it." in page
+    assert (
+        "cameras moved by 0.47 mm / 0.11 deg together (hand-eye), 0.19 mm / 0.03 deg each" in page
+    )
+    assert "http" not in page.replace("http-equiv", "")  # nothing is loaded from elsewhere
+
+
+def test_what_cannot_be_drawn_is_left_out(store: SessionStore, result: Registered) -> None:
+    claimed = result.cameras.claimed
+    still = replace(result, cameras=CameraChange(claimed=claimed, refined=dict(claimed)))
+    assert "cameras.jpg" not in draw_pictures(store, still, MODELS)
+    nothing = replace(result, scene=replace(result.scene, objects=()), seen={})
+    assert draw_pictures(store, nothing, MODELS) == {}
+    assert b"Not placed" in page_bytes(store, nothing, MODELS, {})
+
+
+def test_the_gain_is_shown_on_the_object_that_moved_most(
+    store: SessionStore, result: Registered
+) -> None:
+    refined = result.cameras.refined
+    claimed = {k: T.copy() for k, T in refined.items()}
+    assert set(camera_shifts_px(_with(result, claimed), MODELS, CAMERA).values()) == {0.0}
+    claimed[2] = refined[2] @ se3.exp(np.array([0.0, 0.01, 0.0, 0.0, 0.0, 0.0]))
+    shifts = camera_shifts_px(_with(result, claimed), MODELS, CAMERA)
+    assert {k for (k, _), px in shifts.items() if px > 1e-9} == {2}
+    # A turn of 10 mrad about y moves what is near the middle by 3 px at f = 300.
+    assert all(px == pytest.approx(3.0, rel=0.12) for (k, _), px in shifts.items() if k == 2)
+    assert gain_picture(store, _with(result, claimed), MODELS) is not None
+
+
+def _with(result: Registered, claimed: dict[int, np.ndarray]) -> Registered:
+    """Return a registration with other claims."""
+    return replace(result, cameras=CameraChange(claimed=claimed, refined=result.cameras.refined))
+
+
+def test_a_zoomed_camera_sees_the_same_points_enlarged() -> None:
+    lens = np.array([-0.05, 0.06, 3e-4, -2e-4, 0.0])
+    raw = CameraIntrinsics(
+        width=1280, height=720, fx=645.0, fy=643.0, cx=640.3, cy=358.7, distortion=lens
+    )
+    points = np.random.default_rng(0).uniform([-0.2, -0.1, 0.4], [0.2, 0.1, 0.6], (50, 3))
+    uv = camera.project(raw, points)
+    zoomed = zoomed_camera(raw, (300, 200), 64, 10)
+    # A pixel's area, from its centre -1/2 to +1/2, becomes ten pixels.
+    expected = (uv - [300, 200] + 0.5) * 10 - 0.5
+    np.testing.assert_allclose(camera.project(zoomed, points), expected, atol=1e-9)
+    assert (zoomed.width, zoomed.height) == (640, 640)
+
+
+def test_first_surfaces_are_those_of_the_labels(result: Registered) -> None:
+    placed = placed_objects(result, MODELS)
+    T = result.cameras.refined[1]
+    ids, depth = FirstSurfaces(placed).look(CAMERA, T)
+    labels = LabelRenderer(placed).render(CAMERA, T)
+    assert np.array_equal(ids, labels.ids) and set(np.unique(ids)) == {-1, 0, 1}
+    assert np.array_equal(np.nan_to_num(depth), labels.depth_m)
+
+
+def test_the_window_shows_all_objects_in_the_picture_s_proportions() -> None:
+    ids = np.full((240, 320), -1, np.int32)
+    ids[100:120, 250:310] = 3
+    rows, columns = window_of(ids, PictureConfig())
+    assert rows.start <= 100 and rows.stop >= 120
+    assert columns.start <= 250 and columns.stop >= 310 and columns.stop <= 320
+    assert (columns.stop - columns.start) / (rows.stop - rows.start) == pytest.approx(4 / 3, 0.02)
+    assert window_of(np.full((240, 320), -1, np.int32), PictureConfig()) == (
+        slice(0, 240), slice(0, 320),
+    )  # fmt: skip
+
+
+def test_two_biases_one_after_the_other_are_one(result: Registered) -> None:
+    first, then = (
+        DepthBias(scale=1.004, offset_per_m=-0.003),
+        DepthBias(scale=0.998, offset_per_m=0.01),
+    )
+    report = {
+        "asked": {"depth_bias_taken_out": {"scale": 1.004, "offset_per_m": -0.003}},
+        "refinement": {"depth_scale": 0.998, "depth_offset_per_m": 0.01},
+    }
+    z = np.linspace(0.2, 1.5, 9)
+    both = bias_of(replace(result, report=report))
+    np.testing.assert_allclose(both.corrected(z), then.corrected(first.corrected(z)), rtol=1e-12)
+
+
+def test_pixel_sigma_is_what_random_poses_show() -> None:
+    rng = np.random.default_rng(4)
+    T_cam_obj = se3.exp(np.array([0.4, -0.2, 0.9, 0.02, -0.03, 0.45]))
+    A = rng.normal(size=(6, 6)) * np.repeat([2e-3, 3e-4], 3)[:, None]
+    points = part("mug").mesh.vertices[::50]
+    there = camera.project(CAMERA, se3.transform(T_cam_obj, points))
+    seen = [
+        camera.project(CAMERA, se3.transform(T_cam_obj @ se3.exp(A @ rng.normal(size=6)), points))
+        for _ in range(2000)
+    ]
+    spread = np.sqrt(np.mean(np.sum((np.array(seen) - there) ** 2, axis=-1)))
+    assert pixel_sigma(CAMERA, T_cam_obj, A @ A.T, points) == pytest.approx(spread, rel=0.06)
+    assert np.isnan(pixel_sigma(CAMERA, T_cam_obj, np.full((6, 6), np.nan), points))
+
+
+def test_a_turn_that_cannot_be_seen_is_no_pixel_uncertainty() -> None:
+    tube = part("tube")
+    points = tube.mesh.vertices[::20]
+    axis, place = tube.symmetry_axes[0]
+    free = np.concatenate([axis, -np.cross(axis, place)])
+    rest = np.diag([1e-3, 2e-3, 0.0, 1e-4, 2e-4, 3e-4]) ** 2
+    both = without_free_turns(rest + 0.25 * np.outer(free, free), tube, points)
+    np.testing.assert_allclose(both, without_free_turns(rest, tube, points), atol=1e-15)
+    # A part without such an axis keeps everything.
+    assert np.array_equal(without_free_turns(rest, part("wedge"), points), rest)
+
+
+def test_the_ellipse_is_where_random_poses_put_the_middle() -> None:
+    rng = np.random.default_rng(5)
+    model = part("mug")
+    A = rng.normal(size=(6, 6)) * np.repeat([3e-3, 5e-4], 3)[:, None]
+    T, T_map_world = se3.exp(rng.normal(size=6) * 0.5), se3.exp(rng.normal(size=6) * 0.5)
+    pose = ObjectPose(obj_id=model.obj_id, instance=0, T_world_obj=T, covariance=A @ A.T)
+    middle = model.mesh.bounds.mean(0)[None]
+    places = [
+        1e3 * se3.transform(T_map_world @ T @ se3.exp(A @ rng.normal(size=6)), middle)[0, :2]
+        for _ in range(4000)
+    ]
+    C = place_covariance_mm2(pose, model, T_map_world)
+    assert C is not None
+    np.testing.assert_allclose(C, np.cov(np.array(places).T), atol=0.08 * np.trace(C))
+
+
+def test_a_footprint_holds_every_vertex() -> None:
+    model = part("wedge")
+    T = se3.exp(np.array([0.2, 0.5, -0.4, 0.1, 0.2, 0.0]))
+    outline = footprint_mm(model, T)
+    points = 1e3 * se3.transform(T, model.mesh.vertices)[:, :2]
+    following = np.roll(outline, -1, axis=0)
+    for a, b in zip(outline, following, strict=True):
+        side = (b - a)[0] * (points - a)[:, 1] - (b - a)[1] * (points - a)[:, 0]
+        assert side.min() > -1e-6  # the outline runs counter-clockwise
+
+
+def test_objects_are_listed_worst_first(result: Registered) -> None:
+    assert [o.verdict for o in worst_first(result)] == ["doubtful", "accepted"]
+    rows = object_rows(result, MODELS)
+    assert rows[0][0] == "1 wedge" and rows[0][-1] == "half of it is hidden."
+    assert rows[1][2:7] == ["97.0", "0.990", "0.30", "0.17", "0.25"]
+
+
+def test_pictures_of_a_single_view(store: SessionStore, result: Registered) -> None:
+    alone = {0: result.cameras.refined[0]}
+    one = replace(result, cameras=CameraChange(claimed=dict(alone), refined=alone))
+    assert set(draw_pictures(store, one, MODELS)) == {"overlay.jpg", "residuals.jpg", "map.png"}

@@ -1,0 +1,167 @@
+"""Whether depth lies on colour is told on simulated and on real images, shifted on purpose."""
+
+import json
+import os
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.records import CameraIntrinsics
+from realsim.registration.depth_alignment import (
+    AlignmentConfig,
+    check_alignment,
+    pooled_alignment,
+)
+from realsim.registration.simulated import seen_instances
+from table_scenes import small_scene
+
+ROOT = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get("REALSIM_DATA", ROOT.parent / "shared" / "data"))
+SCENES = DATA / "scenes"
+CONFIG = AlignmentConfig()
+real = [
+    pytest.mark.real,
+    pytest.mark.skipif(not SCENES.is_dir(), reason=f"no scenes under {DATA} (set REALSIM_DATA)"),
+]
+
+
+def warped(depth, sx=1.0, sy=1.0, dx=0.0, dy=0.0):
+    """Depth stretched about the image's middle and moved."""
+    h, w = depth.shape
+    M = np.array([[sx, 0, w / 2 * (1 - sx) + dx], [0, sy, h / 2 * (1 - sy) + dy]])
+    return cv2.warpAffine(depth, M, (w, h), flags=cv2.INTER_NEAREST)
+
+
+@lru_cache(maxsize=1)
+def painted():
+    """Camera, and pairs of a colour and a depth image of simulated objects, 640 px wide."""
+    scene = small_scene(5, 6, 6)
+    rng = np.random.default_rng(0)
+    paint = rng.integers(30, 230, (8, 3))
+    shown = seen_instances(scene, range(4))
+    pairs = []
+    for labels, frame in zip(shown, scene.frames[:4], strict=True):
+        rgb = paint[labels] + rng.normal(0, 4, (*labels.shape, 3))
+        big = (640, 360)
+        rgb = cv2.resize(np.clip(rgb, 0, 255).astype(np.uint8), big, interpolation=cv2.INTER_LINEAR)
+        pairs.append((rgb, cv2.resize(frame.depth_m, big, interpolation=cv2.INTER_NEAREST)))
+    camera = CameraIntrinsics(width=640, height=360, fx=324, fy=324, cx=319.5, cy=179.5)
+    return camera, pairs
+
+
+def pooled(camera, pairs, **warp):
+    found = [check_alignment(rgb, warped(d, **warp), camera, CONFIG) for rgb, d in pairs]
+    return pooled_alignment(found, CONFIG)
+
+
+def test_simulated_depth_is_aligned():
+    found = pooled(*painted())
+    assert found.kind == "aligned" and found.agreeing == found.views == 4
+    assert np.hypot(*found.shift_px) < 2
+
+
+@pytest.mark.parametrize(("dx", "dy", "side"), [(-14, 0, "14 px to the left"), (9, 12, "below")])
+def test_a_shift_is_measured(dx, dy, side):
+    still, found = pooled(*painted()), pooled(*painted(), dx=dx, dy=dy)
+    assert found.kind == "not_aligned" and found.stretch == (1.0, 1.0)
+    moved = np.array(found.shift_px) - still.shift_px
+    assert np.allclose(moved, [dx, dy], atol=1.0)
+    assert side in found.words and f"{found.agreeing} of 4 views" in found.words
+    assert found.agreeing >= 3
+
+
+def test_a_stretch_is_measured():
+    found = pooled(*painted(), sx=0.85, sy=1.12)
+    assert found.kind == "not_aligned"
+    assert np.allclose(found.stretch, [1 / 0.85, 1 / 1.12], rtol=0.025)
+    assert "stretched" in found.words
+
+
+def test_depth_of_other_views_says_nothing():
+    camera, pairs = painted()
+    mixed = [(pairs[k][0], pairs[(k + 2) % 4][1][:, ::-1].copy()) for k in range(4)]
+    assert pooled(camera, mixed).kind == "unknown"
+
+
+def test_a_bare_table_says_nothing():
+    camera, pairs = painted()
+    found = check_alignment(pairs[0][0], np.full((360, 640), 0.4, np.float32), camera, CONFIG)
+    assert found.kind == "unknown" and "0 pixels of outlines" in found.words
+    assert pooled_alignment([found], CONFIG).kind == "unknown"
+
+
+def test_another_size_is_named_at_once():
+    camera, pairs = painted()
+    found = check_alignment(pairs[0][0], pairs[0][1][:, :600], camera, CONFIG)
+    assert found.kind == "other_size" and "600x360" in found.words and "640x360" in found.words
+    assert pooled_alignment([found], CONFIG).kind == "other_size"
+
+
+def test_senseless_images_are_errors():
+    camera, pairs = painted()
+    with pytest.raises(InputError, match="8-bit"):
+        check_alignment(pairs[0][0][..., 0], pairs[0][1], camera, CONFIG)
+    with pytest.raises(InputError, match="at least one"):
+        pooled_alignment([], CONFIG)
+
+
+# --- real data --------------------------------------------------------------------------------
+
+
+def ycbv():
+    pairs = []
+    for scene in (50, 51, 54):
+        folder = SCENES / "ycbv_mini/test" / f"{scene:06d}"
+        unit = next(iter(json.loads((folder / "scene_camera.json").read_text()).values()))
+        counts = cv2.imread(str(next((folder / "depth").iterdir())), cv2.IMREAD_UNCHANGED)
+        rgb = cv2.imread(str(next((folder / "rgb").iterdir())))[..., ::-1].copy()
+        pairs.append((rgb, (counts * (unit["depth_scale"] / 1000)).astype(np.float32)))
+    return CameraIntrinsics.from_K(unit["cam_K"], 640, 480), pairs
+
+
+def apc():
+    folder, pairs = SCENES / "apc_shelf_multiview/scene-0000", []
+    for k in range(4):
+        v = cv2.imread(str(folder / f"frame-{k:06d}.depth.png"), cv2.IMREAD_UNCHANGED)
+        counts = ((v >> 3) | (v << 13)).astype(np.uint16)  # the format's rotated bits, 0.1 mm
+        rgb = cv2.imread(str(folder / f"frame-{k:06d}.color.png"))[..., ::-1].copy()
+        pairs.append((rgb, counts.astype(np.float32) * np.float32(1e-4)))
+    return CameraIntrinsics(width=640, height=480, fx=615.2, fy=615.2, cx=298.4, cy=247.5), pairs
+
+
+def graspnet():
+    folder = SCENES / "graspnet_demo_frame"
+    counts = cv2.imread(str(folder / "depth.png"), cv2.IMREAD_UNCHANGED)
+    rgb = cv2.imread(str(folder / "color.png"))[..., ::-1].copy()
+    camera = CameraIntrinsics(width=1280, height=720, fx=631.55, fy=631.21, cx=638.44, cy=366.5)
+    return camera, [(rgb, counts.astype(np.float32) / 1000)]
+
+
+class TestReal:
+    pytestmark = real
+
+    @pytest.mark.parametrize("read", [ycbv, apc, graspnet])
+    def test_published_images_are_aligned(self, read):
+        found = pooled(*read())
+        assert found.kind == "aligned" and found.agreeing == found.views
+
+    @pytest.mark.parametrize("read", [ycbv, apc, graspnet])
+    def test_and_no_longer_when_shifted(self, read):
+        camera, pairs = read()
+        dx = 14 * camera.width / 640
+        still, found = pooled(camera, pairs), pooled(camera, pairs, dx=-dx)
+        assert found.kind == "not_aligned" and "left" in found.words
+        assert abs(found.shift_px[0] - still.shift_px[0] + dx) < 2 * camera.width / 640
+        assert found.agreeing == found.views
+
+    def test_raw_depth_of_another_size_is_named(self):
+        folder = DATA / "handeye/rtde_ur5e/Hand-Eye-Data"
+        rgb = cv2.imread(str(folder / "1.jpg"))[..., ::-1].copy()
+        counts = cv2.imread(str(folder / "1.png"), cv2.IMREAD_UNCHANGED)
+        camera = CameraIntrinsics(width=1920, height=1080, fx=1360, fy=1360, cx=960, cy=540)
+        found = check_alignment(rgb, counts.astype(np.float32) / 1000, camera, CONFIG)
+        assert found.kind == "other_size" and "1024x768" in found.words

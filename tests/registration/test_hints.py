@@ -1,0 +1,329 @@
+"""Hints lead to regions that hold the object; what cannot be meant is an error with its row."""
+
+import json
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError, NotRigidError, UnitError
+from realsim.geometry import se3
+from realsim.records import CaptureSession, SupportPlane, View
+from realsim.registration.hints import (
+    Box,
+    Click,
+    Hint,
+    HintConfig,
+    HintScene,
+    Marked,
+    RoughPose,
+    parse_object,
+    parse_objects,
+    read_hints,
+    read_starts,
+    region_of,
+    save_hints,
+    wanted_objects,
+)
+from realsim.registration.simulated import seen_instances
+from realsim.store import SessionStore
+from table_scenes import part_models, small_scene
+
+CONFIG = HintConfig()
+TABLE = SupportPlane(T_world_table=np.eye(4))
+
+
+@lru_cache(maxsize=4)
+def setting(seed: int):
+    """A simulated scene, its hint scene, and (F, H, W) which instance is seen where."""
+    scene = small_scene(seed, 6, 8)
+    frames = {f.index: f for f in scene.frames}
+    shown = seen_instances(scene, range(8))
+    return scene, HintScene(intrinsics=scene.intrinsics, frames=frames, plane=TABLE), shown
+
+
+def seen_well(seed: int, least: int = 150):
+    """Return (view, pose, model, rows, columns) of every object that a view sees well."""
+    scene, _, shown = setting(seed)
+    for view in range(8):
+        for pose in scene.truth:
+            rows, columns = np.nonzero(shown[view] == pose.instance)
+            if len(rows) >= least:
+                yield view, pose, scene.models[pose.obj_id], rows, columns
+
+
+def middle_of(pose, model):
+    return se3.transform(pose.T_world_obj, model.mesh.bounds.mean(0))[0]
+
+
+def radius_of(model):
+    return 0.5 * float(np.linalg.norm(model.mesh.extent))
+
+
+def check_region(hint, model, scene, pose):
+    region = region_of(hint, model, scene, CONFIG)
+    assert region is not None
+    gap = float(np.linalg.norm(region.center_world - middle_of(pose, model)))
+    assert gap <= region.radius_m
+    return region
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_any_click_on_an_object_leads_to_it(seed):
+    _, scene, _ = setting(seed)
+    rng, count, tried = np.random.default_rng(seed), 0, 0
+    for view, pose, model, rows, columns in seen_well(seed):
+        for i in rng.integers(0, len(rows), 4):
+            click = Click(view=view, pixel=(float(columns[i]), float(rows[i])))
+            hint = Hint(obj_id=pose.obj_id, instance=pose.instance, where=click)
+            region = region_of(hint, model, scene, CONFIG)
+            assert region is not None and region.R_world_obj is None
+            assert region.radius_m < 1.5 * radius_of(model) + CONFIG.slack_m
+            gap = np.linalg.norm(region.center_world - middle_of(pose, model))
+            # At an outline the 5 x 5 pixels may lie on what is behind.
+            count += gap > region.radius_m
+            tried += 1
+    assert tried > 60 and count <= 0.03 * tried
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_boxes_and_masks_lead_to_the_object(seed):
+    _, scene, shown = setting(seed)
+    import cv2
+
+    tried = 0
+    for view, pose, model, rows, columns in seen_well(seed):
+        x, y = float(columns.min()), float(rows.min())
+        xywh = (x - 3, y - 3, float(np.ptp(columns)) + 7, float(np.ptp(rows)) + 7)
+        box = Hint(obj_id=pose.obj_id, instance=0, where=Box(view=view, xywh=xywh))
+        check_region(box, model, scene, pose)
+        # A network's mask: too fat by 4 px, so that it holds table and neighbours.
+        exact = (shown[view] == pose.instance).astype(np.uint8)
+        fat = np.asarray(cv2.dilate(exact, np.ones((9, 9), np.uint8))) > 0
+        mask = Hint(obj_id=pose.obj_id, instance=0, where=Marked(view=view, inside=fat))
+        check_region(mask, model, scene, pose)
+        tried += 1
+    assert tried > 15
+
+
+def test_without_depth_the_table_tells():
+    scene_, scene, _ = setting(1)
+    frames = {
+        k: type(f)(index=k, depth_m=np.zeros_like(f.depth_m), T_world_cam=f.T_world_cam)
+        for k, f in scene.frames.items()
+    }
+    blind = HintScene(intrinsics=scene.intrinsics, frames=frames, plane=TABLE)
+    for view, pose, model, rows, columns in seen_well(1):
+        click = Click(view=view, pixel=(float(np.median(columns)), float(np.median(rows))))
+        hint = Hint(obj_id=pose.obj_id, instance=0, where=click)
+        check_region(hint, model, blind, pose)
+        with pytest.raises(InputError, match="no depth is measured"):
+            region_of(hint, model, HintScene(intrinsics=scene.intrinsics, frames=frames), CONFIG)
+    assert len(scene_.truth) == 6
+
+
+def test_regions_move_with_the_world():
+    _, scene, _ = setting(1)
+    T = se3.from_rt(se3.exp_so3([0.2, 0.5, -1.0]), [1.0, -2.0, 0.5])
+    frames = {
+        k: type(f)(index=k, depth_m=f.depth_m, T_world_cam=T @ f.T_world_cam)
+        for k, f in scene.frames.items()
+    }
+    there = HintScene(
+        intrinsics=scene.intrinsics, frames=frames, plane=SupportPlane(T_world_table=T)
+    )
+    view, pose, model, rows, columns = next(seen_well(1))
+    box = Box(view=view, xywh=(columns.min(), rows.min(), np.ptp(columns), np.ptp(rows)))
+    hint = Hint(obj_id=pose.obj_id, instance=0, where=box)
+    a, b = (region_of(hint, model, s, CONFIG) for s in (scene, there))
+    assert a is not None and b is not None and a.radius_m == pytest.approx(b.radius_m)
+    assert np.allclose(se3.transform(T, a.center_world), b.center_world, atol=1e-6)
+
+
+def test_a_rough_pose_keeps_its_accuracy():
+    scene, hints, _ = setting(1)
+    pose = scene.truth[0]
+    model = scene.models[pose.obj_id]
+    where = RoughPose(T_world_obj=pose.T_world_obj, radius_m=0.02, turn_deg=15)
+    wanted = wanted_objects(
+        [Hint(obj_id=pose.obj_id, instance=4, where=where), Hint(obj_id=pose.obj_id, instance=5)],
+        scene.models, hints, CONFIG,
+    )  # fmt: skip
+    region = wanted[0].region
+    assert region is not None and wanted[1].region is None and wanted[1].T_start is None
+    assert (region.radius_m, region.turn_deg) == (0.02, 15)
+    assert np.allclose(region.center_world, middle_of(pose, model))
+    assert region.R_world_obj is not None
+    assert np.array_equal(region.R_world_obj, pose.T_world_obj[:3, :3])
+    assert wanted[0].T_start is not None and wanted[0].instance == 4
+
+
+@pytest.mark.parametrize(
+    ("where", "words"),
+    [
+        (Click(view=99, pixel=(1, 1)), "view 99"),
+        (Click(view=0, pixel=(320.0, 5.0)), "320x180"),
+        (Click(view=0, pixel=(5.0, -1.0)), "-1"),
+        (Box(view=0, xywh=(400, 10, 20, 20)), "outside"),
+        (Box(view=0, xywh=(40, 10, 0, 20)), "positive"),
+        (Marked(view=0, inside=np.ones((90, 160), dtype=bool)), "160x90"),
+        (Marked(view=0, inside=np.zeros((180, 320), dtype=bool)), "empty"),
+    ],
+)
+def test_places_that_cannot_be_meant_are_errors(where, words):
+    scene, hints, _ = setting(1)
+    pose = scene.truth[0]
+    with pytest.raises(InputError, match=words):
+        region_of(
+            Hint(obj_id=pose.obj_id, instance=0, where=where), scene.models[pose.obj_id], hints,
+            CONFIG,
+        )  # fmt: skip
+
+
+# --- typed ------------------------------------------------------------------------------------
+
+
+def test_typed_objects_are_understood():
+    models = part_models()
+    obj_id = 5
+    name = models[obj_id].name
+    for text in (str(obj_id), name):
+        (hint,) = parse_object(text, models)
+        assert (hint.obj_id, hint.instance, hint.where) == (obj_id, 0, None)
+    assert [h.instance for h in parse_object(f"{name}x3", models)] == [0, 1, 2]
+    (click,) = parse_object("5@view3:640,360.5", models)
+    assert isinstance(click.where, Click)
+    assert (click.where.view, click.where.pixel) == (3, (640.0, 360.5))
+    (box,) = parse_object(f"{name}@view12:100,80,60x40", models)
+    assert isinstance(box.where, Box)
+    assert (box.where.view, box.where.xywh) == (12, (100.0, 80.0, 60.0, 40.0))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("999", "no object '999'"),
+        ("zebra", "no object 'zebra'"),
+        ("5@view3", "does not name"),
+        ("5@3:1,2", "does not name"),
+        ("5@view3:1,2,3", "does not name"),
+        ("5x0", "at least 1"),
+        ("5x2@view0:1,2", "one place"),
+        ("", "does not name"),
+    ],
+)
+def test_typed_nonsense_is_an_error(text, words):
+    with pytest.raises(InputError, match=words):
+        parse_object(text, part_models())
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def store(tmp_path):
+    scene, _, _ = setting(1)
+    session = CaptureSession(name="table", intrinsics=scene.intrinsics, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(tmp_path / "session", session)
+    grey = np.zeros((180, 320, 3), np.uint8)
+    for f in scene.frames:
+        store.add_view(View(index=f.index, T_world_cam=f.T_world_cam), grey, f.depth_m)
+    return store
+
+
+def test_hints_come_back_from_the_file(store):
+    scene, _, shown = setting(1)
+    a, b, c, d, e = (p.obj_id for p in scene.truth[:5])
+    inside = shown[0] == scene.truth[4].instance
+    T = scene.truth[0].T_world_obj
+    hints = [
+        Hint(obj_id=a, instance=0, where=RoughPose(T_world_obj=T, radius_m=0.03, turn_deg=20.0)),
+        Hint(obj_id=b, instance=1, where=Click(view=0, pixel=(160.0, 90.0))),
+        Hint(obj_id=c, instance=2, where=Box(view=1, xywh=(100.0, 50.0, 60.0, 40.0))),
+        Hint(obj_id=d, instance=3),
+        Hint(obj_id=e, instance=7, where=Marked(view=0, inside=inside)),
+    ]
+    save_hints(store, hints, "a person")
+    path = store.path("registration/starts.json")
+    back = read_hints(path, part_models())
+    assert [(h.obj_id, h.instance, type(h.where)) for h in back] == [
+        (h.obj_id, h.instance, type(h.where)) for h in hints
+    ]
+    pose, click, box, _, mask = (h.where for h in back)
+    assert isinstance(pose, RoughPose) and np.array_equal(pose.T_world_obj, T)
+    assert (pose.radius_m, pose.turn_deg) == (pytest.approx(0.03), 20.0)
+    assert isinstance(click, Click) and click.pixel == (160.0, 90.0)
+    assert isinstance(box, Box) and box.xywh == (100.0, 50.0, 60.0, 40.0)
+    assert isinstance(mask, Marked) and np.array_equal(mask.inside, inside)
+    assert store.verify() == [] and json.loads(path.read_text())["source"] == "a person"
+    wanted = read_starts(path, part_models(), store)
+    assert [w.region is None for w in wanted] == [False, False, False, True, False]
+    region = wanted[4].region
+    assert region is not None
+    true = middle_of(scene.truth[4], scene.models[e])
+    assert np.linalg.norm(region.center_world - true) <= region.radius_m
+
+
+def test_typed_places_become_regions_in_a_session(store):
+    view, pose, model, rows, columns = next(seen_well(1))
+    i = len(rows) // 2
+    texts = [f"{pose.obj_id}@view{view}:{columns[i]},{rows[i]}", f"{pose.obj_id}x2"]
+    wanted = parse_objects(texts, part_models(), store)
+    assert [w.instance for w in wanted] == [0, 1, 2]
+    region = wanted[0].region
+    assert region is not None and wanted[1].region is None
+    assert np.linalg.norm(region.center_world - middle_of(pose, model)) <= region.radius_m
+    with pytest.raises(InputError, match="view 77"):
+        parse_objects(["5@view77:1,2"], part_models(), store)
+
+
+def test_files_of_rough_poses_are_read_as_ever(tmp_path):
+    T = se3.from_translation([0.4, 0.1, 0.05])
+    rows = [{"obj_id": 5, "instance": 3, "T_world_obj": T.tolist()}]
+    (tmp_path / "starts.json").write_text(json.dumps({"source": "cosypose", "starts": rows}))
+    (hint,) = read_hints(tmp_path / "starts.json", part_models())
+    assert isinstance(hint.where, RoughPose) and hint.where.radius_m is None
+    assert (hint.obj_id, hint.instance) == (5, 3) and np.array_equal(hint.where.T_world_obj, T)
+
+
+EYE = np.eye(4).tolist()
+FAR = se3.from_translation([400.0, 100.0, 50.0]).tolist()
+SHEARED = (np.eye(4) + np.eye(4, k=1) * 0.3).tolist()
+
+
+@pytest.mark.parametrize(
+    ("row", "error", "words"),
+    [
+        ({"obj_id": 5, "clik": {}}, InputError, "row 1 has the key 'clik'"),
+        ({"obj_id": 999}, InputError, "row 1: obj_id is 999"),
+        ({"obj_id": "5"}, InputError, "obj_id is '5'"),
+        ({"obj_id": 5, "instance": 0}, InputError, "row 1: instance 0 is there twice"),
+        ({"obj_id": 5, "instance": -1}, InputError, "instance is -1"),
+        ({"obj_id": 5, "T_world_obj": FAR}, UnitError, "row 1.*millimetres"),
+        ({"obj_id": 5, "T_world_obj": SHEARED}, NotRigidError, "row 1"),
+        ({"obj_id": 5, "T_world_obj": [[1, 2]]}, InputError, "row 1"),
+        ({"obj_id": 5, "T_world_obj": EYE, "radius_mm": -3}, InputError, "positive"),
+        ({"obj_id": 5, "radius_mm": 3}, InputError, "belong to T_world_obj"),
+        ({"obj_id": 5, "click": {"pixel": [1, 2]}}, InputError, "view and pixel"),
+        ({"obj_id": 5, "click": {"view": 0, "pixel": [1]}}, InputError, "2 finite numbers"),
+        ({"obj_id": 5, "box": {"view": 0, "xywh": [1, 2, "a", 4]}}, InputError, "4 finite"),
+        ({"obj_id": 5, "mask": {"view": 0, "file": "none.png"}}, InputError, "no mask"),
+        (
+            {"obj_id": 5, "T_world_obj": EYE, "click": {"view": 0, "pixel": [1, 2]}},
+            InputError, "twice: T_world_obj and click",
+        ),
+        (7, InputError, "row 1 is 7"),
+    ],
+)  # fmt: skip
+def test_a_wrong_row_is_named(tmp_path, row, error, words):
+    path = tmp_path / "starts.json"
+    path.write_text(json.dumps({"starts": [{"obj_id": 5, "instance": 0}, row]}))
+    with pytest.raises(error, match=words):
+        read_hints(path, part_models())
+
+
+def test_a_file_without_rows_is_an_error(tmp_path):
+    path = tmp_path / "starts.json"
+    path.write_text(json.dumps({"objects": []}))
+    with pytest.raises(InputError, match="no list 'starts'; it has: objects"):
+        read_hints(path, part_models())

@@ -1,0 +1,228 @@
+"""From depth images to points, noise, table and sound views; frames that are read when asked."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from table_scenes import SMALL_LAB, small_scene
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records.depth_bias import DepthBias
+from realsim.registration.body import make_body
+from realsim.registration.config import RegistrationConfig
+from realsim.registration.evidence import DepthFrame, LazyFrame, corrected_frame, held
+from realsim.registration.intake import sampling, scene_cloud, take_in
+from realsim.registration.simulated import TableScene
+from realsim.registration.simulated_faults import foreign, shifted_view, without_any_depth
+from realsim.registration.simulated_lab import camera_of
+
+CONFIG = RegistrationConfig()
+Image = NDArray[np.float32]
+
+
+def scene() -> TableScene:
+    return small_scene(0)
+
+
+def taken(frames, config: RegistrationConfig = CONFIG):
+    return take_in(scene().intrinsics, frames, config)
+
+
+# --- frames that are read when asked -------------------------------------------------------------
+
+
+class Reader:
+    """An image on disk, so to speak: it counts how often it is read."""
+
+    def __init__(self, image: Image) -> None:
+        self.image, self.times = image, 0
+
+    def __call__(self) -> Image:
+        self.times += 1
+        return self.image
+
+
+def test_a_lazy_frame_reads_when_asked_and_keeps_nothing():
+    reader = Reader(np.full((3, 4), 0.5, np.float32))
+    T = se3.random_transform(np.random.default_rng(0))
+    frame = LazyFrame(7, T, reader)
+    assert frame.index == 7 and frame.T_world_cam is T and reader.times == 0
+    assert frame.depth_m is reader.image and frame.depth_m is reader.image
+    assert reader.times == 2
+    kept = held(frame)
+    assert reader.times == 3
+    assert kept.depth_m is reader.image and kept.depth_m is reader.image
+    assert reader.times == 3 and isinstance(frame, DepthFrame)
+    with pytest.raises(AttributeError):
+        frame.depth_m = reader.image  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_a_corrected_frame_has_its_bias_taken_out_and_its_camera_moved():
+    bias = DepthBias(scale=1.01, offset_per_m=-0.02)
+    z = np.array([[0.0, 0.2, 0.4]], np.float32)
+    reader = Reader(bias.measured(z).astype(np.float32))
+    T = se3.from_translation([1, 2, 3])
+    frame = corrected_frame(LazyFrame(3, np.eye(4), reader), T, bias)
+    assert reader.times == 0
+    np.testing.assert_allclose(frame.depth_m, z, atol=1e-7)
+    assert frame.depth_m.dtype == np.float32 and frame.index == 3
+    np.testing.assert_array_equal(frame.T_world_cam, T)
+    twice = corrected_frame(frame, np.eye(4), DepthBias(scale=2.0 / 1.5))
+    np.testing.assert_allclose(twice.depth_m, 0.75 * z, atol=1e-7)
+
+
+def test_a_lazy_frame_may_be_given_in_place_of_an_image():
+    readers = [Reader(f.depth_m) for f in scene().frames]
+    lazy = [
+        LazyFrame(f.index, f.T_world_cam, r) for f, r in zip(scene().frames, readers, strict=True)
+    ]
+    here, there = taken(scene().frames), taken(lazy)
+    for a, b in zip(here.views, there.views, strict=True):
+        assert a.points.tobytes() == b.points.tobytes()
+    # Once for the points, and once more for the noise of some.
+    assert max(r.times for r in readers) <= 3
+
+
+def test_a_lazy_frame_can_be_replaced_like_any_other():
+    reader = Reader(np.ones((2, 2), np.float32))
+    frame = LazyFrame(1, np.eye(4), reader)
+    assert replace(frame, depth_m=2 * reader.image).depth_m[0, 0] == 2
+    with pytest.raises(InputError, match="view 1 has neither"):
+        LazyFrame(1, np.eye(4))
+    moved = replace(frame, T_world_cam=se3.from_translation([0, 0, 1]))
+    assert moved.index == 1 and moved.depth_m.shape == (2, 2) and moved.T_world_cam[2, 3] == 1
+
+
+# --- thinning out --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "width, frames, stride, reach",
+    [(1280, 32, 4, 3), (1280, 256, 8, 3), (640, 32, 2, 2), (320, 32, 1, 1), (2560, 32, 4, 3)],
+)
+def test_images_are_thinned_out_by_size_and_number(width, frames, stride, reach):
+    camera = camera_of(replace(SMALL_LAB, width=width, height=width * 9 // 16))
+    found = sampling(camera, frames, CONFIG)
+    assert (found.stride, found.edge_reach_px) == (stride, reach)
+
+
+# --- what is taken in ----------------------------------------------------------------------------
+
+
+def test_table_noise_and_points_are_those_of_the_scene():
+    intake = taken(scene().frames)
+    assert intake.findings == () and len(intake.views) == SMALL_LAB.views
+    assert intake.plane is not None and intake.no_plane == ""
+    T = intake.plane.T_world_table
+    assert np.degrees(np.arccos(T[2, 2])) < 0.1 and abs(T[2, 3]) < 7e-4
+    k = scene().sensor.disparity_noise_px / (scene().intrinsics.fx * 0.018)
+    assert intake.noise.per_m == pytest.approx(k, rel=0.35)
+    np.testing.assert_array_equal(intake.cameras, scene().Ts_world_cam_claimed)
+
+
+def test_frames_come_in_the_order_of_their_numbers():
+    here, there = taken(scene().frames), taken(scene().frames[::-1])
+    assert [f.index for f in there.frames] == list(range(SMALL_LAB.views))
+    assert [v.index for v in there.views] == [f.index for f in there.frames]
+    assert here.plane is not None and there.plane is not None
+    np.testing.assert_array_equal(here.plane.T_world_table, there.plane.T_world_table)
+
+
+def test_a_known_bias_is_taken_out():
+    bias = DepthBias(scale=1.003, offset_per_m=-0.01)
+    spoilt = [
+        replace(f, depth_m=np.where(f.depth_m > 0, bias.measured(f.depth_m), 0).astype(np.float32))
+        for f in scene().frames
+    ]
+    here, there = taken(scene().frames), taken(spoilt, RegistrationConfig(bias=bias))
+    for a, b in zip(here.views, there.views, strict=True):
+        assert abs(len(a.points) - len(b.points)) < 0.001 * len(a.points)
+        assert b.points[:, 2].mean() == pytest.approx(a.points[:, 2].mean(), abs=5e-6)
+    np.testing.assert_allclose(there.frames[0].depth_m, scene().frames[0].depth_m, atol=1e-6)
+    # What is only unsure leaves the images as they are.
+    unsure = taken(scene().frames, RegistrationConfig(bias=DepthBias.unmeasured()))
+    assert unsure.frames[0].depth_m is scene().frames[0].depth_m
+
+
+def test_progress_is_told_for_every_frame():
+    seen: list[int] = []
+    take_in(scene().intrinsics, scene().frames, CONFIG, progress=lambda: seen.append(1))
+    assert len(seen) == SMALL_LAB.views
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan])
+def test_an_empty_view_is_left_out_and_named(value: float):
+    frames = list(scene().frames)
+    frames[0] = replace(frames[0], depth_m=np.full_like(frames[0].depth_m, value))
+    frames[5] = without_any_depth(frames[5])
+    intake = taken(frames)
+    assert [f.index for f in intake.frames] == [k for k in range(12) if k not in (0, 5)]
+    assert [v.index for v in intake.views] == [f.index for f in intake.frames]
+    found = {f.index: f for f in intake.findings}
+    assert set(found) == {0, 5} and all(f.exclude for f in found.values())
+    assert "view 5" in found[5].words and "empty" in found[5].words
+
+
+def test_a_view_of_another_scene_and_a_slipped_view_are_named():
+    frames = list(scene().frames)
+    frames[4] = foreign(frames[4], small_scene(1).frames[4])
+    frames[9] = shifted_view(frames[9], [0.02, -0.03, 0.01, 0.012, 0.0, 0.008])
+    intake = taken(frames)
+    assert {f.index for f in intake.findings} == {4, 9}
+    left = {f.index for f in intake.frames}
+    assert left == set(range(12)) - {f.index for f in intake.findings if f.exclude}
+    assert intake.plane is not None and abs(intake.plane.T_world_table[2, 3]) < 1e-3
+
+
+def test_noise_is_measured_although_every_other_view_is_empty():
+    frames = [f if f.index % 2 else without_any_depth(f) for f in scene().frames]
+    frames += [replace(f, index=20 + f.index) for f in frames]  # every third is looked at
+    frames = [without_any_depth(f) if k % 3 == 0 else f for k, f in enumerate(frames)]
+    intake = taken(frames)
+    assert intake.noise.per_m == pytest.approx(taken(scene().frames).noise.per_m, rel=0.05)
+    assert len(intake.frames) == sum(bool(np.any(f.depth_m)) for f in frames)
+
+
+def test_nothing_to_use_is_refused_by_name():
+    with pytest.raises(InputError, match="at least one"):
+        taken([])
+    with pytest.raises(InputError, match="unique"):
+        taken([scene().frames[0], replace(scene().frames[1], index=0)])
+    empty = [without_any_depth(f) for f in scene().frames[:3]]
+    with pytest.raises(InputError, match="3 depth images.*all zero"):
+        taken(empty)
+    given = RegistrationConfig(evidence=replace(CONFIG.evidence, noise_per_m=0.007))
+    with pytest.raises(InputError, match=r"none of the 3 views can be used.*view 0.*view 2"):
+        taken(empty, given)
+    small = replace(scene().frames[1], depth_m=np.ones((9, 16), np.float32))
+    with pytest.raises(InputError, match="shape"):
+        taken([scene().frames[0], small])
+
+
+def test_one_view_is_enough():
+    intake = taken(scene().frames[:1])
+    assert len(intake.views) == 1 and intake.plane is not None
+
+
+def test_scene_cloud_is_what_stands_on_the_table():
+    intake = taken(scene().frames)
+    whole = scene_cloud(intake, scene().Ts_world_cam, intake.plane)
+    # Far away the table's own noise is higher than what stands on it.
+    cloud = whole.select(np.linalg.norm(whole.points[:, :2], axis=1) < 0.17)
+    distance = np.min(
+        [
+            np.abs(
+                make_body(p, scene().models[p.obj_id], 48, 50).field.distance(
+                    cloud.points, se3.invert(p.T_world_obj)
+                )
+            )
+            for p in scene().truth
+        ],
+        axis=0,
+    )
+    assert np.mean(distance < 2e-3) > 0.95
+    everything = scene_cloud(intake, scene().Ts_world_cam, None)
+    assert len(everything.points) > 2 * len(whole.points)
+    assert whole.points[:, 2].min() > 0.002

@@ -1,0 +1,192 @@
+"""How sure refined poses are: covariances that hold what they promise."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from table_scenes import named_scene
+
+from realsim.geometry import se3
+from realsim.geometry.camera import project
+from realsim.registration.body import Body, make_body
+from realsim.registration.config import RegistrationConfig
+from realsim.registration.intake import take_in
+from realsim.registration.refinement.equations import HAND_EYE, OBJECTS
+from realsim.registration.refinement.refine import Refined, refine
+from realsim.registration.refinement.uncertainty import (
+    SeenPose,
+    object_covariance,
+    seen_poses,
+)
+from realsim.registration.simulated import TableScene
+
+Array = NDArray[np.float64]
+NAMES = ("wedge", "l_bracket", "elbow", "t_profile")
+"""Parts without a symmetry about an axis: every turn is seen."""
+SEEDS = range(4)
+
+
+@lru_cache(maxsize=8)
+def refined_scene(seed: int) -> tuple[TableScene, list[Body], Refined]:
+    scene = named_scene(seed, NAMES)
+    intake = take_in(scene.intrinsics, scene.frames, RegistrationConfig())
+    bodies = [make_body(p, scene.models[p.obj_id], 96, 400) for p in scene.truth]
+    poses = [b.T_start for b in bodies]
+    result = refine(
+        scene.intrinsics, intake.views, bodies, poses, intake.plane, intake.noise
+    )
+    return scene, bodies, result
+
+
+@lru_cache(maxsize=8)
+def seen(seed: int) -> list[list[SeenPose]]:
+    scene, bodies, refined = refined_scene(seed)
+    return seen_poses(refined, bodies, scene.intrinsics)
+
+
+def normalised(xi: Array, C: Array) -> float:
+    return float(xi @ np.linalg.solve(C, xi)) / len(xi)
+
+
+# --- laws ----------------------------------------------------------------------------------------
+
+
+def test_covariances_are_symmetric_and_positive():
+    _, bodies, refined = refined_scene(0)
+    matrices = [object_covariance(refined, b, k) for k, b in enumerate(bodies)]
+    matrices += [s.covariance for of in seen(0) for s in of] + list(refined.covariance.views)
+    matrices.append(refined.covariance.shared)
+    for C in matrices:
+        np.testing.assert_allclose(C, C.T, atol=1e-9 * np.abs(C).max())
+        assert np.linalg.eigvalsh(C).min() > 0
+
+
+def test_covariance_is_about_the_objects_origin():
+    """Samples of the centred twist, applied as the refinement does, spread as it says."""
+    _, bodies, refined = refined_scene(0)
+    body, k = bodies[1], 1
+    at = slice(OBJECTS + 6 * k, OBJECTS + 6 * k + 6)
+    rng = np.random.default_rng(0)
+    eta = rng.multivariate_normal(np.zeros(6), refined.covariance.shared[at, at], 20_000)
+    c = se3.from_translation(body.center_obj)
+    xi = se3.log(c @ se3.exp(eta) @ se3.invert(c))
+    C = object_covariance(refined, body, k)
+    scale = np.sqrt(np.diag(C))
+    np.testing.assert_allclose(np.cov(xi.T) / np.outer(scale, scale), C / np.outer(scale, scale),
+                               atol=0.04)  # fmt: skip
+
+
+def test_pose_in_a_view_is_that_of_camera_and_object():
+    scene, bodies, refined = refined_scene(0)
+    for k in range(len(bodies)):
+        for v in range(len(scene.frames)):
+            T = refined.cameras[v] @ seen(0)[k][v].T_cam_obj
+            np.testing.assert_allclose(T, refined.poses[k], atol=1e-12)
+
+
+def test_covariance_in_a_view_is_that_of_samples_of_everything():
+    """Drawn together with their correlations: object, hand-eye and view."""
+    scene, bodies, refined = refined_scene(0)
+    rng = np.random.default_rng(1)
+    k, v, body = 2, 5, bodies[2]
+    C = refined.covariance
+    at = np.r_[
+        np.arange(OBJECTS + 6 * k, OBJECTS + 6 * k + 6), np.arange(HAND_EYE.start, HAND_EYE.stop)
+    ]
+    joint = np.block([
+        [C.shared[np.ix_(at, at)], C.cross[v][at]],
+        [C.cross[v][at].T, C.views[v]],
+    ])  # fmt: skip
+    x = rng.multivariate_normal(np.zeros(18), joint, 20_000)
+    c = se3.from_translation(body.center_obj)
+    object_ = refined.poses[k] @ c @ se3.exp(x[:, :6]) @ se3.invert(c)
+    camera = refined.cameras[v] @ se3.exp(x[:, 6:12] + x[:, 12:])
+    T = seen(0)[k][v].T_cam_obj
+    xi = se3.log(se3.invert(T) @ se3.invert(camera) @ object_)
+    expected = seen(0)[k][v].covariance
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(
+        np.cov(xi.T) / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.04
+    )
+    # And in pixels.
+    every = max(1, len(body.samples) // 40)
+    points = body.samples[::every]
+    uv = np.stack([
+        project(scene.intrinsics, se3.transform(se3.invert(cam) @ obj, points))
+        for cam, obj in zip(camera[:1500], object_[:1500], strict=True)
+    ])  # fmt: skip
+    spread = np.sqrt(uv.var(0).sum(-1).mean())
+    assert seen(0)[k][v].sigma_px == pytest.approx(spread, rel=0.05)
+
+
+def test_what_camera_and_object_have_in_common_does_not_count_twice():
+    _, bodies, refined = refined_scene(0)
+    for k, body in enumerate(bodies):
+        in_world = np.trace(object_covariance(refined, body, k)[3:, 3:])
+        in_view = np.median([np.trace(s.covariance[3:, 3:]) for s in seen(0)[k]])
+        cameras = np.trace(refined.covariance.shared[HAND_EYE, HAND_EYE][3:, 3:]) + np.median(
+            [np.trace(C[3:, 3:]) for C in refined.covariance.views]
+        )
+        assert in_view < in_world + cameras
+
+
+def test_fewer_views_are_less_sure():
+    scene, bodies, refined = refined_scene(0)
+    few = take_in(scene.intrinsics, scene.frames[:5], RegistrationConfig())
+    less = refine(
+        scene.intrinsics, few.views, bodies, [b.T_start for b in bodies], few.plane, few.noise
+    )
+    for k, body in enumerate(bodies):
+        many, few_ = (np.trace(object_covariance(r, body, k)[3:, 3:]) for r in (refined, less))
+        assert few_ > many
+
+
+def test_behind_the_camera_has_no_pixels():
+    scene, bodies, refined = refined_scene(0)
+    turned = refined.cameras.copy()
+    turned[0] = turned[0] @ se3.from_rt(se3.exp_so3([np.pi, 0, 0]), np.zeros(3))
+    around = seen_poses(replace(refined, cameras=turned), bodies, scene.intrinsics)
+    assert np.isnan(around[0][0].sigma_px) and np.isfinite(around[0][1].sigma_px)
+
+
+# --- statistics ----------------------------------------------------------------------------------
+
+
+def test_errors_are_as_large_as_the_covariance_says():
+    """The normalised square of six errors is 1 on average."""
+    in_world: list[float] = []
+    in_views: list[float] = []
+    hands: list[float] = []
+    for seed in SEEDS:
+        scene, bodies, refined = refined_scene(seed)
+        off = refined.state.hand_eye - se3.log(se3.invert(scene.T_ee_cam) @ scene.T_ee_cam_true)
+        hands.append(normalised(off, refined.covariance.shared[HAND_EYE, HAND_EYE]))
+        Ts_cam_world = se3.invert(scene.Ts_world_cam)
+        for k, (p, body) in enumerate(zip(scene.truth, bodies, strict=True)):
+            xi = se3.log(se3.invert(refined.poses[k]) @ p.T_world_obj)
+            in_world.append(normalised(xi, object_covariance(refined, body, k)))
+            for s, T in zip(seen(seed)[k], Ts_cam_world, strict=True):
+                xi = se3.log(se3.invert(s.T_cam_obj) @ T @ p.T_world_obj)
+                in_views.append(normalised(xi, s.covariance))
+    assert 0.3 < np.mean(in_world) < 3 and 0.3 < np.median(in_world) < 3
+    assert 0.3 < np.mean(in_views) < 3
+    assert 0.2 < np.mean(hands) < 3
+
+
+def test_pixels_are_off_by_as_much_as_said():
+    said: list[float] = []
+    true: list[float] = []
+    for seed in SEEDS:
+        scene, bodies, _ = refined_scene(seed)
+        for k, (p, body) in enumerate(zip(scene.truth, bodies, strict=True)):
+            for s, T in zip(seen(seed)[k], scene.Ts_world_cam, strict=True):
+                here = project(scene.intrinsics, se3.transform(s.T_cam_obj, body.samples))
+                T_true = se3.invert(T) @ p.T_world_obj
+                there = project(scene.intrinsics, se3.transform(T_true, body.samples))
+                true.append(float(np.mean(np.sum((here - there) ** 2, axis=1))))
+                said.append(s.sigma_px**2)
+    assert 0.3 < np.mean(true) / np.mean(said) < 3
+    # 320 px wide: a quarter of a D405's pixels.
+    assert np.sqrt(np.median(true)) < 0.25

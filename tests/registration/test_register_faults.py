@@ -1,0 +1,353 @@
+"""What a registration makes of bad input: named per object or per view, the rest goes on."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from table_scenes import named_scene, part_models
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.metrics import mssd_symmetric
+from realsim.geometry.parts import part
+from realsim.records import Mesh, ObjectModel, ObjectPose
+from realsim.registration.evidence import DepthFrame
+from realsim.registration.register import RegistrationConfig, register_scene
+from realsim.registration.result import Registration
+from realsim.registration.search.records import Region, Wanted
+from realsim.registration.simulated import TableScene
+from realsim.registration.simulated_faults import (
+    foreign,
+    shifted_view,
+    without_any_depth,
+    without_depth_on,
+)
+
+CONFIG = RegistrationConfig(field_cells=64, with_single_view=False)
+NAMES = ("wedge", "l_bracket", "elbow", "t_profile")
+RIGHT_MM = 1.5
+
+
+def scene() -> TableScene:
+    return named_scene(3, NAMES, 8)
+
+
+@lru_cache(maxsize=1)
+def starts() -> tuple[ObjectPose, ...]:
+    """The truth, moved by 10 mm and turned by 8 deg about the objects' centres."""
+    rng = np.random.default_rng(0)
+    out: list[ObjectPose] = []
+    for p in scene().truth:
+        w, v = rng.normal(size=(2, 3))
+        xi = np.r_[w * np.radians(8) / np.linalg.norm(w), 0.01 * v / np.linalg.norm(v)]
+        c = se3.from_translation(scene().models[p.obj_id].mesh.bounds.mean(0))
+        out.append(replace(p, T_world_obj=p.T_world_obj @ c @ se3.exp(xi) @ se3.invert(c)))
+    return tuple(out)
+
+
+def anywhere(*which: int) -> list[Wanted]:
+    return [Wanted(obj_id=p.obj_id, instance=p.instance) for p in scene().truth
+            if not which or p.instance in which]  # fmt: skip
+
+
+def run(
+    wanted: Sequence[ObjectPose] | Sequence[Wanted] | None,
+    frames: Sequence[DepthFrame] | None = None,
+    models: Mapping[int, ObjectModel] | None = None,
+    config: RegistrationConfig = CONFIG,
+) -> Registration:
+    frames = scene().frames if frames is None else frames
+    result = register_scene(
+        "s", scene().intrinsics, frames, models or scene().models, wanted, config
+    )
+    json.dumps(result.report)
+    return result
+
+
+def with_view(number: int, frame: DepthFrame) -> list[DepthFrame]:
+    return [frame if f.index == number else f for f in scene().frames]
+
+
+def error_mm(result: Registration, instance: int) -> float:
+    found, true = result.scene.object(instance), scene().true_pose(instance)
+    model = scene().models[true.obj_id]
+    return 1e3 * mssd_symmetric(true.T_world_obj, found.T_world_obj, model)
+
+
+def all_right(result: Registration, *but: int) -> None:
+    """Assert that all objects but some are accepted and right."""
+    for p in scene().truth:
+        if p.instance not in but:
+            assert result.scene.object(p.instance).verdict == "accepted"
+            assert error_mm(result, p.instance) < RIGHT_MM
+
+
+def not_accepted(result: Registration, instance: int) -> str:
+    """Return why an object is not placed or not accepted."""
+    missing = [n for n in result.not_placed if n.instance == instance]
+    if missing:
+        assert instance not in {o.instance for o in result.scene.objects}
+        return missing[0].reason
+    found = result.scene.object(instance)
+    assert found.verdict != "accepted" and found.reasons
+    return " ".join(found.reasons)
+
+
+@lru_cache(maxsize=1)
+def ghost() -> ObjectModel:
+    """A part that is not in the scene."""
+    return part("mug")
+
+
+# --- sound input ---------------------------------------------------------------------------------
+
+
+def test_sound_input_is_accepted_and_consistent():
+    result = run(starts())
+    all_right(result)
+    assert result.not_placed == () and result.findings == ()
+    assert sorted(result.cameras) == list(range(8)) == sorted(result.seen)
+    for number, T in result.cameras.items():
+        for o in result.scene.objects:
+            here = result.seen[number][o.instance]
+            np.testing.assert_allclose(T @ here.T_cam_obj, o.T_world_obj, atol=1e-9)
+            assert o.covariance is not None and np.linalg.eigvalsh(o.covariance).min() > 0
+
+
+def test_starts_and_hints_may_be_mixed():
+    first = starts()[0]
+    center = scene().models[first.obj_id].mesh.bounds.mean(0)
+    near = Region(
+        center_world=se3.transform(first.T_world_obj, center[None])[0], radius_m=0.03
+    )
+    wanted = [
+        Wanted(obj_id=first.obj_id, instance=first.instance, region=near),
+        Wanted(
+            obj_id=starts()[1].obj_id, instance=starts()[1].instance,
+            T_start=starts()[1].T_world_obj,
+        ),
+        *anywhere(2, 3),
+    ]  # fmt: skip
+    all_right(run(wanted))
+
+
+# --- objects -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("claimed", [True, False])
+def test_a_model_that_is_not_in_the_scene(claimed: bool):
+    models = {**scene().models, ghost().obj_id: ghost()}
+    if claimed:
+        T = se3.from_translation([0.03, 0.03, 0.0])
+        result = run(
+            [*starts(), ObjectPose(obj_id=ghost().obj_id, instance=9, T_world_obj=T)],
+            models=models,
+        )
+    else:
+        result = run([*anywhere(), Wanted(obj_id=ghost().obj_id, instance=9)], models=models)
+    all_right(result)
+    assert not_accepted(result, 9)
+
+
+def in_millimetres(model: ObjectModel) -> ObjectModel:
+    mesh = Mesh(vertices=1e3 * model.mesh.vertices, faces=model.mesh.faces)
+    return replace(model, mesh=mesh)
+
+
+@pytest.mark.parametrize("known", ["starts", "ids", "nothing"])
+def test_a_mesh_in_millimetres_is_named_and_the_rest_goes_on(known: str):
+    one = scene().truth[1]
+    models = {**scene().models, one.obj_id: in_millimetres(scene().models[one.obj_id])}
+    wanted = {"starts": starts(), "ids": anywhere(), "nothing": None}[known]
+    result = run(wanted, models=models)
+    (missing,) = result.not_placed
+    assert missing.obj_id == one.obj_id
+    assert "millimetres and metres were mixed up" in missing.reason
+    others = {p.obj_id for p in scene().truth} - {one.obj_id}
+    assert {o.obj_id for o in result.scene.objects if o.verdict == "accepted"} == others
+    if known != "nothing":
+        assert missing.instance == one.instance
+        all_right(result, one.instance)
+
+
+def test_a_start_in_millimetres_is_named_and_the_rest_goes_on():
+    T = starts()[2].T_world_obj.copy()
+    T[:3, 3] *= 1e3
+    wanted = [replace(s, T_world_obj=T) if s.instance == 2 else s for s in starts()]
+    result = run(wanted)
+    all_right(result, 2)
+    assert "millimetres" in not_accepted(result, 2)
+
+
+def test_no_model_in_metres_is_refused():
+    models = {i: in_millimetres(m) for i, m in scene().models.items()}
+    with pytest.raises(InputError, match="none of the 4 models.*mixed up"):
+        run(None, models=models)
+    # Those that were asked for are reported one by one.
+    result = run(starts(), models=models)
+    assert result.scene.objects == () and len(result.not_placed) == 4
+    assert sorted(result.cameras) == list(range(8))
+
+
+def test_two_swapped_ids_are_not_accepted():
+    a, b = starts()[0], starts()[2]
+    wanted = [
+        replace(a, T_world_obj=b.T_world_obj), starts()[1],
+        replace(b, T_world_obj=a.T_world_obj), starts()[3],
+    ]  # fmt: skip
+    result = run(wanted)
+    all_right(result, 0, 2)
+    for instance in (0, 2):
+        right = instance in {o.instance for o in result.scene.objects} and (
+            error_mm(result, instance) < RIGHT_MM
+        )
+        assert right or not_accepted(result, instance)
+
+
+@pytest.mark.parametrize("surface", ["black", "transparent"])
+def test_an_object_without_depth_is_not_accepted_and_the_rest_is_right(surface):
+    frames = without_depth_on(scene(), 0, surface)
+    result = run(starts(), frames)
+    all_right(result, 0)
+    assert not_accepted(result, 0)
+
+
+def test_unknown_ids_are_found_among_more_models():
+    extra = ["mug", "gear", "bowl", "flange", "tube"]
+    more = {part(n).obj_id: part_models()[part(n).obj_id] for n in extra}
+    models = {**more, **scene().models}
+    assert len(models) == 9
+    result = run(None, models=models)
+    found = [o for o in result.scene.objects if o.verdict == "accepted"]
+    assert sorted(o.obj_id for o in found) == sorted(p.obj_id for p in scene().truth)
+    for p in scene().truth:
+        (o,) = [o for o in found if o.obj_id == p.obj_id]
+        model = scene().models[p.obj_id]
+        assert 1e3 * mssd_symmetric(p.T_world_obj, o.T_world_obj, model) < RIGHT_MM
+    assert len({o.instance for o in result.scene.objects}) == len(result.scene.objects)
+
+
+# --- views ---------------------------------------------------------------------------------------
+
+
+def test_an_empty_depth_image_is_left_out_and_named():
+    result = run(starts(), with_view(2, without_any_depth(scene().frames[2])))
+    all_right(result)
+    assert sorted(result.cameras) == [0, 1, 3, 4, 5, 6, 7] == sorted(result.seen)
+    (finding,) = result.findings
+    assert "view 2" in finding.words and "empty" in finding.words
+
+
+def test_a_view_of_another_scene_is_left_out_and_named():
+    other = named_scene(4, ("mug", "gear"), 8).frames[2]
+    result = run(starts(), with_view(2, foreign(scene().frames[2], other)))
+    all_right(result)
+    assert 2 not in result.cameras
+    assert any("view 2" in f.words for f in result.findings)
+
+
+def test_a_slipped_view_is_named_and_does_no_harm():
+    moved = shifted_view(scene().frames[5], [0.03, 0.0, 0.02, 0.012, 0.006, 0.0])
+    result = run(starts(), with_view(5, moved))
+    all_right(result)
+    assert any("view 5" in f.words for f in result.findings)
+
+
+def test_one_view_only_is_worse_and_says_so():
+    result = run(starts(), scene().frames[:1])
+    assert sorted(result.cameras) == [0] and result.seen == {}
+    np.testing.assert_array_equal(result.cameras[0], scene().frames[0].T_world_cam)
+    for p in scene().truth:
+        found = result.scene.object(p.instance)
+        assert error_mm(result, p.instance) < 3 or found.verdict != "accepted"
+        assert found.covariance is not None
+
+
+def test_three_views_take_the_cameras_at_their_word():
+    result = run(starts(), scene().frames[:3])
+    for k in range(3):
+        np.testing.assert_array_equal(result.cameras[k], scene().frames[k].T_world_cam)
+    assert all(error_mm(result, p.instance) < 3 for p in scene().truth)
+
+
+def test_cameras_are_left_alone_if_told_so():
+    result = run(starts(), config=replace(CONFIG, refine_cameras=False))
+    all(error_mm(result, p.instance) < 3 for p in scene().truth)
+    for f in scene().frames:
+        np.testing.assert_array_equal(result.cameras[f.index], f.T_world_cam)
+
+
+# --- the paper's way -----------------------------------------------------------------------------
+
+
+def test_top_down_is_one_view_and_the_claimed_cameras():
+    config = replace(CONFIG, method="top-down")
+    result = run(starts(), config=config)
+    assert result.report["method"] == "top-down"
+    assert {o.instance for o in result.scene.objects} == {0, 1, 2, 3}
+    joint = run(starts())
+    one = np.median([error_mm(result, k) for k in range(4)])
+    assert one > 3 * np.median([error_mm(joint, k) for k in range(4)]) and one < 20
+    for f in scene().frames:
+        np.testing.assert_array_equal(result.cameras[f.index], f.T_world_cam)
+    assert result.seen == {}
+
+
+def test_top_down_needs_starts_and_says_so():
+    config = replace(CONFIG, method="top-down")
+    with pytest.raises(InputError, match="rough poses"):
+        run(None, config=config)
+    first = starts()[0]
+    wanted = [
+        Wanted(obj_id=first.obj_id, instance=0, T_start=first.T_world_obj), *anywhere(1, 2, 3)
+    ]
+    result = run(wanted, config=config)
+    assert [o.instance for o in result.scene.objects] == [0]
+    assert {n.instance for n in result.not_placed} == {1, 2, 3}
+    assert all("rough poses only" in n.reason for n in result.not_placed)
+
+
+def test_top_down_names_what_its_view_does_not_show():
+    frames = list(without_depth_on(scene(), 0))
+    result = run(starts(), frames, config=replace(CONFIG, method="top-down"))
+    named = {o.instance for o in result.scene.objects} | {n.instance for n in result.not_placed}
+    assert named == {0, 1, 2, 3}
+    assert 0 in {n.instance for n in result.not_placed} or not_accepted(result, 0)
+
+
+# --- nothing to do -------------------------------------------------------------------------------
+
+
+def test_what_cannot_be_registered_is_refused_by_name():
+    with pytest.raises(InputError, match="at least one"):
+        run(starts(), [])
+    with pytest.raises(InputError, match="same number"):
+        run(starts(), [*scene().frames, scene().frames[0]])
+    with pytest.raises(InputError, match="no start poses"):
+        run([])
+    with pytest.raises(InputError, match="same instance"):
+        run([starts()[0], starts()[0]])
+    with pytest.raises(InputError, match="no object models"):
+        register_scene("s", scene().intrinsics, scene().frames, {}, None, CONFIG)
+    with pytest.raises(InputError, match="object 99, which is not among the models"):
+        run([replace(starts()[0], obj_id=99)])
+    with pytest.raises(InputError, match="'best'; joint or top-down"):
+        run(starts(), config=replace(CONFIG, method="best"))  # pyright: ignore[reportArgumentType]
+    blind = [without_any_depth(f) for f in scene().frames]
+    with pytest.raises(InputError, match="all zero"):
+        run(starts(), blind)
+
+
+def test_an_empty_table_holds_nothing():
+    """Every object without depth: nothing is placed, and each is named."""
+    frames = scene().frames
+    for p in scene().truth:
+        spoilt = replace(scene(), frames=frames)
+        frames = without_depth_on(spoilt, p.instance, "transparent")
+    result = run(anywhere(), frames)
+    assert all(o.verdict != "accepted" for o in result.scene.objects)
+    named = {o.instance for o in result.scene.objects} | {n.instance for n in result.not_placed}
+    assert named == {0, 1, 2, 3}

@@ -1,0 +1,155 @@
+"""Points of views: which pixels are trusted, and that they lie where the surface is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.geometry.camera import project
+from realsim.records import CameraIntrinsics
+from realsim.registration.evidence import DepthFrame, DepthNoise
+from realsim.registration.views import SampleConfig, sample_view, sample_views, world_cloud
+
+Array = NDArray[np.float64]
+CAMERA = CameraIntrinsics(width=160, height=90, fx=115.0, fy=112.0, cx=80.3, cy=44.1)
+NOISE = DepthNoise(per_m=0.007, floor_m=2e-4)
+EVERY = SampleConfig(stride=1)
+
+
+def frame(depth: NDArray, T: Array | None = None, index: int = 0) -> DepthFrame:
+    return DepthFrame(
+        index=index, depth_m=np.asarray(depth, np.float32),
+        T_world_cam=np.eye(4) if T is None else T,
+    )  # fmt: skip
+
+
+def plane_depth(camera: CameraIntrinsics, T_world_cam: Array) -> NDArray[np.float32]:
+    """Exact depth of the plane z = 0 of the world (no lens distortion)."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = np.stack(
+        [(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1
+    )
+    down = rays @ T_world_cam[2, :3]
+    return np.where(down < 0, -T_world_cam[2, 3] / down, 0).astype(np.float32)
+
+
+def trusted_by_definition(depth: NDArray, config: SampleConfig) -> list[tuple[int, int]]:
+    """(column, row) of the pixels that a reader of the config would keep."""
+    known = np.isfinite(depth) & (depth > 0)
+    pitch = config.edge_slope / min(CAMERA.fx, CAMERA.fy)
+    kept: list[tuple[int, int]] = []
+    reach = config.edge_reach_px
+    for i in range(0, depth.shape[0], config.stride):
+        for j in range(0, depth.shape[1], config.stride):
+            if not known[i, j]:
+                continue
+            window = (slice(max(0, i - reach), i + reach + 1), slice(max(0, j - reach), j + reach + 1))
+            near = depth[window][known[window]]
+            z = float(depth[i, j])
+            allowed = config.edge_jump_m + pitch * z + config.edge_sigmas * NOISE.sigma(np.array(z))
+            if float(near.max()) - float(near.min()) <= allowed:
+                kept.append((j, i))
+    return kept
+
+
+@pytest.mark.parametrize("stride, reach", [(1, 3), (3, 2), (4, 1)])
+def test_trusted_pixels_are_those_of_the_definition(stride: int, reach: int):
+    rng = np.random.default_rng(stride)
+    steps = np.kron(rng.uniform(0.3, 0.45, (6, 8)), np.ones((15, 20)))
+    depth = (steps + rng.normal(0, 1e-3, steps.shape)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = 0
+    depth[rng.random(depth.shape) < 0.01] = np.nan
+    depth[rng.random(depth.shape) < 0.01] = np.inf
+    depth[rng.random(depth.shape) < 0.01] = -0.3
+    config = SampleConfig(stride=stride, edge_reach_px=reach)
+    view = sample_view(CAMERA, frame(depth), NOISE, config)
+    expected = trusted_by_definition(depth, config)
+    assert 50 < len(expected) < len(depth[::stride, ::stride].ravel())
+    assert [(int(u), int(v)) for u, v in view.pixels] == expected
+    sampled = depth[::stride, ::stride]
+    measured = np.isfinite(sampled) & (sampled > 0)
+    assert view.measured_share == pytest.approx(measured.mean())
+    assert view.area_px == stride**2
+
+
+@pytest.mark.parametrize("distortion", [(), (-0.05, 0.02, 0.001, -0.002, 0.0)])
+def test_a_point_is_seen_where_its_pixel_is(distortion: tuple[float, ...]):
+    camera = replace(CAMERA, distortion=np.array(distortion))
+    depth = np.full((90, 160), 0.4, np.float32)
+    view = sample_view(camera, frame(depth), NOISE, SampleConfig(stride=7))
+    assert len(view.points) > 200 and view.points.dtype == np.float32
+    np.testing.assert_allclose(view.points[:, 2], 0.4, rtol=1e-6)
+    uv = project(camera, view.points.astype(np.float64))
+    np.testing.assert_allclose(uv, view.pixels, atol=1e-3)
+
+
+def test_points_in_world_lie_on_the_surface_and_move_with_the_camera():
+    T = se3.look_at([0.2, -0.1, 0.4], [0.0, 0.02, 0.0])
+    view = sample_view(CAMERA, frame(plane_depth(CAMERA, T), T), NOISE, EVERY)
+    np.testing.assert_allclose(view.world()[:, 2], 0, atol=1e-6)
+    np.testing.assert_array_equal(view.world(), view.world(T))
+    S = se3.random_transform(np.random.default_rng(0))
+    np.testing.assert_allclose(view.world(S @ T), se3.transform(S, view.world()), atol=1e-12)
+
+
+def test_slopes_are_kept_and_steps_are_not():
+    # The table at 65 degrees from its normal: a steep slope is no edge. The reach is that of so
+    # small an image.
+    eye = 0.35 * np.array([np.sin(np.radians(65)), 0, np.cos(np.radians(65))])
+    T = se3.look_at(eye, [0, 0, 0])
+    slope = plane_depth(CAMERA, T)
+    slope[(slope <= 0) | (slope > 0.6)] = 0
+    view = sample_view(CAMERA, frame(slope, T), NOISE, replace(EVERY, edge_reach_px=1))
+    assert len(view.points) > 0.95 * np.count_nonzero(slope)
+    step = np.full((90, 160), 0.40, np.float32)
+    step[:, 80:] = 0.46
+    columns = set(sample_view(CAMERA, frame(step), NOISE, EVERY).pixels[:, 0])
+    reach = EVERY.edge_reach_px
+    assert columns == set(range(160)) - set(range(80 - reach, 80 + reach))
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf, -1.0])
+def test_an_empty_image_has_no_points(value: float):
+    view = sample_view(CAMERA, frame(np.full((90, 160), value)), NOISE, EVERY)
+    assert view.points.shape == (0, 3) and view.pixels.shape == (0, 2)
+    assert view.measured_share == 0 and view.world().shape == (0, 3)
+
+
+def test_the_image_is_left_as_it_was():
+    depth = np.full((90, 160), 0.4, np.float32)
+    depth.setflags(write=False)
+    image = frame(depth)
+    sample_view(CAMERA, image, NOISE, EVERY)
+    assert image.depth_m is depth and np.all(depth == np.float32(0.4))
+
+
+def test_views_come_in_the_order_of_the_frames_and_each_is_counted():
+    T = se3.look_at([0, 0, 0.4], [0, 0, 0])
+    frames = [frame(np.full((90, 160), 0.3 + 0.1 * k), T, index=9 - k) for k in range(3)]
+    seen: list[tuple[int, int]] = []
+    views = sample_views(CAMERA, frames, NOISE, EVERY, lambda done, of: seen.append((done, of)))
+    assert [v.index for v in views] == [9, 8, 7]
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    np.testing.assert_allclose([v.points[0, 2] for v in views], [0.3, 0.4, 0.5], rtol=1e-6)
+
+
+def test_cloud_looks_back_at_the_cameras_with_their_noise():
+    Ts = [se3.look_at([0.2, 0, 0.4], [0, 0, 0]), se3.look_at([0, -0.3, 0.9], [0, 0, 0])]
+    views = sample_views(
+        CAMERA, [frame(plane_depth(CAMERA, T), T, k) for k, T in enumerate(Ts)], NOISE,
+        SampleConfig(stride=5),
+    )  # fmt: skip
+    cloud = world_cloud(views, NOISE)
+    n = len(views[0].points)
+    assert len(cloud.points) == n + len(views[1].points)
+    np.testing.assert_allclose(np.linalg.norm(cloud.towards, axis=1), 1)
+    for part, T, view in ((slice(0, n), Ts[0], views[0]), (slice(n, None), Ts[1], views[1])):
+        far = np.linalg.norm(T[:3, 3] - cloud.points[part], axis=1, keepdims=True)
+        np.testing.assert_allclose(
+            cloud.points[part] + far * cloud.towards[part], np.tile(T[:3, 3], (len(far), 1)),
+            atol=1e-9,
+        )  # fmt: skip
+        z = view.points[:, 2].astype(np.float64)
+        np.testing.assert_allclose(cloud.sigmas[part], np.maximum(2e-4, 0.007 * z**2), rtol=1e-6)
