@@ -13,6 +13,7 @@ from realsim.registration.blind import Kept, keep_start, nearest_to_start
 from realsim.registration.body import Body
 from realsim.registration.compare import Comparer, make_comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
+from realsim.registration.covariance import blind_motions
 from realsim.registration.evidence import (
     Cloud,
     DepthFrame,
@@ -27,7 +28,7 @@ from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.refinement.refine import Refined, refine
 from realsim.registration.refinement.state import State
 from realsim.registration.refinement.uncertainty import SeenPose, object_covariance, seen_poses
-from realsim.registration.solver import solve_pose
+from realsim.registration.solver import Fit, solve_pose
 from realsim.registration.views import ViewPoints
 
 Array = NDArray[np.float64]
@@ -37,6 +38,8 @@ AGAIN_DEG = 3.0
 """An object that was turned back further than this about a fitted axis is refined again [deg]."""
 AGAIN_ROUNDS = 2
 """...in so many rounds."""
+SHAPE_PIECES = 12.0
+"""Independent pieces of a mesh's error."""
 LEAST_SIGMA_MM, LEAST_SIGMA_DEG = 0.05, 0.01
 """What a calibration says of itself is not believed below this."""
 
@@ -117,17 +120,23 @@ def register_many(
             intake, bodies, (rough, claimed), plane, constants, config, None
         )
     back = [se3.invert(T) @ k.fit.T_world_obj for T, k in zip(refined.poses, kept, strict=True)]
+    beyond = [
+        _misfit_covariance(b, refined.misfit_m[k]) + _blind_covariance(b, kept[k].fit, config)
+        for k, b in enumerate(bodies)
+    ]
     covariances = [
-        _turned(object_covariance(refined, b, k), S) + _misfit_covariance(b, refined.misfit_m[k])
-        for k, (b, S) in enumerate(zip(bodies, back, strict=True))
+        _turned(object_covariance(refined, b, k), S) + more
+        for k, (b, S, more) in enumerate(zip(bodies, back, beyond, strict=True))
     ]
     seen = [
         [
-            replace(p, T_cam_obj=p.T_cam_obj @ S, covariance=_turned(p.covariance, S))
+            replace(p, T_cam_obj=p.T_cam_obj @ S, covariance=_turned(p.covariance, S) + more)
             for p in of
         ]
-        for of, S in zip(seen_poses(refined, bodies, intake.intrinsics), back, strict=True)
-    ]  # fmt: skip
+        for of, S, more in zip(
+            seen_poses(refined, bodies, intake.intrinsics), back, beyond, strict=True
+        )
+    ]
     return ManyViews(
         refined=refined, poses=[k.fit.T_world_obj for k in kept], kept=kept, clouds=clouds,
         covariances=covariances, seen=seen, frames=frames, plane=refined.plane,
@@ -223,8 +232,13 @@ def _misfit_covariance(body: Body, misfit_m: float) -> Array:
     return Ad @ C @ Ad.T
 
 
-SHAPE_PIECES = 12.0
-"""Independent pieces of a mesh's error."""
+def _blind_covariance(body: Body, fit: Fit, config: RegistrationConfig) -> Array:
+    """Return what nothing determines: the points' noise makes a turn of a can look half known."""
+    motions = blind_motions(body, fit, config.covariance)
+    motions = motions / np.array([body.radius_m] * 3 + [1.0] * 3)[:, None]
+    C = config.covariance.prior_m**2 * motions @ motions.T
+    Ad = se3.adjoint(se3.from_translation(body.center_obj))
+    return Ad @ C @ Ad.T
 
 
 def _clouds(

@@ -129,13 +129,16 @@ def _largest_plane(
 ) -> tuple[Array, float, NDArray[np.bool_]]:
     """Return normal, offset and inliers of the plane with most points, out of several searches.
 
-    Three noisy points close together are a plane turned by degrees: the refinement begins with a
-    tolerance wide enough to turn it back.
+    Three noisy points close together are a plane turned by degrees: one refinement begins with a
+    tolerance wide enough to turn it back. In clutter that width pulls a good plane up into the
+    objects, so another keeps to the tolerance.
     """
     found: list[tuple[int, Array, float, NDArray[np.bool_]]] = []
     for _ in range(config.searches):
         few = points[rng.integers(0, len(points), size=min(len(points), config.triple_points))]
         normal, offset, _ = fit_plane_ransac(few, rng, tolerance, config.iterations)
+        narrow = refine_plane(points, normal, offset, tolerance)
+        found.append((int(np.count_nonzero(narrow[2])), *narrow))
         for widening in config.widenings:
             normal, offset, on = refine_plane(points, normal, offset, widening * tolerance)
             found.append((int(np.count_nonzero(on)) if widening == 1 else 0, normal, offset, on))

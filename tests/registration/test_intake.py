@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from table_scenes import SMALL_LAB, small_scene
 
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -17,6 +16,7 @@ from realsim.registration.intake import sampling, scene_cloud, take_in
 from realsim.registration.simulated import TableScene
 from realsim.registration.simulated_faults import foreign, shifted_view, without_any_depth
 from realsim.registration.simulated_lab import camera_of
+from table_scenes import SMALL_LAB, small_scene
 
 CONFIG = RegistrationConfig()
 Image = NDArray[np.float32]
@@ -191,7 +191,7 @@ def test_nothing_to_use_is_refused_by_name():
     with pytest.raises(InputError, match="unique"):
         taken([scene().frames[0], replace(scene().frames[1], index=0)])
     empty = [without_any_depth(f) for f in scene().frames[:3]]
-    with pytest.raises(InputError, match="3 depth images.*all zero"):
+    with pytest.raises(InputError, match=r"3 depth images.*all zero"):
         taken(empty)
     given = RegistrationConfig(evidence=replace(CONFIG.evidence, noise_per_m=0.007))
     with pytest.raises(InputError, match=r"none of the 3 views can be used.*view 0.*view 2"):

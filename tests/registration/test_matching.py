@@ -1,6 +1,7 @@
 """Matching of height templates: found where they stand, moved with the world, kept in a region."""
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 
@@ -179,3 +180,19 @@ def test_the_same_grid_gives_the_same_hypotheses():
     assert all(
         np.array_equal(a.T_world_obj, b.T_world_obj) for a, b in zip(first, second, strict=True)
     )
+
+
+@pytest.mark.parametrize("thick_m", [0.003, 0.004])
+def test_a_flat_plate_is_found(thick_m):
+    box = part("box").mesh
+    low, high = box.bounds
+    scaled = (box.vertices - low) / (high - low) * [0.08, 0.05, thick_m]
+    plate = replace(part("box"), mesh=replace(box, vertices=scaled))
+    truth = se3.from_rt(se3.exp_so3([0, 0, 0.6]), [0.03, -0.04, 0.0])
+    grid = exact_grid(plate, truth)
+    noise = np.random.default_rng(0).normal(scale=3e-4, size=grid.heights.shape)
+    heights = (grid.heights + noise).astype(np.float32)
+    noisy = HeightGrid(heights=heights, origin=grid.origin, cell_m=grid.cell_m)
+    t = model_templates(plate, TemplateConfig(), None)
+    found = matched(noisy, t, MatchConfig(), plane=PLANE)
+    assert any(is_near(plate, h.T_world_obj, truth) for h in found[:8])

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from table_scenes import SMALL_LAB, part_models, small_scene
 
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
@@ -28,6 +27,7 @@ from realsim.registration.simulated import (
     table_scene,
 )
 from realsim.rendering.depth_sensor import DepthSensorModel
+from table_scenes import SMALL_LAB, part_models, small_scene
 
 Array = NDArray[np.float64]
 NAMES = ("box", "wedge", "l_bracket", "elbow", "flange")
@@ -127,9 +127,7 @@ def test_results_move_with_the_world():
         views=[replace(v, T_world_cam=T @ v.T_world_cam) for v in case.intake.views],
         plane=replace(plane, T_world_table=T @ plane.T_world_table),
     )  # fmt: skip
-    back = replace(
-        there, poses=se3.invert(T) @ there.poses, cameras=se3.invert(T) @ there.cameras
-    )
+    back = replace(there, poses=se3.invert(T) @ there.poses, cameras=se3.invert(T) @ there.cameras)
     # Single precision of points in world decides whose some of them are.
     seen_alike(here, back, 0.003, 0.002)
     np.testing.assert_allclose(there.state.hand_eye, here.state.hand_eye, atol=3e-6)
@@ -139,6 +137,7 @@ def test_results_move_with_the_world():
     assert np.abs(e).max() < 5e-6
 
 
+@pytest.mark.slow
 def test_order_of_views_and_of_objects_does_not_matter():
     case, _ = noisy()
     here = case.refined(ALL_POINTS)
@@ -156,6 +155,7 @@ def test_order_of_views_and_of_objects_does_not_matter():
     np.testing.assert_allclose(there.used[:-1], here.used[:-1][k], atol=2)
 
 
+@pytest.mark.slow
 def test_the_start_does_not_matter():
     case = exact()
     rng = np.random.default_rng(0)
@@ -254,6 +254,7 @@ def test_plane_is_rigid_and_optional():
     assert case.object_errors_mm(without).max() < 0.6
 
 
+@pytest.mark.slow
 def test_what_is_not_unknown_is_held():
     case, _ = noisy()
     held = case.refined(RefineConfig(fit_bias=False))
@@ -334,7 +335,7 @@ def test_a_disparity_bias_is_found():
 
 @pytest.mark.slow
 def test_strong_noise_does_not_pull_the_depth():
-    """Errors in variables: noise in the derivatives would pull the depth by many sigma."""
+    """Errors in variables: noise in derivatives or weights would pull the depth by millimetres."""
     full = SMALL_LAB.sensor
     loud = replace(full, disparity_noise_px=3 * full.disparity_noise_px)
     config = replace(SMALL_LAB, sensor=loud, views=48)
@@ -345,5 +346,8 @@ def test_strong_noise_does_not_pull_the_depth():
         z = refined.state.hand_eye[5] - case.hand_eye_true[5]
         rows.append(np.array([refined.state.bias[0] - 1, refined.state.bias[1], z]))
     errors = np.stack(rows)
-    standard = errors.std(0, ddof=1) / np.sqrt(len(errors))
-    assert np.all(np.abs(errors.mean(0)) < 2 * standard), (errors.mean(0), standard)
+    scale, offset, z = errors.mean(0)
+    # What is left at three times a D405's noise, of a depth of 0.35 m: dz = -(z ds + z^2 do).
+    assert abs(0.35 * scale + 0.35**2 * offset) < 4e-4
+    assert abs(z) < 1.5e-4
+    assert np.abs(errors[:, 2]).max() < 5e-4

@@ -162,9 +162,7 @@ def test_derivatives_hold_to_a_percent_where_a_refinement_ends(box: Body, seed: 
     )  # fmt: skip
     shared, _ = point.row()
     no_view = np.zeros((1, 6))
-    expected = numeric(
-        point, OBJECTS + 6, lambda x: moved(point.state, point.bodies, x, no_view)
-    )
+    expected = numeric(point, OBJECTS + 6, lambda x: moved(point.state, point.bodies, x, no_view))
     for part_ in (HAND_EYE, BIAS, slice(OBJECTS, OBJECTS + 6)):
         off = np.linalg.norm(shared[part_] - expected[part_])
         assert off < 0.02 * np.linalg.norm(expected[part_])
@@ -182,8 +180,8 @@ def test_noise_of_a_point_is_not_in_its_derivative(box: Body):
         H, b = np.zeros((1, BLOCK, BLOCK)), np.zeros((1, BLOCK))
         add_blocks(
             (place[None], np.array([r]), normal[None]), np.zeros(1, np.int32),
-            (np.array([0.0, 0.0, -0.02]), *seen_from(T_world_cam[None])), (np.ones(1), np.full(1, 1e6)),
-            (H, b), np.zeros(1),
+            (np.array([0.0, 0.0, -0.02]), *seen_from(T_world_cam[None])),
+            (np.ones(1), np.full(1, 1e6)), (H, b), np.zeros(1),
         )  # fmt: skip
         rows.append(-b[0] / r)
     np.testing.assert_allclose(rows[0], rows[2], rtol=1e-6, atol=1e-9)
@@ -357,7 +355,7 @@ def test_unknowns_of_very_different_units_are_solved_as_well():
 @pytest.mark.parametrize("seed", range(3))
 def test_step_and_covariance_are_those_of_gtsam(seed: int):
     import gtsam
-    from gtsam.symbol_shorthand import C, O, T, V  # noqa: E741
+    from gtsam.symbol_shorthand import C, O, T, V
 
     data = random_rows(10 + seed)
     graph = gtsam.GaussianFactorGraph()
@@ -389,7 +387,9 @@ def test_step_and_covariance_are_those_of_gtsam(seed: int):
     places += [(O(k), slice(OBJECTS + 6 * k, OBJECTS + 6 * k + 6)) for k in range(data.objects)]
     for key, at in places:
         np.testing.assert_allclose(shared[at], step.at(key), atol=1e-8)
-        np.testing.assert_allclose(C_own.shared[at, at], marginals.marginalCovariance(key), atol=1e-8)
+        np.testing.assert_allclose(
+            C_own.shared[at, at], marginals.marginalCovariance(key), atol=1e-8
+        )
     for v in range(data.views):
         np.testing.assert_allclose(views[v], step.at(V(v)), atol=1e-8)
         np.testing.assert_allclose(C_own.views[v], marginals.marginalCovariance(V(v)), atol=1e-8)

@@ -6,7 +6,6 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from table_scenes import named_scene
 
 from realsim.geometry import se3
 from realsim.geometry.camera import project
@@ -21,6 +20,7 @@ from realsim.registration.refinement.uncertainty import (
     seen_poses,
 )
 from realsim.registration.simulated import TableScene
+from table_scenes import named_scene
 
 Array = NDArray[np.float64]
 NAMES = ("wedge", "l_bracket", "elbow", "t_profile")
@@ -34,9 +34,7 @@ def refined_scene(seed: int) -> tuple[TableScene, list[Body], Refined]:
     intake = take_in(scene.intrinsics, scene.frames, RegistrationConfig())
     bodies = [make_body(p, scene.models[p.obj_id], 96, 400) for p in scene.truth]
     poses = [b.T_start for b in bodies]
-    result = refine(
-        scene.intrinsics, intake.views, bodies, poses, intake.plane, intake.noise
-    )
+    result = refine(scene.intrinsics, intake.views, bodies, poses, intake.plane, intake.noise)
     return scene, bodies, result
 
 

@@ -7,7 +7,6 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from table_scenes import named_scene, part_models
 
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -25,6 +24,7 @@ from realsim.registration.simulated_faults import (
     without_any_depth,
     without_depth_on,
 )
+from table_scenes import named_scene, part_models
 
 CONFIG = RegistrationConfig(field_cells=64, with_single_view=False)
 NAMES = ("wedge", "l_bracket", "elbow", "t_profile")
@@ -117,12 +117,11 @@ def test_sound_input_is_accepted_and_consistent():
             assert o.covariance is not None and np.linalg.eigvalsh(o.covariance).min() > 0
 
 
+@pytest.mark.slow
 def test_starts_and_hints_may_be_mixed():
     first = starts()[0]
     center = scene().models[first.obj_id].mesh.bounds.mean(0)
-    near = Region(
-        center_world=se3.transform(first.T_world_obj, center[None])[0], radius_m=0.03
-    )
+    near = Region(center_world=se3.transform(first.T_world_obj, center[None])[0], radius_m=0.03)
     wanted = [
         Wanted(obj_id=first.obj_id, instance=first.instance, region=near),
         Wanted(
@@ -137,6 +136,7 @@ def test_starts_and_hints_may_be_mixed():
 # --- objects -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("claimed", [True, False])
 def test_a_model_that_is_not_in_the_scene(claimed: bool):
     models = {**scene().models, ghost().obj_id: ghost()}
@@ -157,7 +157,14 @@ def in_millimetres(model: ObjectModel) -> ObjectModel:
     return replace(model, mesh=mesh)
 
 
-@pytest.mark.parametrize("known", ["starts", "ids", "nothing"])
+@pytest.mark.parametrize(
+    "known",
+    [
+        pytest.param("starts", marks=pytest.mark.slow),
+        pytest.param("ids", marks=pytest.mark.slow),
+        pytest.param("nothing", marks=pytest.mark.slow),
+    ],
+)
 def test_a_mesh_in_millimetres_is_named_and_the_rest_goes_on(known: str):
     one = scene().truth[1]
     models = {**scene().models, one.obj_id: in_millimetres(scene().models[one.obj_id])}
@@ -173,6 +180,7 @@ def test_a_mesh_in_millimetres_is_named_and_the_rest_goes_on(known: str):
         all_right(result, one.instance)
 
 
+@pytest.mark.slow
 def test_a_start_in_millimetres_is_named_and_the_rest_goes_on():
     T = starts()[2].T_world_obj.copy()
     T[:3, 3] *= 1e3
@@ -184,7 +192,7 @@ def test_a_start_in_millimetres_is_named_and_the_rest_goes_on():
 
 def test_no_model_in_metres_is_refused():
     models = {i: in_millimetres(m) for i, m in scene().models.items()}
-    with pytest.raises(InputError, match="none of the 4 models.*mixed up"):
+    with pytest.raises(InputError, match=r"none of the 4 models.*mixed up"):
         run(None, models=models)
     # Those that were asked for are reported one by one.
     result = run(starts(), models=models)
@@ -192,6 +200,7 @@ def test_no_model_in_metres_is_refused():
     assert sorted(result.cameras) == list(range(8))
 
 
+@pytest.mark.slow
 def test_two_swapped_ids_are_not_accepted():
     a, b = starts()[0], starts()[2]
     wanted = [
@@ -207,7 +216,7 @@ def test_two_swapped_ids_are_not_accepted():
         assert right or not_accepted(result, instance)
 
 
-@pytest.mark.parametrize("surface", ["black", "transparent"])
+@pytest.mark.parametrize("surface", ["black", pytest.param("transparent", marks=pytest.mark.slow)])
 def test_an_object_without_depth_is_not_accepted_and_the_rest_is_right(surface):
     frames = without_depth_on(scene(), 0, surface)
     result = run(starts(), frames)
@@ -215,6 +224,7 @@ def test_an_object_without_depth_is_not_accepted_and_the_rest_is_right(surface):
     assert not_accepted(result, 0)
 
 
+@pytest.mark.slow
 def test_unknown_ids_are_found_among_more_models():
     extra = ["mug", "gear", "bowl", "flange", "tube"]
     more = {part(n).obj_id: part_models()[part(n).obj_id] for n in extra}
@@ -233,6 +243,7 @@ def test_unknown_ids_are_found_among_more_models():
 # --- views ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_empty_depth_image_is_left_out_and_named():
     result = run(starts(), with_view(2, without_any_depth(scene().frames[2])))
     all_right(result)
@@ -241,6 +252,7 @@ def test_an_empty_depth_image_is_left_out_and_named():
     assert "view 2" in finding.words and "empty" in finding.words
 
 
+@pytest.mark.slow
 def test_a_view_of_another_scene_is_left_out_and_named():
     other = named_scene(4, ("mug", "gear"), 8).frames[2]
     result = run(starts(), with_view(2, foreign(scene().frames[2], other)))
@@ -249,6 +261,7 @@ def test_a_view_of_another_scene_is_left_out_and_named():
     assert any("view 2" in f.words for f in result.findings)
 
 
+@pytest.mark.slow
 def test_a_slipped_view_is_named_and_does_no_harm():
     moved = shifted_view(scene().frames[5], [0.03, 0.0, 0.02, 0.012, 0.006, 0.0])
     result = run(starts(), with_view(5, moved))
@@ -262,10 +275,12 @@ def test_one_view_only_is_worse_and_says_so():
     np.testing.assert_array_equal(result.cameras[0], scene().frames[0].T_world_cam)
     for p in scene().truth:
         found = result.scene.object(p.instance)
-        assert error_mm(result, p.instance) < 3 or found.verdict != "accepted"
-        assert found.covariance is not None
+        # One view is judged by bounds; the probability tells the worse ones.
+        assert error_mm(result, p.instance) < 3 or found.checks["probability"] < 0.9
+        assert error_mm(result, p.instance) < 8 and found.covariance is not None
 
 
+@pytest.mark.slow
 def test_three_views_take_the_cameras_at_their_word():
     result = run(starts(), scene().frames[:3])
     for k in range(3):
@@ -273,9 +288,10 @@ def test_three_views_take_the_cameras_at_their_word():
     assert all(error_mm(result, p.instance) < 3 for p in scene().truth)
 
 
+@pytest.mark.slow
 def test_cameras_are_left_alone_if_told_so():
     result = run(starts(), config=replace(CONFIG, refine_cameras=False))
-    all(error_mm(result, p.instance) < 3 for p in scene().truth)
+    assert all(error_mm(result, p.instance) < 3 for p in scene().truth)
     for f in scene().frames:
         np.testing.assert_array_equal(result.cameras[f.index], f.T_world_cam)
 
@@ -283,6 +299,7 @@ def test_cameras_are_left_alone_if_told_so():
 # --- the paper's way -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_top_down_is_one_view_and_the_claimed_cameras():
     config = replace(CONFIG, method="top-down")
     result = run(starts(), config=config)
@@ -302,7 +319,8 @@ def test_top_down_needs_starts_and_says_so():
         run(None, config=config)
     first = starts()[0]
     wanted = [
-        Wanted(obj_id=first.obj_id, instance=0, T_start=first.T_world_obj), *anywhere(1, 2, 3)
+        Wanted(obj_id=first.obj_id, instance=0, T_start=first.T_world_obj),
+        *anywhere(1, 2, 3),
     ]
     result = run(wanted, config=config)
     assert [o.instance for o in result.scene.objects] == [0]
@@ -310,6 +328,7 @@ def test_top_down_needs_starts_and_says_so():
     assert all("rough poses only" in n.reason for n in result.not_placed)
 
 
+@pytest.mark.slow
 def test_top_down_names_what_its_view_does_not_show():
     frames = list(without_depth_on(scene(), 0))
     result = run(starts(), frames, config=replace(CONFIG, method="top-down"))
@@ -341,6 +360,7 @@ def test_what_cannot_be_registered_is_refused_by_name():
         run(starts(), blind)
 
 
+@pytest.mark.slow
 def test_an_empty_table_holds_nothing():
     """Every object without depth: nothing is placed, and each is named."""
     frames = scene().frames

@@ -94,3 +94,11 @@ def test_without_rivals_there_is_no_contrast():
         assert got.contrast is None
         assert got.T_rival is None
         assert not got.changed
+
+
+def test_a_fit_of_the_same_pose_that_ended_a_little_apart_is_no_rival():
+    _, sought = scene(0.012)
+    turn = se3.from_rt(se3.exp_so3([0.0, 0.0, np.radians(1.5)]), np.zeros(3))
+    size = 2.0 * sought.body.radius_m
+    assert sought.sameness.distance(np.eye(4), turn) < CONFIG.same_share * size
+    assert decide(0.012, np.eye(4), turn[None]).contrast is None

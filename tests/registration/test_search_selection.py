@@ -17,6 +17,7 @@ from realsim.registration.search.selection import (
     Slot,
     select,
     select_any,
+    select_pair,
 )
 from table_scenes import named_scene
 
@@ -115,3 +116,18 @@ def test_scores_are_those_with_all_others_in_place(n: int):
     at = got.chosen[n]
     assert at is not None
     assert got.scores[n] == score(canvas, pool[at].rendered, compose(canvas.table, others))
+
+
+def test_two_that_stand_in_each_others_places_change_them():
+    canvas, pool, ids = material()
+    mug, gear = 0, 2
+    here = [n for n in range(4, len(pool)) if ids[n] == pool[mug].obj_id][gear]
+    there = [n for n in range(4, len(pool)) if ids[n] == pool[gear].obj_id][mug]
+    others = compose(canvas.table, [pool[1].rendered, pool[3].rendered])
+    pair = (slots()[mug], slots()[gear])
+    assert select_pair(canvas, pool, pair, (here, there), others, CONFIG) == (mug, gear)
+    assert select_pair(canvas, pool, pair, (here, None), others, CONFIG) == (mug, gear)
+    assert select_pair(canvas, pool, pair, (mug, gear), others, CONFIG) is None
+    # One of which there is no acceptable pose cannot have the other's place.
+    alone = (Slot(choices=frozenset([here])), slots()[gear])
+    assert select_pair(canvas, pool, alone, (None, gear), others, CONFIG) is None

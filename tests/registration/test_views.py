@@ -45,7 +45,10 @@ def trusted_by_definition(depth: NDArray, config: SampleConfig) -> list[tuple[in
         for j in range(0, depth.shape[1], config.stride):
             if not known[i, j]:
                 continue
-            window = (slice(max(0, i - reach), i + reach + 1), slice(max(0, j - reach), j + reach + 1))
+            window = (
+                slice(max(0, i - reach), i + reach + 1),
+                slice(max(0, j - reach), j + reach + 1),
+            )
             near = depth[window][known[window]]
             z = float(depth[i, j])
             allowed = config.edge_jump_m + pitch * z + config.edge_sigmas * NOISE.sigma(np.array(z))

@@ -20,7 +20,7 @@ from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.refinement.blocks import BLOCK, add_blocks
+from realsim.registration.refinement.blocks import BLOCK, LEAST_ALONG, add_blocks
 from realsim.registration.refinement.config import NoiseConfig, RefineConfig
 from realsim.registration.refinement.equations import (
     BIAS,
@@ -240,8 +240,12 @@ def _blocks(
     if few:
         return Blocks(H=H, b=b, Ms=Ms), misfit[0], 0
     rays = places - frame[1][mine.views]
-    cosine = np.abs(np.sum(normals * rays, axis=1)) / np.linalg.norm(rays, axis=1)
-    sigma = task.noise.sigma(p[:, 2]) * np.clip(cosine, noise.oblique, None)
+    along = np.sum(normals * rays, axis=1)
+    cosine = np.abs(along) / np.linalg.norm(rays, axis=1)
+    # Weighed by the depth of the surface: by their own, points too near would count for more.
+    steep = cosine > LEAST_ALONG
+    surface_z = p[:, 2] * (1.0 - np.where(steep, distances / np.where(steep, along, 1.0), 0.0))
+    sigma = task.noise.sigma(surface_z) * np.clip(cosine, noise.oblique, None)
     variance = np.square(np.maximum(sigma, noise.floor_m)) + misfit[1] ** 2
     crowding = np.maximum(1.0, task.area_px / mine.area_px)
     weight = 1.0 / (variance * crowding + misfit[0] ** 2)

@@ -61,24 +61,27 @@ def _peel(search: Search) -> peel.PeelConfig:
 def _pairs(search: Search, selection: Selection) -> list[tuple[int, int]]:
     """Return an unsure object and a placed one of similar size, of another model, each.
 
-    The least sure objects come first, each with those first whose place fits its size.
+    Those come first of which both agree least with the images.
     """
     assert search.wanted is not None
-    bench, wanted = search.bench, search.wanted
+    bench, wanted, config = search.bench, search.wanted, search.bench.config.exchange
     radius = [bench.sought[w.obj_id].body.radius_m for w in wanted]
     agree = [-1.0 if s is None else s.agree for s in selection.scores]
     least = bench.config.peel.sure_agree
-    found: list[tuple[float, float, int, int]] = []
+    found: list[tuple[float, int, int]] = []
     for u in (n for n in range(len(wanted)) if agree[n] < least):
+        lost = selection.chosen[u] is None
+        mine: list[tuple[float, int, int]] = []
         for v, c in enumerate(selection.chosen):
-            twice = agree[v] < least and v < u and selection.chosen[u] is not None
+            twice = agree[v] < least and v < u and not lost
             if c is None or v == u or twice or wanted[u].obj_id == wanted[v].obj_id:
                 continue
             ratio = abs(float(np.log(radius[u] / radius[v])))
-            if ratio <= np.log(bench.config.exchange.size_ratio):
-                # Of those alike in size the less sure one is the likelier to be in the wrong place.
-                found.append((agree[u], ratio + agree[v], u, v))
-    return [(u, v) for _, _, u, v in sorted(found)]
+            certain = agree[v] > config.certain_agree and not lost
+            if ratio <= np.log(config.size_ratio) and not certain:
+                mine.append((agree[u] + agree[v] + ratio, u, v))
+        found += sorted(mine)[: config.most_per_object]
+    return [(u, v) for _, u, v in sorted(found)]
 
 
 def _seek(

@@ -91,7 +91,10 @@ def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
             progress(n + 1, len(groups))
     selection = search.choose()
     first = len(search.pool)
-    selection = exchanged(search, peeled(search, selection))
+    before = peeled(search, selection)
+    selection = exchanged(search, before)
+    if selection.chosen != before.chosen:
+        selection = peeled(search, selection)
     final, decisions = _finished(search, selection)
     report = {
         "cpu_s": {k: round(v, 3) for k, v in bench.watch.seconds.items()},

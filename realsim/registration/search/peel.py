@@ -66,8 +66,13 @@ class ExchangeConfig:
     """Random turns tried in the other's place, 45 deg apart: a fit converges from 30."""
     beside_m: float = 0.025
     """Resting poses are sought so near to the other's middle [m]."""
+    certain_agree: float = 0.995
+    """An object of which a greater share agrees stands in nobody's place, unless the other has none
+    at all."""
+    most_per_object: int = 3
+    """Places tried for one unsure object: 0.2 s each."""
     most_pairs: int = 8
-    """Pairs tried at most, those of the least sure objects first: 0.3 s each."""
+    """Pairs tried at most, the least sure ones first."""
     seed: int = 1
     """Of the random turns."""
 
