@@ -24,6 +24,7 @@ from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.search.find import FindConfig
 from realsim.registration.single_view import SingleViewConfig
 from realsim.registration.solver import SolverConfig
+from realsim.registration.swapped import SwappedConfig
 from realsim.registration.verify import OffsetConfig, SinkingConfig, VerifyConfig
 from realsim.registration.view_findings import ViewCheckConfig
 from realsim.registration.views import SampleConfig
@@ -101,6 +102,7 @@ class RegistrationConfig:
     blind: BlindConfig = field(default_factory=BlindConfig)
     covariance: CovarianceConfig = field(default_factory=CovarianceConfig)
     verify: VerifyConfig = field(default_factory=VerifyConfig)
+    swapped: SwappedConfig = field(default_factory=SwappedConfig)
     rivals: RivalConfig = field(default_factory=RivalConfig)
     judging: JudgingConfig = field(default_factory=JudgingConfig)
     offset: OffsetConfig = field(default_factory=OffsetConfig)

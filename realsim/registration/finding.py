@@ -14,11 +14,13 @@ from realsim.registration.body import Body, make_body
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.few_views import begin, search_near
 from realsim.registration.intake import Intake
+from realsim.registration.judging.scene_checks import Finding
 from realsim.registration.judging.unit_checks import unit_errors
 from realsim.registration.odometry.cross_check import KinematicsCheck
 from realsim.registration.reports import search_report
 from realsim.registration.search.find import find_objects
 from realsim.registration.search.records import NotPlaced, Placed, Region, SearchResult, Wanted
+from realsim.registration.swapped import with_swaps
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -70,6 +72,8 @@ class Found:
     reports: list[dict[str, Any]]
     not_placed: tuple[NotPlaced, ...]
     report: dict[str, Any]
+    findings: tuple[Finding, ...] = ()
+    """What is wrong with what was claimed."""
 
 
 def wanted_objects(
@@ -191,16 +195,25 @@ def found_objects(work: Work, asked: list[Wanted] | None) -> Found:
             )
         found = _found_near(work, near)
         return replace(found, not_placed=(*found.not_placed, *missing))
-    result = find_objects(
-        intake.intrinsics, intake.frames, intake.views, intake.plane, intake.noise, work.models,
-        asked, config.find, field_folder=config.field_folder, progress=work.tick.each,
-    )  # fmt: skip
-    return _as_found(work, result, asked)
+    plane = intake.plane
+
+    def search(these: Sequence[Wanted] | None) -> SearchResult:
+        return find_objects(
+            intake.intrinsics, intake.frames, intake.views, plane, intake.noise, work.models,
+            these, config.find, field_folder=config.field_folder, progress=work.tick.each,
+        )  # fmt: skip
+
+    result, findings = search(asked), []
+    if asked is not None:
+        result, findings = with_swaps(result, asked, dict(work.models), search, config.swapped)
+    wrong = {i for f in findings for i in f.instances}
+    claims = [w for w in asked or () if w.instance not in wrong]
+    return replace(_as_found(work, result, claims), findings=tuple(findings))
 
 
-def _as_found(work: Work, result: SearchResult, asked: list[Wanted] | None) -> Found:
-    """Return what a search placed as bodies."""
-    claims = {w.instance: w.T_start for w in asked or ()}
+def _as_found(work: Work, result: SearchResult, asked: Sequence[Wanted]) -> Found:
+    """Return what a search placed as bodies, with what was rightly claimed of them."""
+    claims = {w.instance: w.T_start for w in asked}
     placed: list[Placed] = sorted(result.placed, key=lambda p: p.instance)
     return Found(
         bodies=[_body(work, p.obj_id, p.instance, p.T_world_obj) for p in placed],

@@ -48,6 +48,8 @@ class Poses:
     cameras: Array
     """(V, 4, 4) of all views, refined if they were."""
     plane: SupportPlane | None
+    known: tuple[SceneFinding, ...]
+    """What has been found wrong with the objects before."""
     with_starts: bool
     """Whether the bodies' starts were claimed by somebody."""
 
@@ -72,6 +74,7 @@ def judged(intake: Intake, given: Poses, comparer: Comparer, config: Registratio
         given.bodies, given.poses, probabilities, scene_cloud(intake, given.cameras, given.plane),
         comparer, config.judging.scene, given.with_starts, usable,
     )  # fmt: skip
+    findings = [*given.known, *findings]
     objects = [
         _object(given, k, checked[k], features[k], probabilities[k], findings, config)
         for k in range(len(given.bodies))

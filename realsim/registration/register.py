@@ -141,7 +141,7 @@ def _with_many(work: Work, found: Found, missing: tuple[NotPlaced, ...]) -> Regi
         bodies=claimed, poses=many.poses, clouds=many.clouds, covariances=list(many.covariances),
         blind=[len(u.unobservable) for u in uncertain], contrasts=contrasts,
         cameras=many.refined.cameras, plane=many.plane,
-        with_starts=all(T is not None for T in found.claimed),
+        known=found.findings, with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
     result = judged(intake, given, comparer, config)
     off = _views_off(intake, many, claimed, config)
@@ -214,7 +214,7 @@ def _with_few(work: Work, found: Found, missing: tuple[NotPlaced, ...]) -> Regis
         covariances=[u.covariance for u in uncertain],
         blind=[len(u.unobservable) for u in uncertain], contrasts=found.contrasts,
         cameras=intake.cameras, plane=plane,
-        with_starts=all(T is not None for T in found.claimed),
+        known=found.findings, with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
     result = judged(intake, given, comparer, config)
     work.tick()
