@@ -36,6 +36,7 @@ def views_of(text: str) -> int | None:
 @click.option("--views", default="all", show_default=True, help="At most so many, spread evenly.")
 @click.option("--no-cameras", is_flag=True, help="Take the claimed camera poses at their word.")
 @click.option("--hand-held", is_flag=True, help="Without a robot: cameras from the depth alone.")
+@click.option("--odometry", is_flag=True, help="Check the robot's poses by the depth alone.")
 @click.option("--depth-bias", default="", metavar="FILE|off",
               help="Depth camera's bias.  [that of the session's calibration]")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="The result as JSON on stdout.")
@@ -69,7 +70,7 @@ def register_command(session: Path, as_json: bool, quiet: bool, **options: Any) 
         method=options["method"], objects=options["objects"], find_all=options["find_all"],
         library=options["library"], views=views_of(options["views"]),
         refine_cameras=not options["no_cameras"], hand_held=options["hand_held"],
-        depth_bias=options["depth_bias"],
+        depth_bias=options["depth_bias"], odometry=options["odometry"],
     )  # fmt: skip
     console = Console(quiet=quiet or as_json)
     store = open_session(session)

@@ -40,6 +40,8 @@ class RegisterRequest:
     refine_cameras: bool = True
     hand_held: bool = False
     """Whether the cameras' poses are found from the depth images alone."""
+    odometry: bool = False
+    """Whether the robot's poses are checked by odometry from the depth images (KISS-ICP)."""
     depth_bias: str = ""
     """A file, `off`, or empty = that of the session's calibration, if it has one."""
 
@@ -57,7 +59,7 @@ def config_of(store: SessionStore, request: RegisterRequest) -> "RegistrationCon
         # The paper's way carries poses by the cameras as they are claimed.
         method=request.method,
         refine_cameras=request.refine_cameras and request.method != "top-down",
-        field_folder=store.path(CACHE), bias=_bias_of(store, request),
+        field_folder=store.path(CACHE), bias=_bias_of(store, request), odometry=request.odometry,
     )  # fmt: skip
     if request.depth_bias == OFF:
         config = replace(config, refine=replace(config.refine, fit_bias=False))

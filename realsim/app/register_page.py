@@ -18,6 +18,7 @@ from realsim.app.register_tables import (
     depth_line,
     missing_rows,
     object_rows,
+    odometry_line,
     summary_line,
     table_line,
     view_rows,
@@ -82,7 +83,8 @@ def page_bytes(
     if result.remarks:
         page.section("Views and scene")
         page.table(VIEW_HEADER, view_rows(result))
-    page.section("Cameras", " ".join(t for t in (camera_line(result), depth_line(result)) if t))
+    lines = (camera_line(result), depth_line(result), odometry_line(result))
+    page.section("Cameras", " ".join(t for t in lines if t))
     for file, (title, caption) in CAPTIONS.items():
         if file in pictures:
             page.section(title)

@@ -108,6 +108,17 @@ def camera_line(result: Registered) -> str:
     )
 
 
+def odometry_line(result: Registered) -> str:
+    """Return in one line what odometry says of the robot's poses; empty if it was not asked."""
+    found: dict[str, Any] | None = result.report.get("kinematics")
+    if not found:
+        return ""
+    noise = f"{found['noise_mm']:.1f} mm / {found['noise_deg']:.2f} deg a pair"
+    if found["faults"]:
+        return f"odometry from depth names {len(found['faults'])} faults (noise {noise})."
+    return f"odometry from depth finds nothing gross against the robot's poses (noise {noise})."
+
+
 def depth_line(result: Registered) -> str:
     """Return in one line what was found of the depth camera; empty where nothing was."""
     found: dict[str, Any] = result.report.get("refinement", {})
@@ -164,7 +175,8 @@ def show_registered(
         console.table("Not placed", MISSING_HEADER, missing_rows(result, models))
     if result.remarks:
         console.table("Views and scene", VIEW_HEADER, view_rows(result))
-    for line in (table_line(result), camera_line(result), depth_line(result)):
+    lines = (table_line(result), camera_line(result), depth_line(result), odometry_line(result))
+    for line in lines:
         if line:
             console.say(line)
     console.say(next_line(folder, result))

@@ -15,7 +15,7 @@ from realsim import __version__
 from realsim.app import report_plots
 from realsim.app.console import StageTime
 from realsim.app.show import GRASP_HEADER, grasp_rows
-from realsim.app.stages import BOARD_VIEWS, session_models
+from realsim.app.stages import BOARD_VIEWS, registered_views, session_models
 from realsim.app.truth import LoopErrors
 from realsim.records import HandEye, Scene
 from realsim.store import SessionStore
@@ -134,8 +134,10 @@ def _photograph_section(page: Page, store: SessionStore, folder: Path) -> None:
         )
         scene, models = load_scene(store), session_models(store)
         grasps = load_grasps(store.folder / "grasps")
-        pick = np.unique(np.linspace(0, len(indices) - 1, OVERLAY_VIEWS).round().astype(int))
-        for index in (indices[k] for k in pick):
+        known = registered_views(store)
+        told = [k for k in indices if known is None or k in known]
+        pick = np.unique(np.linspace(0, len(told) - 1, OVERLAY_VIEWS).round().astype(int))
+        for index in (told[k] for k in pick):
             path = folder / f"overlay_{index:06d}.png"
             save_png(path, overlay_picture(store, index, scene, models, grasps))
             page.picture(path, f"view {index}")

@@ -194,19 +194,31 @@ def take_models(store: SessionStore, library: Path, obj_ids: Sequence[int]) -> t
 def judged_scene(store: SessionStore) -> Scene:
     """Return the registered scene with the reviewers' decisions in place of computed verdicts.
 
+    A registration that was killed while it was put in place is put in place first.
+
     Raises:
         InputError: the session has not been registered.
     """
+    from realsim.app.register_files import finish_interrupted
     from realsim.review import replay, reviewed_scene
     from realsim.review.journal import JOURNAL_FILE, read
     from realsim.store import load_scene
 
+    finish_interrupted(store)
     if not store.has("registration/scene.json"):
         raise InputError(
             f"session '{store.folder}' is not registered yet: run "
             f"`realsim register {store.folder}` first."
         )
     return reviewed_scene(load_scene(store), replay(read(store.path(JOURNAL_FILE)).entries))
+
+
+def registered_views(store: SessionStore) -> list[int] | None:
+    """Return the views in which the objects were registered; None = nothing says it of any."""
+    from realsim.app.register_results import load_cameras
+
+    record = load_cameras(store)
+    return sorted(record.refined) if record is not None and record.refined else None
 
 
 def school_session(
@@ -248,7 +260,7 @@ def school_session(
 
 
 def annotate_session(store: SessionStore, console: Console) -> "TransferSummary":
-    """Write masks, poses, visibility and grasps of every frame.
+    """Write masks, poses, visibility and grasps of every frame that the objects are registered in.
 
     Raises:
         InputError: the session has not been registered.
@@ -258,8 +270,10 @@ def annotate_session(store: SessionStore, console: Console) -> "TransferSummary"
 
     require_sound(store)
     scene = judged_scene(store)
-    with console.stage("annotate", f"{len(store.session.views)} frames") as tick:
+    only = registered_views(store)
+    n = len(store.session.views) if only is None else len(only)
+    with console.stage("annotate", f"{n} frames") as tick:
         return annotate(
-            store, scene, session_models(store), load_grasps(store.folder / "grasps"),
+            store, scene, session_models(store), load_grasps(store.folder / "grasps"), only=only,
             progress=tick,
         )  # fmt: skip

@@ -218,24 +218,24 @@ def _registration_notes(store: SessionStore) -> list[str]:
     """Return what the registration found out about the scene as a whole."""
     report: dict[str, Any] = store.read_json("registration/report.json")
     notes: list[str] = []
-    offset = report["common_offset_mm"]
-    if offset["consistent"]:
+    offset = report.get("common_offset_mm")  # only of objects that all had starts
+    if offset is not None and offset["consistent"]:
         x, y, z = offset["offset_mm"]
         notes.append(
             f"all objects moved together by ({x:.1f}, {y:.1f}, {z:.1f}) mm from their start poses, "
             f"agreeing within {offset['spread_mm']:.1f} mm: the given poses are off as a whole, as "
             "those of a neighbouring frame, of a moved camera, or with a common depth error."
         )
-    sinking = report["common_sinking"]
-    if sinking["consistent"]:
+    sinking = report.get("common_sinking")
+    if sinking is not None and sinking["consistent"]:
         notes.append(
             f"the objects sink into the table by {-100 * sinking['share_of_height']:.1f} % of "
             "their height, all alike: the depth reads short, or the models are too large."
         )
     kept = [
         f"{o['name']} ({axis['fit_deg']:.0f} deg)"
-        for o in report["objects"]
-        if o["blind"].get("start_kept")
+        for o in report.get("objects", ())
+        if o.get("blind", {}).get("start_kept")
         for axis in o["blind"]["axes"]
         if not axis["declared"] and abs(axis.get("fit_deg", 0.0)) >= 1.0
     ]

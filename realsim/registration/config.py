@@ -92,6 +92,9 @@ class RegistrationConfig:
     odometry: bool = False
     """Whether the claimed camera poses are checked by odometry from depth (KISS-ICP): 0.03 CPU-s a
     view, and it names a mount that slipped or images that belong to other poses."""
+    odometry_deg: float = 15.0
+    """Only where views lie this near to their neighbours [deg]: 24 views all around, 20 degrees
+    apart, raised false alarms."""
     kinematics: CheckConfig = field(default_factory=CheckConfig)
     """How."""
     find: FindConfig = field(default_factory=FindConfig)

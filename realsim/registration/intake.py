@@ -17,10 +17,9 @@ from realsim.registration.evidence import (
     averaged,
     corrected_frame,
     held,
-    measure_noise,
     without_table,
 )
-from realsim.registration.find_table import find_table
+from realsim.registration.find_table import find_table, looked_at
 from realsim.registration.odometry.cross_check import KinematicsCheck, check_kinematics
 from realsim.registration.view_checks import check_views
 from realsim.registration.view_findings import ViewFinding
@@ -126,13 +125,36 @@ def take_in(
     )  # fmt: skip
 
 
-def check_odometry(intake: Intake, config: RegistrationConfig) -> KinematicsCheck:
-    """Return what the depth images alone say of the claimed camera poses."""
+def check_odometry(
+    intake: Intake, config: RegistrationConfig
+) -> tuple[KinematicsCheck | None, ViewFinding | None]:
+    """Return what the depth images alone say of the claimed camera poses, or why they cannot."""
+    apart = neighbours_apart_deg(intake)
+    if apart > config.odometry_deg:
+        words = (
+            f"odometry was not tried: the views lie {apart:.0f} degrees from their neighbours in "
+            f"the median; at most {config.odometry_deg:.0f} are accepted. Capture more views."
+        )
+        return None, ViewFinding(index=None, kind="odometry", words=words, exclude=False)
     fine = sampling(intake.intrinsics, 1, config)
     views = intake.views
     if views[0].area_px > fine.stride**2:
         views = sample_views(intake.intrinsics, intake.frames, intake.noise, fine)
-    return check_kinematics(views, intake.plane, config.kinematics)
+    return check_kinematics(views, intake.plane, config.kinematics), None
+
+
+def neighbours_apart_deg(intake: Intake) -> float:
+    """Return the median angle between a view's direction to the scene and its nearest one's [deg].
+
+    Infinite of a single view.
+    """
+    if len(intake.views) < 2:
+        return float("inf")
+    away = looked_at(intake.views) - intake.cameras[:, :3, 3]
+    away /= np.linalg.norm(away, axis=1, keepdims=True)
+    cosines = away @ away.T
+    np.fill_diagonal(cosines, -1.0)
+    return float(np.median(np.degrees(np.arccos(np.clip(cosines.max(1), -1.0, 1.0)))))
 
 
 def _noise(frames: Sequence[DepthFrame], config: RegistrationConfig) -> DepthNoise:

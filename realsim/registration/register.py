@@ -97,8 +97,10 @@ def register_scene(
     if asked is None:
         models, refused = models_in_units(models, intake, config)
     kinematics = None
-    if config.odometry and len(intake.frames) > 1:
-        kinematics = check_odometry(intake, config)
+    if config.odometry:
+        kinematics, why_not = check_odometry(intake, config)
+        if why_not is not None:
+            intake = replace(intake, findings=(*intake.findings, why_not))
     work = Work(name, intake, models, config, up, tick, kinematics)
     found = found_objects(work, asked)
     missing = (*refused, *found.not_placed)

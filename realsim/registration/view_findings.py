@@ -7,7 +7,7 @@ from realsim.registration.find_table import TableSearchConfig
 
 Kind = Literal[
     "no_depth", "little_depth", "table_off", "foreign", "partly_foreign", "pose_of_another",
-    "slipped", "all_disagree", "objects_off",
+    "slipped", "all_disagree", "objects_off", "odometry",
 ]  # fmt: skip
 
 

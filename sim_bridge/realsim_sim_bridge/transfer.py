@@ -13,7 +13,7 @@ a kill skips the views whose digest still holds, and does the others.
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -40,6 +40,8 @@ from realsim_sim_bridge.transfer_pictures import overlay_picture
 __all__ = ["TransferConfig", "TransferSummary", "annotate", "overlay_picture"]
 
 Progress = Callable[[int, int], None]
+MOST_NAMED = 8
+"""So many views are named in a message."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -74,6 +76,8 @@ class TransferSummary:
     """Instances not annotated because they are rejected."""
     doubtful: tuple[int, ...]
     """Instances annotated and flagged: their verdict is not 'accepted'."""
+    views_left_out: tuple[int, ...]
+    """Views not annotated because the objects were not registered in them."""
     agreement: dict[int, float]
     """Per instance, the share of measured visible pixels that agree with the rendered depth, over
     all views; NaN = never seen with a measurement."""
@@ -85,10 +89,14 @@ class TransferSummary:
     def __str__(self) -> str:
         """Return one line for the terminal."""
         shares = ", ".join(f"{i}: {100 * a:.0f} %" for i, a in self.agreement.items())
+        which = ", ".join(map(str, self.views_left_out[:MOST_NAMED]))
+        which += ", ..." if len(self.views_left_out) > MOST_NAMED else ""
+        without = f", {len(self.views_left_out)} not registered ({which})" if which else ""
         return (
-            f"{self.views} views annotated ({self.skipped} still held), {len(self.objects)} "
-            f"objects ({len(self.doubtful)} not accepted, {len(self.left_out)} rejected and left "
-            f"out), {self.grasps} grasps a view; agreement with the depth {shares or 'unknown'}"
+            f"{self.views} views annotated ({self.skipped} still held{without}), "
+            f"{len(self.objects)} objects ({len(self.doubtful)} not accepted, "
+            f"{len(self.left_out)} rejected and left out), {self.grasps} grasps a view; "
+            f"agreement with the depth {shares or 'unknown'}"
         )
 
 
@@ -112,6 +120,7 @@ def annotate(
     grasp_sets: Sequence[GraspSet],
     config: TransferConfig | None = None,
     *,
+    only: Collection[int] | None = None,
     progress: Progress | None = None,
 ) -> TransferSummary:
     """Write masks, poses, visibility and grasps for every view of a session.
@@ -122,6 +131,8 @@ def annotate(
         models: obj_id -> model.
         grasp_sets: the scored grasps of the instances; those of rejected ones are left out.
         config: settings; None = the defaults.
+        only: the views in which the objects were registered; None = all. Others get no labels:
+            their camera, or their depth, is not to be trusted.
         progress: called with (views done, views in all).
 
     Raises:
@@ -129,7 +140,7 @@ def annotate(
             that is not in the scene.
     """
     config = config or TransferConfig()
-    views = _calibrated_views(store)
+    views = _calibrated_views(store, only)
     inputs = _gathered(store, scene, models, grasp_sets, config)
     files.write_objects(store, _object_entries(scene, models))
     parts: dict[int, dict[str, Any]] = {}
@@ -148,12 +159,13 @@ def annotate(
     return _summary(scene, inputs, parts, skipped)
 
 
-def _calibrated_views(store: SessionStore) -> tuple[View, ...]:
-    """Return the views, all of which must know their camera."""
-    views = store.session.views
+def _calibrated_views(store: SessionStore, only: Collection[int] | None) -> tuple[View, ...]:
+    """Return the views that are annotated, all of which must know their camera."""
+    views = tuple(v for v in store.session.views if only is None or v.index in only)
     missing = [v.index for v in views if v.T_world_cam is None]
     if missing or not views:
-        which = ", ".join(map(str, missing[:8])) + ("..." if len(missing) > 8 else "")
+        which = ", ".join(map(str, missing[:MOST_NAMED]))
+        which += "..." if len(missing) > MOST_NAMED else ""
         raise InputError(
             f"session '{store.session.name}' has "
             + (f"no camera pose for view {which}" if missing else "no views")
@@ -350,6 +362,7 @@ def _summary(
         objects=tuple(agreed),
         left_out=tuple(o.instance for o in scene.objects if o.verdict == "rejected"),
         doubtful=tuple(o.instance for o in inputs.objects if o.verdict != "accepted"),
+        views_left_out=tuple(v.index for v in inputs.store.session.views if v.index not in parts),
         agreement={i: agreed[i] / n if n > 0 else float("nan") for i, n in measured.items()},
         grasps=sum(len(g) for g in inputs.grasp_sets),
         seen_grasps=seen,
