@@ -17,6 +17,7 @@ from realsim.registration.evidence import (
     averaged,
     corrected_frame,
     held,
+    measure_noise,
     without_table,
 )
 from realsim.registration.find_table import find_table, looked_at
