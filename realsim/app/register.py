@@ -1,11 +1,13 @@
 """The registration of a session: read what is there, find the objects, write, draw."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.console import Console
+from realsim.app.register_colour import colour_remark
 from realsim.app.register_config import RegisterRequest
 from realsim.app.register_files import finish_interrupted, remark_of, write_result
 from realsim.app.register_inputs import RegisterInputs, read_inputs
@@ -102,7 +104,9 @@ def _registered(
             inputs.wanted, inputs.config,
             gravity_up_world=None if up is None else np.array(up), progress=tick,
         )  # fmt: skip
-    return as_registered(found, inputs, store.session.intrinsics, request)
+    result = as_registered(found, inputs, store.session.intrinsics, request)
+    off = colour_remark(store, sorted(found.cameras))
+    return result if off is None else replace(result, remarks=(*result.remarks, off))
 
 
 def as_registered(

@@ -175,7 +175,7 @@ def _bop_cameras(result: Registered, store: SessionStore) -> Json:
 
 
 class FoundThing(Protocol):
-    """A finding of the registration; that of a view has an `index` as well."""
+    """A finding; that of a view has an `index` as well, that of a robot pose a `view`."""
 
     @property
     def kind(self) -> str: ...  # noqa: D102
@@ -186,7 +186,7 @@ class FoundThing(Protocol):
 
 def remark_of(finding: FoundThing) -> Remark:
     """Return a finding as it is stored."""
-    view: int | None = getattr(finding, "index", None)
+    view: int | None = getattr(finding, "index", getattr(finding, "view", None))
     return Remark(view=view, kind=str(finding.kind), words=finding.words)
 
 

@@ -76,6 +76,11 @@ def read_inputs(
     available = _available(store, request)
     claimed = _claimed(store, request, tick)
     wanted = _wanted(store, request, available)
+    if wanted is not None and not wanted:
+        raise InputError(
+            f"'{store.path(STARTS_FILE)}' names no object: 'starts' is empty. Give a "
+            "row per object, name them by --object, or delete the file and ask for --find-all."
+        )
     views, left_out = _views(store, request, claimed)
     if wanted is not None:
         _check_distances(wanted, [claimed[k] for k in views])
@@ -196,6 +201,11 @@ def _claimed(
     """
     claimed = claimed_cameras(store)
     record = load_cameras(store)
+    if request.hand_held and request.odometry:
+        raise InputError(
+            "--odometry holds the robot's poses against the depth images, and with --hand-held "
+            "there is no robot: leave one of both away."
+        )
     if not request.hand_held:
         if claimed:
             return claimed

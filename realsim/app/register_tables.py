@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from realsim.app.console import Console
+from realsim.app.register_files import plain
 from realsim.app.register_results import Registered, sigmas_of
 from realsim.records import ObjectModel, ObjectPose
 
@@ -17,6 +18,7 @@ OBJECT_HEADER = [
 ]  # fmt: skip
 MISSING_HEADER = ["not placed", "why"]
 VIEW_HEADER = ["view", "what", "in words"]
+NOISE_KEYS = ("noise_mm", "noise_deg")
 
 
 def worst_first(result: Registered) -> list[ObjectPose]:
@@ -113,7 +115,9 @@ def odometry_line(result: Registered) -> str:
     found: dict[str, Any] | None = result.report.get("kinematics")
     if not found:
         return ""
-    noise = f"{found['noise_mm']:.1f} mm / {found['noise_deg']:.2f} deg a pair"
+    # Not a number, and null once stored, where no pair could be aligned.
+    mm, deg = (float(found[k]) if found[k] is not None else np.nan for k in NOISE_KEYS)
+    noise = f"{_figure(mm, 1)} mm / {_figure(deg, 2)} deg a pair"
     if found["faults"]:
         return f"odometry from depth names {len(found['faults'])} faults (noise {noise})."
     return f"odometry from depth finds nothing gross against the robot's poses (noise {noise})."
@@ -210,5 +214,6 @@ def as_json(result: Registered, models: Mapping[int, ObjectModel]) -> dict[str, 
         ],
         "findings": [{"view": r.view, "kind": r.kind, "words": r.words} for r in result.remarks],
         "cameras": camera_line(result),
+        "kinematics": plain(result.report.get("kinematics")),
         "views": sorted(result.cameras.refined),
     }

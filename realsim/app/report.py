@@ -135,7 +135,7 @@ def _photograph_section(page: Page, store: SessionStore, folder: Path) -> None:
         scene, models = load_scene(store), session_models(store)
         grasps = load_grasps(store.folder / "grasps")
         known = registered_views(store)
-        told = [k for k in indices if known is None or k in known]
+        told = [k for k in indices if known is None or k in known] or indices
         pick = np.unique(np.linspace(0, len(told) - 1, OVERLAY_VIEWS).round().astype(int))
         for index in (told[k] for k in pick):
             path = folder / f"overlay_{index:06d}.png"

@@ -10,8 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.records import GraspSet, HandEye, ObjectModel, ObjectPose, Scene
@@ -147,27 +145,6 @@ def save_starts(store: SessionStore, starts: Sequence[ObjectPose], source: str) 
         for s in starts
     ]
     store.write_json("registration/starts.json", {"source": source, "starts": rows})
-
-
-def load_starts(store: SessionStore) -> list[ObjectPose]:
-    """Read the rough poses that registration starts from.
-
-    Raises:
-        InputError: there are none.
-    """
-    if not (store.folder / "registration/starts.json").is_file():
-        raise InputError(
-            f"session '{store.folder}' has no registration/starts.json: registration needs a rough "
-            "pose (within about 2 cm and 20 degrees) for every object."
-        )
-    return [
-        ObjectPose(
-            obj_id=row["obj_id"],
-            instance=row["instance"],
-            T_world_obj=np.array(row["T_world_obj"]),
-        )
-        for row in store.read_json("registration/starts.json")["starts"]
-    ]
 
 
 def session_models(store: SessionStore) -> dict[int, ObjectModel]:

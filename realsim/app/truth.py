@@ -138,7 +138,9 @@ def _mask_ious(store: SessionStore, truth: LabTruth) -> tuple[dict[int, float], 
         [PlacedMesh(o.instance, models[o.obj_id].mesh, o.T_world_obj) for o in truth.objects]
     )
     cameras = {v.index: v.T_world_cam for v in truth.views}
-    indices = sorted(cameras)
+    # A view that the registration left out has no masks.
+    labelled = [k for k in sorted(cameras) if store.has(f"annotations/{k:06d}.json")]
+    indices = labelled or sorted(cameras)
     pick = np.unique(np.linspace(0, len(indices) - 1, IOU_VIEWS).round().astype(int))
     values: dict[int, list[float]] = {o.instance: [] for o in truth.objects}
     for index in (indices[k] for k in pick):

@@ -45,7 +45,8 @@ def store(tmp_path: Path) -> SessionStore:
 
 
 def starts_of(store: SessionStore) -> list[ObjectPose]:
-    return stages.load_starts(store)
+    rows = store.read_json("registration/starts.json")["starts"]
+    return [ObjectPose(**row) for row in rows]
 
 
 @pytest.mark.parametrize("spoil", ["zero depth", "cut list", "lost photograph"])

@@ -175,6 +175,7 @@ def test_the_key_changes_with_everything_that_matters(session: Path) -> None:
         RegisterRequest(objects=("mug",), method="top-down"),
         RegisterRequest(objects=("mug",), refine_cameras=False),
         RegisterRequest(objects=("mug",), depth_bias="off"),
+        RegisterRequest(objects=("mug",), odometry=True),
     ]  # fmt: skip
     keys = {read_inputs(store, other).key for other in others}
     assert len(keys) == len(others) and key not in keys
@@ -182,6 +183,32 @@ def test_the_key_changes_with_everything_that_matters(session: Path) -> None:
         store.session.intrinsics, {0: cameras_now(store)[0] @ se3.from_translation([1e-4, 0, 0])}
     )
     assert read_inputs(store, base).key != key
+
+
+def test_a_start_brings_how_far_off_it_may_be(session: Path) -> None:
+    store = SessionStore.open(session)
+    near, far = true_poses()
+    rows = [
+        {"obj_id": o.obj_id, "instance": o.instance, "T_world_obj": o.T_world_obj.tolist()}
+        for o in (near, far)
+    ]
+    rows[1] |= {"radius_mm": 80.0, "turn_deg": 120.0}
+    store.write_json("registration/starts.json", {"source": "test", "starts": rows})
+    wanted = read_inputs(store, RegisterRequest()).wanted
+    assert wanted is not None
+    usual, told = (w.region for w in wanted)
+    assert usual is not None and told is not None
+    assert (told.radius_m, told.turn_deg) == (0.08, 120.0)
+    assert usual.radius_m < 0.08 and usual.turn_deg < 120.0
+    for w, o in zip(wanted, (near, far), strict=True):
+        assert w.T_start is not None
+        np.testing.assert_allclose(w.T_start, o.T_world_obj, atol=1e-15)
+
+
+def test_the_robot_is_not_checked_where_there_is_none(tmp_path: Path) -> None:
+    store = table_session(tmp_path / "s", views=2, posed=False)
+    with pytest.raises(InputError, match="no robot"):
+        read_inputs(store, RegisterRequest(objects=("mug",), hand_held=True, odometry=True))
 
 
 def test_the_depth_bias_is_that_of_the_calibration_unless_it_is_off(session: Path) -> None:

@@ -1,0 +1,158 @@
+"""What other stages make of a registration: which views count, interrupted ones, notes, colour."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.app.console import Console
+from realsim.app.register_colour import colour_remark
+from realsim.app.register_files import documents, remark_of, write_result
+from realsim.app.register_results import NEXT_FILE, SCENE_FILE, cameras_now
+from realsim.app.register_tables import as_json, odometry_line
+from realsim.app.report import write_report
+from realsim.app.stages import annotate_session, judged_scene, registered_views
+from realsim.app.upgrade import _registration_notes  # pyright: ignore[reportPrivateUsage]
+from realsim.records import CaptureSession, Mesh, View
+from realsim.registration.odometry.cross_check import Fault, KinematicsCheck, ViewDifference
+from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim.store import SessionStore, atomic
+from registered_sessions import (
+    CAMERA,
+    models_of,
+    registered_by_hand,
+    table_session,
+    true_cameras,
+    true_poses,
+)
+
+MODELS = models_of()
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> SessionStore:
+    """A session of four views whose cameras are a little off."""
+    return table_session(tmp_path / "s", views=4)
+
+
+def test_views_that_were_left_out_get_no_labels_and_are_named(store: SessionStore) -> None:
+    write_result(store, registered_by_hand(store), MODELS, {})
+    assert registered_views(store) == [0, 1, 2, 3]
+    whole = annotate_session(store, QUIET)
+    assert whole.views == 4 and whole.views_left_out == () and "not registered" not in str(whole)
+    # One view less than before: its labels of the earlier run go, too.
+    write_result(store, registered_by_hand(store, left_out=2), MODELS, {})
+    summary = annotate_session(SessionStore.open(store.folder), QUIET)
+    assert (summary.views, summary.views_left_out) == (3, (2,))
+    assert "1 not registered (2)" in str(summary)
+    assert set(store.read_json("scene_gt.json")) == {"0", "1", "3"}
+    assert not store.has("annotations/000002.json") and store.has("annotations/000003.json")
+    assert not store.has("mask_visib/000002_000000.png")
+    page = write_report(store, None)
+    shown = {p.name for p in page.parent.glob("overlay_*.png")}
+    assert shown == {f"overlay_{k:06d}.png" for k in (0, 1, 3)}
+
+
+def test_a_session_without_a_record_of_cameras_is_labelled_whole(store: SessionStore) -> None:
+    result = registered_by_hand(store)
+    store.set_cameras(CAMERA, result.cameras.refined)
+    store.write_json(SCENE_FILE, documents(result, store, MODELS)[SCENE_FILE])
+    assert registered_views(store) is None
+    assert annotate_session(store, QUIET).views == 4
+
+
+def test_an_interrupted_registration_is_finished_by_whoever_comes_next(
+    store: SessionStore,
+) -> None:
+    result = registered_by_hand(store, left_out=1)
+    before = {str(k): T.tolist() for k, T in cameras_now(store).items()}
+    files = documents(result, store, MODELS)
+    store.write_bytes(NEXT_FILE, atomic.json_bytes({"before": before, "files": files}))
+    assert not store.has(SCENE_FILE)
+    scene = judged_scene(store)
+    assert [o.instance for o in scene.objects] == [0, 1] and not store.has(NEXT_FILE)
+    np.testing.assert_allclose(cameras_now(store)[0], result.cameras.refined[0], atol=1e-15)
+
+
+@pytest.mark.parametrize("missing", ["all", "common_offset_mm", "common_sinking", "objects"])
+def test_notes_of_a_registration_that_could_not_tell_everything(
+    store: SessionStore, missing: str
+) -> None:
+    offset = {"consistent": True, "offset_mm": [1.0, 2.0, 3.0], "spread_mm": 0.4}
+    sinking = {"consistent": True, "share_of_height": -0.05}
+    blind = {"start_kept": True, "axes": [{"declared": False, "fit_deg": 12.0}]}
+    told = {
+        "common_offset_mm": offset,
+        "common_sinking": sinking,
+        "objects": [{"name": "can", "blind": blind}, {"name": "bare"}],
+    }
+    report = {} if missing == "all" else {k: v for k, v in told.items() if k != missing}
+    store.write_json("registration/report.json", report)
+    words = " ".join(_registration_notes(store))
+    expected = {
+        "common_offset_mm": "moved together", "common_sinking": "sink into the table by 5.0 %",
+        "objects": "can (12 deg)",
+    }  # fmt: skip
+    for key, part_of in expected.items():
+        assert (part_of in words) == (key in report)
+
+
+# --- depth against colour ---------------------------------------------------------------------
+
+
+def coloured(folder: Path, shift_px: int, *, blank: bool = False) -> SessionStore:
+    """Return a session whose colour lies `shift_px` to the right of its depth."""
+    camera = replace(CAMERA, width=640, height=480, fx=600.0, fy=600.0, cx=320.0, cy=240.0)
+    session = CaptureSession(name="colour", intrinsics=camera, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(folder, session)
+    corners = np.array([[-0.5, -0.5, 0], [0.5, -0.5, 0], [0.5, 0.5, 0], [-0.5, 0.5, 0]])
+    table = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
+    placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in true_poses()]
+    renderer = LabelRenderer([*placed, PlacedMesh(-1, table, np.eye(4))])
+    for k, T in enumerate(true_cameras(10)):
+        labels = renderer.render(camera, T)
+        grey = np.where(labels.ids >= 0, 200, 90).astype(np.uint8)
+        grey = np.zeros_like(grey) if blank else np.roll(grey, shift_px, axis=1)
+        rgb = np.repeat(grey[..., None], 3, axis=2)
+        store.add_view(View(index=k, T_world_cam=T), rgb, labels.depth_m)
+    return store
+
+
+def test_depth_that_does_not_lie_on_colour_is_said_in_pixels(tmp_path: Path) -> None:
+    remark = colour_remark(coloured(tmp_path / "off", 15), range(10))
+    assert remark is not None and remark.kind == "not_aligned" and remark.view is None
+    assert "15 px to the left of" in remark.words and "of 5 views" in remark.words
+
+
+def test_depth_that_lies_on_colour_or_cannot_be_told_is_not_spoken_of(tmp_path: Path) -> None:
+    assert colour_remark(coloured(tmp_path / "on", 0), range(10)) is None
+    assert colour_remark(coloured(tmp_path / "blank", 0, blank=True), range(10)) is None
+    assert colour_remark(SessionStore.open(tmp_path / "on"), []) is None
+
+
+# --- odometry ---------------------------------------------------------------------------------
+
+
+def test_what_odometry_found_is_shown_and_survives_not_a_number(store: SessionStore) -> None:
+    fault = Fault(kind="view", view=2, other=None, mm=12.0, deg=1.0, words="view 2 is 12 mm off.")
+    view = ViewDifference(index=2, mm=12.0, deg=1.0, pairs=3, overlap=0.8)
+    check = KinematicsCheck(
+        views=(view,), faults=(fault,), noise_mm=0.43, noise_deg=0.06, pairs=3, unchecked=(),
+        cpu_s=0.1,
+    )  # fmt: skip
+    remark = remark_of(fault)
+    assert (remark.view, remark.kind, remark.words) == (2, "view", fault.words)
+    result = registered_by_hand(store)
+    assert odometry_line(result) == ""
+    told = replace(result, report=result.report | {"kinematics": check.as_json()})
+    assert "1 faults" in odometry_line(told) and "0.4 mm / 0.06 deg" in odometry_line(told)
+    none = replace(check, faults=(), noise_mm=float("nan"), noise_deg=float("nan"))
+    fresh = replace(result, report=result.report | {"kinematics": none.as_json()})
+    write_result(store, fresh, MODELS, {})
+    stored = replace(result, report=store.read_json("registration/report.json"))
+    assert "- mm / - deg" in odometry_line(fresh) == odometry_line(stored)
+    one, two = (as_json(r, MODELS)["kinematics"] for r in (fresh, stored))
+    assert json.dumps(one, allow_nan=False) == json.dumps(two, allow_nan=False)
