@@ -141,7 +141,11 @@ def check_odometry(
     views = intake.views
     if views[0].area_px > fine.stride**2:
         views = sample_views(intake.intrinsics, intake.frames, intake.noise, fine)
-    return check_kinematics(views, intake.plane, config.kinematics), None
+    try:
+        return check_kinematics(views, intake.plane, config.kinematics), None
+    except InputError as error:
+        words = f"odometry was not tried: {error}"
+        return None, ViewFinding(index=None, kind="odometry", words=words, exclude=False)
 
 
 def neighbours_apart_deg(intake: Intake) -> float:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene
+from realsim.registration.blind import Kept
 from realsim.registration.body import Body
 from realsim.registration.compare import Comparer
 from realsim.registration.config import METHODS, RegistrationConfig
@@ -133,7 +134,7 @@ def _with_many(work: Work, found: Found, missing: tuple[NotPlaced, ...]) -> Regi
         many = register_many(intake, bodies, starts, intake.plane, config)
         fought = _fought(found, many, config)
     contrasts = [
-        c if d is None else d.contrast for c, d in zip(found.contrasts, fought, strict=True)
+        _contrast(c, d, k) for c, d, k in zip(found.contrasts, fought, many.kept, strict=True)
     ]
     comparer = comparer_on(intake, many.frames, many.plane, claimed, many.poses, config)
     uncertain = [
@@ -181,6 +182,19 @@ def _views_off(
     )  # fmt: skip
     known = {f.index for f in intake.findings}
     return [f for f in found if f.kind == "objects_off" and f.index not in known]
+
+
+def _contrast(search: float | None, fought: Duel | None, kept: Kept) -> float | None:
+    """Return how clearly a pose is better than its rival; None = it has none.
+
+    Where the depth cannot see a turn and the claimed one was kept, a rival that is no worse is the
+    same object turned unseen.
+    """
+    contrast = search if fought is None else fought.contrast
+    unseen = bool(kept.report.get("start_kept"))
+    if unseen and contrast is not None and abs(contrast) < CONTRAST_DECIDED:
+        return None
+    return contrast
 
 
 def _is_lost(fought: Duel | None) -> bool:
