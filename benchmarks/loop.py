@@ -26,9 +26,10 @@ import numpy as np
 from realsim.app.console import Console
 from realsim.app.demo import DemoConfig, DemoResult, run_demo
 from realsim.app.truth import GOALS
-from realsim_sim_bridge.school.score import ScoreLimits, score_stages
-from realsim_sim_bridge.school.slip_test import SlipConfig, SlipTrial, run_slip_test
-from realsim_sim_bridge.school.slip_world import SlipBody, SlipPhysics
+from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.world import SlipPhysics
 
 PACKAGES = ("realsim", "numpy", "open3d-cpu", "gtsam", "pybullet", "opencv-python-headless")
 PAPER_GRASPS_PER_S = 100 * 2198 / (7 * 86400)

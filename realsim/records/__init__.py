@@ -6,7 +6,7 @@ here, at construction. All units are SI (m, rad, s, kg, N) unless the name says 
 
 from realsim.records.calibration import ArmErrorMap, Check, HandEye, RobotErrorMap
 from realsim.records.capture import DISTORTION_TERMS, CameraIntrinsics, CaptureSession, View
-from realsim.records.grasps import STAGES, GraspSet
+from realsim.records.grasps import MEASURES, STAGES, GraspSet, Measure
 from realsim.records.objects import (
     Mesh,
     ObjectModel,
@@ -24,9 +24,12 @@ from realsim.records.targets import (
     TagBoard,
     Target,
 )
+from realsim.records.trajectories import PHASES, GraspTrajectories
 
 __all__ = [
     "DISTORTION_TERMS",
+    "MEASURES",
+    "PHASES",
     "STAGES",
     "TAG_CELLS",
     "ArmErrorMap",
@@ -37,7 +40,9 @@ __all__ = [
     "Chessboard",
     "CircleGrid",
     "GraspSet",
+    "GraspTrajectories",
     "HandEye",
+    "Measure",
     "Mesh",
     "ObjectModel",
     "ObjectPose",

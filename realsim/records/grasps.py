@@ -14,6 +14,51 @@ STAGES = ("close", "lift", "oscillate", "pendulum")
 """The four stages of the slip test, in order."""
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Measure:
+    """What one column of a grasp set's measures says."""
+
+    unit: str
+    meaning: str
+    by_stage: bool = False
+    """True: one value a stage (N, 4); False: one a grasp (N,)."""
+
+
+MEASURES = {
+    "force_n": Measure(
+        unit="N", meaning="least normal force of the weaker finger; NaN = not executed",
+        by_stage=True,
+    ),
+    "duration_s": Measure(
+        unit="s", meaning="time until the stage ended or the object was lost", by_stage=True
+    ),
+    "second_score": Measure(unit="1", meaning="the score by the second engine"),
+    "second_base_score": Measure(unit="1", meaning="the base score by the second engine"),
+    "second_slip_m": Measure(unit="m", meaning="slip by the second engine", by_stage=True),
+    "second_slip_rad": Measure(unit="rad", meaning="turn by the second engine", by_stage=True),
+    "confidence": Measure(
+        unit="1", meaning="agreement of the two engines, 0 to 1: 1 - |difference of the scores|"
+    ),
+    "least_friction": Measure(
+        unit="1", meaning="smallest friction at which all four stages are passed; inf = at none tried"
+    ),
+    "least_force_n": Measure(
+        unit="N", meaning="smallest finger force at which all four stages are passed; inf likewise"
+    ),
+    "margin": Measure(
+        unit="1", meaning="share of the swept frictions and forces at which it is passed"
+    ),
+    "ferrari_canny": Measure(
+        unit="1", meaning="radius of the largest ball in the hull of the contact wrenches"
+    ),
+    "closure_friction": Measure(
+        unit="1", meaning="smallest friction of GraspNet's levels that closes; inf = none"
+    ),
+    "dexnet_closure": Measure(unit="1", meaning="1 = force closure as Dex-Net tests it, 0 = none"),
+}
+"""The columns that a grasp set may carry besides its score. NaN = not measured."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class GraspSet:
     """The grasp candidates of one object instance and what physics said of each.
@@ -39,6 +84,8 @@ class GraspSet:
     """(N,) whether the arm has a collision-free trajectory to closure."""
     failures: tuple[str, ...]
     """(N,) why the grasp stopped where it stopped; '' = passed all."""
+    measures: dict[str, Array] = field(default_factory=dict[str, Array])
+    """What else was measured of each grasp, by the names of `MEASURES`."""
     parameters: dict[str, Any] = field(default_factory=dict[str, Any])
     """Everything the scores depend on, as plain JSON values."""
 
@@ -55,6 +102,7 @@ class GraspSet:
             value = np.asarray(getattr(self, name), dtype=np.float64).reshape(n, len(STAGES))
             object.__setattr__(self, name, frozen(value, np.float64, (n, len(STAGES)), name))
         object.__setattr__(self, "reachable", frozen(self.reachable, np.bool_, (n,), "reachable"))
+        object.__setattr__(self, "measures", _checked_measures(self.measures, n))
         if len(self.failures) != n:
             raise InputError(f"{len(self.failures)} failure notes for {n} grasps.")
 
@@ -66,3 +114,18 @@ class GraspSet:
     def good(self) -> NDArray[np.bool_]:
         """(N,) whether the grasp is good: score >= 0.5."""
         return np.nan_to_num(self.scores, nan=-1.0) >= 0.5
+
+
+def _checked_measures(measures: dict[str, Array], n: int) -> dict[str, Array]:
+    """Return the measures as private read-only arrays.
+
+    Raises:
+        InputError: one of an unknown name, or of another number of grasps.
+    """
+    checked: dict[str, Array] = {}
+    for name, values in measures.items():
+        if name not in MEASURES:
+            raise InputError(f"'{name}' is no measure of a grasp; there are: {', '.join(MEASURES)}.")
+        shape = (n, len(STAGES)) if MEASURES[name].by_stage else (n,)
+        checked[name] = frozen(values, np.float64, shape, name)
+    return checked

@@ -3,6 +3,7 @@
 import io
 import math
 import zipfile
+import zlib
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 
 from realsim.errors import InputError
 from realsim.records import STAGES, GraspSet, HandEye, Scene, TagBoard
+from realsim.records.grasps import MEASURES
 from realsim.store import atomic, records_json
 from realsim.store.records_json import number_to_json
 from realsim.store.session_store import SessionStore, read_json_file
@@ -20,7 +22,10 @@ BOARD_FILE = "calibration/board.json"
 SCENE_FILE = "registration/scene.json"
 GRASP_FOLDER = "grasps"
 ARRAYS = ("Ts_obj_grasp", "widths_m", "scores", "base_scores", "slip_m", "slip_rad", "reachable")
-GRASP_FORMAT_VERSION = 1
+MEASURE_PREFIX = "measure."
+"""Before the name of a measure in the npz file, so that no array of the set is shadowed."""
+GRASP_FORMAT_VERSION = 2
+"""Version 1 has no measures; it is still read."""
 
 
 # --- one record, one file ---------------------------------------------------------------------
@@ -85,7 +90,7 @@ def grasp_counts(grasps: GraspSet) -> dict[str, Any]:
 
 def grasps_to_json(grasps: GraspSet) -> dict[str, Any]:
     """Return the readable side of a grasp set; the arrays are in the npz file beside it."""
-    rows = [
+    rows: list[dict[str, Any]] = [
         {
             "index": i,
             "score": number_to_json(float(grasps.scores[i])),
@@ -97,14 +102,27 @@ def grasps_to_json(grasps: GraspSet) -> dict[str, Any]:
         }
         for i in range(len(grasps))
     ]
+    for name, values in grasps.measures.items():
+        for row, value in zip(rows, values, strict=True):
+            row.setdefault("measures", {})[name] = _measure_to_json(name, value)
     return {
         "format_version": GRASP_FORMAT_VERSION,
         "obj_id": int(grasps.obj_id),
         "instance": int(grasps.instance),
         "counts": grasp_counts(grasps),
+        "measures": {
+            name: {"unit": MEASURES[name].unit, "meaning": MEASURES[name].meaning}
+            for name in grasps.measures
+        },
         "parameters": grasps.parameters,
         "grasps": rows,
     }
+
+
+def _measure_to_json(name: str, value: Any) -> Any:
+    if MEASURES[name].by_stage:
+        return {s: number_to_json(float(v)) for s, v in zip(STAGES, value, strict=True)}
+    return number_to_json(float(value))
 
 
 def _by_stage(values: Any) -> dict[str, Any]:
@@ -120,6 +138,7 @@ def save_grasps(store_or_folder: SessionStore | Path | str, grasps: GraspSet) ->
         grasps: the grasp set.
     """
     arrays: dict[str, Any] = {name: getattr(grasps, name) for name in ARRAYS}
+    arrays |= {MEASURE_PREFIX + name: values for name, values in grasps.measures.items()}
     arrays["failures"] = np.array(grasps.failures, dtype=np.str_).reshape(len(grasps))
     stem = grasp_stem(grasps)
     # The npz comes last: a set whose npz is there is complete.
@@ -141,7 +160,7 @@ def load_grasps(folder: SessionStore | Path | str) -> list[GraspSet]:
     """Return all complete grasp sets of a session or of a folder, by instance number.
 
     Raises:
-        InputError: a file is broken.
+        InputError: a file is broken, or of a newer format.
     """
     path = folder.folder if isinstance(folder, SessionStore) else Path(folder)
     if (path / GRASP_FOLDER).is_dir():
@@ -152,11 +171,22 @@ def load_grasps(folder: SessionStore | Path | str) -> list[GraspSet]:
 def _load_grasp_set(file: Path) -> GraspSet:
     keys = ("obj_id", "instance", "parameters")
     head = records_json.need(read_json_file(file.with_suffix(".json")), keys, f"{file.stem}.json")
+    found = head.get("format_version", 1)
+    if not (isinstance(found, int) and 1 <= found <= GRASP_FORMAT_VERSION):
+        raise InputError(
+            f"{file.stem}.json has the format version {found!r}; this realsim reads 1 to "
+            f"{GRASP_FORMAT_VERSION}. Read it with the version that wrote it, or a newer one."
+        )
     try:
         with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as npz:
             arrays = {name: npz[name] for name in ARRAYS}
+            measures = {
+                name.removeprefix(MEASURE_PREFIX): npz[name]
+                for name in npz.files
+                if name.startswith(MEASURE_PREFIX)
+            }
             failures = tuple(str(f) for f in npz["failures"].tolist())
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise InputError(
             f"{file} is not a complete grasp file ({error}). Delete it and its .json, and run the "
             "school again for this object."
@@ -165,6 +195,7 @@ def _load_grasp_set(file: Path) -> GraspSet:
         obj_id=int(head["obj_id"]),
         instance=int(head["instance"]),
         failures=failures,
+        measures=measures,
         parameters=head["parameters"],
         **arrays,
     )

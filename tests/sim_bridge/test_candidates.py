@@ -4,9 +4,9 @@ import numpy as np
 
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim_sim_bridge.school.candidates import CandidateConfig, Surroundings, sample_candidates
-from realsim_sim_bridge.school.hand import HandGeometry
-from realsim_sim_bridge.school.hand_free import boxes_free, lowest_corner
+from realsim_sim_bridge.grasping.candidates import CandidateConfig, Surroundings, sample_candidates
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.grasping.hand_free import boxes_free, lowest_corner
 
 HAND = HandGeometry()
 

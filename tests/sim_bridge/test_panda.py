@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from realsim.geometry import se3
-from realsim_sim_bridge.school import panda
-from realsim_sim_bridge.school.candidates import Surroundings
-from realsim_sim_bridge.school.hand import HandGeometry
-from realsim_sim_bridge.school.joint_path import PlannerConfig, connect, straight
-from realsim_sim_bridge.school.reach import ReachConfig, ReachTask, base_on_table, check_reach
+from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.grasping.candidates import Surroundings
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.arm.joint_path import PlannerConfig, connect, straight
+from realsim_sim_bridge.arm.reach import ReachConfig, ReachTask, base_on_table, check_reach
 
 DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])

@@ -9,7 +9,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim_sim_bridge.school import SchoolConfig, recompute_scores, run_school
-from realsim_sim_bridge.school.candidates import CandidateConfig
+from realsim_sim_bridge.grasping.candidates import CandidateConfig
 
 CONFIG = SchoolConfig(max_candidates=6, candidates=CandidateConfig(surface_points=200))
 

@@ -8,7 +8,7 @@ import pytest
 from realsim.errors import InputError
 from realsim.records import GraspSet
 from realsim_sim_bridge.school import ScoreLimits, recompute_scores
-from realsim_sim_bridge.school.score import score_stages
+from realsim_sim_bridge.slip.score import score_stages
 
 NAN, INF = np.nan, np.inf
 TEN = np.radians(10.0)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from realsim.geometry import se3
-from realsim_sim_bridge.school.hand import HandGeometry
-from realsim_sim_bridge.school.motion import (
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.motion import (
     SlipMotion,
     inertial_wrench,
     lift_acceleration,
@@ -16,9 +16,9 @@ from realsim_sim_bridge.school.motion import (
     pendulum_angle,
     pendulum_load,
 )
-from realsim_sim_bridge.school.score import ScoreLimits, score_stages
-from realsim_sim_bridge.school.slip_test import SlipConfig, SlipTrial, batches, run_slip_test
-from realsim_sim_bridge.school.slip_world import SlipBody, SlipPhysics, SlipWorld
+from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, batches, run_slip_test
+from realsim_sim_bridge.slip.slip_world import SlipBody, SlipPhysics, SlipWorld
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 SIDE = 0.05

@@ -2,6 +2,6 @@
 
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.school import run_school
-from realsim_sim_bridge.school.score import ScoreLimits, recompute_scores
+from realsim_sim_bridge.slip.score import ScoreLimits, recompute_scores
 
 __all__ = ["SchoolConfig", "ScoreLimits", "recompute_scores", "run_school"]

@@ -3,11 +3,11 @@
 from dataclasses import dataclass, field
 
 from realsim.models.convex import ConvexConfig
-from realsim_sim_bridge.school.candidates import CandidateConfig
-from realsim_sim_bridge.school.hand import HandGeometry
-from realsim_sim_bridge.school.reach import ReachConfig
-from realsim_sim_bridge.school.score import ScoreLimits
-from realsim_sim_bridge.school.slip_test import SlipConfig
+from realsim_sim_bridge.grasping.candidates import CandidateConfig
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.arm.reach import ReachConfig
+from realsim_sim_bridge.slip.score import ScoreLimits
+from realsim_sim_bridge.slip.slip_test import SlipConfig
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

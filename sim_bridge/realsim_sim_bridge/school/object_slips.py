@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from realsim.records import STAGES, GraspSet
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
-from realsim_sim_bridge.school import panda
+from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.school.object_task import ObjectTask, Prepared
-from realsim_sim_bridge.school.score import score_stages
-from realsim_sim_bridge.school.slip_test import Slips, SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.score import score_stages
+from realsim_sim_bridge.slip.slip_test import Slips, SlipTrial, run_slip_test
 
 Rows = NDArray[np.int64]
 

@@ -20,11 +20,11 @@ from realsim.models.convex import convex_parts
 from realsim.models.library_records import KnownSolid
 from realsim.records import Mesh
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
-from realsim_sim_bridge.school import panda
-from realsim_sim_bridge.school.candidates import Surroundings, sample_candidates
+from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.grasping.candidates import Surroundings, sample_candidates
 from realsim_sim_bridge.school.config import SchoolConfig
-from realsim_sim_bridge.school.reach import ReachTask, check_reach
-from realsim_sim_bridge.school.slip_world import SlipBody
+from realsim_sim_bridge.arm.reach import ReachTask, check_reach
+from realsim_sim_bridge.slip.body import SlipBody
 
 Array = NDArray[np.float64]
 

@@ -14,12 +14,12 @@ from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
 from realsim.records import GraspSet, Mesh, ObjectModel, Scene, names_of
 from realsim.store.arrays_on_disk import is_whole
-from realsim_sim_bridge.school.candidates import Surroundings
+from realsim_sim_bridge.grasping.candidates import Surroundings
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.kept_sets import read_grasp_set, write_grasp_set
 from realsim_sim_bridge.school.object_slips import grasp_set_of, rows_path, slips_of_rows
 from realsim_sim_bridge.school.object_task import ObjectTask, Prepared, prepare, surface_points
-from realsim_sim_bridge.school.slip_test import Slips, batches
+from realsim_sim_bridge.slip.slip_test import Slips, batches
 from realsim_sim_bridge.school.workers import executor
 
 Progress = Callable[[int, int], None]

@@ -1,52 +1,182 @@
-"""Processes that work for the school and end with it."""
+"""Who does the school's jobs: this process, or processes beside it.
+
+Every process has its own pool of one, so that one which dies takes down its own job alone, and it is
+known which job that was; a pool of many breaks as a whole.
+"""
 
 import os
 import signal
 import threading
 from collections.abc import Callable, Generator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import partial
 from multiprocessing import get_context, parent_process
-from typing import Any
+from multiprocessing.process import BaseProcess
+from typing import Any, Protocol
+
+from threadpoolctl import threadpool_limits
+
+from realsim.errors import RealsimError
 
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-"""The processes share the cores; threads of their libraries would fight over them."""
+"""The processes share the cores; threads of their libraries would fight over them, and sums split
+over threads differ in their last bits."""
 
 
-class _InThisProcess(Executor):
-    """An executor that does the job at once."""
+class WorkerDiedError(RealsimError):
+    """A worker ended before its job did: killed, out of memory, or crashed in a library."""
 
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+
+class Workers(Protocol):
+    """Does jobs. One that is lost with its worker ends in a `WorkerDiedError`."""
+
+    shares_files: bool
+    """Whether a path of this process leads to the same file where the jobs run."""
+
+    def capacity(self) -> int:
+        """Return how many jobs may be under way at once; it may change."""
+        ...
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any) -> Future[Any]:
+        """Start a job; never called with more than `capacity` of them under way."""
+        ...
+
+
+@contextmanager
+def local_workers(count: int | None = None) -> Generator[Workers]:
+    """Yield that many fresh processes (None = one a core), or this process where it is one."""
+    count = cores() if count is None else count
+    if count <= 1:
+        yield _ThisProcess()
+        return
+    processes = _Processes(count)
+    try:
+        yield processes
+    except BaseException:
+        # A job may take half a minute, and an interrupted user does not wait for it.
+        processes.end(at_once=True)
+        raise
+    processes.end(at_once=False)
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+class _ThisProcess:
+    """Does the job at once."""
+
+    shares_files = True
+
+    def capacity(self) -> int:
+        """Return 1."""
+        return 1
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any) -> Future[Any]:
         """Do it and return the finished future; what it raises is raised by `result()`."""
         future: Future[Any] = Future()
         try:
-            future.set_result(fn(*args, **kwargs))
+            with threadpool_limits(1):
+                future.set_result(fn(*args))
         except Exception as error:
             future.set_exception(error)
         return future
 
 
-@contextmanager
-def executor(workers: int) -> Generator[Executor]:
-    """Yield an executor of that many fresh processes; of this one where 1 or fewer are wanted."""
-    if workers <= 1:
-        yield _InThisProcess()
-        return
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    # The libraries read this when they load: it has to stand before the processes start.
-    os.environ.update(ONE_THREAD)
-    try:
-        with ProcessPoolExecutor(
-            max_workers=workers, mp_context=get_context("spawn"), initializer=_end_with_parent
-        ) as pool:
-            try:
-                yield pool
-            except BaseException:
-                # A job may take half a minute, and an interrupted user does not wait for it.
+class _Processes:
+    """One pool of one process for each job that may be under way."""
+
+    shares_files = True
+
+    def __init__(self, count: int) -> None:
+        self._pools: list[ProcessPoolExecutor | None] = [None] * count
+        self._idle = list(range(count))
+
+    def capacity(self) -> int:
+        """Return the number of processes."""
+        return len(self._pools)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any) -> Future[Any]:
+        """Give the job to an idle process; a new one takes the place of one that died."""
+        place = self._idle.pop()
+        try:
+            pool, inner = self._start(place, fn, args)
+        except BrokenProcessPool:  # it was killed while it had nothing to do
+            self._pools[place] = None
+            pool, inner = self._start(place, fn, args)
+        # The pool knows why its process ended; it tells nobody.
+        process = next(iter(pool._processes.values()), None)  # pyright: ignore[reportPrivateUsage]
+        outer: Future[Any] = Future()
+        inner.add_done_callback(partial(self._settle, place, process, outer))
+        return outer
+
+    def _start(
+        self, place: int, fn: Callable[..., Any], args: tuple[Any, ...]
+    ) -> tuple[ProcessPoolExecutor, Future[Any]]:
+        """Submit to the process of a place, which is started if there is none."""
+        pool = self._pools[place]
+        if pool is None:
+            pool = self._pools[place] = ProcessPoolExecutor(
+                max_workers=1, mp_context=get_context("spawn"), initializer=_end_with_parent
+            )
+        with _one_thread():
+            return pool, pool.submit(fn, *args)
+
+    def _settle(
+        self, place: int, process: BaseProcess | None, outer: Future[Any], inner: Future[Any]
+    ) -> None:
+        """Pass on what became of a job, and free its place first: the next may come at once."""
+        if inner.cancelled():
+            outer.cancel()
+            return
+        error = inner.exception()
+        if isinstance(error, BrokenProcessPool):
+            self._pools[place] = None
+            error = WorkerDiedError(_end_of(process))
+        self._idle.append(place)
+        if error is None:
+            outer.set_result(inner.result())
+        else:
+            outer.set_exception(error)
+
+    def end(self, *, at_once: bool) -> None:
+        """End the processes; at once means in the middle of their jobs."""
+        for pool in self._pools:
+            if pool is None:
+                continue
+            if at_once:
                 for process in list(pool._processes.values()):  # pyright: ignore[reportPrivateUsage]
                     process.terminate()
-                pool.shutdown(wait=False, cancel_futures=True)
-                raise
+            pool.shutdown(wait=not at_once, cancel_futures=at_once)
+
+
+def _end_of(process: BaseProcess | None) -> str:
+    """Return in words how a process ended."""
+    if process is not None:
+        process.join(timeout=5.0)
+    code = None if process is None else process.exitcode
+    if code is None:
+        return "its process ended without a word"
+    if code == -signal.SIGKILL:
+        return "its process was killed (signal SIGKILL), as the system does when memory runs out"
+    if code < 0:
+        return f"its process ended by signal {signal.Signals(-code).name}"
+    return f"its process ended with exit code {code}"
+
+
+@contextmanager
+def _one_thread() -> Generator[None]:
+    """Set the environment that keeps a process which starts within to one thread.
+
+    The libraries read it when they load: it has to stand before the process starts.
+    """
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)
+    try:
+        yield
     finally:
         for name, value in before.items():
             if value is None:

@@ -28,10 +28,6 @@ class SlipMotion:
 
     gravity: float = 9.81
     """[m/s^2], along -z of the table."""
-    close_speed: float = 0.1
-    """Speed of each finger [m/s]: the Franka Hand's top speed."""
-    close_settle_s: float = 0.2
-    """Time at full force after the last finger can have arrived [s]."""
     lift_height_m: float = 0.20
     """Vertical displacement [m]; the paper's."""
     lift_s: float = 1.0
@@ -97,37 +93,43 @@ def pendulum_angle(motion: SlipMotion, dt: float, low: float, high: float) -> Ar
     return np.concatenate(pieces, axis=1)
 
 
-def pendulum_load(angle: Array, axis: Array, gravity: float) -> tuple[Array, Array, Array]:
-    """Return what every pendulum step needs of a pair, in table axes at the stage's start.
+def pendulum_wrenches(
+    angles: Array, axes: Array, arms: Array, inertias: Array, mass: float, gravity: float
+) -> Array:
+    """Return wrenches (K, T, 6) on objects in hands that turn about joint 5.
 
     Args:
-        angle: (3, T) angle, speed and acceleration of the joint.
-        axis: (3,) unit axis of the joint.
+        angles: (K, 3, T) angle, speed and acceleration of each joint.
+        axes: (K, 3) unit axes, world axes at the stage's start.
+        arms: (K, 3) from the axis to the centre of mass [m].
+        inertias: (K, 3, 3) about the centre of mass, world axes [kg m^2].
+        mass: [kg].
         gravity: [m/s^2] along -z.
-
-    Returns:
-        gravity in the hand's frame (T, 3), omega (T, 3) and alpha (T, 3).
     """
-    theta, speed, acceleration = angle
+    theta, speed, acceleration = (angles[:, i, :, None] for i in range(3))
+    axis = axes[:, None, :]
     g = np.array([0.0, 0.0, -gravity])
     # g in the hand's frame is exp(-axis theta) g (Rodrigues).
-    cos, sin = np.cos(theta)[:, None], np.sin(theta)[:, None]
-    turned = cos * g - sin * np.cross(axis, g) + (1 - cos) * axis * (axis @ g)
-    return turned, speed[:, None] * axis, acceleration[:, None] * axis
+    cos, sin = np.cos(theta), np.sin(theta)
+    along = np.sum(axis * g, axis=-1, keepdims=True)
+    turned = cos * g - sin * np.cross(axis, g) + (1 - cos) * axis * along
+    omega, alpha = speed * axis, acceleration * axis
+    arm = arms[:, None, :]
+    force = mass * (turned - np.cross(alpha, arm) - np.cross(omega, np.cross(omega, arm)))
+    spin = np.einsum("kij,ktj->kti", inertias, omega)
+    torque = -(np.einsum("kij,ktj->kti", inertias, alpha) + np.cross(omega, spin))
+    return np.concatenate([torque, force], axis=-1)
 
 
-def inertial_wrench(
-    load: tuple[Array, Array, Array], arm: Array, mass: float, inertia: Array
-) -> tuple[Array, Array]:
-    """Return force (T, 3) [N] and torque (T, 3) [N m] on an object in the turning hand.
+def field_wrenches(acceleration: Array, mass: float, gravity: float, count: int) -> Array:
+    """Return wrenches (K, T, 6) in hands that are moved with an acceleration (T, 3) [m/s^2].
 
     Args:
-        load: gravity, omega and alpha (T, 3) from `pendulum_load`.
-        arm: (3,) from the axis to the centre of mass [m].
+        acceleration: (T, 3) of all hands, table axes [m/s^2].
         mass: [kg].
-        inertia: (3, 3) about the centre of mass [kg m^2], in the axes of the load.
+        gravity: [m/s^2] along -z.
+        count: number of hands K.
     """
-    g, omega, alpha = load
-    force = mass * (g - np.cross(alpha, arm) - np.cross(omega, np.cross(omega, arm)))
-    torque = -(alpha @ inertia.T + np.cross(omega, omega @ inertia.T))
-    return force, torque
+    wrench = np.zeros((len(acceleration), 6))
+    wrench[:, 3:] = mass * (np.array([0.0, 0.0, -gravity]) - acceleration)
+    return np.broadcast_to(wrench, (count, *wrench.shape))

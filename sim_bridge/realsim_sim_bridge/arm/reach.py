@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_sim_bridge.school import panda
-from realsim_sim_bridge.school.arm_space import (
+from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.arm.arm_space import (
     AT_LIMITS,
     FREE,
     IN_TABLE,
@@ -23,10 +23,10 @@ from realsim_sim_bridge.school.arm_space import (
     Codes,
     in_words,
 )
-from realsim_sim_bridge.school.candidates import Surroundings
-from realsim_sim_bridge.school.hand import HandGeometry
-from realsim_sim_bridge.school.hand_free import first_point_inside, lowest_corner
-from realsim_sim_bridge.school.joint_path import PlannerConfig, connect, straight
+from realsim_sim_bridge.grasping.candidates import Surroundings
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.grasping.hand_free import first_point_inside, lowest_corner
+from realsim_sim_bridge.arm.joint_path import PlannerConfig, connect, straight
 
 Array = NDArray[np.float64]
 

@@ -1,11 +1,10 @@
-"""Franka Panda: forward kinematics, inverse kinematics, limits and the arm's capsules.
+"""Franka Panda: forward kinematics, inverse kinematics and limits.
 
 Modified (Craig) Denavit-Hartenberg parameters and limits from Franka's control interface
 documentation. Frame `base` is panda_link0; frame `grasp` is the hand's (z approach, y closing),
 with its origin at the tool centre point.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -29,6 +28,12 @@ HAND_TURN = -np.pi / 4
 LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
 """Joint limits of the Panda [rad]; those shipped with PyBullet are wider than the robot's."""
+VELOCITY = np.array([2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61])
+"""Greatest speeds of the joints [rad/s] (Franka's control interface documentation, Panda)."""
+ACCELERATION = np.array([15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0])
+"""Greatest accelerations of the joints [rad/s^2] (ibid.)."""
+TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
+"""Greatest torques of the joints [N m] (ibid.)."""
 
 JOINT7_GRASP = se3.invert(
     se3.from_translation([0, 0, FLANGE_M + TCP_M])
@@ -96,35 +101,57 @@ def _solvers(samples: int) -> tuple[tuple[float, Any], ...]:
     return tuple((float(a), HPRobot(axes, steps, fixed_axes=[(6, float(a))])) for a in angles)
 
 
-def inverse(T_base_grasp: Array, samples: int, margin: float) -> Array:
-    """Return joint angles (S, 7) [rad] that reach T_base_grasp (4, 4) exactly, within limits.
+def inverse_all(
+    Ts_base_grasp: Array, samples: int, margin: float
+) -> tuple[NDArray[np.int64], Array]:
+    """Return joint angles that reach each of the poses (N, 4, 4) exactly, within limits.
 
     Joint 7 is held at each of `samples` values; the other six have up to 8 closed-form solutions
     (Ostermeier, Kuelz & Althoff 2024, EAIK).
 
     Args:
-        T_base_grasp: (4, 4) [m].
+        Ts_base_grasp: (N, 4, 4) [m].
         samples: how many values of joint 7 are tried.
         margin: distance kept from the joint limits [rad].
+
+    Returns:
+        owner (S,), the row of each solution's pose, not decreasing, and joints (S, 7) [rad].
     """
     # EAIK's frame has the base's axes at the zero configuration.
-    R_zero = forward(np.zeros(JOINTS))[:3, :3]
-    target = T_base_grasp.copy()
-    target[:3, :3] = target[:3, :3] @ R_zero.T
-    found: list[Array] = []
+    R_zero = link_frames(np.zeros(JOINTS))[-1, :3, :3]
+    targets = np.array(Ts_base_grasp, dtype=np.float64)
+    targets[:, :3, :3] = targets[:, :3, :3] @ R_zero.T
+    poses = list(targets)
+    owners: list[NDArray[np.int64]] = [np.zeros(0, dtype=np.int64)]
+    found: list[Array] = [np.zeros((0, JOINTS))]
     for angle, solver in _solvers(samples):
-        solution = solver.IK(target)
-        for q, least_squares in zip(solution.Q, solution.is_LS, strict=True):
-            if not least_squares:
-                found.append(np.append(np.asarray(q, dtype=np.float64)[:6], angle))
-    if not found:
-        return np.zeros((0, JOINTS))
-    q = np.stack(found)
-    q = (q + np.pi) % (2 * np.pi) - np.pi
+        # One thread: the objects of a scene are spread over the cores.
+        solutions = solver.IK_batched(poses, 1) if poses else []
+        exact = [
+            (row, q)
+            for row, solution in enumerate(solutions)
+            for q, least_squares in zip(solution.Q, solution.is_LS, strict=True)
+            if not least_squares
+        ]
+        if exact:
+            q = np.array([q for _, q in exact], dtype=np.float64)
+            q[:, 6] = angle
+            found.append(q)
+            owners.append(np.array([row for row, _ in exact], dtype=np.int64))
+    owner, q = np.concatenate(owners), np.concatenate(found)
+    q[:, :6] = (q[:, :6] + np.pi) % (2 * np.pi) - np.pi
     # Joint 6 reaches beyond pi: the same pose a turn further.
-    further = q[q[:, 5] + 2 * np.pi <= UPPER[5]] + np.array([0, 0, 0, 0, 0, 2 * np.pi, 0])
-    q = np.concatenate([q, further])
-    return q[within_limits(q, margin)]
+    beyond = q[:, 5] + 2 * np.pi <= UPPER[5]
+    further = q[beyond] + np.array([0, 0, 0, 0, 0, 2 * np.pi, 0])
+    owner, q = np.concatenate([owner, owner[beyond]]), np.concatenate([q, further])
+    inside = np.nonzero(within_limits(q, margin))[0]
+    order = inside[np.argsort(owner[inside], kind="stable")]
+    return owner[order], q[order]
+
+
+def inverse(T_base_grasp: Array, samples: int, margin: float) -> Array:
+    """Return joint angles (S, 7) [rad] that reach T_base_grasp (4, 4); as `inverse_all`."""
+    return inverse_all(T_base_grasp[None], samples, margin)[1]
 
 
 def joint5_in_grasp(q: Array) -> tuple[Array, Array]:
@@ -134,74 +161,20 @@ def joint5_in_grasp(q: Array) -> tuple[Array, Array]:
     return T_grasp_5[..., :3, 2], T_grasp_5[..., :3, 3]
 
 
-# --- shape --------------------------------------------------------------------------------------
+SHOULDER_M = float(D_M[0])
+"""Height of the shoulder (the axes of joints 1 and 2 meet there) over the base [m]."""
+WRIST_REACH_M = float(np.hypot(D_M[2], A_M[3]) + np.hypot(D_M[4], A_M[4]))
+"""Distance from the shoulder to the wrist (the axes of joints 5 and 6 meet there), stretched [m]."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Capsule:
-    """A cylinder with round ends, fixed to a link."""
+def wrist_distance(T_base_grasp: Array) -> Array:
+    """Return the least distance (N,) [m] from the shoulder to the wrist at poses (N, 4, 4).
 
-    link: int
-    """0 = base, 1 to 7 = the joints' frames, 8 = the grasp frame."""
-    start: tuple[float, float, float]
-    """[m], link frame."""
-    end: tuple[float, float, float]
-    radius_m: float
-
-
-def _capsule(link: int, radius_m: float, *ends: tuple[float, float, float]) -> Capsule:
-    return Capsule(link=link, start=ends[0], end=ends[-1], radius_m=radius_m)
-
-
-_PALM, _TIPS = 0.04 - TCP_M, 0.10 - TCP_M
-ARM_CAPSULES = (
-    _capsule(0, 0.06, (-0.09, 0, 0.06), (-0.06, 0, 0.06)),
-    _capsule(1, 0.06, (0, 0, -0.333), (0, 0, -0.05)),
-    _capsule(2, 0.06, (0, 0, -0.06), (0, 0, 0.06)),
-    _capsule(3, 0.06, (0, 0, -0.22), (0, 0, -0.07)),
-    _capsule(4, 0.06, (0, 0, -0.06), (0, 0, 0.06)),
-    _capsule(5, 0.06, (0, 0, -0.31), (0, 0, -0.21)),
-    _capsule(5, 0.025, (0, 0.08, -0.20), (0, 0.08, -0.06)),
-    _capsule(6, 0.05, (0, 0, -0.07), (0, 0, 0.01)),
-    _capsule(7, 0.04, (0, 0, -0.06), (0, 0, 0.08)),
-)
-"""The arm's coarse collision geometry of franka_description."""
-HAND_CAPSULES = (
-    _capsule(8, 0.04, (0, -0.05, _PALM), (0, 0.05, _PALM)),
-    _capsule(8, 0.02, (0, -0.05, _TIPS), (0, 0.05, _TIPS)),
-)
-"""The hand's, which contains the fingers at any opening; for moves far from objects only."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Spheres:
-    """Spheres that contain capsules."""
-
-    links: NDArray[np.int64]
-    """(S,) link of each."""
-    centers: Array
-    """(S, 3) link frame [m]."""
-    radii: Array
-    """(S,) [m]."""
-
-
-def spheres_of(capsules: tuple[Capsule, ...]) -> Spheres:
-    """Return spheres that contain the capsules: at most one radius apart, and grown to meet."""
-    links: list[int] = []
-    centers: list[Array] = []
-    radii: list[float] = []
-    for c in capsules:
-        start, end = np.array(c.start), np.array(c.end)
-        length = float(np.linalg.norm(end - start))
-        count = int(np.ceil(length / c.radius_m)) + 1
-        step = length / max(count - 1, 1)
-        centers += list(start + np.linspace(0, 1, count)[:, None] * (end - start))
-        radii += [float(np.hypot(c.radius_m, step / 2))] * count
-        links += [c.link] * count
-    return Spheres(np.array(links), np.stack(centers), np.array(radii))
-
-
-def sphere_centers(spheres: Spheres, frames: Array) -> Array:
-    """Return the centres (..., S, 3) in base [m] at link frames (..., 9, 4, 4)."""
-    T = frames[..., spheres.links, :, :]
-    return (T[..., :3, :3] @ spheres.centers[:, :, None])[..., 0] + T[..., :3, 3]
+    The wrist lies on a circle of radius a_7 about joint 7's axis, whatever that joint's angle. No
+    inverse kinematics exists where this is more than `WRIST_REACH_M`.
+    """
+    T_base_7 = T_base_grasp @ se3.invert(JOINT7_GRASP)
+    out = T_base_7[:, :3, 3] - [0.0, 0.0, SHOULDER_M]
+    along = np.sum(out * T_base_7[:, :3, 2], axis=1)
+    across = np.sqrt(np.maximum(np.sum(out * out, axis=1) - along**2, 0.0))
+    return np.hypot(along, across - A_M[6])

@@ -1,0 +1,285 @@
+"""What a school tries: a scene from a session or from another program's files, and its matter."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.console import Console
+from realsim.errors import InputError
+from realsim.models.library_records import KnownSolid
+from realsim.records import ObjectModel, Scene, names_of
+from realsim.store import SessionStore
+
+Array = NDArray[np.float64]
+
+CACHE = "grasps/cache"
+"""Where in the results' folder pieces of work and convex parts are kept."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SchoolRequest:
+    """What the user asked for; None = the school's own value."""
+
+    grasps: int = 60
+    """Candidates kept per object, at most."""
+    seed: int = 0
+    engine: str = "pybullet"
+    """'pybullet' or 'mujoco'."""
+    cross_check: bool = False
+    """Whether the other engine tries the same grasps."""
+    sweep: bool = False
+    """Whether margins are measured."""
+    force_n: float | None = None
+    """Of each finger [N]."""
+    friction: float | None = None
+    density: float | None = None
+    """Of all objects that are not weighed [kg/m^3]."""
+    masses: tuple[str, ...] = ()
+    """Weighed objects, each NAME=KG or ID=KG."""
+    base_pose: Path | None = None
+    """File with the pose of the robot's base."""
+    points: int | None = None
+    """Points on the surface that candidates start from."""
+    rotations: int | None = None
+    """Grasps per pair of contacts."""
+    workers: int = 2
+    address: str = ""
+    """Of a Ray cluster; '' = this machine's processes."""
+    restart: bool = False
+    """Whether results of other parameters are thrown away."""
+    models: Path | None = None
+    """Folder of the models, where a scene's source has them elsewhere."""
+
+    def __post_init__(self) -> None:
+        """Check the numbers: physics with them would mean nothing.
+
+        Raises:
+            InputError: one that cannot be; its option is named.
+        """
+        _require_positive("--force", self.force_n, "N; 70 is the Franka Hand's", most=1000.0)
+        _require_positive("--friction", self.friction, "; dry rubber on wood has 1", most=10.0)
+        _require_positive(
+            "--density", self.density, "kg/m^3; plastics have 1000", most=25000.0, least=1.0
+        )
+
+
+def _require_positive(
+    option: str, value: float | None, words: str, *, most: float, least: float = 0.0
+) -> None:
+    """Raise if a number is given that is not positive and finite, or out of all proportion."""
+    if value is None or (math.isfinite(value) and least <= value <= most and value > 0):
+        return
+    raise InputError(
+        f"{option} {value:g} cannot be: a number above {least:g} and up to {most:g} is accepted "
+        f"({words.lstrip('; ')})."
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SchoolInputs:
+    """A scene that the school can try."""
+
+    scene: Scene
+    models: dict[int, ObjectModel]
+    solids: dict[int, KnownSolid]
+    """Convex parts and matter by object id, as far as they are known; the school makes the rest."""
+    folder: Path
+    """Where results go: the session, or a folder of the user's."""
+    store: SessionStore | None
+    """The session; None = the scene came from elsewhere."""
+
+
+def is_session(source: Path) -> bool:
+    """Return whether the source is a session of realsim."""
+    return (source / "session.json").is_file()
+
+
+def read_inputs(
+    source: Path, out: Path | None, request: SchoolRequest, console: Console
+) -> SchoolInputs:
+    """Return what is to be tried.
+
+    Args:
+        source: a session, or a BOP scene, GraspNet scene or scene.yaml.
+        out: folder for the results of a source that is no session.
+        request: masses, density, and where models are.
+        console: notes go there.
+
+    Raises:
+        InputError: nothing usable there, a folder missing or not wanted, or an unknown object.
+    """
+    if is_session(source) or (out is None and source.is_dir() and not _known_elsewhere(source)):
+        if out is not None:
+            raise InputError(
+                f"'{source}' is a session, which keeps its own results; leave --out away, or use "
+                "`realsim school export` to write them elsewhere."
+            )
+        found = _of_session(source, console)
+    else:
+        if out is None:
+            raise InputError(
+                f"'{source}' is no session, so its results need a folder: give --out FOLDER."
+            )
+        if is_session(out):
+            raise InputError(f"--out '{out}' is a session; give a folder of its own.")
+        found = _of_source(source, out, request, console)
+    return weighed(found, request)
+
+
+def _known_elsewhere(source: Path) -> bool:
+    """Return whether a folder holds a scene of another program."""
+    from realsim_sim_bridge.scenes.source import load_scene_source
+
+    try:
+        load_scene_source(source)
+    except InputError:
+        return False
+    return True
+
+
+def _of_session(folder: Path, console: Console) -> SchoolInputs:
+    """Return the registered scene of a session, as the reviewers left it."""
+    from realsim.app.stages import judged_scene, open_session, session_models
+    from realsim.models.library_session import known_solids
+
+    store = open_session(folder)
+    scene, models = judged_scene(store), session_models(store)
+    solids, unknown = known_solids(store.folder / "models", [o.obj_id for o in scene.objects])
+    for obj_id, why in unknown.items():
+        console.warn(f"object {obj_id}: its convex parts are made again: {why}.")
+    return SchoolInputs(
+        scene=scene, models=models, solids=dict(solids), folder=store.folder, store=store
+    )
+
+
+def _of_source(
+    source: Path, out: Path, request: SchoolRequest, console: Console
+) -> SchoolInputs:
+    """Return the scene of another program's files."""
+    from realsim_sim_bridge.scenes.school_scene import Matter
+    from realsim_sim_bridge.scenes.source import load_scene_source
+
+    found = load_scene_source(source, Matter(cache=out / CACHE), models=request.models)
+    for note in found.notes:
+        console.warn(note)
+    return SchoolInputs(
+        scene=found.scene, models=found.models, solids=dict(found.solids), folder=out, store=None
+    )
+
+
+# --- matter -----------------------------------------------------------------------------------
+
+
+def weighed(found: SchoolInputs, request: SchoolRequest) -> SchoolInputs:
+    """Return the inputs with the masses and the density that the user knows better.
+
+    Raises:
+        InputError: a mass is of no object, or cannot be.
+    """
+    used = {o.obj_id for o in found.scene.objects}
+    models = {i: m for i, m in found.models.items() if i in used}
+    masses = masses_of(request.masses, models)
+    if not masses and request.density is None:
+        return found
+    from realsim_sim_bridge.scenes.school_scene import Matter, known_solids
+
+    solids, changed = dict(found.solids), dict(found.models)
+    if request.density is not None:
+        changed |= {i: replace(m, density=request.density) for i, m in models.items()}
+    matter = Matter(cache=found.folder / CACHE)
+    for obj_id in models:
+        if obj_id in masses:
+            mine = replace(matter, masses_kg={obj_id: masses[obj_id]})
+            have = {obj_id: solids[obj_id]} if obj_id in solids else {}
+            solids |= known_solids({obj_id: changed[obj_id]}, mine, have)
+        elif request.density is not None and obj_id in solids:
+            solids[obj_id] = _of_density(changed[obj_id], solids[obj_id], request.density)
+    return replace(found, models=changed, solids=solids)
+
+
+def _of_density(model: ObjectModel, solid: KnownSolid, density: float) -> KnownSolid:
+    """Return the same parts with the matter of another density."""
+    from realsim.models.properties import physical_properties
+
+    matter = physical_properties(model.mesh, density=density, parts=solid.parts)
+    return replace(solid, matter=matter)
+
+
+def masses_of(texts: Sequence[str], models: Mapping[int, ObjectModel]) -> dict[int, float]:
+    """Return weighed masses [kg] by object id.
+
+    Args:
+        texts: NAME=KG or ID=KG each.
+        models: the objects of the scene.
+
+    Raises:
+        InputError: no such form, no such object, one named twice, or no positive mass.
+    """
+    masses: dict[int, float] = {}
+    for text in texts:
+        name, mark, number = text.rpartition("=")
+        try:
+            mass = float(number)
+        except ValueError:
+            mass = math.nan
+        if not mark or not name or not (math.isfinite(mass) and 0 < mass <= 100):
+            raise InputError(
+                f"--mass '{text}' is no weighed object; NAME=KG with a mass above 0 and up to 100 "
+                "kg is one, such as mug=0.31."
+            )
+        named = [i for i, m in models.items() if m.name == name or str(i) == name]
+        if len(named) != 1:
+            what = "names several objects" if named else "is of no object of this scene"
+            raise InputError(
+                f"--mass '{text}' {what}; there are: {names_of(list(models.values()))}."
+            )
+        if named[0] in masses:
+            raise InputError(f"--mass names the object '{name}' twice; give it once.")
+        masses[named[0]] = mass
+    return masses
+
+
+# --- where the robot stands -------------------------------------------------------------------
+
+BASE_KEYS = ("T_world_base", "T_table_base")
+
+
+def base_on_table(path: Path, scene: Scene) -> Array:
+    """Return T_table_base (4, 4) [m] from a JSON file with T_world_base or T_table_base.
+
+    Raises:
+        InputError: no such file, not JSON, neither or both keys, no rigid transform, or no table.
+    """
+    from realsim.geometry import se3
+
+    if not path.is_file():
+        raise InputError(
+            f"the base pose '{path}' does not exist; a JSON file with one of "
+            f"{' or '.join(BASE_KEYS)} (4 x 4, metres) is expected, or leave --base-pose away."
+        )
+    try:
+        value: Any = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, UnicodeDecodeError) as error:
+        raise InputError(f"the base pose '{path}' is no JSON ({error}).") from error
+    keys = [k for k in BASE_KEYS if isinstance(value, dict) and k in value]
+    if len(keys) != 1:
+        raise InputError(
+            f"the base pose '{path}' holds {' and '.join(keys) or 'no pose'}; exactly one of "
+            f"{' or '.join(BASE_KEYS)} (4 x 4, metres) is accepted."
+        )
+    try:
+        T = np.array(value[keys[0]], dtype=np.float64).reshape(4, 4)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{keys[0]} of '{path}' is no 4 x 4 matrix ({error}).") from error
+    T = se3.check_rigid(T[None], f"{keys[0]} of '{path}'")[0]
+    if keys[0] == "T_table_base":
+        return T
+    if scene.plane is None:
+        raise InputError(f"scene '{scene.name}' has no table, so T_world_base says nothing of it.")
+    return se3.invert(scene.plane.T_world_table) @ T

@@ -1,0 +1,238 @@
+"""What Robot School found, as rows of tables and as words: for the console and for the page."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.console import Console
+from realsim.app.register_files import plain
+from realsim.records import STAGES, GraspSet, ObjectModel
+
+Rows = list[list[str]]
+Array = NDArray[np.float64]
+Names = Mapping[int, ObjectModel]
+
+SCHOOL_HEADER = [
+    "object", "candidates", "reachable", "closed", "lifted", "shaken", "swung", "good", "score",
+    "margin", "agree [%]",
+]  # fmt: skip
+FILTER_HEADER = [
+    "object", "turned", "in the table", "in the object", "in a neighbour", "free", "kept",
+]  # fmt: skip
+_FILTERS = ("turned", "hand_in_table", "hand_in_object", "hand_in_neighbour", "free", "kept")
+REASON_HEADER = ["why a grasp stopped", "grasps", "share [%]"]
+MOST_REASONS = 12
+"""Reasons of one table; the rest are one row."""
+
+
+def named(grasps: GraspSet, models: Names) -> str:
+    """Return number and name of the set's object."""
+    model = models.get(grasps.obj_id)
+    return f"{grasps.instance} {model.name if model else f'object {grasps.obj_id}'}"
+
+
+def school_rows(sets: Sequence[GraspSet], models: Names) -> Rows:
+    """Return one row an object, and all of them together; a dash is what was not measured."""
+    rows = [[named(s, models), *_figures([s])] for s in sets]
+    if len(sets) > 1:
+        rows.append(["all", *_figures(sets)])
+    return rows
+
+
+def _figures(sets: Sequence[GraspSet]) -> list[str]:
+    """Return the figures of a row of the school's table."""
+    base = _joined(sets, lambda s: s.base_scores)
+    passed = [int(np.sum(base >= (k + 1) / len(STAGES))) for k in range(len(STAGES))]
+    scores = _joined(sets, lambda s: s.scores)
+    margins = _joined(sets, lambda s: s.measures.get("margin", np.zeros(0)))
+    held, same = agreement_counts(sets)
+    return [
+        str(sum(len(s) for s in sets)),
+        str(sum(int(s.reachable.sum()) for s in sets)),
+        *map(str, passed),
+        str(sum(int(s.good.sum()) for s in sets)),
+        _mean(scores),
+        _mean(margins),
+        f"{100 * same / held:.0f}" if held else "-",
+    ]
+
+
+def _joined(sets: Sequence[GraspSet], of: Callable[[GraspSet], Array]) -> Array:
+    """Return one column of all sets (N,)."""
+    return np.concatenate([np.zeros(0), *(of(s) for s in sets)])
+
+
+def _mean(values: Array) -> str:
+    """Return the mean of what was measured, or a dash."""
+    known = values[~np.isnan(values)]
+    return f"{known.mean():.2f}" if len(known) else "-"
+
+
+def agreement_counts(sets: Sequence[GraspSet]) -> tuple[int, int]:
+    """Return how many grasps two engines tried, and of how many both say the same label."""
+    from realsim_sim_bridge.school.cross_check import agreement_of
+
+    found = agreement_of(sets)
+    return found.count, found.agree
+
+
+def filter_rows(sets: Sequence[GraspSet], models: Names) -> Rows:
+    """Return what each filter took of the candidates of each object."""
+    counts = [(s, s.parameters.get("counts") or {}) for s in sets]
+    return [[named(s, models), *[str(c.get(k, "-")) for k in _FILTERS]] for s, c in counts]
+
+
+def reasons(sets: Sequence[GraspSet]) -> dict[str, int]:
+    """Return how many grasps stopped for which reason, most first.
+
+    Figures within a reason ("slipped 21.3 mm") do not make it another one.
+    """
+    counts = Counter(_kind(f) for s in sets for f in s.failures if f)
+    return dict(sorted(counts.items(), key=lambda item: (-item[1], item[0])))
+
+
+def _kind(failure: str) -> str:
+    """Return a failure without its figures."""
+    stage, mark, why = failure.partition(": ")
+    if mark and stage in STAGES and "slipped" in why and "turned" in why:
+        return f"{stage}: the object slipped or turned too far"
+    return failure
+
+
+def reason_rows(sets: Sequence[GraspSet]) -> Rows:
+    """Return the table of why grasps stopped."""
+    found = list(reasons(sets).items())
+    total = max(1, sum(len(s) for s in sets))
+    shown, rest = found[:MOST_REASONS], found[MOST_REASONS:]
+    rows = [[why, str(n), f"{100 * n / total:.1f}"] for why, n in shown]
+    if rest:
+        others = sum(n for _, n in rest)
+        rows.append([f"{len(rest)} other reasons", str(others), f"{100 * others / total:.1f}"])
+    return rows
+
+
+LEVELS = (("least_friction", "friction", ""), ("least_force_n", "force", " N"))
+"""Measure of a sweep, what it sweeps, and its unit."""
+
+
+def level_tables(sets: Sequence[GraspSet], models: Names) -> list[tuple[list[str], Rows]]:
+    """Return for each swept quantity the share [%] of the tested grasps that survive a level."""
+    tables: list[tuple[list[str], Rows]] = []
+    for measure, what, unit in LEVELS:
+        swept = [s for s in sets if np.isfinite(s.measures.get(measure, np.zeros(0))).any()]
+        levels = np.unique(_joined(swept, lambda s, m=measure: s.measures[m]))
+        levels = levels[np.isfinite(levels)][::-1]
+        if len(levels) == 0:
+            continue
+        header = ["object", *[f"{what} {v:g}{unit}" for v in levels]]
+        rows: Rows = []
+        for s in swept:
+            least = s.measures[measure][~np.isnan(s.measures[measure])]
+            rows.append([named(s, models), *[f"{100 * np.mean(least <= v):.0f}" for v in levels]])
+        tables.append((header, rows))
+    return tables
+
+
+def agreement_line(sets: Sequence[GraspSet]) -> str:
+    """Return in one line how far two engines agree; empty where only one was asked."""
+    from realsim_sim_bridge.school.cross_check import agreement_of
+
+    found = agreement_of(sets)
+    if found.count == 0:
+        return ""
+    low, high = found.interval
+    return (
+        f"two engines agree on held or lost for {100 * found.share:.1f} % of {found.count} grasps "
+        f"(95 % interval {100 * low:.1f} to {100 * high:.1f}): {found.both_held} held by both, "
+        f"{found.only_first} by the first alone, {found.only_second} by the second alone."
+    )
+
+
+def setting_line(sets: Sequence[GraspSet]) -> str:
+    """Return in one line what the labels hang on: engine, force, friction, density."""
+    for s in sets:
+        slip: dict[str, Any] = (s.parameters.get("config") or {}).get("slip") or {}
+        physics: dict[str, Any] = slip.get("physics") or {}
+        if physics:
+            densities = sorted({float(x.parameters["density"]) for x in sets
+                                if x.parameters.get("density") is not None})  # fmt: skip
+            weight = ", ".join(f"{d:g}" for d in densities) or "unknown"
+            return (
+                f"labels hold at {physics['force_n']:g} N a finger, friction "
+                f"{physics['friction']:g}, density {weight} kg/m^3"
+                f"{_engine_of(s)}."
+            )
+    return ""
+
+
+def _engine_of(s: GraspSet) -> str:
+    """Return the engine as the set's parameters name it; empty where they do not."""
+    engine: Any = s.parameters.get("engine")
+    if isinstance(engine, dict):
+        name, version = engine.get("name", ""), engine.get("version", "")  # pyright: ignore
+        return f", engine {name} {version}".rstrip()
+    return f", engine {engine}" if isinstance(engine, str) else ""
+
+
+def not_tried(sets: Sequence[GraspSet], models: Names) -> list[str]:
+    """Return in words, of each object without tried grasps, why there are none."""
+    from realsim.app.show import why_no_grasp
+
+    words: list[str] = []
+    for s in sets:
+        if len(s) == 0:
+            words.append(f"{named(s, models)}: {why_no_grasp(s)}")
+        elif s.parameters.get("not_tried"):
+            words.append(f"{named(s, models)}: not tried: {s.parameters['not_tried']}")
+    return words
+
+
+def show_school(sets: Sequence[GraspSet], models: Names, console: Console) -> None:
+    """Print the outcome of a run."""
+    console.table("Robot School", SCHOOL_HEADER, school_rows(sets, models))
+    for words in not_tried(sets, models):
+        console.warn(words)
+    stopped = reason_rows(sets)
+    if stopped:
+        console.table("Why grasps stopped", REASON_HEADER, stopped)
+    for line in (setting_line(sets), agreement_line(sets)):
+        if line:
+            console.say(line)
+
+
+def as_json(sets: Sequence[GraspSet], models: Names) -> dict[str, Any]:
+    """Return what a program wants to know, as plain JSON values."""
+    from realsim.store.results import grasp_counts
+    from realsim_sim_bridge.school.cross_check import agreement_of
+
+    objects: list[dict[str, Any]] = []
+    for s in sets:
+        margins = s.measures.get("margin", np.zeros(0))
+        scores = s.scores[~np.isnan(s.scores)]
+        objects.append(
+            {
+                "instance": s.instance,
+                "obj_id": s.obj_id,
+                "name": named(s, models).partition(" ")[2],
+                **grasp_counts(s),
+                "mean_score": float(scores.mean()) if len(scores) else None,
+                "mean_margin": float(np.nanmean(margins)) if np.isfinite(margins).any() else None,
+                "not_tried": s.parameters.get("not_tried"),
+                "filters": s.parameters.get("counts"),
+            }
+        )
+    found = agreement_of(sets)
+    low, high = found.interval
+    agree = {"count": found.count, "agree": found.agree, "share": found.share,
+             "interval": [low, high]}  # fmt: skip
+    return plain(
+        {
+            "objects": objects,
+            "reasons": reasons(sets),
+            "agreement": agree if found.count else None,
+            "setting": setting_line(sets),
+        }
+    )

@@ -1,0 +1,244 @@
+"""Grasps of one object as an ACRONYM file, and ACRONYM files as grasps.
+
+    object/{file, scale, density, friction, mass, volume, com, inertia}
+    gripper/{type, configuration}
+    grasps/transforms                       (N, 4, 4) hand in object [m]; frame `acronym`
+    grasps/qualities/flex/object_in_gripper (N,) 0 or 1
+    grasps/qualities/realsim/               what our own physics said (written by realsim only)
+
+ACRONYM's readers look for the label under `flex`, the name of its simulator, and nowhere else. So
+the label is written there, with the attribute `simulator` that says it is not FleX's: 1 = the
+fingers still held the object after all four stages. Everything that has no counterpart (score,
+slips, reasons, measures) goes to `qualities/realsim`; ACRONYM's motions while closing and shaking
+are left out, because our stages are other motions. Grasps that physics has not tried have no label,
+so they are not written; their number is an attribute.
+
+Source: NVlabs/acronym, acronym_tools/acronym.py and the example files.
+"""
+
+import io
+import json
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.formats.grasps_hdf5 import COLUMNS, known_measures
+from realsim.formats.hand_frames import FINGER_OPEN_M, grasp_poses, hand_poses
+from realsim.formats.hdf5_checked import CheckedGroup, opened
+from realsim.formats.scene_grasps import (
+    check_values,
+    executed,
+    held,
+    parameters_json,
+    untried_set,
+)
+from realsim.geometry import se3
+from realsim.records import STAGES, GraspSet
+from realsim.records.grasps import MEASURES
+from realsim.store import atomic
+
+Array = NDArray[np.float64]
+FLEX = "grasps/qualities/flex"
+OURS = "grasps/qualities/realsim"
+MOTIONS = tuple(
+    f"object_motion_during_{phase}_{kind}"
+    for phase in ("closing", "shaking")
+    for kind in ("linear", "angular")
+)
+"""Other qualities of FleX's: how far the object moved [m] or turned [rad]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class AcronymObject:
+    """The object of an ACRONYM file; None = the file does not say."""
+
+    file: str
+    """Of the mesh, relative to the data set's folder."""
+    scale: float = 1.0
+    """What the mesh is multiplied by to be in metres; the grasps belong to the scaled mesh."""
+    density: float | None = None
+    """[kg/m^3]."""
+    friction: float | None = None
+    mass_kg: float | None = None
+    volume_m3: float | None = None
+    center_of_mass: Array | None = None
+    """(3,) [m]."""
+    inertia: Array | None = None
+    """(3, 3) [kg m^2]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class AcronymGrasps:
+    """What an ACRONYM file says."""
+
+    obj: AcronymObject
+    Ts_obj_grasp: Array
+    """(N, 4, 4) [m], frame `grasp`."""
+    object_in_gripper: NDArray[np.bool_]
+    """(N,) whether the simulator of the file found the object held."""
+    simulator: str
+    """Whose label it is."""
+    motions: dict[str, Array] = field(default_factory=dict[str, Array])
+    """(N,) FleX's motions of the object [m or rad], by the names of MOTIONS."""
+    tried: GraspSet | None = None
+    """The set, score and all, where realsim wrote the file; without the rows that it left out."""
+
+    def as_set(self, obj_id: int, instance: int = 0) -> GraspSet:
+        """Return the grasps as a set that our physics has not tried; the label is not a score."""
+        source = {"from": "ACRONYM", "file": self.obj.file, "simulator": self.simulator}
+        return untried_set(
+            self.Ts_obj_grasp, obj_id=obj_id, instance=instance, parameters={"source": source}
+        )
+
+
+# --- writing ----------------------------------------------------------------------------------
+
+
+def write_acronym(path: Path | str, grasps: GraspSet, obj: AcronymObject) -> Path:
+    """Write the tried grasps of one object, whole or not at all.
+
+    Raises:
+        InputError: the set holds what no grasp has.
+    """
+    path = Path(path)
+    atomic.write_bytes(path, acronym_bytes(grasps, obj))
+    return path
+
+
+def acronym_bytes(grasps: GraspSet, obj: AcronymObject) -> bytes:
+    """Return the tried grasps of one object as the content of an ACRONYM file."""
+    import h5py
+
+    check_values(grasps)
+    rows = np.flatnonzero(executed(grasps))
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        _put_object(file.create_group("object"), obj)
+        gripper = file.create_group("gripper")
+        gripper["type"] = "panda"
+        gripper["configuration"] = np.array([FINGER_OPEN_M])
+        file["grasps/transforms"] = hand_poses(grasps.Ts_obj_grasp[rows], "acronym")
+        flex = file.create_group(FLEX)
+        flex["object_in_gripper"] = held(grasps)[rows].astype(np.int64)
+        flex.attrs["simulator"] = f"realsim {version('realsim')}, not FleX; see {OURS}"
+        ours = file.create_group(OURS)
+        ours.attrs["obj_id"], ours.attrs["instance"] = grasps.obj_id, grasps.instance
+        ours.attrs["left_out"] = len(grasps) - len(rows)
+        ours.attrs["left_out_meaning"] = "grasps of the set that physics has not tried"
+        ours["row"] = rows.astype(np.int64)
+        for name, (attribute, unit, meaning) in COLUMNS.items():
+            _put(ours, name, getattr(grasps, attribute)[rows], unit, meaning)
+        _put(ours, "reachable", grasps.reachable[rows], "1", "whether the arm has a path")
+        texts = [grasps.failures[row].encode() for row in rows.tolist()]
+        length = max([1, *(len(t) for t in texts)])
+        _put(ours, "failure", np.array(texts, dtype=f"S{length}"), "", "why it stopped")
+        measures = ours.create_group("measures")
+        for name, values in grasps.measures.items():
+            _put(measures, name, values[rows], MEASURES[name].unit, MEASURES[name].meaning)
+        text = parameters_json(grasps).encode()
+        _put(ours, "parameters", np.array(text, dtype=f"S{len(text)}"), "", "JSON")
+    return buffer.getvalue()
+
+
+def _put_object(group: Any, obj: AcronymObject) -> None:
+    """Write what is known of the object."""
+    group["file"] = obj.file
+    known = {
+        "scale": obj.scale, "density": obj.density, "friction": obj.friction, "mass": obj.mass_kg,
+        "volume": obj.volume_m3, "com": obj.center_of_mass, "inertia": obj.inertia,
+    }  # fmt: skip
+    for name, value in known.items():
+        if value is not None:
+            group[name] = np.asarray(value, dtype=np.float64)
+
+
+def _put(group: Any, name: str, values: NDArray[Any], unit: str, meaning: str) -> None:
+    group.create_dataset(name, data=values, track_times=False)
+    group[name].attrs["unit"] = unit
+    group[name].attrs["meaning"] = meaning
+
+
+# --- reading ----------------------------------------------------------------------------------
+
+
+def read_acronym(path: Path | str) -> AcronymGrasps:
+    """Return the grasps of an ACRONYM file, ACRONYM's own or one of `write_acronym`.
+
+    Raises:
+        InputError: it is none, damaged, or points into other files; the grasps are not rigid, or
+            not of the Panda's hand.
+    """
+    with opened(path) as file:
+        gripper = file.group("gripper").text("type") if file.has("gripper") else "panda"
+        if gripper != "panda":
+            raise file.wrong(f"the gripper is '{gripper}'; grasps of the Panda's hand are read.")
+        grasps = file.group("grasps")
+        Ts_hand = grasps.numbers("transforms", (None, 4, 4))
+        n = len(Ts_hand)
+        qualities = grasps.group("qualities")
+        flex = qualities.group("flex")
+        label = flex.numbers("object_in_gripper", (n,))
+        if not np.all((label == 0) | (label == 1)):
+            raise flex.wrong("object_in_gripper holds other values than 0 and 1.")
+        is_ours = qualities.has("realsim")
+        Ts = se3.check_rigid(grasp_poses(Ts_hand, "acronym"), f"{path}: grasps") if n else Ts_hand
+        return AcronymGrasps(
+            obj=_get_object(file.group("object")),
+            Ts_obj_grasp=Ts,
+            object_in_gripper=label == 1,
+            simulator=flex.attribute("simulator", str) if is_ours else "FleX",
+            motions={m: flex.numbers(m, (n,)) for m in MOTIONS if flex.has(m)},
+            tried=_get_set(qualities.group("realsim"), Ts) if is_ours else None,
+        )
+
+
+def _get_object(group: CheckedGroup) -> AcronymObject:
+    def number(name: str) -> float | None:
+        return float(group.numbers(name, ())) if group.has(name) else None
+
+    scale = number("scale")
+    if scale is None or not (np.isfinite(scale) and scale > 0):
+        raise group.wrong(f"the scale is {scale}; a number above 0 is expected.")
+    return AcronymObject(
+        file=group.text("file"),
+        scale=scale,
+        density=number("density"),
+        friction=number("friction"),
+        mass_kg=number("mass"),
+        volume_m3=number("volume"),
+        center_of_mass=group.numbers("com", (3,)) if group.has("com") else None,
+        inertia=group.numbers("inertia", (3, 3)) if group.has("inertia") else None,
+    )
+
+
+def _get_set(group: CheckedGroup, Ts_obj_grasp: Array) -> GraspSet:
+    """Return the set that realsim wrote."""
+    n, stages = len(Ts_obj_grasp), len(STAGES)
+    columns = {
+        attribute: group.numbers(name, (n, stages) if attribute.startswith("slip") else (n,))
+        for name, (attribute, _, _) in COLUMNS.items()
+    }
+    measured = group.group("measures")
+    try:
+        parameters = json.loads(group.text("parameters"))
+    except ValueError as error:
+        raise group.wrong(f"the parameters are not JSON ({error}).") from error
+    found = GraspSet(
+        obj_id=group.attribute("obj_id", int),
+        instance=group.attribute("instance", int),
+        Ts_obj_grasp=Ts_obj_grasp,
+        reachable=group.booleans("reachable", (n,)),
+        failures=group.texts("failure", n),
+        measures={
+            name: measured.numbers(name, (n, stages) if MEASURES[name].by_stage else (n,))
+            for name in known_measures(measured.names(), measured)
+        },
+        parameters=parameters,
+        **columns,
+    )
+    check_values(found)
+    return found

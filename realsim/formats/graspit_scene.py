@@ -1,0 +1,463 @@
+"""The scenes of GraspIT (KochPJ/GraspIt): scene.yaml, meshes beside it, grasps.hdf5.
+
+    object1: {file_path: assets/cup.usd, name: cup, orientation: [4], position: [3], scale: [3]}
+    table: {...}                      grasp_path: scenes/scene_0/grasps.hdf5
+
+Metres, world z up. The file does not say in which order its quaternions are written, so the content
+has to prove it: read in the right order, the objects stand at one height and the grasps' contacts
+lie on the objects. USD files are read from the STL of the same name.
+
+The grasps' frame is ours (y closing, z approach, origin midway between the contacts); that is
+checked on the surfaces, not believed.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, cast, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats.graspit_contacts import contact_distances, midway_error
+from realsim.geometry import se3
+from realsim.geometry.mesh import load_mesh
+from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
+
+Array = NDArray[np.float64]
+QuaternionOrder = Literal["wxyz", "xyzw"]
+ORDERS: tuple[QuaternionOrder, ...] = get_args(QuaternionOrder)
+SCENE_FILE, GRASP_FILE, TABLE = "scene.yaml", "grasps.hdf5", "table"
+LARGEST_YAML = 4_000_000
+"""[bytes]: ten thousand objects; a scene has ten."""
+MOST_OBJECTS = 1000
+MOST_GRASPS = 1_000_000
+"""Of one object."""
+SAMPLED_GRASPS = 40
+"""Grasps of an object whose contacts are looked at: enough for a median."""
+TABLE_TOLERANCE_M = 0.003
+"""Objects whose lowest points differ by less stand on the same plane: physics left them there, with
+the engine's own tolerance."""
+CLEARER = 3.0
+"""The right order's evidence is at least so many times better than the wrong one's..."""
+EVIDENCE_FLOOR_M = 0.001
+"""...after this is added to both: the grasps were snapped to samples a millimetre apart."""
+ON_SURFACE_M = 0.005
+"""Grasps whose middle misses the contacts' middle by more (median) are not of these objects."""
+HAND_M = 0.1
+"""The palm stands about so far behind the fingertips."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class OrderEvidence:
+    """What speaks for one order of the quaternions; less is better, NaN = there is none."""
+
+    spread_m: float
+    """Median distance of the objects' lowest points from their common height [m]."""
+    midway_m: float
+    """Median distance of a grasp's origin from the middle of its contacts [m]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class WorldGrasps:
+    """The grasps of one object, each with its half turn about the approach axis."""
+
+    obj_id: int
+    instance: int
+    Ts_obj_grasp: Array
+    """(N, 2, 4, 4) [m]."""
+    widths_m: Array
+    """(N,) distance of the outer contacts along the closing axis [m]; NaN = it meets no surface."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class GraspitScene:
+    """A scene.yaml as it was read."""
+
+    scene: Scene
+    models: dict[int, ObjectModel]
+    order: QuaternionOrder
+    evidence: dict[QuaternionOrder, OrderEvidence]
+    grasp_file: Path | None
+    """None: there is none beside the scene."""
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Entry:
+    """One object of the file."""
+
+    name: str
+    mesh_file: Path
+    numbers: Array
+    """(4,) the quaternion, in the file's order."""
+    position: Array
+    scale: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Placed:
+    """An object with its mesh, which the quaternions are judged by."""
+
+    entry: _Entry
+    mesh: Mesh
+    Ts_world_grasp: Array
+    """(N, 4, 4) some of its grasps."""
+
+    def T_world_obj(self, order: QuaternionOrder) -> Array:
+        q = self.entry.numbers if order == "wxyz" else np.roll(self.entry.numbers, 1)
+        return se3.from_rt(se3.from_quaternion_wxyz(q), self.entry.position)
+
+
+def is_graspit_scene(path: Path) -> bool:
+    """Return whether this file, or the scene.yaml in this folder, looks like a scene of GraspIT."""
+    path = path / SCENE_FILE if path.is_dir() else path
+    if path.suffix not in (".yaml", ".yml") or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        head = file.read(20_000)
+    return b"file_path" in head and b"orientation" in head and b"position" in head
+
+
+def read_graspit_scene(
+    path: Path | str, *, order: QuaternionOrder | None = None, meshes: Path | None = None
+) -> GraspitScene:
+    """Read a scene and prove the order of its quaternions.
+
+    Objects with the same file and scale are instances of one model; ids count models from 1 in the
+    order of the file, instances count objects from 0.
+
+    Args:
+        path: scene.yaml, or the folder that holds it.
+        order: of the quaternions, where it is known; None = to be proven.
+        meshes: folder of the meshes, where they are not beside the scene or in assets/.
+
+    Raises:
+        InputError: something is missing or damaged, or the content proves neither order.
+    """
+    path = Path(path)
+    path = path / SCENE_FILE if path.is_dir() else path
+    data = _read_yaml(path)
+    entries = _entries(data, path, meshes)
+    grasp_file = _beside(path.parent, str(data.get("grasp_path", GRASP_FILE)))
+    notes = [] if grasp_file else ["there is no grasps.hdf5 beside the scene."]
+    placed = _placed(entries, grasp_file)
+    evidence = {o: _evidence(placed, o) for o in ORDERS}
+    if order is None:
+        order, said = _proven(placed, evidence, path)
+        notes.append(said)
+    Ts = [p.T_world_obj(order) for p in placed]
+    plane, said = _table(placed, Ts, path)
+    notes += [said, *_leaning(placed, Ts, plane)]
+    keys = list(dict.fromkeys((e.mesh_file, e.scale) for e in entries))
+    models: dict[int, ObjectModel] = {}
+    objects: list[ObjectPose] = []
+    for k, (p, T) in enumerate(zip(placed, Ts, strict=True)):
+        obj_id = 1 + keys.index((p.entry.mesh_file, p.entry.scale))
+        if obj_id not in models:
+            models[obj_id] = ObjectModel(obj_id=obj_id, name=p.entry.name, mesh=p.mesh)
+        objects.append(ObjectPose(obj_id=obj_id, instance=k, T_world_obj=T))
+    name = path.stem if path.name != SCENE_FILE else path.resolve().parent.name
+    return GraspitScene(
+        scene=Scene(name=name, objects=tuple(objects), plane=plane),
+        models=models,
+        order=order,
+        evidence=evidence,
+        grasp_file=grasp_file,
+        notes=tuple(notes),
+    )
+
+
+def read_graspit_grasps(found: GraspitScene) -> list[WorldGrasps]:
+    """Return the grasps of the scene's objects, in the objects' frames.
+
+    Raises:
+        InputError: no file, damaged, of other objects, or in another frame than its authors' code
+            writes: y does not close on the surface, or z points out of the table.
+    """
+    if found.grasp_file is None:
+        raise InputError(f"scene '{found.scene.name}' has no {GRASP_FILE} beside it.")
+    by_name = _read_grasp_file(found.grasp_file)
+    sets: list[WorldGrasps] = []
+    for o in found.scene.objects:
+        model = found.models[o.obj_id]
+        Ts_world = by_name.get(model.name)
+        if Ts_world is None:
+            continue
+        where = f"{found.grasp_file.name}, '{model.name}'"
+        half_turn = se3.invert(Ts_world[:, 0]) @ Ts_world[:, 1]
+        if np.abs(half_turn - np.diag([-1.0, -1.0, 1.0, 1.0])).max(initial=0.0) > 1e-4:
+            raise InputError(
+                f"{where}: the second pose of a grasp is not its half turn about z; pairs of a "
+                "grasp and its flip about the approach axis are expected."
+            )
+        Ts_obj = se3.invert(o.T_world_obj) @ Ts_world
+        reach = contact_distances(model.mesh, Ts_obj[:, 0], "y")
+        _require_our_frame(model.mesh, Ts_obj[:, 0], where)
+        _require_from_above(Ts_world[:, 0], found.scene.plane, where)
+        sets.append(
+            WorldGrasps(
+                obj_id=o.obj_id, instance=o.instance, Ts_obj_grasp=Ts_obj, widths_m=reach.sum(1)
+            )
+        )
+    if not sets:
+        raise InputError(
+            f"{found.grasp_file} has grasps of {', '.join(by_name) or 'nothing'}, and the scene "
+            f"has {', '.join(m.name for m in found.models.values())}: none of them is common."
+        )
+    return sets
+
+
+# --- the file -----------------------------------------------------------------------------------
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    """Return the file's mapping; the safe loader makes plain values only."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; the {SCENE_FILE} of a GraspIT scene is expected.")
+    if path.stat().st_size > LARGEST_YAML:
+        raise InputError(
+            f"{path} has {path.stat().st_size / 1e6:.1f} MB; a scene has a few kilobytes and at "
+            f"most {LARGEST_YAML / 1e6:g} MB are read."
+        )
+    try:
+        data: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8-sig"))
+    except (YAMLError, ValueError, TypeError, RecursionError, AttributeError) as error:
+        first = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path} is not YAML that can be read ({first}).") from error
+    if not isinstance(data, dict):
+        raise InputError(f"{path} holds no named objects; object1: {{file_path: ...}} is expected.")
+    mapping = cast("dict[Any, Any]", data)
+    return {str(key): value for key, value in mapping.items()}
+
+
+def _entries(data: dict[str, Any], path: Path, meshes: Path | None) -> list[_Entry]:
+    """Return the objects of the file; the table is none."""
+    found: list[_Entry] = []
+    for key, value in data.items():
+        if not isinstance(value, Mapping):
+            continue
+        fields = cast("Mapping[str, Any]", value)
+        where = f"'{key}' of {path}"
+        lacking = [
+            k for k in ("file_path", "name", "orientation", "position") if k not in fields
+        ]
+        if lacking:
+            raise InputError(f"{where} has no {', '.join(lacking)}.")
+        if key == TABLE or fields["name"] == TABLE:
+            continue
+        sx, sy, sz = _numbers(fields.get("scale", (1.0, 1.0, 1.0)), 3, f"the scale of {where}")
+        if min(sx, sy, sz) <= 0:
+            raise InputError(f"the scale of {where} is {[sx, sy, sz]}; positive ones are needed.")
+        q = _numbers(fields["orientation"], 4, f"the orientation of {where}")
+        if abs(float(np.linalg.norm(q)) - 1.0) > 0.01:
+            raise InputError(
+                f"the orientation of {where} has the length {float(np.linalg.norm(q)):.3g}; a "
+                "quaternion of length 1 is needed."
+            )
+        found.append(
+            _Entry(
+                name=str(fields["name"]),
+                mesh_file=_mesh_file(str(fields["file_path"]), path.parent, meshes, where),
+                numbers=np.array(q),
+                position=np.array(_numbers(fields["position"], 3, f"the position of {where}")),
+                scale=(sx, sy, sz),
+            )
+        )
+    if not 0 < len(found) <= MOST_OBJECTS:
+        raise InputError(f"{path} holds {len(found)} objects; 1 to {MOST_OBJECTS} are expected.")
+    return found
+
+
+def _numbers(value: Any, count: int, name: str) -> list[float]:
+    try:
+        numbers = [float(v) for v in value]
+    except (TypeError, ValueError):
+        numbers = []
+    if len(numbers) != count or not np.all(np.isfinite(numbers)):
+        raise InputError(f"{name} is {str(value)[:60]!r}; {count} finite numbers are needed.")
+    return numbers
+
+
+def _beside(folder: Path, name: str) -> Path | None:
+    """Return the file of this name in the scene's folder: paths in the file are of its authors."""
+    path = folder / Path(name).name
+    return path if path.is_file() else None
+
+
+def _mesh_file(name: str, folder: Path, meshes: Path | None, where: str) -> Path:
+    stl = Path(name).with_suffix(".stl").name
+    places = [p for p in (meshes, folder, folder / "assets") if p is not None]
+    for place in places:
+        if (place / stl).is_file():
+            return place / stl
+    raise InputError(
+        f"the mesh of {where} is {name}; neither it nor {stl} can be read from "
+        f"{', '.join(map(str, places))}. Put {stl} (in metres) there, or give its folder."
+    )
+
+
+def _placed(entries: list[_Entry], grasp_file: Path | None) -> list[_Placed]:
+    grasps = _read_grasp_file(grasp_file) if grasp_file is not None else {}
+    known: dict[tuple[Path, tuple[float, float, float]], Mesh] = {}
+    placed: list[_Placed] = []
+    for e in entries:
+        key = (e.mesh_file, e.scale)
+        if key not in known:
+            mesh = load_mesh(e.mesh_file, "m")
+            known[key] = Mesh(vertices=mesh.vertices * np.array(e.scale), faces=mesh.faces)
+        Ts = grasps.get(e.name, np.zeros((0, 2, 4, 4)))[:, 0]
+        some = Ts[:: max(1, len(Ts) // SAMPLED_GRASPS)]
+        placed.append(_Placed(entry=e, mesh=known[key], Ts_world_grasp=some))
+    return placed
+
+
+def _read_grasp_file(path: Path) -> dict[str, Array]:
+    """Return Ts_world_grasp (N, 2, 4, 4) by the object's name."""
+    import h5py
+
+    found: dict[str, Array] = {}
+    try:
+        with h5py.File(path, "r") as file:
+            for name in file:
+                data: Any = file[name]
+                shape = getattr(data, "shape", ())
+                if len(shape) != 4 or shape[1:] != (2, 4, 4) or shape[0] > MOST_GRASPS:
+                    raise InputError(
+                        f"{path}: '{name}' has the shape {shape}; (N, 2, 4, 4) is expected, at "
+                        f"most {MOST_GRASPS} grasps."
+                    )
+                found[str(name)] = np.asarray(data[()], dtype=np.float64)
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path} is not an HDF5 file of grasps ({error}).") from error
+    return {
+        n: se3.check_rigid(T, f"the grasps of '{n}' in {path}") if len(T) else T
+        for n, T in found.items()
+    }
+
+
+# --- what the content proves --------------------------------------------------------------------
+
+
+def _lowest(placed: list[_Placed], Ts: list[Array]) -> Array:
+    heights = [
+        float(se3.transform(T, p.mesh.vertices)[:, 2].min())
+        for p, T in zip(placed, Ts, strict=True)
+    ]
+    return np.array(heights)
+
+
+def _evidence(placed: list[_Placed], order: QuaternionOrder) -> OrderEvidence:
+    Ts = [p.T_world_obj(order) for p in placed]
+    low = _lowest(placed, Ts)
+    spread = float(np.median(np.abs(low - np.median(low)))) if len(low) > 1 else float("nan")
+    errors = [
+        midway_error(p.mesh, se3.invert(T) @ p.Ts_world_grasp, "y")
+        for p, T in zip(placed, Ts, strict=True)
+        if len(p.Ts_world_grasp)
+    ]
+    midway = float(np.median(np.concatenate(errors))) if errors else float("nan")
+    return OrderEvidence(spread_m=spread, midway_m=midway)
+
+
+def _proven(
+    placed: list[_Placed], evidence: dict[QuaternionOrder, OrderEvidence], path: Path
+) -> tuple[QuaternionOrder, str]:
+    """Return the order that the content proves, and the sentence that says how.
+
+    Raises:
+        InputError: nothing speaks for either, or one thing for each.
+    """
+    a, b = (evidence[o] for o in ORDERS)
+    votes = {v for v in (_vote(a.spread_m, b.spread_m), _vote(a.midway_m, b.midway_m)) if v}
+    words = "; ".join(
+        f"{o}: lowest points within {1e3 * e.spread_m:.1f} mm, grasps "
+        f"{1e3 * e.midway_m:.1f} mm off the middle of their contacts"
+        for o, e in evidence.items()
+    )
+    if len(votes) == 1:
+        order = votes.pop()
+        return order, f"quaternions are in the order {order[0]} {order[1]} {order[2]} {order[3]} " + (
+            f"({words})."
+        )
+    Ts = [np.stack([p.T_world_obj(o) for p in placed]) for o in ORDERS]
+    if np.abs(Ts[0] - Ts[1]).max() < 1e-9:
+        return "wxyz", "both orders of the quaternions give the same poses."
+    raise InputError(
+        f"{path}: the order of the quaternions cannot be told from the content ({words}). Say "
+        "which one it is: order='wxyz' or order='xyzw'."
+    )
+
+
+def _vote(wxyz: float, xyzw: float) -> QuaternionOrder | None:
+    """Return the order for which one kind of evidence speaks clearly, None if for neither."""
+    if np.isnan(wxyz) or np.isnan(xyzw):
+        return None
+    a, b = wxyz + EVIDENCE_FLOOR_M, xyzw + EVIDENCE_FLOOR_M
+    if CLEARER * a < b:
+        return "wxyz"
+    return "xyzw" if CLEARER * b < a else None
+
+
+def _table(placed: list[_Placed], Ts: list[Array], path: Path) -> tuple[SupportPlane, str]:
+    """Return the plane at the height that most objects' lowest points agree on, the lower first."""
+    low = np.sort(_lowest(placed, Ts))
+    near = np.abs(low[:, None] - low) < TABLE_TOLERANCE_M
+    on = low[near[int(np.argmax(near.sum(1)))]]
+    height = float(np.median(on))
+    rms = float(np.sqrt(np.mean(np.square(on - height))))
+    missing = not any((path.parent / f"{TABLE}{s}").is_file() for s in (".stl", ".obj", ".usd"))
+    why = "the table's mesh is not there" if missing else "the table's own mesh is not needed"
+    plane = SupportPlane(
+        T_world_table=se3.from_translation([0.0, 0.0, height]), rms_m=rms, inliers=len(on)
+    )
+    return plane, (
+        f"{why}: its height, {height:.4f} m, is that of the lowest points of {len(on)} of "
+        f"{len(low)} objects."
+    )
+
+
+def _leaning(placed: list[_Placed], Ts: list[Array], plane: SupportPlane) -> list[str]:
+    """Name the objects that do not touch the table as they are given."""
+    gaps = _lowest(placed, Ts) - plane.T_world_table[2, 3]
+    off = [
+        f"{p.entry.name} {1e3 * g:+.1f} mm"
+        for p, g in zip(placed, gaps.tolist(), strict=True)
+        if abs(g) > TABLE_TOLERANCE_M / 2
+    ]
+    return [f"not at the table's height: {', '.join(off)}."] if off else []
+
+
+def _require_our_frame(mesh: Mesh, Ts_obj_grasp: Array, where: str) -> None:
+    """Raise unless the grasps close along y, midway between two contacts."""
+    some = Ts_obj_grasp[:: max(1, len(Ts_obj_grasp) // SAMPLED_GRASPS)]
+    if len(some) == 0:
+        return
+    off = float(np.median(midway_error(mesh, some, "y")))
+    if off > ON_SURFACE_M:
+        others = ", ".join(
+            f"{1e3 * float(np.median(midway_error(mesh, some, a))):.1f} mm along {a}"
+            for a in ("x", "z")
+        )
+        raise InputError(
+            f"{where}: the grasps' origins are {1e3 * off:.1f} mm (median) off the middle of their "
+            f"contacts along y ({others}); at most {1e3 * ON_SURFACE_M:g} mm is accepted. Are they "
+            "of another scene, or is y not the closing axis?"
+        )
+
+
+def _require_from_above(Ts_world_grasp: Array, plane: SupportPlane | None, where: str) -> None:
+    """Raise if more hands would stand in the table than behind the opposite approach."""
+    if plane is None or len(Ts_world_grasp) == 0:
+        return
+    z, at = Ts_world_grasp[:, 2, 2], Ts_world_grasp[:, 2, 3] - plane.T_world_table[2, 3]
+    inside, opposite = np.mean(at - HAND_M * z < 0), np.mean(at + HAND_M * z < 0)
+    if inside > opposite and inside > 0.1:
+        raise InputError(
+            f"{where}: in {100 * inside:.0f} % of the grasps the palm would stand below the table; "
+            "z is not the approach direction of these grasps."
+        )

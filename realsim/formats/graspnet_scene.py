@@ -1,0 +1,242 @@
+"""The scenes of GraspNet-1Billion (Fang et al. 2020): annotated objects in the table's frame.
+
+    SCENE/{realsense,kinect}/{annotations/0000.xml, camera_poses.npy, cam0_wrt_table.npy}
+    MODELS/000/{nontextured.ply, textured.obj, ...}
+
+Metres, OpenCV cameras. In spite of its name, pos_in_world/ori_in_world is the object's pose in
+THIS image's camera, the quaternion w x y z (graspnetAPI's xmlhandler), so that
+
+    T_table_obj = cam0_wrt_table @ camera_poses[i] @ T_cam_obj
+
+GraspNet's objects count from 0, realsim's ids are one more (as are the dataset's cls_indexes). The
+numbers have four decimals: 0.05 mm and 0.01 deg at best.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.mesh import load_mesh
+from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
+
+Array = NDArray[np.float64]
+CAMERAS = ("realsense", "kinect")
+POSES, FIRST, ANNOTATIONS = "camera_poses.npy", "cam0_wrt_table.npy", "annotations"
+MESH_FILES = ("nontextured.ply", "textured.ply", "textured.obj", "nontextured_simplified.ply")
+"""Looked for in a model's folder, in this order."""
+LARGEST_XML = 1_000_000
+"""[bytes]: a scene of ten objects has 4 kB."""
+MOST_VIEWS = 100_000
+CHECKED_VIEWS = 8
+"""Other images whose annotations are compared with the one that is used."""
+AGREE_M = 0.005
+"""Annotations of one standing object that differ by more between images are named."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class GraspnetScene:
+    """One scene as seen by one camera."""
+
+    scene: Scene
+    """World is the table's frame, z up."""
+    models: dict[int, ObjectModel]
+    camera: str
+    view: int
+    """The image whose annotations were used."""
+    notes: tuple[str, ...]
+
+
+def cameras_of(folder: Path) -> list[str]:
+    """Return the cameras of a GraspNet scene folder; none if it is not one."""
+    return [c for c in CAMERAS if (folder / c / POSES).is_file()]
+
+
+def read_graspnet_scene(
+    folder: Path | str, models: Path | str | None = None, *, camera: str | None = None, view: int = 0
+) -> GraspnetScene:
+    """Read one scene.
+
+    Args:
+        folder: scene_0000, or the folder of one of its cameras.
+        models: folder of the models; None = 'models' beside 'scenes', as the dataset has it.
+        camera: 'realsense' or 'kinect'; None = realsense where it is there.
+        view: number of the image whose annotations are used.
+
+    Raises:
+        InputError: a file is missing, damaged, or of another scene.
+        NotRigidError: a matrix that is no rigid transform.
+    """
+    folder = Path(folder)
+    if folder.name in CAMERAS and (folder / POSES).is_file():
+        folder, camera = folder.parent, folder.name
+    there = cameras_of(folder)
+    if not there or (camera is not None and camera not in there):
+        raise InputError(
+            f"{folder} has no {camera or ' or '.join(CAMERAS)}/{POSES}; a scene of "
+            f"GraspNet-1Billion is expected (cameras found: {', '.join(there) or 'none'})."
+        )
+    camera = camera or there[0]
+    root = folder / camera
+    Ts_table_cam = _camera_poses(root)
+    files = _annotation_files(root)
+    if view not in files or view >= len(Ts_table_cam):
+        raise InputError(
+            f"{root / ANNOTATIONS} has no annotation of image {view} with a camera pose; there are "
+            f"{len(files)} annotations and {len(Ts_table_cam)} poses."
+        )
+    Ts = _objects_on_table(files[view], Ts_table_cam[view])
+    models_folder = Path(models) if models is not None else folder.parent.parent / "models"
+    loaded, notes = _load_models(models_folder, Ts)
+    notes += _disagreements(files, Ts_table_cam, Ts, view)
+    notes.append(_heights(loaded, Ts))
+    objects = tuple(
+        ObjectPose(obj_id=i + 1, instance=k, T_world_obj=T) for k, (i, T) in enumerate(Ts.items())
+    )
+    plane = SupportPlane(T_world_table=np.eye(4))
+    return GraspnetScene(
+        scene=Scene(name=f"{folder.name} {camera}", objects=objects, plane=plane),
+        models=loaded,
+        camera=camera,
+        view=view,
+        notes=tuple(notes),
+    )
+
+
+def _camera_poses(root: Path) -> Array:
+    """Return T_table_cam (N, 4, 4) [m]."""
+    first, relative = _read_npy(root / FIRST), _read_npy(root / POSES)
+    if first.shape != (4, 4) or relative.ndim != 3 or relative.shape[1:] != (4, 4):
+        raise InputError(
+            f"{root}: {FIRST} has the shape {first.shape} and {POSES} {relative.shape}; (4, 4) and "
+            "(N, 4, 4) are needed."
+        )
+    if not 0 < len(relative) <= MOST_VIEWS:
+        raise InputError(f"{root / POSES} holds {len(relative)} poses; 1 to {MOST_VIEWS} are read.")
+    first = se3.check_rigid(first, str(root / FIRST))
+    return first @ se3.check_rigid(relative, str(root / POSES))
+
+
+def _read_npy(path: Path) -> Array:
+    if not path.is_file():
+        raise InputError(f"there is no {path}; a GraspNet camera folder holds {POSES} and {FIRST}.")
+    try:
+        # Mapped first: a header can claim any size, and pickles are refused.
+        array: Any = np.load(path, mmap_mode="r", allow_pickle=False)
+        return np.array(array, dtype=np.float64)
+    except (ValueError, EOFError, TypeError, OSError) as error:
+        raise InputError(f"{path} is not a numpy array of numbers ({error}).") from error
+
+
+def _annotation_files(root: Path) -> dict[int, Path]:
+    files = {int(p.stem): p for p in (root / ANNOTATIONS).glob("*.xml") if p.stem.isdecimal()}
+    if not files:
+        raise InputError(f"{root} has no {ANNOTATIONS}/0000.xml; the objects' poses are in there.")
+    return dict(sorted(files.items()))
+
+
+def _objects_on_table(path: Path, T_table_cam: Array) -> dict[int, Array]:
+    """Return T_table_obj (4, 4) by GraspNet's object number, in the order of the file."""
+    return {i: T_table_cam @ T for i, T in read_annotation(path).items()}
+
+
+def read_annotation(path: Path) -> dict[int, Array]:
+    """Return T_cam_obj (4, 4) [m] by GraspNet's object number.
+
+    Raises:
+        InputError: missing, too large, with entities, or not GraspNet's XML.
+    """
+    from xml.etree import ElementTree
+
+    if path.stat().st_size > LARGEST_XML:
+        raise InputError(
+            f"{path} has {path.stat().st_size / 1e6:.1f} MB; an annotation has a few kilobytes."
+        )
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (UnicodeDecodeError, OSError) as error:
+        raise InputError(f"{path} cannot be read as text ({error}).") from error
+    if "<!" in text.replace("<!--", ""):
+        raise InputError(f"{path} declares a document type or entities; no annotation needs them.")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} is damaged XML ({error}).") from error
+    found: dict[int, Array] = {}
+    for k, node in enumerate(root.iter("obj")):
+        where = f"object {k} of {path}"
+        number = _numbers(node.findtext("obj_id", ""), 1, f"obj_id of {where}")[0]
+        position = _numbers(node.findtext("pos_in_world", ""), 3, f"pos_in_world of {where}")
+        q = np.array(_numbers(node.findtext("ori_in_world", ""), 4, f"ori_in_world of {where}"))
+        if abs(float(np.linalg.norm(q)) - 1.0) > 0.01:
+            raise InputError(
+                f"ori_in_world of {where} has the length {float(np.linalg.norm(q)):.3g}; a "
+                "quaternion w x y z of length 1 is needed."
+            )
+        if number != int(number) or number < 0 or int(number) in found:
+            raise InputError(f"{where} has the obj_id {number:g}; whole numbers, each once.")
+        found[int(number)] = se3.from_rt(se3.from_quaternion_wxyz(q), position)
+    if not found:
+        raise InputError(f"{path} holds no <obj>; <scene><obj>...</obj></scene> is expected.")
+    return found
+
+
+def _numbers(text: str, count: int, name: str) -> list[float]:
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not np.all(np.isfinite(numbers)):
+        raise InputError(f"{name} is {text.strip()[:60]!r}; {count} finite number(s) are needed.")
+    return numbers
+
+
+def _load_models(folder: Path, Ts: dict[int, Array]) -> tuple[dict[int, ObjectModel], list[str]]:
+    models: dict[int, ObjectModel] = {}
+    for i in Ts:
+        home = folder / f"{i:03d}"
+        file = next((home / n for n in MESH_FILES if (home / n).is_file()), None)
+        if file is None:
+            raise InputError(
+                f"object {i} has no mesh: none of {', '.join(MESH_FILES)} is in {home}. Give the "
+                "dataset's 'models' folder."
+            )
+        models[i + 1] = ObjectModel(obj_id=i + 1, name=f"{i:03d}", mesh=load_mesh(file, "m"))
+    return models, ["ids are GraspNet's object numbers + 1; names are its numbers."]
+
+
+def _disagreements(
+    files: dict[int, Path], Ts_table_cam: Array, Ts: dict[int, Array], view: int
+) -> list[str]:
+    """Compare with other images' annotations: the objects stand still."""
+    others = [i for i in files if i != view and i < len(Ts_table_cam)]
+    others = others[:: max(1, len(others) // CHECKED_VIEWS)][:CHECKED_VIEWS]
+    worst, name, at = 0.0, -1, -1
+    for i in others:
+        seen = _objects_on_table(files[i], Ts_table_cam[i])
+        for k in Ts.keys() & seen.keys():
+            off = float(np.linalg.norm(Ts[k][:3, 3] - seen[k][:3, 3]))
+            if off > worst:
+                worst, name, at = off, k, i
+    if worst <= AGREE_M:
+        return []
+    return [
+        f"object {name:03d} lies {1e3 * worst:.1f} mm elsewhere by the annotation of image {at}: "
+        f"that of image {view} was used."
+    ]
+
+
+def _heights(models: dict[int, ObjectModel], Ts: dict[int, Array]) -> str:
+    """Say where the objects' lowest points lie: nothing else tells whether z = 0 is the table."""
+    low = [
+        1e3 * float(se3.transform(T, models[i + 1].mesh.vertices)[:, 2].min())
+        for i, T in Ts.items()
+    ]
+    return (
+        f"the objects' lowest points lie {min(low):.1f} to {max(low):.1f} mm above the table's "
+        "z = 0 of cam0_wrt_table."
+    )

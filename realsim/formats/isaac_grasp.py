@@ -1,0 +1,227 @@
+"""Grasps of one object as an isaac_grasp YAML file, and such files as grasps.
+
+    format: isaac_grasp
+    format_version: 1.0
+    object_frame_link: mug
+    gripper_frame_link: panda_hand
+    grasps:
+      "grasp_0":
+        confidence: 0.75
+        position: [x, y, z]                     # of the gripper's frame in the object's [m]
+        orientation: {w: 1.0, xyz: [0.0, 0.0, 0.0]}
+        cspace_position: {panda_finger_joint1: 0.012}
+        pregrasp_cspace_position: {panda_finger_joint1: 0.04}
+
+The gripper's frame is franka_description's panda_hand. The confidence is our score, the number in
+the name is the grasp's row in its set. The joint is half the distance of the fingers; joint 2
+mimics it. Grasps that physics has not tried have no score and are left out.
+
+Source: Isaac Sim, Grasp Editor, "What is an Isaac Grasp File?"; Isaac ROS names the two frames
+object_frame and gripper_frame, which are read, too.
+"""
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim import interop
+from realsim.errors import InputError
+from realsim.formats.hand_frames import FINGER_OPEN_M, HandFrame, grasp_poses, hand_poses
+from realsim.formats.scene_grasps import check_values, executed, untried_set
+from realsim.geometry import se3
+from realsim.records import GraspSet
+from realsim.store import atomic
+
+Array = NDArray[np.float64]
+FORMAT_VERSION = 1.0
+FINGER = "panda_finger_joint1"
+MOST_BYTES = 256 << 20
+"""Largest file that is read [bytes]: 800,000 grasps; YAML is read at some MB/s."""
+UNIT_TOLERANCE = 1e-3
+"""How far a quaternion's length may be from 1: files written by hand have five decimals."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class IsaacGrasps:
+    """What an isaac_grasp file says."""
+
+    names: tuple[str, ...]
+    Ts_obj_grasp: Array
+    """(N, 4, 4) [m], frame `grasp`."""
+    confidences: Array
+    """(N,) in [0, 1]."""
+    widths_m: Array
+    """(N,) distance of the fingers [m]; NaN = the file names no such joint."""
+    openings_m: Array
+    """(N,) distance of the fingers before closing [m]; NaN likewise."""
+
+    def as_set(self, obj_id: int, instance: int = 0) -> GraspSet:
+        """Return the grasps as a set that our physics has not tried."""
+        return untried_set(
+            self.Ts_obj_grasp, obj_id=obj_id, instance=instance, widths_m=self.widths_m,
+            parameters={"source": {"from": "isaac_grasp"}},
+        )  # fmt: skip
+
+
+def write_isaac_grasp(
+    path: Path | str, grasps: GraspSet, *, object_frame: str, least_score: float = 0.0
+) -> Path:
+    """Write the tried grasps of one object, whole or not at all.
+
+    Args:
+        path: the YAML file.
+        grasps: the set; its parameters' openings_m are the fingers' distance before closing, where
+            they are there, else the hand opens fully.
+        object_frame: name of the object's frame.
+        least_score: grasps below it are left out.
+
+    Raises:
+        InputError: the set holds what no grasp has, or a width that the hand cannot take.
+    """
+    check_values(grasps)
+    rows = np.flatnonzero(executed(grasps) & (np.nan_to_num(grasps.scores, nan=-1) >= least_score))
+    Ts = hand_poses(grasps.Ts_obj_grasp[rows], "panda_hand")
+    widths, openings = grasps.widths_m[rows], _openings(grasps)[rows]
+    _require_panda(widths)
+    _require_panda(openings)
+    xyzw = interop.quaternion_xyzw_from_R(Ts) if len(rows) else np.zeros((0, 4))
+    lines = [
+        "format: isaac_grasp",
+        f"format_version: {FORMAT_VERSION}",
+        f"object_frame_link: {json.dumps(object_frame)}",
+        'gripper_frame_link: "panda_hand"',
+        "grasps:" if len(rows) else "grasps: {}",
+    ]
+    for k, row in enumerate(rows.tolist()):
+        x, y, z, w = (_number(q) for q in xyzw[k])
+        lines += [
+            f'  "grasp_{row}":',
+            f"    confidence: {_number(grasps.scores[row])}",
+            f"    position: [{', '.join(_number(t) for t in Ts[k, :3, 3])}]",
+            f"    orientation: {{w: {w}, xyz: [{x}, {y}, {z}]}}",
+            f"    cspace_position: {{{FINGER}: {_number(widths[k] / 2)}}}",
+            f"    pregrasp_cspace_position: {{{FINGER}: {_number(openings[k] / 2)}}}",
+        ]
+    path = Path(path)
+    atomic.write_text(path, "\n".join(lines) + "\n")
+    return path
+
+
+def _openings(grasps: GraspSet) -> Array:
+    """Return the distance of the fingers (N,) before they close [m]."""
+    stored = grasps.parameters.get("openings_m")
+    if isinstance(stored, list) and np.shape(stored) == (len(grasps),):  # pyright: ignore[reportUnknownArgumentType]
+        return np.array(stored, dtype=np.float64)
+    return np.full(len(grasps), 2 * FINGER_OPEN_M)
+
+
+def _require_panda(widths_m: Array, most_m: float = 2 * FINGER_OPEN_M) -> None:
+    """Check that the widths are known and fit between the Panda's fingers.
+
+    Raises:
+        InputError: one is NaN or wider than the hand opens.
+    """
+    wrong = ~((widths_m >= 0) & (widths_m <= most_m))
+    if np.any(wrong):
+        at = int(np.flatnonzero(wrong)[0])
+        raise InputError(
+            f"grasp {at} has the width {widths_m[at]:g} m; 0 to {most_m:g} m, what the Panda's "
+            "hand opens, is needed to say where its fingers are."
+        )
+
+
+def _number(x: float) -> str:
+    """Return a float that every YAML reader takes for one: 1e-05 is a text in YAML 1.1."""
+    text = repr(float(x))
+    return text if "." in text or "e" not in text else text.replace("e", ".0e")
+
+
+def read_isaac_grasp(path: Path | str, frame: HandFrame = "panda_hand") -> IsaacGrasps:
+    """Return the grasps of an isaac_grasp file, in the order of the file.
+
+    Args:
+        path: the YAML file.
+        frame: of its gripper; the file's own entry is for human readers, as its specification says.
+
+    Raises:
+        InputError: it is none, of another version, or a grasp of it is not one.
+    """
+    path = Path(path)
+    data = _loaded(path)
+    if not isinstance(data, dict) or data.get("format") != "isaac_grasp":
+        raise InputError(f"{path} is no isaac_grasp file: it must begin with format: isaac_grasp.")
+    try:
+        found = float(data.get("format_version", "nan"))
+    except (TypeError, ValueError):
+        found = float("nan")
+    if found != FORMAT_VERSION:
+        raise InputError(
+            f"{path} has the format_version {data.get('format_version')!r}; "
+            f"{FORMAT_VERSION} is read."
+        )
+    listed: Any = data.get("grasps")
+    if not isinstance(listed, dict):
+        raise InputError(f"{path} has no grasps: names with a grasp each are expected.")
+    rows: list[Array] = []
+    for name, entry in listed.items():
+        try:
+            rows.append(_row(entry))
+        except (KeyError, TypeError, ValueError, InputError) as error:
+            raise InputError(
+                f"{path}: {name} is no grasp ({error}); confidence in 0 to 1, position [x, y, z] "
+                "and orientation {w, xyz: [x, y, z]} of unit length are expected."
+            ) from error
+    table = np.stack(rows) if rows else np.zeros((0, 10))
+    R = interop.R_from_quaternion_xyzw(table[:, 3:7]) if rows else np.zeros((0, 3, 3))
+    Ts = grasp_poses(se3.from_rt(R, table[:, :3]), frame)
+    return IsaacGrasps(
+        names=tuple(str(name) for name in listed),
+        Ts_obj_grasp=Ts,
+        confidences=table[:, 7],
+        widths_m=table[:, 8],
+        openings_m=table[:, 9],
+    )
+
+
+def _loaded(path: Path) -> Any:
+    """Return the values of a YAML file, plain ones only."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; give an isaac_grasp YAML file.")
+    if path.stat().st_size > MOST_BYTES:
+        raise InputError(f"{path} has {path.stat().st_size / 1e6:.0f} MB; at most 268 MB are read.")
+    try:
+        return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+    except (YAMLError, ValueError, RecursionError) as error:
+        reason = re.sub(r"\s+", " ", str(error))[:200]
+        raise InputError(f"{path} is not valid YAML ({reason}).") from error
+
+
+def _row(entry: Any) -> Array:
+    """Return position, quaternion x y z w, confidence, width and opening of one grasp (10,)."""
+    turn = entry["orientation"]
+    xyzw = [*(float(q) for q in turn["xyz"]), float(turn["w"])]
+    row = np.array(
+        [
+            *(float(x) for x in entry["position"]), *xyzw, float(entry["confidence"]),
+            _fingers_m(entry.get("cspace_position")),
+            _fingers_m(entry.get("pregrasp_cspace_position")),
+        ]
+    )  # fmt: skip
+    if row.shape != (10,) or not np.all(np.isfinite(row[:8])) or not 0 <= row[7] <= 1:
+        raise ValueError(f"found {row.tolist()}")
+    if abs(float(np.linalg.norm(xyzw)) - 1) > UNIT_TOLERANCE:
+        raise ValueError(f"the quaternion has the length {np.linalg.norm(xyzw):.4f}")
+    return row
+
+
+def _fingers_m(joints: Any) -> float:
+    """Return the distance of the fingers [m], NaN if the file does not say it."""
+    return 2 * float(joints[FINGER]) if isinstance(joints, dict) and FINGER in joints else np.nan

@@ -1,0 +1,61 @@
+"""What the arm did in each attempt at a grasp: joint angles over time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.records.checked_arrays import Array, frozen
+
+PHASES = ("reach", "approach", "close", "lift", "oscillate", "pendulum")
+"""The parts of an attempt, in order: from home to the pre-grasp, straight on, and the stages."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class GraspTrajectories:
+    """The attempts of one grasp set; samples of attempt a are starts[a] to starts[a + 1]."""
+
+    rows: NDArray[np.int64]
+    """(A,) row of the grasp set that each attempt belongs to, increasing."""
+    starts: NDArray[np.int64]
+    """(A + 1,) first sample of each attempt; the last is the number of samples."""
+    time_s: Array
+    """(S,) since the attempt's start [s], not decreasing within an attempt."""
+    joints_rad: Array
+    """(S, J) angles of the arm's joints [rad]."""
+    opening_m: Array
+    """(S,) commanded distance of the finger faces [m]."""
+    phase: NDArray[np.int64]
+    """(S,) number in PHASES."""
+
+    def __post_init__(self) -> None:
+        """Check that everything fits together and freeze it."""
+        rows = np.asarray(self.rows)
+        joints = np.asarray(self.joints_rad, dtype=np.float64)
+        joints = joints.reshape(len(joints), -1)
+        n, s = len(rows), len(joints)
+        object.__setattr__(self, "rows", frozen(rows, np.int64, (n,), "rows"))
+        object.__setattr__(self, "starts", frozen(self.starts, np.int64, (n + 1,), "starts"))
+        object.__setattr__(self, "joints_rad", frozen(joints, np.float64, joints.shape, "joints"))
+        for name in ("time_s", "opening_m"):
+            object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (s,), name))
+        object.__setattr__(self, "phase", frozen(self.phase, np.int64, (s,), "phase"))
+        whole = self.starts[0] == 0 and self.starts[-1] == s and bool(np.all(np.diff(self.starts) >= 0))
+        if not whole:
+            raise InputError(
+                f"the starts of {n} attempts do not cover their {s} samples from 0 to the end."
+            )
+        if s and not (self.phase.min() >= 0 and self.phase.max() < len(PHASES)):
+            raise InputError(f"a phase is not one of 0 to {len(PHASES) - 1}: {', '.join(PHASES)}.")
+
+    def __len__(self) -> int:
+        """Return the number of attempts."""
+        return len(self.rows)
+
+    def attempt(self, row: int) -> slice | None:
+        """Return the samples of a grasp set's row, or None if it was not attempted."""
+        at = int(np.searchsorted(self.rows, row))
+        if at == len(self.rows) or self.rows[at] != row:
+            return None
+        return slice(int(self.starts[at]), int(self.starts[at + 1]))

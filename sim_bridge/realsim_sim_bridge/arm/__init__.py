@@ -1,0 +1,1 @@
+"""The Franka Panda: kinematics, reach, collision-free and timed paths."""

@@ -1,0 +1,1 @@
+"""Grasp candidates: the hand, antipodal sampling, collision, force closure."""

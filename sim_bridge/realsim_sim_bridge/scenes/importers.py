@@ -1,0 +1,204 @@
+"""Scenes of other programs as school scenes: GraspIT's scene.yaml, GraspNet-1Billion, BOP."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats.graspit_scene import QuaternionOrder, read_graspit_scene
+from realsim.formats.graspnet_scene import read_graspnet_scene
+from realsim.geometry import se3
+from realsim.models.library_records import KnownSolid
+from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
+
+Array = NDArray[np.float64]
+TABLE_STRIDE = 6
+"""Every how many rows and columns of a depth image is looked at for the table."""
+
+
+def from_graspit_yaml(
+    path: Path | str,
+    matter: Matter | None = None,
+    *,
+    supports: Sequence[Support] = (),
+    order: QuaternionOrder | None = None,
+    meshes: Path | None = None,
+) -> SchoolScene:
+    """Return the scene of a scene.yaml; see `read_graspit_scene`."""
+    found = read_graspit_scene(path, order=order, meshes=meshes)
+    return SchoolScene(
+        scene=found.scene,
+        models=found.models,
+        solids=known_solids(found.models, matter),
+        supports=tuple(supports),
+        notes=found.notes,
+    )
+
+
+def from_graspnet(
+    folder: Path | str,
+    matter: Matter | None = None,
+    *,
+    models: Path | None = None,
+    supports: Sequence[Support] = (),
+    camera: str | None = None,
+    view: int = 0,
+) -> SchoolScene:
+    """Return a scene of GraspNet-1Billion; see `read_graspnet_scene`."""
+    found = read_graspnet_scene(folder, models, camera=camera, view=view)
+    return SchoolScene(
+        scene=found.scene,
+        models=found.models,
+        solids=known_solids(found.models, matter),
+        supports=tuple(supports),
+        notes=found.notes,
+    )
+
+
+def from_bop(
+    folder: Path | str,
+    scene_id: int | None = None,
+    matter: Matter | None = None,
+    *,
+    image: int | None = None,
+    models: Path | None = None,
+    supports: Sequence[Support] = (),
+) -> SchoolScene:
+    """Return a scene of a BOP dataset, its objects as annotated, its table as the depth shows it.
+
+    World is the dataset's own where every image has cam_R_w2c: then the objects are those of all
+    images, each at its median position. Else world is the camera of one image, and the objects are
+    those annotated in it.
+
+    Args:
+        folder: dataset, split or scene.
+        scene_id: number of the scene, where there are several.
+        matter: weighed masses, convex parts.
+        image: number of the image; None = the first that has annotations and depth.
+        models: folder of the models; None = 'models' of the dataset.
+        supports: bodies that stand still.
+
+    Raises:
+        InputError: no scene or several, no annotation, no depth, no table in it, no model.
+    """
+    from realsim.formats.bop import BopScene, read_scene
+    from realsim.formats.bop_models import load_models
+    from realsim.formats.bop_source import choose_scene
+
+    bop: BopScene = read_scene(choose_scene(folder, scene_id))
+    usable = [i for i, rows in sorted(bop.ground_truth.items()) if rows and bop.has_depth(i)]
+    if image is not None and image not in usable:
+        raise InputError(
+            f"image {image} of {bop.ref.folder} has no annotated object, or no depth; these have "
+            f"both: {', '.join(map(str, usable[:12])) or 'none'}."
+        )
+    if not usable:
+        raise InputError(
+            f"{bop.ref.folder} has no image with annotated objects and depth; poses and table "
+            "come from there. Register its images first: `realsim upgrade`."
+        )
+    cameras = bop.Ts_world_cam if image is None else None
+    notes: list[str] = []
+    if bop.approximate:
+        notes.append(f"the poses are of {bop.ground_truth_file}, which calls itself approximate.")
+    if cameras is None:
+        first = usable[0] if image is None else image
+        cameras = {first: np.eye(4)}
+        notes.append(f"the poses are those of image {first}; world is its camera.")
+    used = [i for i in usable if i in cameras]
+    rows = {i: [(a.obj_id, a.T_cam_obj) for a in bop.ground_truth[i]] for i in used}
+    objects, said = _consensus(rows, cameras)
+    notes += said
+    plane, said = _table(bop, used, cameras)
+    notes += said
+    models_folder = models or bop.ref.folder.parent.parent / "models"
+    loaded = load_models(models_folder, {o.obj_id for o in objects})
+    scene = Scene(name=f"{bop.ref.split}-{bop.ref.folder.name}", objects=objects, plane=plane)
+    return SchoolScene(
+        scene=scene,
+        models=loaded,
+        solids=known_solids(loaded, matter, _library_solids(models_folder, loaded)),
+        supports=tuple(supports),
+        notes=tuple(notes),
+    )
+
+
+def _library_solids(folder: Path, models: Mapping[int, ObjectModel]) -> dict[int, KnownSolid]:
+    """Return what a model library already knows; a plain BOP folder knows nothing."""
+    from realsim.models.library_reading import LibraryReader
+
+    library = LibraryReader.open(folder)
+    found = {i: library.solid(i)[0] for i in models}
+    return {i: solid for i, solid in found.items() if solid is not None}
+
+
+def _consensus(
+    rows: Mapping[int, list[tuple[int, Array]]], cameras: Mapping[int, Array]
+) -> tuple[tuple[ObjectPose, ...], list[str]]:
+    """Return the objects in world: of several images each at its median position.
+
+    The k-th row of one id in an image counts as its k-th instance.
+    """
+    seen: dict[tuple[int, int], list[Array]] = {}
+    for image, annotations in rows.items():
+        counts: dict[int, int] = {}
+        for obj_id, T_cam_obj in annotations:
+            k = counts[obj_id] = counts.get(obj_id, -1) + 1
+            seen.setdefault((obj_id, k), []).append(cameras[image] @ T_cam_obj)
+    objects: list[ObjectPose] = []
+    worst = 0.0
+    for instance, ((obj_id, _), found) in enumerate(seen.items()):
+        Ts = np.stack(found)
+        middle = np.median(Ts[:, :3, 3], axis=0)
+        off = np.linalg.norm(Ts[:, :3, 3] - middle, axis=1)
+        worst = max(worst, float(off.max()))
+        # A pose that was given, not a mean: symmetric objects may be annotated turned.
+        objects.append(
+            ObjectPose(obj_id=obj_id, instance=instance, T_world_obj=Ts[int(np.argmin(off))])
+        )
+    if len(rows) == 1:
+        return tuple(objects), []
+    words = f"the annotations of {len(rows)} images differ by up to {1e3 * worst:.1f} mm."
+    return tuple(objects), [words]
+
+
+def _table(
+    bop: Any, images: Sequence[int], cameras: Mapping[int, Array]
+) -> tuple[SupportPlane, list[str]]:
+    """Return the table that the depth images show.
+
+    Raises:
+        InputError: they show none.
+    """
+    from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
+    from realsim.registration.find_table import TableSearchConfig, find_table
+    from realsim.registration.views import SampleConfig, sample_views
+
+    some = images[:: max(1, -(-len(images) // 8))]
+    frames = [DepthFrame(index=i, depth_m=bop.depth_m(i), T_world_cam=cameras[i]) for i in some]
+    noise = measure_noise(frames, EvidenceConfig())
+    views = sample_views(
+        bop.session.intrinsics, frames, noise, SampleConfig(stride=TABLE_STRIDE)
+    )
+    found = find_table(views, noise, TableSearchConfig())
+    if found.plane is None:
+        raise InputError(f"no table is seen in the depth of {bop.ref.folder}: {found.reason}")
+    return found.plane, [
+        f"the table is the plane of {100 * found.share:.0f} % of the depth around the middle, RMS "
+        f"{1e3 * found.plane.rms_m:.1f} mm."
+    ]
+
+
+def heights_above_table(scene: SchoolScene) -> dict[int, float]:
+    """Return the height of each object's lowest point above the table, by instance [m]."""
+    T = scene.T_table_world
+    return {
+        o.instance: float(
+            se3.transform(T @ o.T_world_obj, scene.models[o.obj_id].mesh.vertices)[:, 2].min()
+        )
+        for o in scene.scene.objects
+    }

@@ -1,0 +1,100 @@
+"""A shard: some grasps of one object that one worker tests in one go, and its file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
+from realsim_sim_bridge.school.config import SchoolConfig
+from realsim_sim_bridge.school.shard_measures import shard_measures
+from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.slip_test import SlipTrial, run_slip_test
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+SHARD_S = 7.0
+"""Work in a shard [s]: what a dead worker loses; against it, handing out a job (some ms) is nothing."""
+BULLET_S, MUJOCO_S = 0.4, 0.035
+"""A grasp's four stages with the default settings on one core [s]; only the size of a shard depends
+on it."""
+MEASURE = "measure."
+"""Before a measure's name in a file."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Tested:
+    """What the slip test said of some rows of an object's candidates."""
+
+    rows: Rows
+    """(n,)"""
+    slip_m: Array
+    """(n, 4) [m]."""
+    slip_rad: Array
+    """(n, 4) [rad]."""
+    failures: tuple[str, ...]
+    """(n,)"""
+    measures: dict[str, Array]
+    """(n,) or (n, 4) each."""
+
+
+def default_shard_grasps(config: SchoolConfig) -> int:
+    """Return the grasps of a shard: about `SHARD_S` of work in whole worlds of the engine."""
+    engine = config.slip.engine
+    grasp_s = MUJOCO_S if isinstance(engine, MujocoSettings) else BULLET_S
+    worlds = round(SHARD_S / grasp_s / engine.pairs_per_world)
+    return max(1, worlds) * engine.pairs_per_world
+
+
+def shards_of(tested: Rows, size: int) -> list[Rows]:
+    """Return rows in shards of at most `size`."""
+    return [tested[i : i + size] for i in range(0, len(tested), size)]
+
+
+def run_shard(trial: SlipTrial, rows: Rows, config: SchoolConfig) -> Tested:
+    """Return what the slip test says of a shard; it depends on nothing but the arguments.
+
+    Args:
+        trial: the shard's grasps.
+        rows: which of the object's candidates they are (n,).
+        config: the school's.
+    """
+    slips = run_slip_test(trial, config.slip, config.score, config.hand)
+    return Tested(
+        rows=rows,
+        slip_m=slips.slip_m,
+        slip_rad=slips.slip_rad,
+        failures=slips.failures,
+        measures=shard_measures(trial, slips, config),
+    )
+
+
+def write_tested(path: Path, tested: Tested) -> None:
+    """Keep a shard's result; a reader finds all of it or nothing."""
+    arrays: dict[str, NDArray[np.float64] | Rows] = {
+        "rows": tested.rows,
+        "slip_m": tested.slip_m,
+        "slip_rad": tested.slip_rad,
+    }
+    arrays |= {MEASURE + name: values for name, values in tested.measures.items()}
+    write_arrays(path, arrays, {"failures": tested.failures})
+
+
+def read_tested(path: Path) -> Tested | None:
+    """Return a shard's result, or None if there is none; a damaged file is deleted."""
+    if not is_whole(path):
+        return None
+    arrays, notes = read_arrays(path)
+    return Tested(
+        rows=arrays["rows"],
+        slip_m=arrays["slip_m"],
+        slip_rad=arrays["slip_rad"],
+        failures=tuple(notes["failures"]),
+        measures={
+            name.removeprefix(MEASURE): values
+            for name, values in arrays.items()
+            if name.startswith(MEASURE)
+        },
+    )

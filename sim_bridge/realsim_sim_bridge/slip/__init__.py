@@ -1,0 +1,1 @@
+"""The slip test: loads, worlds of two physics engines, stages."""

@@ -1,0 +1,258 @@
+"""One hand and one object in PyBullet; any number of grasps are put into it one after the other.
+
+What makes the friction right (each was measured to be wrong without it):
+- `changeDynamics` with damping on a link silently drops the friction given in the same call (the
+  fingers stay at 0.5). Damping is set in a call of its own, and everything is read back.
+- Bullet's solver puts a flat pad's whole load on one corner: sphere pads with finite stiffness.
+- `numSubSteps` multiplies the motors' force: never used; the time step is set instead.
+- A light object between stiff pads does not converge: it is given a mass of at least the floor.
+
+Pairs in one world are not independent: Bullet sorts their constraints by an unstable sort, so that
+the order in which a hand's own are solved depends on the others, and closing amplifies that to
+millimetres. One pair, built once and reset for every grasp, costs no more.
+"""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim import interop
+from realsim.errors import RealsimError
+from realsim.geometry import se3
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.bullet_settings import BulletSettings
+from realsim_sim_bridge.slip.hand_urdf import hand_urdf
+from realsim_sim_bridge.slip.world import SlipPhysics
+
+Array = NDArray[np.float64]
+FINGERS = (0, 1)
+"""PyBullet's link numbers of the two fingers; 0 is the one at +y."""
+FAR_AWAY = (0.0, 0.0, 50.0)
+"""Where the object waits while contacts of the grasp before are forgotten [m]."""
+
+
+class BulletPair:
+    """A hand fixed at the origin, in the grasp frame's axes, and an object."""
+
+    def __init__(
+        self, body: SlipBody, physics: SlipPhysics, geometry: HandGeometry, settings: BulletSettings
+    ) -> None:
+        """Build the pair.
+
+        Raises:
+            RealsimError: PyBullet does not take the shape, or a setting.
+        """
+        with interop.quiet_output():
+            import pybullet
+            from pybullet_utils.bullet_client import BulletClient
+
+            self.engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
+        self._physics, self._settings = physics, settings
+        self.dt = 1.0 / settings.rate_hz
+        self._T_obj_body, moments = body.principal_frame()
+        self._mass = max(body.mass_kg, physics.mass_floor_kg)
+        self._moments = moments * (self._mass / body.mass_kg)
+        self.engine.setPhysicsEngineParameter(
+            fixedTimeStep=self.dt,
+            numSolverIterations=settings.iterations,
+            numSubSteps=0,
+            deterministicOverlappingPairs=1,
+        )
+        self.engine.setGravity(0.0, 0.0, 0.0)
+        with tempfile.TemporaryDirectory() as folder:
+            self.hand = self._add_hand(Path(folder), geometry)
+            self.object = self._add_object(self._shape(body, Path(folder)))
+
+    def disconnect(self) -> None:
+        """Free the engine's memory."""
+        if self.engine.isConnected():
+            self.engine.disconnect()
+
+    # --- what is in it ------------------------------------------------------------------------
+
+    def _add_hand(self, folder: Path, geometry: HandGeometry) -> int:
+        """Load the hand; its fingers stand still until they are driven."""
+        engine, settings = self.engine, self._settings
+        urdf = folder / "hand.urdf"
+        urdf.write_text(hand_urdf(geometry, self._physics.pads))
+        hand: int = engine.loadURDF(
+            str(urdf),
+            [0.0, 0.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+            useFixedBase=True,
+            flags=engine.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS,
+        )
+        # Never together with a link's settings: see the head of this file.
+        engine.changeDynamics(hand, -1, linearDamping=0.0, angularDamping=0.0)
+        wanted: dict[str, float] = {
+            "lateralFriction": 1.0,
+            "spinningFriction": 0.0,
+            "rollingFriction": 0.0,
+        }
+        if self._physics.pads:
+            wanted["contactStiffness"] = settings.stiffness
+            wanted["contactDamping"] = settings.damping
+        for finger in FINGERS:
+            engine.changeDynamics(hand, finger, **wanted)
+            self._check(hand, finger, wanted)
+        gear = engine.createConstraint(
+            hand, 0, hand, 1, engine.JOINT_GEAR, [0, 1, 0], [0, 0, 0], [0, 0, 0]
+        )
+        engine.changeConstraint(
+            gear, gearRatio=-1, erp=settings.gear_erp, maxForce=settings.gear_force_n
+        )
+        return hand
+
+    def _shape(self, body: SlipBody, folder: Path) -> int:
+        """Return the collision shape, in the body's principal frame."""
+        T_body_obj = se3.invert(self._T_obj_body)
+        path = folder / "parts.obj"
+        path.write_text(wavefront([se3.transform(T_body_obj, part) for part in body.parts]))
+        shape: int = self.engine.createCollisionShape(
+            self.engine.GEOM_MESH, fileName=str(path), meshScale=[1.0, 1.0, 1.0]
+        )
+        if shape < 0:
+            raise RealsimError(
+                f"PyBullet refused the collision shape of {len(body.parts)} convex parts."
+            )
+        return shape
+
+    def _add_object(self, shape: int) -> int:
+        """Add the object; its frame in the engine is the principal one."""
+        obj: int = self.engine.createMultiBody(
+            baseMass=self._mass, baseCollisionShapeIndex=shape, basePosition=FAR_AWAY
+        )
+        self.engine.changeDynamics(obj, -1, linearDamping=0.0, angularDamping=0.0)
+        wanted = {
+            "lateralFriction": self._physics.friction,
+            "spinningFriction": 0.0,
+            "rollingFriction": 0.0,
+        }
+        self.engine.changeDynamics(obj, -1, localInertiaDiagonal=self._moments.tolist(), **wanted)
+        self._check(obj, -1, wanted)
+        return obj
+
+    def _check(self, body: int, link: int, wanted: dict[str, float]) -> None:
+        """Raise if the engine did not take a setting."""
+        info = self.engine.getDynamicsInfo(body, link)
+        for name, value in wanted.items():
+            found = float(info[_INFO[name]])
+            if abs(found - value) > 1e-9 * max(1.0, abs(value)):
+                raise RealsimError(
+                    f"PyBullet holds {name} = {found} for link {link} instead of {value}; its "
+                    "results would be wrong. Was changeDynamics called with damping on a link?"
+                )
+
+    # --- what happens in it -------------------------------------------------------------------
+
+    def put(self, T_hand_body: Array, twist: Array, fingers_m: Array, speeds: Array) -> None:
+        """Put the object (4, 4) with its twist (6,) and the fingers (2,) there, contacts forgotten."""
+        engine = self.engine
+        still = [0.0, 0.0, 0.0]
+        engine.resetBasePositionAndOrientation(self.object, FAR_AWAY, [0.0, 0.0, 0.0, 1.0])
+        engine.resetBaseVelocity(self.object, still, still)
+        engine.stepSimulation()
+        position, xyzw = interop.pybullet_from_T(T_hand_body)
+        engine.resetBasePositionAndOrientation(self.object, position, xyzw)
+        engine.resetBaseVelocity(self.object, twist[3:].tolist(), twist[:3].tolist())
+        for finger in FINGERS:
+            engine.resetJointState(
+                self.hand, finger, float(fingers_m[finger]), float(speeds[finger])
+            )
+
+    def drive(self, speed: float) -> None:
+        """Let the fingers close at a speed [m/s] each, with at most the hand's force."""
+        for finger in FINGERS:
+            self.engine.setJointMotorControl2(
+                self.hand,
+                finger,
+                self.engine.VELOCITY_CONTROL,
+                targetVelocity=-speed,
+                force=self._physics.force_n,
+            )
+
+    def drag(self, rate_per_s: float) -> None:
+        """Let the object's speeds decay at a rate [1/s]."""
+        self.engine.changeDynamics(
+            self.object, -1, linearDamping=rate_per_s, angularDamping=rate_per_s
+        )
+
+    def push(self, torque: list[float], force: list[float]) -> None:
+        """Apply a torque [N m] and a force [N] at the centre of mass, for one step."""
+        engine, frame = self.engine, self.engine.WORLD_FRAME
+        at = engine.getBasePositionAndOrientation(self.object)[0]
+        engine.applyExternalForce(self.object, -1, force, at, frame)
+        engine.applyExternalTorque(self.object, -1, torque, frame)
+
+    # --- what is seen -------------------------------------------------------------------------
+
+    def pose(self) -> Array:
+        """Return T_hand_body (4, 4)."""
+        return interop.T_from_pybullet(*self.engine.getBasePositionAndOrientation(self.object))
+
+    def twist(self) -> Array:
+        """Return the object's twist (6,), hand axes."""
+        linear, angular = self.engine.getBaseVelocity(self.object)
+        return np.array([*angular, *linear])
+
+    def fingers(self) -> Array:
+        """Return the fingers' positions [m] and speeds [m/s] (2, 2): row 0 positions."""
+        return np.array([self.engine.getJointState(self.hand, f)[:2] for f in FINGERS]).T
+
+    def finger_forces(self) -> Array:
+        """Return the normal force of each finger on the object (2,) [N]."""
+        forces = np.zeros(2)
+        for finger in FINGERS:
+            contacts = self.engine.getContactPoints(
+                bodyA=self.hand, bodyB=self.object, linkIndexA=finger
+            )
+            forces[finger] = sum(c[9] for c in contacts)
+        return forces
+
+    def settings(self) -> dict[str, float]:
+        """Return what the engine says its settings are."""
+        engine = self.engine
+        finger = engine.getDynamicsInfo(self.hand, FINGERS[0])
+        held = engine.getDynamicsInfo(self.object, -1)
+        parameters = engine.getPhysicsEngineParameters()
+        return {
+            "finger_friction": float(finger[_INFO["lateralFriction"]]),
+            "object_friction": float(held[_INFO["lateralFriction"]]),
+            "contact_stiffness": float(finger[_INFO["contactStiffness"]]),
+            "contact_damping": float(finger[_INFO["contactDamping"]]),
+            "object_mass_kg": float(held[0]),
+            "object_inertia_least": float(min(held[2])),
+            "dt_s": float(parameters["fixedTimeStep"]),
+            "iterations": float(parameters["numSolverIterations"]),
+            "substeps": float(parameters["numSubSteps"]),
+            "force_n": abs(float(engine.getJointState(self.hand, FINGERS[0])[3])),
+        }
+
+
+_INFO = {
+    "lateralFriction": 1,
+    "rollingFriction": 6,
+    "spinningFriction": 7,
+    "contactDamping": 8,
+    "contactStiffness": 9,
+}
+"""Where getDynamicsInfo has each setting."""
+
+
+def wavefront(parts: list[Array]) -> str:
+    """Return an OBJ with one group per part (V, 3); the engine takes the convex hull of each.
+
+    The faces only name the vertices: a hull is made of points.
+    """
+    lines: list[str] = []
+    first = 1
+    for i, part in enumerate(parts):
+        lines.append(f"o part{i}")
+        lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in part.tolist()]
+        lines += [f"f {first} {first + j} {first + j + 1}" for j in range(1, len(part) - 1)]
+        first += len(part)
+    return "\n".join(lines) + "\n"

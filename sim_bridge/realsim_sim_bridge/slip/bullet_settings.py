@@ -1,0 +1,31 @@
+"""PyBullet's settings for the slip test."""
+
+from dataclasses import dataclass, field
+
+from realsim_sim_bridge.slip.world import Replay
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BulletSettings:
+    """Settings that pass the validation suite; every one is read back from the engine."""
+
+    rate_hz: float = 240.0
+    """Steps per second of simulated time."""
+    iterations: int = 100
+    """Solver iterations a step; at 50 the 5 cm box turns 1.9 deg instead of 0.14."""
+    stiffness: float = 10000.0
+    """Contact stiffness of the pads [N/m]: shares the load between spheres."""
+    damping: float = 1.0
+    """Contact damping [N s/m]; at 100 and more the sharing is lost."""
+    gear_force_n: float = 1000.0
+    """What keeps the two fingers symmetric [N], as the rack of the real hand does."""
+    gear_erp: float = 0.3
+    """Share of the fingers' asymmetry that is corrected per step."""
+    pairs_per_world: int = 16
+    """Pairs in one world; 16 share the cost of setting up, 64 are slower again."""
+    replay: Replay = field(default_factory=Replay)
+
+    @classmethod
+    def reference(cls) -> "BulletSettings":
+        """Return the slow settings that the fast ones are judged by."""
+        return cls(replay=Replay())

@@ -1,0 +1,226 @@
+"""PyBullet as an engine of the slip test: K grasps, one after the other in one pair."""
+
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.bullet_pair import BulletPair
+from realsim_sim_bridge.slip.bullet_settings import BulletSettings
+from realsim_sim_bridge.slip.world import Closing, Grips, Motion, PairStates, SlipPhysics
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class BulletEngine:
+    """PyBullet with its settings; keeps the pair of the last body."""
+
+    name = "pybullet"
+
+    def __init__(self, settings: BulletSettings) -> None:
+        """Keep the settings."""
+        self.settings = settings
+        self.pairs_per_world = settings.pairs_per_world
+        self.replay = settings.replay
+        self._kept: tuple[SlipBody, SlipPhysics, HandGeometry, BulletPair] | None = None
+
+    def version(self) -> str:
+        """Return PyBullet's version."""
+        from importlib.metadata import version
+
+        return version("pybullet")
+
+    def world(
+        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: HandGeometry
+    ) -> "BulletWorld":
+        """Return a world with these pairs."""
+        return BulletWorld(self._pair(body, physics, geometry), body, grips, physics)
+
+    def _pair(self, body: SlipBody, physics: SlipPhysics, geometry: HandGeometry) -> BulletPair:
+        """Return the pair of this body, built if it is another one than the last."""
+        if self._kept is not None:
+            kept_body, kept_physics, kept_geometry, pair = self._kept
+            if kept_body is body and kept_physics == physics and kept_geometry == geometry:
+                return pair
+            pair.disconnect()
+        pair = BulletPair(body, physics, geometry, self.settings)
+        self._kept = (body, physics, geometry, pair)
+        return pair
+
+    def __del__(self) -> None:
+        """Free the engine's memory."""
+        if self._kept is not None:
+            self._kept[3].disconnect()
+
+
+class BulletWorld:
+    """K pairs of hand and object; a `HandWorld`. The pair it is played in may serve other worlds."""
+
+    def __init__(
+        self, pair: BulletPair, body: SlipBody, grips: Grips, physics: SlipPhysics
+    ) -> None:
+        """Put nothing into the engine yet; the interface is described in `world.py`."""
+        n = len(grips.openings_m)
+        self._pair, self._physics = pair, physics
+        self.dt = pair.dt
+        self._R_world_hand = grips.Ts_table_grasp[:, :3, :3]
+        self._Ts_hand_body = se3.invert(grips.Ts_obj_grasp) @ body.principal_frame()[0]
+        self._twists = np.zeros((n, 6))
+        self._fingers = np.repeat(grips.openings_m[:, None] / 2.0, 2, axis=1)
+        self._speeds = np.zeros((n, 2))
+        self.alive: Mask = np.ones(n, dtype=np.bool_)
+
+    def __enter__(self) -> "BulletWorld":
+        """Return the world."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Nothing is held here: the engine keeps its pair for the next world."""
+
+    def close(self, closing: Closing) -> Motion:
+        """Close all hands; see `HandWorld`. Each pair ends where it came to rest."""
+        sample = max(1, round(closing.sample_s / self.dt))
+        pair = self._pair
+        pair.drag(closing.drag_per_s)
+        seen = [
+            self._close(k, closing, sample) if self.alive[k] else [] for k in range(len(self.alive))
+        ]
+        pair.drag(0.0)
+        # What has come to rest stays as it was seen last.
+        longest = max((len(s) for s in seen), default=0)
+        seen = [s + s[-1:] * (longest - len(s)) for s in seen]
+        return self._motion(seen, longest, sample)
+
+    def _close(self, k: int, closing: Closing, sample: int) -> list[tuple[Array, Array]]:
+        """Close hand k and return what is seen every `sample` steps."""
+        pair = self._pair
+        self._take(k)
+        pair.drive(closing.speed)
+        duration_s = float(self._fingers[k].max()) / closing.speed + closing.settle_s
+        start = before = self._Ts_hand_body[k, :3, 3]
+        seen: list[tuple[Array, Array]] = []
+        while len(seen) * sample < duration_s / self.dt:
+            for _ in range(sample):
+                pair.engine.stepSimulation()
+            seen.append((pair.pose(), pair.finger_forces()))
+            at, forces = seen[-1][0][:3, 3], seen[-1][1]
+            still = float(np.linalg.norm(at - before)) < closing.settled_m
+            gone = float(np.linalg.norm(at - start)) > closing.lost_m
+            if gone or (still and bool(np.all(forces > self._physics.contact_n))):
+                break
+            before = at
+        self._leave(k)
+        return seen
+
+    def play(self, wrenches: Array, sample: int, lost_m: float) -> Motion:
+        """Apply wrenches (K, T, 6) and return what is seen; see `HandWorld`."""
+        looks = -(-wrenches.shape[1] // sample)
+        # The hand's axes are the engine's.
+        torques, forces = (
+            np.einsum("kji,ktj->kti", self._R_world_hand, w)
+            for w in (wrenches[..., :3], wrenches[..., 3:])
+        )
+        seen = [
+            self._play(k, torques[k].tolist(), forces[k].tolist(), sample, lost_m)
+            if self.alive[k]
+            else []
+            for k in range(len(self.alive))
+        ]
+        return self._motion(seen, looks, sample, wrenches.shape[1])
+
+    def _play(
+        self,
+        k: int,
+        torques: list[list[float]],
+        forces: list[list[float]],
+        sample: int,
+        lost_m: float,
+    ) -> list[tuple[Array, Array]]:
+        """Play pair k and return what is seen every `sample` steps, until it is lost."""
+        pair = self._pair
+        self._take(k)
+        pair.drive(Closing().speed)
+        start = self._Ts_hand_body[k, :3, 3]
+        seen: list[tuple[Array, Array]] = []
+        for t, (torque, force) in enumerate(zip(torques, forces, strict=True), 1):
+            pair.push(torque, force)
+            pair.engine.stepSimulation()
+            if t % sample == 0 or t == len(torques):
+                seen.append((pair.pose(), pair.finger_forces()))
+                if float(np.linalg.norm(seen[-1][0][:3, 3] - start)) > lost_m:
+                    break
+        self._leave(k)
+        return seen
+
+    def states(self) -> PairStates:
+        """Return where everything is; see `HandWorld`."""
+        R = self._R_world_hand
+        gone = ~self.alive
+        Ts = self._hands() @ self._Ts_hand_body
+        turned = np.einsum("kij,kpj->kpi", R, self._twists.reshape(-1, 2, 3)).reshape(-1, 6)
+        fingers, speeds = self._fingers.copy(), self._speeds.copy()
+        for array in (Ts, turned, fingers, speeds):
+            array[gone] = np.nan
+        return PairStates(Ts_world_body=Ts, twists=turned, fingers_m=fingers, finger_speeds=speeds)
+
+    def put(self, states: PairStates) -> None:
+        """Put pairs there; see `HandWorld`."""
+        there = ~np.isnan(states.Ts_world_body[:, 0, 0]) & self.alive
+        Ts = se3.invert(self._hands()[there]) @ states.Ts_world_body[there]
+        self._Ts_hand_body[there] = Ts
+        turned = np.einsum(
+            "kji,kpj->kpi", self._R_world_hand[there], states.twists[there].reshape(-1, 2, 3)
+        )
+        self._twists[there] = turned.reshape(-1, 6)
+        self._fingers[there], self._speeds[there] = (
+            states.fingers_m[there],
+            states.finger_speeds[there],
+        )
+
+    def remove(self, rows: Mask) -> None:
+        """Take pairs out; see `HandWorld`."""
+        self.alive &= ~rows
+
+    def settings(self) -> dict[str, float]:
+        """Return the engine's own settings; see `HandWorld`."""
+        return self._pair.settings()
+
+    # --- between here and the engine ----------------------------------------------------------
+
+    def _take(self, k: int) -> None:
+        """Put pair k into the engine."""
+        self._pair.put(self._Ts_hand_body[k], self._twists[k], self._fingers[k], self._speeds[k])
+
+    def _leave(self, k: int) -> None:
+        """Note where pair k is now."""
+        self._Ts_hand_body[k], self._twists[k] = self._pair.pose(), self._pair.twist()
+        self._fingers[k], self._speeds[k] = self._pair.fingers()
+
+    def _hands(self) -> Array:
+        """Return T_world_hand (K, 4, 4)."""
+        return se3.from_rt(self._R_world_hand, np.zeros((len(self.alive), 3)))
+
+    def _motion(
+        self,
+        seen: list[list[tuple[Array, Array]]],
+        looks: int,
+        sample: int,
+        steps: int | None = None,
+    ) -> Motion:
+        """Return what was seen of all pairs; NaN where nothing was."""
+        n = len(self.alive)
+        Ts, forces = np.full((n, looks, 4, 4), np.nan), np.full((n, looks, 2), np.nan)
+        for k, looked in enumerate(seen):
+            for i, (T, force) in enumerate(looked):
+                Ts[k, i], forces[k, i] = T, force
+        times = np.minimum(sample * np.arange(1, looks + 1), steps or sample * looks) * self.dt
+        return Motion(Ts_world_body=self._hands()[:, None] @ Ts, finger_n=forces, times_s=times)

@@ -1,0 +1,271 @@
+"""The compiled MuJoCo model of one hand that stands still and one object.
+
+What makes its friction right (each was measured to be wrong without it):
+- The fingers' speed is limited by a velocity drive whose force saturates at the hand's. Damping of
+  the joint would be integrated implicitly but not be seen by the contact solver: fingers chatter
+  and heavy objects slip at half of Coulomb's limit.
+- 2 x 3 sphere pads a finger: a mesh finger touches at two or three points and carries no torque.
+- `impratio` makes friction stiff against the normal, so that objects do not creep; the cone is
+  elliptic, for a pyramid is stronger along its edges.
+- Light objects and light fingers kick each other: mass floor and armature.
+- MuJoCo takes the greater friction of the two geoms, hence both have the contact's.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.mujoco_approach import surface_triangles
+from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.pads import PadModel
+from realsim_sim_bridge.slip.world import Closing, SlipPhysics
+
+Array = NDArray[np.float64]
+
+FINGER_NAMES = ("left", "right")
+SIDES = (1.0, -1.0)
+"""Finger 0 is at +y."""
+OBJECT = "object"
+HAND_SIDE, OBJECT_SIDE = 1, 2
+"""Collision bits: the hand's geoms meet the object's and nothing else."""
+STIFF = (0.99, 0.999, 0.001, 0.5, 2.0)
+"""`solimp` of joint limits and of the fingers' coupling: with the default one, 2 x 70 N push the
+fingers millimetres past their limits."""
+FINGER_MOMENT = 3e-5
+"""Moments of inertia of a finger [kg m^2]; it only slides, so that they do not matter."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class PairModel:
+    """One hand and one object, compiled, with what the model itself does not keep."""
+
+    model: Any
+    """MuJoCo's `MjModel`; its world is the hand's frame `grasp`."""
+    T_obj_body: Array
+    """(4, 4) the object's principal frame."""
+    triangles_obj: Array
+    """(T, 3, 3) surface of the convex parts, object frame [m]."""
+    reach_m: float
+    """Greatest distance of a vertex from the centre of mass [m]."""
+    geometry: HandGeometry
+
+
+def load_mujoco() -> Any:
+    """Return the module `mujoco`, which comes without types."""
+    import mujoco
+    from mujoco import rollout  # noqa: F401  # pyright: ignore[reportUnusedImport]
+
+    module: Any = mujoco
+    return module
+
+
+def compile_pair(
+    body: SlipBody, physics: SlipPhysics, geometry: HandGeometry, settings: MujocoSettings
+) -> PairModel:
+    """Compile the model.
+
+    Raises:
+        InputError: MuJoCo refuses the object.
+    """
+    mujoco = load_mujoco()
+
+    T_obj_body, moments = body.principal_frame()
+    spec: Any = mujoco.MjSpec()
+    _set_options(spec, physics, settings)
+    low, high = geometry.boxes(0.0)[0, 0]
+    palm = _add_box(spec.worldbody, low, high, 1.0)
+    _set_contact(palm, HAND_SIDE, physics, settings)
+    for finger in range(2):
+        _add_finger(spec, finger, geometry, physics, settings)
+    _couple_fingers(spec, settings)
+    parts = [se3.transform(se3.invert(T_obj_body), part) for part in body.parts]
+    _add_object(spec, parts, body.mass_kg, moments, physics, settings)
+    try:
+        model = spec.compile()
+        triangles = surface_triangles(body.parts)
+    except (ValueError, RuntimeError) as error:
+        raise InputError(
+            f"MuJoCo cannot simulate the object of {len(parts)} convex parts and "
+            f"{body.mass_kg:g} kg: {str(error).strip()}. Each part must be a solid of at least "
+            "four points that are not in a plane, and mass and inertia those of one solid."
+        ) from error
+    return PairModel(
+        model=model,
+        T_obj_body=T_obj_body,
+        triangles_obj=triangles,
+        reach_m=body.reach(),
+        geometry=geometry,
+    )
+
+
+def set_drive(model: Any, force_n: float, speed: float) -> None:
+    """Let the drives press with a force [N] and limit each finger's speed [m/s].
+
+    The gain is such that the force saturates until the finger has half its speed.
+    """
+    gain = 2.0 * force_n / speed
+    model.actuator_gainprm[:, 0] = gain
+    model.actuator_biasprm[:, 2] = -gain
+
+
+def set_drag(model: Any, rate_per_s: float) -> None:
+    """Let the object's speeds decay at a rate [1/s]."""
+    matter = model.body(OBJECT)
+    model.dof_damping[2:5] = rate_per_s * matter.mass[0]
+    model.dof_damping[5:8] = rate_per_s * matter.inertia
+
+
+def read_settings(model: Any) -> dict[str, float]:
+    """Return what the compiled model says."""
+    hand = model.geom_contype == HAND_SIDE
+    return {
+        "finger_friction": float(model.geom_friction[hand, 0].min()),
+        "object_friction": float(model.geom_friction[~hand, 0].min()),
+        "dt_s": float(model.opt.timestep),
+        "object_mass_kg": float(model.body(OBJECT).mass[0]),
+        "force_n": float(model.actuator_forcerange[:, 1].min()),
+        "impratio": float(model.opt.impratio),
+        "noslip_iterations": float(model.opt.noslip_iterations),
+        "elliptic_cone": float(model.opt.cone),
+        "armature_kg": float(model.dof_armature[:2].min()),
+        "finger_damping": float(model.dof_damping[:2].max()),
+        "object_drag_per_s": float(model.dof_damping[2] / model.body(OBJECT).mass[0]),
+        "gravity": float(np.linalg.norm(model.opt.gravity)),
+    }
+
+
+def _set_options(spec: Any, physics: SlipPhysics, settings: MujocoSettings) -> None:
+    """Set integrator, solver and cone."""
+    mujoco = load_mujoco()
+
+    option = spec.option
+    option.timestep = settings.step_s
+    option.gravity = [0.0, 0.0, 0.0]
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = settings.impratio
+    option.noslip_iterations = settings.noslip_iterations
+    off = mujoco.mjtDisableBit
+    # A diverged pair must not be put back to where it began, as if nothing had happened.
+    option.disableflags |= int(off.mjDSBL_AUTORESET)
+    # One hand and one object are one island: looking for others only costs time (5 %).
+    option.disableflags |= int(off.mjDSBL_ISLAND)
+    if physics.pads:
+        # The spheres carry the load; more points of the finger's box cost time (7 %).
+        option.disableflags |= int(off.mjDSBL_MULTICCD)
+
+
+def _add_finger(
+    spec: Any,
+    finger: int,
+    geometry: HandGeometry,
+    physics: SlipPhysics,
+    settings: MujocoSettings,
+) -> None:
+    """Add a finger that slides along y; its joint's position is its face's distance from y = 0."""
+    mujoco = load_mujoco()
+
+    name, side, pads = FINGER_NAMES[finger], SIDES[finger], physics.pads
+    body = spec.worldbody.add_body(name=name)
+    body.explicitinertial = True
+    body.mass = (pads or PadModel()).finger_mass_kg
+    body.inertia = [FINGER_MOMENT] * 3
+    body.add_joint(
+        name=name,
+        type=mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=[0.0, side, 0.0],
+        range=[0.0, geometry.max_opening_m / 2.0],
+        limited=True,
+        armature=settings.armature_kg,
+        solref_limit=[settings.contact_time_s, 1.0],
+        solimp_limit=STIFF,
+    )
+    low, high = geometry.boxes(0.0)[0, 2]
+    if pads:
+        low[1] += pads.protrusion_m
+        for x, z in pads.centers_xz():
+            pad = body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_SPHERE,
+                size=[pads.sphere_radius_m, 0.0, 0.0],
+                pos=[x, side * pads.sphere_radius_m, z],
+            )
+            _set_contact(pad, HAND_SIDE, physics, settings)
+    _set_contact(_add_box(body, low, high, side), HAND_SIDE, physics, settings)
+    # The sensor adds up the normal forces of the body's contacts inside its site: the whole finger.
+    body.add_site(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1.0, 0.0, 0.0])
+    spec.add_sensor(
+        name=name,
+        type=mujoco.mjtSensor.mjSENS_TOUCH,
+        objtype=mujoco.mjtObj.mjOBJ_SITE,
+        objname=name,
+    )
+    drive = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
+    drive.set_to_velocity(kv=2.0 * physics.force_n / Closing().speed)
+    drive.forcelimited = True
+    drive.forcerange = [-physics.force_n, physics.force_n]
+
+
+def _couple_fingers(spec: Any, settings: MujocoSettings) -> None:
+    """Keep both fingers at the same distance from the middle, as the real hand's drive does."""
+    mujoco = load_mujoco()
+
+    gear = spec.add_equality(
+        type=mujoco.mjtEq.mjEQ_JOINT,
+        objtype=mujoco.mjtObj.mjOBJ_JOINT,
+        name1=FINGER_NAMES[0],
+        name2=FINGER_NAMES[1],
+        solref=[settings.contact_time_s, 1.0],
+        solimp=STIFF,
+    )
+    gear.data[:5] = [0.0, 1.0, 0.0, 0.0, 0.0]  # a polynomial: y0 = y1
+
+
+def _add_object(
+    spec: Any,
+    parts: list[Array],
+    mass_kg: float,
+    moments: Array,
+    physics: SlipPhysics,
+    settings: MujocoSettings,
+) -> None:
+    """Add the object; its body frame is the principal one, its parts are in that frame."""
+    mujoco = load_mujoco()
+
+    factor = max(1.0, physics.mass_floor_kg / mass_kg)
+    body = spec.worldbody.add_body(name=OBJECT)
+    body.add_freejoint()
+    body.explicitinertial = True
+    body.mass = mass_kg * factor
+    body.inertia = moments * factor
+    for i, part in enumerate(parts):
+        mesh = spec.add_mesh(name=f"part{i}")
+        mesh.uservert = part.ravel().tolist()
+        # Thin parts have too little volume for MuJoCo; the body's inertia is given anyway.
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
+        _set_contact(geom, OBJECT_SIDE, physics, settings)
+
+
+def _add_box(body: Any, low: Array, high: Array, side: float) -> Any:
+    """Add the box from `low` to `high`, mirrored in y if side < 0, and return its geom."""
+    mujoco = load_mujoco()
+
+    center, half = (low + high) / 2.0, (high - low) / 2.0
+    return body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=[center[0], side * center[1], center[2]]
+    )
+
+
+def _set_contact(geom: Any, side: int, physics: SlipPhysics, settings: MujocoSettings) -> None:
+    """Set friction, stiffness and what the geom meets."""
+    geom.contype, geom.conaffinity = side, HAND_SIDE + OBJECT_SIDE - side
+    geom.condim = 3
+    geom.friction = [physics.friction, 0.0, 0.0]
+    if physics.pads:
+        geom.solref = [settings.contact_time_s, 1.0]

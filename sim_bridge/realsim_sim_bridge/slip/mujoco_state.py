@@ -1,0 +1,94 @@
+"""MuJoCo's state vector of a pair, and poses and speeds in the frame `world` of the pair.
+
+A row is [time, qpos, qvel] (`mjSTATE_FULLPHYSICS` of a model without activations):
+
+    time | finger 0, finger 1, body position, body quaternion w x y z |
+    finger 0, finger 1, linear velocity of the body's origin, angular velocity in the body's axes
+
+all in the hand's frame `grasp`, because one model, whose hand does not turn, serves all pairs.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim_sim_bridge.slip.world import PairStates
+
+Array = NDArray[np.float64]
+
+TIME = 0
+FINGERS = slice(1, 3)
+POSITION = slice(3, 6)
+QUATERNION_WXYZ = slice(6, 10)
+FINGER_SPEEDS = slice(10, 12)
+VELOCITY = slice(12, 15)
+SPIN = slice(15, 18)
+WIDTH = 18
+"""Numbers in a row."""
+
+
+def rows_at(Ts_grasp_body: Array, fingers_m: Array) -> Array:
+    """Return rows (K, 18) of pairs at rest.
+
+    Args:
+        Ts_grasp_body: (K, 4, 4) principal frame of the object in the hand's [m].
+        fingers_m: (K,) distance of each finger's face from the middle [m].
+    """
+    rows = np.zeros((len(fingers_m), WIDTH))
+    rows[:, FINGERS] = fingers_m[:, None]
+    rows[:, POSITION] = Ts_grasp_body[:, :3, 3]
+    rows[:, QUATERNION_WXYZ] = se3.quaternion_wxyz(Ts_grasp_body[:, :3, :3])
+    return rows
+
+
+def poses(rows: Array, Rs_world_hand: Array) -> Array:
+    """Return Ts_world_body (..., 4, 4) [m] of rows (..., 18)."""
+    R = Rs_world_hand @ se3.from_quaternion_wxyz(rows[..., QUATERNION_WXYZ])
+    return se3.from_rt(R, _turned(Rs_world_hand, rows[..., POSITION]))
+
+
+def pair_states(rows: Array, Rs_world_hand: Array) -> PairStates:
+    """Return where pairs are, from rows (K, 18)."""
+    Ts_world_body = poses(rows, Rs_world_hand)
+    angular = _turned(Ts_world_body[:, :3, :3], rows[:, SPIN])
+    linear = _turned(Rs_world_hand, rows[:, VELOCITY])
+    return PairStates(
+        Ts_world_body=Ts_world_body,
+        twists=np.concatenate([angular, linear], axis=-1),
+        fingers_m=rows[:, FINGERS].copy(),
+        finger_speeds=rows[:, FINGER_SPEEDS].copy(),
+    )
+
+
+def rows_of(states: PairStates, Rs_world_hand: Array) -> Array:
+    """Return rows (K, 18): the inverse of `pair_states`; time is zero."""
+    Rs_hand_world = np.swapaxes(Rs_world_hand, -1, -2)
+    Rs_body_world = np.swapaxes(states.Ts_world_body[:, :3, :3], -1, -2)
+    rows = np.zeros((len(Rs_world_hand), WIDTH))
+    rows[:, FINGERS] = states.fingers_m
+    rows[:, POSITION] = _turned(Rs_hand_world, states.Ts_world_body[:, :3, 3])
+    rows[:, QUATERNION_WXYZ] = se3.quaternion_wxyz(Rs_hand_world @ states.Ts_world_body[:, :3, :3])
+    rows[:, FINGER_SPEEDS] = states.finger_speeds
+    rows[:, VELOCITY] = _turned(Rs_hand_world, states.twists[:, 3:])
+    rows[:, SPIN] = _turned(Rs_body_world, states.twists[:, :3])
+    return rows
+
+
+def moved_m(before: Array, after: Array, reach_m: float) -> Array:
+    """Return at most how far any point of object or fingers moved between rows (K, 18) [m].
+
+    Args:
+        before: (K, 18).
+        after: (K, 18).
+        reach_m: greatest distance of a point of the object from its centre of mass [m].
+    """
+    shift = np.linalg.norm(after[:, POSITION] - before[:, POSITION], axis=1)
+    # |q - q0| is half the angle for small ones.
+    turn = 2.0 * np.linalg.norm(after[:, QUATERNION_WXYZ] - before[:, QUATERNION_WXYZ], axis=1)
+    slide = np.abs(after[:, FINGERS] - before[:, FINGERS]).max(axis=1)
+    return np.maximum(shift + turn * reach_m, slide)
+
+
+def _turned(R: Array, v: Array) -> Array:
+    """Return vectors (..., 3) turned by rotations (..., 3, 3)."""
+    return (R @ v[..., None])[..., 0]

@@ -1,0 +1,345 @@
+"""The four-stage slip test: close, lift, oscillate, swing, in any engine.
+
+Slip is the motion of the object's centre of mass and its rotation, both relative to the gripper,
+since the start of the stage; its largest value over the stage counts. In the stage `close` the
+object is free and weightless, and the reference is where the scene has it: the slip is how far the
+closing fingers moved it. In the other stages the reference is where the stage before left it.
+"""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.records import STAGES
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.score import ScoreLimits
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.bullet_settings import BulletSettings
+from realsim_sim_bridge.slip.engines import make_engine
+from realsim_sim_bridge.slip.motion import SlipMotion
+from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.stage_loads import stage_wrenches
+from realsim_sim_bridge.slip.world import (
+    Closing,
+    Engine,
+    Grips,
+    HandWorld,
+    Motion,
+    PairStates,
+    Replay,
+    SlipPhysics,
+)
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.int64]
+CLOSE, LIFT, OSCILLATE, PENDULUM = range(len(STAGES))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SlipConfig:
+    """Everything the slip test depends on besides the score's limits."""
+
+    physics: SlipPhysics = field(default_factory=SlipPhysics)
+    closing: Closing = field(default_factory=Closing)
+    motion: SlipMotion = field(default_factory=SlipMotion)
+    engine: BulletSettings | MujocoSettings = field(default_factory=BulletSettings)
+    sample_s: float = 0.05
+    """How often slip and contact are looked at [s]: within it a free fall is 12 mm."""
+    lost_m: float = 0.05
+    """An object that slipped so far in one stage is lost [m]: a pad is 20 mm."""
+    headroom_m: float = 0.004
+    """Fingers that stand farther than this outside the object start here [m]: closing through air
+    takes time and changes nothing."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SlipTrial:
+    """Grasps of one object, ready for the test."""
+
+    body: SlipBody
+    Ts_obj_grasp: Array
+    """(N, 4, 4) grasps [m]."""
+    Ts_table_grasp: Array
+    """(N, 4, 4) the same where the object stands; gravity is the table's -z."""
+    openings_m: Array
+    """(N,) distance of the finger faces before closing [m]."""
+    joint5_axes: Array
+    """(N, 3) unit axis of joint 5 in the grasp frame, in the arm's configuration."""
+    joint5_points: Array
+    """(N, 3) a point on it, in the grasp frame [m]."""
+    joint5_ranges: Array
+    """(N, 2) least and greatest angle it may swing from there [rad]."""
+
+    def __len__(self) -> int:
+        """Return the number of grasps."""
+        return len(self.openings_m)
+
+    def part(self, rows: slice | Rows | Mask) -> "SlipTrial":
+        """Return the trial of some of the grasps."""
+        return SlipTrial(
+            body=self.body,
+            Ts_obj_grasp=self.Ts_obj_grasp[rows],
+            Ts_table_grasp=self.Ts_table_grasp[rows],
+            openings_m=self.openings_m[rows],
+            joint5_axes=self.joint5_axes[rows],
+            joint5_points=self.joint5_points[rows],
+            joint5_ranges=self.joint5_ranges[rows],
+        )
+
+    def grips(self, headroom_m: float) -> Grips:
+        """Return where the hands are, fingers no farther outside the object than `headroom_m`."""
+        corners = np.concatenate(self.body.parts)
+        T = se3.invert(self.Ts_obj_grasp)
+        widest = np.abs(corners @ T[:, 1, :3].T + T[:, 1, 3]).max(axis=0)
+        return Grips(
+            Ts_table_grasp=self.Ts_table_grasp,
+            Ts_obj_grasp=self.Ts_obj_grasp,
+            openings_m=np.minimum(self.openings_m, 2.0 * (widest + headroom_m)),
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Slips:
+    """What each grasp did in each stage: NaN = not executed, inf = lost."""
+
+    slip_m: Array
+    """(N, 4) [m]."""
+    slip_rad: Array
+    """(N, 4) [rad]."""
+    force_n: Array
+    """(N, 4) least normal force of the weaker finger at a look [N]; at the end of `close`."""
+    duration_s: Array
+    """(N, 4) until the stage ended or the object was lost [s]."""
+    failures: tuple[str, ...]
+    """(N,) where and why it stopped; '' = passed all."""
+
+    @property
+    def passed(self) -> Mask:
+        """(N,) whether all four stages were passed."""
+        return np.array([not f for f in self.failures], dtype=np.bool_)
+
+
+def run_slip_test(
+    trial: SlipTrial,
+    config: SlipConfig | None = None,
+    limits: ScoreLimits | None = None,
+    geometry: HandGeometry | None = None,
+    engine: Engine | None = None,
+) -> Slips:
+    """Return the slips of all grasps of the trial.
+
+    Args:
+        trial: the grasps.
+        config: physics, loads and the engine's settings.
+        limits: when a stage has failed; a grasp that failed one does not go on to the next.
+        geometry: the hand.
+        engine: an engine made before with `config.engine`, which may keep what it has compiled;
+            None = a new one.
+
+    Raises:
+        InputError: the engine is not installed.
+    """
+    config = config or SlipConfig()
+    engine = engine or make_engine(config.engine)
+    return _SlipTest(
+        trial, config, limits or ScoreLimits(), geometry or HandGeometry(), engine
+    ).run()
+
+
+def batches(n: int, size: int) -> list[slice]:
+    """Return n rows in slices of at most `size`."""
+    return [slice(i, min(i + size, n)) for i in range(0, n, size)]
+
+
+class _SlipTest:
+    """A trial on its way through the stages, in worlds of the engine's size."""
+
+    def __init__(
+        self,
+        trial: SlipTrial,
+        config: SlipConfig,
+        limits: ScoreLimits,
+        geometry: HandGeometry,
+        engine: Engine,
+    ) -> None:
+        self._trial, self._config, self._limits = trial, config, limits
+        self._geometry, self._engine = geometry, engine
+        self._grips = trial.grips(config.headroom_m)
+        n = len(trial)
+        shape = (n, len(STAGES))
+        self._slip_m, self._slip_rad = np.full(shape, np.nan), np.full(shape, np.nan)
+        self._force_n, self._duration_s = np.full(shape, np.nan), np.full(shape, np.nan)
+        self._end_n = np.full(n, np.nan)
+        self._failures = [""] * n
+        self._going: Mask = np.ones(n, dtype=np.bool_)
+
+    def run(self) -> Slips:
+        """Go through all stages with all worlds side by side."""
+        with ExitStack() as stack:
+            worlds = [
+                (rows, stack.enter_context(self._world(rows)))
+                for rows in self._parts(np.arange(len(self._trial)))
+            ]
+            for rows, world in worlds:
+                start = world.states().Ts_world_body
+                self._observe(CLOSE, rows, start, world.close(self._config.closing))
+                self._judge(CLOSE, rows)
+                world.remove(~self._going[rows])
+            for stage in (LIFT, OSCILLATE, PENDULUM):
+                self._stage(stage, worlds)
+        return Slips(
+            slip_m=self._slip_m,
+            slip_rad=self._slip_rad,
+            force_n=self._force_n,
+            duration_s=self._duration_s,
+            failures=tuple(self._failures),
+        )
+
+    # --- a stage -----------------------------------------------------------------------------
+
+    def _stage(self, stage: int, worlds: list[tuple[Rows, HandWorld]]) -> None:
+        """Play a stage in all worlds; what moved in a fast replay is played again at true speed."""
+        replay = self._engine.replay
+        again: list[tuple[Rows, PairStates]] = []
+        for rows, world in worlds:
+            if not world.alive.any():
+                continue
+            start = world.states()
+            self._play(stage, rows, world, replay.speed)
+            if replay.speed > 1:
+                moved = self._moved(stage, rows, replay) & world.alive
+                again.append((rows[moved], start.rows(moved)))
+        played_again = self._at_true_speed(stage, again)
+        for rows, world in worlds:
+            self._judge(stage, rows)
+            world.remove(~self._going[rows])
+            _put_back(world, rows, played_again)
+
+    def _play(self, stage: int, rows: Rows, world: HandWorld, speed: int) -> None:
+        """Play a stage in one world, `speed` times as fast as it is."""
+        config = self._config
+        start = world.states().Ts_world_body
+        wrenches = stage_wrenches(
+            stage, self._trial.part(rows), start, config.motion, speed * world.dt
+        )
+        sample = max(1, round(config.sample_s / world.dt / speed))
+        motion = world.play(
+            np.where(world.alive[:, None, None], wrenches, 0.0), sample, config.lost_m
+        )
+        self._observe(stage, rows, start, motion, speed)
+
+    def _moved(self, stage: int, rows: Rows, replay: Replay) -> Mask:
+        """Return whether objects moved more than the triggers (K,)."""
+        far = self._slip_m[rows, stage] > replay.trigger_m
+        turned = self._slip_rad[rows, stage] > np.radians(replay.trigger_deg)
+        loose = self._force_n[rows, stage] < self._config.physics.contact_n
+        return far | turned | loose
+
+    def _at_true_speed(
+        self, stage: int, again: list[tuple[Rows, PairStates]]
+    ) -> dict[int, PairStates]:
+        """Play rows again at true speed from where they began, and return where each ended."""
+        ended: dict[int, PairStates] = {}
+        rows = np.concatenate([np.zeros(0, dtype=np.int64), *(r for r, _ in again)])
+        if len(rows) == 0:
+            return ended
+        states = _together([s for _, s in again])
+        for part in batches(len(rows), self._engine.pairs_per_world):
+            with self._world(rows[part]) as world:
+                world.put(states.rows(np.arange(part.start, part.stop)))
+                self._play(stage, rows[part], world, 1)
+                after = world.states()
+            for i, row in enumerate(rows[part].tolist()):
+                ended[row] = after.rows(np.array([i]))
+        return ended
+
+    def _world(self, rows: Rows) -> HandWorld:
+        """Return a world of some rows."""
+        return self._engine.world(
+            self._trial.body, self._grips.rows(rows), self._config.physics, self._geometry
+        )
+
+    def _parts(self, rows: Rows) -> Iterator[Rows]:
+        """Yield rows in worlds' worth."""
+        for part in batches(len(rows), self._engine.pairs_per_world):
+            yield rows[part]
+
+    # --- what is seen --------------------------------------------------------------------------
+
+    def _observe(
+        self, stage: int, rows: Rows, start: Array, motion: Motion, speed: int = 1
+    ) -> None:
+        """Note slips, forces and durations of a stage; overwrites what was noted before."""
+        Ts, forces = motion.Ts_world_body, motion.finger_n
+        far = np.linalg.norm(Ts[:, :, :3, 3] - start[:, None, :3, 3], axis=-1)
+        R = np.swapaxes(start[:, None, :3, :3], -1, -2) @ Ts[:, :, :3, :3]
+        turn = se3.angle(np.where(np.isnan(R), np.eye(3), R))
+        weaker, both = np.nan_to_num(forces.min(axis=-1)), np.nan_to_num(forces.sum(axis=-1))
+        if stage == CLOSE:
+            # Before the fingers arrive nothing is touched, and nothing needs to be.
+            weaker, both = weaker[:, -1:], np.ones_like(far)
+        gone = ~(far <= self._config.lost_m) | ~(both > 0)
+        lost = gone.any(axis=1)
+        last = np.where(lost, np.argmax(gone, axis=1), far.shape[1] - 1)
+        seen = {
+            "_slip_m": np.where(lost, np.inf, np.nan_to_num(far).max(axis=1)),
+            "_slip_rad": np.where(lost, np.inf, np.nan_to_num(turn).max(axis=1)),
+            "_force_n": np.where(lost, 0.0, weaker.min(axis=1)),
+            "_duration_s": speed * motion.times_s[last],
+        }
+        going = self._going[rows]
+        for name, values in seen.items():
+            getattr(self, name)[rows[going], stage] = values[going]
+        self._end_n[rows[going]] = np.where(lost, 0.0, weaker[:, -1])[going]
+
+    def _judge(self, stage: int, rows: Rows) -> None:
+        """Note which grasps failed in this stage and why; they do not go on."""
+        limits = self._limits
+        for row in rows[self._going[rows]].tolist():
+            slip, turn_deg = self._slip_m[row, stage], np.degrees(self._slip_rad[row, stage])
+            if np.isinf(slip):
+                why = "the object was lost"
+            elif self._end_n[row] <= self._config.physics.contact_n:
+                why = "the fingers did not both touch the object"
+                self._slip_m[row, stage] = self._slip_rad[row, stage] = np.inf
+            elif slip > limits.slip_m or turn_deg > limits.slip_deg:
+                why = f"the object slipped {1e3 * slip:.1f} mm and turned {turn_deg:.1f} deg"
+            else:
+                continue
+            self._failures[row] = f"{STAGES[stage]}: {why}"
+            self._going[row] = False
+
+
+def _together(states: list[PairStates]) -> PairStates:
+    """Return the pairs of all."""
+    return PairStates(
+        Ts_world_body=np.concatenate([s.Ts_world_body for s in states]),
+        twists=np.concatenate([s.twists for s in states]),
+        fingers_m=np.concatenate([s.fingers_m for s in states]),
+        finger_speeds=np.concatenate([s.finger_speeds for s in states]),
+    )
+
+
+def _put_back(world: HandWorld, rows: Rows, ended: dict[int, PairStates]) -> None:
+    """Put the pairs that were played again where they ended; the others stay as they are."""
+    mine = [
+        (k, ended[row]) for k, row in enumerate(rows.tolist()) if row in ended and world.alive[k]
+    ]
+    if not mine:
+        return
+    n = len(rows)
+    nothing = PairStates(
+        Ts_world_body=np.full((n, 4, 4), np.nan),
+        twists=np.full((n, 6), np.nan),
+        fingers_m=np.full((n, 2), np.nan),
+        finger_speeds=np.full((n, 2), np.nan),
+    )
+    for k, state in mine:
+        nothing.Ts_world_body[k], nothing.twists[k] = state.Ts_world_body[0], state.twists[0]
+        nothing.fingers_m[k], nothing.finger_speeds[k] = state.fingers_m[0], state.finger_speeds[0]
+    world.put(nothing)

@@ -1,0 +1,202 @@
+"""What a physics engine must be able to do for the slip test: K hands hold K copies of one object.
+
+The hands stand still; the load that an object feels in a moving hand is applied to it. Each pair
+has a frame `world` of its own: the table's axes (gravity is -z), origin at the grasp frame's. A
+hand's rotation in it is that of T_table_grasp. `body` is the object's principal frame
+(`SlipBody.principal_frame`).
+
+Twists and wrenches are rotation first: (angular, linear), (torque about the centre of mass, force),
+in world axes. Wrenches are true ones: where an engine simulates a greater mass than the object has
+(`SlipPhysics.mass_floor_kg`), it applies them unscaled by that mass - forces on the heavier body are
+the same newtons.
+"""
+
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.pads import PadModel
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SlipPhysics:
+    """What is true of hand and object in any engine."""
+
+    force_n: float = 70.0
+    """Force of each finger on the object [N]: the Franka Hand's continuous grasping force, which
+    each of two facing fingers exerts."""
+    friction: float = 1.0
+    """Coulomb coefficient of the contact; the paper's."""
+    mass_floor_kg: float = 0.2
+    """Least mass of a simulated object [kg]; 0 = the true mass. A lighter one gets this mass, and
+    inertia in proportion; the loads stay the true ones. Lighter ones do not converge."""
+    pads: PadModel | None = field(default_factory=PadModel)
+    """The sphere pads; None = the finger's bare box with the engine's default contact."""
+    touch_n: float = 1.0
+    """Least normal force of a finger that counts as contact [N]; a weak hand's is a tenth of its
+    force."""
+
+    @property
+    def contact_n(self) -> float:
+        """Least normal force that counts as contact [N]."""
+        return min(self.touch_n, 0.1 * self.force_n)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Closing:
+    """How the fingers close."""
+
+    speed: float = 0.1
+    """Of each finger [m/s]: the Franka Hand's top speed."""
+    drag_per_s: float = 0.0
+    """The object's speed decays at this rate while the fingers close [1/s]: what the table's
+    friction does to it."""
+    settle_s: float = 0.2
+    """Time at full force after the last finger can have arrived [s]."""
+    sample_s: float = 0.05
+    """How often the object is looked at [s]."""
+    settled_m: float = 2e-5
+    """Closing ends when both fingers press and no object moved more than this in a sample [m]."""
+    lost_m: float = 0.05
+    """An object that moved so far is lost [m]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Grips:
+    """Where K hands are on K copies of the object."""
+
+    Ts_table_grasp: Array
+    """(K, 4, 4) where the object stands [m]; only the rotation matters here."""
+    Ts_obj_grasp: Array
+    """(K, 4, 4) [m]."""
+    openings_m: Array
+    """(K,) distance of the finger faces before closing [m]."""
+
+    def rows(self, rows: NDArray[np.int64] | Mask | slice) -> "Grips":
+        """Return some of them."""
+        return Grips(
+            Ts_table_grasp=self.Ts_table_grasp[rows],
+            Ts_obj_grasp=self.Ts_obj_grasp[rows],
+            openings_m=self.openings_m[rows],
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class PairStates:
+    """Positions and speeds of K pairs: enough to go on from, in this world or another."""
+
+    Ts_world_body: Array
+    """(K, 4, 4) [m]; NaN = the pair has been removed, or (`put`) stays where it is."""
+    twists: Array
+    """(K, 6) angular [rad/s] and linear velocity of the centre of mass [m/s], world axes."""
+    fingers_m: Array
+    """(K, 2) distance of each finger's face from the middle [m]; finger 0 is at +y."""
+    finger_speeds: Array
+    """(K, 2) [m/s], positive = opening."""
+
+    def rows(self, rows: NDArray[np.int64] | Mask) -> "PairStates":
+        """Return some of them."""
+        return PairStates(
+            Ts_world_body=self.Ts_world_body[rows],
+            twists=self.twists[rows],
+            fingers_m=self.fingers_m[rows],
+            finger_speeds=self.finger_speeds[rows],
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Motion:
+    """What was seen of K pairs while they were played; NaN rows after a pair was removed or lost."""
+
+    Ts_world_body: Array
+    """(K, S, 4, 4) [m]."""
+    finger_n: Array
+    """(K, S, 2) normal force of each finger on the object [N]."""
+    times_s: Array
+    """(S,) simulated time of each sample since the start of the play [s]; the last is its end."""
+
+
+class HandWorld(AbstractContextManager["HandWorld"], Protocol):
+    """K pairs of hand and object in an engine. Leaving the context frees the engine's memory."""
+
+    dt: float
+    """Time between two wrenches of `play` [s]."""
+    alive: Mask
+    """(K,) pairs that have not been removed."""
+
+    def close(self, closing: Closing) -> Motion:
+        """Close all hands on their weightless objects and press with the hand's force from then.
+
+        Before the first `close` or `put` the objects are where the grips say and fingers are open.
+        """
+        ...
+
+    def play(self, wrenches: Array, sample: int, lost_m: float) -> Motion:
+        """Apply wrenches (K, T, 6), one a time step, and return what is seen every `sample` steps.
+
+        The fingers press with the hand's force. A pair whose object moved more than `lost_m` [m]
+        need not be simulated further: its later samples may be NaN.
+        """
+        ...
+
+    def states(self) -> PairStates:
+        """Return where everything is now."""
+        ...
+
+    def put(self, states: PairStates) -> None:
+        """Put pairs there, with fingers that press with the hand's force; rows of NaN stay."""
+        ...
+
+    def remove(self, rows: Mask) -> None:
+        """Take pairs (K,) out of the world."""
+        ...
+
+    def settings(self) -> dict[str, float]:
+        """Return what the engine says its settings are: read back from it, not what was asked for.
+
+        At least: 'finger_friction', 'object_friction', 'dt_s', 'object_mass_kg', 'force_n'.
+        """
+        ...
+
+
+class Engine(Protocol):
+    """A physics engine with its settings; cheap to make, may keep compiled models of bodies."""
+
+    name: str
+    """'pybullet' or 'mujoco'."""
+    pairs_per_world: int
+    """How many pairs its worlds should hold."""
+    replay: "Replay"
+
+    def version(self) -> str:
+        """Return the engine's version."""
+        ...
+
+    def world(
+        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: HandGeometry
+    ) -> HandWorld:
+        """Return a world with these pairs."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Replay:
+    """Playing loads faster than they were.
+
+    Sticking does not depend on the rate, so the same forces are played `speed` times as fast; a
+    stage in which an object moved more than the triggers is played again at true speed from where it
+    began. Sliding distances shrink with the square of the speed, hence the small triggers.
+    """
+
+    speed: int = 1
+    """1 = every stage at true speed."""
+    trigger_m: float = 0.3e-3
+    trigger_deg: float = 0.5

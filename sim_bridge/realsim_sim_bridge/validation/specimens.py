@@ -1,0 +1,172 @@
+"""The suite's objects, made of a few points each, and grasps of them on the edge of holding."""
+
+from functools import lru_cache
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.mesh import Mesh, mass_properties
+from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.slip_test import SlipTrial
+
+Array = NDArray[np.float64]
+
+SIDE_M = 0.05
+"""Side of the cube."""
+DOWN = np.diag([1.0, -1.0, -1.0])
+"""Rotation of a grasp from above."""
+READY = np.array([0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 4])
+"""Franka's ready pose (7,) [rad]: its joint 5 swings in the suite."""
+CLEARANCE_M = 0.003
+"""Between object and palm [m]."""
+
+
+def cube(mass_kg: float) -> SlipBody:
+    """Return the 5 cm cube with its centre in the origin."""
+    return _body((_box((-SIDE_M / 2,) * 3, (SIDE_M / 2,) * 3),), mass_kg)
+
+
+def specimen(shape: str, mass_kg: float) -> SlipBody:
+    """Return one of the shapes with a mass; closing along its y meets it within the opening.
+
+    Raises:
+        InputError: there is no such shape.
+    """
+    if shape not in _SHAPES:
+        raise InputError(f"there is no specimen '{shape}'; there are: {', '.join(_SHAPES)}.")
+    return _body(_SHAPES[shape], mass_kg)
+
+
+def ready_trial(
+    body: SlipBody, Ts_obj_grasp: Array, Ts_table_grasp: Array, opening_m: float
+) -> SlipTrial:
+    """Return grasps (N, 4, 4) carried by an arm in its ready pose."""
+    n = len(Ts_obj_grasp)
+    axis, point = panda.joint5_in_grasp(READY)
+    return SlipTrial(
+        body=body,
+        Ts_obj_grasp=Ts_obj_grasp,
+        Ts_table_grasp=Ts_table_grasp,
+        openings_m=np.full(n, opening_m),
+        joint5_axes=np.tile(axis, (n, 1)),
+        joint5_points=np.tile(point, (n, 1)),
+        joint5_ranges=np.tile([panda.LOWER[4], panda.UPPER[4]], (n, 1)),
+    )
+
+
+def cube_trial(mass_kg: float, rotations: Array) -> SlipTrial:
+    """Return grasps of the cube in its centre, with the hand at rotations (N, 3, 3)."""
+    n = len(rotations)
+    return ready_trial(
+        cube(mass_kg), np.tile(np.eye(4), (n, 1, 1)), se3.from_rt(rotations, np.zeros(3)),
+        SIDE_M + 0.008,
+    )  # fmt: skip
+
+
+def edge_trial(
+    shape: str, mass_kg: float, grasps: int, seed: int, shift_m: float = 0.0
+) -> SlipTrial:
+    """Return grasps of a shape that close beside its centre, in all positions to gravity.
+
+    The closing axis is the shape's y; where the fingers meet it, the turn about y and the hand's
+    tilt are drawn. The same seed gives the same grasps at every mass.
+
+    Args:
+        shape: name of the specimen.
+        mass_kg: its mass [kg].
+        grasps: number of grasps.
+        seed: of the draw.
+        shift_m: moves every grasp along a drawn direction [m].
+    """
+    body = specimen(shape, mass_kg)
+    corners = np.concatenate(body.parts)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    hand = HandGeometry()
+    rng = np.random.default_rng([seed, sorted(_SHAPES).index(shape)])
+    found: list[tuple[Array, Array]] = []
+    while len(found) < grasps:
+        at = rng.uniform(low, high) * [1.0, 0.0, 1.0]
+        turn = se3.exp_so3([0.0, rng.uniform(-np.pi, np.pi), 0.0])
+        tilt = se3.exp_so3(rng.uniform(-0.5, 0.5, 3))
+        shift = rng.normal(size=3)
+        T_obj_grasp = se3.from_rt(turn, at + shift_m * shift / np.linalg.norm(shift))
+        in_hand = se3.transform(se3.invert(T_obj_grasp), corners)
+        fits = np.abs(in_hand[:, 1]).max() < hand.max_opening_m / 2 - CLEARANCE_M
+        if fits and in_hand[:, 2].min() > hand.palm_face_z_m + CLEARANCE_M and _met(body, at):
+            found.append((T_obj_grasp, se3.from_rt(tilt @ DOWN @ turn, np.zeros(3))))
+    return ready_trial(
+        body, np.stack([T for T, _ in found]), np.stack([T for _, T in found]), hand.max_opening_m
+    )
+
+
+def _met(body: SlipBody, at: Array) -> bool:
+    """Return whether a line along y through a point (3,) meets a part: seen along y, it is inside."""
+    from scipy.spatial import ConvexHull
+
+    for part in body.parts:
+        sides = ConvexHull(part[:, [0, 2]]).equations
+        if np.all(sides[:, :2] @ at[[0, 2]] + sides[:, 2] <= 0.0):
+            return True
+    return False
+
+
+def _body(parts: tuple[Array, ...], mass_kg: float) -> SlipBody:
+    """Return a body of one density: the parts' moments add up about the common centre."""
+    # A mesh of one face is not closed; its convex hull is what counts.
+    solids = [
+        mass_properties(Mesh(vertices=part, faces=np.array([[0, 1, 2]])), 1.0) for part in parts
+    ]
+    volumes = np.array([s.volume_m3 for s in solids])
+    center = volumes @ np.stack([s.center_of_mass for s in solids]) / volumes.sum()
+    inertia = np.zeros((3, 3))
+    for solid in solids:
+        d = solid.center_of_mass - center
+        inertia += solid.inertia + solid.volume_m3 * (d @ d * np.eye(3) - np.outer(d, d))
+    density = mass_kg / volumes.sum()
+    return SlipBody(
+        parts=parts, mass_kg=mass_kg, center_of_mass=center, inertia=density * inertia
+    )
+
+
+def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Array:
+    """Return the corners (8, 3) of a box [m]."""
+    return np.array(list(product(*zip(low, high, strict=True))))
+
+
+def _along_y(outline: Array, width: float) -> Array:
+    """Return the corners (2 V, 3) of a prism: an outline (V, 2) in x and z, as wide along y [m]."""
+    sides = [np.insert(outline, 1, y, axis=1) for y in (-width / 2, width / 2)]
+    return np.concatenate(sides)
+
+
+def _cylinder() -> Array:
+    """Return the corners (48, 3) of an upright cylinder, 50 mm thick and 60 mm high [m]."""
+    angle = 2 * np.pi * np.arange(24) / 24
+    ring = 0.025 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-0.03, 0.03)])
+
+
+@lru_cache(maxsize=1)
+def _wedge() -> Array:
+    """Return the corners (6, 3) of a wedge: its faces along y lean by 8 deg together [m]."""
+    lean = 0.03 * np.tan(np.radians(8.0))
+    points = _box((-0.02, -0.02, -0.03), (0.02, 0.02, 0.03))
+    points[:, 1] += np.sign(points[:, 1]) * np.sign(-points[:, 2]) * lean
+    return points
+
+
+_SHAPES = {
+    "box": (_box((-0.03, -0.02, -0.045), (0.03, 0.02, 0.045)),),
+    "l_shape": (
+        _box((-0.01, -0.02, -0.04), (0.01, 0.02, 0.04)),
+        _box((0.01, -0.02, -0.04), (0.06, 0.02, -0.02)),
+    ),
+    "cylinder": (_cylinder(),),
+    "wedge": (_wedge(),),
+}
+"""Convex parts (V, 3) of each shape, about its middle [m]; y is where the hand closes."""

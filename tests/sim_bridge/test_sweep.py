@@ -1,0 +1,181 @@
+"""Margins: how little friction and force a grasp survives."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.score import ScoreLimits
+from realsim_sim_bridge.school.sweep import SweepConfig, find_levels, run_sweep, sweep_margins
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.engines import make_engine
+from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.world import SlipPhysics
+
+DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
+SIDE = 0.05
+GRAVITY = 9.81
+PEAK = 11.6
+"""Greatest acceleration that any of the stages asks the pads to carry on a centred box [m/s^2]."""
+LEVELS = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1, 0.05)
+
+
+def box(mass, length=SIDE):
+    """A box `length` long along its x, held across the 5 cm of its y."""
+    half = np.array([length, SIDE, SIDE]) / 2
+    corners = np.array(list(product((-1.0, 1.0), repeat=3))) * half
+    squares = (2 * half) ** 2
+    inertia = np.diag(mass / 12 * (squares.sum() - squares))
+    return SlipBody(parts=(corners,), mass_kg=mass, center_of_mass=np.zeros(3), inertia=inertia)
+
+
+def trial(body, off_m=(0.0,)):
+    """Grasps from above, each `off_m` beside the centre of mass along x."""
+    n = len(off_m)
+    Ts = np.repeat(se3.from_rt(DOWN, np.zeros(3))[None], n, axis=0)
+    Ts[:, 0, 3] = off_m
+    return SlipTrial(
+        body=body,
+        Ts_obj_grasp=Ts,
+        Ts_table_grasp=Ts,
+        openings_m=np.full(n, SIDE + 0.008),
+        joint5_axes=np.tile([0.0, 1.0, 0.0], (n, 1)),
+        joint5_points=np.tile([-0.088, 0.0, -0.21], (n, 1)),
+        joint5_ranges=np.tile([-2.0, 2.0], (n, 1)),
+    )
+
+
+def measured(t, sweep, physics=None):
+    config = SlipConfig(physics=physics or SlipPhysics())
+    engine = make_engine(config.engine)
+    slips = run_slip_test(t, config, engine=engine)
+    return run_sweep(t, slips, config, ScoreLimits(), HandGeometry(), engine, sweep)
+
+
+# --- the search, on a law that is known --------------------------------------------------------
+
+
+class Law:
+    """Grasps that pass from a threshold on, and a count of how often each was tried."""
+
+    def __init__(self, thresholds):
+        self.thresholds = np.asarray(thresholds)
+        self.tries = np.zeros(len(self.thresholds), dtype=int)
+
+    def __call__(self, level, rows):
+        self.tries[rows] += 1
+        return np.where(level >= self.thresholds[rows], 1.0, 0.25)
+
+    def known(self, own):
+        return np.where(own >= self.thresholds, 1.0, 0.25)
+
+
+@pytest.mark.parametrize("own", [1.0, 0.3, 0.2, 0.01, 2.0])
+def test_all_searches_find_the_same_least_level(own):
+    thresholds = np.random.default_rng(3).uniform(0.0, 1.3, 60)
+    found = {}
+    for search in ("descent", "bisect", "every"):
+        law = Law(thresholds)
+        found[search] = find_levels(law, law.known(own), own, LEVELS, search)
+        ladder = found[search].levels
+        # The smallest level above the threshold, by definition.
+        above = np.where(ladder >= thresholds[:, None], ladder, np.inf)
+        assert np.array_equal(found[search].least, above.min(axis=1))
+        assert not found[search].exceptions.any()
+        most = {"descent": len(LEVELS), "bisect": 3, "every": len(LEVELS)}[search]
+        assert law.tries.max() <= most
+    passed = [f.passed for f in found.values()]
+    assert all(np.array_equal(p, passed[0]) for p in passed)
+
+
+def test_the_own_level_is_not_tried_again_and_counts_in_the_share_only_if_listed():
+    law = Law([0.0, 0.4, 9.0])
+    found = find_levels(law, law.known(0.8), 0.8, LEVELS, "every")
+    assert 0.8 in found.levels and law.tries.tolist() == [len(LEVELS)] * 3
+    assert found.share_survived(LEVELS) == pytest.approx([1.0, 3 / 7, 0.0])
+    assert found.least.tolist() == [0.05, 0.5, np.inf]
+
+
+def test_a_grasp_that_passes_below_a_level_at_which_it_fails_is_an_exception():
+    def run(level, rows):
+        return np.where((level == 0.5) & (rows == 1), 0.25, 1.0)
+
+    every = find_levels(run, np.ones(3), 1.0, LEVELS, "every")
+    assert every.exceptions.tolist() == [False, True, False]
+    assert every.passed[1].sum() == len(LEVELS) - 1 and every.least[1] == 0.05
+    # Descending stops at the gap: the margin is that of the unbroken run.
+    assert find_levels(run, np.ones(3), 1.0, LEVELS, "descent").least.tolist() == [0.05, 0.7, 0.05]
+
+
+def test_no_grasps_have_no_levels():
+    law = Law([])
+    found = find_levels(law, np.zeros(0), 1.0, LEVELS, "bisect")
+    assert found.least.shape == (0,) and found.share_survived(LEVELS).shape == (0,)
+
+
+@pytest.mark.parametrize("levels", [(), (0.5, 1.0), (0.5, 0.5), (1.0, 0.0), (1.0, -1.0), (np.nan,)])
+@pytest.mark.parametrize("name", ["frictions", "forces_n"])
+def test_levels_that_do_not_descend_are_refused(name, levels):
+    with pytest.raises(InputError, match=name):
+        SweepConfig(**{name: levels})
+
+
+# --- the physics, on a box that Coulomb's law is solved for -------------------------------------
+
+
+@pytest.mark.parametrize("mass", [0.125, 0.5])
+def test_the_least_friction_and_force_are_coulomb_s(mass):
+    # Two pads carry 2 mu F. Below the weight the box falls, above the peak load it stays; between
+    # it slides for a moment, which may stay below 2 cm.
+    force_n, friction = 20.0, 0.25
+    weight, peak = mass * GRAVITY, mass * PEAK
+    frictions = (peak * 4, peak * 1.05, weight * 0.9, weight * 0.5)
+    sweep = SweepConfig(
+        frictions=tuple(load / (2 * force_n) for load in frictions),
+        forces_n=tuple(load / (2 * friction) for load in frictions),
+        search="every",
+    )
+    found = measured(trial(box(mass)), sweep, SlipPhysics(force_n=force_n, friction=friction))
+    assert found.friction.least == pytest.approx([peak * 1.05 / (2 * force_n)])
+    assert found.force.least == pytest.approx([peak * 1.05 / (2 * friction)])
+    assert found.measures()["margin"] == pytest.approx([0.5])
+    assert not found.friction.exceptions.any() and not found.force.exceptions.any()
+
+
+def test_off_centre_grasps_and_heavy_objects_need_more():
+    sweep = SweepConfig(frictions=(1.0, 0.5, 0.25, 0.12, 0.06, 0.03), forces_n=(20.0, 10.0, 5.0))
+    physics = SlipPhysics(force_n=20.0)
+    by_mass = {}
+    for mass in (0.15, 0.6):
+        t = trial(box(mass, length=0.14), off_m=(0.0, 0.03, 0.055))
+        by_mass[mass] = measured(t, sweep, physics).measures()
+        least, margin = by_mass[mass]["least_friction"], by_mass[mass]["margin"]
+        assert np.all(np.diff(least) >= 0) and least[2] > least[0]
+        assert np.all(np.diff(margin) <= 0) and margin[2] < margin[0]
+    assert np.all(by_mass[0.6]["least_friction"] >= 2 * by_mass[0.15]["least_friction"])
+    assert np.all(by_mass[0.6]["least_force_n"] >= by_mass[0.15]["least_force_n"])
+    assert np.all(by_mass[0.6]["margin"] < by_mass[0.15]["margin"])
+
+
+def test_a_sweep_repeats_to_the_bit_and_leaves_the_first_verdict_alone():
+    t = trial(box(0.3), off_m=(0.0, 0.02))
+    sweep = SweepConfig(frictions=(1.0, 0.2, 0.02), forces_n=(70.0, 2.0))
+    first, again = (measured(t, sweep) for _ in range(2))
+    assert np.array_equal(first.friction.scores, again.friction.scores, equal_nan=True)
+    assert np.array_equal(first.force.scores, again.force.scores, equal_nan=True)
+    assert np.all(first.friction.scores[:, 0] == 1.0)
+
+
+def test_the_measures_are_those_of_the_sweep():
+    t, config = trial(box(0.3)), SlipConfig()
+    engine = make_engine(config.engine)
+    slips = run_slip_test(t, config, engine=engine)
+    sweep = SweepConfig(frictions=(1.0, 0.2, 0.02), forces_n=(70.0, 2.0))
+    arguments = (t, slips, config, ScoreLimits(), HandGeometry(), engine, sweep)
+    measures = sweep_margins(*arguments)
+    assert set(measures) == {"least_friction", "least_force_n", "margin"}
+    for name, values in run_sweep(*arguments).measures().items():
+        assert np.array_equal(values, measures[name])
