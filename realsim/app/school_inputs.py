@@ -50,7 +50,7 @@ class SchoolRequest:
     """Grasps per pair of contacts."""
     workers: int = 2
     address: str = ""
-    """Of a Ray cluster; '' = this machine's processes."""
+    """HOST:PORT of a Ray cluster, or 'local' to start one here; '' = processes of this machine."""
     restart: bool = False
     """Whether results of other parameters are thrown away."""
     models: Path | None = None

@@ -14,7 +14,6 @@ from realsim.app.school_tables import (
     REASON_HEADER,
     SCHOOL_HEADER,
     Names,
-    Rows,
     agreement_line,
     filter_rows,
     level_tables,
@@ -55,7 +54,6 @@ def page_bytes(
     sets: Sequence[GraspSet],
     models: Names,
     pictures: Mapping[str, bytes],
-    summary: Rows,
 ) -> bytes:
     """Return the page.
 
@@ -64,7 +62,6 @@ def page_bytes(
         sets: the grasps.
         models: the objects by id.
         pictures: file name -> PNG; empty and missing ones are left out.
-        summary: the rows of the paper's statistics: what, count, share.
     """
     page = Page(parts=[STYLE])
     page.section("Objects", f"{setting_line(sets)} {MEANING}".strip())
@@ -72,9 +69,6 @@ def page_bytes(
     for words in (agreement_line(sets), *not_tried(sets, models)):
         if words:
             page.parts.append(f'<p class="note">{html.escape(words)}</p>')
-    if summary:
-        page.section("Summary, row by row as in the paper")
-        page.table(summary[0], summary[1:])
     for file, (title, caption) in CAPTIONS.items():
         if pictures.get(file):
             page.section(title)

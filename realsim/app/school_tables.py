@@ -169,12 +169,12 @@ def setting_line(sets: Sequence[GraspSet]) -> str:
 
 
 def _engine_of(s: GraspSet) -> str:
-    """Return the engine as the set's parameters name it; empty where they do not."""
-    engine: Any = s.parameters.get("engine")
-    if isinstance(engine, dict):
-        name, version = engine.get("name", ""), engine.get("version", "")  # pyright: ignore
-        return f", engine {name} {version}".rstrip()
-    return f", engine {engine}" if isinstance(engine, str) else ""
+    """Return the engine as the set's versions name it; empty where they do not."""
+    versions: dict[str, Any] = s.parameters.get("versions") or {}
+    for name in ("mujoco", "pybullet"):
+        if name in versions:
+            return f", engine {name} {versions[name]}"
+    return ""
 
 
 def not_tried(sets: Sequence[GraspSet], models: Names) -> list[str]:

@@ -67,6 +67,18 @@ def read_grasps_parquet(folder: Path | str) -> SceneGrasps:
             numbers that no grasp has.
     """
     table = CheckedTable(Path(folder) / GRASPS_FILE)
+    try:
+        return _scene_of(table, Path(folder))
+    except InputError as error:
+        if str(folder) in str(error):
+            raise
+        raise table.wrong(str(error)) from error  # of a record, which knows no file
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise table.wrong(f"the metadata '{HEAD.decode()}' lacks something ({error!r}).") from error
+
+
+def _scene_of(table: CheckedTable, folder: Path) -> SceneGrasps:
+    """Return what the table and its metadata say."""
     head = table.head(HEAD)
     if head.get("format") != FORMAT or head.get("format_version") != FORMAT_VERSION:
         raise table.wrong(
@@ -76,29 +88,23 @@ def read_grasps_parquet(folder: Path | str) -> SceneGrasps:
     sets: list[GraspSet] = []
     poses: dict[int, Array] = {}
     first = 0
-    try:
-        for entry in head["sets"]:
-            count = int(entry["grasps"])
-            s = _set_of(table, entry, slice(first, first + count))
-            sets.append(s)
-            first += count
-            if entry["T_world_obj"] is not None:
-                poses[s.instance] = np.array(entry["T_world_obj"], dtype=np.float64)
-        names = {int(key): str(name) for key, name in head["names"].items()}
-        T = head["T_world_table"]
-        attempts = None if head["trajectories"] is None else dict(head["trajectories"])
-        name = str(head["scene"])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise table.wrong(f"the metadata '{HEAD.decode()}' lacks something ({error!r}).") from error
+    for entry in head["sets"]:
+        count = int(entry["grasps"])
+        s = _set_of(table, entry, slice(first, first + count))
+        sets.append(s)
+        first += count
+        if entry["T_world_obj"] is not None:
+            poses[s.instance] = np.array(entry["T_world_obj"], dtype=np.float64)
     if first != table.rows:
         raise table.wrong(f"{table.rows} rows for {first} grasps of its sets; the file is damaged.")
+    T, attempts = head["T_world_table"], head["trajectories"]
     return SceneGrasps(
         sets=tuple(sets),
-        name=name,
-        names=names,
+        name=str(head["scene"]),
+        names={int(key): str(name) for key, name in head["names"].items()},
         Ts_world_obj=poses,
         T_world_table=None if T is None else np.array(T, dtype=np.float64),
-        trajectories={} if attempts is None else _read_attempts(Path(folder), attempts),
+        trajectories={} if attempts is None else _read_attempts(folder, dict(attempts)),
     )
 
 

@@ -179,7 +179,11 @@ def opened(path: Path | str) -> Generator[CheckedGroup]:
         ) from error
     try:
         yield CheckedGroup(file, path)
-    except (OSError, RuntimeError, KeyError) as error:
+    except InputError as error:
+        if str(path) in str(error):
+            raise
+        raise InputError(f"{path}: {error}") from error  # of a record, which knows no file
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
         # What h5py raises where the file's own structure is broken.
         raise InputError(
             f"{path} is damaged ({error}). Write it again from the session."

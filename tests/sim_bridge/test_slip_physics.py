@@ -8,17 +8,19 @@ import pytest
 
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.bullet_settings import BulletSettings
+from realsim_sim_bridge.slip.bullet_world import BulletEngine
 from realsim_sim_bridge.slip.motion import (
     SlipMotion,
-    inertial_wrench,
     lift_acceleration,
     oscillation_acceleration,
     pendulum_angle,
-    pendulum_load,
+    pendulum_wrenches,
 )
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, batches, run_slip_test
-from realsim_sim_bridge.slip.slip_world import SlipBody, SlipPhysics, SlipWorld
+from realsim_sim_bridge.slip.world import Closing, Replay, SlipPhysics
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 SIDE = 0.05
@@ -43,8 +45,9 @@ def trial(n=1, mass=0.125, R=DOWN):
     )
 
 
-def run(physics=None, **kwargs):
-    return run_slip_test(trial(**kwargs), SlipConfig(physics=physics or SlipPhysics()))
+def run(physics=None, engine=None, **kwargs):
+    config = SlipConfig(physics=physics or SlipPhysics(), engine=engine or BulletSettings())
+    return run_slip_test(trial(**kwargs), config)
 
 
 def score(slips):
@@ -59,9 +62,9 @@ def test_the_box_is_held_through_all_stages_without_slip():
 
 
 def test_a_bare_default_world_drops_the_same_box():
-    default = SlipPhysics(pads=None, iterations=50, mass_floor_kg=0.0)
+    default = SlipPhysics(pads=None, mass_floor_kg=0.0)
     patient = ScoreLimits(slip_m=0.04, slip_deg=360.0)
-    config = SlipConfig(physics=default)
+    config = SlipConfig(physics=default, engine=BulletSettings(iterations=50, replay=Replay()))
     assert score(run_slip_test(trial(), config))[0] < 0.5
     # Even if turning and slipping are let pass, the box falls out before the end.
     slips = run_slip_test(trial(), config, patient)
@@ -78,22 +81,17 @@ def test_too_weak_a_squeeze_fails_in_the_lift_and_70_newton_hold():
 def hold(load_share, force_n, friction, direction):
     """Return how far a cube moves in 0.5 s under a share of Coulomb's limit 2 mu F."""
     physics = SlipPhysics(force_n=force_n, friction=friction)
-    mass = 0.3
-    t = trial(mass=mass)
-    with SlipWorld(
-        t.body, t.Ts_table_grasp, t.Ts_obj_grasp, t.openings_m, physics, HandGeometry()
-    ) as world:
-        world.set_acceleration(np.zeros(3))
-        world.close_fingers(0.1)
-        for _ in range(120):
-            world.step()
-        assert np.allclose(world.finger_forces(), force_n, rtol=0.02)
-        start = world.Ts_world_body()
-        load = load_share * 2 * friction * force_n / mass * np.asarray(direction)
-        for i in range(150):
-            world.set_acceleration(load * min(1.0, i / 30))  # a ramp: a step would overshoot
-            world.step()
-        now = world.Ts_world_body()
+    t = trial(mass=0.3)
+    engine = BulletEngine(BulletSettings())
+    with engine.world(t.body, t.grips(0.004), physics, HandGeometry()) as world:
+        closed = world.close(Closing())
+        assert np.allclose(closed.finger_n[0, -1], force_n, rtol=0.02)
+        start = world.states().Ts_world_body
+        load = load_share * 2 * friction * force_n * np.asarray(direction)
+        ramp = np.minimum(1.0, np.arange(150) / 30)  # a step would overshoot
+        wrenches = np.zeros((1, 150, 6))
+        wrenches[0, :, 3:] = ramp[:, None] * load
+        now = world.play(wrenches, 150, 1.0).Ts_world_body[:, -1]
     return float(np.linalg.norm(now[0, :3, 3] - start[0, :3, 3]))
 
 
@@ -117,10 +115,77 @@ def test_light_objects_are_held_and_carry_their_true_weight():
     assert run(SlipPhysics(friction=0.05, force_n=4.0), mass=0.013).failures[0] == ""
 
 
-def test_results_are_repeatable_to_the_bit_and_alike_among_pairs():
-    a, b = run(n=3), run(n=3)
+def turned_trial(n):
+    """Return grasps of the cube that differ: off its middle, and about its closing axis."""
+    t = trial(n)
+    Ts = t.Ts_obj_grasp.copy()
+    for k in range(n):
+        Ts[k] = se3.from_rt(DOWN @ se3.exp_so3([0, 0.3 * k, 0]), [0.004 * k, 0.0, 0.002 * k])
+    return replace(t, Ts_obj_grasp=Ts, Ts_table_grasp=Ts)
+
+
+def test_results_are_repeatable_to_the_bit():
+    a, b = run_slip_test(turned_trial(3)), run_slip_test(turned_trial(3))
     assert np.array_equal(a.slip_m, b.slip_m) and np.array_equal(a.slip_rad, b.slip_rad)
-    assert np.ptp(a.slip_m, axis=0).max() < 5e-5
+
+
+def test_no_grasp_depends_on_the_others_it_is_tried_with():
+    together = run_slip_test(turned_trial(4))
+    backwards = run_slip_test(turned_trial(4).part(np.array([3, 2, 1, 0])))
+    alone = run_slip_test(turned_trial(4).part(slice(2, 3)))
+    small = SlipConfig(engine=BulletSettings(pairs_per_world=3))
+    parted = run_slip_test(turned_trial(4), small)
+    assert together.slip_m[:, 1:].max() > 0
+    for name in ("slip_m", "slip_rad", "force_n", "duration_s"):
+        whole = getattr(together, name)
+        assert np.array_equal(whole[::-1], getattr(backwards, name))
+        assert np.array_equal(whole[2:3], getattr(alone, name))
+        assert np.array_equal(whole, getattr(parted, name))
+
+
+def test_a_replay_at_speed_gives_the_labels_of_true_speed():
+    for force, lost in ((70.0, False), (5.0, True)):
+        physics = SlipPhysics(friction=0.05 if lost else 1.0, force_n=force)
+        slow = run(physics, BulletSettings.reference())
+        fast = run(physics, BulletSettings())
+        assert slow.failures[0].partition(":")[0] == fast.failures[0].partition(":")[0]
+        assert bool(slow.failures[0]) == lost
+        assert np.allclose(slow.duration_s, fast.duration_s, atol=0.06, equal_nan=True)
+
+
+def test_what_slips_in_a_fast_replay_is_judged_at_true_speed():
+    # 2 x 0.05 x 13 N = 1.3 N carry 1.23 N of weight, and not the lift's 1.37 N.
+    physics = SlipPhysics(friction=0.05, force_n=13.0)
+    slow, fast = run(physics, BulletSettings.reference()), run(physics)
+    assert slow.slip_m[0, 1] > 1e-3
+    assert fast.slip_m[0, 1] == pytest.approx(slow.slip_m[0, 1], rel=0.05)
+
+
+def test_every_setting_is_read_back_from_the_engine():
+    t, physics, settings = trial(mass=0.013), SlipPhysics(friction=0.37), BulletSettings()
+    with BulletEngine(settings).world(t.body, t.grips(0.004), physics, HandGeometry()) as world:
+        world.close(Closing())
+        read = world.settings()
+    assert read["object_friction"] == pytest.approx(0.37) and read["finger_friction"] == 1.0
+    assert read["dt_s"] == pytest.approx(1 / 240) and read["iterations"] == settings.iterations
+    assert read["object_mass_kg"] == pytest.approx(physics.mass_floor_kg)
+    assert read["substeps"] == 0 and read["contact_stiffness"] == settings.stiffness
+    assert read["force_n"] == pytest.approx(70.0, rel=0.02)
+
+
+def test_states_put_back_go_on_alike():
+    t = turned_trial(2)
+    engine = BulletEngine(BulletSettings())
+    pull = np.zeros((2, 60, 6))
+    pull[:, :, 5] = -1.2
+    with engine.world(t.body, t.grips(0.004), SlipPhysics(), HandGeometry()) as world:
+        world.close(Closing())
+        before = world.states()
+        first = world.play(pull, 20, 1.0).Ts_world_body
+        world.put(before)
+        assert np.allclose(world.states().twists, before.twists, atol=1e-15)
+        again = world.play(pull, 20, 1.0).Ts_world_body
+    assert np.allclose(first, again, atol=1e-9)
 
 
 def test_a_hand_that_closes_on_nothing_fails_in_the_first_stage():
@@ -160,7 +225,10 @@ def test_inertial_forces_are_those_of_newton_in_the_world():
     axis /= np.linalg.norm(axis)
     arm, mass = rng.normal(size=3), 0.7
     angle = pendulum_angle(motion, dt, -1.0, 1.0)
-    force, _ = inertial_wrench(pendulum_load(angle, axis, 9.81), arm, mass, np.eye(3))
+    wrench = pendulum_wrenches(
+        angle[None], axis[None], arm[None], np.eye(3)[None] * 1e-3, mass, 9.81
+    )
+    torque, force = wrench[0, :, :3], wrench[0, :, 3:]
     R = se3.exp_so3(angle[0][:, None] * axis)
     path = R @ arm
     acceleration = np.gradient(np.gradient(path, dt, axis=0), dt, axis=0)
@@ -168,3 +236,5 @@ def test_inertial_forces_are_those_of_newton_in_the_world():
     expected = (np.swapaxes(R, -1, -2) @ expected[..., None])[..., 0]
     middle = slice(10, len(path) // 8)
     assert np.allclose(force[middle], expected[middle], atol=2e-2)
+    # A ball's spin: torque against the angular acceleration alone.
+    assert np.allclose(torque, -1e-3 * angle[2][:, None] * axis, atol=1e-12)

@@ -1,9 +1,9 @@
 """Does the Panda reach a grasp: inverse kinematics, straight approach, lift, and the way there.
 
-The arm hangs above the table, its base tilted by 90 degrees (the paper's "perfect reach"). For each
-candidate the closed-form solutions at the grasp are followed back along the approach and up along
-the table's normal without changing branch; the first whose moves are free and that can be reached
-from home is kept.
+The arm stands where a lab's does, or hangs above the table with its base tilted by 90 degrees (the
+paper's "perfect reach"). For each candidate the closed-form solutions at the grasp are followed back
+along the approach and up along the table's normal without changing branch, the nearest to home
+first; the first whose moves are free and that can be reached from home is kept.
 """
 
 from dataclasses import dataclass, field
@@ -13,63 +13,51 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.records.trajectories import GraspTrajectories
 from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.arm.arm_space import (
-    AT_LIMITS,
-    FREE,
-    IN_TABLE,
-    ArmSpace,
-    ArmSpaceConfig,
-    Codes,
-    in_words,
+from realsim_sim_bridge.arm.arm_space import AT_LIMITS, FREE, IN_TABLE, ArmSpace, Codes, in_words
+from realsim_sim_bridge.arm.chain import follow_lines
+from realsim_sim_bridge.arm.joint_path import connect
+from realsim_sim_bridge.arm.lifted_object import touched_when_lifted
+from realsim_sim_bridge.arm.obstacles import obstacles_of
+from realsim_sim_bridge.arm.reach_config import ReachConfig, base_on_table, home_joints
+from realsim_sim_bridge.arm.stage_motion import (
+    MOVED_STAGES,
+    Attempts,
+    Line,
+    StageMotions,
+    stage_motions,
 )
+from realsim_sim_bridge.arm.swept_hand import first_touched
+from realsim_sim_bridge.arm.timing import timed_path
 from realsim_sim_bridge.grasping.candidates import Surroundings
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.grasping.hand_free import first_point_inside, lowest_corner
-from realsim_sim_bridge.arm.joint_path import PlannerConfig, connect, straight
+from realsim_sim_bridge.grasping.hand_free import lowest_corner
+from realsim_sim_bridge.slip.motion import SlipMotion
+
+__all__ = ["Reach", "ReachConfig", "ReachTask", "base_on_table", "check_reach", "home_joints"]
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class ReachConfig:
-    """Where the arm stands and which moves it must be able to make."""
-
-    base_height_m: float = 0.70
-    """Height of the base over the table [m]. With the next among the best of a grid: 89 %
-    of random grasps within 60 deg of straight down on 36 x 36 cm are reached and lifted."""
-    base_back_m: float = 0.60
-    """Distance of the base from the middle of the scene, against its own tilted z axis [m]; nearer
-    than 0.4 m joint 5 cannot turn the hand straight down."""
-    home_height_m: float = 0.30
-    """Height of the hand over the table, above the middle of the scene, before each grasp [m]."""
-    approach_m: float = 0.08
-    """Length of the straight approach [m]: a finger and a half."""
-    lift_m: float = 0.20
-    """Height that the arm must be able to lift straight up [m]; the slip test's."""
-    step_m: float = 0.02
-    """Distance between checked poses of the straight moves [m]."""
-    joint7_samples: int = 12
-    """Values of joint 7 tried at each grasp."""
-    branches: int = 6
-    """Free solutions per grasp that are followed."""
-    limit_margin_rad: float = 0.02
-    """Distance kept from the joint limits [rad]."""
-    space: ArmSpaceConfig = field(default_factory=ArmSpaceConfig)
-    planner: PlannerConfig = field(default_factory=PlannerConfig)
-    hand_clearance_m: float = 0.001
-    """Least distance of the hand's boxes from objects during approach and lift [m]; at the grasp
-    the candidates' own, larger ones hold."""
-    tolerance: float = 1e-6
-    """Largest error of a followed pose [m, rad]."""
+def _no_trajectories() -> GraspTrajectories:
+    return GraspTrajectories(
+        rows=np.zeros(0, dtype=np.int64),
+        starts=np.zeros(1, dtype=np.int64),
+        time_s=np.zeros(0),
+        joints_rad=np.zeros((0, panda.JOINTS)),
+        opening_m=np.zeros(0),
+        phase=np.zeros(0, dtype=np.int64),
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Reach:
     """Which candidates the arm can take."""
 
-    reachable: NDArray[np.bool_]
-    """(N,) whether there is a collision-free trajectory to closure."""
+    reachable: Mask
+    """(N,) whether there is a collision-free trajectory to closure, and a free lift."""
     joints: Array
     """(N, 7) joint angles at the grasp [rad]; NaN where there are none."""
     joints_lifted: Array
@@ -78,6 +66,13 @@ class Reach:
     """(N,) why not; '' = reachable."""
     planned: int
     """How many needed more than the straight move from home."""
+    stage_possible: Mask
+    """(N, 3) whether the arm can lift, oscillate and swing as the slip test does, within its joint
+    limits and speeds; False where not reachable or not computed."""
+    notes: tuple[str, ...]
+    """(N,) why a stage is not possible, or how it is cut; '' = nothing to say."""
+    trajectories: GraspTrajectories = field(default_factory=_no_trajectories)
+    """The joints over time of each reachable row."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -95,37 +90,15 @@ class ReachTask:
     neighbours: Surroundings
     """Points on the others."""
     middle_xy: tuple[float, float]
-    """Middle of the scene on the table [m]: the arm's base is placed by it."""
-
-
-def base_on_table(middle_xy: tuple[float, float], config: ReachConfig) -> Array:
-    """Return T_table_base (4, 4): above the table, z along the table's x, x straight down."""
-    R = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-    at = [middle_xy[0] - config.base_back_m, middle_xy[1], config.base_height_m]
-    return se3.from_rt(R, at)
-
-
-def home_joints(config: ReachConfig) -> Array:
-    """Return the joints (7,) [rad] with the hand pointing down above the middle of the scene.
-
-    Raises:
-        InputError: the arm's base is placed so that it cannot.
-    """
-    down = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-    T_table_grasp = se3.from_rt(down, [0.0, 0.0, config.home_height_m])
-    T_base_grasp = se3.invert(base_on_table((0.0, 0.0), config)) @ T_table_grasp
-    q = panda.inverse(T_base_grasp, config.joint7_samples, config.limit_margin_rad)
-    if len(q) == 0:
-        raise InputError(
-            f"the arm cannot hold its hand {config.home_height_m} m over the table from a base "
-            f"{config.base_height_m} m high and {config.base_back_m} m back; choose another base."
-        )
-    middle = (panda.LOWER + panda.UPPER) / 2
-    return q[np.argmin(np.linalg.norm((q - middle) / (panda.UPPER - panda.LOWER), axis=1))]
+    """Middle of the scene on the table [m]: the arm's home is above it."""
 
 
 def check_reach(
-    task: ReachTask, config: ReachConfig, geometry: HandGeometry, rng: np.random.Generator
+    task: ReachTask,
+    config: ReachConfig,
+    geometry: HandGeometry,
+    rng: np.random.Generator,
+    motion: SlipMotion | None = None,
 ) -> Reach:
     """Return which grasps have a collision-free trajectory to closure and lift.
 
@@ -134,212 +107,294 @@ def check_reach(
         config: the arm's place and moves.
         geometry: the hand.
         rng: chance for the planner alone.
+        motion: the stages' motions; None = the slip test's own with the configuration's lift.
+
+    Raises:
+        InputError: home cannot be reached, the hand is mounted at another distance than the
+            kinematics have, or the motion's lift is not the configuration's.
     """
-    return _ReachCheck(task, config, geometry).run(rng)
+    motion = motion or SlipMotion(lift_height_m=config.lift_m)
+    if abs(motion.lift_height_m - config.lift_m) > 1e-9:
+        raise InputError(
+            f"the slip test lifts by {motion.lift_height_m} m and the arm is asked to lift by "
+            f"{config.lift_m} m; make slip.motion.lift_height_m and reach.lift_m equal."
+        )
+    if abs(geometry.mount_z_m + panda.TCP_M) > 1e-6:
+        raise InputError(
+            f"the hand's mounting face is at z = {geometry.mount_z_m} m of the grasp frame; the "
+            f"arm's kinematics have the tool centre point {panda.TCP_M} m from the flange, so "
+            f"mount_z_m must be {-panda.TCP_M}."
+        )
+    return _ReachCheck(task, config, geometry, motion).run(rng)
+
+
+IK, AT_GRASP, APPROACH, LIFT, BEFORE, HOME = range(6)
+"""How far a grasp got: its reason is that of the branch that got farthest."""
+_MOVES = {
+    AT_GRASP: "the arm at the grasp",
+    APPROACH: "the approach",
+    LIFT: "the lift",
+    BEFORE: "the arm before the approach",
+}
 
 
 class _ReachCheck:
-    """The check of one object's grasps; `branch` rows are (grasp, solution) pairs."""
+    """The check of one object's grasps; a `branch` is one solution at one grasp."""
 
-    def __init__(self, task: ReachTask, config: ReachConfig, geometry: HandGeometry) -> None:
-        self._task, self._config, self._geometry = task, config, geometry
+    def __init__(
+        self, task: ReachTask, config: ReachConfig, geometry: HandGeometry, motion: SlipMotion
+    ) -> None:
+        self._task, self._config, self._geometry, self._motion = task, config, geometry, motion
         self._T_table_base = base_on_table(task.middle_xy, config)
-        obstacles = Surroundings(
-            points=np.concatenate([task.obj.points, task.neighbours.points]),
-            instances=np.concatenate([task.obj.instances, task.neighbours.instances]),
+        self._T_base_table = se3.invert(self._T_table_base)
+        self._Ts_base_grasp = self._T_base_table @ task.Ts_table_grasp
+        own, others = task.obj, task.neighbours
+        obstacles = obstacles_of(
+            np.concatenate([own.points, others.points]),
+            np.concatenate([own.instances, others.instances]),
+            np.arange(len(own.points) + len(others.points)) < len(own.points),
         )
-        self._space = ArmSpace(self._T_table_base, obstacles, config.space)
-        self._home = home_joints(config)
-        n = len(task.Ts_table_grasp)
+        self._space = ArmSpace(self._T_table_base, obstacles, config.space, geometry)
+        self._home = home_joints(config, task.middle_xy)
+        n, back, up = len(task.widths_m), _distances(config.approach_m, config), _distances(
+            config.lift_m, config
+        )
+        self._back, self._up = back, up
         self._reasons = ["no inverse kinematics at the grasp"] * n
-        self._joints = np.full((n, panda.JOINTS), np.nan)
-        self._lifted = np.full((n, panda.JOINTS), np.nan)
-        self._planned = 0
+        self._got = np.full(n, IK)
+        self._done = np.zeros(n, dtype=np.bool_)
+        self._approach = np.full((n, 2, len(back), panda.JOINTS), np.nan)
+        self._lift = np.full((n, 2, len(up), panda.JOINTS), np.nan)
+        self._bent: dict[int, Array] = {}
 
     def run(self, rng: np.random.Generator) -> Reach:
-        """Go through the moves; each step keeps the branches that are still free."""
-        owner, q = self._solutions()
-        codes = self._space.blame(panda.link_frames(q), with_hand=False)
-        rows = self._free(owner, codes, "the arm at the grasp")
-        rows = rows[self._nearest_home(owner[rows], q[rows])]
-        owner, q = owner[rows], q[rows]
-        back, up = self._moves()
-        approach, codes = self._follow(q, back[owner])
-        codes = _first(self._hand_on_approach(back)[owner], codes)
-        rows = self._free(owner, codes, "the approach")
-        owner, q, approach = owner[rows], q[rows], approach[rows]
-        lift, codes = self._follow(q, up[owner])
-        codes = _first(self._hand_on_lift(up)[owner], codes)
-        rows = self._free(owner, codes, "the lift")
-        self._reach_from_home(owner[rows], q[rows], approach[rows, -1], lift[rows, -1], rng)
-        reachable = ~np.isnan(self._joints[:, 0])
+        """Go through the moves: what does not depend on the arm first, then branch by branch."""
+        open_rows = self._in_workspace()
+        open_rows = open_rows[self._hand_is_free(open_rows)]
+        waiting = self._try_branches(open_rows)
+        self._plan(waiting, rng)
+        done = self._done
+        motions = self._motions() if self._config.with_trajectories else None
+        n = len(done)
+        possible, notes = np.zeros((n, len(MOVED_STAGES)), dtype=np.bool_), [""] * n
+        if motions is not None:
+            possible[done] = motions.possible
+            for row, note in zip(np.nonzero(done)[0].tolist(), motions.notes, strict=True):
+                notes[row] = note
         return Reach(
-            reachable=reachable,
-            joints=self._joints,
-            joints_lifted=self._lifted,
+            reachable=done,
+            joints=np.where(done[:, None], self._approach[:, 0, 0], np.nan),
+            joints_lifted=np.where(done[:, None], self._lift[:, 0, -1], np.nan),
             reasons=tuple(
-                "" if ok else why for ok, why in zip(reachable, self._reasons, strict=True)
+                "" if ok else why for ok, why in zip(done.tolist(), self._reasons, strict=True)
             ),
-            planned=self._planned,
+            planned=len(self._bent),
+            stage_possible=possible,
+            notes=tuple(notes),
+            trajectories=motions.trajectories if motions is not None else _no_trajectories(),
         )
 
-    # --- branches ------------------------------------------------------------------------------
+    # --- before any joint angle ----------------------------------------------------------------
 
-    def _solutions(self) -> tuple[Codes, Array]:
-        """Return all solutions at the grasps: owner (B,) and joints (B, 7)."""
-        config = self._config
-        Ts = se3.invert(self._T_table_base) @ self._task.Ts_table_grasp
-        found = [panda.inverse(T, config.joint7_samples, config.limit_margin_rad) for T in Ts]
-        owner = np.repeat(np.arange(len(found)), [len(q) for q in found])
-        return owner, np.concatenate([np.zeros((0, panda.JOINTS)), *found])
+    def _in_workspace(self) -> Codes:
+        """Return the rows whose wrist is within reach, and say of the others how far it is."""
+        out = panda.wrist_distance(self._Ts_base_grasp)
+        for row in np.nonzero(out > panda.WRIST_REACH_M)[0].tolist():
+            self._reasons[row] += (
+                f": the wrist would be {out[row]:.2f} m from the arm's shoulder, its reach is "
+                f"{panda.WRIST_REACH_M:.2f} m"
+            )
+        return np.nonzero(out <= panda.WRIST_REACH_M)[0].astype(np.int64)
 
-    def _free(self, owner: Codes, codes: Codes, move: str) -> Codes:
-        """Return the rows of the free branches, and note why grasps without one have none."""
-        free = codes == FREE
-        alive = set(owner[free].tolist())
-        for grasp, code in zip(owner[~free].tolist(), codes[~free].tolist(), strict=True):
-            if grasp not in alive:
-                self._reasons[grasp] = f"{move} {in_words(code)}"
-        return np.nonzero(free)[0]
+    def _hand_is_free(self, rows: Codes) -> Mask:
+        """Return whether hand and lifted object are free on the straight moves, and say if not."""
+        task, config = self._task, self._config
+        Ts = task.Ts_table_grasp[rows]
+        out = -config.approach_m * Ts[:, :3, 2]
+        up = np.tile([0.0, 0.0, config.lift_m], (len(rows), 1))
+        open_hand = self._geometry.boxes(task.openings_m[rows])
+        closed_hand = self._geometry.boxes(task.widths_m[rows])
+        obstacles, clearance = self._space.obstacles, config.hand_clearance_m
+        approach = first_touched(open_hand, Ts, out, obstacles, clearance, own_too=True)
+        Ts_out = Ts.copy()
+        Ts_out[:, :3, 3] += out
+        lowest = np.minimum(lowest_corner(open_hand, Ts), lowest_corner(open_hand, Ts_out))
+        approach = np.where(lowest < 0, IN_TABLE, approach)
+        lift = first_touched(closed_hand, Ts, up, obstacles, clearance, own_too=False)
+        touched = touched_when_lifted(
+            task.obj, task.neighbours, config.lift_m, config.lifted_clearance_m
+        )
+        for row, code in zip(rows.tolist(), lift.tolist(), strict=True):
+            if code != FREE:
+                self._reasons[row] = f"the lift {in_words(code)}"
+            elif touched is not None:
+                self._reasons[row] = f"the lifted object touches the object of instance {touched}"
+        for row, code in zip(rows.tolist(), approach.tolist(), strict=True):
+            if code != FREE:
+                self._reasons[row] = f"the approach {in_words(code)}"
+        return (approach == FREE) & (lift == FREE) & (touched is None)
 
-    def _nearest_home(self, owner: Codes, q: Array) -> Codes:
-        """Return the rows of at most `branches` solutions of each grasp, the nearest home first."""
-        distance = np.linalg.norm(q - self._home, axis=1)
-        order = np.lexsort((distance, owner))
-        owner = owner[order]
-        rank = np.arange(len(owner)) - np.searchsorted(owner, owner)
-        return order[rank < self._config.branches]
+    # --- branch by branch ------------------------------------------------------------------------
 
-    # --- straight moves ------------------------------------------------------------------------
-
-    def _moves(self) -> tuple[Array, Array]:
-        """Return T_table_grasp backwards from the grasp, and up from above it (N, W, 4, 4)."""
-        Ts, config = self._task.Ts_table_grasp, self._config
-        back = np.linspace(0, 1, round(config.approach_m / config.step_m) + 1)
-        up = np.linspace(0, 1, round(config.lift_m / config.step_m) + 1)[1:]
-        approach, lift = np.repeat(Ts[:, None], len(back), 1), np.repeat(Ts[:, None], len(up), 1)
-        approach[..., :3, 3] -= config.approach_m * back[:, None] * Ts[:, None, :3, 2]
-        lift[..., 2, 3] += config.lift_m * up
-        return approach, lift
-
-    def _follow(self, q: Array, Ts_table_grasp: Array) -> tuple[Array, Codes]:
-        """Follow poses (B, W, 4, 4) from q (B, 7) without changing branch.
+    def _try_branches(self, rows: Codes) -> dict[int, tuple[Array, Array]]:
+        """Keep of each row the first branch that is free all the way from home.
 
         Returns:
-            joints (B, W, 7) and what stops each branch (B,).
+            approach and lift, joints and slopes (2, W, 7), of the first branch of each other row
+            that is free but for the move from home.
         """
-        Ts = se3.invert(self._T_table_base) @ Ts_table_grasp
-        path = np.empty((*Ts.shape[:2], panda.JOINTS))
-        ok = np.ones(len(q), dtype=np.bool_)
-        for w in range(Ts.shape[1]):
-            q, error = _towards(q, Ts[:, w])
-            path[:, w] = q
-            ok &= error < self._config.tolerance
-            ok &= panda.within_limits(q, self._config.limit_margin_rad)
-        codes = _worst(self._space.blame(panda.link_frames(path), with_hand=False))
-        return path, np.where(ok, codes, AT_LIMITS)
+        config = self._config
+        owner, q = panda.inverse_all(
+            self._Ts_base_grasp[rows], config.joint7_samples, config.limit_margin_rad
+        )
+        owner = rows[owner]
+        order = np.lexsort((np.linalg.norm(q - self._home, axis=1), owner))
+        owner, q = owner[order], q[order]
+        rank = np.arange(len(owner)) - np.searchsorted(owner, owner)
+        followed = np.zeros(len(self._done), dtype=np.int64)
+        waiting: dict[int, tuple[Array, Array]] = {}
+        home_free = self._at_home() == FREE
+        for turn in range(int(rank.max(initial=-1)) + 1):
+            branch = (rank == turn) & ~self._done[owner] & (followed[owner] < config.branches)
+            at, angles = owner[branch], q[branch]
+            free = self._note(at, self._blame(angles[:, None], at), AT_GRASP)
+            at, angles = at[free], angles[free]
+            followed[at] += 1
+            at, approach, lift = self._follow(at, angles)
+            before = approach[:, 0, -1]
+            free = self._note(at, self._blame(before[:, None], at, with_hand=True), BEFORE)
+            at, approach, lift, before = at[free], approach[free], lift[free], before[free]
+            moves = np.stack([np.broadcast_to(self._home, before.shape), before], axis=1)
+            direct = self._blame(moves, at, with_hand=True) == FREE if home_free else at < 0
+            self._keep(at[direct], approach[direct], lift[direct])
+            for row, a, b in zip(at[~direct], approach[~direct], lift[~direct], strict=True):
+                waiting.setdefault(int(row), (a, b))
+        return {row: moves for row, moves in waiting.items() if not self._done[row]}
 
-    def _hand_on_approach(self, back: Array) -> Codes:
-        """Return what the open hand meets on each grasp's approach (N,)."""
-        boxes = self._geometry.boxes(self._task.openings_m)
-        return self._hand_blame(boxes, back, (self._task.neighbours, self._task.obj))
+    def _at_home(self) -> int:
+        """Return what stops the arm at home with its hand open, or FREE."""
+        widest = np.array([self._task.openings_m.max(initial=0.0)])
+        return int(self._space.blame(self._home[None], widest, with_hand=True)[0])
 
-    def _hand_on_lift(self, up: Array) -> Codes:
-        """Return what the closed hand meets on each grasp's lift (N,); the object rises with it."""
-        boxes = self._geometry.boxes(self._task.widths_m)
-        return self._hand_blame(boxes, up, (self._task.neighbours,))
+    def _follow(self, at: Codes, q: Array) -> tuple[Codes, Array, Array]:
+        """Follow approach and lift from q (B, 7); return what is left: rows and both moves."""
+        still = self._T_base_table[:3, :3]
+        Ts = self._Ts_base_grasp[at]
+        approach, free = self._line(q, Ts, -Ts[:, :3, 2], self._back, at, APPROACH)
+        at, q, Ts, approach = at[free], q[free], Ts[free], approach[free]
+        up = np.tile(still[:, 2], (len(at), 1))
+        lift, free = self._line(q, Ts, up, self._up, at, LIFT)
+        return at[free], approach[free], lift[free]
 
-    def _hand_blame(
-        self, boxes: Array, Ts_table_grasp: Array, obstacles: tuple[Surroundings, ...]
-    ) -> Codes:
-        """Return what the hand's boxes (N, 3, 2, 3) meet on poses (N, W, 4, 4)."""
-        codes = np.full(len(boxes), FREE, dtype=np.int64)
-        for w in range(Ts_table_grasp.shape[1]):
-            Ts = Ts_table_grasp[:, w]
-            below = np.where(lowest_corner(boxes, Ts) < 0, IN_TABLE, FREE)
-            codes = _first(codes, below)
-            for things in obstacles:
-                point = first_point_inside(boxes, Ts, things.points, self._config.hand_clearance_m)
-                hit = point >= 0
-                codes[hit] = _first(codes[hit], things.instances[point[hit]])
-        return codes
+    def _line(
+        self, q: Array, Ts: Array, directions: Array, distances: Array, at: Codes, move: int
+    ) -> tuple[Array, Mask]:
+        """Return joints and slopes (B, 2, W, 7) along lines, and which are free."""
+        joints, slopes, inside = self._followed(q, Ts, directions, distances)
+        codes = np.full(len(at), AT_LIMITS)
+        codes[inside] = self._blame(joints[inside], at[inside])
+        return np.stack([joints, slopes], axis=1), self._note(at, codes, move)
+
+    def _followed(
+        self, q: Array, Ts: Array, directions: Array, distances: Array
+    ) -> tuple[Array, Array, Mask]:
+        """Return joints and slopes (B, W, 7) along lines, and whether they keep the limits."""
+        config = self._config
+        joints, slopes, error = follow_lines(
+            np.ascontiguousarray(q),
+            np.ascontiguousarray(Ts),
+            np.ascontiguousarray(directions),
+            distances,
+        )
+        within = panda.within_limits(joints, config.limit_margin_rad).all(axis=1)
+        return joints, slopes, within & (error < config.tolerance)
+
+    def _blame(self, paths: Array, at: Codes, *, with_hand: bool = False) -> Codes:
+        """Return what stops paths (B, W, 7) of the rows `at`."""
+        openings = np.ascontiguousarray(self._task.openings_m[at], dtype=np.float64)
+        return self._space.blame_moves(paths, openings, with_hand=with_hand)
+
+    def _note(self, at: Codes, codes: Codes, move: int) -> Mask:
+        """Return which branches are free, and note for the rows `at` why the others are not."""
+        free = codes == FREE
+        for row, code in zip(at[~free].tolist(), codes[~free].tolist(), strict=True):
+            if move > self._got[row]:
+                self._got[row] = move
+                self._reasons[row] = f"{_MOVES[move]} {in_words(code)}"
+        return free
+
+    def _keep(self, at: Codes, approach: Array, lift: Array) -> None:
+        """Keep branches of the rows `at`."""
+        self._approach[at], self._lift[at], self._done[at] = approach, lift, True
 
     # --- the way there ---------------------------------------------------------------------------
 
-    def _reach_from_home(
-        self, owner: Codes, q: Array, before: Array, after: Array, rng: np.random.Generator
-    ) -> None:
-        """Keep of each grasp the first branch whose pre-grasp `before` is reached from home."""
-        step = self._config.planner.resolution_rad
-        paths = [straight(self._home, goal, step) for goal in before]
-        counts = np.array([len(path) for path in paths], dtype=np.int64)
-        row = np.repeat(np.arange(len(paths)), counts)
-        free = self._is_free(np.concatenate([np.zeros((0, panda.JOINTS)), *paths]))
-        blocked = np.bincount(row[~free], minlength=len(paths)) > 0
-        goals_free = self._is_free(before)
-        for grasp in np.unique(owner).tolist():
-            branches = np.nonzero(owner == grasp)[0]
-            direct = branches[~blocked[branches]]
-            # Branches come nearest to home first; only free pre-grasps are worth a plan.
-            chosen = (
-                direct[0]
-                if len(direct)
-                else self._plan(before, branches[goals_free[branches]], rng)
-            )
-            if chosen is None:
-                self._reasons[grasp] = "no path from home"
+    def _plan(self, waiting: dict[int, tuple[Array, Array]], rng: np.random.Generator) -> None:
+        """Look for paths from home round obstacles."""
+        at_home = self._at_home()
+        for row in sorted(waiting):
+            if at_home != FREE:
+                self._reasons[row] = f"no path from home: the arm at home {in_words(at_home)}"
                 continue
-            self._joints[grasp], self._lifted[grasp] = q[chosen], after[chosen]
+            approach, lift = waiting[row]
+            opening, config = float(self._task.openings_m[row]), self._config.planner
+            path = connect(self._home, approach[0, -1], self._space, opening, config, rng)
+            if path is None:
+                self._reasons[row] = "no path from home"
+                continue
+            self._bent[row] = path
+            at = np.array([row])
+            self._keep(at, approach[None], lift[None])
 
-    def _plan(self, before: Array, branches: Codes, rng: np.random.Generator) -> int | None:
-        """Return the first of the branches with a path from home, or None; the first is tried."""
-        for branch in branches[:1].tolist():
-            path = connect(self._home, before[branch], self._is_free, self._config.planner, rng)
-            if path is not None:
-                self._planned += 1
-                return branch
-        return None
+    # --- over time -------------------------------------------------------------------------------
 
-    def _is_free(self, q: Array) -> NDArray[np.bool_]:
-        """Return whether arm and hand are free at joints (M, 7)."""
-        return self._space.blame(panda.link_frames(q), with_hand=True) == FREE
+    def _motions(self) -> StageMotions:
+        """Return all reachable grasps' attempts over time."""
+        task, motion, timing = self._task, self._motion, self._config.timing
+        rows = np.nonzero(self._done)[0].astype(np.int64)
+        bent: dict[int, tuple[Array, float]] = {}
+        for attempt, row in enumerate(rows.tolist()):
+            if row in self._bent:
+                at = np.array([row])
+
+                def is_free(q: Array, at: Codes = at) -> bool:
+                    return bool(self._blame(q[None], at, with_hand=True)[0] == FREE)
+
+                bent[attempt] = timed_path(self._bent[row], is_free, timing)
+        lifted = self._lift[rows, 0, -1]
+        Ts = self._Ts_base_grasp[rows].copy()
+        Ts[:, :3, 3] += self._config.lift_m * self._T_base_table[:3, 2]
+        sides = _distances(2 * motion.oscillation_m, self._config)
+        yes = np.ones(len(rows), dtype=np.bool_)
+        x, y = (self._shaken(lifted, Ts, axis, sides) for axis in (0, 1))
+        return stage_motions(
+            Attempts(
+                rows=rows,
+                home=self._home,
+                bent=bent,
+                approach=_as_line(self._approach[rows], self._back, yes),
+                lift=_as_line(self._lift[rows], self._up, yes),
+                along_x=x,
+                along_y=y,
+                openings_m=task.openings_m[rows],
+                widths_m=task.widths_m[rows],
+            ),
+            motion,
+            timing,
+        )
+
+    def _shaken(self, lifted: Array, Ts: Array, axis: int, distances: Array) -> Line:
+        """Return the line of the lifted hand along a table axis."""
+        direction = np.tile(self._T_base_table[:3, axis], (len(lifted), 1))
+        joints, slopes, inside = self._followed(lifted, Ts, direction, distances)
+        return Line(nodes=distances, joints=joints, slopes=slopes, possible=inside)
 
 
-NEWTON_STEPS = 4
-"""Newton steps per followed pose: 2 cm apart, the error is below 1e-9 after three."""
-DAMPING = 1e-10
-"""Keeps the step finite at a singularity, where the error then stays large."""
+def _distances(length_m: float, config: ReachConfig) -> Array:
+    """Return distances from 0 to the length, steps of about `step_m`."""
+    return np.linspace(0.0, length_m, max(round(length_m / config.step_m), 1) + 1)
 
 
-def _towards(q: Array, Ts_base_grasp: Array) -> tuple[Array, Array]:
-    """Return joints (B, 7) that move least from q to reach the poses, and the error left (B,)."""
-    error = np.zeros(len(q))
-    for step in range(NEWTON_STEPS + 1):
-        frames = panda.link_frames(q)
-        T = frames[..., -1, :, :]
-        turn = se3.log_so3(Ts_base_grasp[:, :3, :3] @ np.swapaxes(T[:, :3, :3], -1, -2))
-        gap = np.concatenate([turn, Ts_base_grasp[:, :3, 3] - T[:, :3, 3]], axis=1)
-        error = np.linalg.norm(gap, axis=1)
-        if step == NEWTON_STEPS:
-            break
-        J = panda.jacobian(frames)
-        square = J @ np.swapaxes(J, -1, -2) + DAMPING * np.eye(6)
-        change = (np.swapaxes(J, -1, -2) @ np.linalg.solve(square, gap[..., None]))[..., 0]
-        # Far steps happen only near singularities, and they change the branch.
-        q = q + np.clip(change, -0.5, 0.5)
-    return q, error
-
-
-def _first(codes: Codes, others: Codes) -> Codes:
-    """Return `codes`, and `others` where those are free."""
-    return np.where(codes == FREE, others, codes)
-
-
-def _worst(codes: Codes) -> Codes:
-    """Return the first code of each row (B, W) that is not free, or FREE."""
-    if codes.shape[1] == 0:
-        return np.full(len(codes), FREE, dtype=np.int64)
-    stopped = codes != FREE
-    return np.where(
-        stopped.any(axis=1), codes[np.arange(len(codes)), np.argmax(stopped, axis=1)], FREE
-    )
+def _as_line(moves: Array, distances: Array, possible: Mask) -> Line:
+    """Return joints and slopes (A, 2, W, 7) as a line."""
+    return Line(nodes=distances, joints=moves[:, 0], slopes=moves[:, 1], possible=possible)

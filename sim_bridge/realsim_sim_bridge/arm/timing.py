@@ -34,6 +34,10 @@ class TimingConfig:
     """Share of the joints' greatest accelerations, likewise."""
     approach_speed: float = 0.15
     """Greatest speed of the straight approach [m/s]: stops within 2 mm at 0.3 of the limits."""
+    close_speed: float = 0.1
+    """Speed of each finger [m/s]: the Franka Hand's top speed."""
+    close_settle_s: float = 0.2
+    """Time at full force after both fingers have arrived [s]."""
     sample_hz: float = 50.0
     """Samples of a trajectory per second; an attempt of 9 s has 450, 36 kB."""
     grid_points: int = 31
@@ -48,10 +52,12 @@ class TimingConfig:
         shares = (self.velocity_share, self.acceleration_share)
         if not all(0 < share <= 1 for share in shares):
             raise InputError(f"the shares of the arm's limits are {shares}; 0 < share <= 1.")
-        if not (self.approach_speed > 0 and self.sample_hz > 0 and self.grid_points >= 5):
+        rates = (self.approach_speed, self.close_speed, self.sample_hz)
+        if not (min(rates) > 0 and self.close_settle_s >= 0 and self.grid_points >= 5):
             raise InputError(
-                f"approach_speed {self.approach_speed}, sample_hz {self.sample_hz}, grid_points "
-                f"{self.grid_points}: speeds and rates must be positive, and 5 grid points or more."
+                f"approach_speed, close_speed and sample_hz are {rates}, close_settle_s "
+                f"{self.close_settle_s}, grid_points {self.grid_points}: speeds and rates must be "
+                "positive, times not negative, and 5 grid points or more."
             )
 
     def limits(self) -> tuple[Array, Array]:

@@ -1,12 +1,14 @@
-"""A finished grasp set in the school's cache."""
+"""A finished object in the school's cache: its scored set and the arm's trajectories."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
 from realsim.records import GraspSet
-from realsim.store.arrays_on_disk import read_arrays, write_arrays
+from realsim.records.trajectories import GraspTrajectories
+from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
 
 _ARRAYS = (
     "Ts_obj_grasp",
@@ -17,27 +19,69 @@ _ARRAYS = (
     "slip_rad",
     "reachable",
 )
+_TRAJECTORY_ARRAYS = ("rows", "starts", "time_s", "joints_rad", "opening_m", "phase")
+MEASURE, TRAJECTORY = "measure.", "trajectory."
+"""Before the names of measures and trajectory arrays in a file."""
 
 
-def write_grasp_set(path: Path, grasp_set: GraspSet) -> None:
-    """Keep a set; a reader finds all of it or nothing."""
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SchoolResult:
+    """What the school made of one object."""
+
+    grasp_set: GraspSet
+    trajectories: GraspTrajectories
+    """What the arm did in each attempt; its rows are those of the set."""
+    unfinished: tuple[str, ...] = ()
+    """Work that was given up because it ended its worker again and again; the grasps concerned
+    have no score, and the next run in the same cache tries them again."""
+
+
+def write_result(path: Path, result: SchoolResult) -> None:
+    """Keep a result; a reader finds all of it or nothing."""
+    grasp_set = result.grasp_set
+    arrays: dict[str, NDArray[Any]] = {name: getattr(grasp_set, name) for name in _ARRAYS}
+    arrays |= named(MEASURE, grasp_set.measures) | trajectory_arrays(result.trajectories)
     notes = {
         "obj_id": grasp_set.obj_id,
         "instance": grasp_set.instance,
         "failures": grasp_set.failures,
         "parameters": grasp_set.parameters,
     }
-    write_arrays(path, {name: getattr(grasp_set, name) for name in _ARRAYS}, notes)
+    write_arrays(path, arrays, notes)
 
 
-def read_grasp_set(path: Path) -> GraspSet:
-    """Return a set kept before."""
+def read_result(path: Path) -> SchoolResult | None:
+    """Return a result kept before, or None if there is none; a damaged file is deleted."""
+    if not is_whole(path):
+        return None
     arrays, notes = read_arrays(path)
     rows: dict[str, NDArray[Any]] = {name: arrays[name] for name in _ARRAYS}
-    return GraspSet(
+    grasp_set = GraspSet(
         obj_id=int(notes["obj_id"]),
         instance=int(notes["instance"]),
         failures=tuple(notes["failures"]),
         parameters=notes["parameters"],
+        measures=of_name(MEASURE, arrays),
         **rows,
     )
+    return SchoolResult(grasp_set=grasp_set, trajectories=trajectories_in(arrays))
+
+
+def trajectory_arrays(trajectories: GraspTrajectories) -> dict[str, NDArray[Any]]:
+    """Return trajectories as arrays for a file."""
+    return named(TRAJECTORY, {name: getattr(trajectories, name) for name in _TRAJECTORY_ARRAYS})
+
+
+def trajectories_in(arrays: dict[str, NDArray[Any]]) -> GraspTrajectories:
+    """Return the trajectories among a file's arrays."""
+    return GraspTrajectories(**of_name(TRAJECTORY, arrays))
+
+
+def named(prefix: str, arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return arrays under names with a prefix."""
+    return {prefix + name: values for name, values in arrays.items()}
+
+
+def of_name(prefix: str, arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return those of a file's arrays whose names have a prefix, without it."""
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}

@@ -1,21 +1,23 @@
-"""The second job of an object in the school: its grasps in the slip test, and the scored set."""
+"""An object's grasps on their way into the slip test, and the scored set out of what it said."""
 
 import json
 from dataclasses import asdict
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.records import STAGES, GraspSet
-from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
+from realsim.records.grasps import MEASURES
 from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.school.kept_sets import SchoolResult
 from realsim_sim_bridge.school.object_task import ObjectTask, Prepared
+from realsim_sim_bridge.school.run_record import versions
+from realsim_sim_bridge.school.shards import Tested
 from realsim_sim_bridge.slip.score import score_stages
-from realsim_sim_bridge.slip.slip_test import Slips, SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.slip_test import SlipTrial
 
+Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 
@@ -38,54 +40,34 @@ def trial_of(task: ObjectTask, prepared: Prepared, rows: Rows) -> SlipTrial:
     )
 
 
-def rows_path(task: ObjectTask, rows: Rows) -> Path | None:
-    """Return where the slips of these rows are kept."""
-    return task.path(f"rows_{int(rows[0]):05d}")
+def result_of(
+    task: ObjectTask,
+    prepared: Prepared,
+    tested: list[Tested],
+    given_up: list[tuple[Rows, str]],
+) -> SchoolResult:
+    """Return what the school made of an object.
 
-
-def slips_of_rows(task: ObjectTask, prepared: Prepared, rows: Rows) -> Slips:
-    """Return the slips of some rows of the candidates, all tested in one world."""
-    path = rows_path(task, rows)
-    if path is not None and is_whole(path):
-        arrays, notes = read_arrays(path)
-        return Slips(
-            slip_m=arrays["slip_m"],
-            slip_rad=arrays["slip_rad"],
-            failures=tuple(notes["failures"]),
-        )
-    config = task.config
-    slips = run_slip_test(trial_of(task, prepared, rows), config.slip, config.score, config.hand)
-    if path is not None:
-        arrays = {"slip_m": slips.slip_m, "slip_rad": slips.slip_rad}
-        write_arrays(path, arrays, {"failures": slips.failures})
-    return slips
-
-
-def grasp_set_of(
-    task: ObjectTask, prepared: Prepared, tested: list[tuple[Rows, Slips]]
-) -> GraspSet:
-    """Return the scored set of an object from all its parts."""
+    Args:
+        task: the object.
+        prepared: its candidates.
+        tested: what the slip test said of its shards, in any order.
+        given_up: rows that could not be tested, and why; they have no score.
+    """
     n = len(prepared.widths_m)
     slip_m, slip_rad = np.full((n, len(STAGES)), np.nan), np.full((n, len(STAGES)), np.nan)
     failures = list(prepared.reasons)
-    for rows, slips in tested:
-        slip_m[rows], slip_rad[rows] = slips.slip_m, slips.slip_rad
-        for row, failure in zip(rows.tolist(), slips.failures, strict=True):
-            failures[row] = failure
     tried = np.full(n, prepared.body is not None)
+    for shard in tested:
+        slip_m[shard.rows], slip_rad[shard.rows] = shard.slip_m, shard.slip_rad
+        for row, failure in zip(shard.rows.tolist(), shard.failures, strict=True):
+            failures[row] = failure
+    for rows, why in given_up:
+        tried[rows] = False
+        for row in rows.tolist():
+            failures[row] = f"not tested: {why}"
     base, scores = score_stages(slip_m, slip_rad, tried, task.config.score)
-    nothing = [None] * panda.JOINTS
-    parameters: dict[str, Any] = {
-        "config": asdict(task.config),
-        "inputs": task.key(),
-        "versions": {name: version(name) for name in ("realsim", "pybullet", "coacd", "eaik")},
-        "density": task.density,
-        "middle_xy_m": list(task.middle_xy),
-        "openings_m": prepared.openings_m.tolist(),
-        "joints_rad": [q if q[0] == q[0] else nothing for q in prepared.joints.tolist()],
-        **prepared.notes,
-    }
-    return GraspSet(
+    grasp_set = GraspSet(
         obj_id=task.obj_id,
         instance=task.instance,
         Ts_obj_grasp=prepared.Ts_obj_grasp,
@@ -96,6 +78,51 @@ def grasp_set_of(
         slip_rad=slip_rad,
         reachable=prepared.reachable,
         failures=tuple(failures),
-        # Through JSON: what is kept is what is returned (tuples become lists).
-        parameters=json.loads(json.dumps(parameters)),
+        measures={**prepared.measures, **_measures(n, tested)},
+        parameters=_parameters(task, prepared),
     )
+    return SchoolResult(
+        grasp_set=grasp_set,
+        trajectories=prepared.trajectories,
+        unfinished=tuple(f"{in_words(rows)}: {why}" for rows, why in given_up),
+    )
+
+
+def in_words(rows: Rows) -> str:
+    """Return the numbers of some grasps in words: 'grasps 3, 5 to 9 and 12'."""
+    if len(rows) == 0:
+        return "all grasps"
+    breaks = np.nonzero(np.diff(rows) != 1)[0] + 1
+    runs = [(int(run[0]), int(run[-1])) for run in np.split(rows, breaks) if len(run)]
+    words = [f"{first}" if first == last else f"{first} to {last}" for first, last in runs]
+    told = words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+    return f"{'grasp' if len(rows) == 1 else 'grasps'} {told}"
+
+
+def _measures(n: int, tested: list[Tested]) -> dict[str, Array]:
+    """Return the shards' measures as columns of all candidates; NaN where not tested."""
+    # In the table's order, whichever shard came first.
+    names = [name for name in MEASURES if any(name in shard.measures for shard in tested)]
+    columns: dict[str, Array] = {}
+    for name in names:
+        columns[name] = np.full((n, len(STAGES)) if MEASURES[name].by_stage else (n,), np.nan)
+        for shard in tested:
+            columns[name][shard.rows] = shard.measures[name]
+    return columns
+
+
+def _parameters(task: ObjectTask, prepared: Prepared) -> dict[str, Any]:
+    """Return everything the scores depend on, as plain JSON values."""
+    nothing = [None] * panda.JOINTS
+    parameters: dict[str, Any] = {
+        "config": asdict(task.config),
+        "inputs": task.inputs(),
+        "versions": versions(task.config),
+        "density": task.density,
+        "middle_xy_m": list(task.middle_xy),
+        "openings_m": prepared.openings_m.tolist(),
+        "joints_rad": [q if q[0] == q[0] else nothing for q in prepared.joints.tolist()],
+        **prepared.notes,
+    }
+    # Through JSON: what is kept is what is returned (tuples become lists).
+    return json.loads(json.dumps(parameters))

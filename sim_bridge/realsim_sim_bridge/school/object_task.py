@@ -1,12 +1,7 @@
-"""The first job of an object in the school: its candidates, and which of them the arm takes.
-
-Any process can do it; the result is left in the cache, so that nothing is done twice.
-"""
+"""The first job of an object in the school: its candidates, and which of them the arm takes."""
 
 import hashlib
-import json
-from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +14,14 @@ from realsim.geometry.mesh import MassProperties, mass_properties, sample_surfac
 from realsim.models.convex import convex_parts
 from realsim.models.library_records import KnownSolid
 from realsim.records import Mesh
-from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
+from realsim.records.trajectories import GraspTrajectories
 from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.arm.reach import ReachTask, check_reach
 from realsim_sim_bridge.grasping.candidates import Surroundings, sample_candidates
 from realsim_sim_bridge.school.config import SchoolConfig
-from realsim_sim_bridge.arm.reach import ReachTask, check_reach
 from realsim_sim_bridge.slip.body import SlipBody
 
 Array = NDArray[np.float64]
-
-RESULTS_VERSION = 1
-"""Raised whenever the same inputs give other results, so that old cache files are not used."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -51,35 +43,40 @@ class ObjectTask:
     """Middle of the scene on the table [m]."""
     config: SchoolConfig
     cache: Path | None
+    """Folder for the convex parts of meshes, or None to keep none."""
     solid: KnownSolid | None = None
     """Convex parts and matter, where a model library knows them."""
 
-    def key(self) -> str:
-        """Return a hash of everything the result depends on."""
-        digest = hashlib.sha256()
-        for array in (
-            self.mesh.vertices,
-            self.mesh.faces,
-            self.T_table_obj,
-            self.neighbours.points,
-            self.neighbours.instances,
-            np.array([self.density, *self.middle_xy]),
-        ):
-            digest.update(np.ascontiguousarray(array).tobytes())
+    def inputs(self) -> dict[str, Any]:
+        """Return everything the result depends on besides the config; arrays as hashes."""
+        known: dict[str, Any] = {}
         if self.solid is not None:
             matter = self.solid.matter
-            for array in (matter.mass_kg, matter.center_of_mass, matter.inertia):
-                digest.update(np.ascontiguousarray(array).tobytes())
-            for part in self.solid.parts.parts:
-                digest.update(part.tobytes())
-        notes = [RESULTS_VERSION, version("pybullet"), self.obj_id, self.instance]
-        digest.update(json.dumps([*notes, asdict(self.config)], sort_keys=True).encode())
-        return digest.hexdigest()[:24]
+            known = {
+                "known_mass_kg": float(matter.mass_kg),
+                "known_center_of_mass_m": np.asarray(matter.center_of_mass).tolist(),
+                "known_inertia": _hash(matter.inertia),
+                "known_parts": _hash(*self.solid.parts.parts),
+            }
+        return {
+            "obj_id": self.obj_id,
+            "name": self.name,
+            "mesh": _hash(self.mesh.vertices, self.mesh.faces),
+            "density": self.density,
+            "T_table_obj": self.T_table_obj.tolist(),
+            "middle_xy_m": list(self.middle_xy),
+            "neighbours": _hash(self.neighbours.points, self.neighbours.instances),
+            **known,
+        }
 
-    def path(self, what: str) -> Path | None:
-        """Return where `what` of this task is kept."""
-        name = f"instance_{self.instance:06d}_{self.key()}.{what}.npz"
-        return None if self.cache is None else self.cache / name
+
+def _hash(*arrays: NDArray[Any]) -> str:
+    """Return a short hash of arrays."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(str(array.shape).encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:16]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -98,6 +95,10 @@ class Prepared:
     """(N, 7) after the lift [rad]; NaN likewise."""
     reasons: tuple[str, ...]
     """(N,) why not reachable."""
+    trajectories: GraspTrajectories
+    """Of the candidates that the arm takes."""
+    measures: dict[str, Array]
+    """What geometry alone says of the candidates, (N,) each."""
     body: SlipBody | None
     """None = the object is not tried."""
     notes: dict[str, Any]
@@ -116,9 +117,6 @@ def prepare(task: ObjectTask) -> Prepared:
 
     An object that cannot be tried (no volume, mass out of range) has no body; the notes say why.
     """
-    path = task.path("prepared")
-    if path is not None and is_whole(path):
-        return _read_prepared(path)
     config = task.config
     rng = np.random.default_rng([config.seed, task.instance])
     found = sample_candidates(
@@ -156,7 +154,7 @@ def prepare(task: ObjectTask) -> Prepared:
         reachable, joints, lifted = reach.reachable, reach.joints, reach.joints_lifted
         reasons = reach.reasons
         notes["counts"] |= {"reachable": int(reachable.sum()), "planned": reach.planned}
-    prepared = Prepared(
+    return Prepared(
         Ts_obj_grasp=found.Ts_obj_grasp,
         widths_m=found.widths_m,
         openings_m=found.openings_m,
@@ -164,12 +162,41 @@ def prepare(task: ObjectTask) -> Prepared:
         joints=joints,
         joints_lifted=lifted,
         reasons=reasons,
+        trajectories=no_trajectories(),
+        measures={},
         body=body,
         notes=notes,
     )
-    if path is not None:
-        _write_prepared(path, prepared)
-    return prepared
+
+
+def not_prepared(why: str) -> Prepared:
+    """Return what there is of an object whose preparation could not be finished: no candidate."""
+    nothing = np.zeros(0)
+    return Prepared(
+        Ts_obj_grasp=np.zeros((0, 4, 4)),
+        widths_m=nothing,
+        openings_m=nothing,
+        reachable=np.zeros(0, dtype=np.bool_),
+        joints=np.zeros((0, panda.JOINTS)),
+        joints_lifted=np.zeros((0, panda.JOINTS)),
+        reasons=(),
+        trajectories=no_trajectories(),
+        measures={},
+        body=None,
+        notes={"not_tried": why},
+    )
+
+
+def no_trajectories() -> GraspTrajectories:
+    """Return the trajectories of no attempt."""
+    return GraspTrajectories(
+        rows=np.zeros(0, dtype=np.int64),
+        starts=np.zeros(1, dtype=np.int64),
+        time_s=np.zeros(0),
+        joints_rad=np.zeros((0, panda.JOINTS)),
+        opening_m=np.zeros(0),
+        phase=np.zeros(0, dtype=np.int64),
+    )
 
 
 def _object_points(task: ObjectTask) -> Surroundings:
@@ -228,38 +255,3 @@ def _body(task: ObjectTask, notes: dict[str, Any]) -> tuple[SlipBody | None, str
         inertia=mass.inertia,
     )
     return body, ""
-
-
-# --- on disk ----------------------------------------------------------------------------------
-
-_ROW_ARRAYS = ("Ts_obj_grasp", "widths_m", "openings_m", "reachable", "joints", "joints_lifted")
-
-
-def _write_prepared(path: Path, prepared: Prepared) -> None:
-    """Keep what was prepared."""
-    arrays: dict[str, NDArray[Any]] = {name: getattr(prepared, name) for name in _ROW_ARRAYS}
-    if prepared.body is not None:
-        arrays |= {
-            "body_mass": np.array(prepared.body.mass_kg),
-            "body_center": prepared.body.center_of_mass,
-            "body_inertia": prepared.body.inertia,
-            "part_vertices": np.concatenate(prepared.body.parts),
-            "part_counts": np.array([len(part) for part in prepared.body.parts]),
-        }
-    write_arrays(path, arrays, {"reasons": prepared.reasons, "notes": prepared.notes})
-
-
-def _read_prepared(path: Path) -> Prepared:
-    """Return what was prepared before."""
-    arrays, notes = read_arrays(path)
-    body = None
-    if "body_mass" in arrays:
-        ends = np.cumsum(arrays["part_counts"])[:-1]
-        body = SlipBody(
-            parts=tuple(np.split(arrays["part_vertices"], ends)),
-            mass_kg=float(arrays["body_mass"]),
-            center_of_mass=arrays["body_center"],
-            inertia=arrays["body_inertia"],
-        )
-    rows: dict[str, NDArray[Any]] = {name: arrays[name] for name in _ROW_ARRAYS}
-    return Prepared(**rows, reasons=tuple(notes["reasons"]), body=body, notes=notes["notes"])

@@ -1,28 +1,24 @@
 """Robot School: every object of a registered scene, every grasp, through reach and slip test."""
 
-from collections.abc import Callable, Mapping
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
 from realsim.records import GraspSet, Mesh, ObjectModel, Scene, names_of
-from realsim.store.arrays_on_disk import is_whole
 from realsim_sim_bridge.grasping.candidates import Surroundings
+from realsim_sim_bridge.school.cluster import ClusterConfig, ray_workers
 from realsim_sim_bridge.school.config import SchoolConfig
-from realsim_sim_bridge.school.kept_sets import read_grasp_set, write_grasp_set
-from realsim_sim_bridge.school.object_slips import grasp_set_of, rows_path, slips_of_rows
-from realsim_sim_bridge.school.object_task import ObjectTask, Prepared, prepare, surface_points
-from realsim_sim_bridge.slip.slip_test import Slips, batches
-from realsim_sim_bridge.school.workers import executor
-
-Progress = Callable[[int, int], None]
+from realsim_sim_bridge.school.day import Day, Progress, Pupil
+from realsim_sim_bridge.school.kept_sets import SchoolResult
+from realsim_sim_bridge.school.object_task import ObjectTask, surface_points
+from realsim_sim_bridge.school.run_record import folder_of_run, run_record
+from realsim_sim_bridge.school.shards import default_shard_grasps
+from realsim_sim_bridge.school.workers import Workers, local_workers
 
 
 def run_school(
@@ -30,36 +26,113 @@ def run_school(
     models: Mapping[int, ObjectModel],
     config: SchoolConfig | None = None,
     *,
-    workers: int = 2,
+    workers: int | ClusterConfig | None = None,
     cache: Path | None = None,
     progress: Progress | None = None,
     solids: Mapping[int, KnownSolid] | None = None,
+    restart: bool = False,
+    shard_grasps: int | None = None,
 ) -> list[GraspSet]:
     """Return the scored grasps of every object whose pose was not rejected.
 
+    Arguments and errors are those of `run_school_results`.
+    """
+    results = run_school_results(
+        scene,
+        models,
+        config,
+        workers=workers,
+        cache=cache,
+        progress=progress,
+        solids=solids,
+        restart=restart,
+        shard_grasps=shard_grasps,
+    )
+    return [result.grasp_set for result in results]
+
+
+def run_school_results(
+    scene: Scene,
+    models: Mapping[int, ObjectModel],
+    config: SchoolConfig | None = None,
+    *,
+    workers: int | ClusterConfig | None = None,
+    cache: Path | None = None,
+    progress: Progress | None = None,
+    solids: Mapping[int, KnownSolid] | None = None,
+    restart: bool = False,
+    shard_grasps: int | None = None,
+) -> list[SchoolResult]:
+    """Return grasps and trajectories of every object whose pose was not rejected.
+
     A rejected object is not grasped, but stays an obstacle: something stands there. Every finished
-    piece of work is kept in `cache` under a hash of all it depends on; running the same again after
-    a crash goes on from there.
+    piece of work is kept in `cache`; running the same again after a crash goes on from there. The
+    same seed gives the same bytes for any number of workers, on one machine or a cluster of alike
+    ones.
 
     Args:
         scene: the registered scene; its plane is the table, its normal is up.
         models: the objects by id.
         config: everything the scores depend on.
-        workers: processes; 1 = this one. More need the caller's script to guard its start with
-            `if __name__ == "__main__"`.
-        cache: folder for results, or None to keep nothing.
+        workers: processes; None = one a core, 1 = this one; or a Ray cluster. More than one need
+            the caller's script to guard its start with `if __name__ == "__main__"`.
+        cache: folder for this run's results, or None to keep nothing.
         progress: called with (grasps judged, grasps expected).
         solids: convex parts and matter by object id, as a model library knows them; of other
             objects they are computed from the mesh.
+        restart: discard the results in `cache` if they are of another run, instead of refusing.
+        shard_grasps: most grasps that are tested in one go; None = some seconds' worth. A dead
+            worker loses one shard at most.
 
     Raises:
-        InputError: the scene has no plane, or an object without a model.
+        InputError: the scene has no plane, or an object without a model; the cache holds a run with
+            another config, other versions or other objects, or is in use.
+        KeyboardInterrupt: Ctrl-C; it says how to go on.
     """
-    tasks = object_tasks(scene, models, config or SchoolConfig(), cache, solids)
-    pupils = [_Pupil(task) for task in tasks]
-    with executor(workers) as pool:
-        _Day(pool, pupils, progress).run()
-    return [pupil.result() for pupil in pupils]
+    config = config or SchoolConfig()
+    tasks = object_tasks(scene, models, config, cache, solids)
+    size = default_shard_grasps(config) if shard_grasps is None else shard_grasps
+    if size < 1:
+        raise InputError(f"shard_grasps is {size}; 1 or more grasps in one go are accepted.")
+    with ExitStack() as stack:
+        if cache is not None:
+            record = run_record(tasks, config, size)
+            stack.enter_context(folder_of_run(cache, record, restart=restart))
+        pupils = [Pupil(task=task, folder=cache, shard_grasps=size) for task in tasks]
+        try:
+            if any(pupil.result is None for pupil in pupils):
+                with _staff(workers) as staff:
+                    Day(staff, pupils, progress).run()
+            elif progress is not None:
+                progress(*_progress(pupils))
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(_how_to_go_on(pupils, cache)) from None
+    return [_result(pupil) for pupil in pupils]
+
+
+def _staff(workers: int | ClusterConfig | None) -> AbstractContextManager[Workers]:
+    """Return who does the work."""
+    return ray_workers(workers) if isinstance(workers, ClusterConfig) else local_workers(workers)
+
+
+def _progress(pupils: list[Pupil]) -> tuple[int, int]:
+    """Return how many grasps are judged and how many will be."""
+    return sum(p.judged for p in pupils), sum(p.expected for p in pupils)
+
+
+def _how_to_go_on(pupils: list[Pupil], cache: Path | None) -> str:
+    """Return what is left after an interruption."""
+    judged, expected = _progress(pupils)
+    done = f"interrupted after {judged} of {expected} grasps"
+    if cache is None:
+        return f"{done}; nothing of it is kept, as no cache folder was given."
+    return f"{done}; they are kept in {cache}. Run the same again, and it goes on from there."
+
+
+def _result(pupil: Pupil) -> SchoolResult:
+    """Return what became of a pupil."""
+    assert pupil.result is not None, "the day ends when all results are there"
+    return pupil.result
 
 
 def object_tasks(
@@ -123,102 +196,3 @@ def _together(surfaces: list[Surroundings]) -> Surroundings:
         points=np.concatenate([nothing.points, *(s.points for s in surfaces)]),
         instances=np.concatenate([nothing.instances, *(s.instances for s in surfaces)]),
     )
-
-
-@dataclass(eq=False, slots=True)
-class _Pupil:
-    """One object on its way through the school."""
-
-    task: ObjectTask
-    grasp_set: GraspSet | None = None
-    prepared: Prepared | None = None
-    slips: list[tuple[NDArray[np.int64], Slips]] = field(
-        default_factory=list[tuple[NDArray[np.int64], Slips]]
-    )
-    open_jobs: int = 0
-
-    def __post_init__(self) -> None:
-        """Take the finished set from the cache if it is there."""
-        path = self.task.path("grasps")
-        if path is not None and is_whole(path):
-            self.grasp_set = read_grasp_set(path)
-
-    @property
-    def judged(self) -> int:
-        """How many grasps are done."""
-        if self.grasp_set is not None:
-            return len(self.grasp_set)
-        if self.prepared is None:
-            return 0
-        n, tested = len(self.prepared.widths_m), len(self.prepared.tested)
-        return n - tested + sum(len(rows) for rows, _ in self.slips)
-
-    @property
-    def expected(self) -> int:
-        """How many there will be, as far as it is known."""
-        if self.grasp_set is not None:
-            return len(self.grasp_set)
-        if self.prepared is None:
-            return self.task.config.max_candidates
-        return len(self.prepared.widths_m)
-
-    def finish(self) -> None:
-        """Put the set together, keep it, and drop the pieces it was made of."""
-        assert self.prepared is not None, "a pupil finishes after its preparation"
-        self.grasp_set = grasp_set_of(self.task, self.prepared, self.slips)
-        path = self.task.path("grasps")
-        if path is None:
-            return
-        write_grasp_set(path, self.grasp_set)
-        pieces = [self.task.path("prepared"), *(rows_path(self.task, r) for r, _ in self.slips)]
-        for piece in pieces:
-            if piece is not None:
-                piece.unlink(missing_ok=True)
-
-    def result(self) -> GraspSet:
-        """Return the finished set."""
-        assert self.grasp_set is not None, "the day ends when all sets are finished"
-        return self.grasp_set
-
-
-class _Day:
-    """Hands out the jobs: first each object's preparation, then its grasps in worlds' worth."""
-
-    def __init__(self, pool: Executor, pupils: list[_Pupil], progress: Progress | None) -> None:
-        self._pool, self._pupils, self._progress = pool, pupils, progress
-        self._jobs: dict[Future[Any], tuple[_Pupil, NDArray[np.int64] | None]] = {}
-
-    def run(self) -> None:
-        """Work until every pupil has its set."""
-        for pupil in self._pupils:
-            if pupil.grasp_set is None:
-                self._jobs[self._pool.submit(prepare, pupil.task)] = (pupil, None)
-        self._report()
-        while self._jobs:
-            done, _ = wait(self._jobs, return_when=FIRST_COMPLETED)
-            for future in done:
-                pupil, rows = self._jobs.pop(future)
-                if rows is None:
-                    self._hand_out(pupil, future.result())
-                else:
-                    pupil.slips.append((rows, future.result()))
-                    pupil.open_jobs -= 1
-                if pupil.open_jobs == 0:
-                    pupil.finish()
-            self._report()
-
-    def _hand_out(self, pupil: _Pupil, prepared: Prepared) -> None:
-        """Submit the slip tests of a prepared object."""
-        pupil.prepared = prepared
-        size = pupil.task.config.slip.pairs_per_world
-        for part in batches(len(prepared.tested), size):
-            rows = prepared.tested[part]
-            job = self._pool.submit(slips_of_rows, pupil.task, prepared, rows)
-            self._jobs[job] = (pupil, rows)
-            pupil.open_jobs += 1
-
-    def _report(self) -> None:
-        """Tell how many grasps are judged."""
-        if self._progress is not None:
-            judged = sum(pupil.judged for pupil in self._pupils)
-            self._progress(judged, sum(pupil.expected for pupil in self._pupils))

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
 from realsim_sim_bridge.school.config import SchoolConfig
+from realsim_sim_bridge.school.kept_sets import MEASURE, named, of_name
 from realsim_sim_bridge.school.shard_measures import shard_measures
 from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
 from realsim_sim_bridge.slip.slip_test import SlipTrial, run_slip_test
@@ -16,12 +17,10 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 SHARD_S = 7.0
-"""Work in a shard [s]: what a dead worker loses; against it, handing out a job (some ms) is nothing."""
+"""Work in a shard [s]: what a dead worker loses; handing out a job takes some ms."""
 BULLET_S, MUJOCO_S = 0.4, 0.035
 """A grasp's four stages with the default settings on one core [s]; only the size of a shard depends
 on it."""
-MEASURE = "measure."
-"""Before a measure's name in a file."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -73,13 +72,8 @@ def run_shard(trial: SlipTrial, rows: Rows, config: SchoolConfig) -> Tested:
 
 def write_tested(path: Path, tested: Tested) -> None:
     """Keep a shard's result; a reader finds all of it or nothing."""
-    arrays: dict[str, NDArray[np.float64] | Rows] = {
-        "rows": tested.rows,
-        "slip_m": tested.slip_m,
-        "slip_rad": tested.slip_rad,
-    }
-    arrays |= {MEASURE + name: values for name, values in tested.measures.items()}
-    write_arrays(path, arrays, {"failures": tested.failures})
+    arrays = {"rows": tested.rows, "slip_m": tested.slip_m, "slip_rad": tested.slip_rad}
+    write_arrays(path, arrays | named(MEASURE, tested.measures), {"failures": tested.failures})
 
 
 def read_tested(path: Path) -> Tested | None:
@@ -92,9 +86,5 @@ def read_tested(path: Path) -> Tested | None:
         slip_m=arrays["slip_m"],
         slip_rad=arrays["slip_rad"],
         failures=tuple(notes["failures"]),
-        measures={
-            name.removeprefix(MEASURE): values
-            for name, values in arrays.items()
-            if name.startswith(MEASURE)
-        },
+        measures=of_name(MEASURE, arrays),
     )

@@ -1,7 +1,7 @@
 """Who does the school's jobs: this process, or processes beside it.
 
-Every process has its own pool of one, so that one which dies takes down its own job alone, and it is
-known which job that was; a pool of many breaks as a whole.
+Every process has its own pool of one, so that one which dies takes down its own job alone, and it
+is known which job that was; a pool of many breaks as a whole.
 """
 
 import os

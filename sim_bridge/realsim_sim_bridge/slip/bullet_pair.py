@@ -67,10 +67,11 @@ class BulletPair:
             self.hand = self._add_hand(Path(folder), geometry)
             self.object = self._add_object(self._shape(body, Path(folder)))
 
-    def disconnect(self) -> None:
+    def __del__(self) -> None:
         """Free the engine's memory."""
-        if self.engine.isConnected():
-            self.engine.disconnect()
+        engine = getattr(self, "engine", None)
+        if engine is not None and engine.isConnected():
+            engine.disconnect()
 
     # --- what is in it ------------------------------------------------------------------------
 
@@ -150,7 +151,7 @@ class BulletPair:
     # --- what happens in it -------------------------------------------------------------------
 
     def put(self, T_hand_body: Array, twist: Array, fingers_m: Array, speeds: Array) -> None:
-        """Put the object (4, 4) with its twist (6,) and the fingers (2,) there, contacts forgotten."""
+        """Put object (4, 4), its twist (6,) and fingers (2,) there; contacts are forgotten."""
         engine = self.engine
         still = [0.0, 0.0, 0.0]
         engine.resetBasePositionAndOrientation(self.object, FAR_AWAY, [0.0, 0.0, 0.0, 1.0])

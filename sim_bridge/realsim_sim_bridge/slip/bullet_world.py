@@ -46,19 +46,13 @@ class BulletEngine:
             kept_body, kept_physics, kept_geometry, pair = self._kept
             if kept_body is body and kept_physics == physics and kept_geometry == geometry:
                 return pair
-            pair.disconnect()
         pair = BulletPair(body, physics, geometry, self.settings)
         self._kept = (body, physics, geometry, pair)
         return pair
 
-    def __del__(self) -> None:
-        """Free the engine's memory."""
-        if self._kept is not None:
-            self._kept[3].disconnect()
-
 
 class BulletWorld:
-    """K pairs of hand and object; a `HandWorld`. The pair it is played in may serve other worlds."""
+    """K pairs of hand and object; a `HandWorld`. Other worlds may be played in the same pair."""
 
     def __init__(
         self, pair: BulletPair, body: SlipBody, grips: Grips, physics: SlipPhysics
@@ -95,10 +89,7 @@ class BulletWorld:
             self._close(k, closing, sample) if self.alive[k] else [] for k in range(len(self.alive))
         ]
         pair.drag(0.0)
-        # What has come to rest stays as it was seen last.
-        longest = max((len(s) for s in seen), default=0)
-        seen = [s + s[-1:] * (longest - len(s)) for s in seen]
-        return self._motion(seen, longest, sample)
+        return self._motion(seen, max((len(s) for s in seen), default=0), sample)
 
     def _close(self, k: int, closing: Closing, sample: int) -> list[tuple[Array, Array]]:
         """Close hand k and return what is seen every `sample` steps."""

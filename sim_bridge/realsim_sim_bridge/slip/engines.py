@@ -23,7 +23,8 @@ def make_engine(settings: BulletSettings | MujocoSettings) -> Engine:
     except ImportError:
         raise InputError(
             "MuJoCo is not installed; it is the Robot School's second engine. Install it with "
-            "`uv sync --extra mujoco` or `pip install 'realsim[mujoco]'`, or use the engine pybullet."
+            "`uv sync --extra mujoco` or `pip install 'realsim[mujoco]'`, or use the engine "
+            "pybullet."
         ) from None
     from realsim_sim_bridge.slip.mujoco_world import MujocoEngine
 

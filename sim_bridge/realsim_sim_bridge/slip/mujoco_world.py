@@ -82,9 +82,9 @@ class MujocoEngine:
         Raises:
             InputError: MuJoCo refuses the object.
         """
-        return MujocoWorld(self._model(body, physics, geometry), grips, physics, self.settings)
+        return MujocoWorld(self.pair(body, physics, geometry), grips, physics, self.settings)
 
-    def _model(self, body: SlipBody, physics: SlipPhysics, geometry: HandGeometry) -> PairModel:
+    def pair(self, body: SlipBody, physics: SlipPhysics, geometry: HandGeometry) -> PairModel:
         """Return the compiled model, from those kept if it is there."""
         key = _content(body, physics, geometry)
         if key not in self._models:

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.bullet_settings import BulletSettings
 from realsim_sim_bridge.slip.engines import make_engine
 from realsim_sim_bridge.slip.motion import SlipMotion
 from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.stage_loads import stage_wrenches
 from realsim_sim_bridge.slip.world import (
     Closing,
@@ -280,12 +280,14 @@ class _SlipTest:
         R = np.swapaxes(start[:, None, :3, :3], -1, -2) @ Ts[:, :, :3, :3]
         turn = se3.angle(np.where(np.isnan(R), np.eye(3), R))
         weaker, both = np.nan_to_num(forces.min(axis=-1)), np.nan_to_num(forces.sum(axis=-1))
+        ended = np.maximum(np.sum(~np.isnan(far), axis=1), 1) - 1
         if stage == CLOSE:
             # Before the fingers arrive nothing is touched, and nothing needs to be.
-            weaker, both = weaker[:, -1:], np.ones_like(far)
+            weaker, both = np.take_along_axis(weaker, ended[:, None], 1), np.ones_like(far)
+            far[np.isnan(far)] = 0.0
         gone = ~(far <= self._config.lost_m) | ~(both > 0)
         lost = gone.any(axis=1)
-        last = np.where(lost, np.argmax(gone, axis=1), far.shape[1] - 1)
+        last = np.where(lost, np.argmax(gone, axis=1), ended)
         seen = {
             "_slip_m": np.where(lost, np.inf, np.nan_to_num(far).max(axis=1)),
             "_slip_rad": np.where(lost, np.inf, np.nan_to_num(turn).max(axis=1)),

@@ -7,8 +7,7 @@ hand's rotation in it is that of T_table_grasp. `body` is the object's principal
 
 Twists and wrenches are rotation first: (angular, linear), (torque about the centre of mass, force),
 in world axes. Wrenches are true ones: where an engine simulates a greater mass than the object has
-(`SlipPhysics.mass_floor_kg`), it applies them unscaled by that mass - forces on the heavier body are
-the same newtons.
+(`SlipPhysics.mass_floor_kg`), the heavier body feels the same newtons.
 """
 
 from contextlib import AbstractContextManager
@@ -56,9 +55,10 @@ class Closing:
 
     speed: float = 0.1
     """Of each finger [m/s]: the Franka Hand's top speed."""
-    drag_per_s: float = 0.0
-    """The object's speed decays at this rate while the fingers close [1/s]: what the table's
-    friction does to it."""
+    drag_per_s: float = 40.0
+    """The object's speed decays at this rate while the fingers close [1/s]: mu g / v, what the
+    friction of 0.4 with a table does to an object that moves with a finger. Without it a weightless
+    object flies off the first finger that touches it, and the outcome is chance."""
     settle_s: float = 0.2
     """Time at full force after the last finger can have arrived [s]."""
     sample_s: float = 0.05
@@ -114,7 +114,7 @@ class PairStates:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Motion:
-    """What was seen of K pairs while they were played; NaN rows after a pair was removed or lost."""
+    """What was seen of K pairs; NaN after one was removed or lost, or closed and came to rest."""
 
     Ts_world_body: Array
     """(K, S, 4, 4) [m]."""
@@ -170,11 +170,20 @@ class HandWorld(AbstractContextManager["HandWorld"], Protocol):
 class Engine(Protocol):
     """A physics engine with its settings; cheap to make, may keep compiled models of bodies."""
 
-    name: str
-    """'pybullet' or 'mujoco'."""
-    pairs_per_world: int
-    """How many pairs its worlds should hold."""
-    replay: "Replay"
+    @property
+    def name(self) -> str:
+        """'pybullet' or 'mujoco'."""
+        ...
+
+    @property
+    def pairs_per_world(self) -> int:
+        """How many pairs its worlds should hold."""
+        ...
+
+    @property
+    def replay(self) -> "Replay":
+        """How much faster than they were its loads are played."""
+        ...
 
     def version(self) -> str:
         """Return the engine's version."""
@@ -192,8 +201,8 @@ class Replay:
     """Playing loads faster than they were.
 
     Sticking does not depend on the rate, so the same forces are played `speed` times as fast; a
-    stage in which an object moved more than the triggers is played again at true speed from where it
-    began. Sliding distances shrink with the square of the speed, hence the small triggers.
+    stage in which an object moved more than the triggers is played again at true speed from where
+    it began. Sliding distances shrink with the square of the speed, hence the small triggers.
     """
 
     speed: int = 1

@@ -1,0 +1,105 @@
+"""Grasps of the school in other programs' formats."""
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from realsim.app.school_files import MODELS, stored_grasps
+from realsim.errors import InputError
+from realsim.formats.scene_grasps import SceneGrasps
+from realsim.records import GraspSet
+from realsim.store.results import grasp_stem
+
+if TYPE_CHECKING:
+    from realsim.formats.acronym import AcronymObject
+
+M_PER_MM = 1e-3
+"""Scale of the exported meshes, which are in millimetres as BOP has them."""
+
+
+def export(source: Path, target: str, out: Path, least_score: float = 0.0) -> list[Path]:
+    """Write the grasps of a session or of a folder of results, and return the files.
+
+    ACRONYM, GraspGen and isaac_grasp files hold one object each and are named after its instance;
+    the meshes they speak of are copied beside them. HDF5 and Parquet hold the scene.
+
+    Args:
+        source: the session, or the folder of results.
+        target: 'acronym', 'graspgen', 'isaac', 'hdf5' or 'parquet'.
+        out: folder to write into; made if it is not there.
+        least_score: of the grasps that an isaac_grasp file takes.
+
+    Raises:
+        InputError: no results there, an unknown format, or the source's own folder as `out`.
+    """
+    if out.resolve() in (source.resolve(), (source / "grasps").resolve()):
+        raise InputError(f"--out '{out}' holds the results themselves; give another folder.")
+    grasps = stored_grasps(source)[0]
+    out.mkdir(parents=True, exist_ok=True)
+    if target == "hdf5":
+        from realsim.formats.grasps_hdf5 import write_grasps_hdf5
+
+        return [write_grasps_hdf5(out / "grasps.h5", grasps)]
+    if target == "parquet":
+        from realsim.formats.grasps_parquet import write_grasps_parquet
+
+        return [write_grasps_parquet(out, grasps)]
+    return list(_one_by_one(source, grasps, target, out, least_score))
+
+
+def _one_by_one(
+    source: Path, grasps: SceneGrasps, target: str, out: Path, least_score: float
+) -> Iterator[Path]:
+    """Write one file an object."""
+    from realsim.formats.acronym import write_acronym
+    from realsim.formats.graspgen import write_graspgen
+    from realsim.formats.isaac_grasp import write_isaac_grasp
+
+    for s in grasps.sets:
+        stem = grasp_stem(s)
+        if target == "isaac":
+            frame = grasps.names.get(s.obj_id) or f"object_{s.obj_id}"
+            path = out / f"{stem}.yaml"
+            yield write_isaac_grasp(path, s, object_frame=frame, least_score=least_score)
+            continue
+        mesh = _copied_mesh(source, s.obj_id, out)
+        if target == "acronym":
+            yield write_acronym(out / f"{stem}.h5", s, acronym_object(s, mesh))
+        elif target == "graspgen":
+            yield write_graspgen(out / f"{stem}.json", s, file=mesh, scale=M_PER_MM)
+        else:
+            raise InputError(f"there is no format '{target}' of grasps.")
+
+
+def _copied_mesh(source: Path, obj_id: int, out: Path) -> str:
+    """Copy an object's mesh beside the grasps and return its name there."""
+    from realsim.formats.bop_models import model_file
+
+    name = model_file(obj_id)
+    (out / MODELS).mkdir(exist_ok=True)
+    for file in (source / MODELS).glob(f"{Path(name).stem}.*"):
+        if file.suffix in (".ply", ".png"):
+            shutil.copyfile(file, out / MODELS / file.name)
+    return f"{MODELS}/{name}"
+
+
+def acronym_object(s: GraspSet, mesh: str) -> "AcronymObject":
+    """Return what an ACRONYM file says of the object, as far as the set's parameters know it."""
+    from realsim.formats.acronym import AcronymObject
+
+    known = s.parameters
+    physics: dict[str, Any] = ((known.get("config") or {}).get("slip") or {}).get("physics") or {}
+    center = known.get("center_of_mass_m")
+    mass, density = known.get("mass_kg"), known.get("density")
+    return AcronymObject(
+        file=mesh,
+        scale=M_PER_MM,
+        density=density,
+        friction=physics.get("friction"),
+        mass_kg=mass,
+        volume_m3=mass / density if mass and density else None,
+        center_of_mass=None if center is None else np.asarray(center, dtype=np.float64),
+    )

@@ -1,0 +1,256 @@
+"""What becomes of a scene when physics starts: who stands, jumps, falls, floats, sits in another.
+
+Poses come from images and are off by millimetres; an object that starts inside the table is thrown
+out by the engine, one above it drops. Nothing is damped: what moves here moves in the school, too.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError, RealsimError
+from realsim.geometry import se3
+from realsim.records import Scene
+from realsim_sim_bridge.scenes.table_world import TABLE, TableWorld
+
+Array = NDArray[np.float64]
+Standing = Literal["stands", "jumps", "falls", "inside another", "floats"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StandConfig:
+    """When an object is said to stand, and how long it is watched."""
+
+    longest_s: float = 3.0
+    """Simulated time at most [s]: a fall from 20 cm takes 0.2, rocking dies within 2."""
+    shortest_s: float = 0.5
+    """Time at least [s]: what stands on its edge takes a while to begin to fall."""
+    rest_s: float = 0.25
+    """Rest has to last so long [s]: a body is slow at the top of its bounce, too."""
+    rest_m_s: float = 0.002
+    """Centres of mass slower than this rest [m/s]: 0.5 mm in the time above."""
+    rest_rad_s: float = 0.02
+    """And turning slower than this [rad/s]."""
+    stands_m: float = 0.002
+    """What moved no more still stands where it did [m]: poses are not known better."""
+    stands_deg: float = 2.0
+    """What turned no more, likewise [deg]."""
+    jump_window_s: float = 0.05
+    """How long after the start a speed counts as a jump [s]: free fall is left out of it."""
+    jump_m_s: float = 0.1
+    """Upward or sideways speed of a jump [m/s]: it lifts a body by 0.5 mm."""
+    sunk_m: float = 0.0005
+    """Penetration from which a speed is put down to it [m]; resting contacts have 0.01 mm."""
+    inside_m: float = 0.003
+    """Penetration from which an object is inside another [m]: more than two poses' errors."""
+    float_m: float = 0.002
+    """Distance to everything from which an object floats [m]."""
+    fell_over_deg: float = 30.0
+    """What turned more has fallen over [deg]."""
+    reach_m: float = 0.1
+    """Distances are looked for up to this [m]."""
+
+    def __post_init__(self) -> None:
+        """Check the times."""
+        if not 0 < self.rest_s <= self.longest_s or self.shortest_s > self.longest_s:
+            raise InputError(
+                f"watching {self.shortest_s:g} to {self.longest_s:g} s for {self.rest_s:g} s of "
+                "rest is impossible; shortest_s and rest_s must fit into longest_s."
+            )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ObjectStand:
+    """What became of one object."""
+
+    instance: int
+    name: str
+    verdict: Standing
+    sentence: str
+    """What happened, with figures."""
+    moved_m: float
+    """Of the centre of mass [m]."""
+    turned_deg: float
+    jump_m_s: float
+    """Largest upward and sideways speed in the first moments [m/s]."""
+    gap_m: float
+    """Distance to the nearest thing before the start [m]; negative = penetration, inf = far."""
+    into: dict[str, float]
+    """Name of what it penetrates before the start -> how deep [m]."""
+    at_rest: bool
+    """Whether it rested in the end."""
+    T_world_before: Array
+    T_world_after: Array
+    """(4, 4) object in world, before and after [m]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class StandReport:
+    """What became of a scene."""
+
+    objects: tuple[ObjectStand, ...]
+    inside: tuple[tuple[str, str, float], ...]
+    """Pairs of which one is inside the other, and how deep [m]; the deepest first."""
+    simulated_s: float
+    notes: tuple[str, ...]
+    """Shapes that cannot be trusted: parts too large, meshes without volume."""
+    settings: dict[str, float] = field(default_factory=dict[str, float])
+    """Of the engine, read back."""
+
+    @property
+    def stable(self) -> bool:
+        """Whether every object stands."""
+        return all(o.verdict == "stands" for o in self.objects)
+
+    def settled(self, scene: Scene) -> Scene:
+        """Return the scene with every object where it came to rest."""
+        after = {o.instance: o.T_world_after for o in self.objects}
+        objects = tuple(replace(o, T_world_obj=after[o.instance]) for o in scene.objects)
+        return replace(scene, objects=objects)
+
+
+HEADERS = ("object", "verdict", "moved [mm]", "turned [deg]", "jump [m/s]", "sunk [mm]", "what")
+
+
+def stand_rows(report: StandReport) -> list[tuple[str, ...]]:
+    """Return a row for each object, by `HEADERS`."""
+    return [
+        (
+            o.name,
+            o.verdict,
+            f"{1e3 * o.moved_m:.1f}",
+            f"{o.turned_deg:.1f}",
+            f"{o.jump_m_s:.2f}",
+            f"{1e3 * max(o.into.values(), default=0.0):.1f}",
+            o.sentence,
+        )
+        for o in report.objects
+    ]
+
+
+def stable_state(world: TableWorld, config: StandConfig | None = None) -> StandReport:
+    """Let physics run until everything rests, or the time is over, and say what happened.
+
+    Args:
+        world: as it was built; it is in its final state afterwards.
+        config: see there.
+
+    Raises:
+        RealsimError: the engine's numbers are no longer finite.
+    """
+    config = config or StandConfig()
+    distances = _distances(world, config.reach_m)
+    instances = list(world.bodies)
+    before, centers = {i: world.pose(i) for i in instances}, world.centers()
+    jump, seconds, resting = _run(world, config)
+    moved = np.linalg.norm(world.centers() - centers, axis=1)
+    if not np.all(np.isfinite(moved)):
+        raise RealsimError(
+            "PyBullet's positions are no longer finite: the physics exploded. Are masses or sizes "
+            "of the objects extreme?"
+        )
+    assert world.scene.scene.plane is not None
+    T_world_table = world.scene.scene.plane.T_world_table
+    stands: list[ObjectStand] = []
+    for k, i in enumerate(instances):
+        after = world.pose(i)
+        near = distances[i]
+        stand = ObjectStand(
+            instance=i,
+            name=world.names[world.bodies[i]],
+            verdict="stands",
+            sentence="",
+            moved_m=float(moved[k]),
+            turned_deg=float(np.degrees(se3.angle(se3.invert(before[i]) @ after))),
+            jump_m_s=float(jump[k]),
+            gap_m=min(near.values(), default=float("inf")),
+            into={n: -d for n, d in near.items() if d < -config.sunk_m},
+            at_rest=bool(resting[k]),
+            T_world_before=T_world_table @ before[i],
+            T_world_after=T_world_table @ after,
+        )
+        verdict, sentence = _judged(stand, float(world.centers()[k, 2]), seconds, config)
+        stands.append(replace(stand, verdict=verdict, sentence=sentence))
+    return StandReport(
+        objects=tuple(stands),
+        inside=_pairs(stands, config),
+        simulated_s=seconds,
+        notes=tuple(world.notes),
+        settings=world.settings(),
+    )
+
+
+def _distances(world: TableWorld, reach_m: float) -> dict[int, dict[str, float]]:
+    """Return each object's distances to what is near, by instance and name [m]."""
+    found: dict[int, dict[str, float]] = {i: {} for i in world.bodies}
+    bodies = list(world.bodies.items())
+    for k, (i, body) in enumerate(bodies):
+        for other in world.statics:
+            found[i][world.names[other]] = world.distance(body, other, reach_m)
+        for j, other in bodies[:k]:
+            d = world.distance(body, other, reach_m)
+            found[i][world.names[other]] = found[j][world.names[body]] = d
+    return found
+
+
+def _run(world: TableWorld, config: StandConfig) -> tuple[Array, float, NDArray[np.bool_]]:
+    """Return every object's jump [m/s], the simulated time [s], and whether it rests."""
+    jump = np.zeros(len(world.bodies))
+    resting = np.zeros(len(world.bodies), dtype=np.bool_)
+    quiet = seconds = 0.0
+    for n in range(1, round(config.longest_s / world.dt) + 1):
+        world.step()
+        seconds = n * world.dt
+        twists = world.twists()
+        if seconds <= config.jump_window_s:
+            v = twists[:, 3:].copy()
+            v[:, 2] = np.maximum(v[:, 2], 0.0)
+            jump = np.maximum(jump, np.linalg.norm(v, axis=1))
+        slow = np.linalg.norm(twists[:, 3:], axis=1) < config.rest_m_s
+        resting = slow & (np.linalg.norm(twists[:, :3], axis=1) < config.rest_rad_s)
+        quiet = quiet + world.dt if resting.all() else 0.0
+        if seconds >= config.shortest_s and quiet >= config.rest_s:
+            break
+    return jump, seconds, resting
+
+
+def _judged(
+    o: ObjectStand, height_m: float, seconds: float, config: StandConfig
+) -> tuple[Standing, str]:
+    """Return the verdict and the sentence."""
+    deepest = max(o.into, key=lambda name: o.into[name], default="")
+    depth_mm = 1e3 * o.into.get(deepest, 0.0)
+    others = {n: d for n, d in o.into.items() if n != TABLE and d > config.inside_m}
+    travel = f"moved by {1e3 * o.moved_m:.1f} mm and turned by {o.turned_deg:.1f} deg"
+    end = "" if o.at_rest else f"; after {seconds:.1f} s it still moves"
+    if others:
+        listed = ", ".join(f"{n} ({1e3 * d:.1f} mm)" for n, d in others.items())
+        return "inside another", f"it is inside {listed}; {travel}{end}."
+    if o.into and o.jump_m_s > config.jump_m_s:
+        return "jumps", (
+            f"it starts {depth_mm:.1f} mm inside {deepest} and is thrown out at {o.jump_m_s:.2f} "
+            f"m/s; {travel}{end}."
+        )
+    if o.gap_m > config.float_m:
+        above = f"{1e3 * o.gap_m:.1f}" if np.isfinite(o.gap_m) else f"over {1e3 * config.reach_m:g}"
+        return "floats", f"it hangs {above} mm from everything and drops; {travel}{end}."
+    if o.moved_m <= config.stands_m and o.turned_deg <= config.stands_deg:
+        return "stands", f"{travel}{end}."
+    if height_m < 0:
+        return "falls", f"it fell off the table{end}."
+    if o.turned_deg > config.fell_over_deg:
+        return "falls", f"it fell over: {travel}{end}."
+    return "falls", f"it does not stay where it is: {travel}{end}."
+
+
+def _pairs(stands: list[ObjectStand], config: StandConfig) -> tuple[tuple[str, str, float], ...]:
+    """Return the pairs that are inside one another, each once; the table is no partner."""
+    found: dict[tuple[str, str], float] = {}
+    for o in stands:
+        for name, depth in o.into.items():
+            if name != TABLE and depth > config.inside_m and (name, o.name) not in found:
+                found[o.name, name] = depth
+    deepest_first = sorted(found.items(), key=lambda item: -item[1])
+    return tuple((a, b, depth) for (a, b), depth in deepest_first)

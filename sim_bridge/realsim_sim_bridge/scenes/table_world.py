@@ -1,0 +1,299 @@
+"""A scene in PyBullet: the table, what stands still, and the objects as bodies of convex parts.
+
+Everything happens in the table's frame: z up, the table's top at z = 0. A body's frame in the
+engine is its principal one, at its centre of mass (`SlipBody.principal_frame`). What is set is read
+back: `changeDynamics` loses settings without a word (damping and friction in one call, for one).
+"""
+
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim import interop
+from realsim.errors import InputError, RealsimError
+from realsim.geometry import se3
+from realsim.models.convex import ConvexConfig, collision_obj, convex_parts
+from realsim.models.library_records import KnownSolid
+from realsim.records import ObjectPose
+from realsim_sim_bridge.scenes.school_scene import SchoolScene, Support
+from realsim_sim_bridge.scenes.world_config import WorldConfig
+from realsim_sim_bridge.slip.body import SlipBody
+
+Array = NDArray[np.float64]
+TABLE = "the table"
+_INFO = {
+    "mass": 0,
+    "lateralFriction": 1,
+    "restitution": 5,
+    "rollingFriction": 6,
+    "spinningFriction": 7,
+    "collisionMargin": 11,
+}
+"""Where getDynamicsInfo has each setting; the inertia, a list, is at 2."""
+
+
+class TableWorld:
+    """The scene's bodies in an engine of their own; leaving the context frees it."""
+
+    def __init__(
+        self, scene: SchoolScene, config: WorldConfig | None = None, cache: Path | None = None
+    ) -> None:
+        """Build the world.
+
+        Args:
+            scene: objects, supports and table.
+            config: the engine's settings.
+            cache: folder for the convex parts of supports' meshes.
+
+        Raises:
+            InputError: a URDF that PyBullet cannot read, or a support's mesh that is flat.
+            RealsimError: the engine did not take a setting.
+        """
+        self.scene, self.config = scene, config or WorldConfig()
+        self.notes: list[str] = _of_solids(scene, self.config)
+        self.names: dict[int, str] = {}
+        """Body number in the engine -> what it is."""
+        self.bodies: dict[int, int] = {}
+        """Instance -> body number."""
+        self.statics: list[int] = []
+        """Body numbers of the table and the supports."""
+        self._Ts_obj_body: dict[int, Array] = {}
+        self._engine: Any = _connected()
+        with ExitStack() as on_failure:
+            # Not `.disconnect` itself: BulletClient ends its connection when the name is looked up.
+            on_failure.callback(self._close)
+            self._set_engine()
+            self._add_table()
+            with tempfile.TemporaryDirectory() as folder:
+                for support in scene.supports:
+                    self._add_support(support, Path(folder), cache)
+                names = scene.names()
+                for o in scene.scene.objects:
+                    self._add_object(o, scene.solids[o.obj_id], names[o.instance], Path(folder))
+            on_failure.pop_all()
+
+    def __enter__(self) -> "TableWorld":
+        """Return the world."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the engine."""
+        self._close()
+
+    def _close(self) -> None:
+        self._engine.disconnect()
+
+    # --- what is in it ------------------------------------------------------------------------
+
+    def _set_engine(self) -> None:
+        wanted: dict[str, float] = {
+            "fixedTimeStep": 1.0 / self.config.rate_hz,
+            "numSolverIterations": self.config.iterations,
+            # Substeps multiply motors' forces, and ending early would make bodies depend on others.
+            "numSubSteps": 0,
+        }
+        self._engine.setPhysicsEngineParameter(
+            **wanted, deterministicOverlappingPairs=1, solverResidualThreshold=0.0
+        )
+        self._engine.setGravity(0.0, 0.0, -self.config.gravity)
+        found = self._engine.getPhysicsEngineParameters()
+        for name, value in wanted.items():
+            _require_taken(name, float(found[name]), value, "the engine")
+
+    def _add_table(self) -> None:
+        T = self.scene.T_table_world
+        at = np.array([(T @ o.T_world_obj)[:2, 3] for o in self.scene.scene.objects])
+        low, high = at.min(axis=0), at.max(axis=0)
+        reach = (high - low) / 2.0 + self.config.table_reach_m
+        depth = self.config.table_depth_m
+        shape = self._engine.createCollisionShape(
+            self._engine.GEOM_BOX, halfExtents=[*reach.tolist(), depth / 2.0]
+        )
+        middle: list[float] = ((low + high) / 2.0).tolist()
+        body: int = self._engine.createMultiBody(0.0, shape, basePosition=[*middle, -depth / 2.0])
+        self._add_static(body, TABLE)
+
+    def _add_support(self, support: Support, folder: Path, cache: Path | None) -> None:
+        T = self.scene.T_table_world @ support.T_world_support
+        position, xyzw = interop.pybullet_from_T(T)
+        if support.urdf is not None:
+            try:
+                with interop.quiet_output():
+                    body: int = self._engine.loadURDF(
+                        str(support.urdf.resolve()), position, xyzw, useFixedBase=True
+                    )
+            except self._engine.error as error:
+                raise InputError(
+                    f"PyBullet cannot read the support '{support.name}' from {support.urdf} "
+                    f"({error}). A URDF with collision shapes is needed, its meshes beside it."
+                ) from error
+        else:
+            assert support.mesh is not None
+            try:
+                parts = convex_parts(support.mesh, ConvexConfig(), cache)
+            except InputError as error:
+                raise InputError(f"the support '{support.name}' is no solid: {error}") from error
+            if not self.config.thin_ratio <= parts.volume_ratio <= self.config.fat_ratio:
+                self.notes.append(_blown_up(f"the support '{support.name}'", parts.volume_ratio))
+            shape = self._shape(list(parts.parts), folder / f"support{len(self.statics)}.obj")
+            body = self._engine.createMultiBody(0.0, shape, -1, position, xyzw)
+        self._add_static(body, support.name)
+
+    def _add_static(self, body: int, name: str) -> None:
+        wanted = self._contact()
+        for link in range(-1, self._engine.getNumJoints(body)):
+            self._engine.changeDynamics(body, link, **wanted)
+            # A box keeps its margin within itself, whatever it is told.
+            read = {k: v for k, v in wanted.items() if k != "collisionMargin"}
+            self._check(body, link, read, name)
+        self.statics.append(body)
+        self.names[body] = name
+
+    def _add_object(self, o: ObjectPose, solid: KnownSolid, name: str, folder: Path) -> None:
+        slip_body = SlipBody(
+            parts=solid.parts.parts,
+            mass_kg=solid.matter.mass_kg,
+            center_of_mass=solid.matter.center_of_mass,
+            inertia=solid.matter.inertia,
+        )
+        T_obj_body, moments = slip_body.principal_frame()
+        T_body_obj = se3.invert(T_obj_body)
+        shape = self._shape(
+            [se3.transform(T_body_obj, part) for part in slip_body.parts],
+            folder / f"object{o.instance}.obj",
+        )
+        T = self.scene.T_table_world @ o.T_world_obj @ T_obj_body
+        position, xyzw = interop.pybullet_from_T(T)
+        mass = slip_body.mass_kg
+        body: int = self._engine.createMultiBody(mass, shape, -1, position, xyzw)
+        # Alone: given together with other settings, damping can make them be lost.
+        self._engine.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
+        wanted = self._contact() | {"mass": mass}
+        self._engine.changeDynamics(body, -1, localInertiaDiagonal=moments.tolist(), **wanted)
+        self._check(body, -1, wanted, name)
+        found = self._engine.getDynamicsInfo(body, -1)[2]
+        for i in range(3):
+            _require_taken(f"inertia {i}", float(found[i]), float(moments[i]), name)
+        self.bodies[o.instance] = body
+        self.names[body] = name
+        self._Ts_obj_body[o.instance] = T_obj_body
+
+    def _contact(self) -> dict[str, float]:
+        return {
+            "lateralFriction": float(np.sqrt(self.config.friction)),
+            "restitution": 0.0,
+            "rollingFriction": 0.0,
+            "spinningFriction": 0.0,
+            "collisionMargin": self.config.collision_margin_m,
+        }
+
+    def _shape(self, parts: list[Array], path: Path) -> int:
+        path.write_bytes(collision_obj(parts))
+        shape: int = self._engine.createCollisionShape(
+            self._engine.GEOM_MESH, fileName=str(path), meshScale=[1.0, 1.0, 1.0]
+        )
+        if shape < 0:
+            raise RealsimError(
+                f"PyBullet refused the collision shape of {len(parts)} convex parts."
+            )
+        return shape
+
+    def _check(self, body: int, link: int, wanted: dict[str, float], name: str) -> None:
+        info = self._engine.getDynamicsInfo(body, link)
+        for key, value in wanted.items():
+            _require_taken(key, float(info[_INFO[key]]), value, name)
+
+    # --- what happens in it -------------------------------------------------------------------
+
+    @property
+    def dt(self) -> float:
+        """Time of a step [s]."""
+        return 1.0 / self.config.rate_hz
+
+    def step(self) -> None:
+        """Let one time step pass."""
+        self._engine.stepSimulation()
+
+    def pose(self, instance: int) -> Array:
+        """Return T_table_obj (4, 4) of an object [m]."""
+        position, xyzw = self._engine.getBasePositionAndOrientation(self.bodies[instance])
+        return interop.T_from_pybullet(position, xyzw) @ se3.invert(self._Ts_obj_body[instance])
+
+    def centers(self) -> Array:
+        """Return the centres of mass (K, 3) in the table's frame, in the scene's order [m]."""
+        engine = self._engine
+        return np.array([engine.getBasePositionAndOrientation(b)[0] for b in self.bodies.values()])
+
+    def twists(self) -> Array:
+        """Return angular [rad/s] and linear velocity of the centre of mass [m/s] (K, 6)."""
+        rows = [self._engine.getBaseVelocity(b) for b in self.bodies.values()]
+        return np.array([[*angular, *linear] for linear, angular in rows])
+
+    def distance(self, body_a: int, body_b: int, reach_m: float) -> float:
+        """Return the least distance of two bodies [m], < 0 = penetration, inf = beyond reach."""
+        points = self._engine.getClosestPoints(body_a, body_b, reach_m)
+        return min((float(p[8]) for p in points), default=float("inf"))
+
+    def settings(self) -> dict[str, float]:
+        """Return the engine's own settings, read back, and the first object's."""
+        found = self._engine.getPhysicsEngineParameters()
+        info = self._engine.getDynamicsInfo(next(iter(self.bodies.values())), -1)
+        return {
+            "dt_s": float(found["fixedTimeStep"]),
+            "iterations": float(found["numSolverIterations"]),
+            "gravity": -float(found["gravityAccelerationZ"]),
+            "contact_friction": float(info[1]) ** 2,
+            "collision_margin_m": float(info[_INFO["collisionMargin"]]),
+        }
+
+
+def _connected() -> Any:
+    with interop.quiet_output():
+        import pybullet
+        from pybullet_utils.bullet_client import BulletClient
+
+        return BulletClient(connection_mode=pybullet.DIRECT)
+
+
+def _require_taken(name: str, found: float, wanted: float, of: str) -> None:
+    """Raise if the engine holds another value than it was given."""
+    if abs(found - wanted) > 1e-9 * max(1.0, abs(wanted)):
+        raise RealsimError(
+            f"PyBullet holds {name} = {found:g} for {of} instead of {wanted:g}; its results would "
+            "be wrong."
+        )
+
+
+def _of_solids(scene: SchoolScene, config: WorldConfig) -> list[str]:
+    """Return what is doubtful about the objects' shapes: no volume, parts too large."""
+    notes: list[str] = []
+    for obj_id in sorted({o.obj_id for o in scene.scene.objects}):
+        solid, name = scene.solids[obj_id], f"'{scene.models[obj_id].name}'"
+        if solid.matter.volume_of != "mesh":
+            notes.append(
+                f"the mesh of {name} is not closed and has no volume of its own: that of its "
+                f"{solid.matter.volume_of} stands for it ({1e3 * solid.matter.mass_kg:.0f} g). "
+                "Repair it: `realsim scan import`."
+            )
+        elif not config.thin_ratio <= solid.parts.volume_ratio <= config.fat_ratio:
+            notes.append(_blown_up(name, solid.parts.volume_ratio))
+    return notes
+
+
+def _blown_up(name: str, ratio: float) -> str:
+    if ratio > 1:
+        return (
+            f"the convex parts of {name} are {ratio:.2f} times as large as its mesh: it touches "
+            "others before its surface does, and its hollow is smaller."
+        )
+    return f"the convex parts of {name} are only {ratio:.2f} of its mesh: others sink into it."

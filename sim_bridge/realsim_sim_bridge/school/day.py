@@ -1,0 +1,248 @@
+"""A day at school: every object's preparation, then its grasps in shards, on whatever workers."""
+
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from realsim.errors import RealsimError
+from realsim_sim_bridge.school.kept_prepared import read_prepared, write_prepared
+from realsim_sim_bridge.school.kept_sets import SchoolResult, read_result, write_result
+from realsim_sim_bridge.school.object_slips import Rows, in_words, result_of, trial_of
+from realsim_sim_bridge.school.object_task import ObjectTask, Prepared, not_prepared, prepare
+from realsim_sim_bridge.school.shards import (
+    Tested,
+    read_tested,
+    run_shard,
+    shards_of,
+    write_tested,
+)
+from realsim_sim_bridge.school.workers import WorkerDiedError, Workers
+
+Progress = Callable[[int, int], None]
+
+MOST_DEATHS = 3
+"""A job that ended so many workers is not given to another: it is the job, not the machine."""
+LOOK_UP_S = 5.0
+"""How often a waiting day asks whether there are more workers [s]."""
+
+
+@dataclass(eq=False, kw_only=True, slots=True)
+class Pupil:
+    """One object on its way through the school."""
+
+    task: ObjectTask
+    folder: Path | None
+    """Where its files are kept; None = nowhere."""
+    shard_grasps: int
+    result: SchoolResult | None = None
+    prepared: Prepared | None = None
+    shards: list[Rows] = field(default_factory=list[Rows])
+    tested: list[Tested] = field(default_factory=list[Tested])
+    given_up: list[tuple[Rows, str]] = field(default_factory=list[tuple[Rows, str]])
+
+    def __post_init__(self) -> None:
+        """Take from the folder whatever has been done before."""
+        path = self.path("grasps")
+        self.result = None if path is None else read_result(path)
+        path = self.path("prepared")
+        if self.result is None and path is not None:
+            prepared = read_prepared(path)
+            if prepared is not None:
+                self._divide(prepared)
+
+    def path(self, what: str) -> Path | None:
+        """Return where `what` of this object is kept."""
+        if self.folder is None:
+            return None
+        return self.folder / f"instance_{self.task.instance:06d}.{what}.npz"
+
+    @property
+    def name(self) -> str:
+        """The object in words."""
+        return f"object '{self.task.name}' (instance {self.task.instance})"
+
+    @property
+    def open_shards(self) -> list[Rows]:
+        """The shards of which nothing is known yet."""
+        done = {int(t.rows[0]) for t in self.tested}
+        done |= {int(rows[0]) for rows, _ in self.given_up if len(rows)}
+        return [rows for rows in self.shards if int(rows[0]) not in done]
+
+    @property
+    def judged(self) -> int:
+        """How many grasps are done."""
+        if self.result is not None:
+            return len(self.result.grasp_set)
+        if self.prepared is None:
+            return 0
+        waiting = sum(len(rows) for rows in self.open_shards)
+        return len(self.prepared.widths_m) - waiting
+
+    @property
+    def expected(self) -> int:
+        """How many there will be, as far as it is known."""
+        if self.result is not None:
+            return len(self.result.grasp_set)
+        if self.prepared is None:
+            return self.task.config.max_candidates
+        return len(self.prepared.widths_m)
+
+    def take_prepared(self, prepared: Prepared, *, keep: bool = True) -> None:
+        """Keep the preparation and divide the grasps into shards."""
+        path = self.path("prepared")
+        if path is not None and keep:
+            write_prepared(path, prepared)
+        self._divide(prepared)
+
+    def _divide(self, prepared: Prepared) -> None:
+        """Divide the grasps into shards and take those tested before from the folder."""
+        self.prepared = prepared
+        self.shards = shards_of(prepared.tested, self.shard_grasps)
+        for rows in self.shards:
+            path = self._shard_path(rows)
+            tested = None if path is None else read_tested(path)
+            if tested is not None:
+                self.tested.append(tested)
+
+    def take_tested(self, tested: Tested) -> None:
+        """Keep what was found of a shard."""
+        path = self._shard_path(tested.rows)
+        if path is not None:
+            write_tested(path, tested)
+        self.tested.append(tested)
+
+    def finish(self) -> None:
+        """Put the result together, keep it, and drop the pieces it was made of.
+
+        One with a job that was given up is not kept, so that the next run tries that job again.
+        """
+        assert self.prepared is not None, "a pupil finishes after its preparation"
+        self.result = result_of(self.task, self.prepared, self.tested, self.given_up)
+        path = self.path("grasps")
+        if path is None or self.given_up:
+            return
+        write_result(path, self.result)
+        for piece in [self.path("prepared"), *(self._shard_path(rows) for rows in self.shards)]:
+            if piece is not None:
+                piece.unlink(missing_ok=True)
+
+    def _shard_path(self, rows: Rows) -> Path | None:
+        """Return where a shard's result is kept."""
+        return self.path(f"shard_{int(rows[0]):06d}")
+
+
+@dataclass(eq=False, slots=True)
+class _Job:
+    """A preparation, or the test of a shard."""
+
+    pupil: Pupil
+    rows: Rows | None = None
+    """None = the preparation."""
+    deaths: int = 0
+    """Workers that ended in the middle of it."""
+
+    @property
+    def name(self) -> str:
+        """The job in words."""
+        what = "preparation" if self.rows is None else in_words(self.rows)
+        return f"{self.pupil.name}, {what}"
+
+
+class Day:
+    """Hands out the jobs; this process alone writes the files."""
+
+    def __init__(self, workers: Workers, pupils: list[Pupil], progress: Progress | None) -> None:
+        self._workers, self._pupils, self._progress = workers, pupils, progress
+        self._waiting: deque[_Job] = deque()
+        self._under_way: dict[Future[Any], _Job] = {}
+
+    def run(self) -> None:
+        """Work until every pupil has its result.
+
+        Raises:
+            RealsimError: a job met input that it cannot use; object and grasps are named.
+        """
+        for pupil in self._pupils:
+            if pupil.result is None and pupil.prepared is None:
+                self._waiting.append(_Job(pupil))
+            elif pupil.result is None:
+                self._go_on(pupil)
+        self._report()
+        while self._waiting or self._under_way:
+            while self._waiting and len(self._under_way) < self._workers.capacity():
+                job = self._waiting.popleft()
+                self._under_way[self._start(job)] = job
+            done, _ = wait(self._under_way, LOOK_UP_S, FIRST_COMPLETED)
+            for future in done:
+                self._take(self._under_way.pop(future), future)
+            if done:
+                self._report()
+
+    def _start(self, job: _Job) -> Future[Any]:
+        """Hand a job to a worker."""
+        task = job.pupil.task
+        if job.rows is None:
+            there = task if self._workers.shares_files else replace(task, cache=None)
+            return self._workers.submit(prepare, there)
+        assert job.pupil.prepared is not None, "shards come out of a preparation"
+        trial = trial_of(task, job.pupil.prepared, job.rows)
+        return self._workers.submit(run_shard, trial, job.rows, task.config)
+
+    def _take(self, job: _Job, future: Future[Any]) -> None:
+        """Take what a job came to."""
+        try:
+            found = future.result()
+        except WorkerDiedError as error:
+            self._again_or_never(job, str(error))
+            return
+        except Exception as error:
+            raise _with_name(error, job.name) from None
+        if job.rows is None:
+            job.pupil.take_prepared(found)
+            self._go_on(job.pupil)
+        else:
+            job.pupil.take_tested(found)
+            self._finish_if_done(job.pupil)
+
+    def _again_or_never(self, job: _Job, how: str) -> None:
+        """Put a job whose worker died back in front, or give it up."""
+        job.deaths += 1
+        if job.deaths < MOST_DEATHS:
+            self._waiting.appendleft(job)
+            return
+        why = f"{MOST_DEATHS} workers ended in the middle of it; of the last: {how}"
+        if job.rows is None:
+            job.pupil.take_prepared(not_prepared(f"the preparation failed: {why}"), keep=False)
+            job.pupil.given_up.append((np.zeros(0, dtype=np.int64), why))
+        else:
+            job.pupil.given_up.append((job.rows, why))
+        self._finish_if_done(job.pupil)
+
+    def _go_on(self, pupil: Pupil) -> None:
+        """Let the slip tests of a prepared object wait for workers."""
+        self._waiting.extend(_Job(pupil, rows) for rows in pupil.open_shards)
+        self._finish_if_done(pupil)
+
+    def _finish_if_done(self, pupil: Pupil) -> None:
+        """Put a pupil's result together after its last shard."""
+        if not pupil.open_shards:
+            pupil.finish()
+
+    def _report(self) -> None:
+        """Tell how many grasps are judged."""
+        if self._progress is not None:
+            judged = sum(pupil.judged for pupil in self._pupils)
+            self._progress(judged, sum(pupil.expected for pupil in self._pupils))
+
+
+def _with_name(error: Exception, job: str) -> Exception:
+    """Return an error that says in which job it came up."""
+    if isinstance(error, RealsimError):
+        return type(error)(f"{job}: {error}")
+    error.add_note(f"in the Robot School: {job}")
+    return error

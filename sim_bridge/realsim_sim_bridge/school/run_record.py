@@ -1,0 +1,148 @@
+"""What a run in a cache folder was started with: whoever goes on with it must want the same.
+
+The folder's `run.json` holds the whole config, the versions of what computes, and of every object
+hashes of its mesh and surroundings. Another run in the same folder is refused, field by field: old
+and new grasps side by side look alike and mean different things.
+"""
+
+import fcntl
+import json
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from realsim.errors import InputError
+from realsim.store import atomic
+from realsim_sim_bridge.school.config import SchoolConfig
+from realsim_sim_bridge.school.object_task import ObjectTask
+from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+
+RUN_FILE, LOCK_FILE = "run.json", "run.lock"
+RESULTS = "instance_*.npz"
+"""The run's own files; those of the convex parts carry a hash of all they depend on."""
+RESULTS_VERSION = 2
+"""Raised whenever the same inputs give other results with the same versions of all packages."""
+PACKAGES = ("realsim", "numpy", "numba", "scipy", "coacd", "eaik", "coal", "pin", "ompl", "toppra")
+"""Besides the engines: what the grasps and trajectories come from."""
+ABSENT = "(nothing)"
+
+
+def versions(config: SchoolConfig) -> dict[str, str]:
+    """Return the versions of everything that computes; "not installed" where it is not."""
+    engine = "mujoco" if isinstance(config.slip.engine, MujocoSettings) else "pybullet"
+    found = {"results": str(RESULTS_VERSION)}
+    for name in (*PACKAGES, engine):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def run_record(tasks: list[ObjectTask], config: SchoolConfig, shard_grasps: int) -> dict[str, Any]:
+    """Return what a run is told by, as plain JSON values."""
+    record = {
+        "config": asdict(config),
+        "versions": versions(config),
+        "shard_grasps": shard_grasps,
+        "objects": {f"instance_{task.instance:06d}": task.inputs() for task in tasks},
+    }
+    return json.loads(json.dumps(record))
+
+
+@contextmanager
+def folder_of_run(folder: Path, record: dict[str, Any], *, restart: bool) -> Generator[None]:
+    """Hold a folder for this run while the context lasts.
+
+    Args:
+        folder: made if it is not there.
+        record: what `run_record` says of this run.
+        restart: discard another run's results instead of refusing.
+
+    Raises:
+        InputError: another process is at work there, or its results are of another run.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / LOCK_FILE).open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"another Robot School is at work in {folder}. Wait until it has ended, or choose "
+                "another folder."
+            ) from None
+        for leftover in folder.glob(f".{RESULTS}.*"):  # of a process killed while it wrote
+            leftover.unlink()
+        path = folder / RUN_FILE
+        if restart:
+            # The record goes last: killed in between, the folder still says whose results remain.
+            for result in folder.glob(RESULTS):
+                result.unlink()
+        else:
+            _refuse_others(folder, path, record)
+        # Not strict JSON: a config may hold infinity.
+        atomic.write_text(path, json.dumps(record, indent=1) + "\n")
+        yield
+
+
+def _refuse_others(folder: Path, path: Path, record: dict[str, Any]) -> None:
+    """Raise if the folder holds results of another run than this one."""
+    remedy = (
+        "Results are not mixed: restart discards the old ones (`--restart`, restart=True), or "
+        "choose another folder."
+    )
+    if not path.is_file():
+        if next(folder.glob(RESULTS), None) is not None:
+            raise InputError(
+                f"{folder} holds grasps of a Robot School but no {RUN_FILE}, so it is not known "
+                f"what they were made with. {remedy}"
+            )
+        return
+    try:
+        old = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        raise InputError(
+            f"{path} is damaged, so it is not known what the grasps beside it were made with. "
+            f"{remedy}"
+        ) from None
+    changed = list(differences(old, record))
+    if changed:
+        told = "".join(f"\n  {field}: {was} -> {now}" for field, was, now in changed)
+        raise InputError(
+            f"{folder} holds a run that was started with something else:{told}\n{remedy}"
+        )
+
+
+def differences(old: Any, new: Any, field: str = "") -> Iterator[tuple[str, str, str]]:
+    """Yield (field, old value, new value) of all that differs between two JSON values."""
+    was, now = _children(old), _children(new)
+    if was is None or now is None:
+        if old != new:
+            yield field, _short(old), _short(new)
+        return
+    for key in [*was, *(k for k in now if k not in was)]:
+        name = f"{field}.{key}" if field else key
+        if key not in was:
+            yield name, ABSENT, _short(now[key])
+        elif key not in now:
+            yield name, _short(was[key]), ABSENT
+        else:
+            yield from differences(was[key], now[key], name)
+
+
+def _children(value: Any) -> dict[str, Any] | None:
+    """Return what a JSON value is made of by name, or None if it is one value."""
+    if isinstance(value, dict):
+        return {str(key): child for key, child in value.items()}  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
+    if isinstance(value, list):
+        return {str(key): child for key, child in enumerate(value)}  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
+    return None
+
+
+def _short(value: Any) -> str:
+    """Return a JSON value in at most a line."""
+    text = json.dumps(value)
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,220 @@
+"""The same grasps carried by a whole Panda in PyBullet, with gravity on and nothing replayed.
+
+The hand that stands still feels loads that were computed; here nothing is: seven position-controlled
+joints move a hand with the same pads, and the object has its true mass. What the two have in common
+is the hand's motion alone.
+"""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim import interop
+from realsim.geometry import se3
+from realsim.records import STAGES
+from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.bullet_settings import BulletSettings
+from realsim_sim_bridge.slip.hand_urdf import hand_urdf
+from realsim_sim_bridge.slip.score import ScoreLimits
+from realsim_sim_bridge.slip.slip_test import SlipConfig
+from realsim_sim_bridge.validation.moving_arm import TORQUES_NM, arm_urdf, stage_joints
+from realsim_sim_bridge.validation.specimens import READY, SIDE_M
+
+Array = NDArray[np.float64]
+
+RATE_HZ = 1000.0
+"""Steps per second: the arm carries true masses, for which the hand's steps are too long."""
+STIFFNESS, DAMPING = 1e5, 10.0
+"""Of the pads [N/m, N s/m]. In a hand that turns, Bullet's friction makes the velocities equal of two
+points that lie as far apart as pad and object overlap; at 10000 N/m and 70 N these are 1.2 of 25 mm,
+and the object lags behind the hand by 5 % of its turn. A hand that stands still knows no such lag."""
+CLOSE_S = 0.5
+"""Time for closing [s]: the fingers arrive within 0.1 s."""
+HEADROOM_M = 0.004
+"""The fingers start this far from the cube [m]."""
+PULL = 0.3
+"""Share of a joint's error that its control takes back per step."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class CarriedCube:
+    """What a cube did in the hand of a moving arm."""
+
+    slip_m: Array
+    """(4,) by stage: NaN = not executed, inf = lost."""
+    slip_rad: Array
+    """(4,)."""
+    tracking_rad: float
+    """Greatest error of a joint while it followed its path."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether all four stages were passed."""
+        limits = ScoreLimits()
+        held = (self.slip_m <= limits.slip_m) & (self.slip_rad <= np.radians(limits.slip_deg))
+        return bool(held.all())
+
+
+def carry_cube(
+    mass_kg: float, T_obj_grasp: Array, config: SlipConfig, settings: BulletSettings
+) -> CarriedCube:
+    """Close on a weightless cube in the ready pose, turn gravity on and play the stages.
+
+    Args:
+        mass_kg: of the cube.
+        T_obj_grasp: (4, 4) where it is grasped; the hand points down, the cube as it comes [m].
+        config: the hand's force and friction, and the motions.
+        settings: of the engine; time step and stiffness are this module's own.
+    """
+    slip_m, slip_rad = np.full(len(STAGES), np.nan), np.full(len(STAGES), np.nan)
+    limits = ScoreLimits()
+    with _ArmWorld(mass_kg, T_obj_grasp, config, settings) as world:
+        q, tracking = READY.copy(), 0.0
+        for stage in range(len(STAGES)):
+            if stage == 0:
+                path = np.tile(q, (round(CLOSE_S / world.dt), 1))
+                world.close_fingers(config.closing.speed)
+            else:
+                world.set_gravity(config.motion.gravity)
+                path = stage_joints(stage, q, config.motion, world.dt)
+            slip_m[stage], slip_rad[stage], error = world.follow(
+                path, q, config.sample_s, config.lost_m
+            )
+            q, tracking = path[-1], max(tracking, error)
+            if not (slip_m[stage] <= limits.slip_m and np.degrees(slip_rad[stage]) <= limits.slip_deg):
+                break
+    return CarriedCube(slip_m=slip_m, slip_rad=slip_rad, tracking_rad=tracking)
+
+
+class _ArmWorld:
+    """An arm with a hand and a cube in PyBullet."""
+
+    def __init__(
+        self, mass_kg: float, T_obj_grasp: Array, config: SlipConfig, settings: BulletSettings
+    ) -> None:
+        with interop.quiet_output():
+            import pybullet
+            from pybullet_utils.bullet_client import BulletClient
+
+            self._engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
+        self._config, self.dt = config, 1.0 / RATE_HZ
+        self._engine.setPhysicsEngineParameter(
+            fixedTimeStep=self.dt, numSolverIterations=settings.iterations, numSubSteps=0,
+            deterministicOverlappingPairs=1, solverResidualThreshold=0.0,
+        )  # fmt: skip
+        self._engine.setGravity(0.0, 0.0, 0.0)
+        self._add_arm(settings)
+        self._add_cube(mass_kg, panda.forward(READY) @ se3.invert(T_obj_grasp))
+
+    def __enter__(self) -> "_ArmWorld":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._engine.disconnect()
+
+    def close_fingers(self, speed: float) -> None:
+        """Let the fingers close at `speed` [m/s] and press with the hand's force from then."""
+        for finger in self._fingers:
+            self._engine.setJointMotorControl2(
+                self._arm, finger, self._engine.VELOCITY_CONTROL, targetVelocity=-speed,
+                force=self._config.physics.force_n,
+            )  # fmt: skip
+
+    def set_gravity(self, gravity: float) -> None:
+        """Turn gravity on [m/s^2]."""
+        self._engine.setGravity(0.0, 0.0, -gravity)
+
+    def follow(self, path: Array, q: Array, sample_s: float, lost_m: float) -> tuple[float, float, float]:
+        """Follow joint angles (T, 7) from q (7,); return slip [m], turn [rad] and tracking error."""
+        engine, start = self._engine, self._in_hand()
+        speeds = np.diff(np.vstack([q, path]), axis=0) / self.dt
+        slip = turn = tracking = 0.0
+        for t, (target, speed) in enumerate(zip(path.tolist(), speeds.tolist(), strict=True), 1):
+            engine.setJointMotorControlArray(
+                self._arm, self._joints, engine.POSITION_CONTROL, targetPositions=target,
+                targetVelocities=speed, forces=TORQUES_NM, positionGains=[PULL] * panda.JOINTS,
+                velocityGains=[1.0] * panda.JOINTS,
+            )  # fmt: skip
+            engine.stepSimulation()
+            if t % max(1, round(sample_s / self.dt)) == 0 or t == len(path):
+                now = self._in_hand()
+                slip = max(slip, float(np.linalg.norm(now[:3, 3] - start[:3, 3])))
+                turn = max(turn, float(se3.angle(start[:3, :3].T @ now[:3, :3])))
+                states = engine.getJointStates(self._arm, self._joints)
+                errors = [abs(s[0] - a) for s, a in zip(states, target, strict=True)]
+                tracking = max(tracking, *errors)
+                if slip > lost_m:
+                    return float("inf"), float("inf"), tracking
+        return slip, turn, tracking
+
+    def _in_hand(self) -> Array:
+        """Return the cube's pose (4, 4) in the grasp frame, as the engine has both."""
+        link = self._engine.getLinkState(self._arm, self._palm, computeForwardKinematics=1)
+        hand = interop.T_from_pybullet(link[4], link[5])
+        cube = interop.T_from_pybullet(*self._engine.getBasePositionAndOrientation(self._cube))
+        return se3.invert(hand) @ cube
+
+    def _add_arm(self, settings: BulletSettings) -> None:
+        """Load the arm in its ready pose with its hand open."""
+        engine, physics = self._engine, self._config.physics
+        with tempfile.TemporaryDirectory() as folder:
+            urdf = Path(folder) / "arm.urdf"
+            urdf.write_text(arm_urdf(hand_urdf(HandGeometry(), physics.pads)))
+            self._arm: int = engine.loadURDF(
+                str(urdf),
+                useFixedBase=True,
+                flags=engine.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS
+                | engine.URDF_USE_INERTIA_FROM_FILE,
+            )
+        count = engine.getNumJoints(self._arm)
+        names = [engine.getJointInfo(self._arm, j) for j in range(count)]
+        link = {info[12].decode(): j for j, info in enumerate(names)}
+        self._joints = [link[f"link{i + 1}"] for i in range(panda.JOINTS)]
+        self._fingers, self._palm = (link["left"], link["right"]), link["palm"]
+        # Never together with a link's settings: PyBullet then drops these.
+        engine.changeDynamics(self._arm, -1, linearDamping=0.0, angularDamping=0.0)
+        for joint, angle in zip(self._joints, READY.tolist(), strict=True):
+            engine.resetJointState(self._arm, joint, angle)
+        for finger in self._fingers:
+            engine.resetJointState(self._arm, finger, SIDE_M / 2 + HEADROOM_M)
+            engine.changeDynamics(
+                self._arm, finger, lateralFriction=1.0, spinningFriction=0.0, rollingFriction=0.0
+            )
+            if physics.pads:
+                engine.changeDynamics(
+                    self._arm, finger,
+                    contactStiffness=STIFFNESS, contactDamping=DAMPING,
+                )  # fmt: skip
+        gear = engine.createConstraint(
+            self._arm, self._fingers[0], self._arm, self._fingers[1], engine.JOINT_GEAR,
+            [0, 1, 0], [0, 0, 0], [0, 0, 0],
+        )  # fmt: skip
+        engine.changeConstraint(
+            gear, gearRatio=-1, erp=settings.gear_erp, maxForce=settings.gear_force_n
+        )
+
+    def _add_cube(self, mass_kg: float, T_base_cube: Array) -> None:
+        """Add the cube, weightless until gravity is turned on."""
+        engine = self._engine
+        position, xyzw = interop.pybullet_from_T(T_base_cube)
+        shape: int = engine.createCollisionShape(engine.GEOM_BOX, halfExtents=[SIDE_M / 2] * 3)
+        self._cube: int = engine.createMultiBody(
+            baseMass=mass_kg, baseCollisionShapeIndex=shape, basePosition=position,
+            baseOrientation=xyzw,
+        )  # fmt: skip
+        engine.changeDynamics(self._cube, -1, linearDamping=0.0, angularDamping=0.0)
+        engine.changeDynamics(
+            self._cube, -1, lateralFriction=self._config.physics.friction, spinningFriction=0.0,
+            rollingFriction=0.0,
+        )  # fmt: skip

@@ -1,0 +1,241 @@
+"""ACRONYM files: the hand's frame, the label's name, and NVIDIA's own example."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tried_grasps import assert_same, tried_set
+
+from realsim.errors import InputError
+from realsim.formats.acronym import AcronymObject, read_acronym, write_acronym
+from realsim.formats.hand_frames import (
+    FINGERTIP_Z_M,
+    T_GRASP_HAND,
+    TCP_Z_M,
+    grasp_poses,
+    hand_poses,
+)
+from realsim.formats.scene_grasps import executed, held
+from realsim.geometry import se3
+from realsim.geometry.mesh import sample_surface
+from realsim.records import GraspSet
+from realsim_sim_bridge.grasping.hand import HandGeometry
+
+DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
+MUG = DATA / "school/acronym_mug"
+needs_mug = pytest.mark.skipif(not MUG.is_dir(), reason=f"no ACRONYM example at {MUG}")
+OBJECT = AcronymObject(
+    file="meshes/mug.obj", scale=0.001, density=150.0, friction=1.0, mass_kg=0.013,
+    volume_m3=8.7e-5, center_of_mass=np.array([0.0, -0.002, 0.09]), inertia=np.eye(3) * 2e-5,
+)  # fmt: skip
+
+
+def rows_of(s, rows):
+    """Return some grasps of a set."""
+    names = ("Ts_obj_grasp", "widths_m", "scores", "base_scores", "slip_m", "slip_rad", "reachable")
+    return replace(
+        s,
+        **{name: getattr(s, name)[rows] for name in names},
+        failures=tuple(f for f, kept in zip(s.failures, rows, strict=True) if kept),
+        measures={name: values[rows] for name, values in s.measures.items()},
+    )
+
+
+# --- frames -----------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(T_GRASP_HAND)))
+@settings(max_examples=30, deadline=None)
+def test_to_a_hand_frame_and_back_is_the_same_grasp(seed, frame):
+    Ts = se3.random_transform(np.random.default_rng(seed), 10)
+    back = grasp_poses(hand_poses(Ts, frame), frame)
+    np.testing.assert_array_equal(back[:, :3, :3], Ts[:, :3, :3])  # signed permutations
+    np.testing.assert_allclose(back, Ts, rtol=0, atol=4e-16 * (1 + np.abs(Ts).max()))
+
+
+@pytest.mark.parametrize("frame", sorted(T_GRASP_HAND))
+def test_the_frame_goes_with_the_object(frame):
+    rng = np.random.default_rng(0)
+    Ts, T = se3.random_transform(rng, 10), se3.random_transform(rng)
+    np.testing.assert_allclose(T @ hand_poses(Ts, frame), hand_poses(T @ Ts, frame), atol=1e-14)
+
+
+def test_the_axes_of_acronyms_hand_are_known():
+    """In a grasp at the origin the fingers close along y, 0.1034 m before the mounting face."""
+    T = hand_poses(np.eye(4), "acronym")
+    np.testing.assert_array_equal(T[:3, 0], [0, 1, 0])  # its closing axis x is our y
+    np.testing.assert_array_equal(T[:3, 2], [0, 0, 1])  # the approach stays
+    tip = T @ [0.041, 0.0, FINGERTIP_Z_M, 1.0]  # ACRONYM's own marker of a fingertip
+    np.testing.assert_allclose(tip[:3], [0.0, 0.041, 0.0088], atol=1e-12)
+    T_acronym_panda = se3.invert(T) @ hand_poses(np.eye(4), "panda_hand")
+    np.testing.assert_allclose(se3.log_so3(T_acronym_panda[:3, :3]), [0, 0, -np.pi / 2])
+    np.testing.assert_allclose(T_acronym_panda[:3, 3], 0, atol=1e-15)  # one origin
+
+
+def test_the_frames_are_those_of_the_hand_that_is_simulated():
+    hand = HandGeometry()
+    assert hand.mount_z_m == -TCP_Z_M
+    assert hand.tip_beyond_tcp_m == pytest.approx(FINGERTIP_Z_M - TCP_Z_M, abs=1e-9)
+
+
+# --- files ------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=15, deadline=None)
+def test_tried_grasps_written_and_read_are_the_same(tmp_path_factory, seed):
+    s = tried_set(np.random.default_rng(seed), 30)
+    path = write_acronym(tmp_path_factory.mktemp("a") / "mug.h5", s, OBJECT)
+    found, kept = read_acronym(path), rows_of(s, executed(s))
+    assert isinstance(found.tried, GraspSet)
+    np.testing.assert_allclose(found.Ts_obj_grasp, kept.Ts_obj_grasp, rtol=0, atol=1e-15)
+    assert_same(replace(kept, Ts_obj_grasp=found.tried.Ts_obj_grasp), found.tried)
+    assert_same(OBJECT, found.obj)
+    assert np.array_equal(found.object_in_gripper, held(kept))
+    assert path.read_bytes() == write_acronym(path, s, OBJECT).read_bytes()
+
+
+def test_acronyms_own_reader_finds_what_it_looks_for(tmp_path):
+    """The very accesses of acronym_tools.load_grasps and load_mesh."""
+    s = tried_set(np.random.default_rng(1), 40)
+    data = h5py.File(write_acronym(tmp_path / "mug.h5", s, OBJECT), "r")
+    T = np.array(data["grasps/transforms"])
+    success = np.array(data["grasps/qualities/flex/object_in_gripper"])
+    assert data["object/file"][()] == b"meshes/mug.obj" and data["object/scale"][()] == 0.001
+    assert T.shape == (int(executed(s).sum()), 4, 4) and set(success.tolist()) == {0, 1}
+    assert success.dtype == np.int64
+
+
+def test_our_physics_does_not_pass_for_flex(tmp_path):
+    s = tried_set(np.random.default_rng(1), 40)
+    path = write_acronym(tmp_path / "mug.h5", s, OBJECT)
+    with h5py.File(path) as file:
+        flex = file["grasps/qualities/flex"]
+        assert list(flex) == ["object_in_gripper"]  # no score, no motion of ours under that name
+        assert "not FleX" in flex.attrs["simulator"]
+        ours = file["grasps/qualities/realsim"]
+        assert ours.attrs["left_out"] == len(s) - int(executed(s).sum()) > 0
+        np.testing.assert_array_equal(s.scores[ours["row"][()]], ours["score"][()])
+    found = read_acronym(path)
+    assert "not FleX" in found.simulator
+    assert np.isnan(found.as_set(3).scores).all()  # a label is not a score
+
+
+def test_a_set_without_a_tried_grasp_is_a_file_too(tmp_path):
+    s = tried_set(np.random.default_rng(1), 0)
+    found = read_acronym(write_acronym(tmp_path / "none.h5", s, AcronymObject(file="a.obj")))
+    assert len(found.Ts_obj_grasp) == 0 and found.obj.mass_kg is None
+
+
+def link(file):
+    del file["grasps/transforms"]
+    file["grasps/transforms"] = h5py.ExternalLink("other.h5", "grasps/transforms")
+
+
+def half_held(file):
+    file["grasps/qualities/flex/object_in_gripper"][0] = 2
+
+
+def no_label(file):
+    del file["grasps/qualities/flex/object_in_gripper"]
+
+
+def of_robotiq(file):
+    del file["gripper/type"]
+    file["gripper/type"] = "robotiq"
+
+
+def sheared(file):
+    file["grasps/transforms"][0, 0, 1] += 0.1
+
+
+def no_scale(file):
+    file["object/scale"][()] = 0.0
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (link, "points elsewhere"),
+        (half_held, "other values than 0 and 1"),
+        (no_label, "is missing"),
+        (of_robotiq, "robotiq"),
+        (sheared, "not rigid"),
+        (no_scale, "scale is 0"),
+    ],
+)
+def test_what_is_no_acronym_file_is_refused(tmp_path, change, words):
+    path = write_acronym(tmp_path / "mug.h5", tried_set(np.random.default_rng(1), 40), OBJECT)
+    with h5py.File(path, "r+") as file:
+        change(file)
+    with pytest.raises(InputError, match=words):
+        read_acronym(path)
+
+
+# --- NVIDIA's example -------------------------------------------------------------------------
+
+
+def fingers_and_gap(Ts, points):
+    """Return (N,) whether the open fingers are free of points, and whether some lie between."""
+    x, y, z = np.moveaxis(np.abs(se3.transform(se3.invert(Ts), points)), -1, 0)
+    depth = se3.transform(se3.invert(Ts), points)[..., 2]
+    in_finger = (x < 0.008) & (y > 0.0405) & (y < 0.05) & (depth > -0.04) & (depth < 0.0088)
+    between = (x < 0.008) & (y < 0.04) & (z < 0.0088)
+    return ~in_finger.any(axis=1), between.any(axis=1)
+
+
+@pytest.mark.real
+@needs_mug
+def test_real_grasps_close_on_the_mug_and_only_in_the_right_frame():
+    import trimesh
+
+    from realsim.records import Mesh
+
+    found = read_acronym(next(MUG.glob("*.h5")))
+    assert len(found.Ts_obj_grasp) == 2000 and found.object_in_gripper.sum() == 1290
+    assert found.simulator == "FleX" and found.tried is None and len(found.motions) == 4
+    assert found.obj.density == 150 and found.obj.friction == 1
+    loaded = trimesh.load(next(MUG.glob("*.obj")), force="mesh", process=False)
+    mesh = Mesh(vertices=np.asarray(loaded.vertices) * found.obj.scale, faces=loaded.faces)
+    points = sample_surface(mesh, 4000, np.random.default_rng(0))[0]
+    free, between = fingers_and_gap(found.Ts_obj_grasp, points)
+    # Fingers that are open touch nothing, and the pads have something between them: all 2000.
+    assert free.all() and between.all()
+    Ts = found.Ts_obj_grasp[::4]
+    unturned, _ = fingers_and_gap(grasp_poses(hand_poses(Ts, "acronym"), "panda_hand"), points)
+    assert unturned.mean() < 0.6  # without the quarter turn the fingers stand in the mug
+    deeper, _ = fingers_and_gap(Ts @ se3.from_translation([0, 0, 0.02]), points)
+    _, short = fingers_and_gap(Ts @ se3.from_translation([0, 0, -0.02]), points)
+    assert deeper.mean() < 0.95 and short.mean() < 0.9  # and the shift is right to 2 cm
+
+
+@pytest.mark.real
+@needs_mug
+def test_real_grasps_closing_rays_meet_the_mug():
+    import trimesh
+
+    from realsim.records import Mesh
+    from realsim.rendering.rays import PlacedMesh, RayScene
+
+    found = read_acronym(next(MUG.glob("*.h5")))
+    loaded = trimesh.load(next(MUG.glob("*.obj")), force="mesh", process=False)
+    mesh = Mesh(vertices=np.asarray(loaded.vertices) * found.obj.scale, faces=loaded.faces)
+    scene = RayScene([PlacedMesh(0, mesh, np.eye(4))])
+    Ts = found.Ts_obj_grasp[found.object_in_gripper]
+    x, z = np.meshgrid([-0.006, 0.0, 0.006], [-0.008, -0.004, 0.0, 0.004, 0.008])
+    for side in (1.0, -1.0):
+        pad = np.stack([x.ravel(), np.full(x.size, side * 0.04), z.ravel()], axis=1)
+        origins = se3.transform(Ts, pad).reshape(-1, 3)
+        inward = np.repeat(-side * Ts[:, :3, 1], len(pad), axis=0).astype(np.float32)
+        t, _ = scene.first_hits(origins, inward)
+        assert np.all((t.reshape(len(Ts), -1) < 0.08).any(axis=1))
+    # At the mounting face, where the unshifted frame is, the same rays meet nothing.
+    face = hand_poses(Ts, "panda_hand")
+    inward = np.ascontiguousarray(-face[:, :3, 1], dtype=np.float32)
+    t, _ = scene.first_hits(se3.transform(face, np.array([[0.0, 0.04, 0.0]]))[:, 0], inward)
+    assert np.mean(t < 0.08) < 0.1

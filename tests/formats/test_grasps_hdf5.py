@@ -1,0 +1,254 @@
+"""HDF5 files of grasps: what is written is read bit for bit, and nothing else is read at all."""
+
+import json
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tried_grasps import assert_same, tried_scene, tried_set
+
+from realsim.errors import InputError, RealsimError
+from realsim.formats.grasps_hdf5 import grasps_hdf5_bytes, read_grasps_hdf5, write_grasps_hdf5
+from realsim.formats.scene_grasps import SceneGrasps, executed, held
+from realsim.records.grasps import MEASURES
+
+SET = "sets/000004_obj000009"
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.booleans(), st.booleans())
+def test_grasps_written_and_read_are_the_same_bit_for_bit(tmp_path_factory, seed, poses, attempts):
+    scene = tried_scene(seed, with_poses=poses, with_attempts=attempts)
+    path = write_grasps_hdf5(tmp_path_factory.mktemp("h5") / "deep" / "grasps.h5", scene)
+    assert_same(scene, read_grasps_hdf5(path))
+    assert path.read_bytes() == grasps_hdf5_bytes(scene)  # the same grasps, the same bytes
+
+
+def test_a_scene_without_an_object_is_a_file_too(tmp_path):
+    scene = SceneGrasps(sets=())
+    assert_same(scene, read_grasps_hdf5(write_grasps_hdf5(tmp_path / "none.h5", scene)))
+
+
+def test_a_stranger_finds_units_meanings_and_poses(tmp_path):
+    scene = tried_scene(3)
+    with h5py.File(write_grasps_hdf5(tmp_path / "g.h5", scene)) as file:
+        group, s = file[SET], scene.sets[-2]
+        assert s.instance == 4 and group.attrs["name"] == "mug"
+        missing = []
+        file.visititems(
+            lambda name, o: missing.append(name)
+            if isinstance(o, h5py.Dataset) and not {"unit", "meaning"} <= set(o.attrs)
+            else None
+        )
+        assert missing == []
+        for name, values in group["measures"].items():
+            assert values.attrs["unit"] == MEASURES[name].unit
+        T_world_obj = group["T_world_obj"][()]
+        np.testing.assert_array_equal(group["T_world_grasp"][()], T_world_obj @ s.Ts_obj_grasp)
+        table = file["T_world_table"][()] @ group["T_table_grasp"][()]
+        np.testing.assert_allclose(table, group["T_world_grasp"][()], atol=1e-12)
+        assert tuple(group["failure"].asstr()[()]) == s.failures
+        assert json.loads(group["parameters"].asstr()[()]) == s.parameters
+        attempts, found = scene.trajectories[4], group["trajectories"]
+        a, b = found["starts"][1:3]
+        np.testing.assert_array_equal(found["joints_rad"][a:b], attempts.joints_rad[a:b])
+
+
+def test_executed_and_held_are_told_by_the_slips_alone():
+    s = tried_set(np.random.default_rng(5), 200)
+    assert np.array_equal(executed(s), ~np.isnan(s.slip_m[:, 0]))
+    assert held(s).any() and not np.any(held(s) & ~executed(s))
+    # Base 1 = all four stages: the sample's passing slips are all finite.
+    assert np.all(held(s)[s.base_scores == 1])
+    assert not held(s)[np.isinf(s.slip_m).any(axis=1)].any()
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("widths_m", -0.01, "a width"),
+        ("widths_m", np.inf, "a width"),
+        ("scores", 1.5, "a score"),
+        ("base_scores", 0.3, "a base score"),
+        ("slip_m", -1e-9, "slip_m"),
+        ("slip_rad", -np.inf, "slip_rad"),
+    ],
+)
+def test_what_no_grasp_has_is_not_written(field, value, words):
+    s = tried_set(np.random.default_rng(0), 6)
+    values = np.array(getattr(s, field))
+    values[3] = value
+    with pytest.raises(InputError, match=words):
+        SceneGrasps(sets=(replace(s, **{field: values}),))
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"failures": ("nul\0", *[""] * 5)},
+        {"failures": ("\ud800", *[""] * 5)},
+        {"parameters": {"x": float("nan")}},
+        {"parameters": {"x": (1, 2)}},
+        {"parameters": {"x": object()}},
+    ],
+)
+def test_what_a_file_cannot_give_back_is_not_written(changed):
+    s = tried_set(np.random.default_rng(0), 6)
+    with pytest.raises(InputError):
+        SceneGrasps(sets=(replace(s, **changed),))
+
+
+def test_sets_and_attempts_that_do_not_fit_together_are_refused():
+    scene = tried_scene(0)
+    s, t = scene.sets[0], scene.trajectories[4]
+    with pytest.raises(InputError, match="more than one grasp set"):
+        SceneGrasps(sets=(s, s))
+    with pytest.raises(InputError, match="instance 99"):
+        SceneGrasps(sets=(s,), Ts_world_obj={99: np.eye(4)})
+    with pytest.raises(InputError, match="increasing rows"):
+        SceneGrasps(sets=scene.sets, trajectories={4: replace(t, rows=t.rows + 1000)})
+    with pytest.raises(InputError, match="back in time"):
+        SceneGrasps(sets=scene.sets, trajectories={4: replace(t, time_s=-t.time_s)})
+
+
+# --- hostile files ----------------------------------------------------------------------------
+
+
+def with_dataset(name, **how):
+    def change(file):
+        del file[f"{SET}/{name}"]
+        file[SET].create_dataset(name, **how)
+
+    return change
+
+
+def external_link(file):
+    del file[f"{SET}/score"]
+    file[f"{SET}/score"] = h5py.ExternalLink("/etc/passwd", "/x")
+
+
+def soft_link(file):
+    del file[f"{SET}/score"]
+    file[f"{SET}/score"] = h5py.SoftLink(f"/{SET}/base_score")
+
+
+def set_link(file):
+    file["sets/zz"] = h5py.SoftLink(f"/{SET}")
+
+
+def virtual(file):
+    n = len(file[f"{SET}/score"])
+    del file[f"{SET}/score"]
+    layout = h5py.VirtualLayout(shape=(n,), dtype="f8")
+    layout[:] = h5py.VirtualSource("other.h5", "x", shape=(n,))
+    file[SET].create_virtual_dataset("score", layout)
+
+
+def external_storage(file):
+    n = len(file[f"{SET}/score"])
+    del file[f"{SET}/score"]
+    file[SET].create_dataset("score", shape=(n,), dtype="f8", external=[("raw.bin", 0, 8 * n)])
+
+
+def scaled(file):
+    Ts = file[f"{SET}/T_obj_grasp"]
+    Ts[0, :3, :3] = 2 * Ts[0, :3, :3]
+
+
+def of_nan(file):
+    file[f"{SET}/T_obj_grasp"][1, 0, 3] = np.nan
+
+
+def negative_slip(file):
+    file[f"{SET}/slip_m"][0, 0] = -1.0
+
+
+def unknown_measure(file):
+    file[f"{SET}/measures"]["goodness"] = np.zeros(len(file[f"{SET}/score"]))
+
+
+def newer(file):
+    file.attrs["format_version"] = 99
+
+
+def another(file):
+    file.attrs["format"] = "something"
+
+
+def wrong_attribute(file):
+    file[SET].attrs["obj_id"] = "seven"
+
+
+def no_json(file):
+    del file[f"{SET}/parameters"]
+    file[f"{SET}/parameters"] = np.array(b"{not json", dtype="S9")
+
+
+def starts_beyond(file):
+    file[f"{SET}/trajectories/starts"][-1] = 10**9
+
+
+def phase_beyond(file):
+    file[f"{SET}/trajectories/phase"][0] = 17
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (external_link, "points elsewhere"),
+        (soft_link, "points elsewhere"),
+        (set_link, "points elsewhere"),
+        (virtual, "in another file"),
+        (external_storage, "in another file"),
+        (with_dataset("score", data=np.zeros(1)), "the shape"),
+        (with_dataset("score", data=np.array([b"x"] * 3)), "the kinds"),
+        (with_dataset("T_obj_grasp", shape=(2**40, 4, 4), dtype="f8", chunks=(1, 4, 4)), "GB"),
+        (with_dataset("T_obj_grasp", data=np.zeros((3, 4, 4)), compression="lzf"), "filter"),
+        (scaled, "not rigid"),
+        (of_nan, "NaN"),
+        (negative_slip, "slip_m"),
+        (unknown_measure, "no measure"),
+        (newer, "version is 99"),
+        (another, "format is not"),
+        (wrong_attribute, "obj_id"),
+        (no_json, "not JSON"),
+        (starts_beyond, "samples"),
+        (phase_beyond, "phase"),
+    ],
+)
+def test_a_file_that_is_not_ours_alone_is_refused(tmp_path, change, words):
+    path = write_grasps_hdf5(tmp_path / "g.h5", tried_scene(1))
+    with h5py.File(path, "r+") as file:
+        change(file)
+    with pytest.raises(InputError, match=words):
+        read_grasps_hdf5(path)
+
+
+def test_a_missing_file_and_one_of_another_kind_are_named(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        read_grasps_hdf5(tmp_path / "none.h5")
+    (tmp_path / "text.h5").write_text("no HDF5")
+    with pytest.raises(InputError, match="no HDF5 file"):
+        read_grasps_hdf5(tmp_path / "text.h5")
+
+
+def test_a_torn_file_ends_in_a_message_wherever_it_is_torn(tmp_path):
+    data = grasps_hdf5_bytes(tried_scene(2))
+    path = tmp_path / "torn.h5"
+    for share in np.linspace(0.02, 0.98, 25):
+        path.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(RealsimError):
+            read_grasps_hdf5(path)
+
+
+def test_an_export_that_fails_leaves_the_earlier_file(tmp_path, monkeypatch):
+    path = write_grasps_hdf5(tmp_path / "g.h5", tried_scene(1))
+    before = path.read_bytes()
+    monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
+    with pytest.raises(OSError, match="full"):
+        write_grasps_hdf5(path, tried_scene(2))
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["g.h5"]

@@ -1,0 +1,136 @@
+"""isaac_grasp YAML: any YAML reader reads it, and the grasps come back."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from ruamel.yaml import YAML
+from tried_grasps import tried_set
+
+from realsim.errors import InputError
+from realsim.formats.hand_frames import hand_poses
+from realsim.formats.isaac_grasp import read_isaac_grasp, write_isaac_grasp
+from realsim.formats.scene_grasps import executed
+from realsim.geometry import se3
+
+EXAMPLE = """
+format: isaac_grasp
+format_version: 1.0
+object_frame: /World/mug
+gripper_frame: /World/panda_hand
+grasps:
+  "grasp_0":
+    confidence: 1.0
+    position: [-0.04346, 0.06759, 0.19895]
+    orientation: {w: 0.00332, xyz: [0.98453, 0.16837, 0.04837]}
+    cspace_position: {panda_finger_joint1: 0.00943}
+    pregrasp_cspace_position: {panda_finger_joint1: 0.04}
+"""
+"""The example of the specification."""
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=15, deadline=None)
+def test_tried_grasps_written_and_read_are_the_same(tmp_path_factory, seed):
+    s = tried_set(np.random.default_rng(seed), 25)
+    path = tmp_path_factory.mktemp("ig") / "mug.yaml"
+    found, rows = read_isaac_grasp(write_isaac_grasp(path, s, object_frame="mug")), executed(s)
+    np.testing.assert_allclose(found.Ts_obj_grasp, s.Ts_obj_grasp[rows], rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(found.confidences, s.scores[rows])
+    np.testing.assert_array_equal(found.widths_m, s.widths_m[rows])
+    np.testing.assert_array_equal(found.openings_m, 0.08)
+    assert found.names == tuple(f"grasp_{row}" for row in np.flatnonzero(rows))
+    assert np.isnan(found.as_set(1).scores).all()
+
+
+def test_the_specifications_example_is_read(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text(EXAMPLE)
+    found = read_isaac_grasp(path)
+    T_hand = hand_poses(found.Ts_obj_grasp[0], "panda_hand")
+    np.testing.assert_allclose(T_hand[:3, 3], [-0.04346, 0.06759, 0.19895], atol=1e-15)
+    # A half turn about the axis (0.98453, 0.16837, 0.04837), nearly.
+    w = np.array([0.98453, 0.16837, 0.04837])
+    expected = 2 * np.outer(w, w) - np.eye(3)
+    np.testing.assert_allclose(T_hand[:3, :3], expected, atol=0.01)
+    assert found.widths_m[0] == 2 * 0.00943 and found.openings_m[0] == 0.08
+
+
+def test_the_quaternion_is_scalar_first_and_turns_the_right_way(tmp_path):
+    s = tried_set(np.random.default_rng(3), 25)
+    data = YAML(typ="safe").load(write_isaac_grasp(tmp_path / "a.yaml", s, object_frame="a"))
+    assert data["format"] == "isaac_grasp" and data["format_version"] == 1.0
+    assert data["gripper_frame_link"] == "panda_hand"
+    for row in np.flatnonzero(executed(s)):
+        entry = data["grasps"][f"grasp_{row}"]
+        w, (x, y, z) = entry["orientation"]["w"], entry["orientation"]["xyz"]
+        R = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        np.testing.assert_allclose(R, s.Ts_obj_grasp[row, :3, :3], atol=1e-14)
+
+
+def test_every_yaml_reader_takes_tiny_numbers_for_numbers(tmp_path):
+    """1e-05 without a dot is a text in YAML 1.1, which PyYAML and Isaac Sim speak."""
+    s = tried_set(np.random.default_rng(3), 25)
+    Ts = np.tile(se3.from_translation([1e-7, -3e-12, 0.1034]), (25, 1, 1))
+    path = write_isaac_grasp(tmp_path / "a.yaml", replace(s, Ts_obj_grasp=Ts), object_frame="a")
+    reader = YAML(typ="safe")
+    reader.version = "1.1"
+    for entry in reader.load(path)["grasps"].values():
+        assert [type(x) for x in entry["position"]] == [float] * 3
+
+
+def test_openings_and_the_least_score_are_kept(tmp_path):
+    s = tried_set(np.random.default_rng(5), 40)
+    s = replace(s, parameters={"openings_m": np.linspace(0.02, 0.08, 40).tolist()})
+    found = read_isaac_grasp(
+        write_isaac_grasp(tmp_path / "a.yaml", s, object_frame='a "b"', least_score=0.5)
+    )
+    rows = [int(name.removeprefix("grasp_")) for name in found.names]
+    assert rows == np.flatnonzero(executed(s) & s.good).tolist() and rows
+    np.testing.assert_array_equal(found.openings_m, np.linspace(0.02, 0.08, 40)[rows])
+    none = write_isaac_grasp(tmp_path / "n.yaml", s, object_frame="a", least_score=1.1)
+    assert len(read_isaac_grasp(none).Ts_obj_grasp) == 0
+
+
+def test_a_width_that_the_hand_cannot_take_is_refused(tmp_path):
+    s = tried_set(np.random.default_rng(5), 40)
+    for width in (0.09, np.nan):
+        with pytest.raises(InputError, match="width"):
+            write_isaac_grasp(
+                tmp_path / "a.yaml", replace(s, widths_m=np.full(40, width)), object_frame="a"
+            )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("format: isaac_grasp", "format: other"),
+        ("format_version: 1.0", "format_version: 2.0"),
+        ("format_version: 1.0", "format_version: [1]"),
+        ("confidence: 1.0", "confidence: 1.5"),
+        ("confidence: 1.0", "confidence: .nan"),
+        ("-0.04346, ", ""),
+        ("w: 0.00332", "w: 1.0"),
+        ("w: 0.00332, ", ""),
+        ("-0.04346", "left"),
+        ("grasps:", "other:"),
+        ("  \"grasp_0\":", "  - 7"),
+        ("grasps:", "grasps: !!python/object:os.system"),
+        ("format: isaac_grasp", "format: [isaac_grasp"),
+    ],
+)  # fmt: skip
+def test_what_is_no_isaac_grasp_file_is_refused(tmp_path, old, new):
+    assert old in EXAMPLE
+    path = tmp_path / "a.yaml"
+    path.write_text(EXAMPLE.replace(old, new, 1))
+    with pytest.raises(InputError):
+        read_isaac_grasp(path)

@@ -1,0 +1,327 @@
+"""MuJoCo holds what Coulomb's law holds, drops what it drops, and repeats itself to the bit."""
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.motion import SlipMotion, lift_acceleration, oscillation_acceleration
+from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.mujoco_world import MODELS_KEPT, MujocoEngine
+from realsim_sim_bridge.slip.world import Closing, Grips, SlipPhysics
+
+pytest.importorskip("mujoco")
+
+DOWN = np.diag([1.0, -1.0, -1.0])
+SIDE = 0.05
+GRAVITY = np.array([0.0, 0.0, -9.81])
+ENGINE = MujocoEngine(MujocoSettings())
+
+
+def cube(mass=0.125):
+    corners = np.array(list(product((-SIDE / 2, SIDE / 2), repeat=3)))
+    inertia = np.eye(3) * mass * SIDE**2 / 6
+    return SlipBody(parts=(corners,), mass_kg=mass, center_of_mass=np.zeros(3), inertia=inertia)
+
+
+def grips(Ts_obj_grasp=None, R=DOWN, opening=SIDE + 0.008):
+    """Grips by hands of rotation R; the cube is seen turned so that its faces meet the fingers."""
+    if Ts_obj_grasp is None:
+        Ts_obj_grasp = np.eye(4)[None]
+    n = len(Ts_obj_grasp)
+    Ts = se3.from_rt(np.broadcast_to(R, (n, 3, 3)), np.zeros((n, 3)))
+    return Grips(Ts_table_grasp=Ts, Ts_obj_grasp=Ts_obj_grasp, openings_m=np.full(n, opening))
+
+
+def scattered(n, seed=0):
+    """Return n grasps of the cube beside its middle and a little turned about x and z."""
+    rng = np.random.default_rng(seed)
+    turns = rng.uniform(-0.1, 0.1, (n, 3)) * [1, 0, 1]
+    return se3.from_rt(se3.exp_so3(turns), rng.uniform(-0.01, 0.01, (n, 3)) * [1, 0.2, 1])
+
+
+def world(body=None, given=None, physics=None, engine=ENGINE):
+    return engine.world(body or cube(), given or grips(), physics or SlipPhysics(), HandGeometry())
+
+
+def constant(force, steps, n=1, ramp=100):
+    """Return wrenches (n, steps, 6) of a force that grows within `ramp` steps."""
+    wrenches = np.zeros((n, steps, 6))
+    rise = np.minimum(1.0, np.arange(steps) / max(ramp, 1)) if ramp else np.ones(steps)
+    wrenches[:, :, 3:] = rise[:, None] * np.asarray(force)
+    return wrenches
+
+
+def slip_mm(hands, wrenches, sample=25, lost_m=0.05):
+    """Return how far each object of the closed hands went (K, S) [mm]."""
+    start = hands.states().Ts_world_body[:, None, :3, 3]
+    seen = hands.play(wrenches, sample, lost_m).Ts_world_body[:, :, :3, 3]
+    return 1e3 * np.linalg.norm(seen - start, axis=-1)
+
+
+def same(a, b):
+    """Return whether two states or motions are equal to the bit."""
+    return all(
+        np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True) for name in a.__slots__
+    )
+
+
+# --- laws -----------------------------------------------------------------------------------------
+
+
+def test_results_repeat_to_the_bit_and_do_not_depend_on_the_company():
+    given = grips(scattered(48))
+    loads = constant([0.0, 0.0, -90.0], 150, n=48)  # some slide, some are lost
+    together = []
+    for _ in range(2):
+        with world(given=given) as hands:
+            together.append((hands.close(Closing()), hands.play(loads, 10, 0.01), hands.states()))
+    assert all(same(a, b) for a, b in zip(*together, strict=True))
+    closed, played, states = together[0]
+    for row in (0, 17, 47):
+        with world(given=given.rows(np.array([row]))) as hands:
+            alone = hands.close(Closing())
+            ended = closed.Ts_world_body[row, -1]
+            assert np.array_equal(alone.Ts_world_body[0, -1], ended)
+            assert np.array_equal(alone.finger_n[0, -1], closed.finger_n[row, -1])
+            seen = hands.play(loads[:1], 10, 0.01)
+            assert np.array_equal(seen.finger_n[0], played.finger_n[row], equal_nan=True)
+            assert same(hands.states(), states.rows(np.array([row])))
+
+
+def test_states_carry_over_into_another_world():
+    given, loads = grips(scattered(3)), constant([0.0, 0.0, -60.0], 100, n=3)
+    with world(given=given) as hands, world(given=given) as other, world(given=given) as third:
+        hands.close(Closing())
+        states = hands.states()
+        other.put(states)
+        third.put(states)
+        back = other.states()
+        for name in states.__slots__:
+            assert np.allclose(getattr(back, name), getattr(states, name), rtol=0, atol=1e-12)
+        a, b, c = (w.play(loads, 20, 0.05) for w in (hands, other, third))
+        assert same(b, c)
+        assert np.allclose(a.Ts_world_body, b.Ts_world_body, rtol=0, atol=1e-7)
+        assert np.allclose(a.finger_n, b.finger_n, rtol=0, atol=1e-2)
+
+
+def test_a_free_object_moves_as_its_twist_and_its_wrench_say():
+    mass, steps = 0.3, 10
+    R = se3.exp_so3([0.3, -1.1, 0.7])
+    aside = se3.from_translation([0.0, 0.0, 0.3])[None]  # no finger touches the object
+    twist = np.array([1.0, -2.0, 3.0, 0.2, 0.5, -0.4])
+    wrench = np.array([2e-4, 1e-4, -3e-4, 0.3, -0.6, 0.9])
+    with world(cube(mass), grips(aside, R)) as hands:
+        start = hands.states()
+        moving = replace(start, twists=twist[None])
+        hands.put(moving)
+        assert np.allclose(hands.states().twists, twist, rtol=0, atol=1e-12)
+        hands.play(np.broadcast_to(wrench, (1, steps, 6)), steps, 1.0)
+        end = hands.states()
+    t = steps * hands.dt
+    inertia = mass * SIDE**2 / 6  # a cube's is the same about all axes
+    speeds = np.concatenate(
+        [twist[:3] + wrench[:3] / inertia * t, twist[3:] + wrench[3:] / mass * t]
+    )
+    assert np.allclose(end.twists[0], speeds, rtol=0, atol=1e-9)
+    way = end.Ts_world_body[0, :3, 3] - start.Ts_world_body[0, :3, 3]
+    assert np.allclose(way, 0.5 * (twist[3:] + speeds[3:]) * t, rtol=0, atol=1e-4)
+    turn = end.Ts_world_body[0, :3, :3] @ start.Ts_world_body[0, :3, :3].T
+    assert np.allclose(se3.log_so3(turn), 0.5 * (twist[:3] + speeds[:3]) * t, rtol=0, atol=2e-3)
+
+
+def test_turning_hand_and_load_together_changes_nothing_in_the_hand():
+    force = np.array([4.0, 5.0, -13.0])
+    found = []
+    for R in (np.eye(3), DOWN, se3.exp_so3([0.3, -1.1, 0.7])):
+        with world(given=grips(R=R), physics=SlipPhysics(force_n=20.0, friction=0.25)) as hands:
+            hands.close(Closing())
+            seen = hands.play(constant(R @ force, 100), 20, 0.05)
+        in_hand = R.T @ seen.Ts_world_body[0, :, :3, :]
+        found.append(np.concatenate([in_hand.ravel(), 1e-3 * seen.finger_n.ravel()]))
+    assert np.allclose(found[0], found[1], atol=1e-6) and np.allclose(found[0], found[2], atol=1e-6)
+    assert np.ptp(found[0].reshape(-1)) > 0
+
+
+@pytest.mark.parametrize("force_n", [2.0, 20.0, 70.0])
+def test_each_finger_presses_with_the_hand_s_force_and_carries_the_load_across(force_n):
+    across = 0.5 * force_n
+    with world(given=grips(R=np.eye(3)), physics=SlipPhysics(force_n=force_n)) as hands:
+        closed = hands.close(Closing())
+        assert np.allclose(closed.finger_n[0, -1], force_n, rtol=0.01)
+        held = hands.play(np.zeros((1, 200, 6)), 50, 0.05)
+        assert np.allclose(held.finger_n, force_n, rtol=0.01)
+        assert np.allclose(held.times_s, [0.1, 0.2, 0.3, 0.4])
+        pushed = hands.play(constant([0.0, across, 0.0], 300), 300, 0.05).finger_n[0, -1]
+    # The coupled fingers press with 2 F together; their difference carries the load (Newton).
+    assert pushed[0] - pushed[1] == pytest.approx(across, rel=0.01)
+    assert pushed.sum() == pytest.approx(2 * force_n, rel=0.01)
+
+
+# --- Coulomb --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("force_n", "friction"), [(2.0, 0.25), (20.0, 0.25), (70.0, 1.0)])
+@pytest.mark.parametrize("direction", [(0, 0, -1), (1, 0, 0), (0.7071, 0, -0.7071)])
+def test_coulomb_s_limit_is_met_within_three_percent(force_n, friction, direction):
+    capacity = 2 * friction * force_n
+    with world(cube(0.3), physics=SlipPhysics(force_n=force_n, friction=friction)) as hands:
+        hands.close(Closing())
+        closed = hands.states()
+        below = slip_mm(hands, constant(0.97 * capacity * np.array(direction), 250))
+        hands.put(closed)
+        above = slip_mm(hands, constant(1.03 * capacity * np.array(direction), 250))
+    assert below.max() < 0.03
+    assert np.nanmax(above) > 1.0
+
+
+def test_a_sliding_box_obeys_newton():
+    mass, capacity = 0.3, 10.0
+    with world(cube(mass), physics=SlipPhysics(force_n=20.0, friction=0.25)) as hands:
+        hands.close(Closing())
+        way = slip_mm(hands, constant([2 * capacity, 0, 0], 15, ramp=0), 15)[0, -1]
+    assert way == pytest.approx(1e3 * 0.5 * capacity / mass * (15 * 0.002) ** 2, rel=0.1)
+
+
+def test_no_more_than_4_um_a_second_creep_in_five_seconds_at_nine_tenths_of_the_limit():
+    with world(cube(0.3), physics=SlipPhysics(force_n=20.0, friction=0.25)) as hands:
+        hands.close(Closing())
+        slip = slip_mm(hands, constant([0, 0, -9.0], 2600), 100)[0]
+    assert slip[-1] - slip[1] < 0.02
+
+
+@pytest.mark.parametrize("mass", [0.125, 0.013])
+@pytest.mark.parametrize("settings", [MujocoSettings(), MujocoSettings.reference()])
+def test_a_box_sticks_through_lift_and_oscillation(mass, settings):
+    motion, engine = SlipMotion(), MujocoEngine(settings)
+    with world(cube(mass), engine=engine) as hands:
+        hands.close(Closing())
+        for a in (lift_acceleration(motion, hands.dt), oscillation_acceleration(motion, hands.dt)):
+            wrenches = np.zeros((1, len(a), 6))
+            wrenches[:, :, 3:] = mass * (GRAVITY - a)
+            before = hands.states().Ts_world_body
+            assert slip_mm(hands, wrenches).max() < 0.02
+            turn = np.swapaxes(before[0, :3, :3], 0, 1) @ hands.states().Ts_world_body[0, :3, :3]
+            assert np.degrees(se3.angle(turn)) < 0.05
+
+
+@pytest.mark.parametrize(("mass", "force_n"), [(0.125, 5.0), (0.013, 1.0)])
+def test_a_load_beyond_the_capacity_is_lost_although_light_objects_are_simulated_heavier(
+    mass, force_n
+):
+    weight = constant(mass * GRAVITY, 600)
+    with world(cube(mass), physics=SlipPhysics(force_n=force_n, friction=0.05)) as hands:
+        assert hands.settings()["object_mass_kg"] == pytest.approx(0.2)
+        hands.close(Closing())
+        assert not slip_mm(hands, weight)[0, -1] < 10.0
+    with world(cube(mass), physics=SlipPhysics(force_n=4 * force_n, friction=0.05)) as hands:
+        hands.close(Closing())
+        assert slip_mm(hands, weight).max() < 0.05
+
+
+# --- closing, losing, removing --------------------------------------------------------------------
+
+
+def test_fingers_that_meet_nothing_stop_at_the_middle_no_faster_than_they_may():
+    beside = np.repeat(se3.from_translation([0.0, 0.0, 0.2])[None], 1, axis=0)
+    with world(given=grips(beside, opening=0.06)) as hands:
+        seen = hands.close(Closing(sample_s=0.02))
+        assert not seen.finger_n.any()
+        assert seen.times_s[-1] >= 0.03 / 0.1 + 0.2
+        end = hands.states()
+    assert np.abs(end.fingers_m).max() < 3e-4 and np.abs(end.finger_speeds).max() < 1e-3
+    assert np.allclose(seen.Ts_world_body[0], seen.Ts_world_body[0, 0])
+
+
+def test_drag_slows_what_the_first_finger_pushes_and_is_gone_afterwards():
+    aside = np.repeat(se3.from_translation([0.0, 0.012, 0.0])[None], 1, axis=0)
+    least = []
+    for drag in (0.0, 30.0):
+        closing = Closing(drag_per_s=drag, sample_s=0.01)
+        with world(given=grips(aside, opening=0.08)) as hands:
+            start = hands.states().Ts_world_body[0, 1, 3]
+            seen = hands.close(closing)
+            least.append(np.abs(seen.Ts_world_body[0, :, 1, 3] - start))
+            assert hands.settings()["object_drag_per_s"] == 0.0
+            assert np.allclose(seen.finger_n[0, -1], 70.0, rtol=0.01)
+    # Both end in the middle; the free one runs ahead of the finger that hit it.
+    assert np.allclose([way[-1] for way in least], 0.012, atol=1e-3)
+    early = min(len(way) for way in least) // 3
+    assert least[1][:early].max() <= least[0][:early].max()
+
+
+def test_a_lost_pair_stops_and_a_removed_one_is_nan_and_neither_disturbs_the_others():
+    n = 3
+    with world(given=grips(np.repeat(np.eye(4)[None], n, axis=0))) as hands:
+        hands.close(Closing())
+        hands.remove(np.array([False, True, False]))
+        loads = constant([0.0, 0.0, -1.0], 600, n=n)
+        loads[2] *= 500.0
+        loads[1] = np.nan  # nobody looks
+        seen = hands.play(loads, 20, 0.05)
+        assert np.isfinite(seen.Ts_world_body[0]).all() and np.isnan(seen.finger_n[1]).all()
+        assert np.isfinite(seen.Ts_world_body[2, 0]).all()
+        assert np.isnan(seen.Ts_world_body[2, -1, :3]).all()
+        states = hands.states()
+        assert np.isnan(states.Ts_world_body[1, :3]).all() and hands.alive.tolist() == [1, 0, 1]
+        hands.put(states)  # NaN rows stay as they are
+        assert hands.alive.tolist() == [1, 0, 1]
+
+
+def test_every_step_is_played_whatever_the_sampling():
+    with world() as hands:
+        hands.close(Closing())
+        for steps, sample, stops in ((7, 3, [3, 6, 7]), (6, 3, [3, 6]), (2, 5, [2]), (0, 5, [])):
+            seen = hands.play(np.zeros((1, steps, 6)), sample, 0.05)
+            assert np.allclose(seen.times_s, np.array(stops) * hands.dt)
+            assert seen.Ts_world_body.shape == (1, len(stops), 4, 4)
+            assert np.isfinite(seen.Ts_world_body).all()
+
+
+# --- settings, models, bad input ------------------------------------------------------------------
+
+
+def test_settings_are_what_the_compiled_model_has():
+    physics = SlipPhysics(force_n=33.0, friction=0.4)
+    with world(cube(0.5), physics=physics) as hands:
+        found = hands.settings()
+    assert found["finger_friction"] == found["object_friction"] == 0.4
+    assert found["force_n"] == 33.0 and found["dt_s"] == hands.dt == 0.002
+    assert found["object_mass_kg"] == 0.5 and found["impratio"] == 1000.0
+    assert found["elliptic_cone"] == 1.0 and found["finger_damping"] == found["gravity"] == 0.0
+
+
+def test_one_model_is_compiled_per_content():
+    engine = MujocoEngine(MujocoSettings())
+    geometry = HandGeometry()
+    first = engine.pair(cube(), SlipPhysics(), geometry)
+    assert engine.pair(cube(), SlipPhysics(), geometry) is first
+    assert engine.pair(cube(), SlipPhysics(friction=0.5), geometry) is not first
+    for mass in range(1, MODELS_KEPT + 1):
+        engine.pair(cube(mass), SlipPhysics(), geometry)
+    assert engine.pair(cube(), SlipPhysics(), geometry) is not first
+    assert engine.name == "mujoco" and engine.version()[0].isdigit()
+    assert engine.replay.speed == 4 and engine.pairs_per_world == 48
+
+
+def test_bad_input_is_refused_in_words():
+    flat = replace(cube(), parts=(np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0.0]]),))
+    with pytest.raises(InputError, match="plane"):
+        world(flat)
+    with world() as hands:
+        with pytest.raises(InputError, match=r"\(1, 5, 3\)"):
+            hands.play(np.zeros((1, 5, 3)), 1, 0.05)
+        with pytest.raises(InputError, match="pair 0"):
+            hands.play(np.full((1, 5, 6), np.nan), 1, 0.05)
+
+
+def test_no_pairs_give_no_motion():
+    with world(given=grips(np.zeros((0, 4, 4)))) as hands:
+        assert hands.close(Closing()).Ts_world_body.shape == (0, 0, 4, 4)
+        assert hands.play(np.zeros((0, 5, 6)), 5, 0.05).finger_n.shape == (0, 1, 2)
+        assert hands.states().twists.shape == (0, 6)

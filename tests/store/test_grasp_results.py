@@ -1,0 +1,67 @@
+"""Grasp sets in a session: measures are kept, files of the first format are still read."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tried_grasps import assert_same, attempts_of, tried_set
+
+from realsim import store as stores
+from realsim.errors import InputError
+from realsim.records.grasps import MEASURES
+from realsim.store.trajectories import save_trajectories
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=15, deadline=None)
+def test_sets_with_measures_come_back_bit_for_bit(tmp_path_factory, seed):
+    folder = tmp_path_factory.mktemp("g")
+    s = tried_set(np.random.default_rng(seed), 12)
+    stores.save_grasps(folder, s)
+    assert_same(s, stores.load_grasps(folder)[0])
+
+
+def test_the_readable_side_says_what_was_measured(tmp_path):
+    s = tried_set(np.random.default_rng(1), 12, measures=("margin", "force_n"))
+    data = json.loads(stores.save_grasps(tmp_path, s).with_suffix(".json").read_text())
+    assert data["format_version"] == 2
+    assert data["measures"]["force_n"]["unit"] == MEASURES["force_n"].unit
+    for row, margin in zip(data["grasps"], s.measures["margin"], strict=True):
+        shown = row["measures"]["margin"]
+        assert (shown is None) == np.isnan(margin)
+        assert set(row["measures"]["force_n"]) == {"close", "lift", "oscillate", "pendulum"}
+    plain = json.loads(
+        stores.save_grasps(tmp_path, replace(s, measures={})).with_suffix(".json").read_text()
+    )
+    assert plain["measures"] == {} and "measures" not in plain["grasps"][0]
+
+
+def test_files_of_the_first_format_are_still_read(tmp_path):
+    s = tried_set(np.random.default_rng(1), 12, measures=())
+    path = stores.save_grasps(tmp_path, s)
+    note = path.with_suffix(".json")
+    head = json.loads(note.read_text())
+    head["format_version"] = 1
+    del head["measures"]
+    note.write_text(json.dumps(head))
+    assert_same(s, stores.load_grasps(tmp_path)[0])
+
+
+@pytest.mark.parametrize("found", [3, 0, "2", None])
+def test_a_newer_format_is_refused_by_its_number(tmp_path, found):
+    path = stores.save_grasps(tmp_path, tried_set(np.random.default_rng(1), 3))
+    note = path.with_suffix(".json")
+    note.write_text(json.dumps(json.loads(note.read_text()) | {"format_version": found}))
+    with pytest.raises(InputError, match="format version"):
+        stores.load_grasps(tmp_path)
+
+
+def test_trajectories_beside_the_sets_are_not_taken_for_sets(tmp_path):
+    rng = np.random.default_rng(1)
+    s = tried_set(rng, 12)
+    stores.save_grasps(tmp_path, s)
+    save_trajectories(tmp_path, s, attempts_of(rng, s))
+    assert len(stores.load_grasps(tmp_path)) == 1
