@@ -22,7 +22,7 @@ class RunByDefault(click.Group):
 
 
 @click.group("school", cls=RunByDefault)
-def SCHOOL() -> None:  # noqa: N802 - a group is a constant of the command line
+def SCHOOL() -> None:
     """Try grasps by physics: reach, close, lift, shake, swing.
 
     \b
@@ -50,7 +50,9 @@ def SCHOOL() -> None:  # noqa: N802 - a group is a constant of the command line
 @click.option("--friction", type=float, default=None, help="Coulomb coefficient.  [1.0]")
 @click.option("--density", type=float, default=None,
               help="Of all objects that are not weighed [kg/m^3].  [the models' own, 1000]")  # fmt: skip
-@click.option("--mass", "masses", multiple=True, metavar="NAME=KG", help="A weighed object; repeat.")
+@click.option(
+    "--mass", "masses", multiple=True, metavar="NAME=KG", help="A weighed object; repeat."
+)
 @click.option("--base-pose", type=FOLDER, default=None,
               help="JSON with T_world_base or T_table_base.  [above the table, tilted]")  # fmt: skip
 @click.option("--points", type=click.IntRange(1, 1_000_000), default=None,
@@ -123,7 +125,9 @@ def validate_command(
 @SCHOOL.command("settle")
 @click.argument("source", type=FOLDER)
 @click.option("--models", type=FOLDER, default=None, help="Models of a SOURCE that is no session.")
-@click.option("--mass", "masses", multiple=True, metavar="NAME=KG", help="A weighed object; repeat.")
+@click.option(
+    "--mass", "masses", multiple=True, metavar="NAME=KG", help="A weighed object; repeat."
+)
 @click.option("--density", type=float, default=None, help="Of the others [kg/m^3].")
 @click.option("--out", type=FOLDER, default=None, help="Folder for the picture.")
 @click.option("--json", "json_file", type=FOLDER, default=None, help="Write the table there, too.")

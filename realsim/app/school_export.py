@@ -1,16 +1,19 @@
-"""Grasps of the school in other programs' formats."""
+"""Grasps of the school in other programs' formats, and figures over many schools."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from realsim.app.console import Console
 from realsim.app.school_files import MODELS, stored_grasps
+from realsim.app.school_tables import SUMMARY_HEADER, agreement_line, setting_lines
 from realsim.errors import InputError
 from realsim.formats.scene_grasps import SceneGrasps
 from realsim.records import GraspSet
+from realsim.store import atomic
 from realsim.store.results import grasp_stem
 
 if TYPE_CHECKING:
@@ -103,3 +106,33 @@ def acronym_object(s: GraspSet, mesh: str) -> "AcronymObject":
         volume_m3=mass / density if mass and density else None,
         center_of_mass=None if center is None else np.asarray(center, dtype=np.float64),
     )
+
+
+def summarise(sources: Sequence[Path], json_file: Path | None, console: Console) -> None:
+    """Show the paper's statistics over many sessions or folders of results.
+
+    Raises:
+        InputError: one of them has no results, or is given twice.
+    """
+    from realsim_sim_bridge.school.summary import summarise as summary_of
+
+    scenes: dict[str, Sequence[GraspSet]] = {}
+    for source in sources:
+        key = str(source.resolve())
+        if key in scenes:
+            raise InputError(f"'{source}' is given twice; its grasps would count twice.")
+        scenes[key] = stored_grasps(source)[0].sets
+    summary = summary_of(scenes)
+    number = "one scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
+    console.table(f"Robot School of {number}", SUMMARY_HEADER, summary.to_rows())
+    sets = [s for part in scenes.values() for s in part]
+    settings = setting_lines(sets)
+    if len(settings) > 1:
+        console.warn(
+            "these scenes were tried at different settings; their scores are no one thing:"
+        )
+    for line in (*settings, agreement_line(sets)):
+        if line:
+            console.say(line)
+    if json_file is not None:
+        atomic.write_json(json_file, summary.to_json())

@@ -1,11 +1,11 @@
 """What a school leaves behind: the sets, tables for other programs, the page, and all of it read back.
 
-    grasps/000002_obj000007.npz .json   every set, exact and readable
-    grasps/trajectories/                what the arm did
-    grasps/grasps.h5                    everything in one file
-    grasps/grasps.parquet trajectories.parquet
-    models/                             the meshes, where the scene came from another program
-    reports/school.html school.json     the page, and its counts for programs
+grasps/000002_obj000007.npz .json   every set, exact and readable
+grasps/trajectories/                what the arm did
+grasps/grasps.h5                    everything in one file
+grasps/grasps.parquet trajectories.parquet
+models/                             the meshes, where the scene came from another program
+reports/school.html school.json     the page, and its counts for programs
 """
 
 from collections.abc import Mapping

@@ -114,33 +114,23 @@ def read_inputs(
     Raises:
         InputError: nothing usable there, a folder missing or not wanted, or an unknown object.
     """
-    if is_session(source) or (out is None and source.is_dir() and not _known_elsewhere(source)):
+    if is_session(source):
         if out is not None:
             raise InputError(
                 f"'{source}' is a session, which keeps its own results; leave --out away, or use "
                 "`realsim school export` to write them elsewhere."
             )
-        found = _of_session(source, console)
-    else:
-        if out is None:
-            raise InputError(
-                f"'{source}' is no session, so its results need a folder: give --out FOLDER."
-            )
-        if is_session(out):
-            raise InputError(f"--out '{out}' is a session; give a folder of its own.")
-        found = _of_source(source, out, request, console)
-    return weighed(found, request)
-
-
-def _known_elsewhere(source: Path) -> bool:
-    """Return whether a folder holds a scene of another program."""
-    from realsim_sim_bridge.scenes.source import load_scene_source
-
-    try:
-        load_scene_source(source)
-    except InputError:
-        return False
-    return True
+        return weighed(_of_session(source, console), request)
+    if out is None:
+        inner = sorted(p.parent for p in source.glob("*/session.json")) if source.is_dir() else []
+        hint = f" Did you mean {', '.join(map(str, inner))}?" if inner else ""
+        raise InputError(
+            f"'{source}' holds no session.json, so it is not a session.{hint} Give a session, or "
+            "a BOP scene, a GraspNet scene or a scene.yaml with --out FOLDER for its results."
+        )
+    if is_session(out):
+        raise InputError(f"--out '{out}' is a session; give a folder of its own.")
+    return weighed(_of_source(source, out, request, console), request)
 
 
 def _of_session(folder: Path, console: Console) -> SchoolInputs:
@@ -158,9 +148,7 @@ def _of_session(folder: Path, console: Console) -> SchoolInputs:
     )
 
 
-def _of_source(
-    source: Path, out: Path, request: SchoolRequest, console: Console
-) -> SchoolInputs:
+def _of_source(source: Path, out: Path, request: SchoolRequest, console: Console) -> SchoolInputs:
     """Return the scene of another program's files."""
     from realsim_sim_bridge.scenes.school_scene import Matter
     from realsim_sim_bridge.scenes.source import load_scene_source

@@ -13,6 +13,7 @@ from realsim.app.school_tables import (
     FILTER_HEADER,
     REASON_HEADER,
     SCHOOL_HEADER,
+    SUMMARY_HEADER,
     Names,
     agreement_line,
     filter_rows,
@@ -20,7 +21,7 @@ from realsim.app.school_tables import (
     not_tried,
     reason_rows,
     school_rows,
-    setting_line,
+    setting_lines,
 )
 from realsim.records import GraspSet
 
@@ -63,12 +64,16 @@ def page_bytes(
         models: the objects by id.
         pictures: file name -> PNG; empty and missing ones are left out.
     """
+    from realsim_sim_bridge.school.summary import summarise
+
     page = Page(parts=[STYLE])
-    page.section("Objects", f"{setting_line(sets)} {MEANING}".strip())
+    page.section("Objects", " ".join([*setting_lines(sets), MEANING]))
     page.table(SCHOOL_HEADER, school_rows(sets, models))
     for words in (agreement_line(sets), *not_tried(sets, models)):
         if words:
             page.parts.append(f'<p class="note">{html.escape(words)}</p>')
+    page.section("Summary", "Row by row as in the paper's table of statistics.")
+    page.table(SUMMARY_HEADER, summarise(sets).to_rows())
     for file, (title, caption) in CAPTIONS.items():
         if pictures.get(file):
             page.section(title)

@@ -85,7 +85,11 @@ def _panel(s: GraspSet, models: Names, T_table_obj: Array) -> Rgb:
     T_table_cam[:3, 3] /= factor
     T_cam_obj = se3.invert(T_table_cam) @ T_table_obj
     rgb = draw_grasps(rgb, view.intrinsics, T_cam_obj, s, rows)
-    legend = [("holds", score_color(1.0)), ("half way", score_color(0.5)), ("lost", score_color(0.0))]
+    legend = [
+        ("holds", score_color(1.0)),
+        ("half way", score_color(0.5)),
+        ("lost", score_color(0.0)),
+    ]
     return draw_legend(rgb, legend)
 
 
@@ -97,7 +101,9 @@ def margins_png(sets: Sequence[GraspSet], models: Names) -> bytes:
     columns: Mapping[str, str] = {
         "least_friction": "friction", "least_force_n": "force of a finger [N]"
     }  # fmt: skip
-    swept = [s for s in sets if all(np.isfinite(s.measures.get(c, np.zeros(0))).any() for c in columns)]
+    swept = [
+        s for s in sets if all(np.isfinite(s.measures.get(c, np.zeros(0))).any() for c in columns)
+    ]
     if not swept:
         return b""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

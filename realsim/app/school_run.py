@@ -60,9 +60,7 @@ def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
     return config
 
 
-def run(
-    source: Path, out: Path | None, request: SchoolRequest, console: Console
-) -> SchoolOutcome:
+def run(source: Path, out: Path | None, request: SchoolRequest, console: Console) -> SchoolOutcome:
     """Try grasps on a scene and write everything that comes out of it.
 
     Args:

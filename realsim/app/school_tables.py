@@ -1,5 +1,6 @@
 """What Robot School found, as rows of tables and as words: for the console and for the page."""
 
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -99,7 +100,7 @@ def _kind(failure: str) -> str:
     stage, mark, why = failure.partition(": ")
     if mark and stage in STAGES and "slipped" in why and "turned" in why:
         return f"{stage}: the object slipped or turned too far"
-    return failure
+    return re.sub(r"\d+\.\d+", "...", failure)
 
 
 def reason_rows(sets: Sequence[GraspSet]) -> Rows:
@@ -151,21 +152,22 @@ def agreement_line(sets: Sequence[GraspSet]) -> str:
     )
 
 
-def setting_line(sets: Sequence[GraspSet]) -> str:
-    """Return in one line what the labels hang on: engine, force, friction, density."""
+def setting_lines(sets: Sequence[GraspSet]) -> list[str]:
+    """Return what the labels hang on, a line for each setting: engine, force, friction, density."""
+    densities: dict[str, set[str]] = {}
     for s in sets:
         slip: dict[str, Any] = (s.parameters.get("config") or {}).get("slip") or {}
         physics: dict[str, Any] = slip.get("physics") or {}
         if physics:
-            densities = sorted({float(x.parameters["density"]) for x in sets
-                                if x.parameters.get("density") is not None})  # fmt: skip
-            weight = ", ".join(f"{d:g}" for d in densities) or "unknown"
-            return (
-                f"labels hold at {physics['force_n']:g} N a finger, friction "
-                f"{physics['friction']:g}, density {weight} kg/m^3"
-                f"{_engine_of(s)}."
+            at = (
+                f"{physics['force_n']:g} N a finger, friction {physics['friction']:g}"
+                f"{_engine_of(s)}"
             )
-    return ""
+            densities.setdefault(at, set()).add(f"{s.parameters.get('density', float('nan')):g}")
+    return [
+        f"labels hold at {at}, density {', '.join(sorted(d, key=float))} kg/m^3 where not weighed."
+        for at, d in densities.items()
+    ]
 
 
 def _engine_of(s: GraspSet) -> str:
@@ -190,6 +192,9 @@ def not_tried(sets: Sequence[GraspSet], models: Names) -> list[str]:
     return words
 
 
+SUMMARY_HEADER = ["property", "here", "in the paper"]
+
+
 def show_school(sets: Sequence[GraspSet], models: Names, console: Console) -> None:
     """Print the outcome of a run."""
     console.table("Robot School", SCHOOL_HEADER, school_rows(sets, models))
@@ -198,7 +203,7 @@ def show_school(sets: Sequence[GraspSet], models: Names, console: Console) -> No
     stopped = reason_rows(sets)
     if stopped:
         console.table("Why grasps stopped", REASON_HEADER, stopped)
-    for line in (setting_line(sets), agreement_line(sets)):
+    for line in (*setting_lines(sets), agreement_line(sets)):
         if line:
             console.say(line)
 
@@ -233,6 +238,6 @@ def as_json(sets: Sequence[GraspSet], models: Names) -> dict[str, Any]:
             "objects": objects,
             "reasons": reasons(sets),
             "agreement": agree if found.count else None,
-            "setting": setting_line(sets),
+            "settings": setting_lines(sets),
         }
     )

@@ -7,8 +7,7 @@ Metres, world z up. The file does not say in which order its quaternions are wri
 has to prove it: read in the right order, the objects stand at one height and the grasps' contacts
 lie on the objects. USD files are read from the STL of the same name.
 
-The grasps' frame is ours (y closing, z approach, origin midway between the contacts); that is
-checked on the surfaces, not believed.
+Grasps are in `graspit_grasps`.
 """
 
 from collections.abc import Mapping
@@ -20,7 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.graspit_contacts import contact_distances, midway_error
+from realsim.formats.graspit_contacts import midway_error
+from realsim.formats.graspit_grasps import (
+    GRASP_FILE,
+    SAMPLED_GRASPS,
+    WorldGrasps,
+    object_grasps,
+    read_grasp_file,
+)
 from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh
 from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
@@ -28,14 +34,10 @@ from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
 Array = NDArray[np.float64]
 QuaternionOrder = Literal["wxyz", "xyzw"]
 ORDERS: tuple[QuaternionOrder, ...] = get_args(QuaternionOrder)
-SCENE_FILE, GRASP_FILE, TABLE = "scene.yaml", "grasps.hdf5", "table"
+SCENE_FILE, TABLE = "scene.yaml", "table"
 LARGEST_YAML = 4_000_000
 """[bytes]: ten thousand objects; a scene has ten."""
 MOST_OBJECTS = 1000
-MOST_GRASPS = 1_000_000
-"""Of one object."""
-SAMPLED_GRASPS = 40
-"""Grasps of an object whose contacts are looked at: enough for a median."""
 TABLE_TOLERANCE_M = 0.003
 """Objects whose lowest points differ by less stand on the same plane: physics left them there, with
 the engine's own tolerance."""
@@ -43,10 +45,6 @@ CLEARER = 3.0
 """The right order's evidence is at least so many times better than the wrong one's..."""
 EVIDENCE_FLOOR_M = 0.001
 """...after this is added to both: the grasps were snapped to samples a millimetre apart."""
-ON_SURFACE_M = 0.005
-"""Grasps whose middle misses the contacts' middle by more (median) are not of these objects."""
-HAND_M = 0.1
-"""The palm stands about so far behind the fingertips."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -57,18 +55,6 @@ class OrderEvidence:
     """Median distance of the objects' lowest points from their common height [m]."""
     midway_m: float
     """Median distance of a grasp's origin from the middle of its contacts [m]."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class WorldGrasps:
-    """The grasps of one object, each with its half turn about the approach axis."""
-
-    obj_id: int
-    instance: int
-    Ts_obj_grasp: Array
-    """(N, 2, 4, 4) [m]."""
-    widths_m: Array
-    """(N,) distance of the outer contacts along the closing axis [m]; NaN = it meets no surface."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -143,7 +129,7 @@ def read_graspit_scene(
     grasp_file = _beside(path.parent, str(data.get("grasp_path", GRASP_FILE)))
     notes = [] if grasp_file else ["there is no grasps.hdf5 beside the scene."]
     placed = _placed(entries, grasp_file)
-    evidence = {o: _evidence(placed, o) for o in ORDERS}
+    evidence: dict[QuaternionOrder, OrderEvidence] = {o: _evidence(placed, o) for o in ORDERS}
     if order is None:
         order, said = _proven(placed, evidence, path)
         notes.append(said)
@@ -170,43 +156,14 @@ def read_graspit_scene(
 
 
 def read_graspit_grasps(found: GraspitScene) -> list[WorldGrasps]:
-    """Return the grasps of the scene's objects, in the objects' frames.
+    """Return the grasps of the scene's objects; see `object_grasps`.
 
     Raises:
-        InputError: no file, damaged, of other objects, or in another frame than its authors' code
-            writes: y does not close on the surface, or z points out of the table.
+        InputError: there is no file, or as `object_grasps`.
     """
     if found.grasp_file is None:
         raise InputError(f"scene '{found.scene.name}' has no {GRASP_FILE} beside it.")
-    by_name = _read_grasp_file(found.grasp_file)
-    sets: list[WorldGrasps] = []
-    for o in found.scene.objects:
-        model = found.models[o.obj_id]
-        Ts_world = by_name.get(model.name)
-        if Ts_world is None:
-            continue
-        where = f"{found.grasp_file.name}, '{model.name}'"
-        half_turn = se3.invert(Ts_world[:, 0]) @ Ts_world[:, 1]
-        if np.abs(half_turn - np.diag([-1.0, -1.0, 1.0, 1.0])).max(initial=0.0) > 1e-4:
-            raise InputError(
-                f"{where}: the second pose of a grasp is not its half turn about z; pairs of a "
-                "grasp and its flip about the approach axis are expected."
-            )
-        Ts_obj = se3.invert(o.T_world_obj) @ Ts_world
-        reach = contact_distances(model.mesh, Ts_obj[:, 0], "y")
-        _require_our_frame(model.mesh, Ts_obj[:, 0], where)
-        _require_from_above(Ts_world[:, 0], found.scene.plane, where)
-        sets.append(
-            WorldGrasps(
-                obj_id=o.obj_id, instance=o.instance, Ts_obj_grasp=Ts_obj, widths_m=reach.sum(1)
-            )
-        )
-    if not sets:
-        raise InputError(
-            f"{found.grasp_file} has grasps of {', '.join(by_name) or 'nothing'}, and the scene "
-            f"has {', '.join(m.name for m in found.models.values())}: none of them is common."
-        )
-    return sets
+    return object_grasps(found.grasp_file, found.scene, found.models)
 
 
 # --- the file -----------------------------------------------------------------------------------
@@ -243,9 +200,7 @@ def _entries(data: dict[str, Any], path: Path, meshes: Path | None) -> list[_Ent
             continue
         fields = cast("Mapping[str, Any]", value)
         where = f"'{key}' of {path}"
-        lacking = [
-            k for k in ("file_path", "name", "orientation", "position") if k not in fields
-        ]
+        lacking = [k for k in ("file_path", "name", "orientation", "position") if k not in fields]
         if lacking:
             raise InputError(f"{where} has no {', '.join(lacking)}.")
         if key == TABLE or fields["name"] == TABLE:
@@ -302,7 +257,7 @@ def _mesh_file(name: str, folder: Path, meshes: Path | None, where: str) -> Path
 
 
 def _placed(entries: list[_Entry], grasp_file: Path | None) -> list[_Placed]:
-    grasps = _read_grasp_file(grasp_file) if grasp_file is not None else {}
+    grasps = read_grasp_file(grasp_file) if grasp_file is not None else {}
     known: dict[tuple[Path, tuple[float, float, float]], Mesh] = {}
     placed: list[_Placed] = []
     for e in entries:
@@ -314,30 +269,6 @@ def _placed(entries: list[_Entry], grasp_file: Path | None) -> list[_Placed]:
         some = Ts[:: max(1, len(Ts) // SAMPLED_GRASPS)]
         placed.append(_Placed(entry=e, mesh=known[key], Ts_world_grasp=some))
     return placed
-
-
-def _read_grasp_file(path: Path) -> dict[str, Array]:
-    """Return Ts_world_grasp (N, 2, 4, 4) by the object's name."""
-    import h5py
-
-    found: dict[str, Array] = {}
-    try:
-        with h5py.File(path, "r") as file:
-            for name in file:
-                data: Any = file[name]
-                shape = getattr(data, "shape", ())
-                if len(shape) != 4 or shape[1:] != (2, 4, 4) or shape[0] > MOST_GRASPS:
-                    raise InputError(
-                        f"{path}: '{name}' has the shape {shape}; (N, 2, 4, 4) is expected, at "
-                        f"most {MOST_GRASPS} grasps."
-                    )
-                found[str(name)] = np.asarray(data[()], dtype=np.float64)
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise InputError(f"{path} is not an HDF5 file of grasps ({error}).") from error
-    return {
-        n: se3.check_rigid(T, f"the grasps of '{n}' in {path}") if len(T) else T
-        for n, T in found.items()
-    }
 
 
 # --- what the content proves --------------------------------------------------------------------
@@ -373,7 +304,8 @@ def _proven(
         InputError: nothing speaks for either, or one thing for each.
     """
     a, b = (evidence[o] for o in ORDERS)
-    votes = {v for v in (_vote(a.spread_m, b.spread_m), _vote(a.midway_m, b.midway_m)) if v}
+    given = (_vote(a.spread_m, b.spread_m), _vote(a.midway_m, b.midway_m))
+    votes: set[QuaternionOrder] = {v for v in given if v is not None}
     words = "; ".join(
         f"{o}: lowest points within {1e3 * e.spread_m:.1f} mm, grasps "
         f"{1e3 * e.midway_m:.1f} mm off the middle of their contacts"
@@ -381,8 +313,10 @@ def _proven(
     )
     if len(votes) == 1:
         order = votes.pop()
-        return order, f"quaternions are in the order {order[0]} {order[1]} {order[2]} {order[3]} " + (
-            f"({words})."
+        return (
+            order,
+            f"quaternions are in the order {order[0]} {order[1]} {order[2]} {order[3]} "
+            + (f"({words})."),
         )
     Ts = [np.stack([p.T_world_obj(o) for p in placed]) for o in ORDERS]
     if np.abs(Ts[0] - Ts[1]).max() < 1e-9:
@@ -430,34 +364,3 @@ def _leaning(placed: list[_Placed], Ts: list[Array], plane: SupportPlane) -> lis
         if abs(g) > TABLE_TOLERANCE_M / 2
     ]
     return [f"not at the table's height: {', '.join(off)}."] if off else []
-
-
-def _require_our_frame(mesh: Mesh, Ts_obj_grasp: Array, where: str) -> None:
-    """Raise unless the grasps close along y, midway between two contacts."""
-    some = Ts_obj_grasp[:: max(1, len(Ts_obj_grasp) // SAMPLED_GRASPS)]
-    if len(some) == 0:
-        return
-    off = float(np.median(midway_error(mesh, some, "y")))
-    if off > ON_SURFACE_M:
-        others = ", ".join(
-            f"{1e3 * float(np.median(midway_error(mesh, some, a))):.1f} mm along {a}"
-            for a in ("x", "z")
-        )
-        raise InputError(
-            f"{where}: the grasps' origins are {1e3 * off:.1f} mm (median) off the middle of their "
-            f"contacts along y ({others}); at most {1e3 * ON_SURFACE_M:g} mm is accepted. Are they "
-            "of another scene, or is y not the closing axis?"
-        )
-
-
-def _require_from_above(Ts_world_grasp: Array, plane: SupportPlane | None, where: str) -> None:
-    """Raise if more hands would stand in the table than behind the opposite approach."""
-    if plane is None or len(Ts_world_grasp) == 0:
-        return
-    z, at = Ts_world_grasp[:, 2, 2], Ts_world_grasp[:, 2, 3] - plane.T_world_table[2, 3]
-    inside, opposite = np.mean(at - HAND_M * z < 0), np.mean(at + HAND_M * z < 0)
-    if inside > opposite and inside > 0.1:
-        raise InputError(
-            f"{where}: in {100 * inside:.0f} % of the grasps the palm would stand below the table; "
-            "z is not the approach direction of these grasps."
-        )

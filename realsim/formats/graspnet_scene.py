@@ -57,7 +57,11 @@ def cameras_of(folder: Path) -> list[str]:
 
 
 def read_graspnet_scene(
-    folder: Path | str, models: Path | str | None = None, *, camera: str | None = None, view: int = 0
+    folder: Path | str,
+    models: Path | str | None = None,
+    *,
+    camera: str | None = None,
+    view: int = 0,
 ) -> GraspnetScene:
     """Read one scene.
 

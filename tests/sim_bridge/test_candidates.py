@@ -1,10 +1,18 @@
 """Antipodal candidates: their geometry, what is filtered, and that chance is the seed's alone."""
 
 import numpy as np
+import pytest
 
+from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.parts import part
 from realsim.records import Mesh
-from realsim_sim_bridge.grasping.candidates import CandidateConfig, Surroundings, sample_candidates
+from realsim_sim_bridge.grasping.candidates import (
+    CandidateConfig,
+    Surroundings,
+    sample_candidates,
+    standing_object,
+)
 from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.grasping.hand_free import boxes_free, lowest_corner
 
@@ -36,20 +44,29 @@ def candidates(mesh, height=0.025, seed=0, surroundings=None, limit=60):
 def test_contacts_lie_on_the_surface_and_inside_both_friction_cones():
     found = candidates(box())
     assert 0 < len(found.widths_m) <= 60
+    y, z = found.Ts_obj_grasp[:, :3, 1], found.Ts_obj_grasp[:, :3, 2]
+    middle = found.Ts_obj_grasp[:, :3, 3] + found.contact_depths_m[:, None] * z
     for side in (-0.5, 0.5):
-        y = found.Ts_obj_grasp[:, :3, 1]
-        contact = found.Ts_obj_grasp[:, :3, 3] + side * found.widths_m[:, None] * y
+        contact = middle + side * found.widths_m[:, None] * y
         # On a box the outermost coordinate is the face's.
         assert np.allclose(np.abs(contact).max(axis=1), 0.025, atol=1e-6)
         face = np.argmax(np.abs(contact), axis=1)
         assert np.all(np.abs(np.take_along_axis(y, face[:, None], 1)) >= np.sqrt(0.5) - 1e-6)
 
 
-def test_counts_add_up():
-    c = candidates(box()).counts
-    taken = c["hand_in_table"] + c["hand_in_object"] + c["hand_in_neighbour"]
-    assert c["turned"] == 8 * c["antipodal_pairs"] and c["free"] == c["turned"] - taken
-    assert c["kept"] == min(60, c["free"]) and c["hand_in_table"] > 0
+def test_each_filter_s_counts_add_up_to_what_came_in():
+    near = standing_object(box(), se3.from_translation([0.09, 0.0, 0.025]), 1, 500)
+    c = candidates(box(0.05, 0.05, 0.09), height=0.045, surroundings=near).counts
+    assert c["surface_points"] == c["points_without_pair"] + c["antipodal_points"] == 400
+    assert c["exits"] == sum(
+        c[k] for k in ("too_near", "too_wide", "outside_cone", "antipodal_pairs")
+    )
+    assert c["turned"] == CandidateConfig().rotations * c["antipodal_pairs"]
+    assert c["turned"] == sum(
+        c[k] for k in ("hand_in_table", "hand_in_object", "hand_in_neighbour", "free")
+    )
+    assert c["free"] == c["not_chosen"] + c["kept"] and c["kept"] == 60
+    assert min(c[f"hand_in_{what}"] for what in ("table", "object", "neighbour")) > 0
 
 
 def test_same_seed_same_bytes_and_another_seed_others():
@@ -104,3 +121,60 @@ def test_boxes_free_agrees_with_looking_at_each_point():
     expected = ~inside.all(axis=-1).any(axis=(1, 2))
     assert np.array_equal(boxes_free(boxes, Ts, points, 1e-3), expected)
     assert 0 < expected.sum() < 40
+
+
+@pytest.mark.parametrize(
+    ("name", "up"),
+    [("flange", 1.0), ("flange", -1.0), ("wedge", 1.0), ("bowl", 1.0), ("bowl", -1.0)],
+)
+def test_flat_parts_on_a_table_are_grasped_where_a_hand_fits(name, up):
+    mesh = part(name).mesh
+    T = np.diag([1.0, up, up, 1.0])
+    T[2, 3] = -np.min(up * mesh.vertices[:, 2])
+    found = sample_candidates(
+        mesh, T, Surroundings(), CandidateConfig(), HAND, np.random.default_rng(0), 60
+    )
+    assert len(found.widths_m) >= 10
+
+
+def test_contacts_nearer_to_the_tips_let_the_fingers_clear_a_table():
+    plate = box(0.04, 0.04, 0.02)
+    T = se3.from_translation([0.0, 0.0, 0.01])
+    found = {}
+    for depths in ((0.0,), (0.0, 0.003, 0.006)):
+        config = CandidateConfig(surface_points=300, contact_depths_m=depths)
+        rng = np.random.default_rng(0)
+        found[depths] = sample_candidates(plate, T, Surroundings(), config, HAND, rng, 10**6)
+    centred, shifted = found.values()
+    assert shifted.counts["free"] > 1.5 * centred.counts["free"]
+    assert set(shifted.contact_depths_m.tolist()) == {0.0, 0.003, 0.006}
+    # Who can stand centred does.
+    assert np.sum(shifted.contact_depths_m == 0.0) == centred.counts["free"]
+
+
+def test_a_thin_neighbour_that_points_miss_stops_the_hand_by_its_triangles():
+    sheet = box(0.0004, 0.2, 0.2)
+    T = se3.from_translation([0.04, 0.0, 0.1])
+    exact = standing_object(sheet, T, 1, 4)
+    points = Surroundings(points=exact.points[:4], instances=exact.instances[:4])
+    with_triangles, with_points = (
+        candidates(box(), surroundings=s).counts for s in (exact, points)
+    )
+    assert with_triangles["hand_in_neighbour"] > 1.3 * with_points["hand_in_neighbour"] > 0
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("surface_points", 0),
+        ("rotations", 0),
+        ("friction", 0.0),
+        ("friction", float("nan")),
+        ("spread_m", 0.0),
+        ("contact_depths_m", ()),
+        ("opening_margins_m", (0.001,)),
+    ],
+)
+def test_impossible_settings_are_named(field, value):
+    with pytest.raises(InputError, match="candidates"):
+        CandidateConfig(**{field: value})

@@ -16,9 +16,9 @@ from realsim_sim_bridge.school.cross_check import (
     cross_check,
     wilson_interval,
 )
-from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
+from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import SlipPhysics
 

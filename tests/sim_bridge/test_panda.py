@@ -1,18 +1,18 @@
-"""The Panda: kinematics, limits, and whether grasps are reached."""
+"""The Panda: kinematics, limits, and its URDF."""
 
-from itertools import pairwise
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from realsim.geometry import se3
 from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.grasping.candidates import Surroundings
+from realsim_sim_bridge.arm.chain import follow_lines, frames_into
+from realsim_sim_bridge.arm.panda_urdf import panda_urdf
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.arm.joint_path import PlannerConfig, connect, straight
-from realsim_sim_bridge.arm.reach import ReachConfig, ReachTask, base_on_table, check_reach
+from realsim_sim_bridge.slip.hand_urdf import hand_urdf
+from realsim_sim_bridge.slip.pads import PadModel
 
-DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
 
 
@@ -62,92 +62,112 @@ def test_joint_5_s_axis_in_the_grasp_frame_stays_when_joint_5_turns():
     assert np.allclose(se3.transform(turned, point[:, None]), world_point, atol=1e-12)
 
 
-def test_spheres_contain_their_capsules():
-    spheres = panda.spheres_of(panda.ARM_CAPSULES)
-    rng = np.random.default_rng(0)
-    for c in panda.ARM_CAPSULES:
-        axis = rng.random((300, 1)) * (np.array(c.end) - c.start) + c.start
-        on = rng.normal(size=(300, 3))
-        points = axis + c.radius_m * on / np.linalg.norm(on, axis=1, keepdims=True)
-        mine = spheres.links == c.link
-        gap = np.linalg.norm(points[:, None] - spheres.centers[mine], axis=2) - spheres.radii[mine]
-        assert gap.min(axis=1).max() < 1e-9
+def test_the_compiled_chain_is_the_same_one():
+    frames = np.empty((9, 3, 4))
+    T_a_base = se3.from_rt(se3.exp_so3([0.3, -0.8, 0.2]), [0.1, 0.2, -0.3])
+    for q in random_joints(20):
+        frames_into(q, T_a_base, frames)
+        assert np.allclose(frames, (T_a_base @ panda.link_frames(q))[:, :3], atol=1e-12)
 
 
-def reach_of(Ts, neighbours=None, config=None):
-    n = len(Ts)
-    task = ReachTask(
-        Ts_table_grasp=np.asarray(Ts),
-        widths_m=np.full(n, 0.05),
-        openings_m=np.full(n, 0.06),
-        obj=Surroundings(),
-        neighbours=neighbours or Surroundings(),
-        middle_xy=(0.0, 0.0),
-    )
-    return check_reach(task, config or ReachConfig(), HandGeometry(), np.random.default_rng(0))
+def test_many_poses_are_solved_as_each_alone():
+    Ts = panda.forward(random_joints(12, seed=4))
+    owner, q = panda.inverse_all(Ts, 6, 0.01)
+    assert np.all(np.diff(owner) >= 0)
+    for row, T in enumerate(Ts):
+        assert np.array_equal(q[owner == row], panda.inverse(T, 6, 0.01))
+    none, empty = panda.inverse_all(np.zeros((0, 4, 4)), 6, 0.01)
+    assert len(none) == 0 and empty.shape == (0, 7)
 
 
-def test_a_grasp_from_above_is_reached_at_its_pose():
-    T = se3.from_rt(DOWN, [0.05, 0.02, 0.03])
-    reach = reach_of([T])
-    assert reach.reachable[0] and reach.reasons[0] == ""
-    T_table_base = base_on_table((0.0, 0.0), ReachConfig())
-    assert np.allclose(T_table_base @ panda.forward(reach.joints[0]), T, atol=1e-6)
-    lifted = T_table_base @ panda.forward(reach.joints_lifted[0])
-    assert np.allclose(lifted[:3, 3] - T[:3, 3], [0, 0, 0.2], atol=1e-6)
+def test_the_wrist_s_distance_is_a_lower_bound_that_configurations_attain():
+    q = random_joints(300, seed=1)
+    frames = panda.link_frames(q)
+    true = np.linalg.norm(frames[:, 6, :3, 3] - frames[:, 2, :3, 3], axis=1)
+    least = panda.wrist_distance(frames[:, -1])
+    assert np.all(true >= least - 1e-12) and np.all(true <= panda.WRIST_REACH_M + 1e-12)
+    assert np.min(true - least) < 1e-3
 
 
-def test_reasons_are_given_in_words():
-    far = se3.from_rt(DOWN, [2.0, 0.0, 0.03])
-    into_table = se3.from_rt(DOWN, [0.0, 0.0, -0.01])
-    reach = reach_of([far, into_table])
-    assert not reach.reachable.any()
-    assert reach.reasons[0] == "no inverse kinematics at the grasp"
-    assert "collides with the table" in reach.reasons[1]
+def test_poses_beyond_the_wrist_s_reach_have_no_solution():
+    rng = np.random.default_rng(2)
+    Ts = panda.forward(random_joints(60, seed=2))
+    Ts[:, :3, 3] += rng.uniform(-0.6, 0.6, (60, 3))
+    owner, _ = panda.inverse_all(Ts, 12, 0.0)
+    beyond = panda.wrist_distance(Ts) > panda.WRIST_REACH_M
+    assert 5 < beyond.sum() < 55
+    assert not beyond[owner].any()
 
 
-def test_an_object_in_the_way_of_the_hand_is_named():
-    T = se3.from_rt(DOWN, [0.0, 0.0, 0.03])
-    grid = np.linspace(-0.05, 0.05, 30)
-    lid = np.stack([*np.meshgrid(grid, grid), np.full((30, 30), 0.16)], -1).reshape(-1, 3)
-    neighbours = Surroundings(points=lid, instances=np.full(len(lid), 7))
-    reach = reach_of([T], neighbours)
-    assert not reach.reachable[0]
-    assert reach.reasons[0].endswith("collides with the object of instance 7")
+def test_followed_lines_are_straight_and_their_slopes_are_derivatives():
+    q = panda.inverse(panda.forward(READY), 12, 0.1)[:6]
+    Ts = panda.forward(q)
+    along = np.tile([0.6, 0.0, -0.8], (len(q), 1))
+    distances = np.linspace(0.0, 0.1, 6)
+    joints, slopes, error = follow_lines(q, Ts, along, distances)
+    assert np.all(error < 1e-9) and np.array_equal(joints[:, 0], q)
+    wanted = Ts[:, None, :3, 3] + distances[:, None] * along[:, None]
+    assert np.allclose(panda.forward(joints)[..., :3, 3], wanted, atol=1e-9)
+    assert np.allclose(panda.forward(joints)[..., :3, :3], Ts[:, None, :3, :3], atol=1e-9)
+    h = 1e-6
+    moved = (panda.forward(joints + h * slopes) - panda.forward(joints))[..., :3, 3] / h
+    assert np.allclose(moved, along[:, None], atol=1e-4)
 
 
-def test_the_planner_goes_round_what_blocks_the_straight_move():
-    start, goal = READY.copy(), READY.copy()
-    start[0], goal[0] = -1.0, 1.0
+def test_the_urdf_s_own_numbers_give_the_same_forward_kinematics():
+    def numbers(element, name):
+        return np.array([float(x) for x in element.get(name).split()])
 
-    def is_free(q):
-        return ~((np.abs(q[:, 0]) < 0.2) & (q[:, 1] < 0.3))
-
-    config = PlannerConfig(iterations=300)
-    path = connect(start, goal, is_free, config, np.random.default_rng(3))
-    again = connect(start, goal, is_free, config, np.random.default_rng(3))
-    assert path is not None and again is not None and np.array_equal(path, again)
-    assert np.array_equal(path[0], start) and np.array_equal(path[-1], goal)
-    for a, b in pairwise(path):
-        assert is_free(straight(a, b, config.resolution_rad)).all()
-    assert not is_free(straight(start, goal, config.resolution_rad)).all()
-
-
-def test_the_planner_gives_up_on_a_closed_wall():
-    goal = READY + np.array([2.0, 0, 0, 0, 0, 0, 0])
-
-    def is_free(q):
-        return np.abs(q[:, 0] - 1.0) > 0.2
-
-    config = PlannerConfig(iterations=20)
-    assert connect(READY, goal, is_free, config, np.random.default_rng(0)) is None
+    robot = ElementTree.fromstring(panda_urdf(HandGeometry(), hand_urdf(HandGeometry(), None)))
+    joints = {j.find("child").get("link"): j for j in robot.iter("joint")}
+    for q in random_joints(10):
+        angles = {f"joint{i + 1}": q[i] for i in range(7)}
+        T, link = np.eye(4), "palm"
+        while link in joints:
+            joint, origin = joints[link], joints[link].find("origin")
+            roll, pitch, yaw = numbers(origin, "rpy")
+            assert pitch == 0
+            R = se3.exp_so3([0, 0, yaw]) @ se3.exp_so3([roll, 0, 0])
+            turn = se3.exp_so3([0, 0, angles.get(joint.get("name"), 0.0)])
+            T = se3.from_rt(R, numbers(origin, "xyz")) @ se3.from_rt(turn, np.zeros(3)) @ T
+            link = joint.find("parent").get("link")
+        assert link == "link0"
+        assert np.allclose(T, panda.forward(q), rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("x", [-0.15, 0.0, 0.15])
-def test_the_perfect_reach_covers_the_table(x):
-    Ts = [
-        se3.from_rt(se3.exp_so3([0, 0, yaw]) @ DOWN, [x, y, 0.05])
-        for y in (-0.15, 0.0, 0.15)
-        for yaw in np.linspace(0, np.pi, 4, endpoint=False)
-    ]
-    assert reach_of(Ts).reachable.mean() > 0.9
+@pytest.mark.parametrize("with_hand", [False, True])
+def test_pybullet_has_the_same_forward_kinematics(with_hand, tmp_path):
+    import pybullet
+
+    geometry = HandGeometry()
+    hand = hand_urdf(geometry, PadModel()) if with_hand else ""
+    path = tmp_path / "panda.urdf"
+    path.write_text(panda_urdf(geometry, hand), encoding="utf-8")
+    client = pybullet.connect(pybullet.DIRECT)
+    try:
+        arm = pybullet.loadURDF(str(path), useFixedBase=True, physicsClientId=client)
+        names = [
+            pybullet.getJointInfo(arm, i, physicsClientId=client)[12].decode()
+            for i in range(pybullet.getNumJoints(arm, physicsClientId=client))
+        ]
+        last = names.index("palm" if with_hand else "flange")
+        for q in random_joints(20):
+            for i in range(7):
+                pybullet.resetJointState(arm, i, q[i], physicsClientId=client)
+            state = pybullet.getLinkState(
+                arm, last, computeForwardKinematics=True, physicsClientId=client
+            )
+            R = np.array(pybullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)
+            T = se3.from_rt(R, state[4])
+            wanted = panda.forward(q)
+            if not with_hand:
+                T_7_flange = se3.from_translation([0.0, 0.0, panda.FLANGE_M])
+                wanted = panda.link_frames(q)[7] @ T_7_flange
+            # It reads a URDF's vectors as float32.
+            assert np.allclose(T, wanted, rtol=0, atol=5e-7)
+        for i in range(7):
+            info = pybullet.getJointInfo(arm, i, physicsClientId=client)
+            limits = (panda.LOWER[i], panda.UPPER[i], panda.TORQUE[i], panda.VELOCITY[i])
+            assert np.allclose(info[8:12], limits)
+    finally:
+        pybullet.disconnect(client)

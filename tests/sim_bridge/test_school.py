@@ -1,50 +1,24 @@
 """Robot School as a whole: sets, resumption, and the objects that cannot be tried."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
-from realsim_sim_bridge.school import SchoolConfig, recompute_scores, run_school
-from realsim_sim_bridge.grasping.candidates import CandidateConfig
-
-CONFIG = SchoolConfig(max_candidates=6, candidates=CandidateConfig(surface_points=200))
-
-
-def box(size=0.05):
-    import trimesh
-
-    shape = trimesh.creation.box((size, size, size))
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
-
-
-def model(obj_id=1, size=0.05, **kwargs):
-    return ObjectModel(obj_id=obj_id, name=f"box{obj_id}", mesh=box(size), **kwargs)
-
-
-def at(x, y, instance=0, obj_id=1, size=0.05, **kwargs):
-    T = se3.from_translation([x, y, size / 2])
-    return ObjectPose(obj_id=obj_id, instance=instance, T_world_obj=T, **kwargs)
-
-
-def scene(*objects, plane=True):
-    table = SupportPlane(T_world_table=np.eye(4)) if plane else None
-    return Scene(name="test", objects=objects, plane=table)
-
-
-def same(a, b):
-    return all(
-        np.array_equal(getattr(a, f), getattr(b, f), equal_nan=True)
-        for f in ("Ts_obj_grasp", "scores", "base_scores", "slip_m", "slip_rad")
-    ) and (a.failures, a.parameters) == (b.failures, b.parameters)
+from realsim.records import ObjectPose, Scene, SupportPlane
+from realsim.records.grasps import MEASURES
+from realsim_sim_bridge.school import recompute_scores, run_school, run_school_results
+from school_scenes import CONFIG, at, model, same, same_motion, scene, small_worlds
 
 
 @pytest.fixture(scope="module")
-def one_set():
-    return run_school(scene(at(0, 0)), {1: model()}, CONFIG, workers=1)[0]
+def one_result():
+    return run_school_results(scene(at(0, 0)), {1: model()}, CONFIG, workers=1)[0]
+
+
+@pytest.fixture(scope="module")
+def one_set(one_result):
+    return one_result.grasp_set
 
 
 def test_a_box_gets_good_grasps_and_scores_that_follow_from_the_set(one_set):
@@ -75,46 +49,43 @@ def test_the_same_scene_elsewhere_in_the_world_gives_the_same_grasps(one_set):
     assert np.array_equal(again.reachable, one_set.reachable)
 
 
-def test_a_second_run_takes_everything_from_the_cache(tmp_path, one_set, monkeypatch):
-    from realsim_sim_bridge.school import school
-
-    objects = scene(at(0, 0))
-    first = run_school(objects, {1: model()}, CONFIG, workers=1, cache=tmp_path)[0]
-    assert same(first, one_set)
-    assert [p.name.split(".")[1] for p in tmp_path.glob("instance_*")] == ["grasps"]
-
-    def never(*_):
-        raise AssertionError("the work was done again")
-
-    monkeypatch.setattr(school, "prepare", never)
-    seen = []
-    again = run_school(
-        objects,
-        {1: model()},
-        CONFIG,
-        workers=1,
-        cache=tmp_path,
-        progress=lambda d, n: seen.append((d, n)),
-    )
-    assert same(again[0], one_set) and seen[-1] == (6, 6)
-    with pytest.raises(AssertionError, match="again"):
-        other = replace(CONFIG, seed=1)
-        run_school(objects, {1: model()}, other, workers=1, cache=tmp_path)
+def test_every_grasp_that_was_tested_has_a_trajectory_and_measures(one_result):
+    grasp_set, trajectories = one_result.grasp_set, one_result.trajectories
+    assert np.array_equal(trajectories.rows, np.flatnonzero(grasp_set.reachable))
+    joints = np.array(grasp_set.parameters["joints_rad"], dtype=float)
+    for row in trajectories.rows:
+        ways = trajectories.joints_rad[trajectories.attempt(row)]
+        assert np.abs(ways - joints[row]).max(axis=1).min() < 1e-6
+    assert list(grasp_set.measures) == [
+        name
+        for name in MEASURES
+        if name in ("force_n", "duration_s", "ferrari_canny", "closure_friction", "dexnet_closure")
+    ]
+    executed = ~np.isnan(grasp_set.slip_m)
+    assert np.all(grasp_set.measures["force_n"][executed & (grasp_set.slip_m < 1)] > 1)
+    assert np.all(np.isnan(grasp_set.measures["duration_s"][~executed]))
+    assert one_result.unfinished == ()
 
 
-def test_a_run_that_died_in_the_slip_test_goes_on_after_it(tmp_path, one_set, monkeypatch):
-    from realsim_sim_bridge.school import object_task, school
+def test_a_second_run_takes_everything_from_the_cache(tmp_path, one_result):
+    def run(**kwargs):
+        seen = []
+        result = run_school_results(
+            scene(at(0, 0)), {1: model()}, CONFIG, workers=1, cache=tmp_path,
+            progress=lambda *report: seen.append(report), **kwargs,
+        )[0]  # fmt: skip
+        return result, seen
 
-    def dies(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as m, pytest.raises(KeyboardInterrupt):
-        m.setattr(school, "slips_of_rows", dies)
-        run_school(scene(at(0, 0)), {1: model()}, CONFIG, workers=1, cache=tmp_path)
-    assert [p.name.split(".")[1] for p in tmp_path.glob("instance_*")] == ["prepared"]
-    monkeypatch.setattr(object_task, "sample_candidates", dies)
-    resumed = run_school(scene(at(0, 0)), {1: model()}, CONFIG, workers=1, cache=tmp_path)[0]
-    assert same(resumed, one_set)
+    first, seen = run()
+    assert seen[0] == (0, 6) and seen[-1] == (6, 6)
+    files = sorted(p.name for p in tmp_path.glob("instance_*"))
+    assert files == ["instance_000000.grasps.npz"]
+    made = (tmp_path / files[0]).stat().st_mtime_ns
+    again, seen = run()
+    assert seen == [(6, 6)] and (tmp_path / files[0]).stat().st_mtime_ns == made
+    for result in (first, again):
+        assert same(result.grasp_set, one_result.grasp_set)
+        assert same_motion(result.trajectories, one_result.trajectories)
 
 
 def test_rejected_objects_are_obstacles_but_not_grasped():
@@ -147,8 +118,10 @@ def test_what_is_missing_is_named():
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_same_as_one(one_set):
+def test_two_processes_give_the_same_bytes_as_one():
     objects = scene(at(0, 0), at(0.2, 0.1, instance=1))
-    serial = run_school(objects, {1: model()}, CONFIG, workers=1)
-    parallel = run_school(objects, {1: model()}, CONFIG, workers=2)
-    assert all(same(a, b) for a, b in zip(serial, parallel, strict=True))
+    config = small_worlds()
+    serial = run_school_results(objects, {1: model()}, config, workers=1, shard_grasps=2)
+    parallel = run_school_results(objects, {1: model()}, config, workers=2, shard_grasps=2)
+    for a, b in zip(serial, parallel, strict=True):
+        assert same(a.grasp_set, b.grasp_set) and same_motion(a.trajectories, b.trajectories)

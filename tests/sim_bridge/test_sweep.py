@@ -8,10 +8,10 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.school.sweep import SweepConfig, find_levels, run_sweep, sweep_margins
 from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.engines import make_engine
+from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import SlipPhysics
 

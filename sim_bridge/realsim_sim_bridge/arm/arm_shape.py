@@ -2,13 +2,14 @@
 
 The arm's were fitted to Franka's meshes (franka_description; collision and visual ones): per link
 the samples of the surface are split into a few groups, each with its least enclosing sphere, grown
-by 1.5 mm for what lies between the samples. They stand out of the link's convex hull by 7 to 14 mm
-on average. The hand's follow from its boxes.
+by 1.5 mm (the foot by 4) for what lies between the samples. They stand out of the link's convex hull
+by 7 to 10 mm on average (the foot's by 23). The hand's follow from its boxes.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.grasping.hand import HandGeometry
 
 Array = NDArray[np.float64]
@@ -17,16 +18,18 @@ HAND = 8
 """Link number of the hand's palm: its frame is the grasp frame. 0 = base, 1 to 7 = the joints."""
 FINGER_SIDE = (9, 10)
 """Link numbers of the fingers at +y and -y, in the grasp frame of a closed hand."""
-PALM_CELL_M, FINGER_CELL_M = 0.036, 0.018
+PALM_CELL_M, FINGER_CELL_M, BEHIND_CELL_M = 0.036, 0.018, 0.036
 """Largest edge of the pieces of a box that one sphere contains [m]."""
 
 _ARM = (
-    (0, -0.0131, -0.0106, 0.1103, 0.0793),
-    (0, -0.1089, -0.0225, 0.0306, 0.0746),
-    (0, -0.0074, -0.0570, 0.0360, 0.0735),
-    (0, -0.0190, 0.0545, 0.0468, 0.0717),
-    (0, -0.0902, 0.0276, 0.0378, 0.0730),
-    (0, 0.0441, 0.0127, 0.0473, 0.0727),
+    (0, -0.0076, 0.0569, 0.0278, 0.0720),
+    (0, -0.1128, -0.0396, 0.0146, 0.0613),
+    (0, 0.0069, -0.0203, 0.1078, 0.0677),
+    (0, 0.0413, -0.0218, 0.0179, 0.0716),
+    (0, -0.1014, 0.0340, 0.0064, 0.0659),
+    (0, -0.0637, 0.0018, 0.0817, 0.0714),
+    (0, -0.0279, -0.0493, 0.0389, 0.0720),
+    (0, 0.0064, 0.0288, 0.1008, 0.0692),
     (1, -0.0011, -0.0004, -0.1478, 0.0731),
     (1, 0.0021, -0.0262, -0.0008, 0.0647),
     (1, -0.0028, -0.0690, -0.0040, 0.0658),
@@ -53,15 +56,32 @@ _ARM = (
     (6, 0.0863, -0.0201, 0.0004, 0.0573),
     (6, 0.0825, 0.0386, -0.0018, 0.0568),
     (6, 0.0028, -0.0015, 0.0077, 0.0576),
-    (7, 0.0302, 0.0352, 0.0836, 0.0534),
-    (7, -0.0014, -0.0042, 0.0728, 0.0541),
+    (7, 0.0076, -0.0200, 0.0750, 0.0390),
+    (7, -0.0236, -0.0207, 0.0777, 0.0351),
+    (7, -0.0199, 0.0067, 0.0779, 0.0383),
+    (7, -0.0011, 0.0356, 0.0762, 0.0387),
+    (7, 0.0446, 0.0447, 0.0808, 0.0400),
+    (7, 0.0308, 0.0012, 0.0824, 0.0393),
 )
 """Link, centre in the link's frame [m], radius [m]."""
 
 
+_MOUNT = -panda.TCP_M
+_BEHIND = (
+    ((-0.029, -0.104, _MOUNT - 0.0105), (0.029, 0.089, _MOUNT)),
+    ((-0.006, -0.104, _MOUNT - 0.026), (0.006, -0.045, _MOUNT)),
+)
+"""Boxes (2, 3) around what the hand has beside and behind the flange, grasp frame [m]: the rim of
+its body and its plug."""
+
+
 def arm_spheres() -> Array:
-    """Return the spheres (S, 5) of links 0 to 7: link, centre in its frame [m], radius [m]."""
-    return np.array(_ARM, dtype=np.float64)
+    """Return the spheres (S, 5) of links 0 to 7: link, centre in its frame [m], radius [m].
+
+    With them goes what Franka's hand has behind its mounting face, which is no part of its boxes.
+    """
+    behind = [_cover(HAND, np.array(box), BEHIND_CELL_M) for box in _BEHIND]
+    return np.concatenate([np.array(_ARM, dtype=np.float64), *behind])
 
 
 def hand_spheres(geometry: HandGeometry) -> Array:

@@ -61,27 +61,45 @@ def obstacles_of(points: Array, instances: NDArray[np.int64], own: NDArray[np.bo
     )
 
 
-def _bounds(occupied: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _compiled(function: Any) -> Any:
+    return numba.njit(cache=True)(function)
+
+
+@_compiled
+def _bounds(occupied: Any) -> Any:
     """Return the distance (X, Y, Z) [m] from each cell's box to the nearest occupied one.
 
     Along an axis, boxes k cells apart have a gap of k - 1 cells; the squares add up over the axes,
-    so that the least is found one axis after the other.
+    so that the least is found one axis after the other. Distances end at `FAR_CELLS`.
     """
-    far = np.int32(FAR_CELLS**2)
-    squared = np.where(occupied, np.int32(0), far)
-    for axis in (2, 1, 0):
-        lines = np.moveaxis(squared, axis, 0)
-        least = lines.copy()
-        for k in range(1, FAR_CELLS + 1):
-            gap = np.int32((k - 1) ** 2)
-            np.minimum(least[k:], lines[:-k] + gap, out=least[k:])
-            np.minimum(least[:-k], lines[k:] + gap, out=least[:-k])
-        squared = np.moveaxis(least, 0, axis)
-    return np.ascontiguousarray(np.sqrt(squared) * CELL_M, dtype=np.float32)
-
-
-def _compiled(function: Any) -> Any:
-    return numba.njit(cache=True)(function)
+    nx, ny, nz = occupied.shape
+    squared = np.empty((nx, ny, nz), dtype=np.int32)
+    for i in range(nx):
+        for j in range(ny):
+            gap = FAR_CELLS + 1
+            for k in range(nz):
+                gap = 0 if occupied[i, j, k] else gap + 1
+                squared[i, j, k] = min(max(gap - 1, 0), FAR_CELLS) ** 2
+            gap = FAR_CELLS + 1
+            for k in range(nz - 1, -1, -1):
+                gap = 0 if occupied[i, j, k] else gap + 1
+                squared[i, j, k] = min(squared[i, j, k], min(max(gap - 1, 0), FAR_CELLS) ** 2)
+    far = FAR_CELLS**2
+    along_y = np.full((nx, ny, nz), far, dtype=np.int32)
+    for i in range(nx):
+        for j in range(ny):
+            for other in range(max(j - FAR_CELLS, 0), min(j + FAR_CELLS + 1, ny)):
+                gap = max(abs(other - j) - 1, 0) ** 2
+                for k in range(nz):
+                    along_y[i, j, k] = min(along_y[i, j, k], squared[i, other, k] + gap)
+    squared[:] = far
+    for i in range(nx):
+        for other in range(max(i - FAR_CELLS, 0), min(i + FAR_CELLS + 1, nx)):
+            gap = max(abs(other - i) - 1, 0) ** 2
+            for j in range(ny):
+                for k in range(nz):
+                    squared[i, j, k] = min(squared[i, j, k], along_y[other, j, k] + gap)
+    return (np.sqrt(squared) * CELL_M).astype(np.float32)
 
 
 @_compiled

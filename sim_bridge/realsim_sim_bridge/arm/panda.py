@@ -173,7 +173,7 @@ def wrist_distance(T_base_grasp: Array) -> Array:
     The wrist lies on a circle of radius a_7 about joint 7's axis, whatever that joint's angle. No
     inverse kinematics exists where this is more than `WRIST_REACH_M`.
     """
-    T_base_7 = T_base_grasp @ se3.invert(JOINT7_GRASP)
+    T_base_7 = T_base_grasp @ JOINT7_GRASP
     out = T_base_7[:, :3, 3] - [0.0, 0.0, SHOULDER_M]
     along = np.sum(out * T_base_7[:, :3, 2], axis=1)
     across = np.sqrt(np.maximum(np.sum(out * out, axis=1) - along**2, 0.0))

@@ -6,7 +6,7 @@ along the approach and up along the table's normal without changing branch, the 
 first; the first whose moves are free and that can be reached from home is kept.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,17 +41,6 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-def _no_trajectories() -> GraspTrajectories:
-    return GraspTrajectories(
-        rows=np.zeros(0, dtype=np.int64),
-        starts=np.zeros(1, dtype=np.int64),
-        time_s=np.zeros(0),
-        joints_rad=np.zeros((0, panda.JOINTS)),
-        opening_m=np.zeros(0),
-        phase=np.zeros(0, dtype=np.int64),
-    )
-
-
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Reach:
     """Which candidates the arm can take."""
@@ -71,8 +60,9 @@ class Reach:
     limits and speeds; False where not reachable or not computed."""
     notes: tuple[str, ...]
     """(N,) why a stage is not possible, or how it is cut; '' = nothing to say."""
-    trajectories: GraspTrajectories = field(default_factory=_no_trajectories)
-    """The joints over time of each reachable row."""
+    trajectories: GraspTrajectories | None = None
+    """The joints over time of each reachable row; None = there is none, or they are not asked
+    for."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -174,7 +164,8 @@ class _ReachCheck:
         waiting = self._try_branches(open_rows)
         self._plan(waiting, rng)
         done = self._done
-        motions = self._motions() if self._config.with_trajectories else None
+        wanted = self._config.with_trajectories and bool(done.any())
+        motions = self._motions() if wanted else None
         n = len(done)
         possible, notes = np.zeros((n, len(MOVED_STAGES)), dtype=np.bool_), [""] * n
         if motions is not None:
@@ -191,7 +182,7 @@ class _ReachCheck:
             planned=len(self._bent),
             stage_possible=possible,
             notes=tuple(notes),
-            trajectories=motions.trajectories if motions is not None else _no_trajectories(),
+            trajectories=None if motions is None else motions.trajectories,
         )
 
     # --- before any joint angle ----------------------------------------------------------------

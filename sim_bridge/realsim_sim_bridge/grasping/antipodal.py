@@ -163,7 +163,11 @@ def antipodal_pairs(
 
 
 def _exits(
-    surface: RaySurface, points: Array, rays: Array, config: CandidateConfig, rng: np.random.Generator
+    surface: RaySurface,
+    points: Array,
+    rays: Array,
+    config: CandidateConfig,
+    rng: np.random.Generator,
 ) -> tuple[Rows, Array, Array]:
     """Return where rays leave the solid: ray numbers (M,), distances (M,) [m], normals (M, 3).
 
@@ -224,12 +228,12 @@ class _SmoothNormals:
     """Normals averaged over a small piece of surface, across no edge."""
 
     def __init__(self, surface: RaySurface, radius_m: float, rng: np.random.Generator) -> None:
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
         self._radius_m, self._surface = radius_m, surface
         points, normals = sample_surface(surface.mesh, NORMAL_SAMPLES, rng)
         self._normals = normals * surface.orientation
-        self._tree: Any = cKDTree(points)
+        self._tree: Any = KDTree(points)
 
     def at(self, points: Array, normals: Array) -> Array:
         """Return the means (N, 3) of the normals around points that are near to those given.

@@ -32,8 +32,8 @@ class CandidateConfig:
     order. Fingers that stand back by 6 mm clear a table, and the pads (12 mm) still hold."""
     opening_margins_m: tuple[float, ...] = (0.004, 0.04)
     """Gaps left on each side of the object before closing [m], tried in this order and cut to the
-    open hand; 40 mm is the open hand itself. Of 12,600 grasps of 9 parts the narrow one served 44 %,
-    the open hand 55 %, one of 2 mm between them 0.2 %."""
+    open hand; 40 mm is the open hand itself. Of 12,600 grasps of 9 parts the narrow one served
+    44 %, the open hand 55 %, one of 2 mm beside them 0.2 %."""
     clearance_m: float = 0.001
     """Least distance of the hand from the grasped object [m]: the error of a good registration."""
     neighbour_clearance_m: float = 0.003
@@ -53,7 +53,8 @@ class CandidateConfig:
         """
         for name in ("surface_points", "rays_per_point", "rotations"):
             if getattr(self, name) < 1:
-                raise InputError(f"candidates: {name} is {getattr(self, name)}; at least 1 is needed.")
+                value = getattr(self, name)
+                raise InputError(f"candidates: {name} is {value}; at least 1 is needed.")
         if not (math.isfinite(self.friction) and self.friction > 0):
             raise InputError(
                 f"candidates: a friction of {self.friction} has no cone; a positive one is needed."

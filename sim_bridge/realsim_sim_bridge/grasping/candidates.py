@@ -48,13 +48,14 @@ class Candidates:
     openings_m: Array
     """(N,) distance of the finger faces before closing [m]."""
     contact_depths_m: Array
-    """(N,) z of the two contacts in the grasp frame [m]: 0 = middle of the pads, + = to the tips."""
+    """(N,) z of both contacts in the grasp frame [m]: 0 = middle of the pads, + = to the tips."""
     counts: dict[str, int]
     """How many there were after each step, and what each filter took:
 
     surface_points = points_without_pair + antipodal_points;
     exits = too_near + too_wide + outside_cone + antipodal_pairs;
-    turned = rotations x antipodal_pairs = hand_in_table + hand_in_object + hand_in_neighbour + free;
+    turned = rotations x antipodal_pairs
+           = hand_in_table + hand_in_object + hand_in_neighbour + free;
     free = not_chosen + kept. A grasp counts where the best of its stands ended.
     """
 
@@ -71,7 +72,7 @@ def sample_candidates(
     """Return the grasp candidates of an object.
 
     No piece of the object's triangles reaches into the hand's boxes, nor of the neighbours' into
-    what the hand sweeps, where the surroundings have triangles; of points only the points are known.
+    what the hand sweeps, where the surroundings have triangles; where they have points, no point.
 
     Args:
         mesh: the object [m].
@@ -115,9 +116,7 @@ def sample_candidates(
     )
 
 
-def _reach_of_hands(
-    mesh: Mesh, T_table_obj: Array, geometry: HandGeometry
-) -> tuple[Array, float]:
+def _reach_of_hands(mesh: Mesh, T_table_obj: Array, geometry: HandGeometry) -> tuple[Array, float]:
     """Return a sphere on the table (centre (3,), radius [m]) that no hand at the object leaves."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     boxes = geometry.boxes(geometry.max_opening_m)

@@ -5,8 +5,8 @@ Three measures on the contacts of the closing pads, named as in `realsim.records
 - ferrari_canny: radius of the largest ball in the hull of the wrenches that two soft fingers with
   normal forces of sum 1 exert; torques about the centre of mass, in units of the farthest point's
   distance from it. Hard point contacts would all have 0: nothing holds a turn about their line.
-- closure_friction: the smallest of GraspNet's friction levels at which the line between the contacts
-  is inside both friction cones (Nguyen 1988; graspnetAPI's label, 1.1 - score); inf = at none.
+- closure_friction: the smallest of GraspNet's friction levels at which the line between the
+  contacts is inside both friction cones (Nguyen 1988; graspnetAPI's label); inf = at none.
 - dexnet_closure: 1 if it is so at the configured friction, as Dex-Net tests it; else 0.
 """
 
@@ -147,7 +147,7 @@ def force_closure(
 
 
 def _needed_friction(points: Array, normals: Array) -> Array:
-    """Return the tangent (N,) of the greater angle between contact line and normal; inf >= 90 deg."""
+    """Return the tangent (N,) of the greater angle of contact line and normal; inf from 90 deg."""
     line = points[:, 1] - points[:, 0]
     along = np.stack([-line, line], axis=1)
     cos = np.sum(normals * along, axis=-1)

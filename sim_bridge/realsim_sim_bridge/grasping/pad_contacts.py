@@ -28,7 +28,7 @@ class PadContacts:
     @property
     def both(self) -> NDArray[np.bool_]:
         """(N,) whether both fingers touch."""
-        return np.isfinite(self.levers_m).all(axis=1)
+        return np.asarray(np.isfinite(self.levers_m).all(axis=1))
 
 
 def pad_contacts(
@@ -60,12 +60,13 @@ def pad_contacts(
     origins = np.empty((n, 2, rays * rays, 3))
     origins[..., 0], origins[..., 2] = x.ravel(), z.ravel()
     origins[..., 1] = 0.5 * openings_m[:, None, None] * side[:, None]
-    origins = se3.transform(Ts_obj_grasp, origins.reshape(n, -1, 3)).reshape(origins.shape)
+    shape = origins.shape
+    origins = se3.transform(Ts_obj_grasp, origins.reshape(n, 2 * rays * rays, 3)).reshape(shape)
     inward = -side[:, None] * Ts_obj_grasp[:, None, :3, 1]
     directions = np.broadcast_to(inward[:, :, None], origins.shape)
 
     t, face = surface.first_hits(origins.reshape(-1, 3), directions.reshape(-1, 3))
-    t, face = t.reshape(n, 2, -1), face.reshape(n, 2, -1)
+    t, face = t.reshape(shape[:3]), face.reshape(shape[:3])
     # The other pad is where the opening ends.
     t = np.where(t <= openings_m[:, None, None], t, np.inf)
     first = t.min(axis=2, keepdims=True, initial=np.inf)

@@ -3,9 +3,9 @@
 A finger that presses with force 1 along its inward normal n at p can add friction f (|f| <= mu,
 tangential) and a torsional torque t about n (|t| <= gamma): together at most |(f / mu, t / gamma)|
 = 1. That ball is replaced by the double pyramid over a regular polygon of m corners with both
-poles. The wrenches of a finger are then the corners of a polytope in a flat of three dimensions, and
-those of the grasp (normal forces that sum to 1) the hull of both polytopes in six. The quality is
-the distance of that hull's nearest facet from the origin (Ferrari and Canny 1992), 0 where the
+poles. The wrenches of a finger are then the corners of a polytope in a flat of three dimensions,
+and those of the grasp (normal forces that sum to 1) the hull of both polytopes in six. The quality
+is the distance of that hull's nearest facet from the origin (Ferrari and Canny 1992), 0 where the
 origin is not inside.
 
 All faces of a double pyramid are simplices, so every facet of the hull is spanned by two triangles,
@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+SPANLESS = 1e-10
+"""Six points whose differences have a pivot below this span no hyperplane."""
 FLAT = 1e-9
 """Below this share of the wrenches' size a hull counts as flat, and a point as on a hyperplane."""
 
@@ -47,7 +49,7 @@ def largest_balls(
 def finger_wrenches(
     points: Array, normals: Array, tangents: Array, friction: float, torsions: Array, edges: int
 ) -> Array:
-    """Return the corners (N, 2, m + 2, 6) of the fingers' wrenches, torque first; the poles last."""
+    """Return the corners (N, 2, m + 2, 6) of both wrench polytopes, torque first; poles last."""
     across = np.cross(normals, tangents[:, None])
     small = np.linalg.norm(across, axis=-1, keepdims=True) < 1e-6
     across = np.where(small, np.cross(normals, np.roll(tangents, 1, axis=-1)[:, None]), across)
@@ -78,6 +80,26 @@ def _double_pyramid(edges: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 # --- compiled ----------------------------------------------------------------------------------
 
 
+def _pivot_loops(rows: Any, order: Any, i: Any) -> Any:
+    """Bring the greatest element of the rest of rows (5, 6) to (i, i); False if there is none."""
+    best, pi, pk = 0.0, i, i
+    for r in range(i, 5):
+        for k in range(i, 6):
+            if abs(rows[r, k]) > best:
+                best, pi, pk = abs(rows[r, k]), r, k
+    if best < SPANLESS:
+        return False
+    for k in range(6):
+        rows[i, k], rows[pi, k] = rows[pi, k], rows[i, k]
+    for r in range(5):
+        rows[r, i], rows[r, pk] = rows[r, pk], rows[r, i]
+    order[i], order[pk] = order[pk], order[i]
+    return True
+
+
+_pivot = numba.njit(cache=True)(_pivot_loops)
+
+
 def _hyperplane_loops(p: Any, rows: Any, normal: Any) -> Any:
     """Set the unit normal of the hyperplane through six points; False if they span less.
 
@@ -91,18 +113,8 @@ def _hyperplane_loops(p: Any, rows: Any, normal: Any) -> Any:
         for k in range(6):
             rows[i, k] = p[i + 1, k] - p[0, k]
     for i in range(5):
-        best, pi, pk = 0.0, i, i
-        for r in range(i, 5):
-            for k in range(i, 6):
-                if abs(rows[r, k]) > best:
-                    best, pi, pk = abs(rows[r, k]), r, k
-        if best < 1e-10:
+        if not _pivot(rows, order, i):
             return False
-        for k in range(6):
-            rows[i, k], rows[pi, k] = rows[pi, k], rows[i, k]
-        for r in range(5):
-            rows[r, i], rows[r, pk] = rows[r, pk], rows[r, i]
-        order[i], order[pk] = order[pk], order[i]
         for r in range(i + 1, 5):
             factor = rows[r, i] / rows[i, i]
             for k in range(i, 6):

@@ -18,6 +18,9 @@ from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support,
 Array = NDArray[np.float64]
 TABLE_STRIDE = 6
 """Every how many rows and columns of a depth image is looked at for the table."""
+SUNK_M = 0.0015
+"""What all objects reach into the table beyond this is common to them [m]: depth cameras are right
+to about a millimetre at half a metre."""
 
 
 def from_graspit_yaml(
@@ -117,6 +120,7 @@ def from_bop(
     notes += said
     models_folder = models or bop.ref.folder.parent.parent / "models"
     loaded = load_models(models_folder, {o.obj_id for o in objects})
+    notes += _sunk(objects, loaded, plane)
     scene = Scene(name=f"{bop.ref.split}-{bop.ref.folder.name}", objects=objects, plane=plane)
     return SchoolScene(
         scene=scene,
@@ -181,9 +185,7 @@ def _table(
     some = images[:: max(1, -(-len(images) // 8))]
     frames = [DepthFrame(index=i, depth_m=bop.depth_m(i), T_world_cam=cameras[i]) for i in some]
     noise = measure_noise(frames, EvidenceConfig())
-    views = sample_views(
-        bop.session.intrinsics, frames, noise, SampleConfig(stride=TABLE_STRIDE)
-    )
+    views = sample_views(bop.session.intrinsics, frames, noise, SampleConfig(stride=TABLE_STRIDE))
     found = find_table(views, noise, TableSearchConfig())
     if found.plane is None:
         raise InputError(f"no table is seen in the depth of {bop.ref.folder}: {found.reason}")
@@ -193,12 +195,19 @@ def _table(
     ]
 
 
-def heights_above_table(scene: SchoolScene) -> dict[int, float]:
-    """Return the height of each object's lowest point above the table, by instance [m]."""
-    T = scene.T_table_world
-    return {
-        o.instance: float(
-            se3.transform(T @ o.T_world_obj, scene.models[o.obj_id].mesh.vertices)[:, 2].min()
-        )
-        for o in scene.scene.objects
-    }
+def _sunk(
+    objects: Sequence[ObjectPose], models: Mapping[int, ObjectModel], plane: SupportPlane
+) -> list[str]:
+    """Say when all objects lie below the table alike: then it is the poses or the depth."""
+    T = se3.invert(plane.T_world_table)
+    low = [
+        float(se3.transform(T @ o.T_world_obj, models[o.obj_id].mesh.vertices)[:, 2].min())
+        for o in objects
+    ]
+    if max(low) > -SUNK_M:
+        return []
+    return [
+        f"all {len(low)} objects reach {-1e3 * max(low):.1f} to {-1e3 * min(low):.1f} mm into the "
+        "table: the depth reads short, or the poses are off as a whole. `realsim upgrade` fits the "
+        "poses to the depth."
+    ]

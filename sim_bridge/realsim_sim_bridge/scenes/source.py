@@ -51,6 +51,10 @@ def load_scene_source(
 
 def _contents(path: Path) -> str:
     if path.is_file():
-        return f"it is a file of the kind '{path.suffix or 'no suffix'}' without the keys of a scene"
+        return (
+            f"it is a file of the kind '{path.suffix or 'no suffix'}' without the keys of a scene"
+        )
     names = sorted(p.name for p in path.iterdir())
-    return f"the folder has {', '.join(names[:12]) or 'nothing'}{', ...' if len(names) > 12 else ''}"
+    return (
+        f"the folder has {', '.join(names[:12]) or 'nothing'}{', ...' if len(names) > 12 else ''}"
+    )

@@ -239,10 +239,11 @@ def _judged(
     if o.moved_m <= config.stands_m and o.turned_deg <= config.stands_deg:
         return "stands", f"{travel}{end}."
     if height_m < 0:
-        return "falls", f"it fell off the table{end}."
-    if o.turned_deg > config.fell_over_deg:
-        return "falls", f"it fell over: {travel}{end}."
-    return "falls", f"it does not stay where it is: {travel}{end}."
+        how = "it fell off the table"
+    else:
+        fell_over = o.turned_deg > config.fell_over_deg
+        how = f"it {'fell over' if fell_over else 'does not stay where it is'}: {travel}"
+    return "falls", f"{how}{end}."
 
 
 def _pairs(stands: list[ObjectStand], config: StandConfig) -> tuple[tuple[str, str, float], ...]:

@@ -22,7 +22,7 @@ COLORS: dict[Standing, str] = {
 }
 VIEWS = (("from above", 0, 1, 2), ("from the side", 0, 2, 1))
 """Title, the axes drawn to the right and upwards, and the axis looked along."""
-MOST_FACES = 20_000
+MOST_FACES = 8_000
 """Of a mesh that is drawn; a picture of 1600 pixels shows no more."""
 
 
@@ -34,10 +34,10 @@ def stand_picture(scene: SchoolScene, report: StandReport) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15, 8), dpi=110, layout="constrained")
+    figure = Figure(figsize=(10, 12), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     meshes = {i: _light(m.mesh) for i, m in scene.models.items()}
-    axes: Any = figure.subplots(1, len(VIEWS))
+    axes: Any = figure.subplots(len(VIEWS), 1, sharex=True)
     for ax, (title, right, up, along) in zip(axes, VIEWS, strict=True):
         for o, stand in zip(scene.scene.objects, report.objects, strict=True):
             _draw(ax, scene, meshes[o.obj_id], stand, (right, up, along))
@@ -70,6 +70,7 @@ def _draw(
     ax: Any, scene: SchoolScene, mesh: Mesh, stand: ObjectStand, axes: tuple[int, int, int]
 ) -> None:
     from matplotlib.collections import LineCollection, PolyCollection
+    from matplotlib.patheffects import withStroke
 
     right, up, along = axes
     color, is_moved = COLORS[stand.verdict], stand.verdict != "stands"
@@ -78,19 +79,22 @@ def _draw(
         for T in (stand.T_world_before, stand.T_world_after)
     )
     flat = after[mesh.faces][:, :, [right, up]]
-    ax.add_collection(PolyCollection(flat, facecolors=color, edgecolors="none", alpha=0.25))
+    ax.add_collection(PolyCollection(list(flat), facecolors=color, edgecolors="none", alpha=0.25))
     lines = outline(after, mesh.faces, along)[:, :, [right, up]]
-    ax.add_collection(LineCollection(lines, colors=color, linewidths=0.8))
+    ax.add_collection(LineCollection(list(lines), colors=color, linewidths=0.8))
     if is_moved:
         lines = outline(before, mesh.faces, along)[:, :, [right, up]]
         ax.add_collection(
-            LineCollection(lines, colors="#777777", linewidths=0.6, linestyles="dashed")
+            LineCollection(list(lines), colors="#777777", linewidths=0.6, linestyles="dashed")
         )
     start, end = before.mean(axis=0)[[right, up]], after.mean(axis=0)[[right, up]]
     if is_moved and np.linalg.norm(end - start) > 1.0:
         arrow = {"arrowstyle": "->", "color": color, "lw": 2.0}
-        ax.annotate("", xy=end, xytext=start, arrowprops=arrow)
-    ax.annotate(stand.name, xy=end, color=color, ha="center", va="bottom", fontsize=8)
+        ax.annotate("", xy=end, xytext=start, arrowprops=arrow, zorder=4)
+    words = ax.annotate(
+        stand.name, xy=end, color=color, ha="center", va="bottom", fontsize=8, zorder=5
+    )
+    words.set_path_effects([withStroke(linewidth=2.5, foreground="white")])
 
 
 def outline(vertices: Array, faces: NDArray[np.int32], along: int) -> Array:

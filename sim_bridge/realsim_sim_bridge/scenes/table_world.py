@@ -20,6 +20,7 @@ from realsim.geometry import se3
 from realsim.models.convex import ConvexConfig, collision_obj, convex_parts
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectPose
+from realsim_sim_bridge.scenes.hull_margin import drawn_in
 from realsim_sim_bridge.scenes.school_scene import SchoolScene, Support
 from realsim_sim_bridge.scenes.world_config import WorldConfig
 from realsim_sim_bridge.slip.body import SlipBody
@@ -145,17 +146,17 @@ class TableWorld:
                 raise InputError(f"the support '{support.name}' is no solid: {error}") from error
             if not self.config.thin_ratio <= parts.volume_ratio <= self.config.fat_ratio:
                 self.notes.append(_blown_up(f"the support '{support.name}'", parts.volume_ratio))
-            shape = self._shape(list(parts.parts), folder / f"support{len(self.statics)}.obj")
+            cores, margin = drawn_in(list(parts.parts), self.config.collision_margin_m)
+            shape = self._shape(cores, folder / f"support{len(self.statics)}.obj")
             body = self._engine.createMultiBody(0.0, shape, -1, position, xyzw)
+            self._engine.changeDynamics(body, -1, collisionMargin=margin)
         self._add_static(body, support.name)
 
     def _add_static(self, body: int, name: str) -> None:
         wanted = self._contact()
         for link in range(-1, self._engine.getNumJoints(body)):
             self._engine.changeDynamics(body, link, **wanted)
-            # A box keeps its margin within itself, whatever it is told.
-            read = {k: v for k, v in wanted.items() if k != "collisionMargin"}
-            self._check(body, link, read, name)
+            self._check(body, link, wanted, name)
         self.statics.append(body)
         self.names[body] = name
 
@@ -168,17 +169,16 @@ class TableWorld:
         )
         T_obj_body, moments = slip_body.principal_frame()
         T_body_obj = se3.invert(T_obj_body)
-        shape = self._shape(
-            [se3.transform(T_body_obj, part) for part in slip_body.parts],
-            folder / f"object{o.instance}.obj",
-        )
+        parts = [se3.transform(T_body_obj, part) for part in slip_body.parts]
+        cores, margin = drawn_in(parts, self.config.collision_margin_m)
+        shape = self._shape(cores, folder / f"object{o.instance}.obj")
         T = self.scene.T_table_world @ o.T_world_obj @ T_obj_body
         position, xyzw = interop.pybullet_from_T(T)
         mass = slip_body.mass_kg
         body: int = self._engine.createMultiBody(mass, shape, -1, position, xyzw)
         # Alone: given together with other settings, damping can make them be lost.
         self._engine.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0)
-        wanted = self._contact() | {"mass": mass}
+        wanted = self._contact() | {"mass": mass, "collisionMargin": margin}
         self._engine.changeDynamics(body, -1, localInertiaDiagonal=moments.tolist(), **wanted)
         self._check(body, -1, wanted, name)
         found = self._engine.getDynamicsInfo(body, -1)[2]
@@ -194,7 +194,6 @@ class TableWorld:
             "restitution": 0.0,
             "rollingFriction": 0.0,
             "spinningFriction": 0.0,
-            "collisionMargin": self.config.collision_margin_m,
         }
 
     def _shape(self, parts: list[Array], path: Path) -> int:

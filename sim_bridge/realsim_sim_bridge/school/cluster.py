@@ -139,8 +139,8 @@ def _join(address: str) -> Any:
         raise InputError(
             f"there is no token for the Ray cluster at {address}, and without one whoever reaches "
             "a cluster runs any code on its machines. Set RAY_AUTH_MODE=token on all machines, "
-            "make a token with `ray get-auth-token --generate`, copy ~/.ray/auth_token to all of them "
-            "and start the cluster again."
+            "make a token with `ray get-auth-token --generate`, copy ~/.ray/auth_token to all of "
+            "them and start the cluster again."
         )
     ray = _import_ray(loopback=False)
     try:
@@ -187,8 +187,8 @@ def _import_ray(*, loopback: bool) -> Any:
     by_uv = constants.RAY_ENABLE_UV_RUN_RUNTIME_ENV
     if by_uv or (loopback and constants.ENABLE_RAY_CLUSTER):
         raise InputError(
-            "Ray was imported in this process before the Robot School could tell it to keep to this "
-            "machine. Run the Robot School in a process of its own."
+            "Ray was imported in this process before the Robot School could tell it how to start. "
+            "Run the Robot School in a process of its own."
         )
     # Ray remembers the first token it was asked for.
     ray._raylet.AuthenticationTokenLoader.instance().reset_cache()

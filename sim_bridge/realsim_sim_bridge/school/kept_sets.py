@@ -29,8 +29,8 @@ class SchoolResult:
     """What the school made of one object."""
 
     grasp_set: GraspSet
-    trajectories: GraspTrajectories
-    """What the arm did in each attempt; its rows are those of the set."""
+    trajectories: GraspTrajectories | None
+    """What the arm did in each attempt, by rows of the set; None = there was none."""
     unfinished: tuple[str, ...] = ()
     """Work that was given up because it ended its worker again and again; the grasps concerned
     have no score, and the next run in the same cache tries them again."""
@@ -67,14 +67,17 @@ def read_result(path: Path) -> SchoolResult | None:
     return SchoolResult(grasp_set=grasp_set, trajectories=trajectories_in(arrays))
 
 
-def trajectory_arrays(trajectories: GraspTrajectories) -> dict[str, NDArray[Any]]:
+def trajectory_arrays(trajectories: GraspTrajectories | None) -> dict[str, NDArray[Any]]:
     """Return trajectories as arrays for a file."""
+    if trajectories is None:
+        return {}
     return named(TRAJECTORY, {name: getattr(trajectories, name) for name in _TRAJECTORY_ARRAYS})
 
 
-def trajectories_in(arrays: dict[str, NDArray[Any]]) -> GraspTrajectories:
+def trajectories_in(arrays: dict[str, NDArray[Any]]) -> GraspTrajectories | None:
     """Return the trajectories among a file's arrays."""
-    return GraspTrajectories(**of_name(TRAJECTORY, arrays))
+    found = of_name(TRAJECTORY, arrays)
+    return GraspTrajectories(**found) if found else None
 
 
 def named(prefix: str, arrays: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:

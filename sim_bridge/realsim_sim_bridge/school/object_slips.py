@@ -78,7 +78,7 @@ def result_of(
         slip_rad=slip_rad,
         reachable=prepared.reachable,
         failures=tuple(failures),
-        measures={**prepared.measures, **_measures(n, tested)},
+        measures=_measures(prepared, tested),
         parameters=_parameters(task, prepared),
     )
     return SchoolResult(
@@ -99,15 +99,19 @@ def in_words(rows: Rows) -> str:
     return f"{'grasp' if len(rows) == 1 else 'grasps'} {told}"
 
 
-def _measures(n: int, tested: list[Tested]) -> dict[str, Array]:
-    """Return the shards' measures as columns of all candidates; NaN where not tested."""
-    # In the table's order, whichever shard came first.
-    names = [name for name in MEASURES if any(name in shard.measures for shard in tested)]
+def _measures(prepared: Prepared, tested: list[Tested]) -> dict[str, Array]:
+    """Return all measures as columns of all candidates; NaN where a shard was not tested."""
+    n = len(prepared.widths_m)
     columns: dict[str, Array] = {}
-    for name in names:
-        columns[name] = np.full((n, len(STAGES)) if MEASURES[name].by_stage else (n,), np.nan)
-        for shard in tested:
-            columns[name][shard.rows] = shard.measures[name]
+    for name in MEASURES:  # in the table's order, whichever shard came first
+        shards = [shard for shard in tested if name in shard.measures]
+        if name in prepared.measures:
+            columns[name] = prepared.measures[name]
+        elif shards:
+            shape = (n, len(STAGES)) if MEASURES[name].by_stage else (n,)
+            columns[name] = np.full(shape, np.nan)
+            for shard in shards:
+                columns[name][shard.rows] = shard.measures[name]
     return columns
 
 

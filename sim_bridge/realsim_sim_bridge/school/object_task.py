@@ -9,15 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.geometry import se3
-from realsim.geometry.mesh import MassProperties, mass_properties, sample_surface
+from realsim.geometry.mesh import MassProperties, mass_properties
 from realsim.models.convex import convex_parts
 from realsim.models.library_records import KnownSolid
 from realsim.records import Mesh
 from realsim.records.trajectories import GraspTrajectories
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.reach import ReachTask, check_reach
-from realsim_sim_bridge.grasping.candidates import Surroundings, sample_candidates
+from realsim_sim_bridge.grasping.candidates import sample_candidates
+from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
+from realsim_sim_bridge.grasping.surroundings import Surroundings, standing_object
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.slip.body import SlipBody
 
@@ -38,7 +39,7 @@ class ObjectTask:
     T_table_obj: Array
     """(4, 4) [m]."""
     neighbours: Surroundings
-    """Points on all other objects, table frame."""
+    """The surfaces of all other objects, table frame."""
     middle_xy: tuple[float, float]
     """Middle of the scene on the table [m]."""
     config: SchoolConfig
@@ -65,7 +66,12 @@ class ObjectTask:
             "density": self.density,
             "T_table_obj": self.T_table_obj.tolist(),
             "middle_xy_m": list(self.middle_xy),
-            "neighbours": _hash(self.neighbours.points, self.neighbours.instances),
+            "neighbours": _hash(
+                self.neighbours.points,
+                self.neighbours.instances,
+                self.neighbours.triangles,
+                self.neighbours.triangle_instances,
+            ),
             **known,
         }
 
@@ -95,8 +101,8 @@ class Prepared:
     """(N, 7) after the lift [rad]; NaN likewise."""
     reasons: tuple[str, ...]
     """(N,) why not reachable."""
-    trajectories: GraspTrajectories
-    """Of the candidates that the arm takes."""
+    trajectories: GraspTrajectories | None
+    """Of the candidates that the arm takes; None = there is none."""
     measures: dict[str, Array]
     """What geometry alone says of the candidates, (N,) each."""
     body: SlipBody | None
@@ -132,38 +138,57 @@ def prepare(task: ObjectTask) -> Prepared:
     body, why_not = _body(task, notes)
     n = len(found.widths_m)
     if body is None:
-        notes["not_tried"] = why_not
         nowhere = np.full((n, panda.JOINTS), np.nan)
-        reachable, joints, lifted = np.zeros(n, dtype=np.bool_), nowhere, nowhere
-        reasons = (f"not tried: {why_not}",) * n
-    else:
-        points = _object_points(task)
-        reach = check_reach(
-            ReachTask(
-                Ts_table_grasp=task.T_table_obj @ found.Ts_obj_grasp,
-                widths_m=found.widths_m,
-                openings_m=found.openings_m,
-                obj=points,
-                neighbours=task.neighbours,
-                middle_xy=task.middle_xy,
-            ),
-            config.reach,
-            config.hand,
-            rng,
+        return Prepared(
+            Ts_obj_grasp=found.Ts_obj_grasp,
+            widths_m=found.widths_m,
+            openings_m=found.openings_m,
+            reachable=np.zeros(n, dtype=np.bool_),
+            joints=nowhere,
+            joints_lifted=nowhere,
+            reasons=(f"not tried: {why_not}",) * n,
+            trajectories=None,
+            measures={},
+            body=None,
+            notes=notes | {"not_tried": why_not},
         )
-        reachable, joints, lifted = reach.reachable, reach.joints, reach.joints_lifted
-        reasons = reach.reasons
-        notes["counts"] |= {"reachable": int(reachable.sum()), "planned": reach.planned}
+    reach = check_reach(
+        ReachTask(
+            Ts_table_grasp=task.T_table_obj @ found.Ts_obj_grasp,
+            widths_m=found.widths_m,
+            openings_m=found.openings_m,
+            obj=standing_object(
+                task.mesh, task.T_table_obj, task.instance, config.candidates.object_points
+            ),
+            neighbours=task.neighbours,
+            middle_xy=task.middle_xy,
+        ),
+        config.reach,
+        config.hand,
+        rng,
+        config.slip.motion,
+    )
+    notes["counts"] |= {"reachable": int(reach.reachable.sum()), "planned": reach.planned}
+    notes["arm"] = {"stage_possible": reach.stage_possible.tolist(), "notes": list(reach.notes)}
+    closure = force_closure(
+        task.mesh,
+        found.Ts_obj_grasp,
+        found.openings_m,
+        # At the friction of the slip test, or the two could not be compared.
+        ClosureConfig(friction=config.slip.physics.friction),
+        config.hand,
+        body.center_of_mass,
+    )
     return Prepared(
         Ts_obj_grasp=found.Ts_obj_grasp,
         widths_m=found.widths_m,
         openings_m=found.openings_m,
-        reachable=reachable,
-        joints=joints,
-        joints_lifted=lifted,
-        reasons=reasons,
-        trajectories=no_trajectories(),
-        measures={},
+        reachable=reach.reachable,
+        joints=reach.joints,
+        joints_lifted=reach.joints_lifted,
+        reasons=reach.reasons,
+        trajectories=reach.trajectories,
+        measures=closure.measures(),
         body=body,
         notes=notes,
     )
@@ -180,39 +205,10 @@ def not_prepared(why: str) -> Prepared:
         joints=np.zeros((0, panda.JOINTS)),
         joints_lifted=np.zeros((0, panda.JOINTS)),
         reasons=(),
-        trajectories=no_trajectories(),
+        trajectories=None,
         measures={},
         body=None,
         notes={"not_tried": why},
-    )
-
-
-def no_trajectories() -> GraspTrajectories:
-    """Return the trajectories of no attempt."""
-    return GraspTrajectories(
-        rows=np.zeros(0, dtype=np.int64),
-        starts=np.zeros(1, dtype=np.int64),
-        time_s=np.zeros(0),
-        joints_rad=np.zeros((0, panda.JOINTS)),
-        opening_m=np.zeros(0),
-        phase=np.zeros(0, dtype=np.int64),
-    )
-
-
-def _object_points(task: ObjectTask) -> Surroundings:
-    """Return points on the grasped object itself, table frame."""
-    return surface_points(
-        task.mesh, task.T_table_obj, task.instance, task.config.candidates.object_points
-    )
-
-
-def surface_points(mesh: Mesh, T_table_obj: Array, instance: int, count: int) -> Surroundings:
-    """Return `count` points on an object and its vertices (at most as many), table frame."""
-    points = sample_surface(mesh, count, np.random.default_rng(instance))[0]
-    points = np.concatenate([points, mesh.vertices[:count]])
-    return Surroundings(
-        points=se3.transform(T_table_obj, points),
-        instances=np.full(len(points), instance, dtype=np.int64),
     )
 
 

@@ -5,7 +5,6 @@ hashes of its mesh and surroundings. Another run in the same folder is refused, 
 and new grasps side by side look alike and mean different things.
 """
 
-import fcntl
 import json
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
@@ -16,11 +15,12 @@ from typing import Any
 
 from realsim.errors import InputError
 from realsim.store import atomic
+from realsim.store.lock import only_run_in
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.object_task import ObjectTask
 from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
 
-RUN_FILE, LOCK_FILE = "run.json", "run.lock"
+RUN_FILE = "run.json"
 RESULTS = "instance_*.npz"
 """The run's own files; those of the convex parts carry a hash of all they depend on."""
 RESULTS_VERSION = 2
@@ -66,14 +66,7 @@ def folder_of_run(folder: Path, record: dict[str, Any], *, restart: bool) -> Gen
         InputError: another process is at work there, or its results are of another run.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    with (folder / LOCK_FILE).open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f"another Robot School is at work in {folder}. Wait until it has ended, or choose "
-                "another folder."
-            ) from None
+    with only_run_in(folder):
         for leftover in folder.glob(f".{RESULTS}.*"):  # of a process killed while it wrote
             leftover.unlink()
         path = folder / RUN_FILE

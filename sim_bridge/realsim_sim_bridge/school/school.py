@@ -10,18 +10,18 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
 from realsim.records import GraspSet, Mesh, ObjectModel, Scene, names_of
-from realsim_sim_bridge.grasping.candidates import Surroundings
+from realsim_sim_bridge.grasping.surroundings import standing_object, together
 from realsim_sim_bridge.school.cluster import ClusterConfig, ray_workers
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.day import Day, Progress, Pupil
 from realsim_sim_bridge.school.kept_sets import SchoolResult
-from realsim_sim_bridge.school.object_task import ObjectTask, surface_points
+from realsim_sim_bridge.school.object_task import ObjectTask
 from realsim_sim_bridge.school.run_record import folder_of_run, run_record
 from realsim_sim_bridge.school.shards import default_shard_grasps
 from realsim_sim_bridge.school.workers import Workers, local_workers
 
 
-def run_school(
+def run_school(  # noqa: PLR0913 - keywords, each with a meaning of its own
     scene: Scene,
     models: Mapping[int, ObjectModel],
     config: SchoolConfig | None = None,
@@ -51,7 +51,7 @@ def run_school(
     return [result.grasp_set for result in results]
 
 
-def run_school_results(
+def run_school_results(  # noqa: PLR0913 - as above
     scene: Scene,
     models: Mapping[int, ObjectModel],
     config: SchoolConfig | None = None,
@@ -162,7 +162,7 @@ def object_tasks(
     Ts = {o.instance: T_table_world @ o.T_world_obj for o in scene.objects}
     count = config.candidates.object_points
     surfaces = {
-        o.instance: surface_points(models[o.obj_id].mesh, Ts[o.instance], o.instance, count)
+        o.instance: standing_object(models[o.obj_id].mesh, Ts[o.instance], o.instance, count)
         for o in scene.objects
     }
     middle = np.mean([T[:2, 3] for T in Ts.values()], axis=0) if Ts else np.zeros(2)
@@ -179,7 +179,7 @@ def object_tasks(
                 mesh=Mesh(vertices=model.mesh.vertices, faces=model.mesh.faces),
                 density=model.density,
                 T_table_obj=Ts[obj.instance],
-                neighbours=_together([s for i, s in surfaces.items() if i != obj.instance]),
+                neighbours=together([s for i, s in surfaces.items() if i != obj.instance]),
                 middle_xy=(float(middle[0]), float(middle[1])),
                 config=config,
                 cache=cache,
@@ -187,12 +187,3 @@ def object_tasks(
             )
         )
     return tasks
-
-
-def _together(surfaces: list[Surroundings]) -> Surroundings:
-    """Return the points of all surfaces."""
-    nothing = Surroundings()
-    return Surroundings(
-        points=np.concatenate([nothing.points, *(s.points for s in surfaces)]),
-        instances=np.concatenate([nothing.instances, *(s.instances for s in surfaces)]),
-    )

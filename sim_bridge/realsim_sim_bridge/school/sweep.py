@@ -154,9 +154,7 @@ def run_sweep(
         def run(level: float, rows: Rows) -> Array:
             physics = replace(config.physics, **{knob: level})
             at = replace(config, physics=physics)
-            return scores_of(
-                run_slip_test(trial.part(rows), at, limits, geometry, engine), limits
-            )
+            return scores_of(run_slip_test(trial.part(rows), at, limits, geometry, engine), limits)
 
         return find_levels(run, known, float(getattr(config.physics, knob)), levels, sweep.search)
 

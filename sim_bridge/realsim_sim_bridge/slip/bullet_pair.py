@@ -5,6 +5,8 @@ What makes the friction right (each was measured to be wrong without it):
   fingers stay at 0.5). Damping is set in a call of its own, and everything is read back.
 - Bullet's solver puts a flat pad's whole load on one corner: sphere pads with finite stiffness.
 - `numSubSteps` multiplies the motors' force: never used; the time step is set instead.
+- Friction is solved for speeds alone: what is squeezed where it is curved crawls, unless a contact
+  is anchored to where it first touched.
 - A light object between stiff pads does not converge: it is given a mass of at least the floor.
 
 Pairs in one world are not independent: Bullet sorts their constraints by an unstable sort, so that
@@ -61,6 +63,7 @@ class BulletPair:
             numSolverIterations=settings.iterations,
             numSubSteps=0,
             deterministicOverlappingPairs=1,
+            frictionERP=settings.friction_erp,
         )
         self.engine.setGravity(0.0, 0.0, 0.0)
         with tempfile.TemporaryDirectory() as folder:
@@ -100,6 +103,9 @@ class BulletPair:
         for finger in FINGERS:
             engine.changeDynamics(hand, finger, **wanted)
             self._check(hand, finger, wanted)
+            if self._physics.pads:
+                engine.changeDynamics(hand, finger, frictionAnchor=int(settings.friction_anchor))
+                self._check(hand, finger, wanted)
         gear = engine.createConstraint(
             hand, 0, hand, 1, engine.JOINT_GEAR, [0, 1, 0], [0, 0, 0], [0, 0, 0]
         )

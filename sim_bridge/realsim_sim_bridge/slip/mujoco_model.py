@@ -1,13 +1,15 @@
 """The compiled MuJoCo model of one hand that stands still and one object.
 
 What makes its friction right (each was measured to be wrong without it):
-- The fingers' speed is limited by a velocity drive whose force saturates at the hand's. Damping of
-  the joint would be integrated implicitly but not be seen by the contact solver: fingers chatter
-  and heavy objects slip at half of Coulomb's limit.
+- What drives the fingers is dry friction of the hand's force against a carriage that moves at the
+  closing speed: a constraint, solved together with the contacts. Damping of a joint, or a velocity
+  drive before its force saturates, is integrated implicitly but not seen by the contact solver:
+  fingers chatter, light objects are lost while closing (by a drive of 3 cm/s most of them) and
+  heavy ones slip at half of Coulomb's limit.
 - 2 x 3 sphere pads a finger: a mesh finger touches at two or three points and carries no torque.
 - `impratio` makes friction stiff against the normal, so that objects do not creep; the cone is
   elliptic, for a pyramid is stronger along its edges.
-- Light objects and light fingers kick each other: mass floor and armature.
+- Light objects between stiff pads do not converge: mass floor.
 - MuJoCo takes the greater friction of the two geoms, hence both have the contact's.
 """
 
@@ -24,7 +26,7 @@ from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.mujoco_approach import surface_triangles
 from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
 from realsim_sim_bridge.slip.pads import PadModel
-from realsim_sim_bridge.slip.world import Closing, SlipPhysics
+from realsim_sim_bridge.slip.world import SlipPhysics
 
 Array = NDArray[np.float64]
 
@@ -32,13 +34,22 @@ FINGER_NAMES = ("left", "right")
 SIDES = (1.0, -1.0)
 """Finger 0 is at +y."""
 OBJECT = "object"
+CARRIAGE = "carriage"
+CARRIAGE_KG_PER_N = 150.0
+"""Mass of the carriage [kg per N of the hand's force]: 2 F slow it by 1.3 cm/s in a second."""
+SIDES = (1.0, -1.0)
+"""Finger 0 is at +y."""
+OBJECT = "object"
+CARRIAGE = "carriage"
+CARRIAGE_KG = 1e6
+"""Mass of the carriage [kg]: 2 x 70 N slow it by 1 mm/s in 7 s."""
 HAND_SIDE, OBJECT_SIDE = 1, 2
 """Collision bits: the hand's geoms meet the object's and nothing else."""
 STIFF = (0.99, 0.999, 0.001, 0.5, 2.0)
 """`solimp` of joint limits and of the fingers' coupling: with the default one, 2 x 70 N push the
 fingers millimetres past their limits."""
 FINGER_MOMENT = 3e-5
-"""Moments of inertia of a finger [kg m^2]; it only slides, so that they do not matter."""
+"""Moments of inertia of what only slides [kg m^2]: they do not matter."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -86,8 +97,10 @@ def compile_pair(
     _couple_fingers(spec, settings)
     parts = [se3.transform(se3.invert(T_obj_body), part) for part in body.parts]
     _add_object(spec, parts, body.mass_kg, moments, physics, settings)
+    _add_drive(spec, physics, settings)
     try:
         model = spec.compile()
+        _keep_tolerance(model)
         triangles = surface_triangles(body.parts)
     except (ValueError, RuntimeError) as error:
         raise InputError(
@@ -104,14 +117,12 @@ def compile_pair(
     )
 
 
-def set_drive(model: Any, force_n: float, speed: float) -> None:
-    """Let the drives press with a force [N] and limit each finger's speed [m/s].
+def _keep_tolerance(model: Any) -> None:
+    """Let the solver be as exact as if the carriage were not there.
 
-    The gain is such that the force saturates until the finger has half its speed.
+    Its tolerance is relative to the mean inertia of the model, most of which is the carriage's.
     """
-    gain = 2.0 * force_n / speed
-    model.actuator_gainprm[:, 0] = gain
-    model.actuator_biasprm[:, 2] = -gain
+    model.opt.tolerance *= model.dof_M0[:-1].mean() / model.stat.meaninertia
 
 
 def set_drag(model: Any, rate_per_s: float) -> None:
@@ -129,7 +140,7 @@ def read_settings(model: Any) -> dict[str, float]:
         "object_friction": float(model.geom_friction[~hand, 0].min()),
         "dt_s": float(model.opt.timestep),
         "object_mass_kg": float(model.body(OBJECT).mass[0]),
-        "force_n": float(model.actuator_forcerange[:, 1].min()),
+        "force_n": float(model.tendon_frictionloss.min()),
         "impratio": float(model.opt.impratio),
         "noslip_iterations": float(model.opt.noslip_iterations),
         "elliptic_cone": float(model.opt.cone),
@@ -205,10 +216,29 @@ def _add_finger(
         objtype=mujoco.mjtObj.mjOBJ_SITE,
         objname=name,
     )
-    drive = spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, target=name)
-    drive.set_to_velocity(kv=2.0 * physics.force_n / Closing().speed)
-    drive.forcelimited = True
-    drive.forcerange = [-physics.force_n, physics.force_n]
+
+
+def _add_drive(spec: Any, physics: SlipPhysics, settings: MujocoSettings) -> None:
+    """Add the carriage that takes the fingers along until they resist with more than their force.
+
+    Each finger is held to the carriage by dry friction of the hand's force; the carriage is too
+    heavy to be slowed.
+    """
+    mujoco = load_mujoco()
+    body = spec.worldbody.add_body(name=CARRIAGE)
+    body.explicitinertial = True
+    body.mass = CARRIAGE_KG_PER_N * physics.force_n
+    body.inertia = [FINGER_MOMENT] * 3
+    body.add_joint(name=CARRIAGE, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0.0, 1.0, 0.0])
+    for name in FINGER_NAMES:
+        clutch = spec.add_tendon(
+            name=name,
+            frictionloss=physics.force_n,
+            solref_friction=[settings.contact_time_s, 1.0],
+            solimp_friction=STIFF,
+        )
+        clutch.wrap_joint(name, 1.0)
+        clutch.wrap_joint(CARRIAGE, -1.0)
 
 
 def _couple_fingers(spec: Any, settings: MujocoSettings) -> None:

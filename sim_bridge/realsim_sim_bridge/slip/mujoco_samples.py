@@ -16,7 +16,7 @@ class Samples:
     """State rows and forces of K pairs at S times; NaN until they are filled in."""
 
     rows: Array
-    """(K, S, 18), see `mujoco_state`."""
+    """(K, S, 20), see `mujoco_state`."""
     finger_n: Array
     """(K, S, 2) sum of the normal forces of each finger's contacts [N]."""
     times_s: Array

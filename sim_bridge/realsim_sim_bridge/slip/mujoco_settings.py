@@ -10,16 +10,17 @@ class MujocoSettings:
     """Settings that pass the validation suite."""
 
     step_s: float = 0.002
-    """Time step [s]; at 4 ms the closing fingers lose light objects."""
+    """Time step [s]."""
     impratio: float = 1000.0
     """Stiffness of friction against that of the normal: without it objects creep."""
     noslip_iterations: int = 0
     """Passes of the solver that removes what slip is left; not needed at a high `impratio`."""
     armature_kg: float = 0.4
-    """Reflected inertia of a finger's drive [kg]: light fingers kick light objects."""
+    """Reflected inertia of a finger's drive [kg]; chosen, not measured. Without it as many objects
+    are closed on."""
     contact_time_s: float = 0.004
     """Time constant of contacts, joint limits and of the fingers' coupling [s]: two steps of 2 ms,
-    the stiffest that MuJoCo integrates. Softer ones let objects go while the fingers close."""
+    the stiffest that MuJoCo integrates."""
     pairs_per_world: int = 48
     """Pairs of one rollout."""
     replay: Replay = field(default_factory=lambda: Replay(speed=4))

@@ -2,8 +2,9 @@
 
 A row is [time, qpos, qvel] (`mjSTATE_FULLPHYSICS` of a model without activations):
 
-    time | finger 0, finger 1, body position, body quaternion w x y z |
-    finger 0, finger 1, linear velocity of the body's origin, angular velocity in the body's axes
+    time |
+    finger 0, finger 1, body position, body quaternion w x y z, carriage |
+    finger 0, finger 1, linear velocity of the body, angular velocity in its own axes, carriage
 
 all in the hand's frame `grasp`, because one model, whose hand does not turn, serves all pairs.
 """
@@ -20,15 +21,17 @@ TIME = 0
 FINGERS = slice(1, 3)
 POSITION = slice(3, 6)
 QUATERNION_WXYZ = slice(6, 10)
-FINGER_SPEEDS = slice(10, 12)
-VELOCITY = slice(12, 15)
-SPIN = slice(15, 18)
-WIDTH = 18
+CARRIAGE = 10
+FINGER_SPEEDS = slice(11, 13)
+VELOCITY = slice(13, 16)
+SPIN = slice(16, 19)
+CARRIAGE_SPEED = 19
+WIDTH = 20
 """Numbers in a row."""
 
 
 def rows_at(Ts_grasp_body: Array, fingers_m: Array) -> Array:
-    """Return rows (K, 18) of pairs at rest.
+    """Return rows (K, 20) of pairs at rest.
 
     Args:
         Ts_grasp_body: (K, 4, 4) principal frame of the object in the hand's [m].
@@ -42,13 +45,13 @@ def rows_at(Ts_grasp_body: Array, fingers_m: Array) -> Array:
 
 
 def poses(rows: Array, Rs_world_hand: Array) -> Array:
-    """Return Ts_world_body (..., 4, 4) [m] of rows (..., 18)."""
+    """Return Ts_world_body (..., 4, 4) [m] of rows (..., 20)."""
     R = Rs_world_hand @ se3.from_quaternion_wxyz(rows[..., QUATERNION_WXYZ])
     return se3.from_rt(R, _turned(Rs_world_hand, rows[..., POSITION]))
 
 
 def pair_states(rows: Array, Rs_world_hand: Array) -> PairStates:
-    """Return where pairs are, from rows (K, 18)."""
+    """Return where pairs are, from rows (K, 20)."""
     Ts_world_body = poses(rows, Rs_world_hand)
     angular = _turned(Ts_world_body[:, :3, :3], rows[:, SPIN])
     linear = _turned(Rs_world_hand, rows[:, VELOCITY])
@@ -61,7 +64,7 @@ def pair_states(rows: Array, Rs_world_hand: Array) -> PairStates:
 
 
 def rows_of(states: PairStates, Rs_world_hand: Array) -> Array:
-    """Return rows (K, 18): the inverse of `pair_states`; time is zero."""
+    """Return rows (K, 20): the inverse of `pair_states`; time is zero."""
     Rs_hand_world = np.swapaxes(Rs_world_hand, -1, -2)
     Rs_body_world = np.swapaxes(states.Ts_world_body[:, :3, :3], -1, -2)
     rows = np.zeros((len(Rs_world_hand), WIDTH))
@@ -75,11 +78,11 @@ def rows_of(states: PairStates, Rs_world_hand: Array) -> Array:
 
 
 def moved_m(before: Array, after: Array, reach_m: float) -> Array:
-    """Return at most how far any point of object or fingers moved between rows (K, 18) [m].
+    """Return at most how far any point of object or fingers moved between rows (K, 20) [m].
 
     Args:
-        before: (K, 18).
-        after: (K, 18).
+        before: (K, 20).
+        after: (K, 20).
         reach_m: greatest distance of a point of the object from its centre of mass [m].
     """
     shift = np.linalg.norm(after[:, POSITION] - before[:, POSITION], axis=1)

@@ -26,7 +26,6 @@ from realsim_sim_bridge.slip.mujoco_model import (
     load_mujoco,
     read_settings,
     set_drag,
-    set_drive,
 )
 from realsim_sim_bridge.slip.mujoco_samples import Samples
 from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
@@ -48,6 +47,9 @@ MODELS_KEPT = 4
 """Compiled models that an engine keeps; a scene's objects are tested one after the other."""
 PIECE_STEPS = 100
 """Steps of one rollout: loads and states of 48 pairs then take 2 MB."""
+
+SLOWEST = 0.01
+"""Least closing speed [m/s]: within a piece the drive loses up to 3 mm/s."""
 
 
 class MujocoEngine:
@@ -110,10 +112,9 @@ class MujocoWorld(HandWorld):
         self._model: Any = copy.copy(pair.model)
         self._data: Any = mujoco.MjData(self._model)
         self._rollout: Any = mujoco.rollout.Rollout(nthread=0)
-        loads = mujoco.mjtState.mjSTATE_CTRL | mujoco.mjtState.mjSTATE_XFRC_APPLIED
-        self._control_spec = int(loads)
+        self._control_spec = int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
         self._control_width = int(mujoco.mj_stateSize(self._model, self._control_spec))
-        first = int(self._model.nu) + 6 * int(self._model.body(OBJECT).id)
+        first = 6 * int(self._model.body(OBJECT).id)
         self._load = slice(first, first + 6)
         self._memory: dict[str, Array] = {}
         self._speed = Closing().speed
@@ -146,10 +147,17 @@ class MujocoWorld(HandWorld):
 
         Hands that are open start near the object (`mujoco_approach`). A pair ends when it rests or
         its time is up, and what was seen last of it is seen from then on, unless it was lost.
+
+        Raises:
+            InputError: the closing speed is too low.
         """
+        if not closing.speed >= SLOWEST:
+            raise InputError(
+                f"the fingers cannot close at {closing.speed} m/s in MuJoCo, where their drive "
+                f"slows down under load; {SLOWEST} m/s or more is expected."
+            )
         self._start_near_objects()
         self._speed = closing.speed
-        set_drive(self._model, self._physics.force_n, closing.speed)
         set_drag(self._model, closing.drag_per_s)
         every = max(1, round(closing.sample_s / self.dt))
         arrival_s = self._rows[:, mujoco_state.FINGERS].max(axis=1) / closing.speed
@@ -252,13 +260,12 @@ class MujocoWorld(HandWorld):
             wrenches: (n, steps, 6) torque and force, world axes; None = no load.
 
         Returns:
-            state rows (n, steps, 18), normal forces of the fingers (n, steps, 2) [N] and whether
+            state rows (n, steps, 20), normal forces of the fingers (n, steps, 2) [N] and whether
             MuJoCo went through without a warning (n,). Pairs with one stay where they were. The
             arrays are overwritten by the next call.
         """
         n = len(k)
         control = self._space("control", n, steps, self._control_width)
-        control[..., :2] = -self._speed
         if wrenches is None:
             control[..., self._load] = 0.0
         else:
@@ -269,7 +276,8 @@ class MujocoWorld(HandWorld):
         states = self._space("states", n, steps, mujoco_state.WIDTH)
         forces = self._space("forces", n, steps, 2)
         begin = self._rows[k]
-        begin[:, mujoco_state.TIME] = 0.0
+        begin[:, mujoco_state.TIME] = begin[:, mujoco_state.CARRIAGE] = 0.0
+        begin[:, mujoco_state.CARRIAGE_SPEED] = -self._speed
         self._rollout.rollout(
             [self._model] * n,
             [self._data],

@@ -1,8 +1,8 @@
 """The same grasps carried by a whole Panda in PyBullet, with gravity on and nothing replayed.
 
-The hand that stands still feels loads that were computed; here nothing is: seven position-controlled
-joints move a hand with the same pads, and the object has its true mass. What the two have in common
-is the hand's motion alone.
+The hand that stands still feels loads that were computed; here nothing is: seven joints under
+position control move a hand with the same pads, and the object has its true mass. What the two have
+in common is the hand's motion alone.
 """
 
 import tempfile
@@ -19,21 +19,28 @@ from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.bullet_settings import BulletSettings
 from realsim_sim_bridge.slip.hand_urdf import hand_urdf
 from realsim_sim_bridge.slip.score import ScoreLimits
-from realsim_sim_bridge.slip.slip_test import SlipConfig
+from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
+from realsim_sim_bridge.slip.world import Engine
+from realsim_sim_bridge.validation.config import ValidationConfig
+from realsim_sim_bridge.validation.loads import with_hand
 from realsim_sim_bridge.validation.moving_arm import TORQUES_NM, arm_urdf, stage_joints
-from realsim_sim_bridge.validation.specimens import READY, SIDE_M
+from realsim_sim_bridge.validation.report import CheckResult
+from realsim_sim_bridge.validation.specimens import READY, SIDE_M, cube, ready_trial
 
 Array = NDArray[np.float64]
 
 RATE_HZ = 1000.0
 """Steps per second: the arm carries true masses, for which the hand's steps are too long."""
 STIFFNESS, DAMPING = 1e5, 10.0
-"""Of the pads [N/m, N s/m]. In a hand that turns, Bullet's friction makes the velocities equal of two
-points that lie as far apart as pad and object overlap; at 10000 N/m and 70 N these are 1.2 of 25 mm,
-and the object lags behind the hand by 5 % of its turn. A hand that stands still knows no such lag."""
+"""Of the pads [N/m, N s/m]. In a hand that turns, Bullet's friction makes the velocities equal of
+two points that lie as far apart as pad and object overlap; at 10000 N/m and 70 N these are 1.2 of
+25 mm, and the object lags behind the hand by 5 % of its turn. A hand at rest knows no such lag."""
+ITERATIONS = 100
+"""Of the solver, each step."""
+GEAR_ERP, GEAR_FORCE_N = 0.3, 1000.0
+"""What keeps the two fingers symmetric: share of the error taken back per step, and force [N]."""
 CLOSE_S = 0.5
 """Time for closing [s]: the fingers arrive within 0.1 s."""
 HEADROOM_M = 0.004
@@ -61,20 +68,61 @@ class CarriedCube:
         return bool(held.all())
 
 
-def carry_cube(
-    mass_kg: float, T_obj_grasp: Array, config: SlipConfig, settings: BulletSettings
-) -> CarriedCube:
+def arm_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
+    """Return how far the engine's hand that stands still agrees with an arm that moves."""
+    labels = config.labels
+    same, slip_m, turn_rad, tracking = 0, 0.0, 0.0, 0.0
+    told: list[str] = []
+    R_down = se3.from_rt(panda.forward(READY)[:3, :3], np.zeros(3))
+    for mass, force_n, friction, beside_m in labels.arm_cases:
+        slip = with_hand(config.slip, force_n, friction)
+        T_obj_grasp = se3.from_translation([beside_m, 0.0, 0.0])
+        arm = carry_cube(mass, T_obj_grasp, slip)
+        trial = ready_trial(cube(mass), T_obj_grasp[None], R_down[None], SIDE_M + 2 * HEADROOM_M)
+        hand = run_slip_test(trial, slip, engine=engine)
+        agree = arm.passed == bool(hand.passed[0])
+        same += agree
+        tracking = max(tracking, arm.tracking_rad)
+        verdict = ("held" if arm.passed else "dropped") if agree else "DIFFERENT"
+        told.append(
+            f"{mass:g} kg, {force_n:g} N, mu {friction:g}, {1e3 * beside_m:g} mm: {verdict}"
+        )
+        if arm.passed and hand.passed[0]:
+            slip_m = max(slip_m, float(np.abs(arm.slip_m - hand.slip_m[0]).max()))
+            turn_rad = max(turn_rad, float(np.abs(arm.slip_rad - hand.slip_rad[0]).max()))
+    followed = f"the arm's joints within {np.degrees(tracking):.2f} deg of their path"
+    return [
+        CheckResult(
+            group="full_arm", name="full arm, labels",
+            what="share of boxes with the same label in the hand alone and in PyBullet's whole arm",
+            measured=same / len(labels.arm_cases), unit="", limit=1.0, at_least=True,
+            detail="; ".join(told),
+        ),
+        CheckResult(
+            group="full_arm", name="full arm, slip",
+            what="difference of slip in a stage between the hand alone and the whole arm",
+            measured=1e3 * slip_m, unit="mm", limit=1e3 * labels.arm_slip_m, detail=followed,
+        ),
+        CheckResult(
+            group="full_arm", name="full arm, turn",
+            what="difference of turn in a stage between the hand alone and the whole arm",
+            measured=float(np.degrees(turn_rad)), unit="deg", limit=labels.arm_turn_deg,
+            detail=followed,
+        ),
+    ]  # fmt: skip
+
+
+def carry_cube(mass_kg: float, T_obj_grasp: Array, config: SlipConfig) -> CarriedCube:
     """Close on a weightless cube in the ready pose, turn gravity on and play the stages.
 
     Args:
         mass_kg: of the cube.
         T_obj_grasp: (4, 4) where it is grasped; the hand points down, the cube as it comes [m].
         config: the hand's force and friction, and the motions.
-        settings: of the engine; time step and stiffness are this module's own.
     """
     slip_m, slip_rad = np.full(len(STAGES), np.nan), np.full(len(STAGES), np.nan)
     limits = ScoreLimits()
-    with _ArmWorld(mass_kg, T_obj_grasp, config, settings) as world:
+    with _ArmWorld(mass_kg, T_obj_grasp, config) as world:
         q, tracking = READY.copy(), 0.0
         for stage in range(len(STAGES)):
             if stage == 0:
@@ -87,7 +135,9 @@ def carry_cube(
                 path, q, config.sample_s, config.lost_m
             )
             q, tracking = path[-1], max(tracking, error)
-            if not (slip_m[stage] <= limits.slip_m and np.degrees(slip_rad[stage]) <= limits.slip_deg):
+            if not (
+                slip_m[stage] <= limits.slip_m and np.degrees(slip_rad[stage]) <= limits.slip_deg
+            ):
                 break
     return CarriedCube(slip_m=slip_m, slip_rad=slip_rad, tracking_rad=tracking)
 
@@ -95,9 +145,7 @@ def carry_cube(
 class _ArmWorld:
     """An arm with a hand and a cube in PyBullet."""
 
-    def __init__(
-        self, mass_kg: float, T_obj_grasp: Array, config: SlipConfig, settings: BulletSettings
-    ) -> None:
+    def __init__(self, mass_kg: float, T_obj_grasp: Array, config: SlipConfig) -> None:
         with interop.quiet_output():
             import pybullet
             from pybullet_utils.bullet_client import BulletClient
@@ -105,11 +153,11 @@ class _ArmWorld:
             self._engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
         self._config, self.dt = config, 1.0 / RATE_HZ
         self._engine.setPhysicsEngineParameter(
-            fixedTimeStep=self.dt, numSolverIterations=settings.iterations, numSubSteps=0,
+            fixedTimeStep=self.dt, numSolverIterations=ITERATIONS, numSubSteps=0,
             deterministicOverlappingPairs=1, solverResidualThreshold=0.0,
         )  # fmt: skip
         self._engine.setGravity(0.0, 0.0, 0.0)
-        self._add_arm(settings)
+        self._add_arm()
         self._add_cube(mass_kg, panda.forward(READY) @ se3.invert(T_obj_grasp))
 
     def __enter__(self) -> "_ArmWorld":
@@ -135,8 +183,10 @@ class _ArmWorld:
         """Turn gravity on [m/s^2]."""
         self._engine.setGravity(0.0, 0.0, -gravity)
 
-    def follow(self, path: Array, q: Array, sample_s: float, lost_m: float) -> tuple[float, float, float]:
-        """Follow joint angles (T, 7) from q (7,); return slip [m], turn [rad] and tracking error."""
+    def follow(
+        self, path: Array, q: Array, sample_s: float, lost_m: float
+    ) -> tuple[float, float, float]:
+        """Follow joint angles (T, 7) from q (7,); return slip [m], turn and tracking error [rad]."""
         engine, start = self._engine, self._in_hand()
         speeds = np.diff(np.vstack([q, path]), axis=0) / self.dt
         slip = turn = tracking = 0.0
@@ -165,7 +215,7 @@ class _ArmWorld:
         cube = interop.T_from_pybullet(*self._engine.getBasePositionAndOrientation(self._cube))
         return se3.invert(hand) @ cube
 
-    def _add_arm(self, settings: BulletSettings) -> None:
+    def _add_arm(self) -> None:
         """Load the arm in its ready pose with its hand open."""
         engine, physics = self._engine, self._config.physics
         with tempfile.TemporaryDirectory() as folder:
@@ -200,9 +250,7 @@ class _ArmWorld:
             self._arm, self._fingers[0], self._arm, self._fingers[1], engine.JOINT_GEAR,
             [0, 1, 0], [0, 0, 0], [0, 0, 0],
         )  # fmt: skip
-        engine.changeConstraint(
-            gear, gearRatio=-1, erp=settings.gear_erp, maxForce=settings.gear_force_n
-        )
+        engine.changeConstraint(gear, gearRatio=-1, erp=GEAR_ERP, maxForce=GEAR_FORCE_N)
 
     def _add_cube(self, mass_kg: float, T_base_cube: Array) -> None:
         """Add the cube, weightless until gravity is turned on."""

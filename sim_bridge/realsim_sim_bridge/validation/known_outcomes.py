@@ -30,8 +30,10 @@ def box_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
         size = f"{label} cube of 5 cm, {config.slip.physics.force_n:g} N"
         failed = "; ".join(dict.fromkeys(f for f in slips.failures if f))
         with np.errstate(invalid="ignore"):
-            slip_mm = np.nan_to_num(1e3 * slips.slip_m, nan=np.inf).max(axis=0)
-            turn_deg = np.nan_to_num(np.degrees(slips.slip_rad), nan=np.inf).max(axis=0)
+            slip_mm = np.nan_to_num(1e3 * slips.slip_m, nan=np.inf, posinf=np.inf).max(axis=0)
+            turn_deg = np.nan_to_num(np.degrees(slips.slip_rad), nan=np.inf, posinf=np.inf).max(
+                axis=0
+            )
         checks += [
             CheckResult(
                 group="box", name=f"box {label}, score", what=f"least score of the {size}",

@@ -1,4 +1,4 @@
-"""Labels of grasps on the edge: they must not hang on the time step, the iterations or the replay."""
+"""Labels of grasps on the edge: they must not hang on time step, iterations or replay."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -91,7 +91,9 @@ class LabelChecks:
     def convergence(self) -> list[CheckResult]:
         """Return the agreement of the labels with those at finer settings."""
         config = self._config
-        beside = edge_labels(self._make(at_true_speed(self._settings)), config, config.labels.jitter_m)
+        beside = edge_labels(
+            self._make(at_true_speed(self._settings)), config, config.labels.jitter_m
+        )
         jitter = f"{1e3 * config.labels.jitter_m:g} mm beside: {_share(self._true, beside):.3f}"
         return [self._finer(*finer, jitter) for finer in config.labels.finer]
 
@@ -139,6 +141,6 @@ def _by_mass(a: EdgeLabels, b: EdgeLabels) -> str:
         f"{1e3 * m:g} g {int(np.sum((a.passed != b.passed)[a.masses_kg == m]))}"
         for m in np.unique(a.masses_kg).tolist()
     ]
-    return (
-        f"{len(a.passed)} grasps, {100 * a.passed.mean():.0f} % held; differing at " + ", ".join(words)
+    return f"{len(a.passed)} grasps, {100 * a.passed.mean():.0f} % held; differing at " + ", ".join(
+        words
     )

@@ -72,6 +72,8 @@ class FrictionPatch:
         twist = w / (w @ w)
         for _ in range(SWEEPS):
             speeds = np.linalg.norm(rows @ twist, axis=1)
+            if not np.any(speeds):
+                return twist
             weights = self.friction_n / np.maximum(speeds, SMALLEST_M_S * speeds.max())
             Q = np.einsum("p,pij,pik->jk", weights, rows, rows)
             # A patch on a line or in a point does not resist every twist.
@@ -81,7 +83,7 @@ class FrictionPatch:
 
 
 def _turns_about(rows: Array, w: Array) -> list[Array]:
-    """Return the twists (3,) with w . t = 1 about each point: corners that descent reaches slowly."""
+    """Return the twists (3,) with w . t = 1 about each point: corners, which descent is slow at."""
     twists: list[Array] = []
     for S in rows:
         turn = np.cross(S[0], S[1])

@@ -80,7 +80,7 @@ def _hold(
         closed = world.close(config.closing)
         start = world.states().Ts_world_body
         steps, ramp = round((ramp_s + hold_s) / world.dt), round(ramp_s / world.dt)
-        growth = min_jerk(1.0, ramp_s, world.dt * np.arange(1, steps + 1))[0]
+        growth = min_jerk(1.0, ramp_s, world.dt * np.arange(1, steps + 1, dtype=np.float64))[0]
         sample = max(1, round(0.025 / world.dt))
         motion = world.play(loads[:, None, :] * growth[:, None], sample, LOST_M)
     Ts = motion.Ts_world_body
@@ -97,7 +97,7 @@ def _hold(
 
 
 def _since(start: Array, Ts: Array) -> tuple[Array, Array]:
-    """Return shift (K, S) [m] and turn (K, S) [rad] of poses (K, S, 4, 4) since a start (K, 4, 4)."""
+    """Return shift [m] and turn [rad] (K, S) of poses (K, S, 4, 4) since a start (K, 4, 4)."""
     lost = np.isnan(Ts[..., 0, 3]) | np.isnan(start[:, None, 0, 3])
     shift = np.linalg.norm(Ts[..., :3, 3] - start[:, None, :3, 3], axis=-1)
     R = np.swapaxes(start[:, None, :3, :3], -1, -2) @ Ts[..., :3, :3]

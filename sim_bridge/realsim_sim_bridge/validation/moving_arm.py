@@ -19,7 +19,7 @@ TORQUES_NM = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
 
 
 def arm_urdf(hand: str) -> str:
-    """Return the Panda with a hand (the URDF of a robot with root `palm`), without the arm's shapes.
+    """Return the Panda with a hand (a URDF with root `palm`), without the arm's shapes.
 
     A joint's frame is Rx(alpha) Tx(a) Tz(d) Rz(q) from the one before (Craig).
     """
@@ -64,7 +64,7 @@ def stage_joints(stage: int, q: Array, motion: SlipMotion, dt: float) -> Array:
 def _hand_path(stage: int, motion: SlipMotion, dt: float) -> Array:
     """Return where the hand is (T, 3) [m], since the start of the stage, table axes."""
     if STAGES[stage] == "lift":
-        t = dt * np.arange(1, round((motion.lift_s + motion.lift_hold_s) / dt) + 1)
+        t = dt * np.arange(1.0, round((motion.lift_s + motion.lift_hold_s) / dt) + 1)
         up = min_jerk(motion.lift_height_m, motion.lift_s, t)[0]
         return np.stack([0 * up, 0 * up, up], axis=-1)
     count = round(motion.oscillation_cycles / motion.oscillation_hz / dt)

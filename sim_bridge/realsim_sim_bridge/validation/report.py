@@ -1,4 +1,4 @@
-"""What the validation suite found: a table of checks, each with its figure, its limit and a verdict."""
+"""What the validation suite found: checks, each with its figure, its limit and a verdict."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -59,7 +59,7 @@ class LimitRatio:
     held: float
     """Largest share of the limit below which every one tried was held; 0 = not even the least."""
     slipped: float
-    """Smallest share at which and above which every one tried slipped; inf = not even the largest."""
+    """Smallest share from which on every one tried slipped; inf = not even the largest."""
 
     @property
     def error(self) -> float:

@@ -1,4 +1,4 @@
-"""The load at which a held cube slips or turns, against Coulomb's limit; and that below it nothing creeps."""
+"""The load at which a held cube slips or turns, against Coulomb's limit; and no creep below it."""
 
 from dataclasses import dataclass
 
@@ -138,9 +138,7 @@ def force_check(engine: Engine, config: ValidationConfig) -> CheckResult:
     worst, seen = 0.0, ""
     for force_n, friction in config.limits.cases:
         slip = with_hand(config.slip, force_n, friction)
-        held = hold(
-            engine, slip, _mass(config, slip), np.zeros((1, 6)), ramp_s=0.05, hold_s=0.05
-        )
+        held = hold(engine, slip, _mass(config, slip), np.zeros((1, 6)), ramp_s=0.05, hold_s=0.05)
         error = float(100 * np.abs(held.finger_n / force_n - 1.0).max())
         seen += f"{', ' if seen else ''}{held.finger_n.min():.4g} of {force_n:g} N"
         worst = max(worst, error) if np.isfinite(error) else float("nan")
@@ -190,7 +188,7 @@ def _slipped(held: Held, config: ValidationConfig) -> NDArray[np.bool_]:
 
 
 def _limit(load: PlanarLoad, slip: SlipConfig) -> float:
-    """Return how many units of the load two fingers carry; bare boxes are judged as the pads are."""
+    """Return how many units of the load two fingers carry; bare boxes are judged like pads."""
     physics = slip.physics
     points = (physics.pads or PadModel()).centers_xz()
     return hand_patch(points, physics.force_n, physics.friction).slip_load(load.planar())

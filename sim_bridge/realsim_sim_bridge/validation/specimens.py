@@ -28,7 +28,8 @@ CLEARANCE_M = 0.003
 
 def cube(mass_kg: float) -> SlipBody:
     """Return the 5 cm cube with its centre in the origin."""
-    return _body((_box((-SIDE_M / 2,) * 3, (SIDE_M / 2,) * 3),), mass_kg)
+    half = SIDE_M / 2
+    return _body((_box((-half, -half, -half), (half, half, half)),), mass_kg)
 
 
 def specimen(shape: str, mass_kg: float) -> SlipBody:
@@ -105,7 +106,7 @@ def edge_trial(
 
 
 def _met(body: SlipBody, at: Array) -> bool:
-    """Return whether a line along y through a point (3,) meets a part: seen along y, it is inside."""
+    """Return whether a point (3,) is inside a part, seen along y."""
     from scipy.spatial import ConvexHull
 
     for part in body.parts:
@@ -128,20 +129,12 @@ def _body(parts: tuple[Array, ...], mass_kg: float) -> SlipBody:
         d = solid.center_of_mass - center
         inertia += solid.inertia + solid.volume_m3 * (d @ d * np.eye(3) - np.outer(d, d))
     density = mass_kg / volumes.sum()
-    return SlipBody(
-        parts=parts, mass_kg=mass_kg, center_of_mass=center, inertia=density * inertia
-    )
+    return SlipBody(parts=parts, mass_kg=mass_kg, center_of_mass=center, inertia=density * inertia)
 
 
 def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Array:
     """Return the corners (8, 3) of a box [m]."""
     return np.array(list(product(*zip(low, high, strict=True))))
-
-
-def _along_y(outline: Array, width: float) -> Array:
-    """Return the corners (2 V, 3) of a prism: an outline (V, 2) in x and z, as wide along y [m]."""
-    sides = [np.insert(outline, 1, y, axis=1) for y in (-width / 2, width / 2)]
-    return np.concatenate(sides)
 
 
 def _cylinder() -> Array:

@@ -7,6 +7,7 @@ from dataclasses import asdict, replace
 from realsim.errors import InputError
 from realsim_sim_bridge.slip.engines import make_engine
 from realsim_sim_bridge.validation.config import CHECKS, ValidationConfig
+from realsim_sim_bridge.validation.full_arm import arm_checks
 from realsim_sim_bridge.validation.known_outcomes import box_checks, capacity_checks
 from realsim_sim_bridge.validation.labels import LabelChecks, MakeEngine, Settings
 from realsim_sim_bridge.validation.repeat import repeat_checks, settings_check
@@ -68,6 +69,8 @@ def validate(
             checks += labels.convergence()
         elif part == "replay":
             checks += labels.replay()
+        else:
+            checks += arm_checks(engine, config)
     return ValidationReport(
         engine=engine.name,
         version=engine.version(),

@@ -1,0 +1,139 @@
+"""The grasps of GraspIT: grasps.hdf5, one array (N, 2, 4, 4) float64 an object, in world.
+
+Each grasp stands beside its half turn about the approach axis. Its frame is ours (y closing, z
+approach, origin midway between the outer contacts); that is checked on the surfaces, not believed.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats.graspit_contacts import contact_distances, midway_error
+from realsim.geometry import se3
+from realsim.records import Mesh, ObjectModel, Scene, SupportPlane
+
+Array = NDArray[np.float64]
+GRASP_FILE = "grasps.hdf5"
+MOST_GRASPS = 1_000_000
+"""Of one object."""
+SAMPLED_GRASPS = 40
+"""Grasps of an object whose contacts are looked at: enough for a median."""
+ON_SURFACE_M = 0.005
+"""Grasps whose middle misses the contacts' middle by more (median) are not of these objects."""
+HAND_M = 0.1
+"""The palm stands about so far behind the fingertips."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class WorldGrasps:
+    """The grasps of one object, each with its half turn about the approach axis."""
+
+    obj_id: int
+    instance: int
+    Ts_obj_grasp: Array
+    """(N, 2, 4, 4) [m]."""
+    widths_m: Array
+    """(N,) distance of the outer contacts along the closing axis [m]; NaN = it meets no surface."""
+
+
+def object_grasps(path: Path, scene: Scene, models: Mapping[int, ObjectModel]) -> list[WorldGrasps]:
+    """Return the grasps of a scene's objects, in the objects' frames.
+
+    Raises:
+        InputError: damaged, of other objects, or in another frame than its authors' code writes:
+            y does not close on the surface, or z points out of the table.
+    """
+    by_name = read_grasp_file(path)
+    sets: list[WorldGrasps] = []
+    for o in scene.objects:
+        model = models[o.obj_id]
+        Ts_world = by_name.get(model.name)
+        if Ts_world is None:
+            continue
+        where = f"{path.name}, '{model.name}'"
+        half_turn = se3.invert(Ts_world[:, 0]) @ Ts_world[:, 1]
+        if np.abs(half_turn - np.diag([-1.0, -1.0, 1.0, 1.0])).max(initial=0.0) > 1e-4:
+            raise InputError(
+                f"{where}: the second pose of a grasp is not its half turn about z; pairs of a "
+                "grasp and its flip about the approach axis are expected."
+            )
+        Ts_obj = se3.invert(o.T_world_obj) @ Ts_world
+        reach = contact_distances(model.mesh, Ts_obj[:, 0], "y")
+        _require_our_frame(model.mesh, Ts_obj[:, 0], where)
+        _require_from_above(Ts_world[:, 0], scene.plane, where)
+        sets.append(
+            WorldGrasps(
+                obj_id=o.obj_id, instance=o.instance, Ts_obj_grasp=Ts_obj, widths_m=reach.sum(1)
+            )
+        )
+    if not sets:
+        raise InputError(
+            f"{path} has grasps of {', '.join(by_name) or 'nothing'}, and the scene "
+            f"has {', '.join(m.name for m in models.values())}: none of them is common."
+        )
+    return sets
+
+
+def read_grasp_file(path: Path) -> dict[str, Array]:
+    """Return Ts_world_grasp (N, 2, 4, 4) by the object's name.
+
+    Raises:
+        InputError: no such file, or other content.
+        NotRigidError: a pose is not rigid.
+    """
+    import h5py
+
+    found: dict[str, Array] = {}
+    try:
+        with h5py.File(path, "r") as file:
+            for name in file:
+                data: Any = file[name]
+                shape = getattr(data, "shape", ())
+                if len(shape) != 4 or shape[1:] != (2, 4, 4) or shape[0] > MOST_GRASPS:
+                    raise InputError(
+                        f"{path}: '{name}' has the shape {shape}; (N, 2, 4, 4) is expected, at "
+                        f"most {MOST_GRASPS} grasps."
+                    )
+                found[str(name)] = np.asarray(data[()], dtype=np.float64)
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{path} is not an HDF5 file of grasps ({error}).") from error
+    return {
+        n: se3.check_rigid(T, f"the grasps of '{n}' in {path}") if len(T) else T
+        for n, T in found.items()
+    }
+
+
+def _require_our_frame(mesh: Mesh, Ts_obj_grasp: Array, where: str) -> None:
+    """Raise unless the grasps close along y, midway between two contacts."""
+    some = Ts_obj_grasp[:: max(1, len(Ts_obj_grasp) // SAMPLED_GRASPS)]
+    if len(some) == 0:
+        return
+    off = float(np.median(midway_error(mesh, some, "y")))
+    if off > ON_SURFACE_M:
+        others = ", ".join(
+            f"{1e3 * float(np.median(midway_error(mesh, some, a))):.1f} mm along {a}"
+            for a in ("x", "z")
+        )
+        raise InputError(
+            f"{where}: the grasps' origins are {1e3 * off:.1f} mm (median) off the middle of their "
+            f"contacts along y ({others}); at most {1e3 * ON_SURFACE_M:g} mm is accepted. Are they "
+            "of another scene, or is y not the closing axis?"
+        )
+
+
+def _require_from_above(Ts_world_grasp: Array, plane: SupportPlane | None, where: str) -> None:
+    """Raise if more hands would stand in the table than behind the opposite approach."""
+    if plane is None or len(Ts_world_grasp) == 0:
+        return
+    z, at = Ts_world_grasp[:, 2, 2], Ts_world_grasp[:, 2, 3] - plane.T_world_table[2, 3]
+    inside, opposite = np.mean(at - HAND_M * z < 0), np.mean(at + HAND_M * z < 0)
+    if inside > opposite and inside > 0.1:
+        raise InputError(
+            f"{where}: in {100 * inside:.0f} % of the grasps the palm would stand below the table; "
+            "z is not the approach direction of these grasps."
+        )

@@ -1,0 +1,70 @@
+"""Convex parts drawn in by Bullet's collision margin, which is laid around them again.
+
+Bullet finds contact normals reliably only between hulls that do not overlap: their margins do. With
+a margin of 0, faces that lie on each other get normals that are off by tens of degrees (a flat box
+of mu 0.3 then sticks to a slope of 22 degrees); with the margin around the true hull, everything
+stands 1 mm off the table. So the planes of each hull are moved inwards by the margin first.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+LEAST_CORE = 0.5
+"""The margin is at most this share of the thinnest part's inner radius: a core has to be left."""
+
+
+def drawn_in(parts: list[Array], margin_m: float) -> tuple[list[Array], float]:
+    """Return the parts' cores and the margin that makes them the parts again.
+
+    Corners and edges become round by the margin.
+
+    Args:
+        parts: vertices (V, 3) of each convex part [m].
+        margin_m: wished for [m]; less is used where a part is too thin for it.
+    """
+    hulls = [_planes(part) for part in parts]
+    inner = [_inner_ball(planes) for planes in hulls]
+    margin = min([margin_m, *(LEAST_CORE * radius for _, radius in inner)])
+    cores = [
+        _core(part, planes, ball[0], margin)
+        for part, planes, ball in zip(parts, hulls, inner, strict=True)
+    ]
+    return cores, margin
+
+
+def _planes(part: Array) -> Array:
+    """Return the hull's planes (F, 4): n . x + d <= 0 inside, |n| = 1; each once."""
+    from scipy.spatial import ConvexHull
+
+    hull: Any = ConvexHull(part)
+    return np.unique(np.round(hull.equations, 12), axis=0)
+
+
+def _inner_ball(planes: Array) -> tuple[Array, float]:
+    """Return centre (3,) and radius [m] of the largest ball inside (a linear program)."""
+    from scipy.optimize import linprog
+
+    A = np.hstack([planes[:, :3], np.ones((len(planes), 1))])
+    found: Any = linprog(
+        [0.0, 0.0, 0.0, -1.0], A_ub=A, b_ub=-planes[:, 3], bounds=[(None, None)] * 3 + [(0, None)]
+    )
+    return np.asarray(found.x[:3], dtype=np.float64), float(found.x[3])
+
+
+def _core(part: Array, planes: Array, inside: Array, margin_m: float) -> Array:
+    """Return the corners of the hull whose planes lie deeper by the margin."""
+    from scipy.spatial import HalfspaceIntersection, QhullError
+
+    if margin_m <= 0.0:
+        return part
+    deeper = planes + np.array([0.0, 0.0, 0.0, margin_m])
+    try:
+        found: Any = HalfspaceIntersection(deeper, inside)
+    except QhullError:  # numerically flat: left as it is, larger by the margin
+        return part
+    corners = np.asarray(found.intersections, dtype=np.float64)
+    corners = corners[np.all(np.isfinite(corners), axis=1)]
+    return np.unique(np.round(corners, 9), axis=0)

@@ -1,0 +1,163 @@
+"""How the physical score and what was measured beside it go together.
+
+Only grasps that physics has tried are counted: of the others nobody knows what they are worth.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.formats.scene_grasps import executed
+from realsim.records import GraspSet
+
+Array = NDArray[np.float64]
+QUALITIES = ("score", "margin", "ferrari_canny", "closure_friction")
+"""What is ranked; closure_friction is better where it is smaller, so its correlations are negative
+where it agrees."""
+LEAST_GRASPS = 10
+"""Of fewer grasps no correlation is given: its interval would span nearly everything."""
+RESAMPLES = 1000
+"""Bootstrap samples: the ends of a 95 % interval are good to about a twentieth of its width."""
+MOST_DRAWS = 50_000_000
+"""Numbers drawn in one bootstrap; beyond, there are fewer samples, and the interval is tiny."""
+INTERVAL = (2.5, 97.5)
+"""Percentiles of the interval."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RankCorrelation:
+    """Spearman's rank correlation of two qualities, with its 95 % bootstrap interval."""
+
+    first: str
+    second: str
+    grasps: int
+    """Of which both are known."""
+    rho: float
+    """NaN = too few grasps, or one of the two is the same for all."""
+    low: float
+    high: float
+    """The grasps are resampled one by one: what other objects would say is not in the interval."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ClosureConfusion:
+    """Force closure as an analytic label against the physical one: good = score >= 0.5."""
+
+    closure: str
+    """How closure was told: the name of the measure."""
+    closed_good: int
+    closed_bad: int
+    open_good: int
+    open_bad: int
+
+    @property
+    def grasps(self) -> int:
+        """Return of how many grasps both are known."""
+        return self.closed_good + self.closed_bad + self.open_good + self.open_bad
+
+    @property
+    def agree(self) -> float:
+        """Return the share of grasps on which both agree; NaN of none."""
+        same = self.closed_good + self.open_bad
+        return same / self.grasps if self.grasps else math.nan
+
+    @property
+    def balanced_accuracy(self) -> float:
+        """Return the mean share of good and of bad ones told right; NaN without either."""
+        good, bad = self.closed_good + self.open_good, self.closed_bad + self.open_bad
+        if not good or not bad:
+            return math.nan
+        return 0.5 * (self.closed_good / good + self.open_bad / bad)
+
+
+def rank_correlations(
+    sets: Sequence[GraspSet], rng: np.random.Generator
+) -> tuple[RankCorrelation, ...]:
+    """Return the correlation of every pair of QUALITIES that was measured."""
+    values = {name: _quality(sets, name) for name in QUALITIES}
+    known = [name for name in QUALITIES if not np.all(np.isnan(values[name]))]
+    found: list[RankCorrelation] = []
+    for k, first in enumerate(known):
+        for second in known[k + 1 :]:
+            both = ~np.isnan(values[first]) & ~np.isnan(values[second])
+            x, y = values[first][both], values[second][both]
+            rho, low, high = spearman(x, y, rng)
+            found.append(
+                RankCorrelation(
+                    first=first, second=second, grasps=len(x), rho=rho, low=low, high=high
+                )
+            )
+    return tuple(found)
+
+
+def closure_confusions(sets: Sequence[GraspSet]) -> tuple[ClosureConfusion, ...]:
+    """Return the confusion of every way of telling force closure that was measured."""
+    score = _quality(sets, "score")
+    found: list[ClosureConfusion] = []
+    for name in ("dexnet_closure", "closure_friction"):
+        value = _quality(sets, name)
+        known = ~np.isnan(value) & ~np.isnan(score)
+        if not known.any():
+            continue
+        closed = value > 0.5 if name == "dexnet_closure" else np.isfinite(value)
+        good = score >= 0.5
+        found.append(
+            ClosureConfusion(
+                closure=name,
+                closed_good=int(np.sum(known & closed & good)),
+                closed_bad=int(np.sum(known & closed & ~good)),
+                open_good=int(np.sum(known & ~closed & good)),
+                open_bad=int(np.sum(known & ~closed & ~good)),
+            )
+        )
+    return tuple(found)
+
+
+def spearman(x: Array, y: Array, rng: np.random.Generator) -> tuple[float, float, float]:
+    """Return Spearman's rank correlation of (N,) and (N,), and the ends of its interval.
+
+    Ties have their mean rank. The percentile bootstrap ranks every sample anew: the rank of a value
+    follows from how often it and the smaller ones were drawn, which needs no sorting.
+    """
+    n = len(x)
+    nothing = (math.nan, math.nan, math.nan)
+    if n < LEAST_GRASPS:
+        return nothing
+    x_level = np.unique(x, return_inverse=True)[1]
+    y_level = np.unique(y, return_inverse=True)[1]
+    rho = _rank_correlation(x_level, y_level)
+    if math.isnan(rho):
+        return nothing
+    samples = max(100, min(RESAMPLES, MOST_DRAWS // n))
+    drawn: list[float] = []
+    for _ in range(samples):
+        rows = rng.integers(0, n, n)
+        drawn.append(_rank_correlation(x_level[rows], y_level[rows]))
+    low, high = np.nanpercentile(drawn, INTERVAL)
+    return rho, float(low), float(high)
+
+
+def _rank_correlation(x_level: NDArray[np.intp], y_level: NDArray[np.intp]) -> float:
+    """Return Pearson's correlation of the mean ranks of levels; NaN where all are the same."""
+    x, y = (_mean_ranks(levels) for levels in (x_level, y_level))
+    x, y = x - x.mean(), y - y.mean()
+    spread = math.sqrt(float(x @ x) * float(y @ y))
+    return float(x @ y) / spread if spread > 0 else math.nan
+
+
+def _mean_ranks(levels: NDArray[np.intp]) -> Array:
+    counts = np.bincount(levels)
+    return (np.cumsum(counts) - 0.5 * (counts - 1))[levels]
+
+
+def _quality(sets: Sequence[GraspSet], name: str) -> Array:
+    """Return a quality of all grasps, one after the other; NaN = not tried or not measured."""
+    parts: list[Array] = [np.zeros(0)]
+    for s in sets:
+        nothing = np.full(len(s), np.nan)
+        value = s.scores if name == "score" else s.measures.get(name, nothing)
+        parts.append(np.where(executed(s), value, np.nan))
+    return np.concatenate(parts)

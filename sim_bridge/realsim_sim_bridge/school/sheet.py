@@ -1,0 +1,254 @@
+"""The Robot School's picture sheet: what became of all grasps of a scene, and object by object.
+
+Above, how many candidates are left after each stage, and how scores and margins are distributed;
+below, every object with its grasps as small hands, red to green by score.
+"""
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats.scene_grasps import executed
+from realsim.models.model_picture_views import INK, MUTED, PAPER
+from realsim.records import GraspSet, ObjectModel
+from realsim.rendering.overlay import score_color
+from realsim_sim_bridge.school.sheet_object import (
+    STOPS,
+    Box,
+    axes_at,
+    draw_object,
+    ink_on,
+    names_of_sets,
+    stops_of,
+    text_at,
+)
+
+Array = NDArray[np.float64]
+WIDTH_PX = 1600
+DPI = 100
+MARGIN_PX = 28
+TITLE_PX = 64
+CHARTS_PX = 270
+LEGEND_PX = 46
+OBJECT_PX = 372
+"""Height of one object [px]."""
+FEW = 6
+"""Up to so many objects stand three in a row, more four."""
+MOST_OBJECTS = 60
+"""Objects on one sheet: 15 rows, and a picture of 6,000 pixels."""
+SCORE_STEP = 1 / 12
+"""Scores are multiples of the penalty."""
+MARGIN_BINS = 10
+LEFT_AFTER = ("candidates", "trajectory", "close", "lift", "oscillate", "pendulum")
+BAR_COLOR = "#5b7f95"
+
+
+def school_sheet(
+    sets: Sequence[GraspSet],
+    models: Mapping[int, ObjectModel],
+    *,
+    title: str = "Robot School",
+    Ts_up_obj: Mapping[int, Array] | None = None,
+) -> bytes:
+    """Return the sheet as the content of a PNG file, 1600 px wide; the same sets, the same bytes.
+
+    Args:
+        sets: the grasps of a scene, one set per object instance.
+        models: the objects by id.
+        title: of the sheet.
+        Ts_up_obj: (4, 4) pose of an object in a frame whose z axis is up [m], by instance, such as
+            the table's; of others the object's own z axis is drawn upwards.
+
+    Raises:
+        InputError: an object has no model, or there are more than 60.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    _require_models(sets, models)
+    columns = 3 if len(sets) <= FEW else 4
+    rows = -(-len(sets) // columns)
+    top = TITLE_PX + CHARTS_PX + LEGEND_PX
+    height = top + rows * OBJECT_PX + MARGIN_PX
+    figure = Figure(figsize=(WIDTH_PX / DPI, height / DPI), dpi=DPI, facecolor=PAPER)
+    FigureCanvasAgg(figure)
+    _title(figure, sets, title)
+    _charts(figure, sets)
+    _legend(figure, TITLE_PX + CHARTS_PX)
+    names = names_of_sets(sets, {i: m.name for i, m in models.items()})
+    width = (WIDTH_PX - 2 * MARGIN_PX) / columns
+    for k, (s, name) in enumerate(zip(sets, names, strict=True)):
+        row, column = divmod(k, columns)
+        box = (
+            MARGIN_PX + column * width + 8, top + row * OBJECT_PX, width - 16, OBJECT_PX - 22,
+        )  # fmt: skip
+        T_up_obj = (Ts_up_obj or {}).get(s.instance, np.eye(4))
+        draw_object(figure, box, s, models[s.obj_id].mesh, name, T_up_obj)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None}, facecolor=PAPER)
+    return buffer.getvalue()
+
+
+def _require_models(sets: Sequence[GraspSet], models: Mapping[int, ObjectModel]) -> None:
+    """Check that every object can be drawn."""
+    without = sorted({s.obj_id for s in sets} - set(models))
+    if without:
+        raise InputError(
+            f"object {without[0]} has grasps but no model; there are: "
+            f"{', '.join(map(str, sorted(models))) or 'none'}."
+        )
+    if len(sets) > MOST_OBJECTS:
+        raise InputError(
+            f"{len(sets)} objects; one sheet shows {MOST_OBJECTS}. Give a scene at a time."
+        )
+
+
+def _title(figure: Any, sets: Sequence[GraspSet], title: str) -> None:
+    """Write the title and the figures of the scene."""
+    text_at(figure, MARGIN_PX, 34, title[:70], 19, INK, bold=True)
+    scores = _joined([s.scores for s in sets])
+    known = scores[~np.isnan(scores)]
+    plural = "" if len(sets) == 1 else "s"
+    said = f"{len(sets)} object{plural}, {len(scores):,} candidates"
+    if len(known):
+        said += f", {100 * np.mean(known >= 0.5):.1f} % good, mean score {np.mean(known):.2f}"
+    text_at(figure, WIDTH_PX - MARGIN_PX, 34, said, 13, MUTED, align="right")
+
+
+def _charts(figure: Any, sets: Sequence[GraspSet]) -> None:
+    """Draw the stages' attrition, and the distributions of scores and margins."""
+    margins = _joined([s.measures["margin"] for s in sets if "margin" in s.measures])
+    margins = margins[~np.isnan(margins)]
+    charts: list[Any] = [_attrition, _score_histogram]
+    if len(margins):
+        charts.append(_margin_histogram)
+    width = (WIDTH_PX - 2 * MARGIN_PX) / len(charts)
+    for k, chart in enumerate(charts):
+        left = MARGIN_PX + k * width + (98 if k == 0 else 62)
+        right = MARGIN_PX + (k + 1) * width - 30
+        chart(_chart_axes(figure, (left, TITLE_PX + 34, right - left, CHARTS_PX - 96)), sets)
+
+
+def _chart_axes(figure: Any, box: Box) -> Any:
+    ax = axes_at(figure, box)
+    ax.set_facecolor(PAPER)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        ax.spines[side].set_color(MUTED)
+    ax.tick_params(labelsize=9.5, colors=MUTED, length=3)
+    return ax
+
+
+def _named(ax: Any, title: str, below: str, beside: str = "") -> None:
+    """Write the title of a chart and of its axes."""
+    ax.set_title(title, fontsize=12, color=INK, loc="left", pad=10)
+    ax.set_xlabel(below, fontsize=10, color=MUTED)
+    ax.set_ylabel(beside, fontsize=10, color=MUTED)
+
+
+def left_after(sets: Sequence[GraspSet]) -> NDArray[np.int64]:
+    """Return how many candidates are left: all, with a trajectory, and after each stage."""
+    stops = _joined([stops_of(s) for s in sets])
+    return np.array([len(stops), *(int(np.sum(stops > k)) for k in range(1, len(STOPS) - 1))])
+
+
+def _attrition(ax: Any, sets: Sequence[GraspSet]) -> None:
+    """Draw how many candidates are left after each stage, and what the stage took."""
+    counts = left_after(sets)
+    lost = -np.diff(counts, prepend=counts[0])
+    places = np.arange(len(counts))[::-1]
+    ax.barh(places, counts, height=0.72, color=BAR_COLOR)
+    untried = int(np.sum(_joined([stops_of(s) for s in sets]) == 0))
+    taken = [0, lost[1] - untried, *lost[2:]]
+    colors = [color for _, color in STOPS[:-1]]
+    ax.barh(places, taken, left=counts, height=0.72, color=colors)
+    most = max(1, counts[0])
+    for place, count in zip(places, counts, strict=True):
+        said = f"{count:,}  ({100 * count / most:.0f} %)"
+        inside = count > 0.35 * most
+        ax.text(
+            count - 0.015 * most if inside else 0.015 * most, place - 0.03, said, fontsize=10,
+            color=ink_on(BAR_COLOR) if inside or count > 0.3 * most else INK,
+            ha="right" if inside else "left", va="center",
+        )  # fmt: skip
+    ax.set_yticks(places, LEFT_AFTER, fontsize=10.5, color=INK)
+    ax.set_xlim(0, most)
+    ax.xaxis.get_major_locator().set_params(integer=True)
+    _named(ax, "Left after each stage, and what it took", "grasps")
+
+
+def _score_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
+    """Draw how many grasps have which score, by twelfths; grey is what physics has not tried."""
+    scores = _joined([s.scores for s in sets])
+    tried = _joined([executed(s).astype(np.float64) for s in sets]) > 0
+    steps = np.arange(13)
+    counts = [
+        np.bincount(np.rint(scores[rows] / SCORE_STEP).astype(np.int64), minlength=13)[:13]
+        for rows in (tried & ~np.isnan(scores), ~tried & ~np.isnan(scores))
+    ]
+    colors = ["#{:02x}{:02x}{:02x}".format(*score_color(k * SCORE_STEP)) for k in steps]
+    at = steps * SCORE_STEP
+    ax.bar(at, counts[0], width=0.8 * SCORE_STEP, color=colors)
+    ax.bar(at, counts[1], width=0.8 * SCORE_STEP, bottom=counts[0], color=STOPS[1][1])
+    ax.axvline(0.5 - SCORE_STEP / 2, color=MUTED, linewidth=1, linestyle=(0, (4, 3)))
+    top = max(1, int(np.max(counts[0] + counts[1])))
+    ax.set_ylim(0, 1.18 * top)
+    ax.text(0.5 - 0.3 * SCORE_STEP, 1.14 * top, "good", fontsize=10, color=MUTED, va="center")
+    ax.set_xlim(-0.06, 1.06)
+    ax.set_xticks([0, 0.25, 0.5, 0.75, 1])
+    ax.yaxis.get_major_locator().set_params(integer=True)
+    _named(ax, "Scores", "score", "grasps")
+
+
+def _margin_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
+    """Draw how many grasps have which margin: 1 = held at every friction and force tried."""
+    margins = _joined([s.measures["margin"] for s in sets if "margin" in s.measures])
+    known = margins[~np.isnan(margins)]
+    edges = np.linspace(0, 1, MARGIN_BINS + 1)
+    counts = np.histogram(np.clip(known, 0, 1), edges)[0]
+    ax.bar(edges[:-1], counts, width=0.94 / MARGIN_BINS, align="edge", color=BAR_COLOR)
+    ax.set_xlim(-0.02, 1.02)
+    ax.set_ylim(0, 1.18 * max(1, counts.max()))
+    ax.yaxis.get_major_locator().set_params(integer=True)
+    _named(ax, "Margins over friction and force", "margin", "grasps")
+
+
+def _legend(figure: Any, top: float) -> None:
+    """Explain the colours of the bars and of the hands, in one line."""
+    width = WIDTH_PX - 2 * MARGIN_PX
+    ax = axes_at(figure, (MARGIN_PX, top, width, LEGEND_PX))
+    middle = LEGEND_PX / 2 + 2
+    at = _written(ax, 12.0, middle, "stopped at:", MUTED) + 14
+    for label, color in STOPS:
+        ax.add_patch(_swatch(at, middle, color))
+        at = _written(ax, at + 20, middle, label, INK) + 18
+    # To the right the hands, whose colours run with the score.
+    at = _written(ax, width - 320, middle, "hands by score:  0", MUTED) + 8
+    ramp = np.array([[score_color(x) for x in np.linspace(0, 1, 64)]], dtype=np.uint8)
+    ax.imshow(ramp, extent=(at, at + 120, middle + 6, middle - 6), aspect="auto")
+    _written(ax, at + 128, middle, "1", MUTED)
+    ax.set_axis_off()
+    ax.axhline(2, color="#d3d8de", linewidth=1)
+    ax.set_xlim(0, width)
+    ax.set_ylim(LEGEND_PX, 0)
+
+
+def _written(ax: Any, left: float, middle: float, text: str, color: str) -> float:
+    """Write into axes whose unit is a pixel, and return where the text ends."""
+    written = ax.text(left, middle, text, fontsize=10.5, color=color, va="center")
+    return left + float(written.get_window_extent(ax.figure.canvas.get_renderer()).width)
+
+
+def _swatch(left: float, middle: float, color: str) -> Any:
+    from matplotlib.patches import Rectangle
+
+    return Rectangle((left, middle - 7), 14, 14, fc=color, ec="none")
+
+
+def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    return np.concatenate([np.zeros(0), *parts])

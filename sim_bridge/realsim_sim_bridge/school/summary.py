@@ -1,0 +1,237 @@
+"""The Robot School's results in figures, row by row as in the paper's table of statistics.
+
+Every candidate is in exactly one outcome, so the outcomes sum to the candidates, and
+
+    good = fail horizontal + fail pendulum + full success
+    bad  = no trajectory + fail close + fail lift + penalized
+
+The paper counts what fails to close as "no trajectory to closure"; here it has a row of its own.
+Its row "fail horizontal (s = 0.50)" needs a stage that fails without a penalty. By equation 3 a
+stage fails by the very slip that is penalized, so a grasp that fails the horizontal shaking scores
+0.42 at most and is counted as penalized; `penalized_by` says where such grasps stopped.
+
+Source: GraspIT, table "GraspIT v1 Statistics" and equation 3.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats.scene_grasps import check_values, executed
+from realsim.records import STAGES, GraspSet
+from realsim_sim_bridge.school.measure_statistics import (
+    ClosureConfusion,
+    RankCorrelation,
+    closure_confusions,
+    rank_correlations,
+)
+
+Array = NDArray[np.float64]
+OUTCOMES = (
+    "not_tried", "no_trajectory", "fail_close", "fail_lift", "penalized", "fail_horizontal",
+    "fail_pendulum", "full_success",
+)  # fmt: skip
+"""What can become of a candidate, worst first. not_tried: without a score (the object has no body
+for physics); no_trajectory: the arm does not get there, score 0; fail_close and fail_lift: base
+score 0 and 0.25; penalized: base score of 0.5 or more, but a score below 0.5; fail_horizontal,
+fail_pendulum and full_success: base score 0.5, 0.75 and 1, and a score of 0.5 or more."""
+GOOD = ("fail_horizontal", "fail_pendulum", "full_success")
+"""Outcomes with a score of 0.5 or more."""
+GOOD_FROM = 0.5
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Spread:
+    """Mean and standard deviation (of the population) of what was counted; NaN of nothing."""
+
+    mean: float
+    sd: float
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SchoolSummary:
+    """What became of all candidates."""
+
+    scenes: int
+    objects: int
+    """Different object ids; scenes share their ids."""
+    sets: int
+    """Object instances."""
+    outcomes: dict[str, int]
+    """Candidates by OUTCOMES; they sum to `candidates`."""
+    penalized_by: dict[str, int]
+    """Of the penalized: the stage that failed first; 'none' = none did."""
+    score: Spread
+    """Of all candidates with a score."""
+    score_good: float
+    score_bad: float
+    """Mean scores; NaN of none."""
+    per_object: dict[str, Spread]
+    per_scene: dict[str, Spread]
+    """Numbers of candidates, good and bad ones: of an object over all scenes, and of a scene."""
+    correlations: tuple[RankCorrelation, ...] = ()
+    closures: tuple[ClosureConfusion, ...] = ()
+
+    @property
+    def candidates(self) -> int:
+        """Return how many candidates there are."""
+        return sum(self.outcomes.values())
+
+    @property
+    def judged(self) -> int:
+        """Return how many have a score; shares are shares of these."""
+        return self.candidates - self.outcomes["not_tried"]
+
+    @property
+    def with_trajectory(self) -> int:
+        """Return how many of the judged ones the arm gets to."""
+        return self.judged - self.outcomes["no_trajectory"]
+
+    @property
+    def good(self) -> int:
+        """Return how many have a score of 0.5 or more."""
+        return sum(self.outcomes[name] for name in GOOD)
+
+    @property
+    def bad(self) -> int:
+        """Return how many have a score below 0.5."""
+        return self.judged - self.good
+
+    def share(self, count: int) -> float:
+        """Return a number of candidates as a share of the judged ones; NaN of none."""
+        return count / self.judged if self.judged else math.nan
+
+    def to_rows(self) -> list[tuple[str, str, str]]:
+        """Return (property, here, in the paper) as texts, in the paper's order."""
+        from realsim_sim_bridge.school.summary_rows import rows_of
+
+        return rows_of(self)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything as plain JSON values; null = not known."""
+        derived = ("candidates", "judged", "with_trajectory", "good", "bad")
+        shares = {name: self.share(count) for name, count in self.outcomes.items()}
+        values = asdict(self) | {name: getattr(self, name) for name in derived}
+        values["shares"] = shares | {
+            name: self.share(getattr(self, name)) for name in ("with_trajectory", "good", "bad")
+        }
+        for entry, c in zip(values["closures"], self.closures, strict=True):
+            entry |= {"agree": c.agree, "balanced_accuracy": c.balanced_accuracy}
+        return _plain(values)
+
+
+def summarise(
+    scenes: Mapping[str, Sequence[GraspSet]] | Sequence[GraspSet],
+    rng: np.random.Generator | None = None,
+) -> SchoolSummary:
+    """Return what became of the candidates of any number of scenes.
+
+    Args:
+        scenes: grasp sets by the name of their scene, or those of one scene.
+        rng: draws the bootstrap samples; None = always the same ones.
+
+    Raises:
+        InputError: a set holds scores that equation 3 cannot give.
+    """
+    by_scene = dict(scenes) if isinstance(scenes, Mapping) else {"": scenes}
+    sets = [s for part in by_scene.values() for s in part]
+    outcome = [outcomes_of(s) for s in sets]
+    scores = _joined([s.scores for s in sets])
+    scored = scores[~np.isnan(scores)]
+    is_good = scored >= GOOD_FROM
+    by_object: dict[int, list[GraspSet]] = {}
+    for s in sets:
+        by_object.setdefault(s.obj_id, []).append(s)
+    counts = np.bincount(_joined(outcome).astype(np.int64), minlength=len(OUTCOMES))
+    return SchoolSummary(
+        scenes=len(by_scene),
+        objects=len(by_object),
+        sets=len(sets),
+        outcomes={name: int(n) for name, n in zip(OUTCOMES, counts, strict=True)},
+        penalized_by=_penalized_by(sets, outcome),
+        score=_spread(scored),
+        score_good=_spread(scored[is_good]).mean,
+        score_bad=_spread(scored[~is_good]).mean,
+        per_object=_numbers(list(by_object.values())),
+        per_scene=_numbers(list(by_scene.values())),
+        correlations=rank_correlations(sets, rng or np.random.default_rng(0)),
+        closures=closure_confusions(sets),
+    )
+
+
+def outcomes_of(s: GraspSet) -> NDArray[np.int64]:
+    """Return (N,) the number in OUTCOMES of every candidate.
+
+    Raises:
+        InputError: a score without a base score, or above it, or a base score that is none.
+    """
+    check_values(s)
+    judged = ~np.isnan(s.scores)
+    base, score = np.nan_to_num(s.base_scores), np.nan_to_num(s.scores)
+    wrong = (judged == np.isnan(s.base_scores)) | (score > base)
+    if np.any(wrong):
+        row = int(np.flatnonzero(wrong)[0])
+        raise InputError(
+            f"grasp {row} of instance {s.instance} has the score {s.scores[row]:g} and the base "
+            f"score {s.base_scores[row]:g}; a score is at most its base score, and both are known "
+            "or neither."
+        )
+    stopped = np.select(
+        [base == 0, base == 0.25, score < GOOD_FROM, base == 0.5, base == 0.75],
+        [OUTCOMES.index(n) for n in
+         ("fail_close", "fail_lift", "penalized", "fail_horizontal", "fail_pendulum")],
+        OUTCOMES.index("full_success"),
+    )  # fmt: skip
+    # A set tried without an arm has slips, but no trajectory was asked for.
+    nowhere = ~s.reachable & ~executed(s)
+    stopped = np.where(nowhere, OUTCOMES.index("no_trajectory"), stopped)
+    return np.where(judged, stopped, OUTCOMES.index("not_tried")).astype(np.int64)
+
+
+def _penalized_by(sets: Sequence[GraspSet], outcome: Sequence[NDArray[np.int64]]) -> dict[str, int]:
+    """Return at which stage the penalized grasps failed first."""
+    names = (*STAGES, "none")
+    counts = np.zeros(len(names), dtype=np.int64)
+    for s, out in zip(sets, outcome, strict=True):
+        passed = np.rint(s.base_scores[out == OUTCOMES.index("penalized")] * len(STAGES))
+        counts += np.bincount(passed.astype(np.int64), minlength=len(names))
+    return {name: int(n) for name, n in zip(names, counts, strict=True)}
+
+
+def _numbers(groups: Sequence[Sequence[GraspSet]]) -> dict[str, Spread]:
+    """Return how many candidates, good and bad ones the groups have."""
+    good = np.array([sum(int(s.good.sum()) for s in group) for group in groups], dtype=np.float64)
+    judged = np.array(
+        [sum(int(np.sum(~np.isnan(s.scores))) for s in group) for group in groups],
+        dtype=np.float64,
+    )
+    total = np.array([sum(len(s) for s in group) for group in groups], dtype=np.float64)
+    return {
+        "candidates": _spread(total),
+        "good": _spread(good),
+        "bad": _spread(judged - good),
+    }
+
+
+def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    return np.concatenate([np.zeros(0), *parts])
+
+
+def _spread(values: Array) -> Spread:
+    if len(values) == 0:
+        return Spread(mean=math.nan, sd=math.nan)
+    return Spread(mean=float(np.mean(values)), sd=float(np.std(values)))
+
+
+def _plain(value: Any) -> Any:
+    """Return values as JSON has them: null for what is not finite."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]  # pyright: ignore[reportUnknownVariableType]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

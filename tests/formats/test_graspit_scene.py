@@ -1,0 +1,226 @@
+"""GraspIT's scene.yaml: the order of the quaternions is proven, the grasps' frame is checked."""
+
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from realsim.errors import InputError, NotRigidError
+from realsim.formats.graspit_contacts import contact_distances
+from realsim.formats.graspit_scene import (
+    is_graspit_scene,
+    read_graspit_grasps,
+    read_graspit_scene,
+)
+from realsim.geometry import se3
+
+DATA = Path(os.environ.get("REALSIM_DATA", "/nonexistent"))
+REAL = DATA / "school/graspit_assets"
+HEIGHT = 0.8
+EXTENTS = {"brick": (0.06, 0.04, 0.1), "slab": (0.12, 0.05, 0.02), "post": (0.03, 0.03, 0.15)}
+
+
+def write_stl(folder, name, extents):
+    import trimesh
+
+    (folder / f"{name}.stl").write_bytes(trimesh.creation.box(extents).export(file_type="stl"))
+
+
+def standing_poses():
+    """Return T_world_obj by name: each on the table, turned about the vertical, one lying."""
+    poses = {}
+    for k, (name, extents) in enumerate(EXTENTS.items()):
+        R = se3.exp_so3(np.array([0.0, 0.0, 0.4 + k]))
+        half = extents[2] / 2
+        if name == "post":
+            R = R @ se3.exp_so3(np.array([np.pi / 2, 0.0, 0.0]))
+            half = extents[1] / 2
+        poses[name] = se3.from_rt(R, [0.2 * k, -0.1 * k, HEIGHT + half])
+    return poses
+
+
+def grasps_of(T, axes="y"):
+    """Return 20 grasps (N, 2, 4, 4) from above across the object's own x, beside its middle."""
+    z = np.array([0.0, 0.0, -1.0])
+    y = T[:3, 0] if abs(T[2, 0]) < 0.1 else T[:3, 1]
+    R = np.stack([np.cross(y, z), y, z], axis=1)
+    if axes == "x":
+        R = R @ se3.exp_so3(np.array([0.0, 0.0, np.pi / 2]))
+    if axes == "up":
+        R = R @ se3.exp_so3(np.array([0.0, np.pi, 0.0]))
+    along = np.linspace(-0.005, 0.005, 20)[:, None] * z + 0.012 * np.cross(y, z)
+    Ts = se3.from_rt(np.tile(R, (20, 1, 1)), T[:3, 3] + along)
+    return np.stack([Ts, Ts @ np.diag([-1.0, -1.0, 1.0, 1.0])], axis=1)
+
+
+def write_scene(folder, order="wxyz", poses=None, grasps=True, scale=1.0, axes="y"):
+    poses = poses or standing_poses()
+    lines = ["grasp_path: scenes/scene_0/grasps.hdf5"]
+    for k, (name, T) in enumerate(poses.items()):
+        q = se3.quaternion_wxyz(T[:3, :3])
+        q = q if order == "wxyz" else np.roll(q, -1)
+        write_stl(folder, name, np.array(EXTENTS[name]) / scale)
+        lines += [
+            f"object{k + 1}:",
+            f"  file_path: assets/{name}.usd",
+            f"  name: {name}",
+            f"  orientation: {[float(v) for v in q]}",
+            f"  position: {[float(v) for v in T[:3, 3]]}",
+            f"  scale: {[scale] * 3}",
+        ]
+    lines += ["table:", "  file_path: assets/table.obj", "  name: table"]
+    lines += ["  orientation: [0.0, 0.0, 0.0, 0.0]", "  position: [0.0, 0.0, 0.0]"]
+    (folder / "scene.yaml").write_text("\n".join(lines))
+    if grasps:
+        with h5py.File(folder / "grasps.hdf5", "w") as file:
+            for name, T in poses.items():
+                file[name] = grasps_of(T, axes)
+    return folder
+
+
+@pytest.mark.parametrize("grasps", [True, False])
+@pytest.mark.parametrize("order", ["wxyz", "xyzw"])
+def test_poses_come_back_whatever_the_order_of_the_quaternions(tmp_path, order, grasps):
+    found = read_graspit_scene(write_scene(tmp_path, order, grasps=grasps))
+    assert found.order == order
+    for o, T in zip(found.scene.objects, standing_poses().values(), strict=True):
+        assert np.allclose(o.T_world_obj, T, atol=1e-6)
+    assert [m.name for m in found.models.values()] == list(EXTENTS)
+    assert found.scene.plane.T_world_table[2, 3] == pytest.approx(HEIGHT, abs=1e-6)
+    assert any("table" in n and "0.8000 m" in n for n in found.notes)
+
+
+def test_an_order_that_the_content_does_not_prove_is_an_error_with_the_evidence(tmp_path):
+    """A single cube without grasps stands in both orders."""
+    EXTENTS["die"] = (0.05, 0.05, 0.05)
+    try:
+        poses = {"die": se3.from_rt(se3.exp_so3([0, 0, 0.3]), [0, 0, HEIGHT + 0.025])}
+        folder = write_scene(tmp_path, poses=poses, grasps=False)
+    finally:
+        del EXTENTS["die"]
+    with pytest.raises(InputError, match=r"cannot be told.*wxyz.*xyzw.*order='wxyz'"):
+        read_graspit_scene(folder)
+    for order in ("wxyz", "xyzw"):
+        assert read_graspit_scene(folder, order=order).order == order
+
+
+def test_grasps_come_back_in_the_objects_frame_with_their_widths(tmp_path):
+    found = read_graspit_scene(write_scene(tmp_path))
+    sets = read_graspit_grasps(found)
+    assert [s.instance for s in sets] == [0, 1, 2]
+    for s, (name, T) in zip(sets, standing_poses().items(), strict=True):
+        assert np.allclose(T @ s.Ts_obj_grasp, grasps_of(T), atol=1e-6)
+        assert np.allclose(s.widths_m, EXTENTS[name][0], atol=1e-5)
+
+
+def test_contacts_do_not_depend_on_where_the_object_is(tmp_path):
+    found = read_graspit_scene(write_scene(tmp_path))
+    mesh = found.models[1].mesh
+    Ts = read_graspit_grasps(found)[0].Ts_obj_grasp[:, 0]
+    flipped = Ts @ np.diag([-1.0, -1.0, 1.0, 1.0])
+    a, b = contact_distances(mesh, Ts, "y"), contact_distances(mesh, flipped, "y")
+    assert np.allclose(a, b[:, ::-1], atol=1e-6)
+
+
+@pytest.mark.parametrize(("axes", "what"), [("x", "closing axis"), ("up", "approach direction")])
+def test_grasps_in_another_frame_are_refused(tmp_path, axes, what):
+    found = read_graspit_scene(write_scene(tmp_path, axes=axes))
+    with pytest.raises(InputError, match=what):
+        read_graspit_grasps(found)
+
+
+def test_a_flip_that_is_none_and_a_wrong_shape_are_refused(tmp_path):
+    folder = write_scene(tmp_path)
+    with h5py.File(folder / "grasps.hdf5", "a") as file:
+        file["brick"][:, 1] = file["brick"][:, 0]
+    with pytest.raises(InputError, match="half turn"):
+        read_graspit_grasps(read_graspit_scene(folder))
+    with h5py.File(folder / "grasps.hdf5", "a") as file:
+        del file["brick"]
+        file["brick"] = np.zeros((3, 4, 4))
+    with pytest.raises(InputError, match=r"shape \(3, 4, 4\)"):
+        read_graspit_scene(folder)
+    with h5py.File(folder / "grasps.hdf5", "a") as file:
+        del file["brick"]
+        file["brick"] = np.ones((3, 2, 4, 4))
+    with pytest.raises(NotRigidError, match="brick"):
+        read_graspit_scene(folder)
+    (folder / "grasps.hdf5").write_bytes(b"no hdf5")
+    with pytest.raises(InputError, match="not an HDF5"):
+        read_graspit_scene(folder)
+
+
+def test_a_scale_is_applied_to_the_mesh(tmp_path):
+    found = read_graspit_scene(write_scene(tmp_path, scale=0.5))
+    assert np.allclose(found.models[1].mesh.extent, EXTENTS["brick"], atol=1e-6)
+
+
+def test_two_objects_of_one_file_share_a_model(tmp_path):
+    folder = write_scene(tmp_path, grasps=False)
+    text = (folder / "scene.yaml").read_text()
+    second = text[text.index("object1:") : text.index("object2:")].replace("object1", "object9")
+    (folder / "scene.yaml").write_text(text + "\n" + second.replace("position: [", "position: [3"))
+    found = read_graspit_scene(folder)
+    assert [o.obj_id for o in found.scene.objects] == [1, 2, 3, 1]
+    assert [o.instance for o in found.scene.objects] == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("object1: {file_path: a.usd, name: a}", "orientation, position"),
+        ("object1: [1, 2]", "0 objects"),
+        ("- 1\n- 2", "no named objects"),
+        ("a: {b: [", "not YAML"),
+        ("a: !!python/object/apply:os.system ['true']", "not YAML"),
+        (
+            "o: {file_path: brick.usd, name: a, orientation: [1, 0, 0, .nan], position: [0, 0, 0]}",
+            "4 finite numbers",
+        ),
+        (
+            "o: {file_path: brick.usd, name: a, orientation: [2, 0, 0, 0], position: [0, 0, 0]}",
+            "length 2",
+        ),
+        (
+            "o: {file_path: gone.usd, name: a, orientation: [1, 0, 0, 0], position: [0, 0, 0]}",
+            r"gone\.stl",
+        ),
+        (
+            "o: {file_path: brick.usd, name: a, orientation: [1, 0, 0, 0], position: [0, 0, 0], "
+            "scale: [1, -1, 1]}",
+            "scale",
+        ),
+    ],
+)
+def test_a_bad_file_is_named(tmp_path, text, what):
+    write_stl(tmp_path, "brick", EXTENTS["brick"])
+    (tmp_path / "scene.yaml").write_text(text)
+    with pytest.raises(InputError, match=what):
+        read_graspit_scene(tmp_path)
+
+
+def test_a_missing_or_huge_file_is_named(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        read_graspit_scene(tmp_path)
+    (tmp_path / "scene.yaml").write_bytes(b"#" * 4_000_001)
+    with pytest.raises(InputError, match="MB"):
+        read_graspit_scene(tmp_path)
+    assert not is_graspit_scene(tmp_path) and not is_graspit_scene(tmp_path / "gone.yaml")
+
+
+@pytest.mark.real
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"no graspit_assets under {DATA} (set REALSIM_DATA)")
+def test_the_authors_scene_proves_its_order_twice_over():
+    found = read_graspit_scene(REAL)
+    assert is_graspit_scene(REAL) and found.order == "wxyz" and len(found.scene.objects) == 7
+    right, wrong = found.evidence["wxyz"], found.evidence["xyzw"]
+    assert right.spread_m < 1e-3 < 0.03 < wrong.spread_m
+    assert right.midway_m < 1e-4 < 0.03 < wrong.midway_m
+    assert found.scene.plane.T_world_table[2, 3] == pytest.approx(0.8266, abs=1e-3)
+    assert any("bottle -3.3 mm" in n for n in found.notes)
+    sets = read_graspit_grasps(found)
+    counts = {found.models[s.obj_id].name: len(s.Ts_obj_grasp) for s in sets}
+    assert sum(counts.values()) == 1654 and counts["motor"] == 784
+    assert all(np.nanmax(s.widths_m) < 0.08 for s in sets)

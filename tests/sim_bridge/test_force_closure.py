@@ -1,0 +1,201 @@
+"""Analytic grasp quality: contacts, friction levels, and the largest ball of wrenches."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import MEASURES, Mesh
+from realsim_sim_bridge.grasping.antipodal import RaySurface
+from realsim_sim_bridge.grasping.candidates import CandidateConfig, Surroundings, sample_candidates
+from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.grasping.pad_contacts import pad_contacts
+from realsim_sim_bridge.grasping.wrench_hull import finger_wrenches, largest_balls
+
+HAND = HandGeometry()
+
+
+def solid(shape):
+    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
+
+
+def box(*size):
+    return solid(trimesh.creation.box(size or (0.05, 0.05, 0.05)))
+
+
+def cup():
+    return solid(trimesh.creation.annulus(0.028, 0.032, 0.08, sections=96))
+
+
+def moved(mesh, T):
+    return Mesh(vertices=se3.transform(T, mesh.vertices), faces=mesh.faces)
+
+
+def grasps(mesh, limit=80, seed=0):
+    T = se3.from_translation([0.0, 0.0, -mesh.vertices[:, 2].min()])
+    config, rng = CandidateConfig(surface_points=200), np.random.default_rng(seed)
+    found = sample_candidates(mesh, T, Surroundings(), config, HAND, rng, limit)
+    return found.Ts_obj_grasp, found.openings_m
+
+
+def wedge(half_angle, length=0.06, thin=0.01):
+    """Return a wedge that grows along x, its slopes facing +y and -y, open at +-half_angle."""
+    end = thin + length * np.tan(half_angle)
+    x = np.array([-length / 2, length / 2])
+    outline = np.array([[x[0], -thin], [x[1], -end], [x[1], end], [x[0], thin]])
+    corners = np.concatenate([np.c_[outline, np.full(4, z)] for z in (-0.02, 0.02)])
+    return solid(trimesh.convex.convex_hull(corners))
+
+
+def random_contacts(n, seed):
+    """Return grasps of which some have force closure and others none, as `largest_balls` takes."""
+    rng = np.random.default_rng(seed)
+    points = 0.5 * rng.normal(size=(n, 2, 3))
+    points[:, 1] = -points[:, 0] + 0.2 * rng.normal(size=(n, 3))
+    normals = -points / np.linalg.norm(points, axis=-1, keepdims=True)
+    normals = normals + 0.4 * rng.normal(size=(n, 2, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return points, normals, rng.normal(size=(n, 3)), rng.uniform(0.05, 0.3, (n, 2))
+
+
+@pytest.mark.parametrize("mesh", [box(), cup()], ids=["box", "cup"])
+def test_nothing_changes_when_object_and_grasps_move_together(mesh):
+    Ts, openings = grasps(mesh)
+    T = se3.exp([0.8, -0.3, 1.1, 0.2, -0.1, 0.3])
+    here = force_closure(mesh, Ts, openings)
+    there = force_closure(moved(mesh, T), T @ Ts, openings)
+    # Rays have single precision: at the rim of a pad one may fall off an edge.
+    same = np.isclose(here.ferrari_canny, there.ferrari_canny, atol=1e-5)
+    assert len(same) == 80 and np.mean(same) >= 0.9
+    # The needed friction turns with the mean of what touches, so it moves a little more.
+    assert np.mean(np.isclose(here.needed_friction, there.needed_friction, atol=1e-4)) >= 0.85
+    assert np.mean(here.dexnet_closure == there.dexnet_closure) >= 0.98
+
+
+def test_nothing_changes_when_the_fingers_change_places():
+    mesh = cup()
+    Ts, openings = grasps(mesh)
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    a, b = force_closure(mesh, Ts, openings), force_closure(mesh, Ts @ half_turn, openings)
+    assert np.allclose(a.contacts.points, b.contacts.points[:, ::-1], atol=1e-6)
+    assert np.mean(np.isclose(a.ferrari_canny, b.ferrari_canny, atol=1e-5)) >= 0.95
+
+
+def test_quality_grows_with_friction_and_with_torsion():
+    points, normals, tangents, torsions = random_contacts(200, 1)
+    by_friction = [
+        largest_balls(points, normals, tangents, mu, torsions, 8) for mu in (0.3, 0.6, 1)
+    ]
+    assert np.all(np.diff(by_friction, axis=0) >= -1e-12)
+    assert np.sum(by_friction[-1] > by_friction[0] + 1e-6) > 50
+    less = largest_balls(points, normals, tangents, 1.0, 0.5 * torsions, 8)
+    assert np.all(less <= by_friction[-1] + 1e-12) and np.any(less < by_friction[-1] - 1e-3)
+
+
+def test_the_quality_is_the_hull_s_by_qhull():
+    from scipy.spatial import ConvexHull
+
+    contacts = random_contacts(120, 0)
+    for friction, edges in ((0.7, 8), (0.6, 4), (1.0, 12)):
+        args = (*contacts[:3], friction, contacts[3], edges)
+        corners = finger_wrenches(*args).reshape(120, -1, 6)
+        expected = [max(0.0, -ConvexHull(c).equations[:, -1].max()) for c in corners]
+        assert np.allclose(largest_balls(*args), expected, atol=1e-10)
+        assert 10 < np.count_nonzero(expected) < 110
+
+
+def test_a_centred_grasp_of_a_cube_has_the_quality_of_the_formula():
+    """Torsion (gamma) and the friction of both fingers at their arm (r) share the normal force."""
+    closure = force_closure(box(), np.eye(4)[None], np.array([0.06]))
+    length = np.sqrt(3) * 0.025
+    gamma = closure.contacts.levers_m[0, 0] / length
+    r = np.cos(np.pi / 8) * 0.025 / length
+    assert closure.ferrari_canny[0] == pytest.approx(1 / np.hypot(1 / gamma, 1 / r), rel=1e-4)
+
+
+def test_the_lever_of_a_pad_on_a_flat_face_is_that_of_an_evenly_loaded_patch():
+    contacts = pad_contacts(
+        RaySurface(box()), np.eye(4)[None], np.array([0.06]), HAND, rays=7, softness_m=5e-4
+    )
+    xz = np.random.default_rng(0).uniform(-0.5, 0.5, (200000, 2)) * [0.02, 0.0176]
+    assert contacts.levers_m == pytest.approx(np.linalg.norm(xz, axis=1).mean(), rel=0.02)
+    assert np.allclose(contacts.points[0], [[0, -0.025, 0], [0, 0.025, 0]], atol=1e-7)
+    assert np.allclose(contacts.normals[0], [[0, -1, 0], [0, 1, 0]])
+
+
+def test_hard_point_contacts_hold_no_turn_about_their_line():
+    points, normals, tangents, torsions = random_contacts(20, 2)
+    assert not largest_balls(points, normals, tangents, 1.0, 0 * torsions, 8).any()
+
+
+def test_parallel_faces_close_at_the_smallest_level():
+    closure = force_closure(box(), np.eye(4)[None], np.array([0.06]), ClosureConfig(friction=0.01))
+    assert closure.needed_friction[0] == pytest.approx(0, abs=1e-6)
+    assert closure.closure_friction[0] == 0.2 and closure.dexnet_closure[0] == 1
+    assert closure.ferrari_canny[0] > 0
+
+
+@pytest.mark.parametrize("angle_deg", [5, 15, 25, 40])
+def test_a_wedge_closes_from_the_tangent_of_its_half_angle_on(angle_deg):
+    mesh, tangent = wedge(np.radians(angle_deg)), np.tan(np.radians(angle_deg))
+    T, opening = np.eye(4)[None], np.array([0.08])
+    for friction, closes in ((tangent - 0.001, False), (tangent + 0.001, True)):
+        closure = force_closure(mesh, T, opening, ClosureConfig(friction=friction))
+        assert closure.dexnet_closure[0] == closes
+        # A corner of the polygon in the cone points along the slope, so it is not narrower there.
+        assert (closure.ferrari_canny[0] > 0) == closes
+    assert closure.needed_friction[0] == pytest.approx(tangent, abs=1e-4)
+    levels = np.array([0.2, 0.4, 0.6, 0.8, 1.0, 1.2])
+    assert closure.closure_friction[0] == levels[levels >= tangent - 1e-6].min()
+
+
+def test_a_ball_of_wrenches_needs_closure():
+    # Torsion about tilted normals bears a line a little outside the cones: a small ball is left.
+    Ts, openings = grasps(cup())
+    for friction in (0.1, 0.4):
+        closure = force_closure(cup(), Ts, openings, ClosureConfig(friction=friction))
+        assert np.all(closure.dexnet_closure[closure.ferrari_canny > 1e-3] == 1)
+
+
+def test_a_finger_that_touches_nothing_closes_nothing():
+    Ts = np.stack([np.eye(4), se3.from_translation([0.0, 0.0, 0.2])])
+    closure = force_closure(box(), Ts, np.array([0.06, 0.06]))
+    assert closure.contacts.both.tolist() == [True, False]
+    assert np.isnan(closure.contacts.points[1]).all()
+    assert closure.ferrari_canny[1] == 0 and closure.dexnet_closure[1] == 0
+    assert np.isinf(closure.closure_friction[1]) and np.isinf(closure.needed_friction[1])
+
+
+def test_a_mesh_whose_triangles_face_inwards_has_the_same_quality():
+    mesh = cup()
+    Ts, openings = grasps(mesh)
+    inside_out = Mesh(vertices=mesh.vertices, faces=mesh.faces[:, ::-1])
+    a, b = force_closure(mesh, Ts, openings), force_closure(inside_out, Ts, openings)
+    assert np.allclose(a.ferrari_canny, b.ferrari_canny, atol=1e-6)
+    assert np.array_equal(a.closure_friction, b.closure_friction)
+
+
+def test_the_columns_bear_the_names_of_the_records():
+    closure = force_closure(box(), np.eye(4)[None], np.array([0.06]))
+    assert set(closure.measures()) <= set(MEASURES)
+    assert all(column.shape == (1,) for column in closure.measures().values())
+
+
+def test_no_grasps_have_no_quality():
+    closure = force_closure(box(), np.zeros((0, 4, 4)), np.zeros(0))
+    assert all(column.shape == (0,) for column in closure.measures().values())
+
+
+def test_impossible_input_is_named():
+    with pytest.raises(InputError, match="2 openings for 1 grasps"):
+        force_closure(box(), np.eye(4)[None], np.zeros(2))
+    for change in ({"friction": 0.0}, {"cone_edges": 6}, {"levels": (0.2, -1.0)}, {"pad_rays": 0}):
+        with pytest.raises(InputError, match="force closure"):
+            replace(ClosureConfig(), **change)
+    flat = Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]]))
+    with pytest.raises(InputError, match="flat"):
+        force_closure(flat, np.eye(4)[None], np.array([0.06]))

@@ -1,0 +1,320 @@
+"""A scene under physics: what rests must rest, and what cannot stand must be named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError, RealsimError
+from realsim.geometry import se3
+from realsim.models.library_records import KnownSolid
+from realsim.models.model_records import ConvexParts
+from realsim.models.properties import physical_properties
+from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim_sim_bridge.scenes.hull_margin import drawn_in
+from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
+from realsim_sim_bridge.scenes.stable_state import (
+    HEADERS,
+    StandConfig,
+    stable_state,
+    stand_rows,
+)
+from realsim_sim_bridge.scenes.stand_picture import outline, stand_picture
+from realsim_sim_bridge.scenes.table_world import TableWorld
+from realsim_sim_bridge.scenes.world_config import WorldConfig
+
+SIDE = 0.05
+ONE_SECOND = StandConfig(shortest_s=1.0, longest_s=1.0, rest_s=0.25)
+
+
+def box(extents=(SIDE, SIDE, SIDE), at=(0.0, 0.0, 0.0)):
+    import trimesh
+
+    shape = trimesh.creation.box(extents)
+    return Mesh(vertices=np.array(shape.vertices) + at, faces=np.array(shape.faces))
+
+
+def cube(obj_id=1, **kwargs):
+    return ObjectModel(obj_id=obj_id, name=f"cube{obj_id}", mesh=box(), **kwargs)
+
+
+def place(x, y, z, instance=0, obj_id=1, turn=(0.0, 0.0, 0.0)):
+    T = se3.from_rt(se3.exp_so3(np.asarray(turn, float)), [x, y, z])
+    return ObjectPose(obj_id=obj_id, instance=instance, T_world_obj=T)
+
+
+def school_scene(*objects, models=None, T_world_table=None, matter=None, supports=()):
+    models = models or {1: cube()}
+    T = np.eye(4) if T_world_table is None else T_world_table
+    moved = tuple(replace(o, T_world_obj=T @ o.T_world_obj) for o in objects)
+    scene = Scene(name="test", objects=moved, plane=SupportPlane(T_world_table=T))
+    solids = known_solids(models, matter)
+    return SchoolScene(scene=scene, models=models, solids=solids, supports=supports)
+
+
+def run(scene, config=ONE_SECOND, world_config=None):
+    with TableWorld(scene, world_config) as world:
+        return stable_state(world, config)
+
+
+def verdicts(report):
+    return [o.verdict for o in report.objects]
+
+
+@pytest.mark.parametrize("mass", [0.01, 0.125, 2.0])
+def test_a_box_stands_for_a_second_within_a_tenth_of_a_millimetre(mass):
+    report = run(school_scene(place(0, 0, SIDE / 2), matter=Matter(masses_kg={1: mass})))
+    (stand,) = report.objects
+    assert stand.verdict == "stands" and stand.at_rest
+    assert stand.moved_m < 1e-4 and stand.turned_deg < 0.05 and stand.jump_m_s < 0.02
+    assert abs(stand.gap_m) < 1e-5 and stand.into == {}
+
+
+def test_nothing_depends_on_where_the_table_is_in_the_world():
+    rng = np.random.default_rng(3)
+    objects = (place(0, 0, SIDE / 2), place(0.12, 0, SIDE / 2 + 0.004, 1, turn=(0.3, 0.0, 0.1)))
+    T = se3.random_transform(rng)
+    here, there = run(school_scene(*objects)), run(school_scene(*objects, T_world_table=T))
+    assert verdicts(here) == verdicts(there)
+    for a, b in zip(here.objects, there.objects, strict=True):
+        assert np.allclose(T @ a.T_world_before, b.T_world_before, atol=1e-9)
+        assert abs(a.moved_m - b.moved_m) < 5e-4 and abs(a.turned_deg - b.turned_deg) < 0.5
+
+
+def test_the_same_scene_gives_the_same_bytes():
+    scene = school_scene(place(0, 0, SIDE / 2), place(0.01, 0, 2.1 * SIDE, 1, turn=(0.4, 0.2, 0)))
+    a, b = run(scene), run(scene)
+    for x, y in zip(a.objects, b.objects, strict=True):
+        assert x.T_world_after.tobytes() == y.T_world_after.tobytes()
+    assert stand_rows(a) == stand_rows(b)
+
+
+def test_a_stack_with_a_light_part_below_stands():
+    models = {1: cube(1), 2: cube(2)}
+    matter = Matter(masses_kg={1: 0.05, 2: 1.0})
+    pile = [place(0, 0, SIDE * (k + 0.5), k, 1 + k % 2) for k in range(3)]
+    report = run(school_scene(*pile, models=models, matter=matter))
+    assert verdicts(report) == ["stands"] * 3
+    assert max(o.moved_m for o in report.objects) < 2e-4
+
+
+@pytest.mark.parametrize("degrees", [25, 44, 46, 50])
+def test_a_box_on_a_wedge_slides_just_where_coulomb_says(degrees):
+    """A flat box of mu 1 holds up to 45 degrees and slides beyond; it is too low to tip over."""
+    angle = np.radians(degrees)
+    R = se3.exp_so3(np.array([0.0, angle, 0.0]))
+    slab = box((0.8, 0.4, 0.02))
+    T_slope = se3.from_rt(R, [0.0, 0.0, 0.4])
+    flat = ObjectModel(obj_id=1, name="flat", mesh=box((0.06, 0.06, 0.01)))
+    T = T_slope @ se3.from_translation([0.0, 0.0, 0.015])
+    pose = ObjectPose(obj_id=1, instance=0, T_world_obj=T)
+    support = Support(name="slope", T_world_support=T_slope, mesh=slab)
+    scene = school_scene(pose, models={1: flat}, supports=(support,))
+    seconds = 0.3
+    config = StandConfig(shortest_s=seconds, longest_s=seconds)
+    (stand,) = run(scene, config).objects
+    expected = 0.5 * 9.81 * seconds**2 * max(0.0, np.sin(angle) - np.cos(angle))
+    assert abs(stand.moved_m - expected) < 1e-4 + 0.02 * expected
+    assert stand.verdict == ("stands" if degrees < 45 else "falls")
+
+
+def test_friction_is_of_the_contact_not_its_square():
+    """At mu 0.5 the limit is 26.6 degrees; a product of 0.25 would give 14."""
+    angle = np.radians(22)
+    T_slope = se3.from_rt(se3.exp_so3(np.array([0.0, angle, 0.0])), [0, 0, 0.3])
+    flat = ObjectModel(obj_id=1, name="flat", mesh=box((0.06, 0.06, 0.01)))
+    T = T_slope @ se3.from_translation([0.0, 0.0, 0.015])
+    support = Support(name="slope", T_world_support=T_slope, mesh=box((0.8, 0.4, 0.02)))
+    scene = school_scene(
+        ObjectPose(obj_id=1, instance=0, T_world_obj=T), models={1: flat}, supports=(support,)
+    )
+    assert verdicts(run(scene, world_config=WorldConfig(friction=0.5))) == ["stands"]
+    assert verdicts(run(scene, world_config=WorldConfig(friction=0.3))) == ["falls"]
+
+
+def test_the_centre_of_mass_decides_who_tips_over_the_edge():
+    """A rod over an edge falls exactly if its centre of mass is beyond the edge."""
+    support = Support(
+        name="step", T_world_support=np.eye(4), mesh=box((0.2, 0.2, 0.2), (0, 0, 0.1))
+    )
+    rod = ObjectModel(obj_id=1, name="rod", mesh=box((0.1, 0.02, 0.02)))
+    for overhang, verdict in ((-0.01, "stands"), (0.01, "falls")):
+        scene = school_scene(place(0.1 + overhang, 0, 0.21), models={1: rod}, supports=(support,))
+        assert verdicts(run(scene)) == [verdict]
+
+
+def test_a_heavy_end_shifts_the_centre_of_mass():
+    """The matter given decides, not the shape: with the mass at its far end the rod falls."""
+    support = Support(
+        name="step", T_world_support=np.eye(4), mesh=box((0.2, 0.2, 0.2), (0, 0, 0.1))
+    )
+    rod = ObjectModel(obj_id=1, name="rod", mesh=box((0.1, 0.02, 0.02)))
+    scene = school_scene(place(0.08, 0, 0.21), models={1: rod}, supports=(support,))
+    solid = scene.solids[1]
+    heavy = replace(solid.matter, center_of_mass=np.array([0.04, 0.0, 0.0]))
+    assert verdicts(run(scene)) == ["stands"]
+    leaning = replace(scene, solids={1: replace(solid, matter=heavy)})
+    assert verdicts(run(leaning)) == ["falls"]
+
+
+def test_a_box_on_its_corner_falls_over():
+    R = se3.exp_so3(np.array([0.5, 0.4, 0.0]))
+    height = -float((box().vertices @ R.T)[:, 2].min())
+    (stand,) = run(school_scene(place(0, 0, height, turn=(0.5, 0.4, 0.0)))).objects
+    assert stand.verdict == "falls" and stand.turned_deg > 5
+
+
+def test_an_object_sunk_into_the_table_jumps_and_the_depth_is_named():
+    (stand,) = run(school_scene(place(0, 0, SIDE / 2 - 0.006))).objects
+    assert stand.verdict == "jumps"
+    assert stand.into == pytest.approx({"the table": 0.006}, abs=1e-5)
+    assert "6.0 mm inside the table" in stand.sentence
+
+
+def test_an_object_in_the_air_floats_and_the_gap_is_named():
+    (stand,) = run(school_scene(place(0, 0, SIDE / 2 + 0.008))).objects
+    assert stand.verdict == "floats" and stand.gap_m == pytest.approx(0.008, abs=1e-5)
+    assert stand.moved_m == pytest.approx(0.008, abs=2e-4)
+
+
+def test_objects_inside_one_another_are_named_in_pairs():
+    scene = school_scene(
+        place(0, 0, SIDE / 2),
+        place(SIDE - 0.01, 0.002, SIDE / 2 + 1e-4, 1),
+        place(0.3, 0, SIDE / 2, 2),
+    )
+    report = run(scene)
+    assert verdicts(report) == ["inside another", "inside another", "stands"]
+    ((a, b, depth),) = report.inside
+    assert {a, b} == {"cube1 #0", "cube1 #1"} and depth == pytest.approx(0.01, abs=1e-4)
+
+
+def test_the_settled_scene_stands():
+    scene = school_scene(place(0, 0, SIDE / 2 + 0.01), place(0.1, 0, SIDE / 2 - 0.005, 1))
+    first = run(scene, StandConfig())
+    again = run(replace(scene, scene=first.settled(scene.scene)))
+    assert not first.stable and again.stable
+
+
+def test_every_parameter_is_read_back_and_a_lost_one_is_an_error(monkeypatch):
+    scene = school_scene(place(0, 0, SIDE / 2))
+    with TableWorld(scene, WorldConfig(friction=0.6)) as world:
+        settings = world.settings()
+        assert settings["contact_friction"] == pytest.approx(0.6)
+        assert settings["iterations"] == 300
+        assert settings["collision_margin_m"] == pytest.approx(0.0005)
+
+    from pybullet_utils.bullet_client import BulletClient
+
+    whole = BulletClient.__getattr__
+
+    def forgetful(self, name):
+        found = whole(self, name)
+        if name != "changeDynamics":
+            return found
+        return lambda body, link, **given: found(
+            body, link, **{k: v for k, v in given.items() if k != "lateralFriction"}
+        )
+
+    monkeypatch.setattr(BulletClient, "__getattr__", forgetful)
+    with pytest.raises(RealsimError, match="lateralFriction"):
+        TableWorld(scene, WorldConfig(friction=0.6))
+
+
+def test_blown_up_parts_and_meshes_without_volume_are_named():
+    scene = school_scene(place(0, 0, SIDE / 2))
+    solid = scene.solids[1]
+    fat = KnownSolid(
+        parts=ConvexParts(parts=solid.parts.parts, volume_ratio=1.4, method="hull"),
+        matter=solid.matter,
+    )
+    (note,) = run(replace(scene, solids={1: fat})).notes
+    assert "cube1" in note and "1.40" in note
+    opened = Mesh(vertices=box().vertices, faces=box().faces[2:])
+    matter = physical_properties(opened)
+    lidless = replace(scene, solids={1: KnownSolid(parts=solid.parts, matter=matter)})
+    (note,) = run(lidless).notes
+    assert "cube1" in note and "no volume" in note
+    flat = ObjectModel(
+        obj_id=1, name="sheet", mesh=Mesh(vertices=box().vertices * [1, 1, 0], faces=box().faces)
+    )
+    with pytest.raises(InputError, match=r"sheet.*flat"):
+        known_solids({1: flat})
+
+
+def test_bad_input_is_named(tmp_path):
+    with pytest.raises(InputError, match="friction"):
+        WorldConfig(friction=0.0)
+    with pytest.raises(InputError, match="does not exist"):
+        Support(name="shelf", T_world_support=np.eye(4), urdf=tmp_path / "shelf.urdf")
+    with pytest.raises(InputError, match="neither a mesh nor"):
+        Support(name="shelf", T_world_support=np.eye(4))
+    broken = tmp_path / "broken.urdf"
+    broken.write_text("<robot name='x'><link")
+    shelf = Support(name="shelf", T_world_support=np.eye(4), urdf=broken)
+    with pytest.raises(InputError, match=r"'shelf'.*broken\.urdf"):
+        TableWorld(school_scene(place(0, 0, SIDE / 2), supports=(shelf,)))
+    with pytest.raises(InputError, match="mass is given for object 7"):
+        known_solids({1: cube()}, Matter(masses_kg={7: 0.1}))
+    scene = Scene(name="bare", objects=(place(0, 0, 0),))
+    with pytest.raises(InputError, match="no supporting plane"):
+        SchoolScene(scene=scene, models={1: cube()}, solids={})
+
+
+def test_an_object_stands_on_a_support_from_a_urdf(tmp_path):
+    urdf = tmp_path / "stand.urdf"
+    urdf.write_text(
+        "<robot name='stand'><link name='base'><collision><origin xyz='0 0 0.05'/><geometry>"
+        "<box size='0.2 0.2 0.1'/></geometry></collision></link></robot>"
+    )
+    support = Support(name="stand", T_world_support=se3.from_translation([1, 0, 0]), urdf=urdf)
+    scene = school_scene(
+        place(1, 0, 0.1 + SIDE / 2), place(0, 0, 0.1 + SIDE / 2, 1), supports=(support,)
+    )
+    on_it, beside = run(scene).objects
+    assert on_it.verdict == "stands" and on_it.moved_m < 1e-4
+    assert beside.verdict == "floats" and beside.moved_m == pytest.approx(0.1, abs=1e-3)
+
+
+def test_the_outline_of_a_box_is_its_square():
+    mesh = box()
+    edges = outline(mesh.vertices, mesh.faces, 2)[:, :, :2]
+    assert np.allclose(np.abs(edges).max(axis=(1, 2)), SIDE / 2)
+    assert np.ptp(edges[:, :, 0]) == pytest.approx(SIDE)
+
+
+def test_rows_and_picture_say_what_happened():
+    import cv2
+
+    scene = school_scene(place(0, 0, SIDE / 2), place(0.2, 0, SIDE / 2 + 0.02, 1))
+    report = run(scene)
+    rows = stand_rows(report)
+    assert all(len(row) == len(HEADERS) for row in rows)
+    assert rows[0][1] == "stands" and rows[1][1] == "floats" and rows[1][2] == "20.0"
+    png = stand_picture(scene, report)
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    rgb = image[..., ::-1].astype(int)
+    teal = np.abs(rgb - [0x2A, 0x9D, 0x8F]).max(-1) < 12
+    assert teal.sum() > 200  # the floating one's outline and arrow
+    assert png == stand_picture(scene, report)
+
+
+@pytest.mark.parametrize("extents", [(0.05, 0.05, 0.05), (0.1, 0.03, 0.0006)])
+def test_a_hull_drawn_in_and_its_margin_are_the_hull_again(extents):
+    corners = box(extents).vertices
+    (core,), margin = drawn_in([corners], 0.0005)
+    assert margin == pytest.approx(min(0.0005, min(extents) / 4))
+    assert np.allclose(np.abs(core), np.array(extents) / 2 - margin, atol=1e-8)
+
+
+def test_a_hull_is_drawn_in_by_the_margin_along_every_normal():
+    from scipy.spatial import ConvexHull
+
+    rng = np.random.default_rng(5)
+    points = rng.normal(size=(40, 3)) * [0.03, 0.02, 0.05]
+    (core,), margin = drawn_in([points], 0.0005)
+    planes = ConvexHull(points).equations
+    depth = (core @ planes[:, :3].T + planes[:, 3]).max(axis=0)
+    # small faces may vanish behind their neighbours, none comes nearer than the margin
+    assert depth.max() < -margin + 1e-7
+    assert np.isclose(depth, -margin, atol=1e-7).mean() > 0.8

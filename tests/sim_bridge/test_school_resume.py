@@ -1,0 +1,330 @@
+"""Robot School interrupted, killed, and started again with something else."""
+
+import dataclasses
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import Future
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim_sim_bridge.school import recompute_scores, run_school, run_school_results
+from realsim_sim_bridge.school.object_slips import in_words
+from realsim_sim_bridge.school.run_record import RUN_FILE, differences, folder_of_run
+from realsim_sim_bridge.school.workers import WorkerDiedError, local_workers
+from school_scenes import at, model, same, same_motion, scene, small_worlds
+
+CONFIG = small_worlds()
+SHARD = 2
+
+
+def run(cache=None, config=CONFIG, objects=None, models=None, **kwargs):
+    kwargs = {"workers": 1, "shard_grasps": SHARD} | kwargs
+    objects = objects or scene(at(0, 0))
+    return run_school_results(objects, models or {1: model()}, config, cache=cache, **kwargs)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """The result of an uninterrupted run."""
+    return run()[0]
+
+
+def is_whole_again(result, whole):
+    return same(result.grasp_set, whole.grasp_set) and same_motion(
+        result.trajectories, whole.trajectories
+    )
+
+
+def names(folder, what):
+    return sorted(p.name for p in folder.glob(f"instance_*.{what}*.npz"))
+
+
+# --- interrupted --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("judged", [0, 2])
+def test_ctrl_c_says_how_to_go_on_and_the_next_run_does_no_shard_again(tmp_path, whole, judged):
+    def stop(done, expected):
+        if done >= judged + np.sum(~whole.grasp_set.reachable):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match=r"of 6 grasps; they are kept in .* goes on"):
+        run(tmp_path, progress=stop)
+    kept = names(tmp_path, "shard")
+    before = {name: (tmp_path / name).stat().st_mtime_ns for name in kept}
+    assert len(kept) == judged // SHARD and names(tmp_path, "prepared")
+    seen = []
+
+    def look(done, _):
+        seen.append(done)
+        for name in names(tmp_path, "shard"):
+            assert before.get(name, 0) in (0, (tmp_path / name).stat().st_mtime_ns)
+
+    result = run(tmp_path, progress=look)[0]
+    assert seen[0] >= judged and is_whole_again(result, whole)
+    assert names(tmp_path, "") == ["instance_000000.grasps.npz"]
+
+
+def test_an_interrupted_run_without_a_folder_says_that_nothing_is_kept():
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="nothing of it is kept"):
+        run(progress=stop)
+
+
+def test_a_damaged_piece_is_made_again(tmp_path, whole):
+    def stop(done, _):
+        if done >= 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, progress=stop)
+    for path in tmp_path.glob("instance_*.npz"):
+        path.write_bytes(path.read_bytes()[:100])
+    assert is_whole_again(run(tmp_path)[0], whole)
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from school_scenes import at, model, scene, small_worlds
+from realsim_sim_bridge.school import run_school
+
+if __name__ == "__main__":
+    run_school(
+        scene(at(0, 0), at(0.2, 0.1, instance=1)), {1: model()}, small_worlds(),
+        workers=int(sys.argv[2]), cache=Path(sys.argv[1]), shard_grasps=2,
+        progress=lambda done, of: print(done, of, flush=True),
+    )
+"""
+
+
+def start(tmp_path, workers):
+    (tmp_path / "script.py").write_text(SCRIPT)
+    support = Path(__file__).parents[1] / "support"
+    return subprocess.Popen(
+        [sys.executable, tmp_path / "script.py", tmp_path / "cache", str(workers)],
+        env=os.environ | {"PYTHONPATH": str(support)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_run_killed_at_random_moments_ends_as_if_it_had_not_been(tmp_path, workers):
+    rng = np.random.default_rng(workers)
+    judged = 0
+    for _ in range(4):
+        process = start(tmp_path, workers)
+        first = process.stdout.readline()
+        if first:  # what was judged before the kill needs no second test
+            assert int(first.split()[0]) >= judged
+            time.sleep(rng.uniform(0.0, 1.5 + workers))
+        process.kill()
+        lines = process.stdout.read().split("\n")
+        judged = max([judged, *(int(line.split()[0]) for line in [first, *lines] if line)])
+        process.wait()
+    process = start(tmp_path, workers)
+    lines = process.communicate(timeout=120)[0].splitlines()
+    assert process.returncode == 0 and lines[-1] == "12 12"
+    assert int(lines[0].split()[0]) >= judged > 0
+    objects = scene(at(0, 0), at(0.2, 0.1, instance=1))
+    kept = run(tmp_path / "cache", objects=objects)
+    for a, b in zip(kept, run(objects=objects), strict=True):
+        assert is_whole_again(a, b)
+    assert not list((tmp_path / "cache").glob(".*"))
+
+
+# --- dead workers -------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_killed_worker_loses_one_shard_and_the_run_goes_on(whole):
+    killed = []
+
+    def kill_one(done, _):
+        if not killed and done > 0:
+            children = multiprocessing.active_children()
+            killed.append(children[0].pid)
+            os.kill(children[0].pid, signal.SIGKILL)
+
+    result = run(workers=2, progress=kill_one)[0]
+    assert killed and is_whole_again(result, whole)
+
+
+class Deadly:
+    """Workers that die of every shard with a certain grasp in it."""
+
+    shares_files = True
+
+    def __init__(self, workers, row, error=None):
+        self._workers, self._row, self._error = workers, row, error
+        self.deaths = 0
+
+    def capacity(self):
+        return 3
+
+    def submit(self, fn, /, *args):
+        if len(args) == 3 and self._row in args[1]:
+            self.deaths += 1
+            future = Future()
+            future.set_exception(self._error or WorkerDiedError("its process was killed"))
+            return future
+        return self._workers.submit(fn, *args)
+
+
+@pytest.fixture
+def deadly(monkeypatch, whole):
+    """Workers that die of the object's second shard."""
+    from contextlib import contextmanager
+
+    from realsim_sim_bridge.school import school
+
+    shard = np.flatnonzero(whole.grasp_set.reachable)[SHARD : 2 * SHARD]
+    made = []
+
+    def hire(error=None):
+        @contextmanager
+        def staff(_):
+            with local_workers(1) as workers:
+                made.append(Deadly(workers, shard[0], error))
+                yield made[-1]
+
+        monkeypatch.setattr(school, "_staff", staff)
+        return shard, made
+
+    return hire
+
+
+def test_a_shard_that_kills_its_workers_is_given_up_with_its_grasps_named(
+    tmp_path, whole, deadly, monkeypatch
+):
+    with monkeypatch.context():
+        shard, made = deadly()
+        result = run(tmp_path)[0]
+    assert made[0].deaths == 3
+    found = result.grasp_set
+    assert result.unfinished == (f"{in_words(shard)}: {found.failures[shard[0]][12:]}",)
+    assert "3 workers ended in the middle of it" in found.failures[shard[0]]
+    assert np.isnan(found.scores[shard]).all() and np.isnan(recompute_scores(found)[1][shard]).all()
+    others = np.setdiff1d(np.arange(6), shard)
+    assert np.array_equal(found.scores[others], whole.grasp_set.scores[others])
+    monkeypatch.undo()
+    assert is_whole_again(run(tmp_path)[0], whole)
+
+
+def test_an_error_in_a_shard_names_object_and_grasps(deadly):
+    shard, _ = deadly(InputError("the mesh is odd"))
+    with pytest.raises(InputError, match=rf"'box1' \(instance 0\), {in_words(shard)}: the mesh"):
+        run()
+    deadly(ZeroDivisionError("x"))
+    with pytest.raises(ZeroDivisionError) as caught:
+        run()
+    assert any(in_words(shard) in note for note in caught.value.__notes__)
+
+
+def test_rows_in_words():
+    assert in_words(np.array([3])) == "grasp 3"
+    assert in_words(np.array([1, 2, 3, 7, 9, 10])) == "grasps 1 to 3, 7 and 9 to 10"
+
+
+# --- something else in the same folder ------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finished")
+    run(folder)
+    return folder
+
+
+def test_another_config_is_refused_field_by_field(finished):
+    physics = dataclasses.replace(CONFIG.slip.physics, friction=0.5, force_n=20.0)
+    other = dataclasses.replace(
+        CONFIG, seed=4, slip=dataclasses.replace(CONFIG.slip, physics=physics)
+    )
+    before = {p: p.read_bytes() for p in finished.iterdir() if p.is_file()}
+    with pytest.raises(InputError) as caught:
+        run(finished, other)
+    lines = str(caught.value).splitlines()[1:-1]
+    assert [line.strip() for line in lines] == [
+        "config.seed: 0 -> 4",
+        "config.slip.physics.force_n: 70.0 -> 20.0",
+        "config.slip.physics.friction: 1.0 -> 0.5",
+    ]
+    assert "--restart" in str(caught.value) and "another folder" in str(caught.value)
+    assert before == {p: p.read_bytes() for p in finished.iterdir() if p.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"models": {1: model(size=0.04)}}, "objects.instance_000000.mesh"),
+        ({"models": {1: model(density=500.0)}}, "objects.instance_000000.density"),
+        ({"objects": scene(at(0.1, 0))}, "objects.instance_000000.T_table_obj.0.3"),
+        ({"objects": scene(at(0, 0), at(0.2, 0, 1))}, "objects.instance_000001: (nothing) ->"),
+        ({"shard_grasps": 4}, "shard_grasps: 2 -> 4"),
+    ],
+)
+def test_another_mesh_pose_or_object_is_refused(finished, change, field):
+    with pytest.raises(InputError, match="started with something else") as caught:
+        run(finished, **change)
+    assert field in str(caught.value)
+
+
+def test_another_version_is_refused(finished, monkeypatch):
+    from realsim_sim_bridge.school import run_record
+
+    monkeypatch.setattr(
+        run_record, "version", lambda name: "9.9" if name == "pybullet" else "unknown"
+    )
+    with pytest.raises(InputError, match=r"versions.pybullet: \"[\d.]+\" -> \"9.9\""):
+        run(finished)
+
+
+def test_restart_discards_the_other_run(tmp_path, whole):
+    run(tmp_path, dataclasses.replace(CONFIG, seed=1))
+    assert is_whole_again(run(tmp_path, restart=True)[0], whole)
+    assert is_whole_again(run(tmp_path)[0], whole)
+
+
+def test_results_of_unknown_origin_are_refused(tmp_path):
+    (tmp_path / "instance_000000.grasps.npz").write_bytes(b"")
+    with pytest.raises(InputError, match=f"no {RUN_FILE}"):
+        run(tmp_path)
+    (tmp_path / RUN_FILE).write_text("{")
+    with pytest.raises(InputError, match="damaged"):
+        run(tmp_path)
+
+
+def test_two_runs_at_once_in_one_folder_are_refused(tmp_path):
+    with folder_of_run(tmp_path, {}, restart=False), pytest.raises(InputError, match="another run"):
+        run_school(scene(at(0, 0)), {1: model()}, CONFIG, workers=1, cache=tmp_path)
+
+
+def test_a_shard_needs_a_grasp():
+    with pytest.raises(InputError, match="shard_grasps is 0"):
+        run(shard_grasps=0)
+
+
+def test_differences_are_those_values_that_differ():
+    old = {"a": 1, "b": {"c": [1, 2], "d": None}, "e": "x"}
+    assert list(differences(old, json.loads(json.dumps(old)))) == []
+    new = {"a": 1, "b": {"c": [1, 3, 4], "d": 0.5}, "f": True}
+    assert list(differences(old, new)) == [
+        ("b.c.1", "2", "3"),
+        ("b.c.2", "(nothing)", "4"),
+        ("b.d", "null", "0.5"),
+        ("e", '"x"', "(nothing)"),
+        ("f", "(nothing)", "true"),
+    ]

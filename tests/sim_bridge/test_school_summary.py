@@ -1,0 +1,238 @@
+"""The School's summary: its rows sum exactly, and they are the paper's rows."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import spearmanr
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import GraspSet
+from realsim_sim_bridge.school import summary_rows as paper
+from realsim_sim_bridge.school.measure_statistics import LEAST_GRASPS, spearman
+from realsim_sim_bridge.school.summary import GOOD, OUTCOMES, outcomes_of, summarise
+from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from tried_grasps import tried_set
+
+
+def scored_set(rng, n, *, obj_id=1, instance=0, tried=True, **measures):
+    """Return a set whose scores follow from its slips, as the School's do."""
+    slip_m, slip_rad = rng.gamma(0.6, 0.012, (n, 4)), rng.gamma(0.6, 0.1, (n, 4))
+    slip_m[rng.random((n, 4)) < 0.08] = np.inf
+    slip_rad[np.isinf(slip_m)] = np.inf
+    lost = np.cumsum(np.isinf(slip_m), axis=1) - np.isinf(slip_m) > 0
+    reachable = rng.random(n) < 0.8
+    slip_m[lost | ~reachable[:, None]] = slip_rad[lost | ~reachable[:, None]] = np.nan
+    base, scores = score_stages(slip_m, slip_rad, np.full(n, tried), ScoreLimits())
+    if not tried:
+        reachable, slip_m, slip_rad = np.zeros(n, bool), slip_m * np.nan, slip_rad * np.nan
+    return GraspSet(
+        obj_id=obj_id, instance=instance, widths_m=np.full(n, 0.03), scores=scores,
+        Ts_obj_grasp=se3.random_transform(rng, n) if n else np.zeros((0, 4, 4)),
+        base_scores=base, slip_m=slip_m, slip_rad=slip_rad, reachable=reachable,
+        failures=("",) * n, measures=measures,
+    )  # fmt: skip
+
+
+def some_scenes(seed):
+    rng = np.random.default_rng(seed)
+    return {
+        "a": [scored_set(rng, int(rng.integers(0, 80)), obj_id=k, instance=k) for k in (1, 2, 3)],
+        "b": [scored_set(rng, 50, obj_id=1), scored_set(rng, 9, obj_id=9, tried=False)],
+        "c": [],
+    }
+
+
+# --- laws -------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_every_candidate_is_in_exactly_one_row(seed):
+    scenes = some_scenes(seed)
+    sets = [s for part in scenes.values() for s in part]
+    found = summarise(scenes)
+    out = found.outcomes
+    assert sum(out.values()) == found.candidates == sum(len(s) for s in sets)
+    assert found.good == sum(int(s.good.sum()) for s in sets)
+    assert found.good + found.bad + out["not_tried"] == found.candidates
+    assert found.bad == (
+        out["no_trajectory"] + out["fail_close"] + out["fail_lift"] + out["penalized"]
+    )
+    assert found.with_trajectory + out["no_trajectory"] == found.judged
+    assert sum(found.penalized_by.values()) == out["penalized"]
+    if found.judged:
+        mean = found.share(found.good) * (found.score_good if found.good else 0)
+        mean += found.share(found.bad) * (found.score_bad if found.bad else 0)
+        assert mean == pytest.approx(found.score.mean)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=10, deadline=None)
+def test_counts_add_up_and_the_order_does_not_matter(seed):
+    scenes = some_scenes(seed)
+    parts = [summarise(part) for part in scenes.values()]
+    whole = summarise(dict(reversed(scenes.items())))
+    assert whole.outcomes == {k: sum(p.outcomes[k] for p in parts) for k in OUTCOMES}
+    assert whole.per_object == summarise(scenes).per_object
+
+
+def test_the_papers_rows_sum_as_ours_do():
+    out = paper.PAPER_OUTCOMES
+    assert sum(out.values()) == paper.PAPER_CANDIDATES == paper.PAPER_GOOD + paper.PAPER_BAD
+    assert paper.PAPER_GOOD == sum(out[n] for n in GOOD)
+    assert paper.PAPER_BAD == sum(out[n] for n in ("no_trajectory", "fail_lift", "penalized"))
+    assert paper.PAPER_WITH_TRAJECTORY == paper.PAPER_CANDIDATES - out["no_trajectory"]
+
+
+# --- known answers ----------------------------------------------------------------------------
+
+
+def by_hand(rows):
+    """Return a set of (reachable, base, score, executed stages)."""
+    n = len(rows)
+    slip = np.full((n, 4), np.nan)
+    for row, (_, _, _, stages) in zip(slip, rows, strict=True):
+        row[:stages] = 0.001
+    return GraspSet(
+        obj_id=1, instance=0, Ts_obj_grasp=np.tile(np.eye(4), (n, 1, 1)),
+        widths_m=np.zeros(n), scores=np.array([r[2] for r in rows]),
+        base_scores=np.array([r[1] for r in rows]), slip_m=slip, slip_rad=slip,
+        reachable=np.array([r[0] for r in rows]), failures=("",) * n,
+    )  # fmt: skip
+
+
+def test_each_outcome_is_told_by_base_and_score():
+    nan = math.nan
+    s = by_hand(
+        [
+            (False, nan, nan, 0), (False, 0.0, 0.0, 0), (True, 0.0, 0.0, 1), (True, 0.25, 0.0, 2),
+            (True, 0.25, 0.25, 2), (True, 0.5, 0.5 - 1 / 12, 3), (True, 1.0, 0.25, 4),
+            (True, 0.5, 0.5, 3), (True, 0.75, 0.75 - 2 / 12, 4), (True, 1.0, 1.0, 4),
+            (False, 0.75, 0.75, 4),
+        ]
+    )  # fmt: skip
+    named = [OUTCOMES[k] for k in outcomes_of(s)]
+    assert named == [
+        "not_tried", "no_trajectory", "fail_close", "fail_lift", "fail_lift", "penalized",
+        "penalized", "fail_horizontal", "fail_pendulum", "full_success", "fail_pendulum",
+    ]  # fmt: skip
+    found = summarise([s])
+    assert found.penalized_by == {"close": 0, "lift": 0, "oscillate": 1, "pendulum": 0, "none": 1}
+    assert (found.judged, found.with_trajectory, found.good, found.bad) == (10, 9, 4, 6)
+    assert found.score.mean == pytest.approx(np.nanmean(s.scores))
+    assert found.score.sd == pytest.approx(np.nanstd(s.scores))
+
+
+def test_candidates_are_counted_per_object_over_scenes_and_per_scene():
+    rng = np.random.default_rng(0)
+    scenes = {
+        "a": [scored_set(rng, 10, obj_id=1), scored_set(rng, 20, obj_id=2, instance=1)],
+        "b": [scored_set(rng, 40, obj_id=1)],
+    }
+    found = summarise(scenes)
+    assert (found.scenes, found.objects, found.sets) == (2, 2, 3)
+    per = found.per_object["candidates"]
+    assert (per.mean, per.sd) == (35.0, 15.0)
+    assert (found.per_scene["candidates"].mean, found.per_scene["candidates"].sd) == (35.0, 5.0)
+
+
+def test_impossible_scores_are_named():
+    with pytest.raises(InputError, match="at most its base score"):
+        outcomes_of(by_hand([(True, 0.5, 0.75, 3)]))
+    with pytest.raises(InputError, match="both are known or neither"):
+        outcomes_of(by_hand([(True, math.nan, 0.75, 3)]))
+    with pytest.raises(InputError, match="a base score"):
+        outcomes_of(by_hand([(True, 0.6, 0.5, 3)]))
+
+
+def test_nothing_at_all_has_a_summary_too():
+    found = summarise([])
+    assert found.candidates == 0 and math.isnan(found.score.mean)
+    assert json.loads(json.dumps(found.to_json(), allow_nan=False))["score"]["mean"] is None
+    assert len(found.to_rows()) > 15
+
+
+def test_rows_and_json_say_the_same():
+    found = summarise(some_scenes(5))
+    rows = {label: here for label, here, _ in found.to_rows()}
+    data = json.loads(json.dumps(found.to_json(), allow_nan=False))
+    assert rows["candidates"] == f"{data['candidates']:,}"
+    assert rows["good (s >= 0.5)"] == f"{data['good']:,} ({100 * data['shares']['good']:.2f} %)"
+    published = {label: theirs for label, _, theirs in found.to_rows()}
+    assert published["with trajectory"] == "2,014,689 (88.54 %)"
+    assert published["good (s >= 0.5)"] == "1,887,185 (82.94 %)"
+    assert published["full success (s = 1)"] == "835,903 (36.74 %)"
+    assert published["fail close (s = 0)"] == "-"
+
+
+# --- what was measured beside -----------------------------------------------------------------
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(LEAST_GRASPS, 200))
+@settings(max_examples=25, deadline=None)
+def test_the_rank_correlation_is_scipys_ties_and_infinities_included(seed, n):
+    rng = np.random.default_rng(seed)
+    x = rng.integers(0, 5, n) / 4
+    y = np.where(rng.random(n) < 0.2, np.inf, x + rng.normal(size=n).round(1))
+    rho = spearman(x, y, np.random.default_rng(0))[0]
+    ranks = np.where(np.isinf(y), 1e6, y)  # scipy drops no infinity, but its own ranks want numbers
+    assert rho == pytest.approx(spearmanr(x, ranks).statistic, abs=1e-12, nan_ok=True)
+
+
+def test_the_interval_holds_the_truth_about_as_often_as_it_says():
+    rng = np.random.default_rng(1)
+    truth = 6 / np.pi * np.arcsin(0.6 / 2)  # Spearman's of a normal pair with correlation 0.6
+    hits = 0
+    for _ in range(60):
+        x = rng.normal(size=80)
+        y = 0.6 * x + 0.8 * rng.normal(size=80)
+        _, low, high = spearman(x, y, rng)
+        hits += low <= truth <= high
+    assert hits >= 51  # 57 expected; 51 is below the 1st percentile of a 95 % interval
+
+
+def test_a_quality_that_is_the_same_for_all_has_no_correlation():
+    rng = np.random.default_rng(0)
+    assert all(map(math.isnan, spearman(np.ones(50), rng.normal(size=50), rng)))
+    assert all(map(math.isnan, spearman(np.arange(5.0), np.arange(5.0), rng)))
+
+
+def test_only_tried_grasps_are_compared_with_force_closure():
+    rng = np.random.default_rng(3)
+    s = scored_set(rng, 300)
+    n = len(s)
+    tried = ~np.isnan(s.slip_m[:, 0])
+    closed = (rng.random(n) < 0.7).astype(float)
+    closed[:10] = np.nan
+    s = replace(
+        s,
+        measures={
+            "margin": np.where(tried, np.nan_to_num(s.scores) ** 2, np.nan),
+            "dexnet_closure": closed,
+            "closure_friction": np.where(rng.random(n) < 0.5, np.inf, 0.4),
+        },
+    )
+    found = summarise([s])
+    pair = next(c for c in found.correlations if (c.first, c.second) == ("score", "margin"))
+    assert pair.rho == pytest.approx(1.0) and pair.grasps == int(tried.sum())
+    known = tried & ~np.isnan(closed)
+    c = found.closures[0]
+    assert c.closure == "dexnet_closure" and c.grasps == int(known.sum())
+    assert c.closed_good == int(np.sum(known & (closed == 1) & s.good))
+    assert c.agree == pytest.approx(np.mean(s.good[known] == (closed[known] == 1)))
+    assert found.closures[1].closed_good + found.closures[1].closed_bad == int(
+        np.sum(tried & np.isfinite(s.measures["closure_friction"]))
+    )
+    assert found == summarise([s])  # the same draws
+
+
+def test_sets_without_measures_say_nothing_of_them():
+    s = tried_set(np.random.default_rng(0), 0, measures=())
+    found = summarise([s, scored_set(np.random.default_rng(1), 40)])
+    assert found.correlations == () and found.closures == ()
