@@ -49,12 +49,12 @@ def SCHOOL() -> None:
 @click.option("--force", "force_n", type=float, default=None, help="Of each finger [N].  [70]")
 @click.option("--friction", type=float, default=None, help="Coulomb coefficient.  [1.0]")
 @click.option("--density", type=float, default=None,
-              help="Of all objects that are not weighed [kg/m^3].  [the models' own, 1000]")  # fmt: skip
+              help="Of objects that are not weighed [kg/m^3].  [the models' own]")  # fmt: skip
 @click.option(
     "--mass", "masses", multiple=True, metavar="NAME=KG", help="A weighed object; repeat."
 )
 @click.option("--base-pose", type=FOLDER, default=None,
-              help="JSON with T_world_base or T_table_base.  [above the table, tilted]")  # fmt: skip
+              help="JSON with T_world_base or T_table_base.  [above the table]")  # fmt: skip
 @click.option("--points", type=click.IntRange(1, 1_000_000), default=None,
               help="Surface points that candidates start from.  [1000]")  # fmt: skip
 @click.option("--rotations", type=click.IntRange(1, 360), default=None,

@@ -1,4 +1,4 @@
-"""What a school leaves behind: the sets, tables for other programs, the page, and all of it read back.
+"""What a school leaves behind, and how it is read back.
 
 grasps/000002_obj000007.npz .json   every set, exact and readable
 grasps/trajectories/                what the arm did

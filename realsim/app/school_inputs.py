@@ -114,13 +114,15 @@ def read_inputs(
     Raises:
         InputError: nothing usable there, a folder missing or not wanted, or an unknown object.
     """
+    from realsim.app.stages import open_session
+
     if is_session(source):
         if out is not None:
             raise InputError(
                 f"'{source}' is a session, which keeps its own results; leave --out away, or use "
                 "`realsim school export` to write them elsewhere."
             )
-        return weighed(_of_session(source, console), request)
+        return session_inputs(open_session(source), request, console)
     if out is None:
         inner = sorted(p.parent for p in source.glob("*/session.json")) if source.is_dir() else []
         hint = f" Did you mean {', '.join(map(str, inner))}?" if inner else ""
@@ -133,19 +135,23 @@ def read_inputs(
     return weighed(_of_source(source, out, request, console), request)
 
 
-def _of_session(folder: Path, console: Console) -> SchoolInputs:
-    """Return the registered scene of a session, as the reviewers left it."""
-    from realsim.app.stages import judged_scene, open_session, session_models
+def session_inputs(store: SessionStore, request: SchoolRequest, console: Console) -> SchoolInputs:
+    """Return the registered scene of a session, as the reviewers left it.
+
+    Raises:
+        InputError: the session is not registered, or a mass is of no object.
+    """
+    from realsim.app.stages import judged_scene, session_models
     from realsim.models.library_session import known_solids
 
-    store = open_session(folder)
     scene, models = judged_scene(store), session_models(store)
     solids, unknown = known_solids(store.folder / "models", [o.obj_id for o in scene.objects])
     for obj_id, why in unknown.items():
         console.warn(f"object {obj_id}: its convex parts are made again: {why}.")
-    return SchoolInputs(
+    found = SchoolInputs(
         scene=scene, models=models, solids=dict(solids), folder=store.folder, store=store
     )
+    return weighed(found, request)
 
 
 def _of_source(source: Path, out: Path, request: SchoolRequest, console: Console) -> SchoolInputs:

@@ -16,6 +16,7 @@ from realsim.app.school_tables import (
     SUMMARY_HEADER,
     Names,
     agreement_line,
+    doubts,
     filter_rows,
     level_tables,
     not_tried,
@@ -39,8 +40,8 @@ MEANING = (
 CAPTIONS: dict[str, tuple[str, str]] = {
     SHEET: (
         "The grasps",
-        "Every object as it stands, with its best and its worst grasps: green passed all four "
-        "stages, red was lost at once.",
+        "Above, how many candidates are left after each stage; below, every object as it stands "
+        "with its grasps.",
     ),
     MARGINS: (
         "What is left with less friction and less force",
@@ -69,22 +70,22 @@ def page_bytes(
     page = Page(parts=[STYLE])
     page.section("Objects", " ".join([*setting_lines(sets), MEANING]))
     page.table(SCHOOL_HEADER, school_rows(sets, models))
-    for words in (agreement_line(sets), *not_tried(sets, models)):
+    for words in (agreement_line(sets), *not_tried(sets, models), *doubts(sets, models)):
         if words:
             page.parts.append(f'<p class="note">{html.escape(words)}</p>')
-    page.section("Summary", "Row by row as in the paper's table of statistics.")
-    page.table(SUMMARY_HEADER, summarise(sets).to_rows())
     for file, (title, caption) in CAPTIONS.items():
         if pictures.get(file):
             page.section(title)
             page.parts.append(_figure(pictures[file], caption))
-    for header, rows in level_tables(sets, models):
-        page.section(f"Share of the tested grasps that pass, by {header[1].split()[0]} [%]")
+    for what, header, rows in level_tables(sets, models):
+        page.section(f"Share [%] of the tested grasps that pass, by {what}")
         page.table(header, rows)
     page.section("Why grasps stopped")
     page.table(REASON_HEADER, reason_rows(sets))
     page.section("What the filters took", "Candidates before the arm and physics had their say.")
     page.table(FILTER_HEADER, filter_rows(sets, models))
+    page.section("Summary", "Row by row as in the paper's table of statistics.")
+    page.table(SUMMARY_HEADER, summarise(sets).to_rows())
     template = Template((files("realsim.app") / "report_page.html").read_text())
     text = template.substitute(
         title=html.escape(f"Robot School of {name}"),

@@ -12,8 +12,10 @@ from realsim.app.school_inputs import (
     SchoolRequest,
     base_on_table,
     read_inputs,
+    session_inputs,
 )
 from realsim.records import Scene
+from realsim.store import SessionStore
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.school import SchoolConfig
@@ -78,9 +80,26 @@ def run(source: Path, out: Path | None, request: SchoolRequest, console: Console
     inputs.folder.mkdir(parents=True, exist_ok=True)
     config = config_of(request, inputs.scene)
     with only_run_in(inputs.folder):
-        outcome = _tried(inputs, config, request, console)
-        with console.stage("write", "files and pictures"):
-            write_outcome(outcome)
+        return try_grasps(inputs, config, request, console)
+
+
+def run_in_session(store: SessionStore, request: SchoolRequest, console: Console) -> SchoolOutcome:
+    """Try grasps on the registered objects of a session that is open and held by the caller.
+
+    Raises:
+        InputError: as `run`.
+    """
+    inputs = session_inputs(store, request, console)
+    return try_grasps(inputs, config_of(request, inputs.scene), request, console)
+
+
+def try_grasps(
+    inputs: SchoolInputs, config: "SchoolConfig", request: SchoolRequest, console: Console
+) -> SchoolOutcome:
+    """Run the school and write everything that comes out of it."""
+    outcome = _tried(inputs, config, request, console)
+    with console.stage("write", "files and pictures"):
+        write_outcome(outcome)
     return outcome
 
 
@@ -104,6 +123,8 @@ def _tried(
     return SchoolOutcome(
         inputs=inputs,
         sets=[r.grasp_set for r in results],
-        trajectories={r.grasp_set.instance: r.trajectories for r in results},
+        trajectories={
+            r.grasp_set.instance: r.trajectories for r in results if r.trajectories is not None
+        },
         unfinished={r.grasp_set.instance: r.unfinished for r in results if r.unfinished},
     )

@@ -115,25 +115,40 @@ def reason_rows(sets: Sequence[GraspSet]) -> Rows:
     return rows
 
 
-LEVELS = (("least_friction", "friction", ""), ("least_force_n", "force", " N"))
-"""Measure of a sweep, what it sweeps, and its unit."""
+LEVELS = (("least_friction", "frictions", "friction"), ("least_force_n", "forces_n", "force [N]"))
+"""Measure of a sweep, the config's name of its levels, and what is swept."""
 
 
-def level_tables(sets: Sequence[GraspSet], models: Names) -> list[tuple[list[str], Rows]]:
-    """Return for each swept quantity the share [%] of the tested grasps that survive a level."""
-    tables: list[tuple[list[str], Rows]] = []
-    for measure, what, unit in LEVELS:
-        swept = [s for s in sets if np.isfinite(s.measures.get(measure, np.zeros(0))).any()]
-        levels = np.unique(_joined(swept, lambda s, m=measure: s.measures[m]))
-        levels = levels[np.isfinite(levels)][::-1]
-        if len(levels) == 0:
+def survivors(s: GraspSet, measure: str, levels_of: str) -> tuple[Array, Array]:
+    """Return the levels (L,) of a sweep, descending, and the share (L,) [%] of grasps that pass.
+
+    Both are empty where the set was not swept.
+    """
+    least = s.measures.get(measure, np.zeros(0))
+    least = least[~np.isnan(least)]
+    if len(least) == 0:
+        return np.zeros(0), np.zeros(0)
+    sweep: dict[str, Any] = (s.parameters.get("config") or {}).get("sweep") or {}
+    known = np.array(sweep.get(levels_of, []), dtype=np.float64)
+    levels = np.unique(np.concatenate([known, least[np.isfinite(least)]]))[::-1]
+    return levels, np.array([100.0 * np.mean(least <= v) for v in levels])
+
+
+def level_tables(sets: Sequence[GraspSet], models: Names) -> list[tuple[str, list[str], Rows]]:
+    """Return for each swept quantity its name, and a table of the share [%] that pass by level."""
+    tables: list[tuple[str, list[str], Rows]] = []
+    for measure, levels_of, what in LEVELS:
+        found = [(s, *survivors(s, measure, levels_of)) for s in sets]
+        found = [(s, levels, share) for s, levels, share in found if len(levels)]
+        if not found:
             continue
-        header = ["object", *[f"{what} {v:g}{unit}" for v in levels]]
+        every = np.unique(np.concatenate([levels for _, levels, _ in found]))[::-1]
         rows: Rows = []
-        for s in swept:
-            least = s.measures[measure][~np.isnan(s.measures[measure])]
-            rows.append([named(s, models), *[f"{100 * np.mean(least <= v):.0f}" for v in levels]])
-        tables.append((header, rows))
+        for s, levels, share in found:
+            at = dict(zip(levels.tolist(), share.tolist(), strict=True))
+            cells = [f"{at[v]:.0f}" if v in at else "-" for v in every.tolist()]
+            rows.append([named(s, models), *cells])
+        tables.append((what, ["object", *[f"{v:g}" for v in every]], rows))
     return tables
 
 
@@ -146,7 +161,7 @@ def agreement_line(sets: Sequence[GraspSet]) -> str:
         return ""
     low, high = found.interval
     return (
-        f"two engines agree on held or lost for {100 * found.share:.1f} % of {found.count} grasps "
+        f"Two engines agree on held or lost for {100 * found.share:.1f} % of {found.count} grasps "
         f"(95 % interval {100 * low:.1f} to {100 * high:.1f}): {found.both_held} held by both, "
         f"{found.only_first} by the first alone, {found.only_second} by the second alone."
     )
@@ -165,7 +180,7 @@ def setting_lines(sets: Sequence[GraspSet]) -> list[str]:
             )
             densities.setdefault(at, set()).add(f"{s.parameters.get('density', float('nan')):g}")
     return [
-        f"labels hold at {at}, density {', '.join(sorted(d, key=float))} kg/m^3 where not weighed."
+        f"Labels hold at {at}, density {', '.join(sorted(d, key=float))} kg/m^3 where not weighed."
         for at, d in densities.items()
     ]
 
@@ -192,13 +207,38 @@ def not_tried(sets: Sequence[GraspSet], models: Names) -> list[str]:
     return words
 
 
+FAT, THIN = 1.10, 0.90
+"""Convex parts of a larger or smaller share of the mesh's volume are named."""
+
+
+def doubts(sets: Sequence[GraspSet], models: Names) -> list[str]:
+    """Return in words, of each object, what makes its labels doubtful: its shape, its volume."""
+    words: list[str] = []
+    for s in sets:
+        convex: dict[str, Any] = s.parameters.get("convex") or {}
+        ratio = float(convex.get("volume_ratio", 1.0))
+        if ratio > FAT:
+            words.append(
+                f"{named(s, models)}: its convex parts are {ratio:.2f} times as large as its mesh, "
+                "so hollows are smaller and walls thicker than they are"
+            )
+        elif ratio < THIN:
+            words.append(f"{named(s, models)}: its convex parts are only {ratio:.2f} of its mesh")
+        if s.parameters.get("watertight") is False:
+            words.append(
+                f"{named(s, models)}: its mesh is not closed, so its mass is a guess: weigh it "
+                "(`--mass`) or repair it (`realsim scan import`)"
+            )
+    return words
+
+
 SUMMARY_HEADER = ["property", "here", "in the paper"]
 
 
 def show_school(sets: Sequence[GraspSet], models: Names, console: Console) -> None:
     """Print the outcome of a run."""
     console.table("Robot School", SCHOOL_HEADER, school_rows(sets, models))
-    for words in not_tried(sets, models):
+    for words in (*not_tried(sets, models), *doubts(sets, models)):
         console.warn(words)
     stopped = reason_rows(sets)
     if stopped:

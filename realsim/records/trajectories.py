@@ -33,7 +33,10 @@ class GraspTrajectories:
         """Check that everything fits together and freeze it."""
         rows = np.asarray(self.rows)
         joints = np.asarray(self.joints_rad, dtype=np.float64)
-        joints = joints.reshape(len(joints), -1)
+        if joints.ndim != 2:
+            raise InputError(
+                f"joints_rad has the shape {joints.shape}; (samples, joints) is expected."
+            )
         n, s = len(rows), len(joints)
         object.__setattr__(self, "rows", frozen(rows, np.int64, (n,), "rows"))
         object.__setattr__(self, "starts", frozen(self.starts, np.int64, (n + 1,), "starts"))
@@ -41,8 +44,10 @@ class GraspTrajectories:
         for name in ("time_s", "opening_m"):
             object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (s,), name))
         object.__setattr__(self, "phase", frozen(self.phase, np.int64, (s,), "phase"))
-        whole = self.starts[0] == 0 and self.starts[-1] == s and bool(np.all(np.diff(self.starts) >= 0))
-        if not whole:
+        if np.any(np.diff(self.rows) <= 0):
+            raise InputError("the rows of attempts do not increase; each grasp has one attempt.")
+        counts = np.diff(self.starts)
+        if self.starts[0] != 0 or self.starts[-1] != s or np.any(counts < 0):
             raise InputError(
                 f"the starts of {n} attempts do not cover their {s} samples from 0 to the end."
             )

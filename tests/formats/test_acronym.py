@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tried_grasps import assert_same, tried_set
 
 from realsim.errors import InputError
 from realsim.formats.acronym import AcronymObject, read_acronym, write_acronym
@@ -25,6 +24,7 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import sample_surface
 from realsim.records import GraspSet
 from realsim_sim_bridge.grasping.hand import HandGeometry
+from tried_grasps import assert_same, tried_set
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 MUG = DATA / "school/acronym_mug"

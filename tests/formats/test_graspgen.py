@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tried_grasps import tried_set
 
 from realsim.errors import InputError
 from realsim.formats.graspgen import read_graspgen, write_graspgen
 from realsim.formats.hand_frames import hand_poses
 from realsim.formats.scene_grasps import executed, held
+from tried_grasps import tried_set
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["acronym", "panda_hand", "grasp"]))

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tried_grasps import assert_same, tried_scene, tried_set
 
 from realsim.errors import InputError, RealsimError
 from realsim.formats.grasps_hdf5 import grasps_hdf5_bytes, read_grasps_hdf5, write_grasps_hdf5
 from realsim.formats.scene_grasps import SceneGrasps, executed, held
 from realsim.records.grasps import MEASURES
+from tried_grasps import assert_same, tried_scene, tried_set
 
 SET = "sets/000004_obj000009"
 
@@ -39,9 +39,11 @@ def test_a_stranger_finds_units_meanings_and_poses(tmp_path):
         assert s.instance == 4 and group.attrs["name"] == "mug"
         missing = []
         file.visititems(
-            lambda name, o: missing.append(name)
-            if isinstance(o, h5py.Dataset) and not {"unit", "meaning"} <= set(o.attrs)
-            else None
+            lambda name, o: (
+                missing.append(name)
+                if isinstance(o, h5py.Dataset) and not {"unit", "meaning"} <= set(o.attrs)
+                else None
+            )
         )
         assert missing == []
         for name, values in group["measures"].items():

@@ -8,12 +8,12 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tried_grasps import assert_same, tried_scene
 
 from realsim.errors import InputError, RealsimError
 from realsim.formats.grasps_hdf5 import read_grasps_hdf5, write_grasps_hdf5
 from realsim.formats.grasps_parquet import read_grasps_parquet, write_grasps_parquet
 from realsim.formats.scene_grasps import SceneGrasps
+from tried_grasps import assert_same, tried_scene
 
 
 @settings(max_examples=20, deadline=None)

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
-from tried_grasps import tried_set
 
 from realsim.errors import InputError
 from realsim.formats.hand_frames import hand_poses
 from realsim.formats.isaac_grasp import read_isaac_grasp, write_isaac_grasp
 from realsim.formats.scene_grasps import executed
 from realsim.geometry import se3
+from tried_grasps import tried_set
 
 EXAMPLE = """
 format: isaac_grasp

@@ -35,7 +35,8 @@ def outcome(*arguments):
     process = program(*arguments)
     out, err = process.communicate(timeout=LONGEST_S)
     assert process.returncode == 0, err[-2000:]
-    return json.loads(out.strip().splitlines()[-1])
+    # Ray tells of its nodes on the same way out.
+    return json.loads(next(line for line in out.splitlines() if line.startswith("{")))
 
 
 @pytest.mark.slow

@@ -1,5 +1,8 @@
 """The hand's boxes against triangles: nothing that reaches into a box goes unnoticed."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -19,6 +22,7 @@ from realsim_sim_bridge.grasping.surface_tree import (
 )
 
 HAND = HandGeometry()
+DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 
 
 def cup():
@@ -159,3 +163,28 @@ def test_points_count_only_where_an_instance_has_no_triangles():
     )
     _, instances = both.tree()
     assert len(instances) == len(known.triangles) + 3 and np.sum(instances == 2) == 3
+
+
+@pytest.mark.real
+def test_the_open_hand_is_free_in_all_grasps_of_acronym_s_mug():
+    """Another simulator placed these hands so that they are free; their closing axis is x."""
+    import h5py
+
+    folder = DATA / "school" / "acronym_mug"
+    files = sorted(folder.glob("Mug_*.h5"))
+    if not files:
+        pytest.skip(f"no real data at {folder} (set REALSIM_DATA)")
+    with h5py.File(files[0]) as file:
+        Ts = np.array(file["grasps/transforms"], dtype=float)
+        scale = float(np.array(file["object/scale"]))
+    shape = trimesh.load(next(folder.glob("*.obj")), force="mesh")
+    tree = surface_tree(scale * np.array(shape.triangles))
+    T_hand_grasp = np.eye(4)
+    T_hand_grasp[:3, :3] = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
+    T_hand_grasp[2, 3] = -HAND.mount_z_m
+    boxes = HAND.boxes(np.full(len(Ts), HAND.max_opening_m))
+    assert len(Ts) == 2000
+    assert hands_free(boxes, Ts @ T_hand_grasp, tree, 0.0).mean() > 0.99
+    # With the fingers along the other axis hardly any is.
+    wrong = Ts @ se3.from_translation([0.0, 0.0, -HAND.mount_z_m])
+    assert hands_free(boxes, wrong, tree, 0.0).mean() < 0.5

@@ -11,7 +11,7 @@ from realsim.models.library_records import KnownSolid
 from realsim.models.model_records import ConvexParts
 from realsim.models.properties import physical_properties
 from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
-from realsim_sim_bridge.scenes.hull_margin import drawn_in
+from realsim_sim_bridge.slip.hull_margin import drawn_in
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
 from realsim_sim_bridge.scenes.stable_state import (
     HEADERS,
@@ -299,7 +299,7 @@ def test_rows_and_picture_say_what_happened():
     assert png == stand_picture(scene, report)
 
 
-@pytest.mark.parametrize("extents", [(0.05, 0.05, 0.05), (0.1, 0.03, 0.0006)])
+@pytest.mark.parametrize("extents", [(0.05, 0.05, 0.05), (0.1, 0.03, 0.0008)])
 def test_a_hull_drawn_in_and_its_margin_are_the_hull_again(extents):
     corners = box(extents).vertices
     (core,), margin = drawn_in([corners], 0.0005)
@@ -318,3 +318,11 @@ def test_a_hull_is_drawn_in_by_the_margin_along_every_normal():
     # small faces may vanish behind their neighbours, none comes nearer than the margin
     assert depth.max() < -margin + 1e-7
     assert np.isclose(depth, -margin, atol=1e-7).mean() > 0.8
+
+
+def test_a_sliver_does_not_take_the_margin_of_the_whole_body():
+    slab, sliver = box().vertices, box((0.05, 0.05, 1e-5), (0, 0, 0.03)).vertices
+    cores, margin = drawn_in([slab, sliver], 0.0005)
+    assert margin == pytest.approx(1e-4)
+    assert np.allclose(np.abs(cores[0]), SIDE / 2 - 1e-4, atol=1e-8)
+    assert 0 < np.ptp(cores[1][:, 2]) < 1e-5

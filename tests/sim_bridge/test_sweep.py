@@ -10,7 +10,7 @@ from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.school.sweep import SweepConfig, find_levels, run_sweep, sweep_margins
 from realsim_sim_bridge.slip.body import SlipBody
-from realsim_sim_bridge.slip.engines import make_engine
+from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import SlipPhysics
@@ -48,8 +48,8 @@ def trial(body, off_m=(0.0,)):
     )
 
 
-def measured(t, sweep, physics=None):
-    config = SlipConfig(physics=physics or SlipPhysics())
+def measured(t, sweep, physics=None, engine="pybullet"):
+    config = SlipConfig(physics=physics or SlipPhysics(), engine=settings_of(engine))
     engine = make_engine(config.engine)
     slips = run_slip_test(t, config, engine=engine)
     return run_sweep(t, slips, config, ScoreLimits(), HandGeometry(), engine, sweep)
@@ -126,8 +126,12 @@ def test_levels_that_do_not_descend_are_refused(name, levels):
 # --- the physics, on a box that Coulomb's law is solved for -------------------------------------
 
 
-@pytest.mark.parametrize("mass", [0.125, 0.5])
-def test_the_least_friction_and_force_are_coulomb_s(mass):
+@pytest.mark.parametrize(
+    ("engine", "mass"), [("pybullet", 0.125), ("mujoco", 0.125), ("mujoco", 0.5)]
+)
+def test_the_least_friction_and_force_are_coulomb_s(engine, mass):
+    if engine == "mujoco":
+        pytest.importorskip("mujoco")
     # Two pads carry 2 mu F. Below the weight the box falls, above the peak load it stays; between
     # it slides for a moment, which may stay below 2 cm.
     force_n, friction = 20.0, 0.25
@@ -138,7 +142,8 @@ def test_the_least_friction_and_force_are_coulomb_s(mass):
         forces_n=tuple(load / (2 * friction) for load in frictions),
         search="every",
     )
-    found = measured(trial(box(mass)), sweep, SlipPhysics(force_n=force_n, friction=friction))
+    physics = SlipPhysics(force_n=force_n, friction=friction)
+    found = measured(trial(box(mass)), sweep, physics, engine)
     assert found.friction.least == pytest.approx([peak * 1.05 / (2 * force_n)])
     assert found.force.least == pytest.approx([peak * 1.05 / (2 * friction)])
     assert found.measures()["margin"] == pytest.approx([0.5])

@@ -68,7 +68,7 @@ def test_the_pads_limits_beside_the_centre_are_the_known_ones():
     assert np.allclose(limits, [5.30, 2.34, 1.48], atol=6e-3)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(SEEDS)
 def test_the_upper_bound_meets_the_largest_load_that_friction_forces_carry(seed):
     patch, load = patch_of(seed), load_of(seed)
@@ -77,7 +77,7 @@ def test_the_upper_bound_meets_the_largest_load_that_friction_forces_carry(seed)
     assert found <= lower / np.cos(np.pi / 180) ** 2 * (1 + 1e-4)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(SEEDS)
 def test_limits_are_convex_symmetric_and_scale_with_the_friction(seed):
     patch, a, b = patch_of(seed), load_of(seed), load_of(seed + 7)
@@ -91,7 +91,7 @@ def test_limits_are_convex_symmetric_and_scale_with_the_friction(seed):
     assert twice.slip_load(a) == pytest.approx(2 * patch.slip_load(a), rel=1e-7)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(SEEDS)
 def test_turning_and_moving_the_plane_changes_nothing(seed):
     patch, (torque, *force) = patch_of(seed), load_of(seed)

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tried_grasps import assert_same, attempts_of, tried_set
 
 from realsim import store as stores
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession
 from realsim.store.trajectories import load_trajectories, save_trajectories
+from tried_grasps import assert_same, attempts_of, tried_set
 
 
 @given(st.integers(0, 2**32 - 1))

@@ -2,8 +2,8 @@
 
 The arm's were fitted to Franka's meshes (franka_description; collision and visual ones): per link
 the samples of the surface are split into a few groups, each with its least enclosing sphere, grown
-by 1.5 mm (the foot by 4) for what lies between the samples. They stand out of the link's convex hull
-by 7 to 10 mm on average (the foot's by 23). The hand's follow from its boxes.
+by 1.5 mm (the foot by 4) for what lies between the samples. They stand out of the link's convex
+hull by 7 to 10 mm on average (the foot's by 23). The hand's follow from its boxes.
 """
 
 import numpy as np

@@ -5,9 +5,9 @@ are points on their surfaces. A move is checked along its whole length, not at s
 checked configurations a joint motion dq moves a sphere by at most sum |dq_j| r_j, with r_j the
 greatest distance that its centre can have from joint j's axis. Hence the guarantee, for a straight
 move in joint space that is called free: at each checked configuration every sphere keeps
-`clearance_m` from all points and from the table, and anywhere between at least half of it; wrist and
-hand keep `self_clearance_m` from base and shoulder in the same sense. What is left out: the arm's
-foot (link 0) against table and objects, because it is bolted to where it stands.
+`clearance_m` from all points and from the table, and anywhere between at least half of it; wrist
+and hand keep `self_clearance_m` from base and shoulder in the same sense. What is left out: the
+arm's foot (link 0) against table and objects, because it is bolted to where it stands.
 """
 
 from dataclasses import dataclass
@@ -87,6 +87,9 @@ class _Body(NamedTuple):
     """(S, 7) greatest distance of the centre from each joint's axis [m]; 0 = not moved by it."""
     clearances: Array
     """(2,) from others, from itself [m]."""
+    trunk: Array
+    """(4,) the shoulder in the table's frame and the radius around it that base and shoulder never
+    leave [m]."""
 
 
 class ArmSpace:
@@ -149,7 +152,18 @@ def _body(
         sides=sides,
         levers=levers,
         clearances=np.array([config.clearance_m, config.self_clearance_m]),
+        trunk=_trunk(T_table_base, links, spheres),
     )
+
+
+def _trunk(T_table_base: Array, links: NDArray[np.int64], spheres: Array) -> Array:
+    """Return the shoulder (3,) and the radius of a ball around it that contains links 0 to 2."""
+    shoulder = np.array([0.0, 0.0, panda.SHOULDER_M])
+    centers = spheres[:, 1:4] - np.where((links == 0)[:, None], shoulder, 0.0)
+    # The frames of links 1 and 2 have their origin there, however they turn.
+    reach = np.linalg.norm(centers, axis=1) + spheres[:, 4]
+    radius = reach[np.isin(links, NEAR_LINKS)].max()
+    return np.append(se3.transform(T_table_base, shoulder[None])[0], radius)
 
 
 def _levers(links: NDArray[np.int64], centers: Array, slides: Array) -> Array:
@@ -202,54 +216,79 @@ def _centers_into(q: Any, opening: float, body: Any, frames: Any, centers: Any) 
 
 
 @_compiled
+def _outer_gap(
+    x: float, y: float, z: float, radius: float, clearance: float, obstacles: Any
+) -> Any:
+    """Return how far a sphere is at least from table and objects [m], and what is too near."""
+    table = z - radius
+    if table < clearance:
+        return table, IN_TABLE
+    gap = least_distance(obstacles, x, y, z) - radius
+    if gap < clearance:
+        reach = radius + 2 * clearance
+        near, row = nearest_within(obstacles, x, y, z, reach)
+        if row >= 0 and near - radius < clearance:
+            return near - radius, obstacles.instances[row]
+        gap = min(near - radius, 2 * clearance)
+    return min(gap, table), FREE
+
+
+@_compiled
+def _self_step(centers: Any, body: Any, rates: Any, turns: Any, step: float) -> float:
+    """Return how far along a move wrist and hand are safe of base and shoulder; -1 = too near.
+
+    `step` is the safe share known so far; the rest is as in `_stop_or_step`.
+    """
+    count, clearance = len(body.links), body.clearances[1]
+    for b in range(count - 1, -1, -1):
+        if body.links[b] < _FAR_START:
+            break
+        x, y, z, radius = centers[b, 0], centers[b, 1], centers[b, 2], body.radii[b]
+        near = max(clearance, step * rates[b]) + radius
+        dx, dy, dz = x - body.trunk[0], y - body.trunk[1], z - body.trunk[2]
+        if dx * dx + dy * dy + dz * dz > (body.trunk[3] + near) ** 2:
+            continue
+        for a in range(count):
+            if body.links[a] >= _NEAR_END:
+                break
+            dx, dy, dz = x - centers[a, 0], y - centers[a, 1], z - centers[a, 2]
+            squared = dx * dx + dy * dy + dz * dz
+            if squared > (near + body.radii[a]) ** 2:
+                continue
+            gap = np.sqrt(squared) - radius - body.radii[a]
+            if gap < clearance:
+                return -1.0
+            # Only the joints between the two links change their distance.
+            rate = 0.0
+            for j in range(body.links[a], 7):
+                rate += turns[j] * body.levers[b, j]
+            step = min(step, gap / max(rate, 1e-300))
+    return step
+
+
+@_compiled
 def _stop_or_step(centers: Any, body: Any, obstacles: Any, rates: Any, turns: Any) -> Any:
     """Return what stops a configuration (or FREE), and how far along a move it is safe.
 
     Args:
+        centers: (S, 3) of the spheres [m].
+        body: the arm.
+        obstacles: what it may not touch.
         rates: (S,) how fast each sphere moves at most [m per whole move].
         turns: (7,) |dq| of the move [rad].
     """
     step = np.inf
-    clearance, self_clearance = body.clearances[0], body.clearances[1]
-    count = len(body.links)
-    for s in range(count):
+    for s in range(len(body.links)):
         if body.links[s] == 0:
             continue
-        x, y, z, radius = centers[s, 0], centers[s, 1], centers[s, 2], body.radii[s]
-        gap = z - radius
-        if gap < clearance:
-            return IN_TABLE, 0.0
-        if rates[s] > 0.0:
-            step = min(step, gap / rates[s])
-        gap = least_distance(obstacles, x, y, z) - radius
-        if gap < clearance:
-            near, row = nearest_within(obstacles, x, y, z, radius + 2 * clearance)
-            if row >= 0 and near - radius < clearance:
-                return obstacles.instances[row], 0.0
-            gap = min(near - radius, 2 * clearance)
-        if rates[s] > 0.0:
-            step = min(step, gap / rates[s])
-    for a in range(count):
-        if body.links[a] >= _NEAR_END:
-            break
-        for b in range(count - 1, a, -1):
-            if body.links[b] < _FAR_START:
-                break
-            dx = centers[a, 0] - centers[b, 0]
-            dy = centers[a, 1] - centers[b, 1]
-            dz = centers[a, 2] - centers[b, 2]
-            squared = dx * dx + dy * dy + dz * dz
-            radii = body.radii[a] + body.radii[b]
-            if squared < (radii + self_clearance) ** 2:
-                return IN_ITSELF, 0.0
-            gap = np.sqrt(squared) - radii
-            # Only the joints between the two links change their distance.
-            if step * rates[b] > gap:
-                rate = 0.0
-                for j in range(body.links[a], 7):
-                    rate += turns[j] * body.levers[b, j]
-                if rate > 0.0:
-                    step = min(step, gap / rate)
+        x, y, z = centers[s, 0], centers[s, 1], centers[s, 2]
+        gap, code = _outer_gap(x, y, z, body.radii[s], body.clearances[0], obstacles)
+        if code != FREE:
+            return code, 0.0
+        step = min(step, gap / max(rates[s], 1e-300))
+    step = _self_step(centers, body, rates, turns, step)
+    if step < 0.0:
+        return IN_ITSELF, 0.0
     return FREE, step
 
 
@@ -257,8 +296,7 @@ def _stop_or_step(centers: Any, body: Any, obstacles: Any, rates: Any, turns: An
 def blame_move(start: Any, end: Any, opening: float, body: Any, obstacles: Any, room: Any) -> Any:
     """Return what stops the straight move from `start` to `end` (7,), or FREE.
 
-    Args:
-        room: (frames (9, 3, 4), centers (S, 3), rates (S,), turns (7,), q (7,)) to work in.
+    `room` are the arrays (frames, centers, rates, turns, q) of `room_for` to work in.
     """
     frames, centers, rates, turns, q = room
     for j in range(7):

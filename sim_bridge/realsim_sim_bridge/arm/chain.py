@@ -70,8 +70,7 @@ def _jacobian_into(frames: Any, J: Any) -> None:
 def _least_motion(J: Any, twist: Any, L: Any, joints: Any) -> None:
     """Write the least joint motion (7,) that gives the twist (6,): J^T (J J^T + damping)^-1 twist.
 
-    Args:
-        L: (6, 6) room for the Cholesky factor.
+    L (6, 6) is room for the Cholesky factor.
     """
     y = np.empty(6)
     for r in range(6):
@@ -143,6 +142,7 @@ def follow_lines(q: Any, Ts: Any, directions: Any, distances: Any) -> Any:
             x = Ts[b, 0, 3] + s * directions[b, 0]
             y = Ts[b, 1, 3] + s * directions[b, 1]
             z = Ts[b, 2, 3] + s * directions[b, 2]
+            error = np.inf
             for turn in range(NEWTON_STEPS + 1):
                 frames_into(now, still, frames)
                 error = _gap_to(frames, Ts[b, :3, :3], x, y, z, gap)

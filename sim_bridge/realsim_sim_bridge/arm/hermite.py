@@ -1,8 +1,8 @@
 """Joint paths as cubics between followed poses (Hermite): value and slope are exact at the nodes.
 
-With nodes 2 cm apart the hand leaves the straight line by h^4 / 384 times a fourth derivative,
-microns. Because all lines of a kind share their nodes and times, a path at many times is one matrix
-product.
+With nodes 2 cm apart the hand leaves the straight line by h^4 / 384 times a fourth derivative, less
+than a tenth of a millimetre. Because all lines of a kind share their nodes and times, a path at
+many times is one matrix product.
 """
 
 import numpy as np

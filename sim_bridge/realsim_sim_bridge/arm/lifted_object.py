@@ -1,10 +1,10 @@
 """What an object touches when it is lifted straight up: the same for all its grasps.
 
-Objects are points on their surfaces. A neighbour's point is in the way if it stands above a point of
-the object, nearer to its vertical line than the clearance and within the lift's height. Objects that
-stand or lean together are nearer than that from the beginning, and sliding along each other is no
-obstacle: of such a neighbour a point is in the way only if the object lies beneath it on all sides,
-that is in each of eight directions around it.
+Objects are points on their surfaces. A neighbour's point is in the way if it stands above a point
+of the object, nearer to its vertical line than the clearance and within the lift's height. Objects
+that stand or lean together are nearer than that from the beginning, and sliding along each other is
+no obstacle: of such a neighbour a point is in the way only if the object lies beneath it on all
+sides, that is in each of eight directions around it.
 """
 
 from typing import Any
@@ -36,7 +36,8 @@ def touched_when_lifted(
     if len(obj.points) == 0 or len(neighbours.points) == 0:
         return None
     low, high = obj.points.min(axis=0), obj.points.max(axis=0)
-    low, high = low - clearance_m, high + [clearance_m, clearance_m, clearance_m + lift_m]
+    low, high = low - clearance_m, high + clearance_m
+    high[2] += lift_m
     near = np.all((neighbours.points > low) & (neighbours.points < high), axis=1)
     points, instances = neighbours.points[near], neighbours.instances[near]
     grid = _column_grid(obj.points, clearance_m)

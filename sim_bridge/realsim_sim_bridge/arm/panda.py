@@ -164,7 +164,7 @@ def joint5_in_grasp(q: Array) -> tuple[Array, Array]:
 SHOULDER_M = float(D_M[0])
 """Height of the shoulder (the axes of joints 1 and 2 meet there) over the base [m]."""
 WRIST_REACH_M = float(np.hypot(D_M[2], A_M[3]) + np.hypot(D_M[4], A_M[4]))
-"""Distance from the shoulder to the wrist (the axes of joints 5 and 6 meet there), stretched [m]."""
+"""Greatest distance of the wrist, where the axes of joints 5 and 6 meet, from the shoulder [m]."""
 
 
 def wrist_distance(T_base_grasp: Array) -> Array:

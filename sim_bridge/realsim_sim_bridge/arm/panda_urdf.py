@@ -1,8 +1,9 @@
 """The Panda as a URDF, from the same Denavit-Hartenberg numbers as its kinematics.
 
-Joints, limits, torques and masses are the real robot's; there is no collision geometry, because what
-is moved by this arm in a simulation is watched at the hand. PyBullet reads the offsets and angles
-of a URDF in single precision, so that its link frames are right to 1e-7 and not to the last digit.
+Joints, limits, torques and masses are the real robot's; there is no collision geometry, because
+what is moved by this arm in a simulation is watched at the hand. PyBullet reads the offsets and
+angles of a URDF in single precision, so that its link frames are right to 1e-7 and not to the last
+digit.
 """
 
 import numpy as np
@@ -14,14 +15,22 @@ from realsim_sim_bridge.grasping.hand import HandGeometry
 Array = NDArray[np.float64]
 
 _LINKS = (
-    (0.629769, (-0.041018, -0.00014, 0.049974), (0.00315, 8.2904e-07, 0.00015, 0.00388, 8.2299e-06, 0.004285)),
-    (4.970684, (0.003875, 0.002081, -0.04762), (0.70337, -0.000139, 0.006772, 0.70661, 0.019169, 0.009117)),
-    (0.646926, (-0.003141, -0.02872, 0.003495), (0.007962, -0.003925, 0.010254, 0.02811, 0.000704, 0.025995)),
-    (3.228604, (0.027518, 0.039252, -0.066502), (0.037242, -0.004761, -0.011396, 0.036155, -0.012805, 0.01083)),
-    (3.587895, (-0.05317, 0.104419, 0.027454), (0.025853, 0.007796, -0.001332, 0.019552, 0.008641, 0.028323)),
-    (1.225946, (-0.011953, 0.041065, -0.038437), (0.035549, -0.002117, -0.004037, 0.029474, 0.000229, 0.008627)),
-    (1.666555, (0.060149, -0.014117, -0.010517), (0.001964, 0.000109, -0.001158, 0.004354, 0.000341, 0.005433)),
-    (0.735522, (0.010517, -0.004252, 0.061597), (0.012516, -0.000428, -0.001196, 0.010027, -0.000741, 0.004815)),
+    (0.629769, (-0.041018, -0.00014, 0.049974),
+     (0.00315, 8.2904e-07, 0.00015, 0.00388, 8.2299e-06, 0.004285)),
+    (4.970684, (0.003875, 0.002081, -0.04762),
+     (0.70337, -0.000139, 0.006772, 0.70661, 0.019169, 0.009117)),
+    (0.646926, (-0.003141, -0.02872, 0.003495),
+     (0.007962, -0.003925, 0.010254, 0.02811, 0.000704, 0.025995)),
+    (3.228604, (0.027518, 0.039252, -0.066502),
+     (0.037242, -0.004761, -0.011396, 0.036155, -0.012805, 0.01083)),
+    (3.587895, (-0.05317, 0.104419, 0.027454),
+     (0.025853, 0.007796, -0.001332, 0.019552, 0.008641, 0.028323)),
+    (1.225946, (-0.011953, 0.041065, -0.038437),
+     (0.035549, -0.002117, -0.004037, 0.029474, 0.000229, 0.008627)),
+    (1.666555, (0.060149, -0.014117, -0.010517),
+     (0.001964, 0.000109, -0.001158, 0.004354, 0.000341, 0.005433)),
+    (0.735522, (0.010517, -0.004252, 0.061597),
+     (0.012516, -0.000428, -0.001196, 0.010027, -0.000741, 0.004815)),
 )  # fmt: skip
 """Mass [kg], centre of mass [m] and inertia ixx ixy ixz iyy iyz izz [kg m^2] of links 0 to 7:
 franka_description, after Gaz et al., Dynamic identification of the Franka Emika Panda robot with
@@ -53,9 +62,7 @@ def panda_urdf(geometry: HandGeometry, hand: str = "") -> str:
     return f'<robot name="panda">{links}{joints}{flange}{mounted}</robot>'
 
 
-def _massive(
-    name: str, mass: float, center: tuple[float, ...], inertia: tuple[float, ...]
-) -> str:
+def _massive(name: str, mass: float, center: tuple[float, ...], inertia: tuple[float, ...]) -> str:
     """Return the element of a link with a mass [kg] and inertia ixx ixy ixz iyy iyz izz."""
     names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     moments = " ".join(f'{name}="{value!r}"' for name, value in zip(names, inertia, strict=True))

@@ -1,8 +1,8 @@
 """Does the Panda reach a grasp: inverse kinematics, straight approach, lift, and the way there.
 
 The arm stands where a lab's does, or hangs above the table with its base tilted by 90 degrees (the
-paper's "perfect reach"). For each candidate the closed-form solutions at the grasp are followed back
-along the approach and up along the table's normal without changing branch, the nearest to home
+paper's "perfect reach"). For each candidate the closed-form solutions at the grasp are followed
+back along the approach and up along the table's normal without changing branch, the nearest to home
 first; the first whose moves are free and that can be reached from home is kept.
 """
 
@@ -146,8 +146,10 @@ class _ReachCheck:
         )
         self._space = ArmSpace(self._T_table_base, obstacles, config.space, geometry)
         self._home = home_joints(config, task.middle_xy)
-        n, back, up = len(task.widths_m), _distances(config.approach_m, config), _distances(
-            config.lift_m, config
+        n, back, up = (
+            len(task.widths_m),
+            _distances(config.approach_m, config),
+            _distances(config.lift_m, config),
         )
         self._back, self._up = back, up
         self._reasons = ["no inverse kinematics at the grasp"] * n

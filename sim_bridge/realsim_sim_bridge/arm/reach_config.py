@@ -37,7 +37,7 @@ class ReachConfig:
     """Height that the arm must be able to lift straight up [m]; the slip test's."""
     step_m: float = 0.02
     """Distance between followed poses of the straight moves [m]; between them the hand leaves the
-    line by microns."""
+    line by less than a tenth of a millimetre."""
     joint7_samples: int = 12
     """Values of joint 7 tried at each grasp."""
     branches: int = 6

@@ -184,7 +184,9 @@ def _close(attempts: Attempts, config: TimingConfig) -> _Part:
     return _Part(durations, counts, attempts.approach.joints[row, 0], openings)
 
 
-def _stage(attempts: Attempts, possible: NDArray[np.bool_], duration: float, joints: Array) -> _Part:
+def _stage(
+    attempts: Attempts, possible: NDArray[np.bool_], duration: float, joints: Array
+) -> _Part:
     """Return a stage that lasts equally long for all, or not at all: joints (A, S, 7)."""
     count = joints.shape[1]
     return _Part(
@@ -242,9 +244,7 @@ def _swing(attempts: Attempts, motion: SlipMotion, config: TimingConfig) -> _Par
 # --- what the arm can do ------------------------------------------------------------------------
 
 
-def _possible(
-    attempts: Attempts, motion: SlipMotion
-) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
+def _possible(attempts: Attempts, motion: SlipMotion) -> tuple[NDArray[np.bool_], tuple[str, ...]]:
     """Return which stages (A, 3) stay within the arm's limits, and notes (A,) on the others."""
     count = len(attempts.rows)
     possible = np.zeros((count, len(MOVED_STAGES)), dtype=np.bool_)

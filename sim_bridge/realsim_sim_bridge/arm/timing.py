@@ -84,10 +84,11 @@ def trapezoid(length: Array, speed: Array, acceleration: Array) -> tuple[Array, 
 def trapezoid_share(t: Array, ramp: Array | float, duration: Array | float) -> Array:
     """Return the share of a trapezoid's length that is done at times t [s]."""
     t = np.clip(t, 0.0, duration)
-    whole = np.maximum(np.asarray(duration) - ramp, 1e-300) * np.maximum(ramp, 1e-300)
+    whole = (np.asarray(duration) - ramp) * ramp
     start, end = t**2 / 2, whole - (duration - t) ** 2 / 2
     middle = ramp * (t - np.asarray(ramp) / 2)
-    return np.where(t < ramp, start, np.where(t > duration - ramp, end, middle)) / whole
+    done = np.where(t < ramp, start, np.where(t > duration - ramp, end, middle))
+    return done / np.where(whole > 0, whole, 1.0)
 
 
 def straight_times(moves: Array, config: TimingConfig) -> tuple[Array, Array]:
@@ -134,9 +135,7 @@ _DENSE = 12
 """Points per leg of the spline at which it is checked."""
 
 
-def _rounded(
-    corners: Array, is_free: FreePath, config: TimingConfig
-) -> tuple[Array, float] | None:
+def _rounded(corners: Array, is_free: FreePath, config: TimingConfig) -> tuple[Array, float] | None:
     """Return samples and duration of the rounded path by TOPP-RA, or None if it is not free."""
     import toppra
     import toppra.algorithm
@@ -169,15 +168,31 @@ def _rounded(
     timed: Any = solver.compute_trajectory()
     if timed is None:
         return None
-    duration = float(timed.duration) * _excess(timed, velocity, acceleration, config)
-    t = sample_times(duration, config.sample_hz) * (float(timed.duration) / duration)
-    return np.asarray(timed(t), dtype=np.float64), duration
+    return _slowed(timed, corners[-1], config)
 
 
-def _excess(timed: Any, velocity: Array, acceleration: Array, config: TimingConfig) -> float:
-    """Return by what factor the motion must be slowed so that limits hold between grid points."""
-    t = np.linspace(0.0, float(timed.duration), 4 * config.grid_points)
-    speed = np.max(np.abs(timed(t, 1)) / velocity)
-    # Time k times as long divides accelerations by k^2.
-    force = np.sqrt(np.max(np.abs(timed(t, 2)) / acceleration))
-    return float(max(1.0, speed, force)) * (1.0 + 1e-6)
+def _slowed(timed: Any, end: Array, config: TimingConfig) -> tuple[Array, float]:
+    """Return samples and duration, slowed until they keep the limits: TOPP-RA does on its grid."""
+    velocity, acceleration = config.limits()
+    slower = 1.0
+    while True:
+        duration = float(timed.duration) * slower
+        t = sample_times(duration, config.sample_hz)
+        q = np.asarray(timed(t / slower), dtype=np.float64)
+        fine = np.linspace(0.0, float(timed.duration), 8 * config.grid_points)
+        speed = np.abs(timed(fine, 1)) / slower / velocity
+        force = np.abs(timed(fine, 2)) / slower**2 / acceleration
+        # The samples' own divided differences are what a controller makes of them.
+        steps = np.diff(np.append(t, duration))[:, None]
+        speeds = np.diff(np.concatenate([q, end[None]]), axis=0) / steps
+        forces = np.diff(speeds, axis=0) / ((steps[1:] + steps[:-1]) / 2)
+        most = max(
+            float(speed.max()),
+            float(np.max(np.abs(speeds) / velocity)),
+            float(np.sqrt(force.max())),
+            float(np.sqrt(np.max(np.abs(forces) / acceleration, initial=0.0))),
+        )
+        if most <= 1.0:
+            return q, duration
+        # Time k times as long divides speeds by k and accelerations by k^2.
+        slower *= most * (1.0 + 1e-9)

@@ -1,12 +1,14 @@
 """Analytic quality of grasps, to be compared with what physics says of them.
 
-Three measures on the contacts of the closing pads, named as in `realsim.records.MEASURES`:
+Three measures, named as in `realsim.records.MEASURES`:
 
 - ferrari_canny: radius of the largest ball in the hull of the wrenches that two soft fingers with
-  normal forces of sum 1 exert; torques about the centre of mass, in units of the farthest point's
-  distance from it. Hard point contacts would all have 0: nothing holds a turn about their line.
-- closure_friction: the smallest of GraspNet's friction levels at which the line between the
-  contacts is inside both friction cones (Nguyen 1988; graspnetAPI's label); inf = at none.
+  normal forces of sum 1 exert, where their pads touch first; torques about the centre of mass, in
+  units of the farthest point's distance from it. Hard point contacts would all have 0: nothing
+  holds a turn about their line.
+- closure_friction: the smallest of GraspNet's friction levels at which the line between two point
+  contacts is inside both friction cones (Nguyen 1988; graspnetAPI's label); inf = at none. The
+  contacts are where the closing axis meets the object, as in Dex-Net, on which GraspNet builds.
 - dexnet_closure: 1 if it is so at the configured friction, as Dex-Net tests it; else 0.
 """
 
@@ -79,7 +81,9 @@ class Closure:
     needed_friction: Array
     """(N,) smallest friction that closes, between the levels; inf = none does."""
     contacts: PadContacts
-    """Where the pads touch."""
+    """Where the pads touch: the contacts of ferrari_canny."""
+    axis_contacts: PadContacts
+    """Where the closing axis meets the object: those of the other measures."""
 
     def measures(self) -> dict[str, Array]:
         """Return the columns for a grasp set, by the names of `realsim.records.MEASURES`."""
@@ -97,6 +101,8 @@ def force_closure(
     config: ClosureConfig | None = None,
     geometry: HandGeometry | None = None,
     center_of_mass: Array | None = None,
+    *,
+    contact_depths_m: Array | None = None,
 ) -> Closure:
     """Return the analytic quality of grasps.
 
@@ -107,6 +113,8 @@ def force_closure(
         config: what is assumed.
         geometry: the hand.
         center_of_mass: (3,) object frame [m]; None = the mesh's at even density.
+        contact_depths_m: (N,) z of the closing axis in the grasp frame [m], as of `Candidates`;
+            None = in the middle of the pads.
 
     Raises:
         InputError: the mesh has no volume, or the numbers of grasps and openings differ.
@@ -120,12 +128,13 @@ def force_closure(
         Ts = se3.check_rigid(Ts, "the grasps")
     center = mass_properties(mesh, 1.0).center_of_mass if center_of_mass is None else center_of_mass
     length = float(np.linalg.norm(hull_vertices(mesh.vertices) - center, axis=1).max())
-    contacts = pad_contacts(
-        RaySurface(mesh), Ts, openings, geometry, config.pad_rays, config.softness_m
-    )
-    both = contacts.both
+    surface = RaySurface(mesh)
+    axis = pad_contacts(surface, _at_depth(Ts, contact_depths_m), openings, geometry, 1, 0.0)
     needed = np.full(len(Ts), np.inf)
-    needed[both] = _needed_friction(contacts.points[both], contacts.normals[both])
+    needed[axis.both] = _needed_friction(axis.points[axis.both], axis.normals[axis.both])
+
+    contacts = pad_contacts(surface, Ts, openings, geometry, config.pad_rays, config.softness_m)
+    both = contacts.both
     quality = np.zeros(len(Ts))
     quality[both] = largest_balls(
         (contacts.points[both] - center) / length,
@@ -143,7 +152,17 @@ def force_closure(
         dexnet_closure=(needed - ROUNDING <= config.friction).astype(np.float64),
         needed_friction=needed,
         contacts=contacts,
+        axis_contacts=axis,
     )
+
+
+def _at_depth(Ts: Array, depths_m: Array | None) -> Array:
+    """Return the grasps (N, 4, 4), moved along their approach by depths (N,) [m]."""
+    if depths_m is None:
+        return Ts
+    moved = Ts.copy()
+    moved[:, :3, 3] += np.asarray(depths_m, dtype=np.float64)[:, None] * Ts[:, :3, 2]
+    return moved
 
 
 def _needed_friction(points: Array, normals: Array) -> Array:

@@ -18,6 +18,7 @@ import functools
 import os
 import secrets
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -54,6 +55,8 @@ import sys, ray
 ray.init(address=sys.argv[1], log_to_driver=False, logging_level="CRITICAL")
 """
 """Succeeds where a cluster lets in who has no token."""
+ANSWER_S = 5.0
+"""Longest wait for the head node's answer [s]."""
 STRANGER_S = 30.0
 """Longest wait for the stranger [s]; a cluster that says nothing has not let it in."""
 COUNT_AGAIN_S = 5.0
@@ -91,13 +94,13 @@ def ray_workers(config: ClusterConfig) -> Generator[Workers]:
 @contextmanager
 def _environment_restored() -> Generator[None]:
     """Undo what is set for Ray, and its own answer to SIGTERM."""
-    before = {name: value for name, value in os.environ.items() if name.startswith("RAY_")}
+    before = dict(os.environ)
     in_main = threading.current_thread() is threading.main_thread()
     on_sigterm = signal.getsignal(signal.SIGTERM) if in_main else None
     try:
         yield
     finally:
-        for name in [name for name in os.environ if name.startswith("RAY_")]:
+        for name in set(os.environ) - set(before):
             del os.environ[name]
         os.environ.update(before)
         if on_sigterm is not None:
@@ -144,8 +147,10 @@ def _join(address: str) -> Any:
         )
     ray = _import_ray(loopback=False)
     try:
+        # Ray itself looks for minutes for one that is not there.
+        socket.create_connection((host, int(port)), ANSWER_S).close()
         ray.init(address=address, **QUIET)
-    except (ConnectionError, RuntimeError, ValueError, ray.exceptions.RayError) as error:
+    except (OSError, RuntimeError, ValueError, OverflowError, ray.exceptions.RayError) as error:
         raise InputError(
             f"the Ray cluster at {address} cannot be joined: {_first_line(error)} Check that it is "
             "running (`ray status`), that this machine is one of its nodes (`ray start "
@@ -268,8 +273,6 @@ def _on_node(driver_version: str, fn: Callable[..., Any], args: tuple[Any, ...])
     Raises:
         InputError: the node has another version of realsim.
     """
-    import socket
-
     from threadpoolctl import threadpool_limits
 
     if version("realsim") != driver_version:

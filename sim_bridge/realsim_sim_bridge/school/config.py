@@ -3,9 +3,12 @@
 from dataclasses import dataclass, field
 
 from realsim.models.convex import ConvexConfig
+from realsim_sim_bridge.arm.reach import ReachConfig
 from realsim_sim_bridge.grasping.candidates import CandidateConfig
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.arm.reach import ReachConfig
+from realsim_sim_bridge.school.sweep import SweepConfig
+from realsim_sim_bridge.slip.bullet_settings import BulletSettings
+from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
 from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 
@@ -28,3 +31,7 @@ class SchoolConfig:
     reach: ReachConfig = field(default_factory=ReachConfig)
     slip: SlipConfig = field(default_factory=SlipConfig)
     score: ScoreLimits = field(default_factory=ScoreLimits)
+    sweep: SweepConfig | None = None
+    """Frictions and forces at which each grasp is tried besides, for its margin; None = none."""
+    second_engine: BulletSettings | MujocoSettings | None = None
+    """The engine that judges every grasp a second time; None = none does."""

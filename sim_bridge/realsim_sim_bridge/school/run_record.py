@@ -32,9 +32,14 @@ ABSENT = "(nothing)"
 
 def versions(config: SchoolConfig) -> dict[str, str]:
     """Return the versions of everything that computes; "not installed" where it is not."""
-    engine = "mujoco" if isinstance(config.slip.engine, MujocoSettings) else "pybullet"
+    settings = (config.slip.engine, config.second_engine)
+    engines = {
+        "mujoco" if isinstance(engine, MujocoSettings) else "pybullet"
+        for engine in settings
+        if engine is not None
+    }
     found = {"results": str(RESULTS_VERSION)}
-    for name in (*PACKAGES, engine):
+    for name in (*PACKAGES, *sorted(engines)):
         try:
             found[name] = version(name)
         except PackageNotFoundError:

@@ -1,6 +1,7 @@
 """A shard: some grasps of one object that one worker tests in one go, and its file."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,11 @@ from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.kept_sets import MEASURE, named, of_name
 from realsim_sim_bridge.school.shard_measures import shard_measures
+from realsim_sim_bridge.slip.bullet_settings import BulletSettings
+from realsim_sim_bridge.slip.engines import make_engine
 from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
 from realsim_sim_bridge.slip.slip_test import SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.world import Engine
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -39,12 +43,22 @@ class Tested:
     """(n,) or (n, 4) each."""
 
 
+SWEPT = 8
+"""Slip tests that a sweep adds to each grasp, about: four levels each of friction and force."""
+
+
 def default_shard_grasps(config: SchoolConfig) -> int:
     """Return the grasps of a shard: about `SHARD_S` of work in whole worlds of the engine."""
-    engine = config.slip.engine
-    grasp_s = MUJOCO_S if isinstance(engine, MujocoSettings) else BULLET_S
-    worlds = round(SHARD_S / grasp_s / engine.pairs_per_world)
-    return max(1, worlds) * engine.pairs_per_world
+    grasp_s = _grasp_s(config.slip.engine) * (1 if config.sweep is None else 1 + SWEPT)
+    if config.second_engine is not None:
+        grasp_s += _grasp_s(config.second_engine)
+    pairs = config.slip.engine.pairs_per_world
+    return max(1, round(SHARD_S / grasp_s / pairs)) * pairs
+
+
+def _grasp_s(settings: BulletSettings | MujocoSettings) -> float:
+    """Return about how long a slip test takes [s]."""
+    return MUJOCO_S if isinstance(settings, MujocoSettings) else BULLET_S
 
 
 def shards_of(tested: Rows, size: int) -> list[Rows]:
@@ -60,14 +74,21 @@ def run_shard(trial: SlipTrial, rows: Rows, config: SchoolConfig) -> Tested:
         rows: which of the object's candidates they are (n,).
         config: the school's.
     """
-    slips = run_slip_test(trial, config.slip, config.score, config.hand)
+    engine = _engine(config.slip.engine)
+    slips = run_slip_test(trial, config.slip, config.score, config.hand, engine)
     return Tested(
         rows=rows,
         slip_m=slips.slip_m,
         slip_rad=slips.slip_rad,
         failures=slips.failures,
-        measures=shard_measures(trial, slips, config),
+        measures=shard_measures(trial, slips, config, engine),
     )
+
+
+@lru_cache(maxsize=1)
+def _engine(settings: BulletSettings | MujocoSettings) -> Engine:
+    """Return this worker's engine: it may keep what it has compiled of an object."""
+    return make_engine(settings)
 
 
 def write_tested(path: Path, tested: Tested) -> None:

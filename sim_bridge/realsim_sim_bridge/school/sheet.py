@@ -45,6 +45,8 @@ SCORE_STEP = 1 / 12
 MARGIN_BINS = 10
 LEFT_AFTER = ("candidates", "trajectory", "close", "lift", "oscillate", "pendulum")
 BAR_COLOR = "#5b7f95"
+ROOM, PAD = 0.35, 0.015
+"""Share of a chart's width that a number takes, and that is left beside it."""
 
 
 def school_sheet(
@@ -66,6 +68,20 @@ def school_sheet(
     Raises:
         InputError: an object has no model, or there are more than 60.
     """
+    figure = sheet_figure(sets, models, title, Ts_up_obj or {})
+    buffer = io.BytesIO()
+    # Without the software's name the same sets give the same bytes.
+    figure.savefig(buffer, format="png", metadata={"Software": None}, facecolor=PAPER)
+    return buffer.getvalue()
+
+
+def sheet_figure(
+    sets: Sequence[GraspSet],
+    models: Mapping[int, ObjectModel],
+    title: str,
+    Ts_up_obj: Mapping[int, Array],
+) -> Any:
+    """Return the sheet as a figure of Matplotlib; arguments as of `school_sheet`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -86,11 +102,9 @@ def school_sheet(
         box = (
             MARGIN_PX + column * width + 8, top + row * OBJECT_PX, width - 16, OBJECT_PX - 22,
         )  # fmt: skip
-        T_up_obj = (Ts_up_obj or {}).get(s.instance, np.eye(4))
+        T_up_obj = Ts_up_obj.get(s.instance, np.eye(4))
         draw_object(figure, box, s, models[s.obj_id].mesh, name, T_up_obj)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None}, facecolor=PAPER)
-    return buffer.getvalue()
+    return figure
 
 
 def _require_models(sets: Sequence[GraspSet], models: Mapping[int, ObjectModel]) -> None:
@@ -167,15 +181,18 @@ def _attrition(ax: Any, sets: Sequence[GraspSet]) -> None:
     taken = [0, lost[1] - untried, *lost[2:]]
     colors = [color for _, color in STOPS[:-1]]
     ax.barh(places, taken, left=counts, height=0.72, color=colors)
+    ax.barh(places[1], untried, left=counts[0] - untried, height=0.72, color=colors[0])
     most = max(1, counts[0])
-    for place, count in zip(places, counts, strict=True):
+    for place, count, loss, color in zip(places, counts, taken, colors, strict=True):
         said = f"{count:,}  ({100 * count / most:.0f} %)"
-        inside = count > 0.35 * most
-        ax.text(
-            count - 0.015 * most if inside else 0.015 * most, place - 0.03, said, fontsize=10,
-            color=ink_on(BAR_COLOR) if inside or count > 0.3 * most else INK,
-            ha="right" if inside else "left", va="center",
-        )  # fmt: skip
+        # In the bar, in what the stage took, or beside both: wherever there is room.
+        at, align, ink = count, "right", ink_on(BAR_COLOR)
+        if count < ROOM * most:
+            at, ink = count + loss, ink_on(color)
+            if loss < ROOM * most:
+                align, ink = "left", INK
+        pad = PAD * most if align == "left" else -PAD * most
+        ax.text(at + pad, place - 0.03, said, fontsize=10, color=ink, ha=align, va="center")
     ax.set_yticks(places, LEFT_AFTER, fontsize=10.5, color=INK)
     ax.set_xlim(0, most)
     ax.xaxis.get_major_locator().set_params(integer=True)
@@ -213,6 +230,7 @@ def _margin_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
     counts = np.histogram(np.clip(known, 0, 1), edges)[0]
     ax.bar(edges[:-1], counts, width=0.94 / MARGIN_BINS, align="edge", color=BAR_COLOR)
     ax.set_xlim(-0.02, 1.02)
+    ax.set_xticks([0, 0.25, 0.5, 0.75, 1])
     ax.set_ylim(0, 1.18 * max(1, counts.max()))
     ax.yaxis.get_major_locator().set_params(integer=True)
     _named(ax, "Margins over friction and force", "margin", "grasps")

@@ -1,4 +1,4 @@
-"""One object of the School's picture sheet: its surface, its grasps in the colour of their score."""
+"""One object of the School's picture sheet: its surface, its grasps in their scores' colours."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

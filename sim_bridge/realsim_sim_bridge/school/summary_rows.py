@@ -90,8 +90,8 @@ def _measured_rows(summary: "SchoolSummary") -> list[tuple[str, str, str]]:
     for c in summary.closures:
         of = f"{c.closure}: "
         rows += [
-            (of + "closed, good | bad", f"{c.closed_good:,} | {c.closed_bad:,}", NOTHING),
-            (of + "not closed, good | bad", f"{c.open_good:,} | {c.open_bad:,}", NOTHING),
+            (of + "closed: good, bad", f"{c.closed_good:,}, {c.closed_bad:,}", NOTHING),
+            (of + "not closed: good, bad", f"{c.open_good:,}, {c.open_bad:,}", NOTHING),
             (of + "agrees with good", f"{100 * c.agree:.1f} % of {c.grasps:,}", NOTHING),
         ]
     return rows

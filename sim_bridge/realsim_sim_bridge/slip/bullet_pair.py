@@ -28,6 +28,7 @@ from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.bullet_settings import BulletSettings
 from realsim_sim_bridge.slip.hand_urdf import hand_urdf
+from realsim_sim_bridge.slip.hull_margin import drawn_in
 from realsim_sim_bridge.slip.world import SlipPhysics
 
 Array = NDArray[np.float64]
@@ -68,7 +69,10 @@ class BulletPair:
         self.engine.setGravity(0.0, 0.0, 0.0)
         with tempfile.TemporaryDirectory() as folder:
             self.hand = self._add_hand(Path(folder), geometry)
-            self.object = self._add_object(self._shape(body, Path(folder)))
+            T_body_obj = se3.invert(self._T_obj_body)
+            parts = [se3.transform(T_body_obj, part) for part in body.parts]
+            cores, margin = drawn_in(parts, settings.collision_margin_m)
+            self.object = self._add_object(self._shape(cores, Path(folder)), margin)
 
     def __del__(self) -> None:
         """Free the engine's memory."""
@@ -114,21 +118,18 @@ class BulletPair:
         )
         return hand
 
-    def _shape(self, body: SlipBody, folder: Path) -> int:
-        """Return the collision shape, in the body's principal frame."""
-        T_body_obj = se3.invert(self._T_obj_body)
+    def _shape(self, parts: list[Array], folder: Path) -> int:
+        """Return the collision shape of convex parts (V, 3) in the body's principal frame."""
         path = folder / "parts.obj"
-        path.write_text(wavefront([se3.transform(T_body_obj, part) for part in body.parts]))
+        path.write_text(wavefront(parts))
         shape: int = self.engine.createCollisionShape(
             self.engine.GEOM_MESH, fileName=str(path), meshScale=[1.0, 1.0, 1.0]
         )
         if shape < 0:
-            raise RealsimError(
-                f"PyBullet refused the collision shape of {len(body.parts)} convex parts."
-            )
+            raise RealsimError(f"PyBullet refused the collision shape of {len(parts)} convex parts.")
         return shape
 
-    def _add_object(self, shape: int) -> int:
+    def _add_object(self, shape: int, margin_m: float) -> int:
         """Add the object; its frame in the engine is the principal one."""
         obj: int = self.engine.createMultiBody(
             baseMass=self._mass, baseCollisionShapeIndex=shape, basePosition=FAR_AWAY
@@ -138,6 +139,7 @@ class BulletPair:
             "lateralFriction": self._physics.friction,
             "spinningFriction": 0.0,
             "rollingFriction": 0.0,
+            "collisionMargin": margin_m,
         }
         self.engine.changeDynamics(obj, -1, localInertiaDiagonal=self._moments.tolist(), **wanted)
         self._check(obj, -1, wanted)
@@ -246,6 +248,7 @@ _INFO = {
     "spinningFriction": 7,
     "contactDamping": 8,
     "contactStiffness": 9,
+    "collisionMargin": 11,
 }
 """Where getDynamicsInfo has each setting."""
 

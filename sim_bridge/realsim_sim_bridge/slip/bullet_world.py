@@ -98,17 +98,20 @@ class BulletWorld:
         pair.drive(closing.speed)
         duration_s = float(self._fingers[k].max()) / closing.speed + closing.settle_s
         start = before = self._Ts_hand_body[k, :3, 3]
+        fingers = self._fingers[k]
         seen: list[tuple[Array, Array]] = []
         while len(seen) * sample < duration_s / self.dt:
             for _ in range(sample):
                 pair.engine.stepSimulation()
             seen.append((pair.pose(), pair.finger_forces()))
             at, forces = seen[-1][0][:3, 3], seen[-1][1]
-            still = float(np.linalg.norm(at - before)) < closing.settled_m
+            now = pair.fingers()[0]
+            moved = max(float(np.linalg.norm(at - before)), float(np.abs(now - fingers).max()))
             gone = float(np.linalg.norm(at - start)) > closing.lost_m
-            if gone or (still and bool(np.all(forces > self._physics.contact_n))):
+            pressed = bool(np.all(forces > self._physics.contact_n))
+            if gone or (pressed and moved < closing.settled_m):
                 break
-            before = at
+            before, fingers = at, now
         self._leave(k)
         return seen
 

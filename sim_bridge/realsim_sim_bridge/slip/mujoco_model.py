@@ -37,12 +37,6 @@ OBJECT = "object"
 CARRIAGE = "carriage"
 CARRIAGE_KG_PER_N = 150.0
 """Mass of the carriage [kg per N of the hand's force]: 2 F slow it by 1.3 cm/s in a second."""
-SIDES = (1.0, -1.0)
-"""Finger 0 is at +y."""
-OBJECT = "object"
-CARRIAGE = "carriage"
-CARRIAGE_KG = 1e6
-"""Mass of the carriage [kg]: 2 x 70 N slow it by 1 mm/s in 7 s."""
 HAND_SIDE, OBJECT_SIDE = 1, 2
 """Collision bits: the hand's geoms meet the object's and nothing else."""
 STIFF = (0.99, 0.999, 0.001, 0.5, 2.0)
@@ -85,7 +79,6 @@ def compile_pair(
         InputError: MuJoCo refuses the object.
     """
     mujoco = load_mujoco()
-
     T_obj_body, moments = body.principal_frame()
     spec: Any = mujoco.MjSpec()
     _set_options(spec, physics, settings)

@@ -64,7 +64,7 @@ class Closing:
     sample_s: float = 0.05
     """How often the object is looked at [s]."""
     settled_m: float = 2e-5
-    """Closing ends when both fingers press and no object moved more than this in a sample [m]."""
+    """Closing ends when both fingers press and nothing moved more than this in a sample [m]."""
     lost_m: float = 0.05
     """An object that moved so far is lost [m]."""
 

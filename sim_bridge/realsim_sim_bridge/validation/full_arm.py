@@ -186,7 +186,7 @@ class _ArmWorld:
     def follow(
         self, path: Array, q: Array, sample_s: float, lost_m: float
     ) -> tuple[float, float, float]:
-        """Follow joint angles (T, 7) from q (7,); return slip [m], turn and tracking error [rad]."""
+        """Follow angles (T, 7) from q (7,); return slip [m], turn and tracking error [rad]."""
         engine, start = self._engine, self._in_hand()
         speeds = np.diff(np.vstack([q, path]), axis=0) / self.dt
         slip = turn = tracking = 0.0

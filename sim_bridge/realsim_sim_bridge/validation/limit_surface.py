@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 
 SWEEPS = 400
 """Steps of the reweighted least squares; 60 reach 1e-6 away from a corner of the limit surface."""
+STILL = 1e-13
+"""Relative change of the twist at which the search ends."""
 SMALLEST_M_S = 1e-9
 """Slower points weigh no more than at this speed, in units of the fastest: no division by 0."""
 
@@ -77,8 +79,10 @@ class FrictionPatch:
             weights = self.friction_n / np.maximum(speeds, SMALLEST_M_S * speeds.max())
             Q = np.einsum("p,pij,pik->jk", weights, rows, rows)
             # A patch on a line or in a point does not resist every twist.
-            twist = np.linalg.pinv(Q) @ w
+            before, twist = twist, np.linalg.pinv(Q) @ w
             twist /= w @ twist
+            if np.abs(twist - before).max() <= STILL * np.abs(twist).max():
+                break
         return twist
 
 

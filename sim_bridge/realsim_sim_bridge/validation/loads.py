@@ -1,4 +1,4 @@
-"""A cube between two pads under a constant load: how far does it move?"""
+"""A body between two pads under a constant load: how far does it move?"""
 
 from dataclasses import dataclass, replace
 
@@ -7,20 +7,21 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.motion import min_jerk
 from realsim_sim_bridge.slip.slip_test import SlipConfig, batches
 from realsim_sim_bridge.slip.world import Engine, Grips
-from realsim_sim_bridge.validation.specimens import SIDE_M, cube
+from realsim_sim_bridge.validation.specimens import SIDE_M
 
 Array = NDArray[np.float64]
 
 LOST_M = 0.02
-"""A cube that moved so far need not be looked at further [m]: a pad's size."""
+"""A body that moved so far need not be looked at further [m]: a pad's size."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Held:
-    """What K cubes did under K loads; inf where one was lost."""
+    """What K copies did under K loads; inf where one was lost."""
 
     shift_m: Array
     """(K,) greatest motion of the centre since before the load [m]."""
@@ -37,24 +38,24 @@ class Held:
 def hold(
     engine: Engine,
     config: SlipConfig,
-    mass_kg: float,
+    body: SlipBody,
     loads: Array,
     *,
     ramp_s: float,
     hold_s: float,
 ) -> Held:
-    """Close on cubes, let a load on each grow and stand, and return how they moved.
+    """Close on copies, let a load on each grow and stand, and return how they moved.
 
     Args:
         engine: the engine.
         config: the physics and the closing.
-        mass_kg: of the cube.
+        body: 5 cm wide where the hand closes, about its centre.
         loads: (K, 6) wrench on each: torque about the centre and force, grasp axes.
         ramp_s: time in which the loads grow [s].
         hold_s: time for which they then stand [s].
     """
     parts = [
-        _hold(engine, config, mass_kg, loads[rows], ramp_s, hold_s)
+        _hold(engine, config, body, loads[rows], ramp_s, hold_s)
         for rows in batches(len(loads), engine.pairs_per_world)
     ]
     return Held(
@@ -66,7 +67,7 @@ def hold(
 
 
 def _hold(
-    engine: Engine, config: SlipConfig, mass_kg: float, loads: Array, ramp_s: float, hold_s: float
+    engine: Engine, config: SlipConfig, body: SlipBody, loads: Array, ramp_s: float, hold_s: float
 ) -> Held:
     """Return the same of the pairs of one world."""
     n = len(loads)
@@ -76,7 +77,7 @@ def _hold(
         Ts_obj_grasp=upright,
         openings_m=np.full(n, SIDE_M + 0.006),
     )
-    with engine.world(cube(mass_kg), grips, config.physics, HandGeometry()) as world:
+    with engine.world(body, grips, config.physics, HandGeometry()) as world:
         closed = world.close(config.closing)
         start = world.states().Ts_world_body
         steps, ramp = round((ramp_s + hold_s) / world.dt), round(ramp_s / world.dt)

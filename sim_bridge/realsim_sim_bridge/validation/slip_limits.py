@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.pads import PadModel
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.slip.world import Engine
@@ -12,6 +13,7 @@ from realsim_sim_bridge.validation.config import ValidationConfig
 from realsim_sim_bridge.validation.limit_surface import hand_patch
 from realsim_sim_bridge.validation.loads import Held, hold, with_hand
 from realsim_sim_bridge.validation.report import CheckResult, LimitRatio
+from realsim_sim_bridge.validation.specimens import cube, specimen
 
 Array = NDArray[np.float64]
 
@@ -111,7 +113,7 @@ def creep_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
             for size, load in zip(sizes, loads, strict=True)
         ]
         held = hold(
-            engine, slip, _mass(config, slip), np.stack(wrenches), ramp_s=limits.ramp_s,
+            engine, slip, _cube(config, slip), np.stack(wrenches), ramp_s=limits.ramp_s,
             hold_s=limits.creep_s,
         )  # fmt: skip
         k = int(np.argmax(held.creep_m))
@@ -133,12 +135,46 @@ def creep_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
     ]  # fmt: skip
 
 
+def curved_check(engine: Engine, config: ValidationConfig) -> CheckResult:
+    """Return how far an upright cylinder creeps under half of what its contacts carry along it.
+
+    Where a sphere meets a curved face its normal leans; along the cylinder all of them carry
+    2 mu F or more, whichever they are.
+    """
+    limits = config.limits
+    worst, where = 0.0, ""
+    pulled = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, sign] for sign in (-1.0, 1.0)])
+    for force_n, friction in limits.torque_cases:
+        slip = with_hand(config.slip, force_n, friction)
+        load = limits.curved_share * 2.0 * friction * force_n
+        held = hold(
+            engine,
+            slip,
+            specimen("cylinder", _mass(config, slip)),
+            load * pulled,
+            ramp_s=limits.ramp_s,
+            hold_s=limits.creep_s,
+        )
+        creep = float(held.creep_m.max())
+        if creep >= worst:
+            worst, where = creep, _case(slip)
+    return CheckResult(
+        group="creep",
+        name="no creep on a cylinder",
+        what="motion of the held cylinder along its axis",
+        measured=1e3 * worst,
+        unit="mm",
+        limit=1e3 * limits.creep_m,
+        detail=f"{limits.creep_s:g} s at {limits.curved_share:g} of 2 mu F; worst at {where}",
+    )
+
+
 def force_check(engine: Engine, config: ValidationConfig) -> CheckResult:
     """Return the error of the fingers' measured force on a closed, unloaded cube."""
     worst, seen = 0.0, ""
     for force_n, friction in config.limits.cases:
         slip = with_hand(config.slip, force_n, friction)
-        held = hold(engine, slip, _mass(config, slip), np.zeros((1, 6)), ramp_s=0.05, hold_s=0.05)
+        held = hold(engine, slip, _cube(config, slip), np.zeros((1, 6)), ramp_s=0.05, hold_s=0.05)
         error = float(100 * np.abs(held.finger_n / force_n - 1.0).max())
         seen += f"{', ' if seen else ''}{held.finger_n.min():.4g} of {force_n:g} N"
         worst = max(worst, error) if np.isfinite(error) else float("nan")
@@ -175,7 +211,7 @@ def _ratio(
     ascending = np.sort(np.array(shares))
     wrenches = ascending[:, None] * _limit(load, slip) * load.wrench()
     held = hold(
-        engine, slip, _mass(config, slip), wrenches, ramp_s=limits.ramp_s, hold_s=limits.hold_s
+        engine, slip, _cube(config, slip), wrenches, ramp_s=limits.ramp_s, hold_s=limits.hold_s
     )
     low, high = bracket(ascending, _slipped(held, config))
     return LimitRatio(group=group, load=load.name, case=_case(slip), held=low, slipped=high)
@@ -195,10 +231,15 @@ def _limit(load: PlanarLoad, slip: SlipConfig) -> float:
 
 
 def _mass(config: ValidationConfig, slip: SlipConfig) -> float:
-    """Return the cube's mass [kg]."""
+    """Return the mass that goes with what is carried [kg]."""
     physics, limits = slip.physics, config.limits
     carried = 2.0 * physics.friction * physics.force_n / limits.limit_acceleration
     return float(np.clip(carried, *limits.masses_kg))
+
+
+def _cube(config: ValidationConfig, slip: SlipConfig) -> SlipBody:
+    """Return the cube."""
+    return cube(_mass(config, slip))
 
 
 def _case(slip: SlipConfig) -> str:

@@ -15,6 +15,7 @@ from realsim_sim_bridge.validation.report import CheckResult, LimitRatio, Valida
 from realsim_sim_bridge.validation.slip_limits import (
     coulomb_checks,
     creep_checks,
+    curved_check,
     force_check,
     torque_checks,
 )
@@ -58,7 +59,7 @@ def validate(
             found, measured = measure(engine, config)
             checks, ratios = checks + found, ratios + measured
         elif part == "creep":
-            checks += creep_checks(engine, config)
+            checks += [*creep_checks(engine, config), curved_check(engine, config)]
         elif part == "box":
             checks += box_checks(engine, config)
         elif part == "capacity":

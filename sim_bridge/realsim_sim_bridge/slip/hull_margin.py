@@ -13,7 +13,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 LEAST_CORE = 0.5
-"""The margin is at most this share of the thinnest part's inner radius: a core has to be left."""
+"""A part is drawn in by at most this share of its inner radius: a core has to be left."""
+LEAST_MARGIN_M = 1e-4
+"""The margin is not made smaller for thin parts [m], which are up to so much too fat then: at
+0.1 mm normals are still right."""
 
 
 def drawn_in(parts: list[Array], margin_m: float) -> tuple[list[Array], float]:
@@ -27,10 +30,11 @@ def drawn_in(parts: list[Array], margin_m: float) -> tuple[list[Array], float]:
     """
     hulls = [_planes(part) for part in parts]
     inner = [_inner_ball(planes) for planes in hulls]
-    margin = min([margin_m, *(LEAST_CORE * radius for _, radius in inner)])
+    thinnest = min(LEAST_CORE * radius for _, radius in inner)
+    margin = min(margin_m, max(LEAST_MARGIN_M, thinnest))
     cores = [
-        _core(part, planes, ball[0], margin)
-        for part, planes, ball in zip(parts, hulls, inner, strict=True)
+        _core(part, planes, middle, min(margin, LEAST_CORE * radius))
+        for part, planes, (middle, radius) in zip(parts, hulls, inner, strict=True)
     ]
     return cores, margin
 

@@ -1,0 +1,459 @@
+"""`realsim school`: what it runs, writes, refuses, and its exit codes."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app.console import Console
+from realsim.app.school_cli import SCHOOL
+from realsim.app.school_files import stored_grasps
+from realsim.app.school_inputs import SchoolRequest, base_on_table, masses_of
+from realsim.app.school_page import page_bytes
+from realsim.app.school_run import config_of, run_in_session
+from realsim.app.school_tables import (
+    agreement_line,
+    doubts,
+    level_tables,
+    reasons,
+    school_rows,
+    setting_lines,
+    survivors,
+)
+from realsim.errors import InputError
+from realsim.formats.acronym import read_acronym
+from realsim.formats.bop_models import save_models
+from realsim.formats.grasps_hdf5 import read_grasps_hdf5
+from realsim.formats.grasps_parquet import read_grasps_parquet
+from realsim.geometry import se3
+from realsim.geometry.parts import part
+from realsim.records import CaptureSession, ObjectPose, Scene, SupportPlane
+from realsim.store import SessionStore, load_grasps, save_scene
+from realsim_sim_bridge.school.sweep import SweepConfig
+from realsim_sim_bridge.slip.bullet_settings import BulletSettings
+from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from registered_sessions import CAMERA
+from tried_grasps import tried_set
+
+GRASPS = 5
+QUICK = ("--engine", "mujoco", "--grasps", GRASPS, "--workers", "1", "--quiet")
+NAMES = ("cube", "wedge")
+T_WORLD_TABLE = se3.from_rt(se3.exp_so3(np.array([0.0, 0.0, 0.4])), [0.3, 0.1, 0.02])
+
+
+def run(*args: object) -> Result:
+    """Run the group in this process."""
+    return CliRunner().invoke(SCHOOL, [str(a) for a in args])
+
+
+def refused(*args: object) -> str:
+    """Return what the group refuses the arguments with."""
+    result = run(*args)
+    assert isinstance(result.exception, InputError), result.output
+    return str(result.exception)
+
+
+def scene() -> Scene:
+    """Two convex things, apart on a table that is not the world's xy plane."""
+    objects = tuple(
+        ObjectPose(
+            obj_id=part(name).obj_id,
+            instance=k,
+            T_world_obj=T_WORLD_TABLE @ _standing(name, x, angle),
+        )
+        for k, (name, x, angle) in enumerate(zip(NAMES, (-0.1, 0.1), (0.2, 1.1), strict=True))
+    )
+    return Scene(name="two", objects=objects, plane=SupportPlane(T_world_table=T_WORLD_TABLE))
+
+
+def _standing(name: str, x: float, angle: float) -> np.ndarray:
+    """Return T_table_obj of a part on its lowest point."""
+    T = se3.from_rt(se3.exp_so3(np.array([0.0, 0.0, angle])), [x, 0.0, 0.0])
+    T[2, 3] = -part(name).mesh.bounds[0][2]
+    return T
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A registered session."""
+    folder = tmp_path_factory.mktemp("pristine") / "s"
+    session = CaptureSession(name="two", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(folder, session)
+    save_models(folder / "models", {part(n).obj_id: part(n) for n in NAMES})
+    save_scene(store, scene())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def tried(pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    """The same session after a school, and what the command said."""
+    folder = tmp_path_factory.mktemp("tried") / "s"
+    shutil.copytree(pristine, folder)
+    return folder, run(folder, *QUICK, "--json", folder.parent / "counts.json")
+
+
+# --- a run --------------------------------------------------------------------------------------
+
+
+def test_a_run_needs_no_name_and_writes_everything(tried: tuple[Path, Result]) -> None:
+    folder, result = tried
+    assert result.exit_code == 0, result.output
+    store = SessionStore.open(folder)
+    sets = load_grasps(store)
+    assert [s.instance for s in sets] == [0, 1] and all(len(s) == GRASPS for s in sets)
+    assert any(s.good.any() for s in sets)
+    for name in ("grasps/grasps.h5", "grasps/grasps.parquet", "reports/school.html",
+                 "reports/school.json", "reports/school_sheet.png"):  # fmt: skip
+        assert store.has(name), name
+    assert store.verify() == []
+    for words in ("cube", "wedge", "70 N a finger, friction 1, engine mujoco", "school.html"):
+        assert words in result.output
+
+
+def test_all_files_hold_the_same_grasps(tried: tuple[Path, Result]) -> None:
+    folder, _ = tried
+    sets = load_grasps(folder)
+    for found in (
+        read_grasps_hdf5(folder / "grasps/grasps.h5"),
+        read_grasps_parquet(folder / "grasps"),
+        stored_grasps(folder)[0],
+    ):
+        assert found.T_world_table == pytest.approx(T_WORLD_TABLE)
+        for s, other in zip(sets, found.sets, strict=True):
+            assert np.array_equal(s.Ts_obj_grasp, other.Ts_obj_grasp)
+            assert np.array_equal(s.scores, other.scores, equal_nan=True)
+            assert s.failures == other.failures and set(s.measures) == set(other.measures)
+            rows = found.trajectories[s.instance].rows
+            assert np.array_equal(rows, np.nonzero(s.reachable)[0])
+
+
+def test_the_counts_are_those_of_the_sets(tried: tuple[Path, Result]) -> None:
+    folder, _ = tried
+    counts = json.loads((folder.parent / "counts.json").read_text())
+    assert counts == json.loads((folder / "reports/school.json").read_text())
+    for s, entry in zip(load_grasps(folder), counts["objects"], strict=True):
+        assert entry["reachable"] == int(s.reachable.sum())
+        assert entry["passed"]["pendulum"] == int(np.sum(s.base_scores >= 1.0))
+        assert sum(entry["failures"].values()) == sum(bool(f) for f in s.failures)
+
+
+def test_the_page_stands_alone(tried: tuple[Path, Result]) -> None:
+    text = (tried[0] / "reports/school.html").read_text()
+    assert text.count("data:image/png;base64") == 1 and "http" not in text.split("<body>")[1]
+    for words in (
+        "0 cube",
+        "1 wedge",
+        "in the paper",
+        "Why grasps stopped",
+        "not what a real hand",
+    ):
+        assert words in text
+
+
+def test_a_second_run_computes_nothing_and_other_parameters_are_refused(
+    tried: tuple[Path, Result], tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(tried[0], tmp_path / "s"))
+    before = {p.name: p.stat().st_mtime_ns for p in (folder / "grasps/cache").glob("instance_*")}
+    assert before and run(folder, *QUICK).exit_code == 0
+    after = {p.name: p.stat().st_mtime_ns for p in (folder / "grasps/cache").glob("instance_*")}
+    assert after == before
+    message = refused(folder, *QUICK, "--friction", "0.5")
+    assert "friction: 1.0 -> 0.5" in message and "--restart" in message
+    again = run(folder, *QUICK, "--friction", "0.5", "--restart")
+    assert again.exit_code == 0 and "friction 0.5" in again.output
+
+
+def test_a_session_in_hand_gives_the_same_without_asking_twice(
+    tried: tuple[Path, Result], tmp_path: Path
+) -> None:
+    store = SessionStore.open(Path(shutil.copytree(tried[0], tmp_path / "s")))
+    request = SchoolRequest(engine="mujoco", grasps=GRASPS, workers=1)
+    outcome = run_in_session(store, request, Console(quiet=True))
+    for s, before in zip(outcome.sets, load_grasps(tried[0]), strict=True):
+        assert np.array_equal(s.Ts_obj_grasp, before.Ts_obj_grasp)
+        assert np.array_equal(s.scores, before.scores, equal_nan=True)
+    assert store.verify() == []
+
+
+def test_margins_and_a_second_engine_come_with_the_same_grasps(
+    tried: tuple[Path, Result], tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(tried[0], tmp_path / "s"))
+    alone = load_grasps(folder)
+    result = run(folder, *QUICK, "--sweep", "--cross-check", "--restart")
+    assert result.exit_code == 0 and "Two engines agree" in result.output
+    for s, before in zip(load_grasps(folder), alone, strict=True):
+        assert np.array_equal(s.scores, before.scores, equal_nan=True)
+        tested, held = ~np.isnan(s.slip_m[:, 0]), s.base_scores >= 1.0
+        for name in ("margin", "least_friction", "least_force_n", "second_score", "confidence"):
+            assert np.array_equal(~np.isnan(s.measures[name]), tested)
+        assert np.all(s.measures["least_friction"][held] <= 1.0)
+        assert np.all(s.measures["margin"][held] > 0.0)
+    assert (folder / "reports/school_margins.png").is_file()
+    assert "by force" in (folder / "reports/school.html").read_text()
+
+
+def test_a_weighed_object_has_its_mass_and_the_others_the_density(
+    pristine: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(pristine, tmp_path / "s"))
+    options = ("--mass", "cube=0.31", "--density", "500")
+    assert run(folder, *QUICK, "--grasps", "2", *options).exit_code in (0, 1)
+    cube, wedge = load_grasps(folder)
+    assert cube.parameters["mass_kg"] == pytest.approx(0.31)
+    lighter = 500 / part("wedge").density
+    assert wedge.parameters["mass_kg"] == pytest.approx(lighter * _mass("wedge"), rel=1e-3)
+
+
+def _mass(name: str) -> float:
+    """Return the mass of a part at its own density [kg]."""
+    from realsim.geometry.mesh import mass_properties
+
+    return mass_properties(part(name).mesh, part(name).density).mass_kg
+
+
+# --- other commands -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("target", ["acronym", "graspgen", "isaac", "hdf5", "parquet"])
+def test_grasps_are_exported(tried: tuple[Path, Result], tmp_path: Path, target: str) -> None:
+    result = run("export", tried[0], "--to", target, "--out", tmp_path / "x")
+    assert result.exit_code == 0, result.output
+    for line in result.output.split():
+        assert Path(line).stat().st_size > 100
+    if target == "acronym":
+        found = read_acronym(tmp_path / "x/000000_obj000002.h5")
+        s = load_grasps(tried[0])[0]
+        assert np.array_equal(found.object_in_gripper, np.isfinite(s.slip_m).all(axis=1)[
+            ~np.isnan(s.slip_m[:, 0])
+        ])  # fmt: skip
+        assert (tmp_path / "x" / found.obj.file).is_file() and found.obj.scale == 1e-3
+        assert found.obj.mass_kg == pytest.approx(_mass("cube"), rel=1e-3)
+
+
+def test_the_summary_counts_every_session_once(tried: tuple[Path, Result], tmp_path: Path) -> None:
+    other = shutil.copytree(tried[0], tmp_path / "s")
+    file = tmp_path / "summary.json"
+    result = run("summary", tried[0], other, "--json", file)
+    assert result.exit_code == 0 and "2,275,352" in result.output
+    found = json.loads(file.read_text())
+    assert found["scenes"] == 2 and found["candidates"] == 4 * GRASPS
+    assert "twice" in refused("summary", tried[0], tried[0])
+
+
+def test_things_that_stand_settle_and_one_in_the_air_does_not(
+    pristine: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(pristine, tmp_path / "s"))
+    result = run("settle", folder, "--quiet")
+    assert result.exit_code == 0, result.output
+    assert (folder / "reports/settle.png").is_file()
+    there = scene()
+    up = se3.from_rt(np.eye(3), [0.0, 0.0, 0.03])
+    cube, wedge = there.objects
+    lifted = ObjectPose(obj_id=cube.obj_id, instance=0, T_world_obj=up @ cube.T_world_obj)
+    save_scene(
+        SessionStore.open(folder), Scene(name="two", objects=(lifted, wedge), plane=there.plane)
+    )
+    result = run("settle", folder, "--quiet", "--json", tmp_path / "settle.json")
+    assert result.exit_code == 1 and "floats" in result.output
+    verdicts = [o["verdict"] for o in json.loads((tmp_path / "settle.json").read_text())["objects"]]
+    assert verdicts == ["floats", "stands"]
+
+
+@pytest.mark.slow
+def test_the_physics_is_validated(tmp_path: Path) -> None:
+    result = run("validate", "--engine", "mujoco", "--quick", "--quiet", "--out", tmp_path,
+                 "--json", tmp_path / "all.json")  # fmt: skip
+    report = json.loads((tmp_path / "validation_mujoco.json").read_text())
+    assert result.exit_code == (0 if report["passed"] else 1)
+    assert json.loads((tmp_path / "all.json").read_text())["mujoco"]["checks"] == report["checks"]
+    assert (tmp_path / "validation_mujoco.png").stat().st_size > 1000
+    assert report["passed"], result.output
+
+
+# --- bad input ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("option", ["--force", "--friction", "--density"])
+@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf"])
+def test_physics_that_cannot_be_is_refused(pristine: Path, option: str, value: str) -> None:
+    assert option in refused(pristine, *QUICK, option, value)
+    assert not (pristine / "grasps").exists()
+
+
+@pytest.mark.parametrize(
+    ("mass", "words"),
+    [
+        ("mug=0.3", "no object of this scene"),
+        ("cube", "NAME=KG"),
+        ("cube=heavy", "NAME=KG"),
+        ("cube=0", "NAME=KG"),
+        ("cube=-1", "NAME=KG"),
+        ("=1", "NAME=KG"),
+    ],
+)
+def test_a_mass_of_nothing_or_of_no_object_is_refused(
+    pristine: Path, mass: str, words: str
+) -> None:
+    message = refused(pristine, *QUICK, "--mass", mass)
+    assert words in message and mass in message
+
+
+def test_masses_are_told_by_name_or_number_and_once() -> None:
+    models = {part(n).obj_id: part(n) for n in NAMES}
+    assert masses_of(["cube=0.3", "8=1e-1"], models) == {2: 0.3, 8: 0.1}
+    with pytest.raises(InputError, match="twice"):
+        masses_of(["cube=0.3", "2=0.4"], models)
+
+
+def test_a_base_pose_is_taken_from_world_or_table(tmp_path: Path) -> None:
+    T = se3.from_rt(se3.exp_so3(np.array([0.1, 0.2, 0.3])), [-0.4, 0.1, 0.0])
+    file = tmp_path / "base.json"
+    file.write_text(json.dumps({"T_table_base": T.tolist()}))
+    assert base_on_table(file, scene()) == pytest.approx(T)
+    config = config_of(SchoolRequest(base_pose=file), scene())
+    assert np.array(config.reach.T_table_base) == pytest.approx(T)
+    file.write_text(json.dumps({"T_world_base": (T_WORLD_TABLE @ T).tolist()}))
+    assert base_on_table(file, scene()) == pytest.approx(T)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, "does not exist"),
+        ("{", "no JSON"),
+        ("[1, 2]", "no pose"),
+        ('{"T_base_world": []}', "no pose"),
+        ('{"T_world_base": [], "T_table_base": []}', "exactly one"),
+        ('{"T_table_base": [[1, 2], [3, 4]]}', "4 x 4"),
+        ('{"T_table_base": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "T_table_base"),
+    ],
+)
+def test_a_base_pose_that_is_none_is_refused(
+    pristine: Path, tmp_path: Path, content: str | None, words: str
+) -> None:
+    file = tmp_path / "base.json"
+    if content is not None:
+        file.write_text(content)
+    message = refused(pristine, *QUICK, "--base-pose", file)
+    assert words in message and str(file) in message
+
+
+def test_an_engine_that_is_not_installed_is_named_before_anything_runs(
+    pristine: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
+    assert "realsim[mujoco]" in refused(pristine, "--engine", "mujoco", "--quiet")
+    assert "realsim[mujoco]" in refused(pristine, "--cross-check", "--quiet")
+    assert "realsim[mujoco]" in refused("validate", "--engine", "both", "--quiet")
+
+
+def test_a_mesh_without_volume_is_named_and_the_others_are_tried(
+    pristine: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(pristine, tmp_path / "s"))
+    flat = part("cube")
+    sheet = flat.mesh.vertices.copy()
+    sheet[:, 2] = 0.0
+    mesh = type(flat.mesh)(vertices=sheet, faces=flat.mesh.faces)
+    models = {2: type(flat)(obj_id=2, name="cube", mesh=mesh), 8: part("wedge")}
+    save_models(folder / "models", models)
+    result = run(folder, *QUICK)
+    assert result.exit_code == 0, result.output
+    assert "0 cube: not tried" in result.stderr
+    cube, wedge = load_grasps(folder)
+    assert not cube.good.any() and wedge.reachable.any()
+
+
+def test_a_scene_out_of_the_arm_s_reach_has_reasons_and_no_scores_above_zero(
+    pristine: Path, tmp_path: Path
+) -> None:
+    far = tmp_path / "far.json"
+    T = se3.from_rt(np.eye(3), [5.0, 0.0, 0.0])
+    far.write_text(json.dumps({"T_table_base": T.tolist()}))
+    folder = Path(shutil.copytree(pristine, tmp_path / "s"))
+    result = run(folder, *QUICK, "--base-pose", far)
+    if isinstance(result.exception, InputError):
+        assert "base" in str(result.exception)  # the arm cannot even hold its hand over the table
+    else:
+        assert result.exit_code == 1
+        for s in load_grasps(folder):
+            assert not s.reachable.any() and np.all(s.scores == 0) and all(s.failures)
+
+
+def test_sources_that_are_none_are_refused(pristine: Path, tmp_path: Path) -> None:
+    assert "no session.json" in refused(tmp_path, *QUICK)
+    assert "no session.json" in refused(tmp_path / "nowhere", *QUICK)
+    assert str(pristine) in refused(pristine.parent, *QUICK)
+    assert "--out" in refused(pristine, *QUICK, "--out", tmp_path)
+    assert "is a session" in refused(tmp_path, *QUICK, "--out", pristine)
+    assert "scene" in refused(tmp_path, *QUICK, "--out", tmp_path / "o")
+    assert "no grasps yet" in refused("export", pristine, "--to", "hdf5", "--out", tmp_path / "o")
+    assert "no results" in refused("summary", tmp_path)
+
+
+def test_an_export_over_its_own_source_is_refused(tried: tuple[Path, Result]) -> None:
+    for out in (tried[0], tried[0] / "grasps"):
+        assert "another folder" in refused("export", tried[0], "--to", "parquet", "--out", out)
+
+
+# --- tables, without physics --------------------------------------------------------------------
+
+
+def test_what_is_asked_for_reaches_the_config() -> None:
+    asked = SchoolRequest(
+        engine="mujoco", cross_check=True, sweep=True, force_n=20.0, friction=0.4, points=50,
+        rotations=5, seed=3, grasps=7,
+    )  # fmt: skip
+    config = config_of(asked, scene())
+    assert isinstance(config.slip.engine, MujocoSettings)
+    assert isinstance(config.second_engine, BulletSettings) and config.sweep == SweepConfig()
+    assert (config.slip.physics.force_n, config.slip.physics.friction) == (20.0, 0.4)
+    assert (config.candidates.surface_points, config.candidates.rotations) == (50, 5)
+    assert (config.seed, config.max_candidates) == (3, 7)
+    plain = config_of(SchoolRequest(), scene())
+    assert plain.second_engine is None and plain.sweep is None
+
+
+def test_rows_add_up_and_levels_only_rise() -> None:
+    rng = np.random.default_rng(5)
+    sets = [tried_set(rng, 40, obj_id=2, instance=k) for k in range(3)]
+    models = {2: part("cube")}
+    rows = school_rows(sets, models)
+    for column in range(1, 8):
+        assert int(rows[-1][column]) == sum(int(r[column]) for r in rows[:-1])
+    assert [r[0] for r in rows] == ["0 cube", "1 cube", "2 cube", "all"]
+    levels, share = survivors(sets[0], "least_friction", "frictions")
+    assert np.all(np.diff(levels) < 0) and np.all(np.diff(share) <= 0)
+    assert [t[0] for t in level_tables(sets, models)] == ["friction", "force [N]"]
+    assert sum(reasons(sets).values()) == sum(bool(f) for s in sets for f in s.failures)
+
+
+def test_shapes_that_make_labels_doubtful_are_named() -> None:
+    rng = np.random.default_rng(7)
+    sound = {"convex": {"volume_ratio": 1.02}, "watertight": True}
+    fat = {"convex": {"volume_ratio": 1.41}, "watertight": True}
+    open_mesh = {"convex": {"volume_ratio": 0.8}, "watertight": False}
+    sets = [
+        replace(tried_set(rng, 3, instance=k), parameters=p)
+        for k, p in enumerate((sound, fat, open_mesh, {}))
+    ]
+    words = doubts(sets, {})
+    assert [w[0] for w in words] == ["1", "2", "2"]
+    assert "1.41 times" in words[0] and "0.80 of" in words[1] and "not closed" in words[2]
+
+
+def test_sets_without_measures_have_dashes_and_a_page() -> None:
+    rng = np.random.default_rng(6)
+    sets = [tried_set(rng, n, measures=(), instance=n) for n in (0, 9)]
+    rows = school_rows(sets, {})
+    assert rows[0][0] == "0 object 7" and rows[0][-2:] == ["-", "-"]
+    assert level_tables(sets, {}) == [] and agreement_line(sets) == "" and setting_lines(sets) == []
+    assert b"9 grasps on 2 objects" in page_bytes("a < b", sets, {}, {})
+    assert b"a &lt; b" in page_bytes("a < b", sets, {}, {})

@@ -1,0 +1,337 @@
+"""Whether grasps are reached, why not, and what the arm does over time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records.trajectories import PHASES
+from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.arm.lifted_object import touched_when_lifted
+from realsim_sim_bridge.arm.obstacles import obstacles_of
+from realsim_sim_bridge.arm.reach import (
+    ReachConfig,
+    ReachTask,
+    base_on_table,
+    check_reach,
+    home_joints,
+)
+from realsim_sim_bridge.arm.swept_hand import first_touched
+from realsim_sim_bridge.arm.timing import TimingConfig
+from realsim_sim_bridge.grasping.candidates import Surroundings
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.grasping.hand_free import first_point_inside
+from realsim_sim_bridge.slip.motion import SlipMotion, min_jerk, pendulum_angle
+
+DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+OPENING, WIDTH = 0.06, 0.05
+
+
+def from_above(x, y, z, yaw=0.0):
+    return se3.from_rt(se3.exp_so3([0, 0, yaw]) @ DOWN, [x, y, z])
+
+
+def some_grasps():
+    return [
+        from_above(x, y, 0.05, yaw)
+        for x in (-0.1, 0.05)
+        for y in (-0.1, 0.1)
+        for yaw in (0.0, 0.8, 1.9)
+    ]
+
+
+def box_points(low, high, instance, step=0.004):
+    """Points on the six faces of a box."""
+    axes = [np.arange(a, b + 1e-9, step) for a, b in zip(low, high, strict=True)]
+    faces = []
+    for k in range(3):
+        for side in (low[k], high[k]):
+            rest = [axes[i] if i != k else np.array([side]) for i in range(3)]
+            faces.append(np.stack(np.meshgrid(*rest, indexing="ij"), -1).reshape(-1, 3))
+    points = np.concatenate(faces)
+    return Surroundings(points=points, instances=np.full(len(points), instance))
+
+
+def reach_of(Ts, neighbours=None, config=None, obj=None, geometry=None, motion=None, seed=0):
+    n = len(Ts)
+    task = ReachTask(
+        Ts_table_grasp=np.asarray(Ts),
+        widths_m=np.full(n, WIDTH),
+        openings_m=np.full(n, OPENING),
+        obj=obj or Surroundings(),
+        neighbours=neighbours or Surroundings(),
+        middle_xy=(0.0, 0.0),
+    )
+    rng = np.random.default_rng(seed)
+    return check_reach(task, config or ReachConfig(), geometry or HandGeometry(), rng, motion)
+
+
+# --- laws ---------------------------------------------------------------------------------------
+
+
+def test_a_grasp_from_above_is_reached_at_its_pose():
+    T = from_above(0.05, 0.02, 0.03)
+    reach = reach_of([T])
+    assert reach.reachable[0] and reach.reasons[0] == ""
+    T_table_base = base_on_table((0.0, 0.0), ReachConfig())
+    assert np.allclose(T_table_base @ panda.forward(reach.joints[0]), T, atol=1e-6)
+    lifted = T_table_base @ panda.forward(reach.joints_lifted[0])
+    assert np.allclose(lifted[:3, 3] - T[:3, 3], [0, 0, 0.2], atol=1e-6)
+
+
+def test_a_moved_and_turned_table_changes_nothing_but_the_base():
+    Ts = some_grasps()
+    known = ReachConfig(T_table_base=base_on_table((0.0, 0.0), ReachConfig()))
+    assert known.T_table_base == ReachConfig(T_table_base=known.T_table_base).T_table_base
+    a, b = reach_of(Ts), reach_of(Ts, config=known)
+    assert np.array_equal(a.joints, b.joints, equal_nan=True)
+
+
+def test_grasps_do_not_depend_on_the_others():
+    Ts = some_grasps()
+    lid = box_points([-0.02, -0.02, 0.0], [0.02, 0.02, 0.18], 4)
+    together, alone = reach_of(Ts, lid), [reach_of([T], lid) for T in Ts]
+    assert np.array_equal(together.reachable, [r.reachable[0] for r in alone])
+    assert together.reasons == tuple(r.reasons[0] for r in alone)
+
+
+def test_the_same_seed_gives_the_same_trajectories():
+    walls = [box_points([-0.15, y, 0.0], [0.15, y + 0.01, 0.24], 2) for y in (-0.12, 0.11)]
+    wall = Surroundings(
+        points=np.concatenate([w.points for w in walls]),
+        instances=np.concatenate([w.instances for w in walls]),
+    )
+    Ts = [from_above(x, y, 0.08, 0.0) for y in (-0.2, 0.2) for x in (-0.1, 0.0, 0.1)]
+    first, again = reach_of(Ts, wall), reach_of(Ts, wall)
+    assert first.planned > 0
+    assert np.array_equal(first.trajectories.joints_rad, again.trajectories.joints_rad)
+    assert first.reasons == again.reasons
+
+
+@pytest.mark.parametrize("x", [-0.15, 0.0, 0.15])
+def test_the_perfect_reach_covers_the_table(x):
+    Ts = [
+        from_above(x, y, 0.05, yaw)
+        for y in (-0.15, 0.0, 0.15)
+        for yaw in np.linspace(0, np.pi, 4, endpoint=False)
+    ]
+    assert reach_of(Ts).reachable.mean() > 0.9
+
+
+def test_a_lab_s_arm_beside_the_table_reaches_too():
+    beside = ReachConfig(T_table_base=se3.from_translation([-0.5, 0.0, 0.0]))
+    reach = reach_of(some_grasps(), config=beside)
+    assert reach.reachable.mean() > 0.7
+    T = se3.from_translation([-0.5, 0.0, 0.0]) @ panda.forward(reach.joints[reach.reachable])
+    assert np.allclose(T, np.array(some_grasps())[reach.reachable], atol=1e-6)
+
+
+# --- reasons ------------------------------------------------------------------------------------
+
+
+def test_reasons_are_given_in_words():
+    far, into_table = from_above(2.0, 0.0, 0.03), from_above(0.0, 0.0, -0.01)
+    reach = reach_of([far, into_table])
+    assert not reach.reachable.any() and np.isnan(reach.joints).all()
+    assert reach.reasons[0].startswith("no inverse kinematics at the grasp: the wrist would be")
+    assert "its reach is 0.72 m" in reach.reasons[0]
+    assert reach.reasons[1] == "the approach collides with the table"
+
+
+def test_an_object_in_the_way_of_the_hand_is_named():
+    lid = box_points([-0.05, -0.05, 0.16], [0.05, 0.05, 0.17], 7)
+    reach = reach_of([from_above(0.0, 0.0, 0.03)], lid)
+    assert reach.reasons[0] == "the approach collides with the object of instance 7"
+
+
+def test_a_swept_hand_meets_what_a_thousand_poses_meet():
+    rng, hand = np.random.default_rng(0), HandGeometry()
+    n, k = 60, 1000
+    Ts = np.stack([from_above(*rng.uniform(-0.1, 0.1, 3), rng.uniform(0, 3)) for _ in range(n)])
+    Ts[:, :3, :3] = se3.exp_so3(rng.uniform(-1, 1, (n, 3))) @ Ts[:, :3, :3]
+    moves = rng.uniform(-0.15, 0.15, (n, 3))
+    boxes = hand.boxes(rng.uniform(0.01, 0.08, n))
+    points = rng.uniform(-0.3, 0.3, (24, 3))
+    obstacles = obstacles_of(points, np.arange(24), np.arange(24) < 10)
+    for own_too in (True, False):
+        found = first_touched(boxes, Ts, moves, obstacles, 0.001, own_too=own_too)
+        left = points if own_too else points[10:]
+        dense = np.zeros(n, dtype=bool)
+        for s in np.linspace(0, 1, k):
+            moved = Ts.copy()
+            moved[:, :3, 3] += s * moves
+            dense |= first_point_inside(boxes, moved, left, 0.001) >= 0
+        assert 5 < dense.sum() < n - 5
+        assert np.array_equal(found >= 0, dense)
+
+
+def test_a_home_that_is_blocked_is_said():
+    block = box_points([-0.05, -0.05, 0.2], [0.05, 0.05, 0.4], 9, step=0.01)
+    reach = reach_of([from_above(0.12, 0.16, 0.03)], block)
+    assert reach.reasons[0].startswith("no path from home: the arm at home collides with")
+    assert reach.reasons[0].endswith("instance 9")
+
+
+def test_a_base_from_which_home_cannot_be_reached_is_refused():
+    with pytest.raises(InputError, match=r"wrist would be .* from the shoulder"):
+        home_joints(ReachConfig(base_height_m=3.0))
+    with pytest.raises(InputError, match=r"rigid|transform"):
+        ReachConfig(T_table_base=np.eye(3))
+    far = ReachConfig(T_table_base=se3.from_translation([-3.0, 0.0, 0.0]))
+    with pytest.raises(InputError, match="another base"):
+        reach_of([from_above(0.0, 0.0, 0.05)], config=far)
+
+
+def test_contradictions_are_refused():
+    T = [from_above(0.0, 0.0, 0.05)]
+    with pytest.raises(InputError, match="lift"):
+        reach_of(T, motion=SlipMotion(lift_height_m=0.1))
+    with pytest.raises(InputError, match="mount"):
+        reach_of(T, geometry=replace(HandGeometry(), mount_z_m=-0.15))
+
+
+def test_nothing_to_reach_is_no_error():
+    reach = reach_of(np.zeros((0, 4, 4)))
+    assert len(reach.reachable) == 0 and reach.trajectories is None
+
+
+# --- the lifted object --------------------------------------------------------------------------
+
+
+def lifted(neighbour, obj=None):
+    obj = obj or box_points([-0.03, -0.03, 0.0], [0.03, 0.03, 0.05], 1)
+    return touched_when_lifted(obj, neighbour, 0.2, 0.004)
+
+
+def test_what_hangs_over_the_object_stops_its_lift():
+    assert lifted(box_points([0.02, -0.1, 0.1], [0.2, 0.1, 0.12], 6)) == 6
+    assert lifted(box_points([0.02, -0.1, 0.3], [0.2, 0.1, 0.32], 6)) is None
+    assert lifted(box_points([0.05, -0.1, 0.1], [0.2, 0.1, 0.12], 6)) is None
+    reach = reach_of(
+        [from_above(0.0, 0.0, 0.03)],
+        box_points([0.027, -0.01, 0.13], [0.032, 0.01, 0.135], 6, step=0.002),
+        obj=box_points([-0.03, -0.02, 0.0], [0.03, 0.02, 0.035], 1),
+    )
+    assert not reach.reachable[0] and reach.reasons[0].endswith("instance 6")
+
+
+def test_an_object_slides_up_along_a_neighbour_that_it_touches():
+    for gap in (0.0, 0.001, 0.003, 0.006):
+        beside = box_points([0.03 + gap, -0.05, 0.0], [0.09, 0.05, 0.12], 3)
+        assert lifted(beside) is None
+    turned = se3.from_rt(se3.exp_so3([0, 0, 0.6]), np.zeros(3))
+    obj, beside = (
+        Surroundings(points=se3.transform(turned, b.points), instances=b.instances)
+        for b in (
+            box_points([-0.03, -0.03, 0.0], [0.03, 0.03, 0.05], 1),
+            box_points([0.031, -0.05, 0.0], [0.09, 0.05, 0.12], 3),
+        )
+    )
+    assert lifted(beside, obj) is None
+
+
+def test_what_lies_on_the_object_stops_its_lift_though_it_touches():
+    assert lifted(box_points([-0.01, -0.1, 0.05], [0.01, 0.1, 0.06], 8)) == 8
+
+
+# --- over time ----------------------------------------------------------------------------------
+
+
+def test_an_attempt_has_its_phases_in_order_and_ends_where_it_was_lifted():
+    reach = reach_of(some_grasps())
+    paths = reach.trajectories
+    assert np.array_equal(paths.rows, np.nonzero(reach.reachable)[0])
+    home = home_joints(ReachConfig())
+    for row in paths.rows.tolist():
+        at = paths.attempt(row)
+        phase, t, q = paths.phase[at], paths.time_s[at], paths.joints_rad[at]
+        assert np.all(np.diff(phase) >= 0) and np.all(np.diff(t) > 0)
+        possible = reach.stage_possible[row]
+        missing = {"oscillate"} if "oscillate: the motion" in reach.notes[row] else set()
+        assert {PHASES[p] for p in phase} == set(PHASES) - missing
+        assert possible.shape == (3,)
+        assert np.allclose(q[0], home) and np.array_equal(q[-1], reach.joints_lifted[row])
+        closed = q[phase == PHASES.index("close")]
+        assert np.allclose(closed, reach.joints[row], atol=1e-12)
+        openings = paths.opening_m[at]
+        assert openings[0] == OPENING and openings[-1] == WIDTH
+        assert np.diff(openings).min() >= -2 * 0.1 / 50 - 1e-12 and np.diff(openings).max() <= 0
+
+
+def test_limits_hold_at_all_samples():
+    timing = TimingConfig(sample_hz=100.0)
+    reach = reach_of(some_grasps(), config=ReachConfig(timing=timing))
+    velocity, acceleration = timing.limits()
+    paths, checked = reach.trajectories, 0
+    for row in paths.rows.tolist():
+        at = paths.attempt(row)
+        phase, t, q = paths.phase[at], paths.time_s[at], paths.joints_rad[at]
+        assert panda.within_limits(q).all()
+        dt = np.diff(t)[:, None]
+        speed = np.diff(q, axis=0) / dt
+        going = phase[1:] <= PHASES.index("approach")
+        assert np.all(np.abs(speed[going]) <= velocity * (1 + 1e-6))
+        change = np.diff(speed, axis=0) / ((dt[1:] + dt[:-1]) / 2)
+        assert np.all(np.abs(change[going[1:]]) <= acceleration * (1 + 1e-6))
+        for stage, name in enumerate(("lift", "oscillate", "pendulum")):
+            if reach.stage_possible[row, stage]:
+                during = phase[:-1] == PHASES.index(name)
+                assert np.all(np.abs(speed[during]) <= panda.VELOCITY * (1 + 2e-3))
+                checked += 1
+    assert checked > 20
+
+
+def test_the_stages_are_the_slip_test_s_motions():
+    reach = reach_of(some_grasps())
+    paths, motion, rate = reach.trajectories, SlipMotion(), 50.0
+    T_table_base = base_on_table((0.0, 0.0), ReachConfig())
+    seen = 0
+    for row in paths.rows.tolist():
+        at = paths.attempt(row)
+        phase, t, q = paths.phase[at], paths.time_s[at], paths.joints_rad[at]
+        T = T_table_base @ panda.forward(q)
+
+        def during(name, phase=phase, t=t):
+            mine = np.nonzero(phase == PHASES.index(name))[0]
+            return mine, t[mine] - t[mine[0]]
+
+        mine, clock = during("approach")
+        start, end = T[mine[0], :3, 3], T[phase == PHASES.index("close")][0]
+        assert np.allclose(end[:3, 3] - start, 0.08 * end[:3, 2], atol=1e-6)
+        off = np.cross(T[mine, :3, 3] - start, end[:3, 2])
+        assert np.abs(off).max() < 1e-4
+        mine, clock = during("lift")
+        wanted = min_jerk(motion.lift_height_m, motion.lift_s, clock)[0]
+        assert np.allclose(T[mine, :3, 3] - end[:3, 3], np.outer(wanted, [0, 0, 1]), atol=1e-4)
+        top = end[:3, 3] + [0.0, 0.0, motion.lift_height_m]
+        if reach.stage_possible[row, 1]:
+            mine, clock = during("oscillate")
+            half = motion.oscillation_cycles / motion.oscillation_hz
+            wave = motion.oscillation_m * (1 - np.cos(2 * np.pi * motion.oscillation_hz * clock))
+            wanted = np.where((clock < half)[:, None], np.outer(wave, [1, 0, 0]), 0.0)
+            wanted = np.where((clock >= half)[:, None], np.outer(wave, [0, 1, 0]), wanted)
+            assert np.allclose(T[mine, :3, 3] - top, wanted, atol=1e-4)
+            seen += 1
+        mine, clock = during("pendulum")
+        mine = mine[: round(motion.pendulum_s * rate)]
+        lift = reach.joints_lifted[row]
+        low = max(panda.LOWER[4] - lift[4], -np.radians(60))
+        high = min(panda.UPPER[4] - lift[4], np.radians(60))
+        swing = pendulum_angle(motion, 1 / rate, low, high)[0]
+        assert np.allclose(q[mine, 4] - lift[4], swing, atol=1e-12)
+        assert np.array_equal(np.delete(q[mine], 4, axis=1), np.tile(np.delete(lift, 4), (160, 1)))
+    assert seen > 3
+
+
+def test_trajectories_can_be_left_out_and_sampled_otherwise():
+    Ts = some_grasps()[:3]
+    without = reach_of(Ts, config=ReachConfig(with_trajectories=False))
+    assert without.trajectories is None and not without.stage_possible.any()
+    fine, coarse = (
+        reach_of(Ts, config=ReachConfig(timing=TimingConfig(sample_hz=rate))).trajectories
+        for rate in (100.0, 10.0)
+    )
+    assert np.allclose(fine.time_s[fine.starts[1:] - 1], coarse.time_s[coarse.starts[1:] - 1])
+    assert 8 < len(fine.time_s) / len(coarse.time_s) < 11

@@ -1,0 +1,154 @@
+"""The School's picture sheet: its figures are the sets', and its words do not overlap."""
+
+import io
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from realsim.errors import InputError
+from realsim.formats.scene_grasps import executed, untried_set
+from realsim.records import ObjectModel
+from realsim_sim_bridge.school.sheet import left_after, school_sheet, sheet_figure
+from realsim_sim_bridge.school.sheet_object import MOST_HANDS, STOPS, shown_rows, stops_of
+from realsim_sim_bridge.school.summary import summarise
+from tried_grasps import tried_set
+
+
+def model(obj_id=1, name="box"):
+    import trimesh
+
+    from realsim.records import Mesh
+
+    solid = trimesh.creation.box((0.05, 0.08, 0.1))
+    return ObjectModel(
+        obj_id=obj_id, name=name, mesh=Mesh(vertices=solid.vertices, faces=solid.faces)
+    )
+
+
+def some_sets(n_sets=3, n=50, seed=0, **how):
+    rng = np.random.default_rng(seed)
+    return [tried_set(rng, n, obj_id=1, instance=k, **how) for k in range(n_sets)]
+
+
+def pixels(png):
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
+
+
+def with_score(s, score):
+    """Return the set as if every grasp had been tried and had this score."""
+    n = len(s)
+    slip = np.full((n, 4), 0.001)
+    return replace(
+        s, scores=np.full(n, score), base_scores=np.full(n, score), slip_m=slip, slip_rad=slip,
+        reachable=np.ones(n, bool), measures={},
+    )  # fmt: skip
+
+
+# --- what is counted --------------------------------------------------------------------------
+
+
+def test_every_grasp_stopped_somewhere_and_fewer_are_left_each_time():
+    sets = some_sets(5)
+    stops = np.concatenate([stops_of(s) for s in sets])
+    assert stops.min() >= 0 and stops.max() < len(STOPS)
+    left = left_after(sets)
+    assert left[0] == sum(len(s) for s in sets) and np.all(np.diff(left) <= 0)
+    assert left[-1] == sum(int(np.sum(s.base_scores == 1)) for s in sets)
+    found = summarise(sets)
+    assert left[1] == found.with_trajectory
+    assert left[2] == found.with_trajectory - found.outcomes["fail_close"]
+    assert left[3] == left[2] - found.outcomes["fail_lift"]
+
+
+def test_the_hands_drawn_have_the_scores_of_the_set():
+    s = tried_set(np.random.default_rng(1), 900)
+    rows = shown_rows(s)
+    assert len(rows) == MOST_HANDS == len(set(rows.tolist())) and executed(s)[rows].all()
+    tried = np.sort(s.scores[executed(s)])
+    for q in (0, 0.25, 0.5, 0.75, 1):
+        assert np.quantile(s.scores[rows], q) == pytest.approx(np.quantile(tried, q), abs=0.1)
+    few = tried_set(np.random.default_rng(1), 9)
+    assert sorted(shown_rows(few)) == np.flatnonzero(executed(few)).tolist()
+
+
+# --- the picture ------------------------------------------------------------------------------
+
+
+def test_the_same_sets_give_the_same_bytes_and_1600_pixels():
+    sets = some_sets(2)
+    png = school_sheet(sets, {1: model()}, title="Tisch 1")
+    assert png == school_sheet(sets, {1: model()}, title="Tisch 1")
+    assert pixels(png).shape[1] == 1600
+
+
+@pytest.mark.parametrize("measures", [(), ("margin",)])
+@pytest.mark.parametrize("n_sets", [1, 3, 7])
+def test_no_two_words_overlap_and_all_are_on_the_sheet(n_sets, measures):
+    name = "a name that is far too long for any panel of a sheet, with a number 000123"
+    sets = [
+        replace(s, instance=100 + s.instance) for s in some_sets(n_sets, 160, measures=measures)
+    ]
+    figure = sheet_figure(sets, {1: model(name=name)}, "A title that is also long " * 4, {})
+    figure.canvas.draw()
+    texts = [t for ax in figure.axes for t in (*ax.texts, ax.title, ax._left_title)]
+    for ax in figure.axes:
+        if ax.axison:
+            texts += [ax.xaxis.label, ax.yaxis.label]
+            for axis, (low, high) in ((ax.xaxis, ax.get_xlim()), (ax.yaxis, ax.get_ylim())):
+                texts += [t.label1 for t in axis.get_major_ticks() if low <= t.get_loc() <= high]
+    shown = [t for t in (*texts, *figure.texts) if t.get_text().strip() and t.get_visible()]
+    boxes = [(t.get_text(), t.get_window_extent()) for t in shown]
+    width, height = figure.get_size_inches() * figure.dpi
+    assert len(boxes) > 20
+    for text, box in boxes:
+        assert box.x0 >= 0 and box.x1 <= width and box.y0 >= 0 and box.y1 <= height, text
+    for (a, box), (b, other) in combinations(boxes, 2):
+        across = min(box.x1, other.x1) - max(box.x0, other.x0)
+        down = min(box.y1, other.y1) - max(box.y0, other.y0)
+        assert across <= 0.5 or down <= 0.5, (a, b)
+
+
+def test_the_hands_are_green_where_all_hold_and_red_where_none_does():
+    def counted(score):
+        s = with_score(some_sets(1, 30)[0], score)
+        rgb = pixels(school_sheet([s], {1: model()}))[390:600]  # the object alone
+        saturated = np.ptp(rgb, axis=-1) > 90
+        return (
+            int(np.sum(saturated & (rgb[..., 1] > rgb[..., 0]))),
+            int(np.sum(saturated & (rgb[..., 0] > rgb[..., 1]))),
+        )
+
+    green, red = counted(1.0)
+    assert green > 500 and red == 0
+    green, red = counted(0.0)
+    assert red > 500 and green == 0
+
+
+def test_a_set_that_is_empty_or_untried_has_its_panel_too():
+    empty = tried_set(np.random.default_rng(0), 0, obj_id=1, instance=0, measures=())
+    Ts = tried_set(np.random.default_rng(0), 5).Ts_obj_grasp
+    untried = untried_set(Ts, obj_id=2, instance=1)
+    models = {1: model(), 2: model(2, "ünknown $x_1$")}
+    figure = sheet_figure([empty, untried], models, "t", {})
+    said = [t.get_text() for t in figure.texts]
+    assert "no candidate" in said and "n = 5, not tried" in said
+    assert "1  ünknown $x_1$" in said  # names are not taken for formulas
+    assert len(pixels(school_sheet([], {}))) > 300
+
+
+def test_an_object_stands_as_it_is_told_to():
+    s = some_sets(1)
+    turned = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    a = school_sheet(s, {1: model()})
+    assert a != school_sheet(s, {1: model()}, Ts_up_obj={0: turned})
+    assert a == school_sheet(s, {1: model()}, Ts_up_obj={0: np.eye(4)})
+
+
+def test_an_object_without_a_model_and_too_many_are_named():
+    with pytest.raises(InputError, match="object 1 has grasps but no model"):
+        school_sheet(some_sets(1), {5: model(5)})
+    with pytest.raises(InputError, match="61 objects"):
+        school_sheet(some_sets(61, 1), {1: model()})

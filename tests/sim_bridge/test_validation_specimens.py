@@ -1,0 +1,120 @@
+"""The suite's specimens, its loads, and the arm that carries a cube."""
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.hand_urdf import hand_urdf
+from realsim_sim_bridge.slip.motion import SlipMotion
+from realsim_sim_bridge.slip.pads import PadModel
+from realsim_sim_bridge.slip.slip_test import SlipConfig
+from realsim_sim_bridge.validation.config import LabelConfig
+from realsim_sim_bridge.validation.full_arm import carry_cube
+from realsim_sim_bridge.validation.known_outcomes import peak_load
+from realsim_sim_bridge.validation.loads import with_hand
+from realsim_sim_bridge.validation.moving_arm import arm_urdf, stage_joints
+from realsim_sim_bridge.validation.specimens import READY, cube, edge_trial, specimen
+
+SHAPES = LabelConfig().shapes
+
+
+def test_the_cube_has_a_cube_s_moments():
+    body = cube(0.125)
+    assert np.allclose(body.inertia, np.eye(3) * 0.125 * 0.05**2 / 6)
+    assert np.allclose(body.center_of_mass, 0.0)
+
+
+def test_two_parts_have_the_moments_of_the_whole():
+    body = specimen("l_shape", 1.0)
+    rng = np.random.default_rng(0)
+    low = np.stack([p.min(axis=0) for p in body.parts])
+    high = np.stack([p.max(axis=0) for p in body.parts])
+    volumes = np.prod(high - low, axis=1)
+    which = rng.choice(2, size=400_000, p=volumes / volumes.sum())
+    points = rng.uniform(low[which], high[which]) - body.center_of_mass
+    assert np.allclose(points.mean(axis=0), 0.0, atol=2e-4)
+    second = points.T @ points / len(points)
+    assert np.allclose(body.inertia, np.trace(second) * np.eye(3) - second, atol=6e-6)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_grasps_on_the_edge_fit_the_hand_and_do_not_hang_on_the_mass(shape):
+    hand = HandGeometry()
+    light, heavy = edge_trial(shape, 0.01, 5, 7), edge_trial(shape, 2.0, 5, 7)
+    assert np.array_equal(light.Ts_obj_grasp, heavy.Ts_obj_grasp)
+    assert heavy.body.mass_kg == pytest.approx(2.0)
+    corners = np.concatenate(light.body.parts)
+    for T in light.Ts_obj_grasp:
+        seen = se3.transform(se3.invert(T), corners)
+        assert np.abs(seen[:, 1]).max() < hand.max_opening_m / 2
+        assert seen[:, 2].min() > hand.palm_face_z_m
+    beside = edge_trial(shape, 0.01, 5, 7, 5e-5)
+    moved = np.linalg.norm((beside.Ts_obj_grasp - light.Ts_obj_grasp)[:, :3, 3], axis=1)
+    assert np.allclose(moved, 5e-5)
+
+
+def test_a_shape_that_there_is_not_is_named():
+    with pytest.raises(InputError, match=r"no specimen 'cone'.*wedge"):
+        specimen("cone", 1.0)
+
+
+def test_the_peak_load_is_what_lift_and_oscillation_ask_for():
+    motion = SlipMotion()
+    shake = motion.oscillation_m * (2 * np.pi * motion.oscillation_hz) ** 2
+    lift = 9.81 + 5.7735 * motion.lift_height_m / motion.lift_s**2
+    assert peak_load(2.0, motion) == pytest.approx(2.0 * max(np.hypot(9.81, shake), lift), rel=1e-4)
+
+
+def test_the_urdf_s_palm_is_where_the_arm_s_kinematics_say(tmp_path):
+    import pybullet
+    from pybullet_utils.bullet_client import BulletClient
+
+    from realsim import interop
+
+    path = tmp_path / "arm.urdf"
+    path.write_text(arm_urdf(hand_urdf(HandGeometry(), PadModel())))
+    engine = BulletClient(connection_mode=pybullet.DIRECT)
+    try:
+        arm = engine.loadURDF(str(path), useFixedBase=True)
+        links = {
+            engine.getJointInfo(arm, j)[12].decode(): j for j in range(engine.getNumJoints(arm))
+        }
+        rng = np.random.default_rng(0)
+        for q in rng.uniform(panda.LOWER, panda.UPPER, (5, 7)):
+            for i, angle in enumerate(q):
+                engine.resetJointState(arm, links[f"link{i + 1}"], angle)
+            state = engine.getLinkState(arm, links["palm"], computeForwardKinematics=1)
+            found = interop.T_from_pybullet(state[4], state[5])
+            assert np.allclose(found, panda.forward(q), atol=1e-6)
+    finally:
+        engine.disconnect()
+
+
+def test_joint_paths_carry_the_hand_as_the_stages_do():
+    motion, dt = SlipMotion(), 0.01
+    start = panda.forward(READY)
+    lift = panda.forward(stage_joints(1, READY, motion, dt))
+    assert np.allclose(lift[-1, :3, 3] - start[:3, 3], [0, 0, motion.lift_height_m], atol=1e-4)
+    assert np.allclose(lift[:, :3, :3], start[:3, :3], atol=1e-3)
+    shake = panda.forward(stage_joints(2, READY, motion, dt))[:, :3, 3] - start[:3, 3]
+    ends = [2 * motion.oscillation_m, 2 * motion.oscillation_m, 0.0]
+    assert np.allclose(np.ptp(shake, axis=0), ends, atol=1e-3)
+    swing = stage_joints(3, READY, motion, dt)
+    assert np.array_equal(
+        np.delete(swing, 4, axis=1), np.tile(np.delete(READY, 4), (len(swing), 1))
+    )
+    assert np.degrees(np.ptp(swing[:, 4])) == pytest.approx(2 * motion.pendulum_deg, abs=0.1)
+
+
+def test_the_arm_drops_what_is_too_slippery():
+    dropped = carry_cube(0.125, np.eye(4), with_hand(SlipConfig(), 5.0, 0.05))
+    assert not dropped.passed and np.isinf(dropped.slip_m[1]) and np.isnan(dropped.slip_m[2])
+
+
+def test_the_arm_carries_what_the_hand_holds():
+    held = carry_cube(0.125, np.eye(4), with_hand(SlipConfig(), 10.0, 0.3))
+    assert held.passed and held.tracking_rad < np.radians(0.5)
+    assert held.slip_m.max() < 2e-3 and np.degrees(held.slip_rad.max()) < 1.0
