@@ -13,6 +13,7 @@ from realsim.app.cli_capture import CAPTURE_COMMANDS
 from realsim.app.cli_scan import SCAN
 from realsim.app.option_values import numbers_of
 from realsim.app.register_cli import register_command
+from realsim.app.school_cli import SCHOOL
 from realsim.errors import RealsimError
 
 FOLDER = click.Path(path_type=Path)
@@ -147,24 +148,6 @@ def calibrate(source: Path, quiet: bool, live: bool, **options: object) -> None:
 
 @commands.command()
 @click.argument("session", type=FOLDER)
-@click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000))
-@click.option("--seed", default=0, show_default=True)
-@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 64))
-@click.option("--quiet", is_flag=True)
-def school(session: Path, grasps: int, seed: int, workers: int, quiet: bool) -> None:
-    """Try grasps on the registered objects of SESSION in the Robot School."""
-    from realsim.app.console import Console
-    from realsim.app.show import show_grasps
-    from realsim.app.stages import open_session, school_session
-
-    console = Console(quiet=quiet)
-    store = open_session(session)
-    sets = school_session(store, console, grasps_per_object=grasps, seed=seed, workers=workers)
-    show_grasps(store, sets, console)
-
-
-@commands.command()
-@click.argument("session", type=FOLDER)
 @click.option("--quiet", is_flag=True)
 def annotate(session: Path, quiet: bool) -> None:
     """Write masks, poses, visibility and grasps for every frame of SESSION."""
@@ -217,6 +200,7 @@ def review(session: Path, host: str, port: int) -> None:
 for _command in CAPTURE_COMMANDS:
     commands.add_command(_command)
 commands.add_command(SCAN)
+commands.add_command(SCHOOL)
 commands.add_command(register_command)
 
 

@@ -56,7 +56,7 @@ def show_report(report: "ValidationReport", console: Console) -> None:
     red = [c for c in report.checks if not c.passed]
     if red:
         console.warn(f"{title}: {len(red)} of {len(report.checks)} checks are red: "
-                     f"{', '.join(c.name for c in red)}. Its labels mean nothing.")  # fmt: skip
+                     f"{', '.join(c.name for c in red)}. Do not trust its labels.")  # fmt: skip
     else:
         console.say(
             f"{title}: all {len(report.checks)} checks are green ({report.cpu_s:.0f} CPU s)."

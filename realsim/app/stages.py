@@ -213,27 +213,14 @@ def school_session(
     School makes the parts itself, and takes the mass from the mesh and its density.
 
     Raises:
-        InputError: the session has not been registered, or has no supporting plane.
+        InputError: the session has not been registered, or has no supporting plane, or holds
+            unfinished results of other parameters.
     """
-    from realsim.models.library_session import known_solids
-    from realsim.store import save_grasps
-    from realsim_sim_bridge.school import SchoolConfig, run_school
+    from realsim.app.school_inputs import SchoolRequest
+    from realsim.app.school_run import run_in_session
 
-    scene, models = judged_scene(store), session_models(store)
-    solids, unknown = known_solids(store.folder / "models", [o.obj_id for o in scene.objects])
-    for obj_id, why in unknown.items():
-        console.warn(f"object {obj_id}: its convex parts are made again: {why}.")
-    config = SchoolConfig(max_candidates=grasps_per_object, seed=seed)
-    with console.stage("school", f"up to {grasps_per_object} grasps an object") as tick:
-        sets = run_school(
-            scene, models, config, workers=workers, cache=store.folder / "grasps/cache",
-            progress=tick, solids=solids,
-        )  # fmt: skip
-        stems = {save_grasps(store, grasp_set).stem for grasp_set in sets}
-        for file in (store.folder / "grasps").glob("*.*"):
-            if file.is_file() and file.stem not in stems:
-                store.remove(f"grasps/{file.name}")  # of an object that has been rejected since
-    return sets
+    request = SchoolRequest(grasps=grasps_per_object, seed=seed, workers=workers)
+    return run_in_session(store, request, console).sets
 
 
 def annotate_session(store: SessionStore, console: Console) -> "TransferSummary":

@@ -173,7 +173,7 @@ def test_soft_friction_in_mujoco_creeps():
     pytest.importorskip("mujoco")
     assert failed(run("creep", settings=MujocoSettings())) == set()
     report = run("creep", settings=MujocoSettings(impratio=1.0))
-    assert failed(report) == {"no creep", "no creeping turn"}
+    assert {"no creep", "no creeping turn", "no creep on a cylinder"} <= failed(report)
 
 
 @pytest.mark.slow

@@ -178,6 +178,7 @@ def prepare(task: ObjectTask) -> Prepared:
         ClosureConfig(friction=config.slip.physics.friction),
         config.hand,
         body.center_of_mass,
+        contact_depths_m=found.contact_depths_m,
     )
     return Prepared(
         Ts_obj_grasp=found.Ts_obj_grasp,

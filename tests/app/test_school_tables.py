@@ -1,0 +1,56 @@
+"""The school's tables and page, from sets alone."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from realsim.app.school_page import page_bytes
+from realsim.app.school_tables import (
+    agreement_line,
+    doubts,
+    level_tables,
+    reasons,
+    school_rows,
+    setting_lines,
+    survivors,
+)
+from realsim.geometry.parts import part
+from tried_grasps import tried_set
+
+
+def test_rows_add_up_and_levels_only_rise() -> None:
+    rng = np.random.default_rng(5)
+    sets = [tried_set(rng, 40, obj_id=2, instance=k) for k in range(3)]
+    models = {2: part("cube")}
+    rows = school_rows(sets, models)
+    for column in range(1, 8):
+        assert int(rows[-1][column]) == sum(int(r[column]) for r in rows[:-1])
+    assert [r[0] for r in rows] == ["0 cube", "1 cube", "2 cube", "all"]
+    levels, share = survivors(sets[0], "least_friction", "frictions")
+    assert np.all(np.diff(levels) < 0) and np.all(np.diff(share) <= 0)
+    assert [t[0] for t in level_tables(sets, models)] == ["friction", "force [N]"]
+    assert sum(reasons(sets).values()) == sum(bool(f) for s in sets for f in s.failures)
+
+
+def test_shapes_that_make_labels_doubtful_are_named() -> None:
+    rng = np.random.default_rng(7)
+    sound = {"convex": {"volume_ratio": 1.02}, "watertight": True}
+    fat = {"convex": {"volume_ratio": 1.41}, "watertight": True}
+    open_mesh = {"convex": {"volume_ratio": 0.8}, "watertight": False}
+    sets = [
+        replace(tried_set(rng, 3, instance=k), parameters=p)
+        for k, p in enumerate((sound, fat, open_mesh, {}))
+    ]
+    words = doubts(sets, {})
+    assert [w[0] for w in words] == ["1", "2", "2"]
+    assert "1.41 times" in words[0] and "0.80 of" in words[1] and "not closed" in words[2]
+
+
+def test_sets_without_measures_have_dashes_and_a_page() -> None:
+    rng = np.random.default_rng(6)
+    sets = [tried_set(rng, n, measures=(), instance=n) for n in (0, 9)]
+    rows = school_rows(sets, {})
+    assert rows[0][0] == "0 object 7" and rows[0][-2:] == ["-", "-"]
+    assert level_tables(sets, {}) == [] and agreement_line(sets) == "" and setting_lines(sets) == []
+    assert b"9 grasps on 2 objects" in page_bytes("a < b", sets, {}, {})
+    assert b"a &lt; b" in page_bytes("a < b", sets, {}, {})
