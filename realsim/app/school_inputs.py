@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +51,8 @@ class SchoolRequest:
     workers: int = 2
     address: str = ""
     """HOST:PORT of a Ray cluster, or 'local' to start one here; '' = processes of this machine."""
-    restart: bool = False
-    """Whether results of other parameters are thrown away."""
+    restart: bool | Literal["finished"] = False
+    """Whether results of other parameters are thrown away; "finished" = those of a finished run."""
     models: Path | None = None
     """Folder of the models, where a scene's source has them elsewhere."""
 

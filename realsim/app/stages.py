@@ -219,7 +219,9 @@ def school_session(
     from realsim.app.school_inputs import SchoolRequest
     from realsim.app.school_run import run_in_session
 
-    request = SchoolRequest(grasps=grasps_per_object, seed=seed, workers=workers)
+    request = SchoolRequest(
+        grasps=grasps_per_object, seed=seed, workers=workers, restart="finished"
+    )
     return run_in_session(store, request, console).sets
 
 

@@ -9,6 +9,7 @@ import click
 import pytest
 
 from realsim.app.cli import commands
+from realsim.app.school_cli import RunByDefault
 
 ROOT = Path(__file__).parents[2]
 CHAPTERS = sorted((ROOT / "docs" / "tour").glob("*.md"))
@@ -26,14 +27,18 @@ def snippets(document: Path) -> list[str]:
 def commands_of(text: str) -> list[tuple[str, list[str]]]:
     """Return every `realsim COMMAND --option ...` that stands in code.
 
-    A command of a group comes with the group's name before it: `scan import`.
+    A command of a group comes with the group's name before it: `scan import`. Where a group runs
+    one by default, a path or a NAME in capitals is that one's argument.
     """
     code = "\n".join(CODE.findall(text))
     found: list[tuple[str, list[str]]] = []
     for name, rest in COMMAND.findall(code):
         first = (rest.split() or [""])[0]
-        if isinstance(commands.commands.get(name), click.Group) and re.match(r"[a-z]", first):
+        group = commands.commands.get(name)
+        if isinstance(group, click.Group) and re.fullmatch(r"[a-z][a-z-]*", first):
             name = f"{name} {first}"
+        elif isinstance(group, RunByDefault):
+            name = f"{name} run"
         found.append((name, re.findall(r"--[a-z-]+", rest)))
     return found
 
@@ -59,6 +64,8 @@ def test_commands_are_found_in_code_only() -> None:
     assert commands_of(text) == [("demo", ["--out"]), ("fly", ["--high"])]
     assert commands_of("    from realsim import View\n") == []
     assert commands_of("`realsim scan import MESH --unit m`") == [("scan import", ["--unit"])]
+    assert commands_of("`realsim school a/b --seed 1`") == [("school run", ["--seed"])]
+    assert commands_of("`realsim school settle A --out B`") == [("school settle", ["--out"])]
     assert command_of("scan fly") is None and command_of("demo fly") is None
 
 

@@ -328,3 +328,12 @@ def test_differences_are_those_values_that_differ():
         ("e", '"x"', "(nothing)"),
         ("f", "(nothing)", "true"),
     ]
+
+
+def test_only_a_finished_run_gives_way_to_another(tmp_path, whole):
+    other = dataclasses.replace(CONFIG, seed=7)
+    run(tmp_path, other)
+    assert is_whole_again(run(tmp_path, restart="finished")[0], whole)
+    (tmp_path / "finished").unlink()
+    with pytest.raises(InputError, match="seed: "):
+        run(tmp_path, other, restart="finished")

@@ -7,15 +7,13 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.hand_urdf import hand_urdf
 from realsim_sim_bridge.slip.motion import SlipMotion
-from realsim_sim_bridge.slip.pads import PadModel
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.validation.config import LabelConfig
 from realsim_sim_bridge.validation.full_arm import carry_cube
 from realsim_sim_bridge.validation.known_outcomes import peak_load
 from realsim_sim_bridge.validation.loads import with_hand
-from realsim_sim_bridge.validation.moving_arm import arm_urdf, stage_joints
+from realsim_sim_bridge.validation.moving_arm import stage_joints
 from realsim_sim_bridge.validation.specimens import READY, cube, edge_trial, specimen
 
 SHAPES = LabelConfig().shapes
@@ -66,31 +64,6 @@ def test_the_peak_load_is_what_lift_and_oscillation_ask_for():
     shake = motion.oscillation_m * (2 * np.pi * motion.oscillation_hz) ** 2
     lift = 9.81 + 5.7735 * motion.lift_height_m / motion.lift_s**2
     assert peak_load(2.0, motion) == pytest.approx(2.0 * max(np.hypot(9.81, shake), lift), rel=1e-4)
-
-
-def test_the_urdf_s_palm_is_where_the_arm_s_kinematics_say(tmp_path):
-    import pybullet
-    from pybullet_utils.bullet_client import BulletClient
-
-    from realsim import interop
-
-    path = tmp_path / "arm.urdf"
-    path.write_text(arm_urdf(hand_urdf(HandGeometry(), PadModel())))
-    engine = BulletClient(connection_mode=pybullet.DIRECT)
-    try:
-        arm = engine.loadURDF(str(path), useFixedBase=True)
-        links = {
-            engine.getJointInfo(arm, j)[12].decode(): j for j in range(engine.getNumJoints(arm))
-        }
-        rng = np.random.default_rng(0)
-        for q in rng.uniform(panda.LOWER, panda.UPPER, (5, 7)):
-            for i, angle in enumerate(q):
-                engine.resetJointState(arm, links[f"link{i + 1}"], angle)
-            state = engine.getLinkState(arm, links["palm"], computeForwardKinematics=1)
-            found = interop.T_from_pybullet(state[4], state[5])
-            assert np.allclose(found, panda.forward(q), atol=1e-6)
-    finally:
-        engine.disconnect()
 
 
 def test_joint_paths_carry_the_hand_as_the_stages_do():

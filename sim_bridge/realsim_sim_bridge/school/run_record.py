@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from realsim.errors import InputError
 from realsim.store import atomic
@@ -23,7 +23,10 @@ from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
 RUN_FILE = "run.json"
 RESULTS = "instance_*.npz"
 """The run's own files; those of the convex parts carry a hash of all they depend on."""
-RESULTS_VERSION = 2
+FINISHED_FILE = "finished"
+"""Empty; there when the run has been finished."""
+Restart = bool | Literal["finished"]
+RESULTS_VERSION = 3
 """Raised whenever the same inputs give other results with the same versions of all packages."""
 PACKAGES = ("realsim", "numpy", "numba", "scipy", "coacd", "eaik", "coal", "pin", "ompl", "toppra")
 """Besides the engines: what the grasps and trajectories come from."""
@@ -59,13 +62,14 @@ def run_record(tasks: list[ObjectTask], config: SchoolConfig, shard_grasps: int)
 
 
 @contextmanager
-def folder_of_run(folder: Path, record: dict[str, Any], *, restart: bool) -> Generator[None]:
+def folder_of_run(folder: Path, record: dict[str, Any], *, restart: Restart) -> Generator[None]:
     """Hold a folder for this run while the context lasts.
 
     Args:
         folder: made if it is not there.
         record: what `run_record` says of this run.
-        restart: discard another run's results instead of refusing.
+        restart: whether to discard another run's results instead of refusing; "finished" =
+            those of a run that was finished.
 
     Raises:
         InputError: another process is at work there, or its results are of another run.
@@ -75,15 +79,22 @@ def folder_of_run(folder: Path, record: dict[str, Any], *, restart: bool) -> Gen
         for leftover in folder.glob(f".{RESULTS}.*"):  # of a process killed while it wrote
             leftover.unlink()
         path = folder / RUN_FILE
-        if restart:
+        if restart is True or (restart == "finished" and (folder / FINISHED_FILE).is_file()):
+            (folder / FINISHED_FILE).unlink(missing_ok=True)
             # The record goes last: killed in between, the folder still says whose results remain.
             for result in folder.glob(RESULTS):
                 result.unlink()
         else:
             _refuse_others(folder, path, record)
+            (folder / FINISHED_FILE).unlink(missing_ok=True)
         # Not strict JSON: a config may hold infinity.
         atomic.write_text(path, json.dumps(record, indent=1) + "\n")
         yield
+
+
+def mark_finished(folder: Path) -> None:
+    """Note that the run in this folder has been finished."""
+    atomic.write_text(folder / FINISHED_FILE, "")
 
 
 def _refuse_others(folder: Path, path: Path, record: dict[str, Any]) -> None:

@@ -16,7 +16,12 @@ from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.day import Day, Progress, Pupil
 from realsim_sim_bridge.school.kept_sets import SchoolResult
 from realsim_sim_bridge.school.object_task import ObjectTask
-from realsim_sim_bridge.school.run_record import folder_of_run, run_record
+from realsim_sim_bridge.school.run_record import (
+    Restart,
+    folder_of_run,
+    mark_finished,
+    run_record,
+)
 from realsim_sim_bridge.school.shards import default_shard_grasps
 from realsim_sim_bridge.school.workers import Workers, local_workers
 
@@ -30,7 +35,7 @@ def run_school(  # noqa: PLR0913 - keywords, each with a meaning of its own
     cache: Path | None = None,
     progress: Progress | None = None,
     solids: Mapping[int, KnownSolid] | None = None,
-    restart: bool = False,
+    restart: Restart = False,
     shard_grasps: int | None = None,
 ) -> list[GraspSet]:
     """Return the scored grasps of every object whose pose was not rejected.
@@ -60,7 +65,7 @@ def run_school_results(  # noqa: PLR0913 - as above
     cache: Path | None = None,
     progress: Progress | None = None,
     solids: Mapping[int, KnownSolid] | None = None,
-    restart: bool = False,
+    restart: Restart = False,
     shard_grasps: int | None = None,
 ) -> list[SchoolResult]:
     """Return grasps and trajectories of every object whose pose was not rejected.
@@ -80,7 +85,8 @@ def run_school_results(  # noqa: PLR0913 - as above
         progress: called with (grasps judged, grasps expected).
         solids: convex parts and matter by object id, as a model library knows them; of other
             objects they are computed from the mesh.
-        restart: discard the results in `cache` if they are of another run, instead of refusing.
+        restart: whether to discard the results in `cache` if they are of another run, instead of
+            refusing; "finished" = only where that run was finished.
         shard_grasps: most grasps that are tested in one go; None = some seconds' worth. A dead
             worker loses one shard at most.
 
@@ -107,7 +113,10 @@ def run_school_results(  # noqa: PLR0913 - as above
                 progress(*_progress(pupils))
         except KeyboardInterrupt:
             raise KeyboardInterrupt(_how_to_go_on(pupils, cache)) from None
-    return [_result(pupil) for pupil in pupils]
+        results = [_result(pupil) for pupil in pupils]
+        if cache is not None and not any(result.unfinished for result in results):
+            mark_finished(cache)
+    return results
 
 
 def _staff(workers: int | ClusterConfig | None) -> AbstractContextManager[Workers]:

@@ -18,6 +18,7 @@ from realsim import interop
 from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.arm.panda_urdf import panda_urdf
 from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip.hand_urdf import hand_urdf
 from realsim_sim_bridge.slip.score import ScoreLimits
@@ -25,7 +26,7 @@ from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
 from realsim_sim_bridge.validation.config import ValidationConfig
 from realsim_sim_bridge.validation.loads import with_hand
-from realsim_sim_bridge.validation.moving_arm import TORQUES_NM, arm_urdf, stage_joints
+from realsim_sim_bridge.validation.moving_arm import stage_joints
 from realsim_sim_bridge.validation.report import CheckResult
 from realsim_sim_bridge.validation.specimens import READY, SIDE_M, cube, ready_trial
 
@@ -193,8 +194,8 @@ class _ArmWorld:
         for t, (target, speed) in enumerate(zip(path.tolist(), speeds.tolist(), strict=True), 1):
             engine.setJointMotorControlArray(
                 self._arm, self._joints, engine.POSITION_CONTROL, targetPositions=target,
-                targetVelocities=speed, forces=TORQUES_NM, positionGains=[PULL] * panda.JOINTS,
-                velocityGains=[1.0] * panda.JOINTS,
+                targetVelocities=speed, forces=panda.TORQUE.tolist(),
+                positionGains=[PULL] * panda.JOINTS, velocityGains=[1.0] * panda.JOINTS,
             )  # fmt: skip
             engine.stepSimulation()
             if t % max(1, round(sample_s / self.dt)) == 0 or t == len(path):
@@ -220,7 +221,8 @@ class _ArmWorld:
         engine, physics = self._engine, self._config.physics
         with tempfile.TemporaryDirectory() as folder:
             urdf = Path(folder) / "arm.urdf"
-            urdf.write_text(arm_urdf(hand_urdf(HandGeometry(), physics.pads)))
+            geometry = HandGeometry()
+            urdf.write_text(panda_urdf(geometry, hand_urdf(geometry, physics.pads)))
             self._arm: int = engine.loadURDF(
                 str(urdf),
                 useFixedBase=True,

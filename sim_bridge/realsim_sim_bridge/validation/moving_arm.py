@@ -1,4 +1,4 @@
-"""A Panda with a hand as a URDF, and the joint angles that move the hand as each stage does."""
+"""The joint angles of a Panda that move its hand as each stage of the slip test does."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,44 +9,6 @@ from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.slip.motion import SlipMotion, min_jerk, pendulum_angle
 
 Array = NDArray[np.float64]
-
-LINK_KG = (4.97, 0.65, 3.23, 3.59, 1.23, 1.67, 0.74)
-"""Masses of the Panda's links [kg] (Gaz, Cognetti, Oliva, Robuffo Giordano & De Luca 2019)."""
-LINK_RADIUS_M = 0.08
-"""The links' inertia is that of spheres of this radius: the joints' control outweighs it."""
-TORQUES_NM = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)
-"""What the Panda's joints can exert [N m]."""
-
-
-def arm_urdf(hand: str) -> str:
-    """Return the Panda with a hand (a URDF with root `palm`), without the arm's shapes.
-
-    A joint's frame is Rx(alpha) Tx(a) Tz(d) Rz(q) from the one before (Craig).
-    """
-    links = '<link name="base"><inertial><mass value="1"/>' + _UNIT_INERTIA + "</inertial></link>"
-    for i in range(panda.JOINTS):
-        alpha, d = float(panda.ALPHA[i]), float(panda.D_M[i])
-        y, z = -d * np.sin(alpha), d * np.cos(alpha)
-        moment = 0.4 * LINK_KG[i] * LINK_RADIUS_M**2
-        links += (
-            f'<link name="link{i + 1}"><inertial><mass value="{LINK_KG[i]}"/><inertia '
-            f'ixx="{moment}" iyy="{moment}" izz="{moment}" ixy="0" ixz="0" iyz="0"/></inertial>'
-            f'</link><joint name="joint{i + 1}" type="revolute">'
-            f'<parent link="{f"link{i}" if i else "base"}"/><child link="link{i + 1}"/>'
-            f'<origin xyz="{panda.A_M[i]} {y} {z}" rpy="{alpha} 0 0"/><axis xyz="0 0 1"/>'
-            f'<limit lower="{panda.LOWER[i]}" upper="{panda.UPPER[i]}" '
-            f'effort="{TORQUES_NM[i]}" velocity="10"/></joint>'
-        )
-    links += (
-        '<joint name="flange" type="fixed"><parent link="link7"/><child link="palm"/>'
-        f'<origin xyz="0 0 {panda.FLANGE_M + panda.TCP_M}" rpy="0 0 {panda.HAND_TURN}"/></joint>'
-    )
-    inner = hand[hand.index(">") + 1 : hand.rindex("</robot>")]
-    return f'<robot name="arm">{links}{inner}</robot>'
-
-
-_UNIT_INERTIA = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
-"""Of the base, which does not move; without one the engine warns."""
 
 
 def stage_joints(stage: int, q: Array, motion: SlipMotion, dt: float) -> Array:

@@ -1,0 +1,187 @@
+"""The scenes of the school's benchmark: ten objects on a table, and grasps that the arm reaches.
+
+Everything depends on the seed alone. Convex parts, which belong to the model library and take
+seconds an object, are kept in a folder. Seeds from 100 on are for the published figures, those
+below for development.
+"""
+
+import tempfile
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from school_shapes import SHAPES
+
+from realsim.models.convex import ConvexConfig, convex_parts
+from realsim.models.library_records import KnownSolid
+from realsim.models.properties import physical_properties
+from realsim.records import ObjectModel, Scene, SupportPlane
+from realsim.registration.simulated import TableLabConfig, scatter_objects
+from realsim_sim_bridge.school.config import SchoolConfig
+from realsim_sim_bridge.school.object_slips import trial_of
+from realsim_sim_bridge.school.object_task import ObjectTask, prepare
+from realsim_sim_bridge.school.school import object_tasks
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.slip_test import SlipTrial
+
+Array = NDArray[np.float64]
+OBJECTS = 10
+"""In every scene."""
+CONVEX = ConvexConfig(thresholds=(0.05, 0.02), max_parts=32)
+"""Cut until nine of the ten kinds have 16 to 32 parts."""
+QUICK_KINDS = ("mug", "pipe", "ring", "pulley", "flange", "gear")
+"""Those that are cut in 4 s each at most."""
+LAYOUT = TableLabConfig(disc_m=0.20, gap_m=0.01)
+"""A table that is full, but on which fingers fit between the objects."""
+KEEP = Path(tempfile.gettempdir()) / "realsim_school_benchmark"
+WIDER_M = 0.01
+"""By so much the disc is widened until all objects find room [m]."""
+
+
+@cache
+def library(keep: Path, quick: bool) -> dict[int, tuple[ObjectModel, KnownSolid]]:
+    """Return the models and their convex parts by object id."""
+    found: dict[int, tuple[ObjectModel, KnownSolid]] = {}
+    for obj_id, (name, shape) in enumerate(SHAPES.items(), start=1):
+        if quick and name not in QUICK_KINDS:
+            continue
+        model = ObjectModel(obj_id=obj_id, name=name, mesh=shape())
+        parts = convex_parts(model.mesh, CONVEX, keep / "convex")
+        matter = physical_properties(model.mesh, density=model.density, parts=parts)
+        found[obj_id] = (model, KnownSolid(parts=parts, matter=matter))
+    return found
+
+
+def cut_shape(job: tuple[str, Path]) -> None:
+    """Put one object's convex parts into the folder."""
+    name, keep = job
+    convex_parts(SHAPES[name](), CONVEX, keep / "convex")
+
+
+def shapes_by_time(quick: bool) -> list[str]:
+    """Return the names of the kinds, those that take longest to cut first."""
+    last = [n for n in QUICK_KINDS if n != "mug"]
+    return (["mug"] if quick else [n for n in SHAPES if n not in last]) + last
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SchoolCase:
+    """A scene with everything that the school needs."""
+
+    scene: Scene
+    models: dict[int, ObjectModel]
+    solids: dict[int, KnownSolid]
+
+    def names(self) -> dict[int, str]:
+        """Return the objects' kinds by instance."""
+        return {o.instance: self.models[o.obj_id].name for o in self.scene.objects}
+
+    def parts(self) -> dict[str, int]:
+        """Return how many convex parts each kind has."""
+        return {m.name: len(self.solids[i].parts.parts) for i, m in self.models.items()}
+
+    def alone(self, instance: int) -> "SchoolCase":
+        """Return the same scene with one object to be grasped; the others are obstacles."""
+        objects = tuple(
+            o if o.instance == instance else replace(o, verdict="rejected")
+            for o in self.scene.objects
+        )
+        return replace(self, scene=replace(self.scene, objects=objects))
+
+    def of_density(self, density: float) -> "SchoolCase":
+        """Return the same scene with objects of another density [kg/m^3]."""
+        models = {i: replace(m, density=density) for i, m in self.models.items()}
+        solids = {
+            i: replace(
+                s,
+                matter=physical_properties(models[i].mesh, density=density, parts=s.parts),
+            )
+            for i, s in self.solids.items()
+        }
+        return replace(self, models=models, solids=solids)
+
+
+def school_case(seed: int, keep: Path, quick: bool) -> SchoolCase:
+    """Return ten objects that stand or lie about on a table."""
+    known = library(keep, quick)
+    rng = np.random.default_rng([seed, 1])
+    ids = [*known, *rng.choice(list(known), max(0, OBJECTS - len(known)), replace=False).tolist()]
+    config = LAYOUT
+    while True:
+        put = scatter_objects({i: m.mesh for i, (m, _) in known.items()}, ids, config, rng)
+        if not put.left_out:
+            break
+        config = replace(config, disc_m=config.disc_m + WIDER_M)
+    return SchoolCase(
+        scene=Scene(
+            name=f"seed {seed}",
+            objects=put.objects,
+            plane=SupportPlane(T_world_table=np.eye(4)),
+        ),
+        models={i: m for i, (m, _) in known.items()},
+        solids={i: s for i, (_, s) in known.items()},
+    )
+
+
+def tasks_of(case: SchoolCase, config: SchoolConfig) -> list[ObjectTask]:
+    """Return the school's own task of every object."""
+    return object_tasks(case.scene, case.models, config, None, case.solids)
+
+
+# --- grasps without the school around them -----------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrialKey:
+    """Whose grasps."""
+
+    seed: int
+    instance: int
+    grasps: int
+    """At most."""
+    keep: Path
+    quick: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class NamedTrial:
+    """The grasps of one object of the scene that the arm reaches."""
+
+    name: str
+    instance: int
+    trial: SlipTrial
+
+
+CANDIDATES_PER_GRASP = 2.5
+"""Candidates from which the reachable ones are drawn."""
+
+
+def reached_trial(key: TrialKey) -> NamedTrial | None:
+    """Return grasps of an object that the arm reaches in the scene; None = there is none."""
+    case = school_case(key.seed, key.keep, key.quick)
+    most = round(CANDIDATES_PER_GRASP * key.grasps)
+    config = SchoolConfig(seed=key.seed, max_candidates=most)
+    task = next(t for t in tasks_of(case, config) if t.instance == key.instance)
+    prepared = prepare(task)
+    rows = prepared.tested
+    if len(rows) == 0:
+        return None
+    rng = np.random.default_rng([key.seed, 2, key.instance])
+    chosen = np.sort(rng.permutation(rows)[: key.grasps])
+    return NamedTrial(
+        name=task.name, instance=key.instance, trial=trial_of(task, prepared, chosen)
+    )
+
+
+def of_density(trial: SlipTrial, density: float, now: float = 1000.0) -> SlipTrial:
+    """Return the same grasps on an object of another density [kg/m^3]."""
+    body, factor = trial.body, density / now
+    light = SlipBody(
+        parts=body.parts,
+        mass_kg=factor * body.mass_kg,
+        center_of_mass=body.center_of_mass,
+        inertia=factor * body.inertia,
+    )
+    return replace(trial, body=light)
