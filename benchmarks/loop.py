@@ -18,7 +18,6 @@ import json
 import platform
 import tempfile
 from importlib.metadata import version
-from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +25,11 @@ import numpy as np
 from realsim.app.console import Console
 from realsim.app.demo import DemoConfig, DemoResult, run_demo
 from realsim.app.truth import GOALS
+from realsim_sim_bridge.slip.bullet_settings import BulletSettings
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
-from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
-from realsim_sim_bridge.slip.body import SlipBody
-from realsim_sim_bridge.slip.world import SlipPhysics
+from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
+from realsim_sim_bridge.slip.world import Replay, SlipPhysics
+from realsim_sim_bridge.validation.specimens import DOWN, cube_trial
 
 PACKAGES = ("realsim", "numpy", "open3d-cpu", "gtsam", "pybullet", "opencv-python-headless")
 PAPER_GRASPS_PER_S = 100 * 2198 / (7 * 86400)
@@ -58,20 +58,12 @@ def run(config: DemoConfig) -> tuple[DemoResult, dict[str, float]]:
 
 def held_box() -> dict[str, float]:
     """Slip-test a 5 cm box of 0.125 kg in our setting and in a bare PyBullet world."""
-    side, mass = 0.05, 0.125
-    corners = np.array(list(product((-side / 2, side / 2), repeat=3)))
-    T = np.diag([1.0, -1.0, -1.0, 1.0])[None]  # grasped from above, through its middle
-    trial = SlipTrial(
-        body=SlipBody(
-            parts=(corners,), mass_kg=mass, center_of_mass=np.zeros(3),
-            inertia=np.eye(3) * mass * side**2 / 6,
-        ),
-        Ts_obj_grasp=T, Ts_table_grasp=T, openings_m=np.array([side + 0.008]),
-        joint5_axes=np.array([[0.0, 1.0, 0.0]]), joint5_points=np.array([[-0.088, 0.0, -0.21]]),
-        joint5_ranges=np.array([[-2.0, 2.0]]),
-    )  # fmt: skip
-    bare = SlipPhysics(pads=None, iterations=50, mass_floor_kg=0.0)
-    ours, default = (run_slip_test(trial, SlipConfig(physics=p)) for p in (SlipPhysics(), bare))
+    trial = cube_trial(0.125, DOWN[None])  # grasped from above, through its middle
+    bare = SlipConfig(
+        physics=SlipPhysics(pads=None, mass_floor_kg=0.0),
+        engine=BulletSettings(iterations=50, friction_anchor=False, replay=Replay()),
+    )
+    ours, default = (run_slip_test(trial, config) for config in (SlipConfig(), bare))
     tried = np.ones(1, dtype=bool)
     return {
         "box_slip_mm": 1e3 * float(ours.slip_m.max()),

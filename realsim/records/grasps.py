@@ -26,7 +26,8 @@ class Measure:
 
 MEASURES = {
     "force_n": Measure(
-        unit="N", meaning="least normal force of the weaker finger; NaN = not executed",
+        unit="N",
+        meaning="least normal force of the weaker finger; NaN = not executed",
         by_stage=True,
     ),
     "duration_s": Measure(
@@ -40,7 +41,8 @@ MEASURES = {
         unit="1", meaning="agreement of the two engines, 0 to 1: 1 - |difference of the scores|"
     ),
     "least_friction": Measure(
-        unit="1", meaning="smallest friction at which all four stages are passed; inf = at none tried"
+        unit="1",
+        meaning="smallest friction at which all four stages are passed; inf = at none tried",
     ),
     "least_force_n": Measure(
         unit="N", meaning="smallest finger force at which all four stages are passed; inf likewise"
@@ -125,7 +127,8 @@ def _checked_measures(measures: dict[str, Array], n: int) -> dict[str, Array]:
     checked: dict[str, Array] = {}
     for name, values in measures.items():
         if name not in MEASURES:
-            raise InputError(f"'{name}' is no measure of a grasp; there are: {', '.join(MEASURES)}.")
+            known = ", ".join(MEASURES)
+            raise InputError(f"'{name}' is no measure of a grasp; there are: {known}.")
         shape = (n, len(STAGES)) if MEASURES[name].by_stage else (n,)
         checked[name] = frozen(values, np.float64, shape, name)
     return checked

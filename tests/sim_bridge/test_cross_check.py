@@ -1,13 +1,12 @@
 """Two engines' verdicts on the same grasps, and the interval of their agreement."""
 
-from itertools import product
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from realsim.geometry import se3
+from held_boxes import held_box, held_from_above
 from realsim.records import MEASURES, GraspSet
 from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.school.cross_check import (
@@ -16,38 +15,14 @@ from realsim_sim_bridge.school.cross_check import (
     cross_check,
     wilson_interval,
 )
-from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
-from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.world import SlipPhysics
-
-DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-SIDE = 0.05
 
 
 def trial(off_m, mass=0.3):
-    half = np.array([0.14, SIDE, SIDE]) / 2
-    corners = np.array(list(product((-1.0, 1.0), repeat=3))) * half
-    squares = (2 * half) ** 2
-    body = SlipBody(
-        parts=(corners,),
-        mass_kg=mass,
-        center_of_mass=np.zeros(3),
-        inertia=np.diag(mass / 12 * (squares.sum() - squares)),
-    )
-    n = len(off_m)
-    Ts = np.repeat(se3.from_rt(DOWN, np.zeros(3))[None], n, axis=0)
-    Ts[:, 0, 3] = off_m
-    return SlipTrial(
-        body=body,
-        Ts_obj_grasp=Ts,
-        Ts_table_grasp=Ts,
-        openings_m=np.full(n, SIDE + 0.008),
-        joint5_axes=np.tile([0.0, 1.0, 0.0], (n, 1)),
-        joint5_points=np.tile([-0.088, 0.0, -0.21], (n, 1)),
-        joint5_ranges=np.tile([-2.0, 2.0], (n, 1)),
-    )
+    return held_from_above(held_box(mass, length=0.14), off_m)
 
 
 def checked(t, physics, second):

@@ -11,7 +11,6 @@ from realsim.models.library_records import KnownSolid
 from realsim.models.model_records import ConvexParts
 from realsim.models.properties import physical_properties
 from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
-from realsim_sim_bridge.slip.hull_margin import drawn_in
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
 from realsim_sim_bridge.scenes.stable_state import (
     HEADERS,
@@ -22,6 +21,7 @@ from realsim_sim_bridge.scenes.stable_state import (
 from realsim_sim_bridge.scenes.stand_picture import outline, stand_picture
 from realsim_sim_bridge.scenes.table_world import TableWorld
 from realsim_sim_bridge.scenes.world_config import WorldConfig
+from realsim_sim_bridge.slip.hull_margin import drawn_in
 
 SIDE = 0.05
 ONE_SECOND = StandConfig(shortest_s=1.0, longest_s=1.0, rest_s=0.25)

@@ -1,51 +1,22 @@
 """Margins: how little friction and force a grasp survives."""
 
-from itertools import product
 
 import numpy as np
 import pytest
 
+from held_boxes import held_box, held_from_above
 from realsim.errors import InputError
-from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.school.sweep import SweepConfig, find_levels, run_sweep, sweep_margins
-from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from realsim_sim_bridge.slip.score import ScoreLimits
-from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.world import SlipPhysics
 
-DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
-SIDE = 0.05
 GRAVITY = 9.81
 PEAK = 11.6
 """Greatest acceleration that any of the stages asks the pads to carry on a centred box [m/s^2]."""
 LEVELS = (1.0, 0.7, 0.5, 0.35, 0.2, 0.1, 0.05)
-
-
-def box(mass, length=SIDE):
-    """A box `length` long along its x, held across the 5 cm of its y."""
-    half = np.array([length, SIDE, SIDE]) / 2
-    corners = np.array(list(product((-1.0, 1.0), repeat=3))) * half
-    squares = (2 * half) ** 2
-    inertia = np.diag(mass / 12 * (squares.sum() - squares))
-    return SlipBody(parts=(corners,), mass_kg=mass, center_of_mass=np.zeros(3), inertia=inertia)
-
-
-def trial(body, off_m=(0.0,)):
-    """Grasps from above, each `off_m` beside the centre of mass along x."""
-    n = len(off_m)
-    Ts = np.repeat(se3.from_rt(DOWN, np.zeros(3))[None], n, axis=0)
-    Ts[:, 0, 3] = off_m
-    return SlipTrial(
-        body=body,
-        Ts_obj_grasp=Ts,
-        Ts_table_grasp=Ts,
-        openings_m=np.full(n, SIDE + 0.008),
-        joint5_axes=np.tile([0.0, 1.0, 0.0], (n, 1)),
-        joint5_points=np.tile([-0.088, 0.0, -0.21], (n, 1)),
-        joint5_ranges=np.tile([-2.0, 2.0], (n, 1)),
-    )
 
 
 def measured(t, sweep, physics=None, engine="pybullet"):
@@ -143,7 +114,7 @@ def test_the_least_friction_and_force_are_coulomb_s(engine, mass):
         search="every",
     )
     physics = SlipPhysics(force_n=force_n, friction=friction)
-    found = measured(trial(box(mass)), sweep, physics, engine)
+    found = measured(held_from_above(held_box(mass)), sweep, physics, engine)
     assert found.friction.least == pytest.approx([peak * 1.05 / (2 * force_n)])
     assert found.force.least == pytest.approx([peak * 1.05 / (2 * friction)])
     assert found.measures()["margin"] == pytest.approx([0.5])
@@ -155,7 +126,7 @@ def test_off_centre_grasps_and_heavy_objects_need_more():
     physics = SlipPhysics(force_n=20.0)
     by_mass = {}
     for mass in (0.15, 0.6):
-        t = trial(box(mass, length=0.14), off_m=(0.0, 0.03, 0.055))
+        t = held_from_above(held_box(mass, length=0.14), off_m=(0.0, 0.03, 0.055))
         by_mass[mass] = measured(t, sweep, physics).measures()
         least, margin = by_mass[mass]["least_friction"], by_mass[mass]["margin"]
         assert np.all(np.diff(least) >= 0) and least[2] > least[0]
@@ -166,7 +137,7 @@ def test_off_centre_grasps_and_heavy_objects_need_more():
 
 
 def test_a_sweep_repeats_to_the_bit_and_leaves_the_first_verdict_alone():
-    t = trial(box(0.3), off_m=(0.0, 0.02))
+    t = held_from_above(held_box(0.3), off_m=(0.0, 0.02))
     sweep = SweepConfig(frictions=(1.0, 0.2, 0.02), forces_n=(70.0, 2.0))
     first, again = (measured(t, sweep) for _ in range(2))
     assert np.array_equal(first.friction.scores, again.friction.scores, equal_nan=True)
@@ -175,7 +146,7 @@ def test_a_sweep_repeats_to_the_bit_and_leaves_the_first_verdict_alone():
 
 
 def test_the_measures_are_those_of_the_sweep():
-    t, config = trial(box(0.3)), SlipConfig()
+    t, config = held_from_above(held_box(0.3)), SlipConfig()
     engine = make_engine(config.engine)
     slips = run_slip_test(t, config, engine=engine)
     sweep = SweepConfig(frictions=(1.0, 0.2, 0.02), forces_n=(70.0, 2.0))

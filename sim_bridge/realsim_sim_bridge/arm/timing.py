@@ -33,7 +33,7 @@ class TimingConfig:
     acceleration_share: float = 0.3
     """Share of the joints' greatest accelerations, likewise."""
     approach_speed: float = 0.15
-    """Greatest speed of the straight approach [m/s]: slow beside an object, chosen, not measured."""
+    """Greatest speed of the straight approach [m/s]: slow beside an object; a choice."""
     close_speed: float = 0.1
     """Speed of each finger [m/s]: the Franka Hand's top speed."""
     close_settle_s: float = 0.2

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.graspit_scene import QuaternionOrder, read_graspit_scene
-from realsim.formats.graspnet_scene import read_graspnet_scene
+from realsim.formats.graspit_scene import GraspitScene, QuaternionOrder, read_graspit_scene
+from realsim.formats.graspnet_scene import GraspnetScene, read_graspnet_scene
 from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
@@ -33,13 +33,7 @@ def from_graspit_yaml(
 ) -> SchoolScene:
     """Return the scene of a scene.yaml; see `read_graspit_scene`."""
     found = read_graspit_scene(path, order=order, meshes=meshes)
-    return SchoolScene(
-        scene=found.scene,
-        models=found.models,
-        solids=known_solids(found.models, matter),
-        supports=tuple(supports),
-        notes=found.notes,
-    )
+    return _with_matter(found, matter, supports)
 
 
 def from_graspnet(
@@ -53,6 +47,13 @@ def from_graspnet(
 ) -> SchoolScene:
     """Return a scene of GraspNet-1Billion; see `read_graspnet_scene`."""
     found = read_graspnet_scene(folder, models, camera=camera, view=view)
+    return _with_matter(found, matter, supports)
+
+
+def _with_matter(
+    found: GraspitScene | GraspnetScene, matter: Matter | None, supports: Sequence[Support]
+) -> SchoolScene:
+    """Return what a reader found, with masses, convex parts and what stands around."""
     return SchoolScene(
         scene=found.scene,
         models=found.models,

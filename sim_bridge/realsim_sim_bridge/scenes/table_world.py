@@ -20,10 +20,10 @@ from realsim.geometry import se3
 from realsim.models.convex import ConvexConfig, collision_obj, convex_parts
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectPose
-from realsim_sim_bridge.slip.hull_margin import drawn_in
 from realsim_sim_bridge.scenes.school_scene import SchoolScene, Support
 from realsim_sim_bridge.scenes.world_config import WorldConfig
 from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.hull_margin import drawn_in
 
 Array = NDArray[np.float64]
 TABLE = "the table"

@@ -1,0 +1,157 @@
+"""Whether labels depend on how they were made: fast or reference settings, one engine or the other.
+
+The same grasps, all reached by the arm in a scene of ten objects, are tried by both engines in both
+conditions. Held = the object is still between both fingers after all four stages, however far it
+slipped; passed = under the paper's limits, which the same slips tell.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from school_cases import (
+    OBJECTS,
+    NamedTrial,
+    TrialKey,
+    cut_shape,
+    of_density,
+    reached_trial,
+    shapes_by_time,
+)
+from school_conditions import CONDITIONS, MARGINAL_DENSITY, PATIENT, slip_config
+from school_figures import Found
+from school_processes import in_processes
+
+from realsim_sim_bridge.school.cross_check import wilson_interval
+from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.slip_test import run_slip_test
+
+Mask = NDArray[np.bool_]
+ENGINES = ("pybullet", "mujoco")
+FULL = (40, 16)
+"""Grasps of each object, and how many of them are tried with the reference settings as well."""
+QUICK = (5, 3)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Attempt:
+    """Grasps of an object, and how they are tried."""
+
+    named: NamedTrial
+    engine: str
+    condition: str
+    reference: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Labels:
+    """What came of it."""
+
+    held: Mask
+    passed: Mask
+    """(N,) each."""
+
+
+def labels_of(attempt: Attempt) -> Labels:
+    """Return the labels of an object's grasps."""
+    trial = attempt.named.trial
+    if attempt.condition == "marginal":
+        trial = of_density(trial, MARGINAL_DENSITY)
+    config = slip_config(
+        attempt.engine, attempt.condition, trial.body.mass_kg, reference=attempt.reference
+    )
+    slips = run_slip_test(trial, config, PATIENT)
+    tried = np.ones(len(trial), dtype=np.bool_)
+    _, score = score_stages(slips.slip_m, slips.slip_rad, tried, ScoreLimits())
+    return Labels(held=slips.passed, passed=score >= 1.0)
+
+
+def agreement(seed: int, keep: Path, quick: bool) -> Found:
+    """Return the agreement of settings and of engines."""
+    grasps, judged = QUICK if quick else FULL
+    in_processes(cut_shape, [(name, keep) for name in shapes_by_time(quick)], 2)
+    keys = [
+        TrialKey(seed=seed, instance=k, grasps=grasps, keep=keep, quick=quick)
+        for k in range(OBJECTS)
+    ]
+    trials = [t for t in in_processes(reached_trial, keys, 2) if t is not None]
+    firsts = [
+        NamedTrial(name=t.name, instance=t.instance, trial=t.trial.part(slice(0, judged)))
+        for t in trials
+    ]
+    attempts = [
+        Attempt(named=t, engine=engine, condition=condition, reference=reference)
+        for reference, engine, condition in product((True, False), ENGINES, CONDITIONS)
+        for t in (firsts if reference else trials)
+    ]
+    found = in_processes(labels_of, attempts, 2)
+    table: dict[tuple[str, str, bool], list[Labels]] = {}
+    for attempt, labels in zip(attempts, found, strict=True):
+        key = (attempt.engine, attempt.condition, attempt.reference)
+        table.setdefault(key, []).append(labels)
+    return _figures(table, [t.name for t in trials])
+
+
+def _figures(table: dict[tuple[str, str, bool], list[Labels]], names: list[str]) -> Found:
+    """Return the figures out of all labels by engine, condition and settings, one an object."""
+    found = Found()
+    fast: dict[str, float] = {}
+    for engine, condition in product(ENGINES, CONDITIONS):
+        reference = table[engine, condition, True]
+        first = [
+            Labels(held=a.held[: len(b.held)], passed=a.passed[: len(b.held)])
+            for a, b in zip(table[engine, condition, False], reference, strict=True)
+        ]
+        fast[f"{engine}, {condition}"] = _share(first, reference, "held")
+        found.notes.append(
+            f"fast and reference settings, {engine}, {condition}: "
+            f"{_words(first, reference, 'held')}; {_words(first, reference, 'passed')}"
+        )
+    where = min(fast, key=lambda k: fast[k])
+    count = sum(len(r.held) for r in table["pybullet", "plain", True])
+    found.add("fast_agree_share", fast[where], f"held, {count} grasps; the worst of 4: {where}")
+    for condition in CONDITIONS:
+        a, b = (table[engine, condition, False] for engine in ENGINES)
+        key = "engines_agree_share" if condition == "plain" else "engines_agree_marginal_share"
+        found.add(key, _share(a, b, "held"), _words(a, b, "held"))
+        found.notes.append(f"engines, {condition}: {_words(a, b, 'passed')}")
+        by_object = [
+            f"{name} {int(np.sum(x.held != y.held))}"
+            for name, x, y in zip(names, a, b, strict=True)
+        ]
+        found.notes.append(f"engines, {condition}, differing held labels: {', '.join(by_object)}")
+    both = [x.held for engine in ENGINES for x in table[engine, "marginal", False]]
+    dropped = 1.0 - float(np.mean(np.concatenate(both)))
+    found.add("marginal_dropped_share", dropped, "not held, the mean of both engines")
+    found.cases["agreement"] = {
+        ", ".join((engine, condition, "reference" if reference else "fast")): {
+            name: ["".join("01"[int(v)] for v in x.held), "".join("01"[int(v)] for v in x.passed)]
+            for name, x in zip(names, labels, strict=True)
+        }
+        for (engine, condition, reference), labels in table.items()
+    }
+    return found
+
+
+def _same(a: list[Labels], b: list[Labels], kind: str) -> Mask:
+    """Return whether each label is the same, all objects one after the other."""
+    first = np.concatenate([getattr(x, kind) for x in a])
+    return first == np.concatenate([getattr(x, kind) for x in b])
+
+
+def _share(a: list[Labels], b: list[Labels], kind: str) -> float:
+    """Return the share of equal labels."""
+    return float(np.mean(_same(a, b, kind)))
+
+
+def _words(a: list[Labels], b: list[Labels], kind: str) -> str:
+    """Return the agreement in words, with its 95 % interval."""
+    same = _same(a, b, kind)
+    low, high = wilson_interval(int(same.sum()), len(same))
+    shares = [100 * float(np.mean(np.concatenate([getattr(x, kind) for x in s]))) for s in (a, b)]
+    return (
+        f"{kind} {same.mean():.3f} [{low:.3f}, {high:.3f}] of {len(same)} grasps "
+        f"({shares[0]:.0f} and {shares[1]:.0f} % {kind})"
+    )
