@@ -80,7 +80,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--quick", action="store_true", help="one small loop, under 50 s")
+    parser.add_argument("--quick", action="store_true", help="one small loop, about a minute")
     parser.add_argument("--seeds", type=int, default=1, help="loops to run; figures are medians")
     args = parser.parse_args()
     config = {"views": 6, "objects": 2, "grasps_per_object": 10} if args.quick else {}

@@ -135,8 +135,9 @@ def day(staff: AbstractContextManager[Workers], case: SchoolCase, config: School
         pupils = [Pupil(task=task, folder=None, shard_grasps=shard_grasps) for task in tasks]
         Day(counted, pupils, None).run()
         cost = time.process_time() - begin, time.perf_counter() - wall
+    own_jobs_s = counted.busy.get(str(os.getpid()), 0.0)  # a single worker is this process
     return Run(
-        asking_s=cost[0],
+        asking_s=cost[0] - own_jobs_s,
         busy_s=tuple(counted.busy.values()),
         wall_s=cost[1],
         candidates=sum(len(p.result.grasp_set) for p in pupils if p.result is not None),
@@ -180,18 +181,9 @@ def runs(job: ScalingJob) -> tuple[Run, Run]:
     )
     size = SHARD_GRASPS_QUICK if job.quick else SHARD_GRASPS
     if job.kind == "processes":
-        one, two = (day(_processes(n), case, config, size, n) for n in (1, 2))
+        one, two = (day(local_workers(n), case, config, size, n) for n in (1, 2))
         return one, two
     return _on_nodes(case, config, size)
-
-
-def _processes(count: int) -> AbstractContextManager[Workers]:
-    """Return so many processes beside this one; one as well, as a node is one."""
-    from realsim_sim_bridge.school import workers
-
-    if count > 1:
-        return local_workers(count)
-    return workers.beside(1)
 
 
 def _on_nodes(case: SchoolCase, config: SchoolConfig, size: int) -> tuple[Run, Run]:

@@ -14,6 +14,7 @@ from realsim.app.school_inputs import (
     read_inputs,
     session_inputs,
 )
+from realsim.app.school_settle import warn_of_falls
 from realsim.records import Scene
 from realsim.store import SessionStore
 
@@ -97,6 +98,7 @@ def try_grasps(
     inputs: SchoolInputs, config: "SchoolConfig", request: SchoolRequest, console: Console
 ) -> SchoolOutcome:
     """Run the school and write everything that comes out of it."""
+    warn_of_falls(inputs, console)
     outcome = _tried(inputs, config, request, console)
     with console.stage("write", "files and pictures"):
         write_outcome(outcome)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from realsim.app.console import Console
 from realsim.app.register_files import plain
 from realsim.app.school_inputs import CACHE, SchoolInputs, SchoolRequest, is_session, read_inputs
+from realsim.errors import InputError
 from realsim.store import atomic
 
 if TYPE_CHECKING:
@@ -59,6 +60,37 @@ def settle(
     if json_file is not None:
         atomic.write_json(json_file, as_json(report))
     return report.stable
+
+
+def warn_of_falls(inputs: SchoolInputs, console: Console) -> None:
+    """Say which objects of a scene do not stand, and keep the picture of it with the results.
+
+    Grasps of an object that jumps or falls are tried all the same: the slip test holds it alone.
+    """
+    from realsim_sim_bridge.scenes.stable_state import stable_state
+    from realsim_sim_bridge.scenes.stand_picture import stand_picture
+    from realsim_sim_bridge.scenes.table_world import TableWorld
+
+    try:
+        scene = school_scene(inputs, console)
+        with (
+            console.stage("settle", f"{len(scene.scene.objects)} objects"),
+            TableWorld(scene, cache=inputs.folder / CACHE) as world,
+        ):
+            report = stable_state(world)
+    except InputError as error:  # an object without volume: the School says so of that object alone
+        console.warn(f"whether the objects stand could not be looked at: {error}")
+        return
+    for o in report.objects:
+        if o.verdict != "stands":
+            console.warn(f"'{o.name}' does not stand ({o.verdict}): {o.sentence}")
+    for a, b, depth_m in report.inside:
+        console.warn(f"{a} and {b} are {1e3 * depth_m:.1f} mm inside one another.")
+    picture = stand_picture(scene, report)
+    if inputs.store is not None:
+        inputs.store.write_bytes(f"reports/{PICTURE}", picture)
+    else:
+        atomic.write_bytes(inputs.folder / "reports" / PICTURE, picture)
 
 
 def school_scene(inputs: SchoolInputs, console: Console) -> "SchoolScene":

@@ -1,6 +1,5 @@
 """Two engines' verdicts on the same grasps, and the interval of their agreement."""
 
-
 import numpy as np
 import pytest
 from hypothesis import given

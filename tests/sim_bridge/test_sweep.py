@@ -1,6 +1,5 @@
 """Margins: how little friction and force a grasp survives."""
 
-
 import numpy as np
 import pytest
 
