@@ -100,7 +100,7 @@ def _kind(failure: str) -> str:
     stage, mark, why = failure.partition(": ")
     if mark and stage in STAGES and "slipped" in why and "turned" in why:
         return f"{stage}: the object slipped or turned too far"
-    return re.sub(r"\d+\.\d+", "...", failure)
+    return re.sub(r":[^:]*\d+\.\d+.*", "", failure)
 
 
 def reason_rows(sets: Sequence[GraspSet]) -> Rows:
@@ -111,7 +111,7 @@ def reason_rows(sets: Sequence[GraspSet]) -> Rows:
     rows = [[why, str(n), f"{100 * n / total:.1f}"] for why, n in shown]
     if rest:
         others = sum(n for _, n in rest)
-        rows.append([f"{len(rest)} other reasons", str(others), f"{100 * others / total:.1f}"])
+        rows.append([f"other reasons ({len(rest)})", str(others), f"{100 * others / total:.1f}"])
     return rows
 
 

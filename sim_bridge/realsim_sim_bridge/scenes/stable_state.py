@@ -124,7 +124,7 @@ def stand_rows(report: StandReport) -> list[tuple[str, ...]]:
             f"{o.turned_deg:.1f}",
             f"{o.jump_m_s:.2f}",
             f"{1e3 * max(o.into.values(), default=0.0):.1f}",
-            o.sentence,
+            "" if o.verdict == "stands" else o.sentence,
         )
         for o in report.objects
     ]

@@ -1,6 +1,7 @@
 """The first job of an object in the school: its candidates, and which of them the arm takes."""
 
 import hashlib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,8 @@ class ObjectTask:
     """(4, 4) [m]."""
     neighbours: Surroundings
     """The surfaces of all other objects, table frame."""
+    names: tuple[tuple[int, str], ...]
+    """Instance and name of every object of the scene: reasons speak of neighbours by name."""
     middle_xy: tuple[float, float]
     """Middle of the scene on the table [m]."""
     config: SchoolConfig
@@ -168,7 +171,7 @@ def prepare(task: ObjectTask) -> Prepared:
         rng,
         config.slip.motion,
     )
-    notes["counts"] |= {"reachable": int(reach.reachable.sum()), "planned": reach.planned}
+    notes["counts"] |= {"reachable": int(reach.reachable.sum()), "by_a_planned_path": reach.planned}
     notes["arm"] = {"stage_possible": reach.stage_possible.tolist(), "notes": list(reach.notes)}
     closure = force_closure(
         task.mesh,
@@ -187,12 +190,22 @@ def prepare(task: ObjectTask) -> Prepared:
         reachable=reach.reachable,
         joints=reach.joints,
         joints_lifted=reach.joints_lifted,
-        reasons=reach.reasons,
+        reasons=tuple(_with_names(reason, dict(task.names)) for reason in reach.reasons),
         trajectories=reach.trajectories,
         measures=closure.measures(),
         body=body,
         notes=notes,
     )
+
+
+def _with_names(reason: str, names: dict[int, str]) -> str:
+    """Return a reason with names in place of instance numbers."""
+
+    def named(found: re.Match[str]) -> str:
+        instance = int(found[1])
+        return f"'{names[instance]}' (instance {instance})" if instance in names else found[0]
+
+    return re.sub(r"the object of instance (\d+)", named, reason)
 
 
 def not_prepared(why: str) -> Prepared:

@@ -31,6 +31,8 @@ RESULTS_VERSION = 3
 PACKAGES = ("realsim", "numpy", "numba", "scipy", "coacd", "eaik", "coal", "pin", "ompl", "toppra")
 """Besides the engines: what the grasps and trajectories come from."""
 ABSENT = "(nothing)"
+MOST_TOLD = 8
+"""Changed fields that a refusal names; another engine changes them all."""
 
 
 def versions(config: SchoolConfig) -> dict[str, str]:
@@ -119,7 +121,9 @@ def _refuse_others(folder: Path, path: Path, record: dict[str, Any]) -> None:
         ) from None
     changed = list(differences(old, record))
     if changed:
-        told = "".join(f"\n  {field}: {was} -> {now}" for field, was, now in changed)
+        told = "".join(f"\n  {field}: {was} -> {now}" for field, was, now in changed[:MOST_TOLD])
+        if len(changed) > MOST_TOLD:
+            told += f"\n  and {len(changed) - MOST_TOLD} more"
         raise InputError(
             f"{folder} holds a run that was started with something else:{told}\n{remedy}"
         )

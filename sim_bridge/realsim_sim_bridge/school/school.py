@@ -189,6 +189,7 @@ def object_tasks(
                 density=model.density,
                 T_table_obj=Ts[obj.instance],
                 neighbours=together([s for i, s in surfaces.items() if i != obj.instance]),
+                names=tuple((o.instance, models[o.obj_id].name) for o in scene.objects),
                 middle_xy=(float(middle[0]), float(middle[1])),
                 config=config,
                 cache=cache,
