@@ -9,8 +9,8 @@ JSON's "figures"):
                       candidates, the arm's reach and four stages, per second of two processes on
                       two cores, counted in CPU seconds
               mujoco_marginal_grasps_per_s, marginal_speed_dropped_share
-                      the same at 500 kg/m^3, friction 0.3 and six weights carried
-              plans_per_s, candidates_per_s, candidates_above_table_per_s
+                      the same at 500 kg/m^3, friction 0.3 and twelve weights carried
+  steps       plans_per_s, candidates_per_s, candidates_above_table_per_s
                       of one core: collision-free trajectories; turned hands, those not in the table
   validation  coulomb_worst_pct, torque_worst_pct, box_score, box_slip_mm, box_slip_deg,
               light_convergence_share, suite_checks_failed
@@ -48,11 +48,12 @@ from typing import Any
 import numpy as np
 from school_acronym import acronym
 from school_agreement import agreement
-from school_cases import KEEP
+from school_cases import KEEP, cut_shapes, library
 from school_figures import FIGURES, Found
 from school_margins import margins
 from school_scaling import extrapolation, scaling
 from school_speed import speed
+from school_steps import first_steps
 from school_validation import validation
 
 from realsim.app.console import Console
@@ -60,6 +61,7 @@ from realsim.app.console import Console
 PACKAGES = ("realsim", "numpy", "scipy", "numba", "pybullet", "mujoco", "coacd", "ray")
 PARTS: dict[str, Callable[[int, Path, bool], Found]] = {
     "speed": speed,
+    "steps": first_steps,
     "validation": validation,
     "agreement": agreement,
     "margins": margins,
@@ -91,6 +93,18 @@ def print_table(console: Console, found: Found) -> None:
         console.say(f"{key}: {words}")
     for note in found.notes:
         console.say(note)
+
+
+def say_objects(console: Console, keep: Path, quick: bool) -> None:
+    """Cut the objects, once for all runs, and print into how many convex parts."""
+    start = time.perf_counter()
+    cut_shapes(keep, quick)
+    solids = {m.name: s.parts for m, s in library(keep, quick).values()}
+    words = [f"{n} {len(p.parts)} ({p.volume_ratio:.2f})" for n, p in solids.items()]
+    console.say(
+        f"convex parts (volume over the mesh's): {', '.join(words)}; "
+        f"{time.perf_counter() - start:.0f} s"
+    )
 
 
 def document_of(
@@ -154,6 +168,7 @@ def main() -> None:
     found = Found()
     failures: dict[str, str] = {}
     arguments.keep.mkdir(parents=True, exist_ok=True)
+    say_objects(console, arguments.keep, arguments.quick)
     for name in arguments.parts:
         start = time.perf_counter()
         try:

@@ -32,7 +32,7 @@ ENGINES = ("pybullet", "mujoco")
 DENSITY = 150.0
 """ACRONYM's [kg/m^3]."""
 CONVEX = ConvexConfig(thresholds=(0.05,), max_parts=32)
-EACH, EACH_QUICK = 48, 8
+EACH, EACH_QUICK = 48, 5
 """Grasps of either label."""
 RESAMPLES = 2000
 
@@ -76,7 +76,7 @@ def acronym(seed: int, keep: Path, quick: bool) -> Found:
         for engine in ENGINES
         for k in range(2)
     ]
-    held = in_processes(held_by, halves, 2)
+    held = in_processes(held_by, halves)
     truth = label[rows]
     for n, engine in enumerate(ENGINES):
         ours = np.zeros(len(rows), dtype=np.bool_)

@@ -15,10 +15,8 @@ from school_cases import (
     OBJECTS,
     NamedTrial,
     TrialKey,
-    cut_shape,
     of_density,
     reached_trial,
-    shapes_by_time,
 )
 from school_conditions import CONDITIONS, MARGINAL_DENSITY, PATIENT, slip_config
 from school_figures import Found
@@ -32,7 +30,9 @@ Mask = NDArray[np.bool_]
 ENGINES = ("pybullet", "mujoco")
 FULL = (40, 16)
 """Grasps of each object, and how many of them are tried with the reference settings as well."""
-QUICK = (5, 3)
+QUICK = (3, 1)
+FEW_OBJECTS = 6
+"""Of the short run."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -71,12 +71,11 @@ def labels_of(attempt: Attempt) -> Labels:
 def agreement(seed: int, keep: Path, quick: bool) -> Found:
     """Return the agreement of settings and of engines."""
     grasps, judged = QUICK if quick else FULL
-    in_processes(cut_shape, [(name, keep) for name in shapes_by_time(quick)], 2)
     keys = [
         TrialKey(seed=seed, instance=k, grasps=grasps, keep=keep, quick=quick)
-        for k in range(OBJECTS)
+        for k in range(FEW_OBJECTS if quick else OBJECTS)
     ]
-    trials = [t for t in in_processes(reached_trial, keys, 2) if t is not None]
+    trials = [t for t in in_processes(reached_trial, keys) if t is not None]
     firsts = [
         NamedTrial(name=t.name, instance=t.instance, trial=t.trial.part(slice(0, judged)))
         for t in trials
@@ -86,7 +85,7 @@ def agreement(seed: int, keep: Path, quick: bool) -> Found:
         for reference, engine, condition in product((True, False), ENGINES, CONDITIONS)
         for t in (firsts if reference else trials)
     ]
-    found = in_processes(labels_of, attempts, 2)
+    found = in_processes(labels_of, attempts)
     table: dict[tuple[str, str, bool], list[Labels]] = {}
     for attempt, labels in zip(attempts, found, strict=True):
         key = (attempt.engine, attempt.condition, attempt.reference)

@@ -12,13 +12,17 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from school_processes import in_processes
 from school_shapes import SHAPES
 
+from realsim.geometry import se3
+from realsim.geometry.parts import part
 from realsim.models.convex import ConvexConfig, convex_parts
 from realsim.models.library_records import KnownSolid
 from realsim.models.properties import physical_properties
-from realsim.records import ObjectModel, Scene, SupportPlane
+from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.registration.simulated import TableLabConfig, scatter_objects
+from realsim_sim_bridge.grasping.candidate_config import CandidateConfig
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.object_slips import trial_of
 from realsim_sim_bridge.school.object_task import ObjectTask, prepare
@@ -35,6 +39,8 @@ QUICK_KINDS = ("mug", "pipe", "ring", "pulley", "flange", "gear")
 """Those that are cut in 4 s each at most."""
 LAYOUT = TableLabConfig(disc_m=0.20, gap_m=0.01)
 """A table that is full, but on which fingers fit between the objects."""
+FEW_POINTS = 250
+"""Surface points of the short run."""
 KEEP = Path(tempfile.gettempdir()) / "realsim_school_benchmark"
 WIDER_M = 0.01
 """By so much the disc is widened until all objects find room [m]."""
@@ -54,16 +60,20 @@ def library(keep: Path, quick: bool) -> dict[int, tuple[ObjectModel, KnownSolid]
     return found
 
 
-def cut_shape(job: tuple[str, Path]) -> None:
+def cut_shapes(keep: Path, quick: bool) -> None:
+    """Put all objects' convex parts into the folder, two at a time."""
+    in_processes(_cut_shape, [(name, keep) for name in (QUICK_KINDS if quick else SHAPES)])
+
+
+def _cut_shape(job: tuple[str, Path]) -> None:
     """Put one object's convex parts into the folder."""
     name, keep = job
     convex_parts(SHAPES[name](), CONVEX, keep / "convex")
 
 
-def shapes_by_time(quick: bool) -> list[str]:
-    """Return the names of the kinds, those that take longest to cut first."""
-    last = [n for n in QUICK_KINDS if n != "mug"]
-    return (["mug"] if quick else [n for n in SHAPES if n not in last]) + last
+def candidate_config(quick: bool) -> CandidateConfig:
+    """Return how candidates are sampled; the short run has a tenth of the grasps."""
+    return CandidateConfig(surface_points=FEW_POINTS) if quick else CandidateConfig()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -130,6 +140,27 @@ def tasks_of(case: SchoolCase, config: SchoolConfig) -> list[ObjectTask]:
     return object_tasks(case.scene, case.models, config, None, case.solids)
 
 
+def two_boxes() -> SchoolCase:
+    """Return two cubes on a table, for whatever has to be done once."""
+    model = part("cube")
+    height = float(model.mesh.extent[2]) / 2
+    parts = convex_parts(model.mesh, ConvexConfig())
+    matter = physical_properties(model.mesh, density=model.density)
+    objects = tuple(
+        ObjectPose(
+            obj_id=model.obj_id,
+            instance=k,
+            T_world_obj=se3.from_translation([0.2 * k, 0.0, height]),
+        )
+        for k in range(2)
+    )
+    return SchoolCase(
+        scene=Scene(name="boxes", objects=objects, plane=SupportPlane(T_world_table=np.eye(4))),
+        models={model.obj_id: model},
+        solids={model.obj_id: KnownSolid(parts=parts, matter=matter)},
+    )
+
+
 # --- grasps without the school around them -----------------------------------------------------
 
 
@@ -162,7 +193,9 @@ def reached_trial(key: TrialKey) -> NamedTrial | None:
     """Return grasps of an object that the arm reaches in the scene; None = there is none."""
     case = school_case(key.seed, key.keep, key.quick)
     most = round(CANDIDATES_PER_GRASP * key.grasps)
-    config = SchoolConfig(seed=key.seed, max_candidates=most)
+    config = SchoolConfig(
+        seed=key.seed, max_candidates=most, candidates=candidate_config(key.quick)
+    )
     task = next(t for t in tasks_of(case, config) if t.instance == key.instance)
     prepared = prepare(task)
     rows = prepared.tested

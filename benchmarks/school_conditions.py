@@ -16,8 +16,9 @@ CONDITIONS = ("plain", "marginal")
 MARGINAL_DENSITY = 500.0
 """[kg/m^3]."""
 MARGINAL_FRICTION = 0.3
-MARGINAL_FACTOR = 3.0
-"""The force is this many weights over the friction, so two fingers carry six weights."""
+MARGINAL_FACTOR = 6.0
+"""The force is this many weights over the friction, so two fingers carry twelve weights, and the
+load's lever drops a third of these objects; with half of it, nearly half."""
 PATIENT = ScoreLimits(slip_m=0.05, slip_deg=360.0)
 """Under these a grasp is held whose object is between both fingers at the end of all stages,
 however far it slipped."""

@@ -7,13 +7,12 @@ friction and the least force that a grasp survives, has few.
 from pathlib import Path
 
 import numpy as np
-from school_cases import cut_shape, school_case, shapes_by_time
+from school_cases import candidate_config, school_case
 from school_conditions import slip_config
 from school_figures import Found
-from school_processes import in_processes, spent
+from school_processes import spent
 
 from realsim.formats.scene_grasps import executed
-from realsim_sim_bridge.grasping.candidate_config import CandidateConfig
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.measure_statistics import closure_confusions, rank_correlations
 from realsim_sim_bridge.school.school import run_school
@@ -21,7 +20,7 @@ from realsim_sim_bridge.school.sweep import SweepConfig
 
 ENGINE = "mujoco"
 """The fast one: a margin takes nine slip tests."""
-FULL, QUICK = 42, 5
+FULL, QUICK = 42, 3
 """Candidates per object."""
 KEYS = {
     ("score", "margin"): "rank_margin_score",
@@ -34,12 +33,11 @@ KEYS = {
 
 def margins(seed: int, keep: Path, quick: bool) -> Found:
     """Return the rank correlations with their intervals."""
-    in_processes(cut_shape, [(name, keep) for name in shapes_by_time(quick)], 2)
     case = school_case(seed, keep, quick)
     config = SchoolConfig(
         seed=seed,
         max_candidates=QUICK if quick else FULL,
-        candidates=CandidateConfig(surface_points=250) if quick else CandidateConfig(),
+        candidates=candidate_config(quick),
         slip=slip_config(ENGINE, "plain", 1.0),
         sweep=SweepConfig(),
     )

@@ -10,10 +10,13 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from typing import TypeVar
 
 from registration_jobs import die_with_parent
 
+PROCESSES = 2
+"""Of this benchmark, whatever the machine has."""
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
@@ -44,23 +47,34 @@ def _cpu_seconds() -> float:
     return t.user + t.system + t.children_user + t.children_system
 
 
-def in_processes(
-    work: Callable[[Job], Result], jobs: Sequence[Job], processes: int
-) -> list[Result]:
+def in_processes(work: Callable[[Job], Result], jobs: Sequence[Job]) -> list[Result]:
     """Return what the work makes of each job, in their order; the first failure is raised.
+
+    The two processes stay for the next call, with all that they have loaded.
 
     Args:
         work: a function of a module.
         jobs: the dearest first.
-        processes: how many at a time.
     """
+    pool = _pool()
+    try:
+        return list(pool.map(work, jobs))
+    except KeyboardInterrupt:
+        for process in multiprocessing.active_children():
+            process.terminate()
+        pool.shutdown(wait=False, cancel_futures=True)
+        raise
+
+
+@cache
+def _pool() -> ProcessPoolExecutor:
+    """Return this process's pool."""
     context = multiprocessing.get_context("spawn")
-    count = min(processes, max(len(jobs), 1))
-    with ProcessPoolExecutor(count, mp_context=context, initializer=die_with_parent) as pool:
-        try:
-            return list(pool.map(work, jobs))
-        except KeyboardInterrupt:
-            for process in multiprocessing.active_children():
-                process.terminate()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    return ProcessPoolExecutor(PROCESSES, mp_context=context, initializer=die_with_parent)
+
+
+def in_fresh_process(work: Callable[[Job], Result], job: Job) -> Result:
+    """Return what the work makes of a job in a process that has done nothing else."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context, initializer=die_with_parent) as pool:
+        return pool.submit(work, job).result()

@@ -20,18 +20,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from school_cases import SchoolCase, cut_shape, school_case, shapes_by_time, tasks_of
+from school_cases import SchoolCase, candidate_config, school_case, tasks_of
 from school_conditions import slip_config
 from school_figures import PAPER_GRASPS_PER_S, Found
-from school_processes import in_processes
+from school_processes import in_fresh_process
 
-from realsim_sim_bridge.grasping.candidate_config import CandidateConfig
 from realsim_sim_bridge.school.cluster import ClusterConfig, ray_workers
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.day import Day, Pupil
 from realsim_sim_bridge.school.workers import Workers, local_workers
 
-FULL, QUICK = 80, 8
+FULL, QUICK = 80, 6
 """Candidates per object."""
 SHARD_GRASPS, SHARD_GRASPS_QUICK = 24, 8
 """Of a job: small ones, so that the last one does not decide."""
@@ -176,7 +175,7 @@ def runs(job: ScalingJob) -> tuple[Run, Run]:
     config = SchoolConfig(
         seed=job.seed,
         max_candidates=QUICK if job.quick else FULL,
-        candidates=CandidateConfig(surface_points=250) if job.quick else CandidateConfig(),
+        candidates=candidate_config(job.quick),
         slip=slip_config("mujoco", "plain", 1.0),
     )
     size = SHARD_GRASPS_QUICK if job.quick else SHARD_GRASPS
@@ -220,12 +219,11 @@ def _on_nodes(case: SchoolCase, config: SchoolConfig, size: int) -> tuple[Run, R
 
 def scaling(seed: int, keep: Path, quick: bool) -> Found:
     """Return both scalings."""
-    in_processes(cut_shape, [(name, keep) for name in shapes_by_time(quick)], 2)
     found = Found()
     for kind, key in (("processes", "workers_scaling"), ("nodes", "ray_nodes_scaling")):
         job = ScalingJob(kind=kind, seed=seed, keep=keep, quick=quick)
         try:
-            one, two = in_processes(runs, [job], 1)[0]
+            one, two = in_fresh_process(runs, job)
         except ImportError as error:
             found.notes.append(f"scaling: {kind} not run: {error}")
             continue

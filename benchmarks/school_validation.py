@@ -22,7 +22,7 @@ from realsim_sim_bridge.validation.suite import validate
 ENGINES = ("pybullet", "mujoco")
 RIVAL = "PyBullet's own settings"
 LIGHT_KG = 0.013
-LIGHT_GRASPS, LIGHT_GRASPS_QUICK = 10, 2
+LIGHT_GRASPS, LIGHT_GRASPS_QUICK = 10, 1
 """Grasps of each of the four shapes."""
 QUICK_CHECKS = ("coulomb", "torque", "box")
 
@@ -75,7 +75,7 @@ def validation(seed: int, keep: Path, quick: bool) -> Found:
         for engine in ENGINES
     ]
     jobs += [SuiteJob(engine=RIVAL, part=part, quick=quick) for part in ("coulomb", "box")]
-    reports = dict(zip(jobs, in_processes(run_suite, jobs, 2), strict=True))
+    reports = dict(zip(jobs, in_processes(run_suite, jobs), strict=True))
     found = Found()
     ours = {job: report for job, report in reports.items() if job.engine != RIVAL}
     rival = {job: report for job, report in reports.items() if job.engine == RIVAL}

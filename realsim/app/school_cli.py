@@ -60,6 +60,8 @@ def SCHOOL() -> None:
 @click.option("--rotations", type=click.IntRange(1, 360), default=None,
               help="Approaches tried for each pair of contacts.")  # fmt: skip
 @click.option("--models", type=FOLDER, default=None, help="Models of a SOURCE that is no session.")
+@click.option("--quaternions", type=click.Choice(("wxyz", "xyzw")), default=None,
+              help="Their order in a scene.yaml that does not tell it.")  # fmt: skip
 @click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 256))
 @click.option("--address", default="", metavar="RAY", help="HOST:PORT of a Ray cluster, or local.")
 @click.option("--restart", is_flag=True, help="Throw away results of other parameters.")
@@ -125,6 +127,8 @@ def validate_command(
 @SCHOOL.command("settle")
 @click.argument("source", type=FOLDER)
 @click.option("--models", type=FOLDER, default=None, help="Models of a SOURCE that is no session.")
+@click.option("--quaternions", type=click.Choice(("wxyz", "xyzw")), default=None,
+              help="Their order in a scene.yaml that does not tell it.")  # fmt: skip
 @click.option(
     "--mass", "masses", multiple=True, metavar="NAME=KG", help="A weighed object; repeat."
 )

@@ -55,6 +55,8 @@ class SchoolRequest:
     """Whether results of other parameters are thrown away; "finished" = those of a finished run."""
     models: Path | None = None
     """Folder of the models, where a scene's source has them elsewhere."""
+    quaternions: Literal["wxyz", "xyzw"] | None = None
+    """Their order in a scene.yaml, where its content does not tell it."""
 
     def __post_init__(self) -> None:
         """Check the numbers: physics with them would mean nothing.
@@ -123,6 +125,15 @@ def read_inputs(
                 "`realsim school export` to write them elsewhere."
             )
         return session_inputs(open_session(source), request, console)
+    if not source.exists():
+        raise InputError(
+            f"'{source}' does not exist; a session, a BOP scene, a GraspNet scene or a scene.yaml "
+            "is expected."
+        )
+    if out is None and source.is_file():
+        raise InputError(
+            f"'{source}' is no session, so its results need a folder: add --out FOLDER."
+        )
     if out is None:
         inner = sorted(p.parent for p in source.glob("*/session.json")) if source.is_dir() else []
         hint = f" Did you mean {', '.join(map(str, inner))}?" if inner else ""
@@ -130,6 +141,8 @@ def read_inputs(
             f"'{source}' holds no session.json, so it is not a session.{hint} Give a session, or "
             "a BOP scene, a GraspNet scene or a scene.yaml with --out FOLDER for its results."
         )
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out '{out}' is a file; a folder for the results is expected.")
     if is_session(out):
         raise InputError(f"--out '{out}' is a session; give a folder of its own.")
     return weighed(_of_source(source, out, request, console), request)
@@ -159,7 +172,9 @@ def _of_source(source: Path, out: Path, request: SchoolRequest, console: Console
     from realsim_sim_bridge.scenes.school_scene import Matter
     from realsim_sim_bridge.scenes.source import load_scene_source
 
-    found = load_scene_source(source, Matter(cache=out / CACHE), models=request.models)
+    found = load_scene_source(
+        source, Matter(cache=out / CACHE), models=request.models, order=request.quaternions
+    )
     for note in found.notes:
         console.warn(note)
     return SchoolInputs(
@@ -254,7 +269,7 @@ def base_on_table(path: Path, scene: Scene) -> Array:
 
     if not path.is_file():
         raise InputError(
-            f"the base pose '{path}' does not exist; a JSON file with one of "
+            f"the base pose '{path}' is no file; a JSON file with one of "
             f"{' or '.join(BASE_KEYS)} (4 x 4, metres) is expected, or leave --base-pose away."
         )
     try:

@@ -306,11 +306,7 @@ def _proven(
     a, b = (evidence[o] for o in ORDERS)
     given = (_vote(a.spread_m, b.spread_m), _vote(a.midway_m, b.midway_m))
     votes: set[QuaternionOrder] = {v for v in given if v is not None}
-    words = "; ".join(
-        f"{o}: lowest points within {1e3 * e.spread_m:.1f} mm, grasps "
-        f"{1e3 * e.midway_m:.1f} mm off the middle of their contacts"
-        for o, e in evidence.items()
-    )
+    words = "; ".join(f"{o}: {_in_words(e)}" for o, e in evidence.items())
     if len(votes) == 1:
         order = votes.pop()
         return (
@@ -323,8 +319,18 @@ def _proven(
         return "wxyz", "both orders of the quaternions give the same poses."
     raise InputError(
         f"{path}: the order of the quaternions cannot be told from the content ({words}). Say "
-        "which one it is: order='wxyz' or order='xyzw'."
+        "which one it is: `--quaternions wxyz` or `--quaternions xyzw` (order='wxyz' or 'xyzw')."
     )
+
+
+def _in_words(e: OrderEvidence) -> str:
+    """Return what an order would mean for the content."""
+    spread = f"lowest points within {1e3 * e.spread_m:.1f} mm"
+    if np.isnan(e.spread_m):
+        spread = "one object, nothing to stand level with"
+    if np.isnan(e.midway_m):
+        return f"{spread}, no grasps to compare"
+    return f"{spread}, grasps {1e3 * e.midway_m:.1f} mm off the middle of their contacts"
 
 
 def _vote(wxyz: float, xyzw: float) -> QuaternionOrder | None:

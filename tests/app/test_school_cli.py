@@ -335,7 +335,7 @@ def test_a_base_pose_is_taken_from_world_or_table(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (None, "does not exist"),
+        (None, "is no file"),
         ("{", "no JSON"),
         ("[1, 2]", "no pose"),
         ('{"T_base_world": []}', "no pose"),
@@ -398,7 +398,7 @@ def test_a_scene_out_of_the_arm_s_reach_has_reasons_and_no_scores_above_zero(
 
 def test_sources_that_are_none_are_refused(pristine: Path, tmp_path: Path) -> None:
     assert "no session.json" in refused(tmp_path, *QUICK)
-    assert "no session.json" in refused(tmp_path / "nowhere", *QUICK)
+    assert "does not exist" in refused(tmp_path / "nowhere", *QUICK)
     assert str(pristine) in refused(pristine.parent, *QUICK)
     assert "--out" in refused(pristine, *QUICK, "--out", tmp_path)
     assert "is a session" in refused(tmp_path, *QUICK, "--out", pristine)
@@ -428,3 +428,10 @@ def test_what_is_asked_for_reaches_the_config() -> None:
     assert (config.seed, config.max_candidates) == (3, 7)
     plain = config_of(SchoolRequest(), scene())
     assert plain.second_engine is None and plain.sweep is None
+
+
+def test_a_file_needs_a_folder_for_its_results_and_no_file_is_one(tmp_path: Path) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text("object1: {}\n")
+    assert "add --out FOLDER" in refused(scene, *QUICK)
+    assert "is a file" in refused(scene, *QUICK, "--out", scene)

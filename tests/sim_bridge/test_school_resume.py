@@ -334,6 +334,10 @@ def test_only_a_finished_run_gives_way_to_another(tmp_path, whole):
     other = dataclasses.replace(CONFIG, seed=7)
     run(tmp_path, other)
     assert is_whole_again(run(tmp_path, restart="finished")[0], whole)
+    grasps = names(tmp_path, "grasps")
+    written = [(tmp_path / name).stat().st_mtime_ns for name in grasps]
+    run(tmp_path, restart="finished")
+    assert written == [(tmp_path / name).stat().st_mtime_ns for name in grasps]
     (tmp_path / "finished").unlink()
     with pytest.raises(InputError, match="seed: "):
         run(tmp_path, other, restart="finished")

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from realsim.errors import InputError
-from realsim.formats.graspit_scene import SCENE_FILE, is_graspit_scene
+from realsim.formats.graspit_scene import SCENE_FILE, QuaternionOrder, is_graspit_scene
 from realsim.formats.graspnet_scene import POSES, cameras_of
 from realsim.store.session_store import CAMERA_FILE
 from realsim_sim_bridge.scenes.importers import from_bop, from_graspit_yaml, from_graspnet
@@ -18,6 +18,7 @@ def load_scene_source(
     models: Path | None = None,
     scene_id: int | None = None,
     supports: Sequence[Support] = (),
+    order: QuaternionOrder | None = None,
 ) -> SchoolScene:
     """Read a scene of any known kind, told apart by what the folder holds.
 
@@ -27,6 +28,7 @@ def load_scene_source(
         models: folder of the models (meshes), where it is not at its usual place.
         scene_id: number of the scene in a BOP dataset of several.
         supports: bodies besides the table that stand still.
+        order: of a scene.yaml's quaternions, where its content does not tell it.
 
     Raises:
         InputError: nothing there is known; what was found and what is read is named.
@@ -35,7 +37,7 @@ def load_scene_source(
     if not path.exists():
         raise InputError(f"'{path}' does not exist; a scene's file or folder is expected.")
     if is_graspit_scene(path):
-        return from_graspit_yaml(path, matter, supports=supports, meshes=models)
+        return from_graspit_yaml(path, matter, supports=supports, order=order, meshes=models)
     if path.is_dir():
         if cameras_of(path) or ((path / POSES).is_file() and cameras_of(path.parent)):
             return from_graspnet(path, matter, models=models, supports=supports)

@@ -81,7 +81,7 @@ def folder_of_run(folder: Path, record: dict[str, Any], *, restart: Restart) -> 
         for leftover in folder.glob(f".{RESULTS}.*"):  # of a process killed while it wrote
             leftover.unlink()
         path = folder / RUN_FILE
-        if restart is True or (restart == "finished" and (folder / FINISHED_FILE).is_file()):
+        if restart is True or (restart == "finished" and _gives_way(folder, path, record)):
             (folder / FINISHED_FILE).unlink(missing_ok=True)
             # The record goes last: killed in between, the folder still says whose results remain.
             for result in folder.glob(RESULTS):
@@ -92,6 +92,17 @@ def folder_of_run(folder: Path, record: dict[str, Any], *, restart: Restart) -> 
         # Not strict JSON: a config may hold infinity.
         atomic.write_text(path, json.dumps(record, indent=1) + "\n")
         yield
+
+
+def _gives_way(folder: Path, path: Path, record: dict[str, Any]) -> bool:
+    """Return whether the folder holds a finished run of something else."""
+    if not ((folder / FINISHED_FILE).is_file() and path.is_file()):
+        return False
+    try:
+        old = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        return False
+    return any(True for _ in differences(old, record))
 
 
 def mark_finished(folder: Path) -> None:
