@@ -83,18 +83,24 @@ def run_command(
     """
     from realsim.app.console import Console
     from realsim.app.school_files import PAGE
-    from realsim.app.school_inputs import SchoolRequest
+    from realsim.app.school_inputs import SchoolRequest, require_file_name
     from realsim.app.school_run import run
     from realsim.app.school_tables import as_json, show_school
     from realsim.store import atomic
 
     request = SchoolRequest(**options)
+    require_file_name(json_file)
     console = Console(quiet=quiet)
     outcome = run(source, out, request, console)
     show_school(outcome.sets, outcome.models, console)
     for instance, gave_up in outcome.unfinished.items():
         console.warn(f"instance {instance}: given up: {'; '.join(gave_up)}. Run it again.")
     console.say(f"page      {outcome.inputs.folder / PAGE}")
+    if (outcome.inputs.folder / "grasps/views").is_dir():
+        console.warn(
+            "the frames still show the grasps of before; write them anew with "
+            f"`realsim annotate {outcome.inputs.folder}`."
+        )
     if json_file is not None:
         atomic.write_json(json_file, as_json(outcome.sets, outcome.models))
     if not any(s.reachable.any() for s in outcome.sets):

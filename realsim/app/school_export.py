@@ -36,10 +36,23 @@ def export(source: Path, target: str, out: Path, least_score: float = 0.0) -> li
         least_score: of the grasps that an isaac_grasp file takes.
 
     Raises:
-        InputError: no results there, an unknown format, or the source's own folder as `out`.
+        InputError: no results there, an unknown format, the source's own folder or one that is not
+            empty as `out`, or a least score for a format that keeps all.
     """
+    if not 0.0 <= least_score <= 1.0:
+        raise InputError(f"--least-score {least_score} cannot be: 0 to 1 is accepted.")
+    if least_score > 0.0 and target != "isaac":
+        raise InputError(
+            f"--least-score is of isaac files, which hold grasps to use; a file of {target} keeps "
+            "every grasp with its label. Leave it away."
+        )
     if out.resolve() in (source.resolve(), (source / "grasps").resolve()):
         raise InputError(f"--out '{out}' holds the results themselves; give another folder.")
+    if out.is_dir() and any(out.iterdir()):
+        raise InputError(
+            f"--out '{out}' is not empty; files of two exports would lie side by side. Give a new "
+            "folder."
+        )
     grasps = stored_grasps(source)[0]
     out.mkdir(parents=True, exist_ok=True)
     if target == "hdf5":

@@ -71,6 +71,16 @@ class SchoolRequest:
         )
 
 
+def require_file_name(path: Path | None) -> None:
+    """Raise if a file that a run writes in the end cannot be one: hours later is too late.
+
+    Raises:
+        InputError: a folder stands there.
+    """
+    if path is not None and path.is_dir():
+        raise InputError(f"--json '{path}' is a folder; the name of a file is expected.")
+
+
 def _require_positive(
     option: str, value: float | None, words: str, *, most: float, least: float = 0.0
 ) -> None:
@@ -172,6 +182,8 @@ def _of_source(source: Path, out: Path, request: SchoolRequest, console: Console
     from realsim_sim_bridge.scenes.school_scene import Matter
     from realsim_sim_bridge.scenes.source import load_scene_source
 
+    if request.models is not None and not request.models.is_dir():
+        raise InputError(f"--models '{request.models}' is no folder.")
     found = load_scene_source(
         source, Matter(cache=out / CACHE), models=request.models, order=request.quaternions
     )

@@ -435,3 +435,9 @@ def test_a_file_needs_a_folder_for_its_results_and_no_file_is_one(tmp_path: Path
     scene.write_text("object1: {}\n")
     assert "add --out FOLDER" in refused(scene, *QUICK)
     assert "is a file" in refused(scene, *QUICK, "--out", scene)
+
+
+def test_what_cannot_be_written_in_the_end_is_refused_at_once(
+    pristine: Path, tmp_path: Path
+) -> None:
+    assert "is a folder" in refused(pristine, *QUICK, "--json", tmp_path)
