@@ -1,8 +1,8 @@
 """ACRONYM's labels of a mug against ours: reported, not aimed at.
 
 ACRONYM's simulator lets objects creep out of the fingers, which Coulomb's law does not: a
-simulation that agrees with it more is not a better one (docs/decisions/0018-what-the-labels-mean.md).
-The data is found through REALSIM_DATA.
+simulation that agrees with it more is not a better one
+(docs/decisions/0018-what-the-labels-mean.md). The data is found through REALSIM_DATA.
 """
 
 import os
@@ -70,7 +70,8 @@ def acronym(seed: int, keep: Path, quick: bool) -> Found:
     body, words = _body(folder, given.obj.scale, keep)
     Ts = given.Ts_obj_grasp[rows]
     # The mug stands as its mesh was drawn; what the table frame's place is does not matter.
-    trial = ready_trial(body, Ts, se3.from_rt(Ts[:, :3, :3], np.zeros(3)), HandGeometry().max_opening_m)
+    standing = se3.from_rt(Ts[:, :3, :3], np.zeros(3))
+    trial = ready_trial(body, Ts, standing, HandGeometry().max_opening_m)
     halves = [
         _Half(engine=engine, trial=trial.part(slice(k, None, 2)))
         for engine in ENGINES

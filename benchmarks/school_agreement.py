@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from school_cases import (
-    OBJECTS,
     NamedTrial,
     TrialKey,
     of_density,
     reached_trial,
+    school_case,
 )
 from school_conditions import CONDITIONS, MARGINAL_DENSITY, PATIENT, slip_config
 from school_figures import Found
@@ -31,8 +31,6 @@ ENGINES = ("pybullet", "mujoco")
 FULL = (40, 16)
 """Grasps of each object, and how many of them are tried with the reference settings as well."""
 QUICK = (3, 1)
-FEW_OBJECTS = 6
-"""Of the short run."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -72,8 +70,8 @@ def agreement(seed: int, keep: Path, quick: bool) -> Found:
     """Return the agreement of settings and of engines."""
     grasps, judged = QUICK if quick else FULL
     keys = [
-        TrialKey(seed=seed, instance=k, grasps=grasps, keep=keep, quick=quick)
-        for k in range(FEW_OBJECTS if quick else OBJECTS)
+        TrialKey(seed=seed, instance=o.instance, grasps=grasps, keep=keep, quick=quick)
+        for o in school_case(seed, keep, quick).scene.objects
     ]
     trials = [t for t in in_processes(reached_trial, keys) if t is not None]
     firsts = [

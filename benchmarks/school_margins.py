@@ -43,14 +43,16 @@ def margins(seed: int, keep: Path, quick: bool) -> Found:
     )
     with spent() as cost:
         sets = run_school(case.scene, case.models, config, workers=2, solids=case.solids)
-    tried = sum(int(executed(s).sum()) for s in sets)
+    # What the arm does not reach has no margin, which may be all of an object.
+    swept = [s for s in sets if "margin" in s.measures]
+    tried = sum(int(executed(s).sum()) for s in swept)
     found = Found()
     for c in rank_correlations(sets, np.random.default_rng([seed, 3])):
         key = KEYS.get((c.first, c.second))
         if key is not None:
             found.add(key, c.rho, f"Spearman, [{c.low:.2f}, {c.high:.2f}] of {c.grasps} grasps")
-    scores = np.concatenate([s.scores[executed(s)] for s in sets])
-    margin = np.concatenate([s.measures["margin"][executed(s)] for s in sets])
+    scores = np.concatenate([s.scores[executed(s)] for s in swept])
+    margin = np.concatenate([s.measures["margin"][executed(s)] for s in swept])
     found.notes.append(
         f"margins: {tried} grasps, {1e3 * cost.cpu_s / tried:.0f} CPU ms each; "
         f"{len(np.unique(scores))} different scores ({100 * np.mean(scores >= 1):.0f} % are 1), "

@@ -21,12 +21,13 @@ from school_conditions import (
     slip_config,
 )
 from school_figures import Found
-from school_processes import PROCESSES, in_processes, spent
+from school_processes import PROCESSES, Spent, in_processes, spent
 
 from realsim.formats.scene_grasps import executed
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.school import run_school
 from realsim_sim_bridge.slip.slip_test import SlipConfig
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Size:
@@ -57,8 +58,9 @@ def speed(seed: int, keep: Path, quick: bool) -> Found:
     size = Size(seed=seed, keep=keep, quick=quick, candidates=QUICK if quick else FULL)
     case = school_case(seed, keep, quick)
     found = Found()
+    start = _started(size)
     for engine in ("mujoco", "pybullet"):
-        found.take(_chain(engine, case, size))
+        found.take(_chain(engine, case, size, start))
     found.take(_marginal(case, size))
     return found
 
@@ -66,18 +68,18 @@ def speed(seed: int, keep: Path, quick: bool) -> Found:
 # --- the whole chain ---------------------------------------------------------------------------
 
 
-def _chain(engine: str, case: SchoolCase, size: Size) -> Found:
+def _started(size: Size) -> Spent:
+    """Return what two processes cost before they do anything of note."""
+    boxes = two_boxes()
+    config = replace(size.config("mujoco", slip_config("mujoco", "plain", 1.0)), max_candidates=2)
+    with spent() as cost:
+        run_school(boxes.scene, boxes.models, config, workers=PROCESSES, solids=boxes.solids)
+    return cost
+
+
+def _chain(engine: str, case: SchoolCase, size: Size, start: Spent) -> Found:
     """Return the rate at 70 N and friction 1, two processes in one scene."""
     slip = slip_config(engine, "plain", 1.0)
-    with spent() as start:
-        boxes = two_boxes()
-        run_school(
-            boxes.scene,
-            boxes.models,
-            replace(size.config(engine, slip), max_candidates=2),
-            workers=PROCESSES,
-            solids=boxes.solids,
-        )
     with spent() as cost:
         sets = run_school(
             case.scene,

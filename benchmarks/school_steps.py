@@ -60,7 +60,9 @@ def _rates(job: tuple[int, Path, bool]) -> Found:
     return found
 
 
-def _stepped(case: SchoolCase, config: SchoolConfig, objects: int | None = None) -> dict[str, float]:
+def _stepped(
+    case: SchoolCase, config: SchoolConfig, objects: int | None = None
+) -> dict[str, float]:
     """Return counts and CPU seconds of sampling and planning over the objects of a scene."""
     total: dict[str, float] = {}
     for task in tasks_of(case, config)[:objects]:

@@ -101,7 +101,9 @@ def validation(seed: int, keep: Path, quick: bool) -> Found:
 
 def _worst_limit(reports: dict[SuiteJob, ValidationReport], part: str) -> tuple[float, str]:
     """Return the greatest error of a limit [%] and where it is."""
-    ratios = [(job, r) for job, report in reports.items() if job.part == part for r in report.ratios]
+    ratios = [
+        (job, r) for job, report in reports.items() if job.part == part for r in report.ratios
+    ]
     job, worst = max(ratios, key=lambda pair: pair[1].error)
     return (
         round(100.0 * worst.error, 6),

@@ -14,6 +14,7 @@ the order in which a hand's own are solved depends on the others, and closing am
 millimetres. One pair, built once and reset for every grasp, costs no more.
 """
 
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -77,7 +78,8 @@ class BulletPair:
     def __del__(self) -> None:
         """Free the engine's memory."""
         engine = getattr(self, "engine", None)
-        if engine is not None and engine.isConnected():
+        # When Python ends, what the client is made of may be gone before it; so is its memory then.
+        if engine is not None and not sys.is_finalizing() and engine.isConnected():
             engine.disconnect()
 
     # --- what is in it ------------------------------------------------------------------------
@@ -126,7 +128,9 @@ class BulletPair:
             self.engine.GEOM_MESH, fileName=str(path), meshScale=[1.0, 1.0, 1.0]
         )
         if shape < 0:
-            raise RealsimError(f"PyBullet refused the collision shape of {len(parts)} convex parts.")
+            raise RealsimError(
+                f"PyBullet refused the collision shape of {len(parts)} convex parts."
+            )
         return shape
 
     def _add_object(self, shape: int, margin_m: float) -> int:
