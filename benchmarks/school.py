@@ -2,9 +2,9 @@
 
     uv run python benchmarks/school.py [--quick] [--json FILE] [--seed N] [--part NAME]
 
-Scenes of ten generated objects of 16 to 32 convex parts (six with --quick); seeds from 100 on are those of the
-published figures, use lower ones while developing. Parts and the figures they give (keys of the
-JSON's "figures"):
+Scenes of ten generated objects of 16 to 32 convex parts (six with --quick); seeds from 100 on are
+those of the published figures, use lower ones while developing. Parts and the figures they give
+(keys of the JSON's "figures"):
   speed       bullet_grasps_per_s, mujoco_grasps_per_s
                       candidates, the arm's reach and four stages, per second of two processes on
                       two cores, counted in CPU seconds
@@ -170,8 +170,8 @@ def main() -> None:
     failures: dict[str, str] = {}
     arguments.keep.mkdir(parents=True, exist_ok=True)
     say_objects(console, arguments.keep, arguments.quick)
-    # Scaling counts its own CPU seconds and waits for Ray much of the time: in the short run it goes
-    # on beside the parts that measure no speed.
+    # Scaling counts its own CPU seconds and waits for Ray much of the time: in the short run it
+    # goes on beside the parts that measure no speed.
     beside = arguments.quick and len(arguments.parts) > 1
     later: dict[str, Future[Found]] = {}
     with ThreadPoolExecutor(1) as thread:

@@ -19,7 +19,7 @@ from realsim_sim_bridge.grasping.candidates import sample_candidates
 from realsim_sim_bridge.grasping.surroundings import standing_object
 from realsim_sim_bridge.school.config import SchoolConfig
 
-FULL, QUICK = 220, 40
+FULL, QUICK = 220, 120
 """Grasps per object that are planned; the paper has 220."""
 
 

@@ -252,7 +252,8 @@ def _mesh_file(name: str, folder: Path, meshes: Path | None, where: str) -> Path
             return place / stl
     raise InputError(
         f"the mesh of {where} is {name}; neither it nor {stl} can be read from "
-        f"{', '.join(map(str, places))}. Put {stl} (in metres) there, or give its folder."
+        f"{', '.join(map(str, places))}. Put {stl} (in metres) there, or name its "
+        "folder (`--models FOLDER`)."
     )
 
 
@@ -263,12 +264,35 @@ def _placed(entries: list[_Entry], grasp_file: Path | None) -> list[_Placed]:
     for e in entries:
         key = (e.mesh_file, e.scale)
         if key not in known:
-            mesh = load_mesh(e.mesh_file, "m")
-            known[key] = Mesh(vertices=mesh.vertices * np.array(e.scale), faces=mesh.faces)
+            known[key] = _mesh(e)
         Ts = grasps.get(e.name, np.zeros((0, 2, 4, 4)))[:, 0]
         some = Ts[:: max(1, len(Ts) // SAMPLED_GRASPS)]
         placed.append(_Placed(entry=e, mesh=known[key], Ts_world_grasp=some))
     return placed
+
+
+LARGEST_MM_SCALE = 0.01
+"""Scales up to this are taken as the conversion of a file in millimetres."""
+
+
+def _mesh(e: _Entry) -> Mesh:
+    """Return an object's mesh [m], its scale applied.
+
+    Raises:
+        InputError: it cannot be read, or is not in metres; object and file are named.
+    """
+    scale = np.array(e.scale)
+    # A scale of thousandths is what makes metres of a file in millimetres.
+    unit, metres = ("mm", 1e-3) if scale.max() <= LARGEST_MM_SCALE else ("m", 1.0)
+    try:
+        mesh = load_mesh(e.mesh_file, unit)
+    except InputError as error:
+        raise InputError(
+            f"the object '{e.name}' of the scene cannot be read from {e.mesh_file}: {error} In a "
+            "scene.yaml meshes are in metres; one in millimetres needs `scale: [0.001, 0.001, "
+            "0.001]` there."
+        ) from error
+    return Mesh(vertices=mesh.vertices * (scale / metres), faces=mesh.faces)
 
 
 # --- what the content proves --------------------------------------------------------------------

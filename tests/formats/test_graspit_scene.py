@@ -224,3 +224,14 @@ def test_the_authors_scene_proves_its_order_twice_over():
     counts = {found.models[s.obj_id].name: len(s.Ts_obj_grasp) for s in sets}
     assert sum(counts.values()) == 1654 and counts["motor"] == 784
     assert all(np.nanmax(s.widths_m) < 0.08 for s in sets)
+
+
+def test_meshes_in_millimetres_need_a_scale_and_are_named_without_one(tmp_path):
+    write_scene(tmp_path)
+    write_stl(tmp_path, "brick", [1e3 * side for side in EXTENTS["brick"]])
+    with pytest.raises(InputError, match=r"'brick' .*scale: \[0.001, 0.001, 0.001\]"):
+        read_graspit_scene(tmp_path)
+    write_scene(tmp_path, scale=0.001)
+    models = read_graspit_scene(tmp_path).models
+    sides = {m.name: np.ptp(m.mesh.vertices, axis=0) for m in models.values()}
+    assert all(np.allclose(sides[name], extents, atol=1e-6) for name, extents in EXTENTS.items())

@@ -1,5 +1,6 @@
 """The School's summary: its rows sum exactly, and they are the paper's rows."""
 
+import dataclasses
 import json
 import math
 from dataclasses import replace
@@ -236,3 +237,12 @@ def test_sets_without_measures_say_nothing_of_them():
     s = tried_set(np.random.default_rng(0), 0, measures=())
     found = summarise([s, scored_set(np.random.default_rng(1), 40)])
     assert found.correlations == () and found.closures == ()
+
+
+def test_objects_of_one_number_and_other_meshes_are_different_objects():
+    rng = np.random.default_rng(0)
+    sets = [
+        dataclasses.replace(scored_set(rng, 5, obj_id=1), parameters={"inputs": {"mesh": mesh}})
+        for mesh in ("one", "other", "one")
+    ]
+    assert summarise({"a": sets[:1], "b": sets[1:2], "c": sets[2:]}).objects == 2

@@ -144,9 +144,9 @@ def summarise(
     scores = _joined([s.scores for s in sets])
     scored = scores[~np.isnan(scores)]
     is_good = scored >= GOOD_FROM
-    by_object: dict[int, list[GraspSet]] = {}
+    by_object: dict[tuple[str, ...], list[GraspSet]] = {}
     for s in sets:
-        by_object.setdefault(s.obj_id, []).append(s)
+        by_object.setdefault(_identity(s), []).append(s)
     counts = np.bincount(_joined(outcome).astype(np.int64), minlength=len(OUTCOMES))
     return SchoolSummary(
         scenes=len(by_scene),
@@ -162,6 +162,16 @@ def summarise(
         correlations=rank_correlations(sets, rng or np.random.default_rng(0)),
         closures=closure_confusions(sets),
     )
+
+
+def _identity(s: GraspSet) -> tuple[str, ...]:
+    """Return what tells an object from others: its id, and its mesh where the school noted it.
+
+    Ids alone do not: scenes of other programs all count theirs from 1.
+    """
+    inputs: Any = s.parameters.get("inputs")
+    mesh: Any = inputs.get("mesh") if isinstance(inputs, dict) else None
+    return (str(s.obj_id), str(mesh))
 
 
 def outcomes_of(s: GraspSet) -> NDArray[np.int64]:
