@@ -285,8 +285,9 @@ def test_another_mesh_pose_or_object_is_refused(finished, change, field):
 def test_another_version_is_refused(finished, monkeypatch):
     from realsim_sim_bridge.school import run_record
 
+    real = run_record.version
     monkeypatch.setattr(
-        run_record, "version", lambda name: "9.9" if name == "pybullet" else "unknown"
+        run_record, "version", lambda name: "9.9" if name == "pybullet" else real(name)
     )
     with pytest.raises(InputError, match=r"versions.pybullet: \"[\d.]+\" -> \"9.9\""):
         run(finished)

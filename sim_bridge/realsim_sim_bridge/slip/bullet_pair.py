@@ -14,8 +14,8 @@ the order in which a hand's own are solved depends on the others, and closing am
 millimetres. One pair, built once and reset for every grasp, costs no more.
 """
 
-import sys
 import tempfile
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,8 @@ class BulletPair:
             from pybullet_utils.bullet_client import BulletClient
 
             self.engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
+        # When Python ends, its modules may be gone before this object: a finalizer runs earlier.
+        weakref.finalize(self, _disconnect, self.engine)
         self._physics, self._settings = physics, settings
         self.dt = 1.0 / settings.rate_hz
         self._T_obj_body, moments = body.principal_frame()
@@ -74,13 +76,6 @@ class BulletPair:
             parts = [se3.transform(T_body_obj, part) for part in body.parts]
             cores, margin = drawn_in(parts, settings.collision_margin_m)
             self.object = self._add_object(self._shape(cores, Path(folder)), margin)
-
-    def __del__(self) -> None:
-        """Free the engine's memory."""
-        engine = getattr(self, "engine", None)
-        # When Python ends, what the client is made of may be gone before it; so is its memory then.
-        if engine is not None and not sys.is_finalizing() and engine.isConnected():
-            engine.disconnect()
 
     # --- what is in it ------------------------------------------------------------------------
 
@@ -244,6 +239,12 @@ class BulletPair:
             "substeps": float(parameters["numSubSteps"]),
             "force_n": abs(float(engine.getJointState(self.hand, FINGERS[0])[3])),
         }
+
+
+def _disconnect(engine: Any) -> None:
+    """Free an engine's memory."""
+    if engine.isConnected():
+        engine.disconnect()
 
 
 _INFO = {
