@@ -139,6 +139,8 @@ def validate_command(
     "--mass", "masses", multiple=True, metavar="NAME=KG", help="A weighed object; repeat."
 )
 @click.option("--density", type=float, default=None, help="Of the others [kg/m^3].")
+@click.option("--support", "supports", multiple=True, type=FOLDER, metavar="URDF",
+              help="A bin or shelf, in the table's frame; repeat.")  # fmt: skip
 @click.option("--out", type=FOLDER, default=None, help="Folder for the picture.")
 @click.option("--json", "json_file", type=FOLDER, default=None, help="Write the table there, too.")
 @click.option("--quiet", is_flag=True, help="No progress bars.")

@@ -55,6 +55,8 @@ class SchoolRequest:
     """Whether results of other parameters are thrown away; "finished" = those of a finished run."""
     models: Path | None = None
     """Folder of the models, where a scene's source has them elsewhere."""
+    supports: tuple[Path, ...] = ()
+    """URDF files of what stands still besides the table, each in the table's frame."""
     quaternions: Literal["wxyz", "xyzw"] | None = None
     """Their order in a scene.yaml, where its content does not tell it."""
 

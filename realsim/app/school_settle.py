@@ -1,6 +1,7 @@
 """`realsim school settle`: do the objects of a scene stand when physics starts?"""
 
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +41,7 @@ def settle(
         folder = out or Path(scratch)  # convex parts take minutes: in a folder that stays, once
         inputs = read_inputs(source, None if is_session(source) else folder, request, console)
         scene = school_scene(inputs, console)
+        scene = with_supports(scene, request.supports)
         with (
             console.stage("settle", f"{len(scene.scene.objects)} objects"),
             TableWorld(scene, cache=inputs.folder / CACHE) as world,
@@ -116,6 +118,24 @@ def school_scene(inputs: SchoolInputs, console: Console) -> "SchoolScene":
         models=models,
         solids=known_solids(models, matter, inputs.solids),
     )
+
+
+def with_supports(scene: "SchoolScene", urdfs: Sequence[Path]) -> "SchoolScene":
+    """Return the scene with bodies that stand still, each in the table's frame.
+
+    Raises:
+        InputError: a file does not exist.
+    """
+    from dataclasses import replace
+
+    from realsim_sim_bridge.scenes.school_scene import Support
+
+    plane = scene.scene.plane
+    assert plane is not None, "a SchoolScene has a table"
+    added = tuple(
+        Support(name=path.stem, T_world_support=plane.T_world_table, urdf=path) for path in urdfs
+    )
+    return replace(scene, supports=scene.supports + added)
 
 
 def as_json(report: "StandReport") -> dict[str, Any]:

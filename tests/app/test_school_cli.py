@@ -441,3 +441,27 @@ def test_what_cannot_be_written_in_the_end_is_refused_at_once(
     pristine: Path, tmp_path: Path
 ) -> None:
     assert "is a folder" in refused(pristine, *QUICK, "--json", tmp_path)
+
+
+BIN = """<robot name="bin"><link name="base"><inertial><mass value="1"/>
+<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
+<collision><origin xyz="0 0 -0.3"/><geometry><box size="0.01 0.01 0.01"/></geometry></collision>
+</link></robot>"""
+
+
+def test_supports_stand_beside_the_table_and_a_missing_one_is_named(
+    pristine: Path, tmp_path: Path
+) -> None:
+    missing = refused("settle", pristine, "--support", tmp_path / "shelf.urdf")
+    assert "'shelf'" in missing and "does not exist" in missing
+    below = tmp_path / "bin.urdf"
+    below.write_text(BIN)
+    folder = Path(shutil.copytree(pristine, tmp_path / "s"))
+    with_bin = run("settle", folder, "--support", below, "--json", tmp_path / "a.json")
+    without = run("settle", folder, "--json", tmp_path / "b.json")
+    assert with_bin.exit_code == without.exit_code
+    verdicts = [
+        [o["verdict"] for o in json.loads((tmp_path / n).read_text())["objects"]]
+        for n in ("a.json", "b.json")
+    ]
+    assert verdicts[0] == verdicts[1]
