@@ -53,7 +53,8 @@ def test_a_cluster_that_is_started_stays_on_loopback_and_has_a_token():
     pytest.importorskip("ray")
     found = outcome("started")
     assert found["address"].startswith("127.0.0.1:") and found["mode"] == "token"
-    assert found["same"] and found["environment_restored"] and not found["beyond_loopback"]
+    assert found["same"] and not found["beyond_loopback"]
+    assert found["left_in_environment"] == []
 
 
 @pytest.mark.slow

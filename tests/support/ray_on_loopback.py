@@ -92,7 +92,11 @@ def started():
     local = school(1)
     return seen | {
         "same": agree(found, local) and agree(again, local),
-        "environment_restored": before == dict(os.environ),
+        "left_in_environment": sorted(
+            name
+            for name in {*before, *os.environ}
+            if before.get(name) != os.environ.get(name) and name.startswith("RAY")
+        ),
     }
 
 
