@@ -9,15 +9,12 @@ joints over time of all four stages where the arm gets there.
 import time
 from pathlib import Path
 
-import numpy as np
 from school_cases import SchoolCase, candidate_config, school_case, tasks_of, two_boxes
 from school_figures import Found
 from school_processes import in_processes
 
-from realsim_sim_bridge.arm.reach import ReachTask, check_reach
-from realsim_sim_bridge.grasping.candidates import sample_candidates
-from realsim_sim_bridge.grasping.surroundings import standing_object
 from realsim_sim_bridge.school.config import SchoolConfig
+from realsim_sim_bridge.school.object_task import candidates_of, chance_of, reach_of
 
 FULL, QUICK = 220, 120
 """Grasps per object that are planned; the paper has 220."""
@@ -66,34 +63,11 @@ def _stepped(
     """Return counts and CPU seconds of sampling and planning over the objects of a scene."""
     total: dict[str, float] = {}
     for task in tasks_of(case, config)[:objects]:
-        rng = np.random.default_rng([config.seed, task.instance])
+        rng = chance_of(task)
         begin = time.process_time()
-        found = sample_candidates(
-            task.mesh,
-            task.T_table_obj,
-            task.neighbours,
-            config.candidates,
-            config.hand,
-            rng,
-            config.max_candidates,
-        )
+        found = candidates_of(task, rng)
         sampled = time.process_time()
-        reach = check_reach(
-            ReachTask(
-                Ts_table_grasp=task.T_table_obj @ found.Ts_obj_grasp,
-                widths_m=found.widths_m,
-                openings_m=found.openings_m,
-                obj=standing_object(
-                    task.mesh, task.T_table_obj, task.instance, config.candidates.object_points
-                ),
-                neighbours=task.neighbours,
-                middle_xy=task.middle_xy,
-            ),
-            config.reach,
-            config.hand,
-            rng,
-            config.slip.motion,
-        )
+        reach = reach_of(task, found, rng)
         planned = time.process_time()
         counts = {
             "sample_s": sampled - begin,

@@ -14,24 +14,23 @@ numbers have four decimals: 0.05 mm and 0.01 deg at best.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.formats.graspnet_cameras import POSES, read_camera_poses
 from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 
 Array = NDArray[np.float64]
 CAMERAS = ("realsense", "kinect")
-POSES, FIRST, ANNOTATIONS = "camera_poses.npy", "cam0_wrt_table.npy", "annotations"
+ANNOTATIONS = "annotations"
 MESH_FILES = ("nontextured.ply", "textured.ply", "textured.obj", "nontextured_simplified.ply")
 """Looked for in a model's folder, in this order."""
 LARGEST_XML = 1_000_000
 """[bytes]: a scene of ten objects has 4 kB."""
-MOST_VIEWS = 100_000
 CHECKED_VIEWS = 8
 """Other images whose annotations are compared with the one that is used."""
 AGREE_M = 0.005
@@ -86,7 +85,7 @@ def read_graspnet_scene(
         )
     camera = camera or there[0]
     root = folder / camera
-    Ts_table_cam = _camera_poses(root)
+    Ts_table_cam = read_camera_poses(root)
     files = _annotation_files(root)
     if view not in files or view >= len(Ts_table_cam):
         raise InputError(
@@ -109,31 +108,6 @@ def read_graspnet_scene(
         view=view,
         notes=tuple(notes),
     )
-
-
-def _camera_poses(root: Path) -> Array:
-    """Return T_table_cam (N, 4, 4) [m]."""
-    first, relative = _read_npy(root / FIRST), _read_npy(root / POSES)
-    if first.shape != (4, 4) or relative.ndim != 3 or relative.shape[1:] != (4, 4):
-        raise InputError(
-            f"{root}: {FIRST} has the shape {first.shape} and {POSES} {relative.shape}; (4, 4) and "
-            "(N, 4, 4) are needed."
-        )
-    if not 0 < len(relative) <= MOST_VIEWS:
-        raise InputError(f"{root / POSES} holds {len(relative)} poses; 1 to {MOST_VIEWS} are read.")
-    first = se3.check_rigid(first, str(root / FIRST))
-    return first @ se3.check_rigid(relative, str(root / POSES))
-
-
-def _read_npy(path: Path) -> Array:
-    if not path.is_file():
-        raise InputError(f"there is no {path}; a GraspNet camera folder holds {POSES} and {FIRST}.")
-    try:
-        # Mapped first: a header can claim any size, and pickles are refused.
-        array: Any = np.load(path, mmap_mode="r", allow_pickle=False)
-        return np.array(array, dtype=np.float64)
-    except (ValueError, EOFError, TypeError, OSError) as error:
-        raise InputError(f"{path} is not a numpy array of numbers ({error}).") from error
 
 
 def _annotation_files(root: Path) -> dict[int, Path]:

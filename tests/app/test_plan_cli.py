@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from realsim.app.cli import main
+from realsim.formats.graspnet_cameras import read_camera_poses
 from realsim.geometry import se3
 from realsim_capture_plans.arms.kinematics import UR5, UR5E
 from realsim_capture_plans.collision.mount import d405_mount
-from realsim_capture_plans.plan_files.graspnet import read_graspnet, table_frame
+from realsim_capture_plans.plan_files.graspnet import table_frame
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
@@ -176,7 +177,7 @@ def test_a_plan_goes_out_and_comes_back(realsim: Callable[..., Done]) -> None:
         assert realsim("plan-convert", "p.json", dest, "--overwrite").code == 0
     assert load_plan("copy.json").content_hash == plan.content_hash
     assert "def realsim_plan():" in Path("p.script").read_text()
-    Ts = table_frame(plan) @ read_graspnet("folder")
+    Ts = table_frame(plan) @ read_camera_poses("folder")
     assert np.abs(Ts - plan.Ts_base_cam).max() < 1e-12
     done = realsim("plan-convert", "p.csv", "back.json", "--robot", "UR5", "--center", "0.4,0.1,0")
     assert done.code == 0, done.err

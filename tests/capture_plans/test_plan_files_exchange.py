@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from realsim.errors import DegenerateError, InputError, UnitError
+from realsim.formats.graspnet_cameras import read_camera_poses
 from realsim.geometry import se3
 from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.collision.shapes import Box
 from realsim_capture_plans.plan_files.exported import export_csv, export_urscript
-from realsim_capture_plans.plan_files.graspnet import export_graspnet, read_graspnet, table_frame
+from realsim_capture_plans.plan_files.graspnet import export_graspnet, table_frame
 from realsim_capture_plans.plan_files.imported import (
     axes_meeting_point,
     colliding_legs,
@@ -140,21 +141,21 @@ def test_graspnet_poses_come_back(tmp_path: Path) -> None:
     assert np.array_equal(poses[0], np.eye(4))
     T_base_table = table_frame(plan)
     assert np.abs(T_base_table @ first @ poses - plan.Ts_base_cam).max() < 1e-12
-    assert np.abs(T_base_table @ read_graspnet(tmp_path / "g") - plan.Ts_base_cam).max() < 1e-12
+    assert np.abs(T_base_table @ read_camera_poses(tmp_path / "g") - plan.Ts_base_cam).max() < 1e-12
     assert np.array_equal(T_base_table, se3.from_translation([0.37, 0.02, -0.02]))
     assert load_plan(tmp_path / "g" / "plan.json").content_hash == plan.content_hash
 
 
 def test_damaged_graspnet_folders_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"cam0_wrt_table\.npy"):
-        read_graspnet(tmp_path)
+        read_camera_poses(tmp_path)
     export_graspnet(a_plan(), tmp_path)
     (tmp_path / "camera_poses.npy").write_bytes(b"\x93NUMPY broken")
     with pytest.raises(InputError, match=r"camera_poses\.npy"):
-        read_graspnet(tmp_path)
+        read_camera_poses(tmp_path)
     np.save(tmp_path / "camera_poses.npy", np.eye(4))
     with pytest.raises(InputError, match=r"\(N, 4, 4\)"):
-        read_graspnet(tmp_path)
+        read_camera_poses(tmp_path)
 
 
 # --- what a path does not say is proven from its poses ----------------------------------------

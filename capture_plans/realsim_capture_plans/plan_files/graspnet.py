@@ -16,16 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.formats.graspnet_cameras import FIRST, POSES
 from realsim.geometry import se3
 from realsim_capture_plans.plan_files.plan_json import save_plan
 from realsim_capture_plans.planning.record import CapturePlan
 
 Array = NDArray[np.float64]
-POSES, FIRST, PLAN = "camera_poses.npy", "cam0_wrt_table.npy", "plan.json"
+PLAN = "plan.json"
 GRASPNET_VIEWS = 256
 """graspnetAPI reads scenes of exactly this many views."""
-LARGEST_VIEWS = 100_000
-"""A file with more is no camera poses."""
 
 
 def table_frame(plan: CapturePlan) -> Array:
@@ -62,27 +61,6 @@ def export_graspnet(plan: CapturePlan, folder: Path | str) -> list[Path]:
     return [folder / PLAN, folder / FIRST, folder / POSES]
 
 
-def read_graspnet(folder: Path | str) -> Array:
-    """Return the camera poses T_table_cam (N, 4, 4) [m] of a GraspNet scene's camera folder.
-
-    Raises:
-        InputError: a file is missing, or is not what it should be.
-        NotRigidError: a matrix is not a rigid transform.
-    """
-    folder = Path(folder)
-    first = _read_npy(folder / FIRST)
-    relative = _read_npy(folder / POSES)
-    if first.shape != (4, 4) or relative.ndim != 3 or relative.shape[1:] != (4, 4):
-        raise InputError(
-            f"{folder}: {FIRST} has the shape {first.shape} and {POSES} {relative.shape}; (4, 4) "
-            "and (N, 4, 4) are needed."
-        )
-    if not 0 < len(relative) <= LARGEST_VIEWS:
-        raise InputError(f"{folder / POSES} holds {len(relative)} poses; at least one is needed.")
-    first = se3.check_rigid(first, str(folder / FIRST))
-    return first @ se3.check_rigid(relative, str(folder / POSES))
-
-
 def _write_npy(path: Path, array: Array) -> None:
     import io
 
@@ -91,13 +69,3 @@ def _write_npy(path: Path, array: Array) -> None:
     buffer = io.BytesIO()
     np.save(buffer, np.ascontiguousarray(array))
     write_bytes(path, buffer.getvalue())
-
-
-def _read_npy(path: Path) -> Array:
-    if not path.is_file():
-        raise InputError(f"there is no {path}; a GraspNet camera folder holds {POSES} and {FIRST}.")
-    try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-        return np.array(array, dtype=np.float64)
-    except (ValueError, EOFError, TypeError) as error:
-        raise InputError(f"{path} is not a numpy array of numbers ({error}).") from error

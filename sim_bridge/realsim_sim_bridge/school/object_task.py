@@ -16,8 +16,8 @@ from realsim.models.library_records import KnownSolid
 from realsim.records import Mesh
 from realsim.records.trajectories import GraspTrajectories
 from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.arm.reach import ReachTask, check_reach
-from realsim_sim_bridge.grasping.candidates import sample_candidates
+from realsim_sim_bridge.arm.reach import Reach, ReachTask, check_reach
+from realsim_sim_bridge.grasping.candidates import Candidates, sample_candidates
 from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
 from realsim_sim_bridge.grasping.surroundings import Surroundings, standing_object
 from realsim_sim_bridge.school.config import SchoolConfig
@@ -126,51 +126,13 @@ def prepare(task: ObjectTask) -> Prepared:
 
     An object that cannot be tried (no volume, mass out of range) has no body; the notes say why.
     """
-    config = task.config
-    rng = np.random.default_rng([config.seed, task.instance])
-    found = sample_candidates(
-        task.mesh,
-        task.T_table_obj,
-        task.neighbours,
-        config.candidates,
-        config.hand,
-        rng,
-        config.max_candidates,
-    )
+    config, rng = task.config, chance_of(task)
+    found = candidates_of(task, rng)
     notes: dict[str, Any] = {"counts": found.counts}
     body, why_not = _body(task, notes)
-    n = len(found.widths_m)
     if body is None:
-        nowhere = np.full((n, panda.JOINTS), np.nan)
-        return Prepared(
-            Ts_obj_grasp=found.Ts_obj_grasp,
-            widths_m=found.widths_m,
-            openings_m=found.openings_m,
-            reachable=np.zeros(n, dtype=np.bool_),
-            joints=nowhere,
-            joints_lifted=nowhere,
-            reasons=(f"not tried: {why_not}",) * n,
-            trajectories=None,
-            measures={},
-            body=None,
-            notes=notes | {"not_tried": why_not},
-        )
-    reach = check_reach(
-        ReachTask(
-            Ts_table_grasp=task.T_table_obj @ found.Ts_obj_grasp,
-            widths_m=found.widths_m,
-            openings_m=found.openings_m,
-            obj=standing_object(
-                task.mesh, task.T_table_obj, task.instance, config.candidates.object_points
-            ),
-            neighbours=task.neighbours,
-            middle_xy=task.middle_xy,
-        ),
-        config.reach,
-        config.hand,
-        rng,
-        config.slip.motion,
-    )
+        return _untried(found, why_not, notes)
+    reach = reach_of(task, found, rng)
     notes["counts"] |= {"reachable": int(reach.reachable.sum()), "by_a_planned_path": reach.planned}
     notes["arm"] = {"stage_possible": reach.stage_possible.tolist(), "notes": list(reach.notes)}
     closure = force_closure(
@@ -195,6 +157,61 @@ def prepare(task: ObjectTask) -> Prepared:
         measures=closure.measures(),
         body=body,
         notes=notes,
+    )
+
+
+def chance_of(task: ObjectTask) -> np.random.Generator:
+    """Return the object's own source of chance, whatever the others do."""
+    return np.random.default_rng([task.config.seed, task.instance])
+
+
+def candidates_of(task: ObjectTask, rng: np.random.Generator) -> Candidates:
+    """Return the object's candidates where it stands."""
+    config = task.config
+    return sample_candidates(
+        task.mesh,
+        task.T_table_obj,
+        task.neighbours,
+        config.candidates,
+        config.hand,
+        rng,
+        config.max_candidates,
+    )
+
+
+def reach_of(task: ObjectTask, found: Candidates, rng: np.random.Generator) -> Reach:
+    """Return which candidates the arm takes, and how it moves."""
+    config = task.config
+    obj = standing_object(
+        task.mesh, task.T_table_obj, task.instance, config.candidates.object_points
+    )
+    reach = ReachTask(
+        Ts_table_grasp=task.T_table_obj @ found.Ts_obj_grasp,
+        widths_m=found.widths_m,
+        openings_m=found.openings_m,
+        obj=obj,
+        neighbours=task.neighbours,
+        middle_xy=task.middle_xy,
+    )
+    return check_reach(reach, config.reach, config.hand, rng, config.slip.motion)
+
+
+def _untried(found: Candidates, why_not: str, notes: dict[str, Any]) -> Prepared:
+    """Return the candidates of an object that cannot be tried."""
+    n = len(found.widths_m)
+    nowhere = np.full((n, panda.JOINTS), np.nan)
+    return Prepared(
+        Ts_obj_grasp=found.Ts_obj_grasp,
+        widths_m=found.widths_m,
+        openings_m=found.openings_m,
+        reachable=np.zeros(n, dtype=np.bool_),
+        joints=nowhere,
+        joints_lifted=nowhere,
+        reasons=(f"not tried: {why_not}",) * n,
+        trajectories=None,
+        measures={},
+        body=None,
+        notes=notes | {"not_tried": why_not},
     )
 
 
