@@ -1,4 +1,4 @@
-"""`realsim school`: what it runs, writes, refuses, and its exit codes."""
+"""`realsim school`: what it runs and writes, and its exit codes."""
 
 import json
 import os
@@ -7,76 +7,32 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
 
 from realsim.app.console import Console
-from realsim.app.school_cli import SCHOOL
 from realsim.app.school_files import stored_grasps
-from realsim.app.school_inputs import SchoolRequest, base_on_table, masses_of
+from realsim.app.school_inputs import SchoolRequest
 from realsim.app.school_run import config_of, run_in_session
-from realsim.errors import InputError
 from realsim.formats.acronym import read_acronym
-from realsim.formats.bop_models import save_models
 from realsim.formats.grasps_hdf5 import read_grasps_hdf5
 from realsim.formats.grasps_parquet import read_grasps_parquet
 from realsim.geometry import se3
 from realsim.geometry.parts import part
-from realsim.records import CaptureSession, ObjectPose, Scene, SupportPlane
+from realsim.records import ObjectPose, Scene
 from realsim.store import SessionStore, load_grasps, save_scene
 from realsim_sim_bridge.school.sweep import SweepConfig
 from realsim_sim_bridge.slip.bullet_settings import BulletSettings
 from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
-from registered_sessions import CAMERA
+from school_sessions import GRASPS, QUICK, T_WORLD_TABLE, refused, registered, run, scene
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[3] / "shared/data"))
 GRASPIT = DATA / "school/graspit_assets/scene.yaml"
-GRASPS = 5
-QUICK = ("--engine", "mujoco", "--grasps", GRASPS, "--workers", "1", "--quiet")
-NAMES = ("cube", "wedge")
-T_WORLD_TABLE = se3.from_rt(se3.exp_so3(np.array([0.0, 0.0, 0.4])), [0.3, 0.1, 0.02])
-
-
-def run(*args: object) -> Result:
-    """Run the group in this process."""
-    return CliRunner().invoke(SCHOOL, [str(a) for a in args])
-
-
-def refused(*args: object) -> str:
-    """Return what the group refuses the arguments with."""
-    result = run(*args)
-    assert isinstance(result.exception, InputError), result.output
-    return str(result.exception)
-
-
-def scene() -> Scene:
-    """Two convex things, apart on a table that is not the world's xy plane."""
-    objects = tuple(
-        ObjectPose(
-            obj_id=part(name).obj_id,
-            instance=k,
-            T_world_obj=T_WORLD_TABLE @ _standing(name, x, angle),
-        )
-        for k, (name, x, angle) in enumerate(zip(NAMES, (-0.1, 0.1), (0.2, 1.1), strict=True))
-    )
-    return Scene(name="two", objects=objects, plane=SupportPlane(T_world_table=T_WORLD_TABLE))
-
-
-def _standing(name: str, x: float, angle: float) -> np.ndarray:
-    """Return T_table_obj of a part on its lowest point."""
-    T = se3.from_rt(se3.exp_so3(np.array([0.0, 0.0, angle])), [x, 0.0, 0.0])
-    T[2, 3] = -part(name).mesh.bounds[0][2]
-    return T
 
 
 @pytest.fixture(scope="module")
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A registered session."""
-    folder = tmp_path_factory.mktemp("pristine") / "s"
-    session = CaptureSession(name="two", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session)
-    save_models(folder / "models", {part(n).obj_id: part(n) for n in NAMES})
-    save_scene(store, scene())
-    return folder
+    return registered(tmp_path_factory.mktemp("pristine") / "s")
 
 
 @pytest.fixture(scope="module")
@@ -286,132 +242,6 @@ def test_the_paper_authors_scene_is_tried_and_stays_as_it_is(tmp_path: Path) -> 
     assert exported.exit_code == 0 and len(exported.output.split()) == 7
 
 
-# --- bad input ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("option", ["--force", "--friction", "--density"])
-@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf"])
-def test_physics_that_cannot_be_is_refused(pristine: Path, option: str, value: str) -> None:
-    assert option in refused(pristine, *QUICK, option, value)
-    assert not (pristine / "grasps").exists()
-
-
-@pytest.mark.parametrize(
-    ("mass", "words"),
-    [
-        ("mug=0.3", "no object of this scene"),
-        ("cube", "NAME=KG"),
-        ("cube=heavy", "NAME=KG"),
-        ("cube=0", "NAME=KG"),
-        ("cube=-1", "NAME=KG"),
-        ("=1", "NAME=KG"),
-    ],
-)
-def test_a_mass_of_nothing_or_of_no_object_is_refused(
-    pristine: Path, mass: str, words: str
-) -> None:
-    message = refused(pristine, *QUICK, "--mass", mass)
-    assert words in message and mass in message
-
-
-def test_masses_are_told_by_name_or_number_and_once() -> None:
-    models = {part(n).obj_id: part(n) for n in NAMES}
-    assert masses_of(["cube=0.3", "8=1e-1"], models) == {2: 0.3, 8: 0.1}
-    with pytest.raises(InputError, match="twice"):
-        masses_of(["cube=0.3", "2=0.4"], models)
-
-
-def test_a_base_pose_is_taken_from_world_or_table(tmp_path: Path) -> None:
-    T = se3.from_rt(se3.exp_so3(np.array([0.1, 0.2, 0.3])), [-0.4, 0.1, 0.0])
-    file = tmp_path / "base.json"
-    file.write_text(json.dumps({"T_table_base": T.tolist()}))
-    assert base_on_table(file, scene()) == pytest.approx(T)
-    config = config_of(SchoolRequest(base_pose=file), scene())
-    assert np.array(config.reach.T_table_base) == pytest.approx(T)
-    file.write_text(json.dumps({"T_world_base": (T_WORLD_TABLE @ T).tolist()}))
-    assert base_on_table(file, scene()) == pytest.approx(T)
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (None, "is no file"),
-        ("{", "no JSON"),
-        ("[1, 2]", "no pose"),
-        ('{"T_base_world": []}', "no pose"),
-        ('{"T_world_base": [], "T_table_base": []}', "exactly one"),
-        ('{"T_table_base": [[1, 2], [3, 4]]}', "4 x 4"),
-        ('{"T_table_base": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "T_table_base"),
-    ],
-)
-def test_a_base_pose_that_is_none_is_refused(
-    pristine: Path, tmp_path: Path, content: str | None, words: str
-) -> None:
-    file = tmp_path / "base.json"
-    if content is not None:
-        file.write_text(content)
-    message = refused(pristine, *QUICK, "--base-pose", file)
-    assert words in message and str(file) in message
-
-
-def test_an_engine_that_is_not_installed_is_named_before_anything_runs(
-    pristine: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
-    assert "realsim[mujoco]" in refused(pristine, "--engine", "mujoco", "--quiet")
-    assert "realsim[mujoco]" in refused(pristine, "--cross-check", "--quiet")
-    assert "realsim[mujoco]" in refused("validate", "--engine", "both", "--quiet")
-
-
-def test_a_mesh_without_volume_is_named_and_the_others_are_tried(
-    pristine: Path, tmp_path: Path
-) -> None:
-    folder = Path(shutil.copytree(pristine, tmp_path / "s"))
-    flat = part("cube")
-    sheet = flat.mesh.vertices.copy()
-    sheet[:, 2] = 0.0
-    mesh = type(flat.mesh)(vertices=sheet, faces=flat.mesh.faces)
-    models = {2: type(flat)(obj_id=2, name="cube", mesh=mesh), 8: part("wedge")}
-    save_models(folder / "models", models)
-    result = run(folder, *QUICK)
-    assert result.exit_code == 0, result.output
-    assert "0 cube: not tried" in result.stderr
-    cube, wedge = load_grasps(folder)
-    assert not cube.good.any() and wedge.reachable.any()
-
-
-def test_a_scene_out_of_the_arm_s_reach_has_reasons_and_no_scores_above_zero(
-    pristine: Path, tmp_path: Path
-) -> None:
-    far = tmp_path / "far.json"
-    T = se3.from_rt(np.eye(3), [5.0, 0.0, 0.0])
-    far.write_text(json.dumps({"T_table_base": T.tolist()}))
-    folder = Path(shutil.copytree(pristine, tmp_path / "s"))
-    result = run(folder, *QUICK, "--base-pose", far)
-    if isinstance(result.exception, InputError):
-        assert "base" in str(result.exception)  # the arm cannot even hold its hand over the table
-    else:
-        assert result.exit_code == 1
-        for s in load_grasps(folder):
-            assert not s.reachable.any() and np.all(s.scores == 0) and all(s.failures)
-
-
-def test_sources_that_are_none_are_refused(pristine: Path, tmp_path: Path) -> None:
-    assert "no session.json" in refused(tmp_path, *QUICK)
-    assert "does not exist" in refused(tmp_path / "nowhere", *QUICK)
-    assert str(pristine) in refused(pristine.parent, *QUICK)
-    assert "--out" in refused(pristine, *QUICK, "--out", tmp_path)
-    assert "is a session" in refused(tmp_path, *QUICK, "--out", pristine)
-    assert "scene" in refused(tmp_path, *QUICK, "--out", tmp_path / "o")
-    assert "no grasps yet" in refused("export", pristine, "--to", "hdf5", "--out", tmp_path / "o")
-    assert "no results" in refused("summary", tmp_path)
-
-
-def test_an_export_over_its_own_source_is_refused(tried: tuple[Path, Result]) -> None:
-    for out in (tried[0], tried[0] / "grasps"):
-        assert "another folder" in refused("export", tried[0], "--to", "parquet", "--out", out)
-
-
 # --- the config ---------------------------------------------------------------------------------
 
 
@@ -428,40 +258,3 @@ def test_what_is_asked_for_reaches_the_config() -> None:
     assert (config.seed, config.max_candidates) == (3, 7)
     plain = config_of(SchoolRequest(), scene())
     assert plain.second_engine is None and plain.sweep is None
-
-
-def test_a_file_needs_a_folder_for_its_results_and_no_file_is_one(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.yaml"
-    scene.write_text("object1: {}\n")
-    assert "add --out FOLDER" in refused(scene, *QUICK)
-    assert "is a file" in refused(scene, *QUICK, "--out", scene)
-
-
-def test_what_cannot_be_written_in_the_end_is_refused_at_once(
-    pristine: Path, tmp_path: Path
-) -> None:
-    assert "is a folder" in refused(pristine, *QUICK, "--json", tmp_path)
-
-
-BIN = """<robot name="bin"><link name="base"><inertial><mass value="1"/>
-<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
-<collision><origin xyz="0 0 -0.3"/><geometry><box size="0.01 0.01 0.01"/></geometry></collision>
-</link></robot>"""
-
-
-def test_supports_stand_beside_the_table_and_a_missing_one_is_named(
-    pristine: Path, tmp_path: Path
-) -> None:
-    missing = refused("settle", pristine, "--support", tmp_path / "shelf.urdf")
-    assert "'shelf'" in missing and "does not exist" in missing
-    below = tmp_path / "bin.urdf"
-    below.write_text(BIN)
-    folder = Path(shutil.copytree(pristine, tmp_path / "s"))
-    with_bin = run("settle", folder, "--support", below, "--json", tmp_path / "a.json")
-    without = run("settle", folder, "--json", tmp_path / "b.json")
-    assert with_bin.exit_code == without.exit_code
-    verdicts = [
-        [o["verdict"] for o in json.loads((tmp_path / n).read_text())["objects"]]
-        for n in ("a.json", "b.json")
-    ]
-    assert verdicts[0] == verdicts[1]

@@ -1,0 +1,61 @@
+"""A registered session of two things, and the command `realsim school` in this process."""
+
+from pathlib import Path
+
+import numpy as np
+from click.testing import CliRunner, Result
+
+from realsim.app.school_cli import SCHOOL
+from realsim.errors import InputError
+from realsim.formats.bop_models import save_models
+from realsim.geometry import se3
+from realsim.geometry.parts import part
+from realsim.records import CaptureSession, ObjectPose, Scene, SupportPlane
+from realsim.store import SessionStore, save_scene
+from registered_sessions import CAMERA
+
+GRASPS = 5
+QUICK = ("--engine", "mujoco", "--grasps", GRASPS, "--workers", "1", "--quiet")
+NAMES = ("cube", "wedge")
+T_WORLD_TABLE = se3.from_rt(se3.exp_so3(np.array([0.0, 0.0, 0.4])), [0.3, 0.1, 0.02])
+
+
+def run(*args: object) -> Result:
+    """Run the group in this process."""
+    return CliRunner().invoke(SCHOOL, [str(a) for a in args])
+
+
+def refused(*args: object) -> str:
+    """Return what the group refuses the arguments with."""
+    result = run(*args)
+    assert isinstance(result.exception, InputError), result.output
+    return str(result.exception)
+
+
+def scene() -> Scene:
+    """Two convex things, apart on a table that is not the world's xy plane."""
+    objects = tuple(
+        ObjectPose(
+            obj_id=part(name).obj_id,
+            instance=k,
+            T_world_obj=T_WORLD_TABLE @ standing(name, x, angle),
+        )
+        for k, (name, x, angle) in enumerate(zip(NAMES, (-0.1, 0.1), (0.2, 1.1), strict=True))
+    )
+    return Scene(name="two", objects=objects, plane=SupportPlane(T_world_table=T_WORLD_TABLE))
+
+
+def standing(name: str, x: float, angle: float) -> np.ndarray:
+    """Return T_table_obj of a part on its lowest point."""
+    T = se3.from_rt(se3.exp_so3(np.array([0.0, 0.0, angle])), [x, 0.0, 0.0])
+    T[2, 3] = -part(name).mesh.bounds[0][2]
+    return T
+
+
+def registered(folder: Path) -> Path:
+    """Write a registered session of the scene and return its folder."""
+    session = CaptureSession(name="two", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(folder, session)
+    save_models(folder / "models", {part(n).obj_id: part(n) for n in NAMES})
+    save_scene(store, scene())
+    return folder
