@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -244,10 +245,11 @@ def test_a_changed_byte_is_found(tmp_path):
 
 def test_every_prefix_of_a_view_that_a_kill_can_leave_is_cleaned_up(tmp_path):
     # All files in the order in which add_view writes them, cut at every step and within lines.
-    store = filled(tmp_path / "whole", 1)
-    robot_before = (tmp_path / "whole/robot.jsonl").read_bytes()
-    manifest_before = (tmp_path / "whole/manifest.jsonl").read_bytes()
-    store.add_view(make_view(1), *make_images(1))
+    filled(tmp_path / "one", 1)
+    robot_before = (tmp_path / "one/robot.jsonl").read_bytes()
+    manifest_before = (tmp_path / "one/manifest.jsonl").read_bytes()
+    shutil.copytree(tmp_path / "one", tmp_path / "whole")
+    SessionStore.open(tmp_path / "whole").add_view(make_view(1), *make_images(1))
     robot = (tmp_path / "whole/robot.jsonl").read_bytes()
     manifest = (tmp_path / "whole/manifest.jsonl").read_bytes()
     assert robot.startswith(robot_before)
@@ -260,7 +262,7 @@ def test_every_prefix_of_a_view_that_a_kill_can_leave_is_cleaned_up(tmp_path):
     ]
     for k, (what, images, robot_bytes, manifest_bytes, views) in enumerate(steps):
         folder = tmp_path / str(k)
-        filled(folder, 1)
+        shutil.copytree(tmp_path / "one", folder)  # the same session: begun in the same second
         for image in [*images, "session.json"]:
             (folder / image).write_bytes((tmp_path / "whole" / image).read_bytes())
         (folder / "robot.jsonl").write_bytes(robot_bytes)
