@@ -51,6 +51,15 @@ class Labels:
     3x canvas), where the lens model can be inverted."""
     px_count_visib: dict[int, int]
     """Visible pixels per instance."""
+    geometry: NDArray[np.int32]
+    """(H, W) number of the placed mesh seen; -1 = nothing."""
+    face: NDArray[np.int32]
+    """(H, W) its face; -1 = nothing."""
+    unknown: Mask
+    """(H, W) pixels whose ray does not exist: the lens model cannot be inverted there. They carry
+    no label and no depth."""
+    camera_inside: tuple[int, ...] = ()
+    """Instances that the camera stands inside of: what it sees of them are their inner walls."""
     visible_fraction: dict[int, float] = field(init=False)
     """px_count_visib / px_count_all per instance; 0 where the object is out of view."""
 
@@ -144,8 +153,10 @@ class LabelRenderer:
             amodal[p.instance] = mask
             count_all[p.instance] = int(np.count_nonzero(mask)) + beyond
             count_visible[p.instance] = int(np.count_nonzero(visible))
+        face = self._scene.cast(T[:3, 3], directions.reshape(-1, 3)).face.reshape(ids.shape)
         return Labels(ids=ids, depth_m=depth_m, amodal=amodal, px_count_all=count_all,
-                      px_count_visib=count_visible)  # fmt: skip
+                      px_count_visib=count_visible, geometry=geometry, face=face,
+                      unknown=np.isnan(table[..., 0]))  # fmt: skip
 
     def _first(self, directions: Array32, eye: Array) -> tuple[Array32, NDArray[np.int32]]:
         """Return depth (N,), 0 = nothing, and placed mesh (N,), -1 = nothing, of pixel rays."""

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh
+from realsim.rendering.appearance import Material
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -34,6 +35,8 @@ class PlacedMesh:
     mesh: Mesh
     T_world_obj: Array
     """(4, 4) mesh in world [m]."""
+    material: Material | None = None
+    """Its look; None = the mesh's own texture or colours, else a paint by its instance."""
 
     def __post_init__(self) -> None:
         """Check the instance number and that the pose is rigid."""
