@@ -57,6 +57,62 @@ def distort_jacobian(coefficients: ArrayLike, xy: ArrayLike) -> Array:
     return J
 
 
+TURNING_STEPS = 20000
+"""Steps of the search for the turning radius; each is half a thousandth of a focal length."""
+
+
+@lru_cache(maxsize=32)
+def _turning_radius(coefficients: tuple[float, ...]) -> float:
+    r = np.linspace(0.0, TURNING_STEPS / 2000, TURNING_STEPS + 1)
+    d = np.array(coefficients)
+    d[[2, 3]] = 0.0  # the tangential terms are small and have no single turning radius
+    rd = distort(d, np.stack([r, np.zeros_like(r)], -1))[:, 0]
+    falling = np.flatnonzero((np.diff(rd) <= 0) | ~np.isfinite(np.diff(rd)))
+    return float(r[falling[0]]) if len(falling) else float("inf")
+
+
+def turning_radius(intrinsics: CameraIntrinsics) -> float:
+    """Return the ideal radius sqrt(x^2 + y^2) where the lens model stops growing; inf if never.
+
+    A polynomial fitted inside the image turns round somewhere outside: from there on it folds the
+    scene back into the picture. Only what is nearer to the axis than this exists.
+    """
+    return _turning_radius(tuple(float(v) for v in intrinsics.distortion))
+
+
+BEND_SAMPLES = 48
+"""Points per side of the square in which the bend of the lens model is looked for."""
+
+
+@lru_cache(maxsize=32)
+def _greatest_bend(key: tuple[float, ...]) -> float:
+    fx, fy, *coefficients = key
+    reach = min(_turning_radius(tuple(coefficients)), 3.0)
+    side = np.linspace(-reach, reach, BEND_SAMPLES)
+    xy = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    xy = xy[np.linalg.norm(xy, axis=1) <= reach]
+    h = 1e-4
+    rows: list[Array] = []
+    for axis in (0, 1):
+        step = np.zeros(2)
+        step[axis] = h
+        ahead = distort_jacobian(coefficients, xy + step)
+        behind = distort_jacobian(coefficients, xy - step)
+        rows.append(np.abs(ahead - behind) / (2 * h))
+    second = np.stack(rows, -1) * np.array([fx, fy])[:, None, None]
+    # |f(x + d) - linear| <= 0.5 sum |f_ij| |d_i| |d_j| <= 0.5 max row sum (dx^2 + dy^2).
+    return 0.5 * float(np.nanmax(second.sum((-1, -2))))
+
+
+def greatest_bend(intrinsics: CameraIntrinsics) -> float:
+    """Return the bound b [px] by which the lens bends: at most b (dx^2 + dy^2) over ideal dx, dy.
+
+    It holds to three focal lengths off the axis or to the turning radius.
+    """
+    i = intrinsics
+    return _greatest_bend((i.fx, i.fy, *(float(v) for v in i.distortion)))
+
+
 def project(intrinsics: CameraIntrinsics, points_cam: ArrayLike) -> Array:
     """Return pixels (..., 2) of camera points (..., 3) [m]; NaN where z <= 0."""
     p = np.asarray(points_cam, dtype=np.float64)
@@ -142,6 +198,8 @@ def undistort(intrinsics: CameraIntrinsics, uv: ArrayLike) -> tuple[Array, NDArr
     error_px = np.abs(distort(intrinsics.distortion, xy) - target).max(-1) * intrinsics.fx
     det = np.linalg.det(distort_jacobian(intrinsics.distortion, xy))
     valid = (error_px < 1e-6) & (det > 0)
+    # Beyond the turning radius a solution is on a branch that no lens has.
+    valid &= np.sum(xy * xy, axis=-1) < turning_radius(intrinsics) ** 2
     return np.where(valid[..., None], xy, np.nan), valid
 
 

@@ -1,0 +1,57 @@
+"""Maps of the surfaces that a view sees: where on its object a pixel lies, and how it is turned."""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+Mask = NDArray[np.bool_]
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def surface_maps(
+    rays: Array32,
+    hits: tuple[Array32, Int32, Int32],
+    Ts_obj_cam: Array,
+    normals: Array32,
+    starts: NDArray[np.int64],
+    labelled: Mask,
+    wanted: int,
+) -> Array32:
+    """Return a map (H, W, 3) of the surfaces seen: 0 = object coordinates, 1 = camera normals.
+
+    Args:
+        rays: (H, W, 3).
+        hits: depth (H, W), 0 = nothing [m]; placed mesh (H, W), -1 = nothing; its face (H, W).
+        Ts_obj_cam: (G, 4, 4).
+        normals: (F, 3) unit normals of all meshes' faces, in the meshes' frames.
+        starts: (G,) number of a mesh's first face among them.
+        labelled: (G,) whether the map is wanted on this mesh.
+        wanted: which map.
+    """
+    depth, geometry, face = hits
+    height, width = depth.shape
+    out = np.zeros((height, width, 3), np.float32)
+    for v in range(height):
+        for u in range(width):
+            g = geometry[v, u]
+            if g < 0 or not labelled[g]:
+                continue
+            T = Ts_obj_cam[g]
+            if wanted == 0:
+                z = np.float64(depth[v, u])
+                x, y = z * rays[v, u, 0], z * rays[v, u, 1]
+                for k in range(3):
+                    out[v, u, k] = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z + T[k, 3]
+            else:
+                n = normals[starts[g] + face[v, u]]
+                # R_cam_obj is the transpose of R_obj_cam.
+                x = T[0, 0] * n[0] + T[1, 0] * n[1] + T[2, 0] * n[2]
+                y = T[0, 1] * n[0] + T[1, 1] * n[1] + T[2, 1] * n[2]
+                z = T[0, 2] * n[0] + T[1, 2] * n[1] + T[2, 2] * n[2]
+                away = x * rays[v, u, 0] + y * rays[v, u, 1] + z > 0.0
+                side = -1.0 if away else 1.0
+                out[v, u, 0], out[v, u, 1], out[v, u, 2] = side * x, side * y, side * z
+    return out

@@ -1,0 +1,311 @@
+"""Which pixel rays a triangle stops: ray casting in the order of the triangles.
+
+A ray (x, y, 1) meets the triangle a b c if it passes all three edges on the same side: the signs
+of ray . (a x b), ray . (b x c), ray . (c x a) agree (Plücker's test with the eye as origin). The
+ray parameter of the hit, which is the depth along z, is a . (b x c) over the sum of the three.
+An edge shared by two triangles gives both the same number with opposite sign, so no ray slips
+through between them. Only the pixels in the triangle's box on the image are tried, and scanned
+meshes have triangles smaller than a pixel: this is why going by triangles costs a fifth of going
+by rays, at twice the digits.
+"""
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+Mask = NDArray[np.bool_]
+Placed = tuple[Array, Array, Int32]
+Box = tuple[float, float, float, float]
+PixelRange = tuple[int, int, int, int]
+EdgePlanes = tuple[float, float, float, float, float, float, float, float, float, float]
+NEAREST_M = 1e-6
+"""Depth [m] in front of which a vertex counts as behind the camera."""
+ROUNDING_PX = 0.01
+"""By so much the box of a triangle is widened for rounding, of the ray table above all [px]."""
+CURVED_PX = 0.5
+"""A triangle whose sides may bend by more than this on the image is bounded by a grid [px]."""
+NO_BOX = (1.0, 0.0, 1.0, 0.0)
+"""Bounds of what has no picture."""
+GRID = 9
+"""Points per side of that grid."""
+LENS_SIZE = 15
+"""Length of the array that describes a lens: see `lens_array`."""
+
+
+@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _distorted(lens: Array, x: float, y: float) -> tuple[float, float]:
+    """Return the pixel of ideal coordinates; `lens` as of `project_vertices`."""
+    if lens[14] == 0.0:
+        return x * lens[0] + lens[2], y * lens[1] + lens[3]
+    r2 = x * x + y * y
+    radial = (1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))) / (
+        1.0 + r2 * (lens[9] + r2 * (lens[10] + r2 * lens[11]))
+    )
+    xd = x * radial + 2.0 * lens[6] * x * y + lens[7] * (r2 + 2.0 * x * x)
+    yd = y * radial + lens[6] * (r2 + 2.0 * y * y) + 2.0 * lens[7] * x * y
+    return xd * lens[0] + lens[2], yd * lens[1] + lens[3]
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def project_vertices(vertices: Array, T_cam_obj: Array, lens: Array) -> tuple[Array, Array]:
+    """Return vertices in the camera (V, 3) [m] and where they are seen (V, 4): u, v [px], x/z, y/z.
+
+    u and v are NaN where the vertex is behind the camera or outside the disc in which the lens
+    model is one to one.
+
+    Args:
+        vertices: (V, 3) [m].
+        T_cam_obj: (4, 4).
+        lens: (15,) fx fy cx cy, k1 k2 p1 p2 k3 k4 k5 k6, turning radius, bend, 1 = distorted.
+    """
+    n = len(vertices)
+    points = np.empty((n, 3))
+    seen = np.empty((n, 4))
+    reach2 = lens[12] * lens[12]
+    for i in range(n):
+        vx, vy, vz = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        for k in range(3):
+            points[i, k] = (
+                T_cam_obj[k, 0] * vx + T_cam_obj[k, 1] * vy + T_cam_obj[k, 2] * vz + T_cam_obj[k, 3]
+            )
+        z = points[i, 2]
+        if z > NEAREST_M:
+            x, y = points[i, 0] / z, points[i, 1] / z
+            seen[i, 2], seen[i, 3] = x, y
+            if x * x + y * y < reach2:
+                seen[i, 0], seen[i, 1] = _distorted(lens, x, y)
+                continue
+        seen[i, 0] = np.nan
+        seen[i, 1] = np.nan
+    return points, seen
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _curved_box(low_x: float, high_x: float, low_y: float, high_y: float, lens: Array) -> Box:
+    """Return u and v bounds of a box of ideal coordinates, where the lens model is one to one."""
+    u0 = v0 = np.inf
+    u1 = v1 = -np.inf
+    step_x, step_y = (high_x - low_x) / (GRID - 1), (high_y - low_y) / (GRID - 1)
+    for i in range(GRID):
+        for j in range(GRID):
+            x, y = low_x + i * step_x, low_y + j * step_y
+            r = np.sqrt(x * x + y * y)
+            if r > lens[12]:
+                x, y = x * lens[12] / r, y * lens[12] / r
+            u, v = _distorted(lens, x, y)
+            u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
+    slack = ROUNDING_PX + lens[13] * (step_x * step_x + step_y * step_y)
+    if lens[12] < np.inf:  # a clamped grid misses the rim between its points
+        slack += 0.02 * max(u1 - u0, v1 - v0)
+    return u0 - slack, u1 + slack, v0 - slack, v1 + slack
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _lens_box(points: Array, seen: Array, i: int, j: int, k: int, lens: Array) -> Box:
+    """Return what `_box` does, for a distorted camera or a vertex without a pixel."""
+    za, zb, zc = points[i, 2], points[j, 2], points[k, 2]
+    if max(za, zb, zc) <= NEAREST_M:
+        return NO_BOX
+    if min(za, zb, zc) <= NEAREST_M:  # it reaches behind the camera: no bounds
+        return -np.inf, np.inf, -np.inf, np.inf
+    ax, bx, cx = seen[i, 2], seen[j, 2], seen[k, 2]
+    ay, by, cy = seen[i, 3], seen[j, 3], seen[k, 3]
+    low_x, high_x = min(ax, bx, cx), max(ax, bx, cx)
+    low_y, high_y = min(ay, by, cy), max(ay, by, cy)
+    whole = not (np.isnan(seen[i, 0]) or np.isnan(seen[j, 0]) or np.isnan(seen[k, 0]))
+    if not whole:
+        near_x, near_y = max(low_x, min(0.0, high_x)), max(low_y, min(0.0, high_y))
+        if near_x * near_x + near_y * near_y > lens[12] * lens[12]:
+            return NO_BOX
+    bent = lens[13] * ((high_x - low_x) ** 2 + (high_y - low_y) ** 2)
+    if not whole or bent > CURVED_PX:
+        return _curved_box(low_x, high_x, low_y, high_y, lens)
+    slack = ROUNDING_PX + bent
+    return (
+        min(seen[i, 0], seen[j, 0], seen[k, 0]) - slack,
+        max(seen[i, 0], seen[j, 0], seen[k, 0]) + slack,
+        min(seen[i, 1], seen[j, 1], seen[k, 1]) - slack,
+        max(seen[i, 1], seen[j, 1], seen[k, 1]) + slack,
+    )
+
+
+@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _box(points: Array, seen: Array, i: int, j: int, k: int, lens: Array) -> Box:
+    """Return u and v bounds of a triangle's picture [px]; first > second where there is none."""
+    ua, ub, uc = seen[i, 0], seen[j, 0], seen[k, 0]
+    if lens[14] != 0.0 or np.isnan(ua + ub + uc):
+        return _lens_box(points, seen, i, j, k, lens)
+    va, vb, vc = seen[i, 1], seen[j, 1], seen[k, 1]
+    return (
+        min(ua, ub, uc) - ROUNDING_PX,
+        max(ua, ub, uc) + ROUNDING_PX,
+        min(va, vb, vc) - ROUNDING_PX,
+        max(va, vb, vc) + ROUNDING_PX,
+    )
+
+
+@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _pixel_range(box: Box, width: int, height: int) -> PixelRange:
+    """Return first and last column, first and last row of the pixel centres in a box."""
+    u0, u1, v0, v1 = box
+    if not (u1 >= 0.0 and v1 >= 0.0 and u0 <= width - 1.0 and v0 <= height - 1.0):
+        return 0, -1, 0, -1
+    return (
+        int(np.ceil(max(u0, 0.0))),
+        int(np.floor(min(u1, width - 1.0))),
+        int(np.ceil(max(v0, 0.0))),
+        int(np.floor(min(v1, height - 1.0))),
+    )
+
+
+@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _edge_planes(points: Array, i: int, j: int, k: int) -> EdgePlanes:
+    """Return b x c, c x a and a x b of a triangle a b c, and a . (b x c)."""
+    ax, ay, az = points[i, 0], points[i, 1], points[i, 2]
+    bx, by, bz = points[j, 0], points[j, 1], points[j, 2]
+    cx, cy, cz = points[k, 0], points[k, 1], points[k, 2]
+    px, py, pz = by * cz - bz * cy, bz * cx - bx * cz, bx * cy - by * cx
+    return (
+        px, py, pz,
+        cy * az - cz * ay, cz * ax - cx * az, cx * ay - cy * ax,
+        ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx,
+        ax * px + ay * py + az * pz,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def cast_triangles(
+    mesh: Placed,
+    lens: Array,
+    rays: Array32,
+    number: int,
+    cull: bool,
+    buffers: tuple[Array32, Int32, Int32],
+    covered: Mask,
+) -> tuple[int, PixelRange, Box]:
+    """Enter a mesh's hits where they are nearer than what is there; mark all that it covers.
+
+    Args:
+        mesh: vertices in the camera (V, 3) [m], where they are seen (V, 4), as of
+            `project_vertices`, and faces (F, 3).
+        lens: as of `project_vertices`.
+        rays: (H, W, 2 or 3) x and y of the rays; NaN = no ray.
+        number: what is entered as the placed mesh.
+        cull: whether faces seen from behind are skipped: only for closed meshes seen from outside.
+        buffers: changed: depth (H, W) of the nearest hit, inf = none [m]; placed mesh (H, W);
+            its face (H, W).
+        covered: (H, W) changed: True where any face is hit; may be empty (0, 0) = not wanted.
+
+    Returns:
+        How many pixels of `covered` were set; the first and last column, first and last row of
+        them (last < first = none); and the bounds of the mesh's whole picture, also beyond the
+        border [px].
+    """
+    points, seen, faces = mesh
+    depth, geometry, face = buffers
+    height, width = depth.shape
+    wanted = covered.shape[0] > 0
+    count = 0
+    left, right, top, bottom = width, -1, height, -1
+    low_u = low_v = np.inf
+    high_u = high_v = -np.inf
+    for f in range(len(faces)):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        box = _box(points, seen, i, j, k, lens)
+        if box[0] <= box[1]:
+            low_u, high_u = min(low_u, box[0]), max(high_u, box[1])
+            low_v, high_v = min(low_v, box[2]), max(high_v, box[3])
+        first_u, last_u, first_v, last_v = _pixel_range(box, width, height)
+        if first_u > last_u or first_v > last_v:
+            continue  # it lies between the pixel centres
+        px, py, pz, qx, qy, qz, rx, ry, rz, volume = _edge_planes(points, i, j, k)
+        if volume == 0.0 or (cull and volume > 0.0):
+            continue  # seen exactly from the side, or from behind
+        side = 1.0 if volume > 0.0 else -1.0
+        for v in range(first_v, last_v + 1):
+            for u in range(first_u, last_u + 1):
+                x, y = np.float64(rays[v, u, 0]), np.float64(rays[v, u, 1])
+                wa = side * (x * px + y * py + pz)
+                wb = side * (x * qx + y * qy + qz)
+                wc = side * (x * rx + y * ry + rz)
+                total = wa + wb + wc
+                if not (wa >= 0.0 and wb >= 0.0 and wc >= 0.0 and total > 0.0):
+                    continue
+                if wanted and not covered[v, u]:
+                    covered[v, u] = True
+                    count += 1
+                    left, right = min(left, u), max(right, u)
+                    top, bottom = min(top, v), max(bottom, v)
+                t = np.float32(side * volume / total)
+                if t < depth[v, u]:
+                    depth[v, u] = t
+                    geometry[v, u] = number
+                    face[v, u] = f
+    return count, (left, right, top, bottom), (low_u, high_u, low_v, high_v)
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def count_outside(
+    mesh: Placed, lens: Array, rays: Array32, origin: tuple[int, int], size: tuple[int, int]
+) -> int:
+    """Return how many canvas pixels outside the image a mesh covers.
+
+    Args:
+        mesh: as of `cast_triangles`.
+        lens: as of `project_vertices`.
+        rays: (h, w, 2) rays of a window of the canvas; NaN = no ray.
+        origin: pixel u, v of the window's first ray.
+        size: width and height of the image.
+    """
+    points, seen, faces = mesh
+    height, width = rays.shape[:2]
+    covered = np.zeros((height, width), np.bool_)
+    count = 0
+    for f in range(len(faces)):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        u0, u1, v0, v1 = _box(points, seen, i, j, k, lens)
+        box = (u0 - origin[0], u1 - origin[0], v0 - origin[1], v1 - origin[1])
+        first_u, last_u, first_v, last_v = _pixel_range(box, width, height)
+        if first_u > last_u or first_v > last_v:
+            continue
+        px, py, pz, qx, qy, qz, rx, ry, rz, volume = _edge_planes(points, i, j, k)
+        if volume == 0.0:
+            continue
+        side = 1.0 if volume > 0.0 else -1.0
+        for v in range(first_v, last_v + 1):
+            inside_rows = 0 <= v + origin[1] < size[1]
+            for u in range(first_u, last_u + 1):
+                if covered[v, u] or (inside_rows and 0 <= u + origin[0] < size[0]):
+                    continue
+                x, y = np.float64(rays[v, u, 0]), np.float64(rays[v, u, 1])
+                wa = side * (x * px + y * py + pz)
+                wb = side * (x * qx + y * qy + qz)
+                wc = side * (x * rx + y * ry + rz)
+                if wa >= 0.0 and wb >= 0.0 and wc >= 0.0 and wa + wb + wc > 0.0:
+                    covered[v, u] = True
+                    count += 1
+    return count
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def solid_angle_share(points: Array, faces: Int32) -> float:
+    """Return the share of the sphere about the origin that the faces fill: 1 inside, 0 outside.
+
+    The sum of signed solid angles (van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 1983), which
+    for a closed mesh is its winding number.
+    """
+    total = 0.0
+    for f in range(len(faces)):
+        a, b, c = points[faces[f, 0]], points[faces[f, 1]], points[faces[f, 2]]
+        la, lb, lc = np.sqrt(np.sum(a * a)), np.sqrt(np.sum(b * b)), np.sqrt(np.sum(c * c))
+        volume = (
+            a[0] * (b[1] * c[2] - b[2] * c[1])
+            + a[1] * (b[2] * c[0] - b[0] * c[2])
+            + a[2] * (b[0] * c[1] - b[1] * c[0])
+        )
+        ab, bc, ca = np.sum(a * b), np.sum(b * c), np.sum(c * a)
+        total += np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
+    return total / (2.0 * np.pi)
