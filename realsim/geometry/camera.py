@@ -80,14 +80,16 @@ def turning_radius(intrinsics: CameraIntrinsics) -> float:
     return _turning_radius(tuple(float(v) for v in intrinsics.distortion))
 
 
+FARTHEST_RADIUS = 3.0
+"""Ideal radius beyond which nobody looks: 72 degrees off the axis."""
 BEND_SAMPLES = 48
 """Points per side of the square in which the bend of the lens model is looked for."""
 
 
 @lru_cache(maxsize=32)
-def _greatest_bend(key: tuple[float, ...]) -> float:
+def _greatest_bend(key: tuple[float, ...], radius: float) -> float:
     fx, fy, *coefficients = key
-    reach = min(_turning_radius(tuple(coefficients)), 3.0)
+    reach = min(_turning_radius(tuple(coefficients)), radius)
     side = np.linspace(-reach, reach, BEND_SAMPLES)
     xy = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     xy = xy[np.linalg.norm(xy, axis=1) <= reach]
@@ -104,13 +106,15 @@ def _greatest_bend(key: tuple[float, ...]) -> float:
     return 0.5 * float(np.nanmax(second.sum((-1, -2))))
 
 
-def greatest_bend(intrinsics: CameraIntrinsics) -> float:
+def greatest_bend(intrinsics: CameraIntrinsics, radius: float) -> float:
     """Return the bound b [px] by which the lens bends: at most b (dx^2 + dy^2) over ideal dx, dy.
 
-    It holds to three focal lengths off the axis or to the turning radius.
+    Args:
+        intrinsics: the camera.
+        radius: to which ideal radius it must hold; it never needs to beyond the turning radius.
     """
     i = intrinsics
-    return _greatest_bend((i.fx, i.fy, *(float(v) for v in i.distortion)))
+    return _greatest_bend((i.fx, i.fy, *(float(v) for v in i.distortion)), float(radius))
 
 
 def project(intrinsics: CameraIntrinsics, points_cam: ArrayLike) -> Array:

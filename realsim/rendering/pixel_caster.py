@@ -5,11 +5,12 @@ The work is done triangle by triangle (see `triangle_rays`); this file knows mes
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from realsim.geometry import camera, mesh_shape, se3
+from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.rays import PlacedMesh
 from realsim.rendering.triangle_rays import cast_triangles, project_vertices, solid_angle_share
@@ -49,41 +50,55 @@ class ProjectedMesh:
     faces: Int32
     """(F, 3)."""
     lens: Array
-    """(15,) see `triangle_rays.project_vertices`."""
+    """(17,) see `triangle_rays.project_vertices`."""
     contains_camera: bool
     """Whether the camera stands inside."""
     cull: bool
     """Whether faces seen from behind can be skipped."""
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Body:
+    """A mesh as it is cast: vertices at the same place are one, which STL files repeat."""
+
+    vertices: Array
+    """(V, 3) [m]."""
+    faces: Int32
+    """(F, 3) in the mesh's own order."""
+    bounds: Array
+    """(2, 3) least and greatest corner [m]."""
+    is_solid: bool
+    """Whether it is closed and every piece of it has its faces turned outwards."""
+
+
 class PixelCaster:
     """Casts the pixel rays of any view of one scene."""
 
     def __init__(self, placed: Sequence[PlacedMesh]) -> None:
-        """Find out of every mesh whether it is closed: half of its faces can be skipped then."""
+        """Weld every mesh and find out whether it is closed: half of its faces are skipped then."""
         self.placed = tuple(placed)
-        solid: dict[int, bool] = {}
+        bodies: dict[int, Body] = {}
         for p in self.placed:
-            if id(p.mesh) not in solid:
-                solid[id(p.mesh)] = is_solid(p.mesh)
-        self._solid = [solid[id(p.mesh)] for p in self.placed]
+            if id(p.mesh) not in bodies:
+                bodies[id(p.mesh)] = body_of(p.mesh)
+        self._bodies = [bodies[id(p.mesh)] for p in self.placed]
 
     def project(
         self, number: int, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike
     ) -> ProjectedMesh:
         """Return the placed mesh of this number as the camera has it."""
-        p = self.placed[number]
+        p, body = self.placed[number], self._bodies[number]
         T_cam_obj = se3.invert(T_world_cam) @ p.T_world_obj
         lens = lens_array(intrinsics)
-        points, seen = project_vertices(p.mesh.vertices, T_cam_obj, lens)
+        points, seen = project_vertices(body.vertices, T_cam_obj, lens)
         eye = se3.invert(T_cam_obj)[:3, 3]
-        low, high = p.mesh.bounds
+        low, high = body.bounds
         contains = bool(np.all(eye > low) and np.all(eye < high)) and (
-            abs(solid_angle_share(points, p.mesh.faces)) > INSIDE_SHARE
+            abs(solid_angle_share(points, body.faces)) > INSIDE_SHARE
         )
         return ProjectedMesh(
-            points=points, seen=seen, faces=p.mesh.faces, lens=lens, contains_camera=contains,
-            cull=self._solid[number] and not contains,
+            points=points, seen=seen, faces=body.faces, lens=lens, contains_camera=contains,
+            cull=body.is_solid and not contains,
         )  # fmt: skip
 
     def cast(self, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike) -> FirstHits:
@@ -155,36 +170,54 @@ def finished(buffers: Buffers) -> FirstHits:
     return FirstHits(depth_m=depth, geometry=geometry, face=face)
 
 
+NEAR_IMAGE = 1.1
+"""The bend of the lens is bounded anew beyond this many times the image's own radius: at three
+focal lengths off the axis a polynomial bends a hundred times as much as within the image."""
+
+
+@lru_cache(maxsize=16)
+def _lens_array(key: tuple[float, ...]) -> Array:
+    width, height, fx, fy, cx, cy, *coefficients = key
+    i = CameraIntrinsics(
+        width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy,
+        distortion=np.array(coefficients),
+    )  # fmt: skip
+    numbers = [fx, fy, cx, cy, *coefficients, camera.turning_radius(i)]
+    if not i.is_distorted:
+        return np.array([*numbers, 0.0, 0.0, np.inf, 0.0])
+    rays = camera.ray_table(i)[..., :2].astype(np.float64)
+    radius = NEAR_IMAGE * float(np.sqrt(np.nanmax(np.sum(rays * rays, axis=-1))))
+    bends = [camera.greatest_bend(i, r) for r in (radius, camera.FARTHEST_RADIUS)]
+    return np.array([*numbers, bends[0], 1.0, radius * radius, bends[1]])
+
+
 def lens_array(intrinsics: CameraIntrinsics) -> Array:
     """Return the camera as the kernels take it; see `triangle_rays.project_vertices`."""
     i = intrinsics
-    reach, bend = camera.turning_radius(i), camera.greatest_bend(i) if i.is_distorted else 0.0
-    numbers = [i.fx, i.fy, i.cx, i.cy, *i.distortion, reach, bend, float(i.is_distorted)]
-    return np.array(numbers, dtype=np.float64)
+    key = (i.width, i.height, i.fx, i.fy, i.cx, i.cy, *i.distortion.tolist())
+    return _lens_array(tuple(float(v) for v in key))
 
 
-def is_solid(mesh: Mesh) -> bool:
-    """Return whether every piece of a mesh is closed and has its faces turned outwards.
+def body_of(mesh: Mesh) -> Body:
+    """Return a mesh with its vertices welded.
 
-    Of such a mesh a ray from outside always meets the front of a face first, so that the backs
-    need not be tried.
+    It is solid if every piece is closed and has its faces turned outwards: then a ray from outside
+    always meets the front of a face first, and the backs need not be tried.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
-    vertices, faces = mesh_shape.welded(mesh)
-    if len(faces) != len(mesh.faces):
-        return False
+    vertices, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = index.reshape(-1)[mesh.faces]
     n = len(vertices)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     forth = np.sort(edges[:, 0] * n + edges[:, 1])
     back = np.sort(edges[:, 1] * n + edges[:, 0])
-    if len(np.unique(forth)) != len(forth) or not np.array_equal(forth, back):
-        return False
-    joined = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    pieces, piece = connected_components(joined, directed=False)
-    a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
-    volumes = np.bincount(
-        piece[faces[:, 0]], np.einsum("ij,ij->i", a, np.cross(b, c)), minlength=pieces
-    )
-    return bool(np.all(volumes > 0))
+    solid = len(np.unique(forth)) == len(forth) and bool(np.array_equal(forth, back))
+    if solid:
+        joined = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+        pieces, piece = connected_components(joined, directed=False)
+        a, b, c = (vertices[faces[:, k]] - vertices.mean(0) for k in range(3))
+        volumes = np.einsum("ij,ij->i", a, np.cross(b, c))
+        solid = bool(np.all(np.bincount(piece[faces[:, 0]], volumes, minlength=pieces) > 0))
+    return Body(np.ascontiguousarray(vertices), faces.astype(np.int32), mesh.bounds, solid)

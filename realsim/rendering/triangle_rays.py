@@ -18,6 +18,7 @@ Array32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 Placed = tuple[Array, Array, Int32]
+Sides = tuple[float, float, float, float, float, float, float, float, float]
 Box = tuple[float, float, float, float]
 PixelRange = tuple[int, int, int, int]
 EdgePlanes = tuple[float, float, float, float, float, float, float, float, float, float]
@@ -25,14 +26,14 @@ NEAREST_M = 1e-6
 """Depth [m] in front of which a vertex counts as behind the camera."""
 ROUNDING_PX = 0.01
 """By so much the box of a triangle is widened for rounding, of the ray table above all [px]."""
-CURVED_PX = 0.5
+CURVED_PX = 4.0
 """A triangle whose sides may bend by more than this on the image is bounded by a grid [px]."""
+FEW_PIXELS = 12.0
+"""In boxes of fewer pixels all are tried; in larger ones only those near the triangle [px^2]."""
 NO_BOX = (1.0, 0.0, 1.0, 0.0)
 """Bounds of what has no picture."""
 GRID = 9
 """Points per side of that grid."""
-LENS_SIZE = 15
-"""Length of the array that describes a lens: see `lens_array`."""
 
 
 @numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
@@ -59,7 +60,8 @@ def project_vertices(vertices: Array, T_cam_obj: Array, lens: Array) -> tuple[Ar
     Args:
         vertices: (V, 3) [m].
         T_cam_obj: (4, 4).
-        lens: (15,) fx fy cx cy, k1 k2 p1 p2 k3 k4 k5 k6, turning radius, bend, 1 = distorted.
+        lens: (17,) fx fy cx cy, k1 k2 p1 p2 k3 k4 k5 k6, turning radius, bend near the image,
+            1 = distorted, square of the ideal radius that this bend holds to, bend beyond it.
     """
     n = len(vertices)
     points = np.empty((n, 3))
@@ -97,7 +99,7 @@ def _curved_box(low_x: float, high_x: float, low_y: float, high_y: float, lens: 
                 x, y = x * lens[12] / r, y * lens[12] / r
             u, v = _distorted(lens, x, y)
             u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
-    slack = ROUNDING_PX + lens[13] * (step_x * step_x + step_y * step_y)
+    slack = ROUNDING_PX + lens[16] * (step_x * step_x + step_y * step_y)
     if lens[12] < np.inf:  # a clamped grid misses the rim between its points
         slack += 0.02 * max(u1 - u0, v1 - v0)
     return u0 - slack, u1 + slack, v0 - slack, v1 + slack
@@ -105,45 +107,41 @@ def _curved_box(low_x: float, high_x: float, low_y: float, high_y: float, lens: 
 
 @numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
 def _lens_box(points: Array, seen: Array, i: int, j: int, k: int, lens: Array) -> Box:
-    """Return what `_box` does, for a distorted camera or a vertex without a pixel."""
+    """Return what `_box` does, for a triangle that bends or has a vertex without a pixel."""
     za, zb, zc = points[i, 2], points[j, 2], points[k, 2]
     if max(za, zb, zc) <= NEAREST_M:
         return NO_BOX
     if min(za, zb, zc) <= NEAREST_M:  # it reaches behind the camera: no bounds
         return -np.inf, np.inf, -np.inf, np.inf
-    ax, bx, cx = seen[i, 2], seen[j, 2], seen[k, 2]
-    ay, by, cy = seen[i, 3], seen[j, 3], seen[k, 3]
-    low_x, high_x = min(ax, bx, cx), max(ax, bx, cx)
-    low_y, high_y = min(ay, by, cy), max(ay, by, cy)
-    whole = not (np.isnan(seen[i, 0]) or np.isnan(seen[j, 0]) or np.isnan(seen[k, 0]))
-    if not whole:
-        near_x, near_y = max(low_x, min(0.0, high_x)), max(low_y, min(0.0, high_y))
-        if near_x * near_x + near_y * near_y > lens[12] * lens[12]:
-            return NO_BOX
-    bent = lens[13] * ((high_x - low_x) ** 2 + (high_y - low_y) ** 2)
-    if not whole or bent > CURVED_PX:
-        return _curved_box(low_x, high_x, low_y, high_y, lens)
-    slack = ROUNDING_PX + bent
-    return (
-        min(seen[i, 0], seen[j, 0], seen[k, 0]) - slack,
-        max(seen[i, 0], seen[j, 0], seen[k, 0]) + slack,
-        min(seen[i, 1], seen[j, 1], seen[k, 1]) - slack,
-        max(seen[i, 1], seen[j, 1], seen[k, 1]) + slack,
-    )
+    low_x, high_x = min(seen[i, 2], seen[j, 2], seen[k, 2]), max(seen[i, 2], seen[j, 2], seen[k, 2])
+    low_y, high_y = min(seen[i, 3], seen[j, 3], seen[k, 3]), max(seen[i, 3], seen[j, 3], seen[k, 3])
+    near_x, near_y = max(low_x, min(0.0, high_x)), max(low_y, min(0.0, high_y))
+    if near_x * near_x + near_y * near_y > lens[12] * lens[12]:
+        return NO_BOX  # all of it is beyond what the lens model maps
+    return _curved_box(low_x, high_x, low_y, high_y, lens)
 
 
 @numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
 def _box(points: Array, seen: Array, i: int, j: int, k: int, lens: Array) -> Box:
     """Return u and v bounds of a triangle's picture [px]; first > second where there is none."""
     ua, ub, uc = seen[i, 0], seen[j, 0], seen[k, 0]
-    if lens[14] != 0.0 or np.isnan(ua + ub + uc):
+    if np.isnan(ua + ub + uc):
         return _lens_box(points, seen, i, j, k, lens)
+    slack = ROUNDING_PX
+    if lens[14] != 0.0:
+        ax, bx, cx = seen[i, 2], seen[j, 2], seen[k, 2]
+        ay, by, cy = seen[i, 3], seen[j, 3], seen[k, 3]
+        wide, high = max(ax, bx, cx) - min(ax, bx, cx), max(ay, by, cy) - min(ay, by, cy)
+        bend = lens[13] if ax * ax + ay * ay < lens[15] else lens[16]
+        slack += bend * (wide * wide + high * high)
+        if slack > CURVED_PX:
+            return _lens_box(points, seen, i, j, k, lens)
     va, vb, vc = seen[i, 1], seen[j, 1], seen[k, 1]
     return (
-        min(ua, ub, uc) - ROUNDING_PX,
-        max(ua, ub, uc) + ROUNDING_PX,
-        min(va, vb, vc) - ROUNDING_PX,
-        max(va, vb, vc) + ROUNDING_PX,
+        min(ua, ub, uc) - slack,
+        max(ua, ub, uc) + slack,
+        min(va, vb, vc) - slack,
+        max(va, vb, vc) + slack,
     )
 
 
@@ -174,6 +172,41 @@ def _edge_planes(points: Array, i: int, j: int, k: int) -> EdgePlanes:
         ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx,
         ax * px + ay * py + az * pz,
     )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _sides(seen: Array, i: int, j: int, k: int, box: Box) -> Sides:
+    """Return the three sides of a triangle's picture as lines, pushed outwards by its slack.
+
+    A pixel can be in the picture only where g u + h v + e >= 0 for all three (g, h, e). All zeros,
+    which every pixel passes, for a triangle so small that its box is as good, or without corners.
+    """
+    ua, va, ub, vb = seen[i, 0], seen[i, 1], seen[j, 0], seen[j, 1]
+    uc, vc = seen[k, 0], seen[k, 1]
+    turn = (ub - ua) * (vc - va) - (vb - va) * (uc - ua)
+    few = (box[1] - box[0]) * (box[3] - box[2]) < FEW_PIXELS
+    slack = min(ua, ub, uc) - box[0]
+    if few or np.isnan(turn) or turn == 0.0 or slack > CURVED_PX + 2 * ROUNDING_PX:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    s = 1.0 if turn > 0.0 else -1.0
+    ga, ha = -s * (vc - vb), s * (uc - ub)
+    gb, hb = -s * (va - vc), s * (ua - uc)
+    gc, hc = -s * (vb - va), s * (ub - ua)
+    return (
+        ga, ha, slack * (abs(ga) + abs(ha)) - ga * ub - ha * vb,
+        gb, hb, slack * (abs(gb) + abs(hb)) - gb * uc - hb * vc,
+        gc, hc, slack * (abs(gc) + abs(hc)) - gc * ua - hc * va,
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _narrowed(first: int, last: int, g: float, h: float, e: float, v: int) -> tuple[int, int]:
+    """Return the columns of first..last in which g u + h v + e >= 0 may hold in row v."""
+    if g > 0.0:
+        return max(first, int(np.ceil(max(-(h * v + e) / g, first - 1.0)))), last
+    if g < 0.0:
+        return first, min(last, int(np.floor(min(-(h * v + e) / g, last + 1.0))))
+    return first, last if h * v + e >= 0.0 else first - 1
 
 
 @numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
@@ -225,8 +258,12 @@ def cast_triangles(
         if volume == 0.0 or (cull and volume > 0.0):
             continue  # seen exactly from the side, or from behind
         side = 1.0 if volume > 0.0 else -1.0
+        ga, ha, ea, gb, hb, eb, gc, hc, ec = _sides(seen, i, j, k, box)
         for v in range(first_v, last_v + 1):
-            for u in range(first_u, last_u + 1):
+            first, last = _narrowed(first_u, last_u, ga, ha, ea, v)
+            first, last = _narrowed(first, last, gb, hb, eb, v)
+            first, last = _narrowed(first, last, gc, hc, ec, v)
+            for u in range(first, last + 1):
                 x, y = np.float64(rays[v, u, 0]), np.float64(rays[v, u, 1])
                 wa = side * (x * px + y * py + pz)
                 wb = side * (x * qx + y * qy + qz)

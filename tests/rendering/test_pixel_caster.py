@@ -6,7 +6,7 @@ import pytest
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from realsim.rendering.pixel_caster import PixelCaster, is_solid
+from realsim.rendering.pixel_caster import PixelCaster, body_of
 from realsim.rendering.rays import RayScene, rotated
 
 SIZE = (320, 240)
@@ -171,7 +171,7 @@ def test_turning_a_face_round_changes_no_label() -> None:
         )
         for p in placed
     ]
-    assert is_solid(placed[1].mesh) and not is_solid(turned[1].mesh)
+    assert body_of(placed[1].mesh).is_solid and not body_of(turned[1].mesh).is_solid
     T = views(1)[0]
     a, b = (LabelRenderer(s).render(a_camera("d405"), T) for s in (placed, turned))
     assert np.array_equal(a.ids, b.ids) and np.array_equal(a.depth_m, b.depth_m)
@@ -183,7 +183,7 @@ def test_a_mesh_with_a_hole_is_seen_from_within() -> None:
     ball = a_mesh("ball")
     top = ball.vertices[ball.faces].mean(1)[:, 2] > 0.03
     bowl = Mesh(vertices=ball.vertices, faces=ball.faces[~top])
-    assert is_solid(ball) and not is_solid(bowl)
+    assert body_of(ball).is_solid and not body_of(bowl).is_solid
     T = se3.look_at([0, 0, 0.3], [0, 0, 0])
     labels = LabelRenderer([PlacedMesh(0, bowl, np.eye(4))]).render(a_camera("none"), T)
     middle = labels.depth_m[SIZE[1] // 2, SIZE[0] // 2]
