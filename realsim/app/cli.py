@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from realsim import __version__
+from realsim.app.annotate_cli import annotate_command
 from realsim.app.cli_capture import CAPTURE_COMMANDS
 from realsim.app.cli_scan import SCAN
 from realsim.app.option_values import numbers_of
@@ -148,19 +149,6 @@ def calibrate(source: Path, quiet: bool, live: bool, **options: object) -> None:
 
 @commands.command()
 @click.argument("session", type=FOLDER)
-@click.option("--quiet", is_flag=True)
-def annotate(session: Path, quiet: bool) -> None:
-    """Write masks, poses, visibility and grasps for every frame of SESSION."""
-    from realsim.app.console import Console
-    from realsim.app.stages import annotate_session, open_session
-
-    console = Console(quiet=quiet)
-    summary = annotate_session(open_session(session), console)
-    console.say(str(summary))
-
-
-@commands.command()
-@click.argument("session", type=FOLDER)
 @click.option("--truth", type=FOLDER, default=None, help="The simulated lab's truth folder.")
 def report(session: Path, truth: Path | None) -> None:
     """Write SESSION/reports/report.html: one self-contained page with pictures."""
@@ -202,6 +190,7 @@ for _command in CAPTURE_COMMANDS:
 commands.add_command(SCAN)
 commands.add_command(SCHOOL)
 commands.add_command(register_command)
+commands.add_command(annotate_command)
 
 
 def main() -> None:

@@ -91,6 +91,7 @@ def write_report(
         _calibration_section(page, store, folder)
     if (store.folder / "registration/scene.json").is_file():
         _registration_section(page, store, folder, errors)
+        _slider_section(page, store)
     if any((store.folder / "grasps").glob("*.npz")):
         _school_section(page, store, folder)
     if times:
@@ -118,11 +119,23 @@ def _about(store: SessionStore) -> str:
     )
 
 
+def _slider_section(page: Page, store: SessionStore) -> None:
+    """Add sliders of the outlines before and after registration, where there is a before."""
+    from realsim.app.picture_pages import pair_markup, slider_style
+    from realsim.app.report_sliders import registration_pairs
+
+    pairs, before = registration_pairs(store)
+    if pairs:
+        page.section("Before and after registration", before)
+        page.parts.append(f"<style>{slider_style()}</style>")
+        page.parts += [pair_markup(p) for p in pairs]
+
+
 def _photograph_section(page: Page, store: SessionStore, folder: Path) -> None:
     """Add annotated photographs, or the bare ones when nothing is annotated yet."""
     from realsim.rendering.overlay import contact_sheet, save_png
     from realsim.store import load_grasps, load_scene
-    from realsim_sim_bridge.transfer import overlay_picture
+    from realsim_sim_bridge.annotation.pictures import overlay_picture
 
     indices = [v.index for v in store.session.views]
     if not indices:

@@ -16,7 +16,7 @@ from realsim.records import GraspSet, HandEye, ObjectModel, ObjectPose, Scene
 from realsim.store import SessionStore
 
 if TYPE_CHECKING:
-    from realsim_sim_bridge.transfer import TransferSummary
+    from realsim_sim_bridge.annotation.annotate import AnnotationSummary
 
 BOARD_VIEWS = "calibration/capture"
 """Where in a session the views of the tag board lie: a session of their own."""
@@ -225,21 +225,44 @@ def school_session(
     return run_in_session(store, request, console).sets
 
 
-def annotate_session(store: SessionStore, console: Console) -> "TransferSummary":
+def annotate_session(
+    store: SessionStore,
+    console: Console,
+    *,
+    maps: str = "",
+    workers: int = 1,
+    check_depth: bool = True,
+) -> "AnnotationSummary":
     """Write masks, poses, visibility and grasps of every frame that the objects are registered in.
 
+    Args:
+        store: the session.
+        console: where progress is shown.
+        maps: 'all', 'none' or a list of maps; '' = instances and exact depth.
+        workers: processes that compute frames.
+        check_depth: whether what the measured depth shows in front of an object leaves its mask.
+
     Raises:
-        InputError: the session has not been registered.
+        InputError: the session has not been registered, or there is no such map.
     """
     from realsim.store import load_grasps
-    from realsim_sim_bridge.transfer import annotate
+    from realsim_sim_bridge.annotation.annotate import annotate
+    from realsim_sim_bridge.annotation.config import (
+        DEFAULT_MAPS,
+        AnnotationConfig,
+        OccluderConfig,
+        maps_of,
+    )
 
+    config = AnnotationConfig(
+        maps=maps_of(maps) if maps else DEFAULT_MAPS, occluder=OccluderConfig(is_on=check_depth)
+    )
     require_sound(store)
     scene = judged_scene(store)
     only = registered_views(store)
     n = len(store.session.views) if only is None else len(only)
     with console.stage("annotate", f"{n} frames") as tick:
         return annotate(
-            store, scene, session_models(store), load_grasps(store.folder / "grasps"), only=only,
-            progress=tick,
+            store, scene, session_models(store), load_grasps(store.folder / "grasps"), config,
+            only=only, progress=tick, workers=workers,
         )  # fmt: skip

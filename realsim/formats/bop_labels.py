@@ -46,15 +46,61 @@ def bbox_of(mask: Mask, *, inclusive: bool = False) -> Bbox:
     )
 
 
-def rle_of(mask: Mask) -> Json:
-    """Return a mask as COCO's uncompressed run lengths: column by column, zeros first."""
-    flat = np.asarray(mask, dtype=np.bool_).ravel(order="F")
-    changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
-    runs = np.diff(np.concatenate([[0], changes, [flat.size]]))
+def rle_of(
+    mask: Mask, *, origin: tuple[int, int] = (0, 0), shape: tuple[int, ...] | None = None
+) -> Json:
+    """Return a mask as COCO's uncompressed run lengths: column by column, zeros first.
+
+    Args:
+        mask: (h, w).
+        origin: column x and row y of its first pixel in the image.
+        shape: (height, width) of the image, which is not set elsewhere; None = the mask's own.
+
+    Raises:
+        InputError: the mask reaches out of the image.
+    """
+    mask = np.asarray(mask, dtype=np.bool_)
+    (x, y), (h, w) = origin, mask.shape
+    height, width = mask.shape if shape is None else shape
+    if x < 0 or y < 0 or x + w > width or y + h > height:
+        raise InputError(
+            f"a mask of {w}x{h} pixels at ({x}, {y}) reaches out of an image of {width}x{height}."
+        )
+    # A row of zeros above and below: every run of a column begins and ends inside it.
+    padded = np.zeros((w, h + 2), np.int8)
+    padded[:, 1:-1] = mask.T
+    step = np.diff(padded, axis=1)
+    column, row = np.nonzero(step)
+    at = (column + x) * height + row + y
+    starts, ends = at[0::2], at[1::2]
+    if len(starts):  # a run down to the last row goes on in the first row of the next column
+        is_joined = ends[:-1] == starts[1:]
+        starts = starts[np.concatenate([[True], ~is_joined])]
+        ends = ends[np.concatenate([~is_joined, [True]])]
+    edges = np.stack([starts, ends], 1).ravel()
+    runs = np.diff(np.concatenate([[0], edges, [height * width]]))
     counts: list[int] = runs.tolist()
-    if flat.size and flat[0]:
-        counts = [0, *counts]
-    return {"counts": counts, "size": list(mask.shape)}
+    if len(counts) > 1 and counts[-1] == 0:
+        counts.pop()
+    return {"counts": counts, "size": [int(height), int(width)]}
+
+
+def rle_area_and_bbox(rle: Json) -> tuple[int, Bbox]:
+    """Return the pixels of a mask's run lengths, and its box as COCO has it (width = columns)."""
+    height = int(rle["size"][0])
+    edges = np.cumsum(np.asarray(rle["counts"], dtype=np.int64))
+    edges = edges[: len(edges) // 2 * 2]
+    starts, ends = edges[0::2], edges[1::2]
+    area = int(np.sum(ends - starts))
+    if area == 0:
+        return 0, NO_BBOX
+    first, last = starts // height, (ends - 1) // height
+    # A run over several columns covers the last row of one and the first row of the next.
+    crosses = first != last
+    top = int(np.where(crosses, 0, starts % height).min())
+    bottom = int(np.where(crosses, height - 1, (ends - 1) % height).max())
+    left, right = int(first.min()), int(last.max())
+    return area, (left, top, right - left + 1, bottom - top + 1)
 
 
 def mask_of(rle: Json) -> Mask:
@@ -171,8 +217,8 @@ def write_scene_gt_coco(
         )
         for obj_id, given in masks[index]:
             rle = given if isinstance(given, dict) else rle_of(given)
-            mask = mask_of(rle)
-            if not mask.any():
+            area, box = rle_area_and_bbox(rle)
+            if area == 0:
                 continue
             annotations.append(
                 {
@@ -180,8 +226,8 @@ def write_scene_gt_coco(
                     "image_id": index,
                     "category_id": int(obj_id),
                     "iscrowd": 0,
-                    "area": int(np.count_nonzero(mask)),
-                    "bbox": list(bbox_of(mask, inclusive=True)),
+                    "area": area,
+                    "bbox": list(box),
                     "segmentation": rle,
                     "width": camera.width,
                     "height": camera.height,

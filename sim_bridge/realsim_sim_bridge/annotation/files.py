@@ -1,5 +1,16 @@
-"""The files of the label transfer: what is written, read back, and cleared away."""
+"""The files of the annotation: what is written, read back, and cleared away.
 
+mask/000000_000001.png        silhouette of object 1 of view 0, also where something hides it
+mask_visib/000000_000001.png  its visible part
+labels/instance/000000.png    instances; labels/depth, coordinates, normals alike
+grasps/views/000000.npz       grasps in that camera: pose, score, seen, reachable
+annotations/000000.json       camera, poses, boxes, counts, agreement with the measured depth
+annotations/objects.json      per object: verdict, checks, mass properties, box
+annotations/surfaces/         per model: points on its surface with normals
+scene_gt.json  scene_gt_info.json  scene_gt_coco.json     BOP, made of the annotations above
+"""
+
+import io
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -11,14 +22,16 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats import bop_labels
-from realsim.records import ObjectModel, ObjectPose
+from realsim.rendering.labels import Labels
 from realsim.store import SessionStore
-from realsim.store.records_json import number_to_json
-from realsim_sim_bridge.frame_labels import FrameLabel
-from realsim_sim_bridge.transfer_grasps import GraspsInView
+from realsim.store.records_json import intrinsics_to_json, number_to_json
+from realsim_sim_bridge.annotation.config import MAPS
+from realsim_sim_bridge.annotation.frame_grasps import GraspsInView
+from realsim_sim_bridge.annotation.frame_labels import FrameLabel
+from realsim_sim_bridge.annotation.frame_maps import map_path
+from realsim_sim_bridge.annotation.inputs import FORMAT_VERSION, FrameInputs, FrameView
 
-FORMAT_VERSION = 1
-"""Part of every digest: a new version annotates anew."""
+OBJECTS_FILE = "annotations/objects.json"
 INFO_KEYS = (
     "bbox_obj", "bbox_visib", "px_count_all", "px_count_valid", "px_count_visib", "visib_fract"
 )  # fmt: skip
@@ -38,11 +51,16 @@ def part_path(view: int) -> str:
     return f"annotations/{view:06d}.json"
 
 
+def surface_path(obj_id: int) -> str:
+    """Return where the surface cloud of a model is."""
+    return f"annotations/surfaces/{obj_id:06d}.npz"
+
+
 # --- one view ---------------------------------------------------------------------------------
 
 
-def write_grasps(store: SessionStore, view: int, grasps: Sequence[GraspsInView]) -> None:
-    """Write the grasps of all objects in one view's camera, object after object.
+def grasps_bytes(grasps: Sequence[GraspsInView]) -> bytes:
+    """Return the grasps of all objects in one view's camera, object after object, as npz.
 
     Arrays: instance (N,), obj_id (N,), Ts_cam_grasp (N, 4, 4) [m], widths_m (N,), scores (N,),
     visibility (N,) 0 hidden 1 partly 2 visible, contact_seen (N, 2), reachable (N,).
@@ -53,8 +71,10 @@ def write_grasps(store: SessionStore, view: int, grasps: Sequence[GraspsInView])
         empty = np.zeros((0, *shape), dtype)
         return np.concatenate([empty, *(np.asarray(getattr(g, name), dtype) for g in grasps)])
 
-    store.write_npz(
-        grasps_path(view),
+    buffer = io.BytesIO()
+    # Not compressed: poses have no pattern, and deflating them would cost more than the masks do.
+    np.savez(
+        buffer,
         instance=np.repeat(np.array([g.instance for g in grasps], np.int32), counts),
         obj_id=np.repeat(np.array([g.obj_id for g in grasps], np.int32), counts),
         Ts_cam_grasp=joined("Ts_cam_grasp", (4, 4), np.float64),
@@ -64,13 +84,13 @@ def write_grasps(store: SessionStore, view: int, grasps: Sequence[GraspsInView])
         contact_seen=joined("contact_seen", (2,), np.bool_),
         reachable=joined("reachable", (), np.bool_),
     )
+    return buffer.getvalue()
 
 
 def part_of_view(
-    view: int,
-    digest: str,
-    T_world_cam: NDArray[np.float64],
-    objects: Sequence[tuple[ObjectPose, ObjectModel]],
+    inputs: FrameInputs,
+    view: FrameView,
+    labels: Labels,
     frame: Sequence[FrameLabel],
     grasp_counts: Mapping[int, Mapping[str, int]],
 ) -> dict[str, Any]:
@@ -80,41 +100,68 @@ def part_of_view(
             "mask": k,
             "instance": label.instance,
             "obj_id": label.obj_id,
-            "name": model.name,
+            "name": inputs.models[placed.obj_id].name,
             "verdict": placed.verdict,
             "reasons": list(placed.reasons),
             "T_cam_obj": label.T_cam_obj.tolist(),
+            "corners_px": _pixels(label.corners_px),
             **label.info,
-            "depth": {n: number_to_json(v) for n, v in asdict(label.agreement).items()},
+            "px_hidden_by_unknown": label.unknown.px if label.unknown.is_removed else 0,
+            "unknown_occluder": _json(label.unknown),
+            "depth": _json(label.agreement),
             "grasps": dict(grasp_counts.get(label.instance, {})),
             "mask_visib_rle": label.visible_rle,
         }
-        for k, ((placed, model), label) in enumerate(zip(objects, frame, strict=True))
+        for k, (placed, label) in enumerate(zip(inputs.objects, frame, strict=True))
     ]
     return {
         "format_version": FORMAT_VERSION,
-        "view": view,
-        "inputs": digest,
-        "T_world_cam": T_world_cam.tolist(),
+        "view": view.index,
+        "inputs": view.digest,
+        "camera": intrinsics_to_json(inputs.intrinsics),
+        "T_world_cam": view.T_world_cam.tolist(),
+        "maps": list(inputs.config.maps),
+        "is_empty": not any(label.info["px_count_visib"] for label in frame),
+        "px_without_ray": int(np.count_nonzero(labels.unknown)),
+        "camera_inside": [int(i) for i in labels.camera_inside],
         "objects": entries,
     }
 
 
-def reopen_view(store: SessionStore, view: int) -> None:
-    """Take away a view's old annotation before its other files are replaced.
+def _json(record: Any) -> dict[str, Any]:
+    """Return a record's fields as JSON values."""
+    return {
+        name: number_to_json(value) if isinstance(value, float) else value
+        for name, value in asdict(record).items()
+    }
 
-    Else a kill in between would leave the old annotation, digest and all, beside new masks, and
-    going back to the old inputs would take it for complete.
-    """
-    store.remove(part_path(view))
+
+def _pixels(uv: NDArray[np.float64]) -> list[list[float] | None]:
+    """Return pixels (N, 2) to a thousandth; null = behind the camera."""
+    return [
+        [round(float(u), 3), round(float(v), 3)] if np.isfinite(u) and np.isfinite(v) else None
+        for u, v in uv
+    ]
 
 
-def write_part(store: SessionStore, view: int, part: Mapping[str, Any]) -> None:
-    """Write one view's annotation, which marks the view as complete."""
+def part_bytes(part: Mapping[str, Any]) -> bytes:
+    """Return one view's annotation as the content of its file."""
     text = json.dumps(part, allow_nan=False)
     # One line per object: readable, and a tenth of the lines of an indented matrix.
-    text = text.replace('{"mask": ', '\n{"mask": ')
-    store.write_bytes(part_path(view), (text + "\n").encode())
+    return (text.replace('{"mask": ', '\n{"mask": ') + "\n").encode()
+
+
+def write_view(store: SessionStore, view: int, files: Mapping[str, bytes]) -> None:
+    """Write the files of a view, its annotation last: that marks the view as complete.
+
+    The old annotation goes first. Else a kill in between would leave it, digest and all, beside new
+    masks, and going back to the old inputs would take it for complete.
+    """
+    store.remove(part_path(view))
+    for path, data in files.items():
+        if path != part_path(view):
+            store.write_bytes(path, data)
+    store.write_bytes(part_path(view), files[part_path(view)])
 
 
 def finished_part(store: SessionStore, view: int, digest: str) -> dict[str, Any] | None:
@@ -127,27 +174,20 @@ def finished_part(store: SessionStore, view: int, digest: str) -> dict[str, Any]
         return None  # a broken file is made again
     if not isinstance(part, dict) or part.get("inputs") != digest:
         return None
-    needed = (*_mask_paths(view, part), grasps_path(view))
-    return part if all(store.has(p) for p in needed) else None
+    return part if all(store.has(p) for p in _paths_of(view, part)) else None
 
 
-def _mask_paths(view: int, part: Mapping[str, Any]) -> list[str]:
-    """Return where the masks of a view's annotation are."""
-    return [
+def _paths_of(view: int, part: Mapping[str, Any]) -> list[str]:
+    """Return the files of a view beside its annotation."""
+    masks = [
         bop_labels.mask_path(view, int(entry["mask"]), visible=visible)
         for entry in part["objects"]
         for visible in (False, True)
     ]
+    return [*masks, *(map_path(name, view) for name in part["maps"]), grasps_path(view)]
 
 
 # --- all views --------------------------------------------------------------------------------
-
-
-def write_objects(store: SessionStore, entries: Sequence[Mapping[str, Any]]) -> None:
-    """Write what holds for the objects in every view."""
-    store.write_json(
-        "annotations/objects.json", {"format_version": FORMAT_VERSION, "objects": list(entries)}
-    )
 
 
 def write_bop(
@@ -173,19 +213,23 @@ def write_bop(
     bop_labels.write_scene_gt_coco(store, masks, names)
 
 
-def remove_stale(store: SessionStore, parts: Mapping[int, Mapping[str, Any]]) -> list[str]:
+def remove_stale(
+    store: SessionStore, parts: Mapping[int, Mapping[str, Any]], obj_ids: Iterable[int]
+) -> list[str]:
     """Remove what a former run wrote and this one does not have, and return it.
 
-    A former run may have had more objects, or views that have left the session since.
+    A former run may have had more objects or maps, or views that have left the session since.
     """
-    wanted = {p for view, part in parts.items() for p in _mask_paths(view, part)}
-    wanted |= {p for view in parts for p in (grasps_path(view), part_path(view))}
+    wanted = {p for view, part in parts.items() for p in _paths_of(view, part)}
+    wanted |= {part_path(view) for view in parts} | {surface_path(i) for i in obj_ids}
     written_by_us = {
         "mask": r"\d{6}_\d{6}\.png",
         "mask_visib": r"\d{6}_\d{6}\.png",
         "grasps/views": r"\d{6}\.npz",
         "annotations": r"\d{6}\.json",
+        "annotations/surfaces": r"\d{6}\.npz",
     }
+    written_by_us |= {f"labels/{name}": r"\d{6}\.png" for name in MAPS}
     stale = [
         f"{folder}/{name}"
         for folder, pattern in written_by_us.items()

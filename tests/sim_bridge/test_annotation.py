@@ -1,4 +1,4 @@
-"""Label transfer of a small synthetic session: files, laws across them, and resuming."""
+"""Annotation of a small synthetic session: files, laws across them, and resuming."""
 
 import json
 from dataclasses import replace
@@ -26,13 +26,13 @@ from realsim.formats.bop_labels import mask_of
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore
-from realsim_sim_bridge import transfer_files
-from realsim_sim_bridge.transfer import TransferConfig, annotate, overlay_picture, table_slab
-from realsim_sim_bridge.transfer_pictures import best_and_worst
+from realsim_sim_bridge.annotation.annotate import AnnotationConfig, annotate
+from realsim_sim_bridge.annotation.inputs import table_slab
+from realsim_sim_bridge.annotation.pictures import best_and_worst, overlay_picture
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 TABLE = se3.from_translation([0.5, 0.0, 0.1])
-CONFIG = TransferConfig()
+CONFIG = AnnotationConfig()
 
 
 def box(size: tuple[float, float, float]) -> Mesh:
@@ -89,7 +89,7 @@ def make_session(folder: Path, unmodelled: bool = False) -> SessionStore:
     session = CaptureSession(name="boxes", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
     store = SessionStore.create(folder, session)
     placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
-    placed.append(PlacedMesh(-1, table_slab(TransferConfig(plane_clearance_m=0.0)), TABLE))
+    placed.append(PlacedMesh(-1, table_slab(AnnotationConfig(plane_clearance_m=0.0)), TABLE))
     if unmodelled:
         hand = se3.from_translation([0.53, 0.02, 0.35])
         placed.append(PlacedMesh(-1, box((0.05, 0.05, 0.01)), hand))
@@ -112,11 +112,20 @@ def mask(store: SessionStore, folder: str, view: int, k: int) -> NDArray[np.bool
 
 
 def snapshot(store: SessionStore) -> dict[str, bytes]:
-    """Return the bytes of everything the transfer writes."""
+    """Return the bytes of everything the annotation writes."""
     found = {}
-    for pattern in ("mask/*", "mask_visib/*", "annotations/*", "grasps/views/*", "scene_gt*"):
+    for pattern in (
+        "mask*/*",
+        "labels/*/*",
+        "annotations/*",
+        "annotations/*/*",
+        "grasps/views/*",
+        "scene_gt*",
+    ):
         found |= {
-            str(p.relative_to(store.folder)): p.read_bytes() for p in store.folder.glob(pattern)
+            str(p.relative_to(store.folder)): p.read_bytes()
+            for p in store.folder.glob(pattern)
+            if p.is_file()
         }
     return found
 
@@ -227,7 +236,7 @@ def test_again_is_skipped_and_from_scratch_is_the_same(
     again = annotate(
         annotated, SCENE, MODELS, GRASPS, progress=lambda done, total: calls.append((done, total))
     )
-    assert again.skipped == 3 and calls == [(1, 3), (2, 3), (3, 3)]
+    assert again.skipped == 3 and calls == [(3, 3)]
     assert snapshot(annotated) == before
     fresh = make_session(tmp_path / "fresh")
     annotate(fresh, SCENE, MODELS, GRASPS)
@@ -286,11 +295,15 @@ def test_going_back_after_a_kill_leaves_no_foreign_masks(
     annotate(store, SCENE, MODELS, GRASPS)
     before = snapshot(store)
 
-    def killed(*_: Any) -> None:
-        raise Killed
+    write_bytes = SessionStore.write_bytes
+
+    def killed(self: SessionStore, path: str, data: bytes) -> None:
+        if path == "annotations/000000.json":
+            raise Killed
+        write_bytes(self, path, data)
 
     with monkeypatch.context() as patch:
-        patch.setattr(transfer_files, "write_part", killed)
+        patch.setattr(SessionStore, "write_bytes", killed)
         with pytest.raises(Killed):
             annotate(store, moved(SCENE), MODELS, GRASPS)
     assert snapshot(store) != before

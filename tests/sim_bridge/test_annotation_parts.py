@@ -8,16 +8,21 @@ from realsim import CameraIntrinsics, GraspSet, Mesh, ObjectPose
 from realsim.formats.bop_labels import bbox_of
 from realsim.geometry import camera, se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from realsim_sim_bridge import frame_labels
-from realsim_sim_bridge.transfer_grasps import (
+from realsim_sim_bridge.annotation.config import OccluderConfig, SightConfig
+from realsim_sim_bridge.annotation.frame_grasps import (
     GraspsInView,
     GraspVisibility,
-    SightConfig,
     contact_points,
     free_lines,
     grasps_in_view,
     in_image,
 )
+from realsim_sim_bridge.annotation.frame_labels import (
+    depth_agreement,
+    label_object,
+    unknown_occluder,
+)
+from realsim_sim_bridge.annotation.object_masks import object_masks
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 SIDE = 0.05
@@ -55,7 +60,7 @@ def seen_from(eye: list[float], *walls: PlacedMesh) -> GraspsInView:
     renderer = LabelRenderer([PlacedMesh(0, box((SIDE,) * 3), np.eye(4)), *walls])
     T = se3.look_at(eye, [0, 0, 0])
     grasps = grasp_set(TOP_GRASP[None])
-    return grasps_in_view(renderer, INTRINSICS, T, np.eye(4), grasps, SightConfig())
+    return grasps_in_view(renderer, INTRINSICS, T, [(np.eye(4), grasps)], SightConfig())[0]
 
 
 def test_contacts_lie_half_a_width_along_the_closing_axis() -> None:
@@ -92,8 +97,8 @@ def test_behind_a_wall_nothing_is_seen() -> None:
 def test_out_of_the_image_nothing_is_seen() -> None:
     renderer = LabelRenderer([PlacedMesh(0, box((SIDE,) * 3), np.eye(4))])
     away = se3.look_at([0.0, 0.0, 0.5], [0.6, 0.0, 0.0])
-    view = grasps_in_view(
-        renderer, INTRINSICS, away, np.eye(4), grasp_set(TOP_GRASP[None]), SightConfig()
+    (view,) = grasps_in_view(
+        renderer, INTRINSICS, away, [(np.eye(4), grasp_set(TOP_GRASP[None]))], SightConfig()
     )
     assert view.visibility[0] == GraspVisibility.HIDDEN
 
@@ -106,9 +111,9 @@ def test_grasps_move_with_the_world() -> None:
     T = se3.look_at([0.2, 0.1, 0.4], [0, 0, 0])
     a, b = (
         grasps_in_view(
-            LabelRenderer([PlacedMesh(0, mesh, X)]), INTRINSICS, X @ T, X, grasp_set(Ts),
+            LabelRenderer([PlacedMesh(0, mesh, X)]), INTRINSICS, X @ T, [(X, grasp_set(Ts))],
             SightConfig(),
-        )
+        )[0]
         for X in (np.eye(4), W)
     )  # fmt: skip
     np.testing.assert_allclose(a.Ts_cam_grasp, b.Ts_cam_grasp, atol=1e-12)
@@ -149,7 +154,13 @@ def label(eye: list[float], target: list[float], depth_error: float = 0.0):
     T = se3.look_at(eye, target)
     labels = LabelRenderer([PlacedMesh(0, mesh, np.eye(4))]).render(INTRINSICS, T)
     depth = np.where(labels.depth_m > 0, labels.depth_m + depth_error, 0).astype(np.float32)
-    return labels, frame_labels.label_object(pose, mesh, labels, depth, INTRINSICS, T, 0.01)
+    masks = object_masks(labels, 0)
+    rendered, measured = labels.depth_m[masks.window], depth[masks.window]
+    agreement = depth_agreement(masks.rendered, rendered, measured, 0.01)
+    unknown = unknown_occluder(masks, rendered, measured, agreement, OccluderConfig())
+    return labels, label_object(
+        pose, mesh, masks, labels, depth, (INTRINSICS, T), (agreement, unknown)
+    )
 
 
 def test_an_unhidden_object_is_whole() -> None:

@@ -4,9 +4,11 @@ A grasp's two contacts lie at +-width/2 along its closing axis y. A contact is s
 image and the straight line from the camera to it is free. The line is drawn to a point a clearance
 outside the contact, where the finger's pad would stand: the two sides of a convex object are never
 both in sight of one camera in the strict sense, yet the pads on both sides are what a camera above
-the grasp sees.
+the grasp sees. A contact behind something that the measured depth shows and the scene does not
+have (a hand) is not seen either.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -16,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, GraspSet
 from realsim.rendering.labels import LabelRenderer
+from realsim_sim_bridge.annotation.config import SightConfig
+from realsim_sim_bridge.annotation.unmodelled import UnmodelledRegion
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -33,18 +37,6 @@ class GraspVisibility(IntEnum):
     """One of the two contacts."""
     VISIBLE = 2
     """Both contacts."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SightConfig:
-    """When a contact counts as seen."""
-
-    clearance_m: float = 0.002
-    """How far outside the contact the line of sight ends [m]: half a thin pad. With it a camera
-    0.5 m above a 50 mm wide box sees both contacts down to 40 mm below the edge."""
-    tolerance_m: float = 0.001
-    """How far before the end of the line a surface may lie without hiding it [m]; above float32
-    rounding (0.1 um) and the error of a decimated mesh, below the clearance."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -111,38 +103,64 @@ def free_lines(
     return np.asarray(renderer.cast_rays(rays).t >= length - tolerance_m, dtype=bool)
 
 
+def is_behind(
+    region: UnmodelledRegion, intrinsics: CameraIntrinsics, points_cam: ArrayLike
+) -> Mask:
+    """Return (N,) which camera points (N, 3) [m] lie behind a thing that is not in the model."""
+    p = np.asarray(points_cam, dtype=np.float64)
+    rows, columns = region.window
+    pixel = np.rint(np.nan_to_num(camera.project(intrinsics, p), nan=-1.0)).astype(np.int64)
+    u, v = pixel[:, 0] - columns.start, pixel[:, 1] - rows.start
+    height, width = region.mask.shape
+    behind = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    u, v = u[behind], v[behind]
+    # Where it was not measured it is a hole inside the thing: as near as the rest of it.
+    behind[behind] = region.mask[v, u] & (region.depth_m[v, u] < p[behind, 2])
+    return behind
+
+
 def grasps_in_view(
     renderer: LabelRenderer,
     intrinsics: CameraIntrinsics,
     T_world_cam: ArrayLike,
-    T_world_obj: ArrayLike,
-    grasps: GraspSet,
+    grasp_sets: Sequence[tuple[ArrayLike, GraspSet]],
     config: SightConfig,
-) -> GraspsInView:
-    """Return one object's grasps in the camera, each contact marked as seen or not.
+    region: UnmodelledRegion | None = None,
+) -> list[GraspsInView]:
+    """Return the objects' grasps in the camera, each contact marked as seen or not.
 
     Args:
         renderer: the scene that may stand in the way.
         intrinsics: the camera.
         T_world_cam: (4, 4) camera in world [m].
-        T_world_obj: (4, 4) the grasped object in world [m].
-        grasps: its grasps, in object coordinates.
+        grasp_sets: per object where it stands, T_world_obj (4, 4) [m], and its grasps.
         config: when a contact counts as seen.
+        region: where something that is not in the scene stands in front; None = nowhere.
     """
-    T_cam_world = se3.invert(T_world_cam)
-    Ts_cam_grasp = T_cam_world @ np.asarray(T_world_obj, dtype=np.float64) @ grasps.Ts_obj_grasp
-    pads_cam = contact_points(Ts_cam_grasp, grasps.widths_m, config.clearance_m).reshape(-1, 3)
+    T = np.asarray(T_world_cam, dtype=np.float64)
+    T_cam_world = se3.invert(T)
+    Ts = [T_cam_world @ np.asarray(o, dtype=np.float64) @ g.Ts_obj_grasp for o, g in grasp_sets]
+    # One cast for all objects: a cast has a price, whatever the number of its lines.
+    Ts_cam_grasp = np.concatenate([np.zeros((0, 4, 4)), *Ts])
+    widths_m = np.concatenate([np.zeros(0), *(g.widths_m for _, g in grasp_sets)])
+    pads_cam = contact_points(Ts_cam_grasp, widths_m, config.clearance_m).reshape(-1, 3)
     seen = in_image(intrinsics, pads_cam)
+    if region is not None:
+        seen &= ~is_behind(region, intrinsics, pads_cam)
     if np.any(seen):
-        T = np.asarray(T_world_cam, dtype=np.float64)
         pads_world = se3.transform(T, pads_cam[seen])
         seen[seen] = free_lines(renderer, T[:3, 3], pads_world, config.tolerance_m)
-    return GraspsInView(
-        obj_id=grasps.obj_id,
-        instance=grasps.instance,
-        Ts_cam_grasp=Ts_cam_grasp,
-        widths_m=grasps.widths_m,
-        scores=grasps.scores,
-        reachable=grasps.reachable,
-        contact_seen=seen.reshape(-1, 2),
-    )
+    ends = np.cumsum([len(g) for _, g in grasp_sets])
+    contact_seen = np.split(seen.reshape(-1, 2), ends[:-1])
+    return [
+        GraspsInView(
+            obj_id=grasps.obj_id,
+            instance=grasps.instance,
+            Ts_cam_grasp=Ts_of,
+            widths_m=grasps.widths_m,
+            scores=grasps.scores,
+            reachable=grasps.reachable,
+            contact_seen=seen_of,
+        )
+        for (_, grasps), Ts_of, seen_of in zip(grasp_sets, Ts, contact_seen, strict=False)
+    ]

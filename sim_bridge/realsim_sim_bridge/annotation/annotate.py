@@ -1,0 +1,151 @@
+"""Annotation of a session: the registered scene and its grasps on every view.
+
+A view's annotation file is written last and carries a digest of all its inputs. Running again after
+a kill skips the views whose digest still holds, and does the others. Views can be computed by
+several processes; this one alone writes.
+"""
+
+import pickle
+import tempfile
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import ExitStack, closing
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats import images
+from realsim.records import GraspSet, ObjectModel, Scene, View
+from realsim.store import SessionStore
+from realsim.store.session_store import depth_path
+from realsim_sim_bridge.annotation import files
+from realsim_sim_bridge.annotation.config import AnnotationConfig
+from realsim_sim_bridge.annotation.frame import FrameFiles, frame_files
+from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView, frame_view, gathered
+from realsim_sim_bridge.annotation.objects import write_objects
+from realsim_sim_bridge.annotation.summary import AnnotationSummary, numbers, summary_of
+from realsim_sim_bridge.school.workers import local_workers
+
+__all__ = ["AnnotationConfig", "AnnotationSummary", "annotate"]
+
+Progress = Callable[[int, int], None]
+Parts = dict[int, dict[str, Any]]
+
+
+def annotate(
+    store: SessionStore,
+    scene: Scene,
+    models: Mapping[int, ObjectModel],
+    grasp_sets: Sequence[GraspSet],
+    config: AnnotationConfig | None = None,
+    *,
+    only: Collection[int] | None = None,
+    progress: Progress | None = None,
+    workers: int = 1,
+) -> AnnotationSummary:
+    """Write masks, maps, poses, visibility and grasps for every view of a session.
+
+    Args:
+        store: the session; its views must be calibrated.
+        scene: where the objects stand; rejected ones are left out.
+        models: obj_id -> model.
+        grasp_sets: the scored grasps of the instances; those of rejected ones are left out.
+        config: settings; None = the defaults.
+        only: the views in which the objects were registered; None = all. Others get no labels:
+            their camera, or their depth, is not to be trusted.
+        progress: called with (views done, views in all).
+        workers: processes that compute views; 1 = this one. The files are the same.
+
+    Raises:
+        InputError: a view has no camera pose, a model is missing, an image is not of the camera's
+            size, or grasps are of an instance that is not in the scene.
+    """
+    views = _calibrated_views(store, only)
+    inputs = gathered(store, scene, models, grasp_sets, config or AnnotationConfig())
+    todo = [frame_view(store, inputs, v) for v in views]
+    found = {v.index: files.finished_part(store, v.index, v.digest) for v in todo}
+    parts: Parts = {index: part for index, part in found.items() if part is not None}
+    skipped = len(parts)
+    write_objects(store, scene, models, inputs.config)
+    if progress is not None:
+        progress(skipped, len(views))
+    new = [v for v in todo if v.index not in parts]
+    # Closed at once when it is interrupted, so that no process goes on computing.
+    with closing(_computed(store, inputs, new, workers)) as frames:
+        for index, frame in frames:
+            files.write_view(store, index, frame.files)
+            parts[index] = frame.part
+            if progress is not None:
+                progress(len(parts), len(views))
+    parts = {index: parts[index] for index in sorted(parts)}
+    files.remove_stale(store, parts, inputs.models)
+    files.write_bop(store, parts, {i: m.name for i, m in inputs.models.items()})
+    return summary_of(scene, inputs, parts, skipped, [v.index for v in store.session.views])
+
+
+def _calibrated_views(store: SessionStore, only: Collection[int] | None) -> tuple[View, ...]:
+    """Return the views that are annotated, all of which must know their camera."""
+    views = tuple(v for v in store.session.views if only is None or v.index in only)
+    missing = [v.index for v in views if v.T_world_cam is None]
+    if missing or not views:
+        raise InputError(
+            f"session '{store.session.name}' has "
+            + (f"no camera pose for view {numbers(missing)}" if missing else "no views")
+            + ": calibrate first (labels are projected through the camera's pose)."
+        )
+    return views
+
+
+def _computed(
+    store: SessionStore, inputs: FrameInputs, views: Sequence[FrameView], workers: int
+) -> Generator[tuple[int, FrameFiles]]:
+    """Yield the number and the files of every view, as they are done."""
+    if workers <= 1 or len(views) <= 1:
+        for view in views:
+            yield view.index, frame_files(inputs, view, _measured(inputs, _depth(store, view)))
+        return
+    with ExitStack() as stack:
+        # Meshes go to the processes by a file, once, and not with every view.
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="realsim-annotate-"))
+        shared = Path(folder) / "inputs.pickle"
+        shared.write_bytes(pickle.dumps(inputs))
+        pool = stack.enter_context(local_workers(min(workers, len(views))))
+        running: dict[Future[FrameFiles], int] = {}
+        waiting = list(reversed(views))
+        while waiting or running:
+            while waiting and len(running) < pool.capacity():
+                view = waiting.pop()
+                job = pool.submit(_frame_job, shared, view, _depth(store, view))
+                running[job] = view.index
+            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            for job in done:
+                yield running.pop(job), job.result()
+
+
+def _depth(store: SessionStore, view: FrameView) -> Path | None:
+    """Return where a view's depth is; None = it was recorded without."""
+    return store.path(depth_path(view.index)) if store.has_depth(view.index) else None
+
+
+def _measured(inputs: FrameInputs, path: Path | None) -> NDArray[np.float32]:
+    """Return the depth of a view; no measurement anywhere if it was recorded without."""
+    if path is not None:
+        return images.read_depth(path, inputs.depth_unit_m)
+    return np.zeros((inputs.intrinsics.height, inputs.intrinsics.width), np.float32)
+
+
+def _frame_job(shared: Path, view: FrameView, depth: Path | None) -> FrameFiles:
+    """Return the files of a view; run in a process of its own."""
+    inputs = _shared_inputs(shared)
+    return frame_files(inputs, view, _measured(inputs, depth))
+
+
+@lru_cache(maxsize=1)
+def _shared_inputs(path: Path) -> FrameInputs:
+    """Return the inputs of all views, read once per process."""
+    inputs: FrameInputs = pickle.loads(path.read_bytes())
+    return inputs

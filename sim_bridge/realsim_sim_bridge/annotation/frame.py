@@ -1,0 +1,140 @@
+"""The annotation of one view: a pure function from the scene, the camera and the measured depth.
+
+Nothing is written here, so that views can be computed in other processes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.formats.bop_labels import mask_path
+from realsim.formats.png_window import encode_window
+from realsim.rendering.labels import LabelRenderer, Labels
+from realsim_sim_bridge.annotation import files
+from realsim_sim_bridge.annotation.frame_grasps import (
+    GraspsInView,
+    GraspVisibility,
+    grasps_in_view,
+)
+from realsim_sim_bridge.annotation.frame_labels import (
+    DepthAgreement,
+    FrameLabel,
+    UnknownOccluder,
+    depth_agreement,
+    label_object,
+    unknown_occluder,
+)
+from realsim_sim_bridge.annotation.frame_maps import map_files
+from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView
+from realsim_sim_bridge.annotation.object_masks import ObjectMasks, object_masks, union_of
+from realsim_sim_bridge.annotation.unmodelled import UnmodelledRegion, unmodelled_region
+
+Depth = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FrameFiles:
+    """What one view's annotation consists of."""
+
+    files: dict[str, bytes]
+    """Path in the session -> content; the annotation itself comes last."""
+    part: dict[str, Any]
+    """The annotation as JSON values."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Seen:
+    """Masks of all objects of a view, and how the measured depth bears them out."""
+
+    masks: list[ObjectMasks]
+    agreements: list[DepthAgreement]
+    unknowns: list[UnknownOccluder]
+    region: UnmodelledRegion | None
+
+
+@lru_cache(maxsize=1)
+def renderer_of(inputs: FrameInputs) -> LabelRenderer:
+    """Return the renderer of the scene; the last one is kept for the scene's other views."""
+    return LabelRenderer(inputs.placed())
+
+
+def frame_files(inputs: FrameInputs, view: FrameView, depth_m: Depth) -> FrameFiles:
+    """Return every file of a view's annotation.
+
+    Args:
+        inputs: what all views of the session have in common.
+        view: the view.
+        depth_m: (H, W) its measured depth [m], 0 = none.
+    """
+    renderer, intrinsics, config = renderer_of(inputs), inputs.intrinsics, inputs.config
+    labels = renderer.render(intrinsics, view.T_world_cam)
+    seen = _seen(inputs, labels, depth_m)
+    frame: list[FrameLabel] = [
+        label_object(
+            placed, inputs.models[placed.obj_id].mesh, masks, labels, depth_m,
+            (intrinsics, view.T_world_cam), (agreement, unknown),
+        )
+        for placed, masks, agreement, unknown in zip(
+            inputs.objects, seen.masks, seen.agreements, seen.unknowns, strict=True
+        )
+    ]  # fmt: skip
+    poses = {o.instance: o.T_world_obj for o in inputs.objects}
+    grasps = grasps_in_view(
+        renderer, intrinsics, view.T_world_cam,
+        [(poses[g.instance], g) for g in inputs.grasp_sets], config.sight, seen.region,
+    )  # fmt: skip
+
+    size = (intrinsics.width, intrinsics.height)
+    out: dict[str, bytes] = {}
+    for k, masks in enumerate(seen.masks):
+        for is_visible, mask in ((False, masks.amodal), (True, masks.visible)):
+            path = mask_path(view.index, k, visible=is_visible)
+            out[path] = encode_window(mask, masks.origin, size)
+    by_instance = list(zip((o.instance for o in inputs.objects), seen.masks, strict=True))
+    meshes = {o.instance: inputs.models[o.obj_id].mesh for o in inputs.objects}
+    out |= map_files(
+        config.maps, view.index, labels, by_instance, meshes, inputs.depth_unit_m
+    )  # fmt: skip
+    out[files.grasps_path(view.index)] = files.grasps_bytes(grasps)
+    part = files.part_of_view(inputs, view, labels, frame, _counts(grasps))
+    out[files.part_path(view.index)] = files.part_bytes(part)
+    return FrameFiles(files=out, part=part)
+
+
+def _seen(inputs: FrameInputs, labels: Labels, depth_m: Depth) -> _Seen:
+    """Return the masks of all objects, checked against the measured depth."""
+    config, instances = inputs.config, [o.instance for o in inputs.objects]
+    masks = [object_masks(labels, i) for i in instances]
+    window = union_of([m.window for m in masks])
+    region = unmodelled_region(labels.depth_m, depth_m, window, inputs.intrinsics, config.occluder)
+    agreements: list[DepthAgreement] = []
+    unknowns: list[UnknownOccluder] = []
+    for k, i in enumerate(instances):
+        rendered_m, measured_m = labels.depth_m[masks[k].window], depth_m[masks[k].window]
+        agreements.append(
+            depth_agreement(masks[k].rendered, rendered_m, measured_m, config.agreement_tolerance_m)
+        )
+        covered = object_masks(labels, i, region)
+        unknowns.append(
+            unknown_occluder(covered, rendered_m, measured_m, agreements[k], config.occluder)
+        )
+        if unknowns[k].is_removed:
+            masks[k] = covered
+        elif region is not None:
+            region = region.without(masks[k].window, masks[k].rendered)
+    return _Seen(masks=masks, agreements=agreements, unknowns=unknowns, region=region)
+
+
+def _counts(grasps: Sequence[GraspsInView]) -> dict[int, dict[str, int]]:
+    """Return per instance how many grasps are visible, partly visible and hidden."""
+    return {
+        g.instance: {
+            code.name.lower(): int(np.count_nonzero(g.visibility == code))
+            for code in GraspVisibility
+        }
+        for g in grasps
+    }

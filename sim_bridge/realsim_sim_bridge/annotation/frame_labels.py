@@ -1,0 +1,217 @@
+"""What one frame shows of one object: pose, boxes, pixel counts, and does the depth agree.
+
+Boxes and counts follow BOP's `scene_gt_info`: x, y, w, h in whole pixels with w = x_max - x_min;
+-1 -1 -1 -1 where nothing of the object is seen; the silhouette's box also beyond the border.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.formats.bop_labels import NO_BBOX, Bbox, bbox_of, gt_info_entry, rle_of
+from realsim.geometry import camera, se3
+from realsim.records import CameraIntrinsics, Mesh, ObjectPose
+from realsim.rendering.labels import Labels
+from realsim_sim_bridge.annotation.config import OccluderConfig
+from realsim_sim_bridge.annotation.object_masks import ObjectMasks
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Finding = Literal["none", "occluder", "pose or occluder"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DepthAgreement:
+    """How the measured depth compares with the rendered one inside the rendered visible mask."""
+
+    measured: float
+    """Share of the visible pixels that have a measurement; NaN = no visible pixel."""
+    agree: float
+    """Of these, the share within the tolerance; NaN = none is measured."""
+    nearer: float
+    """Of these, the share where something nearer was measured: an occluder nobody modelled."""
+    farther: float
+    """Of these, the share where the measurement looks through the object: the pose is off."""
+    bias_m: float
+    """Median of measured - rendered over the agreeing pixels [m]; NaN = none."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class UnknownOccluder:
+    """What stands in front of one object and is not in the scene."""
+
+    px: int
+    """Pixels of the rendered visible mask that it covers."""
+    share: float
+    """The same as a share of the rendered visible mask; 0 where that is empty."""
+    gap_m: float
+    """Median of rendered - measured depth there [m]; NaN = none."""
+    finding: Finding
+    """'pose or occluder' where so much disagrees that the pose or the depth may be wrong."""
+    is_removed: bool
+    """Whether the pixels were taken out of the visible mask."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FrameLabel:
+    """One object in one frame."""
+
+    obj_id: int
+    instance: int
+    T_cam_obj: Array
+    """(4, 4) object in camera [m]."""
+    info: dict[str, Any]
+    """BOP's entry of scene_gt_info: bbox_obj, bbox_visib, px_count_all, px_count_valid,
+    px_count_visib [px] and visib_fract."""
+    corners_px: Array
+    """(8, 2) corners of the object's own box in the image, also beyond it; x varies slowest, z
+    fastest; NaN = behind the camera."""
+    visible_rle: dict[str, Any]
+    """The visible mask as COCO's run lengths."""
+    agreement: DepthAgreement
+    unknown: UnknownOccluder
+
+
+def box_corners(mesh: Mesh) -> Array:
+    """Return the corners (8, 3) of a mesh's box in its own frame [m]; x slowest, z fastest."""
+    low, high = mesh.bounds
+    xyz = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1)
+    return xyz.reshape(8, 3)
+
+
+def silhouette_box(
+    inside: Bbox, count_inside: int, px_count_all: int, intrinsics: CameraIntrinsics,
+    points_obj: ArrayLike, T_cam_obj: ArrayLike,
+) -> Bbox:  # fmt: skip
+    """Return the box of an object's whole silhouette, also beyond the border of the image.
+
+    Inside the image it is the box of the amodal mask. A silhouette that goes on beyond the border
+    (`px_count_all` counts more pixels than the mask) is bounded by its projected vertices there,
+    within BOP's canvas of one image size to each side.
+
+    Args:
+        inside: box of the silhouette inside the image.
+        count_inside: its pixels inside the image.
+        px_count_all: its pixels, also beyond the border.
+        intrinsics: the camera.
+        points_obj: (V, 3) the mesh's vertices [m].
+        T_cam_obj: (4, 4) object in camera [m].
+    """
+    if px_count_all in (0, count_inside):
+        return inside
+    p = se3.transform(T_cam_obj, points_obj)
+    uv = camera.project(intrinsics, p[p[:, 2] > 0])
+    w, h = intrinsics.width, intrinsics.height
+    low = np.clip(np.ceil(uv.min(0)), [-w, -h], [2 * w - 1, 2 * h - 1])
+    high = np.clip(np.floor(uv.max(0)), [-w, -h], [2 * w - 1, 2 * h - 1])
+    if inside != NO_BBOX:
+        low = np.minimum(low, inside[:2])
+        high = np.maximum(high, np.add(inside[:2], inside[2:]))
+    x, y = int(low[0]), int(low[1])
+    return x, y, max(0, int(high[0]) - x), max(0, int(high[1]) - y)
+
+
+def depth_agreement(
+    visible: Mask,
+    rendered_m: NDArray[np.float32],
+    measured_m: NDArray[np.float32],
+    tolerance_m: float,
+) -> DepthAgreement:
+    """Return how measured and rendered depth (H, W) [m] agree inside a mask (H, W)."""
+    measured, rendered = measured_m[visible], rendered_m[visible]
+    known = measured > 0
+    error = measured[known] - rendered[known]
+    nan = float("nan")
+    share_measured = float(np.mean(known)) if len(known) else nan
+    if len(error) == 0:
+        return DepthAgreement(
+            measured=share_measured, agree=nan, nearer=nan, farther=nan, bias_m=nan
+        )
+    close = np.abs(error) <= tolerance_m
+    return DepthAgreement(
+        measured=share_measured,
+        agree=float(np.mean(close)),
+        nearer=float(np.mean(error < -tolerance_m)),
+        farther=float(np.mean(error > tolerance_m)),
+        bias_m=float(np.median(error[close])) if np.any(close) else nan,
+    )
+
+
+def unknown_occluder(
+    masks: ObjectMasks,
+    rendered_m: NDArray[np.float32],
+    measured_m: NDArray[np.float32],
+    agreement: DepthAgreement,
+    config: OccluderConfig,
+) -> UnknownOccluder:
+    """Return what an object's masks lost to something that is not in the scene, and how sure.
+
+    Args:
+        masks: the object's masks; `visible` lacks what was found in front of it.
+        rendered_m: (h, w) rendered depth in the masks' window [m].
+        measured_m: (h, w) measured depth there [m], 0 = none.
+        agreement: of the same object.
+        config: when it may as well be the pose.
+    """
+    covered = masks.rendered & ~masks.visible
+    px, whole = int(np.count_nonzero(covered)), int(np.count_nonzero(masks.rendered))
+    if px == 0:
+        return UnknownOccluder(px=0, share=0.0, gap_m=float("nan"), finding="none", is_removed=True)
+    known = covered & (measured_m > 0)
+    gap = float(np.median(rendered_m[known] - measured_m[known])) if known.any() else float("nan")
+    measured = max(1.0, agreement.measured * whole)
+    nearer, farther = np.count_nonzero(known) / measured, float(np.nan_to_num(agreement.farther))
+    is_suspect = nearer + farther > config.suspect_share
+    is_suspect |= farther > max(config.suspect_farther, nearer)
+    return UnknownOccluder(
+        px=px,
+        share=px / whole,
+        gap_m=gap,
+        finding="pose or occluder" if is_suspect else "occluder",
+        is_removed=bool(not is_suspect or gap >= config.certain_gap_m),
+    )
+
+
+def label_object(
+    placed: ObjectPose,
+    mesh: Mesh,
+    masks: ObjectMasks,
+    labels: Labels,
+    depth_m: NDArray[np.float32],
+    camera_pose: tuple[CameraIntrinsics, ArrayLike],
+    evidence: tuple[DepthAgreement, UnknownOccluder],
+) -> FrameLabel:
+    """Return the label of one object in one frame.
+
+    Args:
+        placed: where the object stands.
+        mesh: its mesh.
+        masks: its masks in this frame.
+        labels: the rendered labels of the view.
+        depth_m: (H, W) measured depth [m], 0 = none.
+        camera_pose: the camera, and T_world_cam (4, 4) [m].
+        evidence: how the measured depth agrees, and what hides it that is not in the scene.
+    """
+    (intrinsics, T_world_cam), (agreement, unknown) = camera_pose, evidence
+    T_cam_obj = se3.invert(T_world_cam) @ placed.T_world_obj
+    count_all = labels.px_count_all[placed.instance]
+    inside = int(np.count_nonzero(masks.amodal))
+    box = silhouette_box(
+        masks.moved(bbox_of(masks.amodal)), inside, count_all, intrinsics, mesh.vertices, T_cam_obj
+    )
+    info = gt_info_entry(
+        masks.amodal, masks.visible, depth_m[masks.window], px_count_all=count_all, bbox_obj=box
+    )
+    info["bbox_visib"] = list(masks.moved(bbox_of(masks.visible)))
+    return FrameLabel(
+        obj_id=placed.obj_id,
+        instance=placed.instance,
+        T_cam_obj=T_cam_obj,
+        info=info,
+        corners_px=camera.project(intrinsics, se3.transform(T_cam_obj, box_corners(mesh))),
+        visible_rle=rle_of(masks.visible, origin=masks.origin, shape=labels.ids.shape),
+        agreement=agreement,
+        unknown=unknown,
+    )

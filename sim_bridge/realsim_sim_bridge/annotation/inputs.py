@@ -1,0 +1,180 @@
+"""What the annotation of a view depends on, checked, with a digest that says when it changed."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats import images
+from realsim.records import (
+    CameraIntrinsics,
+    GraspSet,
+    Mesh,
+    ObjectModel,
+    ObjectPose,
+    Scene,
+    View,
+    names_of,
+)
+from realsim.rendering.labels import PlacedMesh
+from realsim.store import SessionStore
+from realsim.store.records_json import object_pose_to_json
+from realsim.store.session_store import depth_path, rgb_path
+from realsim_sim_bridge.annotation.config import AnnotationConfig
+
+FORMAT_VERSION = 2
+"""Part of every digest: a new version annotates anew."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FrameInputs:
+    """What all views of a session have in common; it can be sent to another process."""
+
+    config: AnnotationConfig
+    intrinsics: CameraIntrinsics
+    depth_unit_m: float
+    """Metres per count of the session's depth images."""
+    objects: tuple[ObjectPose, ...]
+    """The objects that are annotated, in the order of the masks."""
+    models: Mapping[int, ObjectModel]
+    """obj_id -> model of these objects."""
+    grasp_sets: tuple[GraspSet, ...]
+    T_world_table: NDArray[np.float64] | None
+    """(4, 4) the supporting plane z = 0 [m]; None = no table hides anything."""
+    digest: str
+
+    def placed(self) -> list[PlacedMesh]:
+        """Return the meshes that are seen or hide things: the objects and the table."""
+        placed = [
+            PlacedMesh(o.instance, self.models[o.obj_id].mesh, o.T_world_obj) for o in self.objects
+        ]
+        if self.T_world_table is not None:
+            placed.append(PlacedMesh(-1, table_slab(self.config), self.T_world_table))
+        return placed
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FrameView:
+    """One view to annotate."""
+
+    index: int
+    T_world_cam: NDArray[np.float64]
+    """(4, 4) camera in world [m]."""
+    digest: str
+    """Of everything its annotation depends on."""
+
+
+def gathered(
+    store: SessionStore,
+    scene: Scene,
+    models: Mapping[int, ObjectModel],
+    grasp_sets: Sequence[GraspSet],
+    config: AnnotationConfig,
+) -> FrameInputs:
+    """Return the checked inputs of all views; rejected objects and their grasps are left out.
+
+    Raises:
+        InputError: a model is missing, or grasps are of an instance that is not in the scene.
+    """
+    chosen = sorted((o for o in scene.objects if o.verdict != "rejected"), key=lambda o: o.instance)
+    missing = sorted({o.obj_id for o in chosen} - set(models))
+    if missing:
+        raise InputError(
+            f"scene '{scene.name}' holds objects {missing} without a model; the models given are: "
+            f"{names_of(list(models.values()))}. Put the missing ones into models/."
+        )
+    for g in grasp_sets:
+        if scene.object(g.instance).obj_id != g.obj_id:
+            raise InputError(
+                f"the grasps of instance {g.instance} are of object {g.obj_id}, but in the scene "
+                f"this instance is object {scene.object(g.instance).obj_id}. Run the school again."
+            )
+    instances = {o.instance for o in chosen}
+    kept = sorted((g for g in grasp_sets if g.instance in instances), key=lambda g: g.instance)
+    return FrameInputs(
+        config=config,
+        intrinsics=store.session.intrinsics,
+        depth_unit_m=store.session.depth_unit_m,
+        objects=tuple(chosen),
+        models={o.obj_id: models[o.obj_id] for o in chosen},
+        grasp_sets=tuple(kept),
+        T_world_table=None if scene.plane is None else scene.plane.T_world_table,
+        digest=_scene_digest(store, scene, chosen, models, kept, config),
+    )
+
+
+def table_slab(config: AnnotationConfig) -> Mesh:
+    """Return the table as a closed box under the plane z = 0 of frame `table` [m]."""
+    half, top = config.table_m / 2, -config.plane_clearance_m
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)], float)
+    corners[:, :2] *= half
+    corners[:, 2] = top - config.table_thickness_m * (1 - corners[:, 2])
+    faces = [
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ]  # fmt: skip
+    return Mesh(vertices=corners, faces=np.array(faces, dtype=np.int32))
+
+
+def _scene_digest(
+    store: SessionStore,
+    scene: Scene,
+    chosen: Sequence[ObjectPose],
+    models: Mapping[int, ObjectModel],
+    grasp_sets: Sequence[GraspSet],
+    config: AnnotationConfig,
+) -> str:
+    """Return the digest of what all views have in common."""
+    i = store.session.intrinsics
+    digest = hashlib.sha256(json.dumps([FORMAT_VERSION, asdict(config)]).encode())
+    numbers = [i.width, i.height, i.fx, i.fy, i.cx, i.cy, store.session.depth_unit_m]
+    digest.update(np.array([*numbers, *i.distortion]).tobytes())
+    for o in chosen:
+        digest.update(json.dumps(object_pose_to_json(o), sort_keys=True).encode())
+    for obj_id in sorted({o.obj_id for o in chosen}):
+        model = models[obj_id]
+        digest.update(f"{obj_id} {model.name} ".encode())
+        digest.update(model.mesh.vertices.tobytes() + model.mesh.faces.tobytes())
+    for g in grasp_sets:
+        digest.update(f"{g.instance} {g.obj_id} {len(g)} ".encode())
+        for array in (g.Ts_obj_grasp, g.widths_m, g.scores, g.reachable):
+            digest.update(np.ascontiguousarray(array).tobytes())
+    if scene.plane is not None:
+        digest.update(scene.plane.T_world_table.tobytes())
+    return digest.hexdigest()
+
+
+def frame_view(store: SessionStore, inputs: FrameInputs, view: View) -> FrameView:
+    """Return a view with the digest of everything its annotation depends on.
+
+    The depth enters as its file's bytes, which are a tenth of the image and need no decoding.
+
+    Raises:
+        InputError: its depth image is missing, or an image is not of the camera's size.
+    """
+    paths = [rgb_path(view.index)]
+    paths += [depth_path(view.index)] if store.has_depth(view.index) else []
+    for path in paths:
+        _check_size(store, inputs.intrinsics, path)
+    digest = hashlib.sha256(inputs.digest.encode())
+    digest.update(np.asarray(view.T_world_cam).tobytes())
+    if len(paths) > 1:
+        digest.update(store.path(paths[1]).read_bytes())
+    return FrameView(
+        index=view.index, T_world_cam=np.asarray(view.T_world_cam), digest=digest.hexdigest()
+    )
+
+
+def _check_size(store: SessionStore, intrinsics: CameraIntrinsics, path: str) -> None:
+    """Raise if an image is not of the camera's size."""
+    width, height = images.image_size(store.path(path))
+    if (width, height) != (intrinsics.width, intrinsics.height):
+        raise InputError(
+            f"{store.path(path)} is {width}x{height} pixels, the session's camera "
+            f"{intrinsics.width}x{intrinsics.height}: labels would not lie on the picture. "
+            "Calibrate at the size of the images, or bring the images back to the camera's size."
+        )

@@ -1,0 +1,155 @@
+"""What the measured depth shows in front of the scene that is not in the model: a hand, a cable.
+
+A measurement nearer than the rendered surface can be noise, the fattened edge of a near object, a
+pose that is a few millimetres off, or a thing. Only a region that is nearer than every surface
+around it, wider than a fattened edge and larger than speckle is taken for a thing.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import CameraIntrinsics
+from realsim_sim_bridge.annotation.config import OccluderConfig
+
+Array32 = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Window = tuple[slice, slice]
+CLOSING_PX = 2
+"""Holes of the measurement up to twice this width inside a thing belong to it [px]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class UnmodelledRegion:
+    """Where something that is not in the model stands in front of the scene."""
+
+    window: Window
+    """Rows and columns of the image that `mask` covers; nothing was looked for elsewhere."""
+    mask: Mask
+    """(h, w) where it stands."""
+    depth_m: Array32
+    """(h, w) how far away it was measured [m], 0 = not measured."""
+
+    def over(self, window: Window) -> Mask:
+        """Return the mask over another window of the image."""
+        rows, columns = window
+        out = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.bool_)
+        mine_rows, mine_columns = self.window
+        r0, r1 = max(rows.start, mine_rows.start), min(rows.stop, mine_rows.stop)
+        c0, c1 = max(columns.start, mine_columns.start), min(columns.stop, mine_columns.stop)
+        if r0 < r1 and c0 < c1:
+            out[r0 - rows.start : r1 - rows.start, c0 - columns.start : c1 - columns.start] = (
+                self.mask[
+                    r0 - mine_rows.start : r1 - mine_rows.start,
+                    c0 - mine_columns.start : c1 - mine_columns.start,
+                ]
+            )
+        return out
+
+    def without(self, window: Window, kept: Mask) -> "UnmodelledRegion":
+        """Return the region without the pixels `kept` (h, w) of a window inside it."""
+        rows, columns = window
+        top, left = self.window[0].start, self.window[1].start
+        mask = self.mask.copy()
+        mask[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] &= ~(
+            kept
+        )
+        return UnmodelledRegion(window=self.window, mask=mask, depth_m=self.depth_m)
+
+
+def unmodelled_region(
+    rendered_m: Array32,
+    measured_m: Array32,
+    window: Window,
+    intrinsics: CameraIntrinsics,
+    config: OccluderConfig,
+) -> UnmodelledRegion | None:
+    """Return where something stands in front of the rendered scene; None = nowhere.
+
+    Args:
+        rendered_m: (H, W) exact depth of everything modelled [m], 0 = nothing.
+        measured_m: (H, W) measured depth [m], 0 = none.
+        window: rows and columns that hold the objects; a margin around them is looked at, too, so
+            that a region is not judged by the part of it that lies on an object.
+        intrinsics: the camera.
+        config: when a difference is a thing.
+    """
+    import cv2
+
+    if not config.is_on or not measured_m.any():
+        return None
+    window = _widened(window, 4 * config.edge_px + config.least_width_px, rendered_m.shape)
+    measured, rendered = measured_m[window], rendered_m[window]
+    if rendered.size == 0:
+        return None
+    per_z2 = config.noise_per_z2(intrinsics.fx)
+    raw = _is_nearer(measured, rendered, config.base_m, per_z2)
+    if _large_cores(raw, config) is None:  # what is asked below is more
+        return None
+    far = np.where(rendered > 0, rendered, np.float32(np.inf))
+    around = np.ones((2 * config.edge_px + 1,) * 2, np.uint8)
+    nearest = np.asarray(cv2.erode(far, around, borderType=cv2.BORDER_REPLICATE), np.float32)
+    nearest[~np.isfinite(nearest)] = 0
+    cores = _large_cores(_is_nearer(measured, nearest, config.base_m, per_z2), config)
+    if cores is None:
+        return None
+    mask = _grown(cores, raw, measured == 0, config)
+    return UnmodelledRegion(window=window, mask=mask, depth_m=measured)
+
+
+def _widened(window: Window, margin: int, shape: tuple[int, ...]) -> Window:
+    """Return the window with a margin, inside the image."""
+    rows, columns = window
+    if rows.stop <= rows.start or columns.stop <= columns.start:
+        return slice(0, 0), slice(0, 0)
+    return (
+        slice(max(0, rows.start - margin), min(shape[0], rows.stop + margin)),
+        slice(max(0, columns.start - margin), min(shape[1], columns.stop + margin)),
+    )
+
+
+def _is_nearer(measured: Array32, surface: Array32, base_m: float, per_z2: float) -> Mask:
+    """Return where a measurement is nearer than the surface by more than noise explains.
+
+    The noise is that at the surface's depth (0 = no surface), the largest that can be meant.
+    """
+    limit = surface * np.float32(-per_z2)
+    limit += 1
+    limit *= surface
+    limit -= np.float32(base_m)
+    return (measured > 0) & (measured < limit)
+
+
+def _large_cores(clear: Mask, config: OccluderConfig) -> Mask | None:
+    """Return the connected regions that are neither thin nor small; None if there are none."""
+    import cv2
+
+    side = config.least_width_px
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+    opened = cv2.morphologyEx(clear.astype(np.uint8), cv2.MORPH_OPEN, disc,
+                              borderType=cv2.BORDER_REPLICATE)  # fmt: skip
+    count, regions, statistics, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
+    areas = np.asarray(statistics)[:, cv2.CC_STAT_AREA]
+    large: Mask = np.asarray(areas >= config.least_region_px, dtype=np.bool_)
+    large[0] = False  # what is not a region
+    if count < 2 or not large.any():
+        return None
+    return large[np.asarray(regions, dtype=np.int32)]
+
+
+def _grown(cores: Mask, raw: Mask, unmeasured: Mask, config: OccluderConfig) -> Mask:
+    """Return the cores with what belongs to them: their rims over edges, and holes inside them.
+
+    Rims were given up to fattening and opening; they come back within as many pixels.
+    """
+    import cv2
+
+    kernel = np.ones((3, 3), np.uint8)
+    grown = cores.astype(np.uint8)
+    allowed = raw.astype(np.uint8)
+    for _ in range(config.edge_px + config.least_width_px // 2 + 1):
+        grown = np.asarray(cv2.dilate(grown, kernel), np.uint8) & allowed | grown
+    wide = np.ones((2 * CLOSING_PX + 1,) * 2, np.uint8)
+    closed = cv2.morphologyEx(grown, cv2.MORPH_CLOSE, wide)
+    return (grown > 0) | ((np.asarray(closed) > 0) & unmeasured)

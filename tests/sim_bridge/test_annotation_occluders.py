@@ -1,0 +1,224 @@
+"""Things that are not in the scene: found in the measured depth, and nothing else taken for one."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from realsim import CameraIntrinsics, GraspSet, Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim.geometry import se3
+from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh
+from realsim_sim_bridge.annotation.config import AnnotationConfig, OccluderConfig
+from realsim_sim_bridge.annotation.frame import frame_files
+from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView, table_slab
+
+CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
+CONFIG = AnnotationConfig(plane_clearance_m=0.0, maps=("instance",))
+Depth = NDArray[np.float32]
+
+
+def box(size: tuple[float, float, float]) -> Mesh:
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
+    return Mesh(vertices=corners * np.array(size) / 2, faces=table_slab(CONFIG).faces)
+
+
+MODELS = {
+    1: ObjectModel(obj_id=1, name="mug", mesh=box((0.08, 0.08, 0.10))),
+    2: ObjectModel(obj_id=2, name="book", mesh=box((0.16, 0.11, 0.03))),
+}
+PLACES = {1: [-0.07, 0.0, 0.05], 2: [0.09, 0.02, 0.015]}
+SCENE = Scene(
+    name="desk",
+    objects=tuple(
+        ObjectPose(obj_id=i, instance=i, verdict="accepted", T_world_obj=se3.from_translation(t))
+        for i, t in PLACES.items()
+    ),
+    plane=SupportPlane(T_world_table=np.eye(4)),
+)
+
+
+def grasps_of_the_book() -> GraspSet:
+    """Return a grasp from above in the middle of the book."""
+    nan4 = np.full((1, 4), np.nan)
+    return GraspSet(
+        obj_id=2, instance=2, widths_m=np.array([0.11]), scores=np.ones(1),
+        Ts_obj_grasp=se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0, 0, 0.01])[None],
+        base_scores=np.ones(1), slip_m=nan4, slip_rad=nan4, reachable=np.ones(1, bool),
+        failures=("",),
+    )  # fmt: skip
+
+
+def inputs_of(occluder: OccluderConfig | None = None) -> FrameInputs:
+    config = AnnotationConfig(
+        plane_clearance_m=0.0, maps=("instance",), occluder=occluder or OccluderConfig()
+    )
+    return FrameInputs(
+        config=config, intrinsics=CAMERA, depth_unit_m=1e-4, objects=SCENE.objects, models=MODELS,
+        grasp_sets=(grasps_of_the_book(),), T_world_table=np.eye(4), digest="",
+    )  # fmt: skip
+
+
+INPUTS = inputs_of()
+
+
+def camera_at(distance_m: float, azimuth: float = 0.7, up: float = 1.2) -> NDArray[np.float64]:
+    eye = np.array([np.cos(azimuth), np.sin(azimuth), up])
+    return se3.look_at(distance_m * eye / np.linalg.norm(eye), [0.0, 0.0, 0.03])
+
+
+def rendered(T: NDArray[np.float64], *things: PlacedMesh) -> Labels:
+    return LabelRenderer([*INPUTS.placed(), *things]).render(CAMERA, T)
+
+
+def annotated(T: NDArray[np.float64], depth_m: Depth, inputs: FrameInputs = INPUTS):
+    """Return the objects' entries by name, and the visible masks by name."""
+    view = FrameView(index=0, T_world_cam=T, digest="")
+    frame = frame_files(inputs, view, depth_m)
+    entries = {e["name"]: e for e in frame.part["objects"]}
+    import cv2
+
+    masks = {
+        name: cv2.imdecode(
+            np.frombuffer(frame.files[f"mask_visib/000000_{e['mask']:06d}.png"], np.uint8),
+            cv2.IMREAD_UNCHANGED,
+        ) > 0
+        for name, e in entries.items()
+    }  # fmt: skip
+    return entries, masks
+
+
+def hand(T: NDArray[np.float64], over: list[float], size: tuple[float, float], before: float):
+    """Return a slab before a point (3,) of the world, on its line of sight [m]."""
+    x, y, z = se3.transform(se3.invert(T), np.array([over]))[0]
+    near = (z - before) / z
+    thing = se3.from_rt(se3.exp_so3([0.0, 0.0, 0.3]), [x * near, y * near, z * near])
+    return PlacedMesh(-1, box((size[0], size[1], 0.02)), T @ thing)
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 1.0, 2.5, 4.0, 5.5])
+@pytest.mark.parametrize("up", [0.15, 0.6, 3.0])
+def test_of_exact_depth_nothing_is_removed(azimuth: float, up: float) -> None:
+    T = camera_at(0.5, azimuth, up)
+    labels = rendered(T)
+    entries, masks = annotated(T, labels.depth_m)
+    for e in entries.values():
+        assert e["unknown_occluder"]["finding"] == "none" and e["px_hidden_by_unknown"] == 0
+        np.testing.assert_array_equal(masks[e["name"]], labels.ids == e["instance"])
+
+
+@pytest.mark.parametrize(
+    "over", [[-0.07, 0.0, 0.1], [0.0, 0.0, 0.05], [0.09, 0.02, 0.03], [0.15, -0.02, 0.02]]
+)
+@pytest.mark.parametrize("before", [0.1, 0.2])
+def test_a_hand_takes_exactly_its_pixels(over: list[float], before: float) -> None:
+    T = camera_at(0.5)
+    alone, held = rendered(T), rendered(T, hand(T, over, (0.05, 0.03), before))
+    covered = (alone.ids >= 0) & (held.ids < 0)
+    assert covered.sum() > 200
+    entries, masks = annotated(T, held.depth_m)
+    for e in entries.values():
+        i = e["instance"]
+        np.testing.assert_array_equal(masks[e["name"]], held.ids == i)
+        hidden = int(np.count_nonzero(covered & (alone.ids == i)))
+        assert e["px_hidden_by_unknown"] == hidden
+        assert e["px_count_visib"] == np.count_nonzero(held.ids == i)
+        assert e["visib_fract"] == pytest.approx(e["px_count_visib"] / e["px_count_all"])
+        if hidden:
+            assert e["unknown_occluder"]["gap_m"] > 0.02
+
+
+@pytest.mark.parametrize("distance", [0.5, 1.0])
+def test_noise_is_not_taken_for_a_thing(distance: float) -> None:
+    removed = seen = 0
+    for seed, azimuth in enumerate([0.0, 1.0, 2.5, 4.0]):
+        T = camera_at(distance, azimuth)
+        labels = rendered(T)
+        sensor = DepthSensorModel()
+        measured = sensor.measure(labels.depth_m, CAMERA, np.random.default_rng(seed))
+        entries, _ = annotated(T, measured)
+        removed += sum(e["px_hidden_by_unknown"] for e in entries.values())
+        seen += sum(labels.px_count_visib.values())
+    assert removed < 1e-3 * seen
+
+
+def test_a_hand_is_found_through_the_sensors_noise() -> None:
+    T = camera_at(0.5)
+    held = rendered(T, hand(T, [0.06, 0.0, 0.03], (0.07, 0.05), 0.15))
+    truly = (rendered(T).ids >= 0) & (held.ids < 0)
+    measured = DepthSensorModel().measure(held.depth_m, CAMERA, np.random.default_rng(5))
+    _, masks = annotated(T, measured)
+    found = (rendered(T).ids >= 0) & ~masks["mug"] & ~masks["book"]
+    is_measured = measured > 0
+    assert np.count_nonzero(found & truly) > 0.95 * np.count_nonzero(truly & is_measured)
+    assert np.count_nonzero(found & ~truly) < 0.05 * np.count_nonzero(truly)
+
+
+def test_speckle_and_fattened_edges_stay() -> None:
+    T = camera_at(0.5)
+    labels = rendered(T)
+    rng = np.random.default_rng(0)
+    measured = labels.depth_m.copy()
+    measured[rng.random(measured.shape) < 0.03] *= 0.6
+    measured[100:104, 60:260] *= 0.7  # a strip of 4 pixels
+    entries, _ = annotated(T, measured)
+    assert all(e["px_hidden_by_unknown"] == 0 for e in entries.values())
+    import cv2
+
+    fat = np.where(labels.depth_m > 0, labels.depth_m, np.float32(np.inf))
+    fat = np.asarray(cv2.erode(fat, np.ones((7, 7), np.uint8)), np.float32)
+    entries, _ = annotated(T, np.where(np.isfinite(fat), fat, 0).astype(np.float32))
+    assert all(e["px_hidden_by_unknown"] == 0 for e in entries.values())
+
+
+def nearer_by(labels: Labels, instance: int, metres: float) -> Depth:
+    return np.where(labels.ids == instance, labels.depth_m - np.float32(metres), labels.depth_m)
+
+
+def test_a_wrong_pose_is_not_silently_taken_for_a_thing() -> None:
+    T = camera_at(0.5)
+    labels = rendered(T)
+    entries, masks = annotated(T, nearer_by(labels, 1, 0.03))
+    mug = entries["mug"]
+    assert mug["unknown_occluder"]["finding"] == "pose or occluder"
+    assert not mug["unknown_occluder"]["is_removed"] and mug["px_hidden_by_unknown"] == 0
+    np.testing.assert_array_equal(masks["mug"], labels.ids == 1)
+    assert mug["unknown_occluder"]["gap_m"] == pytest.approx(0.03, abs=1e-3)
+    assert entries["book"]["unknown_occluder"]["finding"] == "none"
+
+
+def test_biased_depth_flags_every_object_and_removes_none() -> None:
+    T = camera_at(0.5)
+    labels = rendered(T)
+    entries, masks = annotated(T, (labels.depth_m * np.float32(0.92)).astype(np.float32))
+    for e in entries.values():
+        assert e["unknown_occluder"]["finding"] == "pose or occluder"
+        np.testing.assert_array_equal(masks[e["name"]], labels.ids == e["instance"])
+
+
+def test_a_hand_well_before_most_of_an_object_is_removed_and_flagged() -> None:
+    T = camera_at(0.5)
+    held = rendered(T, hand(T, PLACES[2], (0.10, 0.06), 0.2))
+    alone = rendered(T)
+    share = 1 - np.sum(held.ids == 2) / np.sum(alone.ids == 2)
+    assert 0.6 < share < 1.0
+    entries, masks = annotated(T, held.depth_m)
+    assert entries["book"]["unknown_occluder"]["finding"] == "pose or occluder"
+    assert entries["book"]["unknown_occluder"]["is_removed"]
+    np.testing.assert_array_equal(masks["book"], held.ids == 2)
+
+
+def test_switched_off_nothing_is_removed_and_the_disagreement_is_told_all_the_same() -> None:
+    T = camera_at(0.5)
+    held = rendered(T, hand(T, [0.06, 0.0, 0.03], (0.07, 0.05), 0.15))
+    entries, masks = annotated(T, held.depth_m, inputs_of(OccluderConfig(is_on=False)))
+    np.testing.assert_array_equal(masks["book"], rendered(T).ids == 2)
+    assert entries["book"]["depth"]["nearer"] > 0.1
+
+
+def test_a_contact_behind_the_hand_is_not_seen() -> None:
+    T = camera_at(0.5, up=3.0)
+    free, _ = annotated(T, rendered(T).depth_m)
+    assert free["book"]["grasps"] == {"hidden": 0, "partly": 0, "visible": 1}
+    held = rendered(T, hand(T, PLACES[2], (0.13, 0.13), 0.15))
+    behind, _ = annotated(T, held.depth_m)
+    assert behind["book"]["grasps"] == {"hidden": 1, "partly": 0, "visible": 0}
