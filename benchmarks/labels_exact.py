@@ -141,6 +141,7 @@ def _gl_caster(placed, i: CameraIntrinsics):
             program["M"].write(M.T.astype("f4").tobytes())
             program["id"].value = k
             array.render()
-        return np.frombuffer(ids.read(), np.int32).reshape(i.height, i.width)
+        seen = np.frombuffer(ids.read(), np.int32).reshape(i.height, i.width)
+        return np.where(seen < 0, -1, seen)  # the clear colour is written as a float's bits
 
     return cast

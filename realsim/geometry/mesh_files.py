@@ -4,6 +4,11 @@
 metres.
 """
 
+import contextlib
+import io
+import logging
+import warnings
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -51,15 +56,18 @@ def check_unit(largest_extent: float, unit: Unit, name: str) -> None:
         )
 
 
-def load_mesh(path: Path | str, unit: Unit) -> Mesh:
+def load_mesh(path: Path | str, unit: Unit, notes: list[str] | None = None) -> Mesh:
     """Read a ply, obj, stl or glb file as one mesh in metres.
 
     Textures, texture coordinates and vertex colours are kept. STL repeats every corner, so its
-    equal vertices are merged; elsewhere vertices stay as they are in the file.
+    equal vertices are merged; elsewhere vertices stay as they are in the file. A texture that the
+    file names and that is missing, broken or without texture coordinates is left out and named,
+    with what stands for it: the plain colour of the file's material, or none.
 
     Args:
         path: the file; the parts of a scene are merged.
         unit: what one unit of the file is.
+        notes: what is missing is added to it; None = it is said as a Python warning.
 
     Raises:
         InputError: no such file, not a mesh, no triangles.
@@ -72,8 +80,10 @@ def load_mesh(path: Path | str, unit: Unit) -> Mesh:
         raise InputError(f"{path}: '{path.suffix}' is not a mesh format; {', '.join(FORMATS)} are.")
     if not path.is_file():
         raise InputError(f"{path} does not exist; a mesh file was expected there.")
+    beside = _files_beside(path)
     try:
-        loaded: Any = trimesh.load_scene(path, process=False).to_mesh()
+        with _quiet("trimesh"):
+            loaded: Any = trimesh.load_scene(path, process=False, resolver=beside).to_mesh()
     except Exception as error:  # a broken file raises whatever the format's reader trips over
         raise InputError(
             f"{path} cannot be read as a {path.suffix[1:]} mesh ({type(error).__name__}: {error}). "
@@ -88,10 +98,109 @@ def load_mesh(path: Path | str, unit: Unit) -> Mesh:
         )
     check_unit(float(np.ptp(vertices, axis=0).max()), unit, str(path))
     colors, uv, texture = _appearance(loaded, len(vertices))
+    has_pictures = bool(beside.pictures) or path.suffix.lower() == ".glb"
+    if texture is not None and not has_pictures:
+        # The reader makes a grey picture up where the file's own is missing.
+        texture = None
+    if (
+        colors is not None
+        and loaded.visual.kind == "texture"
+        and not (has_pictures or beside.tables or path.suffix.lower() == ".glb")
+    ):
+        colors = None
+    told = _missing_looks(path, beside, colors, texture)
+    if notes is not None:
+        notes += told
+    else:
+        for words in told:
+            warnings.warn(words, stacklevel=2)
     mesh = Mesh(
         vertices=vertices * METRES[unit], faces=faces, colors=colors, uv=uv, texture=texture
     )
     return welded_mesh(mesh) if path.suffix.lower() == ".stl" else mesh
+
+
+def _files_beside(path: Path) -> Any:
+    """Return a trimesh resolver that remembers which files the mesh file asked for."""
+    from trimesh.resolvers import FilePathResolver
+
+    class Beside(FilePathResolver):
+        def __init__(self, source: str) -> None:
+            super().__init__(source)
+            self.missing: list[str] = []
+            self.broken: list[str] = []
+            self.pictures: list[str] = []
+            self.tables: list[str] = []
+
+        def get(self, name: str) -> bytes:
+            try:
+                data: bytes = super().get(name)
+            except OSError:
+                self.missing.append(name)
+                raise
+            if name.lower().endswith((".mtl", ".bin")):
+                self.tables.append(name)
+            elif _is_picture(data):
+                self.pictures.append(name)
+            else:
+                self.broken.append(name)
+            return data
+
+    return Beside(str(path))
+
+
+def _is_picture(data: bytes) -> bool:
+    """Return whether bytes are a picture that can be decoded."""
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data)) as image:
+            image.load()
+    except Exception:  # a broken picture raises whatever its decoder trips over
+        return False
+    return True
+
+
+@contextlib.contextmanager
+def _quiet(name: str) -> Generator[None]:
+    """Keep a library from printing tracebacks of what is reported in words here."""
+    log = logging.getLogger(name)
+    level = log.level
+    log.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+
+
+def _missing_looks(
+    path: Path,
+    beside: Any,
+    colors: NDArray[np.uint8] | None,
+    texture: NDArray[np.uint8] | None,
+) -> list[str]:
+    """Return in words what is missing of a mesh's look, and what stands for it."""
+    if texture is not None:
+        instead = "the plain colour of its part stands for it"
+    elif colors is not None:
+        r, g, b = colors[0].tolist()
+        instead = f"the material's plain colour stands for it (sRGB {r} {g} {b})"
+    else:
+        instead = "the mesh has no colours; renderings paint it, or give it a procedural material"
+    told = [
+        f"{path}: '{name}', named in it, is not in its folder; {instead}. Put the file there."
+        for name in dict.fromkeys(beside.missing)
+    ]
+    told += [
+        f"{path}: '{name}', named in it, cannot be decoded as a picture; {instead}. Save it again."
+        for name in dict.fromkeys(beside.broken)
+    ]
+    if beside.pictures and texture is None:
+        told.append(
+            f"{path} names the texture '{beside.pictures[0]}', but has no texture coordinates; "
+            f"{instead}. Unwrap the mesh and export it again."
+        )
+    return told
 
 
 def _appearance(

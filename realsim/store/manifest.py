@@ -9,7 +9,7 @@ temporary name, and `finish_interrupted` gives them their name.
 import hashlib
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -179,6 +179,22 @@ class Manifest:
         """Write a file whole or not at all, and list it."""
         entry = entry_of(path, data)
         atomic.write_bytes(self._folder / path, data, announce=lambda: self.add([entry]))
+
+    def write_derived(self, files: Mapping[str, bytes]) -> None:
+        """Write files that can be made again from others, and list them: two lines in all.
+
+        Each is whole or not there after a kill; when their bytes reach the disk is left to the
+        system, so that a power cut may leave some that `verify` then names. Files that are replaced
+        leave the list first: after a kill in between they are unlisted, not listed wrongly.
+        """
+        old = [Entry(path=p, sha256="", bytes=REMOVED) for p in files if p in self._entries]
+        if old:
+            atomic.append_line(self._file, "\n".join(line_of(e) for e in old))
+            for entry in old:
+                del self._entries[entry.path]
+        for path, data in files.items():
+            atomic.write_bytes(self._folder / path, data, flush=False)
+        self.add([entry_of(path, data) for path, data in files.items()])
 
     def finish_interrupted(self) -> None:
         """Give listed bytes that a kill left under a temporary name their name; delete the rest."""

@@ -377,6 +377,20 @@ class SessionStore:
         with storing(self.folder, relative):
             self._manifest.write(PurePosixPath(relative).as_posix(), data)
 
+    def write_derived(self, files: Mapping[str, bytes]) -> None:
+        """Write files that can be made again from others: many small ones at the price of one.
+
+        Raises:
+            StorageError: the disk is full, or refuses; files written before it did stay unlisted.
+        """
+        for relative in files:
+            self.path(relative)  # refuses a path that leads out of the session
+        self._write_due_cameras()
+        with storing(self.folder, f"{len(files)} files that are made from others"):
+            self._manifest.write_derived(
+                {PurePosixPath(p).as_posix(): data for p, data in files.items()}
+            )
+
     def write_json(self, relative: str, value: Any) -> None:
         """Write plain JSON values; NaN and infinity are refused."""
         self.write_bytes(relative, atomic.json_bytes(value))

@@ -240,6 +240,22 @@ def test_a_changed_byte_is_found(tmp_path):
     assert fault.path == "rgb/000000.png" and "checksum" in fault.found
 
 
+def test_derived_files_are_listed_and_replaced_together(tmp_path):
+    store = filled(tmp_path, 1)
+    lines = len((tmp_path / "manifest.jsonl").read_bytes().splitlines())
+    store.write_derived({f"mask/{k:06d}.png": b"first %d" % k for k in range(20)})
+    assert store.verify() == []
+    listed = (tmp_path / "manifest.jsonl").read_bytes().splitlines()
+    assert len(listed) == lines + 20
+    store.write_derived({"mask/000003.png": b"second", "labels/x.png": b"new"})
+    reopened = SessionStore.open(tmp_path)
+    assert reopened.verify() == [] and store.verify() == []
+    assert reopened.path("mask/000003.png").read_bytes() == b"second"
+    with pytest.raises(InputError, match="inside the session"):
+        store.write_derived({"mask/a.png": b"1", "../b.png": b"2"})
+    assert not store.has("mask/a.png")
+
+
 # --- kills ---------------------------------------------------------------------------------------
 
 

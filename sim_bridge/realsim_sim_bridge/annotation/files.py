@@ -158,9 +158,7 @@ def write_view(store: SessionStore, view: int, files: Mapping[str, bytes]) -> No
     masks, and going back to the old inputs would take it for complete.
     """
     store.remove(part_path(view))
-    for path, data in files.items():
-        if path != part_path(view):
-            store.write_bytes(path, data)
+    store.write_derived({p: data for p, data in files.items() if p != part_path(view)})
     store.write_bytes(part_path(view), files[part_path(view)])
 
 

@@ -1,0 +1,206 @@
+"""Wood cut from trunks: growth rings, pores and boards; and what imitates it or hides it.
+
+A board is a flat cut near the axis of a trunk, so its growth rings are hyperbola-like arches
+("cathedrals") in the middle and straight lines at the sides. The grain runs along u.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from realsim.rendering.appearance import Material
+from realsim.rendering.procedural.noise import Field, blurred, fine, fractal, grid, smooth, step
+from realsim.rendering.procedural.texels import (
+    Tint,
+    grey8,
+    image8,
+    linear_color,
+    mixed,
+    normals8,
+    random_tint,
+    shaded,
+)
+
+WOOD_PX = 1024
+"""Side of wooden tiles [px]: 0.6 mm a texel, about a pixel of a view from a metre."""
+LAMINATE_PX = 512
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Timber:
+    """What tells one kind of wood from another."""
+
+    name: str
+    early: Tint
+    """sRGB of the light wood of spring."""
+    late: Tint
+    """sRGB of the dark line that ends the year."""
+    rings_per_m: float
+    """Growth rings across a board."""
+    contrast: float
+    """How much darker the late wood is [0, 1]."""
+    pores: float
+    """Share of the early wood that is open pores [0, 1]."""
+    pore_m: float
+    """Length of a pore along the grain [m]."""
+
+
+OAK = Timber(name="oak", early=(205, 167, 118), late=(148, 106, 64), rings_per_m=210,
+             contrast=0.62, pores=0.30, pore_m=0.016)  # fmt: skip
+WALNUT = Timber(name="walnut", early=(126, 90, 62), late=(66, 43, 29), rings_per_m=150,
+                contrast=0.75, pores=0.18, pore_m=0.012)  # fmt: skip
+BIRCH = Timber(name="birch", early=(231, 205, 165), late=(204, 168, 120), rings_per_m=130,
+               contrast=0.55, pores=0.05, pore_m=0.006)  # fmt: skip
+PINE = Timber(name="pine", early=(232, 197, 138), late=(188, 124, 62), rings_per_m=170,
+              contrast=0.8, pores=0.0, pore_m=0.006)  # fmt: skip
+
+
+def oak(rng: np.random.Generator) -> Material:
+    """Return oak boards: strong rings and long open pores."""
+    return _boards(rng, OAK)
+
+
+def walnut(rng: np.random.Generator) -> Material:
+    """Return dark walnut boards."""
+    return _boards(rng, WALNUT)
+
+
+def birch(rng: np.random.Generator) -> Material:
+    """Return pale birch boards with a quiet grain."""
+    return _boards(rng, BIRCH)
+
+
+def pine(rng: np.random.Generator) -> Material:
+    """Return pine boards: yellow, with hard orange rings."""
+    return _boards(rng, PINE)
+
+
+def _boards(rng: np.random.Generator, timber: Timber) -> Material:
+    """Return boards glued side by side, each from its own trunk."""
+    n = WOOD_PX
+    period_m = float(rng.uniform(0.45, 0.75))
+    count = int(rng.integers(3, 7))
+    u, v = grid(n)
+    board, across = _board_of(rng, v, count)
+    rings = _rings(rng, u, across, board, count, timber.rings_per_m * period_m)
+    year = rings - np.floor(rings)
+    # Spring wood darkens slowly; the year ends at once.
+    line = (year**2.2 * step(1.0 - year, 0.0, 0.12)).astype(np.float32)
+    fibre = smooth(rng, n, 7.0, 260.0)
+    tone = timber.contrast * line + 0.07 * fibre + 0.09 * smooth(rng, n, 2.0, 30.0)
+    color = mixed(timber.early, timber.late, (0.08 + tone).astype(np.float32))
+
+    pore = np.zeros((n, n), np.float32)
+    if timber.pores > 0:
+        streak = smooth(rng, n, 0.5 * period_m / timber.pore_m, 340.0)
+        # Ring-porous wood has its pores where the year begins.
+        needed = np.float32(2.6 - 2.2 * timber.pores) + 0.9 * np.minimum(year / 0.45, 1.0)
+        pore = step(streak - needed.astype(np.float32), 0.0, 0.8)
+        color = mixed(color, 0.62 * np.asarray(timber.late), 0.8 * pore)
+    tint = 1.0 + 0.075 * rng.standard_normal((count, 1)) + 0.02 * rng.standard_normal((count, 3))
+    color *= tint[board[:, 0]][:, None, :].astype(np.float32)
+    joint = _joints(board)
+    color *= (1.0 - 0.55 * joint)[..., None]
+
+    base = float(rng.uniform(0.28, 0.6))
+    rough = np.clip(0.80 + 0.05 * fibre + 0.2 * pore + 0.2 * joint, 0.0, 1.0)
+    height = -6e-5 * pore - 1.2e-4 * joint - 1.5e-5 * line + 4e-6 * fibre
+    return Material(
+        base_color=(1.0, 1.0, 1.0),
+        base_color_image=image8(color),
+        roughness=base / 0.8,
+        roughness_image=grey8(rough),
+        normal_image=normals8(blurred(height.astype(np.float32), 0.8), period_m),
+        period_m=period_m,
+        name=timber.name,
+    )
+
+
+def _board_of(
+    rng: np.random.Generator, v: Field, count: int
+) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.int64]], Field]:
+    """Return the board (n, 1) of every row and the place (n, 1) across it, -0.5 to 0.5."""
+    width = rng.uniform(0.8, 1.2, count)
+    edges = np.concatenate([[0.0], np.cumsum(width / width.sum())])
+    board = np.clip(np.searchsorted(edges, v, side="right") - 1, 0, count - 1)
+    across = (v - edges[board]) / (edges[board + 1] - edges[board]) - 0.5
+    return board, across.astype(np.float32)
+
+
+def _rings(
+    rng: np.random.Generator,
+    u: Field,
+    across: Field,
+    board: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
+    count: int,
+    per_tile: float,
+) -> Field:
+    """Return the age (n, n) in years at every texel, by the distance to the trunk's axis."""
+    n = u.shape[1]
+    axis = rng.uniform(-0.9, 0.9, (count, 1))[board[:, 0]]
+    depth = np.zeros((n, n), np.float32)
+    for waves in (1, 2, 3):
+        # The trunk bends, so that the cut leaves and enters rings: closed under the tile's edge.
+        size = rng.normal(0.0, 0.30 / waves**1.4, (count, 1))[board[:, 0]]
+        phase = rng.uniform(0, 2 * np.pi, (count, 1))[board[:, 0]]
+        depth += (size * np.sin(2 * np.pi * waves * u + phase)).astype(np.float32)
+    wobble = 0.035 * smooth(rng, n, 3.0, 8.0) + 0.006 * smooth(rng, n, 14.0, 30.0)
+    lift = rng.uniform(0.25, 0.8, (count, 1))[board[:, 0]]
+    sideways = (across - axis).astype(np.float32) + wobble
+    radius = np.sqrt(sideways**2 + (depth + lift).astype(np.float32) ** 2)
+    start = rng.uniform(0, 50, (count, 1))[board[:, 0]]
+    return (radius * (per_tile / count) + start).astype(np.float32)
+
+
+def _joints(board: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Field:
+    """Return 1 on the lines (n, n) between boards, 0 elsewhere."""
+    n = len(board)
+    line = (board != np.roll(board, 1, 0)).astype(np.float32)
+    return np.repeat(np.maximum(line, 0.5 * np.roll(line, -1, 0)), n, axis=1)
+
+
+LAMINATES: tuple[tuple[str, Tint], ...] = (
+    ("white", (236, 236, 232)), ("light grey", (200, 203, 205)), ("grey", (146, 150, 153)),
+    ("anthracite", (62, 65, 69)), ("black", (34, 34, 36)), ("beige", (216, 203, 180)),
+    ("blue grey", (126, 146, 164)), ("sage", (150, 166, 146)),
+)  # fmt: skip
+
+
+def laminate(rng: np.random.Generator) -> Material:
+    """Return a laminated board: one colour, hardly any pattern, the fine grain of the press."""
+    n, period_m = LAMINATE_PX, 0.25
+    name, tint = LAMINATES[int(rng.integers(len(LAMINATES)))]
+    speckle = fine(rng, n, 60.0)
+    cloud = fractal(rng, n, 1.6)
+    color = shaded(rng, tint, 4.0) + (1.4 * speckle + 1.8 * cloud)[..., None]
+    height = 6e-6 * fine(rng, n, 130.0) + 6e-6 * smooth(rng, n, 40.0)
+    return Material(
+        base_color=(1.0, 1.0, 1.0),
+        base_color_image=image8(color),
+        roughness=float(rng.uniform(0.22, 0.55)),
+        normal_image=normals8(height.astype(np.float32), period_m),
+        period_m=period_m,
+        name=f"{name} laminate",
+    )
+
+
+def painted_wood(rng: np.random.Generator) -> Material:
+    """Return wood under paint: the colour of the paint, the relief of the grain."""
+    n, period_m = LAMINATE_PX, float(rng.uniform(0.3, 0.5))
+    grain = smooth(rng, n, 4.0, 110.0)
+    stroke = smooth(rng, n, 3.0, 60.0)
+    tint = random_tint(rng, (0.1, 0.55), (0.45, 0.95))
+    color = (
+        np.asarray(tint, np.float32) + (1.2 * stroke - 3.5 * np.maximum(grain - 0.8, 0))[..., None]
+    )
+    height = (-3.0e-5 * np.maximum(grain - 0.3, 0) + 1.0e-5 * stroke).astype(np.float32)
+    r, g, b = linear_color((255, 255, 255))
+    return Material(
+        base_color=(r, g, b),
+        base_color_image=image8(color),
+        roughness=float(rng.uniform(0.3, 0.6)),
+        roughness_image=grey8(np.clip(0.9 + 0.05 * grain, 0, 1)),
+        normal_image=normals8(height, period_m),
+        period_m=period_m,
+        name="painted wood",
+    )
