@@ -12,8 +12,10 @@ from realsim import __version__
 from realsim.app.annotate_cli import annotate_command
 from realsim.app.cli_capture import CAPTURE_COMMANDS
 from realsim.app.cli_scan import SCAN
+from realsim.app.generate_cli import generate_command
 from realsim.app.option_values import numbers_of
 from realsim.app.register_cli import register_command
+from realsim.app.render_cli import render_command
 from realsim.app.school_cli import SCHOOL
 from realsim.errors import RealsimError
 
@@ -191,6 +193,8 @@ commands.add_command(SCAN)
 commands.add_command(SCHOOL)
 commands.add_command(register_command)
 commands.add_command(annotate_command)
+commands.add_command(render_command)
+commands.add_command(generate_command)
 
 
 def main() -> None:

@@ -253,10 +253,14 @@ def annotate_session(
         OccluderConfig,
         maps_of,
     )
+    from realsim_sim_bridge.synthetic.labelling import exact_annotation
+    from realsim_sim_bridge.synthetic.surroundings import load_surroundings
 
-    config = AnnotationConfig(
-        maps=maps_of(maps) if maps else DEFAULT_MAPS, occluder=OccluderConfig(is_on=check_depth)
-    )
+    chosen = maps_of(maps) if maps else DEFAULT_MAPS
+    config = AnnotationConfig(maps=chosen, occluder=OccluderConfig(is_on=check_depth))
+    surroundings = load_surroundings(store)
+    if surroundings is not None:  # a synthetic session: everything is known
+        config = exact_annotation(chosen)
     require_sound(store)
     scene = judged_scene(store)
     only = registered_views(store)
@@ -264,5 +268,5 @@ def annotate_session(
     with console.stage("annotate", f"{n} frames") as tick:
         return annotate(
             store, scene, session_models(store), load_grasps(store.folder / "grasps"), config,
-            only=only, progress=tick, workers=workers,
+            only=only, progress=tick, workers=workers, surroundings=surroundings,
         )  # fmt: skip

@@ -9,7 +9,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.errors import InputError
 from realsim.records import Mesh
+from realsim.rendering.developing import srgb_encoded
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 
 Array32 = NDArray[np.float32]
@@ -158,8 +160,11 @@ class Surface:
     SPECKLE_PERIOD_M = 0.12
 
     def __init__(self, placed: PlacedMesh, gamma: float) -> None:
-        """Choose the material: texture, vertex colours, wood (background) or paint."""
-        mesh = placed.mesh
+        """Choose the look: the material's colours, texture, vertex colours, wood or paint.
+
+        Of a material only the base colour counts: how glossy a surface is, the `Lighting` says.
+        """
+        mesh, material = placed.mesh, placed.material
         R = placed.T_world_obj[:3, :3].astype(np.float32)
         local = corner_normals(mesh)
         self.normals: Array32 = local @ R.T
@@ -168,8 +173,20 @@ class Surface:
         self._colors: Array32 | None = None
         self._texture: MipTexture | None = None
         self._tint = np.ones(3, np.float32)
-        if mesh.texture is not None and mesh.uv is not None:
-            self._texture = MipTexture(mesh.texture, gamma, wrap=_repeats(mesh.uv))
+        if material is not None:
+            stored = srgb_encoded(np.array(material.base_color))
+            self._tint = np.asarray(stored**gamma, np.float32)
+            image = material.base_color_image
+            if image is None:
+                image = np.full((1, 1, 3), 255, np.uint8)
+            wrap = True
+            self._uv = box_uv(mesh, material.period_m)
+            if material.projection == "uv" and mesh.uv is not None:
+                wrap = repeats(mesh.uv)
+                self._uv = mesh.uv[mesh.faces].astype(np.float32)
+            self._texture = MipTexture(image, gamma, wrap=wrap)
+        elif mesh.texture is not None and mesh.uv is not None:
+            self._texture = MipTexture(mesh.texture, gamma, wrap=repeats(mesh.uv))
             self._uv = mesh.uv[mesh.faces].astype(np.float32)
         elif mesh.colors is not None:
             decode = (np.arange(256) / 255.0) ** gamma
@@ -177,12 +194,12 @@ class Surface:
             return
         elif placed.instance == BACKGROUND:
             self._texture = _shared_texture("wood", gamma)
-            self._uv = _planar_uv(corners, self.WOOD_PERIOD_M)
+            self._uv = box_uv(mesh, self.WOOD_PERIOD_M)
         else:
             paint = np.array(PLAIN_COLORS[placed.instance % len(PLAIN_COLORS)])
             self._tint = ((paint / 255.0) ** gamma).astype(np.float32)
             self._texture = _shared_texture("speckle", gamma)
-            self._uv = _planar_uv(corners, self.SPECKLE_PERIOD_M)
+            self._uv = box_uv(mesh, self.SPECKLE_PERIOD_M)
         self._texels_per_m = _texel_density(corners, self._uv, self._texture.levels[0].shape)
 
     def normal(self, face: Int32, weights: Array32) -> Array32:
@@ -199,19 +216,35 @@ class Surface:
         return color * self._tint
 
 
+def check_projection(number: int, placed: PlacedMesh) -> None:
+    """Raise where a material needs texture coordinates that its mesh does not have."""
+    material = placed.material
+    if material is not None and material.projection == "uv" and placed.mesh.uv is None:
+        raise InputError(
+            f"placed mesh {number} (instance {placed.instance}) has no texture coordinates, but "
+            f"its material '{material.name}' has the projection 'uv'. Give the mesh uv (V, 2), or "
+            "the material projection='box', which needs none."
+        )
+
+
 @lru_cache(maxsize=8)
 def _shared_texture(name: str, gamma: float) -> MipTexture:
     """Return a procedural texture, built once for all surfaces."""
     return MipTexture(wood_texture() if name == "wood" else speckle_texture(), gamma, wrap=True)
 
 
-def _repeats(uv: NDArray[np.float64]) -> bool:
+def repeats(uv: NDArray[np.float64]) -> bool:
     """Return whether texture coordinates leave [0, 1], so that the texture must repeat."""
     return bool(uv.min() < -1e-6 or uv.max() > 1 + 1e-6)
 
 
-def _planar_uv(corners: NDArray[np.float64], period_m: float) -> Array32:
-    """Return texture coordinates (F, 3, 2) by projection along each face's dominant axis."""
+def box_uv(mesh: Mesh, period_m: float) -> Array32:
+    """Return texture coordinates (F, 3, 2) by projection along each face's dominant axis.
+
+    In the mesh's frame, one tile every `period_m` [m]: (y, z) on faces that look along x, (x, z)
+    along y, (x, y) along z.
+    """
+    corners = mesh.vertices[mesh.faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     axis = np.argmax(np.abs(normal), axis=1)
     kept = np.array([[1, 2], [0, 2], [0, 1]])[axis]

@@ -3,6 +3,10 @@
 Not photoreal, but metrically right: the value of a pixel is the mean over the square around its
 integer centre, in the raw distorted image, so printed edges lie where they are projected.
 Pixels with contrast around them are supersampled, the others cost one ray.
+
+Under a `Lighting` alone the picture is a linear sensor's in a soft even room, made for measuring.
+Under an `Environment` it is lit by a panorama, materials are metallic-roughness, and the picture
+is sRGB (see `environment_view`).
 """
 
 from collections.abc import Sequence
@@ -14,10 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
-from realsim.rendering.materials import Surface
+from realsim.rendering.appearance import Environment
+from realsim.rendering.developing import developed
+from realsim.rendering.environment_view import EnvironmentRenderer, LightSampling
+from realsim.rendering.materials import Surface, check_projection
+from realsim.rendering.pixel_caster import PixelCaster
 from realsim.rendering.rays import PlacedMesh, RayScene, rotated
 
-__all__ = ["Lighting", "Photo", "PhotoRenderer", "PlacedMesh"]
+__all__ = ["Environment", "LightSampling", "Lighting", "Photo", "PhotoRenderer", "PlacedMesh"]
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -31,7 +39,10 @@ SHADOW_LIFT_M = 1e-4
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Lighting:
-    """Light, lens and sensor of a photograph. Colours are linear, 1 = white paper in full light."""
+    """Light, lens and sensor of a photograph. Colours are linear, 1 = white paper in full light.
+
+    Under an `Environment` only lens and sensor count: `psf_px`, `full_well` and `read_noise`.
+    """
 
     sun_direction: Color = (0.35, -0.45, 1.0)
     """World direction towards the sun; oblique, so that shapes and contacts can be seen."""
@@ -102,11 +113,36 @@ class _Frame:
 class PhotoRenderer:
     """Renders photographs of one scene from any view."""
 
-    def __init__(self, placed: Sequence[PlacedMesh], lighting: Lighting | None = None) -> None:
-        """Prepare the scene, its materials and its light (default: `Lighting()`)."""
+    def __init__(
+        self,
+        placed: Sequence[PlacedMesh],
+        lighting: Lighting | None = None,
+        environment: Environment | None = None,
+        sampling: LightSampling | None = None,
+    ) -> None:
+        """Prepare the scene, its materials and its light.
+
+        Args:
+            placed: the meshes.
+            lighting: light, lens and sensor; default `Lighting()`.
+            environment: panorama and sun that light the scene instead.
+            sampling: rays per pixel under an environment; default `LightSampling()`.
+
+        Raises:
+            InputError: a material with the projection 'uv' on a mesh without coordinates.
+        """
         self.placed = tuple(placed)
+        for number, p in enumerate(self.placed):
+            check_projection(number, p)
         self.lighting = Lighting() if lighting is None else lighting
+        self.environment = environment
+        self._under_sky: EnvironmentRenderer | None = None
+        if environment is not None:
+            sampling = LightSampling() if sampling is None else sampling
+            self._under_sky = EnvironmentRenderer(self.placed, environment, sampling)
+            return
         self._scene = RayScene(self.placed)
+        self._caster = PixelCaster(self.placed)
         self._surfaces = [Surface(p, self.lighting.gamma) for p in self.placed]
         sun = np.array(self.lighting.sun_direction)
         self._sun: Array32 = (sun / np.linalg.norm(sun)).astype(np.float32)
@@ -124,27 +160,50 @@ class PhotoRenderer:
             T_world_cam: (4, 4) camera in world [m].
             rng: source of the sensor noise; None = no noise.
         """
+        light, depth_m = self.radiance(intrinsics, T_world_cam)
+        if self.environment is None:
+            return Photo(rgb=self._expose(light, rng), depth_m=depth_m)
+        lens = self.lighting
+        light *= np.float32(self.environment.exposure)
+        rgb = developed(light, rng, lens.full_well, lens.read_noise)
+        return Photo(rgb=rgb, depth_m=depth_m)
+
+    def radiance(
+        self, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike
+    ) -> tuple[Array32, Array32]:
+        """Return linear light (H, W, 3) behind the lens, before exposure and noise, and depth.
+
+        The depth (H, W) is along z at the pixel centres [m]; 0 = nothing. Pixels that the lens
+        model cannot reach are black.
+        """
         import cv2
 
         T = se3.check_rigid(T_world_cam, "T_world_cam")
+        if self._under_sky is not None:
+            color, depth_m = self._under_sky.radiance(intrinsics, T)
+        else:
+            color = self._in_the_room(intrinsics, T)
+            depth_m = self._caster.cast(intrinsics, T).depth_m
+        if self.lighting.psf_px > 0:
+            color = np.asarray(cv2.GaussianBlur(color, (0, 0), self.lighting.psf_px), np.float32)
+        return color, depth_m
+
+    def _in_the_room(self, intrinsics: CameraIntrinsics, T: Array) -> Array32:
+        """Return linear light (H, W, 3) under the `Lighting`, before the lens."""
         height, width = intrinsics.height, intrinsics.width
         frame, known = _frame(intrinsics, T)
         pixel_rad = 1.0 / float(np.sqrt(intrinsics.fx * intrinsics.fy))
-        seen, t, geometry = self._shade(frame.eye, frame.directions, pixel_rad)
+        seen, _, geometry = self._shade(frame.eye, frame.directions, pixel_rad)
 
         color = np.zeros((height * width, 3), np.float32)
-        depth = np.zeros(height * width, np.float32)
         hit = np.full(height * width, -1, np.int32)
-        color[known], depth[known], hit[known] = seen, np.where(np.isfinite(t), t, 0), geometry
+        color[known], hit[known] = seen, geometry
         color = color.reshape(height, width, 3)
         if self.lighting.samples > 1:
             busy = self._busy(color, hit.reshape(height, width)).ravel()
             rows = np.flatnonzero(busy[known])
             color.reshape(-1, 3)[known[rows]] = self._supersampled(frame, rows, pixel_rad)
-        if self.lighting.psf_px > 0:
-            color = np.asarray(cv2.GaussianBlur(color, (0, 0), self.lighting.psf_px), np.float32)
-        rgb = self._expose(color, rng)
-        return Photo(rgb=rgb, depth_m=depth.reshape(height, width))
+        return color
 
     def _busy(self, color: Array32, geometry: Int32) -> NDArray[np.bool_]:
         """Return (H, W) where the neighbourhood has contrast or the edge of a mesh."""

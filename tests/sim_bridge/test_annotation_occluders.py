@@ -8,6 +8,7 @@ from realsim import CameraIntrinsics, GraspSet, Mesh, ObjectModel, ObjectPose, S
 from realsim.geometry import se3
 from realsim.rendering.depth_sensor import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh
+from realsim.rendering.rays import BACKGROUND
 from realsim_sim_bridge.annotation.config import AnnotationConfig, OccluderConfig
 from realsim_sim_bridge.annotation.frame import frame_files
 from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView, table_slab
@@ -54,7 +55,8 @@ def inputs_of(occluder: OccluderConfig | None = None) -> FrameInputs:
     )
     return FrameInputs(
         config=config, intrinsics=CAMERA, depth_unit_m=1e-4, objects=SCENE.objects, models=MODELS,
-        grasp_sets=(grasps_of_the_book(),), T_world_table=np.eye(4), digest="",
+        grasp_sets=(grasps_of_the_book(),), digest="",
+        surroundings=(PlacedMesh(BACKGROUND, table_slab(config), np.eye(4)),),
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.formats import images
 from realsim.records import GraspSet, ObjectModel, Scene, View
+from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore
 from realsim.store.session_store import depth_path
 from realsim_sim_bridge.annotation import files
@@ -36,7 +37,7 @@ Progress = Callable[[int, int], None]
 Parts = dict[int, dict[str, Any]]
 
 
-def annotate(
+def annotate(  # noqa: PLR0913 - keywords, each with a meaning of its own
     store: SessionStore,
     scene: Scene,
     models: Mapping[int, ObjectModel],
@@ -46,6 +47,7 @@ def annotate(
     only: Collection[int] | None = None,
     progress: Progress | None = None,
     workers: int = 1,
+    surroundings: Sequence[PlacedMesh] | None = None,
 ) -> AnnotationSummary:
     """Write masks, maps, poses, visibility and grasps for every view of a session.
 
@@ -59,13 +61,15 @@ def annotate(
             their camera, or their depth, is not to be trusted.
         progress: called with (views done, views in all).
         workers: processes that compute views; 1 = this one. The files are the same.
+        surroundings: what hides things without carrying a label, where it is known exactly, as in
+            a synthetic scene; None = a table under the scene's plane, if it has one.
 
     Raises:
         InputError: a view has no camera pose, a model is missing, an image is not of the camera's
             size, or grasps are of an instance that is not in the scene.
     """
     views = _calibrated_views(store, only)
-    inputs = gathered(store, scene, models, grasp_sets, config or AnnotationConfig())
+    inputs = gathered(store, scene, models, grasp_sets, config or AnnotationConfig(), surroundings)
     todo = [frame_view(store, inputs, v) for v in views]
     found = {v.index: files.finished_part(store, v.index, v.digest) for v in todo}
     parts: Parts = {index: part for index, part in found.items() if part is not None}

@@ -20,7 +20,7 @@ from realsim.records import (
     View,
     names_of,
 )
-from realsim.rendering.labels import PlacedMesh
+from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.store import SessionStore
 from realsim.store.records_json import object_pose_to_json
 from realsim.store.session_store import depth_path, rgb_path
@@ -43,18 +43,16 @@ class FrameInputs:
     models: Mapping[int, ObjectModel]
     """obj_id -> model of these objects."""
     grasp_sets: tuple[GraspSet, ...]
-    T_world_table: NDArray[np.float64] | None
-    """(4, 4) the supporting plane z = 0 [m]; None = no table hides anything."""
+    surroundings: tuple[PlacedMesh, ...]
+    """What hides things without carrying a label: the table."""
     digest: str
 
     def placed(self) -> list[PlacedMesh]:
-        """Return the meshes that are seen or hide things: the objects and the table."""
-        placed = [
+        """Return the meshes that are seen or hide things: the objects and what is around them."""
+        objects = [
             PlacedMesh(o.instance, self.models[o.obj_id].mesh, o.T_world_obj) for o in self.objects
         ]
-        if self.T_world_table is not None:
-            placed.append(PlacedMesh(-1, table_slab(self.config), self.T_world_table))
-        return placed
+        return [*objects, *self.surroundings]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -74,8 +72,11 @@ def gathered(
     models: Mapping[int, ObjectModel],
     grasp_sets: Sequence[GraspSet],
     config: AnnotationConfig,
+    surroundings: Sequence[PlacedMesh] | None = None,
 ) -> FrameInputs:
     """Return the checked inputs of all views; rejected objects and their grasps are left out.
+
+    What hides things are `surroundings`; None = a table under the scene's plane, if it has one.
 
     Raises:
         InputError: a model is missing, or grasps are of an instance that is not in the scene.
@@ -93,6 +94,8 @@ def gathered(
                 f"the grasps of instance {g.instance} are of object {g.obj_id}, but in the scene "
                 f"this instance is object {scene.object(g.instance).obj_id}. Run the school again."
             )
+    if surroundings is None:
+        surroundings = _table(scene, config)
     instances = {o.instance for o in chosen}
     kept = sorted((g for g in grasp_sets if g.instance in instances), key=lambda g: g.instance)
     return FrameInputs(
@@ -102,9 +105,16 @@ def gathered(
         objects=tuple(chosen),
         models={o.obj_id: models[o.obj_id] for o in chosen},
         grasp_sets=tuple(kept),
-        T_world_table=None if scene.plane is None else scene.plane.T_world_table,
-        digest=_scene_digest(store, scene, chosen, models, kept, config),
+        surroundings=tuple(surroundings),
+        digest=_scene_digest(store, chosen, models, kept, config, surroundings),
     )
+
+
+def _table(scene: Scene, config: AnnotationConfig) -> list[PlacedMesh]:
+    """Return the table under the plane of a registered scene, if it has one."""
+    if scene.plane is None:
+        return []
+    return [PlacedMesh(BACKGROUND, table_slab(config), scene.plane.T_world_table)]
 
 
 def table_slab(config: AnnotationConfig) -> Mesh:
@@ -122,11 +132,11 @@ def table_slab(config: AnnotationConfig) -> Mesh:
 
 def _scene_digest(
     store: SessionStore,
-    scene: Scene,
     chosen: Sequence[ObjectPose],
     models: Mapping[int, ObjectModel],
     grasp_sets: Sequence[GraspSet],
     config: AnnotationConfig,
+    surroundings: Sequence[PlacedMesh],
 ) -> str:
     """Return the digest of what all views have in common."""
     i = store.session.intrinsics
@@ -143,8 +153,9 @@ def _scene_digest(
         digest.update(f"{g.instance} {g.obj_id} {len(g)} ".encode())
         for array in (g.Ts_obj_grasp, g.widths_m, g.scores, g.reachable):
             digest.update(np.ascontiguousarray(array).tobytes())
-    if scene.plane is not None:
-        digest.update(scene.plane.T_world_table.tobytes())
+    for p in surroundings:
+        for array in (p.T_world_obj, p.mesh.vertices, p.mesh.faces):
+            digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 

@@ -1,0 +1,157 @@
+"""What `realsim generate` was asked for, and the folder that belongs to it."""
+
+import hashlib
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from realsim import __version__
+from realsim.errors import InputError
+from realsim.store import atomic
+from realsim.store.json_files import read_object
+from realsim_sim_bridge.synthetic.config import SyntheticConfig
+from realsim_sim_bridge.table_scenes.cameras import RANGES, ViewConfig
+from realsim_sim_bridge.table_scenes.config import TableSceneConfig
+from realsim_sim_bridge.table_scenes.looks import OwnLooks
+from realsim_sim_bridge.table_scenes.pool import ObjectPool
+
+REQUEST_FILE = "generate.json"
+FORMAT = 1
+RESULTS_VERSION = 1
+"""Raised whenever the same request gives other scenes."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GenerateRequest:
+    """What every scene of a data set depends on, besides its number."""
+
+    pool: ObjectPool
+    seed: int = 0
+    scene: TableSceneConfig = field(default_factory=TableSceneConfig)
+    views: ViewConfig = field(default_factory=ViewConfig)
+    rendering: SyntheticConfig = field(default_factory=lambda: SyntheticConfig(profile="d435"))
+    looks: OwnLooks = field(default_factory=OwnLooks)
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """Plain JSON values by which two requests are told apart; views may be added to."""
+        values: dict[str, Any] = json.loads(json.dumps({
+            "seed": self.seed,
+            "scene": asdict(self.scene),
+            "views": asdict(self.views),
+            "rendering": asdict(self.rendering),
+            "pool": [{"label": s.label, "weight": s.weight, "objects": len(s.keys),
+                      "digest": s.digest} for s in self.pool.sources],
+            "own_looks": _looks_digest(self.looks),
+        }))  # fmt: skip
+        return values
+
+    @property
+    def key(self) -> str:
+        """A digest of it."""
+        text = json.dumps([RESULTS_VERSION, self.told], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _looks_digest(looks: OwnLooks) -> str:
+    if not looks.hdris and not looks.textures:
+        return ""
+    digest = hashlib.sha256()
+    images = [
+        p
+        for path in looks.textures
+        for p in (sorted(path.iterdir()) if path.is_dir() else [path])
+        if p.is_file()
+    ]
+    for path in (*looks.hdris, *images):
+        digest.update(f"{path.name} {path.stat().st_size}\n".encode())
+    return digest.hexdigest()[:16]
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Return width and height of 'WIDTHxHEIGHT' [px].
+
+    Raises:
+        InputError: it is no such text.
+    """
+    width, mark, height = text.lower().partition("x")
+    if not mark or not width.strip().isdecimal() or not height.strip().isdecimal():
+        raise InputError(f"--size '{text}' is no image size; WIDTHxHEIGHT is, such as 1280x720.")
+    return int(width), int(height)
+
+
+def range_of(option: str, text: str, example: str) -> tuple[float, float]:
+    """Return the ends of 'A-B', or twice A of 'A'.
+
+    Raises:
+        InputError: it is no such text.
+    """
+    low, mark, high = text.partition("-")
+    try:
+        ends = float(low), float(high if mark else low)
+    except ValueError:
+        ends = math.nan, math.nan
+    if not all(math.isfinite(end) for end in ends):
+        raise InputError(f"{option} '{text}' is no range; LEAST-MOST is, such as {example}.")
+    return ends
+
+
+def counts_of(option: str, text: str) -> tuple[int, int]:
+    """Return least and greatest number of 'A-B', or twice A of 'A'.
+
+    Raises:
+        InputError: it is no such text.
+    """
+    few, many = range_of(option, text, "10-20")
+    if few != int(few) or many != int(many):
+        raise InputError(f"{option} '{text}': whole numbers are accepted, such as 10-20.")
+    return int(few), int(many)
+
+
+def radius_of(name: str, radius: str | None) -> tuple[float, float]:
+    """Return the cameras' distances of `--range` and `--radius` [m]."""
+    return RANGES[name] if radius is None else range_of("--radius", radius, "1-2 (metres)")
+
+
+def claim(out: Path, request: GenerateRequest) -> None:
+    """Take the folder for this data set, or say why it cannot be had.
+
+    Raises:
+        InputError: it holds a data set of another request, or something else.
+    """
+    note = out / REQUEST_FILE
+    if out.exists() and not out.is_dir():
+        raise InputError(f"'{out}' is a file; give a folder that may be made or filled.")
+    if note.is_file():
+        found = read_object(note)
+        if found.get("key") != request.key:
+            differs = _differences(found.get("request", {}), request.told)
+            raise InputError(
+                f"'{out}' holds scenes of another request; what differs: {differs}. Choose another "
+                "folder, or delete this one to begin anew; the same request goes on where it "
+                "stopped, also with more --scenes."
+            )
+        return
+    if out.is_dir() and any(out.iterdir()):
+        raise InputError(
+            f"'{out}' is not empty and holds no generated scenes. Choose another folder: nothing "
+            "of yours is overwritten."
+        )
+    out.mkdir(parents=True, exist_ok=True)
+    value = {"format": FORMAT, "key": request.key, "version": __version__, "request": request.told}
+    atomic.write_json(note, value)
+
+
+def _differences(found: Any, wanted: Any, name: str = "") -> str:
+    """Return where two JSON values differ, each with both values."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        keys = sorted({*found, *wanted})
+        told = [
+            _differences(found.get(k), wanted.get(k), f"{name}.{k}" if name else str(k))
+            for k in keys
+            if found.get(k) != wanted.get(k)
+        ]
+        return "; ".join(told) or "the version of realsim's results"
+    return f"{name} ({json.dumps(found)} there, {json.dumps(wanted)} wanted)"

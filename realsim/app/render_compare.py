@@ -1,0 +1,196 @@
+"""How much the synthetic twins are like the real frames: masks, edges, depth noise, holes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.formats.bop_labels import mask_path
+from realsim.geometry.metrics import mask_iou
+from realsim.rendering.depth_profiles import profile
+from realsim.rendering.depth_statistics import hole_share, local_noise
+from realsim.store import SessionStore
+
+Mask = NDArray[np.bool_]
+Ids = NDArray[np.int32]
+MOST_VIEWS = 24
+"""Views that are compared, spread over the session: each costs a second."""
+NEAR_EDGE_PX = 3.0
+"""A rim pixel this near an image edge has found its own; further away the contour has no contrast
+there, or the pose is off [px]."""
+CANNY = (20.0, 60.0)
+"""Thresholds of the edges in 8-bit pictures: contours of objects, not noise."""
+ERODED_PX = 3
+"""Depth is compared inside the objects, so far from their rims [px]: what happens at an edge is
+another thing than noise."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TwinFigures:
+    """Real frames against their synthetic twins; NaN = could not be measured."""
+
+    views: int
+    """Views compared."""
+    mask_iou: float
+    """Mean IoU of the visible masks, as annotated in the real session; 1 = the same pixels."""
+    mask_iou_least: float
+    edge_real_px: float
+    """Median distance of the labels' rims to the nearest edge of the photograph [px]."""
+    edge_synthetic_px: float
+    """The same in the synthetic picture: what perfect poses leave."""
+    edges_real: float
+    """Share of the rims with an edge of the photograph within 3 px."""
+    edges_synthetic: float
+    noise_real_px: float
+    """High-frequency depth noise on the objects, as disparity [px]."""
+    noise_synthetic_px: float
+    holes_real: float
+    """Share of the objects' pixels without a measurement."""
+    holes_synthetic: float
+    rgb_difference: float
+    """Mean difference of the objects' colours, 8-bit values."""
+
+    @property
+    def noise_ratio(self) -> float:
+        """Synthetic over real noise."""
+        return self.noise_synthetic_px / self.noise_real_px if self.noise_real_px else float("nan")
+
+    @property
+    def holes_ratio(self) -> float:
+        """Synthetic over real share of holes."""
+        return self.holes_synthetic / self.holes_real if self.holes_real else float("nan")
+
+    def rows(self) -> list[list[str]]:
+        """Return the table's rows: figure, real, synthetic, both compared."""
+        masks = f"{self.mask_iou:.5f} (least {self.mask_iou_least:.5f})"
+        if np.isnan(self.mask_iou):
+            masks = "the real frames are not annotated"
+        return [
+            ["visible masks, IoU", "", "", masks],
+            ["rim to nearest image edge, median", f"{self.edge_real_px:.2f} px",
+             f"{self.edge_synthetic_px:.2f} px", ""],
+            ["rims with an edge within 3 px", f"{100 * self.edges_real:.0f} %",
+             f"{100 * self.edges_synthetic:.0f} %", ""],
+            ["depth noise on objects", f"{self.noise_real_px:.3f} px",
+             f"{self.noise_synthetic_px:.3f} px", f"x {self.noise_ratio:.2f}"],
+            ["holes on objects", f"{100 * self.holes_real:.1f} %",
+             f"{100 * self.holes_synthetic:.1f} %", f"x {self.holes_ratio:.2f}"],
+            ["colour difference on objects", "", "", f"{self.rgb_difference:.1f} of 255"],
+        ]  # fmt: skip
+
+
+def compared_views(real: Sequence[int]) -> list[tuple[int, int]]:
+    """Return (synthetic view, real view) of the twins that are compared and shown."""
+    pick = np.unique(np.linspace(0, len(real) - 1, MOST_VIEWS).round().astype(int))
+    return [(int(k), real[int(k)]) for k in pick]
+
+
+def compare_twins(
+    store: SessionStore, twin: SessionStore, real: Sequence[int], camera: str
+) -> TwinFigures:
+    """Compare real frames with their twins.
+
+    Args:
+        store: the real session.
+        twin: the synthetic one; its view k is the twin of view real[k].
+        real: numbers of the real views.
+        camera: the depth profile: its baseline turns depth into disparity.
+    """
+    intrinsics, baseline_m = store.session.intrinsics, profile(camera).baseline_m
+    pairs = compared_views(real)
+    ious: list[float] = []
+    edges: tuple[list[NDArray[np.float32]], ...] = ([], [])
+    noise: tuple[list[float], list[float]] = ([], [])
+    holes: tuple[list[float], list[float]] = ([], [])
+    colors: list[float] = []
+    for made, shot in pairs:
+        ids = label_ids(twin, made)
+        ious += _ious(store, shot, ids)
+        pictures = store.rgb(shot), twin.rgb(made)
+        inside = _eroded(ids)
+        for k, picture in enumerate(pictures):
+            edges[k].append(rim_distances_px(ids, picture))
+        if inside.any():
+            difference = pictures[0].astype(np.int16) - pictures[1].astype(np.int16)
+            colors.append(float(np.abs(difference[inside]).mean()))
+        if not (store.has_depth(shot) and inside.any()):
+            continue
+        for k, depth_m in enumerate((store.depth_m(shot), twin.depth_m(made))):
+            noise[k].append(local_noise(depth_m, intrinsics, baseline_m, inside).median_px)
+            holes[k].append(hole_share(depth_m, inside))
+    rims = [np.concatenate(found) for found in edges]
+    medians = [float(np.median(r)) if len(r) else float("nan") for r in rims]
+    shares = [float(np.mean(r <= NEAR_EDGE_PX)) if len(r) else float("nan") for r in rims]
+    return TwinFigures(
+        views=len(pairs), mask_iou=_mean(ious), mask_iou_least=min(ious, default=float("nan")),
+        edge_real_px=medians[0], edge_synthetic_px=medians[1],
+        edges_real=shares[0], edges_synthetic=shares[1],
+        noise_real_px=_mean(noise[0]), noise_synthetic_px=_mean(noise[1]),
+        holes_real=_mean(holes[0]), holes_synthetic=_mean(holes[1]),
+        rgb_difference=_mean(colors),
+    )  # fmt: skip
+
+
+def label_ids(store: SessionStore, view: int) -> Ids:
+    """Return the instance (H, W) that the session's masks say is seen, -1 = none."""
+    i = store.session.intrinsics
+    ids = np.full((i.height, i.width), -1, np.int32)
+    for k, row in enumerate(_entries(store, view)):
+        mask = store.read_image(mask_path(view, int(row.get("mask", k)), visible=True)) > 0
+        ids[mask] = int(row["instance"])
+    return ids
+
+
+def _entries(store: SessionStore, view: int) -> Sequence[Mapping[str, int]]:
+    path = f"annotations/{view:06d}.json"
+    return store.read_json(path)["objects"] if store.has(path) else ()
+
+
+def _ious(store: SessionStore, view: int, ids: Ids) -> list[float]:
+    """Return the IoU of each object's annotated visible mask with what the twin's labels say."""
+    found: list[float] = []
+    for k, row in enumerate(_entries(store, view)):
+        path = mask_path(view, int(row.get("mask", k)), visible=True)
+        if store.has(path):
+            iou = mask_iou(store.read_image(path) > 0, ids == int(row["instance"]))
+            found += [iou] if np.isfinite(iou) else []
+    return found
+
+
+def rim_distances_px(ids: Ids, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return how far each pixel of the labels' rims is from the nearest edge of a picture [px].
+
+    Args:
+        ids: (H, W) instance, -1 = none.
+        rgb: (H, W, 3) the picture.
+
+    Returns:
+        (R,), one for each pixel of a rim; infinite where the picture has no edge at all.
+    """
+    import cv2
+
+    rim = np.zeros(ids.shape, np.bool_)
+    rim[:, 1:] |= ids[:, 1:] != ids[:, :-1]
+    rim[1:] |= ids[1:] != ids[:-1]
+    grey = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
+    edge = np.asarray(cv2.Canny(grey, *CANNY)) > 0
+    if not edge.any():
+        return np.full(int(np.count_nonzero(rim)), np.inf, np.float32)
+    away = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(away, np.float32)[rim]
+
+
+def _eroded(ids: Ids) -> Mask:
+    """Return (H, W) the insides of the objects, away from every rim."""
+    import cv2
+
+    kernel = np.ones((2 * ERODED_PX + 1, 2 * ERODED_PX + 1), np.uint8)
+    value = (ids + 1).astype(np.float32)
+    even = cv2.dilate(value, kernel) == cv2.erode(value, kernel)
+    return np.asarray(even) & (ids >= 0)
+
+
+def _mean(values: Sequence[float]) -> float:
+    finite = [v for v in values if np.isfinite(v)]
+    return float(np.mean(finite)) if finite else float("nan")

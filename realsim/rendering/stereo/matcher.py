@@ -1,0 +1,127 @@
+"""From the pictures of two eyes to disparity: semi-global search, sub-pixels, what is kept.
+
+The search is OpenCV's (Hirschmueller, PAMI 2008) over the range that the scene can have; what it
+finds is refined and judged on the images by `subpixel`.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.rendering.stereo.config import StereoConfig
+from realsim.rendering.stereo.subpixel import refined
+
+Array32 = NDArray[np.float32]
+Image8 = NDArray[np.uint8]
+SEARCH_BLOCK_PX = 5
+"""Edge of the window of the search [px]; small, because the smoothness does the rest."""
+SMALL_STEP = 8
+LARGE_STEP = 32
+"""Penalties of a change of disparity by one and by more, per pixel of the block (OpenCV's)."""
+SEARCH_STEP_PX = 16
+"""OpenCV searches multiples of this many disparities."""
+BAND_PX = 144
+"""Rows that are searched over the same disparities."""
+LEAD_PX = 24
+"""Rows above a band from which the smoothness is carried into it."""
+GRADIENT_NOISE = 0.25
+"""Variance of the mean of two central differences, per variance of a pixel."""
+DIFFERENCE_NOISE = 2.0
+"""Variance of the difference of two pixels, per variance of one."""
+ALIASING = 0.06
+"""Share of the squared gradient by which equal surfaces differ between the eyes: they are sampled
+at different places."""
+
+
+def matched(left: Image8, right: Image8, exact: Array32, config: StereoConfig) -> Array32:
+    """Return the disparity (H, W) [px] of the left eye's pixels, 0 = none.
+
+    Args:
+        left: (H, W).
+        right: (H, W), the same rows.
+        exact: (H, W) true disparity [px], 0 = nothing in range. It only bounds the search: the
+            real chip goes through 128 disparities for every pixel.
+        config: windows and limits.
+    """
+    import cv2
+
+    whole = _searched_in_bands(left, right, exact, config)
+    disparity, texture, residual = refined(left, right, whole, config.window_px)
+    level = cv2.blur(left, (config.window_px,) * 2).astype(np.float32) * np.float32(1 / 255)
+    dark, per_value = config.electron_noise
+    # Rounding to bytes is noise of 1/12 as well.
+    pixel = (np.float32(dark) + level * np.float32(per_value)) * np.float32(255**2)
+    pixel += np.float32(1 / 12)
+    keep = texture >= np.float32(config.least_texture_snr**2 * GRADIENT_NOISE) * pixel
+    expected = np.float32(DIFFERENCE_NOISE) * pixel + np.float32(ALIASING) * texture
+    keep &= residual <= np.float32(config.residual_limit**2) * expected
+    # What lies left of the right eye's picture was not seen by it.
+    keep &= np.arange(left.shape[1], dtype=np.float32) >= disparity
+    keep &= disparity > 0
+    return _without_speckles(np.where(keep, disparity, np.float32(0)), config.speckle_px)
+
+
+def _searched_in_bands(
+    left: Image8, right: Image8, exact: Array32, config: StereoConfig
+) -> Array32:
+    """Return the semi-global match (H, W) [px], 0 = none, searched band by band of rows.
+
+    On a table the distance changes from top to bottom: a band spans half the disparities.
+    """
+    height = left.shape[0]
+    found = np.zeros(left.shape, np.float32)
+    for top in range(0, height, BAND_PX):
+        bottom = min(top + BAND_PX, height)
+        seen = exact[top:bottom]
+        seen = seen[seen > 0]
+        if len(seen) == 0:
+            continue
+        rows = slice(max(0, top - LEAD_PX), min(height, bottom + SEARCH_BLOCK_PX))
+        span = (float(seen.min()), float(seen.max()))
+        band = _searched(left[rows], right[rows], span, config)
+        found[top:bottom] = band[top - rows.start : bottom - rows.start]
+    return found
+
+
+def _searched(
+    left: Image8, right: Image8, search: tuple[float, float], config: StereoConfig
+) -> Array32:
+    """Return the semi-global match (H, W) [px], to sixteenths, 0 = none.
+
+    Args:
+        left: (H, W).
+        right: (H, W).
+        search: least and greatest disparity of what is in view [px].
+        config: margin and limits.
+    """
+    import cv2
+
+    least = max(0, int(np.floor(search[0])) - config.search_margin_px)
+    greatest = int(np.ceil(search[1])) + config.search_margin_px
+    count = -(-(greatest - least + 1) // SEARCH_STEP_PX) * SEARCH_STEP_PX
+    # OpenCV gives up the columns left of the greatest disparity: they are lent a border.
+    border = least + count
+    wide = [cv2.copyMakeBorder(i, 0, 0, border, 0, cv2.BORDER_REPLICATE) for i in (left, right)]
+    area = SEARCH_BLOCK_PX**2
+    matcher: Any = cv2.StereoSGBM.create(
+        minDisparity=least, numDisparities=count, blockSize=SEARCH_BLOCK_PX,
+        P1=SMALL_STEP * area, P2=LARGE_STEP * area, disp12MaxDiff=config.left_right_px,
+        preFilterCap=63, uniquenessRatio=config.uniqueness_percent,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )  # fmt: skip
+    sixteenths = matcher.compute(*wide)[:, border:]
+    found = sixteenths.astype(np.float32) * np.float32(1 / 16)
+    found[sixteenths < 16 * least] = 0
+    return np.maximum(found, 0)
+
+
+def _without_speckles(disparity: Array32, least_px: int) -> Array32:
+    """Return the disparity without islands of fewer pixels than `least_px`."""
+    import cv2
+
+    if least_px <= 1:
+        return disparity
+    sixteenths = (disparity * np.float32(16)).astype(np.int16)
+    cv2.filterSpeckles(sixteenths, 0, least_px - 1, 16)
+    return np.where(sixteenths > 0, disparity, np.float32(0))

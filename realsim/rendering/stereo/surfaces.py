@@ -1,0 +1,212 @@
+"""Placed meshes packed into flat tables that a compiled loop can shade from.
+
+On a face everything that is interpolated between its corners is an affine function of the point:
+24 numbers per face replace the barycentric weights and the look-ups through vertices.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import Mesh
+from realsim.rendering.appearance import Material
+from realsim.rendering.materials import corner_normals, speckle_texture, wood_texture
+from realsim.rendering.rays import BACKGROUND, PlacedMesh
+from realsim.rendering.stereo.light import LUMINANCE, MAP_ROUGHNESS
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+LEVELS = 14
+"""Halvings kept of an image: enough for 8192 texels."""
+WOOD_PERIOD_M = 0.5
+SPECKLE_PERIOD_M = 0.12
+"""Tiles of the looks of meshes without material, as in the colour pictures [m]."""
+FULL_GRAIN_ROUGHNESS = 0.5
+"""From this roughness on a surface has the whole micro texture; polished ones less."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SurfaceTables:
+    """The look of every face of every placed mesh."""
+
+    faces: Array32
+    """(F, 24) affine functions of the point in mesh axes (x, y, z, 1): normal x, y, z, texture u,
+    v, brightness of the vertex colours."""
+    first_face: NDArray[np.int64]
+    """(G,) where a placed mesh's faces begin."""
+    looks: Array32
+    """(G, 9) tint, roughness, metallic, micro texture, level of its reflections, three offsets of
+    its grain [m], binary logarithm of its image's texels per metre."""
+    images: NDArray[np.int64]
+    """(G,) image of a placed mesh; -1 = none."""
+    texels: NDArray[np.uint16]
+    """(T,) linear brightness of all images and their halvings, 65535 = 1."""
+    levels: NDArray[np.int64]
+    """(I, LEVELS, 3) start, height and width of each halving; beyond the last it is repeated."""
+
+
+def packed_surfaces(placed: Sequence[PlacedMesh], texture_contrast: float) -> SurfaceTables:
+    """Return the tables of placed meshes.
+
+    Args:
+        placed: the meshes; one that is placed several times is stored once per look.
+        texture_contrast: rms micro texture of a rough surface, relative.
+    """
+    store = _ImageStore()
+    blocks: list[Array32] = []
+    starts: dict[tuple[int, int | None, float], int] = {}
+    numbers: dict[tuple[int, int | None, float], int] = {}
+    total = 0
+    first, looks, images = [], [], []
+    for number, p in enumerate(placed):
+        material, image = _look(p)
+        on_uv = material.projection == "uv" and p.mesh.uv is not None
+        key = (id(p.mesh), None if on_uv else 0, 0.0 if on_uv else material.period_m)
+        if key not in starts:
+            starts[key] = total
+            numbers[key] = len(blocks)
+            blocks.append(_face_functions(p.mesh, None if on_uv else material.period_m))
+            total += len(blocks[-1])
+        first.append(starts[key])
+        images.append(-1 if image is None else store.add(image))
+        tint = float(np.array(material.base_color) @ LUMINANCE)
+        level = np.interp(material.roughness, MAP_ROUGHNESS, np.arange(len(MAP_ROUGHNESS)))
+        grain = texture_contrast * min(1.0, material.roughness / FULL_GRAIN_ROUGHNESS)
+        offset = np.random.default_rng([31, number, p.instance + 1]).uniform(0, 0.1, 3)
+        of_faces = blocks[numbers[key]]
+        fine = 0.0 if image is None else np.log2(_texels_per_m(p.mesh, of_faces, image.shape))
+        looks.append(
+            [tint, material.roughness, material.metallic, grain, round(level), *offset, fine]
+        )
+    texels, levels = store.packed()
+    return SurfaceTables(
+        faces=np.concatenate(blocks) if blocks else np.zeros((0, 24), np.float32),
+        first_face=np.array(first, np.int64),
+        looks=np.array(looks, np.float32).reshape(-1, 9),
+        images=np.array(images, np.int64),
+        texels=texels,
+        levels=levels,
+    )
+
+
+def _look(p: PlacedMesh) -> tuple[Material, NDArray[np.uint8] | None]:
+    """Return the material of a placed mesh and its image (H, W, 3), sRGB, if it has one."""
+    mesh = p.mesh
+    if p.material is not None:
+        return p.material, p.material.base_color_image
+    if mesh.texture is not None and mesh.uv is not None:
+        return Material(base_color=(1, 1, 1), projection="uv", name="scanned"), mesh.texture
+    if mesh.colors is not None:
+        return Material(base_color=(1, 1, 1), name="scanned"), None
+    if p.instance == BACKGROUND:
+        wood = Material(base_color=(1, 1, 1), roughness=0.8, period_m=WOOD_PERIOD_M, name="wood")
+        return wood, wood_texture()
+    # Infrared sees most paints alike: plain objects share one grey.
+    paint = Material(base_color=(0.45, 0.45, 0.45), period_m=SPECKLE_PERIOD_M, name="paint")
+    return paint, speckle_texture()
+
+
+def _face_functions(mesh: Mesh, period_m: float | None) -> Array32:
+    """Return the affine functions (F, 24) of a mesh's faces.
+
+    Args:
+        mesh: the mesh.
+        period_m: tile of a projection along each face's dominant axis; None = the mesh's own
+            texture coordinates.
+    """
+    corners = mesh.vertices[mesh.faces]
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    normal = np.cross(a, b)
+    square = np.maximum(np.einsum("ij,ij->i", normal, normal), 1e-30)[:, None]
+    # Gradients of the second and third corner's weight: the weight is 1 there, 0 at the others.
+    along = np.stack([np.cross(b, normal) / square, np.cross(normal, a) / square], 1)
+    out = np.zeros((len(corners), 6, 4))
+
+    def interpolate(rows: slice, values: Array) -> None:
+        """Write the functions that take `values` (F, 3 corners, C) at the corners."""
+        step = values[:, 1:] - values[:, :1]
+        gradient = np.einsum("fkc,fkx->fcx", step, along)
+        out[:, rows, :3] = gradient
+        out[:, rows, 3] = values[:, 0] - np.einsum("fcx,fx->fc", gradient, corners[:, 0])
+
+    interpolate(slice(0, 3), corner_normals(mesh).astype(np.float64))
+    if period_m is None:
+        assert mesh.uv is not None
+        interpolate(slice(3, 5), mesh.uv[mesh.faces])
+    else:
+        # The projection is affine in space itself; no need to go through the corners.
+        axis = np.argmax(np.abs(normal), axis=1)
+        kept = np.array([[1, 2], [0, 2], [0, 1]])[axis]
+        rows = np.arange(len(corners))
+        for k in range(2):
+            out[rows, 3 + k, kept[:, k]] = 1.0 / period_m
+    out[:, 5, 3] = 1.0
+    if mesh.colors is not None and mesh.texture is None:
+        linear = _linear(np.arange(256)) / 65535.0
+        grey = linear[mesh.colors].astype(np.float64) @ LUMINANCE
+        interpolate(slice(5, 6), grey[mesh.faces][:, :, None])
+    return out.reshape(-1, 24).astype(np.float32)
+
+
+def _texels_per_m(mesh: Mesh, faces: Array32, shape: tuple[int, ...]) -> float:
+    """Return how finely an image lies on a mesh: the root of its texels over its area."""
+    gradient = faces.reshape(-1, 6, 4)[:, 3:5, :3].astype(np.float64)
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(
+        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1
+    )
+    share = np.linalg.norm(np.cross(gradient[:, 0], gradient[:, 1]), axis=-1)
+    mean = float((share * area).sum() / max(float(area.sum()), 1e-30))
+    return float(np.sqrt(max(mean * shape[0] * shape[1], 1e-12)))
+
+
+def _linear(values: NDArray[np.integer]) -> Array:
+    """Return linear light, 65535 = 1, of sRGB bytes (IEC 61966-2-1)."""
+    s = np.asarray(values, np.float64) / 255.0
+    return 65535.0 * np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4)
+
+
+class _ImageStore:
+    """Images as linear brightness with their halvings, each stored once."""
+
+    def __init__(self) -> None:
+        """Begin empty."""
+        self._numbers: dict[int, int] = {}
+        self._kept: list[NDArray[np.uint8]] = []  # keeps the ids above from being used again
+        self._parts: list[NDArray[np.uint16]] = []
+        self._levels: list[list[tuple[int, int, int]]] = []
+        self._end = 0
+
+    def add(self, image: NDArray[np.uint8]) -> int:
+        """Return the number of an image (H, W, 3), sRGB."""
+        import cv2
+
+        if id(image) in self._numbers:
+            return self._numbers[id(image)]
+        weights = LUMINANCE
+        table = _linear(np.arange(256))
+        grey = sum((table[image[..., c]] * weights[c]).astype(np.float32) for c in range(3))
+        level = np.asarray(grey, np.float32)
+        rows: list[tuple[int, int, int]] = []
+        while True:
+            height, width = level.shape
+            rows.append((self._end, height, width))
+            self._parts.append(np.round(level).astype(np.uint16).ravel())
+            self._end += height * width
+            if min(height, width) <= 1 or len(rows) == LEVELS:
+                break
+            size = (width // 2, height // 2)
+            level = np.asarray(cv2.resize(level, size, interpolation=cv2.INTER_AREA), np.float32)
+        rows += [rows[-1]] * (LEVELS - len(rows))
+        self._levels.append(rows)
+        self._numbers[id(image)] = len(self._kept)
+        self._kept.append(image)
+        return len(self._kept) - 1
+
+    def packed(self) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
+        """Return all texels and where each image's halvings begin."""
+        if not self._kept:
+            return np.zeros(1, np.uint16), np.zeros((1, LEVELS, 3), np.int64)
+        return np.concatenate(self._parts), np.array(self._levels, np.int64)

@@ -1,0 +1,413 @@
+"""The surfaces of a scene as arrays: what lies under a ray, its normals and its material there."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.rendering.appearance import LEAST_ROUGHNESS, Material
+from realsim.rendering.developing import srgb_decoded
+from realsim.rendering.materials import (
+    PLAIN_COLORS,
+    box_uv,
+    check_projection,
+    corner_normals,
+    repeats,
+    speckle_texture,
+    wood_texture,
+)
+from realsim.rendering.rays import BACKGROUND, PlacedMesh
+from realsim.rendering.texture_atlas import (
+    MOST_PROBES,
+    TextureArrays,
+    TextureAtlas,
+    texture_at,
+)
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+Int32 = NDArray[np.int32]
+Edges = tuple[float, float, float, float, float, float]
+OBJECT_ROUGHNESS = 0.42
+"""Of meshes without a material: satin plastic and printed cardboard."""
+TABLE_ROUGHNESS = 0.62
+"""Of background without a material: oiled wood, printed paper."""
+WIDEST_FOOTPRINT = 4.0
+"""Footprints end at so many tiles of the texture: rays that graze a face have no finite one."""
+
+
+class SurfaceArrays(NamedTuple):
+    """Faces of all placed meshes one after another, G meshes, F faces."""
+
+    first_face: NDArray[np.int64]
+    """(G + 1,) first face of each mesh."""
+    corners: Array32
+    """(F, 3, 3) in world, relative to the scene's centre [m]."""
+    normals: Array32
+    """(F, 3, 3) unit shading normals of the corners, world."""
+    uv: Array32
+    """(F, 3, 2) texture coordinates; zeros where there is no image."""
+    colors: Array32
+    """(C, 3, 3) linear colours of the corners of meshes with vertex colours."""
+    first_color: NDArray[np.int64]
+    """(G,) row of the mesh's first face in `colors`; -1 = none."""
+    base: Array32
+    """(G, 3) linear base colour."""
+    roughness: Array32
+    """(G,)."""
+    metallic: Array32
+    """(G,)."""
+    images: NDArray[np.int64]
+    """(G, 3) numbers of the images of base colour, roughness and normals; -1 = none."""
+    mean_color: Array32
+    """(G, 3) linear base colour, averaged over the mesh: what it sends back to its neighbours."""
+
+
+class SurfacePoints(NamedTuple):
+    """What N rays see: one row per ray; rows without a hit stay zero."""
+
+    position: Array
+    """(N, 3) in world [m]."""
+    flat: Array32
+    """(N, 3) unit normal of the face, towards the eye."""
+    smooth: Array32
+    """(N, 3) unit interpolated normal."""
+    normal: Array32
+    """(N, 3) unit normal for shading: interpolated, and bent by the normal image."""
+    base: Array32
+    """(N, 3) linear base colour."""
+    roughness: Array32
+    """(N,) widened where the normal turns within the pixel."""
+    metallic: Array32
+    """(N,)."""
+
+
+def empty_points(n: int) -> SurfacePoints:
+    """Return buffers for n rays."""
+    rows = [np.zeros((n, 3), np.float32) for _ in range(4)]
+    flat, smooth, normal, base = rows
+    rough, metal = np.ones(n, np.float32), np.zeros(n, np.float32)
+    return SurfacePoints(np.zeros((n, 3)), flat, smooth, normal, base, rough, metal)
+
+
+def surface_arrays(
+    placed: Sequence[PlacedMesh], center: Array
+) -> tuple[SurfaceArrays, TextureArrays]:
+    """Return the surfaces and images of placed meshes, coordinates relative to `center` (3,)."""
+    atlas = TextureAtlas()
+    rows = [_one_surface(k, p, center, atlas) for k, p in enumerate(placed)]
+    counts = [len(p.mesh.faces) for p in placed]
+    with_colors = [r["colors"] for r in rows if r["colors"] is not None]
+    first_color, n = [], 0
+    for r in rows:
+        first_color.append(n if r["colors"] is not None else -1)
+        n += 0 if r["colors"] is None else len(r["colors"])
+
+    def joined(name: str, shape: tuple[int, ...]) -> Array32:
+        parts = [r[name] for r in rows]
+        return np.concatenate(parts) if parts else np.zeros((0, *shape), np.float32)
+
+    def listed(name: str, shape: tuple[int, ...]) -> Array32:
+        return np.array([r[name] for r in rows], np.float32).reshape(len(rows), *shape)
+
+    surfaces = SurfaceArrays(
+        first_face=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
+        corners=joined("corners", (3, 3)),
+        normals=joined("normals", (3, 3)),
+        uv=joined("uv", (3, 2)),
+        colors=np.concatenate(with_colors) if with_colors else np.zeros((1, 3, 3), np.float32),
+        first_color=np.array(first_color, np.int64),
+        base=listed("base", (3,)),
+        roughness=listed("roughness", ()),
+        metallic=listed("metallic", ()),
+        images=np.array([r["images"] for r in rows], np.int64).reshape(-1, 3),
+        mean_color=listed("mean_color", (3,)),
+    )
+    return surfaces, atlas.arrays()
+
+
+def _one_surface(
+    number: int, placed: PlacedMesh, center: Array, atlas: TextureAtlas
+) -> dict[str, Any]:
+    """Return the rows of one mesh by the names of `SurfaceArrays`."""
+    mesh, material = placed.mesh, placed.material
+    world = se3.transform(placed.T_world_obj, mesh.vertices) - center
+    R = placed.T_world_obj[:3, :3].astype(np.float32)
+    material, image, uv, wraps = _look(number, placed)
+    images = (
+        atlas.add(image, srgb=True, wrap=wraps),
+        atlas.add(material.roughness_image, srgb=False, wrap=wraps),
+        atlas.add(material.normal_image, srgb=False, wrap=wraps),
+    )
+    base = np.array(material.base_color, np.float32)
+    colors: Array32 | None = None
+    mean = base * (atlas.mean(images[0]) if images[0] >= 0 else 1.0)
+    if placed.material is None and image is None and mesh.colors is not None:
+        linear = srgb_decoded(np.arange(256) / 255.0).astype(np.float32)[mesh.colors]
+        colors = linear[mesh.faces]
+        mean = linear.mean(0)
+    if uv is None:
+        uv = np.zeros((len(mesh.faces), 3, 2), np.float32)
+    return {
+        "corners": world[mesh.faces].astype(np.float32),
+        "normals": corner_normals(mesh) @ R.T,
+        "uv": uv,
+        "colors": colors,
+        "base": base,
+        "roughness": material.roughness,
+        "metallic": material.metallic,
+        "images": images,
+        "mean_color": mean,
+    }
+
+
+def _look(
+    number: int, placed: PlacedMesh
+) -> tuple[Material, NDArray[np.uint8] | None, Array32 | None, bool]:
+    """Return material, base colour image, texture coordinates (F, 3, 2), whether images repeat.
+
+    A mesh without a material is satin: with its own texture or colours, as wood (background) or
+    in a paint by its instance.
+    """
+    mesh, material = placed.mesh, placed.material
+    if material is not None:
+        check_projection(number, placed)
+        if material.projection == "uv":
+            assert mesh.uv is not None
+            uv = mesh.uv[mesh.faces].astype(np.float32)
+            return material, material.base_color_image, uv, repeats(mesh.uv)
+        uv = box_uv(mesh, material.period_m)
+        return material, material.base_color_image, uv, True
+    table = placed.instance == BACKGROUND
+    rough = TABLE_ROUGHNESS if table else OBJECT_ROUGHNESS
+    white = Material(base_color=(1.0, 1.0, 1.0), roughness=rough)
+    if mesh.texture is not None and mesh.uv is not None:
+        uv = mesh.uv[mesh.faces].astype(np.float32)
+        return white, mesh.texture, uv, repeats(mesh.uv)
+    if mesh.colors is not None:
+        return white, None, None, False
+    if table:
+        return white, wood_texture(), box_uv(mesh, 0.5), True
+    r, g, b = srgb_decoded(np.array(PLAIN_COLORS[placed.instance % len(PLAIN_COLORS)]) / 255.0)
+    paint = Material(base_color=(float(r), float(g), float(b)), roughness=rough)
+    return paint, speckle_texture(), box_uv(mesh, 0.12), True
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _meet(
+    e: Edges,
+    o: tuple[float, float, float],
+    q: tuple[float, float, float],
+    d: tuple[float, float, float],
+) -> tuple[float, float, float]:
+    """Return the weights of the second and third corner, and t, where a ray meets a plane.
+
+    Moller and Trumbore, "Fast, minimum storage ray/triangle intersection", 1997.
+
+    Args:
+        e: the two edges from the first corner.
+        o: origin of the ray minus the first corner.
+        q: o x first edge.
+        d: direction of the ray.
+    """
+    x, y, z = d
+    px, py, pz = y * e[5] - z * e[4], z * e[3] - x * e[5], x * e[4] - y * e[3]
+    det = e[0] * px + e[1] * py + e[2] * pz
+    safe = det if abs(det) > 1e-30 else 1e-30
+    u = (o[0] * px + o[1] * py + o[2] * pz) / safe
+    v = (x * q[0] + y * q[1] + z * q[2]) / safe
+    return u, v, (e[3] * q[0] + e[4] * q[1] + e[5] * q[2]) / safe
+
+
+def fill_points(
+    surfaces: SurfaceArrays,
+    images: TextureArrays,
+    rays: tuple[Array, Array, Array32, Array32, Array32],
+    hits: tuple[Int32, Int32],
+    out: SurfacePoints,
+) -> None:
+    """Fill the surface points of rays.
+
+    Args:
+        surfaces: the surfaces.
+        images: their images.
+        rays: eye (3,) and centre of the scene (3,) in world [m], directions (N, 3), and their
+            change over the pixel's width and height (N, 3) each.
+        hits: placed mesh (N,), -1 = none, and face of that mesh (N,) of each ray.
+        out: buffers of N rows.
+    """
+    places = np.empty((len(hits[0]), 7), np.float32)
+    _fill_geometry(surfaces, rays, hits, out, places)
+    _fill_materials(surfaces, images, hits, places, out)
+
+
+@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _fill_geometry(
+    s: SurfaceArrays,
+    rays: tuple[Array, Array, Array32, Array32, Array32],
+    hits: tuple[Int32, Int32],
+    out: SurfacePoints,
+    places: Array32,
+) -> None:
+    """Fill positions and normals, and where in its face each point lies.
+
+    `places` (N, 7): weights of the face's second and third corner; how they change over the
+    pixel's width (2) and height (2); how much the normal turns within the pixel, squared.
+    """
+    eye, center, directions, along_u, along_v = rays
+    geometry, face = hits
+    for i in range(len(geometry)):
+        if geometry[i] < 0:
+            continue
+        f = s.first_face[geometry[i]] + face[i]
+        c = s.corners[f]
+        e = (
+            c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2],
+            c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2],
+        )  # fmt: skip
+        o = (
+            eye[0] - center[0] - c[0, 0],
+            eye[1] - center[1] - c[0, 1],
+            eye[2] - center[2] - c[0, 2],
+        )
+        q = (o[1] * e[2] - o[2] * e[1], o[2] * e[0] - o[0] * e[2], o[0] * e[1] - o[1] * e[0])
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        b, w, t = _meet(e, o, q, (x, y, z))
+        # The footprint: where the rays of the next pixels meet the plane of the face.
+        du = (x + along_u[i, 0], y + along_u[i, 1], z + along_u[i, 2])
+        dv = (x + along_v[i, 0], y + along_v[i, 1], z + along_v[i, 2])
+        bu, wu, _ = _meet(e, o, q, du)
+        bv, wv, _ = _meet(e, o, q, dv)
+        bu, wu, bv, wv = bu - b, wu - w, bv - b, wv - w
+        b, w = min(max(b, 0.0), 1.0), min(max(w, 0.0), 1.0)
+        places[i, 0], places[i, 1] = b, w
+        places[i, 2], places[i, 3], places[i, 4], places[i, 5] = bu, wu, bv, wv
+
+        nx, ny, nz = e[1] * e[5] - e[2] * e[4], e[2] * e[3] - e[0] * e[5], e[0] * e[4] - e[1] * e[3]
+        length = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-30)
+        length *= 1.0 if nx * x + ny * y + nz * z <= 0 else -1.0
+        nx, ny, nz = nx / length, ny / length, nz / length
+        out.flat[i, 0], out.flat[i, 1], out.flat[i, 2] = nx, ny, nz
+        m = s.normals[f]
+        a = max(1.0 - b - w, 0.0)
+        sx = a * m[0, 0] + b * m[1, 0] + w * m[2, 0]
+        sy = a * m[0, 1] + b * m[1, 1] + w * m[2, 1]
+        sz = a * m[0, 2] + b * m[1, 2] + w * m[2, 2]
+        length = max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-12)
+        length *= 1.0 if sx * nx + sy * ny + sz * nz >= 0 else -1.0
+        out.smooth[i, 0], out.smooth[i, 1], out.smooth[i, 2] = sx / length, sy / length, sz / length
+        turn = 0.0
+        for k in range(3):
+            out.position[i, k] = eye[k] + t * directions[i, k]
+            out.normal[i, k] = out.smooth[i, k]
+            d1, d2 = m[1, k] - m[0, k], m[2, k] - m[0, k]
+            turn += (d1 * bu + d2 * wu) ** 2 + (d1 * bv + d2 * wv) ** 2
+        places[i, 6] = turn
+
+
+@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _fill_materials(
+    s: SurfaceArrays,
+    tex: TextureArrays,
+    hits: tuple[Int32, Int32],
+    places: Array32,
+    out: SurfacePoints,
+) -> None:
+    """Fill the materials at `places` (see `_fill_geometry`); bend normals by the normal images.
+
+    Normals that turn within the pixel widen the highlight (Tokuyoshi and Kaplanyan, "Improved
+    geometric specular antialiasing", I3D 2019); else it sparkles.
+    """
+    geometry, face = hits
+    for i in range(len(geometry)):
+        g = geometry[i]
+        if g < 0:
+            continue
+        b, w, turn = places[i, 0], places[i, 1], places[i, 6]
+        red, green, blue = s.base[g, 0], s.base[g, 1], s.base[g, 2]
+        rough = s.roughness[g]
+        if s.first_color[g] >= 0:
+            col = s.colors[s.first_color[g] + face[i]]
+            a = max(1.0 - b - w, 0.0)
+            red *= a * col[0, 0] + b * col[1, 0] + w * col[2, 0]
+            green *= a * col[0, 1] + b * col[1, 1] + w * col[2, 1]
+            blue *= a * col[0, 2] + b * col[1, 2] + w * col[2, 2]
+        if s.images[g, 0] >= 0 or s.images[g, 1] >= 0 or s.images[g, 2] >= 0:
+            f = s.first_face[g] + face[i]
+            p = s.uv[f]
+            ux, uy = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1]
+            vx, vy = p[2, 0] - p[0, 0], p[2, 1] - p[0, 1]
+            at = (p[0, 0] + b * ux + w * vx, p[0, 1] + b * uy + w * vy)
+            bu, wu, bv, wv = places[i, 2], places[i, 3], places[i, 4], places[i, 5]
+            du = (_capped(bu * ux + wu * vx), _capped(bu * uy + wu * vy))
+            dv = (_capped(bv * ux + wv * vx), _capped(bv * uy + wv * vy))
+            if s.images[g, 0] >= 0:
+                r, gr, bl = texture_at(tex, s.images[g, 0], at, du, dv, MOST_PROBES)
+                red, green, blue = red * r, green * gr, blue * bl
+            if s.images[g, 1] >= 0:
+                rough *= texture_at(tex, s.images[g, 1], at, du, dv, 1)[0]
+            if s.images[g, 2] >= 0:
+                bend = texture_at(tex, s.images[g, 2], at, du, dv, 1)
+                n = (out.smooth[i, 0], out.smooth[i, 1], out.smooth[i, 2])
+                x, y, z, more = _bent(n, s.corners[f], (ux, uy, vx, vy), bend)
+                out.normal[i, 0], out.normal[i, 1], out.normal[i, 2] = x, y, z
+                turn += more
+        out.base[i, 0], out.base[i, 1], out.base[i, 2] = red, green, blue
+        rough = min(max(rough, LEAST_ROUGHNESS), 1.0)
+        out.roughness[i] = min(rough**4 + min(0.5 * turn, 0.18), 1.0) ** 0.25
+        out.metallic[i] = s.metallic[g]
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _capped(value: float) -> float:
+    """Return a change of texture coordinates of finite size."""
+    return min(max(value, -WIDEST_FOOTPRINT), WIDEST_FOOTPRINT)
+
+
+@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _bent(
+    n: tuple[float, float, float],
+    c: Array32,
+    uv: tuple[float, float, float, float],
+    bend: tuple[float, float, float],
+) -> tuple[float, float, float, float]:
+    """Return the normal bent by the normal image, and the spread of normals it stands for.
+
+    The averaged normal of many texels is shorter than 1; the rest widens the highlight (Toksvig,
+    "Mipmapping normal maps", 2005).
+    """
+    ux, uy, vx, vy = uv
+    e = (
+        c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2],
+        c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2],
+    )  # fmt: skip
+    det = ux * vy - uy * vx
+    if abs(det) < 1e-20:
+        return n[0], n[1], n[2], 0.0
+    tx, ty, tz = (
+        (e[0] * vy - e[3] * uy) / det,
+        (e[1] * vy - e[4] * uy) / det,
+        (e[2] * vy - e[5] * uy) / det,
+    )
+    along = tx * n[0] + ty * n[1] + tz * n[2]
+    tx, ty, tz = tx - along * n[0], ty - along * n[1], tz - along * n[2]
+    length = max(np.sqrt(tx * tx + ty * ty + tz * tz), 1e-20)
+    tx, ty, tz = tx / length, ty / length, tz / length
+    # The second axis runs along +v; mirrored coordinates turn it round.
+    bx, by, bz = n[1] * tz - n[2] * ty, n[2] * tx - n[0] * tz, n[0] * ty - n[1] * tx
+    wx, wy, wz = e[3] * ux - e[0] * vx, e[4] * ux - e[1] * vx, e[5] * ux - e[2] * vx
+    if (bx * wx + by * wy + bz * wz) * det < 0:
+        bx, by, bz = -bx, -by, -bz
+    # 8-bit images say 128 for "not bent", half a step off the middle.
+    x, y, z = (255 * bend[0] - 128) / 127, (255 * bend[1] - 128) / 127, (255 * bend[2] - 128) / 127
+    size = min(max(np.sqrt(x * x + y * y + z * z), 0.2), 1.0)
+    sx, sy, sz = (
+        tx * x + bx * y + n[0] * z,
+        ty * x + by * y + n[1] * z,
+        tz * x + bz * y + n[2] * z,
+    )
+    length = max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-12)
+    return sx / length, sy / length, sz / length, 2 * (1 - size) / size

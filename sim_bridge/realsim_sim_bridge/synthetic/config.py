@@ -1,0 +1,63 @@
+"""How synthetic views are made: which renderer, which depth camera."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from realsim.errors import InputError
+from realsim.rendering.depth_profiles import profile
+from realsim_sim_bridge.annotation.config import MAPS, checked_maps
+
+Renderer = Literal["embedded", "photoreal"]
+Depth = Literal["stereo", "disparity", "clean"]
+RENDERERS: tuple[Renderer, ...] = ("embedded", "photoreal")
+DEPTHS: tuple[Depth, ...] = ("stereo", "disparity", "clean")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SyntheticConfig:
+    """Settings of synthetic views."""
+
+    renderer: Renderer = "embedded"
+    """embedded: sun, panorama and shadows on the labels' own rays, about 2 CPU-seconds a frame, no
+    system library. photoreal: path traced with Mitsuba, about six times as long."""
+    depth: Depth = "disparity"
+    """stereo: both eyes' pictures are rendered and matched, as the camera does it. disparity: a
+    noise model on exact disparity, ten times cheaper. clean: exact depth."""
+    profile: str = "d405"
+    """The depth camera, by its name in `depth_profiles.PROFILES`."""
+    depth_unit_m: float | None = None
+    """Metres per count of the depth images; None = the profile's own."""
+    samples: int = 8
+    """Photoreal: paths per pixel before denoising; 8 looks as good as 32 after it."""
+    maps: tuple[str, ...] = MAPS
+    """Label maps written of every view. Clean depth is always among them: it is exact, and nothing
+    else in the session is."""
+
+    def __post_init__(self) -> None:
+        """Check the names and ranges.
+
+        Raises:
+            InputError: an unknown renderer, depth or profile, or a number that cannot be.
+        """
+        for what, value, known in (
+            ("renderer", self.renderer, RENDERERS), ("depth", self.depth, DEPTHS)
+        ):  # fmt: skip
+            if value not in known:
+                raise InputError(
+                    f"there is no {what} '{value}'; these are accepted: {', '.join(known)}."
+                )
+        profile(self.profile)
+        if self.depth_unit_m is not None and not 1e-6 <= self.depth_unit_m <= 0.01:
+            raise InputError(
+                f"a depth unit of {self.depth_unit_m} m cannot be; 1e-6 to 0.01 m a count is "
+                "accepted (0.001 = millimetres)."
+            )
+        if self.samples < 1:
+            raise InputError(f"{self.samples} samples per pixel; 1 or more are accepted.")
+        object.__setattr__(self, "maps", checked_maps(("depth", *self.maps)))
+
+    @property
+    def unit_m(self) -> float:
+        """Metres per count of the depth images."""
+        own = self.depth_unit_m
+        return profile(self.profile).depth_unit_m if own is None else own

@@ -1,0 +1,262 @@
+"""Synthetic views of a placed scene, written as a session that every other command opens.
+
+    session.json ... rgb/ depth/        as a capture leaves them; camera poses are exact
+    models/                             the objects
+    registration/scene.json             the objects' exact poses, all accepted
+    synthetic/scene.json                where the scene comes from, what is wrong with views
+    synthetic/surroundings.npz          table and floor, which hide things
+    mask/ labels/ annotations/ ...      the label transfer, as `realsim annotate` writes it
+
+Frames are computed by worker processes and written by this one in their order, so that a session
+has the same bytes however many workers there were and however often it was interrupted.
+"""
+
+import os
+import tempfile
+import time
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, GraspSet, View
+from realsim.rendering.triangle_rays import solid_angle_share
+from realsim.store import SessionStore, save_scene
+from realsim.store.lock import only_run_in
+from realsim_sim_bridge.annotation.summary import AnnotationSummary
+from realsim_sim_bridge.school.workers import Workers, local_workers
+from realsim_sim_bridge.synthetic.claim import claimed_session, with_stored_models
+from realsim_sim_bridge.synthetic.config import SyntheticConfig
+from realsim_sim_bridge.synthetic.frame import (
+    FrameJob,
+    SyntheticFrame,
+    forget_job,
+    frame_of_job,
+    keep_job,
+)
+from realsim_sim_bridge.synthetic.labelling import label_session
+from realsim_sim_bridge.synthetic.scene import SyntheticScene
+from realsim_sim_bridge.synthetic.surroundings import save_surroundings
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+ABOUT_FILE = "synthetic/scene.json"
+INSIDE_SHARE = 0.5
+"""Share of the sphere about a point that a closed mesh around it fills is 1, beside it 0."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SyntheticSummary:
+    """What was rendered."""
+
+    folder: Path
+    views: int
+    """Views in the session, those of an earlier run included."""
+    rendered: int
+    """Views rendered by this run."""
+    left_out: tuple[int, ...]
+    """Instances that are not shown because they are rejected."""
+    empty_views: tuple[int, ...]
+    """Views in which no object is seen."""
+    camera_inside: dict[int, tuple[int, ...]]
+    """View -> instances that its camera stands inside of."""
+    cpu_s: dict[str, float]
+    """CPU time per frame by part [s]: rgb, depth, write, labels; of what this run did."""
+    labels: AnnotationSummary
+    """What the annotation says."""
+    notes: tuple[str, ...] = ()
+    """What the renderer wants a person to know."""
+
+    def __str__(self) -> str:
+        """Return one line for the terminal."""
+        cost = ", ".join(f"{name} {value:.2f}" for name, value in self.cpu_s.items())
+        return (
+            f"{self.views} synthetic views ({self.rendered} rendered now), "
+            f"{len(self.empty_views)} without any object, {len(self.left_out)} objects left out; "
+            f"CPU s per frame: {cost or 'none'}"
+        )
+
+
+def write_session(  # noqa: PLR0913, PLR0917 - the inputs of a session, all of them needed
+    folder: Path | str,
+    synthetic: SyntheticScene,
+    intrinsics: CameraIntrinsics,
+    Ts_world_cam: ArrayLike,
+    config: SyntheticConfig | None = None,
+    seed: int = 0,
+    grasp_sets: Sequence[GraspSet] = (),
+    progress: Progress | None = None,
+    workers: int = 1,
+    *,
+    models_from: Path | None = None,
+) -> SyntheticSummary:
+    """Render views of a scene into a session, going on where an earlier run stopped.
+
+    Args:
+        folder: a new folder, or that of an earlier run with the same inputs.
+        synthetic: what is seen.
+        intrinsics: the raw (distorted) camera.
+        Ts_world_cam: (N, 4, 4) camera in world [m]; more than an earlier run's are added to it.
+        config: renderer and depth camera; None = the defaults.
+        seed: of the noise; frame k's chance comes from (seed, k) alone.
+        grasp_sets: scored grasps of the instances, which are projected into every frame.
+        progress: called with (steps done, steps in all); a frame is two steps, picture and labels.
+        workers: processes that render; the bytes do not depend on it.
+        models_from: a models folder whose files are copied as they are; None = written anew.
+
+    Raises:
+        InputError: the folder belongs to something else, or a renderer cannot run here.
+        WorkerDiedError: a process ended in the middle; running again goes on from there.
+    """
+    config = config or SyntheticConfig()
+    Ts = _checked_cameras(Ts_world_cam)
+    folder = Path(folder)
+    store = claimed_session(folder, synthetic, intrinsics, config, seed, list(Ts))
+    with only_run_in(folder):
+        stored = with_stored_models(synthetic, folder / "models", models_from)
+        save_scene(store, stored.exact())
+        save_surroundings(store, stored.surroundings)
+        inside = cameras_inside(stored, Ts)
+        total = 2 * len(Ts)
+        job = FrameJob(synthetic=stored, intrinsics=intrinsics, config=config, seed=seed)
+        spent = _write_frames(store, job, Ts, workers, lambda k: _tell(progress, k, total))
+        began = _cpu_s()
+        labels = label_session(
+            store, stored, list(grasp_sets), maps=config.maps, workers=workers,
+            progress=lambda done, n: _tell(progress, len(Ts) + done, total),
+        )  # fmt: skip
+        if labels.views > labels.skipped:
+            spent.parts["labels"] = (_cpu_s() - began) / (labels.views - labels.skipped)
+        _write_about(store, synthetic, seed, inside, labels.empty_views)
+    return SyntheticSummary(
+        folder=folder, views=len(Ts), rendered=spent.frames, left_out=synthetic.left_out,
+        empty_views=labels.empty_views, camera_inside=inside, cpu_s=spent.parts, labels=labels,
+        notes=spent.notes,
+    )  # fmt: skip
+
+
+def _tell(progress: Progress | None, done: int, total: int) -> None:
+    """Report progress to whoever wants to know."""
+    if progress is not None:
+        progress(done, total)
+
+
+def _cpu_s() -> float:
+    """Return the CPU time of this process and of its ended children [s]."""
+    t = os.times()
+    return t.user + t.system + t.children_user + t.children_system
+
+
+def _checked_cameras(Ts_world_cam: ArrayLike) -> Array:
+    """Return the cameras (N, 4, 4), at least one and all rigid."""
+    Ts = np.asarray(Ts_world_cam, dtype=np.float64)
+    if Ts.ndim != 3 or Ts.shape[1:] != (4, 4) or len(Ts) == 0:
+        raise InputError(
+            f"camera poses of shape {Ts.shape} were given; (N, 4, 4) with N of 1 or more is needed."
+        )
+    return se3.check_rigid(Ts, "T_world_cam of the synthetic views")
+
+
+def cameras_inside(synthetic: SyntheticScene, Ts_world_cam: Array) -> dict[int, tuple[int, ...]]:
+    """Return view -> instances whose mesh its camera stands inside of; other views are absent."""
+    found: dict[int, list[int]] = {}
+    for placed in synthetic.placed():
+        if placed.instance < 0:
+            continue
+        eyes = se3.transform(se3.invert(placed.T_world_obj), Ts_world_cam[:, :3, 3])
+        low, high = placed.mesh.bounds
+        for k in np.flatnonzero(np.all((eyes > low) & (eyes < high), axis=1)):
+            share = solid_angle_share(placed.mesh.vertices - eyes[k], placed.mesh.faces)
+            if abs(share) > INSIDE_SHARE:
+                found.setdefault(int(k), []).append(placed.instance)
+    return {k: tuple(v) for k, v in sorted(found.items())}
+
+
+# --- frames -----------------------------------------------------------------------------------
+
+
+@dataclass(eq=False, slots=True)
+class _Spent:
+    """Frames rendered by this run, and what each part of one cost on average [s]."""
+
+    frames: int
+    parts: dict[str, float]
+    notes: tuple[str, ...] = ()
+
+
+def _write_frames(
+    store: SessionStore, job: FrameJob, Ts: Array, workers: int, tick: Callable[[int], None]
+) -> _Spent:
+    """Render and write the frames that are not there yet."""
+    completed = store.completed
+    due = [k for k in range(len(Ts)) if k not in completed]
+    tick(len(completed))
+    if not due:
+        return _Spent(0, {})
+    rgb, depth, write = 0.0, 0.0, 0.0
+    notes: tuple[str, ...] = ()
+    with tempfile.TemporaryDirectory(prefix="realsim_frames_") as kept:
+        path = Path(kept) / "job.pickle"
+        keep_job(job, path)
+        try:
+            with local_workers(min(workers, len(due))) as pool:
+                for done, (k, frame) in enumerate(_in_order(pool, str(path), due, Ts), start=1):
+                    began = time.process_time()
+                    view = View(index=k, T_world_cam=Ts[k], time_s=float(k))
+                    store.add_view(view, frame.rgb, depth_counts=frame.depth_counts)
+                    write += time.process_time() - began
+                    rgb, depth = rgb + frame.rgb_cpu_s, depth + frame.depth_cpu_s
+                    notes = frame.notes
+                    tick(len(completed) + done)
+        finally:
+            forget_job()
+    store.close()
+    n = len(due)
+    return _Spent(n, {"rgb": rgb / n, "depth": depth / n, "write": write / n}, notes)
+
+
+def _in_order(
+    pool: Workers, path: str, due: Sequence[int], Ts: Array
+) -> Generator[tuple[int, SyntheticFrame]]:
+    """Yield the frames in their order, a few of them ahead under way."""
+    due_now, ahead = list(due), 2 * pool.capacity()
+    under_way: dict[int, Future[SyntheticFrame]] = {}
+    for k in due:
+        while k not in under_way or not under_way[k].done():
+            busy = [f for f in under_way.values() if not f.done()]
+            if due_now and len(busy) < pool.capacity() and len(under_way) < ahead:
+                j = due_now.pop(0)
+                under_way[j] = pool.submit(frame_of_job, path, j, Ts[j])
+            else:
+                wait(busy, return_when=FIRST_COMPLETED)
+        yield k, under_way.pop(k).result()
+
+
+def _write_about(
+    store: SessionStore,
+    synthetic: SyntheticScene,
+    seed: int,
+    inside: dict[int, tuple[int, ...]],
+    empty: Sequence[int],
+) -> None:
+    """Write where the scene comes from and what is wrong with views."""
+    store.write_json(
+        ABOUT_FILE,
+        {
+            "format_version": 1,
+            "name": synthetic.name,
+            "seed": seed,
+            "provenance": {"poses": "simulated", **synthetic.provenance},
+            "left_out": list(synthetic.left_out),
+            "surroundings": len(synthetic.surroundings),
+            "environment": synthetic.environment.name,
+            "materials": {str(i): m.name for i, m in sorted(synthetic.materials.items())},
+            "views_without_objects": list(empty),
+            "camera_inside": {str(k): list(v) for k, v in inside.items()},
+        },
+    )

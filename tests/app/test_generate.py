@@ -1,0 +1,182 @@
+"""`realsim generate`: data sets that go on after an interruption and repeat to the byte."""
+
+import hashlib
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app.generate_cli import generate_command
+from realsim.app.generate_request import range_of, size_of
+from realsim.errors import InputError
+
+SMALL = ("--views", "2", "--size", "160x90", "--objects", "2-3", "--seed", "5", "--workers", "1",
+         "--depth", "disparity", "--quiet")  # fmt: skip
+UNREPEATED = (
+    "session.json",
+    "session.begun.json",
+    "manifest.jsonl",
+    "generate.json",
+    "scene_gt_coco.json",
+)
+"""Files that name the time at which they were begun, and lists of their checksums."""
+
+
+def _run(out: Path, *arguments: str) -> Result:
+    return CliRunner().invoke(generate_command, [str(out), *arguments])
+
+
+def _refusal(out: Path, *arguments: str) -> str:
+    result = _run(out, *SMALL, *arguments)
+    assert isinstance(result.exception, InputError), result.output
+    return str(result.exception)
+
+
+def _content(folder: Path) -> dict[str, str]:
+    return {
+        str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file() and p.name not in UNREPEATED and not p.name.endswith(".finished.json")
+    }
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("generate") / "out"
+    result = _run(out, *SMALL, "--scenes", "1")
+    assert result.exit_code == 0, result.output + repr(result.exception)
+    return out
+
+
+def test_a_scene_is_an_accepted_session_with_exact_labels(dataset: Path) -> None:
+    scene = json.loads((dataset / "scene_000000/registration/scene.json").read_text())
+    assert {o["verdict"] for o in scene["objects"]} == {"accepted"}
+    session = json.loads((dataset / "scene_000000/session.json").read_text())
+    assert "simulated" in session["extra"]["synthetic"]["provenance"]["poses"]
+    for k in range(2):
+        for name in ("rgb", "depth", "labels/instance"):
+            assert (dataset / f"scene_000000/{name}/{k:06d}.png").is_file()
+
+
+def test_the_data_set_says_what_was_used(dataset: Path) -> None:
+    value = json.loads((dataset / "dataset.json").read_text())
+    scene = value["scenes"][0]
+    assert 2 <= len(scene["objects"]) <= 3
+    assert all(0.02 <= o["size_m"] / scene["side_m"] <= 0.20 for o in scene["objects"])
+    assert value["request"]["seed"] == 5
+    assert value["statistics"]["views"] == 2
+    assert sum(value["statistics"]["visibility"]["counts"]) > 0
+    assert value["statistics"]["worst_moved_mm"] < 1.0
+    assert (dataset / "contact_sheet.png").is_file()
+
+
+def test_a_finished_scene_is_kept_and_a_view_that_is_missing_is_made_again(
+    dataset: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "copy"
+    shutil.copytree(dataset, out)
+    before = _content(out)
+    result = _run(out, *SMALL, "--scenes", "1")
+    assert "kept" in result.output
+    assert _content(out) == before
+    for name in ("rgb/000001.png", "annotations/000001.json"):
+        (out / "scene_000000" / name).unlink()
+    result = _run(out, *SMALL, "--scenes", "1")
+    assert result.exit_code == 0, result.output + repr(result.exception)
+    assert "made" in result.output
+    # The list of views is only ever added to: the view that was taken again is there twice.
+    lines = "scene_000000/robot.jsonl"
+    assert {k: v for k, v in _content(out).items() if k != lines} == {
+        k: v for k, v in before.items() if k != lines
+    }
+
+
+def test_another_request_does_not_mix_with_scenes_that_are_there(dataset: Path) -> None:
+    said = _refusal(dataset, "--object-sizes", "0.05-0.1")
+    assert "scene.sizes" in said
+    assert "0.05" in said
+
+
+@pytest.mark.slow
+def test_a_scene_depends_on_seed_and_number_only(dataset: Path, tmp_path: Path) -> None:
+    result = _run(tmp_path / "two", *SMALL, "--scenes", "2", "--workers", "2")
+    assert result.exit_code == 0, result.output + repr(result.exception)
+    assert _content(tmp_path / "two/scene_000000") == _content(dataset / "scene_000000")
+    more = _run(dataset, *SMALL, "--scenes", "2")
+    assert more.exit_code == 0, more.output + repr(more.exception)
+    assert _content(tmp_path / "two") == _content(dataset)
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
+    script = "from realsim.app.generate_cli import generate_command as g; g()"
+    arguments = [*SMALL, "--scenes", "1", "--views", "5"]
+    command = [sys.executable, "-c", script]
+    with subprocess.Popen([*command, str(tmp_path / "killed"), *arguments]) as process:
+        third = tmp_path / "killed/scene_000000/rgb/000002.png"
+        while not third.is_file() and process.poll() is None:
+            time.sleep(0.02)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL
+    for name in ("killed", "whole"):
+        result = _run(tmp_path / name, *arguments)
+        assert result.exit_code == 0, result.output + repr(result.exception)
+    assert _content(tmp_path / "killed") == _content(tmp_path / "whole")
+
+
+# --- bad input --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--pool", "nowhere"), "'pybullet'"),
+        (("--radius", "0.01-0.05"), "stand in the table"),
+        (("--radius", "near"), "--radius 'near' is no range"),
+        (("--size", "1920"), "WIDTHxHEIGHT"),
+        (("--size", "4x4"), "16 to 8192"),
+        (("--objects", "9-3"), "least <= most"),
+        (("--objects", "2.5"), "whole numbers"),
+        (("--object-sizes", "2-20"), "shares from 0.005 to 0.5"),
+        (("--table", "desk"), "drawer_desk"),
+        (("--profile", "d999"), "d405"),
+        (("--hdris", "nowhere"), "--hdris 'nowhere' is no folder"),
+    ],
+)
+def test_what_cannot_be_used_is_named_before_anything_is_made(
+    tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
+    assert words in _refusal(tmp_path / "out", *arguments)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_empty_pool_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "pool").mkdir()
+    assert "holds nothing" in _refusal(tmp_path / "out", "--pool", str(tmp_path / "pool"))
+
+
+def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("mine")
+    assert "not empty" in _refusal(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_a_scene_that_cannot_be_made_is_named_and_ends_in_1(tmp_path: Path) -> None:
+    (tmp_path / "pool").mkdir()
+    (tmp_path / "pool/torn.obj").write_text("v 0 0\nf 1 2 3\n")
+    result = _run(tmp_path / "out", *SMALL, "--scenes", "1", "--pool", str(tmp_path / "pool"))
+    assert result.exit_code == 1
+    assert "scene_000000 could not be made" in result.output
+    assert "torn.obj" in result.output
+
+
+def test_ranges_and_sizes_are_read_as_written() -> None:
+    assert range_of("--x", "1-2.5", "1-2") == (1.0, 2.5)
+    assert range_of("--x", "3", "1-2") == (3.0, 3.0)
+    assert size_of("1280x720") == size_of("1280X720") == (1280, 720)

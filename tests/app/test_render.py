@@ -1,0 +1,234 @@
+"""`realsim render`: twins of real frames, new views, and what it refuses."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from realsim import CameraIntrinsics, InputError
+from realsim.app.console import Console
+from realsim.app.render_cli import render_command
+from realsim.app.render_compare import rim_distances_px
+from realsim.app.render_light import linear_of, matched_look, neutral_environment, upright
+from realsim.app.render_request import RenderRequest, camera_of, radius_of, resized, size_of
+from realsim.app.render_run import notes_of, run_render
+from realsim.app.render_scene import table_top_m, twin_scene
+from realsim.app.stages import annotate_session
+from realsim.geometry import camera, se3
+from realsim.store import SessionStore, save_scene
+from synthetic_scenes import (
+    INTRINSICS,
+    MODELS,
+    captured_session,
+    placed,
+    rejected,
+    two_boxes,
+)
+
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def real(tmp_path_factory):
+    store = captured_session(tmp_path_factory.mktemp("real") / "s", 3)
+    annotate_session(store, QUIET)
+    return store
+
+
+@pytest.fixture(scope="module")
+def twin(real):
+    return run_render(real.folder, RenderRequest(), QUIET)
+
+
+def test_the_twins_masks_are_those_annotated_in_the_real_frames(real, twin):
+    seen = 0
+    for made, shot in enumerate(twin.real):
+        for k in range(2):
+            name = f"mask_visib/{{:06d}}_{k:06d}.png"
+            ours = twin.twin.read_image(name.format(made))
+            assert np.array_equal(ours, real.read_image(name.format(shot)))
+            seen += int(np.count_nonzero(ours))
+    assert seen > 1000
+    assert twin.figures.mask_iou == twin.figures.mask_iou_least == 1.0
+
+
+def test_the_twins_stand_where_the_real_cameras_stood(real, twin):
+    assert twin.real == (0, 2, 4)
+    for made, shot in enumerate(twin.real):
+        mine = twin.twin.session.view(made).T_world_cam
+        assert np.array_equal(mine, real.session.view(shot).T_world_cam)
+    assert np.array_equal(twin.twin.session.intrinsics.distortion, INTRINSICS.distortion)
+    assert twin.twin.session.depth_unit_m == real.session.depth_unit_m
+
+
+def test_light_and_table_match_the_photographs(real, twin):
+    look = twin.look.look
+    assert look.has_colors
+    assert look.object_error < 0.02 and look.table_error < 0.02
+    for made, shot in enumerate(twin.real):
+        ours, theirs = (linear_of(s.rgb(k)) for s, k in ((twin.twin, made), (real, shot)))
+        assert np.abs(ours.mean((0, 1)) - theirs.mean((0, 1))).max() < 0.05
+
+
+def test_depth_is_like_the_real_one(twin):
+    assert 0.5 < twin.figures.noise_ratio < 2.0
+
+
+def test_the_result_is_a_sound_session_with_sheet_and_page(real, twin):
+    assert twin.twin.folder == real.folder / "synthetic/real-embedded-disparity"
+    assert twin.twin.verify() == []
+    assert twin.sheet.is_file() and b"<html" in twin.page.read_bytes()[:200].lower()
+    annotate_session(twin.twin, QUIET)
+    assert real.verify() == []
+
+
+def test_new_views_see_the_objects_at_the_asked_size(real, tmp_path):
+    arguments = [str(real.folder), "--views", "2", "--size", "120x100", "--radius", "0.3-0.4",
+                 "--material", "table=cork", "--depth", "clean", "--workers", "1", "--quiet",
+                 "--out", str(tmp_path / "new")]  # fmt: skip
+    result = CliRunner().invoke(render_command, arguments, catch_exceptions=False)
+    assert result.exit_code == 0
+    store = SessionStore.open(tmp_path / "new")
+    assert (store.session.intrinsics.width, store.session.intrinsics.height) == (120, 100)
+    center = np.mean([o.T_world_obj[:3, 3] for o in two_boxes().objects], axis=0)
+    for view in store.session.views:
+        assert 0.3 <= np.linalg.norm(view.T_world_cam[:3, 3] - center) <= 0.4
+        assert len(np.unique(store.read_image(f"labels/instance/{view.index:06d}.png"))) == 3
+
+
+def test_a_rejected_object_is_named(real, tmp_path):
+    store = captured_session(tmp_path / "s", 1, two_boxes())
+    save_scene(store, rejected(two_boxes(), 3))
+    outcome = run_render(store.folder, RenderRequest(depth="clean"), QUIET)
+    assert any("flat (instance 3) is rejected" in note for note in notes_of(outcome))
+    assert set(np.unique(outcome.twin.read_image("labels/instance/000000.png"))) == {0, 1}
+
+
+def test_a_session_that_is_not_registered_is_told_the_command(tmp_path):
+    store = captured_session(tmp_path / "s", 1)
+    store.remove("registration/scene.json")
+    with pytest.raises(InputError, match="realsim register"):
+        run_render(store.folder, RenderRequest(), QUIET)
+
+
+def test_a_session_without_models_is_refused(tmp_path):
+    store = captured_session(tmp_path / "s", 1)
+    for path in (store.folder / "models").iterdir():
+        path.unlink()
+    with pytest.raises(InputError, match="has no models"):
+        run_render(store.folder, RenderRequest(), QUIET)
+
+
+def test_a_scene_in_which_everything_is_rejected_is_refused(tmp_path):
+    store = captured_session(tmp_path / "s", 1)
+    save_scene(store, rejected(rejected(two_boxes(), 0), 3))
+    with pytest.raises(InputError, match="realsim review"):
+        run_render(store.folder, RenderRequest(views="2"), QUIET)
+
+
+def test_the_session_itself_is_never_written_over(real):
+    with pytest.raises(InputError, match="the session itself"):
+        run_render(real.folder, RenderRequest(out=real.folder), QUIET)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"views": "some"}, "--views"), ({"views": "0"}, "--views"),
+        ({"radius": "0.4-0.5"}, "--radius"), ({"size": "64x64"}, "--size"),
+        ({"views": "3", "radius": "0.5-0.4"}, "--radius"),
+        ({"views": "3", "radius": "400-700"}, "--radius"),
+        ({"views": "3", "size": "64"}, "--size"), ({"views": "3", "size": "9999x10"}, "--size"),
+        ({"camera": "d999"}, "--camera"),
+    ],
+)  # fmt: skip
+def test_options_that_cannot_be_are_named(options, named):
+    with pytest.raises(InputError, match=named):
+        RenderRequest(**options)
+
+
+def test_a_missing_panorama_and_an_unknown_material_are_named(real, tmp_path):
+    with pytest.raises(InputError, match="--hdri"):
+        RenderRequest(hdri=tmp_path / "none.hdr")
+    for text in ("table=jelly", "chair=oak", "oak"):
+        with pytest.raises(InputError, match="table=KIND"):
+            twin_scene(real, two_boxes(), MODELS, RenderRequest(materials=(text,)))
+
+
+def test_ranges_and_sizes_are_read():
+    assert radius_of("") is None and radius_of("0.5") == (0.5, 0.5)
+    assert radius_of(".4-0.7") == (0.4, 0.7)
+    assert size_of("") is None and size_of("640x480") == (640, 480)
+
+
+def test_a_resized_camera_sees_the_same_rays():
+    big = CameraIntrinsics(width=640, height=480, fx=600, fy=601, cx=318.2, cy=241.7)
+    rays = camera.ray_table(big)
+    half = camera.ray_table(resized(big, 320, 240))
+    # A pixel of half the resolution is the middle of four.
+    mean = rays.reshape(240, 2, 320, 2, 3).mean((1, 3))
+    assert np.abs(half - mean).max() < 1e-5
+    taller = resized(big, 640, 500)
+    assert np.abs(camera.ray_table(taller)[10:-10] - rays).max() < 1e-6
+
+
+def test_the_camera_is_taken_from_the_session(real):
+    assert camera_of(real) == "d405"
+    assert RenderRequest(camera="d435").config(real).profile == "d435"
+
+
+def test_the_table_is_lowered_to_the_deepest_object_but_not_below_the_clearance():
+    for sunk, top in ((0.0, 0.0), (0.001, -0.001), (0.02, -0.002)):
+        pose = placed(1, 0, 0, 0)
+        T = se3.from_translation([0, 0, -sunk]) @ pose.T_world_obj
+        deep = two_boxes(placed(7, 5, 0.1, 0.1))
+        moved = type(pose)(obj_id=1, instance=9, T_world_obj=T, verdict="accepted")
+        scene = type(deep)(name="s", objects=(*deep.objects, moved), plane=deep.plane)
+        assert table_top_m(scene, MODELS) == pytest.approx(top, abs=1e-9)
+
+
+def test_a_brighter_photograph_gives_a_brighter_light(real, tmp_path):
+    looks = []
+    for name, factor in (("dark", 0.5), ("bright", 1.0)):
+        store = captured_session(tmp_path / name, 1)
+        rgb = store.rgb(0)
+        path = store.path("rgb/000000.png")
+        dimmed = linear_of(rgb) * factor
+        encoded = np.where(dimmed < 0.0031308, 12.92 * dimmed, 1.055 * dimmed ** (1 / 2.4) - 0.055)
+        store.write_image("rgb/000000.png", np.round(255 * encoded).astype(np.uint8))
+        assert path.is_file()
+        scene = twin_scene(store, two_boxes(), MODELS, RenderRequest()).synthetic
+        looks.append(matched_look(store, scene, keeps_table=False, keeps_hue=False))
+    ratio = looks[1].environment.panorama.mean() / looks[0].environment.panorama.mean()
+    assert ratio == pytest.approx(2.0, rel=0.1)
+    before = neutral_environment().panorama
+    assert looks[0].environment.panorama.shape == before.shape
+
+
+def test_the_rims_of_a_picture_of_the_labels_lie_on_its_edges():
+    ids = np.full((60, 80), -1, np.int32)
+    ids[20:40, 30:60] = 2
+    picture = np.where(ids[..., None] >= 0, 200, 60).astype(np.uint8).repeat(3, -1)
+    away = rim_distances_px(ids, picture)
+    assert len(away) > 90 and away.max() <= 1.5
+    shifted = rim_distances_px(np.roll(ids, 5, axis=1), picture)
+    assert shifted.max() >= 4
+    assert np.isinf(rim_distances_px(ids, np.zeros_like(picture))).all()
+
+
+def test_surroundings_turn_with_the_up_of_the_world():
+    room = neutral_environment()
+    assert upright(room, np.array([0.0, 0.0, 1.0])) is room
+    up = np.array([0.6, 0.0, -0.8])
+    turned = upright(room, up)
+    rows = room.panorama.shape[0]
+    polar, around = (
+        np.pi * (np.arange(rows) + 0.5) / rows,
+        np.pi * (np.arange(2 * rows) + 0.5) / rows,
+    )
+    along = 0.6 * np.sin(polar)[:, None] * np.cos(around) - 0.8 * np.cos(polar)[:, None]
+    expected = np.where(along > 0, 0.45 + 0.35 * along, 0.45 + 0.25 * along)
+    assert np.abs(turned.panorama[..., 0] - expected).max() < 0.02
+    before, after = np.array(room.sun_direction), np.array(turned.sun_direction)
+    assert after @ up == pytest.approx(before[2]) and np.linalg.norm(after) == pytest.approx(
+        np.linalg.norm(before)
+    )

@@ -1,0 +1,78 @@
+"""Sliders in the report: the outlines before and after, where there is a before."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim import CameraIntrinsics, CaptureSession, Mesh, ObjectModel, ObjectPose, Scene, View
+from realsim.app.report import write_report
+from realsim.app.report_sliders import registration_pairs
+from realsim.app.stages import save_starts
+from realsim.formats.bop_models import save_models
+from realsim.geometry import se3
+from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim.store import SessionStore, save_scene
+
+INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
+SHIFT_M = 0.02
+
+
+def block() -> Mesh:
+    import trimesh
+
+    solid = trimesh.creation.box((0.06, 0.05, 0.04))
+    return Mesh(vertices=solid.vertices, faces=solid.faces)
+
+
+def pose(x: float) -> ObjectPose:
+    return ObjectPose(obj_id=1, instance=2, T_world_obj=se3.from_translation([x, 0.0, 0.02]))
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> SessionStore:
+    session = CaptureSession(name="one", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(tmp_path / "one", session)
+    renderer = LabelRenderer([PlacedMesh(2, block(), pose(0.0).T_world_obj)])
+    for index, a in enumerate((0.0, 1.5, 3.0, 4.5)):
+        T = se3.look_at([0.3 * np.cos(a), 0.3 * np.sin(a), 0.25], [0.0, 0.0, 0.02])
+        labels = renderer.render(INTRINSICS, T)
+        rgb = np.repeat(np.where(labels.ids == 2, 200, 60)[..., None], 3, -1).astype(np.uint8)
+        store.add_view(View(index=index, T_world_cam=T), rgb, labels.depth_m)
+    save_scene(store, Scene(name="one", objects=(pose(0.0),), plane=None))
+    save_models(store.folder / "models", {1: ObjectModel(obj_id=1, name="b", mesh=block())})
+    return store
+
+
+def coloured(picture: np.ndarray) -> np.ndarray:
+    return np.ptp(picture.astype(int), axis=-1) > 40
+
+
+def test_the_outline_moves_from_the_start_onto_the_object(store: SessionStore) -> None:
+    save_starts(store, [pose(SHIFT_M)], "a rough guess")
+    pairs, before = registration_pairs(store)
+    assert "1 of 1 objects at the rough pose" in before and "cameras" not in before
+    assert [p.caption for p in pairs] == ["view 0", "view 2", "view 3"]
+    for p in pairs:
+        assert isinstance(p.before, np.ndarray) and isinstance(p.after, np.ndarray)
+        photo = store.rgb(int(p.caption.split()[1]))
+        on_object = photo[..., 0] == 200
+        # After, the outline lies within the object; before, it does not.
+        assert np.mean(on_object[coloured(p.after)]) > 0.99
+        assert np.mean(on_object[coloured(p.before)]) < 0.9
+
+
+def test_without_a_before_there_are_no_sliders(store: SessionStore) -> None:
+    assert registration_pairs(store) == ([], "")
+    store.write_json(
+        "registration/starts.json", {"starts": [{"instance": 2, "click": [3, 80, 60]}]}
+    )
+    assert registration_pairs(store) == ([], "")
+
+
+def test_the_report_holds_the_sliders(store: SessionStore) -> None:
+    save_starts(store, [pose(SHIFT_M)], "a rough guess")
+    text = write_report(store, None).read_text("utf-8")
+    assert "Before and after registration" in text
+    assert text.count('<div class="pair">') == 3
+    assert "clip-path" in text and "--at" in text

@@ -1,0 +1,152 @@
+"""Photoreal pictures lie on the labels' pixel grid, under every lens."""
+
+import numpy as np
+import pytest
+
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, Mesh
+from realsim.rendering.appearance import Environment, Material
+from realsim.rendering.labels import LabelRenderer
+from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer, find_llvm
+from realsim.rendering.rays import PlacedMesh
+
+SEARCH = find_llvm()
+NEEDS_LLVM = pytest.mark.skipif(SEARCH.library is None, reason=str(SEARCH))
+VARIANTS = [pytest.param("llvm", marks=NEEDS_LLVM), "scalar"]
+LENSES = {
+    "none": np.zeros(8),
+    "brown": np.array([-0.28, 0.11, 0.0012, -0.0009, -0.02, 0, 0, 0]),
+    "rational": np.array([0.4, -0.2, 0.0003, 0.0006, 0.03, 0.7, -0.05, 0.02]),
+}
+
+
+def lens(name: str, width: int, height: int) -> CameraIntrinsics:
+    return CameraIntrinsics(
+        width=width, height=height, fx=0.6 * width, fy=0.61 * width,
+        cx=0.49 * width, cy=0.52 * height, distortion=LENSES[name],
+    )  # fmt: skip
+
+
+def box(x: float, y: float, z: float) -> Mesh:
+    corners = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    return Mesh(vertices=corners * [x, y, z], faces=np.array(faces))
+
+
+def ball(radius: float, rings: int = 16) -> Mesh:
+    polar = np.linspace(0.02, np.pi - 0.02, rings)
+    around = np.arange(2 * rings) * np.pi / rings
+    p, a = np.meshgrid(polar, around, indexing="ij")
+    xyz = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], -1).reshape(-1, 3)
+    i, j = np.divmod(np.arange((rings - 1) * 2 * rings), 2 * rings)
+    q, k = i * 2 * rings + j, i * 2 * rings + (j + 1) % (2 * rings)
+    faces = np.concatenate([np.stack([q, q + 2 * rings, k + 2 * rings], -1),
+                            np.stack([q, k + 2 * rings, k], -1)])  # fmt: skip
+    return Mesh(vertices=radius * xyz, faces=faces)
+
+
+def clutter(origin: np.ndarray) -> list[PlacedMesh]:
+    rng = np.random.default_rng(3)
+    placed = [PlacedMesh(-1, box(1.0, 1.0, 0.02), se3.from_translation(origin - [0, 0, 0.01]))]
+    for i in range(7):
+        mesh = ball(0.04) if i % 2 else box(0.06, 0.04, 0.09)
+        # Apart, and off the table: where two faces coincide either answer is right.
+        at = [0.09 * (i % 3 - 1), 0.1 * (i // 3 - 1), 0.051]
+        T = se3.from_rt(se3.exp_so3([0, 0, rng.uniform(0, 6)]), origin + at)
+        placed.append(PlacedMesh(3 * i, mesh, T))
+    return placed
+
+
+def grey_sky(radiance: float = 0.7) -> Environment:
+    return Environment(panorama=np.full((8, 16, 3), radiance, np.float32), sun=(0.5, 0.5, 0.5))
+
+
+@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("origin", [np.zeros(3), np.array([130.0, -70.0, 12.0])])
+def test_the_path_tracer_meets_what_the_labels_say(
+    variant: str, name: str, origin: np.ndarray
+) -> None:
+    scale = 3 if variant == "llvm" else 1
+    intrinsics = lens(name, 160 * scale, 90 * scale)
+    placed = clutter(origin)
+    T = se3.look_at(origin - np.array([0.25, 0.3, -0.3]), origin + np.array([0, 0, 0.03]))
+    labels = LabelRenderer(placed).render(intrinsics, T)
+    traced = PhotorealRenderer(placed, grey_sky(), PhotorealConfig(variant=variant)).first_hits(
+        intrinsics, T
+    )
+    objects = (labels.ids >= 0) | (traced.instance >= 0)
+    assert np.count_nonzero(labels.ids >= 0) > 1000
+    different = np.count_nonzero((labels.ids != traced.instance)[objects])
+    assert different <= 1e-4 * np.count_nonzero(objects)
+    same = (labels.depth_m > 0) & (labels.geometry == traced.geometry)
+    assert np.count_nonzero(same) >= (1 - 1e-4) * np.count_nonzero(labels.depth_m > 0)
+    error = np.abs(labels.depth_m - traced.depth_m)[same] / labels.depth_m[same]
+    # Rays that graze a face may differ by more: float32 rounds where they begin.
+    assert np.count_nonzero(error >= 1e-5) <= 1e-4 * len(error)
+    assert np.median(error) < 2e-7
+
+
+@pytest.mark.parametrize(
+    ("variant", "name"),
+    [pytest.param("llvm", n, marks=NEEDS_LLVM) for n in LENSES] + [("scalar", "brown")],
+)
+def test_the_picture_s_edges_lie_on_the_labels_edges(variant: str, name: str) -> None:
+    intrinsics = lens(name, 80, 45)
+    dark = Material(base_color=(0.0, 0.0, 0.0), roughness=1.0)
+    placed = [PlacedMesh(0, ball(0.08, 32), np.eye(4), dark)]
+    T = se3.look_at([0.02, -0.2, 0.15], [0.01, 0.0, 0.0])
+    # Against a white sky a black ball darkens a pixel by the share of it that it covers.
+    sky = Environment(panorama=np.full((8, 16, 3), 0.5, np.float32))
+    config = PhotorealConfig(variant=variant, samples=36, denoise=False, psf_px=0)
+    rgb = PhotorealRenderer(placed, sky, config).render(intrinsics, T).rgb[..., 1] / 255.0
+    light = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    known = np.isfinite(light) & (light > 0)
+    cover = 1 - light / 0.5
+
+    k = 8  # the labels of the same lens with 8 x 8 pixels for each
+    fine = CameraIntrinsics(
+        width=intrinsics.width * k, height=intrinsics.height * k,
+        fx=intrinsics.fx * k, fy=intrinsics.fy * k,
+        cx=(intrinsics.cx + 0.5) * k - 0.5, cy=(intrinsics.cy + 0.5) * k - 0.5,
+        distortion=intrinsics.distortion,
+    )  # fmt: skip
+    ids = LabelRenderer(placed).render(fine, T).ids >= 0
+    expected = ids.reshape(intrinsics.height, k, intrinsics.width, k).mean((1, 3))
+    gy, gx = np.gradient(expected)
+    known &= (np.abs(gx) + np.abs(gy) > 0.05) & (expected + np.abs(gx) > 0)
+    slopes = np.stack([gx[known], gy[known]], -1)
+    shift, *_ = np.linalg.lstsq(slopes, (cover - expected)[known], rcond=None)
+    assert np.count_nonzero(known) > 80
+    assert np.abs(shift).max() < 0.03  # [px]; half a pixel is the trap
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_pixels_that_the_lens_cannot_reach_are_black_without_depth(variant: str) -> None:
+    intrinsics = CameraIntrinsics(
+        width=64, height=48, fx=30.0, fy=30.0, cx=31.5, cy=23.5,
+        distortion=np.array([-0.6, 0.05, 0, 0, 0, 0, 0, 0]),
+    )  # fmt: skip
+    placed = clutter(np.zeros(3))
+    T = se3.look_at([0, -0.3, 0.4], [0, 0, 0])
+    labels = LabelRenderer(placed).render(intrinsics, T)
+    config = PhotorealConfig(variant=variant, samples=8, psf_px=0, denoise=False)
+    photo = PhotorealRenderer(placed, grey_sky(), config).render(intrinsics, T)
+    assert 0 < np.count_nonzero(labels.unknown) < labels.unknown.size
+    assert np.all(photo.rgb[labels.unknown] == 0)
+    assert np.all(photo.depth_m[labels.unknown] == 0)
+    assert np.all(photo.rgb[~labels.unknown].max(-1) > 0)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_scene_without_meshes_or_light_is_an_empty_picture(variant: str) -> None:
+    intrinsics = lens("none", 32, 18)
+    T = se3.look_at([0.3, 0, 0.3], [0, 0, 0])
+    dark = Environment(panorama=np.zeros((4, 8, 3), np.float32))
+    config = PhotorealConfig(variant=variant, samples=2)
+    photo = PhotorealRenderer([], dark, config).render(intrinsics, T)
+    assert photo.rgb.shape == (18, 32, 3) and photo.rgb.max() == 0
+    assert photo.depth_m.max() == 0
+    lit = PhotorealRenderer([], grey_sky(), config).render(intrinsics, T)
+    assert lit.rgb.min() > 100 and lit.depth_m.max() == 0

@@ -1,0 +1,209 @@
+"""Which variant renders, what is said when it is not the fast one, and that seeds reproduce."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, Mesh
+from realsim.rendering.appearance import Environment
+from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer, find_llvm, llvm_probe
+from realsim.rendering.photoreal.denoise import denoised
+from realsim.rendering.rays import PlacedMesh
+
+SEARCH = find_llvm()
+NEEDS_LLVM = pytest.mark.skipif(SEARCH.library is None, reason=str(SEARCH))
+VARIANTS = [pytest.param("llvm", marks=NEEDS_LLVM), "scalar"]
+CAMERA = CameraIntrinsics(width=48, height=36, fx=50.0, fy=50.0, cx=23.5, cy=17.5)
+VIEW = se3.look_at([0.2, -0.25, 0.3], [0, 0, 0])
+SKY = Environment(
+    panorama=np.linspace(0.2, 0.9, 8 * 16 * 3, dtype=np.float32).reshape(8, 16, 3),
+    sun=(0.4, 0.4, 0.35),
+)
+
+
+def scene() -> list[PlacedMesh]:
+    corners = np.array([[a, b, c] for a in (-0.5, 0.5) for b in (-0.5, 0.5) for c in (-0.5, 0.5)])
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    table = Mesh(vertices=corners * [1.0, 1.0, 0.02], faces=np.array(faces))
+    cube = Mesh(vertices=corners * 0.1, faces=np.array(faces))
+    return [PlacedMesh(-1, table, se3.from_translation([0, 0, -0.01])),
+            PlacedMesh(2, cube, se3.from_translation([0, 0, 0.05]))]  # fmt: skip
+
+
+@pytest.fixture
+def verdicts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The search begins from nothing: no library named, no verdict kept."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    llvm_probe._find_llvm.cache_clear()  # pyright: ignore[reportPrivateUsage]
+    return tmp_path / "cache" / "realsim" / "llvm_libraries.json"
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("denoise", [False, True])
+def test_the_same_seed_gives_the_same_bytes(variant: str, denoise: bool) -> None:
+    config = PhotorealConfig(variant=variant, samples=4, denoise=denoise)
+    first, second = (PhotorealRenderer(scene(), SKY, config) for _ in range(2))
+    a = first.render(CAMERA, VIEW, np.random.default_rng(5)).rgb
+    other = first.render(CAMERA, VIEW, np.random.default_rng(6)).rgb
+    assert np.array_equal(a, first.render(CAMERA, VIEW, np.random.default_rng(5)).rgb)
+    assert np.array_equal(a, second.render(CAMERA, VIEW, np.random.default_rng(5)).rgb)
+    assert not np.array_equal(a, other)
+    assert np.array_equal(first.render(CAMERA, VIEW).rgb, second.render(CAMERA, VIEW).rgb)
+
+
+@NEEDS_LLVM
+def test_both_variants_make_the_same_picture() -> None:
+    a, b = (
+        PhotorealRenderer(scene(), SKY, PhotorealConfig(variant=v, samples=64)).render(CAMERA, VIEW)
+        for v in ("llvm", "scalar")
+    )
+    difference = np.abs(a.rgb.astype(float) - b.rgb.astype(float))
+    assert np.median(difference) <= 1 and difference.mean() < 2
+    assert np.allclose(a.depth_m, b.depth_m, rtol=1e-5, atol=0)
+
+
+def test_the_denoiser_removes_the_noise_and_keeps_the_picture() -> None:
+    def at(samples: int, denoise: bool) -> np.ndarray:
+        config = PhotorealConfig(variant="scalar", samples=samples, denoise=denoise, psf_px=0)
+        return PhotorealRenderer(scene(), SKY, config).render(CAMERA, VIEW).rgb.astype(float)
+
+    reference = at(128, False)
+    noisy, clean = (np.abs(at(4, d) - reference).mean() for d in (False, True))
+    assert clean < 0.6 * noisy
+
+
+def test_the_denoiser_keeps_even_light_even_up_to_the_corners() -> None:
+    even = np.full((45, 60, 3), 0.4, np.float32)
+    noisy = even * np.random.default_rng(0).uniform(0.9, 1.1, even.shape).astype(np.float32)
+    normal = np.broadcast_to(np.array([0, 0, 1], np.float32), even.shape)
+    clean = denoised(noisy, even, normal)
+    assert clean.shape == even.shape
+    assert np.abs(clean / even - 1).max() < 0.06
+
+
+def test_without_the_denoiser_the_picture_comes_with_a_note(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    config = PhotorealConfig(variant="scalar", samples=1)
+    renderer = PhotorealRenderer(scene(), SKY, config)
+    assert any("realsim[photo]" in note for note in renderer.notes)
+    plain = PhotorealConfig(variant="scalar", samples=1, denoise=False)
+    without = PhotorealRenderer(scene(), SKY, plain)
+    assert without.notes == ()
+    assert np.array_equal(renderer.render(CAMERA, VIEW).rgb, without.render(CAMERA, VIEW).rgb)
+
+
+def test_a_search_that_finds_nothing_says_where_it_looked_and_how_to_get_one(
+    tmp_path: Path, verdicts: Path
+) -> None:
+    search = find_llvm((f"{tmp_path}/libLLVM*.so*",))
+    assert search.library is None
+    for part in (str(tmp_path), "libllvm19", "karellen-llvm-core", "DRJIT_LIBLLVM_PATH"):
+        assert part in str(search)
+    assert not verdicts.exists()
+
+
+def test_libraries_that_cannot_work_are_named_with_the_reason(
+    tmp_path: Path, verdicts: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("libLLVM-15.so.1", "libLLVM.so.20.1"):
+        (tmp_path / name).write_bytes(b"not a library")
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "absent.so"))
+    search = find_llvm((f"{tmp_path}/libLLVM*.so*",))
+    assert search.library is None
+    assert [r.split(": ")[0].rsplit("/")[-1] for r in search.rejected] == [
+        "absent.so", "libLLVM.so.20.1", "libLLVM-15.so.1",
+    ]  # fmt: skip
+    assert "no such file" in search.rejected[0]
+    assert "trial picture ended with" in search.rejected[1]
+    assert "too old" in search.rejected[2]
+    kept = json.loads(verdicts.read_text())
+    assert len(kept) == 1  # only the one that had to be tried
+
+
+def test_a_verdict_is_kept_until_the_library_changes(tmp_path: Path, verdicts: Path) -> None:
+    library = tmp_path / "libLLVM.so.21.0"
+    library.write_bytes(b"not a library")
+    patterns = (f"{tmp_path}/libLLVM*.so*",)
+    assert find_llvm(patterns).library is None
+    kept = json.loads(verdicts.read_text())
+    verdicts.write_text(json.dumps(dict.fromkeys(kept, "")))  # as if it had worked
+    llvm_probe._find_llvm.cache_clear()  # pyright: ignore[reportPrivateUsage]
+    assert find_llvm(patterns).library == library
+    library.write_bytes(b"another file")
+    llvm_probe._find_llvm.cache_clear()  # pyright: ignore[reportPrivateUsage]
+    assert find_llvm(patterns).library is None
+
+
+@pytest.mark.skipif(
+    not Path("/usr/lib/x86_64-linux-gnu/libLLVM-14.so.1").exists(),
+    reason="no LLVM 14 is installed, on which Dr.Jit aborts",
+)
+def test_a_library_that_aborts_the_process_ends_only_the_trial() -> None:
+    said = llvm_probe._try_out(  # pyright: ignore[reportPrivateUsage]
+        Path("/usr/lib/x86_64-linux-gnu/libLLVM-14.so.1")
+    )
+    assert "trial picture ended with" in said
+
+
+def in_another_process(prepare: str, tmp_path: Path, wanted: str = "auto") -> str:
+    """Return what a process prints that renders after `prepare`."""
+    program = f"""
+import sys
+import numpy as np
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics
+from realsim.rendering.appearance import Environment
+from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer, llvm_probe
+llvm_probe.library_patterns = lambda: ({str(tmp_path)!r} + "/libLLVM*.so*",)
+{prepare}
+sky = Environment(panorama=np.full((4, 8, 3), 0.5, np.float32))
+camera = CameraIntrinsics(width=8, height=6, fx=8, fy=8, cx=3.5, cy=2.5)
+try:
+    renderer = PhotorealRenderer([], sky, PhotorealConfig(variant={wanted!r}, samples=1))
+    print(renderer.variant, renderer.render(camera, np.eye(4)).rgb.min(), *renderer.notes)
+except InputError as error:
+    print("InputError", error)
+"""
+    environment = {k: v for k, v in os.environ.items() if k != "DRJIT_LIBLLVM_PATH"}
+    environment["XDG_CACHE_HOME"] = str(tmp_path)
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True,
+                          text=True, timeout=300, check=False)  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_without_llvm_the_scalar_variant_renders_and_says_so(tmp_path: Path) -> None:
+    said = in_another_process("", tmp_path)
+    assert said.startswith("scalar_rgb ")
+    assert int(said.split()[1]) > 100
+    assert "without LLVM" in said and "libllvm19" in said and str(tmp_path) in said
+
+
+def test_llvm_asked_for_and_not_there_is_an_error_that_offers_the_other(tmp_path: Path) -> None:
+    said = in_another_process("", tmp_path, wanted="llvm")
+    assert said.startswith("InputError") and "libllvm19" in said and "scalar" in said
+
+
+def test_without_mitsuba_the_extra_is_named(tmp_path: Path) -> None:
+    said = in_another_process('sys.modules["mitsuba"] = None', tmp_path)
+    assert said.startswith("InputError") and "realsim[photo]" in said
+
+
+@pytest.mark.parametrize(
+    "bad", [{"samples": 0}, {"max_depth": 0}, {"psf_px": -1.0}, {"variant": "cuda"}]
+)
+def test_a_config_out_of_range_is_named(bad: dict[str, object]) -> None:
+    with pytest.raises(InputError, match=str(next(iter(bad.values())))):
+        PhotorealConfig(**bad)  # pyright: ignore[reportArgumentType]

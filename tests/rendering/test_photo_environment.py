@@ -1,0 +1,272 @@
+"""Views under a panorama and a sun: energy, known answers, and the same pixel grid as labels."""
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import camera, se3
+from realsim.records import CameraIntrinsics, Mesh
+from realsim.rendering.appearance import Environment, Material
+from realsim.rendering.labels import LabelRenderer
+from realsim.rendering.photo import Lighting, LightSampling, PhotoRenderer, PlacedMesh
+
+LENS = np.array([-0.25, 0.09, 0.0006, -0.0009, 0.0])
+WIDE = CameraIntrinsics(width=160, height=120, fx=110, fy=110, cx=79.2, cy=60.1, distortion=LENS)
+SHARP = Lighting(psf_px=0.0)
+WHITE = Material(base_color=(1.0, 1.0, 1.0), roughness=1.0, name="white")
+ABOVE = se3.look_at([0, 0, 1.0], [0, 0, 0])
+
+
+def even_sky(level: float = 1.0, rows: int = 16, **more: object) -> Environment:
+    return Environment(panorama=np.full((rows, 2 * rows, 3), level, np.float32), **more)  # pyright: ignore[reportArgumentType]
+
+
+def square(half: float = 0.5, uv: bool = False) -> Mesh:
+    return Mesh(
+        vertices=np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * half,
+        faces=np.array([[0, 1, 2], [0, 2, 3]]),
+        uv=np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]) if uv else None,
+    )
+
+
+def ball(radius: float, segments: int = 48) -> Mesh:
+    polar, azimuth = np.meshgrid(
+        np.linspace(0, np.pi, segments + 1),
+        np.arange(2 * segments) * np.pi / segments,
+        indexing="ij",
+    )
+    v = np.stack(
+        [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], -1
+    )
+    n = 2 * segments
+    i, j = np.meshgrid(np.arange(segments), np.arange(n), indexing="ij")
+    a, b = i * n + j, i * n + (j + 1) % n
+    c, d = (i + 1) * n + j, (i + 1) * n + (j + 1) % n
+    lower, upper = np.stack([a, c, d], -1)[:-1], np.stack([a, d, b], -1)[1:]
+    faces = np.concatenate([lower.reshape(-1, 3), upper.reshape(-1, 3)])
+    return Mesh(vertices=radius * v.reshape(-1, 3), faces=faces)
+
+
+def light_of(
+    placed: list[PlacedMesh], sky: Environment, T: np.ndarray = ABOVE,
+    intrinsics: CameraIntrinsics = WIDE, **sampling: object,
+) -> np.ndarray:  # fmt: skip
+    how = LightSampling(**sampling)  # pyright: ignore[reportArgumentType]
+    return PhotoRenderer(placed, SHARP, sky, how).radiance(intrinsics, T)[0]
+
+
+def cluttered() -> list[PlacedMesh]:
+    """A table with a ball, a small plate in the air and a textured square."""
+    texture = np.random.default_rng(0).integers(0, 255, (16, 16, 3), dtype=np.uint8)
+    card = square(0.08, uv=True)
+    card = Mesh(vertices=card.vertices, faces=card.faces, uv=card.uv, texture=texture)
+    return [
+        PlacedMesh(-1, square(0.45), np.eye(4), WHITE),
+        PlacedMesh(0, ball(0.1), se3.from_translation([0.2, 0.1, 0.1]),
+                   Material(base_color=(0.8, 0.2, 0.1), roughness=0.3)),
+        PlacedMesh(1, square(0.07), se3.from_translation([-0.1, 0.1, 0.12])),
+        PlacedMesh(2, card, se3.from_translation([-0.05, -0.2, 0.001])),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("roughness", [0.05, 0.5, 1.0])
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_white_surfaces_vanish_in_a_white_room(roughness: float, metallic: float) -> None:
+    material = Material(base_color=(1.0, 1.0, 1.0), roughness=roughness, metallic=metallic)
+    for mesh in (square(), ball(0.3)):
+        light = light_of([PlacedMesh(0, mesh, np.eye(4), material)], even_sky())
+        assert np.abs(light - 1).max() < 0.02
+
+
+def test_light_is_linear_in_the_sky() -> None:
+    one, three = (light_of(cluttered(), even_sky(level)) for level in (1.0, 3.0))
+    # Which pixels are refined depends on their brightness, hence the median.
+    assert np.median(np.abs(three - 3 * one)) < 1e-4
+
+
+@pytest.mark.parametrize("tilt_deg", [0, 45, 90, 135, 180])
+def test_a_half_white_sky_lights_by_the_tilt(tilt_deg: float) -> None:
+    # Matte white under a white upper half: (1 + cos tilt) / 2 of white (form factor of the sky).
+    panorama = np.zeros((64, 128, 3), np.float32)
+    panorama[:32] = 1.0
+    T_world_obj = se3.from_rt(se3.exp_so3([np.radians(tilt_deg), 0, 0]), [0, 0, 0])
+    normal = T_world_obj[:3, 2]
+    T = se3.look_at(normal + np.array([1e-3, 0, 0]), [0, 0, 0])
+    placed = [PlacedMesh(0, square(2.0), T_world_obj, WHITE)]
+    light = light_of(placed, Environment(panorama=panorama), T)
+    expected = 0.5 + 0.5 * np.cos(np.radians(tilt_deg))
+    # The coat (4 % reflectance) sees another part of the sky than the matte part does.
+    assert light[50:70, 70:90].mean() == pytest.approx(expected, abs=0.035)
+
+
+def test_everything_turned_together_looks_the_same() -> None:
+    rng = np.random.default_rng(3)
+    panorama = np.repeat(np.repeat(rng.uniform(0, 2, (8, 16, 3)), 8, 0), 8, 1).astype(np.float32)
+    quarter = se3.from_rt(se3.exp_so3([0, 0, np.pi / 2]), [0, 0, 0])
+    T = se3.look_at([0.4, -0.7, 0.6], [0, 0, 0])
+    sun = (0.6, 0.3, 0.8)
+    sky = Environment(panorama=panorama, sun=(1, 1, 1), sun_direction=sun)
+    still = light_of(cluttered(), sky, T)
+    x, y, z = sun
+    turned_sky = Environment(
+        panorama=np.roll(panorama, 32, axis=1), sun=(1, 1, 1), sun_direction=(-y, x, z)
+    )
+    placed = [PlacedMesh(p.instance, p.mesh, quarter @ p.T_world_obj, p.material)
+              for p in cluttered()]  # fmt: skip
+    turned = light_of(placed, turned_sky, quarter @ T)
+    assert np.mean(np.abs(turned - still)) < 0.01 * still.mean()
+    assert np.quantile(np.abs(turned - still), 0.99) < 0.06
+
+
+def test_the_sun_shadow_falls_where_geometry_says() -> None:
+    # 45 degrees up in +x: the plate at z = 0.1 shades x' = x - 0.1, hard-edged.
+    sky = even_sky(0.2, sun=(1, 1, 1), sun_direction=(1, 0, 1), sun_radius_deg=0.0)
+    placed = [
+        PlacedMesh(-1, square(0.5), np.eye(4), WHITE),
+        PlacedMesh(0, square(0.05), se3.from_translation([0, 0, 0.1])),
+    ]
+    light = light_of(placed, sky, ambient_rays=0)
+
+    def at(x: float, y: float) -> float:
+        uv = camera.project(WIDE, se3.transform(se3.invert(ABOVE), [[x, y, 0]]))[0]
+        u, v = np.round(uv).astype(int)
+        return float(light[v, u, 0])
+
+    open_light = at(0.3, 0.3)
+    assert open_light == pytest.approx(0.2 + np.sqrt(0.5), rel=0.05)
+    for x, y, shaded in ((-0.13, 0, True), (-0.17, 0, False), (-0.1, 0.035, True),
+                         (-0.1, 0.07, False)):  # fmt: skip
+        assert (at(x, y) < 0.5 * open_light) == shaded
+
+
+def test_a_wide_sun_makes_a_penumbra_of_the_right_width() -> None:
+    # A half plane's edge 0.2 m up, a sun of 4 deg radius overhead: penumbra 2 * 0.2 * tan 4 deg.
+    half = Mesh(vertices=square(1.0).vertices + np.array([1.0, 0, 0]), faces=square().faces)
+    sky = even_sky(0.0, sun=(1, 1, 1), sun_direction=(0, 0, 1), sun_radius_deg=4.0)
+    view = CameraIntrinsics(width=120, height=40, fx=300, fy=300, cx=59.5, cy=19.5)
+    T = se3.look_at([0, 0, 0.15], [0, 0, 0])
+    placed = [PlacedMesh(-1, square(2.0), np.eye(4), WHITE),
+              PlacedMesh(0, half, se3.from_translation([0, 0, 0.2]))]  # fmt: skip
+    share = light_of(placed, sky, T, view, ambient_rays=0, edge_samples=32)[..., 0].mean(0)
+    share = share / share[:20].mean()
+    x = (np.arange(120) - 59.5) * 0.15 / 300
+    radius = 0.2 * np.tan(np.radians(4.0))
+    s = np.clip(x / radius, -1, 1)
+    expected = (np.arccos(s) - s * np.sqrt(1 - s * s)) / np.pi
+    assert np.abs(share - expected).max() < 0.08
+    assert np.abs(share - expected).mean() < 0.02
+
+
+def test_a_deep_corner_is_darker_than_the_open_table() -> None:
+    wall = se3.from_rt(se3.exp_so3([np.pi / 2, 0, 0]), [0, 0.2, 0.5])
+    black = Material(base_color=(0.0, 0.0, 0.0), roughness=1.0)
+    placed = [
+        PlacedMesh(-1, square(0.8), np.eye(4), WHITE),
+        PlacedMesh(0, square(0.5), wall, black),
+    ]
+    sky = even_sky()
+    light = light_of(placed, sky, se3.look_at([0, -0.3, 1.2], [0, 0, 0]), ambient_rays=4)
+    T = se3.look_at([0, -0.3, 1.2], [0, 0, 0])
+    seen = []
+    for y in (0.19, 0.0, -0.5):
+        uv = camera.project(WIDE, se3.transform(se3.invert(T), [[0, y, 0]]))[0]
+        u, v = np.round(uv).astype(int)
+        seen.append(light[v, u - 3 : u + 4].mean())
+    assert 0.4 < seen[0] < 0.7  # beside an endless black wall it would be half
+    assert seen[0] < seen[1] < seen[2] and seen[2] > 0.8
+
+
+def test_colour_bleeds_off_a_sunlit_neighbour() -> None:
+    wall = se3.from_rt(se3.exp_so3([np.pi / 2, 0, 0]), [0, 0.1, 0.3])
+    red = Material(base_color=(0.9, 0.05, 0.05), roughness=1.0)
+    placed = [PlacedMesh(-1, square(0.8), np.eye(4), WHITE), PlacedMesh(0, square(0.3), wall, red)]
+    sky = even_sky(0.3, sun=(1, 1, 1), sun_direction=(0, -1, 0.4))
+    light = light_of(placed, sky, se3.look_at([0, -0.5, 0.8], [0, 0, 0]))
+    T = se3.look_at([0, -0.5, 0.8], [0, 0, 0])
+    ratio = []
+    for y in (0.07, -0.3):
+        uv = camera.project(WIDE, se3.transform(se3.invert(T), [[0, y, 0]]))[0]
+        u, v = np.round(uv).astype(int)
+        patch = light[v - 1 : v + 2, u - 2 : u + 3].mean((0, 1))
+        ratio.append(patch[0] / patch[1])
+    assert ratio[0] > 1.15 and ratio[1] < 0.5 * ratio[0] + 0.6
+
+
+def test_a_mirror_shows_the_panorama_behind_the_viewer() -> None:
+    panorama = np.full((64, 128, 3), 0.1, np.float32)
+    panorama[:8] = (4.0, 0.1, 0.1)  # a red lamp overhead
+    mirror = Material(base_color=(1, 1, 1), metallic=1.0, roughness=0.05)
+    placed = [PlacedMesh(0, square(), np.eye(4), mirror)]
+    light = light_of(placed, Environment(panorama=panorama))
+    middle, aside = light[55:65, 75:85].mean((0, 1)), light[55:65, 20:28].mean((0, 1))
+    assert middle[0] == pytest.approx(4.0, rel=0.05) and middle[1] == pytest.approx(0.1, rel=0.05)
+    assert aside[0] < 1.0
+
+
+def test_a_mirror_shows_the_thing_above_it() -> None:
+    mirror = Material(base_color=(1, 1, 1), metallic=1.0, roughness=0.05)
+    green = Material(base_color=(0.0, 0.6, 0.0), roughness=1.0)
+    upright = se3.from_rt(se3.exp_so3([np.pi / 2, 0, 0]), [0, 0.3, 0.2])
+    placed = [PlacedMesh(0, square(0.3), np.eye(4), mirror),
+              PlacedMesh(1, square(0.2), upright, green)]  # fmt: skip
+    T = se3.look_at([0, -0.6, 0.4], [0, 0.1, 0.0])
+    uv = camera.project(WIDE, se3.transform(se3.invert(T), [[0, 0.1, 0.0]]))[0]
+    u, v = np.round(uv).astype(int)
+    with_it = light_of(placed, even_sky(), T)[v, u]
+    without = light_of(placed, even_sky(), T, reflections=False, ambient_rays=0)[v, u]
+    assert with_it[1] > 3 * with_it[0] and without[0] == pytest.approx(1.0, abs=0.02)
+
+
+def test_the_background_is_the_panorama() -> None:
+    rng = np.random.default_rng(1)
+    panorama = np.repeat(np.repeat(rng.uniform(0, 1, (8, 16, 3)), 8, 0), 8, 1).astype(np.float32)
+    T = se3.look_at([0, 0, 0], [0.8, 0.5, 0.3])
+    light = light_of([], Environment(panorama=panorama), T)
+    table = camera.ray_table(WIDE)
+    d = (table / np.linalg.norm(table, axis=-1, keepdims=True)) @ T[:3, :3].T
+    phi = np.arctan2(d[..., 1], d[..., 0]) / (2 * np.pi) % 1.0
+    theta = np.arccos(d[..., 2]) / np.pi
+    column, row = (phi * 128).astype(int) % 128, np.minimum((theta * 64).astype(int), 63)
+    differ = np.abs(light - panorama[row, column]).max(-1)
+    assert np.median(differ) < 0.01  # but for the seams between its blocks
+
+
+def test_depth_is_that_of_the_labels_through_a_strong_lens() -> None:
+    T = se3.look_at([0.4, -0.7, 0.6], [0, 0, 0])
+    photo = PhotoRenderer(cluttered(), None, even_sky()).render(WIDE, T)
+    assert np.array_equal(photo.depth_m, LabelRenderer(cluttered()).render(WIDE, T).depth_m)
+
+
+def test_the_same_generator_gives_the_same_bytes() -> None:
+    sky = even_sky(0.5, sun=(1, 1, 1), sun_radius_deg=2.0)
+    T = se3.look_at([0.4, -0.7, 0.6], [0, 0, 0])
+    one, two = (PhotoRenderer(cluttered(), None, sky) for _ in range(2))
+    a, b = (r.render(WIDE, T, np.random.default_rng(5)).rgb for r in (one, two))
+    c = one.render(WIDE, T, np.random.default_rng(6)).rgb
+    assert np.array_equal(a, b) and not np.array_equal(a, c)
+    assert np.array_equal(one.render(WIDE, T).rgb, two.render(WIDE, T).rgb)
+
+
+def test_exposure_brightens_the_picture_not_the_light() -> None:
+    T = se3.look_at([0.4, -0.7, 0.6], [0, 0, 0])
+    dark, bright = (
+        PhotoRenderer(cluttered(), SHARP, even_sky(0.4, exposure=e)) for e in (1.0, 1.5)
+    )
+    assert np.median(np.abs(dark.radiance(WIDE, T)[0] - bright.radiance(WIDE, T)[0])) == 0
+    assert bright.render(WIDE, T).rgb.mean() > 1.1 * dark.render(WIDE, T).rgb.mean()
+
+
+def test_an_empty_scene_and_an_empty_view_show_the_sky() -> None:
+    sky = even_sky(0.5)
+    away = se3.look_at([0, 0, 1], [3, 0, 2])
+    for placed in ([], cluttered()):
+        photo = PhotoRenderer(placed, None, sky).render(WIDE, away)
+        assert np.all(photo.depth_m == 0)
+        assert np.ptp(photo.rgb) == 0 and photo.rgb[0, 0, 0] == 188  # sRGB of one half
+
+
+def test_ray_counts_out_of_range_are_named() -> None:
+    with pytest.raises(InputError, match="ambient rays"):
+        LightSampling(ambient_rays=-1)
+    with pytest.raises(InputError, match="edge samples"):
+        LightSampling(edge_samples=0)

@@ -1,0 +1,93 @@
+"""Cameras of synthetic views: where they stand, where they look, how evenly they are spread."""
+
+import numpy as np
+import pytest
+
+from realsim import InputError
+from realsim.geometry import se3
+from realsim_sim_bridge.synthetic.cameras import cameras_near, hemisphere_cameras
+
+CENTER = np.array([0.4, -0.2, 0.1])
+
+
+def spread(count=200, seed=0, elevation_deg=(15.0, 85.0)):
+    rng = np.random.default_rng(seed)
+    return hemisphere_cameras(CENTER, (0.5, 0.8), count, rng, elevation_deg)
+
+
+def directions(Ts):
+    away = Ts[:, :3, 3] - CENTER
+    return away / np.linalg.norm(away, axis=1, keepdims=True)
+
+
+def test_cameras_stand_within_the_asked_distances_and_elevations():
+    Ts = spread()
+    away = np.linalg.norm(Ts[:, :3, 3] - CENTER, axis=1)
+    assert away.min() >= 0.5 and away.max() <= 0.8
+    assert away.min() < 0.53 and away.max() > 0.77
+    elevation = np.degrees(np.arcsin(directions(Ts)[:, 2]))
+    assert elevation.min() >= 15 - 1e-9 and elevation.max() <= 85 + 1e-9
+
+
+def test_the_picture_stands_upright_and_the_center_is_ahead():
+    Ts = spread()
+    assert np.abs(Ts[:, 2, 0]).max() < 1e-12  # x axis level
+    assert (Ts[:, 2, 1] < 0).all()  # y axis down
+    to_center = -directions(Ts)
+    angle = np.degrees(np.arccos(np.sum(Ts[:, :3, 2] * to_center, axis=1)))
+    assert angle.max() < 10 and angle.mean() > 1
+
+
+def test_equal_areas_of_the_band_get_equal_numbers():
+    height = directions(spread(2000))[:, 2]
+    low, high = np.sin(np.radians([15, 85]))
+    counts, _ = np.histogram(height, np.linspace(low, high, 11))
+    assert counts.min() >= 190 and counts.max() <= 210
+    azimuth = np.arctan2(*directions(spread(2000))[:, 1::-1].T)
+    counts, _ = np.histogram(azimuth, np.linspace(-np.pi, np.pi, 9))
+    assert counts.min() > 225 and counts.max() < 275
+
+
+def test_no_two_cameras_meet():
+    d = directions(spread(256))
+    cosine = d @ d.T - 2 * np.eye(len(d))
+    nearest = np.arccos(cosine.max(1))
+    area = 2 * np.pi * np.diff(np.sin(np.radians([15, 85])))[0] / 256
+    assert nearest.min() > 0.3 * np.sqrt(area)
+
+
+def test_the_same_seed_gives_the_same_cameras_and_another_one_others():
+    assert np.array_equal(spread(20, 3), spread(20, 3))
+    assert not np.allclose(spread(20, 3), spread(20, 4))
+
+
+def test_one_camera_can_be_asked_for():
+    assert se3.check_rigid(spread(1), "camera").shape == (1, 4, 4)
+
+
+def test_a_camera_straight_above_is_still_rigid():
+    se3.check_rigid(spread(50, elevation_deg=(80.0, 90.0)), "cameras")
+
+
+@pytest.mark.parametrize(
+    ("radius", "count", "elevation"),
+    [((0.5, 0.4), 5, (15, 85)), ((0, 1), 5, (15, 85)), ((0.4, 0.5), 0, (15, 85)),
+     ((0.4, 0.5), 5, (50, 20))],
+)  # fmt: skip
+def test_what_cannot_be_is_refused(radius, count, elevation):
+    with pytest.raises(InputError, match="accepted"):
+        hemisphere_cameras(CENTER, radius, count, np.random.default_rng(0), elevation)
+
+
+def test_near_cameras_stay_near_their_own():
+    known = spread(4)
+    near = cameras_near(known, np.random.default_rng(1), 400, sigma_m=0.02, sigma_deg=3.0)
+    move = se3.invert(known[np.arange(400) % 4]) @ near
+    assert np.std(move[:, :3, 3]) == pytest.approx(0.02, rel=0.1)
+    angle = np.degrees(se3.angle(move))
+    assert np.sqrt(np.mean(angle**2)) == pytest.approx(3.0 * np.sqrt(3), rel=0.1)
+
+
+def test_near_cameras_without_any_known_are_refused():
+    with pytest.raises(InputError, match="known"):
+        cameras_near(np.zeros((0, 4, 4)), np.random.default_rng(0), 3)

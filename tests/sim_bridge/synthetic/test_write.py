@@ -1,0 +1,260 @@
+"""Synthetic views as a session: labels against a fresh render, exact poses, what is refused."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim import InputError, Mesh
+from realsim.app.console import Console
+from realsim.app.school_inputs import SchoolRequest, session_inputs
+from realsim.geometry import se3
+from realsim.rendering.labels import LabelRenderer
+from realsim.store import SessionStore, load_scene
+from realsim_sim_bridge.synthetic.config import SyntheticConfig
+from realsim_sim_bridge.synthetic.surroundings import load_surroundings
+from realsim_sim_bridge.synthetic.write import cameras_inside, write_session
+from synthetic_scenes import (
+    INTRINSICS,
+    MODELS,
+    cameras,
+    captured_session,
+    content,
+    placed,
+    rejected,
+    sky,
+    synthetic_scene,
+    table,
+    two_boxes,
+)
+
+
+def write(folder, count=2, config=None, seed=0, **more):
+    synthetic = more.pop("synthetic", None) or synthetic_scene()
+    Ts = more.pop("Ts", cameras(count))
+    config = config or SyntheticConfig(maps=("instance",))
+    return write_session(folder, synthetic, INTRINSICS, Ts, config, seed, **more)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("written") / "session"
+    return write(folder, 3), SessionStore.open(folder)
+
+
+@pytest.fixture(scope="module")
+def fresh(written):
+    renderer = LabelRenderer(synthetic_scene(models=stored_models(written[1])).placed())
+    return [renderer.render(INTRINSICS, T) for T in cameras(3)]
+
+
+def stored_models(store):
+    from realsim.formats.bop_models import load_models
+
+    return load_models(store.folder / "models")
+
+
+def test_the_written_instances_are_those_of_a_fresh_label_render(written, fresh):
+    store = written[1]
+    for k, labels in enumerate(fresh):
+        ids = store.read_image(f"labels/instance/{k:06d}.png").astype(int) - 1
+        assert np.array_equal(ids, labels.ids)
+        for row in store.read_json(f"annotations/{k:06d}.json")["objects"]:
+            mask = store.read_image(f"mask_visib/{k:06d}_{row['mask']:06d}.png") > 0
+            assert np.array_equal(mask, labels.ids == row["instance"])
+    assert {0, 3} <= set(np.unique([x.ids for x in fresh]))
+
+
+def test_clean_depth_is_exact_to_half_a_unit(written, fresh):
+    store = written[1]
+    unit = store.session.depth_unit_m
+    for k, labels in enumerate(fresh):
+        clean = store.read_image(f"labels/depth/{k:06d}.png").astype(float) * unit
+        known = labels.depth_m < 65535 * unit
+        assert np.abs(clean - labels.depth_m)[known].max() <= 0.51 * unit
+        measured = store.depth_m(k)
+        assert not np.array_equal(measured, clean.astype(np.float32))
+        both = (measured > 0) & (labels.ids >= 0)
+        assert np.median(np.abs(measured - clean)[both]) < 0.02
+
+
+def test_a_clean_depth_camera_reports_the_clean_depth(tmp_path):
+    write(tmp_path / "s", 1, SyntheticConfig(depth="clean"))
+    store = SessionStore.open(tmp_path / "s")
+    counts = store.read_image("depth/000000.png").astype(int)
+    clean = store.read_image("labels/depth/000000.png").astype(int)
+    # Photograph and labels cast their rays by two libraries: a rim pixel may fall to either side.
+    assert np.mean(np.abs(counts - clean) > 1) < 1e-3
+
+
+def test_poses_are_exact_and_accepted(written):
+    _, store = written
+    scene = load_scene(store)
+    for pose, wanted in zip(scene.objects, two_boxes().objects, strict=True):
+        assert np.array_equal(pose.T_world_obj, wanted.T_world_obj)
+        assert pose.verdict == "accepted" and pose.covariance is None
+    for view, T in zip(store.session.views, cameras(3), strict=True):
+        assert np.array_equal(view.T_world_cam, T)
+    about = store.read_json("synthetic/scene.json")
+    assert about["provenance"] == {"poses": "simulated", "made by": "a test"}
+
+
+def test_the_session_is_sound_and_the_school_opens_it(written):
+    _, store = written
+    assert store.verify() == []
+    found = session_inputs(store, SchoolRequest(), Console(quiet=True))
+    assert [o.instance for o in found.scene.objects] == [0, 3]
+    assert {m.name for m in found.models.values()} == {"tall", "flat"}
+
+
+def test_the_label_transfer_of_real_sessions_opens_it(written, tmp_path):
+    from realsim.app.stages import annotate_session
+
+    write(tmp_path / "s", 1)
+    store = SessionStore.open(tmp_path / "s")
+    before = store.read_image("mask_visib/000000_000000.png")
+    annotate_session(store, Console(quiet=True))
+    assert np.array_equal(store.read_image("mask_visib/000000_000000.png"), before)
+
+
+def test_running_again_computes_nothing_and_changes_nothing(tmp_path):
+    write(tmp_path / "s")
+    before = content(tmp_path / "s")
+    summary = write(tmp_path / "s")
+    assert summary.rendered == 0 and summary.labels.skipped == 2
+    assert content(tmp_path / "s") == before
+
+
+def test_an_interrupted_run_ends_with_the_bytes_of_an_uninterrupted_one(tmp_path):
+    write(tmp_path / "whole", 3)
+    for last in (1, 2, 4):
+
+        def stop(done, total, last=last):
+            assert total == 6
+            if done >= last:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            write(tmp_path / "cut", 3, progress=stop)
+    write(tmp_path / "cut", 3)
+    assert content(tmp_path / "cut") == content(tmp_path / "whole")
+
+
+def test_more_views_are_added_without_touching_the_first(tmp_path):
+    write(tmp_path / "s", Ts=cameras(3)[:1])
+    first = content(tmp_path / "s")
+    assert write(tmp_path / "s", Ts=cameras(3)).rendered == 2
+    after = content(tmp_path / "s")
+    for name in ("rgb/000000.png", "depth/000000.png", "annotations/000000.json"):
+        assert after[name] == first[name]
+    with pytest.raises(InputError, match="has view 1 already"):
+        write(tmp_path / "s", Ts=cameras(3)[:1])
+
+
+def test_the_seed_is_of_the_noise_and_not_of_the_labels(tmp_path):
+    write(tmp_path / "a", 1, seed=0)
+    write(tmp_path / "b", 1, seed=1)
+    write(tmp_path / "c", 1, SyntheticConfig(maps=("instance",), depth="clean"), seed=1)
+    a, b, c = (content(tmp_path / n) for n in "abc")
+    for noisy in ("rgb/000000.png", "depth/000000.png"):
+        assert a[noisy] != b[noisy]
+    for exact in ("mask_visib/000000_000000.png", "labels/depth/000000.png"):
+        assert a[exact] == b[exact]
+    # Another depth camera leaves the photograph as it is.
+    assert b["rgb/000000.png"] == c["rgb/000000.png"]
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"seed": 1}, "seed"),
+        ({"config": SyntheticConfig(profile="d435")}, "profile"),
+        ({"config": SyntheticConfig(depth="clean")}, "depth"),
+        ({"synthetic": synthetic_scene(environment=sky(0.3))}, "environment"),
+        ({"synthetic": synthetic_scene(surroundings=())}, "surroundings"),
+        ({"synthetic": synthetic_scene(scene=two_boxes(placed(7, 5, 0, 0.1)))}, "objects"),
+        ({"synthetic": synthetic_scene(materials={0: table().material})}, "materials"),
+        ({"Ts": cameras(2, seed=1)}, "camera pose of view 0"),
+    ],
+)
+def test_two_scenes_are_never_mixed_in_one_folder(written, changed, named):
+    folder = written[1].folder
+    before = content(folder)
+    with pytest.raises(InputError, match=named) as error:
+        write(folder, **{"count": 3} | changed)
+    assert "other inputs" in str(error.value)
+    assert content(folder) == before
+
+
+def test_foreign_folders_are_left_alone(tmp_path):
+    store = captured_session(tmp_path / "real", 1)
+    with pytest.raises(InputError, match="not synthetic"):
+        write(store.folder)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="not empty"):
+        write(tmp_path / "full")
+    with pytest.raises(InputError, match="is a file"):
+        write(tmp_path / "full/mine.txt")
+
+
+def test_a_rejected_object_is_left_out_and_named(tmp_path):
+    scene = rejected(two_boxes(), 3)
+    summary = write(tmp_path / "s", 1, synthetic=synthetic_scene(scene=scene))
+    store = SessionStore.open(tmp_path / "s")
+    assert summary.left_out == (3,)
+    assert [o.instance for o in load_scene(store).objects] == [0]
+    assert set(np.unique(store.read_image("labels/instance/000000.png"))) == {0, 1}
+
+
+def test_a_camera_inside_an_object_is_named_and_its_view_is_written(tmp_path):
+    middle = two_boxes().objects[0].T_world_obj[:3, 3] + np.array([0, 0, 0.02])
+    inside = se3.look_at(middle, middle + np.array([0.1, 0.0, 0.01]))
+    summary = write(tmp_path / "s", Ts=np.stack([cameras(1)[0], inside]))
+    assert summary.camera_inside == {1: (0,)}
+    about = json.loads((tmp_path / "s/synthetic/scene.json").read_text())
+    assert about["camera_inside"] == {"1": [0]}
+    assert len(SessionStore.open(tmp_path / "s").session.views) == 2
+
+
+def test_a_camera_in_the_box_around_an_object_but_outside_it_is_not_inside():
+    pyramid = Mesh(
+        vertices=0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]),
+        faces=np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32),
+    )
+    scene = synthetic_scene(models={**MODELS, 1: replace(MODELS[1], mesh=pyramid)})
+    T = scene.scene.object(0).T_world_obj
+
+    def inside(*at):
+        return cameras_inside(scene, (T @ se3.from_translation(at))[None])
+
+    assert inside(0.02, 0.02, 0.02) == {0: (0,)}
+    assert inside(0.08, 0.08, 0.08) == inside(0.05, 0.05, 0.01) == inside(0.2, 0, 0) == {}
+
+
+def test_views_without_any_object_are_counted(tmp_path):
+    away = se3.look_at([0.5, 0, 0.6], [1.5, 0, 0.9])
+    summary = write(tmp_path / "s", Ts=np.stack([away, cameras(1)[0]]))
+    assert summary.empty_views == (0,)
+    assert "1 without any object" in str(summary)
+
+
+def test_the_surroundings_are_kept(written, tmp_path):
+    (kept,) = load_surroundings(written[1])
+    assert np.array_equal(kept.mesh.vertices, table().mesh.vertices)
+    assert np.array_equal(kept.T_world_obj, table().T_world_obj)
+    assert load_surroundings(captured_session(tmp_path / "real", 1)) is None
+
+
+def test_what_cannot_be_rendered_is_refused(tmp_path):
+    with pytest.raises(InputError, match="without a model"):
+        synthetic_scene(models={1: MODELS[1]})
+    with pytest.raises(InputError, match="surroundings"):
+        synthetic_scene(surroundings=(replace(table(), instance=4),))
+    with pytest.raises(InputError, match=r"\(N, 4, 4\)"):
+        write(tmp_path / "s", Ts=np.eye(4))
+    with pytest.raises(InputError, match="no depth 'laser'"):
+        SyntheticConfig(depth="laser")
+    with pytest.raises(InputError, match="no depth camera"):
+        SyntheticConfig(profile="d999")

@@ -1,0 +1,63 @@
+"""Synthetic sessions written by several processes, and by processes that are killed."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from realsim_sim_bridge.synthetic.config import SyntheticConfig
+from realsim_sim_bridge.synthetic.write import write_session
+from synthetic_scenes import INTRINSICS, cameras, content, synthetic_scene
+
+SCRIPT = """
+import sys
+from synthetic_scenes import INTRINSICS, cameras, synthetic_scene
+from realsim_sim_bridge.synthetic.write import write_session
+
+if __name__ == "__main__":
+    write_session(
+        sys.argv[1], synthetic_scene(), INTRINSICS, cameras(6), workers=int(sys.argv[2]),
+        progress=lambda done, of: print(done, of, flush=True),
+    )
+"""
+
+
+def write(folder, workers):
+    return write_session(
+        folder, synthetic_scene(), INTRINSICS, cameras(6), SyntheticConfig(), workers=workers
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole") / "s"
+    write(folder, 1)
+    return content(folder)
+
+
+@pytest.mark.slow
+def test_two_workers_write_the_bytes_of_one(tmp_path, whole):
+    summary = write(tmp_path / "s", 2)
+    assert summary.rendered == 6
+    assert content(tmp_path / "s") == whole
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_killed_run_ends_with_the_bytes_of_one_that_was_not(tmp_path, whole, workers):
+    (tmp_path / "script.py").write_text(SCRIPT)
+    support = Path(__file__).parents[2] / "support"
+    for steps in (2, 5):
+        process = subprocess.Popen(
+            [sys.executable, tmp_path / "script.py", tmp_path / "s", str(workers)],
+            env=os.environ | {"PYTHONPATH": str(support)}, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert process.stdout is not None
+        for _ in range(steps):
+            process.stdout.readline()
+        process.kill()
+        process.wait()
+    write(tmp_path / "s", workers)
+    assert content(tmp_path / "s") == whole

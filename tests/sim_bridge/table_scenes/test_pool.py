@@ -1,0 +1,119 @@
+"""Pools of objects: a fixed order, weights, what is broken is named."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry.mesh import save_ply
+from realsim.geometry.parts import part
+from realsim.models.convex_hulls import hull_volume
+from realsim_sim_bridge.table_scenes.config import PoolConfig
+from realsim_sim_bridge.table_scenes.pool import open_pool
+from realsim_sim_bridge.table_scenes.pool_objects import read_object
+
+HULLS = PoolConfig(hull_only=True)
+
+
+def _folder(path: Path, names: tuple[str, ...]) -> Path:
+    path.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        save_ply(path / f"{name}.ply", part(name).mesh, "mm")
+    return path
+
+
+def test_pybullet_has_a_thousand_objects_in_a_fixed_order() -> None:
+    pool = open_pool(["pybullet"])
+    assert len(pool) == 1000
+    assert list(pool.sources[0].keys) == sorted(pool.sources[0].keys)
+    assert pool.digest == open_pool(["pybullet"]).digest
+
+
+def test_a_procedural_object_is_the_hulls_of_its_parts() -> None:
+    source = open_pool(["pybullet"]).sources[0]
+    for key in source.keys[:200:40]:
+        found = read_object(source, key, PoolConfig())
+        corners = np.concatenate(found.parts.parts)
+        assert np.array_equal(np.unique(corners, axis=0), np.unique(found.mesh.vertices, axis=0))
+        assert all(hull_volume(p) > 0 for p in found.parts.parts)
+        assert 0.01 < float(found.mesh.extent.max()) < 1.0
+
+
+def test_meshes_are_found_in_folders_of_folders_and_drawn_by_weight(tmp_path: Path) -> None:
+    _folder(tmp_path / "a/00000001", ("mug",))
+    _folder(tmp_path / "a/00000002/deep", ("cube",))
+    _folder(tmp_path / "b", ("box",))
+    (tmp_path / "a/notes.txt").write_text("no mesh")
+    pool = open_pool([f"{tmp_path / 'a'}=3", str(tmp_path / "b")])
+    assert pool.sources[0].keys == ("00000001/mug.ply", "00000002/deep/cube.ply")
+    rng = np.random.default_rng(0)
+    drawn = Counter(pool.draw(rng)[0] for _ in range(4000))
+    assert drawn[0] / 4000 == pytest.approx(0.75, abs=0.03)
+
+
+def test_hulls_stand_for_meshes_where_that_is_asked(tmp_path: Path) -> None:
+    source = open_pool([str(_folder(tmp_path, ("l_bracket",)))]).sources[0]
+    found = read_object(source, source.keys[0], HULLS)
+    assert len(found.parts.parts) == 1
+    low, high = found.parts.parts[0].min(axis=0), found.parts.parts[0].max(axis=0)
+    assert np.allclose([low, high], found.mesh.bounds)
+
+
+def test_convex_parts_are_kept_by_content_whatever_the_size(tmp_path: Path) -> None:
+    source = open_pool([str(_folder(tmp_path / "m", ("cube",)))]).sources[0]
+    first = read_object(source, source.keys[0], PoolConfig(), tmp_path / "cache")
+    kept = sorted((tmp_path / "cache").iterdir())
+    again = read_object(source, source.keys[0], PoolConfig(), tmp_path / "cache")
+    assert len(kept) == 1
+    assert sorted((tmp_path / "cache").iterdir()) == kept
+    assert np.array_equal(first.parts.parts[0], again.parts.parts[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("torn.ply", b"ply\nformat ascii 1.0\nelement vertex 9\n", "torn.ply"),
+        ("empty.stl", b"", "empty"),
+        ("flat.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n", "is flat"),
+        ("point.obj", b"v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "no extent"),
+    ],
+)
+def test_a_mesh_that_cannot_be_used_is_named(
+    tmp_path: Path, name: str, content: bytes, words: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    source = open_pool([str(tmp_path)]).sources[0]
+    with pytest.raises(InputError, match=words):
+        read_object(source, name, HULLS)
+
+
+def test_a_mesh_that_is_too_large_is_named_before_it_is_read(tmp_path: Path) -> None:
+    (tmp_path / "huge.stl").write_bytes(bytes(2_000_000))
+    source = open_pool([str(tmp_path)]).sources[0]
+    with pytest.raises(InputError, match=r"2 MB; up to 1 MB"):
+        read_object(source, "huge.stl", PoolConfig(most_mb=1.0))
+    _folder(tmp_path, ("mug",))
+    with pytest.raises(InputError, match="triangles; up to 100"):
+        read_object(source, "mug.ply", PoolConfig(most_faces=100))
+
+
+@pytest.mark.parametrize("text", ["nowhere", "nowhere=2"])
+def test_a_pool_that_is_not_there_is_refused(text: str) -> None:
+    with pytest.raises(InputError, match=r"no folder; 'pybullet'"):
+        open_pool([text])
+
+
+def test_a_folder_without_meshes_is_refused_and_says_what_it_holds(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no mesh \(it holds nothing\)"):
+        open_pool([str(tmp_path)])
+    (tmp_path / "readme.md").write_text("x")
+    with pytest.raises(InputError, match=r"no mesh \(it holds readme.md\)"):
+        open_pool([str(tmp_path)])
+
+
+@pytest.mark.parametrize("weight", ["0", "-1", "nan", "inf"])
+def test_a_weight_that_is_not_positive_is_refused(weight: str) -> None:
+    with pytest.raises(InputError, match="not positive"):
+        open_pool([f"pybullet={weight}"])
