@@ -109,7 +109,8 @@ def _gl_caster(placed, i: CameraIntrinsics):
     except Exception:
         return None
     program = context.program(
-        vertex_shader="#version 330\nuniform mat4 M; in vec3 p; void main(){gl_Position=M*vec4(p,1);}",
+        vertex_shader="#version 330\nuniform mat4 M; in vec3 p; "
+        "void main(){gl_Position=M*vec4(p,1);}",
         fragment_shader="#version 330\nuniform int id; out int c; void main(){c=id;}",
     )
     ids = context.texture((i.width, i.height), 1, dtype="i4")

@@ -62,7 +62,9 @@ def real_masks(seed: int, quick: bool) -> Found:
     """Return the mean distance of mask outlines from image edges on real frames."""
     found = Found()
     if not (DATA / "scenes/ycbv_mini").is_dir():
-        found.notes.append(f"no ycbv_mini under {DATA} (set REALSIM_DATA): boundary_px_real not run")
+        found.notes.append(
+            f"no ycbv_mini under {DATA} (set REALSIM_DATA): boundary_px_real not run"
+        )
         return found
     rows: dict[str, list[Array]] = {"registered": [], "network": [], "registered, shifted": []}
     tried = 0
@@ -70,7 +72,7 @@ def real_masks(seed: int, quick: bool) -> Found:
     # Scenes 52 and 53 have no pose of their own: registration starts from the published ones there.
     scenes = MATCHING[:1] if quick else (*MATCHING, *SHIFTED)
     for scene_id in scenes:
-        camera, gray, frame_masks, network_masks = frame_masks_of(scene_id)
+        gray, frame_masks, network_masks = frame_masks_of(scene_id)
         offsets = [outline_offsets(gray, m) for m in frame_masks]
         mine = np.concatenate([o for o, _ in offsets])
         tried += sum(n for _, n in offsets)
@@ -80,8 +82,8 @@ def real_masks(seed: int, quick: bool) -> Found:
             outline_offsets(gray, np.roll(m, 3, axis=1))[0] for m in frame_masks
         ]
         said.append(
-            f"{scene_id}: {np.abs(mine).mean():.2f}, {100 * np.mean(np.abs(mine) <= 1):.0f} % within "
-            f"1 px, median {np.median(mine):+.2f}"
+            f"{scene_id}: {np.abs(mine).mean():.2f}, {100 * np.mean(np.abs(mine) <= 1):.0f} % "
+            f"within 1 px, median {np.median(mine):+.2f}"
         )
     means = {k: float(np.abs(np.concatenate(v)).mean()) for k, v in rows.items()}
     n = sum(len(o) for o in rows["registered"])
@@ -97,7 +99,7 @@ def real_masks(seed: int, quick: bool) -> Found:
 
 
 def frame_masks_of(scene_id: int):
-    """Return camera, grey photograph and the visible masks at registered and network poses."""
+    """Return the grey photograph and the visible masks at registered and network poses."""
     import cv2
 
     intrinsics, _, models, _, network = ycbv_frame(scene_id)
@@ -111,4 +113,4 @@ def frame_masks_of(scene_id: int):
         ]
         labels = LabelRenderer(placed).render(intrinsics, np.eye(4))
         masks.append([labels.visible(k) for k in range(len(placed))])
-    return intrinsics, gray, *masks
+    return gray, *masks

@@ -8,7 +8,7 @@ from realsim.geometry.mesh import symmetry_transforms
 from realsim.geometry.metrics import mssd
 from realsim.geometry.parts import part
 from realsim.registration.register import DepthFrame, register_scene
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 
 rng = np.random.default_rng(0)

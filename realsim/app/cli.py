@@ -12,6 +12,7 @@ from realsim import __version__
 from realsim.app.annotate_cli import annotate_command
 from realsim.app.cli_capture import CAPTURE_COMMANDS
 from realsim.app.cli_scan import SCAN
+from realsim.app.depth_fit_cli import depth_fit
 from realsim.app.generate_cli import generate_command
 from realsim.app.option_values import numbers_of
 from realsim.app.register_cli import register_command
@@ -195,6 +196,7 @@ commands.add_command(register_command)
 commands.add_command(annotate_command)
 commands.add_command(render_command)
 commands.add_command(generate_command)
+commands.add_command(depth_fit)
 
 
 def main() -> None:

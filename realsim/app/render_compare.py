@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from realsim.formats.bop_labels import mask_path
 from realsim.geometry.metrics import mask_iou
-from realsim.rendering.depth_profiles import profile
-from realsim.rendering.depth_statistics import hole_share, local_noise
+from realsim.rendering.depth_sensors.profiles import profile
+from realsim.rendering.depth_sensors.statistics import hole_share, local_noise
 from realsim.store import SessionStore
 
 Mask = NDArray[np.bool_]

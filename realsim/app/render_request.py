@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Scene
-from realsim.rendering.depth_profiles import PROFILES
+from realsim.rendering.depth_sensors.profiles import PROFILES
 from realsim.store import SessionStore
 from realsim_sim_bridge.synthetic.cameras import hemisphere_cameras
 from realsim_sim_bridge.synthetic.config import SyntheticConfig

@@ -36,7 +36,7 @@ from realsim.registration.simulated_layout import (
     scatter_objects,
     with_found_symmetries,
 )
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.rays import BACKGROUND, PlacedMesh, RayScene, rotated
 from realsim.store.arrays_on_disk import is_whole, read_arrays, write_arrays
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Mesh
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 
 Array = NDArray[np.float64]
 T_EE_CAM = se3.from_translation([0.0, -0.065, 0.035])

@@ -19,10 +19,10 @@ from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment
+from realsim.rendering.casting.pixel_caster import PixelCaster
 from realsim.rendering.developing import developed
-from realsim.rendering.environment_view import EnvironmentRenderer, LightSampling
-from realsim.rendering.materials import Surface, check_projection
-from realsim.rendering.pixel_caster import PixelCaster
+from realsim.rendering.embedded.environment_view import EnvironmentRenderer, LightSampling
+from realsim.rendering.embedded.materials import Surface, check_projection
 from realsim.rendering.rays import PlacedMesh, RayScene, rotated
 
 __all__ = ["Environment", "LightSampling", "Lighting", "Photo", "PhotoRenderer", "PlacedMesh"]

@@ -21,7 +21,7 @@ from realsim.registration.simulated_lab import (
     offset,
     table_square,
 )
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 
 Array = NDArray[np.float64]
 __all__ = [

@@ -127,7 +127,7 @@ def test_true_board_corners_project_onto_the_tags_in_the_picture():
 
 
 def test_depth_agrees_with_the_true_scene_within_the_sensors_noise(lab):
-    from realsim.rendering.depth_sensor import DepthSensorModel
+    from realsim.rendering.depth_sensors.model import DepthSensorModel
     from realsim.rendering.labels import LabelRenderer
     from realsim.rendering.rays import PlacedMesh
 

@@ -26,7 +26,7 @@ from realsim.registration.simulated import (
     scatter_objects,
     table_scene,
 )
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from table_scenes import SMALL_LAB, part_models, small_scene
 
 Array = NDArray[np.float64]

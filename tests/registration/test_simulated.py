@@ -37,7 +37,7 @@ from realsim.registration.simulated_faults import (
     without_depth_on,
 )
 from realsim.registration.simulated_lab import camera_of, sensor_of
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from table_scenes import named_scene, part_models, small_scene, with_found_symmetries
 
 NO_ERRORS = {"hand_eye_mm": 0.0, "hand_eye_deg": 0.0, "arm_mm": 0.0, "arm_deg": 0.0}

@@ -7,7 +7,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=320, fy=320, cx=159.5, cy=119.5)
 EXACT = DepthSensorModel.noiseless()

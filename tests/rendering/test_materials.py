@@ -8,7 +8,7 @@ from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.developing import developed, srgb_decoded, srgb_encoded
-from realsim.rendering.materials import box_uv
+from realsim.rendering.embedded.materials import box_uv
 from realsim.rendering.photo import Lighting, PhotoRenderer, PlacedMesh
 
 VIEW = CameraIntrinsics(

@@ -5,8 +5,8 @@ import pytest
 
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
+from realsim.rendering.casting.pixel_caster import PixelCaster, body_of
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from realsim.rendering.pixel_caster import PixelCaster, body_of
 from realsim.rendering.rays import RayScene, rotated
 
 SIZE = (320, 240)

@@ -15,7 +15,7 @@ from realsim.geometry.parts import part, part_names
 from realsim.models.resting import resting_orientations
 from realsim.records import Mesh, SupportPlane
 from realsim.registration.evidence import Cloud
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.scanning.scale.height_maps import HeightMapConfig, height_map
 from realsim.scanning.scale.result import Similarity
 from realsim.scanning.scale.starts import StartsConfig, find_starts, starts_near

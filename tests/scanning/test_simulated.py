@@ -11,7 +11,7 @@ from realsim.geometry.camera import ray_table
 from realsim.geometry.mesh import to_trimesh
 from realsim.geometry.parts import object_model, part
 from realsim.records import Mesh
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.scanning.simulated import (
     DISC_M,
     EDGES_PER_LENGTH,

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from realsim import CameraIntrinsics, GraspSet, Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.geometry import se3
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh
 from realsim.rendering.rays import BACKGROUND
 from realsim_sim_bridge.annotation.config import AnnotationConfig, OccluderConfig

@@ -15,7 +15,7 @@ from realsim.geometry.depth import points_from_depth
 from realsim.geometry.mesh import vertex_normals
 from realsim.geometry.parts import object_model
 from realsim.records import Mesh, SupportPlane
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.rays import PlacedMesh, RayScene, rotated
 from realsim.scanning.scale.result import Limit, ScaleFit, Similarity, ViewAgreement
 from realsim.scanning.simulated import ScanLabConfig, ScanViews, scan_views, standing

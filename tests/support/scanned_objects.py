@@ -14,7 +14,7 @@ from realsim.geometry import se3
 from realsim.geometry.parts import object_model
 from realsim.records import Mesh
 from realsim.registration.evidence import DepthFrame, measure_noise
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.evidence import ScanEvidence, gather_scan
 from realsim.scanning.scale.fit import fit_scale

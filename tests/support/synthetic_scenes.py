@@ -18,7 +18,7 @@ from realsim import (
 from realsim.formats.bop_models import save_models
 from realsim.geometry import se3
 from realsim.rendering.appearance import Environment, Material
-from realsim.rendering.depth_sensor import DepthSensorModel
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore, save_scene

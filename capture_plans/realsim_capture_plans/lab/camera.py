@@ -111,7 +111,7 @@ class SimulatedDepthCamera:
         self, depth_m: NDArray[np.float32], rng: np.random.Generator
     ) -> NDArray[np.float32]:
         """Return the depth (H, W) [m] as the sensor measures it, in whole counts."""
-        from realsim.rendering.depth_sensor import DepthSensorModel
+        from realsim.rendering.depth_sensors.model import DepthSensorModel
 
         sensor = DepthSensorModel() if self._config.depth_noise else DepthSensorModel.noiseless()
         sensor = replace(sensor, bias_px=self._config.disparity_bias_px)

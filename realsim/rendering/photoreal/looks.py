@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from realsim.rendering.appearance import LEAST_ROUGHNESS, Material
 from realsim.rendering.developing import srgb_decoded
-from realsim.rendering.materials import PLAIN_COLORS, speckle_texture, wood_texture
-from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim.rendering.surface_table import (
+from realsim.rendering.embedded.materials import PLAIN_COLORS, speckle_texture, wood_texture
+from realsim.rendering.embedded.surface_table import (
     OBJECT_ROUGHNESS,
     TABLE_ROUGHNESS,
     check_projection,
 )
+from realsim.rendering.rays import BACKGROUND, PlacedMesh
 
 UInt8 = NDArray[np.uint8]
 Bsdf = dict[str, Any]

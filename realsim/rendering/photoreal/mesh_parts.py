@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.rendering.appearance import Material
 from realsim.rendering.developing import srgb_decoded
-from realsim.rendering.materials import box_uv, corner_normals, repeats
+from realsim.rendering.embedded.materials import box_uv, corner_normals, repeats
 from realsim.rendering.rays import GRID_M, PlacedMesh, rotated
 
 Array = NDArray[np.float64]

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment
-from realsim.rendering.depth_noise import correlated
-from realsim.rendering.depth_profiles import DepthProfile
-from realsim.rendering.pixel_caster import FirstHits, PixelCaster
+from realsim.rendering.casting.pixel_caster import FirstHits, PixelCaster
+from realsim.rendering.depth_sensors.noise import correlated
+from realsim.rendering.depth_sensors.profiles import DepthProfile
 from realsim.rendering.rays import PlacedMesh
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.eyes import Projector, exposed, no_projector, radiance

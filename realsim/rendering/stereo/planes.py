@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Material
-from realsim.rendering.depth_profiles import DepthProfile
+from realsim.rendering.depth_sensors.profiles import DepthProfile
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.rendering.stereo.camera import StereoCamera
 from realsim.rendering.stereo.config import StereoConfig

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.rendering.depth_noise import correlated
+from realsim.rendering.depth_sensors.noise import correlated
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.shading import SHADOW_SLACK
 

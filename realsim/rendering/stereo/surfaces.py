@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from realsim.records import Mesh
 from realsim.rendering.appearance import Material
-from realsim.rendering.materials import corner_normals, speckle_texture, wood_texture
+from realsim.rendering.embedded.materials import corner_normals, speckle_texture, wood_texture
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.rendering.stereo.light import LUMINANCE, MAP_ROUGHNESS
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from realsim.errors import InputError
-from realsim.rendering.depth_profiles import profile
+from realsim.rendering.depth_sensors.profiles import profile
 from realsim_sim_bridge.annotation.config import MAPS, checked_maps
 
 Renderer = Literal["embedded", "photoreal"]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.formats import images
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_profiles import profile
+from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.photo import Photo
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
@@ -153,7 +153,7 @@ class _Disparity:
     """The noise model on exact disparity."""
 
     def __init__(self, config: SyntheticConfig) -> None:
-        from realsim.rendering.depth_sensor import DepthSensorModel
+        from realsim.rendering.depth_sensors.model import DepthSensorModel
 
         self._model = DepthSensorModel.from_profile(profile(config.profile))
 

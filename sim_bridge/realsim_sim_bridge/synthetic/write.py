@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, GraspSet, View
-from realsim.rendering.triangle_rays import solid_angle_share
+from realsim.rendering.casting.triangle_rays import solid_angle_share
 from realsim.store import SessionStore, save_scene
 from realsim.store.lock import only_run_in
 from realsim_sim_bridge.annotation.summary import AnnotationSummary

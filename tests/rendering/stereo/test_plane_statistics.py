@@ -5,8 +5,8 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_noise import correlated
-from realsim.rendering.depth_profiles import profile
+from realsim.rendering.depth_sensors.noise import correlated
+from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.stereo import StereoConfig, disparity_statistics, plane_statistics
 
 CAMERA = CameraIntrinsics(width=240, height=180, fx=400, fy=400, cx=119.5, cy=89.5)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_profiles import profile
+from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.stereo import StereoCamera, StereoConfig, grey_plane, plane_statistics
 
 CAMERA = CameraIntrinsics(width=360, height=240, fx=640, fy=640, cx=179.5, cy=119.5)

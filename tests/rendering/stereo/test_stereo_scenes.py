@@ -9,7 +9,7 @@ from realsim.errors import InputError
 from realsim.geometry import camera as lens
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Material
-from realsim.rendering.depth_profiles import profile
+from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import PlacedMesh
 from realsim.rendering.stereo import (

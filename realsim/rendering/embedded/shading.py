@@ -10,8 +10,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.rendering.sky_light import SkyArrays, lobe_at
-from realsim.rendering.surface_table import SurfacePoints
+from realsim.rendering.embedded.sky_light import SkyArrays, lobe_at
+from realsim.rendering.embedded.surface_table import SurfacePoints
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

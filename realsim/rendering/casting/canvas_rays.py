@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from realsim.geometry import camera
 from realsim.records import CameraIntrinsics
-from realsim.rendering.pixel_caster import ProjectedMesh
-from realsim.rendering.triangle_rays import count_outside
+from realsim.rendering.casting.pixel_caster import ProjectedMesh
+from realsim.rendering.casting.triangle_rays import count_outside
 
 Array32 = NDArray[np.float32]
 CANVAS = 1

@@ -15,25 +15,25 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import camera
 from realsim.records import CameraIntrinsics
-from realsim.rendering import bounce_light
 from realsim.rendering.appearance import Environment
-from realsim.rendering.edge_samples import (
+from realsim.rendering.casting.pixel_caster import PixelCaster
+from realsim.rendering.embedded import bounce_light
+from realsim.rendering.embedded.edge_samples import (
     borrow_light,
     busy_pixels,
     edge_filtered,
     pixel_lattice,
 )
-from realsim.rendering.pixel_caster import PixelCaster
-from realsim.rendering.rays import HitBuffer, PlacedMesh, RayScene
-from realsim.rendering.shading import MIRROR_UNTIL, shade
-from realsim.rendering.sky_light import SkyArrays, background_level, map_at, sky_arrays
-from realsim.rendering.surface_table import (
+from realsim.rendering.embedded.shading import MIRROR_UNTIL, shade
+from realsim.rendering.embedded.sky_light import SkyArrays, background_level, map_at, sky_arrays
+from realsim.rendering.embedded.surface_table import (
     SurfacePoints,
     empty_points,
     fill_points,
     surface_arrays,
 )
-from realsim.rendering.view_rays import world_rays
+from realsim.rendering.embedded.view_rays import world_rays
+from realsim.rendering.rays import HitBuffer, PlacedMesh, RayScene
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

@@ -9,9 +9,9 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.rendering.sky_light import SkyArrays, coarse_at, map_at
-from realsim.rendering.surface_table import SurfaceArrays, SurfacePoints
-from realsim.rendering.texture_atlas import TextureArrays, texture_at
+from realsim.rendering.embedded.sky_light import SkyArrays, coarse_at, map_at
+from realsim.rendering.embedded.surface_table import SurfaceArrays, SurfacePoints
+from realsim.rendering.embedded.texture_atlas import TextureArrays, texture_at
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

@@ -12,8 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
+from realsim.rendering.casting.triangle_rays import (
+    cast_triangles,
+    project_vertices,
+    solid_angle_share,
+)
 from realsim.rendering.rays import PlacedMesh
-from realsim.rendering.triangle_rays import cast_triangles, project_vertices, solid_angle_share
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

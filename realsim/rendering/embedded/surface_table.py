@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.rendering.appearance import LEAST_ROUGHNESS, Material
 from realsim.rendering.developing import srgb_decoded
-from realsim.rendering.materials import (
+from realsim.rendering.embedded.materials import (
     PLAIN_COLORS,
     box_uv,
     check_projection,
@@ -19,13 +19,13 @@ from realsim.rendering.materials import (
     speckle_texture,
     wood_texture,
 )
-from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim.rendering.texture_atlas import (
+from realsim.rendering.embedded.texture_atlas import (
     MOST_PROBES,
     TextureArrays,
     TextureAtlas,
     texture_at,
 )
+from realsim.rendering.rays import BACKGROUND, PlacedMesh
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

@@ -1,0 +1,1 @@
+"""What pixel rays meet: triangle by triangle, exact, in the raw image."""

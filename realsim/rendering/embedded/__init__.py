@@ -1,0 +1,1 @@
+"""The renderer that is always there: surfaces, light and edges of its photographs."""

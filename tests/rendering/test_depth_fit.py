@@ -1,0 +1,210 @@
+"""What a depth sensor was is what a fit to its pictures of a plane says, or says it cannot."""
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.records import CameraIntrinsics
+from realsim.rendering.depth_sensors.fit import FittedDepthModel, fit_depth_model
+from realsim.rendering.depth_sensors.fit_picture import fit_picture
+from realsim.rendering.depth_sensors.model import DepthSensorModel
+from realsim.rendering.depth_sensors.plane import find_plane
+from realsim.rendering.depth_sensors.statistics import disparity_step, hole_share, local_noise
+
+CAMERA = CameraIntrinsics(width=400, height=300, fx=380, fy=380, cx=199.5, cy=149.5)
+SOFT = DepthSensorModel.from_profile(
+    "d405", disparity_noise_px=0.05, correlation_px=1.2, blobs_per_megapixel=80, blob_radius_px=4.0
+)
+
+
+def wall(z: float, tilt_u: float = 0.3, tilt_v: float = 0.2) -> np.ndarray:
+    """Return the exact depth of a plane with the normal (tilt_u, tilt_v, 1)."""
+    v, u = np.mgrid[:300, :400]
+    return (z / (1 + tilt_u * (u - 199.5) / 380 + tilt_v * (v - 149.5) / 380)).astype(np.float32)
+
+
+WALLS = (wall(0.3, 0.3, 0.2), wall(0.38, -0.2, 0.3), wall(0.5, 0.1, -0.3))
+
+
+@lru_cache
+def fitted(model: DepthSensorModel, kind: str = "d405") -> FittedDepthModel:
+    frames = [model.measure(w, CAMERA, np.random.default_rng(k)) for k, w in enumerate(WALLS)]
+    return fit_depth_model(frames, CAMERA, kind)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        DepthSensorModel.from_profile("d405"),
+        SOFT,
+        pytest.param(
+            DepthSensorModel.from_profile("d405", correlation_px=2.5, correlation_aspect=0.6),
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            DepthSensorModel.from_profile("d405", correlation_px=0.0, quantum_px=1 / 16),
+            marks=pytest.mark.slow,
+        ),
+    ],
+    ids=["d405", "soft", "stretched", "white"],
+)
+def test_parameters_are_recovered_within_their_uncertainty(model: DepthSensorModel) -> None:
+    fit = fitted(model)
+    for name in ("disparity_noise_px", "correlation_px", "correlation_aspect", "quantum_px",
+                 "slow_noise_px", "column_band_px", "native_pitch_px"):  # fmt: skip
+        estimate = fit.estimates[name]
+        true = getattr(model, name)
+        assert estimate.determined, name
+        assert abs(estimate.value - true) <= 3 * estimate.uncertainty, name
+        # An uncertainty that is too great would make this law empty.
+        assert estimate.uncertainty <= max(0.15 * true, 0.3 if name == "correlation_px" else 0.04)
+    law = fit.estimates["distance_exponent"]
+    assert law.determined and abs(law.value - 2) <= 3 * law.uncertainty < 0.3
+
+
+def test_holes_without_cause_are_counted() -> None:
+    fit = fitted(SOFT)
+    for name in ("blobs_per_megapixel", "blob_radius_px"):
+        estimate = fit.estimates[name]
+        assert abs(estimate.value - getattr(SOFT, name)) <= 3 * estimate.uncertainty
+
+
+@pytest.mark.slow
+def test_a_fitted_sensor_simulates_what_it_was_fitted_to() -> None:
+    model = DepthSensorModel.from_profile("d435", disparity_noise_px=0.11, correlation_px=1.6)
+    fit = fit_depth_model(
+        [model.measure(wall(z), CAMERA, np.random.default_rng(1)) for z in (0.6, 0.9)],
+        CAMERA, "d435",
+    )  # fmt: skip
+    exact = wall(0.75)
+    real, simulated = (
+        local_noise(m.measure(exact, CAMERA, np.random.default_rng(5)), CAMERA, 0.05).median_px
+        for m in (model, fit.model)
+    )
+    assert simulated == pytest.approx(real, rel=0.05)
+
+
+@pytest.mark.slow
+def test_stripes_and_slow_noise_are_found() -> None:
+    model = DepthSensorModel.from_profile(
+        "structured_light", column_band_px=0.2, slow_noise_px=0.1, slow_correlation_px=7.0,
+        depth_unit_m=1e-4, min_z_m=0.1, band_width_px=40.0,
+    )  # fmt: skip
+    frames = [model.measure(w * 2, CAMERA, np.random.default_rng(k)) for k, w in enumerate(WALLS)]
+    found = fit_depth_model(frames, CAMERA, "structured_light", unit_m=1e-4).estimates
+    assert found["column_band_px"].value == pytest.approx(0.2, rel=0.4)
+    assert found["row_band_px"].value < 0.05
+    assert found["slow_noise_px"].value == pytest.approx(0.1, rel=0.3)
+
+
+def test_noise_of_depth_grows_with_the_square_of_depth_over_focal_length_and_baseline() -> None:
+    model = DepthSensorModel.from_profile("d405", depth_unit_m=0.0, quantum_px=0.0)
+    sigma = []
+    for z in (0.25, 0.5):
+        plane = find_plane(
+            model.measure(wall(z, 0, 0), CAMERA, np.random.default_rng(0)), CAMERA, 0.018
+        )
+        sigma.append(float(np.nanstd(plane.residual)) * plane.distance_m**2 / (380 * 0.018))
+    assert sigma[1] / sigma[0] == pytest.approx(4, rel=0.05)
+    assert sigma == pytest.approx([float(model.sigma_z(z, CAMERA)) for z in (0.25, 0.5)], rel=0.05)
+
+
+@pytest.mark.slow
+def test_bias_is_found_only_against_the_truth() -> None:
+    model = replace(SOFT, bias_px=0.25)
+    frames = [model.measure(w, CAMERA, np.random.default_rng(k)) for k, w in enumerate(WALLS)]
+    blind = fitted(model).estimates["bias_px"]
+    told = fit_depth_model(frames, CAMERA, "d405", truths=WALLS).estimates["bias_px"]
+    assert not blind.determined and blind.value == 0 and "another plane" in blind.note
+    assert abs(told.value - 0.25) <= 3 * told.uncertainty < 0.05
+
+
+@pytest.mark.slow
+def test_loss_by_obliquity_is_found_from_oblique_planes() -> None:
+    model = DepthSensorModel.from_profile(
+        "d405", grazing_from_deg=60.0, grazing_to_deg=80.0, blobs_per_megapixel=0.0, max_z_m=10.0
+    )
+    tilts = (1.4, 2.0, 2.6, 3.2)
+    frames = [
+        model.measure(np.clip(wall(0.5, 0.0, t), 0.05, 9), CAMERA, np.random.default_rng(k))
+        for k, t in enumerate(tilts)
+    ]
+    found = fit_depth_model(frames, CAMERA, "d405").estimates
+    assert found["grazing_from_deg"].determined
+    for name, true in (("grazing_from_deg", 60), ("grazing_to_deg", 80)):
+        assert abs(found[name].value - true) <= 2.5 * found[name].uncertainty < 15
+
+
+def test_what_frames_do_not_determine_is_said() -> None:
+    frame = SOFT.measure(WALLS[0], CAMERA, np.random.default_rng(0))
+    fit = fit_depth_model([frame], CAMERA, "d405")
+    assert not fit.estimates["distance_exponent"].determined
+    assert "one distance only" in fit.estimates["distance_exponent"].note
+    assert not fit.estimates["grazing_from_deg"].determined
+    assert not fit.estimates["warp_px"].determined
+    coarse = fit_depth_model([np.round(frame, 2)], CAMERA, "d405", unit_m=0.01)
+    assert not coarse.estimates["quantum_px"].determined
+    assert "hides steps" in coarse.estimates["quantum_px"].note
+    region = np.zeros(frame.shape, bool)
+    region[100:190, 150:260] = True
+    small = fit_depth_model([frame], CAMERA, "d405", regions=[region])
+    assert not small.estimates["disparity_noise_px"].determined
+    assert "squares of 64 px" in small.estimates["disparity_noise_px"].note
+
+
+def test_a_fit_is_written_drawn_and_loaded(tmp_path: Path) -> None:
+    fit = fitted(SOFT)
+    path = tmp_path / "sensor.json"
+    path.write_text(json.dumps(fit.document(), allow_nan=False))
+    assert DepthSensorModel.load(path) == fit.model
+    picture = fit_picture(fit)
+    assert picture.startswith(b"\x89PNG") and picture == fit_picture(fit)
+
+
+def test_the_step_is_found_down_to_what_the_files_can_show() -> None:
+    def step(quantum: float, unit: float) -> float:
+        model = replace(SOFT, quantum_px=quantum, depth_unit_m=unit)
+        z = model.measure(wall(0.3), CAMERA, np.random.default_rng(2))
+        return disparity_step(z, CAMERA, 0.018, unit).quantum_px
+
+    assert step(1 / 32, 1e-4) == pytest.approx(1 / 32, rel=0.005)
+    assert step(0.07, 1e-4) == pytest.approx(0.07, rel=0.005)
+    assert step(0.0, 1e-4) == 0
+    assert step(1 / 32, 1e-3) == 0
+
+
+def test_local_noise_knows_planes_and_white_noise() -> None:
+    white = replace(DepthSensorModel.noiseless(), disparity_noise_px=0.05, correlation_px=0.0)
+    exact = local_noise(wall(0.4), CAMERA, 0.018)
+    assert exact.median_px < 1e-4 and exact.windows == 292 * 392
+    noisy = white.measure(wall(0.4), CAMERA, np.random.default_rng(3))
+    assert local_noise(noisy, CAMERA, 0.018).median_px == pytest.approx(0.05, rel=0.03)
+    noisy[100:110] = 0
+    band = np.zeros((300, 400), bool)
+    band[100:120] = True
+    assert hole_share(noisy, band) == 0.5
+
+
+def test_mistakes_are_named() -> None:
+    good = SOFT.measure(WALLS[0], CAMERA, np.random.default_rng(0))
+    v, u = np.mgrid[:300, :400]
+    ball = 0.5 - 0.3 * np.sqrt(np.maximum(1 - ((u - 200) / 260) ** 2 - ((v - 150) / 260) ** 2, 0))
+    rough = np.random.default_rng(0).uniform(0.2, 1.0, (300, 400)).astype(np.float32)
+    for frames, said in (
+        ([], "no frames"),
+        ([good * 1000], "millimetres"),
+        ([(good * 1000).astype(np.uint16)], "Multiply them by the unit"),
+        ([good[:200]], "the camera 400x300"),
+        ([np.zeros_like(good)], "holds no measurement"),
+        ([rough], "no plane|bent surface"),
+        ([ball.astype(np.float32)], "bent surface|no plane"),
+    ):
+        with pytest.raises(InputError, match=said):
+            fit_depth_model(frames, CAMERA, "d405")
+    with pytest.raises(InputError, match="1 frames and 2 names"):
+        fit_depth_model([good], CAMERA, "d405", names=["a", "b"])
