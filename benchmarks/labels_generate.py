@@ -1,0 +1,53 @@
+"""How many frames of generated scenes a CPU hour gives, with every label and a photograph.
+
+Imported by `labels.py`. It runs `realsim generate` as a user does, in processes of its own, and
+counts their CPU seconds: dropping, looks, photographs, depth, labels, files.
+"""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from labels_figures import PAPER_FRAMES_PER_GPU_H, Found
+
+SIZE = "1280x720"
+
+
+def generate_cost(seed: int, quick: bool) -> Found:
+    """Return frames per CPU hour of `realsim generate` at 1280x720."""
+    scenes, views = (1, 3) if quick else (10, int(os.environ.get("LABELS_VIEWS", "256")))
+    found = Found()
+    with tempfile.TemporaryDirectory(prefix="realsim_generate_") as folder:
+        command = [
+            str(Path(sys.executable).with_name("realsim")), "generate", f"{folder}/out", "--scenes",
+            str(scenes), "--views", str(views), "--size", SIZE, "--seed", str(seed), "--workers",
+            "2", "--quiet",
+        ]  # fmt: skip
+        before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        wall = time.perf_counter() - start
+        cpu = (after.ru_utime + after.ru_stime) - (before.ru_utime + before.ru_stime)
+        out = Path(folder) / "out"
+        frames = len(list(out.glob("scene_*/rgb/*.png")))
+        size = sum(p.stat().st_size for p in out.rglob("*") if p.is_file())
+        data = json.loads((out / "dataset.json").read_text())
+        objects = [len(s["objects"]) for s in data["scenes"]]
+    if frames != scenes * views:
+        raise RuntimeError(f"{frames} photographs of {scenes} x {views} were written")
+    found.figures["generate_frames_per_cpu_h"] = 3600 * frames / cpu
+    found.over["generate_frames_per_cpu_h"] = (
+        f"{scenes} scenes x {views} views, {min(objects)} to {max(objects)} objects; {cpu:.0f} CPU "
+        f"s, {wall:.0f} s by the clock, {1e-6 * size / frames:.2f} MB a frame, all maps"
+    )
+    days = 1035 * 256 / (3600 * frames / cpu) / 24 / 2
+    found.notes.append(
+        f"1,035 scenes x 256 views at {SIZE} would take {days:.1f} days on two cores; the paper's "
+        f"rate is {PAPER_FRAMES_PER_GPU_H:.0f} frames per GPU hour, grasps included"
+    )
+    return found
