@@ -28,18 +28,15 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import argparse
 import json
-import platform
 import sys
 import time
 import traceback
 from collections.abc import Callable
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from labels_figures import FIGURES, Found
+from figures import Found, document_of, print_table
+from labels_figures import FIGURES
 
 from realsim.app.console import Console
 
@@ -69,59 +66,6 @@ def part_of(name: str) -> Callable[[int, bool], Found]:
     """Return the function that measures a part."""
     module, function = PARTS[name]
     return getattr(import_module(module), function)
-
-
-def print_table(console: Console, found: Found) -> None:
-    """Print every figure beside its goal and its rival, then what else is to be said."""
-    rows: list[list[str]] = []
-    for key, figure in FIGURES.items():
-        if key not in found.figures:
-            continue
-        value = found.figures[key]
-        bounded = "inf" not in str(figure.goal)
-        verdict = ("ok" if figure.goal.met(value) else "FELL SHORT") if bounded else ""
-        rival = "; ".join(r for r in (figure.rival, found.rivals.get(key, "")) if r)
-        goal = str(figure.goal) if bounded else ""
-        rows.append([key, f"{value:.4g}", figure.unit, goal, verdict, rival])
-    console.table("Labels and pictures", ["figure", "value", "unit", "goal", "", "rival"], rows)
-    for key, words in found.over.items():
-        console.say(f"{key}: {words}")
-    for note in found.notes:
-        console.say(note)
-
-
-def document_of(
-    arguments: argparse.Namespace, found: Found, failures: dict[str, str], seconds: float
-) -> dict[str, Any]:
-    """Return what is written; a figure that was not measured is null."""
-    values = {k: found.figures.get(k, float("nan")) for k in FIGURES}
-    return {
-        "benchmark": "labels",
-        "machine": {
-            "cpu": platform.machine(),
-            "cores": len(os.sched_getaffinity(0)),
-            "load": os.getloadavg()[0],
-        },
-        "versions": {name: _version(name) for name in PACKAGES},
-        "seed": arguments.seed,
-        "parts": arguments.parts,
-        "quick": arguments.quick,
-        "wall_s": round(seconds, 1),
-        "figures": {k: float(v) if np.isfinite(v) else None for k, v in values.items()},
-        "goals": {k: str(f.goal) for k, f in FIGURES.items()},
-        "over": found.over,
-        "rivals": found.rivals,
-        "notes": found.notes,
-        "failures": failures,
-    }
-
-
-def _version(name: str) -> str | None:
-    """Return a package's version; None = it is not installed."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 def arguments_of() -> argparse.Namespace:
@@ -158,12 +102,13 @@ def main() -> None:
             print(f"\n{name}:\n{traceback.format_exc()}", file=sys.stderr)
         console.warn(f"{name}: {time.perf_counter() - start:.0f} s")
     seconds = time.perf_counter() - begin
-    print_table(console, found)
+    print_table(console, "Labels and pictures", FIGURES, found)
     for name, why in failures.items():
         console.warn(f"the part {name} failed: {why}")
     console.say(f"{seconds:.0f} s, load {os.getloadavg()[0]:.1f}")
     if arguments.json:
-        document = document_of(arguments, found, failures, seconds)
+        document = document_of("labels", PACKAGES, FIGURES, arguments, found)
+        document |= {"wall_s": round(seconds, 1), "failures": failures}
         arguments.json.write_text(json.dumps(document, indent=1, default=str))
     if failures:
         sys.exit(1)

@@ -10,7 +10,7 @@ import sys
 import time
 
 import numpy as np
-from labels_figures import Found
+from figures import Found
 from labels_scene import camera_720p, camera_1080p, cameras, faces_of, scene
 
 from realsim.geometry import camera

@@ -6,7 +6,7 @@ Imported by `labels.py`.
 import ctypes.util
 
 import numpy as np
-from labels_figures import Found
+from figures import Found
 from labels_scene import LENS, camera_720p, cameras, scene
 
 from realsim.geometry import camera, se3

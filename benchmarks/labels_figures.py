@@ -1,19 +1,7 @@
 """What the figures of `labels.py` are, should be, and have as rivals."""
 
-from dataclasses import dataclass, field
-
 from calibration_goals import Goal
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Figure:
-    """A figure and what it should be."""
-
-    unit: str
-    goal: Goal = field(default_factory=Goal)
-    rival: str = ""
-    """A published value."""
-
+from figures import Figure
 
 PAPER_FRAMES_PER_GPU_H = 100 * 256 / (7 * 24)
 """The paper: 100 scenes of 256 views in a week on one RTX 6000, grasps included."""
@@ -38,22 +26,3 @@ FIGURES = {
     ),
 }
 """All keys, in the table's order. In every run they are in the JSON."""
-
-
-@dataclass(eq=False, kw_only=True, slots=True)
-class Found:
-    """What a part measured."""
-
-    figures: dict[str, float] = field(default_factory=dict[str, float])
-    over: dict[str, str] = field(default_factory=dict[str, str])
-    """What a figure was measured on, and other words about it."""
-    rivals: dict[str, str] = field(default_factory=dict[str, str])
-    """What a rival reached in the same run."""
-    notes: list[str] = field(default_factory=list[str])
-
-    def take(self, other: "Found") -> None:
-        """Add what another part found."""
-        self.figures |= other.figures
-        self.over |= other.over
-        self.rivals |= other.rivals
-        self.notes += other.notes

@@ -13,7 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from labels_figures import PAPER_FRAMES_PER_GPU_H, Found
+from figures import Found
+from labels_figures import PAPER_FRAMES_PER_GPU_H
 
 SIZE = "1280x720"
 

@@ -9,7 +9,7 @@ import time
 from dataclasses import replace
 
 import numpy as np
-from labels_figures import Found
+from figures import Found
 from labels_scene import camera_720p, cameras, scene
 
 from realsim.rendering.appearance import Environment

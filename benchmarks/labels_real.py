@@ -8,7 +8,7 @@ shifted by three pixels, and of those at the network's own poses.
 """
 
 import numpy as np
-from labels_figures import Found
+from figures import Found
 from numpy.typing import NDArray
 from registration_real import DATA, MATCHING, SHIFTED, registered, ycbv_frame
 

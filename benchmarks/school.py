@@ -36,21 +36,18 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import argparse
 import json
-import platform
 import sys
 import time
 import traceback
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+from figures import Found, document_of, print_table
 from school_acronym import acronym
 from school_agreement import agreement
 from school_cases import KEEP, cut_shapes, library
-from school_figures import FIGURES, Found
+from school_figures import FIGURES
 from school_margins import margins
 from school_scaling import extrapolation, scaling
 from school_speed import speed
@@ -72,30 +69,6 @@ PARTS: dict[str, Callable[[int, Path, bool], Found]] = {
 SEED = 100
 
 
-def print_table(console: Console, found: Found) -> None:
-    """Print every figure beside its goal and its rival, then what else is to be said."""
-    rows: list[list[str]] = []
-    for key in [k for k in FIGURES if k in found.figures] + [
-        k for k in found.figures if k not in FIGURES
-    ]:
-        figure, value = FIGURES.get(key), found.figures[key]
-        bounded = figure is not None and "inf" not in str(figure.goal)
-        verdict = ""
-        if figure is not None and bounded:
-            verdict = "ok" if figure.goal.met(value) else "FELL SHORT"
-        rivals = [figure.rival if figure else "", found.rivals.get(key, "")]
-        rows.append([
-            key, f"{value:.4g}", figure.unit if figure else "",
-            str(figure.goal) if figure and bounded else "", verdict,
-            "; ".join(r for r in rivals if r),
-        ])  # fmt: skip
-    console.table("Robot School", ["figure", "value", "unit", "goal", "", "rival"], rows)
-    for key, words in found.over.items():
-        console.say(f"{key}: {words}")
-    for note in found.notes:
-        console.say(note)
-
-
 def say_objects(console: Console, keep: Path, quick: bool) -> None:
     """Cut the objects, once for all runs, and print into how many convex parts."""
     start = time.perf_counter()
@@ -106,42 +79,6 @@ def say_objects(console: Console, keep: Path, quick: bool) -> None:
         f"convex parts (volume over the mesh's): {', '.join(words)}; "
         f"{time.perf_counter() - start:.0f} s"
     )
-
-
-def document_of(
-    arguments: argparse.Namespace, found: Found, failures: dict[str, str], seconds: float
-) -> dict[str, Any]:
-    """Return what is written; a figure that was not measured is null."""
-    keys = [*FIGURES, *(k for k in found.figures if k not in FIGURES)]
-    values = {k: found.figures.get(k, float("nan")) for k in keys}
-    return {
-        "benchmark": "school",
-        "machine": {
-            "cpu": platform.machine(),
-            "cores": len(os.sched_getaffinity(0)),
-            "load": os.getloadavg()[0],
-        },
-        "versions": {name: _version(name) for name in PACKAGES},
-        "seed": arguments.seed,
-        "parts": arguments.parts,
-        "quick": arguments.quick,
-        "wall_s": round(seconds, 1),
-        "figures": {k: float(v) if np.isfinite(v) else None for k, v in values.items()},
-        "goals": {k: str(f.goal) for k, f in FIGURES.items()},
-        "over": found.over,
-        "rivals": found.rivals,
-        "notes": found.notes,
-        "failures": failures,
-        "cases": found.cases,
-    }
-
-
-def _version(name: str) -> str | None:
-    """Return a package's version; None = it is not installed."""
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None
 
 
 def arguments_of() -> argparse.Namespace:
@@ -194,12 +131,13 @@ def main() -> None:
             console.warn(f"{name}: {time.perf_counter() - start:.0f} s")
     found.notes += extrapolation(found.figures)
     seconds = time.perf_counter() - begin
-    print_table(console, found)
+    print_table(console, "Robot School", FIGURES, found)
     for name, why in failures.items():
         console.warn(f"the part {name} failed: {why}")
     console.say(f"{seconds:.0f} s, load {os.getloadavg()[0]:.1f}")
     if arguments.json:
-        document = document_of(arguments, found, failures, seconds)
+        document = document_of("school", PACKAGES, FIGURES, arguments, found)
+        document |= {"wall_s": round(seconds, 1), "failures": failures}
         arguments.json.write_text(json.dumps(document, indent=1, default=str))
     if failures:
         sys.exit(1)

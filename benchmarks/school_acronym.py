@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import Found
 from numpy.typing import NDArray
 from school_conditions import PATIENT, slip_config
-from school_figures import Found
 from school_processes import in_processes
 
 from realsim.formats.acronym import read_acronym

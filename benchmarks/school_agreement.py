@@ -10,6 +10,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+from figures import Found
 from numpy.typing import NDArray
 from school_cases import (
     NamedTrial,
@@ -19,7 +20,6 @@ from school_cases import (
     school_case,
 )
 from school_conditions import CONDITIONS, MARGINAL_DENSITY, PATIENT, slip_config
-from school_figures import Found
 from school_processes import in_processes
 
 from realsim_sim_bridge.school.cross_check import wilson_interval

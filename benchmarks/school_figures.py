@@ -1,25 +1,13 @@
 """What the figures of `school.py` are, should be, and have as rivals.
 
-Imported by `school.py`. A figure that could not be measured is missing from what its part found;
-its key is null in the JSON.
+Imported by `school.py`.
 """
 
-from dataclasses import dataclass, field
-
 from calibration_goals import Goal
+from figures import Figure
 
 PAPER_GRASPS_PER_S = 100 * 2198 / (7 * 86400)
 """The paper: 100 scenes of 2198 candidates in a week on one RTX 6000."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Figure:
-    """A figure and what it should be."""
-
-    unit: str
-    goal: Goal = field(default_factory=Goal)
-    rival: str = ""
-    """A published value."""
 
 
 RATE = f"paper {PAPER_GRASPS_PER_S:.2f}, a GPU"
@@ -50,32 +38,3 @@ FIGURES = {
     "ray_nodes_scaling": Figure(unit="x"),
 }
 """All keys, in the table's order. In every run they are in the JSON."""
-
-
-@dataclass(eq=False, kw_only=True, slots=True)
-class Found:
-    """What a part measured."""
-
-    figures: dict[str, float] = field(default_factory=dict[str, float])
-    over: dict[str, str] = field(default_factory=dict[str, str])
-    """What a figure was taken over, and its interval."""
-    rivals: dict[str, str] = field(default_factory=dict[str, str])
-    """What another way gave in the same run, by the figure's key."""
-    notes: list[str] = field(default_factory=list[str])
-    """Sentences for a person."""
-    cases: dict[str, object] = field(default_factory=dict[str, object])
-    """What is kept in the JSON besides: plain values."""
-
-    def add(self, key: str, value: float, over: str = "") -> None:
-        """Note a figure."""
-        self.figures[key] = value
-        if over:
-            self.over[key] = over
-
-    def take(self, other: "Found") -> None:
-        """Put what another part measured to it."""
-        self.figures |= other.figures
-        self.over |= other.over
-        self.rivals |= other.rivals
-        self.notes += other.notes
-        self.cases |= other.cases

@@ -7,9 +7,9 @@ friction and the least force that a grasp survives, has few.
 from pathlib import Path
 
 import numpy as np
+from figures import Found
 from school_cases import candidate_config, school_case
 from school_conditions import slip_config
-from school_figures import Found
 from school_processes import spent
 
 from realsim.formats.scene_grasps import executed

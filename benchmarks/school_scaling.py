@@ -20,9 +20,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from figures import Found
 from school_cases import SchoolCase, candidate_config, school_case, tasks_of
 from school_conditions import slip_config
-from school_figures import PAPER_GRASPS_PER_S, Found
+from school_figures import PAPER_GRASPS_PER_S
 from school_processes import in_fresh_process
 
 from realsim_sim_bridge.school.cluster import ClusterConfig, ray_workers

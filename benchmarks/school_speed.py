@@ -15,12 +15,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+from figures import Found
 from school_cases import SchoolCase, candidate_config, school_case, two_boxes
 from school_conditions import (
     MARGINAL_DENSITY,
     slip_config,
 )
-from school_figures import Found
 from school_processes import PROCESSES, Spent, in_processes, spent
 
 from realsim.formats.scene_grasps import executed

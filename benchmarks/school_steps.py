@@ -9,8 +9,8 @@ joints over time of all four stages where the arm gets there.
 import time
 from pathlib import Path
 
+from figures import Found
 from school_cases import SchoolCase, candidate_config, school_case, tasks_of, two_boxes
-from school_figures import Found
 from school_processes import in_processes
 
 from realsim_sim_bridge.school.config import SchoolConfig

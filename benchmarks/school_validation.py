@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from school_figures import Found
+from figures import Found
 from school_processes import in_processes
 
 from realsim_sim_bridge.slip.bullet_settings import BulletSettings
