@@ -5,7 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from realsim.app.annotate_page import write_page
+from realsim.app.annotate_table import HEADER, object_row
 from realsim.app.console import Console
 from realsim.app.stages import (
     annotate_session,
@@ -15,19 +18,18 @@ from realsim.app.stages import (
     session_models,
 )
 from realsim.store import SessionStore
+from realsim.store.lock import only_run_in
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.annotation.annotate import AnnotationSummary
-    from realsim_sim_bridge.annotation.summary import ObjectSummary
 
-HEADER = [
-    "object", "verdict", "frames seen", "visible [%]", "agrees with depth [%]",
-    "hidden by unknown [%]", "in frames",
-]  # fmt: skip
+Image = NDArray[np.uint8]
 MOST_NOTES = 12
 """So many notes are shown; the rest are in the annotations."""
+PAGE_PICTURES = 12
+"""Frames on the page."""
 PICTURES = 8
-"""Frames on the contact sheet."""
+"""Of these, frames on the contact sheet."""
 SHEET_GRASPS = 9
 """Grasps drawn in a frame of the sheet: few, so that the outlines can be judged."""
 SHEET_FILE = "reports/annotated.png"
@@ -38,7 +40,7 @@ SHEET_WIDTH_PX = 960
 def run_annotate(
     session: Path, console: Console, *, maps: str, workers: int, check_depth: bool
 ) -> "AnnotationSummary":
-    """Annotate a session, show the summary, and draw the contact sheet.
+    """Annotate a session, show the summary, and draw the contact sheet and the page.
 
     Args:
         session: the session's folder.
@@ -48,13 +50,18 @@ def run_annotate(
         check_depth: whether the measured depth may take pixels out of the masks.
 
     Raises:
-        InputError: no session there, it is not registered, or there is no such map.
+        InputError: no session there, it is not registered, there is no such map, or another run
+            is working there.
     """
     store = open_session(session)
-    summary = annotate_session(store, console, maps=maps, workers=workers, check_depth=check_depth)
-    show_summary(summary, console)
-    path = draw_sheet(store, summary)
-    console.say(f"pictures  {path}")
+    with only_run_in(store.folder):
+        summary = annotate_session(
+            store, console, maps=maps, workers=workers, check_depth=check_depth
+        )
+        show_summary(summary, console)
+        sheet, page = draw(store, summary, console)
+    console.say(f"pictures  {sheet}")
+    console.say(f"page      {page}")
     return summary
 
 
@@ -62,59 +69,58 @@ def show_summary(summary: "AnnotationSummary", console: Console) -> None:
     """Print what was annotated: one line, a row per object, and what was noticed."""
     console.say(str(summary))
     if summary.by_object:
-        console.table("objects", HEADER, [_row(o) for o in summary.by_object])
+        console.table("objects", HEADER, [object_row(o) for o in summary.by_object])
     for note in summary.notes[:MOST_NOTES]:
         console.say(f"note: {note}")
     if len(summary.notes) > MOST_NOTES:
         console.say(f"note: and {len(summary.notes) - MOST_NOTES} more, in annotations/.")
 
 
-def _row(o: "ObjectSummary") -> list[str]:
-    """Return one object's row of the table."""
-    return [
-        f"{o.instance} {o.name}",
-        o.verdict,
-        str(o.frames_seen),
-        _percent(o.mean_visibility),
-        _percent(o.agreement, 1),
-        _percent(o.hidden_by_unknown, 1),
-        str(o.frames_hidden),
-    ]
-
-
-def _percent(share: float, digits: int = 0) -> str:
-    """Return a share in percent, or a dash where nothing was measured."""
-    return "-" if np.isnan(share) else f"{100 * share:.{digits}f}"
-
-
-def draw_sheet(store: SessionStore, summary: "AnnotationSummary") -> Path:
-    """Write reports/annotated.png: frames that are flagged first, others spread over the session.
+def draw(store: SessionStore, summary: "AnnotationSummary", console: Console) -> tuple[Path, Path]:
+    """Write the contact sheet and the page: flagged frames first, others spread over the session.
 
     Returns:
-        Where it is.
+        Where they are.
     """
-    import cv2
-
-    from realsim.rendering.overlay import contact_sheet
     from realsim.store import load_grasps
     from realsim_sim_bridge.annotation.pictures import overlay_pictures
 
     known = registered_views(store)
     views = [v.index for v in store.session.views if known is None or v.index in known]
-    chosen = sheet_views(views, summary.flagged_views)
-    grasps = load_grasps(store.folder / "grasps")
-    pictures = overlay_pictures(
-        store, chosen, judged_scene(store), session_models(store), grasps, SHEET_GRASPS
-    )
-    small: list[np.ndarray[tuple[int, ...], np.dtype[np.uint8]]] = []
+    chosen = sheet_views(views, summary.flagged_views, PAGE_PICTURES)
+    pictures: list[Image] = []
+    drawn = overlay_pictures(
+        store, chosen, judged_scene(store), session_models(store, console),
+        load_grasps(store.folder / "grasps"), SHEET_GRASPS,
+    )  # fmt: skip
+    with console.stage("pictures", f"{len(chosen)} frames") as tick:
+        for picture in drawn:
+            pictures.append(picture)
+            tick(len(pictures), len(chosen))
+    on_sheet = sheet_views(chosen, summary.flagged_views)
+    _write_sheet(store, summary, on_sheet, [pictures[chosen.index(v)] for v in on_sheet])
+    return store.path(SHEET_FILE), write_page(store, summary, chosen, pictures)
+
+
+def _write_sheet(
+    store: SessionStore,
+    summary: "AnnotationSummary",
+    views: Sequence[int],
+    pictures: Sequence[Image],
+) -> None:
+    """Write the contact sheet of these pictures."""
+    import cv2
+
+    from realsim.rendering.overlay import contact_sheet
+
+    small: list[Image] = []
     for picture in pictures:
         height = round(picture.shape[0] * SHEET_WIDTH_PX / picture.shape[1])
         size = (SHEET_WIDTH_PX, height)
         fitted = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
         small.append(np.asarray(fitted, dtype=np.uint8))
-    captions = [f"view {v}" + (": look here" if v in summary.flagged_views else "") for v in chosen]
+    captions = [f"view {v}" + (": look here" if v in summary.flagged_views else "") for v in views]
     store.write_image(SHEET_FILE, contact_sheet(small, columns=2, captions=captions))
-    return store.path(SHEET_FILE)
 
 
 def sheet_views(views: Sequence[int], flagged: Sequence[int], most: int = PICTURES) -> list[int]:

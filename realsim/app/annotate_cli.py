@@ -25,7 +25,8 @@ def annotate_command(
     a cable), it leaves the object's visible mask, and the frame is named. Frames whose inputs are
     the same as of an earlier run are kept.
 
-    Pictures of the frames that need a look first are in SESSION/reports/annotated.png.
+    SESSION/reports/annotated.html shows the frames, those that need a look first; annotated.png
+    beside it is a contact sheet of them.
     """
     from realsim.app.annotate import run_annotate
     from realsim.app.console import Console

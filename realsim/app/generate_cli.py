@@ -44,6 +44,8 @@ FOLDER = click.Path(path_type=Path)
 @click.option("--profile", default=None, metavar="NAME",
               help="Depth camera: d405, d415, d435, structured_light.  [d435; d405 in its range]"
               )  # fmt: skip
+@click.option("--depth-model", type=FOLDER, default=None, metavar="FILE",
+              help="Of `realsim depth-fit`: noise and holes as your own camera's.")  # fmt: skip
 @click.option("--hdris", type=FOLDER, default=None, help="Own panoramas (.hdr, .exr).")
 @click.option("--textures", type=FOLDER, default=None,
               help="Own textures: pictures, or a folder for each material.")  # fmt: skip
@@ -57,30 +59,40 @@ def generate_command(out: Path, scenes: int, workers: int, quiet: bool, **option
     its poses are exact. The same seed gives the same bytes; scene 7 does not depend on the others.
     Run again to go on after an interruption, or with more --scenes to add some.
 
-    Writes OUT/dataset.json and OUT/contact_sheet.png, too.
+    Writes OUT/dataset.json, OUT/contact_sheet.png and OUT/index.html, too.
 
     Exit codes: 0 done, 1 a scene could not be made, 2 bad input.
     """
     from realsim.app.console import Console
+    from realsim.app.generate_page import write_page, write_sheet
     from realsim.app.generate_run import generate
     from realsim.app.generate_tables import (
         dataset_of,
         finished_layouts,
+        notes_of,
         show,
+        summary_of,
+        tables_of,
         write_dataset,
-        write_sheet,
     )
+    from realsim.store.atomic import storing
 
     request = _request(**options)
     console = Console(quiet=quiet)
     outcome = generate(out, scenes, request, workers, console)
     layouts = finished_layouts(out, scenes, request)
     dataset = dataset_of(out, request, layouts)
-    write_dataset(out, dataset)
-    sheet = write_sheet(out, layouts, request.views.count)
+    with storing(out, "the data set's tables and pictures"):
+        write_dataset(out, dataset)
+        sheet = write_sheet(out, layouts, request.views.count)
+        page = write_page(
+            out, layouts, request.views.count, tables_of(out, dataset), summary_of(dataset),
+            notes_of(dataset, outcome),
+        )  # fmt: skip
     show(out, dataset, outcome, console)
     if sheet is not None:
         console.say(f"pictures  {sheet}")
+        console.say(f"page      {page}")
     if outcome.failed:
         sys.exit(1)
 
@@ -94,6 +106,7 @@ def _request(**options: Any) -> "GenerateRequest":
     from realsim.app.generate_request import (
         GenerateRequest,
         counts_of,
+        depth_model_of,
         radius_of,
         range_of,
         size_of,
@@ -109,6 +122,7 @@ def _request(**options: Any) -> "GenerateRequest":
         renderer=options["renderer"],
         depth=options["depth"],
         profile=options["profile"] or ("d405" if near else "d435"),
+        depth_model=depth_model_of(options["depth_model"], options["depth"]),
     )
     return GenerateRequest(
         pool=open_pool(options["pools"]),

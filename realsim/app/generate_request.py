@@ -9,6 +9,7 @@ from typing import Any
 
 from realsim import __version__
 from realsim.errors import InputError
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.store import atomic
 from realsim.store.json_files import read_object
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
@@ -19,7 +20,7 @@ from realsim_sim_bridge.table_scenes.pool import ObjectPool
 
 REQUEST_FILE = "generate.json"
 FORMAT = 1
-RESULTS_VERSION = 1
+RESULTS_VERSION = 2
 """Raised whenever the same request gives other scenes."""
 
 
@@ -108,6 +109,21 @@ def counts_of(option: str, text: str) -> tuple[int, int]:
     if few != int(few) or many != int(many):
         raise InputError(f"{option} '{text}': whole numbers are accepted, such as 10-20.")
     return int(few), int(many)
+
+
+def depth_model_of(path: Path | None, depth: str) -> DepthSensorModel | None:
+    """Return the fitted camera of `--depth-model`; None = the profile's figures.
+
+    Raises:
+        InputError: the file is no such model, or another kind of depth was asked for.
+    """
+    if path is None:
+        return None
+    if depth != "disparity":
+        raise InputError(
+            f"--depth-model is for --depth disparity, and --depth is {depth}. Leave one away."
+        )
+    return DepthSensorModel.load(path)
 
 
 def radius_of(name: str, radius: str | None) -> tuple[float, float]:

@@ -9,8 +9,10 @@ from realsim.app.console import Console
 from realsim.app.generate_request import GenerateRequest, claim
 from realsim.app.generate_scene import SceneCosts, is_finished, make_scene
 from realsim.errors import RealsimError
+from realsim.store.atomic import StorageError
 from realsim.store.lock import only_run_in
-from realsim_sim_bridge.school.workers import local_workers
+from realsim_sim_bridge.school.workers import WorkerDiedError, local_workers
+from realsim_sim_bridge.synthetic.frame import require_renderer
 from realsim_sim_bridge.table_scenes.scene import scene_name
 
 POLL_S = 1.0
@@ -37,8 +39,11 @@ def generate(
     A scene's bytes depend on the request and its number only, not on `workers`.
 
     Raises:
-        InputError: the folder holds something else, or another run works in it.
+        InputError: the folder holds something else, another run works in it, or the renderer is
+            not installed.
+        StorageError: the disk is full, or refuses; the same request goes on from there.
     """
+    require_renderer(request.rendering)
     claim(out, request)
     with only_run_in(out):
         kept = [k for k in range(scenes) if is_finished(out, k, request)]
@@ -78,6 +83,10 @@ def _made(
                 k = under_way.pop(future)
                 try:
                     made.append(future.result())
+                except StorageError:
+                    raise  # the next scenes would fall as this one, and then find no room either
+                except WorkerDiedError as error:
+                    failed[k] = f"{error}. Run the same command again: it goes on from here."
                 except RealsimError as error:
                     failed[k] = str(error)
             tick()

@@ -2,7 +2,7 @@
 
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,10 @@ class SceneCosts:
     """Photographs, depth and labels of all views, and their files."""
     rendered: int = 0
     """Views rendered by this run."""
+    parts: dict[str, float] = field(default_factory=dict[str, float])
+    """CPU time per frame by part [s]: rgb, depth, write, labels."""
+    notes: tuple[str, ...] = ()
+    """What the renderer wants a person to know: that it is slower than it could be, say."""
 
 
 def layout_path(out: Path, number: int) -> Path:
@@ -82,6 +86,7 @@ def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 
 
     Raises:
         InputError: the pool or the cameras cannot be used.
+        StorageError: the disk is full, or refuses.
     """
     began = _cpu_s()
     cache = out / CACHE
@@ -89,7 +94,8 @@ def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 
         layout = load_layout(out, number)
     else:
         layout = sample_layout(request.seed, number, request.pool, request.scene, cache)
-        atomic.write_json(layout_path(out, number), layout_to_json(layout))
+        with atomic.storing(out, f"the layout of {scene_name(number)}"):
+            atomic.write_json(layout_path(out, number), layout_to_json(layout))
     built = build_scene(
         layout, request.pool, request.scene, own=request.looks,
         farthest_m=request.views.radius_m[1], cache=cache,
@@ -100,7 +106,8 @@ def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 
     )
     noise = int(generator(request.seed, number, "noise").integers(2**31))
     with tempfile.TemporaryDirectory(prefix="realsim_models_") as models:
-        write_models(Path(models), built)
+        with atomic.storing(Path(models), "the scene's models"):
+            write_models(Path(models), built)
         summary = write_session(
             out / scene_name(number), built.synthetic,
             intrinsics_of(request.rendering.profile, request.views.size), Ts_table_cam,
@@ -108,9 +115,11 @@ def make_scene(out: Path, number: int, request: GenerateRequest, workers: int = 
         )  # fmt: skip
     costs = SceneCosts(
         number=number, physics_s=between - began, rendering_s=_cpu_s() - between,
-        rendered=summary.rendered,
+        rendered=summary.rendered, parts=summary.cpu_s,
+        notes=summary.notes,
     )  # fmt: skip
-    atomic.write_json(finished_path(out, number), {"key": request.key, "costs": asdict(costs)})
+    with atomic.storing(out, f"the note that {scene_name(number)} is finished"):
+        atomic.write_json(finished_path(out, number), {"key": request.key, "costs": asdict(costs)})
     return costs
 
 

@@ -1,4 +1,4 @@
-"""What generated scenes are like: dataset.json, tables for people, a contact sheet."""
+"""What generated scenes are like: dataset.json, tables for people."""
 
 from collections import Counter
 from importlib.metadata import version
@@ -12,22 +12,17 @@ from realsim.app.console import Console
 from realsim.app.generate_request import GenerateRequest
 from realsim.app.generate_run import GenerateOutcome
 from realsim.app.generate_scene import is_finished, load_layout, stored_costs
-from realsim.formats.images import read_rgb
+from realsim.app.picture_pages import Table
 from realsim.store import atomic
 from realsim.store.json_files import read_object
 from realsim_sim_bridge.table_scenes.layout import Layout
 from realsim_sim_bridge.table_scenes.scene import scene_name
 
 DATASET_FILE = "dataset.json"
-SHEET_FILE = "contact_sheet.png"
 LIBRARIES = ("numpy", "scipy", "pybullet", "open3d-cpu")
 """Whose versions decide on bytes."""
 BANDS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 """Borders of the visibility table."""
-SHEET_PICTURES = 24
-"""Pictures on the contact sheet at most."""
-SHEET_WIDTH_PX = 480
-"""Of each picture."""
 
 
 def finished_layouts(out: Path, scenes: int, request: GenerateRequest) -> list[Layout]:
@@ -127,76 +122,113 @@ def _spread(values: list[float]) -> dict[str, float]:
 # --- for people -------------------------------------------------------------------------------
 
 
-def show(out: Path, dataset: dict[str, Any], outcome: GenerateOutcome, console: Console) -> None:
-    """Print the scenes, the statistics, and what went wrong."""
-    made = {c.number for c in outcome.made}
+LOST = "lost: fell off / hung over the rim / never rested. Times are CPU seconds."
+SCENES_HEADER = ["scene", "table", "objects", "lost", "moves [mm]", "sunk [mm]", "visible",
+                 "physics [s]", "views [s]"]  # fmt: skip
+
+
+def scene_rows(out: Path, dataset: dict[str, Any]) -> list[list[str]]:
+    """Return a row per scene: what stayed on its table, how much is seen, and CPU seconds."""
     rows: list[list[str]] = []
     for scene in dataset["scenes"]:
-        number = int(scene["name"].rpartition("_")[2])
-        costs = stored_costs(out, number)
+        costs = stored_costs(out, _number(scene))
         lost = [len(scene[k]) for k in ("fell", "overhung", "restless")]
         figures = scene["figures"]
         rows.append(
             [scene["name"], scene["table"], str(len(scene["objects"])),
              "/".join(map(str, lost)), f"{figures['moved_mm']:.2f}",
              f"{figures['penetration_mm']:.2f}", _percent(scene["mean_visibility"]),
-             f"{costs.get('physics_s', 0.0):.0f}", f"{costs.get('rendering_s', 0.0):.0f}",
-             "made" if number in made else "kept"]
+             f"{costs.get('physics_s', 0.0):.0f}", f"{costs.get('rendering_s', 0.0):.0f}"]
         )  # fmt: skip
-    console.table(
-        "Generated scenes",
-        ["scene", "table", "objects", "lost", "moves [mm]", "sunk [mm]", "visible", "physics [s]",
-         "views [s]", ""],
-        rows,
-    )  # fmt: skip
-    s = dataset["statistics"]
-    seen = s["visibility"]
-    bands = [
-        [f"{100 * a:.0f} - {100 * b:.0f} %", str(n), _percent(n / max(1, seen["labels"]))]
+    return rows
+
+
+def _number(scene: dict[str, Any]) -> int:
+    return int(scene["name"].rpartition("_")[2])
+
+
+def visibility_rows(dataset: dict[str, Any]) -> list[list[str]]:
+    """Return a row per band of visibility: labels in it, and their share."""
+    seen = dataset["statistics"]["visibility"]
+    if not seen["labels"]:
+        return []
+    return [
+        [f"{100 * a:.0f} - {100 * b:.0f} %", str(n), _percent(n / seen["labels"])]
         for a, b, n in zip(BANDS[:-1], BANDS[1:], seen["counts"], strict=True)
     ]
-    console.table("Visibility of objects in views", ["visible", "labels", "share"], bands)
-    for reason in sorted({r for scene in dataset["scenes"] for r in scene["skipped"]})[:5]:
-        console.warn(f"skipped: {reason}")
-    for number, why in outcome.failed.items():
-        console.warn(f"{scene_name(number)} could not be made: {why}")
-    console.say(
-        f"{s['scenes']} scenes, {s['views']} views, {s['instances']} objects of "
-        f"{s['distinct_objects']} kinds on {len(s['tables'])} kinds of tables; "
+
+
+def cost_rows(out: Path, dataset: dict[str, Any]) -> list[list[str]]:
+    """Return a row per part of a frame: CPU seconds, and its share, over the scenes' frames."""
+    total: dict[str, float] = {}
+    frames = 0
+    for scene in dataset["scenes"]:
+        costs = stored_costs(out, _number(scene))
+        parts, rendered = costs.get("parts", {}), int(costs.get("rendered", 0))
+        if not parts or not rendered:
+            continue
+        frames += rendered
+        for name, value in parts.items():
+            total[name] = total.get(name, 0.0) + rendered * float(value)
+    whole = sum(total.values())
+    return [
+        [name, f"{value / frames:.2f}", _percent(value / max(whole, 1e-9))]
+        for name, value in total.items()
+    ]
+
+
+def tables_of(out: Path, dataset: dict[str, Any]) -> list[Table]:
+    """Return every table of a data set; empty ones are left out."""
+    tables = [
+        Table(title="Generated scenes", header=SCENES_HEADER, rows=scene_rows(out, dataset),
+              text=LOST),
+        Table(title="Visibility of objects in views", header=["visible", "labels", "share"],
+              rows=visibility_rows(dataset)),
+        Table(title="CPU time of a frame", header=["part", "s", "share"],
+              rows=cost_rows(out, dataset)),
+    ]  # fmt: skip
+    return [t for t in tables if t.rows]
+
+
+def summary_of(dataset: dict[str, Any]) -> str:
+    """Return a data set in one line."""
+    s = dataset["statistics"]
+    tables = f"{len(s['tables'])} kind{'' if len(s['tables']) == 1 else 's'} of tables"
+    return (
+        f"{s['scenes']} scene{'' if s['scenes'] == 1 else 's'}, {s['views']} views, "
+        f"{s['instances']} objects of {s['distinct_objects']} kinds on {tables}; "
         f"{s['fell_off']} fell off, {s['overhung']} hung over the rim, {s['restless']} never "
         f"rested, {s['skipped_meshes']} meshes could not be used."
     )
 
 
+def notes_of(dataset: dict[str, Any], outcome: GenerateOutcome) -> list[str]:
+    """Return meshes that were skipped, what the renderer says, scenes that could not be made."""
+    reasons = sorted({r for scene in dataset["scenes"] for r in scene["skipped"]})[:5]
+    notes = [f"skipped: {reason}" for reason in reasons]
+    notes += sorted({note for costs in outcome.made for note in costs.notes})
+    return notes + [
+        f"{scene_name(number)} could not be made: {why}" for number, why in outcome.failed.items()
+    ]
+
+
+def show(out: Path, dataset: dict[str, Any], outcome: GenerateOutcome, console: Console) -> None:
+    """Print the scenes, the statistics, and what went wrong."""
+    made = {c.number for c in outcome.made}
+    for table in tables_of(out, dataset):
+        if table.header is SCENES_HEADER:
+            now = ["made" if _number(s) in made else "kept" for s in dataset["scenes"]]
+            rows = [[*r, n] for r, n in zip(table.rows, now, strict=True)]
+            console.table(table.title, [*table.header, ""], rows)
+        else:
+            console.table(table.title, table.header, table.rows)
+    for note in notes_of(dataset, outcome):
+        console.warn(note)
+    console.say(summary_of(dataset))
+
+
 def _percent(value: float | None) -> str:
     return "-" if value is None else f"{100 * value:.0f} %"
-
-
-def write_sheet(out: Path, layouts: list[Layout], views: int) -> Path | None:
-    """Write a contact sheet with pictures of all scenes, or of as many as fit."""
-    import cv2
-
-    from realsim.rendering.overlay import contact_sheet, save_png
-
-    if not layouts:
-        return None
-    each = max(1, min(views, SHEET_PICTURES // len(layouts), 4))
-    pictures: list[Any] = []
-    captions: list[str] = []
-    for layout in layouts[:SHEET_PICTURES]:
-        for view in np.linspace(0, views - 1, each).round().astype(int):
-            path = out / scene_name(layout.number) / f"rgb/{view:06d}.png"
-            if not path.is_file():
-                continue
-            rgb = read_rgb(path)
-            size = (SHEET_WIDTH_PX, round(SHEET_WIDTH_PX * rgb.shape[0] / rgb.shape[1]))
-            pictures.append(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
-            captions.append(f"{scene_name(layout.number)} {view:06d} {layout.table}")
-    if not pictures:
-        return None
-    columns = each if each > 1 else min(6, len(pictures))
-    save_png(out / SHEET_FILE, contact_sheet(pictures, columns, captions))
-    return out / SHEET_FILE
 
 
 def write_dataset(out: Path, dataset: dict[str, Any]) -> None:

@@ -201,7 +201,8 @@ def _section(section: Section, views: Sequence[str]) -> str:
         return head + _table(section)
     is_sheet = isinstance(section, Sheet)
     what = "pictures" if is_sheet else "views"
-    count = f'<p class="count">{len(views)} of {_view_count(section)} {what} are shown.</p>'
+    total = _view_count(section)
+    count = f'<p class="count">{len(views)} of {total} {what} are shown.</p>' if total > 1 else ""
     return f'{head}{count}<div class="{"sheet" if is_sheet else "views"}">{"".join(views)}</div>'
 
 

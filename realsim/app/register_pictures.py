@@ -13,7 +13,7 @@ from realsim.app.register_results import Registered
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, ObjectPose
 from realsim.records.depth_bias import DepthBias
-from realsim.rendering.overlay import INK, PAPER, contact_sheet, draw_outlines
+from realsim.rendering.overlay import INK, PAPER, VERDICT_RGB, contact_sheet, draw_outlines
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.scanning.scale.picture_shading import diverging
 from realsim.store import SessionStore
@@ -23,12 +23,6 @@ Ids = NDArray[np.int32]
 Image = NDArray[np.uint8]
 Color = tuple[int, int, int]
 Window = tuple[slice, slice]
-VERDICT_RGB: dict[str, Color] = {
-    "accepted": (58, 188, 92),
-    "doubtful": (250, 180, 40),
-    "rejected": (230, 60, 55),
-    "unchecked": (170, 176, 190),
-}
 OUTLINE: Color = (70, 78, 88)
 """Of objects under depth residuals: neither red nor blue."""
 OVERLAY, GAIN, RESIDUALS, MAP = "overlay.jpg", "cameras.jpg", "residuals.jpg", "map.png"

@@ -20,6 +20,8 @@ FOLDER = click.Path(path_type=Path)
               help="How the depth camera is simulated.")  # fmt: skip
 @click.option("--camera", default="", metavar="NAME",
               help="d405, d415, d435, structured_light.  [the session's, else d405]")  # fmt: skip
+@click.option("--depth-model", type=FOLDER, default=None, metavar="FILE",
+              help="Of `realsim depth-fit`: noise and holes as your own camera's.")  # fmt: skip
 @click.option("--radius", default="", metavar="A-B",
               help="Distance of new views [m].  [as the real ones]")  # fmt: skip
 @click.option("--size", default="", metavar="WxH", help="Of new views [px].  [the session's]")

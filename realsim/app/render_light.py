@@ -2,14 +2,17 @@
 
 The scene is rendered small at a few real cameras under a soft neutral sky; the light is scaled per
 colour until the mean of the objects' pixels is that of the photographs, the table's colour until
-the mean of the table's pixels is. It is no inverse rendering: where lamps hang is not asked.
+the mean of the table's pixels is, and so is the paint of each object whose model has no colours. It
+is no inverse rendering: where lamps hang is not asked.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.app.render_compare import label_ids
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, View
@@ -23,6 +26,7 @@ from realsim_sim_bridge.synthetic.scene import SyntheticScene
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Rgb = NDArray[np.uint8]
+Ids = NDArray[np.int32]
 VIEWS = 3
 """Real views that are looked at, spread over the session."""
 SMALL_PX = 320
@@ -32,11 +36,20 @@ ROUNDS = 3
 SATURATED = 250
 """8-bit values from which a pixel says nothing of its light."""
 LEAST_PIXELS = 50
-"""Fewer object pixels than this say nothing."""
+"""Fewer pixels than this say nothing of the light."""
+LEAST_PAINTED = 6
+"""Fewer pixels than this say nothing of an object's paint."""
 NEAR_TABLE_M = 0.05
 """Table pixels are taken up to this far around the objects [m]: further out the table may end."""
 BASE_COLOR = (0.01, 0.95)
 """Least and greatest reflectance of a table: velvet and chalk."""
+MOST_HUE = 1.5
+"""A channel of the light is at most so many times its mean, or under it: cameras balance white,
+and a red object says next to nothing of the light's blue."""
+PAINT = (0.35, 0.35, 0.35)
+"""First reflectance of objects without colours; where none has any, their mean stays near it."""
+PAINT_RANGE = (0.01, 0.9)
+"""Least and greatest reflectance of a paint."""
 LEVEL = 1e-3
 """Sine of the tilt up to which a world stands upright."""
 SKY_ROWS = 64
@@ -51,11 +64,13 @@ class ObservedLook:
     table: Material | None
     """None = the scene has no table."""
     has_colors: bool
-    """Whether the models have colours, so that the hue of the light could be matched."""
+    """Whether some model has colours, so that the hue of the light could be matched."""
     object_error: float
     """Greatest difference left between the means of the objects' pixels, of white = 1 linear."""
     table_error: float
     """The same of the table's pixels; NaN = no table."""
+    paints: Mapping[int, Material]
+    """Instance without colours of its own -> the colour that the photographs show."""
 
 
 def neutral_environment() -> Environment:
@@ -106,7 +121,10 @@ def upright(environment: Environment, up: Array) -> Environment:
 def matched_look(
     store: SessionStore, synthetic: SyntheticScene, *, keeps_table: bool, keeps_hue: bool
 ) -> ObservedLook | None:
-    """Return light and table that make a scene as bright and as coloured as its photographs.
+    """Return light, table and paints that make a scene as bright and coloured as its photographs.
+
+    Objects that have colours tell the light; those that have none are painted in the mean colour
+    that they show. Where none has colours the light is grey, and mean paint as well.
 
     Args:
         store: the session with the photographs.
@@ -123,39 +141,76 @@ def matched_look(
     stride = max(1, round(store.session.intrinsics.width / SMALL_PX))
     camera = strided(store.session.intrinsics, stride)
     renderer = LabelRenderer(synthetic.placed())
-    regions = [_regions(synthetic, renderer.render(camera, _pose(v)), camera, v) for v in views]
+    regions = [
+        _regions(synthetic, renderer.render(camera, _pose(v)), camera, v,
+                 _annotated(store, v, stride))
+        for v in views
+    ]  # fmt: skip
     photographs = [store.rgb(v.index)[::stride, ::stride] for v in views]
-    shown = {o.obj_id for o in synthetic.shown}
-    has_colors = all(
-        synthetic.models[i].mesh.colors is not None or synthetic.models[i].mesh.texture is not None
-        for i in shown
-    )
-    environment = synthetic.environment
+    paints = {i: Material(base_color=PAINT, name="as photographed") for i in _colorless(synthetic)}
+    colored = {o.instance for o in synthetic.shown} - set(paints)
+    telling = [_seen(r, colored) for r in regions]
+    if sum(int(np.count_nonzero(t)) for t in telling) < LEAST_PIXELS:
+        telling, colored = [_seen(r, {*colored, *paints}) for r in regions], set[int]()
+    environment, gain = synthetic.environment, np.ones(3)
     table = synthetic.surroundings[0].material if synthetic.surroundings else None
     error = table_error = float("nan")
     for round_ in range(ROUNDS + 1):
-        pictures = _rendered(synthetic, environment, table, camera, views)
-        means = _means(photographs, pictures, [r[0] for r in regions])
+        look = replace(synthetic, environment=environment, materials=paints)
+        pictures = _rendered(look, table, camera, views)
+        means = _means(photographs, pictures, telling)
         if means is None:
             return None
         light = means[0] / np.maximum(means[1], 1e-4)
-        if keeps_hue or not has_colors:
+        if keeps_hue or not colored:
             light = np.full(3, means[0].mean() / max(float(means[1].mean()), 1e-4))
         error = float(np.abs(means[0] - means[1]).max())
-        paint = _means(photographs, pictures, [r[1] for r in regions])
-        if paint is not None:
-            table_error = float(np.abs(paint[0] - paint[1]).max())
+        on_table = _means(photographs, pictures, [r.table for r in regions])
+        if on_table is not None:
+            table_error = float(np.abs(on_table[0] - on_table[1]).max())
         if round_ == ROUNDS:
             break
-        environment = _scaled(environment, light)
-        if table is not None and paint is not None and not keeps_table:
-            gain = paint[0] / np.maximum(paint[1], 1e-4) / light
-            base = np.clip(np.array(table.base_color) * gain, *BASE_COLOR)
-            table = replace(table, base_color=(float(base[0]), float(base[1]), float(base[2])))
+        before, gain = gain, _plausible(gain * light)
+        light = gain / before
+        environment = _scaled(synthetic.environment, gain)
+        if table is not None and on_table is not None and not keeps_table:
+            table = _repainted(table, on_table, light, BASE_COLOR)
+        for instance, paint in paints.items():
+            of_it = _means(
+                photographs, pictures, [_seen(r, {instance}) for r in regions], LEAST_PAINTED
+            )
+            if of_it is not None:
+                paints[instance] = _repainted(paint, of_it, light, PAINT_RANGE)
     return ObservedLook(
-        environment=environment, table=table, has_colors=has_colors, object_error=error,
-        table_error=table_error,
+        environment=environment, table=table, has_colors=bool(colored), object_error=error,
+        table_error=table_error, paints=paints,
     )  # fmt: skip
+
+
+def _plausible(gain: Array) -> Array:
+    """Return the light's gain (3,) with its hue kept to that of lamps before a balanced camera."""
+    mean = float(gain.mean())
+    return mean * np.clip(gain / mean, 1 / MOST_HUE, MOST_HUE)
+
+
+def _colorless(synthetic: SyntheticScene) -> list[int]:
+    """Return the instances whose model has neither colours nor a texture, nor a material."""
+    return [
+        o.instance
+        for o in synthetic.shown
+        if synthetic.models[o.obj_id].mesh.colors is None
+        and synthetic.models[o.obj_id].mesh.texture is None
+        and o.instance not in synthetic.materials
+    ]
+
+
+def _repainted(
+    material: Material, means: tuple[Array, Array], light: Array, limits: tuple[float, float]
+) -> Material:
+    """Return a material whose pixels have the photographs' mean once the light is scaled."""
+    gain = means[0] / np.maximum(means[1], 1e-4) / light
+    r, g, b = (float(c) for c in np.clip(np.array(material.base_color) * gain, *limits))
+    return replace(material, base_color=(r, g, b))
 
 
 def _pose(view: View) -> Array:
@@ -163,17 +218,51 @@ def _pose(view: View) -> Array:
     return np.asarray(view.T_world_cam)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Regions:
+    """What a small view shows."""
+
+    ids: Ids
+    """(H, W) instance, without the rims of objects; -1 = none, or a rim."""
+    table: Mask
+    """(H, W) the table near the objects."""
+
+
+def _seen(regions: _Regions, instances: set[int]) -> Mask:
+    """Return where (H, W) any of these instances is seen."""
+    return np.isin(regions.ids, sorted(instances))
+
+
+def _annotated(store: SessionStore, view: View, stride: int) -> Ids | None:
+    """Return the instances (H, W) of a real view's visible masks; None = it is not annotated.
+
+    They leave out what something unknown, such as a hand, hides.
+    """
+    if not store.has(f"annotations/{view.index:06d}.json"):
+        return None
+    return label_ids(store, view.index)[::stride, ::stride]
+
+
 def _regions(
-    synthetic: SyntheticScene, labels: Labels, camera: CameraIntrinsics, view: View
-) -> tuple[Mask, Mask]:
-    """Return where (H, W) the objects are seen, without their rims, and the table near them."""
+    synthetic: SyntheticScene,
+    labels: Labels,
+    camera: CameraIntrinsics,
+    view: View,
+    annotated: Ids | None,
+) -> _Regions:
+    """Return where the objects are seen, without their rims, and the table near them."""
     import cv2
 
-    objects = np.asarray(cv2.erode((labels.ids >= 0).astype(np.uint8), np.ones((3, 3), np.uint8)))
+    kernel = np.ones((3, 3), np.uint8)
+    ids = np.full(labels.ids.shape, -1, np.int32)
+    for instance in np.unique(labels.ids[labels.ids >= 0]).tolist():
+        ids[cv2.erode((labels.ids == instance).astype(np.uint8), kernel) > 0] = instance
+    if annotated is not None:
+        ids[annotated != ids] = -1
     table = (labels.ids < 0) & (labels.depth_m > 0)
     plane = synthetic.scene.plane
     if plane is None:
-        return objects > 0, np.zeros_like(table)
+        return _Regions(ids=ids, table=np.zeros_like(table))
     points = ray_table(camera) * labels.depth_m[..., None]
     T_table_cam = se3.invert(plane.T_world_table) @ _pose(view)
     on_table = points @ T_table_cam[:2, :3].T + T_table_cam[:2, 3]
@@ -188,38 +277,37 @@ def _regions(
     )
     low, high = corners.min(0) - NEAR_TABLE_M, corners.max(0) + NEAR_TABLE_M
     near = np.all((on_table > low) & (on_table < high), axis=-1)
-    apart = cv2.dilate((labels.ids >= 0).astype(np.uint8), np.ones((3, 3), np.uint8)) == 0
-    return objects > 0, table & near & np.asarray(apart)
+    apart = cv2.dilate((labels.ids >= 0).astype(np.uint8), kernel) == 0
+    return _Regions(ids=ids, table=table & near & np.asarray(apart))
 
 
 def _rendered(
-    synthetic: SyntheticScene,
-    environment: Environment,
-    table: Material | None,
-    camera: CameraIntrinsics,
-    views: list[View],
+    look: SyntheticScene, table: Material | None, camera: CameraIntrinsics, views: list[View]
 ) -> list[Rgb]:
     """Return small noiseless pictures of the views."""
     from realsim.rendering.photo import PhotoRenderer
 
     placed = [
         PlacedMesh(p.instance, p.mesh, p.T_world_obj, table) if p.instance == BACKGROUND else p
-        for p in synthetic.placed()
+        for p in look.placed()
     ]
-    renderer = PhotoRenderer(placed, environment=environment)
+    renderer = PhotoRenderer(placed, environment=look.environment)
     return [renderer.render(camera, _pose(v)).rgb for v in views]
 
 
 def _means(
-    photographs: list[Rgb], pictures: list[Rgb], regions: list[Mask]
+    photographs: list[Rgb], pictures: list[Rgb], regions: list[Mask], least: int = LEAST_PIXELS
 ) -> tuple[Array, Array] | None:
-    """Return the mean linear colours (3,) of photographs and pictures over regions of them."""
+    """Return the mean linear colours (3,) of photographs and pictures over regions of them.
+
+    None = the regions have fewer pixels than `least`.
+    """
     real = np.concatenate([p[r] for p, r in zip(photographs, regions, strict=True)])
     made = np.concatenate([p[r] for p, r in zip(pictures, regions, strict=True)])
     fine = (real.max(-1) < SATURATED) & (made.max(-1) < SATURATED) if len(real) else []
-    if int(np.count_nonzero(fine)) < LEAST_PIXELS:
+    if int(np.count_nonzero(fine)) < least:
         # All saturated: the values still say in which direction to go.
-        if len(real) < LEAST_PIXELS:
+        if len(real) < least:
             return None
         fine = np.ones(len(real), np.bool_)
     return linear_of(real[fine]).mean(0), linear_of(made[fine]).mean(0)

@@ -20,6 +20,8 @@ SHEET_FILE = "reports/synthetic.png"
 PAGE_FILE = "reports/synthetic.html"
 PAGE_WIDTH_PX = 960
 """Of the pictures in the page."""
+FULL = 65535.0
+"""Greatest count of a label map."""
 
 
 def shown_views(count: int) -> list[int]:
@@ -91,21 +93,50 @@ def pairs(store: SessionStore, twin: SessionStore, real: Sequence[int]) -> list[
     ]  # fmt: skip
 
 
-def layers(twin: SessionStore) -> list[LayeredView]:
-    """Return the shown views as layers: picture, labels, the camera's depth, exact depth."""
+def layers(
+    twin: SessionStore, views: Sequence[int] | None = None, name: str = "synthetic view"
+) -> list[LayeredView]:
+    """Return views as layers: picture, labels, both depths, and the label maps that there are.
+
+    Args:
+        twin: the synthetic session.
+        views: numbers of views; None = some, spread over all.
+        name: what a view is called in its caption.
+    """
+    chosen = shown_views(len(twin.session.views)) if views is None else views
+    return [
+        LayeredView(
+            layers={n: fitted(p, PAGE_WIDTH_PX) for n, p in _layers_of(twin, k).items()},
+            caption=f"{name} {k}",
+        )
+        for k in chosen
+    ]
+
+
+def _layers_of(twin: SessionStore, k: int) -> dict[str, Rgb]:
+    """Return the pictures of view k by the name of the layer."""
+    from realsim.formats import label_maps
+    from realsim.rendering import map_pictures
+
     unit_m = twin.session.depth_unit_m
-    found: list[LayeredView] = []
-    for k in shown_views(len(twin.session.views)):
-        rgb, measured = twin.rgb(k), twin.depth_m(k)
-        exact = twin.read_image(f"labels/depth/{k:06d}.png").astype(np.float32) * unit_m
-        known = measured[measured > 0]
-        near, far = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
-        pictures = {
-            "picture": rgb,
-            "labels": label_picture(rgb, label_ids(twin, k)),
-            "depth of the camera": overlay.depth_picture(measured, float(near), float(far)),
-            "exact depth": overlay.depth_picture(exact, float(near), float(far)),
-        }
-        layers_ = {name: fitted(p, PAGE_WIDTH_PX) for name, p in pictures.items()}
-        found.append(LayeredView(layers=layers_, caption=f"synthetic view {k}"))
-    return found
+    rgb, measured, ids = twin.rgb(k), twin.depth_m(k), label_ids(twin, k)
+    exact = twin.read_image(f"labels/depth/{k:06d}.png").astype(np.float32) * unit_m
+    known = measured[measured > 0]
+    near, far = (float(v) for v in np.percentile(known, [1, 99])) if len(known) else (0.0, 1.0)
+    pictures = {
+        "picture": rgb,
+        "labels": label_picture(rgb, ids),
+        "depth of the camera": overlay.depth_picture(measured, near, far),
+        "exact depth": overlay.depth_picture(exact, near, far),
+    }
+    normals, coordinates = (f"labels/{m}/{k:06d}.png" for m in ("normals", "coordinates"))
+    if twin.has(normals):
+        counts = twin.read_image(normals)
+        pictures["normals"] = map_pictures.normals_picture(label_maps.normals_of(counts))
+    if twin.has(coordinates):
+        # The counts already are shares of each object's box.
+        whole = {int(i): ((0.0, 0.0, 0.0), (FULL, FULL, FULL)) for i in np.unique(ids[ids >= 0])}
+        pictures["object coordinates"] = map_pictures.coordinates_picture(
+            twin.read_image(coordinates), ids, whole
+        )
+    return pictures

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.app.generate_request import depth_model_of
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Scene
@@ -38,6 +39,8 @@ class RenderRequest:
     depth: str = "disparity"
     camera: str = ""
     """Name of a depth profile."""
+    depth_model: Path | None = None
+    """File of `realsim depth-fit`."""
     radius: str = ""
     """A-B [m], of new views."""
     size: str = ""
@@ -69,6 +72,7 @@ class RenderRequest:
                 f"--camera '{self.camera}' is not known; the depth cameras are: "
                 f"{', '.join(sorted(PROFILES))}."
             )
+        depth_model_of(self.depth_model, self.depth)
         if self.hdri is not None and not self.hdri.is_file():
             raise InputError(
                 f"--hdri '{self.hdri}' is no file; an equirectangular .hdr or .exr is expected."
@@ -103,6 +107,7 @@ class RenderRequest:
         return SyntheticConfig(
             renderer=self.renderer, depth=self.depth,  # pyright: ignore[reportArgumentType]
             profile=self.camera or camera_of(store), depth_unit_m=unit_m,
+            depth_model=depth_model_of(self.depth_model, self.depth),
         )  # fmt: skip
 
 

@@ -103,10 +103,16 @@ def twin_scene(
     if look is None:
         notes.append("no photograph shows the objects: light and table are left neutral.")
         return TwinScene(synthetic=synthetic, look=None, notes=tuple(notes))
+    if look.paints:
+        names = sorted({models[scene.object(i).obj_id].name for i in look.paints})
+        notes.append(
+            f"models without colours ({', '.join(names)}) are painted in the mean colour that the "
+            "photographs show of them."
+        )
     if not look.has_colors:
-        notes.append("the models have no colours: only the brightness of the light was matched.")
+        notes.append("no model has colours: only the brightness of the light was matched.")
     synthetic = replace(
-        synthetic, environment=look.environment,
+        synthetic, environment=look.environment, materials=look.paints,
         surroundings=tuple(
             PlacedMesh(p.instance, p.mesh, p.T_world_obj, look.table) for p in surroundings
         ),

@@ -22,6 +22,8 @@ from realsim.store import SessionStore
 
 OVERLAY_VIEWS = 4
 """Annotated photographs in a report: the first view and others spread over the session."""
+GRASPS = 15
+"""Grasps drawn in one of them: few, so that the outlines can be judged."""
 THUMBNAIL_WIDTH_PX = 400
 SHEET_VIEWS = 12
 """Thumbnails of the captured views."""
@@ -46,7 +48,7 @@ class Page:
             "<tr>" + "".join(f"<td>{html.escape(str(c))}</td>" for c in row) + "</tr>"
             for row in rows
         )
-        self.parts.append(f"<table><tr>{head}</tr>{body}</table>")
+        self.parts.append(f'<div class="scroll"><table><tr>{head}</tr>{body}</table></div>')
 
     def picture(self, path: Path, caption: str) -> None:
         """Add a picture, inside the page itself."""
@@ -143,7 +145,8 @@ def _photograph_section(page: Page, store: SessionStore, folder: Path) -> None:
     if (store.folder / "registration/scene.json").is_file():
         page.section(
             "The annotated scene",
-            "Outlines are the visible masks; grippers are coloured by score, red 0 to green 1.",
+            "Outlines are the visible masks in the colour of the verdict; grippers are coloured by "
+            "score, red 0 to green 1. Magenta: hidden by something that is not in the scene.",
         )
         scene, models = load_scene(store), session_models(store)
         grasps = load_grasps(store.folder / "grasps")
@@ -152,7 +155,7 @@ def _photograph_section(page: Page, store: SessionStore, folder: Path) -> None:
         pick = np.unique(np.linspace(0, len(told) - 1, OVERLAY_VIEWS).round().astype(int))
         for index in (told[k] for k in pick):
             path = folder / f"overlay_{index:06d}.png"
-            save_png(path, overlay_picture(store, index, scene, models, grasps))
+            save_png(path, overlay_picture(store, index, scene, models, grasps, GRASPS))
             page.picture(path, f"view {index}")
     if len(indices) > 1:
         pick = np.unique(np.linspace(0, len(indices) - 1, SHEET_VIEWS).round().astype(int))
@@ -221,7 +224,13 @@ def _registration_section(
     mssd_mm = {} if errors is None else errors.object_mssd_mm
     report_plots.plot_registration(scene, models, mssd_mm, folder / "registration.png")
     page.picture(folder / "registration.png", "agreement with the measured depth")
-    page.table(*object_table(scene, store))
+    header, rows = object_table(scene, store)
+    page.table([*header[:3], header[-1]], [[*row[:3], row[-1]] for row in rows])
+    if checks := header[3:-1]:
+        # A check a row: as columns they would be wider than any screen.
+        names = [row[0] for row in rows]
+        values = [[check, *(row[3 + k] for row in rows)] for k, check in enumerate(checks)]
+        page.table(["check", *names], values)
 
 
 def object_table(scene: Scene, store: SessionStore) -> tuple[list[str], list[list[str]]]:

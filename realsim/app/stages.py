@@ -43,14 +43,18 @@ def open_session(folder: Path) -> SessionStore:
     return SessionStore.open(folder)
 
 
-def require_sound(store: SessionStore) -> None:
+def require_sound(store: SessionStore) -> list[str]:
     """Raise if what was captured is not what is on disk: a run refused is better than a view lost.
+
+    Returns:
+        Paths of files that are missing or changed and can be made again from what was captured.
 
     Raises:
         InputError: a photograph, a depth image or the list of views is missing or changed.
     """
     captured = ("rgb/", "depth/", "robot.jsonl")
-    faults = [f for f in store.verify() if f.path.startswith(captured)]
+    found = store.verify()
+    faults = [f for f in found if f.path.startswith(captured)]
     if faults:
         named = "; ".join(f"{f.path} is {f.kind} ({f.found})" for f in faults[:3])
         more = f" and {len(faults) - 3} more" if len(faults) > 3 else ""
@@ -58,6 +62,7 @@ def require_sound(store: SessionStore) -> None:
             f"session '{store.folder}' is not as it was captured: {named}{more}. Restore the files "
             "from a copy, or capture the views again; nothing was computed from what is left."
         )
+    return [f.path for f in found]
 
 
 def content_key(*parts: Any) -> str:
@@ -147,11 +152,28 @@ def save_starts(store: SessionStore, starts: Sequence[ObjectPose], source: str) 
     store.write_json("registration/starts.json", {"source": source, "starts": rows})
 
 
-def session_models(store: SessionStore) -> dict[int, ObjectModel]:
-    """Read the object models of a session."""
+_told: set[str] = set()
+"""Notes on models that this process has told: the stages of a run read the same models."""
+
+
+def session_models(store: SessionStore, console: Console | None = None) -> dict[int, ObjectModel]:
+    """Read the object models of a session; what is missing of their looks is told once.
+
+    Args:
+        store: the session.
+        console: where that is told; None = the terminal's standard error.
+    """
+    from rich.markup import escape
+
     from realsim.formats.bop_models import load_models
 
-    return load_models(store.folder / "models")
+    notes: list[str] = []
+    models = load_models(store.folder / "models", notes=notes)
+    for note in notes:
+        if note not in _told:
+            _told.add(note)
+            (console or Console(quiet=True)).warn(escape(note))
+    return models
 
 
 def take_models(store: SessionStore, library: Path, obj_ids: Sequence[int]) -> tuple[int, ...]:
@@ -261,12 +283,13 @@ def annotate_session(
     surroundings = load_surroundings(store)
     if surroundings is not None:  # a synthetic session: everything is known
         config = exact_annotation(chosen)
-    require_sound(store)
+    damaged = require_sound(store)
     scene = judged_scene(store)
+    models = session_models(store, console)
     only = registered_views(store)
     n = len(store.session.views) if only is None else len(only)
     with console.stage("annotate", f"{n} frames") as tick:
         return annotate(
-            store, scene, session_models(store), load_grasps(store.folder / "grasps"), config,
-            only=only, progress=tick, workers=workers, surroundings=surroundings,
+            store, scene, models, load_grasps(store.folder / "grasps"), config,
+            only=only, progress=tick, workers=workers, surroundings=surroundings, damaged=damaged,
         )  # fmt: skip

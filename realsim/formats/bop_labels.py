@@ -171,14 +171,15 @@ def write_scene_gt(
         annotations: image -> (object id, T_cam_obj (4, 4) [m]) of each object.
 
     Raises:
-        UnitError: an object would be on the lens or farther than any table.
+        UnitError: an object would be farther than any table.
     """
     scene: Json = {}
     for index in sorted(annotations):
         rows: list[Json] = []
         for obj_id, T_cam_obj in annotations[index]:
             rotation, translation = bop_units.lists_from_rigid(T_cam_obj)
-            bop_units.object_in_camera(rotation, translation, f"object {obj_id} of image {index}")
+            name = f"object {obj_id} of image {index}"
+            bop_units.object_in_camera(rotation, translation, name, may_touch=True)
             rows.append({"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": int(obj_id)})
         scene[str(index)] = rows
     store.write_json("scene_gt.json", scene)

@@ -87,13 +87,18 @@ def _matrix_mm(S: Array) -> list[float]:
 
 
 def load_models(
-    folder: Path | str, obj_ids: Collection[int] | None = None
+    folder: Path | str,
+    obj_ids: Collection[int] | None = None,
+    *,
+    notes: list[str] | None = None,
 ) -> dict[int, ObjectModel]:
     """Return the models of a BOP models folder, in metres.
 
     Args:
         folder: holds obj_%06d.ply and models_info.json.
         obj_ids: only these; None = all.
+        notes: what is missing of a model's look is added to it; None = it is said as a Python
+            warning.
 
     Raises:
         InputError: no models there, an id without mesh, or broken files.
@@ -116,7 +121,7 @@ def load_models(
     info: Any = read_json_file(folder / INFO_FILE)
     require_meshes(files if obj_ids is None else obj_ids, files, str(folder))
     return {
-        i: _load_model(i, files[i], info.get(str(i), {}))
+        i: _load_model(i, files[i], info.get(str(i), {}), notes)
         for i in sorted(files if obj_ids is None else obj_ids)
     }
 
@@ -136,8 +141,10 @@ def require_meshes(wanted: Collection[int], present: Collection[int], where: str
         )
 
 
-def _load_model(obj_id: int, file: Path, info: dict[str, Any]) -> ObjectModel:
-    mesh = load_mesh(file, "mm")
+def _load_model(
+    obj_id: int, file: Path, info: dict[str, Any], notes: list[str] | None
+) -> ObjectModel:
+    mesh = load_mesh(file, "mm", notes)
     _check_diameter(mesh, info, file)
     symmetries = [np.eye(4)]
     for numbers in info.get("symmetries_discrete", ()):

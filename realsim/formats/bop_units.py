@@ -47,15 +47,24 @@ def lists_from_rigid(T: ArrayLike) -> tuple[list[float], list[float]]:
     return rotation, translation_mm
 
 
-def object_in_camera(rotation: Any, translation_mm: Any, name: str) -> Array:
+def object_in_camera(
+    rotation: Any, translation_mm: Any, name: str, *, may_touch: bool = False
+) -> Array:
     """Return T_cam_obj (4, 4) [m] of BOP's cam_R_m2c and cam_t_m2c.
+
+    Args:
+        rotation: 9 numbers, row by row.
+        translation_mm: 3 numbers [mm].
+        name: for messages.
+        may_touch: whether the object may be at the lens: the numbers are known to be millimetres
+            and a synthetic camera may stand inside an object.
 
     Raises:
         UnitError: the object would be on the lens or beyond any table.
     """
     T_cam_obj = rigid_from_lists(rotation, translation_mm, name)
     distance_mm = float(np.linalg.norm(T_cam_obj[:3, 3])) * MM_PER_M
-    if distance_mm < NEAREST_MM:
+    if distance_mm < NEAREST_MM and not may_touch:
         raise UnitError(
             f"{name}: cam_t_m2c is {distance_mm:.4g} long; as millimetres the object would touch "
             f"the lens. This looks like metres in a millimetre file ({distance_mm:.4g} m). "

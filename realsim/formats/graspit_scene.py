@@ -128,7 +128,7 @@ def read_graspit_scene(
     entries = _entries(data, path, meshes)
     grasp_file = _beside(path.parent, str(data.get("grasp_path", GRASP_FILE)))
     notes = [] if grasp_file else ["there is no grasps.hdf5 beside the scene."]
-    placed = _placed(entries, grasp_file)
+    placed = _placed(entries, grasp_file, notes)
     evidence: dict[QuaternionOrder, OrderEvidence] = {o: _evidence(placed, o) for o in ORDERS}
     if order is None:
         order, said = _proven(placed, evidence, path)
@@ -257,14 +257,14 @@ def _mesh_file(name: str, folder: Path, meshes: Path | None, where: str) -> Path
     )
 
 
-def _placed(entries: list[_Entry], grasp_file: Path | None) -> list[_Placed]:
+def _placed(entries: list[_Entry], grasp_file: Path | None, notes: list[str]) -> list[_Placed]:
     grasps = read_grasp_file(grasp_file) if grasp_file is not None else {}
     known: dict[tuple[Path, tuple[float, float, float]], Mesh] = {}
     placed: list[_Placed] = []
     for e in entries:
         key = (e.mesh_file, e.scale)
         if key not in known:
-            known[key] = _mesh(e)
+            known[key] = _mesh(e, notes)
         Ts = grasps.get(e.name, np.zeros((0, 2, 4, 4)))[:, 0]
         some = Ts[:: max(1, len(Ts) // SAMPLED_GRASPS)]
         placed.append(_Placed(entry=e, mesh=known[key], Ts_world_grasp=some))
@@ -275,8 +275,8 @@ LARGEST_MM_SCALE = 0.01
 """Scales up to this are taken as the conversion of a file in millimetres."""
 
 
-def _mesh(e: _Entry) -> Mesh:
-    """Return an object's mesh [m], its scale applied.
+def _mesh(e: _Entry, notes: list[str]) -> Mesh:
+    """Return an object's mesh [m], its scale applied; what is missing is added to the notes.
 
     Raises:
         InputError: it cannot be read, or is not in metres; object and file are named.
@@ -285,7 +285,7 @@ def _mesh(e: _Entry) -> Mesh:
     # A scale of thousandths is what makes metres of a file in millimetres.
     unit, metres = ("mm", 1e-3) if scale.max() <= LARGEST_MM_SCALE else ("m", 1.0)
     try:
-        mesh = load_mesh(e.mesh_file, unit)
+        mesh = load_mesh(e.mesh_file, unit, notes)
     except InputError as error:
         raise InputError(
             f"the object '{e.name}' of the scene cannot be read from {e.mesh_file}: {error} In a "

@@ -175,6 +175,7 @@ def _numbers(text: str, count: int, name: str) -> list[float]:
 
 def _load_models(folder: Path, Ts: dict[int, Array]) -> tuple[dict[int, ObjectModel], list[str]]:
     models: dict[int, ObjectModel] = {}
+    notes = ["ids are GraspNet's object numbers + 1; names are its numbers."]
     for i in Ts:
         home = folder / f"{i:03d}"
         file = next((home / n for n in MESH_FILES if (home / n).is_file()), None)
@@ -183,8 +184,9 @@ def _load_models(folder: Path, Ts: dict[int, Array]) -> tuple[dict[int, ObjectMo
                 f"object {i} has no mesh: none of {', '.join(MESH_FILES)} is in {home}. Give the "
                 "dataset's 'models' folder."
             )
-        models[i + 1] = ObjectModel(obj_id=i + 1, name=f"{i:03d}", mesh=load_mesh(file, "m"))
-    return models, ["ids are GraspNet's object numbers + 1; names are its numbers."]
+        mesh = load_mesh(file, "m", notes)
+        models[i + 1] = ObjectModel(obj_id=i + 1, name=f"{i:03d}", mesh=mesh)
+    return models, notes
 
 
 def _disagreements(

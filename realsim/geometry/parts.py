@@ -150,7 +150,8 @@ def _pybullet_model(folder: Path, obj_id: int) -> ObjectModel:
             f"{', '.join(f'{i} ({v[0]})' for i, v in _BULLET.items())}."
         )
     name, file, unit, factor, color = _BULLET[obj_id]
-    raw = load_mesh(folder / file, unit)
+    # What is missing of the file's look is not told: the colour of the list stands for it.
+    raw = load_mesh(folder / file, unit, notes=[])
     vertices = raw.vertices * factor
     vertices = vertices - (vertices.min(0) + vertices.max(0)) / 2
     if raw.texture is not None and raw.uv is not None:

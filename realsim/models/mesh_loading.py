@@ -61,6 +61,9 @@ def load_pieces(path: Path) -> FileContent:
         f"'{name}', named in the file, is not in its folder: colours from it are missing."
         for name in folder.missing
     ]
+    pictures = [n for n in folder.found if not n.lower().endswith((".mtl", ".bin"))]
+    if pictures and kind == ".ply" and all(p.image is None for p in pieces):
+        notes.append(_without_coordinates(f"the texture '{pictures[0]}'"))
     is_gltf = kind in GLTF_FORMATS
     return FileContent(
         pieces=tuple(pieces),
@@ -186,12 +189,22 @@ def _piece(
             tint = tuple((linear if linear is not None else np.ones(3)).tolist())
             key = (id(image), tint)
             return replace(piece, uv=uv, image=tinted(texture, tint), image_key=key)
+    elif image is not None:
+        notes.append(_without_coordinates(f"the texture of '{name}'"))
     if is_gltf:
         return replace(piece, color=None if linear is None else rgb8(linear))
     if not folder.found:  # trimesh makes a material up where the file's own is missing
         return piece
     r, g, b = np.asarray(material.main_color, dtype=int)[:3].tolist()
     return replace(piece, color=(r, g, b))
+
+
+def _without_coordinates(what: str) -> str:
+    """Return the note on a texture that cannot be laid on its mesh."""
+    return (
+        f"{what} cannot be laid on the mesh, which has no texture coordinates: it is left out, and "
+        "a plain colour stands for it where the file has one. Unwrap the mesh and export it again."
+    )
 
 
 def _gltf_header(path: Path) -> dict[str, Any]:

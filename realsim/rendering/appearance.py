@@ -35,7 +35,8 @@ class Material:
     metallic: float = 0.0
     """0 = plastic, wood, stone; 1 = metal."""
     normal_image: NDArray[np.uint8] | None = None
-    """(H, W, 3) tangent-space normals (glTF, OpenGL's y up): value / 127.5 - 1; None = flat."""
+    """(H, W, 3) tangent-space normals (glTF, OpenGL's y up): (value - 128) / 127, so that 128 is
+    exactly "not tilted" and (128, 128, 255) is flat; None = flat."""
     projection: Literal["uv", "box"] = "box"
     """uv: the mesh's own texture coordinates. box: the image is laid on along each face's dominant
     axis of the mesh's frame, for meshes without coordinates and for procedural materials."""

@@ -1,5 +1,6 @@
 """From linear light to the picture: exposure, noise of the sensor, highlights, sRGB."""
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,16 +44,36 @@ def developed(
         full_well: electrons at white; their square root is the shot noise.
         read_noise: electrons of noise in the dark.
     """
-    value = np.clip(light, 0.0, 4.0)
+    noise = np.zeros((1, 1, 3), np.float32)
     if rng is not None:
-        variance = (value * np.float32(full_well) + np.float32(read_noise**2)) / np.float32(
-            full_well**2
-        )
-        noise = rng.standard_normal(value.shape, dtype=np.float32)
-        noise *= np.sqrt(variance)
-        value = np.clip(value + noise, 0.0, 4.0)
-    at = np.sqrt(value) * np.float32(0.5 * (len(ENCODING) - 1))
-    step = np.minimum(at.astype(np.int32), len(ENCODING) - 2)
-    low = ENCODING[step]
-    low += (at - step) * (ENCODING[step + 1] - low)
-    return np.round(low).astype(np.uint8)
+        noise = rng.standard_normal(light.shape, dtype=np.float32)
+    out = np.empty(light.shape, np.uint8)
+    _develop(light, noise, rng is not None, (full_well, read_noise), ENCODING, out)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _develop(
+    light: Array32,
+    noise: Array32,
+    is_noisy: bool,
+    sensor: tuple[float, float],
+    encoding: Array32,
+    out: NDArray[np.uint8],
+) -> None:
+    """Fill the picture (H, W, 3); `noise` (H, W, 3) has the standard deviation 1."""
+    full_well, dark = np.float32(sensor[0]), np.float32(sensor[1] * sensor[1])
+    steps = np.float32(0.5 * (len(encoding) - 1))
+    for y in range(light.shape[0]):
+        for x in range(light.shape[1]):
+            for k in range(3):
+                value = min(max(light[y, x, k], np.float32(0)), np.float32(4))
+                if is_noisy:
+                    deviation = np.sqrt(value * full_well + dark) / full_well
+                    value += noise[y, x, k] * deviation
+                    value = min(max(value, np.float32(0)), np.float32(4))
+                at = np.sqrt(value) * steps
+                step = min(int(at), len(encoding) - 2)
+                low = encoding[step]
+                low += (at - np.float32(step)) * (encoding[step + 1] - low)
+                out[y, x, k] = np.uint8(low + np.float32(0.5))

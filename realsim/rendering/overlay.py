@@ -21,8 +21,17 @@ INSTANCE_COLORS: tuple[Color, ...] = (
     (255, 90, 90), (110, 170, 140), (250, 200, 150), (130, 130, 250),
 )  # fmt: skip
 """Okabe and Ito's colour-blind-safe colours first, then ones that stay apart in brightness."""
-SCORE_STOPS = np.array([[214, 48, 49], [253, 185, 46], [34, 166, 84]], dtype=np.float64)
-"""Colours of the scores 0, 0.5 and 1: red, yellow, green."""
+SCORE_STOPS = np.array([[213, 70, 20], [245, 205, 60], [0, 158, 130]], dtype=np.float64)
+"""Colours of the scores 0, 0.5 and 1: vermilion red, yellow, bluish green. Who cannot tell red from
+green still tells these apart."""
+VERDICT_RGB: dict[str, Color] = {
+    "accepted": (0, 170, 130),
+    "doubtful": (250, 200, 50),
+    "rejected": (222, 76, 10),
+    "unchecked": (176, 180, 192),
+}
+"""Colours of the verdicts on poses: green, amber, red and grey that stay apart without red-green
+vision."""
 UNTRIED: Color = (150, 150, 150)
 """Colour of a grasp without a score."""
 FINGER_M = 0.05
@@ -80,6 +89,38 @@ def draw_outlines(
         # A dark hairline outside keeps the outline visible on any ground.
         hairline = (dark > 0) & (ids < 0)
         out[hairline] = (0.55 * out[hairline]).astype(np.uint8)
+    return out
+
+
+def draw_hatched(
+    rgb: Image, mask: NDArray[np.bool_], color: Color, spacing_px: int = 0, thickness: int = 2
+) -> Image:
+    """Return the picture with a mask hatched by diagonal lines and outlined.
+
+    Hatching tells the region apart from any colour that an object may have, and leaves visible what
+    lies under it.
+
+    Args:
+        rgb: (H, W, 3).
+        mask: (H, W) what is hatched.
+        color: of the lines.
+        spacing_px: from line to line; 0 = 1/72 of the picture's height, at least 8.
+        thickness: width of the lines [px].
+    """
+    import cv2
+
+    out = rgb.copy()
+    if not mask.any():
+        return out
+    spacing = spacing_px or max(8, rgb.shape[0] // 72)
+    rows, columns = np.nonzero(mask)
+    line = (rows + columns) % spacing < thickness
+    shade = 0.7 * out[rows, columns] + 0.3 * np.array(color)
+    out[rows, columns] = np.where(line[:, None], np.array(color), shade).astype(np.uint8)
+    full = mask.astype(np.uint8)
+    core = cv2.erode(full, np.ones((3, 3), np.uint8), iterations=thickness,
+                     borderType=cv2.BORDER_CONSTANT, borderValue=1)  # fmt: skip
+    out[mask & (np.asarray(core) == 0)] = color
     return out
 
 
@@ -158,7 +199,11 @@ def draw_grasps(
 
 
 def draw_axes(
-    rgb: Image, intrinsics: CameraIntrinsics, T_cam_x: ArrayLike, length_m: float = 0.05
+    rgb: Image,
+    intrinsics: CameraIntrinsics,
+    T_cam_x: ArrayLike,
+    length_m: float = 0.05,
+    thickness: int = 3,
 ) -> Image:
     """Return the picture with a frame's axes: x red, y green, z blue, far to near."""
     out = rgb.copy()
@@ -166,7 +211,7 @@ def draw_axes(
     axes: list[tuple[int, Color]] = [(0, (226, 60, 60)), (1, (60, 180, 75)), (2, (66, 118, 240))]
     for axis, color in sorted(axes, key=lambda a: -float(T[2, a[0]])):
         tip = T[:3, 3] + length_m * T[:3, axis]
-        _polyline(out, intrinsics, np.stack([T[:3, 3], tip]), color, 3)
+        _polyline(out, intrinsics, np.stack([T[:3, 3], tip]), color, thickness)
     return out
 
 

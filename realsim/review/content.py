@@ -19,20 +19,12 @@ Array = NDArray[np.float64]
 Rgb = NDArray[np.uint8]
 VERDICT_ORDER = ("rejected", "doubtful", "unchecked", "accepted")
 """Worst first."""
-VERDICT_RGB: dict[str, tuple[int, int, int]] = {
-    "rejected": (214, 63, 56),
-    "doubtful": (240, 168, 40),
-    "unchecked": (140, 146, 158),
-    "accepted": (58, 168, 92),
-}
 LOOK_NEARER = 0.8
 """Distance of the first look, as a share of the cameras' own."""
 LOOK_DOWN_RAD = 0.6
 """Angle under which the first look sees the table [rad]."""
 SAMPLES_PER_POINT = 4
 """Depth samples fused per point shown: on overlapping views about as many fall into one voxel."""
-SCORE_STOPS = np.array([[200, 40, 45], [245, 190, 50], [40, 160, 80]], dtype=np.float64)
-"""RGB at score 0, 1/2 and 1."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

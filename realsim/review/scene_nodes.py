@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from realsim.geometry import mesh as mesh_tools
 from realsim.interop import viser_wxyz_position
 from realsim.records import GraspSet, Mesh, ObjectModel, ObjectPose, SupportPlane, View
+from realsim.rendering.overlay import VERDICT_RGB
 from realsim.review import content
 from realsim.store import SessionStore
 
@@ -85,7 +86,7 @@ class SceneNodes:
                 f"/objects/{placed.instance}/verdict",
                 mesh.vertices.astype(np.float32),
                 mesh.faces.astype(np.uint32),
-                color=content.VERDICT_RGB[placed.verdict],
+                color=VERDICT_RGB[placed.verdict],
                 flat_shading=True,
                 side="double",
                 **pose,
@@ -100,7 +101,7 @@ class SceneNodes:
 
     def color_object(self, instance: int, verdict: str) -> None:
         """Give an object the colour of its verdict."""
-        self._judged[instance].color = content.VERDICT_RGB[verdict]
+        self._judged[instance].color = VERDICT_RGB[verdict]
 
     def add_cloud(self, points: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
         """Add the fused depth; in float32, because viser's float16 has steps of 1 mm at 1 m."""

@@ -1,5 +1,6 @@
 """`realsim generate`: data sets that go on after an interruption and repeat to the byte."""
 
+import errno
 import hashlib
 import json
 import shutil
@@ -8,13 +9,17 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
 
 from realsim.app.generate_cli import generate_command
+from realsim.app.generate_page import sheet_views
 from realsim.app.generate_request import range_of, size_of
+from realsim.app.generate_scene import stored_costs
 from realsim.errors import InputError
+from realsim.store import atomic
 
 SMALL = ("--views", "2", "--size", "160x90", "--objects", "2-3", "--seed", "5", "--workers", "1",
          "--depth", "disparity", "--quiet")  # fmt: skip
@@ -24,8 +29,9 @@ UNREPEATED = (
     "manifest.jsonl",
     "generate.json",
     "scene_gt_coco.json",
+    "index.html",
 )
-"""Files that name the time at which they were begun, and lists of their checksums."""
+"""Files that name the time at which they were begun or how long it took, lists of checksums."""
 
 
 def _run(out: Path, *arguments: str) -> Result:
@@ -74,6 +80,18 @@ def test_the_data_set_says_what_was_used(dataset: Path) -> None:
     assert sum(value["statistics"]["visibility"]["counts"]) > 0
     assert value["statistics"]["worst_moved_mm"] < 1.0
     assert (dataset / "contact_sheet.png").is_file()
+
+
+def test_the_page_switches_layers_and_shows_the_figures(dataset: Path) -> None:
+    page = (dataset / "index.html").read_text()
+    for layer in ("picture", "labels", "depth of the camera", "exact depth", "normals",
+                  "object coordinates"):  # fmt: skip
+        assert page.count(f'data-layer="{layer}"') == 2
+    for title in ("Generated scenes", "Visibility of objects in views", "CPU time of a frame"):
+        assert f"<h2>{title}</h2>" in page
+    costs = stored_costs(dataset, 0)
+    assert set(costs["parts"]) == {"rgb", "depth", "write", "labels"}
+    assert all(value > 0 for value in costs["parts"].values())
 
 
 def test_a_finished_scene_is_kept_and_a_view_that_is_missing_is_made_again(
@@ -147,6 +165,9 @@ def test_a_run_that_is_killed_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
         (("--table", "desk"), "drawer_desk"),
         (("--profile", "d999"), "d405"),
         (("--hdris", "nowhere"), "--hdris 'nowhere' is no folder"),
+        (("--size", "0x0"), "16 to 8192"),
+        (("--depth-model", "nowhere.json"), "nowhere.json"),
+        (("--depth-model", "fit.json", "--depth", "clean"), "--depth-model is for"),
     ],
 )
 def test_what_cannot_be_used_is_named_before_anything_is_made(
@@ -154,6 +175,37 @@ def test_what_cannot_be_used_is_named_before_anything_is_made(
 ) -> None:
     assert words in _refusal(tmp_path / "out", *arguments)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_renderer_that_is_not_installed_is_named_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    said = _refusal(tmp_path / "out", "--renderer", "photoreal")
+    assert "realsim[photo]" in said
+    assert "--renderer embedded" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_full_disk_ends_the_run_and_the_same_request_goes_on(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = atomic.write_bytes
+
+    def refused(path: Path | str, data: bytes, **how: Any) -> None:
+        if Path(path).name == "000001.json":  # the labels of the second view
+            raise OSError(errno.ENOSPC, "No space left on device")
+        whole(path, data, **how)
+
+    monkeypatch.setattr(atomic, "write_bytes", refused)
+    result = _run(tmp_path / "out", *SMALL, "--scenes", "3")
+    assert isinstance(result.exception, atomic.StorageError)
+    assert "no room" in str(result.exception)
+    assert not (tmp_path / "out/scene_000001").exists()
+    monkeypatch.undo()
+    result = _run(tmp_path / "out", *SMALL, "--scenes", "1")
+    assert result.exit_code == 0, result.output + repr(result.exception)
+    assert _content(tmp_path / "out") == _content(dataset)
 
 
 def test_an_empty_pool_is_refused(tmp_path: Path) -> None:
@@ -174,6 +226,12 @@ def test_a_scene_that_cannot_be_made_is_named_and_ends_in_1(tmp_path: Path) -> N
     assert result.exit_code == 1
     assert "scene_000000 could not be made" in result.output
     assert "torn.obj" in result.output
+
+
+def test_the_views_shown_are_spread_over_low_and_high_cameras() -> None:
+    assert sheet_views(256, 4) == [32, 96, 160, 224]
+    assert sheet_views(2, 4) == [0, 1]
+    assert sheet_views(7, 1) == [3]
 
 
 def test_ranges_and_sizes_are_read_as_written() -> None:

@@ -1,19 +1,24 @@
 """`realsim render`: twins of real frames, new views, and what it refuses."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from realsim import CameraIntrinsics, InputError
+from realsim import CameraIntrinsics, InputError, Mesh
 from realsim.app.console import Console
 from realsim.app.render_cli import render_command
-from realsim.app.render_compare import rim_distances_px
+from realsim.app.render_compare import label_ids, rim_distances_px
 from realsim.app.render_light import linear_of, matched_look, neutral_environment, upright
 from realsim.app.render_request import RenderRequest, camera_of, radius_of, resized, size_of
 from realsim.app.render_run import notes_of, run_render
 from realsim.app.render_scene import table_top_m, twin_scene
 from realsim.app.stages import annotate_session
 from realsim.geometry import camera, se3
+from realsim.rendering.depth_sensors.model import DepthSensorModel
+from realsim.rendering.photo import PhotoRenderer
 from realsim.store import SessionStore, save_scene
 from synthetic_scenes import (
     INTRINSICS,
@@ -82,9 +87,11 @@ def test_the_result_is_a_sound_session_with_sheet_and_page(real, twin):
 
 
 def test_new_views_see_the_objects_at_the_asked_size(real, tmp_path):
+    model = DepthSensorModel.noiseless()
+    (tmp_path / "fit.json").write_text(json.dumps(model.document()))
     arguments = [str(real.folder), "--views", "2", "--size", "120x100", "--radius", "0.3-0.4",
-                 "--material", "table=cork", "--depth", "clean", "--workers", "1", "--quiet",
-                 "--out", str(tmp_path / "new")]  # fmt: skip
+                 "--material", "table=cork", "--depth-model", str(tmp_path / "fit.json"),
+                 "--workers", "1", "--quiet", "--out", str(tmp_path / "new")]  # fmt: skip
     result = CliRunner().invoke(render_command, arguments, catch_exceptions=False)
     assert result.exit_code == 0
     store = SessionStore.open(tmp_path / "new")
@@ -93,6 +100,11 @@ def test_new_views_see_the_objects_at_the_asked_size(real, tmp_path):
     for view in store.session.views:
         assert 0.3 <= np.linalg.norm(view.T_world_cam[:3, 3] - center) <= 0.4
         assert len(np.unique(store.read_image(f"labels/instance/{view.index:06d}.png"))) == 3
+        exact = store.read_image(f"labels/depth/{view.index:06d}.png").astype(int)
+        measured = store.read_image(f"depth/{view.index:06d}.png").astype(int)
+        assert np.median(np.abs(measured - exact)[measured > 0]) <= 1  # as the model says
+    page = (tmp_path / "new/reports/synthetic.html").read_text()
+    assert all(f'data-layer="{name}"' in page for name in ("normals", "object coordinates"))
 
 
 def test_a_rejected_object_is_named(real, tmp_path):
@@ -138,7 +150,8 @@ def test_the_session_itself_is_never_written_over(real):
         ({"views": "3", "radius": "0.5-0.4"}, "--radius"),
         ({"views": "3", "radius": "400-700"}, "--radius"),
         ({"views": "3", "size": "64"}, "--size"), ({"views": "3", "size": "9999x10"}, "--size"),
-        ({"camera": "d999"}, "--camera"),
+        ({"camera": "d999"}, "--camera"), ({"depth_model": "none.json"}, "none.json"),
+        ({"depth_model": "fit.json", "depth": "stereo"}, "--depth-model"),
     ],
 )  # fmt: skip
 def test_options_that_cannot_be_are_named(options, named):
@@ -202,6 +215,31 @@ def test_a_brighter_photograph_gives_a_brighter_light(real, tmp_path):
     assert ratio == pytest.approx(2.0, rel=0.1)
     before = neutral_environment().panorama
     assert looks[0].environment.panorama.shape == before.shape
+
+
+@pytest.mark.parametrize("colorless", [{1, 7}, {7}])
+def test_a_model_without_colours_is_painted_as_the_photographs_show_it(real, colorless):
+    models = {
+        i: replace(m, mesh=Mesh(vertices=m.mesh.vertices, faces=m.mesh.faces))
+        if i in colorless else m
+        for i, m in MODELS.items()
+    }  # fmt: skip
+    made = twin_scene(real, two_boxes(), models, RenderRequest())
+    assert any("painted in the mean colour" in note for note in made.notes)
+    paints = made.synthetic.materials
+    instances = {1: 0, 7: 3}
+    assert set(paints) == {instances[i] for i in colorless}
+    view = real.session.view(2)
+    renderer = PhotoRenderer(made.synthetic.placed(), environment=made.synthetic.environment)
+    shown = linear_of(renderer.render(INTRINSICS, view.T_world_cam).rgb)
+    ids, photograph = label_ids(real, 2), linear_of(real.rgb(2))
+    for instance in paints:
+        seen = ids == instance
+        ours, theirs = shown[seen].mean(0), photograph[seen].mean(0)
+        assert np.ptp(theirs) > 0.1 and np.array_equal(np.argsort(ours), np.argsort(theirs))
+        # The photographs are a linear sensor's: beside a red object of known colour they are too
+        # contrasted for any paint, and only the order of the channels can be right.
+        assert len(colorless) == 1 or np.abs(ours - theirs).max() < 0.04
 
 
 def test_the_rims_of_a_picture_of_the_labels_lie_on_its_edges():

@@ -157,6 +157,37 @@ def test_a_wide_sun_makes_a_penumbra_of_the_right_width() -> None:
     assert np.abs(share - expected).mean() < 0.02
 
 
+def test_a_round_body_of_few_faces_has_a_round_terminator() -> None:
+    # Of the light of a side sun a matte ball sends cos(angle to the sun), whatever its facets.
+    sky = even_sky(0.0, sun=(1, 1, 1), sun_direction=(1, 0, 0), sun_radius_deg=0.0)
+    view = CameraIntrinsics(width=120, height=120, fx=500, fy=500, cx=59.5, cy=59.5)
+    dark = Material(base_color=(1.0, 1.0, 1.0), roughness=1.0)
+    T = se3.look_at([0, 0, 1.0], [0, 0, 0])
+    few, many = (
+        light_of([PlacedMesh(0, ball(0.1, n), np.eye(4), dark)], sky, T, view, ambient_rays=0,
+                 reflections=False)[..., 0]
+        for n in (9, 96)
+    )  # fmt: skip
+    middle = np.hypot(*(np.indices((120, 120)) - 59.5)) < 40
+    assert np.abs(few - many)[middle].mean() < 0.02
+    # Facets on the dark side of the terminator would be black where the ball is still lit.
+    lit = middle & (many > 0.03)
+    assert np.mean(few[lit] > 0.3 * many[lit]) > 0.98
+
+
+def test_a_lamp_leaves_no_pattern_in_its_shadow() -> None:
+    # A small strong lamp in a dark room: rays spread evenly would meet it once in 200 times.
+    panorama = np.full((64, 128, 3), 0.1, np.float32)
+    panorama[6:12, 20:36] = 30.0
+    plate = PlacedMesh(0, square(0.12), se3.from_translation([0, 0, 0.15]), WHITE)
+    placed = [PlacedMesh(-1, square(2.0), np.eye(4), WHITE), plate]
+    sky = Environment(panorama=panorama)
+    quick, exact = (light_of(placed, sky, ambient_rays=n)[..., 0] for n in (2, 64))
+    table = PhotoRenderer(placed, SHARP, sky).render(WIDE, ABOVE).depth_m > 0.9
+    differ = np.abs(quick - exact)[table] / np.median(exact[table])
+    assert differ.mean() < 0.015 and np.quantile(differ, 0.99) < 0.12
+
+
 def test_a_deep_corner_is_darker_than_the_open_table() -> None:
     wall = se3.from_rt(se3.exp_so3([np.pi / 2, 0, 0]), [0, 0.2, 0.5])
     black = Material(base_color=(0.0, 0.0, 0.0), roughness=1.0)

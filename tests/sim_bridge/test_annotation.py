@@ -364,7 +364,7 @@ def test_best_and_worst_are_the_extremes() -> None:
 
 def test_the_overlay_draws_on_the_objects_only(annotated: SessionStore) -> None:
     pytest.importorskip("realsim.rendering.overlay")
-    picture = overlay_picture(annotated, 2, SCENE, MODELS, GRASPS, max_grasps=4)
+    picture = overlay_picture(annotated, 2, SCENE, MODELS, GRASPS, max_grasps=4, with_legend=False)
     before = annotated.rgb(2)
     assert picture.shape == before.shape and picture.dtype == np.uint8
     changed = np.any(picture != before, axis=-1)

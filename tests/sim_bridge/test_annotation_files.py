@@ -100,7 +100,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
     store = make_session(tmp_path_factory.mktemp("s") / "boxes")
     summary = annotate(store, SCENE, MODELS, [], ALL)
     assert summary.empty_views == (3,) and summary.flagged_views == ()
-    assert any("1 views show no object: 3." in note for note in summary.notes)
+    assert any("1 view shows no object: 3." in note for note in summary.notes)
     assert "1 without any object" in str(summary)
     return store
 

@@ -159,7 +159,7 @@ def label(eye: list[float], target: list[float], depth_error: float = 0.0):
     agreement = depth_agreement(masks.rendered, rendered, measured, 0.01)
     unknown = unknown_occluder(masks, rendered, measured, agreement, OccluderConfig())
     return labels, label_object(
-        pose, mesh, masks, labels, depth, (INTRINSICS, T), (agreement, unknown)
+        pose, (mesh, mesh.bounds), masks, labels, depth, (INTRINSICS, T), (agreement, unknown)
     )
 
 

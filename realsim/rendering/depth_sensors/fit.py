@@ -7,7 +7,7 @@ constant error of the disparity turns a plane into another plane) the bias, unle
 is given.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -24,21 +24,22 @@ from realsim.rendering.depth_sensors.autocovariance import (
     without_trend,
 )
 from realsim.rendering.depth_sensors.estimate import Estimate
+from realsim.rendering.depth_sensors.fit_resimulated import (
+    resampling_pitch,
+    scaled,
+    typical_ratio,
+)
 from realsim.rendering.depth_sensors.holes import HoleCount, blobs_of, count_holes, grazing_of
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.plane import PlaneConfig, PlaneView, find_plane
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
-from realsim.rendering.depth_sensors.statistics import Step, disparity_step, local_noise
+from realsim.rendering.depth_sensors.statistics import Step, disparity_step
 from realsim.rendering.depth_sensors.stripes import bands_of, warp_of, without_bands
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-MOST_FRAMES = 3
-"""Frames on which the pitch of resampling is looked for: they all have the same."""
 HEAVY_TAILS = 1.15
 """Typical noise that differs by more than this factor from the standard deviation's."""
-LEAST_PITCH = 1.15
-"""A smaller pitch is none: rounding and noise make a few neighbours equal, too."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -105,7 +106,7 @@ class FittedDepthModel:
         }
 
 
-def fit_depth_model(
+def fit_depth_model(  # noqa: PLR0913 - what can be known of frames, each optional
     frames: Sequence[ArrayLike],
     intrinsics: CameraIntrinsics,
     profile_: DepthProfile | str,
@@ -115,6 +116,7 @@ def fit_depth_model(
     truths: Sequence[ArrayLike] | None = None,
     names: Sequence[str] | None = None,
     config: DepthFitConfig | None = None,
+    tick: Callable[[int, int], None] | None = None,
 ) -> FittedDepthModel:
     """Return the parameters of a depth sensor from frames of a plane.
 
@@ -127,6 +129,7 @@ def fit_depth_model(
         truths: (H, W) exact depth [m] each (from a board, or a registered table), for the bias.
         names: of the frames, for messages.
         config: how to fit.
+        tick: called with (done, total) after each frame's plane, and at the end.
 
     Raises:
         InputError: no frames, sizes or units that do not fit, or a frame without a plane.
@@ -136,27 +139,46 @@ def fit_depth_model(
     unit = kind.depth_unit_m if unit_m is None else unit_m
     names = names or [f"frame {k}" for k in range(len(frames))]
     _require_equal_lengths(frames, names, regions, truths)
-    baseline = kind.baseline_m
     depths = [np.asarray(f) for f in frames]
-    planes = [
-        find_plane(
-            d, intrinsics, baseline, region=None if regions is None else regions[k],
-            config=config.plane, name=names[k],
-        )
-        for k, d in enumerate(depths)
-    ]  # fmt: skip
-    fB = intrinsics.fx * baseline
+    planes: list[PlaneView] = []
+    for k, depth in enumerate(depths):
+        planes.append(
+            find_plane(
+                depth, intrinsics, kind.baseline_m, region=None if regions is None else regions[k],
+                config=config.plane, name=names[k],
+            )
+        )  # fmt: skip
+        if tick:
+            tick(k + 1, len(depths) + 1)
+    fit = _of_planes(depths, planes, intrinsics, kind, unit, names, truths, config)
+    if tick:
+        tick(len(depths) + 1, len(depths) + 1)
+    return fit
+
+
+def _of_planes(
+    depths: Sequence[NDArray[Any]],
+    planes: Sequence[PlaneView],
+    intrinsics: CameraIntrinsics,
+    kind: DepthProfile,
+    unit: float,
+    names: Sequence[str],
+    truths: Sequence[ArrayLike] | None,
+    config: DepthFitConfig,
+) -> FittedDepthModel:
+    """Return the fit to planes that were found in their frames."""
+    fB = intrinsics.fx * kind.baseline_m
     on_plane = [np.where(p.mask, d, 0) for p, d in zip(planes, depths, strict=True)]
-    step = _common_step(on_plane, intrinsics, baseline, unit)
+    step = _common_step(on_plane, intrinsics, kind.baseline_m, unit)
     bands = bands_of(planes)
     flat = [without_bands(p, bands) for p in planes]
     sums, trend = steady_sums(flat)
-    fast = [without_trend(r, trend)[0] for r in flat]
     if len(sums.products) == 0:
         raise InputError(
             "the planes are too small or too torn to measure noise on: no square of 64x64 px is a "
             "fifth full. Go nearer, or take a larger wall."
         )
+    fast = [without_trend(r, trend)[0] for r in flat]
     shown = [_frame(*x, fB) for x in zip(names, planes, fast, strict=True)]
     found = _step_estimate(step, kind)
     rounding = _rounding(found["quantum_px"].value, unit, fB, planes)
@@ -173,24 +195,42 @@ def fit_depth_model(
     found |= blobs_of(planes) | grazing_of(holes)
     found |= bands | {"warp_px": warp_of(planes)}
     found["bias_px"] = _bias(planes, truths, fB)
+    model, more = _as_simulated(depths, planes, intrinsics, kind, unit, found, config.seed)
+    notes += more
+    notes += [f"{name}: {e.note}" for name, e in found.items() if e.note]
+    return FittedDepthModel(
+        model=model, profile=kind.name, estimates=found, frames=tuple(shown), holes=holes,
+        covariance_px2=sums.covariance(), trend_px=trend, planes=tuple(planes), notes=tuple(notes),
+    )  # fmt: skip
+
+
+def _as_simulated(
+    depths: Sequence[NDArray[Any]],
+    planes: Sequence[PlaneView],
+    intrinsics: CameraIntrinsics,
+    kind: DepthProfile,
+    unit: float,
+    found: dict[str, Estimate],
+    seed: int,
+) -> tuple[DepthSensorModel, list[str]]:
+    """Return the model, and notes, after comparing the frames with a simulation of their planes.
+
+    `found` is changed: its noise is that of typical places, and the pitch of resampling is added.
+    """
+    notes: list[str] = []
     model = _model(kind, unit, found)
-    ratio = _typical_ratio(depths, planes, intrinsics, model, config)
+    ratio = typical_ratio(depths, planes, intrinsics, model, seed)
     if abs(np.log(ratio)) > np.log(HEAVY_TAILS):
-        found |= {n: _scaled(found[n], ratio) for n in ("disparity_noise_px", "slow_noise_px")}
+        found |= {n: scaled(found[n], ratio) for n in ("disparity_noise_px", "slow_noise_px")}
         model = _model(kind, unit, found)
         notes.append(
             f"the noise has heavy tails (bumps, or patches that are worse than the rest): half of "
             f"the places have {ratio:.2f} x what the standard deviation says, and the model has "
             "what they have."
         )
-    pitch = _pitch(depths, planes, intrinsics, model, unit, config)
+    pitch = resampling_pitch(depths, planes, intrinsics, model, unit, seed)
     found["native_pitch_px"] = pitch
-    model = replace(model, native_pitch_px=pitch.value if pitch.determined else 1.0)
-    notes += [f"{name}: {e.note}" for name, e in found.items() if e.note]
-    return FittedDepthModel(
-        model=model, profile=kind.name, estimates=found, frames=tuple(shown), holes=holes,
-        covariance_px2=sums.covariance(), trend_px=trend, planes=tuple(planes), notes=tuple(notes),
-    )  # fmt: skip
+    return replace(model, native_pitch_px=pitch.value if pitch.determined else 1.0), notes
 
 
 def _require_equal_lengths(
@@ -341,80 +381,3 @@ def _model(kind: DepthProfile, unit_m: float, found: dict[str, Estimate]) -> Dep
     """Return the profile's model with what the frames determined."""
     known = {n: e.value for n, e in found.items() if e.determined and n != "distance_exponent"}
     return DepthSensorModel.from_profile(kind, **known, depth_unit_m=unit_m)
-
-
-def _typical_ratio(
-    depths: Sequence[NDArray[Any]],
-    planes: Sequence[PlaneView],
-    intrinsics: CameraIntrinsics,
-    model: DepthSensorModel,
-    config: DepthFitConfig,
-) -> float:
-    """Return the noise of 9x9 windows of the frames over that of the model, both as medians.
-
-    A standard deviation is the larger the worse the worst places are; a median is not.
-    """
-    ratios: list[float] = []
-    for depth, plane in list(zip(depths, planes, strict=True))[:MOST_FRAMES]:
-        simulated = _resimulated(model, plane, intrinsics, config.seed)
-        on = plane.mask & (simulated > 0)
-        real = local_noise(np.where(on, depth, 0), intrinsics, model.baseline_m, on).median_px
-        own = local_noise(simulated, intrinsics, model.baseline_m, on).median_px
-        if np.isfinite(real) and np.isfinite(own) and real > 0 and own > 0:
-            ratios.append(real / own)
-    return float(np.clip(np.median(ratios), 0.1, 3.0)) if ratios else 1.0
-
-
-def _scaled(estimate: Estimate, ratio: float) -> Estimate:
-    """Return an estimate times a ratio, as unsure as the ratio is far from 1."""
-    value = ratio * estimate.value
-    doubt = float(np.hypot(ratio * estimate.uncertainty, 0.3 * abs(value - estimate.value)))
-    return replace(estimate, value=value, uncertainty=doubt)
-
-
-def _resimulated(
-    model: DepthSensorModel, plane: PlaneView, intrinsics: CameraIntrinsics, seed: int
-) -> NDArray[np.float32]:
-    """Return what the model makes of a plane that was found."""
-    exact = np.where(plane.area, intrinsics.fx * model.baseline_m / plane.disparity, 0)
-    plain = replace(model, occlusion=False, bias_px=0.0)
-    return plain.measure(np.nan_to_num(exact), intrinsics, np.random.default_rng(seed))
-
-
-def _pitch(
-    depths: Sequence[NDArray[Any]],
-    planes: Sequence[PlaneView],
-    intrinsics: CameraIntrinsics,
-    model: DepthSensorModel,
-    unit_m: float,
-    config: DepthFitConfig,
-) -> Estimate:
-    """Return over how many pixels one measurement is repeated.
-
-    Cells of p pixels make a share 1 - 1/p of the neighbours equal, beside those that rounding makes
-    equal; that share a simulation of the same planes gives, and the pitch at which it has as many
-    equal neighbours as the frames is the answer.
-    """
-    found: list[float] = []
-    for depth, plane in list(zip(depths, planes, strict=True))[:MOST_FRAMES]:
-        real = _equal_share(depth, plane.mask, unit_m)
-        pitch = 1.0
-        for _ in range(4):
-            tried = replace(model, native_pitch_px=max(pitch, 1.0))
-            simulated = _resimulated(tried, plane, intrinsics, config.seed)
-            share = _equal_share(simulated, plane.mask & (simulated > 0), unit_m)
-            pitch = float(np.clip(pitch * (1 - share) / max(1 - real, 1e-3), 1.0, 10.0))
-        found.append(pitch)
-    pitch = float(np.mean(found))
-    spread = float(np.hypot(np.std(found), 0.1 * (pitch - 1) + 0.02))
-    return Estimate(pitch if pitch > LEAST_PITCH else 1.0, spread, True)
-
-
-def _equal_share(depth: NDArray[Any], mask: Mask, unit_m: float) -> float:
-    """Return how many neighbours along rows and columns have the same count."""
-    counts = np.round(np.asarray(depth, np.float64) / unit_m)
-    equal = [
-        (counts[:, 1:] == counts[:, :-1])[mask[:, 1:] & mask[:, :-1]],
-        (counts[1:] == counts[:-1])[mask[1:] & mask[:-1]],
-    ]
-    return float(np.mean(np.concatenate(equal)))

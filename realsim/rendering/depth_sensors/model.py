@@ -8,9 +8,8 @@ What the steps of `DepthSensorModel.measure` need stands beside this file: which
 eye sees (depth_shadow), what is lost (depth_loss), and noise (depth_noise).
 """
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +32,7 @@ from realsim.rendering.depth_sensors.noise import (
     uniform,
 )
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
+from realsim.rendering.depth_sensors.sensor_file import checked_fields, read_sensor
 from realsim.rendering.depth_sensors.shadow import half_occluded, require_same_size, shadow_mask
 from realsim.rendering.rays import RayScene
 
@@ -197,20 +197,7 @@ class DepthSensorModel:
         Raises:
             InputError: a name is no field, a value has the wrong type or is out of range.
         """
-        known: dict[str, type[Any]] = {f.name: type(f.default) for f in fields(cls)}
-        for name, value in values.items():
-            if name not in known:
-                raise InputError(
-                    f"{source}: a depth sensor model has no '{name}'; it has: {', '.join(known)}."
-                )
-            kind = known[name]
-            right = isinstance(value, bool) if kind is bool else _is_number(value, kind)
-            if not right:
-                raise InputError(
-                    f"{source}: {name} is {value!r}; a finite {kind.__name__} is accepted."
-                )
-        checked: dict[str, Any] = {n: known[n](v) for n, v in values.items()}
-        return cls(**checked)
+        return cls(**checked_fields(cls, values, source, "a depth sensor model"))
 
     @classmethod
     def load(cls, path: Path | str) -> "DepthSensorModel":
@@ -219,23 +206,8 @@ class DepthSensorModel:
         Raises:
             InputError: the file cannot be read, is of another kind, or holds a wrong value.
         """
-        path = Path(path)
-        try:
-            document = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, ValueError) as error:
-            raise InputError(
-                f"{path} cannot be read as JSON ({error}); give the file that `realsim depth-fit "
-                "FRAMES --out FILE` writes."
-            ) from error
-        if not isinstance(document, dict) or document.get("format") != FORMAT:
-            raise InputError(
-                f"{path} is no depth sensor model: its format is not '{FORMAT}'. Give the file "
-                "that `realsim depth-fit FRAMES --out FILE` writes."
-            )
-        values = document.get("model")
-        if not isinstance(values, dict):
-            raise InputError(f"{path} has no object 'model'.")
-        return cls.from_fields(values, str(path))
+        command = "realsim depth-fit FRAMES --out FILE"
+        return cls.from_fields(read_sensor(path, FORMAT, "model", command), str(path))
 
     def document(self) -> dict[str, Any]:
         """Return what `load` reads, ready for JSON."""
@@ -426,12 +398,6 @@ NOT_NEGATIVE = (
     "edge_flying", "slow_noise_px", "slow_correlation_px", "depth_unit_m", "fattening_px",
     "signal_range_m", "loss_patch_px", "warp_px", "column_band_px", "row_band_px", "specimen",
 )  # fmt: skip
-
-
-def _is_number(value: object, kind: type) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return bool(np.isfinite(value)) and (kind is float or float(value).is_integer())
 
 
 def _neighbourhood(disparity: Array32, valid: Mask, radius_px: int) -> tuple[Array32, Array32]:

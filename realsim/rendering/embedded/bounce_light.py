@@ -1,21 +1,29 @@
 """Light on its last way to a surface: through gaps in what stands around, or off a neighbour.
 
-Few rays per pixel, shared by neighbours: the pixels cast different members of one
-low-discrepancy set, and a filter that stops at edges gathers those of a window. Nothing here is
-random: the same view gives the same light.
+Few rays, shared by neighbours: each cell of pixels casts other members of one low-discrepancy set,
+partly spread by the cosine, partly aimed at what is bright in the sky; a filter that stops at edges
+gathers those of a window. Nothing here is random: the same view gives the same light.
 """
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.rendering.embedded.sky_light import SkyArrays, coarse_at, map_at
+from realsim.rendering.embedded.sky_light import (
+    SkyArrays,
+    coarse_at,
+    lamp_direction,
+    map_at,
+    ray_weight,
+)
 from realsim.rendering.embedded.surface_table import SurfaceArrays, SurfacePoints
-from realsim.rendering.embedded.texture_atlas import TextureArrays, texture_at
+from realsim.rendering.embedded.texture_atlas import TextureArrays, color_at, footprint
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
+BUMPS_UNTIL = 0.25
+"""Roughness from which reflected rays do not follow the normal image."""
 NEIGHBOUR_OPENNESS = 0.7
 """Share of the sky that neighbours see themselves, on average: it is not traced."""
 
@@ -45,21 +53,23 @@ def _axes(x: float, y: float, z: float) -> tuple[float, float, float, float, flo
 
 @numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
 def ambient_rays(
+    sky: SkyArrays,
     points: SurfacePoints,
-    pixels: tuple[NDArray[np.int64], int, int],
+    cells: tuple[NDArray[np.int64], int, int],
     lift: float,
-    rays: tuple[Array, Array32],
+    rays: tuple[Array, Array32, Array32],
 ) -> None:
-    """Fill origins and directions (M * n, 3) of rays spread by the cosine about the normals.
+    """Fill rays (M * n) that are spread by the cosine about the normals or aimed at the lamps.
 
     Args:
+        sky: with its lamps.
         points: (N rows) what is seen.
-        pixels: flat pixel numbers (M,) = rows of `points`, width of the image, rays per pixel n.
+        cells: numbers of the cells (M,) = rows of `points`, cells in a row, rays per cell n.
         lift: distance of the origins from the surface [m].
-        rays: origins (M * n, 3) and directions (M * n, 3); are filled.
+        rays: origins (M * n, 3), directions (M * n, 3) and weights (M * n,), mean 1; are filled.
     """
-    rows, width, n = pixels
-    origins, directions = rays
+    rows, width, n = cells
+    origins, directions, weights = rays
     for m in range(len(rows)):
         i = rows[m]
         sx, sy, sz = points.smooth[i, 0], points.smooth[i, 1], points.smooth[i, 2]
@@ -67,16 +77,20 @@ def ambient_rays(
         ax, ay, az, bx, by, bz = _axes(sx, sy, sz)
         for k in range(n):
             u1, u2 = shared_pair(i, width, k, n)
-            radius, phi = np.sqrt(u1), 2 * np.pi * u2
-            p, q, h = radius * np.cos(phi), radius * np.sin(phi), np.sqrt(1 - u1)
-            x, y, z = (
-                p * ax + q * bx + h * sx,
-                p * ay + q * by + h * sy,
-                p * az + q * bz + h * sz,
-            )
+            j = m * n + k
+            aimed = u1 < sky.lamp_rays
+            if aimed:
+                x, y, z = lamp_direction(sky, u1 / sky.lamp_rays, u2)
+            else:
+                u1 = (u1 - sky.lamp_rays) / (1.0 - sky.lamp_rays)
+                radius, phi = np.sqrt(u1), 2 * np.pi * u2
+                p, q, h = radius * np.cos(phi), radius * np.sin(phi), np.sqrt(1 - u1)
+                x = p * ax + q * bx + h * sx
+                y = p * ay + q * by + h * sy
+                z = p * az + q * bz + h * sz
+            weights[j] = ray_weight(sky, (x, y, z), x * sx + y * sy + z * sz)
             # Below the face although above the interpolated surface: mirrored up.
             below = min(x * fx + y * fy + z * fz - 1e-3, 0.0)
-            j = m * n + k
             directions[j, 0] = x - 2 * below * fx
             directions[j, 1] = y - 2 * below * fy
             directions[j, 2] = z - 2 * below * fz
@@ -117,7 +131,8 @@ def sun_rays(
         directions[m, 1] = sy + p * ay + q * by
         directions[m, 2] = sz + p * az + q * bz
         for k in range(3):
-            origins[m, k] = points.position[i, k] + lift * points.flat[i, k]
+            up = lift * points.flat[i, k] + points.bulge[i] * points.smooth[i, k]
+            origins[m, k] = points.position[i, k] + up
 
 
 @numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
@@ -128,14 +143,23 @@ def mirror_rays(
     lift: float,
     rays: tuple[Array, Array32],
 ) -> None:
-    """Fill origins and directions (M, 3) of the reflected rays of the points `rows` (M,)."""
+    """Fill origins and directions (M, 3) of the reflected rays of the points `rows` (M,).
+
+    The lobe of a rough point is wider than the bumps of its normal image turn it: there one ray
+    about the bent normal would only be noise, and the ray is that of the smooth surface.
+    """
     origins, directions = rays
     for m in range(len(rows)):
         i = rows[m]
         x, y, z = points.position[i] - eye
         length = np.sqrt(x * x + y * y + z * z)
         x, y, z = x / length, y / length, z / length
-        nx, ny, nz = points.normal[i, 0], points.normal[i, 1], points.normal[i, 2]
+        even = min(points.roughness[i] / BUMPS_UNTIL, 1.0)
+        nx = points.normal[i, 0] + even * (points.smooth[i, 0] - points.normal[i, 0])
+        ny = points.normal[i, 1] + even * (points.smooth[i, 1] - points.normal[i, 1])
+        nz = points.normal[i, 2] + even * (points.smooth[i, 2] - points.normal[i, 2])
+        length = max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
+        nx, ny, nz = nx / length, ny / length, nz / length
         along = 2 * (x * nx + y * ny + z * nz)
         x, y, z = x - along * nx, y - along * ny, z - along * nz
         fx, fy, fz = points.flat[i, 0], points.flat[i, 1], points.flat[i, 2]
@@ -171,38 +195,40 @@ def face_light(sky: SkyArrays, surfaces: SurfaceArrays, out: Array32) -> None:
 def gather_ambient(
     sky: SkyArrays,
     face_radiance: Array32,
-    rays: tuple[Array32, Int32, NDArray[np.bool_]],
-    pixels: tuple[NDArray[np.int64], int],
+    rays: tuple[Array32, Array32, Int32, NDArray[np.bool_]],
+    cells: tuple[NDArray[np.int64], int],
     out: Array32,
 ) -> None:
-    """Sum what the ambient rays of each pixel met.
+    """Average what the ambient rays of each cell met.
 
     Args:
         sky: the sky.
         face_radiance: (F, 6) of `face_light`.
-        rays: directions (M * n, 3), face in the scene (M * n,) or -1 = sky, whether the sun shines
-            on that face there (M * n,).
-        pixels: rows of `out` (M,), rays per pixel n.
+        rays: directions (M * n, 3), weights (M * n,), face in the scene (M * n,) or -1 = sky,
+            whether the sun shines on that face there (M * n,).
+        cells: rows of `out` (M,), rays per cell n.
         out: (N, 5) mean luminance of the sky where it is open, and wherever; mean radiance of
             neighbours.
     """
-    directions, face, sunlit = rays
-    rows, n = pixels
+    directions, weights, face, sunlit = rays
+    rows, n = cells
     for m in range(len(rows)):
         seen, whole, red, green, blue = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(n):
             j = m * n + k
-            x, y, z = directions[j, 0], directions[j, 1], directions[j, 2]
-            weight = coarse_at(sky.coarse, x, y, z)
-            whole += weight
+            w = weights[j]
+            if w <= 0:
+                continue
+            light = w * coarse_at(sky.coarse, directions[j, 0], directions[j, 1], directions[j, 2])
+            whole += light
             f = face[j]
             if f < 0:
-                seen += weight
+                seen += light
                 continue
-            more = 1.0 if sunlit[j] else 0.0
-            red += face_radiance[f, 0] + more * face_radiance[f, 3]
-            green += face_radiance[f, 1] + more * face_radiance[f, 4]
-            blue += face_radiance[f, 2] + more * face_radiance[f, 5]
+            more = w if sunlit[j] else 0.0
+            red += w * face_radiance[f, 0] + more * face_radiance[f, 3]
+            green += w * face_radiance[f, 1] + more * face_radiance[f, 4]
+            blue += w * face_radiance[f, 2] + more * face_radiance[f, 5]
         i = rows[m]
         out[i, 0], out[i, 1] = seen / n, whole / n
         out[i, 2], out[i, 3], out[i, 4] = red / n, green / n, blue / n
@@ -250,7 +276,8 @@ def fill_tints(
                 length += (c[1, k] - c[0, k]) ** 2
             size = width[i] * np.sqrt((ux * ux + uy * uy) / length)
             at = (p[0, 0] + b * ux + w * vx, p[0, 1] + b * uy + w * vy)
-            r, gr, bl = texture_at(tex, s.images[g, 0], at, (size, 0.0), (0.0, size), 1)
+            i0 = s.images[g, 0]
+            r, gr, bl = color_at(tex, i0, at, footprint(tex, i0, (size, 0.0), (0.0, size), 1))
             red, green, blue = red * r, green * gr, blue * bl
         out[i, 0] = red / max(s.mean_color[g, 0], 1e-4)
         out[i, 1] = green / max(s.mean_color[g, 1], 1e-4)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.rendering.embedded.sky_light import SkyArrays, map_at
-from realsim.rendering.embedded.surface_table import SurfacePoints
+from realsim.rendering.embedded.surface_table import SAME_DIRECTION, SurfacePoints
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -27,94 +27,6 @@ def pixel_lattice(samples: int) -> Array32:
     k = np.arange(samples)
     uv = np.stack([k, (k * step) % samples], -1)
     return ((uv + 0.5) / samples - 0.5).astype(np.float32)
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
-def _same_surface(
-    away: tuple[float, float, float],
-    n: tuple[float, float, float],
-    m: tuple[float, float, float],
-    slope: float,
-) -> float:
-    """Return how far a point `away` from another lies in its plane and looks the same way [0, 1].
-
-    Args:
-        away: from the one to the other [m].
-        n: normal of the one.
-        m: normal of the other.
-        slope: against the plane, from which it is 0.
-    """
-    off = away[0] * n[0] + away[1] * n[1] + away[2] * n[2]
-    d2 = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
-    near = max(1.0 - off * off / (slope * slope * d2 + 1e-12), 0.0)
-    turn = n[0] * m[0] + n[1] * m[1] + n[2] * m[2]
-    return near * min(max(5.0 * turn - 4.0, 0.0), 1.0)
-
-
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
-def edge_filtered(
-    values: Array32,
-    points: SurfacePoints,
-    geometry: Int32,
-    size: tuple[int, int, float],
-    taps: tuple[int, int, float],
-) -> Array32:
-    """Return values (H * W, K) averaged along rows and then along columns, not across edges.
-
-    A joint bilateral filter whose guides are the pixels' planes and normals (Eisemann and Durand,
-    SIGGRAPH 2004), applied to each axis by itself.
-
-    Args:
-        values: of the pixels.
-        points: what they see.
-        geometry: (H * W,) placed mesh, -1 = none; such pixels stay zero.
-        size: height, width, and the slope against a pixel's plane at which its neighbours end.
-        taps: neighbours on either side, the outermost by half; their spacing [px]; and the
-            difference of the first value at which they end.
-    """
-    reach, step, span = taps
-    height, width, slope = size
-    count = values.shape[1]
-    half = np.empty_like(values)
-    out = np.empty_like(values)
-    for axis in range(2):
-        source = values if axis == 0 else half
-        target = half if axis == 0 else out
-        for y in range(height):
-            for x in range(width):
-                i = y * width + x
-                for c in range(count):
-                    target[i, c] = 0.0
-                if geometry[i] < 0:
-                    continue
-                px, py, pz = points.position[i]
-                nx, ny, nz = points.smooth[i, 0], points.smooth[i, 1], points.smooth[i, 2]
-                total = 0.0
-                for k in range(-reach, reach + 1):
-                    u, v = (x + k * step, y) if axis == 0 else (x, y + k * step)
-                    if u < 0 or v < 0 or u >= width or v >= height:
-                        continue
-                    j = v * width + u
-                    if geometry[j] < 0:
-                        continue
-                    w = 0.5 if abs(k) == reach else 1.0
-                    if k != 0:
-                        differ = (source[j, 0] - source[i, 0]) / span
-                        w *= max(1.0 - differ * differ, 0.0)
-                        away = (
-                            points.position[j, 0] - px,
-                            points.position[j, 1] - py,
-                            points.position[j, 2] - pz,
-                        )
-                        m = (points.smooth[j, 0], points.smooth[j, 1], points.smooth[j, 2])
-                        w *= _same_surface(away, (nx, ny, nz), m, slope)
-                    if w > 0:
-                        total += w
-                        for c in range(count):
-                            target[i, c] += w * source[j, c]
-                for c in range(count):
-                    target[i, c] /= total
-    return out
 
 
 @numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
@@ -164,6 +76,44 @@ def busy_pixels(
 
 
 @numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def settle_by_neighbours(
+    geometry: Int32, rows: NDArray[np.int64], size: tuple[int, int], values: Array32
+) -> NDArray[np.int64]:
+    """Fill the values of pixels whose neighbours are on their mesh and agree; return the others.
+
+    Args:
+        geometry: (H * W,) placed mesh.
+        rows: (M,) pixels.
+        size: height and width of the image.
+        values: (H * W,) known to the left, right, above and below of `rows`; are filled there.
+    """
+    height, width = size
+    left = np.empty(len(rows), np.int64)
+    count = 0
+    for m in range(len(rows)):
+        i = rows[m]
+        y, x = i // width, i % width
+        settled = 0 < y < height - 1 and 0 < x < width - 1
+        if settled:
+            for j in (i - 1, i + 1, i - width, i + width):
+                if geometry[j] != geometry[i] or values[j] != values[i - 1]:
+                    settled = False
+        if settled:
+            values[i] = values[i - 1]
+        else:
+            left[count] = i
+            count += 1
+    return left[:count]
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _alike(p: SurfacePoints, i: int, q: SurfacePoints, j: int) -> bool:
+    """Return whether point i of p and point j of q look the same way."""
+    turn = p.smooth[i, 0] * q.smooth[j, 0] + p.smooth[i, 1] * q.smooth[j, 1]
+    return turn + p.smooth[i, 2] * q.smooth[j, 2] > SAME_DIRECTION
+
+
+@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
 def borrow_light(
     sky: SkyArrays,
     samples: tuple[SurfacePoints, Int32, NDArray[np.int64]],
@@ -187,7 +137,11 @@ def borrow_light(
     for m in range(len(geometry)):
         if geometry[m] < 0:
             continue
-        row, column = of_pixel[m] // width, of_pixel[m] % width
+        own = of_pixel[m]
+        if mesh[own] == geometry[m] and _alike(mine, m, theirs, own):
+            out[0][m], out[1][m] = ambient[own], mirrored[own]
+            continue
+        row, column = own // width, own % width
         total = 0.0
         for c in range(4):
             out[0][m, c] = 0.0

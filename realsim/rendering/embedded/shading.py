@@ -34,7 +34,7 @@ def coat(nv: float, roughness: float) -> tuple[float, float]:
     """
     x, y = 1 - roughness, 0.0425 - 0.0275 * roughness
     z, w = 1.04 - 0.572 * roughness, 0.022 * roughness - 0.04
-    a = min(x * x, 2 ** (-9.28 * nv)) * x + y
+    a = min(x * x, np.exp2(-9.28 * nv)) * x + y
     return -1.04 * a + z, 1.04 * a + w
 
 
@@ -119,7 +119,8 @@ def shade(
         peak, vh = 0.0, 1.0
         if lit > 0:
             peak, vh = highlight(n, v, sun, min(alpha + 0.5 * spread, 1.0))
-        bounce = (1 - vh) ** 5
+        bounce = (1 - vh) * (1 - vh)
+        bounce *= bounce * (1 - vh)
         for k in range(3):
             base = points.base[i, k]
             f0 = DIELECTRIC + metal * (base - DIELECTRIC)
@@ -138,7 +139,9 @@ def shade(
 @numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
 def _open_for_gloss(nv: float, open_share: float, alpha: float) -> float:
     """Return the open share of the glossy lobe (Lagarde and de Rousiers 2014, listing 26)."""
-    power = 2.0 ** (-16.0 * alpha - 1.0)
+    if open_share >= 1.0:
+        return 1.0
+    power = np.exp2(-16.0 * alpha - 1.0)
     return min(max((nv + open_share) ** power - 1.0 + open_share, 0.0), 1.0)
 
 

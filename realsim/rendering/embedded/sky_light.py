@@ -28,8 +28,10 @@ IRRADIANCE_ROWS = 32
 """Rows of the irradiance map and of the panorama it is summed from: the cosine lobe is wide."""
 OCTAHEDRON = 32
 """Edge of the coarse octahedral map by which rays to the sky are weighted."""
-BRIGHTEST = 12.0
-"""The coarse map ends at this many times its mean: one lamp must not outweigh all other rays."""
+LAMP_LEVEL = 2.0
+"""What exceeds the mean of the coarse map so many times is a lamp: rays are aimed at it."""
+MOST_LAMP_RAYS = 0.6
+"""Share of the ambient rays that lamps get at most; the others look for neighbours, too."""
 
 
 class MapStack(NamedTuple):
@@ -53,7 +55,13 @@ class SkyArrays(NamedTuple):
     irradiance: MapStack
     """One picture: radiance of a white matte surface with that normal."""
     coarse: Array32
-    """(OCTAHEDRON, OCTAHEDRON) luminance, octahedral."""
+    """(OCTAHEDRON, OCTAHEDRON) luminance, octahedral, mean 1."""
+    lamps: Array
+    """(OCTAHEDRON^2 + 1,) sums of the lamps' luminance over the texels of `coarse`, 0 to 1."""
+    lamp_excess: float
+    """Sum of the lamps' luminance over the texels."""
+    lamp_rays: float
+    """Share of the ambient rays that are aimed at the lamps."""
     sun_direction: Array
     """(3,) unit, world."""
     sun: Array
@@ -77,11 +85,16 @@ def sky_arrays(environment: Environment) -> SkyArrays:
     irradiance = np.empty((IRRADIANCE_ROWS, 2 * IRRADIANCE_ROWS, 3), np.float32)
     _cosine_average(_resized(environment.panorama, IRRADIANCE_ROWS), irradiance)
     sun = np.array(environment.sun_direction, dtype=np.float64)
+    coarse = _coarse(_resized(environment.panorama, IRRADIANCE_ROWS))
+    lamps, lamp_excess, lamp_rays = _lamps(coarse)
     return SkyArrays(
         panorama=_stack(halvings, np.arange(float(len(halvings)))),
         lobes=_stack(lobes, np.array(roughness)),
         irradiance=_stack([irradiance], np.zeros(1)),
-        coarse=_coarse(_resized(environment.panorama, IRRADIANCE_ROWS)),
+        coarse=coarse,
+        lamps=lamps,
+        lamp_excess=lamp_excess,
+        lamp_rays=lamp_rays,
         sun_direction=sun / np.linalg.norm(sun),
         sun=np.array(environment.sun, dtype=np.float64),
         sun_radius=float(np.radians(environment.sun_radius_deg)),
@@ -114,7 +127,7 @@ def _stack(pictures: list[Array32], roughness: Array) -> MapStack:
 
 
 def _coarse(panorama: Array32) -> Array32:
-    """Return the octahedral luminance map, mean 1, cut off at BRIGHTEST; ones if all is black."""
+    """Return the octahedral luminance map, mean 1; ones if all is black."""
     n = OCTAHEDRON
     stack = _stack([panorama], np.zeros(1))
     out = np.empty((n, n), np.float32)
@@ -122,8 +135,23 @@ def _coarse(panorama: Array32) -> Array32:
     mean = float(out.mean())
     if mean <= 0:
         return np.ones_like(out)
-    out = np.minimum(out / mean, BRIGHTEST)
-    return np.asarray(out / out.mean(), np.float32)
+    return np.asarray(out / mean, np.float32)
+
+
+def _lamps(coarse: Array32) -> tuple[Array, float, float]:
+    """Return the lamps' cumulative sums (n^2 + 1,), their total, and their share of the rays.
+
+    The share is that of the light: in an even sky no ray is aimed.
+    """
+    excess = np.maximum(coarse.astype(np.float64).ravel() - LAMP_LEVEL, 0.0)
+    # Every second row runs backwards, so that texels that follow one another touch.
+    n = coarse.shape[0]
+    excess = excess.reshape(n, n)
+    excess[1::2] = excess[1::2, ::-1]
+    total = float(excess.sum())
+    sums = np.concatenate([[0.0], np.cumsum(excess.ravel())])
+    share = min(total / float(coarse.sum()), MOST_LAMP_RAYS)
+    return sums / max(total, 1e-30), total, share
 
 
 @numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
@@ -157,10 +185,67 @@ def coarse_at(coarse: Array32, x: float, y: float, z: float) -> float:
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def lamp_direction(sky: SkyArrays, u1: float, u2: float) -> tuple[float, float, float]:
+    """Return a unit direction to the lamps, spread by their luminance, of two numbers in [0, 1)."""
+    n = sky.coarse.shape[0]
+    low, high = 0, n * n
+    while high - low > 1:
+        middle = (low + high) // 2
+        if sky.lamps[middle] <= u1:
+            low = middle
+        else:
+            high = middle
+    i, j = low // n, low % n
+    part = (u1 - sky.lamps[low]) / max(sky.lamps[low + 1] - sky.lamps[low], 1e-30)
+    if i % 2:
+        j, part = n - 1 - j, 1.0 - part
+    x, y = 2 * (j + part) / n - 1, 2 * (i + u2) / n - 1
+    z = 1 - abs(x) - abs(y)
+    if z < 0:
+        x, y = (1 - abs(y)) * (1.0 if x >= 0 else -1.0), (1 - abs(x)) * (1.0 if y >= 0 else -1.0)
+    length = np.sqrt(x * x + y * y + z * z)
+    return x / length, y / length, z / length
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def ray_weight(sky: SkyArrays, d: tuple[float, float, float], cosine: float) -> float:
+    """Return by what an ambient ray counts: the cosine's density over that of all the rays.
+
+    The balance heuristic of Veach and Guibas ("Optimally combining sampling techniques", SIGGRAPH
+    1995) for rays spread by the cosine and rays aimed at the lamps.
+    """
+    if cosine <= 0:
+        return 0.0
+    if sky.lamp_rays <= 0:
+        return 1.0
+    n = sky.coarse.shape[0]
+    excess = max(coarse_at(sky.coarse, d[0], d[1], d[2]) - LAMP_LEVEL, 0.0)
+    # Solid angle of a texel of the octahedral map: (2 / n)^2 |d|_1^3.
+    side = abs(d[0]) + abs(d[1]) + abs(d[2])
+    aimed = excess / sky.lamp_excess * n * n / (4 * side * side * side)
+    spread = cosine / np.pi
+    return spread / (sky.lamp_rays * aimed + (1 - sky.lamp_rays) * spread)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
 def _angles(x: float, y: float, z: float) -> tuple[float, float]:
-    """Return azimuth and polar angle of a unit direction as shares of the map, [0, 1]."""
-    azimuth = np.arctan2(y, x) / (2 * np.pi)
-    return azimuth - np.floor(azimuth), np.arccos(min(max(z, -1.0), 1.0)) / np.pi
+    """Return azimuth and polar angle of a unit direction as shares of the map, [0, 1].
+
+    Polynomials of Abramowitz and Stegun, "Handbook of mathematical functions", 4.4.47 and 4.4.45:
+    within 1e-4 rad of arctan2 and arccos at a third of their time.
+    """
+    c, s = abs(x), abs(y)
+    q = min(c, s) / max(c, s, 1e-30)
+    q2 = q * q
+    high = 0.1801410 + q2 * (0.0208351 * q2 - 0.0851330)
+    turn = q * (0.9998660 + q2 * (-0.3302995 + q2 * high))
+    turn = turn if c >= s else 0.5 * np.pi - turn
+    turn = turn if x >= 0 else np.pi - turn
+    azimuth = turn / (2 * np.pi) if y >= 0 else 1.0 - turn / (2 * np.pi)
+    up = min(abs(z), 1.0)
+    polar = np.sqrt(1.0 - up)
+    polar *= 1.5707288 + up * (-0.2121144 + up * (0.0742610 - 0.0187293 * up))
+    return azimuth, (polar if z >= 0 else np.pi - polar) / np.pi
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.rendering.appearance import LEAST_ROUGHNESS, Material
 from realsim.rendering.developing import srgb_decoded
+from realsim.rendering.embedded.face_geometry import bent_normal, bulge_of, edges_of, plane_met
 from realsim.rendering.embedded.materials import (
     PLAIN_COLORS,
     box_uv,
@@ -23,18 +24,22 @@ from realsim.rendering.embedded.texture_atlas import (
     MOST_PROBES,
     TextureArrays,
     TextureAtlas,
-    texture_at,
+    color_at,
+    detail_at,
+    footprint,
 )
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
-Edges = tuple[float, float, float, float, float, float]
+Rows = NDArray[np.int64]
 OBJECT_ROUGHNESS = 0.42
 """Of meshes without a material: satin plastic and printed cardboard."""
 TABLE_ROUGHNESS = 0.62
 """Of background without a material: oiled wood, printed paper."""
+SAME_DIRECTION = 0.98
+"""Cosine of normals (11 deg) within which a part of a pixel is what its centre is."""
 WIDEST_FOOTPRINT = 4.0
 """Footprints end at so many tiles of the texture: rays that graze a face have no finite one."""
 
@@ -83,14 +88,16 @@ class SurfacePoints(NamedTuple):
     """(N,) widened where the normal turns within the pixel."""
     metallic: Array32
     """(N,)."""
+    bulge: Array32
+    """(N,) height of the rounded surface that the normals tell of above the flat face [m]."""
 
 
 def empty_points(n: int) -> SurfacePoints:
     """Return buffers for n rays."""
     rows = [np.zeros((n, 3), np.float32) for _ in range(4)]
     flat, smooth, normal, base = rows
-    rough, metal = np.ones(n, np.float32), np.zeros(n, np.float32)
-    return SurfacePoints(np.zeros((n, 3)), flat, smooth, normal, base, rough, metal)
+    rough, metal, bulge = np.ones(n, np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32)
+    return SurfacePoints(np.zeros((n, 3)), flat, smooth, normal, base, rough, metal, bulge)
 
 
 def surface_arrays(
@@ -137,14 +144,11 @@ def _one_surface(
     world = se3.transform(placed.T_world_obj, mesh.vertices) - center
     R = placed.T_world_obj[:3, :3].astype(np.float32)
     material, image, uv, wraps = _look(number, placed)
-    images = (
-        atlas.add(image, srgb=True, wrap=wraps),
-        atlas.add(material.roughness_image, srgb=False, wrap=wraps),
-        atlas.add(material.normal_image, srgb=False, wrap=wraps),
-    )
+    normal, rough = atlas.add_detail(material.normal_image, material.roughness_image, wrap=wraps)
+    images = (atlas.add_color(image, wrap=wraps), rough, normal)
     base = np.array(material.base_color, np.float32)
     colors: Array32 | None = None
-    mean = base * (atlas.mean(images[0]) if images[0] >= 0 else 1.0)
+    mean = base * (atlas.mean_color(images[0]) if images[0] >= 0 else 1.0)
     if placed.material is None and image is None and mesh.colors is not None:
         linear = srgb_decoded(np.arange(256) / 255.0).astype(np.float32)[mesh.colors]
         colors = linear[mesh.faces]
@@ -196,38 +200,13 @@ def _look(
     return paint, speckle_texture(), box_uv(mesh, 0.12), True
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
-def _meet(
-    e: Edges,
-    o: tuple[float, float, float],
-    q: tuple[float, float, float],
-    d: tuple[float, float, float],
-) -> tuple[float, float, float]:
-    """Return the weights of the second and third corner, and t, where a ray meets a plane.
-
-    Moller and Trumbore, "Fast, minimum storage ray/triangle intersection", 1997.
-
-    Args:
-        e: the two edges from the first corner.
-        o: origin of the ray minus the first corner.
-        q: o x first edge.
-        d: direction of the ray.
-    """
-    x, y, z = d
-    px, py, pz = y * e[5] - z * e[4], z * e[3] - x * e[5], x * e[4] - y * e[3]
-    det = e[0] * px + e[1] * py + e[2] * pz
-    safe = det if abs(det) > 1e-30 else 1e-30
-    u = (o[0] * px + o[1] * py + o[2] * pz) / safe
-    v = (x * q[0] + y * q[1] + z * q[2]) / safe
-    return u, v, (e[3] * q[0] + e[4] * q[1] + e[5] * q[2]) / safe
-
-
 def fill_points(
     surfaces: SurfaceArrays,
     images: TextureArrays,
     rays: tuple[Array, Array, Array32, Array32, Array32],
     hits: tuple[Int32, Int32],
     out: SurfacePoints,
+    pixels: tuple[SurfacePoints, Int32, Rows] | None = None,
 ) -> None:
     """Fill the surface points of rays.
 
@@ -238,9 +217,14 @@ def fill_points(
             change over the pixel's width and height (N, 3) each.
         hits: placed mesh (N,), -1 = none, and face of that mesh (N,) of each ray.
         out: buffers of N rows.
+        pixels: where the rays are parts of pixels: what these see, their mesh, and the pixel (N,)
+            of each ray. A ray on its pixel's own face direction has the pixel's material, which is
+            averaged over the pixel already.
     """
     places = np.empty((len(hits[0]), 7), np.float32)
     _fill_geometry(surfaces, rays, hits, out, places)
+    if pixels is not None:
+        hits = (borrow_materials(pixels, hits[0], out), hits[1])
     _fill_materials(surfaces, images, hits, places, out)
 
 
@@ -264,10 +248,7 @@ def _fill_geometry(
             continue
         f = s.first_face[geometry[i]] + face[i]
         c = s.corners[f]
-        e = (
-            c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2],
-            c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2],
-        )  # fmt: skip
+        e = edges_of(s.corners, f)
         o = (
             eye[0] - center[0] - c[0, 0],
             eye[1] - center[1] - c[0, 1],
@@ -275,12 +256,12 @@ def _fill_geometry(
         )
         q = (o[1] * e[2] - o[2] * e[1], o[2] * e[0] - o[0] * e[2], o[0] * e[1] - o[1] * e[0])
         x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
-        b, w, t = _meet(e, o, q, (x, y, z))
+        b, w, t = plane_met(e, o, q, (x, y, z))
         # The footprint: where the rays of the next pixels meet the plane of the face.
         du = (x + along_u[i, 0], y + along_u[i, 1], z + along_u[i, 2])
         dv = (x + along_v[i, 0], y + along_v[i, 1], z + along_v[i, 2])
-        bu, wu, _ = _meet(e, o, q, du)
-        bv, wv, _ = _meet(e, o, q, dv)
+        bu, wu, _ = plane_met(e, o, q, du)
+        bv, wv, _ = plane_met(e, o, q, dv)
         bu, wu, bv, wv = bu - b, wu - w, bv - b, wv - w
         b, w = min(max(b, 0.0), 1.0), min(max(w, 0.0), 1.0)
         places[i, 0], places[i, 1] = b, w
@@ -306,6 +287,45 @@ def _fill_geometry(
             d1, d2 = m[1, k] - m[0, k], m[2, k] - m[0, k]
             turn += (d1 * bu + d2 * wu) ** 2 + (d1 * bv + d2 * wv) ** 2
         places[i, 6] = turn
+        out.bulge[i] = bulge_of(e, m, (a, b, w)) if turn > 0 else 0.0
+
+
+@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def borrow_materials(
+    pixels: tuple[SurfacePoints, Int32, Rows], geometry: Int32, out: SurfacePoints
+) -> Int32:
+    """Fill the materials of rays on their pixel's surface; return the mesh (N,) of the others.
+
+    See `fill_points`; -1 = nothing is left to look up.
+    """
+    theirs, mesh, owner = pixels
+    left = geometry.copy()
+    for m in range(len(geometry)):
+        i = owner[m]
+        if geometry[m] < 0 or mesh[i] != geometry[m]:
+            continue
+        turn = 0.0
+        for k in range(3):
+            turn += out.smooth[m, k] * theirs.smooth[i, k]
+        if turn < SAME_DIRECTION:
+            continue
+        left[m] = -1
+        length = 1e-12
+        for k in range(3):
+            out.base[m, k] = theirs.base[i, k]
+            bent = theirs.normal[i, k] + out.smooth[m, k] - theirs.smooth[i, k]
+            out.normal[m, k] = bent
+            length += bent * bent
+        for k in range(3):
+            out.normal[m, k] /= np.sqrt(length)
+        out.roughness[m], out.metallic[m] = theirs.roughness[i], theirs.metallic[i]
+    return left
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def _capped(value: float) -> float:
+    """Return a change of texture coordinates of finite size."""
+    return min(max(value, -WIDEST_FOOTPRINT), WIDEST_FOOTPRINT)
 
 
 @numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
@@ -337,77 +357,32 @@ def _fill_materials(
             blue *= a * col[0, 2] + b * col[1, 2] + w * col[2, 2]
         if s.images[g, 0] >= 0 or s.images[g, 1] >= 0 or s.images[g, 2] >= 0:
             f = s.first_face[g] + face[i]
-            p = s.uv[f]
-            ux, uy = p[1, 0] - p[0, 0], p[1, 1] - p[0, 1]
-            vx, vy = p[2, 0] - p[0, 0], p[2, 1] - p[0, 1]
-            at = (p[0, 0] + b * ux + w * vx, p[0, 1] + b * uy + w * vy)
+            p, q = s.uv[f, 0, 0], s.uv[f, 0, 1]
+            ux, uy = s.uv[f, 1, 0] - p, s.uv[f, 1, 1] - q
+            vx, vy = s.uv[f, 2, 0] - p, s.uv[f, 2, 1] - q
+            at = (p + b * ux + w * vx, q + b * uy + w * vy)
             bu, wu, bv, wv = places[i, 2], places[i, 3], places[i, 4], places[i, 5]
             du = (_capped(bu * ux + wu * vx), _capped(bu * uy + wu * vy))
             dv = (_capped(bv * ux + wv * vx), _capped(bv * uy + wv * vy))
-            if s.images[g, 0] >= 0:
-                r, gr, bl = texture_at(tex, s.images[g, 0], at, du, dv, MOST_PROBES)
+            i0, i1, i2 = s.images[g, 0], s.images[g, 1], s.images[g, 2]
+            if i0 >= 0:
+                r, gr, bl = color_at(tex, i0, at, footprint(tex, i0, du, dv, MOST_PROBES))
                 red, green, blue = red * r, green * gr, blue * bl
-            if s.images[g, 1] >= 0:
-                rough *= texture_at(tex, s.images[g, 1], at, du, dv, 1)[0]
-            if s.images[g, 2] >= 0:
-                bend = texture_at(tex, s.images[g, 2], at, du, dv, 1)
+            bend = (0.5, 0.5, 1.0, 1.0)
+            if i2 >= 0:
+                bend = detail_at(tex, i2, at, footprint(tex, i2, du, dv, 1)[3])
+            if i1 >= 0:
+                if i1 != i2:
+                    rough *= detail_at(tex, i1, at, footprint(tex, i1, du, dv, 1)[3])[3]
+                else:
+                    rough *= bend[3]
+            if i2 >= 0:
                 n = (out.smooth[i, 0], out.smooth[i, 1], out.smooth[i, 2])
-                x, y, z, more = _bent(n, s.corners[f], (ux, uy, vx, vy), bend)
+                x, y, z, more = bent_normal(n, edges_of(s.corners, f), (ux, uy, vx, vy), bend)
                 out.normal[i, 0], out.normal[i, 1], out.normal[i, 2] = x, y, z
                 turn += more
         out.base[i, 0], out.base[i, 1], out.base[i, 2] = red, green, blue
         rough = min(max(rough, LEAST_ROUGHNESS), 1.0)
-        out.roughness[i] = min(rough**4 + min(0.5 * turn, 0.18), 1.0) ** 0.25
+        rough = rough * rough * rough * rough + min(0.5 * turn, 0.18)
+        out.roughness[i] = np.sqrt(np.sqrt(min(rough, 1.0)))
         out.metallic[i] = s.metallic[g]
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
-def _capped(value: float) -> float:
-    """Return a change of texture coordinates of finite size."""
-    return min(max(value, -WIDEST_FOOTPRINT), WIDEST_FOOTPRINT)
-
-
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
-def _bent(
-    n: tuple[float, float, float],
-    c: Array32,
-    uv: tuple[float, float, float, float],
-    bend: tuple[float, float, float],
-) -> tuple[float, float, float, float]:
-    """Return the normal bent by the normal image, and the spread of normals it stands for.
-
-    The averaged normal of many texels is shorter than 1; the rest widens the highlight (Toksvig,
-    "Mipmapping normal maps", 2005).
-    """
-    ux, uy, vx, vy = uv
-    e = (
-        c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2],
-        c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2],
-    )  # fmt: skip
-    det = ux * vy - uy * vx
-    if abs(det) < 1e-20:
-        return n[0], n[1], n[2], 0.0
-    tx, ty, tz = (
-        (e[0] * vy - e[3] * uy) / det,
-        (e[1] * vy - e[4] * uy) / det,
-        (e[2] * vy - e[5] * uy) / det,
-    )
-    along = tx * n[0] + ty * n[1] + tz * n[2]
-    tx, ty, tz = tx - along * n[0], ty - along * n[1], tz - along * n[2]
-    length = max(np.sqrt(tx * tx + ty * ty + tz * tz), 1e-20)
-    tx, ty, tz = tx / length, ty / length, tz / length
-    # The second axis runs along +v; mirrored coordinates turn it round.
-    bx, by, bz = n[1] * tz - n[2] * ty, n[2] * tx - n[0] * tz, n[0] * ty - n[1] * tx
-    wx, wy, wz = e[3] * ux - e[0] * vx, e[4] * ux - e[1] * vx, e[5] * ux - e[2] * vx
-    if (bx * wx + by * wy + bz * wz) * det < 0:
-        bx, by, bz = -bx, -by, -bz
-    # 8-bit images say 128 for "not bent", half a step off the middle.
-    x, y, z = (255 * bend[0] - 128) / 127, (255 * bend[1] - 128) / 127, (255 * bend[2] - 128) / 127
-    size = min(max(np.sqrt(x * x + y * y + z * z), 0.2), 1.0)
-    sx, sy, sz = (
-        tx * x + bx * y + n[0] * z,
-        ty * x + by * y + n[1] * z,
-        tz * x + bz * y + n[2] * z,
-    )
-    length = max(np.sqrt(sx * sx + sy * sy + sz * sz), 1e-12)
-    return sx / length, sy / length, sz / length, 2 * (1 - size) / size

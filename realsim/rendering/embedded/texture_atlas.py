@@ -1,8 +1,8 @@
 """All images of a scene in one buffer, with their halvings, read by the shading kernels.
 
-Values stay 8 bit; colours are averaged as linear light and stored as sRGB again, which is finer
-than the picture that is made of them. A look-up averages over the footprint of the pixel: between
-two halvings, with several probes along the longer side where the surface is seen obliquely.
+Values stay 8 bit; colours are averaged as linear light and stored as its square root, which is as
+fine as the picture that is made of them. A look-up averages over the footprint of the pixel:
+between two halvings, with several probes along the longer side where the surface is seen obliquely.
 """
 
 from typing import NamedTuple
@@ -11,11 +11,13 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.rendering.developing import srgb_decoded, srgb_encoded
+from realsim.rendering.developing import srgb_decoded
 
 Array32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 MOST_HALVINGS = 16
+SAME_HALVING = 0.25
+"""A colour so close to one halving is read from that one alone, else from two."""
 MOST_PROBES = 6
 """Footprints longer than this many times their width are read somewhat blurred."""
 
@@ -24,44 +26,74 @@ class TextureArrays(NamedTuple):
     """The images as the kernels read them."""
 
     texels: UInt8
-    """All values of all halvings of all images."""
+    """(T, 4) texels of all halvings of all images, four values each."""
     layout: NDArray[np.int64]
-    """(T, MOST_HALVINGS, 3) first value, rows and columns of each halving."""
+    """(I, MOST_HALVINGS, 3) first texel, rows and columns of each halving."""
     halvings: NDArray[np.int64]
-    """(T,) number of halvings, the image itself included."""
-    channels: NDArray[np.int64]
-    """(T,) values per texel, 1 or 3."""
+    """(I,) number of halvings, the image itself included."""
     wraps: NDArray[np.bool_]
-    """(T,) whether the image repeats; else its border continues."""
-    decode: Array32
-    """(2, 256) values as stored: linear in [0, 1], and sRGB decoded."""
-    is_srgb: NDArray[np.int64]
-    """(T,) row of `decode`."""
+    """(I,) whether the image repeats; else its border continues."""
 
 
 class TextureAtlas:
-    """Collects images; the same image under the same reading is kept once."""
+    """Collects images; the same image under the same reading is kept once.
+
+    Colours are kept as the square root of linear light, which a product decodes; normals and
+    roughness as they are, both in one texel where they have the same size.
+    """
 
     def __init__(self) -> None:
         """Begin without images."""
-        self._index: dict[tuple[int, bool, bool], int] = {}
-        self._kept: list[UInt8] = []
+        self._index: dict[tuple[int, int, bool], int] = {}
+        self._kept: list[UInt8 | None] = []
         self._images: list[list[UInt8]] = []
-        self._srgb: list[bool] = []
         self._wraps: list[bool] = []
 
-    def add(self, image: UInt8 | None, *, srgb: bool, wrap: bool) -> int:
-        """Return the number of an image (H, W) or (H, W, 3), first row at v = 1; -1 = None."""
+    def add_color(self, image: UInt8 | None, *, wrap: bool) -> int:
+        """Return the number of an sRGB image (H, W, 3), first row at v = 1; -1 = None."""
         if image is None:
             return -1
-        key = (id(image), srgb, wrap)
+        key = (id(image), 0, wrap)
         if key not in self._index:
-            self._index[key] = len(self._images)
-            self._kept.append(image)  # an id is only good as long as its object lives
-            self._images.append(_halvings(image, srgb))
-            self._srgb.append(srgb)
-            self._wraps.append(wrap)
+            decode = srgb_decoded(np.arange(256) / 255.0).astype(np.float32)
+            self._append(key, (image,), _halvings(decode[image], rooted=True))
         return self._index[key]
+
+    def add_detail(
+        self, normal: UInt8 | None, roughness: UInt8 | None, *, wrap: bool
+    ) -> tuple[int, int]:
+        """Return the numbers of a normal image (H, W, 3) and a roughness image (H, W); -1 = None.
+
+        They are one and the same where both are of one size.
+        """
+        if normal is not None and roughness is not None and normal.shape[:2] != roughness.shape:
+            return (
+                self.add_detail(normal, None, wrap=wrap)[0],
+                self.add_detail(None, roughness, wrap=wrap)[1],
+            )
+        of = normal if normal is not None else roughness
+        if of is None:
+            return -1, -1
+        key = (id(normal), id(roughness), wrap)
+        if key not in self._index:
+            image = np.full((*of.shape[:2], 4), 255, np.uint8)
+            if normal is not None:
+                image[..., :3] = normal
+            if roughness is not None:
+                image[..., 3] = roughness
+            value = image.astype(np.float32) / np.float32(255)
+            self._append(key, (normal, roughness), _halvings(value, rooted=False))
+        number = self._index[key]
+        return (number if normal is not None else -1), (number if roughness is not None else -1)
+
+    def _append(
+        self, key: tuple[int, int, bool], sources: tuple[UInt8 | None, ...], images: list[UInt8]
+    ) -> None:
+        """Take in the halvings of an image."""
+        self._index[key] = len(self._images)
+        self._kept.extend(sources)  # an id is only good as long as its object lives
+        self._images.append(images)
+        self._wraps.append(key[2])
 
     def arrays(self) -> TextureArrays:
         """Return the buffer."""
@@ -71,47 +103,43 @@ class TextureAtlas:
         for i, images in enumerate(self._images):
             for k, image in enumerate(images):
                 layout[i, k] = first, image.shape[0], image.shape[1]
-                first += image.size
-        flat = [a.ravel() for images in self._images for a in images]
-        ramp = np.arange(256) / 255.0
+                first += image.shape[0] * image.shape[1]
+        flat = [a.reshape(-1, 4) for images in self._images for a in images]
         return TextureArrays(
-            texels=np.concatenate(flat) if flat else np.zeros(1, np.uint8),
+            texels=np.concatenate(flat) if flat else np.zeros((1, 4), np.uint8),
             layout=layout,
             halvings=np.array([len(images) for images in self._images] or [1], np.int64),
-            channels=np.array([1 if a[0].ndim == 2 else 3 for a in self._images] or [1], np.int64),
             wraps=np.array(self._wraps or [False], np.bool_),
-            decode=np.stack([ramp, srgb_decoded(ramp)]).astype(np.float32),
-            is_srgb=np.array([int(s) for s in self._srgb] or [0], np.int64),
         )
 
-    def mean(self, index: int) -> NDArray[np.float64]:
-        """Return the mean (3,) of an image as decoded values."""
-        coarse = self._images[index][-1] / 255.0
-        value = srgb_decoded(coarse) if self._srgb[index] else coarse
-        flat = np.asarray(value, np.float64).reshape(-1, 1 if value.ndim == 2 else 3).mean(0)
-        return np.broadcast_to(flat, (3,)).copy()
+    def mean_color(self, index: int) -> NDArray[np.float64]:
+        """Return the mean (3,) of a colour image in linear light."""
+        coarse = self._images[index][-1][..., :3] / 255.0
+        return np.square(coarse).reshape(-1, 3).mean(0)
 
 
-def _halvings(image: UInt8, srgb: bool) -> list[UInt8]:
-    """Return the image and its halvings, down to one row or column."""
+def _halvings(value: Array32, *, rooted: bool) -> list[UInt8]:
+    """Return an image (H, W, 3 or 4) of values in [0, 1] and its halvings, four bytes a texel."""
     import cv2
 
-    out = [np.ascontiguousarray(image)]
-    ramp = np.arange(256, dtype=np.float32) / np.float32(255)
-    value = (srgb_decoded(ramp).astype(np.float32) if srgb else ramp)[image]
-    while min(value.shape[:2]) > 1 and len(out) < MOST_HALVINGS:
+    out: list[UInt8] = []
+    while True:
+        stored = np.full((*value.shape[:2], 4), 255, np.uint8)
+        coded = np.sqrt(value) if rooted else value
+        stored[..., : value.shape[2]] = np.round(255.0 * coded)
+        out.append(stored)
+        if min(value.shape[:2]) == 1 or len(out) == MOST_HALVINGS:
+            return out
         size = (max(1, value.shape[1] // 2), max(1, value.shape[0] // 2))
         value = np.asarray(cv2.resize(value, size, interpolation=cv2.INTER_AREA), np.float32)
-        stored = srgb_encoded(value) if srgb else value
-        out.append(np.round(255.0 * stored).astype(np.uint8))
-    return out
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
-def _bilinear(tex: TextureArrays, i: int, k: int, u: float, v: float) -> tuple[float, float, float]:
-    """Return the value of halving k of image i at texture coordinates, v up."""
-    first, rows, columns = tex.layout[i, k]
-    lut, channels = tex.decode[tex.is_srgb[i]], tex.channels[i]
+def _corners(
+    tex: TextureArrays, i: int, k: int, u: float, v: float
+) -> tuple[int, int, int, int, float, float]:
+    """Return the four texels about texture coordinates, v up, and the shares of the later ones."""
+    first, rows, columns = tex.layout[i, k, 0], tex.layout[i, k, 1], tex.layout[i, k, 2]
     s, t = u, 1.0 - v
     if tex.wraps[i]:
         s, t = s - np.floor(s), t - np.floor(t)
@@ -125,57 +153,82 @@ def _bilinear(tex: TextureArrays, i: int, k: int, u: float, v: float) -> tuple[f
         c1, r1 = c1 if c1 < columns else 0, r1 if r1 < rows else 0
     else:
         c0, c1, r0, r1 = max(c0, 0), min(c1, columns - 1), max(r0, 0), min(r1, rows - 1)
-    p = first + (r0 * columns + c0) * channels
-    q = first + (r0 * columns + c1) * channels
-    m = first + (r1 * columns + c0) * channels
-    n = first + (r1 * columns + c1) * channels
-    wp, wq, wm, wn = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
-    z = tex.texels
-    red = wp * lut[z[p]] + wq * lut[z[q]] + wm * lut[z[m]] + wn * lut[z[n]]
-    if channels == 1:
-        return red, red, red
-    green = wp * lut[z[p + 1]] + wq * lut[z[q + 1]] + wm * lut[z[m + 1]] + wn * lut[z[n + 1]]
-    blue = wp * lut[z[p + 2]] + wq * lut[z[q + 2]] + wm * lut[z[m + 2]] + wn * lut[z[n + 2]]
-    return red, green, blue
+    top, below = first + r0 * columns, first + r1 * columns
+    return top + c0, top + c1, below + c0, below + c1, a, b
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
-def texture_at(
-    tex: TextureArrays, i: int, at: tuple[float, float], du: tuple[float, float],
-    dv: tuple[float, float], most_probes: int,
-) -> tuple[float, float, float]:  # fmt: skip
-    """Return the mean of image i over a footprint.
+@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def footprint(
+    tex: TextureArrays, i: int, du: tuple[float, float], dv: tuple[float, float], most_probes: int
+) -> tuple[float, float, int, float]:
+    """Return how the pixel lies on image i: its longer side (2), the probes along it, the halving.
 
     Args:
         tex: the images.
         i: number of the image.
-        at: texture coordinates of its middle.
         du: change of the coordinates over the pixel's width.
         dv: change over its height.
         most_probes: look-ups along the longer side, at most.
     """
     rows, columns = tex.layout[i, 0, 1], tex.layout[i, 0, 2]
-    la = np.hypot(du[0] * columns, du[1] * rows)
-    lb = np.hypot(dv[0] * columns, dv[1] * rows)
-    ax, ay, major, minor = du[0], du[1], la, lb
+    la = (du[0] * columns) ** 2 + (du[1] * rows) ** 2
+    lb = (dv[0] * columns) ** 2 + (dv[1] * rows) ** 2
+    ax, ay, major, minor = du[0], du[1], np.sqrt(la), np.sqrt(lb)
     if lb > la:
-        ax, ay, major, minor = dv[0], dv[1], lb, la
-    probes = 1
+        ax, ay, major, minor = dv[0], dv[1], np.sqrt(lb), np.sqrt(la)
+    probes, level = 1, 0.0
     if major > 1.0:
         probes = min(most_probes, int(np.ceil(major / max(minor, 1.0) - 0.25)))
         probes = max(probes, 1)
-    level = np.log2(max(major / probes, 1.0))
-    level = min(level, tex.halvings[i] - 1.0)
+        level = np.log2(max(major / probes, 1.0))
+    return ax, ay, probes, min(level, tex.halvings[i] - 1.0)
+
+
+@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def color_at(
+    tex: TextureArrays, i: int, at: tuple[float, float], spread: tuple[float, float, int, float]
+) -> tuple[float, float, float]:
+    """Return the mean linear colour of image i over a `footprint` about texture coordinates."""
+    ax, ay, probes, level = spread
     # Close to one halving, that one alone will do: the difference is below what is seen.
-    k = int(level + 0.1)
+    k = int(level + SAME_HALVING)
     mix = level - k
+    levels = 2 if mix > SAME_HALVING else 1
+    z = tex.texels
     red, green, blue = 0.0, 0.0, 0.0
-    for p in range(probes):
-        w = (p + 0.5) / probes - 0.5
-        u, v = at[0] + w * ax, at[1] + w * ay
-        r, g, b = _bilinear(tex, i, k, u, v)
-        if mix > 0.1:
-            r1, g1, b1 = _bilinear(tex, i, k + 1, u, v)
-            r, g, b = r + mix * (r1 - r), g + mix * (g1 - g), b + mix * (b1 - b)
-        red, green, blue = red + r, green + g, blue + b
-    return red / probes, green / probes, blue / probes
+    for n in range(probes * levels):
+        w = (n // levels + 0.5) / probes - 0.5
+        part = 1.0
+        if levels == 2:
+            part = mix if n % 2 else 1.0 - mix
+        p, q, m, o, a, b = _corners(tex, i, k + n % levels, at[0] + w * ax, at[1] + w * ay)
+        wp, wq = part * (1 - a) * (1 - b), part * a * (1 - b)
+        wm, wo = part * (1 - a) * b, part * a * b
+        x0, x1, x2 = float(z[p, 0]), float(z[p, 1]), float(z[p, 2])
+        red, green, blue = red + wp * x0 * x0, green + wp * x1 * x1, blue + wp * x2 * x2
+        x0, x1, x2 = float(z[q, 0]), float(z[q, 1]), float(z[q, 2])
+        red, green, blue = red + wq * x0 * x0, green + wq * x1 * x1, blue + wq * x2 * x2
+        x0, x1, x2 = float(z[m, 0]), float(z[m, 1]), float(z[m, 2])
+        red, green, blue = red + wm * x0 * x0, green + wm * x1 * x1, blue + wm * x2 * x2
+        x0, x1, x2 = float(z[o, 0]), float(z[o, 1]), float(z[o, 2])
+        red, green, blue = red + wo * x0 * x0, green + wo * x1 * x1, blue + wo * x2 * x2
+    scale = 1.0 / (65025.0 * probes)
+    return red * scale, green * scale, blue * scale
+
+
+@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+def detail_at(
+    tex: TextureArrays, i: int, at: tuple[float, float], level: float
+) -> tuple[float, float, float, float]:
+    """Return normal and roughness, [0, 1], of image i at texture coordinates.
+
+    Of the nearest halving alone: what changes there is hardly seen.
+    """
+    z = tex.texels
+    p, q, m, o, a, b = _corners(tex, i, int(level + 0.5), at[0], at[1])
+    wp, wq, wm, wo = (1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b
+    s0 = wp * z[p, 0] + wq * z[q, 0] + wm * z[m, 0] + wo * z[o, 0]
+    s1 = wp * z[p, 1] + wq * z[q, 1] + wm * z[m, 1] + wo * z[o, 1]
+    s2 = wp * z[p, 2] + wq * z[q, 2] + wm * z[m, 2] + wo * z[o, 2]
+    s3 = wp * z[p, 3] + wq * z[q, 3] + wm * z[m, 3] + wo * z[o, 3]
+    return s0 / 255.0, s1 / 255.0, s2 / 255.0, s3 / 255.0

@@ -18,6 +18,7 @@ from realsim.rendering.casting.pixel_caster import FirstHits, PixelCaster
 from realsim.rendering.depth_sensors.noise import correlated
 from realsim.rendering.depth_sensors.profiles import DepthProfile
 from realsim.rendering.rays import PlacedMesh
+from realsim.rendering.stereo.between_eyes import depth_between
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.eyes import Projector, exposed, no_projector, radiance
 from realsim.rendering.stereo.light import room_light
@@ -124,28 +125,30 @@ class StereoCamera:
         """Return the matched disparity [px] and both eyes' pictures."""
         baseline = self.profile.baseline_m
         T_right = _shifted(T, baseline)
-        config, at = self.config, self.config.projector_at * baseline
+        config, fB = self.config, pinhole.fx * baseline
+        hits_right = self._caster.cast(pinhole, T_right)
         emitter = no_projector(hits.depth_m.shape)
         second = emitter
         if self.profile.pattern == "dots" and config.dot_power > 0:
-            shadow = self._caster.cast(pinhole, _shifted(T, at)).depth_m
+            at = config.projector_at
+            shadow = depth_between(hits.depth_m, hits_right.depth_m, fB, at)
             pattern = dot_pattern(config.dot_spacing_mrad, config.dot_radius_mrad)
             emitter, second = (
-                Projector(pattern=pattern, offset_m=offset, power=config.dot_power, depth_m=shadow)
-                for offset in (at, at - baseline)
-            )
+                Projector(
+                    pattern=pattern, offset_m=share * baseline, power=config.dot_power,
+                    depth_m=shadow,
+                )
+                for share in (at, at - 1)
+            )  # fmt: skip
         light = self._seen(pinhole, T, hits, emitter, config.ambient)
         gain = _exposure(light, hits, config.mean_level)
         left = exposed(light, gain, config, rng)
-        hits_right = self._caster.cast(pinhole, T_right)
         light = self._seen(pinhole, T_right, hits_right, second, config.ambient)
         right = exposed(light, gain, config, rng)
         nearest, farthest = self._range(pinhole.width)
         z = hits.depth_m
         exact = np.zeros_like(z)
-        np.divide(
-            np.float32(pinhole.fx * baseline), z, out=exact, where=(z >= nearest) & (z <= farthest)
-        )
+        np.divide(np.float32(fB), z, out=exact, where=(z >= nearest) & (z <= farthest))
         return matched(left, right, exact, config), left, right
 
     def _decoded(

@@ -6,6 +6,7 @@ projector's shadow is exact (a second picture from the projector).
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numba
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.light import RoomLight
 from realsim.rendering.stereo.shading import shade
-from realsim.rendering.stereo.solid_noise import block_axes, noise_block
+from realsim.rendering.stereo.solid_noise import block_axes, packed_noise
 from realsim.rendering.stereo.surfaces import SurfaceTables
 
 Array = NDArray[np.float64]
@@ -71,7 +72,7 @@ def radiance(
         hits,
         (np.array(pinhole, np.float32), placed, R_world_cam.astype(np.float32)),
         (surfaces.faces, surfaces.first_face, surfaces.looks, surfaces.images),
-        (surfaces.texels, surfaces.levels, noise_block()),
+        (surfaces.texels, surfaces.levels, packed_noise()),
         (light.harmonics, light.reflections, light.sun_direction, np.float32(light.sun)),
         (
             projector.pattern,
@@ -96,20 +97,37 @@ def exposed(
 
     if config.psf_px > 0:
         light = np.asarray(cv2.GaussianBlur(light, (0, 0), config.psf_px), np.float32)
-    noise = rng.standard_normal(light.shape, dtype=np.float32)
+    noise = rng.integers(0, 1 << 16, light.shape, dtype=np.uint16)
     dark, per_value = config.electron_noise
     out = np.empty(light.shape, np.uint8)
-    _to_bytes(light, noise, np.array([gain, dark, per_value], np.float32), out)
+    _to_bytes(light, noise, _quantiles(), np.array([gain, dark, per_value], np.float32), out)
     return out
 
 
+@lru_cache(maxsize=1)
+def _quantiles() -> Array32:
+    """Return the normal distribution at 65536 equal steps of probability: to 4.3 deviations.
+
+    Looked up by sixteen random bits it costs a quarter of a normal random number.
+    """
+    from scipy.special import ndtri
+
+    return np.asarray(ndtri((np.arange(1 << 16) + 0.5) / (1 << 16)), np.float32)
+
+
 @numba.njit(cache=True, fastmath=True)  # pyright: ignore[reportUntypedFunctionDecorator]
-def _to_bytes(light: Array32, noise: Array32, sensor: Array32, out: NDArray[np.uint8]) -> None:
+def _to_bytes(
+    light: Array32,
+    noise: NDArray[np.uint16],
+    normal: Array32,
+    sensor: Array32,
+    out: NDArray[np.uint8],
+) -> None:
     """Write bytes from light: value + sqrt(dark + value per_value) noise, clipped and rounded."""
     gain, dark, per_value = sensor
     white, half = np.float32(255.0), np.float32(0.5)
     for v in range(light.shape[0]):
         for u in range(light.shape[1]):
             value = min(max(light[v, u] * gain, np.float32(0.0)), np.float32(1.0))
-            value += np.sqrt(dark + value * per_value) * noise[v, u]
+            value += np.sqrt(dark + value * per_value) * normal[noise[v, u]]
             out[v, u] = np.uint8(min(max(value * white + half, np.float32(0.0)), white))

@@ -6,6 +6,7 @@ finds is refined and judged on the images by `subpixel`.
 
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,9 +22,9 @@ LARGE_STEP = 32
 """Penalties of a change of disparity by one and by more, per pixel of the block (OpenCV's)."""
 SEARCH_STEP_PX = 16
 """OpenCV searches multiples of this many disparities."""
-BAND_PX = 144
+BAND_PX = 96
 """Rows that are searched over the same disparities."""
-LEAD_PX = 24
+LEAD_PX = 12
 """Rows above a band from which the smoothness is carried into it."""
 GRADIENT_NOISE = 0.25
 """Variance of the mean of two central differences, per variance of a pixel."""
@@ -48,18 +49,31 @@ def matched(left: Image8, right: Image8, exact: Array32, config: StereoConfig) -
 
     whole = _searched_in_bands(left, right, exact, config)
     disparity, texture, residual = refined(left, right, whole, config.window_px)
-    level = cv2.blur(left, (config.window_px,) * 2).astype(np.float32) * np.float32(1 / 255)
-    dark, per_value = config.electron_noise
-    # Rounding to bytes is noise of 1/12 as well.
-    pixel = (np.float32(dark) + level * np.float32(per_value)) * np.float32(255**2)
-    pixel += np.float32(1 / 12)
-    keep = texture >= np.float32(config.least_texture_snr**2 * GRADIENT_NOISE) * pixel
-    expected = np.float32(DIFFERENCE_NOISE) * pixel + np.float32(ALIASING) * texture
-    keep &= residual <= np.float32(config.residual_limit**2) * expected
-    # What lies left of the right eye's picture was not seen by it.
-    keep &= np.arange(left.shape[1], dtype=np.float32) >= disparity
-    keep &= disparity > 0
-    return _without_speckles(np.where(keep, disparity, np.float32(0)), config.speckle_px)
+    level = np.asarray(cv2.blur(left, (config.window_px,) * 2))
+    limits = (*config.electron_noise, config.least_texture_snr**2, config.residual_limit**2)
+    _judge(disparity, texture, residual, level, np.array(limits, np.float32))
+    return _without_speckles(disparity, config.speckle_px)
+
+
+@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+def _judge(
+    disparity: Array32, texture: Array32, residual: Array32, level: Image8, limits: Array32
+) -> None:
+    """Set to 0 what has too little texture, fits badly, or lies left of the right eye's picture."""
+    dark, per_value, least_texture, greatest_residual = limits
+    f = np.float32
+    for v in range(disparity.shape[0]):
+        for u in range(disparity.shape[1]):
+            value = f(level[v, u]) * f(1 / 255)
+            # Rounding to bytes is noise of 1/12 as well.
+            pixel = (dark + value * per_value) * f(255**2) + f(1 / 12)
+            expected = f(DIFFERENCE_NOISE) * pixel + f(ALIASING) * texture[v, u]
+            if (
+                texture[v, u] < least_texture * f(GRADIENT_NOISE) * pixel
+                or residual[v, u] > greatest_residual * expected
+                or not 0 < disparity[v, u] <= f(u)
+            ):
+                disparity[v, u] = f(0.0)
 
 
 def _searched_in_bands(
@@ -73,14 +87,19 @@ def _searched_in_bands(
     found = np.zeros(left.shape, np.float32)
     for top in range(0, height, BAND_PX):
         bottom = min(top + BAND_PX, height)
-        seen = exact[top:bottom]
-        seen = seen[seen > 0]
-        if len(seen) == 0:
+        there = exact[top:bottom] > 0
+        columns = np.flatnonzero(there.any(0))
+        if len(columns) == 0:
             continue
-        rows = slice(max(0, top - LEAD_PX), min(height, bottom + SEARCH_BLOCK_PX))
+        seen = exact[top:bottom][there]
         span = (float(seen.min()), float(seen.max()))
-        band = _searched(left[rows], right[rows], span, config)
-        found[top:bottom] = band[top - rows.start : bottom - rows.start]
+        # Where nothing is in range nothing is searched; the right eye's part lies further left.
+        reach = int(span[1]) + config.search_margin_px + SEARCH_STEP_PX + LEAD_PX
+        first = max(0, int(columns[0]) - reach)
+        window = slice(first, min(left.shape[1], int(columns[-1]) + 1 + LEAD_PX))
+        rows = slice(max(0, top - LEAD_PX), min(height, bottom + SEARCH_BLOCK_PX))
+        band = _searched(left[rows, window], right[rows, window], span, config)
+        found[top:bottom, window] = band[top - rows.start : bottom - rows.start]
     return found
 
 

@@ -24,8 +24,6 @@ CELLS_PER_PIXEL = 0.70
 
 FIRST_OCTAVE = float(np.log2(CELLS_PER_PIXEL / FINEST_CELL_M))
 """Octave shown by pixels of 1 m."""
-CELLS_PER_M = (0.5 ** np.arange(24) / FINEST_CELL_M).astype(np.float32)
-"""Of every octave: the last has cells of 170 m."""
 
 
 @lru_cache(maxsize=1)
@@ -45,6 +43,22 @@ def noise_block() -> NDArray[np.int8]:
     block = np.clip(np.round(noise * (NOISE_STEPS / noise.std())), -127, 127).astype(np.int8)
     block.setflags(write=False)
     return block
+
+
+@lru_cache(maxsize=1)
+def packed_noise() -> NDArray[np.int32]:
+    """Return the block (BLOCK^3,) with four neighbours in every number.
+
+    The bytes of (i, j, k), from the lowest, are the noise + 128 at (j, k), (j, k + 1), (j + 1, k)
+    and (j + 1, k + 1): interpolation reads two numbers in place of eight.
+    """
+    shifted = (noise_block().astype(np.int16) + 128).astype(np.uint32)
+    after = np.roll(shifted, -1, axis=2)
+    packed = shifted | (after << 8)
+    packed |= (np.roll(shifted, -1, axis=1) << 16) | (np.roll(after, -1, axis=1) << 24)
+    flat = packed.view(np.int32).ravel()
+    flat.setflags(write=False)
+    return flat
 
 
 @lru_cache(maxsize=1)

@@ -48,6 +48,7 @@ def annotate(  # noqa: PLR0913 - keywords, each with a meaning of its own
     progress: Progress | None = None,
     workers: int = 1,
     surroundings: Sequence[PlacedMesh] | None = None,
+    damaged: Collection[str] = (),
 ) -> AnnotationSummary:
     """Write masks, maps, poses, visibility and grasps for every view of a session.
 
@@ -63,6 +64,8 @@ def annotate(  # noqa: PLR0913 - keywords, each with a meaning of its own
         workers: processes that compute views; 1 = this one. The files are the same.
         surroundings: what hides things without carrying a label, where it is known exactly, as in
             a synthetic scene; None = a table under the scene's plane, if it has one.
+        damaged: paths of files that are not as they were written; views that have one are done
+            again.
 
     Raises:
         InputError: a view has no camera pose, a model is missing, an image is not of the camera's
@@ -71,7 +74,7 @@ def annotate(  # noqa: PLR0913 - keywords, each with a meaning of its own
     views = _calibrated_views(store, only)
     inputs = gathered(store, scene, models, grasp_sets, config or AnnotationConfig(), surroundings)
     todo = [frame_view(store, inputs, v) for v in views]
-    found = {v.index: files.finished_part(store, v.index, v.digest) for v in todo}
+    found = {v.index: files.finished_part(store, v.index, v.digest, damaged) for v in todo}
     parts: Parts = {index: part for index, part in found.items() if part is not None}
     skipped = len(parts)
     write_objects(store, scene, models, inputs.config)

@@ -13,7 +13,7 @@ scene_gt.json  scene_gt_info.json  scene_gt_coco.json     BOP, made of the annot
 import io
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -162,8 +162,17 @@ def write_view(store: SessionStore, view: int, files: Mapping[str, bytes]) -> No
     store.write_bytes(part_path(view), files[part_path(view)])
 
 
-def finished_part(store: SessionStore, view: int, digest: str) -> dict[str, Any] | None:
-    """Return the view's annotation if it was made from these inputs and all its files are there."""
+def finished_part(
+    store: SessionStore, view: int, digest: str, damaged: Collection[str] = ()
+) -> dict[str, Any] | None:
+    """Return the view's annotation if it was made from these inputs and all its files are whole.
+
+    Args:
+        store: the session.
+        view: number of the view.
+        digest: of the inputs.
+        damaged: files that are not as they were written.
+    """
     if not store.has(part_path(view)):
         return None
     try:
@@ -172,7 +181,9 @@ def finished_part(store: SessionStore, view: int, digest: str) -> dict[str, Any]
         return None  # a broken file is made again
     if not isinstance(part, dict) or part.get("inputs") != digest:
         return None
-    return part if all(store.has(p) for p in _paths_of(view, part)) else None
+    paths = _paths_of(view, part)
+    is_whole = all(store.has(p) for p in paths) and not {*paths, part_path(view)} & set(damaged)
+    return part if is_whole else None
 
 
 def _paths_of(view: int, part: Mapping[str, Any]) -> list[str]:

@@ -62,6 +62,16 @@ def renderer_of(inputs: FrameInputs) -> LabelRenderer:
     return LabelRenderer(inputs.placed())
 
 
+@lru_cache(maxsize=1)
+def boxes_of(inputs: FrameInputs) -> NDArray[np.float64]:
+    """Return (G, 2, 3) the box of every mesh of the renderer's scene in its own frame [m].
+
+    Kept like the renderer: finding a box walks all vertices of the mesh.
+    """
+    boxes = [p.mesh.bounds for p in inputs.placed()]
+    return np.concatenate([np.zeros((0, 2, 3)), *(b[None] for b in boxes)])
+
+
 def frame_files(inputs: FrameInputs, view: FrameView, depth_m: Depth) -> FrameFiles:
     """Return every file of a view's annotation.
 
@@ -72,14 +82,15 @@ def frame_files(inputs: FrameInputs, view: FrameView, depth_m: Depth) -> FrameFi
     """
     renderer, intrinsics, config = renderer_of(inputs), inputs.intrinsics, inputs.config
     labels = renderer.render(intrinsics, view.T_world_cam)
-    seen = _seen(inputs, labels, depth_m)
+    seen, boxes = _seen(inputs, labels, depth_m), boxes_of(inputs)
     frame: list[FrameLabel] = [
         label_object(
-            placed, inputs.models[placed.obj_id].mesh, masks, labels, depth_m,
+            placed, (inputs.models[placed.obj_id].mesh, box), masks, labels, depth_m,
             (intrinsics, view.T_world_cam), (agreement, unknown),
         )
-        for placed, masks, agreement, unknown in zip(
-            inputs.objects, seen.masks, seen.agreements, seen.unknowns, strict=True
+        for placed, box, masks, agreement, unknown in zip(
+            inputs.objects, boxes[: len(inputs.objects)], seen.masks, seen.agreements,
+            seen.unknowns, strict=True,
         )
     ]  # fmt: skip
     poses = {o.instance: o.T_world_obj for o in inputs.objects}
@@ -95,10 +106,7 @@ def frame_files(inputs: FrameInputs, view: FrameView, depth_m: Depth) -> FrameFi
             path = mask_path(view.index, k, visible=is_visible)
             out[path] = encode_window(mask, masks.origin, size)
     by_instance = list(zip((o.instance for o in inputs.objects), seen.masks, strict=True))
-    meshes = {o.instance: inputs.models[o.obj_id].mesh for o in inputs.objects}
-    out |= map_files(
-        config.maps, view.index, labels, by_instance, meshes, inputs.depth_unit_m
-    )  # fmt: skip
+    out |= map_files(config.maps, view.index, labels, by_instance, boxes, inputs.depth_unit_m)
     out[files.grasps_path(view.index)] = files.grasps_bytes(grasps)
     part = files.part_of_view(inputs, view, labels, frame, _counts(grasps))
     out[files.part_path(view.index)] = files.part_bytes(part)

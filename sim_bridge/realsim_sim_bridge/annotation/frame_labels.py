@@ -74,9 +74,9 @@ class FrameLabel:
     unknown: UnknownOccluder
 
 
-def box_corners(mesh: Mesh) -> Array:
-    """Return the corners (8, 3) of a mesh's box in its own frame [m]; x slowest, z fastest."""
-    low, high = mesh.bounds
+def box_corners(bounds: ArrayLike) -> Array:
+    """Return the corners (8, 3) of a box (2, 3), least and greatest corner; z varies fastest."""
+    low, high = np.asarray(bounds, dtype=np.float64)
     xyz = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1)
     return xyz.reshape(8, 3)
 
@@ -176,7 +176,7 @@ def unknown_occluder(
 
 def label_object(
     placed: ObjectPose,
-    mesh: Mesh,
+    mesh: tuple[Mesh, ArrayLike],
     masks: ObjectMasks,
     labels: Labels,
     depth_m: NDArray[np.float32],
@@ -187,7 +187,7 @@ def label_object(
 
     Args:
         placed: where the object stands.
-        mesh: its mesh.
+        mesh: its mesh and the mesh's box (2, 3) [m], which is the same in every frame.
         masks: its masks in this frame.
         labels: the rendered labels of the view.
         depth_m: (H, W) measured depth [m], 0 = none.
@@ -195,11 +195,12 @@ def label_object(
         evidence: how the measured depth agrees, and what hides it that is not in the scene.
     """
     (intrinsics, T_world_cam), (agreement, unknown) = camera_pose, evidence
+    shape, bounds = mesh
     T_cam_obj = se3.invert(T_world_cam) @ placed.T_world_obj
     count_all = labels.px_count_all[placed.instance]
     inside = int(np.count_nonzero(masks.amodal))
     box = silhouette_box(
-        masks.moved(bbox_of(masks.amodal)), inside, count_all, intrinsics, mesh.vertices, T_cam_obj
+        masks.moved(bbox_of(masks.amodal)), inside, count_all, intrinsics, shape.vertices, T_cam_obj
     )
     info = gt_info_entry(
         masks.amodal, masks.visible, depth_m[masks.window], px_count_all=count_all, bbox_obj=box
@@ -210,7 +211,7 @@ def label_object(
         instance=placed.instance,
         T_cam_obj=T_cam_obj,
         info=info,
-        corners_px=camera.project(intrinsics, se3.transform(T_cam_obj, box_corners(mesh))),
+        corners_px=camera.project(intrinsics, se3.transform(T_cam_obj, box_corners(bounds))),
         visible_rle=rle_of(masks.visible, origin=masks.origin, shape=labels.ids.shape),
         agreement=agreement,
         unknown=unknown,

@@ -4,15 +4,15 @@ Depth and normals are those of the model, also where something that is not in it
 instances and coordinates are set where the object is visible.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.formats import images, label_maps
 from realsim.formats.png_window import encode_window
-from realsim.records import Mesh
 from realsim.rendering.labels import Labels
+from realsim_sim_bridge.annotation import map_counts
 from realsim_sim_bridge.annotation.object_masks import ObjectMasks, Window, union_of
 
 Masks = Sequence[tuple[int, ObjectMasks]]
@@ -28,7 +28,7 @@ def map_files(
     view: int,
     labels: Labels,
     masks: Masks,
-    meshes: Mapping[int, Mesh],
+    boxes: NDArray[np.float64],
     depth_unit_m: float,
 ) -> dict[str, bytes]:
     """Return the maps wanted of a view, by path.
@@ -38,22 +38,25 @@ def map_files(
         view: number of the view.
         labels: its rendered labels.
         masks: (instance, masks) of its objects.
-        meshes: instance -> mesh; its box scales the coordinates.
+        boxes: (G, 2, 3) least and greatest corner of every placed mesh [m]: coordinates run over
+            them.
         depth_unit_m: metres per count of the depth.
     """
     size = (labels.ids.shape[1], labels.ids.shape[0])
     files: dict[str, bytes] = {}
+    window = union_of([m.window for _, m in masks])
+    ids = _instances(masks, window)
     if "instance" in wanted:
-        window, counts = _instances(masks)
+        counts = label_maps.instance_counts(ids)
         files[map_path("instance", view)] = encode_window(counts, _origin(window), size)
     if "depth" in wanted:
         counts = images.depth_counts(labels.depth_m, depth_unit_m)
         files[map_path("depth", view)] = images.png_bytes(counts)
     if "coordinates" in wanted:
-        window, counts = _coordinates(labels.object_coordinates(), masks, meshes)
+        counts = map_counts.coordinate_counts(labels, window, ids >= 0, boxes)
         files[map_path("coordinates", view)] = encode_window(counts, _origin(window), size)
     if "normals" in wanted:
-        counts = label_maps.normal_counts(labels.normals())
+        counts = map_counts.normal_counts(labels)
         files[map_path("normals", view)] = encode_window(counts, (0, 0), size)
     return files
 
@@ -75,30 +78,10 @@ def _inner(window: Window, outer: Window) -> Window:
     )
 
 
-def _instances(masks: Masks) -> tuple[Window, NDArray[np.uint16]]:
-    """Return the window of all objects and the instance map in it."""
-    window = union_of([m.window for _, m in masks])
+def _instances(masks: Masks, window: Window) -> NDArray[np.int32]:
+    """Return the instances (h, w) visible in a window that holds all masks, -1 = none."""
     ids = np.full(_shape(window), label_maps.NO_OBJECT, np.int32)
     for instance, m in masks:
         if m.visible.size:
             ids[_inner(m.window, window)][m.visible] = instance
-    return window, label_maps.instance_counts(ids)
-
-
-def _coordinates(
-    points: NDArray[np.float32], masks: Masks, meshes: Mapping[int, Mesh]
-) -> tuple[Window, NDArray[np.uint16]]:
-    """Return the window of all objects and the coordinate map in it."""
-    window = union_of([m.window for _, m in masks])
-    out = np.zeros((*_shape(window), 3), np.uint16)
-    for instance, m in masks:
-        rows, columns = np.nonzero(m.visible)
-        if len(rows):
-            # Numbers instead of masks: three channels behind a mask are gathered one by one.
-            seen = points[rows + m.origin[1], columns + m.origin[0]]
-            low, high = meshes[instance].bounds
-            x, y = _origin(window)
-            out[rows + (m.origin[1] - y), columns + (m.origin[0] - x)] = (
-                label_maps.coordinate_counts(seen, low, high)
-            )
-    return window, out
+    return ids

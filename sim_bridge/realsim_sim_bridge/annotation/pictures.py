@@ -1,6 +1,7 @@
-"""Pictures of views: the photograph with the objects' outlines, verdicts and grasps.
+"""Pictures of views: photograph, outlines, axes, names, grasps, and what hides objects.
 
-What was taken out of a mask because something that is not in the scene hides it is magenta.
+Outlines and names have the colour of the verdict, grasps that of their score. What was taken out of
+a mask because something that is not in the scene hides it is hatched in magenta.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,24 +12,21 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.formats.bop_labels import mask_path
 from realsim.geometry import se3
-from realsim.records import GraspSet, ObjectModel, ObjectPose, Scene
+from realsim.records import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim.rendering.overlay import VERDICT_RGB, Color
 from realsim.store import SessionStore
 from realsim_sim_bridge.annotation.files import part_path
 
 Rgb = NDArray[np.uint8]
-VERDICT_RGB: dict[str, tuple[int, int, int]] = {
-    "accepted": (58, 188, 92),
-    "doubtful": (250, 180, 40),
-    "rejected": (230, 60, 55),
-    "unchecked": (170, 176, 190),
-}
+Ids = NDArray[np.int32]
+Array = NDArray[np.float64]
 UNKNOWN_RGB = (255, 0, 200)
 """What hides an object and is not in the scene: a colour that no object and no verdict has."""
-INK = (25, 27, 31)
-"""Ground under the names: every verdict's colour is legible on it."""
-TEXT_PER_ROW = 1 / 1400
-"""Font scale per image row: legible at 720 rows, and not larger than a small object."""
+AXIS_SHARE = 0.3
+"""Length of a drawn axis as a share of the object's longest side."""
+MOST_NAMED = 4
+"""So many objects that are not visible are named in the legend."""
 
 
 def overlay_picture(
@@ -38,12 +36,14 @@ def overlay_picture(
     models: Mapping[int, ObjectModel],
     grasp_sets: Sequence[GraspSet],
     max_grasps: int = 30,
+    *,
+    with_legend: bool = True,
 ) -> Rgb:
     """Return the photograph of a view with everything that was annotated on it.
 
-    Outlines of the visible masks and names have the colour of the verdict; the best and the worst
-    grasps of every object are coloured by score. Rejected objects are drawn too: one should see
-    why they were.
+    Outlines of the visible masks and names have the colour of the verdict; axes are x red, y green,
+    z blue; the best and the worst grasps of every object are coloured by score. Rejected objects
+    are drawn too: one should see why they were.
 
     Args:
         store: the session; the view must be calibrated.
@@ -52,11 +52,16 @@ def overlay_picture(
         models: obj_id -> model.
         grasp_sets: the scored grasps.
         max_grasps: grasps drawn in all, shared evenly by the objects.
+        with_legend: whether colours are explained, and objects out of sight named, in a corner.
 
     Raises:
         InputError: the view has no camera pose.
     """
-    return next(overlay_pictures(store, [view_index], scene, models, grasp_sets, max_grasps))
+    return next(
+        overlay_pictures(
+            store, [view_index], scene, models, grasp_sets, max_grasps, with_legend=with_legend
+        )
+    )
 
 
 def overlay_pictures(
@@ -66,42 +71,110 @@ def overlay_pictures(
     models: Mapping[int, ObjectModel],
     grasp_sets: Sequence[GraspSet],
     max_grasps: int = 30,
+    *,
+    with_legend: bool = True,
 ) -> Iterator[Rgb]:
     """Yield the pictures of several views, the scene being prepared once; see `overlay_picture`.
 
     Raises:
         InputError: a view has no camera pose.
     """
-    from realsim.rendering import overlay
-
     objects = [o for o in scene.objects if o.obj_id in models]
     renderer = LabelRenderer(
         [PlacedMesh(o.instance, models[o.obj_id].mesh, o.T_world_obj) for o in objects]
     )
-    intrinsics = store.session.intrinsics
-    colors = {o.instance: VERDICT_RGB[o.verdict] for o in objects}
-    shown = [g for g in grasp_sets if any(o.instance == g.instance for o in objects)]
+    instances = {o.instance for o in objects}
+    shown = [g for g in grasp_sets if g.instance in instances and len(g)]
     for index in view_indices:
         view = store.session.view(index)
         if view.T_world_cam is None:
             raise InputError(f"view {index} has no camera pose; calibrate first.")
-        ids = renderer.render(intrinsics, view.T_world_cam).ids
+        ids = renderer.render(store.session.intrinsics, view.T_world_cam).ids
         hidden = _hidden_by_unknown(store, index, ids)
-        picture = store.rgb(index)
-        picture[hidden] = (0.5 * picture[hidden] + 0.5 * np.array(UNKNOWN_RGB)).astype(np.uint8)
-        picture = overlay.draw_outlines(picture, np.where(hidden, -1, ids), colors)
-        T_cam_world = se3.invert(view.T_world_cam)
-        for grasps in shown:
-            T_cam_obj = T_cam_world @ scene.object(grasps.instance).T_world_obj
-            chosen = best_and_worst(grasps, max(1, max_grasps // len(shown)))
-            picture = overlay.draw_grasps(picture, intrinsics, T_cam_obj, grasps, chosen)
-        picture = np.ascontiguousarray(picture)
-        for o in objects:
-            rows, columns = np.nonzero(ids == o.instance)
-            if len(rows):
-                below = (round(float(columns.mean())), int(rows.max()))
-                _write_name(picture, below, o, models[o.obj_id].name)
+        poses = {o.instance: se3.invert(view.T_world_cam) @ o.T_world_obj for o in objects}
+        picture = _with_scene(store.rgb(index), store.session.intrinsics, objects, models, poses,
+                              ids, hidden)  # fmt: skip
+        picture = _with_grasps(picture, store.session.intrinsics, shown, poses, max_grasps)
+        picture = _with_names(picture, objects, models, ids)
+        if with_legend:
+            picture = _with_legend(picture, objects, models, ids, hidden, bool(shown))
         yield picture
+
+
+def _with_scene(
+    picture: Rgb,
+    intrinsics: CameraIntrinsics,
+    objects: Sequence[ObjectPose],
+    models: Mapping[int, ObjectModel],
+    poses: Mapping[int, Array],
+    ids: Ids,
+    hidden: NDArray[np.bool_],
+) -> Rgb:
+    """Return a photograph with the outlines and axes of objects, and what hides them hatched."""
+    from realsim.rendering import overlay
+
+    colors = {o.instance: VERDICT_RGB[o.verdict] for o in objects}
+    picture = overlay.draw_hatched(picture, hidden, UNKNOWN_RGB)
+    picture = overlay.draw_outlines(picture, np.where(hidden, -1, ids), colors)
+    thickness = 2 if picture.shape[0] < 900 else 3
+    seen = set(np.unique(ids).tolist())
+    for o in objects:
+        if o.instance in seen:
+            length_m = AXIS_SHARE * float(models[o.obj_id].mesh.extent.max())
+            picture = overlay.draw_axes(picture, intrinsics, poses[o.instance], length_m, thickness)
+    return picture
+
+
+def _with_grasps(
+    picture: Rgb,
+    intrinsics: CameraIntrinsics,
+    grasp_sets: Sequence[GraspSet],
+    poses: Mapping[int, Array],
+    most: int,
+) -> Rgb:
+    """Return the picture with the best and the worst grasps of every object, `most` in all."""
+    from realsim.rendering import overlay
+
+    for grasps in grasp_sets:
+        chosen = best_and_worst(grasps, max(2, most // len(grasp_sets)))
+        picture = overlay.draw_grasps(picture, intrinsics, poses[grasps.instance], grasps, chosen)
+    return picture
+
+
+def _with_names(
+    picture: Rgb, objects: Sequence[ObjectPose], models: Mapping[int, ObjectModel], ids: Ids
+) -> Rgb:
+    """Return the picture with the objects' names, and their verdicts where not accepted."""
+    from realsim.rendering.overlay_words import write_names
+
+    names = {
+        o.instance: models[o.obj_id].name + ("" if o.verdict == "accepted" else f" ({o.verdict})")
+        for o in objects
+    }
+    return write_names(picture, ids, names, {o.instance: VERDICT_RGB[o.verdict] for o in objects})
+
+
+def _with_legend(
+    picture: Rgb,
+    objects: Sequence[ObjectPose],
+    models: Mapping[int, ObjectModel],
+    ids: Ids,
+    hidden: NDArray[np.bool_],
+    has_grasps: bool,
+) -> Rgb:
+    """Return the picture with its colours explained, and the objects that are not to be seen."""
+    from realsim.rendering.overlay_words import write_legend
+
+    seen = set(np.unique(ids[~hidden]).tolist())
+    verdicts = [v for v in VERDICT_RGB if any(o.verdict == v for o in objects)]
+    entries: list[tuple[str, Color]] = [(v, VERDICT_RGB[v]) for v in verdicts]
+    if hidden.any():
+        entries.append(("hidden by something unknown", UNKNOWN_RGB))
+    unseen = [models[o.obj_id].name for o in objects if o.instance not in seen]
+    lines = [f"not visible: {name}" for name in unseen[:MOST_NAMED]]
+    if len(unseen) > MOST_NAMED:
+        lines.append(f"and {len(unseen) - MOST_NAMED} more not visible")
+    return write_legend(picture, entries, ids >= 0, with_scores=has_grasps, lines=lines)
 
 
 def _hidden_by_unknown(
@@ -133,18 +206,3 @@ def best_and_worst(grasps: GraspSet, most: int) -> NDArray[np.int64]:
         return ranked
     worst = most // 2
     return np.concatenate([ranked[: most - worst], ranked[len(ranked) - worst :]])
-
-
-def _write_name(picture: Rgb, below: tuple[int, int], placed: ObjectPose, name: str) -> None:
-    """Write an object's name and verdict under a pixel of the picture, in place."""
-    import cv2
-
-    text = name if placed.verdict == "accepted" else f"{name} ({placed.verdict})"
-    scale = max(0.35, picture.shape[0] * TEXT_PER_ROW)
-    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    pad = max(2, height // 3)
-    x = int(np.clip(below[0] - width // 2, pad, max(pad, picture.shape[1] - width - pad)))
-    y = min(below[1] + height + 3 * pad, picture.shape[0] - pad)
-    cv2.rectangle(picture, (x - pad, y - height - pad), (x + width + pad, y + pad), INK, -1)
-    color = VERDICT_RGB[placed.verdict]
-    cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, scale, color, 1, cv2.LINE_AA)

@@ -69,12 +69,16 @@ class AnnotationSummary:
 
     def __str__(self) -> str:
         """Return one line for the terminal."""
-        shares = ", ".join(f"{i}: {100 * a:.0f} %" for i, a in self.agreement.items())
+        shares = ", ".join(
+            f"{i}: unknown" if np.isnan(a) else f"{i}: {100 * a:.0f} %"
+            for i, a in self.agreement.items()
+        )
         which = numbers(self.views_left_out)
         without = f", {len(self.views_left_out)} not registered ({which})" if which else ""
         empty = f", {len(self.empty_views)} without any object" if self.empty_views else ""
         return (
-            f"{self.views} views annotated ({self.skipped} still held{without}{empty}), "
+            f"{self.views} {'view' if self.views == 1 else 'views'} annotated "
+            f"({self.skipped} still held{without}{empty}), "
             f"{len(self.objects)} objects ({len(self.doubtful)} not accepted, "
             f"{len(self.left_out)} rejected and left out), {self.grasps} grasps a view; "
             f"agreement with the depth {shares or 'unknown'}"
@@ -174,7 +178,8 @@ def _notes(inputs: FrameInputs, parts: Parts, empty: Sequence[int]) -> tuple[str
                 )
     notes = [*inside, *suspects, *hidden]
     if empty:
-        notes.append(f"{len(empty)} views show no object: {numbers(empty)}.")
+        what = "view shows" if len(empty) == 1 else "views show"
+        notes.append(f"{len(empty)} {what} no object: {numbers(empty)}.")
     without_ray = max((part["px_without_ray"] for part in parts.values()), default=0)
     if without_ray:
         share = 100 * without_ray / (inputs.intrinsics.width * inputs.intrinsics.height)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from realsim.errors import InputError
+from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.profiles import profile
 from realsim_sim_bridge.annotation.config import MAPS, checked_maps
 
@@ -11,6 +12,8 @@ Renderer = Literal["embedded", "photoreal"]
 Depth = Literal["stereo", "disparity", "clean"]
 RENDERERS: tuple[Renderer, ...] = ("embedded", "photoreal")
 DEPTHS: tuple[Depth, ...] = ("stereo", "disparity", "clean")
+LEAST_UNIT_M = 1e-6
+"""Finer counts than micrometres would end at 65 mm."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -22,11 +25,18 @@ class SyntheticConfig:
     system library. photoreal: path traced with Mitsuba, about six times as long."""
     depth: Depth = "disparity"
     """stereo: both eyes' pictures are rendered and matched, as the camera does it. disparity: a
-    noise model on exact disparity, ten times cheaper. clean: exact depth."""
+    noise model on exact disparity with exact occlusion shadows, several times cheaper. clean: exact
+    depth."""
     profile: str = "d405"
     """The depth camera, by its name in `depth_profiles.PROFILES`."""
+    depth_model: DepthSensorModel | None = None
+    """Figures of the noise model, as `realsim depth-fit` finds them for a camera at hand; None =
+    the profile's. For `disparity` only."""
+    material_loss: bool = True
+    """Disparity: whether dark and mirroring surfaces lose pixels, as they do before a real camera;
+    off, only geometry and chance make holes."""
     depth_unit_m: float | None = None
-    """Metres per count of the depth images; None = the profile's own."""
+    """Metres per count of the depth images; None = the fitted model's, or the profile's own."""
     samples: int = 8
     """Photoreal: paths per pixel before denoising; 8 looks as good as 32 after it."""
     maps: tuple[str, ...] = MAPS
@@ -47,7 +57,12 @@ class SyntheticConfig:
                     f"there is no {what} '{value}'; these are accepted: {', '.join(known)}."
                 )
         profile(self.profile)
-        if self.depth_unit_m is not None and not 1e-6 <= self.depth_unit_m <= 0.01:
+        if self.depth_model is not None and self.depth != "disparity":
+            raise InputError(
+                f"a fitted depth model belongs to the depth 'disparity', and '{self.depth}' was "
+                "asked for; leave one of them away."
+            )
+        if self.depth_unit_m is not None and not LEAST_UNIT_M <= self.depth_unit_m <= 0.01:
             raise InputError(
                 f"a depth unit of {self.depth_unit_m} m cannot be; 1e-6 to 0.01 m a count is "
                 "accepted (0.001 = millimetres)."
@@ -59,5 +74,7 @@ class SyntheticConfig:
     @property
     def unit_m(self) -> float:
         """Metres per count of the depth images."""
-        own = self.depth_unit_m
-        return profile(self.profile).depth_unit_m if own is None else own
+        if self.depth_unit_m is not None:
+            return self.depth_unit_m
+        fitted = 0.0 if self.depth_model is None else self.depth_model.depth_unit_m
+        return fitted if fitted >= LEAST_UNIT_M else profile(self.profile).depth_unit_m

@@ -8,20 +8,21 @@ import pickle
 import time
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.errors import InputError
 from realsim.formats import images
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.photo import Photo
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
+from realsim_sim_bridge.synthetic.depth_camera import depth_source
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
 
-Array32 = NDArray[np.float32]
 PHOTO, DEPTH = 0, 1
 """Streams of chance of a frame: another depth camera leaves the photograph as it is."""
 
@@ -65,20 +66,6 @@ class PictureSource(Protocol):
         ...
 
 
-class DepthSource(Protocol):
-    """A depth camera that looks at the scene."""
-
-    def measure(
-        self,
-        exact_m: Array32,
-        intrinsics: CameraIntrinsics,
-        T_world_cam: ArrayLike,
-        rng: np.random.Generator,
-    ) -> Array32:
-        """Return what it reports (H, W) [m] where the exact depth is `exact_m`; 0 = none."""
-        ...
-
-
 class FrameRenderer:
     """Renders the frames of one scene; what can be built once is built once."""
 
@@ -113,6 +100,20 @@ class FrameRenderer:
         return np.random.default_rng([self.job.seed, index, stream])
 
 
+def require_renderer(config: SyntheticConfig) -> None:
+    """Refuse a renderer that is not installed, before anything is made for it.
+
+    Raises:
+        InputError: it is not; the message names what to install and the fallback.
+    """
+    if config.renderer == "photoreal" and find_spec("mitsuba") is None:
+        raise InputError(
+            "the photoreal renderer needs Mitsuba, which is not installed. Install the extra: "
+            "`pip install 'realsim[photo]'` (or `uv sync --extra photo`), or use the embedded "
+            "renderer, which needs no extra (--renderer embedded)."
+        )
+
+
 def picture_source(synthetic: SyntheticScene, config: SyntheticConfig) -> PictureSource:
     """Return the renderer that the config names."""
     placed = synthetic.placed()
@@ -125,66 +126,6 @@ def picture_source(synthetic: SyntheticScene, config: SyntheticConfig) -> Pictur
     from realsim.rendering.photo import PhotoRenderer
 
     return PhotoRenderer(placed, environment=synthetic.environment)
-
-
-def depth_source(synthetic: SyntheticScene, config: SyntheticConfig) -> DepthSource:
-    """Return the depth camera that the config names."""
-    if config.depth == "clean":
-        return _Clean()
-    if config.depth == "stereo":
-        return _Stereo(synthetic, config)
-    return _Disparity(config)
-
-
-class _Clean:
-    """Reports exact depth."""
-
-    def measure(
-        self,
-        exact_m: Array32,
-        intrinsics: CameraIntrinsics,
-        T_world_cam: ArrayLike,
-        rng: np.random.Generator,
-    ) -> Array32:
-        return exact_m
-
-
-class _Disparity:
-    """The noise model on exact disparity."""
-
-    def __init__(self, config: SyntheticConfig) -> None:
-        from realsim.rendering.depth_sensors.model import DepthSensorModel
-
-        self._model = DepthSensorModel.from_profile(profile(config.profile))
-
-    def measure(
-        self,
-        exact_m: Array32,
-        intrinsics: CameraIntrinsics,
-        T_world_cam: ArrayLike,
-        rng: np.random.Generator,
-    ) -> Array32:
-        return self._model.measure(exact_m, intrinsics, rng)
-
-
-class _Stereo:
-    """Both eyes' pictures, matched."""
-
-    def __init__(self, synthetic: SyntheticScene, config: SyntheticConfig) -> None:
-        from realsim.rendering.stereo import StereoCamera
-
-        self._camera = StereoCamera(
-            synthetic.placed(), profile(config.profile), environment=synthetic.environment
-        )
-
-    def measure(
-        self,
-        exact_m: Array32,
-        intrinsics: CameraIntrinsics,
-        T_world_cam: ArrayLike,
-        rng: np.random.Generator,
-    ) -> Array32:
-        return self._camera.measure(intrinsics, T_world_cam, rng).depth_m
 
 
 # --- in another process -----------------------------------------------------------------------

@@ -38,6 +38,7 @@ from realsim_sim_bridge.synthetic.frame import (
     forget_job,
     frame_of_job,
     keep_job,
+    require_renderer,
 )
 from realsim_sim_bridge.synthetic.labelling import label_session
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
@@ -114,6 +115,7 @@ def write_session(  # noqa: PLR0913, PLR0917 - the inputs of a session, all of t
         WorkerDiedError: a process ended in the middle; running again goes on from there.
     """
     config = config or SyntheticConfig()
+    require_renderer(config)
     Ts = _checked_cameras(Ts_world_cam)
     folder = Path(folder)
     store = claimed_session(folder, synthetic, intrinsics, config, seed, list(Ts))

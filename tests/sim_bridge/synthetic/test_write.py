@@ -218,6 +218,20 @@ def test_a_camera_inside_an_object_is_named_and_its_view_is_written(tmp_path):
     assert len(SessionStore.open(tmp_path / "s").session.views) == 2
 
 
+def test_a_camera_at_an_objects_origin_is_written_too(tmp_path):
+    origin = two_boxes().objects[0].T_world_obj[:3, 3]
+    for k, off in enumerate((0.0, 0.0005)):
+        at = origin + np.array([0.0, 0.0, off])
+        T = se3.look_at(at, at + np.array([0.1, 0.02, 0.01]))
+        summary = write(tmp_path / f"{k}", Ts=np.stack([cameras(1)[0], T]))
+        assert summary.camera_inside == {1: (0,)}
+        rows = json.loads((tmp_path / f"{k}/scene_gt.json").read_text())["1"]
+        away = [np.linalg.norm(row["cam_t_m2c"]) for row in rows if row["obj_id"] == 1]
+        assert away == pytest.approx([1e3 * off], abs=1e-6)
+        part = json.loads((tmp_path / f"{k}/annotations/000001.json").read_text())
+        assert part["camera_inside"] == [0]
+
+
 def test_a_camera_in_the_box_around_an_object_but_outside_it_is_not_inside():
     pyramid = Mesh(
         vertices=0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]]),

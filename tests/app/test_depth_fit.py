@@ -1,0 +1,149 @@
+"""`realsim depth-fit`: from a folder of plane frames to a sensor's file, and refusals that help."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app.cli import commands
+from realsim.app.depth_fit_cli import CAMERAS, depth_fit
+from realsim.app.depth_fit_run import DepthFitRequest, read_frames
+from realsim.errors import InputError
+from realsim.formats.images import depth_counts, png_bytes
+from realsim.records import CameraIntrinsics
+from realsim.rendering.depth_sensors.model import DepthSensorModel
+from realsim.rendering.depth_sensors.profiles import PROFILES
+from realsim.rendering.stereo import StereoConfig
+
+CAMERA = CameraIntrinsics(width=400, height=300, fx=380, fy=380, cx=199.5, cy=149.5)
+UNIT = 1e-4
+
+
+def wall(z: float, tilt: float) -> np.ndarray:
+    v, u = np.mgrid[:300, :400]
+    return (z / (1 + tilt * (u - 199.5) / 380 + 0.2 * (v - 149.5) / 380)).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def walls(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with three frames of a wall by a known D405 and its camera."""
+    folder = tmp_path_factory.mktemp("walls")
+    model = DepthSensorModel.from_profile("d405", disparity_noise_px=0.06)
+    for k, (z, tilt) in enumerate(((0.26, 0.2), (0.33, -0.2), (0.42, 0.1))):
+        seen = model.measure(wall(z, tilt), CAMERA, np.random.default_rng(k))
+        (folder / f"{k:06d}.png").write_bytes(png_bytes(depth_counts(seen, UNIT)))
+    (folder / "cam_K.txt").write_text("380 0 199.5\n0 380 149.5\n0 0 1\n")
+    return folder
+
+
+def fit(*args: object) -> Result:
+    return CliRunner().invoke(commands, ["depth-fit", *map(str, args)])
+
+
+def refusal(*args: object) -> str:
+    """Return the message of a run that has to be refused as the user's mistake."""
+    result = fit(*args)
+    assert result.exit_code != 0
+    assert isinstance(result.exception, InputError | SystemExit), result.exception
+    return str(result.exception) + result.output
+
+
+def test_the_commands_cameras_are_the_profiles() -> None:
+    assert set(CAMERAS) == set(PROFILES)
+    defaults = {p.name: p.default for p in depth_fit.params if p.name in ("profile_name",)}
+    assert defaults["profile_name"] == DepthFitRequest().profile_name
+
+
+def test_a_folder_gives_a_sensor_that_is_what_it_was(walls: Path, tmp_path: Path) -> None:
+    out = tmp_path / "sensor.json"
+    result = fit(walls, "--out", out, "--quiet")
+    assert result.exit_code == 0, result.output
+    found = DepthSensorModel.load(out)
+    assert found.disparity_noise_px == pytest.approx(0.06, rel=0.05)
+    assert found.depth_unit_m == UNIT and found.baseline_m == 0.018
+    assert str(out.with_suffix(".png")) in result.output
+    assert out.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    # What the frames do not tell is said, with the value that is kept.
+    assert "not determined" in result.output and "bias_px" in result.output
+    frames = json.loads(out.read_text())["fit"]["frames"]
+    assert [f["name"] for f in frames] == ["000000.png", "000001.png", "000002.png"]
+
+
+def test_the_stereo_camera_is_fitted_to_the_same_folder(walls: Path, tmp_path: Path) -> None:
+    out = tmp_path / "stereo.json"
+    result = fit(walls, "--simulator", "stereo", "--out", out, "--quiet", "--views", "0-1")
+    assert result.exit_code == 0, result.output
+    config = StereoConfig.load(out)
+    frames = json.loads(out.read_text())["fit"]["frames"]
+    assert len(frames) == 2 and config != StereoConfig()
+    for f in frames:
+        ratio = f["simulated"]["sigma_px"] / f["measured"]["sigma_px"]
+        assert 1 / 1.2 < ratio < 1.2
+    assert "full_well" in result.output and out.with_suffix(".png").is_file()
+
+
+def test_one_frame_is_enough_and_what_it_leaves_open_is_said(walls: Path, tmp_path: Path) -> None:
+    result = fit(walls, "--views", "0", "--out", tmp_path / "one.json", "--quiet")
+    assert result.exit_code == 0
+    assert "one distance only" in result.output and "add frames at" in result.output
+
+
+def test_the_wrong_unit_is_named(walls: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.json"
+    for unit in ("1", "-0.001", "nan"):
+        said = refusal(walls, "--unit", unit, "--out", out)
+        assert "0.001 where the counts are millimetres" in said
+    # Tenths of a millimetre taken for centimetres: a wall 26 m away.
+    assert "millimetres" in refusal(walls, "--unit", "0.01", "--out", out, "--quiet")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("simulator", ["disparity", "stereo"])
+def test_frames_without_a_plane_are_named(simulator: str, tmp_path: Path) -> None:
+    rough = np.random.default_rng(0).uniform(0.2, 0.9, (300, 400)).astype(np.float32)
+    (tmp_path / "rough.png").write_bytes(png_bytes(depth_counts(rough, UNIT)))
+    (tmp_path / "cam_K.txt").write_text("380 0 199.5\n0 380 149.5\n0 0 1\n")
+    out = tmp_path / "out.json"
+    said = refusal(tmp_path, "--simulator", simulator, "--out", out, "--quiet")
+    assert "rough.png" in said and "plane" in said
+    assert not out.exists() and not out.with_suffix(".png").exists()
+
+
+def test_images_of_several_sizes_are_named(walls: Path, tmp_path: Path) -> None:
+    for k, cut in enumerate((300, 200)):
+        counts = depth_counts(wall(0.3, 0.1)[:cut], UNIT)
+        (tmp_path / f"{k}.png").write_bytes(png_bytes(counts))
+    said = refusal(
+        tmp_path, "--camera", walls / "cam_K.txt", "--out", tmp_path / "o.json", "--quiet"
+    )
+    assert "1.png" in said and "400x200" in said and "400x300" in said
+
+
+def test_folders_that_hold_nothing_to_fit_are_named(walls: Path, tmp_path: Path) -> None:
+    assert "no folder" in refusal(tmp_path / "nowhere")
+    assert "holds no PNG" in refusal(tmp_path)
+    assert "names none" in refusal(walls, "--views", "40-50")
+    assert "cannot be the JSON" in refusal(walls, "--out", tmp_path)
+    (tmp_path / "a.png").write_bytes(png_bytes(depth_counts(wall(0.3, 0.1), UNIT)))
+    assert "--camera FILE" in refusal(tmp_path)
+
+
+def test_many_frames_are_thinned_evenly_and_wanted_ones_are_not(tmp_path: Path) -> None:
+    (tmp_path / "cam_K.txt").write_text("380 0 199.5\n0 380 149.5\n0 0 1\n")
+    image = png_bytes(depth_counts(wall(0.3, 0.1), UNIT))
+    for k in range(30):
+        (tmp_path / f"{k:02d}.png").write_bytes(image)
+    names = read_frames(tmp_path, "", None, UNIT).names
+    assert len(names) == 12 and names[0] == "00.png" and names[-1] == "29.png"
+    assert len(read_frames(tmp_path, "3-20", None, UNIT).names) == 18
+
+
+def test_the_intrinsics_of_another_size_are_named(walls: Path, tmp_path: Path) -> None:
+    camera = tmp_path / "camera.json"
+    camera.write_text(
+        json.dumps({"width": 640, "height": 480, "fx": 600, "fy": 600, "cx": 320, "cy": 240})
+    )
+    said = refusal(walls, "--camera", camera, "--out", tmp_path / "o.json", "--quiet")
+    assert "400x300" in said and "640x480" in said

@@ -1,0 +1,65 @@
+"""Pages of a session fit the screen: tables scroll by themselves, never the page."""
+
+import html
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from realsim.app.annotate import run_annotate
+from realsim.app.console import Console
+from realsim.app.register_files import write_result
+from realsim.app.report import write_report
+from realsim.store import SessionStore
+from registered_sessions import models_of, registered_by_hand, table_session
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+
+@pytest.fixture
+def pages(tmp_path: Path) -> dict[str, Path]:
+    """The report and the annotation's page of a registered session."""
+    store = table_session(tmp_path / "s", views=2)
+    write_result(store, registered_by_hand(store), models_of(), {})
+    store = SessionStore.open(store.folder)
+    run_annotate(store.folder, Console(quiet=True), maps="all", workers=1, check_depth=True)
+    return {
+        "report": write_report(store, None),
+        "annotation": store.path("reports/annotated.html"),
+    }
+
+
+def test_tables_scroll_inside_the_page_and_every_check_is_in_one(pages: dict[str, Path]) -> None:
+    for page in pages.values():
+        text = page.read_text("utf-8")
+        assert text.count("<table>") == text.count('<div class="scroll"><table>') > 0
+    rows = re.findall(r"<tr><td>(.*?)</td>", pages["report"].read_text("utf-8"))
+    assert {"agree", "probability"} <= set(rows)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
+@pytest.mark.parametrize("width", [1100, 390])
+def test_in_chromium_no_page_scrolls_sideways(
+    pages: dict[str, Path], tmp_path: Path, width: int
+) -> None:
+    for name, page in pages.items():
+        frame = tmp_path / "frame.html"
+        source = html.escape(page.read_text("utf-8"))
+        frame.write_text(
+            f'<iframe id="f" style="width:{width}px;height:900px;border:0" srcdoc="{source}">'
+            "</iframe><script>onload = () => { const e = f.contentDocument.documentElement;"
+            'document.title = e.scrollWidth + " of " + e.clientWidth; }</script>',
+            "utf-8",
+        )
+        done = subprocess.run(
+            [str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu",
+             "--disable-dev-shm-usage", f"--user-data-dir={tmp_path / 'profile'}",
+             "--dump-dom", frame.as_uri()],
+            capture_output=True, text=True, timeout=120, check=True,
+        )  # fmt: skip
+        found = re.search(r"<title>(\d+) of (\d+)</title>", done.stdout)
+        assert found, name
+        assert int(found[1]) <= int(found[2]) and int(found[2]) > width - 40, name

@@ -1,0 +1,62 @@
+"""Maps as counts: the same as what label_maps makes of the labels' own maps."""
+
+import numpy as np
+import pytest
+
+from realsim.formats import label_maps
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, Mesh
+from realsim.rendering.labels import LabelRenderer
+from realsim.rendering.rays import BACKGROUND, PlacedMesh
+from realsim_sim_bridge.annotation import map_counts
+
+CAMERA = CameraIntrinsics(
+    width=160, height=120, fx=150, fy=150, cx=79.5, cy=59.5,
+    distortion=np.array([-0.05, 0.06, 0.0005, -0.0007, -0.02]),
+)  # fmt: skip
+
+
+def box(x: float, y: float, z: float) -> Mesh:
+    corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)]) / 2.0
+    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+             [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    return Mesh(vertices=corners * [x, y, z], faces=np.array(faces, np.int32))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_counts_equal_those_of_the_float_maps(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    placed = [
+        PlacedMesh(i, box(*rng.uniform(0.02, 0.08, 3)),
+                   se3.exp([*rng.normal(size=3), *rng.uniform(-0.08, 0.08, 3)]))
+        for i in range(3)
+    ]  # fmt: skip
+    placed.append(PlacedMesh(BACKGROUND, box(1, 1, 0.01), se3.from_translation([0, 0, -0.15])))
+    T = se3.look_at([0.1, 0.2, 0.5], [0, 0, 0])
+    labels = LabelRenderer(placed).render(CAMERA, T)
+    window = (slice(10, 110), slice(20, 150))
+    seen = (labels.ids[window] >= 0) & (rng.random((100, 130)) < 0.9)
+    boxes = np.stack([p.mesh.bounds for p in placed])
+    got = map_counts.coordinate_counts(labels, window, seen, boxes)
+    points = labels.object_coordinates()[window]
+    for k in range(3):
+        mask = seen & (labels.ids[window] == k)
+        assert mask.any()
+        wanted = label_maps.coordinate_counts(points[mask], *boxes[k])
+        # Float32 products may fall on either side of a half.
+        assert np.max(np.abs(got[mask].astype(int) - wanted)) <= 1
+    assert not got[~seen].any()
+    normals = map_counts.normal_counts(labels).astype(int)
+    assert np.max(np.abs(normals - label_maps.normal_counts(labels.normals()))) <= 1
+    assert np.array_equal(normals.any(axis=-1), labels.geometry >= 0)
+
+
+def test_a_flat_model_and_the_corner_of_the_box_are_marked_as_seen() -> None:
+    flat = Mesh(
+        vertices=np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]]), faces=np.array([[0, 1, 2]])
+    )
+    placed = [PlacedMesh(0, flat, np.eye(4))]
+    labels = LabelRenderer(placed).render(CAMERA, se3.look_at([0.03, 0.03, 0.3], [0.03, 0.03, 0]))
+    window = (slice(0, 120), slice(0, 160))
+    counts = map_counts.coordinate_counts(labels, window, labels.ids >= 0, flat.bounds[None])
+    assert np.array_equal(counts.any(axis=-1), labels.ids >= 0) and (labels.ids >= 0).any()
