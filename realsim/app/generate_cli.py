@@ -55,9 +55,9 @@ FOLDER = click.Path(path_type=Path)
 def generate_command(out: Path, scenes: int, workers: int, quiet: bool, **options: Any) -> None:
     """Make tabletop scenes in OUT: objects dropped by physics, rendered, with every label.
 
-    Each scene is a session (OUT/scene_000000, ...) that annotate, school, review and show open;
-    its poses are exact. The same seed gives the same bytes; scene 7 does not depend on the others.
-    Run again to go on after an interruption, or with more --scenes to add some.
+    Each scene is a session (OUT/scene_000000, ...) that annotate, school, review and report open;
+    its poses are exact. The same seed gives the same images and labels; scene 7 does not depend on
+    the others. Run again to go on after an interruption, or with more --scenes to add some.
 
     Writes OUT/dataset.json, OUT/contact_sheet.png and OUT/index.html, too.
 

@@ -271,5 +271,6 @@ def _annotation(data: Any, name: str) -> BopAnnotation:
     keys = ("obj_id", "cam_R_m2c", "cam_t_m2c")
     if not isinstance(data, dict) or any(key not in data for key in keys):
         raise InputError(f"{name} must be an object with {', '.join(keys)}; found {data!r}.")
-    T = bop_units.object_in_camera(data["cam_R_m2c"], data["cam_t_m2c"], name)
+    touching = data.get(bop_units.AT_THE_LENS) is True
+    T = bop_units.object_in_camera(data["cam_R_m2c"], data["cam_t_m2c"], name, may_touch=touching)
     return BopAnnotation(obj_id=int(data["obj_id"]), T_cam_obj=T)

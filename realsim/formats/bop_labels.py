@@ -180,7 +180,10 @@ def write_scene_gt(
             rotation, translation = bop_units.lists_from_rigid(T_cam_obj)
             name = f"object {obj_id} of image {index}"
             bop_units.object_in_camera(rotation, translation, name, may_touch=True)
-            rows.append({"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": int(obj_id)})
+            row = {"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": int(obj_id)}
+            if float(np.linalg.norm(translation)) < bop_units.NEAREST_MM:
+                row[bop_units.AT_THE_LENS] = True
+            rows.append(row)
         scene[str(index)] = rows
     store.write_json("scene_gt.json", scene)
 

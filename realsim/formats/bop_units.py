@@ -17,6 +17,9 @@ MM_PER_M = 1000.0
 NEAREST_MM = 10.0
 """An object whose origin is nearer than this to the camera is not seen by any depth camera: the
 file holds metres."""
+AT_THE_LENS = "origin_at_lens"
+"""Key, ours, of an entry of scene_gt.json whose object's origin really is that near: a synthetic
+camera can stand inside an object."""
 FARTHEST_MM = 20_000.0
 """An object farther than 20 m is on no table: the file holds micrometres or was converted twice."""
 

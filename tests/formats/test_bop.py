@@ -215,6 +215,15 @@ def test_poses_that_cannot_be_are_not_written(tmp_path):
     assert (tmp_path / "scene_gt.json").read_bytes() == before
 
 
+def test_an_object_around_a_synthetic_camera_comes_back_and_says_so(tmp_path):
+    store, _ = make_scene(tmp_path, 1)
+    near = se3.from_translation([0.0, 0.001, 0.002])
+    bop_labels.write_scene_gt(store, {0: [(1, near), (1, se3.from_translation([0, 0, 0.5]))]})
+    rows = store.read_json("scene_gt.json")["0"]
+    assert [row.get("origin_at_lens") for row in rows] == [True, None]
+    assert np.allclose(read(tmp_path).ground_truth[0][0].T_cam_obj, near, atol=1e-12)
+
+
 # --- broken data ---------------------------------------------------------------------------------
 
 

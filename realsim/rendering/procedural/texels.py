@@ -39,7 +39,7 @@ def normals8(height_m: Values, period_m: float) -> Image:
     dv = (np.roll(height_m, 1, 0) - np.roll(height_m, -1, 0)) / step_m
     normal = np.stack([-du, -dv, np.ones_like(du)], -1)
     normal /= np.sqrt(1.0 + du * du + dv * dv)[..., None]
-    return np.round((normal + 1.0) * 127.5).astype(np.uint8)
+    return np.round(128.0 + 127.0 * normal).astype(np.uint8)
 
 
 def grey8(share: Values) -> Image:

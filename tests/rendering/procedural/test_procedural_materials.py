@@ -89,7 +89,7 @@ def test_reflectances_are_those_of_real_things(kind: str) -> None:
         clipped = np.mean(np.all(m.base_color_image == 255, -1))
         assert clipped < 0.02
         if m.normal_image is not None:
-            n = m.normal_image / 127.5 - 1.0
+            n = (m.normal_image.astype(np.float64) - 128.0) / 127.0
             np.testing.assert_allclose(np.linalg.norm(n, axis=-1), 1.0, atol=0.02)
             assert n[..., 2].min() > 0.1
             np.testing.assert_allclose(n.mean((0, 1))[:2], 0.0, atol=0.02)
@@ -123,7 +123,7 @@ def test_normals_lean_away_from_a_hill() -> None:
     n, period_m = 64, 0.1
     u, v = noise.grid(n)
     hill = 0.01 * np.exp(-(((u - 0.5) ** 2 + (v - 0.5) ** 2) / 0.02))
-    normal = normals8(hill.astype(np.float32), period_m) / 127.5 - 1.0
+    normal = (normals8(hill.astype(np.float32), period_m) - 128.0) / 127.0
     assert normal[32, 45, 0] > 0.2  # right of the top: to the right
     assert normal[32, 18, 0] < -0.2
     assert normal[18, 32, 1] > 0.2  # above the top in the image: up (OpenGL)
@@ -134,7 +134,7 @@ def test_the_slope_of_a_normal_is_that_of_the_height_field() -> None:
     n, period_m, height_m = 256, 0.2, 0.001
     u, _ = noise.grid(n)
     wave = np.broadcast_to(height_m * np.sin(2 * np.pi * u), (n, n)).astype(np.float32)
-    normal = normals8(wave, period_m) / 127.5 - 1.0
+    normal = (normals8(wave, period_m) - 128.0) / 127.0
     steepest = 2 * np.pi * height_m / period_m
     assert np.max(-normal[..., 0] / normal[..., 2]) == pytest.approx(steepest, abs=0.008)
 
