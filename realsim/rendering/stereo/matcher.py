@@ -49,7 +49,7 @@ def matched(left: Image8, right: Image8, exact: Array32, config: StereoConfig) -
 
     whole = _searched_in_bands(left, right, exact, config)
     disparity, texture, residual = refined(left, right, whole, config.window_px)
-    level = np.asarray(cv2.blur(left, (config.window_px,) * 2))
+    level = np.asarray(cv2.blur(left, (config.window_px,) * 2), np.uint8)
     limits = (*config.electron_noise, config.least_texture_snr**2, config.residual_limit**2)
     _judge(disparity, texture, residual, level, np.array(limits, np.float32))
     return _without_speckles(disparity, config.speckle_px)
