@@ -2,7 +2,7 @@
 
 One compiled pass per eye: base colour, micro texture, room light, highlights and the projected
 dots. Shadows of the room's own lamps are left out: they are soft, and they move no match. The
-projector's shadow is exact (a second picture from the projector).
+projector's shadow is nearly exact (from what both eyes see).
 """
 
 from dataclasses import dataclass
