@@ -476,6 +476,7 @@ def test_a_second_run_finds_the_first(known, fit, session, mesh_file, capsys):
     assert list(stored).index("smallest_box_mm") == list(stored).index("extent_mm") + 1
 
 
+@pytest.mark.slow
 def test_the_real_fit_from_the_command_line(known, session, mesh_file, capsys):
     longest = UNIT_M * length_of(known.scan, parse_measurement("longest=1m"))
     request = ScaleRequest(

@@ -116,6 +116,7 @@ def test_refinement_mends_poses_that_are_wrong_and_spares_right_ones(tmp_path: P
         assert between(found) <= max(0.5 * between(robot), 0.3)
 
 
+@pytest.mark.slow
 def test_masks_uncalibrated_and_two_scenes(tmp_path: Path) -> None:
     Ts = cameras()
     session(tmp_path / "s", Ts, posed=False)
