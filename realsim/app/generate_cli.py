@@ -46,9 +46,9 @@ FOLDER = click.Path(path_type=Path)
               )  # fmt: skip
 @click.option("--depth-model", type=FOLDER, default=None, metavar="FILE",
               help="Of `realsim depth-fit`: noise and holes as your own camera's.")  # fmt: skip
-@click.option("--hdris", type=FOLDER, default=None, help="Own panoramas (.hdr, .exr).")
+@click.option("--hdris", type=FOLDER, default=None, help="Folder of own panoramas (.hdr, .exr).")
 @click.option("--textures", type=FOLDER, default=None,
-              help="Own textures: pictures, or a folder for each material.")  # fmt: skip
+              help="Folder of own textures: pictures, or a folder for each material.")  # fmt: skip
 @click.option("--no-maps", is_flag=True, help="No label maps (coordinates, normals, ...).")
 @click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 256))
 @click.option("--quiet", is_flag=True, help="No progress bar.")

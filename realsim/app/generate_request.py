@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from realsim_sim_bridge.table_scenes.looks import OwnLooks
 from realsim_sim_bridge.table_scenes.pool import ObjectPool
 
 REQUEST_FILE = "generate.json"
+LAYOUTS = "layouts"
+"""Folder of the scenes' layouts and of the notes that they are finished."""
 FORMAT = 1
 RESULTS_VERSION = 2
 """Raised whenever the same request gives other scenes."""
@@ -131,31 +134,88 @@ def radius_of(name: str, radius: str | None) -> tuple[float, float]:
     return RANGES[name] if radius is None else range_of("--radius", radius, "1-2 (metres)")
 
 
+def require_usable(request: GenerateRequest) -> None:
+    """Raise for what is certain to fail later, before anything is written.
+
+    Raises:
+        InputError: no mesh of a pool states its unit though sizes are kept, or a panorama is none.
+    """
+    pool = request.scene.pool
+    for source in request.pool.sources:
+        kinds = sorted({Path(key).suffix.lower() for key in source.keys})
+        unitless = source.kind == "meshes" and not any(k.startswith(".usd") for k in kinds)
+        if unitless and pool.keep_size and pool.unit is None:
+            raise InputError(
+                f"--keep-size needs --unit for the pool '{source.label}': {', '.join(kinds)} files "
+                "do not say what a number in them is. Give --unit m, cm, mm or inch, or leave "
+                "--keep-size away for random sizes."
+            )
+    for path in request.looks.hdris:
+        _require_panorama(path)
+
+
+def _require_panorama(path: Path) -> None:
+    """Raise if a file's first bytes already tell that it is no panorama; the rest is read later.
+
+    Raises:
+        InputError: its kind is another, or it is not twice as wide as high.
+    """
+    from realsim.rendering.procedural.hdri import ASPECT_SLACK
+
+    with path.open("rb") as file:
+        head = file.read(4096)
+    magic = b"\x76\x2f\x31\x01" if path.suffix.lower() == ".exr" else b"#?"
+    if not head.startswith(magic):
+        raise InputError(
+            f"--hdris: {path} is no {path.suffix.lower()[1:]} picture, whatever its name says. "
+            "Export it again, or take it out of the folder."
+        )
+    if size := re.search(rb"\n-Y (\d+) \+X (\d+)\n", head):
+        height, width = int(size[1]), int(size[2])
+        if height < 4 or abs(width / height - 2.0) > 2 * ASPECT_SLACK:
+            raise InputError(
+                f"--hdris: {path} is {width}x{height}; an equirectangular panorama, twice as wide "
+                "as high (such as 2048x1024), is accepted. Cube maps and mirror balls must be "
+                "converted first."
+            )
+
+
+def made_folder(out: Path) -> None:
+    """Make the folder of a data set if it is not there.
+
+    Raises:
+        InputError: a file is in its place.
+    """
+    if out.exists() and not out.is_dir():
+        raise InputError(f"'{out}' is a file; give a folder that may be made or filled.")
+    out.mkdir(parents=True, exist_ok=True)
+
+
 def claim(out: Path, request: GenerateRequest) -> None:
-    """Take the folder for this data set, or say why it cannot be had.
+    """Take a folder that is there for this data set, or say why it cannot be had.
+
+    A folder in which another request got nowhere, so that it holds no scene, is taken over.
 
     Raises:
         InputError: it holds a data set of another request, or something else.
     """
     note = out / REQUEST_FILE
-    if out.exists() and not out.is_dir():
-        raise InputError(f"'{out}' is a file; give a folder that may be made or filled.")
     if note.is_file():
         found = read_object(note)
-        if found.get("key") != request.key:
+        if found.get("key") == request.key:
+            return
+        if any(out.glob("scene_*")) or any(out.glob(f"{LAYOUTS}/*")):
             differs = _differences(found.get("request", {}), request.told)
             raise InputError(
                 f"'{out}' holds scenes of another request; what differs: {differs}. Choose another "
                 "folder, or delete this one to begin anew; the same request goes on where it "
                 "stopped, also with more --scenes."
             )
-        return
-    if out.is_dir() and any(out.iterdir()):
+    elif any(out.iterdir()):
         raise InputError(
             f"'{out}' is not empty and holds no generated scenes. Choose another folder: nothing "
             "of yours is overwritten."
         )
-    out.mkdir(parents=True, exist_ok=True)
     value = {"format": FORMAT, "key": request.key, "version": __version__, "request": request.told}
     atomic.write_json(note, value)
 

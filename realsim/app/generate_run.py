@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from realsim.app.console import Console
-from realsim.app.generate_request import GenerateRequest, claim
+from realsim.app.generate_request import GenerateRequest, claim, made_folder, require_usable
 from realsim.app.generate_scene import SceneCosts, is_finished, make_scene
 from realsim.errors import RealsimError
 from realsim.store.atomic import StorageError
@@ -39,17 +39,21 @@ def generate(
     A scene's bytes depend on the request and its number only, not on `workers`.
 
     Raises:
-        InputError: the folder holds something else, another run works in it, or the renderer is
-            not installed.
+        InputError: the folder holds something else, another run works in it, the pool or the
+            panoramas are certain to fail, or the renderer is not installed.
         StorageError: the disk is full, or refuses; the same request goes on from there.
     """
     require_renderer(request.rendering)
-    claim(out, request)
+    require_usable(request)
+    made_folder(out)
     with only_run_in(out):
+        claim(out, request)
         kept = [k for k in range(scenes) if is_finished(out, k, request)]
         due = [k for k in range(scenes) if k not in kept]
         at_once = max(1, min(workers, len(due)))
-        with console.stage("generate", f"{scenes} scenes of {request.views.count} views") as tick:
+        plural = "" if scenes == 1 else "s"
+        what = f"{scenes} scene{plural} of {request.views.count} views"
+        with console.stage("generate", what) as tick:
             made, failed = _made(out, due, request, (at_once, workers // at_once), _ticker(
                 out, scenes, request.views.count, tick))  # fmt: skip
     return GenerateOutcome(
@@ -72,6 +76,7 @@ def _made(
     made: list[SceneCosts] = []
     failed: dict[int, str] = {}
     waiting = list(due)
+    tick()
     under_way: dict[Future[SceneCosts], int] = {}
     with local_workers(share[0]) as pool:
         while waiting or under_way:

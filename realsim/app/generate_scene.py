@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from realsim.app.generate_request import GenerateRequest
+from realsim.app.generate_request import LAYOUTS, GenerateRequest
 from realsim.errors import InputError
 from realsim.store import SessionStore, atomic
 from realsim.store.json_files import read_object
@@ -16,8 +16,6 @@ from realsim_sim_bridge.table_scenes.layout import Layout, layout_from_json, lay
 from realsim_sim_bridge.table_scenes.sample import generator, sample_layout
 from realsim_sim_bridge.table_scenes.scene import build_scene, scene_name, write_models
 
-LAYOUTS = "layouts"
-"""Where in the data set the layouts and the notes of finished scenes are."""
 CACHE = "cache"
 """Where convex parts of meshes are kept."""
 

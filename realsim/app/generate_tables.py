@@ -224,7 +224,7 @@ def show(out: Path, dataset: dict[str, Any], outcome: GenerateOutcome, console: 
             console.table(table.title, table.header, table.rows)
     for note in notes_of(dataset, outcome):
         console.warn(note)
-    console.say(summary_of(dataset))
+    console.say(summary_of(dataset) if dataset["scenes"] else "no scene was made.")
 
 
 def _percent(value: float | None) -> str:

@@ -136,6 +136,8 @@ def matched_look(
         None where no photograph shows enough of the objects.
     """
     known = [v for v in store.session.views if v.T_world_cam is not None]
+    if not known:
+        return None
     # The objects are seen best where the camera is near them; any spread will do for a mean.
     views = spread(known, VIEWS)
     stride = max(1, round(store.session.intrinsics.width / SMALL_PX))

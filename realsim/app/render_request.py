@@ -95,11 +95,24 @@ class RenderRequest:
         )
 
     def folder(self, session: Path) -> Path:
-        """Return where the views go."""
+        """Return where the views go: without --out, a folder for each set of options.
+
+        Views of other options would be refused in the same folder.
+        """
         if self.out is not None:
             return self.out
-        name = "real" if self.new_views is None else "new"
-        return session / "synthetic" / f"{name}-{self.renderer}-{self.depth}"
+        name = "real" if self.new_views is None else f"new{self.new_views}"
+        chosen = [
+            self.camera,
+            self.depth_model.stem if self.depth_model else "",
+            f"{self.radius}m" if self.radius else "",
+            self.size,
+            self.hdri.stem if self.hdri else "",
+            *self.materials,
+            f"seed{self.seed}" if self.seed else "",
+        ]
+        parts = [name, self.renderer, self.depth, *(c for c in chosen if c)]
+        return session / "synthetic" / re.sub(r"[^\w.-]+", "_", "-".join(parts))
 
     def config(self, store: SessionStore) -> SyntheticConfig:
         """Return the settings; twins store depth as their session does, so that both compare."""

@@ -10,8 +10,10 @@ from realsim.app.render_pictures import PAGE_FILE, SHEET_FILE, layers, pairs, sh
 from realsim.app.render_request import RenderRequest, WantedViews, wanted_views
 from realsim.app.render_scene import TwinScene, require_shown, twin_scene
 from realsim.errors import InputError
+from realsim.formats.images import image_size
 from realsim.records import GraspSet, ObjectModel, Scene
 from realsim.store import SessionStore
+from realsim.store.session_store import rgb_path
 from realsim_sim_bridge.synthetic.write import SyntheticSummary, write_session
 
 FIGURES_HEADER = ["figure", "real", "synthetic", "together"]
@@ -45,7 +47,8 @@ def run_render(session: Path, request: RenderRequest, console: Console) -> Rende
     """Render the registered scene of a session.
 
     Raises:
-        InputError: no registered session, or an option that cannot be.
+        InputError: no registered session, an option that cannot be, photographs of another size
+            than the camera's, or another run works there.
     """
     from threadpoolctl import threadpool_limits
 
@@ -60,9 +63,10 @@ def run_render(session: Path, request: RenderRequest, console: Console) -> Rende
     require_shown(store, scene, models)
     grasps = load_grasps(store.folder / "grasps")
     folder = request.folder(store.folder)
-    _refuse_inside(folder, store.folder)
+    _refuse_folder(folder, store.folder)
     with threadpool_limits(limits=1):
         wanted = wanted_views(store, scene, request)
+        _require_sizes(store, wanted)
         with console.stage("light and table", "from the photographs"):
             look = twin_scene(store, scene, models, request)
         with console.stage("render", f"{len(wanted.Ts_world_cam)} views") as tick:
@@ -98,16 +102,46 @@ def _written(
     )  # fmt: skip
 
 
-def _refuse_inside(folder: Path, session: Path) -> None:
-    """Raise if the views would fall on the session itself.
+def _require_sizes(store: SessionStore, wanted: WantedViews) -> None:
+    """Raise if a photograph that is looked at is not of the camera's size.
 
     Raises:
-        InputError: the folder is the session.
+        InputError: it is not; it is named.
+    """
+    camera = store.session.intrinsics
+    known = [v.index for v in store.session.views if v.T_world_cam is not None]
+    for index in known if wanted.real is None else wanted.real:
+        path = store.path(rgb_path(index))
+        width, height = image_size(path)
+        if (width, height) != (camera.width, camera.height):
+            raise InputError(
+                f"{path} is {width}x{height} pixels, the session's camera "
+                f"{camera.width}x{camera.height}: nothing rendered would lie on the picture. "
+                "Calibrate at the size of the images, or bring the images back to the camera's "
+                "size."
+            )
+
+
+def _refuse_folder(folder: Path, session: Path) -> None:
+    """Raise if the views would fall on the session itself or on something that is no session.
+
+    Raises:
+        InputError: the folder is the session, a file, or holds something else.
     """
     if folder.resolve() == session.resolve():
         raise InputError(
             f"--out '{folder}' is the session itself, which is only read; choose a folder of its "
             f"own, or leave --out away: {session / 'synthetic'}/... is taken."
+        )
+    if folder.exists() and not folder.is_dir():
+        raise InputError(
+            f"--out '{folder}' is a file; a folder that may be made or filled is taken."
+        )
+    begun = any((folder / name).is_file() for name in ("session.json", "session.begun.json"))
+    if folder.is_dir() and any(folder.iterdir()) and not begun:
+        raise InputError(
+            f"--out '{folder}' is not empty and holds no session. Choose another folder: nothing "
+            "of yours is overwritten."
         )
 
 

@@ -226,6 +226,49 @@ def test_a_scene_that_cannot_be_made_is_named_and_ends_in_1(tmp_path: Path) -> N
     assert result.exit_code == 1
     assert "scene_000000 could not be made" in result.output
     assert "torn.obj" in result.output
+    assert "no scene was made" in result.output
+    assert "0 meshes" not in result.output
+
+
+def test_a_folder_in_which_nothing_was_made_is_free_for_another_request(tmp_path: Path) -> None:
+    (tmp_path / "pool").mkdir()
+    (tmp_path / "pool/torn.obj").write_text("v 0 0\nf 1 2 3\n")
+    arguments = (*SMALL, "--scenes", "1", "--pool", str(tmp_path / "pool"))
+    assert _run(tmp_path / "out", *arguments).exit_code == 1
+    (tmp_path / "pool/torn.obj").write_text("v 0 0\nf 1 2 3\nf 1 2 4\n")  # mended, as they think
+    result = _run(tmp_path / "out", *arguments)
+    assert result.exit_code == 1, repr(result.exception)
+    (tmp_path / "out/layouts").mkdir()
+    (tmp_path / "out/layouts/scene_000000.json").write_text("{}")
+    assert "seed (5 there, 6 wanted)" in _refusal(tmp_path / "out", *arguments, "--seed", "6")
+
+
+def test_sizes_are_not_kept_of_meshes_whose_unit_nobody_knows(tmp_path: Path) -> None:
+    (tmp_path / "pool").mkdir()
+    (tmp_path / "pool/cube.stl").write_text("solid")
+    said = _refusal(tmp_path / "out", "--keep-size", "--pool", str(tmp_path / "pool"))
+    assert "--keep-size needs --unit" in said
+    assert ".stl" in said
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("text.hdr", b"hello", "is no hdr picture"),
+        ("text.exr", b"hello", "is no exr picture"),
+        ("cube.hdr", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 64 +X 64\n", "is 64x64"),
+    ],
+)
+def test_a_picture_that_is_no_panorama_is_named_before_anything_falls(
+    tmp_path: Path, name: str, content: bytes, words: str
+) -> None:
+    (tmp_path / "skies").mkdir()
+    (tmp_path / "skies" / name).write_bytes(content)
+    said = _refusal(tmp_path / "out", "--hdris", str(tmp_path / "skies"))
+    assert name in said
+    assert words in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_views_shown_are_spread_over_low_and_high_cameras() -> None:

@@ -20,6 +20,7 @@ from realsim.geometry import camera, se3
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer
 from realsim.store import SessionStore, save_scene
+from realsim.store.lock import only_run_in
 from synthetic_scenes import (
     INTRINSICS,
     MODELS,
@@ -107,6 +108,17 @@ def test_new_views_see_the_objects_at_the_asked_size(real, tmp_path):
     assert all(f'data-layer="{name}"' in page for name in ("normals", "object coordinates"))
 
 
+def test_new_views_of_a_session_that_lost_its_photographs_have_a_neutral_light(tmp_path):
+    store = captured_session(tmp_path / "s", 1)
+    store.path("rgb/000000.png").unlink()
+    assert store.repair() is not None
+    store = SessionStore.open(store.folder)
+    assert not store.session.views
+    look = twin_scene(store, two_boxes(), MODELS, RenderRequest(views="1"))
+    assert look.look is None
+    assert any("left neutral" in note for note in look.notes)
+
+
 def test_a_rejected_object_is_named(real, tmp_path):
     store = captured_session(tmp_path / "s", 1, two_boxes())
     save_scene(store, rejected(two_boxes(), 3))
@@ -140,6 +152,47 @@ def test_a_scene_in_which_everything_is_rejected_is_refused(tmp_path):
 def test_the_session_itself_is_never_written_over(real):
     with pytest.raises(InputError, match="the session itself"):
         run_render(real.folder, RenderRequest(out=real.folder), QUIET)
+
+
+def test_a_folder_that_holds_something_else_is_refused_before_anything_is_rendered(real, tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="not empty"):
+        run_render(real.folder, RenderRequest(out=tmp_path), QUIET)
+    with pytest.raises(InputError, match="is a file"):
+        run_render(real.folder, RenderRequest(out=tmp_path / "mine.txt"), QUIET)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_photographs_of_another_size_than_the_cameras_are_named(tmp_path):
+    store = captured_session(tmp_path / "s", 1)
+    path = store.path("session.json")
+    header = json.loads(path.read_text())
+    header["camera"]["width"] //= 2
+    path.write_text(json.dumps(header))
+    for views in ("real", "2"):
+        with pytest.raises(InputError, match=r"rgb/000000\.png is .* pixels"):
+            run_render(store.folder, RenderRequest(views=views), QUIET)
+    assert not (store.folder / "synthetic").exists()
+
+
+def test_two_runs_at_once_do_not_mix(real, tmp_path):
+    with only_run_in(tmp_path), pytest.raises(InputError, match="another run is working"):
+        run_render(real.folder, RenderRequest(views="1", out=tmp_path), QUIET)
+
+
+def test_views_of_other_options_go_into_another_folder(tmp_path):
+    hdri = tmp_path / "my studio.hdr"
+    hdri.touch()
+    others = (
+        {}, {"views": "8"}, {"views": "16"}, {"views": "8", "size": "64x48"},
+        {"views": "8", "radius": "0.4-0.7"}, {"camera": "d435"}, {"seed": 3}, {"hdri": hdri},
+        {"materials": ("table=painted wood",)}, {"depth": "clean"},
+    )  # fmt: skip
+    folders = [RenderRequest(**o).folder(tmp_path) for o in others]
+    assert len(set(folders)) == len(others)
+    names = {f.name for f in folders}
+    assert {"real-embedded-disparity", "new8-embedded-disparity-0.4-0.7m"} <= names
+    assert {"real-embedded-disparity-my_studio", "real-embedded-clean"} <= names
 
 
 @pytest.mark.parametrize(
