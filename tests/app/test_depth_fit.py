@@ -97,6 +97,9 @@ def test_the_wrong_unit_is_named(walls: Path, tmp_path: Path) -> None:
         assert "0.001 where the counts are millimetres" in said
     # Tenths of a millimetre taken for centimetres: a wall 26 m away.
     assert "millimetres" in refusal(walls, "--unit", "0.01", "--out", out, "--quiet")
+    # Tenths taken for millimetres: a wall at 2.6 m, where a D405 measures nothing.
+    said = refusal(walls, "--unit", "0.001", "--out", out, "--quiet")
+    assert "measures from 0.1 to 1.5 m" in said and "--unit" in said
     assert not out.exists()
 
 

@@ -148,12 +148,33 @@ def fit_depth_model(  # noqa: PLR0913 - what can be known of frames, each option
                 config=config.plane, name=names[k],
             )
         )  # fmt: skip
+        _require_in_reach(planes[-1].distance_m, kind, unit, names[k])
         if tick:
             tick(k + 1, len(depths) + 1)
     fit = _of_planes(depths, planes, intrinsics, kind, unit, names, truths, config)
     if tick:
         tick(len(depths) + 1, len(depths) + 1)
     return fit
+
+
+OUT_OF_REACH = 1.5
+"""A plane at so many times the farthest depth of a camera, or nearer than the nearest by as much,
+was not measured by it: a unit is wrong, or the profile."""
+
+
+def _require_in_reach(distance_m: float, kind: DepthProfile, unit_m: float, name: str) -> None:
+    """Refuse a plane where this kind of camera measures nothing.
+
+    Raises:
+        InputError: its distance is far beyond the range of the profile.
+    """
+    if kind.min_z_m / OUT_OF_REACH <= distance_m <= kind.max_z_m * OUT_OF_REACH:
+        return
+    raise InputError(
+        f"{name}: the plane is at {distance_m:.3g} m, read with {unit_m:g} m per count; a "
+        f"{kind.name} measures from {kind.min_z_m:g} to {kind.max_z_m:g} m. Check --unit (0.001 "
+        "for millimetres, 0.0001 for a D405's tenths) and --profile."
+    )
 
 
 def _of_planes(

@@ -93,7 +93,7 @@ def find_plane(
     """
     config = config or PlaneConfig()
     depth = require_metres(depth_m, name)
-    require_same_size(depth, intrinsics)
+    require_same_size(depth, intrinsics, name)
     rays = ray_table(intrinsics)
     known = (depth > 0) & np.isfinite(rays[..., 0])
     looked = known if region is None else known & region

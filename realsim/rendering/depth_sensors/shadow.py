@@ -65,7 +65,9 @@ def shadow_mask(
     return mask
 
 
-def require_same_size(image: NDArray[np.generic], intrinsics: CameraIntrinsics) -> None:
+def require_same_size(
+    image: NDArray[np.generic], intrinsics: CameraIntrinsics, name: str = "the depth picture"
+) -> None:
     """Refuse a depth picture that is not of the camera's size.
 
     Raises:
@@ -73,12 +75,13 @@ def require_same_size(image: NDArray[np.generic], intrinsics: CameraIntrinsics) 
     """
     if image.ndim != 2:
         raise InputError(
-            f"a depth picture has rows and columns; found an array of shape {image.shape}."
+            f"{name}: a depth picture has rows and columns; found an array of shape {image.shape}."
         )
     if image.shape != (intrinsics.height, intrinsics.width):
         raise InputError(
-            f"the depth picture is {image.shape[1]}x{image.shape[0]}, the camera "
-            f"{intrinsics.width}x{intrinsics.height}."
+            f"{name} is {image.shape[1]}x{image.shape[0]}, the camera "
+            f"{intrinsics.width}x{intrinsics.height}. Give the intrinsics of the depth pictures, "
+            "at their size."
         )
 
 
