@@ -28,8 +28,8 @@ def label_cost(seed: int, quick: bool) -> Found:
     placed = scene()
     found.over["scene"] = f"15 meshes, {faces_of(placed)} faces, table"
     sets = {
-        "720p": (camera_720p(), cameras(12 if quick else 256, 0.5, 0.7)),
-        "1080p": (camera_1080p(), cameras(6 if quick else 256, 1.0, 2.0)),
+        "720p": (camera_720p(), cameras(4 if quick else 256, 0.5, 0.7)),
+        "1080p": (camera_1080p(), cameras(3 if quick else 256, 1.0, 2.0)),
     }
     for name, (intrinsics, views) in sets.items():
         timings = _measured(placed, intrinsics, views)
@@ -43,7 +43,7 @@ def label_cost(seed: int, quick: bool) -> Found:
         parts = ", ".join(f"{k} {1e3 * v / len(views):.1f}" for k, v in total.items())
         found.over[f"labels_{name}"] = f"{len(views)} views; CPU ms a frame: {parts}"
     distorted = camera_720p(distorted=True)
-    timings = _measured(placed, distorted, cameras(8 if quick else 64, 0.5, 0.7))
+    timings = _measured(placed, distorted, cameras(3 if quick else 64, 0.5, 0.7))
     found.figures["labels_over_cast_distorted"] = sum(
         float(np.sum(timings[k])) for k in AS_FILES
     ) / float(np.sum(timings["cast"]))

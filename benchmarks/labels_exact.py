@@ -43,7 +43,7 @@ def _reprojection(found: Found, quick: bool) -> None:
         )
         unknown = 0.0
         largest = 0.0
-        for T in cameras(2 if quick else 8, 0.5, 0.7):
+        for T in cameras(1 if quick else 8, 0.5, 0.7):
             labels = renderer.render(i, T)
             v, u = np.nonzero(labels.geometry >= 0)
             points = camera.ray_table(i)[v, u].astype(np.float64) * labels.depth_m[v, u, None]
@@ -61,7 +61,7 @@ def _masks(found: Found, quick: bool) -> None:
     placed = scene()
     renderer = LabelRenderer(placed)
     i = camera_720p()
-    views = cameras(4 if quick else 32, 0.5, 0.7)
+    views = cameras(1 if quick else 32, 0.5, 0.7)
     amodal = different = alone_different = seen = 0
     gl_different = gl_seen = 0
     gl = _gl_caster(placed, i)
