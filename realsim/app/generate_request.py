@@ -23,7 +23,7 @@ REQUEST_FILE = "generate.json"
 LAYOUTS = "layouts"
 """Folder of the scenes' layouts and of the notes that they are finished."""
 FORMAT = 1
-RESULTS_VERSION = 2
+RESULTS_VERSION = 3
 """Raised whenever the same request gives other scenes."""
 
 

@@ -14,6 +14,7 @@ from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, ObjectPose
 from realsim.records.depth_bias import DepthBias
 from realsim.rendering.overlay import INK, PAPER, VERDICT_RGB, contact_sheet, draw_outlines
+from realsim.rendering.overlay_words import write_names
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.scanning.scale.picture_shading import diverging
 from realsim.store import SessionStore
@@ -193,8 +194,7 @@ def _overlay_sheet(
         ids = _resized_ids(look.ids[look.window], config)
         photo = _resized(store.rgb(look.index)[look.window], config)
         picture = draw_outlines(photo, ids, colors, 2)
-        _write_names(picture, ids, names, colors)
-        pictures.append(picture)
+        pictures.append(write_names(picture, ids, names, colors))
     captions = [_view_caption(result, look.index) for look in looks]
     return contact_sheet(pictures, config.columns, captions)
 
@@ -209,33 +209,6 @@ def _view_caption(result: Registered, index: int) -> str:
     """Return the number of a view and how well it is known where its objects are."""
     sigmas = [p.sigma_px for p in result.seen.get(index, {}).values() if np.isfinite(p.sigma_px)]
     return f"view {index}" + (f": 1 sigma {np.median(sigmas):.2f} px" if sigmas else "")
-
-
-def _write_names(
-    picture: Image, ids: Ids, names: Mapping[int, str], colors: Mapping[int, Color]
-) -> None:
-    """Write every object's name under it, in place; names that would overlap move away."""
-    import cv2
-
-    size = float(np.clip(picture.shape[1] / 1700, 0.32, 0.7))
-    taken: list[tuple[int, int, int]] = []
-    for instance, name in names.items():
-        rows, columns = np.nonzero(ids == instance)
-        if len(rows) == 0:
-            continue
-        (w, h), _ = cv2.getTextSize(name, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
-        pad = max(2, h // 3)
-        step, most = h + 2 * pad, picture.shape[0] - pad
-        x = int(np.clip(float(columns.mean()) - w / 2, pad, max(pad, picture.shape[1] - w - pad)))
-        y = min(int(rows.max()) + h + 2 * pad, most)
-        down = 1 if y + len(names) * step <= most else -1
-        while any(abs(y - v) < step and x < u + b and u < x + w for u, v, b in taken):
-            y += down * step
-        taken.append((x, y, w))
-        cv2.rectangle(picture, (x - pad, y - h - pad), (x + w + pad, y + pad), INK, -1)
-        cv2.putText(
-            picture, name, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, colors[instance], 1, cv2.LINE_AA
-        )
 
 
 # --- depth ------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment
-from realsim.rendering.casting.pixel_caster import PixelCaster
+from realsim.rendering.casting.pixel_caster import FirstHits, PixelCaster
 from realsim.rendering.developing import developed
 from realsim.rendering.embedded.environment_view import EnvironmentRenderer, LightSampling
 from realsim.rendering.embedded.materials import Surface, check_projection
@@ -95,6 +95,8 @@ class Photo:
     """(H, W, 3) encoded colours."""
     depth_m: Array32
     """(H, W) exact depth along z at the pixel centres [m]; 0 = nothing."""
+    geometry: Int32
+    """(H, W) number of the placed mesh seen at the pixel centres; -1 = nothing."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -160,33 +162,32 @@ class PhotoRenderer:
             T_world_cam: (4, 4) camera in world [m].
             rng: source of the sensor noise; None = no noise.
         """
-        light, depth_m = self.radiance(intrinsics, T_world_cam)
+        light, hits = self.radiance(intrinsics, T_world_cam)
         if self.environment is None:
-            return Photo(rgb=self._expose(light, rng), depth_m=depth_m)
-        lens = self.lighting
-        light *= np.float32(self.environment.exposure)
-        rgb = developed(light, rng, lens.full_well, lens.read_noise)
-        return Photo(rgb=rgb, depth_m=depth_m)
+            rgb = self._expose(light, rng)
+        else:
+            lens = self.lighting
+            light *= np.float32(self.environment.exposure)
+            rgb = developed(light, rng, lens.full_well, lens.read_noise)
+        return Photo(rgb=rgb, depth_m=hits.depth_m, geometry=hits.geometry)
 
     def radiance(
         self, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike
-    ) -> tuple[Array32, Array32]:
-        """Return linear light (H, W, 3) behind the lens, before exposure and noise, and depth.
+    ) -> tuple[Array32, FirstHits]:
+        """Return linear light (H, W, 3) behind the lens, before exposure and noise, and the hits.
 
-        The depth (H, W) is along z at the pixel centres [m]; 0 = nothing. Pixels that the lens
-        model cannot reach are black.
+        The hits are those at the pixel centres. Pixels that the lens model cannot reach are black.
         """
         import cv2
 
         T = se3.check_rigid(T_world_cam, "T_world_cam")
         if self._under_sky is not None:
-            color, depth_m = self._under_sky.radiance(intrinsics, T)
+            color, hits = self._under_sky.radiance(intrinsics, T)
         else:
-            color = self._in_the_room(intrinsics, T)
-            depth_m = self._caster.cast(intrinsics, T).depth_m
+            color, hits = self._in_the_room(intrinsics, T), self._caster.cast(intrinsics, T)
         if self.lighting.psf_px > 0:
             color = np.asarray(cv2.GaussianBlur(color, (0, 0), self.lighting.psf_px), np.float32)
-        return color, depth_m
+        return color, hits
 
     def _in_the_room(self, intrinsics: CameraIntrinsics, T: Array) -> Array32:
         """Return linear light (H, W, 3) under the `Lighting`, before the lens."""

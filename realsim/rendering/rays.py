@@ -150,11 +150,15 @@ class RayScene:
             normal=hits["primitive_normals"].numpy(),
         )
 
-    def occluded(self, origins: Array, directions: Array32) -> Mask:
-        """Return (N,) whether a ray meets anything; arguments as of `first_hits`."""
+    def occluded(self, origins: Array, directions: Array32, until: float = np.inf) -> Mask:
+        """Return (N,) whether a ray meets anything up to the parameter `until` of its direction.
+
+        The other arguments are those of `first_hits`.
+        """
         if not self.placed or len(directions) == 0:
             return np.zeros(len(directions), dtype=bool)
-        return self._scene.test_occlusions(self._rays(origins, directions)).numpy()
+        rays = self._rays(origins, directions)
+        return self._scene.test_occlusions(rays, tfar=until).numpy()
 
 
 def rotated(directions: Array32, R: Array) -> Array32:

@@ -97,12 +97,8 @@ def _hidden_from(scene: RayScene, points: Array32, eye: Array, T_world_cam: Arra
     towards = eye.astype(np.float32) - points
     starts = se3.transform(T_world_cam, (points + np.float32(LIFT) * towards).astype(np.float64))
     directions = rotated(towards, T_world_cam[:3, :3])
-    hidden = scene.occluded(starts, directions)
-    # The test knows no end of the ray: what stands behind the eye (a wall) must be told apart.
-    doubtful = np.flatnonzero(hidden)
-    t, _ = scene.first_hits(starts[doubtful], directions[doubtful])
-    hidden[doubtful] = t < 1 - LIFT
-    return hidden
+    # The ray ends at the eye: a wall behind it hides nothing.
+    return scene.occluded(starts, directions, until=1 - LIFT)
 
 
 def half_occluded(

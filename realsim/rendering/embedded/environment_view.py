@@ -16,7 +16,7 @@ from realsim.errors import InputError
 from realsim.geometry import camera
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment
-from realsim.rendering.casting.pixel_caster import PixelCaster
+from realsim.rendering.casting.pixel_caster import FirstHits, PixelCaster
 from realsim.rendering.embedded import bounce_light
 from realsim.rendering.embedded.ambient_cells import (
     CELL_PX,
@@ -121,8 +121,10 @@ class EnvironmentRenderer:
         bounce_light.face_light(self._sky, self._surfaces, self._face_light)
         self._has_sun = bool(np.any(self._sky.sun > 0))
 
-    def radiance(self, intrinsics: CameraIntrinsics, T_world_cam: Array) -> tuple[Array32, Array32]:
-        """Return linear radiance (H, W, 3) and depth (H, W) [m], 0 = nothing, of a view.
+    def radiance(
+        self, intrinsics: CameraIntrinsics, T_world_cam: Array
+    ) -> tuple[Array32, FirstHits]:
+        """Return linear radiance (H, W, 3) of a view, and what its pixel centres see.
 
         Pixels without a ray are black.
         """
@@ -154,7 +156,7 @@ class EnvironmentRenderer:
             size = (height, width, view.exposure, self._sampling.contrast)
             busy = busy_pixels(color, seen.points.base, geometry, sunlit, size) & known
             self._refine(view, seen, (ambient, mirrored), np.flatnonzero(busy), color)
-        return color.reshape(height, width, 3), hits.depth_m
+        return color.reshape(height, width, 3), hits
 
     def _level(self, view: _View) -> int:
         """Return the halving of the panorama that suits the view's pixels."""

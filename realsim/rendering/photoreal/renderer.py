@@ -141,7 +141,8 @@ class PhotorealRenderer:
             light = denoised(light, albedo, normal)
         if self.config.psf_px > 0:
             light = np.asarray(cv2.GaussianBlur(light, (0, 0), self.config.psf_px), np.float32)
-        return Photo(rgb=developed(light, rng), depth_m=self.first_hits(intrinsics, T).depth_m)
+        hits = self.first_hits(intrinsics, T)
+        return Photo(rgb=developed(light, rng), depth_m=hits.depth_m, geometry=hits.geometry)
 
     def first_hits(self, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike) -> FirstHits:
         """Return what the path tracer meets through the pixel centres; arguments as of `render`."""

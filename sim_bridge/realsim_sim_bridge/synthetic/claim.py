@@ -22,7 +22,7 @@ from realsim_sim_bridge.synthetic.scene import SyntheticScene
 Array = NDArray[np.float64]
 NOTE = "synthetic"
 """Key of a synthetic session's `extra`: what its views are made of."""
-RESULTS_VERSION = 2
+RESULTS_VERSION = 3
 """Raised whenever the same inputs give other pictures."""
 SAME_M = 1e-6
 """Vertices of a model in the folder and of the one given differ by rounding only [m]."""

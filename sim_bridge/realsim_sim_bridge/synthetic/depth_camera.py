@@ -9,21 +9,21 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from realsim.geometry import se3
-from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Material
 from realsim.rendering.depth_sensors.loss import material_loss
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.developing import srgb_decoded
-from realsim.rendering.rays import PlacedMesh, RayScene, rotated
+from realsim.rendering.photo import Photo
+from realsim.rendering.rays import PlacedMesh, RayScene
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
 
 Array32 = NDArray[np.float32]
+Chance = np.random.Generator
 LEAST_LOSS = 0.005
-"""A material that loses a smaller share than this loses nothing: rays to tell it are spared."""
+"""A material that loses a smaller share than this loses nothing: looking it up is spared."""
 TEXELS = 10_000
 """So many texels, evenly spread, are a texture's mean."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -34,13 +34,9 @@ class DepthSource(Protocol):
     """A depth camera that looks at the scene."""
 
     def measure(
-        self,
-        exact_m: Array32,
-        intrinsics: CameraIntrinsics,
-        T_world_cam: ArrayLike,
-        rng: np.random.Generator,
+        self, photo: Photo, camera: CameraIntrinsics, T_world_cam: ArrayLike, rng: Chance
     ) -> Array32:
-        """Return what it reports (H, W) [m] where the exact depth is `exact_m`; 0 = none."""
+        """Return what it reports (H, W) [m] of the view of a photograph; 0 = none."""
         ...
 
 
@@ -57,14 +53,10 @@ class ExactCamera:
     """Reports exact depth."""
 
     def measure(
-        self,
-        exact_m: Array32,
-        intrinsics: CameraIntrinsics,
-        T_world_cam: ArrayLike,
-        rng: np.random.Generator,
+        self, photo: Photo, camera: CameraIntrinsics, T_world_cam: ArrayLike, rng: Chance
     ) -> Array32:
         """See `DepthSource`."""
-        return exact_m
+        return photo.depth_m
 
 
 class DisparityCamera:
@@ -91,34 +83,18 @@ class DisparityCamera:
         return share if share >= LEAST_LOSS else 0.0
 
     def measure(
-        self,
-        exact_m: Array32,
-        intrinsics: CameraIntrinsics,
-        T_world_cam: ArrayLike,
-        rng: np.random.Generator,
+        self, photo: Photo, camera: CameraIntrinsics, T_world_cam: ArrayLike, rng: Chance
     ) -> Array32:
         """See `DepthSource`."""
         loss = reflectance = None
         if np.any(self._shares > 0) or self.model.signal_range_m > 0:
-            geometry = self._geometry(exact_m, intrinsics, np.asarray(T_world_cam))
-            loss = self._shares[geometry] if np.any(self._shares > 0) else None
+            loss = self._shares[photo.geometry] if np.any(self._shares > 0) else None
             if self.model.signal_range_m > 0:
-                reflectance = exposed(self._reflectance[geometry], geometry >= 0)
+                reflectance = exposed(self._reflectance[photo.geometry], photo.geometry >= 0)
         return self.model.measure(
-            exact_m, intrinsics, rng, scene=self._scene, T_world_cam=T_world_cam,
+            photo.depth_m, camera, rng, scene=self._scene, T_world_cam=T_world_cam,
             loss=loss, reflectance=reflectance,
         )  # fmt: skip
-
-    def _geometry(
-        self, exact_m: Array32, intrinsics: CameraIntrinsics, T_world_cam: NDArray[np.float64]
-    ) -> NDArray[np.int32]:
-        """Return the number (H, W) of the placed mesh that each pixel shows; -1 = none."""
-        T = se3.check_rigid(T_world_cam, "T_world_cam")
-        rays = ray_table(intrinsics)
-        seen = (exact_m > 0) & np.isfinite(rays[..., 0])
-        found = np.full(exact_m.shape, -1, np.int32)
-        _, found[seen] = self._scene.first_hits(T[:3, 3], rotated(rays[seen], T[:3, :3]))
-        return found
 
 
 class MatchingCamera:
@@ -133,14 +109,10 @@ class MatchingCamera:
         )
 
     def measure(
-        self,
-        exact_m: Array32,
-        intrinsics: CameraIntrinsics,
-        T_world_cam: ArrayLike,
-        rng: np.random.Generator,
+        self, photo: Photo, camera: CameraIntrinsics, T_world_cam: ArrayLike, rng: Chance
     ) -> Array32:
         """See `DepthSource`."""
-        return self._camera.measure(intrinsics, T_world_cam, rng).depth_m
+        return self._camera.measure(camera, T_world_cam, rng).depth_m
 
 
 def exposed(reflectance: Array32, seen: NDArray[np.bool_]) -> Array32:

@@ -85,9 +85,8 @@ class FrameRenderer:
         began = time.process_time()
         photo = self._pictures.render(job.intrinsics, T_world_cam, self._chance(index, PHOTO))
         between = time.process_time()
-        depth_m = self._depth.measure(
-            photo.depth_m, job.intrinsics, T_world_cam, self._chance(index, DEPTH)
-        )
+        chance = self._chance(index, DEPTH)
+        depth_m = self._depth.measure(photo, job.intrinsics, T_world_cam, chance)
         return SyntheticFrame(
             rgb=photo.rgb,
             depth_counts=images.depth_counts(depth_m, job.config.unit_m),

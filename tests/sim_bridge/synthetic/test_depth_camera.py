@@ -11,6 +11,7 @@ from realsim.rendering.appearance import Material
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.profiles import PROFILES
 from realsim.rendering.labels import LabelRenderer
+from realsim.rendering.photo import Photo
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.synthetic.depth_camera import (
@@ -36,7 +37,10 @@ def exact(scene):
 def measured(scene, config, seed=0):
     camera = depth_source(scene, config)
     rng = np.random.default_rng(seed)
-    return camera.measure(exact(scene).depth_m, INTRINSICS, T, rng)
+    seen = exact(scene)
+    rgb = np.zeros((*seen.depth_m.shape, 3), np.uint8)
+    photo = Photo(rgb=rgb, depth_m=seen.depth_m, geometry=seen.geometry)
+    return camera.measure(photo, INTRINSICS, T, rng)
 
 
 def of_model(model, **more):
