@@ -28,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from registration_figures import Done
 
-from realsim.formats import bop
-from realsim.formats.bop_keyframes import read_keyframe_poses
-from realsim.formats.bop_models import load_models
+from realsim.formats.bop import scene as bop
+from realsim.formats.bop.keyframes import read_keyframe_poses
+from realsim.formats.bop.models import load_models
 from realsim.geometry import se3
 from realsim.geometry.depth import points_from_depth
 from realsim.interop import import_open3d

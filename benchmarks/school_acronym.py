@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from school_conditions import PATIENT, slip_config
 from school_processes import in_processes
 
-from realsim.formats.acronym import read_acronym
+from realsim.formats.grasps.acronym import read_acronym
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.models.convex import ConvexConfig, convex_parts

@@ -12,7 +12,7 @@ from school_cases import candidate_config, school_case
 from school_conditions import slip_config
 from school_processes import spent
 
-from realsim.formats.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import executed
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.measure_statistics import closure_confusions, rank_correlations
 from realsim_sim_bridge.school.school import run_school

@@ -23,7 +23,7 @@ from school_conditions import (
 )
 from school_processes import PROCESSES, Spent, in_processes, spent
 
-from realsim.formats.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import executed
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.school import run_school
 from realsim_sim_bridge.slip.slip_test import SlipConfig

@@ -384,7 +384,7 @@ def _keep_board(out: Path, target: Target | None) -> None:
 
 def _give_models(lab: "SimulatedLab", store: SessionStore) -> None:
     """Leave what a real lab has, too: the objects' models and a person's rough poses."""
-    from realsim.formats.bop_models import save_models
+    from realsim.formats.bop.models import save_models
 
     if not store.has("registration/starts.json"):
         save_models(store.folder / "models", lab.models)

@@ -132,7 +132,7 @@ def _capture_all(
     lab: "SimulatedLab", config: DemoConfig, out: Path, console: Console
 ) -> SessionStore:
     """Plan and capture the board views and the scene views."""
-    from realsim.formats.bop_models import save_models
+    from realsim.formats.bop.models import save_models
     from realsim.store import save_board
     from realsim_capture_plans import (
         PlanConfig,

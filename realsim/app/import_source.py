@@ -164,7 +164,7 @@ def kinds_of(path: Path) -> list[KindFit]:
         if any(path.glob(pattern)):
             fits.append(KindFit(kind="bop", why=f"it has {pattern}"))
             break
-    from realsim.formats.colmap import find_model
+    from realsim.formats.colmap.model import find_model
 
     model = find_model(path)
     if model is not None:
@@ -310,13 +310,13 @@ def _open_folder(request: ImportRequest, console: Console) -> FrameSource:
 
 
 def _open_bop(request: ImportRequest, console: Console) -> FrameSource:
-    from realsim.formats.bop_source import open_bop
+    from realsim.formats.bop.source import open_bop
 
     return open_bop(request.source, scene=request.scene, use_depth=not request.no_depth)
 
 
 def _open_colmap(request: ImportRequest, console: Console) -> FrameSource:
-    from realsim.formats.colmap_source import open_colmap
+    from realsim.formats.colmap.source import open_colmap
 
     return open_colmap(
         request.source,
@@ -394,7 +394,7 @@ def list_source(request: ImportRequest, console: Console) -> None:
 
 
 def _bop_rows(request: ImportRequest) -> tuple[Sequence[str], list[Sequence[object]]]:
-    from realsim.formats.bop import find_scenes, read_scene
+    from realsim.formats.bop.scene import find_scenes, read_scene
 
     rows: list[Sequence[object]] = []
     for ref in find_scenes(request.source):
@@ -414,7 +414,7 @@ def _bop_rows(request: ImportRequest) -> tuple[Sequence[str], list[Sequence[obje
 
 
 def _colmap_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
-    from realsim.formats.colmap import find_model, read_model
+    from realsim.formats.colmap.model import find_model, read_model
 
     model = read_model(find_model(root) or root)
     rows: list[Sequence[object]] = []

@@ -41,7 +41,7 @@ from realsim.app.register_results import (
     poses_from_json,
     sigmas_of,
 )
-from realsim.formats import bop_units
+from realsim.formats.bop import units as bop_units
 from realsim.geometry import se3
 from realsim.records import ObjectModel, Scene
 from realsim.store import SessionStore, atomic, records_json

@@ -109,7 +109,7 @@ def read_inputs(
 
 def _available(store: SessionStore, request: RegisterRequest) -> dict[int, ObjectModel]:
     """Return all models that can be spoken of: the session's own before the library's."""
-    from realsim.formats.bop_models import load_models
+    from realsim.formats.bop.models import load_models
 
     models: dict[int, ObjectModel] = {}
     if request.library is not None:

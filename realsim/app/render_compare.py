@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.bop_labels import mask_path
+from realsim.formats.bop.labels import mask_path
 from realsim.geometry.metrics import mask_iou
 from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.depth_sensors.statistics import hole_share, local_noise

@@ -12,7 +12,7 @@ import numpy as np
 from realsim import __version__
 from realsim.app.stages import content_key
 from realsim.errors import InputError
-from realsim.formats.bop_models import INFO_FILE
+from realsim.formats.bop.models import INFO_FILE
 from realsim.records import Mesh, View
 from realsim.scanning.scale.measured import Measurement
 from realsim.scanning.scale.result import Similarity

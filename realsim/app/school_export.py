@@ -11,13 +11,13 @@ from realsim.app.console import Console
 from realsim.app.school_files import MODELS, stored_grasps
 from realsim.app.school_tables import SUMMARY_HEADER, agreement_line, setting_lines
 from realsim.errors import InputError
-from realsim.formats.scene_grasps import SceneGrasps
+from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.records import GraspSet
 from realsim.store import atomic
 from realsim.store.results import grasp_stem
 
 if TYPE_CHECKING:
-    from realsim.formats.acronym import AcronymObject
+    from realsim.formats.grasps.acronym import AcronymObject
 
 M_PER_MM = 1e-3
 """Scale of the exported meshes, which are in millimetres as BOP has them."""
@@ -56,11 +56,11 @@ def export(source: Path, target: str, out: Path, least_score: float = 0.0) -> li
     grasps = stored_grasps(source)[0]
     out.mkdir(parents=True, exist_ok=True)
     if target == "hdf5":
-        from realsim.formats.grasps_hdf5 import write_grasps_hdf5
+        from realsim.formats.grasps.hdf5 import write_grasps_hdf5
 
         return [write_grasps_hdf5(out / "grasps.h5", grasps)]
     if target == "parquet":
-        from realsim.formats.grasps_parquet import write_grasps_parquet
+        from realsim.formats.grasps.parquet import write_grasps_parquet
 
         return [write_grasps_parquet(out, grasps)]
     return list(_one_by_one(source, grasps, target, out, least_score))
@@ -70,9 +70,9 @@ def _one_by_one(
     source: Path, grasps: SceneGrasps, target: str, out: Path, least_score: float
 ) -> Iterator[Path]:
     """Write one file an object."""
-    from realsim.formats.acronym import write_acronym
-    from realsim.formats.graspgen import write_graspgen
-    from realsim.formats.isaac_grasp import write_isaac_grasp
+    from realsim.formats.grasps.acronym import write_acronym
+    from realsim.formats.grasps.graspgen import write_graspgen
+    from realsim.formats.grasps.isaac_grasp import write_isaac_grasp
 
     for s in grasps.sets:
         stem = grasp_stem(s)
@@ -92,7 +92,7 @@ def _one_by_one(
 
 def _copied_mesh(source: Path, obj_id: int, out: Path) -> str:
     """Copy an object's mesh beside the grasps and return its name there."""
-    from realsim.formats.bop_models import model_file
+    from realsim.formats.bop.models import model_file
 
     name = model_file(obj_id)
     (out / MODELS).mkdir(exist_ok=True)
@@ -104,7 +104,7 @@ def _copied_mesh(source: Path, obj_id: int, out: Path) -> str:
 
 def acronym_object(s: GraspSet, mesh: str) -> "AcronymObject":
     """Return what an ACRONYM file says of the object, as far as the set's parameters know it."""
-    from realsim.formats.acronym import AcronymObject
+    from realsim.formats.grasps.acronym import AcronymObject
 
     known = s.parameters
     physics: dict[str, Any] = ((known.get("config") or {}).get("slip") or {}).get("physics") or {}

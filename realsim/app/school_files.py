@@ -14,7 +14,7 @@ from pathlib import Path
 
 from realsim.app.school_inputs import SchoolInputs, is_session
 from realsim.errors import InputError
-from realsim.formats.scene_grasps import SceneGrasps
+from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.records import GraspSet, ObjectModel, Scene
 from realsim.records.trajectories import GraspTrajectories
 from realsim.store import atomic
@@ -48,7 +48,7 @@ def write_outcome(outcome: SchoolOutcome) -> None:
     from realsim.app.school_page import page_bytes
     from realsim.app.school_pictures import MARGINS, SHEET, margins_png, sheet_png
     from realsim.app.school_tables import as_json
-    from realsim.formats.bop_models import save_models
+    from realsim.formats.bop.models import save_models
     from realsim.store import save_grasps
     from realsim.store.trajectories import save_trajectories
 
@@ -115,8 +115,8 @@ def _together(
 
 def write_tables(folder: Path, grasps: SceneGrasps) -> None:
     """Write grasps.h5 and grasps.parquet, which other programs read."""
-    from realsim.formats.grasps_hdf5 import write_grasps_hdf5
-    from realsim.formats.grasps_parquet import write_grasps_parquet
+    from realsim.formats.grasps.hdf5 import write_grasps_hdf5
+    from realsim.formats.grasps.parquet import write_grasps_parquet
 
     write_grasps_hdf5(folder / HDF5, grasps)
     write_grasps_parquet(folder / GRASPS, grasps)
@@ -131,8 +131,8 @@ def stored_grasps(folder: Path) -> tuple[SceneGrasps, dict[int, ObjectModel]]:
     Raises:
         InputError: no results there.
     """
-    from realsim.formats.bop_models import load_models
-    from realsim.formats.grasps_hdf5 import read_grasps_hdf5
+    from realsim.formats.bop.models import load_models
+    from realsim.formats.grasps.hdf5 import read_grasps_hdf5
 
     if is_session(folder):
         return _of_session(folder)

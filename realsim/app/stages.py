@@ -165,7 +165,7 @@ def session_models(store: SessionStore, console: Console | None = None) -> dict[
     """
     from rich.markup import escape
 
-    from realsim.formats.bop_models import load_models
+    from realsim.formats.bop.models import load_models
 
     notes: list[str] = []
     models = load_models(store.folder / "models", notes=notes)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from realsim.formats.bop_labels import mask_path
+from realsim.formats.bop.labels import mask_path
 from realsim.geometry import se3
 from realsim.geometry.mesh import symmetry_transforms
 from realsim.geometry.metrics import mask_iou, mssd

@@ -25,7 +25,7 @@ from realsim.app.stages import (
 )
 from realsim.app.upgrade_source import SceneSource, UpgradeConfig, prepare, world_starts
 from realsim.errors import InputError, RealsimError
-from realsim.formats.bop import BopScene, BopSceneRef
+from realsim.formats.bop.scene import BopScene, BopSceneRef
 from realsim.geometry import se3
 from realsim.records import CaptureSession, GraspSet, ObjectModel, ObjectPose, Scene, View
 from realsim.store import SessionStore
@@ -69,8 +69,8 @@ def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Consol
     """
     from threadpoolctl import threadpool_limits
 
-    from realsim.formats.bop import find_scenes
-    from realsim.formats.bop_models import load_models, save_models
+    from realsim.formats.bop.models import load_models, save_models
+    from realsim.formats.bop.scene import find_scenes
 
     refs = find_scenes(dataset)
     if config.scenes:
@@ -170,7 +170,7 @@ def _upgrade_scene(
 ) -> UpgradedScene:
     """Upgrade one scene, going on where an earlier run stopped."""
     from realsim.app.report import write_report
-    from realsim.formats.bop_models import save_models
+    from realsim.formats.bop.models import save_models
 
     ref, notes = source.bop.ref, list(source.notes)
     store = _copy_views(source.bop, source.Ts_world_cam, out / ref.split / ref.folder.name)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
-from realsim.formats.bop import BopScene, BopSceneRef
+from realsim.formats.bop.scene import BopScene, BopSceneRef
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose
 
@@ -58,8 +58,8 @@ def prepare(
         InputError: something is missing or broken.
         UnitError: something has another unit than it claims.
     """
-    from realsim.formats.bop import read_scene
-    from realsim.formats.bop_models import require_meshes
+    from realsim.formats.bop.models import require_meshes
+    from realsim.formats.bop.scene import read_scene
 
     bop = read_scene(ref)
     annotations, notes = _start_poses(bop, root, config)
@@ -106,7 +106,7 @@ def _start_poses(
     bop: BopScene, root: Path, config: UpgradeConfig
 ) -> tuple[dict[int, list[tuple[int, Array]]], list[str]]:
     """Return {image: [(obj_id, T_cam_obj)]} to start from, and what must be said about it."""
-    from realsim.formats.bop import read_keyframe_poses
+    from realsim.formats.bop.scene import read_keyframe_poses
 
     notes: list[str] = []
     if config.start == "gt":

@@ -11,7 +11,7 @@ import numpy as np
 
 from realsim.errors import InputError
 from realsim.formats import images
-from realsim.formats.bop_models import INFO_FILE, info_of, model_files
+from realsim.formats.bop.models import INFO_FILE, info_of, model_files
 from realsim.geometry.mesh import mass_properties, ply_bytes
 from realsim.models import library_files as files
 from realsim.models.convex import collision_obj

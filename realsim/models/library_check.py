@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from realsim.errors import InputError
-from realsim.formats.bop_models import load_models, model_file
+from realsim.formats.bop.models import load_models, model_file
 from realsim.models import library_files as files
 from realsim.models.library_commit import ADDING
 from realsim.models.library_files import sha256

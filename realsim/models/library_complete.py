@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import asdict, replace
 
-from realsim.formats.bop_models import model_file
+from realsim.formats.bop.models import model_file
 from realsim.models import library_files as files
 from realsim.models.convex import collision_obj
 from realsim.models.library_commit import commit, only_writer_of

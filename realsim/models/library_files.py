@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from realsim.errors import InputError
-from realsim.formats.bop_models import INFO_FILE, model_file
+from realsim.formats.bop.models import INFO_FILE, model_file
 from realsim.models.library_records import (
     PROPERTIES_FORMAT,
     ModelProperties,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from realsim.errors import InputError
-from realsim.formats.bop_models import INFO_FILE, load_models, model_file
+from realsim.formats.bop.models import INFO_FILE, load_models, model_file
 from realsim.models import library_files as files
 from realsim.models.convex import parts_from_collision_obj
 from realsim.models.library_commit import finish_interrupted

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from realsim.errors import InputError
-from realsim.formats.bop_models import INFO_FILE, model_file
+from realsim.formats.bop.models import INFO_FILE, model_file
 from realsim.models import library_files as files
 from realsim.models.library_commit import commit, only_writer_of
 from realsim.models.library_files import read_info

@@ -14,7 +14,7 @@ import viser
 
 from realsim import local_pages
 from realsim.errors import InputError
-from realsim.formats.bop_models import load_models
+from realsim.formats.bop.models import load_models
 from realsim.records import ObjectPose, Scene
 from realsim.review import content, journal
 from realsim.review.journal import JOURNAL_FILE

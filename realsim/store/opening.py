@@ -49,7 +49,7 @@ def require_session(folder: Path) -> None:
             )
         raise InputError(
             f"{folder} holds no session: {SESSION_FILE} is not there. The folder of a capture "
-            "session is expected; a BOP dataset is read by realsim.formats.bop."
+            "session is expected; a BOP dataset is read by realsim.formats.bop.scene."
         )
     if views and not atomic.complete_lines(folder / MANIFEST_FILE):
         raise InputError(

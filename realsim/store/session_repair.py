@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from realsim.errors import InputError, RealsimError
-from realsim.formats import bop_units, images
+from realsim.formats import images
+from realsim.formats.bop import units as bop_units
 from realsim.records import CaptureSession
 from realsim.store import atomic
 from realsim.store.begun import BEGUN_FILE, RECOVERED, read_begun

@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim.formats import bop_units, images
+from realsim.formats import images
+from realsim.formats.bop import units as bop_units
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import atomic, records_json
 from realsim.store.atomic import storing

@@ -14,7 +14,7 @@ from realsim.app import cli, stages
 from realsim.app.console import Console
 from realsim.app.register import register_session
 from realsim.errors import RealsimError
-from realsim.formats.bop_models import save_models
+from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh, save_ply
 from realsim.geometry.parts import part

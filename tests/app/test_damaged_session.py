@@ -10,7 +10,7 @@ from realsim.app import stages
 from realsim.app.console import Console
 from realsim.app.register import register_session
 from realsim.errors import InputError, UnitError
-from realsim.formats.bop_models import save_models
+from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, CaptureSession, Mesh, ObjectPose, View

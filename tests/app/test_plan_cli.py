@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from realsim.app.cli import main
-from realsim.formats.graspnet_cameras import read_camera_poses
+from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
 from realsim_capture_plans.arms.kinematics import UR5, UR5E
 from realsim_capture_plans.collision.mount import d405_mount

@@ -16,7 +16,7 @@ from realsim.app.register_config import RegisterRequest, config_of, load_depth_b
 from realsim.app.register_inputs import read_inputs
 from realsim.app.register_results import cameras_now, claimed_cameras, load_registered
 from realsim.errors import InputError
-from realsim.formats.bop_models import save_models
+from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import ObjectPose

@@ -23,7 +23,7 @@ from realsim.app.register_results import (
     load_table_scene,
     sigmas_of,
 )
-from realsim.formats import bop_units
+from realsim.formats.bop import units as bop_units
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, ObjectPose

@@ -9,7 +9,7 @@ from realsim import CameraIntrinsics, CaptureSession, Mesh, ObjectModel, ObjectP
 from realsim.app.report import write_report
 from realsim.app.report_sliders import registration_pairs
 from realsim.app.stages import save_starts
-from realsim.formats.bop_models import save_models
+from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore, save_scene

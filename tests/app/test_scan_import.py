@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from realsim.app import cli
-from realsim.formats.bop_models import load_models, save_models
+from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.mesh import save_ply
 from realsim.geometry.parts import part
 from realsim.models.library import ModelLibrary

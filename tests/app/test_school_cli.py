@@ -13,9 +13,9 @@ from realsim.app.console import Console
 from realsim.app.school_files import stored_grasps
 from realsim.app.school_inputs import SchoolRequest
 from realsim.app.school_run import config_of, run_in_session
-from realsim.formats.acronym import read_acronym
-from realsim.formats.grasps_hdf5 import read_grasps_hdf5
-from realsim.formats.grasps_parquet import read_grasps_parquet
+from realsim.formats.grasps.acronym import read_acronym
+from realsim.formats.grasps.hdf5 import read_grasps_hdf5
+from realsim.formats.grasps.parquet import read_grasps_parquet
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import ObjectPose, Scene

@@ -12,7 +12,7 @@ from click.testing import Result
 from realsim.app.school_inputs import SchoolRequest, base_on_table, masses_of
 from realsim.app.school_run import config_of
 from realsim.errors import InputError
-from realsim.formats.bop_models import save_models
+from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.store import load_grasps

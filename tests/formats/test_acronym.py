@@ -11,15 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from realsim.errors import InputError
-from realsim.formats.acronym import AcronymObject, read_acronym, write_acronym
-from realsim.formats.hand_frames import (
+from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_acronym
+from realsim.formats.grasps.hand_frames import (
     FINGERTIP_Z_M,
     T_GRASP_HAND,
     TCP_Z_M,
     grasp_poses,
     hand_poses,
 )
-from realsim.formats.scene_grasps import executed, held
+from realsim.formats.grasps.scene_grasps import executed, held
 from realsim.geometry import se3
 from realsim.geometry.mesh import sample_surface
 from realsim.records import GraspSet

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError, NotRigidError, UnitError
-from realsim.formats import bop, bop_labels, bop_models
+from realsim.formats.bop import labels as bop_labels
+from realsim.formats.bop import models as bop_models
+from realsim.formats.bop import scene as bop
 from realsim.geometry import se3
 from realsim.geometry.mesh import symmetry_transforms
 from realsim.records import CameraIntrinsics, CaptureSession, Mesh, ObjectModel, View

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.formats.bop_source import open_bop
+from realsim.formats.bop.source import open_bop
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.store import SessionStore

@@ -8,8 +8,8 @@ import pycolmap
 import pytest
 
 from realsim.errors import InputError
-from realsim.formats.colmap import PARAMETERS, find_model, read_model
-from realsim.formats.colmap_source import open_colmap
+from realsim.formats.colmap.model import PARAMETERS, find_model, read_model
+from realsim.formats.colmap.source import open_colmap
 from realsim.geometry import se3
 from realsim.interop import rigid3d_from_T
 

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from realsim.errors import InputError
-from realsim.formats.graspgen import read_graspgen, write_graspgen
-from realsim.formats.hand_frames import hand_poses
-from realsim.formats.scene_grasps import executed, held
+from realsim.formats.grasps.graspgen import read_graspgen, write_graspgen
+from realsim.formats.grasps.hand_frames import hand_poses
+from realsim.formats.grasps.scene_grasps import executed, held
 from tried_grasps import tried_set
 
 

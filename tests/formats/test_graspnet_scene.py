@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError, NotRigidError
-from realsim.formats.graspnet_scene import read_annotation, read_graspnet_scene
+from realsim.formats.graspnet.scene import read_annotation, read_graspnet_scene
 from realsim.geometry import se3
 
 NUMBERS = (0, 27, 5)

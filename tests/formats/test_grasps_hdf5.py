@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from realsim.errors import InputError, RealsimError
-from realsim.formats.grasps_hdf5 import grasps_hdf5_bytes, read_grasps_hdf5, write_grasps_hdf5
-from realsim.formats.scene_grasps import SceneGrasps, executed, held
+from realsim.formats.grasps.hdf5 import grasps_hdf5_bytes, read_grasps_hdf5, write_grasps_hdf5
+from realsim.formats.grasps.scene_grasps import SceneGrasps, executed, held
 from realsim.records.grasps import MEASURES
 from tried_grasps import assert_same, tried_scene, tried_set
 

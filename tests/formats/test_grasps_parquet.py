@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from realsim.errors import InputError, RealsimError
-from realsim.formats.grasps_hdf5 import read_grasps_hdf5, write_grasps_hdf5
-from realsim.formats.grasps_parquet import read_grasps_parquet, write_grasps_parquet
-from realsim.formats.scene_grasps import SceneGrasps
+from realsim.formats.grasps.hdf5 import read_grasps_hdf5, write_grasps_hdf5
+from realsim.formats.grasps.parquet import read_grasps_parquet, write_grasps_parquet
+from realsim.formats.grasps.scene_grasps import SceneGrasps
 from tried_grasps import assert_same, tried_scene
 
 

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from realsim.errors import InputError
-from realsim.formats.hand_frames import hand_poses
-from realsim.formats.isaac_grasp import read_isaac_grasp, write_isaac_grasp
-from realsim.formats.scene_grasps import executed
+from realsim.formats.grasps.hand_frames import hand_poses
+from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
+from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry import se3
 from tried_grasps import tried_set
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.formats import bop_labels, label_maps
+from realsim.formats import label_maps
+from realsim.formats.bop import labels as bop_labels
 
 
 def test_instances_come_back():

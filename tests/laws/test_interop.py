@@ -158,7 +158,7 @@ def test_realsim_itself_loads_numpy_only():
     done = run(
         "import sys, realsim\n"
         "heavy = {'open3d', 'cv2', 'scipy', 'pybullet', 'trimesh', 'gtsam', 'numba'}\n"
-        "import realsim.store, realsim.formats.bop, realsim.interop, realsim.geometry.mesh\n"
+        "import realsim.store, realsim.formats.bop.scene, realsim.interop, realsim.geometry.mesh\n"
         "print(sorted(heavy & set(sys.modules)))"
     )
     assert done.stdout.strip() == "[]", done.stderr

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.formats.bop_models import load_models, save_models
+from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.mesh import mass_properties
 from realsim.geometry.parts import part
 from realsim.models import library_commit

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.formats.bop_models import load_models, save_models
+from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.parts import part
 from realsim.models.library import ModelLibrary
 from realsim.models.library_prepare import PrepareConfig, prepare_mesh, prepare_unscaled

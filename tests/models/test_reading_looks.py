@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from realsim.formats.bop_models import load_models, save_models
+from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.parts import part
 from realsim.models.mesh_loading import load_pieces
 

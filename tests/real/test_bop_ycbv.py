@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.formats import bop, bop_labels, bop_models
+from realsim.formats.bop import labels as bop_labels
+from realsim.formats.bop import models as bop_models
+from realsim.formats.bop import scene as bop
 from realsim.geometry.mesh import diameter, mass_properties
 from realsim.geometry.metrics import mssd
 from realsim.records import CaptureSession, View

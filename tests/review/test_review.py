@@ -30,7 +30,7 @@ from realsim import (
     View,
     local_pages,
 )
-from realsim.formats.bop_models import save_models
+from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.review import ReviewServer, content, journal

@@ -21,8 +21,9 @@ from realsim import (
     SupportPlane,
     View,
 )
-from realsim.formats import bop, images
-from realsim.formats.bop_labels import mask_of
+from realsim.formats import images
+from realsim.formats.bop import scene as bop
+from realsim.formats.bop.labels import mask_of
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore

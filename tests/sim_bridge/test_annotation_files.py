@@ -22,7 +22,7 @@ from realsim import (
     View,
 )
 from realsim.formats import images, label_maps
-from realsim.formats.bop_labels import mask_of, rle_area_and_bbox
+from realsim.formats.bop.labels import mask_of, rle_area_and_bbox
 from realsim.geometry import camera, se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from realsim import CameraIntrinsics, GraspSet, Mesh, ObjectPose
-from realsim.formats.bop_labels import bbox_of
+from realsim.formats.bop.labels import bbox_of
 from realsim.geometry import camera, se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim_sim_bridge.annotation.config import OccluderConfig, SightConfig

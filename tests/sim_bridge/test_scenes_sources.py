@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.formats.bop_models import save_models
+from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.models.convex import ConvexConfig
 from realsim.records import Mesh, ObjectModel

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from realsim.errors import InputError
-from realsim.formats.scene_grasps import executed, untried_set
+from realsim.formats.grasps.scene_grasps import executed, untried_set
 from realsim.records import ObjectModel
 from realsim_sim_bridge.school.sheet import left_after, school_sheet, sheet_figure
 from realsim_sim_bridge.school.sheet_object import MOST_HANDS, STOPS, shown_rows, stops_of

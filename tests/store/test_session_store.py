@@ -135,7 +135,7 @@ def test_a_pose_known_at_capture_stays_with_its_view(tmp_path):
 
 
 def test_the_folder_is_a_bop_scene_from_its_first_frame_on(tmp_path):
-    from realsim.formats.bop import find_scenes, read_scene
+    from realsim.formats.bop.scene import find_scenes, read_scene
 
     store = filled(tmp_path / "test/000007", 1)
     store.set_cameras(CAMERA, {0: se3.from_translation([0.1, 0.2, 0.3])})

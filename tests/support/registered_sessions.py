@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.register_results import CameraChange, Registered, Remark
-from realsim.formats.bop_models import save_models
+from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import (

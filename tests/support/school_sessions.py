@@ -7,7 +7,7 @@ from click.testing import CliRunner, Result
 
 from realsim.app.school_cli import SCHOOL
 from realsim.errors import InputError
-from realsim.formats.bop_models import save_models
+from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import CaptureSession, ObjectPose, Scene, SupportPlane

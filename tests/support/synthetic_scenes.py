@@ -15,7 +15,7 @@ from realsim import (
     SupportPlane,
     View,
 )
-from realsim.formats.bop_models import save_models
+from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.depth_sensors.model import DepthSensorModel

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from realsim.formats.scene_grasps import SceneGrasps
+from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
 from realsim.records.grasps import MEASURES

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.graspnet_cameras import FIRST, POSES
+from realsim.formats.graspnet.cameras import FIRST, POSES
 from realsim.geometry import se3
 from realsim_capture_plans.plan_files.plan_json import save_plan
 from realsim_capture_plans.planning.record import CapturePlan

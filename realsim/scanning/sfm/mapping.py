@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import DegenerateError
-from realsim.formats.colmap import read_model
+from realsim.formats.colmap.model import read_model
 from realsim.geometry import se3
 from realsim.interop import opencv_from_colmap_px, quiet_output, rigid3d_from_T
 from realsim.scanning.sfm.config import SfmConfig

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats import bop_labels
+from realsim.formats.bop import labels as bop_labels
 from realsim.rendering.labels import Labels
 from realsim.store import SessionStore
 from realsim.store.records_json import intrinsics_to_json, number_to_json

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.bop_labels import mask_path
+from realsim.formats.bop.labels import mask_path
 from realsim.formats.png_window import encode_window
 from realsim.rendering.labels import LabelRenderer, Labels
 from realsim_sim_bridge.annotation import files

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from realsim.formats.bop_labels import NO_BBOX, Bbox, bbox_of, gt_info_entry, rle_of
+from realsim.formats.bop.labels import NO_BBOX, Bbox, bbox_of, gt_info_entry, rle_of
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh, ObjectPose
 from realsim.rendering.labels import Labels

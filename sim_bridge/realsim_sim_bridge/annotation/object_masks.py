@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.bop_labels import NO_BBOX, Bbox
+from realsim.formats.bop.labels import NO_BBOX, Bbox
 from realsim.rendering.labels import Labels
 from realsim_sim_bridge.annotation.unmodelled import UnmodelledRegion
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.bop_labels import mask_path
+from realsim.formats.bop.labels import mask_path
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene
 from realsim.rendering.labels import LabelRenderer, PlacedMesh

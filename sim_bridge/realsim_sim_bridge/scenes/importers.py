@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.graspit_scene import GraspitScene, QuaternionOrder, read_graspit_scene
-from realsim.formats.graspnet_scene import GraspnetScene, read_graspnet_scene
+from realsim.formats.graspit.scene import GraspitScene, QuaternionOrder, read_graspit_scene
+from realsim.formats.graspnet.scene import GraspnetScene, read_graspnet_scene
 from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
@@ -89,9 +89,9 @@ def from_bop(
     Raises:
         InputError: no scene or several, no annotation, no depth, no table in it, no model.
     """
-    from realsim.formats.bop import BopScene, read_scene
-    from realsim.formats.bop_models import load_models
-    from realsim.formats.bop_source import choose_scene
+    from realsim.formats.bop.models import load_models
+    from realsim.formats.bop.scene import BopScene, read_scene
+    from realsim.formats.bop.source import choose_scene
 
     bop: BopScene = read_scene(choose_scene(folder, scene_id))
     usable = [i for i, rows in sorted(bop.ground_truth.items()) if rows and bop.has_depth(i)]

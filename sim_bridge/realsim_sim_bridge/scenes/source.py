@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from realsim.errors import InputError
-from realsim.formats.graspit_scene import SCENE_FILE, QuaternionOrder, is_graspit_scene
-from realsim.formats.graspnet_cameras import POSES
-from realsim.formats.graspnet_scene import cameras_of
+from realsim.formats.graspit.scene import SCENE_FILE, QuaternionOrder, is_graspit_scene
+from realsim.formats.graspnet.cameras import POSES
+from realsim.formats.graspnet.scene import cameras_of
 from realsim.store.session_store import CAMERA_FILE
 from realsim_sim_bridge.scenes.importers import from_bop, from_graspit_yaml, from_graspnet
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support

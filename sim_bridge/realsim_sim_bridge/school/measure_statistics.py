@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import executed
 from realsim.records import GraspSet
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import executed
 from realsim.models.model_picture_views import INK, MUTED, PAPER
 from realsim.records import GraspSet, ObjectModel
 from realsim.rendering.overlay import score_color

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry import se3
 from realsim.models.model_picture_views import (
     INK,

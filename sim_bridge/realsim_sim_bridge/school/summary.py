@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.scene_grasps import check_values, executed
+from realsim.formats.grasps.scene_grasps import check_values, executed
 from realsim.records import STAGES, GraspSet
 from realsim_sim_bridge.school.measure_statistics import (
     ClosureConfusion,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.bop_models import load_models, model_file, save_models
+from realsim.formats.bop.models import load_models, model_file, save_models
 from realsim.models.library_reading import LibraryReader
 from realsim.models.library_session import copy_models
 from realsim.records import CameraIntrinsics, CaptureSession, ObjectModel

@@ -136,7 +136,7 @@ def _content(folder: Path) -> tuple[Kind, tuple[str, ...]]:
     Raises:
         InputError: no object; what is there is named.
     """
-    from realsim.formats.bop_models import INFO_FILE
+    from realsim.formats.bop.models import INFO_FILE
     from realsim.models.library_files import read_info
     from realsim.models.reading import SCAN_FORMATS
 

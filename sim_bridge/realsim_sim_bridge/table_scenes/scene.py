@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim import __version__
-from realsim.formats.bop_models import INFO_FILE, info_of, model_files
+from realsim.formats.bop.models import INFO_FILE, info_of, model_files
 from realsim.geometry import se3
 from realsim.models import library_files as files
 from realsim.models.convex import collision_obj

@@ -50,7 +50,7 @@ def fresh(written):
 
 
 def stored_models(store):
-    from realsim.formats.bop_models import load_models
+    from realsim.formats.bop.models import load_models
 
     return load_models(store.folder / "models")
 

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.hand_frames import HandFrame, grasp_poses, hand_poses, known_frame
-from realsim.formats.scene_grasps import check_values, executed, held, untried_set
+from realsim.formats.grasps.hand_frames import HandFrame, grasp_poses, hand_poses, known_frame
+from realsim.formats.grasps.scene_grasps import check_values, executed, held, untried_set
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.store import atomic

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats import bop_units, images
-from realsim.formats.bop_keyframes import read_keyframe_poses
-from realsim.formats.bop_models import require_meshes
+from realsim.formats import images
+from realsim.formats.bop import units as bop_units
+from realsim.formats.bop.keyframes import read_keyframe_poses
+from realsim.formats.bop.models import require_meshes
 from realsim.records import CaptureSession, View
 from realsim.store.session_store import CAMERA_FILE, read_json_file
 

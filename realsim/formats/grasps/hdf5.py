@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.formats.grasps.scene_grasps import SceneGrasps, parameters_json
 from realsim.formats.hdf5_checked import CheckedGroup, opened
-from realsim.formats.scene_grasps import SceneGrasps, parameters_json
 from realsim.records import STAGES, GraspSet
 from realsim.records.grasps import MEASURES
 from realsim.records.trajectories import PHASES, GraspTrajectories

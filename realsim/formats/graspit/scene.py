@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.graspit_contacts import midway_error
-from realsim.formats.graspit_grasps import (
+from realsim.formats.graspit.contacts import midway_error
+from realsim.formats.graspit.grasps import (
     GRASP_FILE,
     SAMPLED_GRASPS,
     WorldGrasps,

@@ -9,7 +9,7 @@ import numpy as np
 
 from realsim.errors import InputError
 from realsim.formats import images
-from realsim.formats.colmap import ColmapImage, ColmapModel, find_model, read_model
+from realsim.formats.colmap.model import ColmapImage, ColmapModel, find_model, read_model
 from realsim.formats.folders.joining import natural_key
 from realsim.formats.folders.listing import image_header, shown
 from realsim.formats.folders.source import file_digest, require_one_size

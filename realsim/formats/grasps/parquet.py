@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.grasps_hdf5 import COLUMNS, FORMAT, FORMAT_VERSION, FRAMES, SAMPLES
+from realsim.formats.grasps.hdf5 import COLUMNS, FORMAT, FORMAT_VERSION, FRAMES, SAMPLES
+from realsim.formats.grasps.scene_grasps import SceneGrasps, parameters_json
 from realsim.formats.parquet_checked import CheckedTable
-from realsim.formats.scene_grasps import SceneGrasps, parameters_json
 from realsim.records import STAGES, GraspSet
 from realsim.records.grasps import MEASURES
 from realsim.records.trajectories import GraspTrajectories

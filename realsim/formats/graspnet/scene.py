@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.graspnet_cameras import POSES, read_camera_poses
+from realsim.formats.graspnet.cameras import POSES, read_camera_poses
 from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane

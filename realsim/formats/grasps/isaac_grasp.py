@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 
 from realsim import interop
 from realsim.errors import InputError
-from realsim.formats.hand_frames import FINGER_OPEN_M, HandFrame, grasp_poses, hand_poses
-from realsim.formats.scene_grasps import check_values, executed, untried_set
+from realsim.formats.grasps.hand_frames import FINGER_OPEN_M, HandFrame, grasp_poses, hand_poses
+from realsim.formats.grasps.scene_grasps import check_values, executed, untried_set
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.store import atomic

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.colmap_files import require_whole
+from realsim.formats.colmap.files import require_whole
 from realsim.geometry import se3
 from realsim.interop import T_from_rigid3d, opencv_from_colmap_px
 from realsim.records import CameraIntrinsics

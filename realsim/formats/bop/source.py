@@ -1,4 +1,4 @@
-"""A scene of a BOP dataset as a frame source, its conventions as in `realsim.formats.bop`."""
+"""A scene of a BOP dataset as a frame source, its conventions as in `realsim.formats.bop.scene`."""
 
 import hashlib
 from collections.abc import Iterator, Sequence
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats import images
-from realsim.formats.bop import BopScene, BopSceneRef, find_scenes, read_scene
+from realsim.formats.bop.scene import BopScene, BopSceneRef, find_scenes, read_scene
 from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.listing import image_header, shown
 from realsim.formats.folders.source import file_digest, require_one_size

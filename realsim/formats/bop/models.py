@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
 from realsim.formats import images
-from realsim.formats.bop_units import MM_PER_M
+from realsim.formats.bop.units import MM_PER_M
 from realsim.geometry import se3
 from realsim.geometry.mesh import diameter, load_mesh, ply_bytes
 from realsim.records import Mesh, ObjectModel

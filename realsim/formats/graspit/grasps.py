@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.graspit_contacts import contact_distances, midway_error
+from realsim.formats.graspit.contacts import contact_distances, midway_error
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, Scene, SupportPlane
 

@@ -26,16 +26,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.grasps_hdf5 import COLUMNS, known_measures
-from realsim.formats.hand_frames import FINGER_OPEN_M, grasp_poses, hand_poses
-from realsim.formats.hdf5_checked import CheckedGroup, opened
-from realsim.formats.scene_grasps import (
+from realsim.formats.grasps.hand_frames import FINGER_OPEN_M, grasp_poses, hand_poses
+from realsim.formats.grasps.hdf5 import COLUMNS, known_measures
+from realsim.formats.grasps.scene_grasps import (
     check_values,
     executed,
     held,
     parameters_json,
     untried_set,
 )
+from realsim.formats.hdf5_checked import CheckedGroup, opened
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
 from realsim.records.grasps import MEASURES

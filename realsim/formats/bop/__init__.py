@@ -1,0 +1,1 @@
+"""BOP: scenes, annotations, models; millimetres there, metres here."""

@@ -1,0 +1,1 @@
+"""COLMAP: sparse models and the images they place."""

@@ -1,0 +1,1 @@
+"""The GraspIT authors' own scenes and grasps."""

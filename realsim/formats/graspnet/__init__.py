@@ -1,0 +1,1 @@
+"""GraspNet-1Billion: scenes, cameras, grasps."""

@@ -1,0 +1,1 @@
+"""Grasps as files: realsim's own and those of other programs."""
