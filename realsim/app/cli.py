@@ -13,11 +13,13 @@ from realsim.app.annotate_cli import annotate_command
 from realsim.app.cli_capture import CAPTURE_COMMANDS
 from realsim.app.cli_scan import SCAN
 from realsim.app.depth_fit_cli import depth_fit
+from realsim.app.export.cli import export_command
 from realsim.app.generate_cli import generate_command
 from realsim.app.option_values import numbers_of
 from realsim.app.register_cli import register_command
 from realsim.app.render_cli import render_command
 from realsim.app.school_cli import SCHOOL
+from realsim.app.stats.cli import stats_command
 from realsim.errors import RealsimError
 
 FOLDER = click.Path(path_type=Path)
@@ -197,6 +199,8 @@ commands.add_command(annotate_command)
 commands.add_command(render_command)
 commands.add_command(generate_command)
 commands.add_command(depth_fit)
+commands.add_command(export_command)
+commands.add_command(stats_command)
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ A piece (a frame, a model) counts when its line is whole; its files are then on 
 names. `finish` writes SHA256SUMS out of the lines and takes .export away.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -43,6 +44,14 @@ class ExportFolder:
         self.resumed = resumed
         """Whether an interrupted export is gone on with."""
         self._done = done
+        self._prefix = ""
+        self._mended: set[Path] = set()
+
+    def below(self, relative: str) -> "ExportFolder":
+        """Return a folder of this export as a writer sees it that fills a folder of its own."""
+        inner = ExportFolder(self.folder, self.asked, self._done, resumed=self.resumed)
+        inner._prefix, inner._mended = f"{self._prefix}{_inside(relative)}/", self._mended
+        return inner
 
     @classmethod
     def begin(cls, folder: Path | str, asked: Mapping[str, Any]) -> "ExportFolder":
@@ -76,7 +85,7 @@ class ExportFolder:
 
     def has(self, piece: str) -> bool:
         """Return whether a piece is there."""
-        return piece in self._done
+        return f"{self._prefix}{piece}" in self._done
 
     def write_piece(
         self,
@@ -97,25 +106,36 @@ class ExportFolder:
         """
         if self.has(piece):
             return
+        piece = self._prefix + piece
         listed: dict[str, list[Any]] = {}
         with atomic.storing(self.folder, piece):
             for relative, content in files.items():
-                listed[_inside(relative)] = self._write(_inside(relative), content)
+                path = self._path(relative)
+                listed[path] = self._write(path, content)
             for document, (key, value) in (rows or {}).items():
-                path = self.folder / ROWS / f"{_inside(document)}l"
-                path.parent.mkdir(parents=True, exist_ok=True)
-                line = json.dumps([piece, key, value], allow_nan=False)
-                with path.open("a", encoding="utf-8") as file:
-                    file.write(line + "\n")
+                self._append_row(document, [piece, key, value])
             self._append({"piece": piece, "files": listed})
         self._done.add(piece)
+
+    def _path(self, relative: str) -> str:
+        return self._prefix + _inside(relative)
+
+    def _append_row(self, document: str, row: list[Any]) -> None:
+        path = self.folder / ROWS / f"{self._path(document)}l"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # A kill may have torn the last line: the next one must not be glued to it.
+        if self.resumed and path not in self._mended:
+            atomic.repair_lines(path)
+            self._mended.add(path)
+        with path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row, allow_nan=False) + "\n")
 
     def rows(self, document: str) -> Iterator[tuple[str, Any]]:
         """Yield (key, value) of the rows of a document, in the order they were written.
 
         Rows of a piece that was interrupted, and was written again, come once.
         """
-        path = self.folder / ROWS / f"{_inside(document)}l"
+        path = self.folder / ROWS / f"{self._path(document)}l"
         seen: set[str] = set()
         for line in _lines(path):
             try:
@@ -128,10 +148,9 @@ class ExportFolder:
 
     def write_document(self, relative: str, parts: Iterable[str]) -> None:
         """Write a text file of any size out of its parts, whole or not at all."""
-        relative = _inside(relative)
-        piece = f"document {relative}"
-        if self.has(piece):
+        if self.has(f"document {relative}"):
             return
+        piece, relative = f"{self._prefix}document {relative}", self._path(relative)
         with atomic.storing(self.folder, relative):
             entry = self._stream(relative, (p.encode("utf-8") for p in parts))
             self._append({"piece": piece, "files": {relative: entry}})
@@ -142,6 +161,13 @@ class ExportFolder:
     ) -> None:
         """Write the rows of a document as one JSON object, a line a row."""
         self.write_document(relative, _object_text(self.rows(relative), layout))
+
+    def abandon_if_empty(self) -> None:
+        """Take the export's notes away where nothing was written: a refusal leaves no trace."""
+        if not self._done and (self.folder / STATE).is_dir():
+            shutil.rmtree(self.folder / STATE)
+            with contextlib.suppress(OSError):
+                self.folder.rmdir()
 
     def finish(self, files: Mapping[str, bytes]) -> None:
         """Write the last files (the card) and SHA256SUMS, and take the export's own notes away."""

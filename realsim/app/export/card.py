@@ -1,0 +1,177 @@
+"""The card of an exported data set: counts, conventions, what was lost, licences, checksums.
+
+A README.md whose head is that of Hugging Face's dataset cards, so that a folder can be uploaded as
+it is. What nobody stated is written as "not stated", never left out.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from realsim import __version__
+from realsim.formats.labelled_scene import WrittenScene
+
+CARD_FILE = "README.md"
+NOT_STATED = "not stated: ask the source before publishing"
+SIZES = (
+    (1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"),
+    (10_000_000, "1M<n<10M"),
+)  # fmt: skip
+"""Hugging Face's size categories, by the number of frames."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneFacts:
+    """What is known of one scene beside what its writer says."""
+
+    written: WrittenScene
+    labels: str
+    """Where its labels come from: 'annotated by realsim', 'as imported', 'the data set's own'."""
+    instances: int
+    """Things that stand in it."""
+    verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
+    """Verdict of registration and review -> objects."""
+    pose_sigma_mm: float | None = None
+    """Median standard deviation of the objects' positions [mm]."""
+    grasps_tried: int = 0
+    grasps_good: int = 0
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DatasetCard:
+    """What stands on a card."""
+
+    name: str
+    format: str
+    """Name of the format, as people call it."""
+    conventions: Sequence[tuple[str, str]]
+    """(what, convention) of the format as it was written here."""
+    scenes: Sequence[SceneFacts]
+    objects: Mapping[int, str]
+    """Object id -> name."""
+    loading: str
+    """Python that opens the data set."""
+    command: Sequence[tuple[str, str]]
+    """(option, value) that it was made with."""
+    sources: Sequence[str]
+    """Names of the sources."""
+    licence: str
+    models_licence: str
+    attribution: str
+    licence_files: Sequence[str] = ()
+    """Licences that lay beside the sources and were copied along."""
+
+
+def card_bytes(card: DatasetCard) -> bytes:
+    """Return the card as Markdown."""
+    frames = sum(s.written.frames for s in card.scenes)
+    parts = [_head(card, frames), f"# {card.name}\n", _summary(card, frames)]
+    parts.append(_section("Counts", _counts(card)))
+    parts.append(_section("Conventions", _table(("what", "convention"), card.conventions)))
+    parts.append(_section("How far to trust it", _trust(card)))
+    notes = [f"- {s.written.name}: {n}" for s in card.scenes for n in s.written.notes]
+    parts.append(_section("What was changed or lost on the way", _shortened(notes)))
+    parts.append(_section("Objects", _objects(card)))
+    parts.append(_section("Loading", f"```python\n{card.loading.strip()}\n```\n"))
+    parts.append(_section("Licence", _licence(card)))
+    parts.append(_section("Made with", _made_with(card)))
+    parts.append(
+        _section(
+            "Checksums",
+            "`sha256sum -c SHA256SUMS` compares every file with what was written.\n",
+        )
+    )
+    return "\n".join(parts).encode("utf-8")
+
+
+def _head(card: DatasetCard, frames: int) -> str:
+    size = next((name for limit, name in SIZES if frames < limit), "n>10M")
+    fields = {
+        "pretty_name": card.name,
+        "license": "other",
+        "license_name": card.licence or "not stated",
+        "size_categories": [size],
+        "tags": ["robotics", "grasping", "6d-pose", "rgb-d", card.format.lower()],
+    }
+    # JSON is YAML, and quotes what YAML would take for something else.
+    lines = [f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in fields.items()]
+    return "\n".join(["---", *lines, "---", ""])
+
+
+def _summary(card: DatasetCard, frames: int) -> str:
+    scenes = len(card.scenes)
+    objects = sum(s.written.objects for s in card.scenes)
+    return (
+        f"{scenes} {'scene' if scenes == 1 else 'scenes'}, {frames} frames, {objects} object poses "
+        f"in them, {len(card.objects)} object models. Format: {card.format}.\n"
+    )
+
+
+def _section(title: str, body: str) -> str:
+    return f"## {title}\n\n{body or 'Nothing.'}\n"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    def line(cells: Sequence[object]) -> str:
+        return (
+            "| " + " | ".join(str(c).replace("|", r"\|").replace("\n", " ") for c in cells) + " |"
+        )
+
+    return "\n".join([line(header), line(["---"] * len(header)), *(line(r) for r in rows)]) + "\n"
+
+
+def _counts(card: DatasetCard) -> str:
+    extra = sorted({k for s in card.scenes for k in s.written.counts})
+    header = ["scene", "folder", "frames", "things", "poses", *extra, "grasps tried", "good"]
+    rows = [
+        [
+            s.written.name, s.written.folder.as_posix(), s.written.frames, s.instances,
+            s.written.objects, *(s.written.counts.get(k, 0) for k in extra), s.grasps_tried,
+            s.grasps_good,
+        ]
+        for s in card.scenes
+    ]  # fmt: skip
+    if len(rows) > 1:
+        total = [sum(r[k] for r in rows) for k in range(2, len(header))]  # pyright: ignore[reportArgumentType, reportCallIssue]
+        rows.append(["all", "", *total])
+    return _table(header, rows)
+
+
+def _trust(card: DatasetCard) -> str:
+    rows: list[list[object]] = []
+    for s in card.scenes:
+        verdicts = ", ".join(f"{n} {v}" for v, n in sorted(s.verdicts.items())) or "none given"
+        sigma = "not known" if s.pose_sigma_mm is None else f"{s.pose_sigma_mm:.2f}"
+        rows.append([s.written.name, s.labels, verdicts, sigma])
+    text = _table(("scene", "labels", "verdicts", "1 sigma of positions [mm], median"), rows)
+    return (
+        text
+        + "\nA verdict is that of the registration's own checks, or of the person who reviewed "
+        "it: `accepted`, `doubtful` (somebody should look), `unchecked` (nothing was asked).\n"
+    )
+
+
+def _shortened(notes: Sequence[str], most: int = 60) -> str:
+    unique = list(dict.fromkeys(notes))
+    more = [f"- and {len(unique) - most} more notes."] if len(unique) > most else []
+    return "\n".join([*unique[:most], *more])
+
+
+def _objects(card: DatasetCard) -> str:
+    return _table(("id", "name"), sorted(card.objects.items())) if card.objects else ""
+
+
+def _licence(card: DatasetCard) -> str:
+    rows = [
+        ("images and labels", card.licence or NOT_STATED),
+        ("object models", card.models_licence or NOT_STATED),
+        ("attribution", card.attribution or NOT_STATED),
+    ]
+    copied = "".join(f"- [{name}]({name})\n" for name in card.licence_files)
+    beside = f"\nFound beside the sources, and copied:\n\n{copied}" if copied else ""
+    return _table(("of", "licence"), rows) + beside
+
+
+def _made_with(card: DatasetCard) -> str:
+    rows = [("realsim", __version__), ("sources", ", ".join(card.sources)), *card.command]
+    return _table(("what", "value"), rows)

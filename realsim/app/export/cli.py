@@ -1,0 +1,58 @@
+"""`realsim export` on the command line."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from realsim.app.option_values import numbers_of
+
+FOLDER = click.Path(path_type=Path)
+FORMATS = ("bop", "graspnet", "colmap", "nerfstudio")
+
+
+@click.command("export")
+@click.argument("sources", type=FOLDER, nargs=-1, required=True, metavar="SOURCE...")
+@click.option("--to", "target", required=True, type=click.Choice(FORMATS), help="Format.")
+@click.option("--out", type=FOLDER, required=True, help="Folder to fill; new, or to go on in.")
+@click.option("--labels", default="auto", show_default=True,
+              type=click.Choice(("auto", "annotated", "imported", "none")),
+              help="Of a session: realsim's own, or those it came with.")  # fmt: skip
+@click.option("--scenes", default="", help="Scene numbers, such as 1-3,7; all by default.")
+@click.option("--split", default="", help="BOP's split to write.")
+@click.option("--camera", default="", help="One of several cameras; GraspNet: kinect, realsense.")
+@click.option("--models", type=FOLDER, default=None, help="Models of a data set without.")
+@click.option("--colour", default="copy", show_default=True,
+              type=click.Choice(("copy", "png", "jpeg")), help="Colour images.")  # fmt: skip
+@click.option("--jpeg-quality", default=95, show_default=True, type=click.IntRange(1, 100))
+@click.option("--no-masks", is_flag=True, help="Leave the masks out.")
+@click.option("--points", default=100_000, show_default=True, type=click.IntRange(0),
+              help="Coloured points of a COLMAP model.")  # fmt: skip
+@click.option("--ignore-distortion", is_flag=True, help="Of a format that knows no distortion.")
+@click.option("--table-is-world", is_flag=True, help="Where no table is known: it is z = 0.")
+@click.option("--name", default="", help="Of the data set, on its card.")
+@click.option("--licence", default="", help="Of images and labels, on the card.")
+@click.option("--models-licence", default="", help="Of the object models, on the card.")
+@click.option("--attribution", default="", help="Whom to name, on the card.")
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def export_command(
+    sources: tuple[Path, ...], out: Path, scenes: str, no_masks: bool, quiet: bool, **options: Any
+) -> None:
+    """Write sessions or data sets in another format, with a card and checksums.
+
+    SOURCE is a session, a folder of sessions (of `realsim generate` or `upgrade`), a BOP or a
+    GraspNet data set. Interrupted, the same command goes on where it stopped.
+
+    \b
+      realsim export demo/session --to bop --out dataset
+      realsim export graspnet/scenes --to bop --out as_bop --camera kinect
+    """  # noqa: D301 - click's own mark for lines that stay as they are
+    from realsim.app.console import Console
+    from realsim.app.export.request import ExportRequest
+    from realsim.app.export.run import run_export, show_export
+
+    request = ExportRequest(
+        sources=sources, scenes=numbers_of(scenes), masks=not no_masks, **options
+    )
+    console = Console(quiet=quiet)
+    show_export(run_export(request, out, console), console)

@@ -1,0 +1,83 @@
+"""What `realsim export` was asked for."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from realsim.errors import InputError
+
+Colour = Literal["copy", "png", "jpeg"]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ExportRequest:
+    """Everything that an export depends on."""
+
+    sources: tuple[Path, ...]
+    """Sessions, folders of sessions, BOP or GraspNet data sets."""
+    target: str
+    """Format to write; see `realsim.app.export.targets.TARGETS`."""
+    labels: Literal["auto", "annotated", "imported", "none"] = "auto"
+    """Of sessions: which labels are taken."""
+    scenes: tuple[int, ...] = ()
+    """Numbers of scenes; none = all."""
+    split: str = ""
+    """BOP's split to write; '' = the source's own."""
+    camera: str = ""
+    """Of a source with several cameras, and the GraspNet folder to write."""
+    models: Path | None = None
+    """Models of a data set that has none beside it."""
+    colour: Colour = "copy"
+    """Colour images: copied as they are where the format allows it, or written anew."""
+    jpeg_quality: int = 95
+    """[%]: mean error of one grey level on real frames, a fifth of PNG's bytes."""
+    masks: bool = True
+    """Whether masks are written."""
+    ignore_distortion: bool = False
+    """Write images of a distorted lens into a format that knows no distortion."""
+    table_is_world: bool = False
+    """Where no table is known: z = 0 of the world is the table."""
+    points: int = 100_000
+    """Coloured points in a COLMAP model, for programs that start from them; 0 = none."""
+    least_score: float = 0.0
+    """Of the grasps that an isaac file takes."""
+    name: str = ""
+    """Of the data set, on its card; '' = of the folder."""
+    licence: str = ""
+    """Licence of the images and labels as it is to stand on the card."""
+    models_licence: str = ""
+    """Licence of the object models, likewise."""
+    attribution: str = ""
+    """Whom to name, or where it came from, likewise."""
+
+    def __post_init__(self) -> None:
+        """Check what a single value can tell.
+
+        Raises:
+            InputError: a source given twice, or a quality out of range.
+        """
+        seen: set[Path] = set()
+        for source in self.sources:
+            if source.resolve() in seen:
+                raise InputError(f"'{source}' is given twice; its scenes would be there twice.")
+            seen.add(source.resolve())
+        if not 1 <= self.jpeg_quality <= 100:
+            raise InputError(f"--jpeg-quality {self.jpeg_quality} cannot be; 1 to 100 is accepted.")
+        if self.points < 0:
+            raise InputError(f"--points {self.points} cannot be; 0 or more is accepted.")
+
+    def asked(self) -> dict[str, Any]:
+        """Return the request as plain JSON values: what an interrupted export is recognised by."""
+        values: dict[str, Any] = {
+            name: getattr(self, name)
+            for name in (
+                "target", "labels", "split", "camera", "colour", "jpeg_quality", "masks",
+                "ignore_distortion", "table_is_world", "points", "least_score", "name", "licence",
+                "models_licence", "attribution",
+            )
+        }  # fmt: skip
+        return values | {
+            "sources": [str(s.resolve()) for s in self.sources],
+            "scenes": list(self.scenes),
+            "models": None if self.models is None else str(self.models.resolve()),
+        }

@@ -1,0 +1,243 @@
+"""`realsim export`: scene by scene into one folder; interrupted, the same command goes on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from realsim.app.console import Console
+from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes
+from realsim.app.export.request import ExportRequest
+from realsim.app.export.sources import SourceScene, licence_files, source_scenes, trust_in
+from realsim.app.export.targets import TARGETS, SceneJob, ScenePlace, Target
+from realsim.errors import InputError, RealsimError
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.labelled_scene import LabelledScene, WrittenScene
+from realsim.records import ObjectModel
+from realsim.store.lock import only_run_in
+
+ALWAYS = ("sources", "target", "scenes", "name", "licence", "models_licence", "attribution")
+"""Options of every format."""
+OPTION_NAMES = {"models_licence": "models-licence", "masks": "no-masks"}
+WORDS = {
+    "session": "annotated by realsim", "bop": "the data set's own", "graspnet": "the data set's own"
+}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ExportResult:
+    """What an export did."""
+
+    folder: Path
+    card: Path
+    scenes: tuple[WrittenScene, ...]
+
+
+def run_export(request: ExportRequest, out: Path, console: Console) -> ExportResult:
+    """Write the scenes of all sources in another format.
+
+    Raises:
+        InputError: a source cannot be read, an option says nothing of the format, `out` holds
+            something else, or two scenes would have one name.
+    """
+    target = target_of(request)
+    scenes = source_scenes(request)
+    _require_outside(request, out)
+    places = scene_places(scenes, target)
+    folder = ExportFolder.begin(out, request.asked())
+    if folder.resumed:
+        console.say(f"going on with the export in {out}.")
+    facts: list[SceneFacts] = []
+    models: dict[int, ObjectModel] = {}
+    with only_run_in(out):
+        try:
+            for source, place in zip(scenes, places, strict=True):
+                opened = source.open()
+                _add_models(models, opened, source)
+                written = _write(opened, place, target, folder, request, console)
+                facts.append(_facts(source, opened, written))
+        except RealsimError:
+            folder.abandon_if_empty()
+            raise
+        if target.write_root is not None:
+            with console.stage("models and root"):
+                target.write_root([f.written for f in facts], models, folder, request)
+        licences = licence_files(request.sources)
+        folder.write_piece("licences", licences)
+        card = _card(request, out, target, facts, models, licences)
+        folder.finish({CARD_FILE: card_bytes(card)})
+    return ExportResult(folder=out, card=out / CARD_FILE, scenes=tuple(f.written for f in facts))
+
+
+def target_of(request: ExportRequest) -> Target:
+    """Return the format that was asked for.
+
+    Raises:
+        InputError: there is none of this name, or an option says nothing of it.
+    """
+    if request.target not in TARGETS:
+        raise InputError(f"there is no format '{request.target}'; there are {', '.join(TARGETS)}.")
+    target = TARGETS[request.target]
+    plain = ExportRequest(sources=request.sources, target=request.target)
+    given = [f.name for f in fields(request) if getattr(request, f.name) != getattr(plain, f.name)]
+    wrong = [name for name in given if name not in (*ALWAYS, *target.options)]
+    if wrong:
+        options = ", ".join("--" + OPTION_NAMES.get(n, n).replace("_", "-") for n in wrong)
+        raise InputError(
+            f"{options} says nothing of {target.name}; leave it away. Options of this format: "
+            f"{', '.join('--' + OPTION_NAMES.get(n, n).replace('_', '-') for n in target.options)}."
+        )
+    return target
+
+
+def scene_places(scenes: Sequence[SourceScene], target: Target) -> list[ScenePlace]:
+    """Return what each scene is called in the export: numbers in data sets, else its own name.
+
+    Raises:
+        InputError: two scenes of other formats have one name.
+    """
+    if target.kind == "dataset":
+        own = [(s.number, s.camera) for s in scenes]
+        numbers = [s.number for s in scenes]
+        if len(set(own)) < len(own):  # sources that count alike are counted anew
+            numbers = list(range(len(scenes)))
+        shared = len(set(numbers)) < len(numbers)
+        return [
+            ScenePlace(number=n, name=f"{n:06d}", camera=s.camera if shared else "")
+            for n, s in zip(numbers, scenes, strict=True)
+        ]
+    names = [s.name for s in scenes]
+    twice = [n for k, n in enumerate(names) if n in names[:k]]
+    if twice:
+        raise InputError(
+            f"two scenes are called '{twice[0]}' and would be one folder; export them one by one."
+        )
+    return [ScenePlace(number=k, name=n, camera="") for k, n in enumerate(names)]
+
+
+def _require_outside(request: ExportRequest, out: Path) -> None:
+    place = out.resolve()
+    for source in request.sources:
+        root = source.resolve()
+        if place == root or root in place.parents:
+            raise InputError(
+                f"--out '{out}' lies inside the source '{source}', which is only read; choose a "
+                "folder outside it."
+            )
+
+
+def _write(
+    scene: LabelledScene,
+    place: ScenePlace,
+    target: Target,
+    folder: ExportFolder,
+    request: ExportRequest,
+    console: Console,
+) -> WrittenScene:
+    total, done = len(scene.indices), 0
+    for note in scene.notes:
+        console.warn(f"{scene.name}: {note}".replace("[", r"\["))
+    with console.stage("export", f"{scene.name} to {target.name}") as tick:
+
+        def one_more() -> None:
+            nonlocal done
+            done += 1
+            tick(done, total)
+
+        return target.write_scene(
+            scene, folder, SceneJob(request=request, place=place, tick=one_more)
+        )
+
+
+def _add_models(models: dict[int, ObjectModel], scene: LabelledScene, source: SourceScene) -> None:
+    """Collect the models of all scenes; one id must be one object.
+
+    Raises:
+        InputError: it is not.
+    """
+    for obj_id, model in scene.models().items():
+        known = models.setdefault(obj_id, model)
+        if known is model:
+            continue
+        is_same = (
+            known.name == model.name and known.mesh.vertices.shape == model.mesh.vertices.shape
+        )
+        if not is_same:
+            raise InputError(
+                f"object {obj_id} is '{known.name}' ({len(known.mesh.vertices)} vertices) in an "
+                f"earlier scene and '{model.name}' ({len(model.mesh.vertices)} vertices) in "
+                f"{source.name}: one data set has one model an id. Export them one by one."
+            )
+
+
+def _facts(source: SourceScene, scene: LabelledScene, written: WrittenScene) -> SceneFacts:
+    trust = trust_in(source)
+    grasps = scene.grasps()
+    sets = () if grasps is None else grasps.sets
+    words = WORDS[source.kind]
+    if source.kind == "session":
+        is_annotated = getattr(scene, "is_annotated", False)
+        words = words if is_annotated else "as imported" if written.objects else "none"
+    things: set[object] = set()
+    if trust.instances is None and scene.indices:
+        first = scene.frame(scene.indices[0])
+        things = {(k, o.obj_id) for k, o in enumerate(first.objects)}
+    return SceneFacts(
+        written=written,
+        labels=words,
+        instances=len(things) if trust.instances is None else trust.instances,
+        verdicts=trust.verdicts,
+        pose_sigma_mm=trust.pose_sigma_mm,
+        grasps_tried=sum(int((s.base_scores == s.base_scores).sum()) for s in sets),
+        grasps_good=sum(int(s.good.sum()) for s in sets),
+    )
+
+
+def _card(
+    request: ExportRequest,
+    out: Path,
+    target: Target,
+    facts: Sequence[SceneFacts],
+    models: dict[int, ObjectModel],
+    licences: dict[str, Path],
+) -> DatasetCard:
+    command = [
+        (f.name, str(getattr(request, f.name)))
+        for f in fields(request)
+        if f.name in target.options or f.name in ("target", "scenes")
+    ]
+    first = facts[0].written.folder
+    inside = first.relative_to(out) if first.is_relative_to(out) else first
+    return DatasetCard(
+        name=request.name or out.resolve().name,
+        format=target.name,
+        conventions=target.conventions,
+        scenes=facts,
+        objects={i: m.name for i, m in models.items()},
+        loading=target.loading.replace("{scene}", inside.as_posix()),
+        command=command,
+        sources=[s.resolve().name for s in request.sources],
+        licence=request.licence,
+        models_licence=request.models_licence,
+        attribution=request.attribution,
+        licence_files=sorted(licences),
+    )
+
+
+def show_export(result: ExportResult, console: Console) -> None:
+    """Print what was written, and what was lost on the way."""
+    rows = [
+        [
+            s.name,
+            s.frames,
+            s.frames_written,
+            s.objects,
+            ", ".join(f"{v} {k}" for k, v in s.counts.items()),
+        ]
+        for s in result.scenes
+    ]
+    console.table(
+        f"exported into {result.folder}", ("scene", "frames", "written now", "poses", "more"), rows
+    )
+    for note in dict.fromkeys(f"{s.name}: {n}" for s in result.scenes for n in s.notes):
+        console.warn(note.replace("[", r"\["))
+    console.say(f"card      {result.card}")

@@ -1,0 +1,203 @@
+"""What an export can be made of: sessions, folders of them, BOP and GraspNet data sets."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from realsim.app.export.request import ExportRequest
+from realsim.errors import InputError
+from realsim.formats.labelled_scene import LabelledScene
+from realsim.records import Scene
+from realsim.store.session_store import SESSION_FILE
+
+ACCEPTED = (
+    "accepted are a session (session.json), a folder of sessions, a BOP data set "
+    "(SPLIT/000001/scene_camera.json), a GraspNet data set (scenes/scene_0000/kinect)"
+)
+LICENCE_NAMES = ("LICENSE", "LICENCE", "COPYING")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SourceScene:
+    """One scene to be exported; opened when its turn comes."""
+
+    name: str
+    source: Path
+    """What was given."""
+    folder: Path
+    """Its own folder."""
+    kind: str
+    """'session', 'bop' or 'graspnet'."""
+    number: int
+    """Of the scene in its source."""
+    camera: str
+    """'' = the source has one."""
+    open: Callable[[], LabelledScene]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneTrust:
+    """What registration and review say of a session."""
+
+    verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
+    pose_sigma_mm: float | None = None
+    instances: int | None = None
+
+
+def source_scenes(request: ExportRequest) -> list[SourceScene]:
+    """Return the scenes of all sources, in their order.
+
+    Raises:
+        InputError: a source that is none, has no scene, or not the scenes that were asked for.
+    """
+    found = [s for source in request.sources for s in _scenes_of(source, request)]
+    if not found:
+        given = ", ".join(f"'{s}'" for s in request.sources)
+        raise InputError(f"there is no scene in {given}; {ACCEPTED}.")
+    return found
+
+
+def _scenes_of(source: Path, request: ExportRequest) -> list[SourceScene]:
+    if not source.is_dir():
+        what = "a file" if source.is_file() else "not there"
+        raise InputError(f"'{source}' is {what}; {ACCEPTED}.")
+    sessions = session_folders(source)
+    if sessions:
+        return _sessions(source, sessions, request)
+    if any(any(source.glob(f"{up}annotations/*.xml")) for up in ("", "*/", "*/*/", "*/*/*/")):
+        return list(_graspnet(source, request))
+    if any(any(source.glob(f"{up}scene_camera*.json")) for up in ("", "*/", "*/*/")):
+        return list(_bop(source, request))
+    held = ", ".join(sorted(p.name for p in source.iterdir())[:8]) or "nothing"
+    raise InputError(f"'{source}' is no source of an export (it holds {held}); {ACCEPTED}.")
+
+
+def session_folders(source: Path) -> list[Path]:
+    """Return a folder that is a session, or the sessions up to two levels below it."""
+    if (source / SESSION_FILE).is_file():
+        return [source]
+    for pattern in (f"*/{SESSION_FILE}", f"*/*/{SESSION_FILE}"):
+        found = sorted(p.parent for p in source.glob(pattern) if not p.parent.name.startswith("."))
+        if found:
+            return found
+    return []
+
+
+def _sessions(source: Path, folders: list[Path], request: ExportRequest) -> list[SourceScene]:
+    from realsim.app.stages import open_session
+    from realsim.formats.session_scene import open_session_scene
+
+    def opener(folder: Path) -> Callable[[], LabelledScene]:
+        return lambda: open_session_scene(
+            open_session(folder), labels=request.labels, split=request.split
+        )
+
+    scenes: list[SourceScene] = []
+    for folder in folders:
+        number, camera = _place_of(folder)
+        scenes.append(
+            SourceScene(
+                name=folder.resolve().name, source=source, folder=folder, kind="session",
+                number=number, camera=camera, open=opener(folder),
+            )
+        )  # fmt: skip
+    _require_scenes(source, request, [s.number for s in scenes])
+    return [s for s in scenes if not request.scenes or s.number in request.scenes]
+
+
+def _place_of(folder: Path) -> tuple[int, str]:
+    """Return number and camera of a session: those of the data set that it was imported from."""
+    from realsim.formats.imported_labels import SCENE
+    from realsim.store.json_files import read_object
+
+    if (folder / SCENE).is_file():
+        head = read_object(folder / SCENE)
+        if isinstance(head.get("number"), int):
+            return head["number"], str(head.get("camera", ""))
+    digits = folder.resolve().name.rpartition("_")[2]
+    return (int(digits) if digits.isdecimal() else 0), ""
+
+
+def _bop(source: Path, request: ExportRequest) -> Iterator[SourceScene]:
+    from realsim.formats.bop.opening import open_labelled_scene
+    from realsim.formats.bop.scene import find_scenes
+
+    refs = find_scenes(source)
+    _require_scenes(source, request, [r.scene_id for r in refs])
+    cameras = sorted({r.camera for r in refs})
+    if request.camera and request.camera not in cameras:
+        raise InputError(
+            f"'{source}' has no camera '{request.camera}'; it has "
+            f"{', '.join(c for c in cameras if c) or 'one without a name'}."
+        )
+    for ref in refs:
+        if request.scenes and ref.scene_id not in request.scenes:
+            continue
+        if request.camera in ("", ref.camera):
+            yield SourceScene(
+                name=ref.name, source=source, folder=ref.folder, kind="bop",
+                number=ref.scene_id, camera=ref.camera,
+                open=lambda ref=ref: open_labelled_scene(ref, models=request.models),
+            )  # fmt: skip
+
+
+def _require_scenes(source: Path, request: ExportRequest, there: list[int]) -> None:
+    missing = sorted(set(request.scenes) - set(there))
+    if missing:
+        listed = ", ".join(str(n) for n in sorted(set(there))[:20])
+        raise InputError(f"scene {missing[0]} is not in '{source}'; it has {listed}.")
+
+
+def _graspnet(source: Path, request: ExportRequest) -> Iterator[SourceScene]:
+    from realsim.formats.graspnet.opening import open_scene
+    from realsim.formats.graspnet.tree import open_graspnet
+
+    tree = open_graspnet(
+        source,
+        scenes=request.scenes or None,
+        cameras=(request.camera,) if request.camera else None,
+        models=request.models,
+    )
+    for ref in tree.scenes:
+        yield SourceScene(
+            name=ref.name, source=source, folder=ref.folder, kind="graspnet", number=ref.number,
+            camera=ref.camera, open=lambda ref=ref: open_scene(ref),
+        )  # fmt: skip
+
+
+def trust_in(scene: SourceScene) -> SceneTrust:
+    """Return what registration and review say of a scene; nothing of a data set."""
+    if scene.kind != "session":
+        return SceneTrust()
+    from realsim.app.stages import judged_scene, open_session
+
+    store = open_session(scene.folder)
+    if not store.has("registration/scene.json"):
+        return SceneTrust()
+    judged: Scene = judged_scene(store)
+    verdicts: dict[str, int] = {}
+    for o in judged.objects:
+        verdicts[o.verdict] = verdicts.get(o.verdict, 0) + 1
+    sigmas = [
+        1e3 * float(np.sqrt(np.linalg.eigvalsh(o.covariance[3:, 3:])[-1]))
+        for o in judged.objects
+        if o.covariance is not None
+    ]
+    return SceneTrust(
+        verdicts=verdicts,
+        pose_sigma_mm=float(np.median(sigmas)) if sigmas else None,
+        instances=len(judged.objects),
+    )
+
+
+def licence_files(sources: tuple[Path, ...]) -> dict[str, Path]:
+    """Return the licences that lie beside the sources, by the name they are copied under."""
+    found: dict[str, Path] = {}
+    for source in sources:
+        for path in sorted(source.iterdir()):
+            if path.is_file() and path.name.upper().startswith(LICENCE_NAMES):
+                name = f"licences/{source.resolve().name}-{path.name}"
+                found[name] = path
+    return found

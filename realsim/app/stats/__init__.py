@@ -1,0 +1,1 @@
+"""`realsim stats`: what any set of sessions holds, in the figures that papers give."""

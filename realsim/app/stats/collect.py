@@ -1,0 +1,195 @@
+"""What one session holds: frames, objects with verdict, uncertainty, visibility, and grasps."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.stages import judged_scene, open_session
+from realsim.errors import InputError
+from realsim.formats.bop.models import model_file
+from realsim.formats.imported_labels import FOLDER as IMPORTED
+from realsim.records import GraspSet, ObjectPose
+from realsim.store import SessionStore, load_grasps
+from realsim.store.results import GRASP_FOLDER
+
+Array = NDArray[np.float64]
+Kind = Literal["real", "simulated"]
+SIMULATED = "synthetic"
+"""Key of a session's `extra` that only rendered ones have; the simulated lab's camera says it."""
+SCORED = ("mask", "mask_visib", "labels", "grasps", "trajectories", "objects", "depth", "models")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ObjectFacts:
+    """One thing in one scene."""
+
+    instance: int
+    obj_id: int
+    name: str
+    identity: str
+    """The same for the same mesh, in whatever session and under whatever id."""
+    verdict: str
+    sigma_mm: float
+    """1 sigma of the position along its worst axis [mm]; NaN = not known."""
+    sigma_deg: float
+    """1 sigma of the rotation about its worst axis, one of revolution set aside [deg]; NaN = not
+    known."""
+    visibility: Array
+    """(frames,) visible share of its silhouette in every annotated frame."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SessionFacts:
+    """What one session holds."""
+
+    name: str
+    folder: Path
+    kind: Kind
+    width: int
+    height: int
+    frames: int
+    frames_annotated: int
+    objects: tuple[ObjectFacts, ...]
+    sets: tuple[GraspSet, ...]
+    """Tried grasps, without their poses, which no figure needs."""
+    has: frozenset[str] = field(default_factory=frozenset[str])
+    """Which of SCORED there is."""
+
+
+def session_facts(folder: Path) -> SessionFacts:
+    """Return what a session holds.
+
+    Raises:
+        InputError: it is no session, or damaged.
+    """
+    store = open_session(folder)
+    session = store.session
+    infos, instances = _visibility_rows(store)
+    scene_objects: tuple[ObjectPose, ...] = ()
+    if store.has("registration/scene.json"):
+        scene_objects = judged_scene(store).objects
+    known = _infos(store)
+    objects = tuple(
+        ObjectFacts(
+            instance=o.instance,
+            obj_id=o.obj_id,
+            name=str(known.get(o.obj_id, {}).get("name", f"object {o.obj_id}")),
+            identity=_identity(store, o.obj_id),
+            verdict=o.verdict,
+            sigma_mm=_sigma_mm(o),
+            sigma_deg=_sigma_deg(o, known.get(o.obj_id, {})),
+            visibility=_visibility(infos, instances.get(o.instance)),
+        )
+        for o in scene_objects
+    )
+    return SessionFacts(
+        name=folder.resolve().name,
+        folder=folder,
+        kind=_kind(store),
+        width=session.intrinsics.width,
+        height=session.intrinsics.height,
+        frames=len(session.views),
+        frames_annotated=len(infos),
+        objects=objects,
+        sets=tuple(_without_poses(s) for s in load_grasps(store)),
+        has=_present(store),
+    )
+
+
+def _kind(store: SessionStore) -> Kind:
+    camera = str(store.extra.get("camera", ""))
+    return "simulated" if SIMULATED in store.extra or camera.startswith("simulated") else "real"
+
+
+def _sigma_mm(pose: ObjectPose) -> float:
+    if pose.covariance is None:
+        return float("nan")
+    return 1e3 * float(np.sqrt(max(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1], 0.0)))
+
+
+def _sigma_deg(pose: ObjectPose, info: Mapping[str, Any]) -> float:
+    """Return the sigma of the rotation; turns about an axis of revolution change nothing."""
+    if pose.covariance is None:
+        return float("nan")
+    free = np.eye(3)
+    for symmetry in info.get("symmetries_continuous", ()):
+        axis = np.asarray(symmetry["axis"], dtype=np.float64)
+        axis /= np.linalg.norm(axis)
+        free = free @ (np.eye(3) - np.outer(axis, axis))
+    largest = np.linalg.eigvalsh(free @ pose.covariance[:3, :3] @ free.T)[-1]
+    return float(np.degrees(np.sqrt(max(largest, 0.0))))
+
+
+def _infos(store: SessionStore) -> dict[int, Mapping[str, Any]]:
+    path = "models/models_info.json"
+    info: Any = store.read_json(path) if store.has(path) else {}
+    return {int(k): v for k, v in info.items() if str(k).isdecimal()}
+
+
+def _identity(store: SessionStore, obj_id: int) -> str:
+    """Return a digest of the object's mesh; its id where there is no mesh."""
+    path = store.folder / "models" / model_file(obj_id)
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else f"id {obj_id}"
+
+
+def _visibility_rows(store: SessionStore) -> tuple[dict[str, Any], dict[int, int]]:
+    """Return scene_gt_info.json, and in which row of a frame each instance stands."""
+    annotated = store.has("scene_gt_info.json") and (store.folder / "annotations").is_dir()
+    if not annotated:
+        return {}, {}
+    infos: dict[str, Any] = store.read_json("scene_gt_info.json")
+    for view in infos:
+        path = f"annotations/{int(view):06d}.json"
+        if store.has(path):
+            rows: list[Any] = store.read_json(path)["objects"]
+            return infos, {int(row["instance"]): k for k, row in enumerate(rows)}
+    return infos, {}
+
+
+def _visibility(infos: Mapping[str, Any], row: int | None) -> Array:
+    if row is None:
+        return np.zeros(0)
+    try:
+        return np.array([float(rows[row]["visib_fract"]) for rows in infos.values()])
+    except (IndexError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"scene_gt_info.json does not fit the annotations ({error!r}); run `realsim annotate` "
+            "again."
+        ) from error
+
+
+def _without_poses(s: GraspSet) -> GraspSet:
+    """Return a set whose poses are all the identity, kept once: sixteen numbers a grasp less."""
+    light = object.__new__(GraspSet)
+    for name in s.__slots__:
+        object.__setattr__(light, name, getattr(s, name))
+    same = np.broadcast_to(np.eye(4), (len(s), 4, 4))
+    object.__setattr__(light, "Ts_obj_grasp", same)
+    return light
+
+
+def _present(store: SessionStore) -> frozenset[str]:
+    folder = store.folder
+    places = {
+        "mask": ("mask", f"{IMPORTED}/mask"),
+        "mask_visib": ("mask_visib", f"{IMPORTED}/mask_visib"),
+        "labels": ("labels",),
+        "trajectories": (f"{GRASP_FOLDER}/trajectories",),
+        "models": ("models",),
+        "depth": ("depth",),
+    }
+    found = {
+        name
+        for name, paths in places.items()
+        if any((folder / p).is_dir() and any((folder / p).iterdir()) for p in paths)
+    }
+    if store.has("annotations/objects.json"):
+        found.add("objects")
+    if any((folder / GRASP_FOLDER).glob("*.npz")):
+        found.add("grasps")
+    return frozenset(found)

@@ -1,0 +1,157 @@
+"""The pictures of the statistics: what became of grasps, how visible and certain objects are."""
+
+import io
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.report_plots import BAD, GOOD, INK, MUTED, VERDICT_COLORS, WARN
+from realsim.app.stats.statistics import VERDICTS, Statistics
+from realsim.formats.grasps.scene_grasps import executed
+from realsim_sim_bridge.school.summary import GOOD as GOOD_OUTCOMES
+from realsim_sim_bridge.school.summary_rows import OUTCOME_NAMES, PAPER_CANDIDATES, PAPER_OUTCOMES
+
+Image = NDArray[np.uint8]
+BINS = 20
+VIOLIN_LEAST = 3
+"""Fewer scores make no distribution: they are drawn as points."""
+
+
+def figures(stats: Statistics) -> list[tuple[str, Image]]:
+    """Return (caption, picture) of everything that there are figures for."""
+    drawn: list[tuple[str, Image]] = []
+    if stats.school.judged:
+        drawn.append(("What became of the candidates, beside the paper's", _outcomes(stats)))
+        drawn.append(("Score, and force closure against it", _scores(stats)))
+    if len(stats.visibility) or stats.objects:
+        drawn.append(("How visible and how certain the objects are", _trust(stats)))
+    if stats.objects:
+        drawn.append(("Objects, frames and verdicts of the scenes", _scenes(stats)))
+    return drawn
+
+
+def _axes(columns: int) -> tuple[Any, list[Any]]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 3.4), dpi=110, layout="constrained")
+    axes = [figure.add_subplot(1, columns, k + 1) for k in range(columns)]
+    for ax in axes:
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.tick_params(colors=INK, labelsize=8)
+    return figure, axes
+
+
+def _titled(ax: Any, title: str, x: str = "", y: str = "") -> None:
+    ax.set_title(title, fontsize=9, loc="left", color=INK)
+    ax.set_xlabel(x, fontsize=8, color=INK)
+    ax.set_ylabel(y, fontsize=8, color=INK)
+
+
+def _picture(figure: Any) -> Image:
+    from PIL import Image as Picture
+
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", facecolor="white")
+    return np.asarray(Picture.open(buffer).convert("RGB"))
+
+
+def _outcomes(stats: Statistics) -> Image:
+    figure, (ax,) = _axes(1)
+    names = [n for n in OUTCOME_NAMES if stats.school.outcomes[n] or n in PAPER_OUTCOMES]
+    rows = np.arange(len(names))
+    here = [100 * stats.school.share(stats.school.outcomes[n]) for n in names]
+    paper = [100 * PAPER_OUTCOMES.get(n, 0) / PAPER_CANDIDATES for n in names]
+    colors = [GOOD if n in GOOD_OUTCOMES else BAD for n in names]
+    ax.barh(rows - 0.2, here, 0.38, color=colors)
+    ax.barh(rows + 0.2, paper, 0.38, color=MUTED, alpha=0.5)
+    for row, (ours, theirs) in enumerate(zip(here, paper, strict=True)):
+        ax.text(ours + 0.5, row - 0.2, f"{ours:.1f} %", va="center", fontsize=7, color=INK)
+        ax.text(theirs + 0.5, row + 0.2, f"{theirs:.1f} % paper", va="center", fontsize=7,
+                color=MUTED)  # fmt: skip
+    ax.set_yticks(rows, [OUTCOME_NAMES[n] for n in names])
+    ax.invert_yaxis()
+    _titled(ax, f"{stats.school.judged:,} candidates with a score", "share [%]")
+    return _picture(figure)
+
+
+def _scores(stats: Statistics) -> Image:
+    figure, (left, right) = _axes(2)
+    sets = [s for session in stats.sessions for s in session.sets]
+    scores = np.concatenate([np.zeros(0), *(s.scores for s in sets)])
+    scores = scores[np.isfinite(scores)]
+    edges = np.linspace(0.0, 1.0, BINS + 1)
+    counts, _ = np.histogram(scores, edges)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    left.bar(middle, counts, 0.9 / BINS, color=[GOOD if m >= 0.5 else BAD for m in middle])
+    _titled(left, "Scores", "score", "grasps")
+    groups: dict[float, list[float]] = {}
+    for s in sets:
+        friction = s.measures.get("closure_friction")
+        if friction is None:
+            continue
+        for mu, score in zip(friction[executed(s)], s.scores[executed(s)], strict=True):
+            if not (np.isnan(mu) or np.isnan(score)):
+                groups.setdefault(float(mu), []).append(float(score))
+    levels = sorted(groups)
+    for k, mu in enumerate(levels):
+        values = groups[mu]
+        if len(values) >= VIOLIN_LEAST and np.ptp(values) > 0:
+            body = right.violinplot([values], [k], widths=0.8, showextrema=False)["bodies"][0]
+            body.set_facecolor(WARN)
+        right.plot([k], [np.mean(values)], "o", color=INK, ms=4)
+        right.text(k, 1.04, f"{len(values)}", ha="center", fontsize=7, color=MUTED)
+    right.set_xticks(range(len(levels)), ["none" if np.isinf(v) else f"{v:g}" for v in levels])
+    right.set_ylim(-0.02, 1.12)
+    _titled(right, "Score by the friction from which it closes (dot: mean, above: grasps)",
+            "least friction that closes", "score")  # fmt: skip
+    if not levels:
+        right.text(0.5, 0.5, "force closure was not computed", ha="center", color=MUTED, fontsize=9)
+    return _picture(figure)
+
+
+def _trust(stats: Statistics) -> Image:
+    figure, (left, middle, right) = _axes(3)
+    seen = stats.visibility
+    left.hist(seen, np.linspace(0, 1, BINS + 1).tolist(), color=GOOD, rwidth=0.9)
+    _titled(left, f"Visible share, {len(seen):,} objects in frames", "visible share", "number")
+    for ax, name, unit in ((middle, "sigma_mm", "mm"), (right, "sigma_deg", "deg")):
+        values = np.array([getattr(o, name) for o in stats.objects], dtype=np.float64)
+        known = np.isfinite(values)
+        if known.any():
+            edges = np.linspace(0, max(1e-6, 1.02 * float(values[known].max())), BINS + 1)
+            parts = [
+                values[known & np.array([o.verdict == v for o in stats.objects])] for v in VERDICTS
+            ]
+            ax.hist(parts, edges.tolist(), stacked=True, rwidth=0.9, label=list(VERDICTS),
+                    color=[VERDICT_COLORS[v] for v in VERDICTS])  # fmt: skip
+            ax.legend(fontsize=7, frameon=False)
+        else:
+            ax.text(0.5, 0.5, "not known", ha="center", transform=ax.transAxes, color=MUTED)
+        _titled(ax, "Uncertainty of the poses, 1 sigma", f"[{unit}]", "objects")
+    return _picture(figure)
+
+
+def _scenes(stats: Statistics) -> Image:
+    figure, (left, middle, right) = _axes(3)
+    counts = np.array([len(s.objects) for s in stats.sessions])
+    edges = np.arange(counts.min(), counts.max() + 2) - 0.5
+    left.hist(counts, edges.tolist(), color=GOOD, rwidth=0.9)
+    _titled(left, "Objects per scene", "objects", "scenes")
+    kinds = Counter({s.kind: 0 for s in stats.sessions})
+    annotated = Counter(kinds)
+    for s in stats.sessions:
+        kinds[s.kind] += s.frames
+        annotated[s.kind] += s.frames_annotated
+    places = range(len(kinds))
+    middle.bar(places, list(kinds.values()), 0.6, color=MUTED, alpha=0.5, label="all")
+    middle.bar(places, [annotated[k] for k in kinds], 0.4, color=GOOD, label="annotated")
+    middle.set_xticks(list(places), list(kinds))
+    middle.legend(fontsize=7, frameon=False)
+    _titled(middle, "Frames", "", "frames")
+    verdicts = Counter(o.verdict for o in stats.objects)
+    right.bar(VERDICTS, [verdicts.get(v, 0) for v in VERDICTS],
+              color=[VERDICT_COLORS[v] for v in VERDICTS])  # fmt: skip
+    _titled(right, "Verdicts", "", "objects")
+    return _picture(figure)

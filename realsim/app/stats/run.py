@@ -1,0 +1,185 @@
+"""`realsim stats`: read sessions one by one, count, show, write table, CSV, JSON and page."""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from realsim.app.console import Console
+from realsim.app.export.sources import session_folders
+from realsim.app.picture_pages import LayeredView, Layers, Section, Table, picture_page
+from realsim.app.stats import landscape
+from realsim.app.stats.collect import SessionFacts, session_facts
+from realsim.app.stats.statistics import (
+    NOTHING,
+    OBJECT_HEADER,
+    SESSION_HEADER,
+    Cell,
+    Statistics,
+    all_rows,
+    object_table,
+    session_table,
+    statistics_of,
+)
+from realsim.errors import InputError, RealsimError
+from realsim.store import atomic
+
+HEADER = ("property", "here", "in the paper")
+TABLES = ("statistics.csv", "sessions.csv", "objects.csv")
+PAGE, DOCUMENT = "statistics.html", "statistics.json"
+
+
+def run_stats(
+    sources: Sequence[Path], out: Path | None, json_file: Path | None, console: Console
+) -> Statistics:
+    """Show the statistics of sessions, and write them where that was asked for.
+
+    A session that cannot be read is named and left out: of a hundred, one is always damaged.
+
+    Args:
+        sources: sessions, or folders of sessions.
+        out: folder for statistics.csv, sessions.csv, objects.csv, statistics.json and .html.
+        json_file: file for the JSON document alone.
+        console: where tables go.
+
+    Raises:
+        InputError: no session there, one given twice, or none that can be read.
+    """
+    folders = _folders(sources)
+    if out is not None and out.exists() and not out.is_dir():
+        raise InputError(f"--out '{out}' is a file; give a folder.")
+    facts: list[SessionFacts] = []
+    left_out: list[str] = []
+    with console.stage("read", f"{len(folders)} sessions") as tick:
+        for k, folder in enumerate(folders):
+            try:
+                facts.append(session_facts(folder))
+            except RealsimError as error:
+                if len(folders) == 1:
+                    raise
+                left_out.append(f"{folder} is left out: {error}")
+            tick(k + 1, len(folders))
+    for line in left_out:
+        console.warn(line.replace("[", r"\["))
+    stats = statistics_of(facts)
+    rows = all_rows(stats)
+    console.table(f"Statistics of {_sessions(stats)}", HEADER, rows)
+    document = document_of(stats)
+    if json_file is not None:
+        atomic.write_json(json_file, document)
+    if out is not None:
+        _write_all(out, stats, document, left_out, console)
+    return stats
+
+
+def _sessions(stats: Statistics) -> str:
+    n = len(stats.sessions)
+    return "one session" if n == 1 else f"{n} sessions"
+
+
+def _folders(sources: Sequence[Path]) -> list[Path]:
+    """Return the folders of all sessions, each once."""
+    found: dict[Path, Path] = {}
+    for source in sources:
+        folders = session_folders(source) if source.is_dir() else []
+        if not folders:
+            raise InputError(
+                f"'{source}' holds no session; a session (session.json) or a folder of sessions, "
+                "up to two levels deep, is expected. Data sets of others: `realsim import` first."
+            )
+        for folder in folders:
+            if folder.resolve() in found:
+                raise InputError(f"'{folder}' is given twice; it would count twice.")
+            found[folder.resolve()] = folder
+    return list(found.values())
+
+
+def document_of(stats: Statistics) -> dict[str, Any]:
+    """Return everything as plain JSON values; null = not known."""
+    return {
+        "statistics": {name: here for name, here, _ in all_rows(stats)},
+        "school": stats.school.to_json(),
+        "sessions": _records(SESSION_HEADER, session_table(stats)),
+        "objects": _records(OBJECT_HEADER, object_table(stats)),
+        "landscape": dict(
+            zip(landscape.LANDSCAPE_HEADER, landscape.landscape_row(stats), strict=True)
+        ),
+        "grasps": dict(zip(landscape.GRASPS_HEADER, landscape.grasps_row(stats), strict=True)),
+    }
+
+
+def _records(header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> list[dict[str, Any]]:
+    return [_record(header, row) for row in rows]
+
+
+def _record(header: Sequence[str], row: Sequence[Cell]) -> dict[str, Any]:
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in zip(header, row, strict=True)
+    }
+
+
+def csv_bytes(header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> bytes:
+    """Return rows as CSV (RFC 4180, UTF-8); what is not known is an empty cell."""
+    buffer = io.StringIO()
+    writer = csv.writer(buffer)
+    writer.writerow(header)
+    for row in rows:
+        writer.writerow(["" if isinstance(c, float) and math.isnan(c) else c for c in row])
+    return buffer.getvalue().encode("utf-8")
+
+
+def _write_all(
+    out: Path, stats: Statistics, document: dict[str, Any], left_out: list[str], console: Console
+) -> None:
+    out.mkdir(parents=True, exist_ok=True)
+    tables: tuple[tuple[Sequence[str], Sequence[Sequence[Cell]]], ...] = (
+        (HEADER, all_rows(stats)),
+        (SESSION_HEADER, session_table(stats)),
+        (OBJECT_HEADER, object_table(stats)),
+    )
+    for name, (header, rows) in zip(TABLES, tables, strict=True):
+        atomic.write_bytes(out / name, csv_bytes(header, rows))
+    atomic.write_json(out / DOCUMENT, document)
+    _write_page(out / PAGE, stats, left_out)
+    for name in (*TABLES, DOCUMENT, PAGE):
+        console.say(f"written   {out / name}")
+
+
+def _write_page(path: Path, stats: Statistics, left_out: list[str]) -> None:
+    from realsim.app.stats.plots import figures
+
+    sections: list[Section] = [
+        Layers(title=caption, views=[LayeredView(layers={"": picture}, caption="")])
+        for caption, picture in figures(stats)
+    ]
+    sections += [
+        Table(title="Statistics, row by row as in the paper", header=HEADER, rows=all_rows(stats)),
+        Table(
+            title="Beside other data sets",
+            header=landscape.LANDSCAPE_HEADER,
+            rows=[*landscape.LANDSCAPE, landscape.landscape_row(stats)],
+            text="yes: all sessions have it; partly: some have it.",
+        ),
+        Table(
+            title="Grasps beside those of other data sets",
+            header=landscape.GRASPS_HEADER,
+            rows=[*landscape.GRASPS, landscape.grasps_row(stats)],
+        ),
+        Table(title="Sessions", header=SESSION_HEADER, rows=_shown(session_table(stats))),
+        Table(title="Objects", header=OBJECT_HEADER, rows=_shown(object_table(stats))),
+    ]
+    frames = sum(s.frames for s in stats.sessions)
+    about = f"{_sessions(stats)}, {frames:,} frames, {stats.school.candidates:,} grasps"
+    picture_page(path, "Statistics", sections, about=about, notes=left_out)
+
+
+def _shown(rows: Sequence[Sequence[Cell]]) -> list[list[str]]:
+    def cell(value: Cell) -> str:
+        if isinstance(value, float):
+            return NOTHING if math.isnan(value) else f"{value:.3f}"
+        return str(value)
+
+    return [[cell(c) for c in row] for row in rows]

@@ -1,0 +1,189 @@
+"""The figures of many sessions: the paper's two tables, and what the paper does not tell."""
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.stats.collect import ObjectFacts, SessionFacts
+from realsim.errors import InputError
+from realsim_sim_bridge.school.summary import SchoolSummary, summarise
+
+Array = NDArray[np.float64]
+NOTHING = "-"
+SEEN_FROM = 0.1
+"""BOP counts an instance as a test target from a tenth of its silhouette on."""
+VERDICTS = ("accepted", "doubtful", "rejected", "unchecked")
+Row = tuple[str, str, str]
+"""Property, here, in the paper."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Statistics:
+    """What all sessions hold together."""
+
+    sessions: tuple[SessionFacts, ...]
+    school: SchoolSummary
+
+    @property
+    def objects(self) -> list[ObjectFacts]:
+        """Return the things of all scenes."""
+        return [o for s in self.sessions for o in s.objects]
+
+    @property
+    def visibility(self) -> Array:
+        """Return the visible shares of all things in all their frames."""
+        return np.concatenate([np.zeros(0), *(o.visibility for o in self.objects)])
+
+
+def statistics_of(sessions: Iterable[SessionFacts]) -> Statistics:
+    """Return the figures of sessions.
+
+    Raises:
+        InputError: there is none, or a set of grasps holds scores that cannot be.
+    """
+    taken = tuple(sessions)
+    if not taken:
+        raise InputError("there is no session to count.")
+    by_scene = {str(s.folder.resolve()): s.sets for s in taken if s.sets}
+    return Statistics(sessions=taken, school=summarise(by_scene))
+
+
+def scene_rows(stats: Statistics) -> list[Row]:
+    """Return the upper part of the paper's table of statistics: scenes, frames, objects."""
+    by_kind = {k: [s for s in stats.sessions if s.kind == k] for k in ("simulated", "real")}
+    frames = {k: sum(s.frames for s in v) for k, v in by_kind.items()}
+    annotated = {k: sum(s.frames_annotated for s in v) for k, v in by_kind.items()}
+    unique = {k: len({o.identity for s in v for o in s.objects}) for k, v in by_kind.items()}
+    sizes = Counter(f"{s.width}x{s.height}" for s in stats.sessions)
+    counts = np.array([len(s.objects) for s in stats.sessions if s.objects], dtype=np.float64)
+    spread = NOTHING
+    if len(counts):
+        spread = (
+            f"{counts.mean():.1f} ± {counts.std():.1f} (range {counts.min():.0f} to "
+            f"{counts.max():.0f})"
+        )
+    both = "{simulated:,} simulated, {real:,} real"
+    return [
+        ("scenes", both.format(**{k: len(v) for k, v in by_kind.items()}), "1,035 sim, 100 real"),
+        ("frames", both.format(**frames), NOTHING),
+        ("annotated frames", both.format(**annotated), "290,560 sim, 25,600 real"),
+        ("annotated frames in all", f"{sum(annotated.values()):,}", "316,160"),
+        ("image resolution", ", ".join(f"{size} ({n})" for size, n in sizes.most_common()),
+         "1920x1080 sim, 1280x720 real"),
+        ("unique objects", both.format(**unique), "7,396 sim, 100 real"),
+        ("objects per scene", spread, "13.9 ± 2.7 (range 8 to 19)"),
+    ]  # fmt: skip
+
+
+def grasp_rows(stats: Statistics) -> list[Row]:
+    """Return the lower part: candidates, trajectories, stages, scores."""
+    counted = ("scenes", "objects")
+    return [row for row in stats.school.to_rows() if row[0] not in counted]
+
+
+def trust_rows(stats: Statistics) -> list[Row]:
+    """Return what the paper does not tell: verdicts, uncertainty, visibility."""
+    objects = stats.objects
+    verdicts = Counter(o.verdict for o in objects)
+    rows: list[Row] = [
+        (f"poses {name}", _share(verdicts.get(name, 0), len(objects)), NOTHING) for name in VERDICTS
+    ]
+    for name, unit in (("sigma_mm", "mm"), ("sigma_deg", "deg")):
+        values = np.array([getattr(o, name) for o in objects], dtype=np.float64)
+        values = values[np.isfinite(values)]
+        text = NOTHING
+        if len(values):
+            p90 = np.percentile(values, 90)
+            text = f"{np.median(values):.3f}, {p90:.3f}, {values.max():.3f} (n = {len(values)})"
+        rows.append((f"pose uncertainty [{unit}], median, p90, most", text, NOTHING))
+    seen = stats.visibility
+    hidden = sum(bool(len(o.visibility)) and not np.any(o.visibility >= SEEN_FROM) for o in objects)
+    return [
+        *rows,
+        ("visible share of an object in a frame, mean", _mean(seen), NOTHING),
+        ("object-frames seen to 10 % or more", _share(int(np.sum(seen >= SEEN_FROM)), len(seen)),
+         NOTHING),
+        ("objects that no frame shows to 10 %", f"{hidden:,}", NOTHING),
+    ]  # fmt: skip
+
+
+def all_rows(stats: Statistics) -> list[Row]:
+    """Return every property in the order of the paper's table."""
+    return [*scene_rows(stats), *grasp_rows(stats), *trust_rows(stats)]
+
+
+def _share(count: int, of: int) -> str:
+    return f"{count:,} ({100 * count / of:.1f} %)" if of else NOTHING
+
+
+def _mean(values: Array) -> str:
+    return f"{values.mean():.3f} ± {values.std():.3f}" if len(values) else NOTHING
+
+
+# --- one row a session, one row a thing -----------------------------------------------------------
+
+SESSION_HEADER = (
+    "session", "kind", "frames", "annotated", "width", "height", "objects", *VERDICTS,
+    "sigma_mm_median", "visibility_mean", "candidates", "with_trajectory", "good", "bad",
+    "score_mean",
+)  # fmt: skip
+OBJECT_HEADER = (
+    "session", "instance", "obj_id", "name", "verdict", "sigma_mm", "sigma_deg", "frames",
+    "visibility_mean", "visibility_most", "candidates", "with_trajectory", "good", "bad",
+    "score_mean",
+)  # fmt: skip
+Cell = str | int | float
+
+
+def session_table(stats: Statistics) -> list[list[Cell]]:
+    """Return one row a session, as in SESSION_HEADER."""
+    rows: list[list[Cell]] = []
+    for s in stats.sessions:
+        verdicts = Counter(o.verdict for o in s.objects)
+        sigma = np.array([o.sigma_mm for o in s.objects])
+        seen = np.concatenate([np.zeros(0), *(o.visibility for o in s.objects)])
+        rows.append(
+            [
+                s.name, s.kind, s.frames, s.frames_annotated, s.width, s.height, len(s.objects),
+                *(verdicts.get(v, 0) for v in VERDICTS), _median(sigma), _average(seen),
+                *_school_cells(summarise(s.sets)),
+            ]
+        )  # fmt: skip
+    return rows
+
+
+def object_table(stats: Statistics) -> list[list[Cell]]:
+    """Return one row a thing of every session, as in OBJECT_HEADER."""
+    rows: list[list[Cell]] = []
+    for s in stats.sessions:
+        sets = {g.instance: g for g in s.sets}
+        for o in s.objects:
+            tried = [sets[o.instance]] if o.instance in sets else []
+            most = float(o.visibility.max()) if len(o.visibility) else math.nan
+            rows.append(
+                [
+                    s.name, o.instance, o.obj_id, o.name, o.verdict, o.sigma_mm, o.sigma_deg,
+                    len(o.visibility), _average(o.visibility), most,
+                    *_school_cells(summarise(tried)),
+                ]
+            )  # fmt: skip
+    return rows
+
+
+def _school_cells(summary: SchoolSummary) -> Sequence[Cell]:
+    return (
+        summary.candidates, summary.with_trajectory, summary.good, summary.bad, summary.score.mean
+    )  # fmt: skip
+
+
+def _median(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else math.nan
+
+
+def _average(values: Array) -> float:
+    return float(values.mean()) if len(values) else math.nan

@@ -1,0 +1,262 @@
+"""A session as a labelled scene: with the labels that were computed, or those it was imported with.
+
+    SESSION/annotations/000000.json, mask/, mask_visib/   what `realsim annotate` wrote
+    SESSION/imported/                                      what a data set said (`imported_labels`)
+
+Frames keep the numbers that they had in the data set they were imported from.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from realsim.errors import InputError
+from realsim.formats import images
+from realsim.formats.bop import units
+from realsim.formats.bop.labels import mask_path
+from realsim.formats.grasps.scene_grasps import SceneGrasps
+from realsim.formats.imported_labels import ImportedLabels, load_imported
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
+from realsim.records import GraspSet, ObjectModel
+from realsim.records.checked_arrays import Array
+from realsim.store import SessionStore, load_grasps, load_scene
+from realsim.store.session_store import depth_path, rgb_path
+from realsim.store.trajectories import load_trajectories
+
+Labels = Literal["auto", "annotated", "imported", "none"]
+GT_INFO_KEYS = (
+    "bbox_obj", "bbox_visib", "px_count_all", "px_count_valid", "px_count_visib", "visib_fract"
+)  # fmt: skip
+
+
+class SessionScene:
+    """A `LabelledScene`; made by `open_session_scene`."""
+
+    def __init__(
+        self,
+        store: SessionStore,
+        *,
+        number: int,
+        split: str,
+        imported: ImportedLabels | None,
+        views: Mapping[int, int],
+        notes: tuple[str, ...],
+        is_annotated: bool,
+    ) -> None:
+        """Take over a session; see `open_session_scene`."""
+        self.store = store
+        self._number, self._split, self._notes = number, split, notes
+        self._imported, self._views = imported, dict(views)
+        self._is_annotated = is_annotated
+        self._models: dict[int, ObjectModel] | None = None
+
+    @property
+    def name(self) -> str:
+        """The session's folder."""
+        return self.store.folder.resolve().name
+
+    @property
+    def number(self) -> int:
+        """The scene's number in its data set."""
+        return self._number
+
+    @property
+    def split(self) -> str:
+        """BOP's split."""
+        return self._split
+
+    @property
+    def camera(self) -> str:
+        """Of the data set it was imported from; '' of a capture."""
+        return "" if self._imported is None else self._imported.camera
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Numbers of the images."""
+        return tuple(sorted(self._views))
+
+    @property
+    def T_world_table(self) -> Array | None:
+        """(4, 4) supporting plane in world, z up [m]; None = not known."""
+        if self.store.has("registration/scene.json"):
+            plane = load_scene(self.store).plane
+            if plane is not None:
+                return plane.T_world_table
+        return None if self._imported is None else self._imported.T_world_table
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Which views and labels are taken."""
+        return self._notes
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether there are poses of objects."""
+        return self._is_annotated or self._imported is not None
+
+    def _view(self, index: int) -> int:
+        if index not in self._views:
+            raise InputError(
+                f"image {index} is not in {self.store.folder}; it has "
+                f"{', '.join(map(str, self.indices[:12]))}."
+            )
+        return self._views[index]
+
+    def frame(self, index: int) -> LabelledFrame:
+        """Return one frame.
+
+        Raises:
+            InputError: there is no such image, or its labels are damaged.
+        """
+        number = self._view(index)
+        session = self.store.session
+        view = session.view(number)
+        unit_m = session.depth_unit_m if self.store.has_depth(number) else None
+        entry: Mapping[str, Any] | None = None
+        objects: tuple[LabelledObject, ...] = ()
+        if self._is_annotated:
+            objects = self._annotated(number)
+        elif self._imported is not None:
+            objects = self._imported.objects(index)
+            entry = self._imported.camera_entry(index)
+        T = view.T_world_cam
+        if entry is not None and T is not None and not _says(entry, T):
+            entry = None  # the camera was refined since
+        return LabelledFrame(
+            index=index, intrinsics=session.intrinsics, depth_unit_m=unit_m, objects=objects,
+            T_world_cam=T, entry=entry,
+        )  # fmt: skip
+
+    def _annotated(self, view: int) -> tuple[LabelledObject, ...]:
+        part = self.store.read_json(f"annotations/{view:06d}.json")
+        try:
+            return tuple(
+                LabelledObject(
+                    obj_id=int(e["obj_id"]), instance=int(e["instance"]),
+                    T_cam_obj=np.asarray(e["T_cam_obj"], dtype=np.float64),
+                    visible_fraction=float(e["visib_fract"]),
+                    gt_info={key: e[key] for key in GT_INFO_KEYS},
+                )
+                for e in part["objects"]
+            )  # fmt: skip
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"annotations/{view:06d}.json of {self.store.folder} is damaged ({error!r}); run "
+                "`realsim annotate` again."
+            ) from error
+
+    def colour_file(self, index: int) -> Path:
+        """Return the file of the colour image."""
+        return self.store.folder / rgb_path(self._view(index))
+
+    def depth_file(self, index: int) -> Path | None:
+        """Return the file of the 16-bit depth image; None = there is none."""
+        view = self._view(index)
+        return self.store.folder / depth_path(view) if self.store.has_depth(view) else None
+
+    def mask(self, index: int, k: int, *, visible: bool) -> Mask | None:
+        """Return the mask (H, W) of a frame's k-th object; None = there is none."""
+        if self._is_annotated:
+            path = self.store.folder / mask_path(self._view(index), k, visible=visible)
+        elif self._imported is not None:
+            path = self._imported.mask_file(index, k, visible=visible)
+        else:
+            return None
+        return images.read_grey(path) > 0 if path.is_file() else None
+
+    def models(self) -> Mapping[int, ObjectModel]:
+        """Return the models of the session, by object id."""
+        if self._models is None:
+            from realsim.formats.bop.models import load_models
+
+            folder, lacking = self.store.folder / "models", list[str]()
+            has_any = folder.is_dir() and any(folder.glob("obj_*.ply"))
+            self._models = load_models(folder, notes=lacking) if has_any else {}
+        return self._models
+
+    def grasps(self) -> SceneGrasps | None:
+        """Return the grasps that were tried by physics; None = there are none."""
+        sets: list[GraspSet] = load_grasps(self.store)
+        if not sets or not self.store.has("registration/scene.json"):
+            return None
+        scene = load_scene(self.store)
+        wanted = {s.instance for s in sets}
+        attempts = {s.instance: load_trajectories(self.store, s) for s in sets}
+        return SceneGrasps(
+            sets=tuple(sets),
+            name=scene.name,
+            names={i: m.name for i, m in self.models().items()},
+            trajectories={i: a for i, a in attempts.items() if a is not None},
+            Ts_world_obj={o.instance: o.T_world_obj for o in scene.objects if o.instance in wanted},
+            T_world_table=None if scene.plane is None else scene.plane.T_world_table,
+        )
+
+
+def open_session_scene(
+    store: SessionStore, *, labels: Labels = "auto", number: int | None = None, split: str = ""
+) -> SessionScene:
+    """Return a session as a labelled scene.
+
+    Args:
+        store: the session.
+        labels: 'annotated' = what `realsim annotate` wrote; 'imported' = what the data set said that
+            the session was imported from; 'auto' = the former where it is there, else the latter;
+            'none' = images and cameras only.
+        number: of the scene; None = that of its data set, or of its folder, or 0.
+        split: of the scene; '' = that of its data set, or 'train'.
+
+    Raises:
+        InputError: the labels that were asked for are not there, or are damaged.
+    """
+    views = [v.index for v in store.session.views]
+    if not views:
+        raise InputError(f"session '{store.folder}' has no views; there is nothing to export.")
+    imported = load_imported(store)
+    annotated = [i for i in views if store.has(f"annotations/{i:06d}.json")]
+    chosen = labels
+    if labels == "auto":
+        chosen = "annotated" if annotated else "imported" if imported is not None else "none"
+    if chosen == "annotated" and not annotated:
+        raise InputError(
+            f"session '{store.folder}' is not annotated yet: run `realsim annotate {store.folder}`."
+        )
+    if chosen == "imported" and imported is None:
+        raise InputError(
+            f"session '{store.folder}' was not imported with labels; use --labels annotated after "
+            "`realsim annotate`, or --labels none."
+        )
+    notes: list[str] = []
+    taken = annotated if chosen == "annotated" else views
+    if len(taken) < len(views):
+        notes.append(
+            f"{len(views) - len(taken)} of {len(views)} views are not annotated and stay out."
+        )
+    if labels == "auto" and chosen == "imported":
+        notes.append("the labels are those it was imported with: realsim has not checked them.")
+    if chosen == "none" and labels != "none":
+        notes.append("it has no labels: images and cameras only.")
+    numbers = {i: i for i in views} if imported is None else imported.number_of_view
+    return SessionScene(
+        store,
+        number=_number(store, imported) if number is None else number,
+        split=split or (imported.split if imported is not None else "train"),
+        imported=imported if chosen != "none" else None,
+        views={numbers.get(i, i): i for i in taken},
+        notes=tuple(notes),
+        is_annotated=chosen == "annotated",
+    )
+
+
+def _number(store: SessionStore, imported: ImportedLabels | None) -> int:
+    if imported is not None:
+        return imported.number
+    digits = store.folder.resolve().name.rpartition("_")[2]
+    return int(digits) if digits.isdecimal() else 0
+
+
+def _says(entry: Mapping[str, Any], T_world_cam: Array) -> bool:
+    """Return whether a row of scene_camera.json says this pose."""
+    T = units.T_world_cam_of(dict(entry), "camera")
+    return T is not None and bool(np.abs(T - T_world_cam).max() < 1e-9)

@@ -1,0 +1,151 @@
+"""Laws of a folder that an export fills: whole or not at all, gone on with to the same bytes."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from realsim.errors import InputError
+from realsim.formats.export_folder import STATE, SUMS_FILE, ExportFolder
+
+ASKED = {"target": "bop", "scenes": [1, 2]}
+PIECES = 12
+
+
+def fill(folder, stop_after=None):
+    """Write the pieces of a small export; stop as if killed after some of them."""
+    export = ExportFolder.begin(folder, ASKED)
+    for k in range(PIECES):
+        if k == stop_after:
+            return None
+        rows = {"scene/all.json": (str(k), {"number": k, "text": "ü" * k})}
+        export.write_piece(f"frame {k}", {f"scene/{k:03d}.bin": bytes([k]) * 50 * k}, rows)
+    export.write_json_object("scene/all.json")
+    export.finish({"README.md": b"what this is\n"})
+    return export
+
+
+def content(folder):
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes()
+        for p in sorted(folder.rglob("*"))
+        if p.is_file()
+    }
+
+
+@pytest.mark.parametrize("stop_after", [0, 1, 5, PIECES - 1])
+def test_an_interrupted_export_ends_with_the_bytes_of_a_whole_one(tmp_path, stop_after):
+    fill(tmp_path / "whole")
+    fill(tmp_path / "torn", stop_after=stop_after)
+    fill(tmp_path / "torn")
+    assert content(tmp_path / "torn") == content(tmp_path / "whole")
+
+
+KILLED = """
+import sys, os
+from pathlib import Path
+sys.path.insert(0, sys.argv[2])
+import test_export_folder as t
+from realsim.formats import export_folder
+real = export_folder.ExportFolder._append
+count = 0
+def append(self, entry):
+    global count
+    count += 1
+    if count == int(sys.argv[3]):
+        with (self.folder / export_folder.PIECES).open("a") as file:
+            file.write('{"piece": "fra')
+            file.flush()
+        os.kill(os.getpid(), 9)
+    real(self, entry)
+export_folder.ExportFolder._append = append
+t.fill(Path(sys.argv[1]))
+"""
+
+
+@pytest.mark.parametrize("at", [1, 4, PIECES + 1])
+def test_a_kill_within_a_piece_loses_this_piece_only(tmp_path, at):
+    fill(tmp_path / "whole")
+    command = [sys.executable, "-c", KILLED, tmp_path / "torn", Path(__file__).parent, str(at)]
+    done = subprocess.run(command, check=False, env={**os.environ, "PYTHONPATH": ""})
+    assert done.returncode == -signal.SIGKILL
+    begun = ExportFolder.begin(tmp_path / "torn", ASKED)
+    assert begun.resumed
+    assert [begun.has(f"frame {k}") for k in range(PIECES)] == [k < at - 1 for k in range(PIECES)]
+    fill(tmp_path / "torn")
+    assert content(tmp_path / "torn") == content(tmp_path / "whole")
+
+
+def test_a_torn_row_is_not_glued_to_the_next_one(tmp_path):
+    fill(tmp_path / "whole")
+    fill(tmp_path / "torn", stop_after=5)
+    rows = tmp_path / "torn" / STATE / "rows/scene/all.jsonl"
+    with rows.open("a") as file:
+        file.write('["frame 5", "5", {"num')
+    fill(tmp_path / "torn")
+    assert content(tmp_path / "torn") == content(tmp_path / "whole")
+
+
+def test_the_sums_are_those_of_the_files_and_of_all_files(tmp_path):
+    fill(tmp_path)
+    found = content(tmp_path)
+    listed = dict(reversed(line.split("  ", 1)) for line in found[SUMS_FILE].decode().splitlines())
+    assert listed == {
+        name: hashlib.sha256(data).hexdigest() for name, data in found.items() if name != SUMS_FILE
+    }
+    assert not (tmp_path / STATE).exists()
+    assert json.loads(found["scene/all.json"])["3"] == {"number": 3, "text": "üüü"}
+
+
+def test_another_request_is_not_mixed_in(tmp_path):
+    fill(tmp_path, stop_after=3)
+    with pytest.raises(InputError, match=r"another request \(scenes: \[1, 2\] there, \[3\]"):
+        ExportFolder.begin(tmp_path, {**ASKED, "scenes": [3]})
+    fill(tmp_path)
+    with pytest.raises(InputError, match="not empty"):
+        ExportFolder.begin(tmp_path, ASKED)
+    with pytest.raises(InputError, match="is a file"):
+        ExportFolder.begin(tmp_path / "README.md", ASKED)
+
+
+@pytest.mark.parametrize("path", ["../out", "/etc/passwd", "a/../../b", ""])
+def test_no_path_leads_out(tmp_path, path):
+    export = ExportFolder.begin(tmp_path / "export", ASKED)
+    with pytest.raises(InputError, match="not a path inside"):
+        export.write_piece("one", {path: b"x"})
+    with pytest.raises(InputError, match="not a path inside"):
+        export.below("scene").write_piece("one", {}, {path: ("k", 1)})
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_below_keeps_its_names_and_rows_apart(tmp_path):
+    export = ExportFolder.begin(tmp_path, ASKED)
+    for name in ("a", "b"):
+        inner = export.below(name)
+        inner.write_piece("frame 0", {"0.bin": name.encode()}, {"all.json": ("0", name)})
+        inner.write_json_object("all.json")
+    assert not export.has("frame 0") and export.below("a").has("frame 0")
+    assert (tmp_path / "b/0.bin").read_bytes() == b"b"
+    assert json.loads((tmp_path / "a/all.json").read_text()) == {"0": "a"}
+
+
+def test_files_are_copied_byte_for_byte(tmp_path):
+    big = tmp_path / "big.bin"
+    big.write_bytes(os.urandom(3_000_001))
+    export = ExportFolder.begin(tmp_path / "export", ASKED)
+    export.write_piece("one", {"copied.bin": big})
+    assert (tmp_path / "export/copied.bin").read_bytes() == big.read_bytes()
+
+
+def test_a_refusal_before_the_first_piece_leaves_nothing(tmp_path):
+    ExportFolder.begin(tmp_path / "export", ASKED).abandon_if_empty()
+    assert not (tmp_path / "export").exists()
+    begun = ExportFolder.begin(tmp_path / "export", ASKED)
+    begun.write_piece("one", {"1": b"x"})
+    begun.abandon_if_empty()
+    assert ExportFolder.begin(tmp_path / "export", ASKED).has("one")
