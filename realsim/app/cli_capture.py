@@ -180,7 +180,9 @@ def check(session: Path, repair: bool, decode: bool, as_json: bool) -> None:
     "--kind",
     default="auto",
     show_default=True,
-    type=click.Choice(["auto", "bag", "folder", "bop", "colmap", "realsense"]),
+    type=click.Choice(
+        ["auto", "bag", "folder", "bop", "graspnet", "colmap", "nerfstudio", "realsense"]
+    ),
 )
 @click.option("--list", "list_only", is_flag=True, help="Say what is inside; import nothing.")
 @click.option("--camera", type=FOLDER, default=None, help="File with the intrinsics.")
@@ -206,9 +208,12 @@ def check(session: Path, repair: bool, decode: bool, as_json: bool) -> None:
 @click.option("--clock", default=None, type=click.Choice(["header", "receive"]))
 @click.option("--max-pair-gap", type=float, default=None, help="Colour to depth at most [s].")
 @click.option("--only-still", is_flag=True, default=None, help="Leave out frames in motion.")
-@click.option("--scene", type=int, default=None, help="Scene of a BOP dataset.")
-@click.option("--camera-id", type=int, default=None, help="Camera of a COLMAP model.")
-@click.option("--scale", type=float, default=None, help="Metres per unit of a COLMAP model.")
+@click.option("--scene", type=int, default=None, help="Scene of a BOP or GraspNet data set.")
+@click.option("--camera-name", default=None, help="Of its several cameras: kinect, cam1 ...")
+@click.option("--models", type=FOLDER, default=None, help="Models, if not in the data set.")
+@click.option("--no-labels", is_flag=True, default=None, help="Leave its poses and masks there.")
+@click.option("--camera-id", type=int, default=None, help="Camera of COLMAP or nerfstudio.")
+@click.option("--scale", type=float, default=None, help="Metres per unit of their world.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier import in OUT.")
 @click.option("--quiet", is_flag=True, help="No progress bars.")
 def import_command(
@@ -216,11 +221,13 @@ def import_command(
 ) -> None:
     """Turn a recording, a folder of images or a data set into the session OUT.
 
-    SOURCE is a ROS or RealSense bag, a folder of images, a BOP scene or a COLMAP project. What
-    belongs together is joined by time stamp or by name, never by order; what is missing is named.
+    SOURCE is a ROS or RealSense bag, a folder of images, a BOP or GraspNet scene, a COLMAP project,
+    a nerfstudio folder, or an archive of one. What belongs together is joined by time stamp or by
+    name, never by order; what is missing is named. Poses, masks and models of a data set come too.
     """
     from realsim.app.console import Console
-    from realsim.app.import_source import list_source, request_of, run_import
+    from realsim.app.import_listing import list_source
+    from realsim.app.import_source import request_of, run_import
 
     console = Console(quiet=quiet)
     request = request_of(source, **options)

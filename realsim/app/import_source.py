@@ -1,7 +1,7 @@
 """`realsim import`: what kind of recording a path is, by its content, and opening it as such."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +10,6 @@ from realsim.app.console import Console
 from realsim.app.import_folder import (
     FolderRequest,
     camera_of_file,
-    describe_folder,
     open_image_folder,
 )
 from realsim.app.import_session import ImportSummary, import_session
@@ -30,11 +29,13 @@ HEAD_SHOWN = 16
 """First bytes of a file that is no bag, shown to a person."""
 ACCEPTED = (
     "accepted are a ROS1 .bag, a ROS2 .mcap or .db3 or its folder, a RealSense recording, a BOP "
-    "scene (scene_camera.json), a COLMAP project (cameras and images), a folder of images."
+    "scene (scene_camera.json), a GraspNet scene (annotations/0000.xml), a COLMAP project (cameras "
+    "and images), a nerfstudio folder (transforms.json), a folder of images, or one of these in a "
+    "zip or tar archive."
 )
-KINDS = ("auto", "bag", "folder", "bop", "colmap", "realsense")
+KINDS = ("auto", "bag", "folder", "bop", "graspnet", "colmap", "nerfstudio", "realsense")
 ONLY_FOR: dict[str, tuple[str, ...]] = {
-    "depth_unit": ("folder", "bag"),
+    "depth_unit": ("folder", "bag", "nerfstudio"),
     "depth_coding": ("folder",),
     "poses": ("folder",),
     "reading": ("folder",),
@@ -42,9 +43,9 @@ ONLY_FOR: dict[str, tuple[str, ...]] = {
     "poses_of": ("folder",),
     "no_poses": ("folder",),
     "depths": ("folder",),
-    "images": ("folder", "colmap"),
+    "images": ("folder", "colmap", "nerfstudio"),
     "camera": ("folder", "bag"),
-    "no_depth": ("folder", "bag", "bop"),
+    "no_depth": ("folder", "bag", "bop", "graspnet", "nerfstudio"),
     "colour_topic": ("bag",),
     "depth_topic": ("bag",),
     "joints_topic": ("bag",),
@@ -57,9 +58,12 @@ ONLY_FOR: dict[str, tuple[str, ...]] = {
     "clock": ("bag",),
     "max_pair_gap": ("bag",),
     "only_still": ("bag",),
-    "scene": ("bop",),
-    "camera_id": ("colmap",),
-    "scale": ("colmap",),
+    "scene": ("bop", "graspnet"),
+    "camera_name": ("bop", "graspnet"),
+    "models": ("bop", "graspnet"),
+    "no_labels": ("bop", "graspnet"),
+    "camera_id": ("colmap", "nerfstudio"),
+    "scale": ("colmap", "nerfstudio"),
 }
 """Options that say something of some kinds only; with another they are refused, not ignored."""
 BAG_OPTIONS = {
@@ -117,9 +121,15 @@ class ImportRequest:
     """Greatest time between colour and its depth [s]."""
     only_still: bool = False
     scene: int | None = None
+    camera_name: str = ""
+    """Of a data set with several cameras: kinect, cam1 ..."""
+    models: Path | None = None
+    """Folder of the models, when it is not in the data set."""
+    no_labels: bool = False
+    """Leave poses, masks and models of a data set where they are."""
     camera_id: int | None = None
     scale: float | None = None
-    """Metres per unit of a COLMAP model."""
+    """Metres per unit of a COLMAP model or of a transforms.json."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -138,10 +148,18 @@ def run_import(
     Raises:
         InputError: it is not known what it is, or it cannot be read or joined.
     """
+    from realsim.app.import_archive import unpacked
+    from realsim.app.import_labels import import_labels, labels_of
+
     if out.resolve() == request.source.resolve():
         raise InputError(f"{out} is the source itself: give another folder for the session.")
-    source = open_source(request, console)
-    return import_session(source, out, console, overwrite=overwrite)
+    with unpacked(request, out, console) as given:
+        source = open_source(given, console)
+        labels = None if request.no_labels else labels_of(given, source)
+        summary = import_session(source, out, console, overwrite=overwrite)
+        if labels is not None:
+            import_labels(*labels, out, console)
+    return summary
 
 
 def kinds_of(path: Path) -> list[KindFit]:
@@ -164,8 +182,13 @@ def kinds_of(path: Path) -> list[KindFit]:
         if any(path.glob(pattern)):
             fits.append(KindFit(kind="bop", why=f"it has {pattern}"))
             break
+    if _is_graspnet(path):
+        fits.append(KindFit(kind="graspnet", why="it has rgb/ beside annotations/*.xml"))
     from realsim.formats.colmap.model import find_model
+    from realsim.formats.nerfstudio.transforms import find_transforms
 
+    if find_transforms(path) is not None:
+        fits.append(KindFit(kind="nerfstudio", why="it has transforms.json"))
     model = find_model(path)
     if model is not None:
         place = model.relative_to(path).as_posix()
@@ -176,6 +199,14 @@ def kinds_of(path: Path) -> list[KindFit]:
         if found:
             fits.append(KindFit(kind="folder", why=f"it holds image files ({found})"))
     return fits
+
+
+def _is_graspnet(path: Path) -> bool:
+    """Return whether a folder is a GraspNet data set, one of its scenes, or a scene's camera."""
+    return any(
+        any(path.glob(f"{above}annotations/*.xml")) and any(path.glob(f"{above}rgb"))
+        for above in ("", "*/", "*/*/", "*/*/*/")
+    )
 
 
 def _of_file(path: Path) -> list[KindFit]:
@@ -251,7 +282,7 @@ def kind_of(request: ImportRequest, console: Console) -> str:
     return fits[0].kind
 
 
-def _require_fitting(request: ImportRequest, kind: str) -> None:
+def require_fitting(request: ImportRequest, kind: str) -> None:
     """Raise if an option was given that says nothing of this kind."""
     defaults = ImportRequest(source=request.source)
     given = [
@@ -277,14 +308,16 @@ def open_source(request: ImportRequest, console: Console) -> FrameSource:
         InputError: what it is is not known, or it cannot be read or joined.
     """
     kind = kind_of(request, console)
-    _require_fitting(request, kind)
+    require_fitting(request, kind)
     openers: dict[str, Callable[[ImportRequest, Console], FrameSource]] = {
         "bag": _open_bag, "folder": _open_folder, "bop": _open_bop, "colmap": _open_colmap,
+        "graspnet": _open_graspnet, "nerfstudio": _open_nerfstudio,
     }  # fmt: skip
     return openers[kind](request, console)
 
 
-def _folder_request(request: ImportRequest) -> FolderRequest:
+def folder_request(request: ImportRequest) -> FolderRequest:
+    """Return what is asked of a folder of images."""
     return FolderRequest(
         choice=FolderChoice(
             colour=request.images,
@@ -303,7 +336,7 @@ def _folder_request(request: ImportRequest) -> FolderRequest:
 
 
 def _open_folder(request: ImportRequest, console: Console) -> FrameSource:
-    source, notes = open_image_folder(request.source, _folder_request(request))
+    source, notes = open_image_folder(request.source, folder_request(request))
     for note in notes:
         console.say(note)
     return source
@@ -312,7 +345,42 @@ def _open_folder(request: ImportRequest, console: Console) -> FrameSource:
 def _open_bop(request: ImportRequest, console: Console) -> FrameSource:
     from realsim.formats.bop.source import open_bop
 
-    return open_bop(request.source, scene=request.scene, use_depth=not request.no_depth)
+    return open_bop(
+        request.source, scene=request.scene, camera=request.camera_name,
+        use_depth=not request.no_depth,
+    )  # fmt: skip
+
+
+def _open_graspnet(request: ImportRequest, _: Console) -> FrameSource:
+    from realsim.formats.graspnet.opening import open_scene
+    from realsim.formats.graspnet.tree import open_graspnet
+    from realsim.formats.labelled_frames import LabelledFrames
+
+    tree = open_graspnet(
+        request.source,
+        scenes=None if request.scene is None else (request.scene,),
+        cameras=(request.camera_name,) if request.camera_name else None,
+        models=request.models,
+    )
+    if len(tree.scenes) > 1:
+        listed = shown([r.name for r in tree.scenes], 12)
+        raise InputError(
+            f"{request.source} has {len(tree.scenes)} scenes: {listed}, and a session holds one by "
+            "one camera. Choose with --scene N and --camera-name kinect or realsense."
+        )
+    return LabelledFrames(
+        open_scene(next(iter(tree.scenes))), "graspnet", use_depth=not request.no_depth
+    )
+
+
+def _open_nerfstudio(request: ImportRequest, _: Console) -> FrameSource:
+    from realsim.formats.nerfstudio.source import open_nerfstudio
+
+    return open_nerfstudio(
+        request.source, images_folder=request.images or None, camera_id=request.camera_id,
+        metres_per_unit=request.scale, depth_unit_m=request.depth_unit,
+        use_depth=not request.no_depth,
+    )  # fmt: skip
 
 
 def _open_colmap(request: ImportRequest, console: Console) -> FrameSource:
@@ -359,70 +427,6 @@ def option_names(message: str) -> str:
     message = re.sub(r"\bwithout_depth\b(?!=)", "--no-depth", message)
     said = re.sub(rf"(?<![\w-])({names})=(True\b)?", lambda m: BAG_OPTIONS[m[1]], message)
     return re.sub(r" +([),.;]| )", r"\1", said)
-
-
-# --- what is inside ---------------------------------------------------------------------------
-
-
-def list_source(request: ImportRequest, console: Console) -> None:
-    """Print what a recording, folder or data set holds, without importing it.
-
-    Raises:
-        InputError: what it is is not known, or it cannot be read.
-    """
-    kind = kind_of(request, console)
-    _require_fitting(request, kind)
-    rows: Sequence[Sequence[object]]
-    if kind == "bag":
-        from realsim.formats.bags.recording import Recording
-
-        with Recording(request.source) as recording:
-            topics = sorted(recording.topics.values(), key=lambda t: t.name)
-        rows = [(t.name, t.msgtype, t.count) for t in topics]
-        console.table(str(request.source), ("topic", "type", "messages"), rows)
-        return
-    if kind == "folder":
-        rows = describe_folder(request.source, _folder_request(request))
-        for what, text in rows:
-            console.say(f"{what}: {text}")
-        return
-    if kind == "bop":
-        header, rows = _bop_rows(request)
-    else:
-        header, rows = _colmap_rows(request.source)
-    console.table(str(request.source), header, rows)
-
-
-def _bop_rows(request: ImportRequest) -> tuple[Sequence[str], list[Sequence[object]]]:
-    from realsim.formats.bop.scene import find_scenes, read_scene
-
-    rows: list[Sequence[object]] = []
-    for ref in find_scenes(request.source):
-        place = f"{ref.split}/{ref.folder.name}"
-        try:
-            scene = read_scene(ref)
-        except InputError as error:
-            rows.append((ref.scene_id, place, "-", "-", "-", str(error)))
-            continue
-        camera = scene.session.intrinsics
-        posed = sum(v.T_world_cam is not None for v in scene.session.views)
-        rows.append(
-            (ref.scene_id, place, len(scene.session.views), len(scene.depth_files), posed,
-             f"{camera.width}x{camera.height}, fx {camera.fx:.2f}")
-        )  # fmt: skip
-    return ("scene", "folder", "images", "with depth", "with camera pose", "camera"), rows
-
-
-def _colmap_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
-    from realsim.formats.colmap.model import find_model, read_model
-
-    model = read_model(find_model(root) or root)
-    rows: list[Sequence[object]] = []
-    for k, camera in sorted(model.cameras.items()):
-        count = sum(i.camera_id == k for i in model.images)
-        size = f"{camera.width}x{camera.height}"
-        rows.append((k, count, size, f"{camera.fx:.3f}", f"{camera.fy:.3f}"))
-    return ("camera", "images", "size [px]", "fx [px]", "fy [px]"), rows
 
 
 def request_of(source: Path, **options: Any) -> ImportRequest:

@@ -33,6 +33,10 @@ class CheckedGroup:
         """Return the error that names the file and the place."""
         return InputError(f"{self._path}, {self._group.name}: {what}")
 
+    def where(self, name: str) -> str:
+        """Return what messages call a member."""
+        return f"{self._path}, {self._group.name}: '{name}'"
+
     def names(self) -> list[str]:
         """Return the names of the members, each a hard link."""
         names = [str(name) for name in self._group]

@@ -1,5 +1,6 @@
 """Images as files: 8-bit colour, 16-bit depth, masks; a broken file is an error that names it."""
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats import png
+from realsim.formats.image_headers import header_size, require_decodable, require_few_pixels
 
 PNG_END = b"IEND\xaeB`\x82"
 DEPTH_MAX = 65535
@@ -33,7 +35,9 @@ def _decoded(path: Path, flags: int) -> NDArray[Any]:
     torn = data.startswith(png.SIGNATURE) and PNG_END not in data[-32:]
     image: Any = None
     if data and not torn:
-        image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+        require_decodable(data, str(path))
+        with contextlib.suppress(cv2.error):  # of files that end within a header
+            image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     if image is None:
         raise InputError(
             f"{path} is {'truncated' if torn or not data else 'not a readable image'} "
@@ -111,14 +115,8 @@ def image_size(path: Path | str) -> tuple[int, int]:
     """Return (width, height) of an image file without decoding its pixels.
 
     Raises:
-        InputError: missing or not an image.
+        InputError: missing, not an image, or of more than 100 million pixels.
     """
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError(
-            f"{path} is not a readable image ({error}); its size is needed for the camera."
-        ) from error
+    size = header_size(Path(path), str(path))
+    require_few_pixels(*size, str(path))
+    return size

@@ -29,7 +29,7 @@ SCENE = f"{FOLDER}/scene.json"
 GT, INFO, CAMERA = (
     f"{FOLDER}/{n}" for n in ("scene_gt.json", "scene_gt_info.json", "scene_camera.json")
 )
-INSTANCE = "instance"
+INSTANCE = "instance_in_scene"
 """Key, ours, of a row of scene_gt.json: which of several alike."""
 
 

@@ -1,6 +1,5 @@
 """Parquet files of others, read with suspicion: sizes and types are looked at before anything."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.untrusted.json_text import parsed_json
+from realsim.untrusted.values import mapping
 
 MOST_BYTES = 8 << 30
 """Largest table that is read [bytes, unpacked]: more does not fit into a desktop's memory."""
@@ -52,13 +53,12 @@ class CheckedTable:
 
     def head(self, key: bytes) -> dict[str, Any]:
         """Return the file's metadata under a key, a JSON object."""
+        where = f"the metadata '{key.decode()}' of {self._path}"
         try:
-            head = json.loads((self._table.schema.metadata or {})[key])
-        except (KeyError, ValueError) as error:
+            text = (self._table.schema.metadata or {})[key].decode("utf-8")
+        except (KeyError, UnicodeDecodeError) as error:
             raise self.wrong(f"there is no metadata '{key.decode()}' in JSON.") from error
-        if not isinstance(head, dict):
-            raise self.wrong(f"the metadata '{key.decode()}' is no JSON object.")
-        return {str(name): value for name, value in head.items()}  # pyright: ignore[reportUnknownVariableType]
+        return mapping(parsed_json(text, where), where)
 
     def numbers(self, name: str, rows: slice) -> NDArray[np.float64]:
         """Return rows of a column of float64."""

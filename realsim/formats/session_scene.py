@@ -92,9 +92,11 @@ class SessionScene:
         return self._notes
 
     @property
-    def has_labels(self) -> bool:
-        """Whether there are poses of objects."""
-        return self._is_annotated or self._imported is not None
+    def labels(self) -> Labels:
+        """Where the poses of the objects come from."""
+        if self._is_annotated:
+            return "annotated"
+        return "none" if self._imported is None else "imported"
 
     def _view(self, index: int) -> int:
         if index not in self._views:

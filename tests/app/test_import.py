@@ -16,11 +16,11 @@ import pycolmap
 import pytest
 
 from realsim.app.console import Console
+from realsim.app.import_listing import list_source
 from realsim.app.import_session import import_session
 from realsim.app.import_source import (
     ImportRequest,
     kinds_of,
-    list_source,
     open_source,
     option_names,
     run_import,
@@ -319,7 +319,7 @@ def test_a_camera_file_without_image_size_takes_that_of_the_images(tmp_path):
 
 def test_an_option_that_says_nothing_is_refused(tmp_path):
     request = ImportRequest(source=make_folder(tmp_path / "in"), scene=3, depth_unit=0.001)
-    with pytest.raises(InputError, match=r"--scene \(for bop\)"):
+    with pytest.raises(InputError, match=r"--scene \(for bop and graspnet\)"):
         open_source(request, QUIET)
 
 

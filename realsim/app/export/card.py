@@ -71,7 +71,8 @@ def card_bytes(card: DatasetCard) -> bytes:
     parts.append(_section("How far to trust it", _trust(card)))
     notes = [f"- {s.written.name}: {n}" for s in card.scenes for n in s.written.notes]
     parts.append(_section("What was changed or lost on the way", _shortened(notes)))
-    parts.append(_section("Objects", _objects(card)))
+    if card.objects:
+        parts.append(_section("Objects", _table(("id", "name"), sorted(card.objects.items()))))
     parts.append(_section("Loading", f"```python\n{card.loading.strip()}\n```\n"))
     parts.append(_section("Licence", _licence(card)))
     parts.append(_section("Made with", _made_with(card)))
@@ -104,11 +105,14 @@ def _summary(card: DatasetCard, frames: int) -> str:
     return (
         f"{scenes} {'scene' if scenes == 1 else 'scenes'}, {frames} frames, {objects} object poses "
         f"in them, {len(card.objects)} object models. Format: {card.format}.\n"
+        if card.objects
+        else f"{scenes} {'scene' if scenes == 1 else 'scenes'}, {frames} frames. Format: "
+        f"{card.format}.\n"
     )
 
 
 def _section(title: str, body: str) -> str:
-    return f"## {title}\n\n{body or 'Nothing.'}\n"
+    return f"## {title}\n\n{body.strip() or 'Nothing.'}\n"
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -155,10 +159,6 @@ def _shortened(notes: Sequence[str], most: int = 60) -> str:
     unique = list(dict.fromkeys(notes))
     more = [f"- and {len(unique) - most} more notes."] if len(unique) > most else []
     return "\n".join([*unique[:most], *more])
-
-
-def _objects(card: DatasetCard) -> str:
-    return _table(("id", "name"), sorted(card.objects.items())) if card.objects else ""
 
 
 def _licence(card: DatasetCard) -> str:

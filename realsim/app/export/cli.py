@@ -28,7 +28,8 @@ FORMATS = ("bop", "graspnet", "colmap", "nerfstudio")
 @click.option("--no-masks", is_flag=True, help="Leave the masks out.")
 @click.option("--points", default=100_000, show_default=True, type=click.IntRange(0),
               help="Coloured points of a COLMAP model.")  # fmt: skip
-@click.option("--ignore-distortion", is_flag=True, help="Of a format that knows no distortion.")
+@click.option("--undistort", is_flag=True, help="Images as an ideal camera would see them.")
+@click.option("--ignore-distortion", is_flag=True, help="Raw images where no lens can be told.")
 @click.option("--table-is-world", is_flag=True, help="Where no table is known: it is z = 0.")
 @click.option("--name", default="", help="Of the data set, on its card.")
 @click.option("--licence", default="", help="Of images and labels, on the card.")

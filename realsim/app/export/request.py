@@ -1,6 +1,6 @@
 """What `realsim export` was asked for."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -33,6 +33,8 @@ class ExportRequest:
     """[%]: mean error of one grey level on real frames, a fifth of PNG's bytes."""
     masks: bool = True
     """Whether masks are written."""
+    undistort: bool = False
+    """Write images as an ideal camera would have seen them."""
     ignore_distortion: bool = False
     """Write images of a distorted lens into a format that knows no distortion."""
     table_is_world: bool = False
@@ -63,19 +65,14 @@ class ExportRequest:
             seen.add(source.resolve())
         if not 1 <= self.jpeg_quality <= 100:
             raise InputError(f"--jpeg-quality {self.jpeg_quality} cannot be; 1 to 100 is accepted.")
+        if self.undistort and self.ignore_distortion:
+            raise InputError("--undistort and --ignore-distortion contradict each other.")
         if self.points < 0:
             raise InputError(f"--points {self.points} cannot be; 0 or more is accepted.")
 
     def asked(self) -> dict[str, Any]:
         """Return the request as plain JSON values: what an interrupted export is recognised by."""
-        values: dict[str, Any] = {
-            name: getattr(self, name)
-            for name in (
-                "target", "labels", "split", "camera", "colour", "jpeg_quality", "masks",
-                "ignore_distortion", "table_is_world", "points", "least_score", "name", "licence",
-                "models_licence", "attribution",
-            )
-        }  # fmt: skip
+        values: dict[str, Any] = {f.name: getattr(self, f.name) for f in fields(self)}
         return values | {
             "sources": [str(s.resolve()) for s in self.sources],
             "scenes": list(self.scenes),

@@ -1,7 +1,7 @@
 """`realsim export`: scene by scene into one folder; interrupted, the same command goes on."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 from realsim.app.console import Console
@@ -10,17 +10,20 @@ from realsim.app.export.request import ExportRequest
 from realsim.app.export.sources import SourceScene, licence_files, source_scenes, trust_in
 from realsim.app.export.targets import TARGETS, SceneJob, ScenePlace, Target
 from realsim.errors import InputError, RealsimError
-from realsim.formats.export_folder import ExportFolder
+from realsim.formats.export_folder import STATE, ExportFolder
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
+from realsim.formats.session_scene import SessionScene
+from realsim.formats.undistorted import UndistortedScene
 from realsim.records import ObjectModel
 from realsim.store.lock import only_run_in
 
 ALWAYS = ("sources", "target", "scenes", "name", "licence", "models_licence", "attribution")
 """Options of every format."""
+STATED = ("name", "licence", "models_licence", "attribution")
+"""Options that the card tells elsewhere."""
 OPTION_NAMES = {"models_licence": "models-licence", "masks": "no-masks"}
-WORDS = {
-    "session": "annotated by realsim", "bop": "the data set's own", "graspnet": "the data set's own"
-}  # fmt: skip
+LABELS = {"annotated": "computed by realsim", "imported": "as imported, unchecked", "none": "none"}
+OWN_LABELS = "the data set's own, unchecked"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -53,7 +56,9 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
             for source, place in zip(scenes, places, strict=True):
                 opened = source.open()
                 _add_models(models, opened, source)
-                written = _write(opened, place, target, folder, request, console)
+                kept = out / STATE / "undistorted"
+                given = UndistortedScene(opened, kept) if request.undistort else opened
+                written = _write(given, place, target, folder, request, console)
                 facts.append(_facts(source, opened, written))
         except RealsimError:
             folder.abandon_if_empty()
@@ -134,8 +139,6 @@ def _write(
     console: Console,
 ) -> WrittenScene:
     total, done = len(scene.indices), 0
-    for note in scene.notes:
-        console.warn(f"{scene.name}: {note}".replace("[", r"\["))
     with console.stage("export", f"{scene.name} to {target.name}") as tick:
 
         def one_more() -> None:
@@ -143,9 +146,14 @@ def _write(
             done += 1
             tick(done, total)
 
-        return target.write_scene(
+        written = target.write_scene(
             scene, folder, SceneJob(request=request, place=place, tick=one_more)
         )
+    notes = tuple(dict.fromkeys((*scene.notes, *written.notes)))
+    if target.kind == "dataset":
+        return replace(written, notes=notes)
+    # It has a folder of its own, and no place for objects and their poses.
+    return replace(written, notes=notes, folder=folder.folder / place.name, objects=0)
 
 
 def _add_models(models: dict[int, ObjectModel], scene: LabelledScene, source: SourceScene) -> None:
@@ -173,10 +181,7 @@ def _facts(source: SourceScene, scene: LabelledScene, written: WrittenScene) -> 
     trust = trust_in(source)
     grasps = scene.grasps()
     sets = () if grasps is None else grasps.sets
-    words = WORDS[source.kind]
-    if source.kind == "session":
-        is_annotated = getattr(scene, "is_annotated", False)
-        words = words if is_annotated else "as imported" if written.objects else "none"
+    words = LABELS[scene.labels] if isinstance(scene, SessionScene) else OWN_LABELS
     things: set[object] = set()
     if trust.instances is None and scene.indices:
         first = scene.frame(scene.indices[0])
@@ -200,19 +205,19 @@ def _card(
     models: dict[int, ObjectModel],
     licences: dict[str, Path],
 ) -> DatasetCard:
+    plain = ExportRequest(sources=request.sources, target="")
     command = [
-        (f.name, str(getattr(request, f.name)))
+        (f.name.replace("_", "-"), str(getattr(request, f.name)))
         for f in fields(request)
-        if f.name in target.options or f.name in ("target", "scenes")
+        if getattr(request, f.name) != getattr(plain, f.name) and f.name not in STATED
     ]
-    first = facts[0].written.folder
-    inside = first.relative_to(out) if first.is_relative_to(out) else first
+    inside = facts[0].written.folder.relative_to(out)
     return DatasetCard(
         name=request.name or out.resolve().name,
         format=target.name,
         conventions=target.conventions,
-        scenes=facts,
-        objects={i: m.name for i, m in models.items()},
+        scenes=[replace(f, written=_inside(f.written, out)) for f in facts],
+        objects={i: m.name for i, m in models.items()} if target.kind == "dataset" else {},
         loading=target.loading.replace("{scene}", inside.as_posix()),
         command=command,
         sources=[s.resolve().name for s in request.sources],
@@ -221,6 +226,10 @@ def _card(
         attribution=request.attribution,
         licence_files=sorted(licences),
     )
+
+
+def _inside(written: WrittenScene, out: Path) -> WrittenScene:
+    return replace(written, folder=written.folder.relative_to(out))
 
 
 def show_export(result: ExportResult, console: Console) -> None:

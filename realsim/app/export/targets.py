@@ -60,46 +60,35 @@ class Target:
     """Fields of the request that say something of this format; others are refused."""
 
 
-def _bop(
-    scene: LabelledScene,
-    folder: ExportFolder,
-    request: ExportRequest,
-    place: ScenePlace,
-    tick: Progress,
-) -> WrittenScene:
+def _bop(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
     from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 
     config = BopWriteConfig(
         colour=job.request.colour, jpeg_quality=job.request.jpeg_quality, masks=job.request.masks,
-        number=job.place.number, split=job.request.split or scene.split,
+        number=job.place.number, split=job.request.split or scene.split, camera=job.place.camera,
     )  # fmt: skip
     return write_bop_scene(scene, folder, config, progress=job.tick)
 
 
 def _bop_root(
-    written: Sequence[WrittenScene],
-    models: Models,
-    folder: ExportFolder,
-    request: ExportRequest,
+    _written: Sequence[WrittenScene], models: Models, folder: ExportFolder, request: ExportRequest
 ) -> None:
-    from realsim.formats.bop.writing import write_bop_models, write_bop_root
+    from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 
     write_bop_models(models, folder)
-    write_bop_root(written, folder, name=request.name)
+    write_bop_root(folder, name=request.name or folder.folder.resolve().name)
 
 
-def _graspnet(
-    scene: LabelledScene,
-    folder: ExportFolder,
-    request: ExportRequest,
-    place: ScenePlace,
-    tick: Progress,
-) -> WrittenScene:
-    from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
+def _graspnet(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
+    from realsim.formats.graspnet.tree import CAMERAS
+    from realsim.formats.graspnet.write_plan import GraspnetWriteConfig
+    from realsim.formats.graspnet.writing import write_graspnet_scene
 
+    request = job.request
+    camera = scene.camera if scene.camera in CAMERAS else request.camera or CAMERAS[0]
     config = GraspnetWriteConfig(
-        camera=job.request.camera or scene.camera or "realsense", number=job.place.number,
-        ignore_distortion=job.request.ignore_distortion, table_is_world=job.request.table_is_world,
+        camera=camera, number=job.place.number, ignore_distortion=request.ignore_distortion,
+        table_is_world=request.table_is_world, without_labels=not request.masks,
     )  # fmt: skip
     return write_graspnet_scene(scene, folder, config, progress=job.tick)
 
@@ -115,26 +104,14 @@ def _graspnet_root(
     write_graspnet_models(models, folder)
 
 
-def _colmap(
-    scene: LabelledScene,
-    folder: ExportFolder,
-    request: ExportRequest,
-    place: ScenePlace,
-    tick: Progress,
-) -> WrittenScene:
+def _colmap(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
     from realsim.formats.colmap.writing import ColmapWriteConfig, write_colmap
 
     config = ColmapWriteConfig(points=job.request.points)
     return write_colmap(scene, folder.below(job.place.name), config, progress=job.tick)
 
 
-def _nerfstudio(
-    scene: LabelledScene,
-    folder: ExportFolder,
-    request: ExportRequest,
-    place: ScenePlace,
-    tick: Progress,
-) -> WrittenScene:
+def _nerfstudio(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
     from realsim.formats.nerfstudio.writing import NerfstudioWriteConfig, write_nerfstudio
 
     return write_nerfstudio(
@@ -142,6 +119,8 @@ def _nerfstudio(
     )
 
 
+IMAGES = ("labels", "camera", "undistort")
+"""Options of every format that holds images."""
 METRES = ("units", "metres")
 OPENCV = ("camera axes", "OpenCV: x right, y down, z forward")
 PIXEL = ("pixels", "integer coordinates are pixel centres")
@@ -170,7 +149,16 @@ TARGETS: dict[str, Target] = {
         ),
         write_scene=_bop,
         write_root=_bop_root,
-        options=("labels", "split", "camera", "models", "colour", "jpeg_quality", "masks"),
+        options=(
+            "labels",
+            "split",
+            "camera",
+            "models",
+            "colour",
+            "jpeg_quality",
+            "masks",
+            "undistort",
+        ),
     ),
     "graspnet": Target(
         name="GraspNet-1Billion",
@@ -190,7 +178,15 @@ TARGETS: dict[str, Target] = {
         ),
         write_scene=_graspnet,
         write_root=_graspnet_root,
-        options=("labels", "camera", "models", "ignore_distortion", "table_is_world"),
+        options=(
+            "labels",
+            "camera",
+            "models",
+            "masks",
+            "undistort",
+            "ignore_distortion",
+            "table_is_world",
+        ),
     ),
     "colmap": Target(
         name="COLMAP",
@@ -204,7 +200,7 @@ TARGETS: dict[str, Target] = {
         ),
         loading='import pycolmap\nmodel = pycolmap.Reconstruction("{scene}/sparse/0")',
         write_scene=_colmap,
-        options=("labels", "camera", "points"),
+        options=(*IMAGES, "points"),
     ),
     "nerfstudio": Target(
         name="nerfstudio",
@@ -218,6 +214,6 @@ TARGETS: dict[str, Target] = {
         ),
         loading='import json\nframes = json.load(open("{scene}/transforms.json"))["frames"]',
         write_scene=_nerfstudio,
-        options=("labels", "camera"),
+        options=IMAGES,
     ),
 }

@@ -43,6 +43,14 @@ def _axes(columns: int) -> tuple[Any, list[Any]]:
     return figure, axes
 
 
+def _counted(*axes: Any) -> None:
+    """Number the axes of counts by whole numbers."""
+    from matplotlib.ticker import MaxNLocator
+
+    for axis in axes:
+        axis.set_major_locator(MaxNLocator(integer=True))
+
+
 def _titled(ax: Any, title: str, x: str = "", y: str = "") -> None:
     ax.set_title(title, fontsize=9, loc="left", color=INK)
     ax.set_xlabel(x, fontsize=8, color=INK)
@@ -68,8 +76,9 @@ def _outcomes(stats: Statistics) -> Image:
     ax.barh(rows + 0.2, paper, 0.38, color=MUTED, alpha=0.5)
     for row, (ours, theirs) in enumerate(zip(here, paper, strict=True)):
         ax.text(ours + 0.5, row - 0.2, f"{ours:.1f} %", va="center", fontsize=7, color=INK)
-        ax.text(theirs + 0.5, row + 0.2, f"{theirs:.1f} % paper", va="center", fontsize=7,
-                color=MUTED)  # fmt: skip
+        if theirs:
+            ax.text(theirs + 0.5, row + 0.2, f"{theirs:.1f} % paper", va="center", fontsize=7,
+                    color=MUTED)  # fmt: skip
     ax.set_yticks(rows, [OUTCOME_NAMES[n] for n in names])
     ax.invert_yaxis()
     _titled(ax, f"{stats.school.judged:,} candidates with a score", "share [%]")
@@ -130,6 +139,7 @@ def _trust(stats: Statistics) -> Image:
         else:
             ax.text(0.5, 0.5, "not known", ha="center", transform=ax.transAxes, color=MUTED)
         _titled(ax, "Uncertainty of the poses, 1 sigma", f"[{unit}]", "objects")
+        _counted(ax.yaxis)
     return _picture(figure)
 
 
@@ -154,4 +164,5 @@ def _scenes(stats: Statistics) -> Image:
     right.bar(VERDICTS, [verdicts.get(v, 0) for v in VERDICTS],
               color=[VERDICT_COLORS[v] for v in VERDICTS])  # fmt: skip
     _titled(right, "Verdicts", "", "objects")
+    _counted(left.xaxis, left.yaxis, middle.yaxis, right.yaxis)
     return _picture(figure)

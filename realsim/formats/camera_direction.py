@@ -1,0 +1,257 @@
+"""Camera to world or world to camera, OpenCV's axes or OpenGL's: decided by agreement of views.
+
+A file of camera poses does not prove its convention, but a static scene does: only with the right
+one do different views put the same things in the same place. Four readings are compared, each up
+to a turn of the world, which no agreement can tell:
+
+    as stated                T_world_cam = T
+    inverted                 T_world_cam = T^-1             (w2c taken for c2w, or the reverse)
+    other axes               T_world_cam = T G              (OpenGL's axes taken for OpenCV's, ...)
+    inverted, other axes     T_world_cam = T^-1 G           (G = diag(1, -1, -1, 1))
+
+What is compared is either the poses of labelled objects (`objects_evidence`) or measured depth
+(`depth_evidence`). Where the camera hardly moves, or only along x, readings agree equally well;
+then nothing is decided, and that is said.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.formats.depth_agreement import DepthOf, disagreement_mm, near_pairs, sampled_views
+from realsim.formats.labelled_scene import LabelledFrame
+from realsim.geometry import se3
+from realsim.interop import T_CAM_GL
+
+Array = NDArray[np.float64]
+Direction = Literal["as stated", "inverted", "other axes", "inverted, other axes"]
+STATED: Direction = "as stated"
+WORSE_BY = 3.0
+"""A reading is wrong if its spread is this many times the best one's: noise of the views and of the
+labels is in both alike, and a wrong reading of a camera that moves is worse tens of times."""
+WORSE_MM = 5.0
+"""... and larger by this [mm]: public labels disagree between views by 3 to 6 mm at the truth."""
+AGREES_MM = 50.0
+"""A best spread beyond this [mm] is no agreement: the scene moves, or the unit is another."""
+MOST_VIEWS = 200
+"""Views used of a long scene, evenly; more say no more."""
+SPREAD_PERCENTILE = 75.0
+"""Of the distances from the middle: a camera that stands still in half of the views hides nothing,
+and a quarter of wrong labels does not spoil it."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Spread:
+    """How far the views are from agreeing under one reading."""
+
+    mm: float
+    """Of object positions in world, or of reprojected depth [mm]; NaN = nothing to compare."""
+    deg: float | None = None
+    """Of object orientations in world [deg]; None for depth. Symmetric objects, labelled by any of
+    their equal poses, make it large, so it is told and not used."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DirectionEvidence:
+    """What the views say of the four readings."""
+
+    spreads: Mapping[Direction, Spread]
+    compared: str
+    """What was compared, for messages: '5 objects in 20 views'; '' = nothing could be."""
+
+    @property
+    def best(self) -> Direction:
+        """The reading with the smallest spread; the stated one where it is as good."""
+        agreeing = self.agreeing
+        return STATED if STATED in agreeing or not agreeing else agreeing[0]
+
+    @property
+    def agreeing(self) -> tuple[Direction, ...]:
+        """Readings under which the views agree, best first; () = under none, or not compared."""
+        known: list[Direction] = [n for n, s in self.spreads.items() if np.isfinite(s.mm)]
+        known.sort(key=lambda name: self.spreads[name].mm)
+        least = self.spreads[known[0]].mm if known else float("inf")
+        if least > AGREES_MM:
+            return ()
+        limit = max(WORSE_BY * least, least + WORSE_MM)
+        return tuple(name for name in known if self.spreads[name].mm <= limit)
+
+    @property
+    def decisive(self) -> bool:
+        """Whether one reading alone agrees."""
+        return len(self.agreeing) == 1
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the views agree under another reading and not under the stated one."""
+        return bool(self.agreeing) and STATED not in self.agreeing
+
+    @property
+    def numbers(self) -> str:
+        """The spreads in words."""
+        parts = [
+            f"{name}: {s.mm:.1f} mm" + ("" if s.deg is None else f" and {s.deg:.2f} deg")
+            for name, s in self.spreads.items()
+        ]
+        return "; ".join(parts)
+
+
+def readings(Ts: ArrayLike) -> dict[Direction, Array]:
+    """Return T_world_cam (N, 4, 4) under each reading of stated ones (N, 4, 4)."""
+    Ts = np.asarray(Ts, dtype=np.float64)
+    inverted = se3.invert(Ts)
+    return {
+        "as stated": Ts,
+        "inverted": inverted,
+        "other axes": Ts @ T_CAM_GL,
+        "inverted, other axes": inverted @ T_CAM_GL,
+    }
+
+
+# --- by objects -------------------------------------------------------------------------------
+
+
+def objects_evidence(
+    Ts_world_cam: ArrayLike, things: Iterable[Sequence[tuple[int, ArrayLike]]]
+) -> DirectionEvidence:
+    """Return what the poses of static objects, labelled view by view, say.
+
+    Args:
+        Ts_world_cam: (N, 4, 4) camera poses as stated [m].
+        things: of each thing its (view, T_cam_obj) pairs, the view as a place in `Ts_world_cam`
+            and the pose (4, 4) [m]; see `things_of`. Labels that were made out of the camera poses
+            (one pose, brought into all views) agree by construction under the reading they were
+            made with, which is the question.
+    """
+    Ts = np.asarray(Ts_world_cam, dtype=np.float64).reshape(-1, 4, 4)
+    seen = [list(t)[:: max(1, -(-len(t) // MOST_VIEWS))] for t in things if len(t) > 1]
+    stacked = [
+        (np.array([k for k, _ in t]), np.stack([np.asarray(T, np.float64) for _, T in t]))
+        for t in seen
+    ]
+    spreads: dict[Direction, Spread] = {}
+    for name, candidate in readings(Ts).items():
+        rows = [_spread_of(candidate[k] @ T_cam_obj) for k, T_cam_obj in stacked]
+        mm, deg = np.median(rows, axis=0) if rows else (np.nan, np.nan)
+        spreads[name] = Spread(mm=float(mm), deg=float(deg))
+    views = len({k for t in seen for k, _ in t})
+    compared = f"{len(seen)} objects in {views} views" if seen else ""
+    return DirectionEvidence(spreads=spreads, compared=compared)
+
+
+def _spread_of(Ts_world_obj: Array) -> tuple[float, float]:
+    """Return by how much poses (V, 4, 4) of one thing differ [mm, deg]."""
+    positions = Ts_world_obj[:, :3, 3]
+    off = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+    R = Ts_world_obj[:, :3, :3]
+    # The pose nearest to the middle stands for the orientation: a mean of far turns is none.
+    nearest = R[int(np.argmin(off))]
+    angles = np.atleast_1d(se3.angle(np.swapaxes(R, 1, 2) @ nearest))
+    return (
+        1e3 * float(np.percentile(off, SPREAD_PERCENTILE)),
+        float(np.rad2deg(np.percentile(angles, SPREAD_PERCENTILE))),
+    )
+
+
+def things_of(frames: Iterable[LabelledFrame]) -> tuple[Array, list[list[tuple[int, Array]]]]:
+    """Return the camera poses (N, 4, 4) and the things of labelled frames, for `objects_evidence`.
+
+    Frames without a camera pose are left out. A thing is an instance; where the source has no
+    instances it is an object that no frame shows twice, since two alike could be confused.
+    """
+    Ts: list[Array] = []
+    found: dict[tuple[str, int], list[tuple[int, Array]]] = {}
+    doubled: set[tuple[str, int]] = set()
+    for frame in frames:
+        if frame.T_world_cam is None:
+            continue
+        here: set[tuple[str, int]] = set()
+        for o in frame.objects:
+            by_id = ("object", o.obj_id)
+            key = by_id if o.instance is None else ("instance", o.instance)
+            if key in here:
+                doubled.add(key)
+            here.add(key)
+            found.setdefault(key, []).append((len(Ts), o.T_cam_obj))
+        Ts.append(frame.T_world_cam)
+    poses = np.stack(Ts) if Ts else np.zeros((0, 4, 4))
+    return poses, [rows for key, rows in found.items() if key not in doubled]
+
+
+# --- by depth ---------------------------------------------------------------------------------
+
+
+def depth_evidence(Ts_world_cam: ArrayLike, depth_of: DepthOf) -> DirectionEvidence:
+    """Return what measured depth says: each view's points must lie on what its neighbour measured.
+
+    Args:
+        Ts_world_cam: (N, 4, 4) camera poses as stated [m].
+        depth_of: of a place in `Ts_world_cam`: the depth (H, W) [m], 0 = none, and its camera.
+    """
+    Ts = np.asarray(Ts_world_cam, dtype=np.float64).reshape(-1, 4, 4)
+    views = sampled_views(Ts, depth_of)
+    spreads: dict[Direction, Spread] = {}
+    for name, candidate in readings(Ts).items():
+        # Which views are near depends on the reading: each one is judged where it says they are.
+        mm = disagreement_mm(candidate, views, near_pairs(candidate, views))
+        spreads[name] = Spread(mm=mm)
+    compared = f"the depth of near views, out of {len(views)}" if len(views) > 1 else ""
+    return DirectionEvidence(spreads=spreads, compared=compared)
+
+
+# --- verdict ----------------------------------------------------------------------------------
+
+
+def require_direction(evidence: DirectionEvidence, where: str, *, remedy: str = "") -> str:
+    """Return a note on the stated reading if the evidence does not contradict it.
+
+    Args:
+        evidence: of the views.
+        where: the file or scene, for messages.
+        remedy: what a person can do, for the message.
+
+    Returns:
+        That the poses agree, that the evidence cannot tell, or that nothing agrees.
+
+    Raises:
+        InputError: the views agree under another reading and not under the stated one.
+    """
+    if evidence.contradicts:
+        raise InputError(
+            f"{where}: the camera poses are not what they are said to be: {_meaning(evidence.best)}"
+            f". Spread of {evidence.compared}, by how the poses are read: {evidence.numbers}. "
+            f"{remedy or 'Convert the poses, or name the convention that they have.'}"
+        )
+    if not evidence.compared:
+        return (
+            f"{where}: the direction of the camera poses could not be checked: no two views show "
+            "the same thing."
+        )
+    if not evidence.agreeing:
+        return (
+            f"{where}: the views do not agree under any reading of the camera poses "
+            f"({evidence.compared}; {evidence.numbers}): the scene moved, or a unit is wrong."
+        )
+    if not evidence.decisive:
+        return (
+            f"{where}: the direction of the camera poses could not be checked, the camera moves "
+            f"too little ({evidence.compared}; {evidence.numbers})."
+        )
+    return f"{where}: camera poses checked by {evidence.compared}: {evidence.numbers}."
+
+
+def _meaning(direction: Direction) -> str:
+    """Return in words what a reading says of the stated one."""
+    parts = [
+        text
+        for word, text in (
+            ("inverted", "camera to world is taken for world to camera, or the reverse"),
+            ("axes", "OpenGL's camera axes are taken for OpenCV's, or the reverse"),
+        )
+        if word in direction
+    ]
+    return "; and ".join(parts)

@@ -1,0 +1,232 @@
+"""Laws of `realsim export` and of importing labels: what goes in comes out, nothing is mixed."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from labelled_scenes import INTRINSICS, MODELS, labelled_scene
+from realsim.app.cli import commands
+from realsim.errors import InputError
+from realsim.formats import images
+from realsim.formats.bop.opening import open_labelled_bop
+from realsim.formats.bop.root_files import write_bop_models, write_bop_root
+from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
+from realsim.formats.export_folder import ExportFolder
+from realsim.geometry import se3
+from realsim.store import SessionStore
+
+
+def run(*args):
+    return CliRunner().invoke(commands, [str(a) for a in args], catch_exceptions=True)
+
+
+def done(*args):
+    result = run(*args)
+    assert result.exit_code == 0, (result.output, result.exception)
+    return result.output
+
+
+def refused(*args):
+    result = run(*args)
+    assert isinstance(result.exception, InputError), (result.output, result.exception)
+    return str(result.exception)
+
+
+def written_bop(folder, scene, **config):
+    export = ExportFolder.begin(folder, {})
+    write_bop_scene(scene, export, BopWriteConfig(**config))
+    write_bop_models(scene.models(), export)
+    write_bop_root(export, name="three boxes")
+    export.finish({"README.md": b"three boxes\n"})
+    return folder
+
+
+@pytest.fixture(scope="module")
+def bop(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("source")
+    scene = labelled_scene(folder / "images", [2, 5, 9, 14])
+    return written_bop(folder / "bop", scene)
+
+
+def scene_files(root):
+    folder = next(root.glob("*/*/scene_gt.json")).parent
+    names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+    return folder, names
+
+
+def numbers_of(path):
+    return json.loads(path.read_text(), parse_float=str)
+
+
+def assert_same_scene(first, second):
+    """Every number to the last digit, every pixel."""
+    (a, names), (b, others) = scene_files(first), scene_files(second)
+    assert names == others
+    for name in names:
+        if name.endswith("coco.json"):
+            assert (
+                json.loads((a / name).read_text())["annotations"]
+                == (json.loads((b / name).read_text())["annotations"])
+            )
+        elif name.endswith(".json"):
+            assert numbers_of(a / name) == numbers_of(b / name), name
+        else:
+            same = np.array_equal(images.read_image(a / name), images.read_image(b / name))
+            assert same, name
+
+
+def test_bop_to_the_store_and_back_is_the_same_to_the_last_digit(bop, tmp_path):
+    done("import", bop, tmp_path / "session", "--quiet")
+    done("export", tmp_path / "session", "--to", "bop", "--out", tmp_path / "again", "--quiet")
+    assert_same_scene(bop, tmp_path / "again")
+    for name in ("models/obj_000007.ply", "models/models_info.json"):
+        assert (bop / name).is_file() and (tmp_path / "again" / name).is_file()
+
+
+def test_bop_to_bop_without_a_session_is_the_same(bop, tmp_path):
+    done("export", bop, "--to", "bop", "--out", tmp_path / "again", "--quiet")
+    assert_same_scene(bop, tmp_path / "again")
+
+
+def test_graspnet_to_the_store_and_back_keeps_every_digit_of_the_format(bop, tmp_path):
+    first, second = tmp_path / "graspnet", tmp_path / "again"
+    table = ("--table-is-world", "--quiet")
+    done("export", bop, "--to", "graspnet", "--out", first, *table)
+    done("import", first, tmp_path / "session", "--quiet")
+    done("export", tmp_path / "session", "--to", "graspnet", "--out", second, "--quiet")
+    for part in ("annotations", "label", "depth", "rgb"):
+        files = sorted(first.glob(f"scenes/*/*/{part}/*"))
+        assert len(files) == 4
+        for file in files:
+            other = second / file.relative_to(first)
+            if part == "annotations":
+                assert file.read_text() == other.read_text()
+            else:
+                assert np.array_equal(images.read_image(file), images.read_image(other))
+    for name in ("camera_poses.npy", "cam0_wrt_table.npy", "camK.npy"):
+        a, b = (np.load(next(root.glob(f"scenes/*/*/{name}"))) for root in (first, second))
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
+
+
+def test_bop_to_graspnet_and_back_loses_what_four_decimals_lose(bop, tmp_path):
+    done("export", bop, "--to", "graspnet", "--out", tmp_path / "g", "--table-is-world", "--quiet")
+    done("export", tmp_path / "g", "--to", "bop", "--out", tmp_path / "b", "--quiet")
+    before, after = open_labelled_bop(bop), open_labelled_bop(tmp_path / "b")
+    for i, j in zip(before.indices, after.indices, strict=True):
+        for a, b in zip(before.frame(i).objects, after.frame(j).objects, strict=True):
+            assert a.obj_id == b.obj_id
+            T = se3.invert(a.T_cam_obj) @ b.T_cam_obj
+            assert np.linalg.norm(T[:3, 3]) < 0.5e-4 * np.sqrt(3) + 1e-9
+            assert se3.angle(T) < 2e-4
+        for k in range(len(MODELS)):
+            seen = before.mask(i, k, visible=True), after.mask(j, k, visible=True)
+            assert np.array_equal(*seen)
+
+
+def test_labels_that_came_along_become_starts_and_are_never_overwritten(bop, tmp_path):
+    done("import", bop, tmp_path / "session", "--quiet")
+    store = SessionStore.open(tmp_path / "session")
+    starts = store.read_json("registration/starts.json")["starts"]
+    scene = open_labelled_bop(bop)
+    frame = scene.frame(scene.indices[0])
+    for start, o in zip(starts, frame.objects, strict=True):
+        np.testing.assert_allclose(start["T_world_obj"], frame.T_world_cam @ o.T_cam_obj, atol=1e-9)
+    before = (tmp_path / "session/imported/scene_gt.json").read_bytes()
+    assert store.verify() == []
+    done("import", bop, tmp_path / "session", "--quiet")
+    assert (tmp_path / "session/imported/scene_gt.json").read_bytes() == before
+
+
+def test_labels_can_be_left_behind(bop, tmp_path):
+    done("import", bop, tmp_path / "session", "--no-labels", "--quiet")
+    assert not (tmp_path / "session/imported").exists()
+    said = refused("export", tmp_path / "session", "--to", "bop", "--labels", "imported",
+                   "--out", tmp_path / "o")  # fmt: skip
+    assert "not imported with labels" in said
+    assert not (tmp_path / "o").exists()
+
+
+def test_cameras_that_nobody_told_follow_from_objects_that_stand_still(tmp_path):
+    scene = labelled_scene(tmp_path / "images", [0, 1, 2])
+    truth = {i: scene.frame(i).T_world_cam for i in scene.indices}
+    scene.change_frames(T_world_cam=None)
+    written_bop(tmp_path / "bop", scene)
+    done("import", tmp_path / "bop", tmp_path / "session", "--quiet")
+    views = SessionStore.open(tmp_path / "session").session.views
+    for v in views:
+        relative = se3.invert(truth[0]) @ truth[v.index]
+        np.testing.assert_allclose(v.T_world_cam, relative, atol=1e-9)
+
+
+def test_an_archive_is_imported_like_its_content(bop, tmp_path):
+    import shutil
+
+    shutil.make_archive(str(tmp_path / "data"), "zip", bop.parent, bop.name)
+    done("import", bop, tmp_path / "a", "--quiet")
+    done("import", tmp_path / "data.zip", tmp_path / "b", "--quiet")
+    for name in ("rgb/000003.png", "depth/000003.png", "imported/scene_gt.json"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+    assert "scene_gt.json" in done("import", tmp_path / "data.zip", "--list")
+
+
+def test_the_sums_and_counts_on_the_card_are_those_of_the_folder(bop, tmp_path):
+    (tmp_path / "s").mkdir()
+    out = tmp_path / "out"
+    done("export", bop, "--to", "bop", "--out", out, "--licence", "CC BY 4.0", "--quiet")
+    card = (out / "README.md").read_text()
+    assert "| images and labels | CC BY 4.0 |" in card
+    assert "| object models | not stated" in card
+    assert "1 scene, 4 frames, 12 object poses in them, 3 object models" in card
+    sums = dict(reversed(x.split("  ")) for x in (out / "SHA256SUMS").read_text().splitlines())
+    files = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    assert set(sums) == files - {"SHA256SUMS"}
+    assert all(hashlib.sha256((out / f).read_bytes()).hexdigest() == d for f, d in sums.items())
+
+
+def test_two_sources_that_count_alike_are_two_scenes(bop, tmp_path):
+    done("import", bop, tmp_path / "a", "--quiet")
+    done("export", bop, tmp_path / "a", "--to", "bop", "--out", tmp_path / "out", "--quiet")
+    assert sorted(p.parent.name for p in tmp_path.glob("out/*/*/scene_gt.json")) == [
+        "000000", "000001",
+    ]  # fmt: skip
+    assert "given twice" in refused("export", bop, bop, "--to", "bop", "--out", tmp_path / "o")
+
+
+def test_what_cannot_be_is_refused_and_leaves_nothing(bop, tmp_path):
+    out = tmp_path / "out"
+    assert "says nothing of COLMAP" in refused(
+        "export", bop, "--to", "colmap", "--out", out, "--table-is-world"
+    )
+    assert "lies inside the source" in refused("export", bop, "--to", "bop", "--out", bop / "again")
+    assert "it has 3" in refused("export", bop, "--to", "bop", "--out", out, "--scenes", "4")
+    assert "not there" in refused("export", tmp_path / "no", "--to", "bop", "--out", out)
+    (tmp_path / "empty").mkdir()
+    assert "accepted are" in refused("export", tmp_path / "empty", "--to", "bop", "--out", out)
+    assert not out.exists()
+
+
+def test_a_lens_is_told_or_undone_but_not_forgotten(tmp_path):
+    lens = np.array([-0.08, 0.02, 0.001, -0.001, 0.0])
+    from dataclasses import replace
+
+    scene = labelled_scene(
+        tmp_path / "images", [0, 1], intrinsics=replace(INTRINSICS, distortion=lens)
+    )
+    bop = written_bop(tmp_path / "bop", scene)
+    args = ("export", bop, "--to", "graspnet", "--table-is-world", "--quiet", "--out")
+    said = refused(*args, tmp_path / "g")
+    assert "--undistort" in said and "px" in said
+    done(*args, tmp_path / "g", "--undistort")
+    # The straight edge of a box is straight again: its mask is that of an ideal camera.
+    ideal = labelled_scene(tmp_path / "ideal", [0, 1])
+    label = images.read_image(next(Path(tmp_path / "g").glob("scenes/*/*/label/0000.png")))
+    for k, obj_id in enumerate(MODELS):
+        found, true = label == obj_id, ideal.mask(0, k, visible=True)
+        seen = label.shape[0] * label.shape[1]
+        assert np.count_nonzero(found ^ true) < 0.002 * seen
+    assert "contradict" in refused(*args, tmp_path / "x", "--undistort", "--ignore-distortion")
