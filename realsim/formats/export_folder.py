@@ -83,6 +83,11 @@ class ExportFolder:
         atomic.write_json(path, dict(asked))
         return cls(folder, asked, set(), resumed=False)
 
+    @property
+    def place(self) -> Path:
+        """The folder that a writer fills."""
+        return self.folder / self._prefix
+
     def has(self, piece: str) -> bool:
         """Return whether a piece is there."""
         return f"{self._prefix}{piece}" in self._done

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.untrusted.json_text import parsed_json
 
 MOST_ARRAY_BYTES = 4 << 30
 """Largest array that is read [bytes]: 30 million grasps, or 70 million samples of an arm."""
@@ -32,10 +33,6 @@ class CheckedGroup:
     def wrong(self, what: str) -> InputError:
         """Return the error that names the file and the place."""
         return InputError(f"{self._path}, {self._group.name}: {what}")
-
-    def where(self, name: str) -> str:
-        """Return what messages call a member."""
-        return f"{self._path}, {self._group.name}: '{name}'"
 
     def names(self) -> list[str]:
         """Return the names of the members, each a hard link."""
@@ -79,6 +76,13 @@ class CheckedGroup:
         """Return one text."""
         dataset = self._dataset(name, "SO", ())
         return self._decoded(name, self._read(name, dataset))
+
+    def json(self, name: str) -> Any:
+        """Return the values of a text that is JSON."""
+        try:
+            return parsed_json(self.text(name), f"'{name}'")
+        except InputError as error:
+            raise self.wrong(f"'{name}' is not JSON: {error}") from error
 
     def texts(self, name: str, count: int) -> tuple[str, ...]:
         """Return texts of fixed length; their size is known before they are read."""

@@ -2,15 +2,21 @@
 
 import json
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
+from realsim.errors import InputError, UnitError
 from realsim.formats.bop import labels as bop_labels
 from realsim.formats.bop import models as bop_models
 from realsim.formats.bop import scene as bop
+from realsim.formats.bop.opening import open_labelled_bop, open_labelled_scene
+from realsim.formats.bop.root_files import write_bop_models, write_bop_root
+from realsim.formats.bop.targets import read_targets
+from realsim.formats.bop.writing import write_bop_scene
+from realsim.formats.export_folder import ExportFolder
 from realsim.geometry.mesh import diameter, mass_properties
 from realsim.geometry.metrics import mssd
 from realsim.records import CaptureSession, View
@@ -111,3 +117,61 @@ def test_keyframes_that_are_not_there_are_named():
         bop.read_keyframe_poses(YCBV, 50, 2)
     with pytest.raises(InputError, match="cosypose, ground_truth"):
         bop.read_keyframe_poses(YCBV, 50, 1, source="megapose")
+
+
+@needs_ycbv
+@pytest.mark.real
+def test_a_real_data_set_is_written_again_with_the_same_numbers(tmp_path):
+    folder = ExportFolder.begin(tmp_path / "copy", {"what": "ycbv_mini"})
+    scenes = [open_labelled_scene(ref) for ref in bop.find_scenes(YCBV)]
+    for scene in scenes:
+        write_bop_scene(scene, folder)
+    used = {}
+    for scene in scenes:
+        used |= scene.models()
+    write_bop_models(used, folder, infos=scenes[0].models_info())
+    write_bop_root(folder, name="ycbv_mini")
+    folder.finish({})
+    for scene in scenes:
+        copy = open_labelled_bop(tmp_path / "copy", scene=scene.number)
+        path = scene.ref.layout.document("scene_camera")
+        assert json.loads(path.read_text()) == json.loads(
+            copy.ref.layout.document("scene_camera").read_text()
+        )
+        written = json.loads(copy.ref.layout.document("scene_gt").read_text())
+        assert written == json.loads(scene.truth.file.read_text())
+        for i in scene.indices:
+            assert copy.colour_file(i).read_bytes() == scene.colour_file(i).read_bytes()
+            assert copy.depth_file(i).read_bytes() == scene.depth_file(i).read_bytes()
+    said = json.loads((YCBV / "models/models_info.json").read_text())
+    kept = json.loads((tmp_path / "copy/models/models_info.json").read_text())
+    for key, row in kept.items():
+        numbers = {k: v for k, v in row.items() if k not in ("name", "density")}
+        assert numbers == said[key]
+    # Scenes 52 and 53 have approximate labels and no targets in the source.
+    source = {(t.scene_id, t.obj_id) for t in read_targets(YCBV / "test_targets_bop19.json")}
+    targets = read_targets(tmp_path / "copy/test_targets_bop19.json")
+    assert source <= {(t.scene_id, t.obj_id) for t in targets}
+
+
+@needs_ycbv
+@pytest.mark.real
+def test_depth_of_real_scenes_lies_just_before_the_labelled_origins():
+    for number in (50, 51, 54):
+        scene = open_labelled_bop(YCBV, scene=number)
+        assert all(o.instance is not None for o in scene.frame(1).objects)
+        (note,) = (n for n in scene.notes if "times as far" in n)
+        assert 0.9 < float(note.split(" is ")[1].split()[0]) < 1.0
+
+
+@needs_ycbv
+@pytest.mark.real
+@pytest.mark.parametrize("factor", [0.1, 10.0])
+def test_a_wrong_depth_scale_of_a_real_scene_is_found(tmp_path, factor):
+    shutil.copytree(YCBV / "test/000050", tmp_path / "test/000050")
+    path = tmp_path / "test/000050/scene_camera.json"
+    rows = json.loads(path.read_text())
+    rows["1"]["depth_scale"] *= factor
+    path.write_text(json.dumps(rows))
+    with pytest.raises(UnitError, match=r"with depth_scale 0\.1 depth would be 0\.9"):
+        open_labelled_bop(tmp_path)

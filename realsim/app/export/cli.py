@@ -8,7 +8,10 @@ import click
 from realsim.app.option_values import numbers_of
 
 FOLDER = click.Path(path_type=Path)
-FORMATS = ("bop", "graspnet", "colmap", "nerfstudio")
+FORMATS = (
+    "bop", "graspnet", "colmap", "nerfstudio", "grasp-group", "acronym", "graspgen", "isaac",
+    "hdf5", "parquet",
+)  # fmt: skip
 
 
 @click.command("export")
@@ -31,6 +34,8 @@ FORMATS = ("bop", "graspnet", "colmap", "nerfstudio")
 @click.option("--undistort", is_flag=True, help="Images as an ideal camera would see them.")
 @click.option("--ignore-distortion", is_flag=True, help="Raw images where no lens can be told.")
 @click.option("--table-is-world", is_flag=True, help="Where no table is known: it is z = 0.")
+@click.option("--least-score", default=0.0, show_default=True, type=click.FloatRange(0, 1),
+              help="Leave out worse grasps (isaac).")  # fmt: skip
 @click.option("--name", default="", help="Of the data set, on its card.")
 @click.option("--licence", default="", help="Of images and labels, on the card.")
 @click.option("--models-licence", default="", help="Of the object models, on the card.")

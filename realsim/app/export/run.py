@@ -8,7 +8,8 @@ from realsim.app.console import Console
 from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.sources import SourceScene, licence_files, source_scenes, trust_in
-from realsim.app.export.targets import TARGETS, SceneJob, ScenePlace, Target
+from realsim.app.export.target import SceneJob, ScenePlace, Target
+from realsim.app.export.targets import TARGETS
 from realsim.errors import InputError, RealsimError
 from realsim.formats.export_folder import STATE, ExportFolder
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene

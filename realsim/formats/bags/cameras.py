@@ -56,7 +56,7 @@ def colour_camera(recording: Recording, topics: Topics, choice: BagChoice) -> Ca
 
 
 def _of_topic(recording: Recording, info: str, image: ImageTopic) -> CameraIntrinsics:
-    message = next(iter(recording.decoded(info)))
+    message = recording.first_decoded(info)
     rectified = ci.is_rectified(image.name)
     return ci.camera_of(message, info, image.image.width, image.image.height, rectified)
 

@@ -1,5 +1,6 @@
 """From an image message to pixels: colour as RGB, depth as metres or as counts of 16 bit."""
 
+import contextlib
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats.bags.wire import ImageMessage
+from realsim.formats.image_headers import require_decodable
 
 Kind = Literal["colour", "grey", "depth", "other"]
 
@@ -143,6 +145,8 @@ def _rows(message: ImageMessage, used: int, name: str) -> NDArray[np.uint8]:
             f"bytes cannot be in {len(message.pixels)} bytes. The message is damaged."
         )
     pixels = message.pixels
+    if message.height == 1:  # its padding can be claimed to be gigabytes, and nothing follows it
+        return pixels[:used].reshape(1, used)
     if len(pixels) < step * message.height:  # some drivers leave out the last row's padding
         pixels = np.concatenate([pixels, np.zeros(step * message.height - len(pixels), np.uint8)])
     return pixels[: step * message.height].reshape(message.height, step)[:, :used]
@@ -162,7 +166,11 @@ def _decompressed(message: ImageMessage, name: str = "image") -> NDArray[Any]:
 
     skip = DEPTH_HEADER_BYTES if _is_depth_transport(message) else 0
     data = message.pixels[skip:]
-    image: Any = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    image: Any = None
+    if len(data):
+        require_decodable(data.tobytes(), name)
+        with contextlib.suppress(cv2.error):  # of images that end within a header
+            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if image is None:
         raise InputError(
             f"{name}: a compressed image of format '{message.encoding}' and {len(data)} bytes "

@@ -65,10 +65,28 @@ class FrameTimes:
         """Take over the metadata of one frame."""
         fields = fields_of(text)
         if "timestamp" in fields:
-            self.stamps_ns[receive_ns] = round(float(fields["timestamp"]) * NS_PER_MS)
+            self.stamps_ns[receive_ns] = round(
+                _numbers(fields["timestamp"], 1, "timestamp")[0] * NS_PER_MS
+            )
         self.domains.add(fields.get("timestamp_domain", "unknown"))
         if "depth_units" in fields:
-            self.units.add(_decimal(float(fields["depth_units"])))
+            self.units.add(_decimal(_numbers(fields["depth_units"], 1, "depth_units")[0]))
+
+
+def _numbers(text: str | None, count: int | None, name: str) -> Array:
+    """Return the numbers of a text such as "1.0,2.5".
+
+    Raises:
+        InputError: they are not `count` finite ones (None = any count).
+    """
+    try:
+        found = np.array([float(word) for word in (text or "").split(",")])
+    except ValueError:
+        found = np.array([np.nan])
+    if not np.all(np.isfinite(found)) or (count is not None and len(found) != count):
+        wanted = "numbers are" if count is None else f"{count} number{'s' * (count > 1)} are"
+        raise InputError(f"{name} is '{str(text)[:60]}'; {wanted} expected. It is damaged.")
+    return found
 
 
 def _decimal(value: float) -> float:
@@ -85,8 +103,9 @@ def depth_unit_m(recording: Recording, depth_topic: str) -> float | None:
     for name in ("Depth Units", "Depth_Units"):
         topic = recording.topics.get(f"{sensor}/option/{name}/value")
         if topic is not None and topic.count:
-            values = [_decimal(float(m.data)) for m in recording.decoded(topic.name)]
-            if values[-1] > 0:
+            texts = [str(m.data) for m in recording.decoded(topic.name)]
+            values = [_decimal(_numbers(t, 1, topic.name)[0]) for t in texts]
+            if values and values[-1] > 0:
                 return values[-1]
     return None
 
@@ -109,11 +128,11 @@ def _to_references(recording: Recording, stream: str) -> dict[str, Array]:
         start, _, reference = topic.name.rpartition("/")
         if start != f"{stream}/tf" or not topic.count:
             continue
-        message = next(iter(recording.decoded(topic.name)))
+        message = recording.first_decoded(topic.name)
         if topic.msgtype == STRING:
             fields = fields_of(str(message.data))
-            R = np.array([float(v) for v in fields["rotation"].split(",")]).reshape(3, 3).T
-            t = np.array([float(v) for v in fields["translation"].split(",")])
+            R = _numbers(fields.get("rotation"), 9, f"rotation of {topic.name}").reshape(3, 3).T
+            t = _numbers(fields.get("translation"), 3, f"translation of {topic.name}")
             # Six decimals were written: off by 1e-6, which check_rigid puts right.
             T = se3.check_rigid(se3.from_rt(R, t), topic.name)
         else:
@@ -129,9 +148,9 @@ def frame_rate(recording: Recording, image_topic: str) -> float | None:
     topic = recording.topics.get(f"{stream}/info") if stream else None
     if topic is None or not topic.count:
         return None
-    message = next(iter(recording.decoded(topic.name)))
+    message = recording.first_decoded(topic.name)
     text = fields_of(str(message.data)).get("fps", "0") if topic.msgtype == STRING else message.fps
-    return float(text) or None
+    return float(_numbers(str(text), 1, topic.name)[0]) or None
 
 
 def check_model(recording: Recording, image_topic: str) -> None:
@@ -144,9 +163,9 @@ def check_model(recording: Recording, image_topic: str) -> None:
     topic = recording.topics.get(f"{stream}/camera_info") if stream else None
     if topic is None or topic.msgtype != STRING or not topic.count:
         return
-    fields = fields_of(str(next(iter(recording.decoded(topic.name))).data))
+    fields = fields_of(str(recording.first_decoded(topic.name).data))
     model = fields.get("model", "")
-    coefficients = [float(v) for v in fields.get("coeffs", "0").split(",")]
+    coefficients = _numbers(fields.get("coeffs", "0"), None, f"coeffs of {topic.name}").tolist()
     if any(coefficients) and model.lower() not in ("brown conrady", "none"):
         raise InputError(
             f"{topic.name}: the lens model is '{model}' with coefficients {coefficients}; only "

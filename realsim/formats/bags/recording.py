@@ -75,11 +75,11 @@ class Recording:
             store = _ros2_types() if self.is_ros2 else None
             reader = AnyReader([self.path], default_typestore=store)
             reader.open()
-        self._reader = reader
-        for c in reader.connections:
-            known = self.topics.get(c.topic)
-            count = c.msgcount + (known.count if known else 0)
-            self.topics[c.topic] = Topic(c.topic, c.msgtype, count)
+            self._reader = reader
+            for c in reader.connections:
+                known = self.topics.get(c.topic)
+                count = c.msgcount + (known.count if known else 0)
+                self.topics[c.topic] = Topic(c.topic, c.msgtype, count)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -140,6 +140,16 @@ class Recording:
                 message = reader.deserialize(data, msgtype)
             yield message
 
+    def first_decoded(self, topic: str) -> Any:
+        """Return the first message of a topic as an object.
+
+        Raises:
+            InputError: it has none, whatever the recording's table of contents says.
+        """
+        for message in self.decoded(topic):
+            return message
+        raise InputError(f"{self.path.name}: topic {topic} has no messages.")
+
     def _open_reader(self) -> "AnyReader":
         if self._reader is None:
             raise RuntimeError("the recording is used outside its `with` block")
@@ -150,7 +160,7 @@ class Recording:
         """Turn whatever a damaged file makes the reader raise into one sentence."""
         try:
             yield
-        except (RealsimError, MemoryError):
+        except RealsimError:
             raise
         except Exception as error:
             remedy = REMEDY[self.path.suffix if self.path.is_file() else ""]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.untrusted.files import checked_text
 
 Array = NDArray[np.float64]
 YCB_OBJECTS = (
@@ -25,6 +26,8 @@ YCB_OBJECTS = (
 )  # fmt: skip
 """YCB-V's objects in the order of their BOP ids, 1 to 21."""
 COLUMNS = 7
+MOST_BYTES = 50e6
+"""Largest text file that is read [bytes]."""
 UNIT_TOLERANCE = 1e-3
 """How far a quaternion's length may be from 1: the files have six digits."""
 
@@ -38,8 +41,13 @@ def keyframe_row(root: Path | str, scene_id: int, image_id: int) -> int:
     path = Path(root) / "keyframe.txt"
     if not path.is_file():
         raise InputError(f"{path} does not exist; it says which row belongs to which image.")
-    rows = [line.split("/") for line in path.read_text(encoding="utf-8").split()]
-    keyframes = [int(image) for scene, image in rows if int(scene) == scene_id]
+    keyframes: list[int] = []
+    for line in checked_text(path, MOST_BYTES).split():
+        scene, _, image = line.partition("/")
+        if not (scene.isdecimal() and image.isdecimal()):
+            raise InputError(f"{path}: {line[:40]!r} is no keyframe; SCENE/IMAGE is expected.")
+        if int(scene) == scene_id:
+            keyframes.append(int(image))
     if image_id not in keyframes:
         raise InputError(
             f"image {image_id} is not a keyframe of scene {scene_id} in {path}; that scene has "
@@ -94,11 +102,13 @@ def _object_id(file: Path) -> int:
 
 
 def _pose(file: Path, row: int) -> Array | None:
-    lines = file.read_text(encoding="utf-8").splitlines()
+    lines = checked_text(file, MOST_BYTES).splitlines()
     if row >= len(lines):
         raise InputError(f"{file} has {len(lines)} rows; row {row + 1} is needed.")
     try:
         numbers = np.array([float(x) for x in lines[row].split()])
+        if not np.all(np.isfinite(numbers)):
+            raise ValueError
     except ValueError as error:
         raise InputError(f"{file}, row {row + 1} is not numbers: {lines[row]!r}.") from error
     if len(numbers) != COLUMNS:
@@ -107,7 +117,10 @@ def _pose(file: Path, row: int) -> Array | None:
         )
     if not np.any(numbers[:4]):
         return None
-    if abs(float(np.linalg.norm(numbers[:4])) - 1) > UNIT_TOLERANCE:
+    if (
+        np.abs(numbers[:4]).max() > 2
+        or abs(float(np.linalg.norm(numbers[:4])) - 1) > UNIT_TOLERANCE
+    ):
         raise InputError(
             f"{file}, row {row + 1}: the first four numbers {numbers[:4].tolist()} are no unit "
             "quaternion; qw qx qy qz x y z are expected."

@@ -1,6 +1,6 @@
 """Object models as BOP keeps them: obj_%06d.ply in millimetres and models_info.json."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +9,13 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
 from realsim.formats import images
-from realsim.formats.bop.units import MM_PER_M
+from realsim.formats.bop.units import MM_PER_M, flat
 from realsim.geometry import se3
 from realsim.geometry.mesh import diameter, load_mesh, ply_bytes
 from realsim.records import Mesh, ObjectModel
 from realsim.store import atomic
+from realsim.untrusted.json_text import read_json
+from realsim.untrusted.values import mapping, number, numbers, text
 
 Array = NDArray[np.float64]
 INFO_FILE = "models_info.json"
@@ -104,8 +106,6 @@ def load_models(
         InputError: no models there, an id without mesh, or broken files.
         UnitError: a mesh is not in millimetres.
     """
-    from realsim.store.session_store import read_json_file
-
     folder = Path(folder)
     files = {int(p.stem[4:]): p for p in folder.glob("obj_*.ply") if p.stem[4:].isdecimal()}
     if not files:
@@ -118,10 +118,10 @@ def load_models(
             f"{folder} has meshes but no {INFO_FILE}, so their symmetries are not known. Write one "
             'with a diameter [mm] per object, e.g. {"1": {"diameter": 172.1}}.'
         )
-    info: Any = read_json_file(folder / INFO_FILE)
+    info = mapping(read_json(folder / INFO_FILE), str(folder / INFO_FILE))
     require_meshes(files if obj_ids is None else obj_ids, files, str(folder))
     return {
-        i: _load_model(i, files[i], info.get(str(i), {}), notes)
+        i: _load_model(i, files[i], _row_of(info, i, folder / INFO_FILE), notes)
         for i in sorted(files if obj_ids is None else obj_ids)
     }
 
@@ -141,33 +141,51 @@ def require_meshes(wanted: Collection[int], present: Collection[int], where: str
         )
 
 
+def _row_of(info: Mapping[str, Any], obj_id: int, path: Path) -> dict[str, Any]:
+    return mapping(info.get(str(obj_id), {}), f"object {obj_id} of {path}")
+
+
 def _load_model(
     obj_id: int, file: Path, info: dict[str, Any], notes: list[str] | None
 ) -> ObjectModel:
     mesh = load_mesh(file, "mm", notes)
+    where = f"object {obj_id} of {file.parent / INFO_FILE}"
     _check_diameter(mesh, info, file)
     symmetries = [np.eye(4)]
-    for numbers in info.get("symmetries_discrete", ()):
-        S = np.asarray(numbers, dtype=np.float64).reshape(4, 4).copy()
+    for k, given in enumerate(_listed(info, "symmetries_discrete", where)):
+        name = f"discrete symmetry {k} of {where}"
+        S = numbers(flat(given), 16, name).reshape(4, 4).copy()
         S[:3, 3] /= MM_PER_M
-        symmetries.append(se3.check_rigid(S, f"a symmetry of object {obj_id} in {INFO_FILE}"))
-    axes = tuple(
-        (_three(s["axis"], 1.0), _three(s["offset"], 1.0 / MM_PER_M))
-        for s in info.get("symmetries_continuous", ())
-    )
+        symmetries.append(se3.check_rigid(S, name))
+    axes: list[tuple[tuple[float, float, float], tuple[float, float, float]]] = []
+    for k, given in enumerate(_listed(info, "symmetries_continuous", where)):
+        name = f"continuous symmetry {k} of {where}"
+        row = mapping(given, name)
+        axis = _three(row.get("axis"), 1.0, f"axis of {name}")
+        if not any(axis):
+            raise InputError(f"axis of {name} is 0 0 0; a direction is expected.")
+        axes.append((axis, _three(row.get("offset"), 1.0 / MM_PER_M, f"offset of {name}")))
     return ObjectModel(
         obj_id=obj_id,
-        name=str(info.get("name", file.stem)),
+        name=text(info.get("name", file.stem), f"name of {where}"),
         mesh=mesh,
         symmetries=np.stack(symmetries),
-        symmetry_axes=axes,
-        density=float(info.get("density", 1000.0)),
+        symmetry_axes=tuple(axes),
+        density=number(info.get("density", 1000.0), f"density of {where}"),
     )
 
 
-def _three(values: Any, factor: float) -> tuple[float, float, float]:
-    x, y, z = (float(v) * factor for v in values)
-    return x, y, z
+def _listed(info: Mapping[str, Any], key: str, where: str) -> Sequence[Any]:
+    value = info.get(key, ())
+    if not isinstance(value, (list, tuple)):
+        raise InputError(f"{key} of {where} is {value!r:.60}; a list is expected.")
+    return value  # pyright: ignore[reportUnknownVariableType]
+
+
+def _three(value: Any, factor: float, name: str) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in numbers(value, 3, name))
+    # One product for each: an offset that was written comes back to the last digit.
+    return x * factor, y * factor, z * factor
 
 
 def _check_diameter(mesh: Mesh, info: dict[str, Any], file: Path) -> None:
@@ -177,8 +195,10 @@ def _check_diameter(mesh: Mesh, info: dict[str, Any], file: Path) -> None:
             f"{file} has a diameter of {found_mm:.4g} mm; BOP models are in millimetres and at "
             f"most {LARGEST_DIAMETER_M:g} m is accepted. Is it in micrometres?"
         )
-    said_mm = info.get("diameter")
-    if said_mm is not None and not 1 / UNIT_RATIO < found_mm / float(said_mm) < UNIT_RATIO:
+    if "diameter" not in info:
+        return
+    said_mm = number(info["diameter"], f"diameter of {file.name} in {INFO_FILE}", 0.0)
+    if not said_mm / UNIT_RATIO < found_mm < said_mm * UNIT_RATIO:
         raise UnitError(
             f"{file} has a diameter of {found_mm:.4g} mm, but {INFO_FILE} says {said_mm:.4g} mm: "
             "one of them is not in millimetres. Scale the file that is wrong by 1000."

@@ -3,8 +3,9 @@
     DATASET/SPLIT/000050/{rgb|gray, depth, scene_camera.json, scene_gt.json}
 
 A session folder is such a scene, too. What a dataset leaves open (the depth scale, which of two
-ground truths, a camera that changes) is an error, not a guess. Writing is in `bop_labels`, models
-are in `bop_models`, and the estimates that come with YCB-V in `bop_keyframes`.
+ground truths, a camera that changes) is an error, not a guess. Names of files are in `layout`,
+models in `models`, the estimates that come with YCB-V in `keyframes`; `labelled` reads scenes with
+everything in them and a camera per image.
 """
 
 from collections.abc import Collection, Sequence
@@ -19,9 +20,11 @@ from realsim.errors import InputError
 from realsim.formats import images
 from realsim.formats.bop import units as bop_units
 from realsim.formats.bop.keyframes import read_keyframe_poses
+from realsim.formats.bop.layout import SceneLayout, cameras_of, scene_number
 from realsim.formats.bop.models import require_meshes
+from realsim.formats.bop.rows import read_cameras, read_ground_truth
 from realsim.records import CaptureSession, View
-from realsim.store.session_store import CAMERA_FILE, read_json_file
+from realsim.store.session_store import CAMERA_FILE
 
 __all__ = [
     "BopAnnotation",
@@ -34,10 +37,8 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
-COLOR_PLACES = ("rgb/{:06d}.png", "rgb/{:06d}.jpg", "gray/{:06d}.png", "gray/{:06d}.tif")
-DEPTH_PLACES = ("depth/{:06d}.png", "depth/{:06d}.tif")
 GT_FILE = "scene_gt.json"
-NOT_GT = ("scene_gt_info.json", "scene_gt_coco.json")
+NOT_GT = ("scene_gt_info", "scene_gt_coco")
 """Other files that begin like the ground truth."""
 SAME_K_PX = 1e-6
 """Camera matrices that differ by less are the same camera, written by another program."""
@@ -49,7 +50,20 @@ class BopSceneRef:
 
     split: str
     scene_id: int
+    """Of onboarding_static/obj_000001_up it is the object's."""
     folder: Path
+    camera: str = ""
+    """Type of the camera, of scenes with several: that of scene_camera_CAMTYPE.json."""
+
+    @property
+    def layout(self) -> SceneLayout:
+        """Names of its files."""
+        return SceneLayout(folder=self.folder, camera=self.camera)
+
+    @property
+    def name(self) -> str:
+        """Split, scene and camera, such as test-000050 or val-000003-cam1."""
+        return "-".join([self.split, self.folder.name, *([self.camera] if self.camera else [])])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -117,29 +131,39 @@ class BopScene:
 def find_scenes(root: Path | str) -> list[BopSceneRef]:
     """Return all scenes of a dataset root, of a split folder, or of one scene folder.
 
+    A scene with several cameras is there once for each; onboarding folders are scenes.
+
     Raises:
         InputError: there is none; the message lists where it was looked for.
     """
     root = Path(root)
     if not root.is_dir():
         raise InputError(f"{root} is not a folder; the root of a BOP dataset is expected.")
-    if (root / CAMERA_FILE).is_file():
-        return [_ref(root)]
-    scenes = sorted(p.parent for p in root.glob(f"*/{CAMERA_FILE}"))
-    scenes = scenes or sorted(p.parent for p in root.glob(f"*/*/{CAMERA_FILE}"))
+    if cameras_of(root):
+        return _refs(root)
+    pattern = f"{Path(CAMERA_FILE).stem}*.json"
+    scenes = {p.parent for p in root.glob(f"*/{pattern}") if cameras_of(p.parent)}
+    scenes = scenes or {p.parent for p in root.glob(f"*/*/{pattern}") if cameras_of(p.parent)}
     if not scenes:
         found = ", ".join(sorted(p.name for p in root.iterdir())[:12]) or "nothing"
         raise InputError(
             f"{root} holds no BOP scene. Looked for {CAMERA_FILE} here (a scene), in */ (a split) "
             f"and in */*/ (a dataset: SPLIT/000001/{CAMERA_FILE}); the folder has: {found}."
         )
-    return [_ref(scene) for scene in scenes]
+    return [ref for scene in sorted(scenes) for ref in _refs(scene)]
 
 
-def _ref(folder: Path) -> BopSceneRef:
+def _refs(folder: Path) -> list[BopSceneRef]:
     folder = folder.resolve()
-    scene_id = int(folder.name) if folder.name.isdecimal() else 0
-    return BopSceneRef(split=folder.parent.name, scene_id=scene_id, folder=folder)
+    return [
+        BopSceneRef(
+            split=folder.parent.name,
+            scene_id=scene_number(folder.name),
+            folder=folder,
+            camera=camera,
+        )
+        for camera in cameras_of(folder)
+    ]
 
 
 def read_scene(ref: BopSceneRef, image_ids: Sequence[int] | None = None) -> BopScene:
@@ -154,33 +178,36 @@ def read_scene(ref: BopSceneRef, image_ids: Sequence[int] | None = None) -> BopS
         NotRigidError: a rotation that is none.
         UnitError: a translation that is not in millimetres.
     """
-    cameras = _by_image(read_json_file(ref.folder / CAMERA_FILE), ref.folder / CAMERA_FILE)
+    path = ref.layout.document("scene_camera")
+    cameras = read_cameras(path)
     if image_ids is not None:
         absent = sorted(set(image_ids) - set(cameras))
         if absent:
             raise InputError(
-                f"image {', '.join(map(str, absent))} is not in {ref.folder / CAMERA_FILE}; it has "
+                f"image {', '.join(map(str, absent))} is not in {path}; it has "
                 f"{', '.join(map(str, sorted(cameras)[:12]))}."
             )
         cameras = {i: cameras[i] for i in image_ids}
-    color = _files(ref.folder, cameras, COLOR_PLACES)
+    there = ref.layout.colour_files()
+    color = {i: there[i] for i in cameras if i in there}
     missing = tuple(sorted(set(cameras) - set(color)))
     cameras = {i: cameras[i] for i in sorted(color)}
     if not cameras:
         raise InputError(
-            f"{ref.folder} is an empty scene: {CAMERA_FILE} lists {len(missing)} images and none "
-            "of them is in rgb/ or gray/."
+            f"{ref.folder} is an empty scene: {path.name} lists {len(missing)} images and none "
+            f"of them is in rgb{ref.layout.suffix}/ or gray{ref.layout.suffix}/."
         )
-    file, annotations = _read_ground_truth(ref.folder)
+    file, annotations = _read_ground_truth(ref)
+    deep = ref.layout.depth_files()
     return BopScene(
         ref=ref,
         session=_read_session(ref, cameras, color),
         ground_truth={i: annotations.get(i, []) for i in cameras} if file else {},
         ground_truth_file=file,
-        approximate=file not in (None, GT_FILE),
+        approximate=file not in (None, ref.layout.document("scene_gt").name),
         missing_images=missing,
         color_files=color,
-        depth_files=_files(ref.folder, cameras, DEPTH_PLACES),
+        depth_files={i: deep[i] for i in cameras if i in deep},
     )
 
 
@@ -194,30 +221,11 @@ def check_models(scene: BopScene, obj_ids: Collection[int]) -> None:
     require_meshes(used, obj_ids, f"the models given for scene {scene.ref.scene_id}")
 
 
-def _by_image(data: Any, path: Path) -> dict[int, Any]:
-    try:
-        return {int(key): value for key, value in data.items()}
-    except (AttributeError, ValueError) as error:
-        raise InputError(
-            f"{path} is not an object with one entry per image number ({error})."
-        ) from error
-
-
-def _files(folder: Path, wanted: Collection[int], places: Sequence[str]) -> dict[int, Path]:
-    found: dict[int, Path] = {}
-    for index in wanted:
-        for place in places:
-            if (folder / place.format(index)).is_file():
-                found[index] = folder / place.format(index)
-                break
-    return found
-
-
 def _read_session(
     ref: BopSceneRef, cameras: dict[int, Any], color: dict[int, Path]
 ) -> CaptureSession:
     """Return the session of a scene whose images all have one camera."""
-    path = ref.folder / CAMERA_FILE
+    path = ref.layout.document("scene_camera")
     names = {i: f"image {i} of {path}" for i in cameras}
     first = next(iter(cameras))
     width, height = images.image_size(color[first])
@@ -246,32 +254,45 @@ def _read_session(
     )
 
 
-def _read_ground_truth(folder: Path) -> tuple[str | None, dict[int, list[BopAnnotation]]]:
-    """Return the ground-truth file's name and its annotations, by image."""
-    candidates = sorted(p.name for p in folder.glob("scene_gt*.json") if p.name not in NOT_GT)
-    if GT_FILE in candidates:
-        name = GT_FILE
-    elif len(candidates) > 1:
+def ground_truth_file(ref: BopSceneRef) -> Path | None:
+    """Return the file of the annotations: scene_gt.json, or the only other scene_gt*.json.
+
+    Raises:
+        InputError: there is no scene_gt.json, but several others.
+    """
+    expected = ref.layout.document("scene_gt")
+    if expected.is_file() or ref.camera:
+        return expected if expected.is_file() else None
+    others = sorted(p for p in ref.folder.glob("scene_gt*.json") if not _is_of_others(p))
+    if len(others) > 1:
         raise InputError(
-            f"{folder} has no {GT_FILE}, but {', '.join(candidates)}: which one holds is not "
-            f"known. Rename the right one to {GT_FILE}."
+            f"{ref.folder} has no {GT_FILE}, but {', '.join(p.name for p in others)}: which one "
+            f"holds is not known. Rename the right one to {GT_FILE}."
         )
-    elif not candidates:
+    return others[0] if others else None
+
+
+def _is_of_others(path: Path) -> bool:
+    """Return whether a scene_gt*.json holds something else, or what another camera saw."""
+    if path.name.startswith(NOT_GT):
+        return True
+    camera = path.stem.removeprefix("scene_gt_")
+    return SceneLayout(folder=path.parent, camera=camera).document("scene_camera").is_file()
+
+
+def _read_ground_truth(ref: BopSceneRef) -> tuple[str | None, dict[int, list[BopAnnotation]]]:
+    """Return the ground-truth file's name and its annotations, by image."""
+    path = ground_truth_file(ref)
+    if path is None:
         return None, {}
-    else:
-        name = candidates[0]
-    path = folder / name
+    truth = read_ground_truth(path, least_id=0)
     annotations = {
-        i: [_annotation(a, f"object {k} of image {i} of {path}") for k, a in enumerate(rows)]
-        for i, rows in _by_image(read_json_file(path), path).items()
+        i: [
+            BopAnnotation(obj_id=int(obj_id), T_cam_obj=T)
+            for obj_id, T in zip(
+                truth.obj_ids[truth.places(i)], truth.Ts_cam_obj[truth.places(i)], strict=True
+            )
+        ]
+        for i in truth.rows
     }
-    return name, annotations
-
-
-def _annotation(data: Any, name: str) -> BopAnnotation:
-    keys = ("obj_id", "cam_R_m2c", "cam_t_m2c")
-    if not isinstance(data, dict) or any(key not in data for key in keys):
-        raise InputError(f"{name} must be an object with {', '.join(keys)}; found {data!r}.")
-    touching = data.get(bop_units.AT_THE_LENS) is True
-    T = bop_units.object_in_camera(data["cam_R_m2c"], data["cam_t_m2c"], name, may_touch=touching)
-    return BopAnnotation(obj_id=int(data["obj_id"]), T_cam_obj=T)
+    return path.name, annotations

@@ -34,7 +34,12 @@ class BopSource:
     def name(self) -> str:
         """Split and scene, such as test-000050."""
         ref = self._scene.ref
-        return f"{ref.split}-{ref.folder.name}"
+        return ref.name
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Numbers of the images, in the order of the frames."""
+        return self._indices
 
     @property
     def intrinsics(self) -> CameraIntrinsics:
@@ -64,7 +69,7 @@ class BopSource:
 
     def _content_key(self) -> str:
         scene = self._scene
-        digest = hashlib.sha256((scene.ref.folder / CAMERA_FILE).read_bytes())
+        digest = hashlib.sha256(scene.ref.layout.document("scene_camera").read_bytes())
         for i in self._indices:
             for path in (scene.color_files[i], scene.depth_files.get(i)):
                 if path is not None:
@@ -93,19 +98,41 @@ class BopSource:
             )
 
 
-def choose_scene(root: Path | str, number: int | None) -> BopSceneRef:
+def choose_scene(
+    root: Path | str, number: int | None, *, camera: str = "", split: str | None = None
+) -> BopSceneRef:
     """Return the scene of a dataset that was asked for, or its only one.
+
+    Args:
+        root: dataset, split or scene.
+        number: of the scene; None = the only one.
+        camera: type of its camera, where it has several; "" = the only one.
+        split: None = any.
 
     Raises:
         InputError: none, several of which none was chosen, or not that one; lists them.
     """
     scenes = find_scenes(root)
-    listed = shown([f"{s.scene_id} ({s.split}/{s.folder.name})" for s in scenes], 12)
-    chosen = scenes if number is None else [s for s in scenes if s.scene_id == number]
+    places = ["/".join([s.split, s.folder.name, *([s.camera] if s.camera else [])]) for s in scenes]
+    listed = shown([f"{s.scene_id} ({p})" for s, p in zip(scenes, places, strict=True)], 12)
+    chosen = [
+        s
+        for s in scenes
+        if number in (None, s.scene_id) and camera in ("", s.camera) and split in (None, s.split)
+    ]
     if not chosen:
-        raise InputError(f"{root} has no scene {number}; it has {listed}.")
+        asked = [f"scene {'of any number' if number is None else number}"]
+        asked += [f"camera '{camera}'"] if camera else []
+        asked += [f"split '{split}'"] if split else []
+        raise InputError(f"{root} has no {', '.join(asked)}; it has {listed}.")
     if len(chosen) > 1:
         what = "scenes" if number is None else f"scenes of number {number}"
+        if len({s.folder for s in chosen}) == 1:
+            raise InputError(
+                f"{chosen[0].folder} was seen by {len(chosen)} cameras: "
+                f"{', '.join(s.camera or '(none)' for s in chosen)}. Choose one of them by its "
+                "name (camera)."
+            )
         raise InputError(
             f"{root} has {len(chosen)} {what}: {listed}, and a session holds one. Choose with "
             "--scene N, or give the folder of one scene."
@@ -113,18 +140,21 @@ def choose_scene(root: Path | str, number: int | None) -> BopSceneRef:
     return chosen[0]
 
 
-def open_bop(root: Path | str, *, scene: int | None = None, use_depth: bool = True) -> BopSource:
+def open_bop(
+    root: Path | str, *, scene: int | None = None, use_depth: bool = True, camera: str = ""
+) -> BopSource:
     """Return a scene of a BOP dataset as a frame source.
 
     Args:
         root: dataset, split or scene.
         scene: number of the scene, where there are several.
         use_depth: whether depth is imported.
+        camera: type of the camera, where the scene has several.
 
     Raises:
         InputError: no scene, several, cameras that change, sizes that differ, no depth_scale.
     """
-    found = read_scene(choose_scene(root, scene))
+    found = read_scene(choose_scene(root, scene, camera=camera))
     if not use_depth:
         found.depth_files.clear()
     indices = sorted(found.color_files)
@@ -141,7 +171,8 @@ def open_bop(root: Path | str, *, scene: int | None = None, use_depth: bool = Tr
         )
         indices = [i for i in indices if found.has_depth(i)]
     _require_sizes(found, indices)
-    posed = sum(found.session.view(i).T_world_cam is not None for i in indices)
+    used = set(indices)
+    posed = sum(v.index in used and v.T_world_cam is not None for v in found.session.views)
     if posed < len(indices):
         notes.append(
             f"{len(indices) - posed} of {len(indices)} images have no camera pose (cam_R_w2c, "

@@ -1,6 +1,6 @@
 """BOP's numbers and ours: millimetres and row-major lists there, metres and T_a_b here.
 
-The only place, together with `bop_models`, where BOP's units change.
+The only place, together with `models`, where BOP's units change.
 """
 
 from typing import Any
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
+from realsim.untrusted.values import number, numbers
 
 Array = NDArray[np.float64]
 MM_PER_M = 1000.0
@@ -24,6 +25,17 @@ FARTHEST_MM = 20_000.0
 """An object farther than 20 m is on no table: the file holds micrometres or was converted twice."""
 
 
+def flat(value: Any) -> Any:
+    """Return a matrix written as a list of rows as one list; all else as it is.
+
+    BOP's own annotation tool writes rotations nested, its data sets write them flat.
+    """
+    rows: list[Any] = value if isinstance(value, list) else []
+    if rows and all(isinstance(row, list) for row in rows):
+        return [number for row in rows for number in row]
+    return value
+
+
 def rigid_from_lists(rotation: Any, translation_mm: Any, name: str) -> Array:
     """Return T (4, 4) [m] of a row-major rotation (9 numbers or nested) and a translation [mm].
 
@@ -32,14 +44,15 @@ def rigid_from_lists(rotation: Any, translation_mm: Any, name: str) -> Array:
         InputError: the lists do not have 9 and 3 numbers.
     """
     try:
-        R = np.asarray(rotation, dtype=np.float64).reshape(3, 3)
-        t = np.asarray(translation_mm, dtype=np.float64).reshape(3)
-    except (ValueError, TypeError) as error:
+        R = numbers(flat(rotation), 9, "the rotation").reshape(3, 3)
+        t = numbers(flat(translation_mm), 3, "the translation")
+    except InputError as error:
         raise InputError(
             f"{name}: a rotation of 9 numbers (row by row) and a translation of 3 [mm] are "
-            f"expected, found {rotation!r} and {translation_mm!r}."
+            f"expected, found {rotation!r:.300} and {translation_mm!r:.100} ({error})"
         ) from error
-    return se3.check_rigid(se3.from_rt(R, t / MM_PER_M), name)
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers are refused, not warned of
+        return se3.check_rigid(se3.from_rt(R, t / MM_PER_M), name)
 
 
 def lists_from_rigid(T: ArrayLike) -> tuple[list[float], list[float]]:
@@ -114,10 +127,10 @@ def intrinsics_of(entry: dict[str, Any], width: int, height: int, name: str) -> 
             f"{name} has no cam_K; it has: {', '.join(entry) or 'nothing'}. The 9 numbers of the "
             "camera matrix, row by row, are needed."
         )
-    K = np.asarray(entry["cam_K"], dtype=np.float64)
-    if K.size != 9:
-        raise InputError(f"{name}: cam_K has {K.size} numbers; 9 (row by row) are expected.")
+    K = numbers(flat(entry["cam_K"]), 9, f"cam_K of {name}")
     distortion = entry.get("cam_distortion")
+    if distortion is not None:
+        distortion = numbers(distortion, None, f"cam_distortion of {name}")
     return CameraIntrinsics.from_K(K.reshape(3, 3), width, height, distortion)
 
 
@@ -133,7 +146,10 @@ def depth_unit_of(entry: dict[str, Any], name: str) -> float:
             f"{', '.join(entry) or 'nothing'}. Add depth_scale (1.0 if a count is 1 mm, 0.1 if it "
             "is 0.1 mm)."
         )
-    return float(entry["depth_scale"]) / MM_PER_M
+    scale = number(entry["depth_scale"], f"depth_scale of {name}")
+    if scale <= 0:
+        raise InputError(f"depth_scale of {name} is {scale:g}; a positive number is expected.")
+    return scale / MM_PER_M
 
 
 def T_world_cam_of(entry: dict[str, Any], name: str) -> Array | None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats.colmap.files import require_whole
+from realsim.formats.plausible_camera import require_plausible
 from realsim.geometry import se3
 from realsim.interop import T_from_rigid3d, opencv_from_colmap_px
 from realsim.records import CameraIntrinsics
@@ -137,7 +138,7 @@ def _intrinsics(camera: Any, folder: Path) -> CameraIntrinsics:
     names = PARAMETERS[model].split()
     p = dict(zip(names, (float(x) for x in camera.params), strict=True))
     cx, cy = (float(x) for x in opencv_from_colmap_px([p["cx"], p["cy"]]))
-    return CameraIntrinsics(
+    intrinsics = CameraIntrinsics(
         width=int(camera.width),
         height=int(camera.height),
         fx=p.get("fx", p.get("f", 0.0)),
@@ -146,3 +147,5 @@ def _intrinsics(camera: Any, folder: Path) -> CameraIntrinsics:
         cy=cy,
         distortion=np.array([p.get(k, 0.0) for k in OPENCV_ORDER]),
     )
+    require_plausible(intrinsics, f"camera {camera.camera_id} of {folder}")
+    return intrinsics

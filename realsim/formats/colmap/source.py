@@ -1,15 +1,18 @@
 """The registered images of a COLMAP model as a frame source."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats import images
+from realsim.formats.colmap.depth import checked_by_depth, find_depth
 from realsim.formats.colmap.model import ColmapImage, ColmapModel, find_model, read_model
+from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.joining import natural_key
 from realsim.formats.folders.listing import image_header, shown
 from realsim.formats.folders.source import file_digest, require_one_size
@@ -28,8 +31,10 @@ class ColmapSource:
     def __init__(
         self, name: str, model: ColmapModel, camera: CameraIntrinsics,
         files: Sequence[tuple[ColmapImage, Path]], notes: Sequence[str], scale: float | None,
+        depth: Mapping[str, Path], unit_m: float | None,
     ) -> None:  # fmt: skip
         """Take over what was checked; see `open_colmap`."""
+        self._depth, self._unit_m = dict(depth), unit_m
         self._name, self._model, self._camera = name, model, camera
         self._files, self._notes, self._scale = tuple(files), tuple(notes), scale
 
@@ -45,8 +50,8 @@ class ColmapSource:
 
     @property
     def depth_unit_m(self) -> float | None:
-        """None: a COLMAP model has no depth images."""
-        return None
+        """Metres per count; None without depth images, which COLMAP itself has not."""
+        return self._unit_m
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -59,6 +64,8 @@ class ColmapSource:
         digest = hashlib.sha256()
         for image, path in self._files:
             digest.update(file_digest(path, image.name))
+            if image.name in self._depth:
+                digest.update(file_digest(self._depth[image.name], image.name))
             digest.update(image.T_world_cam.tobytes())
         return {
             "kind": "colmap",
@@ -80,11 +87,12 @@ class ColmapSource:
         """
         for k in range(start, len(self._files)):
             image, path = self._files[k]
-            T = image.T_world_cam.copy()
-            T[:3, 3] *= 1.0 if self._scale is None else self._scale
+            deep = self._depth.get(image.name)
             yield SourceFrame(
-                name=image.name, time_s=float(k), rgb=images.read_rgb(path), T_world_cam=T
-            )
+                name=image.name, time_s=float(k), rgb=images.read_rgb(path),
+                depth_counts=None if deep is None else read_counts(deep),
+                T_world_cam=_metric(image, self._scale),
+            )  # fmt: skip
 
 
 def open_colmap(
@@ -93,6 +101,9 @@ def open_colmap(
     images_folder: Path | str | None = None,
     camera_id: int | None = None,
     metres_per_unit: float | None = None,
+    depth_folder: Path | str | None = None,
+    depth_unit_m: float | None = None,
+    use_depth: bool = True,
 ) -> ColmapSource:
     """Return a COLMAP model with its images as a frame source.
 
@@ -101,6 +112,10 @@ def open_colmap(
         images_folder: where the images are; None = looked for in the project.
         camera_id: which camera's images, where the model has several cameras.
         metres_per_unit: metres per unit of the model's world; None = not known.
+        depth_folder: 16-bit PNG of the images' names; None = depth/ in the project, if a unit is
+            given. Depth judges the direction of the poses and the scale.
+        depth_unit_m: metres per count of depth.
+        use_depth: whether depth is imported.
 
     Raises:
         InputError: no model, several cameras, images that are not there or of another size.
@@ -133,15 +148,34 @@ def open_colmap(
             f"{camera.width}x{camera.height} px. Give the images that COLMAP was run on with "
             "--images."
         )
-    if metres_per_unit is None:
+    there.sort(key=lambda pair: natural_key(pair[0].name))
+    depth: dict[str, Path] = {}
+    unit_m: float | None = None
+    if use_depth and (depth_folder is not None or depth_unit_m is not None):
+        depth = find_depth(root, depth_folder, [i.name for i, _ in there], notes)
+    if depth:
+        there = [pair for pair in there if pair[0].name in depth]
+        Ts = np.stack([_metric(i, metres_per_unit) for i, _ in there])
+        paths = [depth[i.name] for i, _ in there]
+        unit_m, said = checked_by_depth(
+            paths, Ts, camera, depth_unit_m, str(folder), metres_per_unit
+        )
+        notes += said
+    elif metres_per_unit is None:
         notes.append(
             "scale unknown: a COLMAP model has an arbitrary scale and world; camera poses are "
             "taken as if its unit were the metre. Give --scale (metres per unit) once it is known, "
             "such as a measured distance over the same distance in the model."
         )
-    there.sort(key=lambda pair: natural_key(pair[0].name))
     name = root.resolve().name if folder != root else folder.resolve().parent.name
-    return ColmapSource(name, model, camera, there, notes, metres_per_unit)
+    return ColmapSource(name, model, camera, there, notes, metres_per_unit, depth, unit_m)
+
+
+def _metric(image: ColmapImage, scale: float | None) -> NDArray[np.float64]:
+    """Return T_world_cam of an image with its translation in metres, as far as they are known."""
+    T = image.T_world_cam.copy()
+    T[:3, 3] *= 1.0 if scale is None else scale
+    return T
 
 
 def _of_one_camera(

@@ -3,6 +3,7 @@
 A text file of titled matrices; a line that begins with # is the title of the numbers below it.
 """
 
+import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +14,14 @@ from numpy.typing import NDArray
 from realsim.errors import InputError, UnitError
 from realsim.formats.folders.joining import FrameState
 from realsim.geometry import se3
+from realsim.untrusted.files import checked_bytes
 
 Array = NDArray[np.float64]
 FILE = "cam.info.txt"
 COLOUR_TITLE = "color camera intrinsic matrix"
 POSE_TITLE = re.compile(r"camera-to-world extrinsic matrix.* for (\S+)\s*$", re.IGNORECASE)
+MOST_BYTES = 20e6
+"""Of 50,000 poses [bytes]."""
 FARTHEST_M = 50.0
 """A camera farther from the world's origin was written in millimetres."""
 
@@ -43,19 +47,22 @@ def read_cam_info(path: Path) -> CamInfo:
     """Return the camera matrix and the poses of a cam.info.txt.
 
     Raises:
-        InputError: a matrix is incomplete, or the camera's is missing.
+        InputError: there is no such file, a matrix is incomplete, or the camera's is missing.
         UnitError: the poses are not in metres.
     """
     blocks: list[tuple[str, list[float]]] = []
-    for number, line in enumerate(path.read_text(errors="replace").splitlines(), start=1):
-        text = line.strip()
-        if text.startswith("#"):
-            blocks.append((text.lstrip("# "), []))
+    text = checked_bytes(path, MOST_BYTES).decode(errors="replace")  # titles may be of any encoding
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.strip()
+        if words.startswith("#"):
+            blocks.append((words.lstrip("# "), []))
             continue
         try:
-            values = [float(word) for word in text.split()]
+            values = [float(word) for word in words.split()]
         except ValueError as error:
             raise InputError(f"{path}, line {number}: numbers are expected ({error}).") from error
+        if not all(map(math.isfinite, values)):
+            raise InputError(f"{path}, line {number}: '{words:.80}' has a number that is none.")
         if values and not blocks:
             raise InputError(f"{path}, line {number}: numbers without a title above them.")
         if values:

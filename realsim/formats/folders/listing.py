@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from realsim.errors import InputError
+from realsim.formats.image_headers import MOST_PIXELS
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """Endings of image files."""
@@ -28,8 +29,6 @@ JPEG_TAIL_BYTES = 4096
 """A JPEG's end mark stands within its last so many bytes, or the file was cut off."""
 MAX_IMAGES = 50_000
 """Images in one folder; more are a whole data set of many scenes."""
-MAX_PIXELS = 250_000_000
-"""Pixels of one image: beyond it the header is damaged or hostile."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -91,8 +90,8 @@ def image_header(path: Path) -> ImageFile:
             f"{path} is not an image that can be read ({size} bytes; {error}). Copy it again from "
             "where it came, or delete it: its frame is then left out."
         ) from error
-    if width * height > MAX_PIXELS:
-        raise InputError(f"{path} claims {width}x{height} pixels; at most {MAX_PIXELS} are read.")
+    if width * height > MOST_PIXELS:
+        raise InputError(f"{path} claims {width}x{height} pixels; at most {MOST_PIXELS} are read.")
     if turned not in (0, 1):
         raise InputError(
             f"{path} is marked to be shown turned (EXIF orientation {turned}): tools differ in "

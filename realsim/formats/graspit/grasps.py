@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats.graspit.contacts import contact_distances, midway_error
+from realsim.formats.hdf5_checked import opened
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, Scene, SupportPlane
 
@@ -41,8 +42,19 @@ class WorldGrasps:
     """(N,) distance of the outer contacts along the closing axis [m]; NaN = it meets no surface."""
 
 
-def object_grasps(path: Path, scene: Scene, models: Mapping[int, ObjectModel]) -> list[WorldGrasps]:
+def object_grasps(
+    path: Path,
+    scene: Scene,
+    models: Mapping[int, ObjectModel],
+    names: Mapping[int, str] | None = None,
+) -> list[WorldGrasps]:
     """Return the grasps of a scene's objects, in the objects' frames.
+
+    Args:
+        path: grasps.hdf5.
+        scene: the objects' poses.
+        models: by object id.
+        names: of the objects in the file, by instance; None = those of their models.
 
     Raises:
         InputError: damaged, of other objects, or in another frame than its authors' code writes:
@@ -52,10 +64,11 @@ def object_grasps(path: Path, scene: Scene, models: Mapping[int, ObjectModel]) -
     sets: list[WorldGrasps] = []
     for o in scene.objects:
         model = models[o.obj_id]
-        Ts_world = by_name.get(model.name)
+        name = model.name if names is None else names[o.instance]
+        Ts_world = by_name.get(name)
         if Ts_world is None:
             continue
-        where = f"{path.name}, '{model.name}'"
+        where = f"{path.name}, '{name}'"
         half_turn = se3.invert(Ts_world[:, 0]) @ Ts_world[:, 1]
         if np.abs(half_turn - np.diag([-1.0, -1.0, 1.0, 1.0])).max(initial=0.0) > 1e-4:
             raise InputError(
@@ -86,26 +99,29 @@ def read_grasp_file(path: Path) -> dict[str, Array]:
         InputError: no such file, or other content.
         NotRigidError: a pose is not rigid.
     """
-    import h5py
-
-    found: dict[str, Array] = {}
-    try:
-        with h5py.File(path, "r") as file:
-            for name in file:
-                data: Any = file[name]
-                shape = getattr(data, "shape", ())
-                if len(shape) != 4 or shape[1:] != (2, 4, 4) or shape[0] > MOST_GRASPS:
-                    raise InputError(
-                        f"{path}: '{name}' has the shape {shape}; (N, 2, 4, 4) is expected, at "
-                        f"most {MOST_GRASPS} grasps."
-                    )
-                found[str(name)] = np.asarray(data[()], dtype=np.float64)
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise InputError(f"{path} is not an HDF5 file of grasps ({error}).") from error
+    with opened(path) as file:
+        names = file.names()
+        _require_sizes(path, names)
+        found = {n: file.numbers(n, (None, 2, 4, 4)) for n in names}
     return {
         n: se3.check_rigid(T, f"the grasps of '{n}' in {path}") if len(T) else T
         for n, T in found.items()
     }
+
+
+def _require_sizes(path: Path, names: list[str]) -> None:
+    """Raise if an array claims more grasps than are read: a short file can claim gigabytes."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        for name in names:
+            data: Any = file[name]
+            shape: Any = getattr(data, "shape", None) or ()
+            if shape[1:] != (2, 4, 4) or shape[0] > MOST_GRASPS:
+                raise InputError(
+                    f"{path}: '{name}' has the shape {shape}; (N, 2, 4, 4) is expected, at most "
+                    f"{MOST_GRASPS} grasps."
+                )
 
 
 def _require_our_frame(mesh: Mesh, Ts_obj_grasp: Array, where: str) -> None:

@@ -7,7 +7,7 @@ Metres, world z up. The file does not say in which order its quaternions are wri
 has to prove it: read in the right order, the objects stand at one height and the grasps' contacts
 lie on the objects. USD files are read from the STL of the same name.
 
-Grasps are in `graspit_grasps`.
+Grasps are in `grasps`, writing in `writing`.
 """
 
 from collections.abc import Mapping
@@ -30,6 +30,7 @@ from realsim.formats.graspit.grasps import (
 from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh
 from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim.untrusted.yaml_text import read_yaml
 
 Array = NDArray[np.float64]
 QuaternionOrder = Literal["wxyz", "xyzw"]
@@ -58,6 +59,16 @@ class OrderEvidence:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SourceFile:
+    """The values of a scene.yaml."""
+
+    values: dict[str, Any]
+    """Everything, keys that are not known here too."""
+    keys: dict[int, str]
+    """Keys of the objects, by instance."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class GraspitScene:
     """A scene.yaml as it was read."""
 
@@ -67,6 +78,10 @@ class GraspitScene:
     evidence: dict[QuaternionOrder, OrderEvidence]
     grasp_file: Path | None
     """None: there is none beside the scene."""
+    names: dict[int, str]
+    """Of the objects in the file, by instance; grasps are kept under them."""
+    source: SourceFile
+    """What the file holds; a writer gives its numbers back to the last digit."""
     notes: tuple[str, ...]
 
 
@@ -74,6 +89,7 @@ class GraspitScene:
 class _Entry:
     """One object of the file."""
 
+    key: str
     name: str
     mesh_file: Path
     numbers: Array
@@ -151,6 +167,8 @@ def read_graspit_scene(
         order=order,
         evidence=evidence,
         grasp_file=grasp_file,
+        names={k: e.name for k, e in enumerate(entries)},
+        source=SourceFile(values=data, keys={k: e.key for k, e in enumerate(entries)}),
         notes=tuple(notes),
     )
 
@@ -163,29 +181,17 @@ def read_graspit_grasps(found: GraspitScene) -> list[WorldGrasps]:
     """
     if found.grasp_file is None:
         raise InputError(f"scene '{found.scene.name}' has no {GRASP_FILE} beside it.")
-    return object_grasps(found.grasp_file, found.scene, found.models)
+    return object_grasps(found.grasp_file, found.scene, found.models, found.names)
 
 
 # --- the file -----------------------------------------------------------------------------------
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
-    """Return the file's mapping; the safe loader makes plain values only."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
+    """Return the file's mapping of plain values."""
     if not path.is_file():
         raise InputError(f"{path} does not exist; the {SCENE_FILE} of a GraspIT scene is expected.")
-    if path.stat().st_size > LARGEST_YAML:
-        raise InputError(
-            f"{path} has {path.stat().st_size / 1e6:.1f} MB; a scene has a few kilobytes and at "
-            f"most {LARGEST_YAML / 1e6:g} MB are read."
-        )
-    try:
-        data: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8-sig"))
-    except (YAMLError, ValueError, TypeError, RecursionError, AttributeError) as error:
-        first = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise InputError(f"{path} is not YAML that can be read ({first}).") from error
+    data = read_yaml(path, most_bytes=LARGEST_YAML)
     if not isinstance(data, dict):
         raise InputError(f"{path} holds no named objects; object1: {{file_path: ...}} is expected.")
     mapping = cast("dict[Any, Any]", data)
@@ -216,6 +222,7 @@ def _entries(data: dict[str, Any], path: Path, meshes: Path | None) -> list[_Ent
             )
         found.append(
             _Entry(
+                key=key,
                 name=str(fields["name"]),
                 mesh_file=_mesh_file(str(fields["file_path"]), path.parent, meshes, where),
                 numbers=np.array(q),

@@ -1,27 +1,44 @@
-"""Camera poses as GraspNet-1Billion stores them: two npy files in a camera's folder.
+"""Camera poses as GraspNet-1Billion stores them: npy files in a camera's folder.
 
 `camera_poses.npy` (N, 4, 4) holds every camera in the FIRST camera's frame, `cam0_wrt_table.npy`
 (4, 4) the first camera in the table's frame, so that
 
     T_table_cam[i] = cam0_wrt_table @ camera_poses[i]
 
-in metres, cameras as OpenCV's.
+in metres, cameras as OpenCV's (generate_scene_model of graspnetAPI). `camK.npy` (3, 3) is the
+camera matrix [px].
 """
 
+import io
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.errors import InputError
+from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
+from realsim.untrusted.arrays import read_npy
 
 Array = NDArray[np.float64]
 
-POSES, FIRST = "camera_poses.npy", "cam0_wrt_table.npy"
+POSES, FIRST, MATRIX = "camera_poses.npy", "cam0_wrt_table.npy", "camK.npy"
 MOST_VIEWS = 100_000
 """A file with more is no camera poses."""
+FARTHEST_M = 20.0
+"""Cameras about a table are nearer to each other, and to it; a greater number is millimetres."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class CameraFiles:
+    """What the npy files of a camera's folder say; None = the file is not there."""
+
+    poses: Array | None
+    """(N, 4, 4) as in the file: camera i in camera 0 [m]."""
+    first: Array | None
+    """(4, 4) as in the file: camera 0 in table [m]."""
+    K: Array | None
+    """(3, 3) [px]."""
 
 
 def read_camera_poses(folder: Path | str) -> Array:
@@ -32,31 +49,65 @@ def read_camera_poses(folder: Path | str) -> Array:
         NotRigidError: a matrix is not a rigid transform.
     """
     folder = Path(folder)
-    first, relative = _read_npy(folder / FIRST), _read_npy(folder / POSES)
-    if first.shape != (4, 4) or relative.ndim != 3 or relative.shape[1:] != (4, 4):
-        raise InputError(
-            f"{folder}: {FIRST} has the shape {first.shape} and {POSES} {relative.shape}; (4, 4) "
-            "and (N, 4, 4) are needed."
-        )
-    if not 0 < len(relative) <= MOST_VIEWS:
-        raise InputError(
-            f"{folder / POSES} holds {len(relative)} poses; 1 to {MOST_VIEWS} are read."
-        )
-    first = se3.check_rigid(first, str(folder / FIRST))
-    return first @ se3.check_rigid(relative, str(folder / POSES))
+    for name in (FIRST, POSES):
+        if not (folder / name).is_file():
+            raise InputError(
+                f"there is no {folder / name}; a GraspNet camera folder holds {POSES} and {FIRST}."
+            )
+    found = read_camera_files(folder)
+    assert found.first is not None and found.poses is not None
+    first = se3.check_rigid(found.first, str(folder / FIRST))
+    return first @ se3.check_rigid(found.poses, str(folder / POSES))
 
 
-def _read_npy(path: Path) -> Array:
-    """Return an array of numbers.
+def read_camera_files(folder: Path) -> CameraFiles:
+    """Return what the npy files of a camera's folder say, their shapes and units checked.
 
     Raises:
-        InputError: no file there, or not one of numbers.
+        InputError: a file is damaged, or has another shape.
+        NotRigidError: a matrix is not a rigid transform.
+        UnitError: translations in millimetres.
+    """
+    poses, first = _optional(folder / POSES), _optional(folder / FIRST)
+    K = _optional(folder / MATRIX)
+    if first is not None and first.shape != (4, 4):
+        raise InputError(f"{folder / FIRST} has the shape {first.shape}; (4, 4) is needed.")
+    if poses is not None and (poses.ndim != 3 or poses.shape[1:] != (4, 4)):
+        raise InputError(f"{folder / POSES} has the shape {poses.shape}; (N, 4, 4) is needed.")
+    if poses is not None and not 0 < len(poses) <= MOST_VIEWS:
+        raise InputError(f"{folder / POSES} holds {len(poses)} poses; 1 to {MOST_VIEWS} are read.")
+    if K is not None and K.shape != (3, 3):
+        raise InputError(f"{folder / MATRIX} has the shape {K.shape}; (3, 3) is needed.")
+    for name, Ts in ((FIRST, first), (POSES, poses)):
+        if Ts is None:
+            continue
+        se3.check_rigid(Ts, str(folder / name))
+        far = float(np.max(np.linalg.norm(Ts[..., :3, 3], axis=-1)))
+        if far > FARTHEST_M:
+            raise UnitError(
+                f"{folder / name} holds a translation of {far:g}; it is in metres, and no camera "
+                f"about a table is {FARTHEST_M:g} m away. If the file is in millimetres, divide "
+                "its translations by 1000."
+            )
+    return CameraFiles(poses=poses, first=first, K=K)
+
+
+def npy_bytes(array: Array) -> bytes:
+    """Return an array as the bytes of a npy file."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _optional(path: Path) -> Array | None:
+    """Return the numbers of a file, None where there is none.
+
+    Raises:
+        InputError: not an array of real numbers.
     """
     if not path.is_file():
-        raise InputError(f"there is no {path}; a GraspNet camera folder holds {POSES} and {FIRST}.")
-    try:
-        # Mapped first: a header can claim any size, and pickles are refused.
-        array: Any = np.load(path, mmap_mode="r", allow_pickle=False)
-        return np.array(array, dtype=np.float64)
-    except (ValueError, EOFError, TypeError, OSError) as error:
-        raise InputError(f"{path} is not a numpy array of numbers ({error}).") from error
+        return None
+    array = read_npy(path, most_bytes=MOST_VIEWS * 16 * 8 + 4096)
+    if array.dtype.kind not in "fiu":
+        raise InputError(f"{path} has the type {array.dtype}; an array of numbers is needed.")
+    return np.array(array, dtype=np.float64)

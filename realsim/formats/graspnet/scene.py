@@ -19,18 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.formats.graspnet.annotations import ANNOTATIONS, read_objects
 from realsim.formats.graspnet.cameras import POSES, read_camera_poses
+from realsim.formats.graspnet.models import MESH_FILES, mesh_file
+from realsim.formats.graspnet.tree import CAMERAS
 from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 
 Array = NDArray[np.float64]
-CAMERAS = ("realsense", "kinect")
-ANNOTATIONS = "annotations"
-MESH_FILES = ("nontextured.ply", "textured.ply", "textured.obj", "nontextured_simplified.ply")
-"""Looked for in a model's folder, in this order."""
-LARGEST_XML = 1_000_000
-"""[bytes]: a scene of ten objects has 4 kB."""
 CHECKED_VIEWS = 8
 """Other images whose annotations are compared with the one that is used."""
 AGREE_M = 0.005
@@ -126,63 +123,27 @@ def read_annotation(path: Path) -> dict[int, Array]:
     """Return T_cam_obj (4, 4) [m] by GraspNet's object number.
 
     Raises:
-        InputError: missing, too large, with entities, or not GraspNet's XML.
+        InputError: missing, too large, with entities, not GraspNet's XML, or an object twice.
     """
-    from xml.etree import ElementTree
-
-    if path.stat().st_size > LARGEST_XML:
-        raise InputError(
-            f"{path} has {path.stat().st_size / 1e6:.1f} MB; an annotation has a few kilobytes."
-        )
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (UnicodeDecodeError, OSError) as error:
-        raise InputError(f"{path} cannot be read as text ({error}).") from error
-    if "<!" in text.replace("<!--", ""):
-        raise InputError(f"{path} declares a document type or entities; no annotation needs them.")
-    try:
-        root = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError, RecursionError) as error:
-        raise InputError(f"{path} is damaged XML ({error}).") from error
     found: dict[int, Array] = {}
-    for k, node in enumerate(root.iter("obj")):
-        where = f"object {k} of {path}"
-        number = _numbers(node.findtext("obj_id", ""), 1, f"obj_id of {where}")[0]
-        position = _numbers(node.findtext("pos_in_world", ""), 3, f"pos_in_world of {where}")
-        q = np.array(_numbers(node.findtext("ori_in_world", ""), 4, f"ori_in_world of {where}"))
-        if abs(float(np.linalg.norm(q)) - 1.0) > 0.01:
-            raise InputError(
-                f"ori_in_world of {where} has the length {float(np.linalg.norm(q)):.3g}; a "
-                "quaternion w x y z of length 1 is needed."
-            )
-        if number != int(number) or number < 0 or int(number) in found:
-            raise InputError(f"{where} has the obj_id {number:g}; whole numbers, each once.")
-        found[int(number)] = se3.from_rt(se3.from_quaternion_wxyz(q), position)
+    for o in read_objects(path):
+        if o.number in found:
+            raise InputError(f"{path} has the obj_id {o.number} twice; whole numbers, each once.")
+        found[o.number] = o.T_cam_obj
     if not found:
         raise InputError(f"{path} holds no <obj>; <scene><obj>...</obj></scene> is expected.")
     return found
-
-
-def _numbers(text: str, count: int, name: str) -> list[float]:
-    try:
-        numbers = [float(word) for word in text.split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count or not np.all(np.isfinite(numbers)):
-        raise InputError(f"{name} is {text.strip()[:60]!r}; {count} finite number(s) are needed.")
-    return numbers
 
 
 def _load_models(folder: Path, Ts: dict[int, Array]) -> tuple[dict[int, ObjectModel], list[str]]:
     models: dict[int, ObjectModel] = {}
     notes = ["ids are GraspNet's object numbers + 1; names are its numbers."]
     for i in Ts:
-        home = folder / f"{i:03d}"
-        file = next((home / n for n in MESH_FILES if (home / n).is_file()), None)
+        file = mesh_file(folder, i)
         if file is None:
             raise InputError(
-                f"object {i} has no mesh: none of {', '.join(MESH_FILES)} is in {home}. Give the "
-                "dataset's 'models' folder."
+                f"object {i} has no mesh: none of {', '.join(MESH_FILES)} is in "
+                f"{folder / f'{i:03d}'}. Give the dataset's 'models' folder."
             )
         mesh = load_mesh(file, "m", notes)
         models[i + 1] = ObjectModel(obj_id=i + 1, name=f"{i:03d}", mesh=mesh)

@@ -17,7 +17,6 @@ Source: NVlabs/acronym, acronym_tools/acronym.py and the example files.
 """
 
 import io
-import json
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -197,11 +196,20 @@ def read_acronym(path: Path | str) -> AcronymGrasps:
 
 
 def _get_object(group: CheckedGroup) -> AcronymObject:
+    def numbers(name: str, shape: tuple[int, ...]) -> Array | None:
+        if not group.has(name):
+            return None
+        found = group.numbers(name, shape)
+        if not np.all(np.isfinite(found)):
+            raise group.wrong(f"'{name}' holds a number that is not finite.")
+        return found
+
     def number(name: str) -> float | None:
-        return float(group.numbers(name, ())) if group.has(name) else None
+        found = numbers(name, ())
+        return None if found is None else float(found)
 
     scale = number("scale")
-    if scale is None or not (np.isfinite(scale) and scale > 0):
+    if scale is None or scale <= 0:
         raise group.wrong(f"the scale is {scale}; a number above 0 is expected.")
     return AcronymObject(
         file=group.text("file"),
@@ -210,8 +218,8 @@ def _get_object(group: CheckedGroup) -> AcronymObject:
         friction=number("friction"),
         mass_kg=number("mass"),
         volume_m3=number("volume"),
-        center_of_mass=group.numbers("com", (3,)) if group.has("com") else None,
-        inertia=group.numbers("inertia", (3, 3)) if group.has("inertia") else None,
+        center_of_mass=numbers("com", (3,)),
+        inertia=numbers("inertia", (3, 3)),
     )
 
 
@@ -223,10 +231,7 @@ def _get_set(group: CheckedGroup, Ts_obj_grasp: Array) -> GraspSet:
         for name, (attribute, _, _) in COLUMNS.items()
     }
     measured = group.group("measures")
-    try:
-        parameters = json.loads(group.text("parameters"))
-    except ValueError as error:
-        raise group.wrong(f"the parameters are not JSON ({error}).") from error
+    parameters = group.json("parameters")
     found = GraspSet(
         obj_id=group.attribute("obj_id", int),
         instance=group.attribute("instance", int),

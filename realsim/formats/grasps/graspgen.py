@@ -125,7 +125,7 @@ def read_graspgen(path: Path | str, frame: HandFrame | None = None) -> GraspGenG
         mesh = str(obj["file"])
         used = known_frame(frame or ours.get("frame", "acronym"))
         scores, widths = _ours(ours, "scores", len(Ts)), _ours(ours, "widths_m", len(Ts))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(
             f"{path} is no file of GraspGen's grasps ({error!r}): object.file, object.scale, "
             "grasps.transforms (4x4 each) and grasps.object_in_gripper are expected."

@@ -18,7 +18,6 @@ reader's convenience: T_obj_grasp and T_world_obj are what is read back.
 """
 
 import io
-import json
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -200,10 +199,7 @@ def _get_set(group: CheckedGroup) -> GraspSet:
         name: measured.numbers(name, (n, stages) if MEASURES[name].by_stage else (n,))
         for name in known_measures(measured.names(), measured)
     }
-    try:
-        parameters = json.loads(group.text("parameters"))
-    except ValueError as error:
-        raise group.wrong(f"the parameters are not JSON ({error}).") from error
+    parameters = group.json("parameters")
     if not isinstance(parameters, dict):
         raise group.wrong("the parameters are no JSON object.")
     return GraspSet(

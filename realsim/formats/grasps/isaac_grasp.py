@@ -21,7 +21,6 @@ object_frame and gripper_frame, which are read, too.
 """
 
 import json
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,12 +35,14 @@ from realsim.formats.grasps.scene_grasps import check_values, executed, untried_
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.store import atomic
+from realsim.untrusted.values import mapping, number, numbers
+from realsim.untrusted.yaml_text import read_yaml
 
 Array = NDArray[np.float64]
 FORMAT_VERSION = 1.0
 FINGER = "panda_finger_joint1"
-MOST_BYTES = 256 << 20
-"""Largest file that is read [bytes]: 800,000 grasps; YAML is read at some MB/s."""
+WIDEST_M = 1.0
+"""A finger that has moved farther is in millimetres [m]."""
 UNIT_TOLERANCE = 1e-3
 """How far a quaternion's length may be from 1: files written by hand have five decimals."""
 
@@ -152,12 +153,12 @@ def read_isaac_grasp(path: Path | str, frame: HandFrame = "panda_hand") -> Isaac
         InputError: it is none, of another version, or a grasp of it is not one.
     """
     path = Path(path)
-    data = _loaded(path)
+    data = read_yaml(path)
     if not isinstance(data, dict) or data.get("format") != "isaac_grasp":
         raise InputError(f"{path} is no isaac_grasp file: it must begin with format: isaac_grasp.")
     try:
         found = float(data.get("format_version", "nan"))
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = float("nan")
     if found != FORMAT_VERSION:
         raise InputError(
@@ -171,7 +172,7 @@ def read_isaac_grasp(path: Path | str, frame: HandFrame = "panda_hand") -> Isaac
     for name, entry in listed.items():
         try:
             rows.append(_row(entry))
-        except (KeyError, TypeError, ValueError, InputError) as error:
+        except InputError as error:
             raise InputError(
                 f"{path}: {name} is no grasp ({error}); confidence in 0 to 1, position [x, y, z] "
                 "and orientation {w, xyz: [x, y, z]} of unit length are expected."
@@ -188,40 +189,26 @@ def read_isaac_grasp(path: Path | str, frame: HandFrame = "panda_hand") -> Isaac
     )
 
 
-def _loaded(path: Path) -> Any:
-    """Return the values of a YAML file, plain ones only."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    if not path.is_file():
-        raise InputError(f"{path} does not exist; give an isaac_grasp YAML file.")
-    if path.stat().st_size > MOST_BYTES:
-        raise InputError(f"{path} has {path.stat().st_size / 1e6:.0f} MB; at most 268 MB are read.")
-    try:
-        return YAML(typ="safe").load(path.read_text(encoding="utf-8"))
-    except (YAMLError, ValueError, RecursionError) as error:
-        reason = re.sub(r"\s+", " ", str(error))[:200]
-        raise InputError(f"{path} is not valid YAML ({reason}).") from error
-
-
 def _row(entry: Any) -> Array:
     """Return position, quaternion x y z w, confidence, width and opening of one grasp (10,)."""
-    turn = entry["orientation"]
-    xyzw = [*(float(q) for q in turn["xyz"]), float(turn["w"])]
-    row = np.array(
+    grasp = mapping(entry, "the grasp")
+    turn = mapping(grasp.get("orientation"), "'orientation'")
+    xyzw = [*numbers(turn.get("xyz"), 3, "'xyz'"), number(turn.get("w"), "'w'")]
+    length = float(np.linalg.norm(xyzw))
+    if abs(length - 1) > UNIT_TOLERANCE:
+        raise InputError(f"the quaternion has the length {length:.4f}")
+    return np.array(
         [
-            *(float(x) for x in entry["position"]), *xyzw, float(entry["confidence"]),
-            _fingers_m(entry.get("cspace_position")),
-            _fingers_m(entry.get("pregrasp_cspace_position")),
+            *numbers(grasp.get("position"), 3, "'position'"), *xyzw,
+            number(grasp.get("confidence"), "'confidence'", 0, 1),
+            _fingers_m(grasp.get("cspace_position")),
+            _fingers_m(grasp.get("pregrasp_cspace_position")),
         ]
     )  # fmt: skip
-    if row.shape != (10,) or not np.all(np.isfinite(row[:8])) or not 0 <= row[7] <= 1:
-        raise ValueError(f"found {row.tolist()}")
-    if abs(float(np.linalg.norm(xyzw)) - 1) > UNIT_TOLERANCE:
-        raise ValueError(f"the quaternion has the length {np.linalg.norm(xyzw):.4f}")
-    return row
 
 
 def _fingers_m(joints: Any) -> float:
     """Return the distance of the fingers [m], NaN if the file does not say it."""
-    return 2 * float(joints[FINGER]) if isinstance(joints, dict) and FINGER in joints else np.nan
+    if not isinstance(joints, dict) or FINGER not in joints:
+        return np.nan
+    return 2 * number(joints[FINGER], f"'{FINGER}'", 0, WIDEST_M)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from realsim.models.convex import ConvexConfig
 from realsim_sim_bridge.arm.reach import ReachConfig
+from realsim_sim_bridge.grasping.analytic_config import AnalyticConfig
 from realsim_sim_bridge.grasping.candidates import CandidateConfig
 from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.school.sweep import SweepConfig
@@ -27,6 +28,8 @@ class SchoolConfig:
     """Heavier ones neither [kg]: the arm carries 3."""
     hand: HandGeometry = field(default_factory=HandGeometry)
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
+    analytic: AnalyticConfig | None = None
+    """Try analytic grasps, with the friction from which they close, instead of sampled ones."""
     convex: ConvexConfig = field(default_factory=ConvexConfig)
     reach: ReachConfig = field(default_factory=ReachConfig)
     slip: SlipConfig = field(default_factory=SlipConfig)

@@ -20,6 +20,7 @@ from realsim_sim_bridge.arm.reach import Reach, ReachTask, check_reach
 from realsim_sim_bridge.grasping.candidates import Candidates, sample_candidates
 from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
 from realsim_sim_bridge.grasping.surroundings import Surroundings, standing_object
+from realsim_sim_bridge.school.analytic_source import analytic_grasps
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.slip.body import SlipBody
 
@@ -50,6 +51,9 @@ class ObjectTask:
     """Folder for the convex parts of meshes, or None to keep none."""
     solid: KnownSolid | None = None
     """Convex parts and matter, where a model library knows them."""
+    labels_file: Path | None = None
+    """GraspNet's labels of the object, where the config asks for analytic grasps; None = they are
+    computed."""
 
     def inputs(self) -> dict[str, Any]:
         """Return everything the result depends on besides the config; arrays as hashes."""
@@ -62,6 +66,9 @@ class ObjectTask:
                 "known_inertia": _hash(matter.inertia),
                 "known_parts": _hash(*self.solid.parts.parts),
             }
+        if self.labels_file is not None:
+            digest = hashlib.sha256(self.labels_file.read_bytes()).hexdigest()
+            known["labels"] = f"{self.labels_file.name} {digest[:16]}"
         return {
             "obj_id": self.obj_id,
             "name": self.name,
@@ -127,8 +134,11 @@ def prepare(task: ObjectTask) -> Prepared:
     An object that cannot be tried (no volume, mass out of range) has no body; the notes say why.
     """
     config, rng = task.config, chance_of(task)
-    found = candidates_of(task, rng)
+    analytic = None if config.analytic is None else analytic_grasps(task, config.analytic, rng)
+    found = candidates_of(task, rng) if analytic is None else analytic.candidates
     notes: dict[str, Any] = {"counts": found.counts}
+    if analytic is not None:
+        notes["analytic"] = analytic.counts
     body, why_not = _body(task, notes)
     if body is None:
         return _untried(found, why_not, notes)
@@ -154,7 +164,9 @@ def prepare(task: ObjectTask) -> Prepared:
         joints_lifted=reach.joints_lifted,
         reasons=tuple(_with_names(reason, dict(task.names)) for reason in reach.reasons),
         trajectories=reach.trajectories,
-        measures=closure.measures(),
+        # A label's own friction goes before that of graspnetAPI's evaluation, which is coarser.
+        measures=closure.measures()
+        | ({} if analytic is None else {"closure_friction": analytic.closure_friction}),
         body=body,
         notes=notes,
     )

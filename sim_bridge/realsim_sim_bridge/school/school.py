@@ -37,6 +37,7 @@ def run_school(  # noqa: PLR0913 - keywords, each with a meaning of its own
     solids: Mapping[int, KnownSolid] | None = None,
     restart: Restart = False,
     shard_grasps: int | None = None,
+    label_files: Mapping[int, Path] | None = None,
 ) -> list[GraspSet]:
     """Return the scored grasps of every object whose pose was not rejected.
 
@@ -52,6 +53,7 @@ def run_school(  # noqa: PLR0913 - keywords, each with a meaning of its own
         solids=solids,
         restart=restart,
         shard_grasps=shard_grasps,
+        label_files=label_files,
     )
     return [result.grasp_set for result in results]
 
@@ -67,6 +69,7 @@ def run_school_results(  # noqa: PLR0913 - as above
     solids: Mapping[int, KnownSolid] | None = None,
     restart: Restart = False,
     shard_grasps: int | None = None,
+    label_files: Mapping[int, Path] | None = None,
 ) -> list[SchoolResult]:
     """Return grasps and trajectories of every object whose pose was not rejected.
 
@@ -89,6 +92,8 @@ def run_school_results(  # noqa: PLR0913 - as above
             refusing; "finished" = only where that run was finished.
         shard_grasps: most grasps that are tested in one go; None = some seconds' worth. A dead
             worker loses one shard at most.
+        label_files: GraspNet's labels by object id, where the config asks for analytic grasps;
+            those of other objects are computed.
 
     Raises:
         InputError: the scene has no plane, or an object without a model; the cache holds a run with
@@ -96,7 +101,7 @@ def run_school_results(  # noqa: PLR0913 - as above
         KeyboardInterrupt: Ctrl-C; it says how to go on.
     """
     config = config or SchoolConfig()
-    tasks = object_tasks(scene, models, config, cache, solids)
+    tasks = object_tasks(scene, models, config, cache, solids, label_files)
     size = default_shard_grasps(config) if shard_grasps is None else shard_grasps
     if size < 1:
         raise InputError(f"shard_grasps is {size}; 1 or more grasps in one go are accepted.")
@@ -150,6 +155,7 @@ def object_tasks(
     config: SchoolConfig,
     cache: Path | None,
     solids: Mapping[int, KnownSolid] | None = None,
+    label_files: Mapping[int, Path] | None = None,
 ) -> list[ObjectTask]:
     """Return the task of every object that is tried.
 
@@ -194,6 +200,7 @@ def object_tasks(
                 config=config,
                 cache=cache,
                 solid=(solids or {}).get(obj.obj_id),
+                labels_file=(label_files or {}).get(obj.obj_id),
             )
         )
     return tasks

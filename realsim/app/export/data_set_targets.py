@@ -1,0 +1,161 @@
+"""Data sets and cameras that `realsim export` writes."""
+
+from collections.abc import Sequence
+
+from realsim.app.export.request import ExportRequest
+from realsim.app.export.target import IMAGES, METRES, OPENCV, PIXEL, Models, SceneJob, Target
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.labelled_scene import LabelledScene, WrittenScene
+
+
+def _bop(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
+    from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
+
+    config = BopWriteConfig(
+        colour=job.request.colour, jpeg_quality=job.request.jpeg_quality, masks=job.request.masks,
+        number=job.place.number, split=job.request.split or scene.split, camera=job.place.camera,
+    )  # fmt: skip
+    return write_bop_scene(scene, folder, config, progress=job.tick)
+
+
+def _bop_root(
+    _written: Sequence[WrittenScene], models: Models, folder: ExportFolder, request: ExportRequest
+) -> None:
+    from realsim.formats.bop.root_files import write_bop_models, write_bop_root
+
+    write_bop_models(models, folder)
+    write_bop_root(folder, name=request.name or folder.folder.resolve().name)
+
+
+def _graspnet(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
+    from realsim.formats.graspnet.tree import CAMERAS
+    from realsim.formats.graspnet.write_plan import GraspnetWriteConfig
+    from realsim.formats.graspnet.writing import write_graspnet_scene
+
+    request = job.request
+    camera = scene.camera if scene.camera in CAMERAS else request.camera or CAMERAS[0]
+    config = GraspnetWriteConfig(
+        camera=camera, number=job.place.number, ignore_distortion=request.ignore_distortion,
+        table_is_world=request.table_is_world, without_labels=not request.masks,
+    )  # fmt: skip
+    return write_graspnet_scene(scene, folder, config, progress=job.tick)
+
+
+def _graspnet_root(
+    _written: Sequence[WrittenScene],
+    models: Models,
+    folder: ExportFolder,
+    _request: ExportRequest,
+) -> None:
+    from realsim.formats.graspnet.writing import write_graspnet_models
+
+    write_graspnet_models(models, folder)
+
+
+def _colmap(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
+    from realsim.formats.colmap.writing import ColmapWriteConfig, write_colmap
+
+    config = ColmapWriteConfig(points=job.request.points)
+    return write_colmap(scene, folder.below(job.place.name), config, progress=job.tick)
+
+
+def _nerfstudio(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
+    from realsim.formats.nerfstudio.writing import NerfstudioWriteConfig, write_nerfstudio
+
+    return write_nerfstudio(
+        scene, folder.below(job.place.name), NerfstudioWriteConfig(), progress=job.tick
+    )
+
+
+DATA_SETS: dict[str, Target] = {
+    "bop": Target(
+        name="BOP",
+        kind="dataset",
+        help="scenewise BOP: images, poses, masks, models, targets",
+        conventions=(
+            ("units", "millimetres; depth png * depth_scale = mm"),
+            OPENCV,
+            PIXEL,
+            ("cam_R_m2c, cam_t_m2c", "object -> camera, row-major"),
+            ("cam_R_w2c, cam_t_w2c", "world -> camera, row-major; left out where not known"),
+            ("visib_fract", "visible pixels / all of the silhouette, beyond the border too"),
+            (
+                "cam_distortion",
+                "not BOP's own key: OpenCV's k1 k2 p1 p2 k3 k4 k5 k6",
+            ),
+        ),
+        loading=(
+            "import json, pathlib\n"
+            'scene = pathlib.Path("{scene}")\n'
+            'poses = json.loads((scene / "scene_gt.json").read_text())'
+        ),
+        write_scene=_bop,
+        write_root=_bop_root,
+        options=(
+            "labels",
+            "split",
+            "camera",
+            "models",
+            "colour",
+            "jpeg_quality",
+            "masks",
+            "undistort",
+        ),
+    ),
+    "graspnet": Target(
+        name="GraspNet-1Billion",
+        kind="dataset",
+        help="GraspNet's tree: annotations, camera poses, meta, labels, models",
+        conventions=(
+            ("units", "metres; depth png in millimetres (factor_depth 1000)"),
+            OPENCV,
+            ("camera_poses.npy", "camera i -> camera 0: p_0 = camera_poses[i] @ p_i"),
+            ("cam0_wrt_table.npy", "camera 0 -> table, z up"),
+            ("pos_in_world, ori_in_world", "object -> THIS image's camera; wxyz; four decimals"),
+            ("objects", "numbered from 0: realsim's and BOP's id - 1; label images hold the id"),
+        ),
+        loading=(
+            "import numpy as np\n"
+            'poses = np.load("{scene}/camera_poses.npy")  # (N, 4, 4) camera i -> camera 0'
+        ),
+        write_scene=_graspnet,
+        write_root=_graspnet_root,
+        options=(
+            "labels",
+            "camera",
+            "models",
+            "masks",
+            "undistort",
+            "ignore_distortion",
+            "table_is_world",
+        ),
+    ),
+    "colmap": Target(
+        name="COLMAP",
+        kind="cameras",
+        help="cameras, images and points of a sparse model, one project a scene",
+        conventions=(
+            METRES,
+            OPENCV,
+            ("poses", "world -> camera, quaternion wxyz"),
+            ("pixels", "the first pixel's centre is at 0.5"),
+        ),
+        loading='import pycolmap\nmodel = pycolmap.Reconstruction("{scene}/sparse/0")',
+        write_scene=_colmap,
+        options=(*IMAGES, "points"),
+    ),
+    "nerfstudio": Target(
+        name="nerfstudio",
+        kind="cameras",
+        help="transforms.json with images, depth and masks, one folder a scene",
+        conventions=(
+            METRES,
+            ("camera axes", "OpenGL: x right, y up, z backward"),
+            ("transform_matrix", "camera -> world"),
+            ("depth", "16-bit PNG; depth_unit_scale_factor = metres per count"),
+        ),
+        loading='import json\nframes = json.load(open("{scene}/transforms.json"))["frames"]',
+        write_scene=_nerfstudio,
+        options=IMAGES,
+    ),
+}

@@ -1,0 +1,133 @@
+"""Grasps of sessions in the formats of other programs, one folder a scene."""
+
+import tempfile
+from pathlib import Path
+
+from realsim.app.export.target import METRES, SceneJob, Target
+from realsim.errors import InputError
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.labelled_scene import LabelledScene, WrittenScene
+from realsim.formats.session_scene import SessionScene
+
+
+def _session_of(scene: LabelledScene) -> SessionScene:
+    """Return the session that a scene is.
+
+    Raises:
+        InputError: it is a data set of others, which has no grasps tried by physics.
+    """
+    if not isinstance(scene, SessionScene):
+        raise InputError(
+            f"{scene.name} is no session, and grasps are tried in sessions: import it "
+            "(`realsim import`), register it, and run `realsim school`."
+        )
+    return scene
+
+
+def _files(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
+    from realsim.app.school_export import export
+
+    session, inner = _session_of(scene), folder.below(job.place.name)
+    request = job.request
+    written = not inner.has("grasps")
+    if written:
+        with tempfile.TemporaryDirectory() as place:
+            target = Path(place) / "grasps"
+            export(session.store.folder, request.target, target, request.least_score)
+            found = {p.relative_to(target).as_posix(): p for p in sorted(target.rglob("*"))}
+            inner.write_piece("grasps", {name: p for name, p in found.items() if p.is_file()})
+    job.tick()
+    sets = () if (grasps := session.grasps()) is None else grasps.sets
+    return WrittenScene(
+        name=session.name, folder=inner.place, frames=0, frames_written=0, objects=len(sets),
+        notes=("grasps that physics did not try have no label and are left out.",)
+        if request.target in ("acronym", "graspgen", "isaac") else (),
+        counts={"grasps": sum(len(s) for s in sets)},
+    )  # fmt: skip
+
+
+def _grasp_groups(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
+    """Write the grasps of every frame in its camera, as graspnetAPI's GraspGroup."""
+    from realsim.formats.graspnet.grasp_group import grasp_group, grasp_group_bytes
+
+    session, inner = _session_of(scene), folder.below(job.place.name)
+    grasps = session.grasps()
+    if grasps is None:
+        raise InputError(
+            f"session '{session.store.folder}' has no grasps yet: run `realsim school "
+            f"{session.store.folder}`."
+        )
+    written, count = 0, 0
+    for index in session.indices:
+        frame = session.frame(index)
+        poses = {o.instance: o.T_cam_obj for o in frame.objects if o.instance is not None}
+        sets = [s for s in grasps.sets if s.instance in poses]
+        group = grasp_group(sets, poses)
+        count += len(group)
+        piece = f"{index:06d}"
+        if not inner.has(piece):
+            inner.write_piece(piece, {f"{piece}.npy": grasp_group_bytes(group)})
+            written += 1
+        job.tick()
+    return WrittenScene(
+        name=session.name, folder=inner.place, frames=len(session.indices),
+        frames_written=written, objects=len(grasps.sets), counts={"grasps": count},
+        notes=("single precision: poses agree to about 1e-6.",),
+    )  # fmt: skip
+
+
+def _target(name: str, what: str, conventions: tuple[tuple[str, str], ...], loading: str,
+            options: tuple[str, ...] = ()) -> Target:  # fmt: skip
+    return Target(
+        name=name, kind="grasps", help=what, conventions=(METRES, *conventions), loading=loading,
+        write_scene=_files, options=options,
+    )  # fmt: skip
+
+
+GRASPS: dict[str, Target] = {
+    "grasp-group": Target(
+        name="GraspGroup (graspnetAPI)",
+        kind="grasps",
+        help="tried grasps of every frame in its camera, (N, 17) npy",
+        conventions=(
+            METRES,
+            ("row", "score, width, height, depth, rotation (9, row-major), translation, object"),
+            ("frame", "x = approach, y = closing, origin `depth` before the contacts"),
+            ("poses", "in the frame's camera (OpenCV axes)"),
+            ("score", "of the slip test, 0 to 1, higher is better; not GraspNet's friction"),
+            ("object", "GraspNet's number: realsim's id - 1"),
+        ),
+        loading='import numpy as np\ngrasps = np.load("{scene}/000000.npy")',
+        write_scene=_grasp_groups,
+        options=("labels",),
+    ),
+    "acronym": _target(
+        "ACRONYM", "HDF5, one file an object",
+        (("frame", "mounting face, 0.1034 m behind the contacts; z = approach, x = closing"),
+         ("label", "1 = still held after all four stages; scores under qualities/realsim")),
+        'import h5py\nfile = h5py.File("{scene}/000000_obj000001.h5")',
+    ),
+    "graspgen": _target(
+        "GraspGen", "JSON, one file an object",
+        (("frame", "as ACRONYM's"), ("label", "1 = still held after all four stages")),
+        'import json\ngrasps = json.load(open("{scene}/000000_obj000001.json"))["grasps"]',
+    ),
+    "isaac": _target(
+        "isaac_grasp", "YAML, one file an object",
+        (("frame", "panda_hand: mounting face; z = approach, y = closing"),
+         ("confidence", "the score")),
+        'import yaml\ngrasps = yaml.safe_load(open("{scene}/000000_obj000001.yaml"))["grasps"]',
+        ("least_score",),
+    ),
+    "hdf5": _target(
+        "realsim HDF5", "all of a scene in one file, exact",
+        (("frame", "between the fingertips; z = approach, y = closing"),),
+        'import h5py\nfile = h5py.File("{scene}/grasps.h5")',
+    ),
+    "parquet": _target(
+        "realsim Parquet", "one row a grasp",
+        (("frame", "between the fingertips; z = approach, y = closing"),),
+        'import pyarrow.parquet as pq\ntable = pq.read_table("{scene}/grasps.parquet")',
+    ),
+}  # fmt: skip
+"""By the name that the command line gives them."""

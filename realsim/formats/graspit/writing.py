@@ -1,0 +1,318 @@
+"""Scenes of GraspIT written: scene.yaml, assets/*.stl, grasps.hdf5, as their authors lay them out.
+
+Quaternions are w x y z, as the authors' own scene proves. Grasps stand in world, each beside its
+half turn about the approach axis. Meshes are STL in metres, and USD too where it is asked for:
+the authors' simulation loads those.
+"""
+
+import io
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.graspit.grasps import GRASP_FILE, WorldGrasps
+from realsim.formats.graspit.scene import SCENE_FILE, TABLE, GraspitScene, QuaternionOrder
+from realsim.formats.labelled_scene import WrittenScene
+from realsim.formats.robot_scenes.mesh_obj import part_file
+from realsim.formats.robot_scenes.placed_scene import (
+    PlacedObject,
+    PlacedScene,
+    TableBox,
+    seen_from,
+    unique_names,
+)
+from realsim.geometry import se3
+from realsim.geometry.mesh import face_normals
+from realsim.records import GraspSet, Mesh
+
+Array = NDArray[np.float64]
+ASSETS = "assets"
+UPRIGHT_RAD = 0.02
+"""A table that leans less in world is level: calibrations are off by so much."""
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+SAME_POSE = 1e-5
+"""Rotation entries and position [m] of the source's row and of the scene agree to this: then the
+row is written as it was."""
+PLAIN_TEXT = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
+NOT_TEXT = frozenset(("y", "n", "yes", "no", "on", "off", "true", "false", "null"))
+"""What YAML would take for something else."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GraspitConfig:
+    """How a scene of GraspIT is written."""
+
+    under: str = ""
+    """Folder in the export that the scene gets; '' = the export's own. One export, many scenes."""
+    with_usd: bool = False
+    """Whether the meshes are written as USD too (extra `usd`); file_path names those then."""
+
+
+def paired_grasps(grasps: GraspSet) -> WorldGrasps:
+    """Return tried grasps with their half turns about the approach axis."""
+    T = grasps.Ts_obj_grasp
+    return WorldGrasps(
+        obj_id=grasps.obj_id,
+        instance=grasps.instance,
+        Ts_obj_grasp=np.stack([T, T @ HALF_TURN], axis=1),
+        widths_m=grasps.widths_m,
+    )
+
+
+def write_graspit(
+    scene: PlacedScene,
+    grasps: Sequence[WorldGrasps],
+    folder: ExportFolder,
+    config: GraspitConfig | None = None,
+    *,
+    source: GraspitScene | None = None,
+    progress: Callable[[], None] | None = None,
+) -> WrittenScene:
+    """Write a scene and its grasps.
+
+    Args:
+        scene: the scene. Where its table leans in world, it is written in the table's frame: the
+            format has z up.
+        grasps: of its objects, in the objects' frames; see `paired_grasps`.
+        folder: what is filled; a mesh is a piece.
+        config: how.
+        source: the scene.yaml that the scene was read from. Rows of objects that have not moved
+            are written as they were, and so is what is not known here.
+        progress: called once a mesh.
+
+    Raises:
+        InputError: grasps of an object that is not in the scene.
+        MissingLibraryError: USD is asked for and its extra is not installed.
+        StorageError: the disk is full, or refuses.
+    """
+    config = config or GraspitConfig()
+    at = f"{config.under.strip('/')}/" if config.under.strip("/") else ""
+    scene, notes = _upright(scene)
+    names = unique_names({o.instance: o.name for o in scene.objects})
+    if source is not None:
+        names = {o.instance: source.names.get(o.instance, names[o.instance]) for o in scene.objects}
+    files = scene.body_names() if source is None else _mesh_names(scene, source)
+    for obj_id, name in files.items():
+        _write_mesh(scene, obj_id, f"{at}{ASSETS}/{name}", name, folder, config)
+        if progress is not None:
+            progress()
+    bare = [n for i, n in files.items() if scene.bodies[i].model.mesh.texture is not None]
+    bare += [n for i, n in files.items() if scene.bodies[i].model.mesh.colors is not None]
+    if bare and not config.with_usd:
+        notes.append(f"STL has no colours; those of {', '.join(bare)} are not written.")
+    rows = _rows(scene, names, files, config, source)
+    last = {f"{at}{SCENE_FILE}": yaml_text(rows).encode("utf-8")}
+    if scene.table is not None and source is None:
+        last[f"{at}{ASSETS}/{TABLE}.obj"] = part_file(table_mesh(scene.table))
+    by_name = _world_grasps(scene, grasps, names)
+    if by_name:
+        last[f"{at}{GRASP_FILE}"] = hdf5_bytes(by_name)
+    folder.write_piece(f"{at}{SCENE_FILE}", last)
+    return WrittenScene(
+        name=scene.name,
+        folder=folder.folder / config.under,
+        frames=0,
+        frames_written=0,
+        objects=len(scene.objects),
+        notes=tuple(notes),
+        counts={"meshes": len(files), "grasps": sum(len(T) for T in by_name.values())},
+    )
+
+
+def _mesh_names(scene: PlacedScene, source: GraspitScene) -> dict[int, str]:
+    """Return names of the mesh files by object id: those of the source, where it has one."""
+    names = dict(scene.body_names())
+    for o in reversed(scene.objects):
+        key = source.source.keys.get(o.instance)
+        if key is not None:
+            names[o.obj_id] = PurePosixPath(str(source.source.values[key]["file_path"])).stem
+    return unique_names(names)
+
+
+def _upright(scene: PlacedScene) -> tuple[PlacedScene, list[str]]:
+    """Return the scene with z up, and what was done."""
+    if scene.table is None:
+        return scene, []
+    up = scene.table.T_world_table[:3, 2]
+    if np.arccos(np.clip(up[2], -1.0, 1.0)) <= UPRIGHT_RAD:
+        return scene, []
+    said = "the table leans in world; poses are in the table's frame, whose z is up."
+    return seen_from(scene, scene.table.T_world_table), [said]
+
+
+def _write_mesh(
+    scene: PlacedScene,
+    obj_id: int,
+    piece: str,
+    name: str,
+    folder: ExportFolder,
+    config: GraspitConfig,
+) -> None:
+    if folder.has(piece):
+        return
+    body = scene.bodies[obj_id]
+    files = {f"{piece}.stl": stl_bytes(body.model.mesh)}
+    if config.with_usd:
+        from realsim.formats.robot_scenes.pixar import Pixar
+        from realsim.formats.robot_scenes.usd_body import body_stage, texture_png
+        from realsim.formats.robot_scenes.usd_scene import layer_bytes
+
+        stage = body_stage(Pixar(), body, name, f"./{name}.png")
+        files[f"{piece}.usd"] = layer_bytes(stage.GetRootLayer(), "usdc")
+        texture = texture_png(body)
+        if texture is not None:
+            files[f"{piece}.png"] = texture
+    folder.write_piece(piece, files)
+
+
+# --- scene.yaml ---------------------------------------------------------------------------------
+
+
+def _rows(
+    scene: PlacedScene,
+    names: Mapping[int, str],
+    files: Mapping[int, str],
+    config: GraspitConfig,
+    source: GraspitScene | None,
+) -> dict[str, Any]:
+    """Return the values of scene.yaml, in the order of the authors' file."""
+    rows: dict[str, Any] = {"grasp_path": f"{config.under.strip('/')}/{GRASP_FILE}".lstrip("/")}
+    if source is not None:
+        objects = set(source.source.keys.values())
+        rows |= {k: v for k, v in source.source.values.items() if k not in objects}
+    suffix = "usd" if config.with_usd else "stl"
+    fresh = 0
+    for o in scene.objects:
+        known = None if source is None else source.source.keys.get(o.instance)
+        row = {
+            "file_path": f"{ASSETS}/{files[o.obj_id]}.{suffix}",
+            "name": names[o.instance],
+            "orientation": se3.quaternion_wxyz(o.T_world_obj[:3, :3]).tolist(),
+            "position": o.T_world_obj[:3, 3].tolist(),
+            "scale": [1, 1, 1],
+        }
+        if source is not None and known is not None:
+            rows[known] = _kept(row, source.source.values[known], o, source.order)
+            continue
+        fresh += 1
+        while f"object{fresh}" in rows:
+            fresh += 1
+        rows[f"object{fresh}"] = row
+    if scene.table is not None and source is None:
+        rows[TABLE] = {
+            "file_path": f"{ASSETS}/{TABLE}.obj",
+            "name": TABLE,
+            "orientation": [1.0, 0.0, 0.0, 0.0],
+            "position": [0.0, 0.0, 0.0],
+            "scale": [1, 1, 1],
+        }
+    ending = {TABLE: rows.pop(TABLE)} if TABLE in rows else {}
+    return {**rows, **ending}
+
+
+def _kept(
+    row: dict[str, Any], before: Any, o: PlacedObject, order: QuaternionOrder
+) -> dict[str, Any]:
+    """Return the source's row, its pose and mesh replaced where they are others."""
+    old = cast("dict[str, Any]", before)
+    q = np.array(old["orientation"], dtype=np.float64)
+    q = q if order == "wxyz" else np.roll(q, 1)
+    T = se3.from_rt(se3.from_quaternion_wxyz(q), old["position"])
+    kept = {**old}
+    if np.abs(T - o.T_world_obj).max() > SAME_POSE or order != "wxyz":
+        kept |= {"orientation": row["orientation"], "position": row["position"]}
+    # The scale of the source is in the meshes that are written.
+    if any(s != 1 for s in old.get("scale", (1, 1, 1))):
+        kept["scale"] = row["scale"]
+    stem = row["file_path"].rpartition("/")[2].rpartition(".")[0]
+    if old["file_path"].rpartition("/")[2].rpartition(".")[0] != stem:
+        kept["file_path"] = row["file_path"]
+    return kept
+
+
+def yaml_text(rows: Mapping[str, Any]) -> str:
+    """Return values as the authors' files have them: a line a value, lists in brackets."""
+    lines: list[str] = []
+    for key, value in rows.items():
+        if isinstance(value, Mapping):
+            inner = cast("Mapping[str, Any]", value)
+            lines.append(f"{_scalar(key)}:")
+            lines += [f"  {_scalar(k)}: {_scalar(v)}" for k, v in inner.items()]
+        else:
+            lines.append(f"{_scalar(key)}: {_scalar(value)}")
+    return "\n".join(lines) + "\n"
+
+
+def _scalar(value: Any) -> str:
+    """Return a plain value; numbers come back bit for bit."""
+    if isinstance(value, str):
+        is_plain = PLAIN_TEXT.fullmatch(value) and value.lower() not in NOT_TEXT
+        return value if is_plain else json.dumps(value)
+    if isinstance(value, float):
+        text = repr(value)
+        # PyYAML takes 1e-05 for a text: it wants the dot.
+        return text.replace("e", ".0e") if "e" in text and "." not in text else text
+    if isinstance(value, Sequence):
+        return f"[{', '.join(_scalar(v) for v in cast('Sequence[Any]', value))}]"
+    return json.dumps(value)
+
+
+# --- grasps and meshes --------------------------------------------------------------------------
+
+
+def _world_grasps(
+    scene: PlacedScene, grasps: Sequence[WorldGrasps], names: Mapping[int, str]
+) -> dict[str, Array]:
+    """Return Ts_world_grasp (N, 2, 4, 4) by the object's name."""
+    Ts_world_obj = {o.instance: o.T_world_obj for o in scene.objects}
+    found: dict[str, Array] = {}
+    for one in grasps:
+        if one.instance not in Ts_world_obj:
+            raise InputError(
+                f"there are grasps of instance {one.instance}, which is not in scene "
+                f"'{scene.name}'; it has {', '.join(map(str, Ts_world_obj)) or 'no objects'}."
+            )
+        Ts = Ts_world_obj[one.instance] @ np.asarray(one.Ts_obj_grasp, dtype=np.float64)
+        found[names[one.instance]] = Ts
+    return found
+
+
+def hdf5_bytes(by_name: Mapping[str, Array]) -> bytes:
+    """Return grasps.hdf5; the same grasps give the same bytes."""
+    import h5py
+
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        for name in sorted(by_name):
+            file.create_dataset(name, data=by_name[name], track_times=False)
+    return buffer.getvalue()
+
+
+def stl_bytes(mesh: Mesh) -> bytes:
+    """Return a mesh as binary STL [m]; corners are float32."""
+    table = np.zeros(
+        len(mesh.faces),
+        dtype=[("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")],
+    )
+    table["normal"] = face_normals(mesh)
+    table["corners"] = mesh.vertices[mesh.faces]
+    header = b"realsim: metres".ljust(80, b" ")
+    return header + np.array(len(mesh.faces), dtype="<u4").tobytes() + table.tobytes()
+
+
+def table_mesh(table: TableBox) -> Mesh:
+    """Return the table in world, 12 triangles [m]."""
+    x, y, z = np.array([*table.size_m, table.thickness_m]) / 2.0
+    corners = np.array([[a, b, c] for a in (-x, x) for b in (-y, y) for c in (-z, z)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = [f for a, b, c, d in quads for f in ((a, b, c), (a, c, d))]
+    at = se3.transform(table.T_world_box, corners)
+    return Mesh(vertices=at, faces=np.array(faces, dtype=np.int32))

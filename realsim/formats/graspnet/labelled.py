@@ -1,0 +1,272 @@
+"""A scene of GraspNet-1Billion as a LabelledScene: its world is the table's frame, z up.
+
+    SCENE/{object_id_list.txt, kinect/, realsense/}
+    CAMERA/{rgb,depth,label}/0000.png, annotations/0000.xml, meta/0000.mat,
+           camera_poses.npy, cam0_wrt_table.npy, camK.npy
+
+Metres, OpenCV cameras. Object ids are GraspNet's numbers + 1, as in cls_indexes and in the label
+images, which show the visible pixels only.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats.graspnet import image_files
+from realsim.formats.graspnet.cameras import CameraFiles
+from realsim.formats.graspnet.image_objects import ImageObject, ImageObjects, read_image_objects
+from realsim.formats.graspnet.instances import Instances
+from realsim.formats.graspnet.models import load_models
+from realsim.formats.grasps.scene_grasps import SceneGrasps
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
+from realsim.geometry import se3
+from realsim.records import ObjectModel
+
+Array = NDArray[np.float64]
+FACTOR_DEPTH = 1000.0
+"""Counts per metre where no meta file says it; graspnetAPI takes nothing else."""
+FIRST_TEST_SCENE = 100
+"""Of the data set's own 190 scenes; those before are for training."""
+ENTRY = "graspnet"
+"""Key of a row's own values, so that no other format takes them for its own."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GraspnetSceneRef:
+    """Where a scene of one camera is."""
+
+    number: int
+    camera: str
+    """'kinect' or 'realsense'."""
+    folder: Path
+    """Of the camera."""
+    models: Path | None
+    """Folder of the models; None = there is none."""
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return f"scene_{self.number:04d}-{self.camera}"
+
+
+class GraspnetLabelledScene:
+    """A scene that `open_scene` has opened and checked."""
+
+    def __init__(
+        self, ref: GraspnetSceneRef, indices: tuple[int, ...], cameras: CameraFiles,
+        instances: Instances, notes: list[str],
+    ) -> None:  # fmt: skip
+        """Take over what was read; see `open_scene`."""
+        self.ref = ref
+        self.files = cameras
+        self._indices = indices
+        self._instances = instances
+        self._notes = notes
+        self._models: dict[int, ObjectModel] | None = None
+        self._label: tuple[int, NDArray[np.uint16]] | None = None
+        self._objects: tuple[int, ImageObjects] | None = None
+        poses = cameras.poses
+        self._Ts_0_cam = None if poses is None else se3.check_rigid(poses, "camera_poses")
+        first = cameras.first
+        self._T_world_0 = np.eye(4) if first is None else se3.check_rigid(first, "cam0_wrt_table")
+
+    @property
+    def name(self) -> str:
+        """Such as scene_0100-kinect."""
+        return self.ref.name
+
+    @property
+    def number(self) -> int:
+        """The scene's number."""
+        return self.ref.number
+
+    @property
+    def split(self) -> str:
+        """The data set's own: its scenes 0 to 99 are for training."""
+        return "train" if self.ref.number < FIRST_TEST_SCENE else "test"
+
+    @property
+    def camera(self) -> str:
+        """'kinect' or 'realsense'."""
+        return self.ref.camera
+
+    @property
+    def indices(self) -> tuple[int, ...]:
+        """Numbers of the images, increasing."""
+        return self._indices
+
+    @property
+    def T_world_table(self) -> Array | None:
+        """The identity: world is the table's frame; None without cam0_wrt_table.npy."""
+        return None if self.files.first is None or self.files.poses is None else np.eye(4)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a person should know."""
+        return tuple(self._notes)
+
+    @property
+    def object_numbers(self) -> tuple[int, ...]:
+        """GraspNet's numbers of the objects, in the order of object_id_list.txt."""
+        places = [(p, n) for n, many in self._instances.places.items() for p in many]
+        return tuple(n for _, n in sorted(places))
+
+    def frame(self, index: int) -> LabelledFrame:
+        """Return one frame.
+
+        Raises:
+            InputError: there is no such image, or its files contradict each other.
+            UnitError: millimetres.
+        """
+        found = self._image_objects(index)
+        T_0_cam = None if self._Ts_0_cam is None else self._Ts_0_cam[index]
+        T_world_cam = None if T_0_cam is None else self._T_world_0 @ T_0_cam
+        K = self._matrix(found, index)
+        size = image_files.same_size(self._images(index))
+        instances = self._instances.of(
+            [o.number for o in found.objects], stands_at(found.objects, T_0_cam)
+        )
+        factor = FACTOR_DEPTH if found.meta is None else found.meta.factor_depth
+        return LabelledFrame(
+            index=index,
+            intrinsics=image_files.intrinsics_of(K, size, f"the camera of image {index} of {self}"),
+            depth_unit_m=None if self.depth_file(index) is None else 1.0 / factor,
+            objects=tuple(_labelled(o, i) for o, i in zip(found.objects, instances, strict=True)),
+            T_world_cam=T_world_cam,
+            entry={ENTRY: self._entry(found, index)},
+        )
+
+    def colour_file(self, index: int) -> Path:
+        """Return the file of the colour image."""
+        self._require(index)
+        return image_files.image_file(self.ref.folder, image_files.RGB, index)
+
+    def depth_file(self, index: int) -> Path | None:
+        """Return the file of the 16-bit depth image; None = there is none."""
+        self._require(index)
+        path = image_files.image_file(self.ref.folder, image_files.DEPTH, index)
+        return path if path.is_file() else None
+
+    def label_file(self, index: int) -> Path | None:
+        """Return the file of the label image; None = there is none."""
+        self._require(index)
+        path = image_files.image_file(self.ref.folder, image_files.LABEL, index)
+        return path if path.is_file() else None
+
+    def label(self, index: int) -> NDArray[np.uint16] | None:
+        """Return the label image (H, W) of object ids, 0 = none; None = there is none.
+
+        Raises:
+            InputError: it is damaged.
+        """
+        path = self.label_file(index)
+        if path is None:
+            return None
+        if self._label is None or self._label[0] != index:
+            self._label = (index, image_files.read_label(path))
+        return self._label[1]
+
+    def mask(self, index: int, k: int, *, visible: bool) -> Mask | None:
+        """Return the visible mask (H, W) of a frame's k-th object.
+
+        None for the whole silhouette, without a label image, and for objects that are there
+        several times, whose pixels have one value.
+
+        Raises:
+            InputError: there is no such object, or the label image is damaged.
+        """
+        numbers = [o.number for o in self._image_objects(index).objects]
+        if not 0 <= k < len(numbers):
+            raise InputError(
+                f"image {index} of {self} has no object {k}; it has {len(numbers)}, from 0."
+            )
+        label = self.label(index) if visible and numbers.count(numbers[k]) == 1 else None
+        return None if label is None else label == numbers[k] + 1
+
+    def models(self) -> Mapping[int, ObjectModel]:
+        """Return the models of the objects, by object id; those without a mesh are not there."""
+        if self._models is None:
+            folder, notes = self.ref.models, list[str]()
+            self._models = {} if folder is None else load_models(
+                folder, self._instances.places.keys(), notes
+            )  # fmt: skip
+            self._notes += notes
+        return self._models
+
+    def grasps(self) -> SceneGrasps | None:
+        """None: GraspNet's grasps are computed, not tried; they are in grasp_label."""
+        return None
+
+    def rect_file(self, index: int) -> Path | None:
+        """Return the file of the rectangle grasps of an image; None = there is none."""
+        self._require(index)
+        path = self.ref.folder / "rect" / f"{index:04d}.npy"
+        return path if path.is_file() else None
+
+    def __str__(self) -> str:
+        """Return its place, for messages."""
+        return str(self.ref.folder)
+
+    def _require(self, index: int) -> None:
+        if index not in self._indices:
+            raise InputError(
+                f"{self} has no image {index}; it has {len(self._indices)}, "
+                f"{self._indices[0]} to {self._indices[-1]}."
+            )
+
+    def _image_objects(self, index: int) -> ImageObjects:
+        """Return what the files of an image say; the last image's are kept, masks come one by one.
+
+        Raises:
+            InputError: there is no such image, or its files are damaged.
+        """
+        self._require(index)
+        if self._objects is None or self._objects[0] != index:
+            self._objects = (index, read_image_objects(self.ref.folder, index))
+        return self._objects[1]
+
+    def _images(self, index: int) -> list[Path]:
+        files = [
+            image_files.image_file(self.ref.folder, kind, index)
+            for kind in (image_files.RGB, image_files.DEPTH, image_files.LABEL)
+        ]
+        return [f for f in files if f.is_file()]
+
+    def _matrix(self, found: ImageObjects, index: int) -> Array:
+        """Return the camera matrix (3, 3) of an image [px]: of its meta file, or of all images."""
+        K = self.files.K if found.meta is None else found.meta.K
+        if K is None:
+            raise InputError(
+                f"{self} has neither camK.npy nor meta/{index:04d}.mat; the camera matrix is in "
+                "them."
+            )
+        return K
+
+    def _entry(self, found: ImageObjects, index: int) -> dict[str, Any]:
+        """Return the numbers as the files have them."""
+        poses, first, K = self.files.poses, self.files.first, self.files.K
+        return {
+            "camera_pose": None if poses is None else poses[index].tolist(),
+            "cam0_wrt_table": None if first is None else first.tolist(),
+            "camK": None if K is None else K.tolist(),
+            "intrinsic_matrix": None if found.meta is None else found.meta.K.tolist(),
+        }
+
+
+def stands_at(objects: tuple[ImageObject, ...], T_0_cam: Array | None) -> Array | None:
+    """Return where objects stand (N, 3) in the first camera [m]; None without camera poses."""
+    if T_0_cam is None:
+        return None
+    points = np.array([o.T_cam_obj[:3, 3] for o in objects]).reshape(-1, 3)
+    return se3.transform(T_0_cam, points)
+
+
+def _labelled(o: ImageObject, instance: int | None) -> LabelledObject:
+    return LabelledObject(
+        obj_id=o.number + 1, T_cam_obj=o.T_cam_obj, instance=instance, entry={ENTRY: o.entry}
+    )

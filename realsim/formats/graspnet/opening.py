@@ -1,0 +1,185 @@
+"""Opening a scene of GraspNet-1Billion: counts, directions and units against the content."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats import images
+from realsim.formats.graspnet import evidence, image_files
+from realsim.formats.graspnet.annotations import ANNOTATIONS
+from realsim.formats.graspnet.cameras import FIRST, MATRIX, POSES, CameraFiles, read_camera_files
+from realsim.formats.graspnet.image_objects import ImageObjects, read_image_objects
+from realsim.formats.graspnet.instances import OBJECT_LIST, number_instances, read_object_list
+from realsim.formats.graspnet.labelled import (
+    FACTOR_DEPTH,
+    GraspnetLabelledScene,
+    GraspnetSceneRef,
+    stands_at,
+)
+from realsim.formats.graspnet.meta import META
+from realsim.formats.graspnet.models import mesh_file
+from realsim.geometry import se3
+
+Array = NDArray[np.float64]
+COMPARED = 12
+"""Images whose objects are compared with each other, spread over the scene."""
+LOOKED_AT = 3
+"""Images of them whose labels and depth are decoded."""
+SAME_K_PX = 0.5
+"""camK.npy and intrinsic_matrix that differ by more contradict each other."""
+
+
+def open_scene(ref: GraspnetSceneRef) -> GraspnetLabelledScene:
+    """Open one scene of one camera and check what a few of its images say.
+
+    Raises:
+        InputError: nothing there, a file is damaged, or the files contradict each other or the
+            images; see `evidence`.
+        NotRigidError: a matrix that is no rigid transform.
+        UnitError: millimetres, or a depth unit that the objects' distances contradict.
+    """
+    notes: list[str] = []
+    cameras = read_camera_files(ref.folder)
+    indices = _indices(ref.folder, cameras, notes)
+    chosen = _spread(indices, COMPARED)
+    found = {i: read_image_objects(ref.folder, i) for i in chosen}
+    _compare_matrices(found, cameras, ref.folder)
+    poses = cameras.poses
+    if poses is None:
+        notes.append(f"there is no {POSES}: where the camera stood is not known.")
+    else:
+        _check_movement(found, poses, ref.folder, notes)
+        if cameras.first is None:
+            notes.append(f"there is no {FIRST}: world is the first camera, no table is known.")
+    standing = [
+        ([o.number for o in f.objects], stands_at(f.objects, None if poses is None else poses[i]))
+        for i, f in found.items()
+    ]
+    listed = read_object_list(ref.folder.parent / OBJECT_LIST)
+    instances, said = number_instances(listed, standing)
+    notes += said + _missing_models(ref, set(instances.places))
+    _count_meta(found, notes)
+    scene = GraspnetLabelledScene(ref, indices, cameras, instances, notes)
+    notes += _check_pixels(scene, {i: found[i] for i in _spread(tuple(chosen), LOOKED_AT)})
+    return scene
+
+
+def _indices(folder: Path, cameras: CameraFiles, notes: list[str]) -> tuple[int, ...]:
+    """Return the numbers of the images that have annotations.
+
+    Raises:
+        InputError: none, or images without a camera pose.
+    """
+    seen = image_files.numbers_in(folder / image_files.RGB, ".png")
+    annotated = image_files.numbers_in(folder / ANNOTATIONS, ".xml")
+    annotated |= image_files.numbers_in(folder / META, ".mat")
+    indices = tuple(sorted(seen & annotated))
+    if not indices:
+        raise InputError(
+            f"{folder} has {len(seen)} images rgb/0000.png and {len(annotated)} annotations or "
+            "meta files, and none of the same number; a GraspNet camera folder is expected."
+        )
+    count = None if cameras.poses is None else len(cameras.poses)
+    if count is not None and indices[-1] >= count:
+        raise InputError(
+            f"{folder / POSES} holds {count} poses, and there are {len(seen)} images and "
+            f"{len(annotated)} annotations, up to number {indices[-1]}; one pose for each image is "
+            "needed."
+        )
+    for what, numbers in (
+        ("image(s) without annotation, left out", seen - annotated),
+        ("annotation(s) without image", annotated - seen),
+        (f"pose(s) in {POSES} without image", set(range(count or 0)) - set(indices)),
+    ):
+        if numbers:
+            first = ", ".join(map(str, sorted(numbers)[:5]))
+            notes.append(f"{len(numbers)} {what}: {first}{', ...' * (len(numbers) > 5)}.")
+    return indices
+
+
+def _spread(indices: tuple[int, ...], count: int) -> tuple[int, ...]:
+    """Return some of the images, evenly spread, the first and the last among them."""
+    places = np.linspace(0, len(indices) - 1, min(count, len(indices))).round().astype(int)
+    return tuple(indices[int(k)] for k in places)
+
+
+def _compare_matrices(found: dict[int, ImageObjects], cameras: CameraFiles, folder: Path) -> None:
+    if cameras.K is None:
+        return
+    for index, f in found.items():
+        if f.meta is None:
+            continue
+        off = float(np.max(np.abs(f.meta.K - cameras.K)))
+        if off > SAME_K_PX:
+            raise InputError(
+                f"{folder / MATRIX} and intrinsic_matrix of {META}/{index:04d}.mat differ by "
+                f"{off:.2f} px: {np.round(cameras.K, 2).tolist()} and "
+                f"{np.round(f.meta.K, 2).tolist()}. Which one belongs to the images? Take the "
+                "other away, or correct it."
+            )
+
+
+def _check_movement(
+    found: dict[int, ImageObjects], poses: Array, folder: Path, notes: list[str]
+) -> None:
+    rigid = se3.check_rigid(poses, str(folder / POSES))
+    posed = [
+        evidence.PosedImage(index=i, T_0_cam=rigid[i], objects=f.objects) for i, f in found.items()
+    ]
+    notes += evidence.check_camera_poses(posed, str(folder / POSES))
+    evidence.check_quaternions(posed, str(folder / ANNOTATIONS))
+
+
+def _missing_models(ref: GraspnetSceneRef, numbers: set[int]) -> list[str]:
+    models = ref.models
+    missing = sorted(n for n in numbers if models is None or mesh_file(models, n) is None)
+    if not missing:
+        return []
+    where = "there is no folder 'models'" if models is None else f"{models} has no mesh"
+    return [f"{where} for object(s) {', '.join(f'{n:03d}' for n in missing[:10])}."]
+
+
+def _count_meta(found: dict[int, ImageObjects], notes: list[str]) -> None:
+    bare = sum(f.meta is None for f in found.values())
+    alone = sum(not f.has_annotation for f in found.values())
+    if bare:
+        notes.append(
+            f"{bare} of {len(found)} images looked at have no meta file: poses have the XML's four "
+            f"decimals, and depth is taken as {FACTOR_DEPTH:g} counts per metre."
+        )
+    if alone:
+        notes.append(
+            f"{alone} of {len(found)} images looked at have no annotation: poses are the meta "
+            "files'."
+        )
+
+
+def _check_pixels(scene: GraspnetLabelledScene, found: dict[int, ImageObjects]) -> list[str]:
+    units: set[float] = set()
+    seen: list[evidence.SeenImage] = []
+    without = 0
+    for index, f in found.items():
+        frame, depth_file = scene.frame(index), scene.depth_file(index)
+        label = scene.label(index)
+        without += label is None
+        depth_m = None
+        if depth_file is not None and frame.depth_unit_m is not None:
+            units.add(frame.depth_unit_m)
+            depth_m = images.read_depth(depth_file, frame.depth_unit_m)
+        seen.append(
+            evidence.SeenImage(
+                index=index,
+                intrinsics=frame.intrinsics,
+                objects=f.objects,
+                label=label,
+                depth_m=depth_m,
+            )
+        )
+    notes = evidence.check_labels(seen, str(scene))
+    if without:
+        notes.append(f"{without} of {len(found)} images looked at have no label image: no masks.")
+    for unit_m in units:
+        evidence.check_depth(seen, unit_m, str(scene))
+    return notes

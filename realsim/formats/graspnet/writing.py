@@ -1,0 +1,255 @@
+"""Writing a scene as GraspNet-1Billion's tree: one camera of one scene at a time.
+
+    scenes/scene_0000/object_id_list.txt
+    scenes/scene_0000/CAMERA/{rgb,depth,label}/0000.png, annotations/0000.xml, meta/0000.mat,
+                             camK.npy, camera_poses.npy, cam0_wrt_table.npy
+    models/000/{nontextured.ply, textured.obj, textured.mtl, texture_map.png}
+
+The annotations have four decimals: up to 0.09 mm and some thousandths of a degree, both measured
+and said. The poses of the meta files have seven digits; a reader that knows both loses nothing.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from realsim.errors import InputError
+from realsim.formats.export_folder import Content, ExportFolder
+from realsim.formats.graspnet.cameras import FIRST, MATRIX, POSES, npy_bytes
+from realsim.formats.graspnet.frame_files import Loss, frame_files
+from realsim.formats.graspnet.instances import OBJECT_LIST
+from realsim.formats.graspnet.label_copies import keeps_numbers, label_files, rect_file
+from realsim.formats.graspnet.labelled import GraspnetLabelledScene
+from realsim.formats.graspnet.model_files import model_files
+from realsim.formats.graspnet.write_plan import GraspnetWriteConfig, WritePlan, plan_scene
+from realsim.formats.labelled_scene import LabelledFrame, LabelledScene, WrittenScene
+from realsim.records import ObjectModel
+from realsim.store.atomic import json_bytes
+
+__all__ = ["GraspnetWriteConfig", "write_graspnet_models", "write_graspnet_scene"]
+
+TAKEN = "graspnet_cameras.json"
+"""Rows of the export that say which source a camera's folder is of."""
+FRAMES_FILE = "frames.json"
+Progress = Callable[[], None]
+
+
+def write_graspnet_scene(
+    scene: LabelledScene,
+    folder: ExportFolder,
+    config: GraspnetWriteConfig,
+    *,
+    progress: Progress | None = None,
+) -> WrittenScene:
+    """Write one scene of one camera, frame by frame; models once for all scenes.
+
+    Args:
+        scene: the source.
+        folder: the export that is being filled; what is there of an interrupted run stays.
+        config: how.
+        progress: called once per frame.
+
+    Raises:
+        InputError: the source lacks what the format needs (depth, masks, camera poses or objects
+            to find them by, a table), or has what it has no place for (distortion).
+        StorageError: the disk is full.
+    """
+    plan = plan_scene(scene, config)
+    home = f"scenes/scene_{plan.number:04d}"
+    camera = f"{home}/{config.camera}"
+    _claim(folder, camera, scene.name)
+    models = _write_models(scene, folder, plan)
+    written, objects = 0, 0
+    for new, index in enumerate(plan.indices):
+        frame = scene.frame(index)
+        objects += len(frame.objects)
+        written += _write_frame(scene, frame, folder, f"{camera}/{new:04d}", plan, config)
+        if progress is not None:
+            progress()
+    _write_cameras(scene, folder, camera, plan)
+    _write_object_list(folder, home, plan)
+    labels = label_files(scene, plan)
+    for relative, file in labels.items():
+        folder.write_piece(relative, {relative: file})
+    losses = [Loss(**row) for _, row in folder.rows(f"{camera}.losses")]
+    return WrittenScene(
+        name=scene.name,
+        folder=folder.folder / camera,
+        frames=len(plan.indices),
+        frames_written=written,
+        objects=objects,
+        notes=(*scene.notes, *plan.notes, *_loss_notes(losses), *_model_notes(plan, models)),
+        counts={
+            "labels": 0 if config.without_labels else len(plan.indices),
+            "models": len(models),
+            "copied_labels": len(labels),
+        },
+    )
+
+
+def _claim(folder: ExportFolder, camera: str, source: str) -> None:
+    """Take the folder of a camera for a source.
+
+    Raises:
+        InputError: another scene of the same export has it.
+    """
+    for key, name in folder.rows(TAKEN):
+        if key == camera and name != source:
+            raise InputError(
+                f"{source} would be written into {camera}, where {name} is. Give another camera "
+                "or scene number (GraspnetWriteConfig)."
+            )
+    folder.write_piece(f"{camera} of {source}", {}, {TAKEN: (camera, source)})
+
+
+def _write_frame(
+    scene: LabelledScene, frame: LabelledFrame, folder: ExportFolder, piece: str,
+    plan: WritePlan, config: GraspnetWriteConfig,
+) -> int:  # fmt: skip
+    """Write the files of an image; return 1, or 0 if they were there."""
+    if folder.has(piece):
+        return 0
+    camera, _, name = piece.rpartition("/")
+    found, loss = frame_files(
+        scene, frame, _order(scene, frame, plan), plan.numbers,
+        with_label=not config.without_labels,
+    )  # fmt: skip
+    files: dict[str, Content] = {
+        f"{camera}/{kind.replace('/', f'/{name}')}": content for kind, content in found.items()
+    }
+    rect = rect_file(scene, frame.index, plan)
+    if rect is not None:
+        files[f"{camera}/rect/{name}.npy"] = rect
+    folder.write_piece(piece, files, {f"{camera}.losses": (name, loss.row())})
+    return 1
+
+
+def _order(scene: LabelledScene, frame: LabelledFrame, plan: WritePlan) -> list[int]:
+    """Return the places of a frame's objects in the order of the object list.
+
+    graspnetAPI takes collision labels by the order of the annotation, so it is the same in all
+    images; a GraspNet source has its own.
+    """
+    places = list(range(len(frame.objects)))
+    if isinstance(scene, GraspnetLabelledScene):
+        return places
+    keys = [(o.obj_id, o.instance) for o in frame.objects]
+    return sorted(places, key=lambda k: plan.places[keys[k]])
+
+
+def _write_cameras(
+    scene: LabelledScene, folder: ExportFolder, camera: str, plan: WritePlan
+) -> None:
+    files: dict[str, Content] = {
+        f"{camera}/{MATRIX}": npy_bytes(plan.K),
+        f"{camera}/{POSES}": npy_bytes(plan.camera_poses),
+        f"{camera}/{FIRST}": npy_bytes(plan.cam0_wrt_table),
+    }
+    renumbered = plan.indices != tuple(range(len(plan.indices)))
+    if renumbered or not keeps_numbers(plan):
+        files[f"{camera}/{FRAMES_FILE}"] = json_bytes(
+            {
+                "source": scene.name,
+                "images": {f"{new:04d}": index for new, index in enumerate(plan.indices)},
+                "object_ids": {f"{n:03d}": i for i, n in plan.numbers.items()},
+            }
+        )
+    folder.write_piece(f"{camera} cameras", files)
+
+
+def _write_object_list(folder: ExportFolder, home: str, plan: WritePlan) -> None:
+    """Write object_id_list.txt, one for both cameras.
+
+    Raises:
+        InputError: the other camera's scene has other objects.
+    """
+    relative = f"{home}/{OBJECT_LIST}"
+    text = "".join(f"{n}\n" for n in plan.order).encode("ascii")
+    if folder.has(relative):
+        there = (folder.folder / relative).read_bytes()
+        if sorted(there.split()) != sorted(text.split()):
+            raise InputError(
+                f"the cameras of {home} do not show the same objects: "
+                f"{there.decode('ascii').split()} and {list(plan.order)}. They are not one scene; "
+                "give another scene number (GraspnetWriteConfig)."
+            )
+        return
+    folder.write_piece(relative, {relative: text})
+
+
+def _write_models(scene: LabelledScene, folder: ExportFolder, plan: WritePlan) -> set[int]:
+    """Write the models that are not there yet; return the numbers of all of the scene's."""
+    for number, home in _own_model_folders(scene, plan.numbers).items():
+        files: dict[str, Content] = {
+            f"models/{number:03d}/{p.name}": p for p in sorted(home.iterdir()) if p.is_file()
+        }
+        folder.write_piece(_model_piece(number), files)
+    needed = {i: n for i, n in plan.numbers.items() if not folder.has(_model_piece(n))}
+    if needed:
+        found = scene.models()
+        models = {i: found[i] for i in needed if i in found}
+        write_graspnet_models(models, folder, numbers=needed)
+    return {n for n in plan.numbers.values() if folder.has(_model_piece(n))}
+
+
+def write_graspnet_models(
+    models: Mapping[int, ObjectModel],
+    folder: ExportFolder,
+    *,
+    numbers: Mapping[int, int] | None = None,
+) -> None:
+    """Write models that are not there yet; scenes bring those that they show.
+
+    Args:
+        models: by object id.
+        folder: the export that is being filled.
+        numbers: object id -> GraspNet's number; None = the id - 1.
+
+    Raises:
+        StorageError: the disk is full.
+    """
+    for obj_id, model in models.items():
+        number = obj_id - 1 if numbers is None else numbers[obj_id]
+        if not folder.has(_model_piece(number)):
+            content: dict[str, Content] = {
+                f"models/{number:03d}/{name}": data for name, data in model_files(model).items()
+            }
+            folder.write_piece(_model_piece(number), content)
+
+
+def _model_piece(number: int) -> str:
+    return f"models/{number:03d}"
+
+
+def _own_model_folders(scene: LabelledScene, numbers: Mapping[int, int]) -> dict[int, Path]:
+    """Return the folders of a GraspNet source's models, to be copied, by the written number."""
+    if not isinstance(scene, GraspnetLabelledScene) or scene.ref.models is None:
+        return {}
+    homes = {n: scene.ref.models / f"{i - 1:03d}" for i, n in numbers.items()}
+    return {n: home for n, home in homes.items() if home.is_dir() and any(home.iterdir())}
+
+
+def _loss_notes(losses: list[Loss]) -> list[str]:
+    notes = [
+        "the XML's four decimals move objects by up to "
+        f"{max((x.position_mm for x in losses), default=0.0):.3f} mm and turn them by up to "
+        f"{max((x.rotation_deg for x in losses), default=0.0):.4f} deg; the meta files have the "
+        "poses in single precision."
+    ]
+    rounded = max((x.depth_mm for x in losses), default=0.0)
+    if rounded > 0:
+        notes.append(f"depth was rounded to GraspNet's millimetres: by up to {rounded:.2f} mm.")
+    for count, text in (
+        (sum(x.too_far_px for x in losses), "depth pixels beyond 65.535 m are left out"),
+        (sum(x.shared_px for x in losses), "pixels were in two masks; the nearer object has them"),
+        (sum(x.merged for x in losses), "objects share their label value with an equal object"),
+    ):
+        if count:
+            notes.append(f"{count} {text}.")
+    return notes
+
+
+def _model_notes(plan: WritePlan, models: set[int]) -> list[str]:
+    missing = sorted(set(plan.numbers.values()) - models)
+    if not missing:
+        return []
+    return [f"the source has no mesh of object(s) {', '.join(f'{n:03d}' for n in missing[:10])}."]

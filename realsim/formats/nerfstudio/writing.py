@@ -1,0 +1,256 @@
+"""A labelled scene as a nerfstudio data set: transforms.json, images, depth, masks, points.
+
+    FOLDER/transforms.json
+    FOLDER/images/000000.png ...
+    FOLDER/depth/000000.png ...     16 bit, millimetres unless asked otherwise
+    FOLDER/masks/000000.png ...     if asked for: white where an object is
+    FOLDER/sparse_pc.ply            what Gaussian splatting begins with
+
+Poses and points are in metres in the scene's own world: `applied_transform` is the identity.
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from realsim.errors import InputError
+from realsim.formats import images
+from realsim.formats.coloured_points import ColouredPoints, coloured_points
+from realsim.formats.export_folder import Content, ExportFolder
+from realsim.formats.folders.depth_evidence import read_counts
+from realsim.formats.folders.listing import shown
+from realsim.formats.labelled_scene import LabelledFrame, LabelledScene, WrittenScene
+from realsim.formats.nerfstudio.cameras import camera_entry, transform_matrix
+from realsim.formats.nerfstudio.transforms import DEFAULT_DEPTH_UNIT_M, FILE, UNIT
+from realsim.records import CameraIntrinsics
+
+POINTS_FILE = "sparse_pc.ply"
+ROWS, POINTS_ROW = "frames.json", "points.json"
+"""Where the export notes the frames that are done, and the number of points."""
+MOST_POINTS = 10_000_000
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class NerfstudioWriteConfig:
+    """How a scene is written for nerfstudio."""
+
+    depth_unit_m: float | None = DEFAULT_DEPTH_UNIT_M
+    """Metres per count of the depth images. nerfstudio takes millimetres unless it is told another
+    on its command line, so finer depth is rounded to them; None = the scene's own unit, exactly."""
+    masks: bool = False
+    """Whether masks of the visible objects are written: nerfstudio then trains on their pixels
+    only, which is not what most want."""
+    points: int = 100_000
+    """Most points in sparse_pc.ply, averaged out of the depth images; 0 = none."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.depth_unit_m is not None and not 1e-6 <= self.depth_unit_m <= 0.1:
+            raise InputError(
+                f"{self.depth_unit_m} m per count of depth; 1e-6 to 0.1 can be written."
+            )
+        if not 0 <= self.points <= MOST_POINTS:
+            raise InputError(f"{self.points} points; 0 to {MOST_POINTS} can be written.")
+
+
+def write_nerfstudio(
+    scene: LabelledScene,
+    folder: ExportFolder,
+    config: NerfstudioWriteConfig,
+    *,
+    progress: Callable[[], None] | None = None,
+) -> WrittenScene:
+    """Write a scene as a nerfstudio data set.
+
+    Args:
+        scene: its images with camera poses are written, the others are named in the notes.
+        folder: to fill; gone on with where it was interrupted.
+        config: what to write.
+        progress: called once per frame.
+
+    Raises:
+        InputError: no image has a camera pose, a lens that nerfstudio has no place for, several
+            depth units where the scene's own was asked for, or an image cannot be read.
+    """
+    posed, without = _posed(scene)
+    shared = _shared_camera(scene, posed)
+    unit_m = _depth_unit(scene, posed, config)
+    written = objects = masks = 0
+    for index in scene.indices:
+        if progress is not None:
+            progress()
+        if index not in posed:
+            continue
+        frame = scene.frame(index)
+        objects += len(frame.objects)
+        masks += config.masks and _has_masks(scene, frame)
+        piece = f"frame {index}"
+        if folder.has(piece):
+            continue
+        entry, files = _frame(scene, frame, config, unit_m)
+        if shared is None:
+            entry |= camera_entry(frame.intrinsics, f"image {index} of {scene.name}")
+        folder.write_piece(piece, files, {ROWS: (str(index), entry)})
+        written += 1
+    points = _write_points(scene, folder, config)
+    top = _top(scene, shared, unit_m, points)
+    folder.write_document(FILE, _document(top, folder))
+    return WrittenScene(
+        name=scene.name, folder=folder.place, frames=len(posed), frames_written=written,
+        objects=objects, notes=_notes(scene, posed, without, unit_m, objects),
+        counts={"points": points, "masks": masks},
+    )  # fmt: skip
+
+
+def _posed(scene: LabelledScene) -> tuple[frozenset[int], list[str]]:
+    """Return the numbers of images with a camera pose, and those without."""
+    posed = frozenset(i for i in scene.indices if scene.frame(i).T_world_cam is not None)
+    if not posed:
+        raise InputError(
+            f"{scene.name}: none of the {len(scene.indices)} images has a camera pose, and "
+            f"{FILE} is made of them. Calibrate or register the session first."
+        )
+    return posed, [str(i) for i in scene.indices if i not in posed]
+
+
+def _shared_camera(scene: LabelledScene, posed: frozenset[int]) -> CameraIntrinsics | None:
+    """Return the camera if all images have the same one."""
+    cameras = {
+        (c.width, c.height, c.fx, c.fy, c.cx, c.cy, *c.distortion.tolist()): c
+        for c in (scene.frame(i).intrinsics for i in posed)
+    }
+    return next(iter(cameras.values())) if len(cameras) == 1 else None
+
+
+def _depth_unit(
+    scene: LabelledScene, posed: frozenset[int], config: NerfstudioWriteConfig
+) -> float | None:
+    """Return metres per count of the depth to be written, None where there is no depth."""
+    units = {scene.frame(i).depth_unit_m for i in posed if scene.depth_file(i) is not None}
+    known = sorted(u for u in units if u is not None)
+    if not known:
+        return None
+    if config.depth_unit_m is not None:
+        return config.depth_unit_m
+    if len(known) > 1:
+        raise InputError(
+            f"{scene.name} has depth in units of {known[0]:g} and {known[-1]:g} m, and nerfstudio "
+            "has one. Say one, such as depth_unit_m=0.001."
+        )
+    return known[0]
+
+
+def _frame(
+    scene: LabelledScene, frame: LabelledFrame, config: NerfstudioWriteConfig, unit_m: float | None
+) -> tuple[dict[str, Any], dict[str, Content]]:
+    """Return the entry of a frame without its camera, and its files."""
+    colour = scene.colour_file(frame.index)
+    name = f"images/{frame.index:06d}{colour.suffix.lower()}"
+    entry: dict[str, Any] = {"file_path": name}
+    files: dict[str, Content] = {name: colour}
+    depth = scene.depth_file(frame.index)
+    if depth is not None and unit_m is not None and frame.depth_unit_m is not None:
+        name = f"depth/{frame.index:06d}.png"
+        entry["depth_file_path"] = name
+        files[name] = depth
+        if frame.depth_unit_m != unit_m:
+            depth_m = read_counts(depth) * np.float64(frame.depth_unit_m)
+            files[name] = images.png_bytes(images.depth_counts(depth_m, unit_m))
+    if config.masks and _has_masks(scene, frame):
+        name = f"masks/{frame.index:06d}.png"
+        entry["mask_path"] = name
+        files[name] = images.png_bytes(_objects_mask(scene, frame))
+    assert frame.T_world_cam is not None  # only posed frames come here
+    entry["transform_matrix"] = transform_matrix(frame.T_world_cam)
+    return entry, files
+
+
+def _has_masks(scene: LabelledScene, frame: LabelledFrame) -> bool:
+    return bool(frame.objects) and scene.mask(frame.index, 0, visible=True) is not None
+
+
+def _objects_mask(scene: LabelledScene, frame: LabelledFrame) -> Any:
+    """Return where (H, W) any object is seen."""
+    union = np.zeros((frame.intrinsics.height, frame.intrinsics.width), dtype=np.bool_)
+    for k in range(len(frame.objects)):
+        mask = scene.mask(frame.index, k, visible=True)
+        union |= False if mask is None else mask
+    return union
+
+
+def _write_points(scene: LabelledScene, folder: ExportFolder, config: NerfstudioWriteConfig) -> int:
+    """Write the point cloud if it is not there yet; return its number of points."""
+    piece = "points"
+    if folder.has(piece):
+        return int(dict(folder.rows(POINTS_ROW)).get(scene.name, 0))
+    cloud = coloured_points(scene, config.points)
+    count = len(cloud.points)
+    files: dict[str, Content] = {POINTS_FILE: ply_of(cloud)} if count else {}
+    folder.write_piece(piece, files, {POINTS_ROW: (scene.name, count)})
+    return count
+
+
+def ply_of(cloud: ColouredPoints) -> bytes:
+    """Return coloured points as binary PLY [m]."""
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(cloud.points)}\n"
+        + "".join(f"property float {axis}\n" for axis in "xyz")
+        + "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
+        + "end_header\n"
+    )
+    rows = np.zeros(len(cloud.points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows["xyz"], rows["rgb"] = cloud.points, cloud.colours
+    return header.encode("ascii") + rows.tobytes()
+
+
+def _top(
+    scene: LabelledScene, shared: CameraIntrinsics | None, unit_m: float | None, points: int
+) -> dict[str, Any]:
+    """Return the keys of the whole file."""
+    top: dict[str, Any] = {"camera_model": "OPENCV"}
+    if shared is not None:
+        top |= camera_entry(shared, scene.name)
+    if unit_m is not None:
+        top[UNIT] = unit_m
+    top["applied_transform"] = np.eye(4)[:3].tolist()
+    if points:
+        top["ply_file_path"] = POINTS_FILE
+    return top
+
+
+def _document(top: dict[str, Any], folder: ExportFolder) -> Iterator[str]:
+    yield "{\n"
+    for key, value in top.items():
+        yield f" {json.dumps(key)}: {json.dumps(value, allow_nan=False)},\n"
+    yield ' "frames": [\n'
+    for k, (_, entry) in enumerate(folder.rows(ROWS)):
+        yield ("  " if k == 0 else ",\n  ") + json.dumps(entry, allow_nan=False)
+    yield "\n ]\n}\n"
+
+
+def _notes(
+    scene: LabelledScene, posed: frozenset[int], without: list[str], unit_m: float | None,
+    objects: int,
+) -> tuple[str, ...]:  # fmt: skip
+    notes: list[str] = []
+    if without:
+        notes.append(
+            f"{len(without)} images have no camera pose and were left out: {shown(without)}."
+        )
+    units = {scene.frame(i).depth_unit_m for i in posed}
+    finer = sorted(u for u in units if u is not None and unit_m is not None and u < unit_m)
+    if finer:
+        notes.append(
+            f"depth was rounded from {finer[0]:g} to {unit_m:g} m per count, what nerfstudio takes."
+        )
+    if unit_m is not None and unit_m != DEFAULT_DEPTH_UNIT_M:
+        notes.append(
+            f"nerfstudio does not read {UNIT} from the file: give it --depth-unit-scale-factor "
+            f"{unit_m:g}."
+        )
+    if objects:
+        notes.append("nerfstudio has no place for objects and their poses: they were left out.")
+    return tuple(notes)

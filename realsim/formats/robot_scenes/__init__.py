@@ -1,0 +1,1 @@
+"""Scenes for physics engines: URDF folders, MJCF, and USD for Isaac Sim."""

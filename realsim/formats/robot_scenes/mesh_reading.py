@@ -1,0 +1,105 @@
+"""Mesh files that a scene names: inside its folder, and in the unit that their scale says."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError, UnitError
+from realsim.formats.robot_scenes.convex_parts import convex_part
+from realsim.geometry.mesh import load_mesh, mass_properties
+from realsim.records import Mesh
+from realsim.untrusted.files import checked_text, file_bytes
+from realsim.untrusted.values import path_inside
+
+Array = NDArray[np.float64]
+MOST_MESH_BYTES = 200e6
+"""[bytes]: three million triangles as text; a body of a scene has ten thousand."""
+MILLIMETRE_SCALE = 0.01
+"""Scales up to this are taken as the conversion of a file in millimetres."""
+CONVEX_FILL = 0.98
+"""A mesh that fills less of its hull is not convex."""
+WORDS_OF_FILES = ("mtllib", "map_", "bump", "disp", "decal", "refl", "norm")
+"""Statements of OBJ and MTL that name files."""
+
+
+def scene_mesh(folder: Path, name: str, scale: Array, where: str, notes: list[str]) -> Mesh:
+    """Return a mesh of a scene [m], its scale applied.
+
+    Args:
+        folder: which nothing may lead out of.
+        name: of the mesh file, as the scene gives it, relative to the folder.
+        scale: (3,) that the scene gives.
+        where: the place in the scene that names it.
+        notes: what is missing of its look is added.
+
+    Raises:
+        InputError: the file is missing, broken, too large, or leads out of the folder.
+        UnitError: the size of the mesh contradicts the unit.
+    """
+    if name.startswith(("package://", "model://")):
+        raise InputError(
+            f"{where} names the mesh '{name[:80]}', which only ROS can look up. Put the file "
+            "beside the scene and name it by its path there."
+        )
+    if "://" in name:
+        raise InputError(f"{where} names the mesh '{name[:80]}'; only files in {folder} are read.")
+    path = path_inside(folder, name, where)
+    file_bytes(path, MOST_MESH_BYTES)
+    if path.suffix.lower() == ".obj":
+        _require_files_inside(path, folder, where)
+    if not (np.all(np.isfinite(scale)) and np.all(np.abs(scale) > 0)):
+        raise InputError(f"{where} has the scale {scale.tolist()}; three numbers, none 0, are.")
+    # A scale of thousandths is what makes metres of a file in millimetres.
+    is_mm = float(np.abs(scale).max()) <= MILLIMETRE_SCALE
+    try:
+        mesh = load_mesh(path, "mm" if is_mm else "m", notes)
+    except UnitError as error:
+        raise UnitError(
+            f"{where}: with the scale {scale.tolist()} the mesh {path.name} cannot be in metres: "
+            f'{error} In a scene, scale="0.001 0.001 0.001" says that a mesh is in millimetres.'
+        ) from error
+    vertices = mesh.vertices * (scale / (1e-3 if is_mm else 1.0))
+    faces = mesh.faces[:, ::-1] if np.prod(np.sign(scale)) < 0 else mesh.faces
+    return Mesh(
+        vertices=vertices, faces=faces, colors=mesh.colors, uv=mesh.uv, texture=mesh.texture
+    )
+
+
+def colliding(mesh: Mesh, where: str, notes: list[str]) -> Mesh:
+    """Return the hull of a shape that collides, as engines make it; a note if that changes it.
+
+    Raises:
+        InputError: it is flat.
+    """
+    hull = convex_part(mesh.vertices, where)
+    solid = mass_properties(mesh, 1.0)
+    if solid.is_watertight and solid.hull_volume_fraction < CONVEX_FILL:
+        notes.append(f"{where} is not convex: its hull collides, as engines take it.")
+    return hull
+
+
+def _require_files_inside(path: Path, folder: Path, where: str) -> None:
+    """Raise if an OBJ, or a material file of it, names a file outside the folder."""
+    for library in _files_named(path):
+        found = path_inside(folder, _from(folder, path, library), f"{where}, {path.name}")
+        if library.lower().endswith(".mtl") and found.is_file():
+            for picture in _files_named(found):
+                path_inside(folder, _from(folder, found, picture), f"{where}, {found.name}")
+
+
+def _files_named(path: Path) -> list[str]:
+    lines = checked_text(path, MOST_MESH_BYTES).splitlines()
+    found: list[str] = []
+    for line in lines:
+        words = line.split(maxsplit=1)
+        if len(words) == 2 and words[0].lower().startswith(WORDS_OF_FILES):
+            found.append(words[1].strip())
+    return found
+
+
+def _from(folder: Path, path: Path, name: str) -> str:
+    """Return a name beside a file as one from the folder; a way out stays one."""
+    if name.startswith("/") or name[1:2] == ":":
+        return name
+    return (path.parent.relative_to(folder) / name).as_posix()

@@ -1,0 +1,247 @@
+"""A scene as physics engines take it: rigid bodies, where they stand, a table, gravity, cameras.
+
+Writers of URDF, MJCF and USD take one; readers give one. World is the scene's world, in metres,
+kilograms and seconds. One body may stand in several places.
+"""
+
+import math
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, Mesh, ObjectModel
+from realsim.records.checked_arrays import frozen, rigid
+
+Array = NDArray[np.float64]
+GRAVITY = 9.81
+"""[m/s^2]."""
+TRIANGLE_TOLERANCE = 1e-6
+"""Moments of inertia of any body obey a + b >= c; by so much of the largest, rounding may miss."""
+NOT_IN_NAMES = re.compile(r"[^A-Za-z0-9_]+")
+TABLE_NAME, WORLD_NAME = "table", "world"
+"""Names that the files need for themselves."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class RigidBody:
+    """What a physics engine needs of an object, wherever it stands."""
+
+    model: ObjectModel
+    """Its id is the body's; its mesh is what is seen."""
+    mass_kg: float
+    center_of_mass: Array
+    """(3,) in the object's frame [m]."""
+    inertia: Array
+    """(3, 3) about the centre of mass, along the object's axes [kg m^2]."""
+    friction: float
+    """Coulomb coefficient against a surface of friction 1, such as the written table. Two bodies
+    meet with the product of theirs in PyBullet and PhysX, with the larger in MuJoCo."""
+    parts: tuple[Mesh, ...] | None = None
+    """Convex parts that collide; None = the hull of the mesh does."""
+
+    def __post_init__(self) -> None:
+        """Check that there can be such a body."""
+        name = f"object '{self.model.name}' ({self.model.obj_id})"
+        if not (math.isfinite(self.mass_kg) and self.mass_kg > 0):
+            raise InputError(f"the mass of {name} is {self.mass_kg} kg; it must be positive.")
+        if not (math.isfinite(self.friction) and self.friction >= 0):
+            raise InputError(f"the friction of {name} is {self.friction}; 0 or more is needed.")
+        if self.parts is not None and len(self.parts) == 0:
+            raise InputError(f"{name} has no convex parts; give None where its hull collides.")
+        com = frozen(self.center_of_mass, np.float64, (3,), f"the centre of mass of {name}")
+        inertia = frozen(self.inertia, np.float64, (3, 3), f"the inertia of {name}")
+        if not (np.all(np.isfinite(com)) and np.all(np.isfinite(inertia))):
+            raise InputError(f"the matter of {name} holds NaN or infinite numbers.")
+        _require_inertia(inertia, name)
+        object.__setattr__(self, "center_of_mass", com)
+        object.__setattr__(self, "inertia", inertia)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class PlacedObject:
+    """A body in the scene."""
+
+    instance: int
+    """Unique in the scene."""
+    name: str
+    """Unique in the scene: letters, digits and underscores, no digit first."""
+    obj_id: int
+    """Of its body."""
+    T_world_obj: Array
+    """(4, 4) [m]."""
+    is_fixed: bool = False
+    """Whether it stands still whatever hits it."""
+
+    def __post_init__(self) -> None:
+        """Check the name and that the pose is rigid."""
+        if self.name != file_name(self.name):
+            raise InputError(
+                f"an object is called '{self.name}'; letters, digits and underscores are accepted, "
+                f"such as '{file_name(self.name)}'."
+            )
+        object.__setattr__(self, "T_world_obj", rigid(self.T_world_obj, f"pose of '{self.name}'"))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class TableBox:
+    """The table: a box that stands still."""
+
+    T_world_table: Array
+    """(4, 4) middle of the top face, z up out of it [m]."""
+    size_m: tuple[float, float]
+    """Along x and y [m]."""
+    thickness_m: float
+    """[m]."""
+
+    def __post_init__(self) -> None:
+        """Check the pose and the sizes."""
+        object.__setattr__(self, "T_world_table", rigid(self.T_world_table, "T_world_table"))
+        sizes = (*self.size_m, self.thickness_m)
+        if len(sizes) != 3 or not all(math.isfinite(s) and s > 0 for s in sizes):
+            raise InputError(f"the table's sizes are {sizes} m; three positive ones are needed.")
+
+    @property
+    def T_world_box(self) -> Array:
+        """(4, 4) centre of the box [m]."""
+        centre: Array = self.T_world_table @ se3.from_translation([0, 0, -self.thickness_m / 2])
+        return centre
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SceneCamera:
+    """A camera to look at the scene with."""
+
+    name: str
+    """As of an object."""
+    intrinsics: CameraIntrinsics
+    T_world_cam: Array
+    """(4, 4) OpenCV axes [m]."""
+
+    def __post_init__(self) -> None:
+        """Check the name and that the pose is rigid."""
+        if self.name != file_name(self.name):
+            raise InputError(
+                f"a camera is called '{self.name}'; letters, digits and underscores are accepted."
+            )
+        object.__setattr__(self, "T_world_cam", rigid(self.T_world_cam, f"pose of '{self.name}'"))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class PlacedScene:
+    """A scene that can be simulated."""
+
+    name: str
+    bodies: dict[int, RigidBody]
+    """By object id."""
+    objects: tuple[PlacedObject, ...]
+    table: TableBox | None
+    """None = there is none; the objects fall."""
+    gravity: Array
+    """(3,) acceleration in world [m/s^2]."""
+    cameras: tuple[SceneCamera, ...] = ()
+    notes: tuple[str, ...] = ()
+    """What was assumed."""
+
+    def __post_init__(self) -> None:
+        """Check that names and instances are unique and every object has its body."""
+        g = frozen(self.gravity, np.float64, (3,), "the gravity")
+        if not np.all(np.isfinite(g)):
+            raise InputError(f"the gravity is {g.tolist()} m/s^2; three finite numbers are needed.")
+        object.__setattr__(self, "gravity", g)
+        # Some file systems take Mug and mug for one name.
+        names = [o.name.lower() for o in self.objects] + [c.name.lower() for c in self.cameras]
+        taken = {TABLE_NAME, WORLD_NAME}
+        twice = sorted({n for n in names if names.count(n) > 1 or n in taken})
+        if twice:
+            raise InputError(
+                f"scene '{self.name}': the name '{twice[0]}' is used twice; names of objects and "
+                f"cameras must differ from each other and from {TABLE_NAME} and {WORLD_NAME}."
+            )
+        instances = [o.instance for o in self.objects]
+        if len(set(instances)) != len(instances):
+            raise InputError(f"scene '{self.name}' has two objects with the same instance number.")
+        for o in self.objects:
+            if o.obj_id not in self.bodies:
+                raise InputError(f"'{o.name}' of scene '{self.name}' has no body {o.obj_id}.")
+        for obj_id, body in self.bodies.items():
+            if body.model.obj_id != obj_id:
+                raise InputError(f"body {obj_id} of '{self.name}' has the id {body.model.obj_id}.")
+
+    def body(self, placed: PlacedObject) -> RigidBody:
+        """Return the body of an object."""
+        return self.bodies[placed.obj_id]
+
+    def body_names(self) -> dict[int, str]:
+        """Return a name for the files of each body that stands somewhere, by object id."""
+        used = {o.obj_id for o in self.objects}
+        bodies = {i: body.model.name for i, body in self.bodies.items() if i in used}
+        return unique_names(bodies)
+
+
+def seen_from(scene: PlacedScene, T_world_new: Array) -> PlacedScene:
+    """Return the same scene in another world frame, such as the table's (z up).
+
+    Args:
+        scene: the scene.
+        T_world_new: (4, 4) the new frame in the scene's world [m].
+    """
+    T = se3.invert(se3.check_rigid(T_world_new, "T_world_new"))
+    table = scene.table
+    return replace(
+        scene,
+        objects=tuple(replace(o, T_world_obj=T @ o.T_world_obj) for o in scene.objects),
+        table=None if table is None else replace(table, T_world_table=T @ table.T_world_table),
+        gravity=T[:3, :3] @ scene.gravity,
+        cameras=tuple(replace(c, T_world_cam=T @ c.T_world_cam) for c in scene.cameras),
+    )
+
+
+# --- names --------------------------------------------------------------------------------------
+
+
+def file_name(text: str) -> str:
+    """Return a name of letters, digits and underscores: right in XML, in USD and as a file."""
+    name = NOT_IN_NAMES.sub("_", text.strip()).strip("_") or "object"
+    return f"_{name}" if name[0].isdigit() else name
+
+
+def unique_names(texts: dict[int, str]) -> dict[int, str]:
+    """Return different names by key; where two are equal, the key is added to both."""
+    names = {k: file_name(text) for k, text in texts.items()}
+    low = [n.lower() for n in names.values()]
+    reserved = (TABLE_NAME, WORLD_NAME)
+    found = {
+        k: f"{n}_{k}" if low.count(n.lower()) > 1 or n.lower() in reserved else n
+        for k, n in names.items()
+    }
+    low = [n.lower() for n in found.values()]
+    # `can` beside `can_2`: the number that was added may make the very name of another.
+    return {k: n if low.count(n.lower()) == 1 else f"object_{k}" for k, n in found.items()}
+
+
+# --- inertia ------------------------------------------------------------------------------------
+
+
+def principal_inertia(inertia: Array) -> tuple[Array, Array]:
+    """Return the moments (3,) [kg m^2], rising, and R_obj_principal (3, 3), right-handed."""
+    moments, axes = np.linalg.eigh(inertia)
+    if np.linalg.det(axes) < 0:
+        axes = axes * np.array([1.0, 1.0, -1.0])
+    return moments, axes
+
+
+def _require_inertia(inertia: Array, name: str) -> None:
+    largest = float(np.abs(inertia).max())
+    if not np.allclose(inertia, inertia.T, atol=1e-9 * largest):
+        raise InputError(f"the inertia of {name} is not symmetric: {inertia.tolist()}.")
+    a, b, c = np.linalg.eigvalsh(inertia).tolist()
+    if not (a > 0 and a + b >= (1.0 - TRIANGLE_TOLERANCE) * c):
+        raise InputError(
+            f"the moments of inertia of {name} are {a:.4g}, {b:.4g}, {c:.4g} kg m^2; positive ones "
+            "of which two exceed the third are what a body can have. Is it about the centre of "
+            "mass, and in kg m^2?"
+        )

@@ -1,0 +1,271 @@
+"""A scene as a folder of URDFs: one per body, one of the table, and where they stand.
+
+    scene.json              the poses, gravity; what load_pybullet.py reads
+    load_pybullet.py        loads the scene: `python load_pybullet.py --gui`
+    world.urdf              all in one file with floating joints, for programs that know them
+    table.urdf
+    objects/NAME.urdf       a body: visual mesh, convex parts, mass
+    objects/meshes/NAME/    visual.obj, visual.mtl, texture.png, part_000.obj ...
+
+URDF has no free bodies, so that a scene is a list of loaded files: a body may stand in several
+places. Meshes are in metres; the scale of 1 is written out.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim import interop
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.labelled_scene import WrittenScene
+from realsim.formats.robot_scenes.convex_parts import collision_parts
+from realsim.formats.robot_scenes.mesh_obj import TABLE_RGB, VISUAL, part_file, visual_files
+from realsim.formats.robot_scenes.placed_scene import (
+    TABLE_NAME,
+    WORLD_NAME,
+    PlacedObject,
+    PlacedScene,
+    RigidBody,
+    SceneCamera,
+    TableBox,
+)
+from realsim.formats.robot_scenes.urdf_angles import rpy_from_R
+from realsim.formats.robot_scenes.xml_numbers import spaced
+from realsim.geometry import se3
+from realsim.store import atomic
+
+Array = NDArray[np.float64]
+SCENE_FILE, SCRIPT, WORLD_FILE = "scene.json", "load_pybullet.py", "world.urdf"
+FORMAT, VERSION = "realsim URDF scene", 1
+ABOUT = (
+    "Metres, kilograms, seconds. position and orientation_xyzw (quaternion, x y z w) are those of "
+    "the URDF's link frame in world, which T_world_obj (4 x 4) says again; not of the centre of "
+    "mass. friction is the Coulomb coefficient against the table, which has 1. Cameras look along "
+    "+z, x right, y down; K in pixels, integers are pixel centres."
+)
+TENSOR = ("xx", "xy", "xz", "yy", "yz", "zz")
+"""URDF's entries of an inertia."""
+TABLE_DENSITY = 700.0
+"""Wood's [kg/m^3]: the table stands still, but a link without matter is warned of."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class UrdfConfig:
+    """How a folder of URDFs is written."""
+
+    under: str = ""
+    """Folder in the export that the scene gets; '' = the export's own. One export, many scenes."""
+    with_world: bool = True
+    """Whether world.urdf is written beside the single files."""
+
+
+def write_urdf_scene(
+    scene: PlacedScene,
+    folder: ExportFolder,
+    config: UrdfConfig | None = None,
+    *,
+    progress: Callable[[], None] | None = None,
+) -> WrittenScene:
+    """Write a scene as a folder of URDFs.
+
+    Args:
+        scene: the scene.
+        folder: what is filled; a body is a piece.
+        config: how.
+        progress: called once a body.
+
+    Raises:
+        InputError: a body without convex parts is flat.
+        StorageError: the disk is full, or refuses.
+    """
+    config = config or UrdfConfig()
+    at = f"{config.under.strip('/')}/" if config.under.strip("/") else ""
+    names = scene.body_names()
+    shapes = 0
+    for obj_id, name in names.items():
+        body = scene.bodies[obj_id]
+        parts = collision_parts(body)
+        shapes += len(parts)
+        piece = f"{at}objects/{name}"
+        if not folder.has(piece):
+            meshes = f"{at}objects/meshes/{name}"
+            files = {f"{meshes}/{n}": data for n, data in visual_files(body.model.mesh).items()}
+            files |= {f"{meshes}/{_part_name(k)}": part_file(p) for k, p in enumerate(parts)}
+            link = body_link(body, name, f"meshes/{name}", len(parts))
+            files[f"{at}objects/{name}.urdf"] = _robot(name, [link])
+            folder.write_piece(piece, files)
+        if progress is not None:
+            progress()
+    files = {f"{at}{SCENE_FILE}": atomic.json_bytes(scene_json(scene, names))}
+    files[f"{at}{SCRIPT}"] = Path(__file__).with_name(SCRIPT).read_bytes()
+    if scene.table is not None:
+        files[f"{at}{TABLE_NAME}.urdf"] = _robot(TABLE_NAME, [table_link(scene.table)])
+    if config.with_world:
+        files[f"{at}{WORLD_FILE}"] = _world(scene, names)
+    folder.write_piece(f"{at}{SCENE_FILE}", files)
+    return WrittenScene(
+        name=scene.name,
+        folder=folder.folder / config.under,
+        frames=0,
+        frames_written=0,
+        objects=len(scene.objects),
+        notes=scene.notes,
+        counts={"bodies": len(names), "collision shapes": shapes, "cameras": len(scene.cameras)},
+    )
+
+
+def _part_name(k: int) -> str:
+    return f"part_{k:03d}.obj"
+
+
+# --- links --------------------------------------------------------------------------------------
+
+
+def body_link(body: RigidBody, name: str, meshes: str, parts: int) -> ET.Element:
+    """Return a body's link: inertial about its centre of mass, visual, convex parts.
+
+    Args:
+        body: the body.
+        name: of the link.
+        meshes: folder of its meshes, from the URDF's.
+        parts: how many convex parts there are.
+    """
+    link = ET.Element("link", name=name)
+    _inertial(link, body.mass_kg, body.center_of_mass, body.inertia)
+    _mesh_shape(link, "visual", "visual", f"{meshes}/{VISUAL}")
+    for k in range(parts):
+        _mesh_shape(link, "collision", f"part_{k:03d}", f"{meshes}/{_part_name(k)}")
+    _contact(link, body.friction)
+    return link
+
+
+def _inertial(link: ET.Element, mass_kg: float, center: Array, inertia: Array) -> None:
+    inertial = ET.SubElement(link, "inertial")
+    # The tensor is about this origin, along its axes: the link's, since rpy is zero.
+    ET.SubElement(inertial, "origin", xyz=spaced(center), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=repr(float(mass_kg)))
+    entries = {f"i{a}{b}": repr(float(inertia["xyz".index(a), "xyz".index(b)])) for a, b in TENSOR}
+    ET.SubElement(inertial, "inertia", entries)
+
+
+def table_link(table: TableBox) -> ET.Element:
+    """Return the table's link, whose frame is in the middle of its top face."""
+    link = ET.Element("link", name=TABLE_NAME)
+    x, y, z = *table.size_m, table.thickness_m
+    mass = TABLE_DENSITY * x * y * z
+    moments = mass / 12.0 * np.array([y * y + z * z, x * x + z * z, x * x + y * y])
+    _inertial(link, mass, np.array([0.0, 0.0, -z / 2.0]), np.diag(moments))
+    for kind in ("visual", "collision"):
+        shape = ET.SubElement(link, kind, name=f"{TABLE_NAME}_{kind}")
+        ET.SubElement(shape, "origin", xyz=spaced([0.0, 0.0, -z / 2.0]), rpy="0 0 0")
+        geometry = ET.SubElement(shape, "geometry")
+        ET.SubElement(geometry, "box", size=spaced([x, y, z]))
+        if kind == "visual":
+            material = ET.SubElement(shape, "material", name="table_top")
+            ET.SubElement(material, "color", rgba=f"{spaced(TABLE_RGB)} 1")
+    _contact(link, 1.0)
+    return link
+
+
+def _mesh_shape(link: ET.Element, kind: str, name: str, file: str) -> None:
+    shape = ET.SubElement(link, kind, name=name)
+    ET.SubElement(shape, "origin", xyz="0 0 0", rpy="0 0 0")
+    ET.SubElement(ET.SubElement(shape, "geometry"), "mesh", filename=file, scale="1 1 1")
+
+
+def _contact(link: ET.Element, friction: float) -> None:
+    """Add what PyBullet reads; other programs pass over it."""
+    contact = ET.SubElement(link, "contact")
+    ET.SubElement(contact, "lateral_friction", value=repr(float(friction)))
+
+
+def _robot(name: str, elements: list[ET.Element]) -> bytes:
+    robot = ET.Element("robot", name=name)
+    robot.extend(elements)
+    ET.indent(robot)
+    return b'<?xml version="1.0"?>\n' + ET.tostring(robot) + b"\n"
+
+
+# --- the scene ----------------------------------------------------------------------------------
+
+
+def _world(scene: PlacedScene, names: dict[int, str]) -> bytes:
+    """Return one URDF of everything: the bodies hang on the world by floating joints."""
+    elements = [ET.Element("link", name=WORLD_NAME)]
+    if scene.table is not None:
+        elements += [
+            table_link(scene.table),
+            _joint(TABLE_NAME, "fixed", scene.table.T_world_table),
+        ]
+    for o in scene.objects:
+        body, name = scene.body(o), names[o.obj_id]
+        count = len(collision_parts(body))
+        elements.append(body_link(body, o.name, f"objects/meshes/{name}", count))
+        elements.append(_joint(o.name, "fixed" if o.is_fixed else "floating", o.T_world_obj))
+    return _robot(scene.name, elements)
+
+
+def _joint(child: str, kind: str, T: Array) -> ET.Element:
+    joint = ET.Element("joint", name=f"{WORLD_NAME}_to_{child}", type=kind)
+    ET.SubElement(joint, "parent", link=WORLD_NAME)
+    ET.SubElement(joint, "child", link=child)
+    rpy = rpy_from_R(T[:3, :3])
+    ET.SubElement(joint, "origin", xyz=spaced(T[:3, 3]), rpy=spaced(rpy))
+    return joint
+
+
+def scene_json(scene: PlacedScene, names: dict[int, str]) -> dict[str, Any]:
+    """Return what scene.json holds."""
+    table = scene.table
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "about": ABOUT,
+        "name": scene.name,
+        "gravity": scene.gravity.tolist(),
+        "table": None
+        if table is None
+        else {
+            "urdf": f"{TABLE_NAME}.urdf",
+            **_pose(table.T_world_table, "T_world_table"),
+            "size_m": list(table.size_m),
+            "thickness_m": table.thickness_m,
+        },
+        "objects": [_object(o, scene.body(o), names[o.obj_id]) for o in scene.objects],
+        "cameras": [_camera(c) for c in scene.cameras],
+    }
+
+
+def _object(o: PlacedObject, body: RigidBody, name: str) -> dict[str, Any]:
+    return {
+        "name": o.name,
+        "instance": o.instance,
+        "obj_id": o.obj_id,
+        "model": body.model.name,
+        "urdf": f"objects/{name}.urdf",
+        "fixed": o.is_fixed,
+        "friction": body.friction,
+        **_pose(o.T_world_obj, "T_world_obj"),
+    }
+
+
+def _camera(c: SceneCamera) -> dict[str, Any]:
+    K = c.intrinsics
+    return {
+        "name": c.name,
+        "width": K.width,
+        "height": K.height,
+        "K": K.K.tolist(),
+        "distortion": K.distortion.tolist(),
+        **_pose(c.T_world_cam, "T_world_cam"),
+    }
+
+
+def _pose(T: Array, name: str) -> dict[str, Any]:
+    position, xyzw = interop.pybullet_from_T(se3.check_rigid(T, name))
+    return {"position": position, "orientation_xyzw": xyzw, name: T.tolist()}

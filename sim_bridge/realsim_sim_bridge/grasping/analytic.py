@@ -1,0 +1,185 @@
+"""GraspNet-style labels of an object: the friction at which each of many grasps closes.
+
+At points spread over the surface the gripper approaches along 300 views, turned by 12 angles, with
+its fingertips 4 depths beyond the point (Fang et al. 2020, section 3.3). Its fingers come in from
+the open gripper along the line between the tips; what each meets first is its contact. The label is
+the smallest friction level whose cone holds that line at both contacts (Nguyen 1988), the opening
+what the fingers need to pass the contacts, the collision whether GraspNet's gripper, so open,
+reaches into the object. Nothing else is asked: tipping, weight and the table are the School's.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats.graspnet.grasp_labels import GraspLabels
+from realsim.formats.graspnet.gripper_frame import (
+    ANGLES,
+    BASE_M,
+    DEPTHS,
+    DEPTHS_M,
+    FINGER_M,
+    HEIGHT_M,
+    VIEWS,
+    angles_rad,
+    rotations,
+    views,
+)
+from realsim.geometry.mesh import sample_surface
+from realsim.records import Mesh
+from realsim_sim_bridge.grasping.analytic_config import AnalyticConfig
+from realsim_sim_bridge.grasping.analytic_spread import farthest_rows
+from realsim_sim_bridge.grasping.antipodal import RaySurface
+from realsim_sim_bridge.grasping.surface_tree import hands_free, surface_tree
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+ROUNDING = 1e-6
+"""A friction so little above a level still counts as the level: rays have single precision."""
+SAMPLES_PER_POINT = 50
+"""Samples of the surface from which points are chosen to be far apart."""
+BLOCK = 8
+"""Points whose lines are cast at a time: 115,000 rays, 20 MB."""
+
+
+def analytic_labels(
+    mesh: Mesh, rng: np.random.Generator, config: AnalyticConfig | None = None
+) -> GraspLabels:
+    """Return the candidates of an object that close at some friction level.
+
+    Args:
+        mesh: the object [m].
+        rng: of the surface points; the only source of chance.
+        config: which candidates.
+
+    Raises:
+        InputError: the mesh has no area.
+    """
+    config = config or AnalyticConfig()
+    points = spread_points(mesh, rng, config.points, config.voxel_m)
+    view_numbers = np.arange(0, VIEWS, config.view_step)
+    tried = np.zeros(VIEWS, dtype=np.bool_)
+    tried[view_numbers] = True
+    R = rotations(-views()[view_numbers, None], angles_rad())  # (V, 12, 3, 3)
+
+    surface = RaySurface(mesh)
+    found = [
+        _closing(surface, points[first : first + BLOCK], R, first, config)
+        for first in range(0, len(points), BLOCK)
+    ]
+    index = np.concatenate([f[0] for f in found])
+    friction: Array = np.concatenate([f[1] for f in found])
+    openings: Array = np.concatenate([f[2] for f in found])
+    collision = _in_object(mesh, points[index[:, 0]], R[index[:, 1], index[:, 2]],
+                           np.array(DEPTHS_M)[index[:, 3]], openings)  # fmt: skip
+    index[:, 1] = view_numbers[index[:, 1]]
+    return GraspLabels(
+        points=points,
+        index=index.astype(np.int32),
+        angles_rad=angles_rad()[index[:, 2]].astype(np.float32),
+        depths_m=np.array(DEPTHS_M, dtype=np.float32)[index[:, 3]],
+        openings_m=openings.astype(np.float32),
+        friction=friction.astype(np.float32),
+        collision=collision,
+        view_tried=tried,
+    )
+
+
+def spread_points(mesh: Mesh, rng: np.random.Generator, count: int, apart_m: float) -> Array:
+    """Return at most `count` surface points (N, 3) [m], each the farthest from those before.
+
+    Args:
+        mesh: the surface [m].
+        rng: of the samples.
+        count: at most; where the surface is too small for that many, fewer.
+        apart_m: least distance of two points [m].
+
+    Raises:
+        InputError: the mesh has no area.
+    """
+    samples, _ = sample_surface(mesh, SAMPLES_PER_POINT * count, rng)
+    if len(samples) == 0:
+        raise InputError("the mesh has no surface on which grasps could be looked for.")
+    chosen = farthest_rows(samples, count, least=apart_m)
+    # In single precision as the label file has them, so that labels and file are the same.
+    return samples[chosen].astype(np.float32).astype(np.float64)
+
+
+def _closing(
+    surface: RaySurface, points: Array, R: Array, first: int, config: AnalyticConfig
+) -> tuple[Rows, Array, Array]:
+    """Return index (M, 4), friction (M,) and opening (M,) [m] of the candidates that close.
+
+    The view in the index is the row of `R` (V, 12, 3, 3).
+    """
+    shape = (len(points), len(R), ANGLES, DEPTHS)
+    x, y = R[:, :, None, :, 0], R[:, :, None, :, 1]
+    middles = points[:, None, None, None] + np.array(DEPTHS_M)[:, None] * x
+    middles = np.broadcast_to(middles, (*shape, 3)).reshape(-1, 3)
+    closing = np.broadcast_to(y, (*shape, 3)).reshape(-1, 3)
+    limit = max(config.levels) + ROUNDING
+
+    rows, at_plus, needed = _contacts(surface, middles, closing, limit, config.max_opening_m)
+    again, at_minus, other = _contacts(
+        surface, middles[rows], -closing[rows], limit, config.max_opening_m
+    )
+    rows, at_plus = rows[again], at_plus[again]
+    needed = np.maximum(needed[again], other)
+    # Along +y the contacts are at at_plus and -at_minus.
+    openings = 2.0 * np.maximum(at_plus, at_minus) + 2.0 * config.clearance_m
+    good = (at_plus + at_minus >= config.least_width_m) & (openings <= config.max_opening_m)
+    levels = np.array(sorted(config.levels))
+    friction = levels[np.searchsorted(levels, needed[good] - ROUNDING)]
+    index = np.stack(np.unravel_index(rows[good], shape), axis=1).astype(np.int64)
+    index[:, 0] += first
+    return index, friction, openings[good]
+
+
+def _contacts(
+    surface: RaySurface, middles: Array, outward: Array, limit: float, opening_m: float
+) -> tuple[Rows, Array, Array]:
+    """Return the contacts of one finger that comes in against `outward`, where a cone holds it.
+
+    Returns:
+        rows (M,), the contact's distance from the middle along outward (M,) [m] and the friction
+        that the closing line needs there (M,).
+    """
+    starts = middles + 0.5 * opening_m * outward
+    t, face = surface.first_hits(starts, -outward)
+    rows = np.flatnonzero(t <= opening_m)
+    cos = np.sum(surface.face_normals[face[rows]] * outward[rows], axis=1)
+    if not surface.is_closed:
+        # A finger comes from outside, whatever way an open mesh's triangles face.
+        cos = np.abs(cos)
+    # A line that leaves a closed surface first began inside it: the object is too wide.
+    close = cos > 1.0 / np.sqrt(1.0 + limit**2) - 1e-12
+    rows, cos = rows[close], np.minimum(cos[close], 1.0)
+    return rows, 0.5 * opening_m - t[rows], np.sqrt(1.0 - cos**2) / cos
+
+
+def _in_object(
+    mesh: Mesh, points: Array, R: Array, depths_m: Array, openings_m: Array
+) -> NDArray[np.bool_]:
+    """Return whether GraspNet's gripper reaches into the object (N,)."""
+    Ts = np.zeros((len(points), 4, 4))
+    Ts[:, :3, :3], Ts[:, :3, 3], Ts[:, 3, 3] = R, points, 1.0
+    tree = surface_tree(mesh.vertices[mesh.faces])
+    return ~hands_free(gripper_boxes(depths_m, openings_m), Ts, tree, 0.0)
+
+
+def gripper_boxes(depths_m: Array, openings_m: Array) -> Array:
+    """Return the boxes (N, 3, 2, 3) [m] of GraspNet's gripper in its own frame: palm, fingers.
+
+    Source: graspnetAPI, eval_utils.collision_detection.
+    """
+    boxes = np.empty((len(depths_m), 3, 2, 3))
+    inner = 0.5 * openings_m
+    outer = inner + FINGER_M
+    boxes[..., 0, 2], boxes[..., 1, 2] = -0.5 * HEIGHT_M, 0.5 * HEIGHT_M
+    boxes[:, 0, 0, 0], boxes[:, 0, 1, 0] = -(BASE_M + FINGER_M), -BASE_M
+    boxes[:, 1:, 0, 0], boxes[:, 1:, 1, 0] = -BASE_M, depths_m[:, None]
+    boxes[:, 0, 0, 1], boxes[:, 0, 1, 1] = -outer, outer
+    boxes[:, 1, 0, 1], boxes[:, 1, 1, 1] = -outer, -inner
+    boxes[:, 2, 0, 1], boxes[:, 2, 1, 1] = inner, outer
+    return boxes

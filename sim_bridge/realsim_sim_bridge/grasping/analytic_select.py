@@ -1,0 +1,86 @@
+"""A few of an object's many analytic grasps, far apart and of every friction level."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.formats.graspnet.grasp_labels import GraspLabels
+from realsim.records import GraspSet
+from realsim_sim_bridge.grasping.analytic_spread import farthest_rows
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+SPREAD_M = 0.03
+"""Distance [m] that counts as much as opposite approach directions, as of generated candidates."""
+MOST_COMPARED = 4000
+"""Grasps of a level that are looked at; a level of a large object has 100,000."""
+
+
+def select_analytic(
+    labels: GraspLabels,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    obj_id: int,
+    instance: int = 0,
+    file: str = "",
+) -> GraspSet:
+    """Return analytic grasps for the School to try, with their label as `closure_friction`.
+
+    Grasps whose gripper is in the object are left out. The set's parameters say which label each
+    row is (`label_index`) and how far the gripper opens (`openings_m`).
+
+    Args:
+        labels: of the object; computed, or read from a file.
+        count: grasps at most.
+        rng: the only source of chance.
+        obj_id: realsim's id.
+        instance: of the object.
+        file: where the labels came from.
+
+    Raises:
+        InputError: the count is negative.
+    """
+    return labels.rows(select_rows(labels, count, rng)).as_set(obj_id, instance, file=file)
+
+
+def select_rows(labels: GraspLabels, count: int, rng: np.random.Generator) -> Rows:
+    """Return increasing rows (N,) of at most `count` labels; see `select_analytic`."""
+    if count < 0:
+        raise InputError(f"analytic grasps: {count} are asked for; a number from 0 is expected.")
+    free = np.flatnonzero(~labels.collision)
+    levels = [free[labels.friction[free] == f] for f in np.unique(labels.friction[free])]
+    shares = _shares([len(rows) for rows in levels], count)
+    chosen = [np.zeros(0, dtype=np.int64)]
+    for level, share in zip(levels, shares, strict=True):
+        few = len(level) <= MOST_COMPARED
+        rows = level if few else np.sort(rng.choice(level, MOST_COMPARED, replace=False))
+        if share > 0:
+            features = _features(labels.rows(rows).Ts_obj_grasp())
+            chosen.append(rows[farthest_rows(features, share, int(rng.integers(len(rows))))])
+    return np.sort(np.concatenate(chosen))
+
+
+def _shares(available: list[int], count: int) -> list[int]:
+    """Return how many each level gives: as even as they allow, the lower levels first."""
+    shares = [0] * len(available)
+    left = min(count, sum(available), sum(min(a, MOST_COMPARED) for a in available))
+    while left > 0:
+        open_levels = [k for k, a in enumerate(available) if shares[k] < min(a, MOST_COMPARED)]
+        each = max(left // len(open_levels), 1)
+        for k in open_levels[:left]:
+            more = min(each, min(available[k], MOST_COMPARED) - shares[k])
+            shares[k] += more
+            left -= more
+    return shares
+
+
+def _features(Ts: Array) -> Array:
+    """Return numbers (N, 15) whose distances say how different grasps (N, 4, 4) are.
+
+    A grasp and its half turn about the approach are one: the closing axis enters as y y'.
+    """
+    y = Ts[:, :3, 1]
+    axis = (y[:, :, None] * y[:, None, :]).reshape(-1, 9)
+    return np.concatenate([2.0 / SPREAD_M * Ts[:, :3, 3], Ts[:, :3, 2], axis], axis=1)

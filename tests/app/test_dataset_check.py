@@ -1,0 +1,136 @@
+"""`realsim check` of a data set: what agrees ends with 0, what was spoiled is named, with 1."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app import cli
+from realsim.app.dataset_check import checked_scenes
+from realsim.geometry.mesh import load_mesh, save_ply
+from realsim.records import Mesh
+from upgradable_datasets import bop_dataset, graspnet_dataset
+
+SCENE = "test/000001"
+
+
+def check(folder: Path, *more: str) -> Result:
+    return CliRunner().invoke(cli.commands, ["check", str(folder), *more])
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return bop_dataset(tmp_path_factory.mktemp("check") / "dataset")
+
+
+def moved(root: Path, offset_mm: tuple[float, float, float]) -> None:
+    path = root / SCENE / "scene_gt.json"
+    rows = json.loads(path.read_text())
+    rows["3"][0]["cam_t_m2c"] = np.add(rows["3"][0]["cam_t_m2c"], offset_mm).tolist()
+    path.write_text(json.dumps(rows))
+
+
+def swapped_masks(root: Path) -> None:
+    for kind in ("mask", "mask_visib"):
+        a, b = (root / SCENE / f"{kind}/000003_00000{k}.png" for k in (0, 1))
+        a.rename(a.with_suffix(".tmp"))
+        b.rename(a)
+        a.with_suffix(".tmp").rename(b)
+
+
+def larger_model(root: Path) -> None:
+    file = root / "models/obj_000001.ply"
+    mesh = load_mesh(file, "mm")
+    save_ply(file, Mesh(vertices=1.3 * mesh.vertices, faces=mesh.faces), "mm")
+
+
+def eaten_mask(root: Path) -> None:
+    path = root / SCENE / "mask_visib/000003_000000.png"
+    mask = cv2.imread(str(path), 0)
+    mask[:, np.flatnonzero(mask.any(0))[:20]] = 0
+    cv2.imwrite(str(path), mask)
+
+
+def wrong_counts(root: Path) -> None:
+    """Counts that no mask has."""
+    rows = [
+        {"bbox_obj": [1, 1, 5, 5], "bbox_visib": [1, 1, 5, 5], "px_count_all": 77,
+         "px_count_valid": 77, "px_count_visib": 77, "visib_fract": 1.0}
+    ] * 2  # fmt: skip
+    (root / SCENE / "scene_gt_info.json").write_text(json.dumps({"3": rows}))
+
+
+SPOILED: dict[str, tuple[Callable[[Path], None], str]] = {
+    "pose to the side": (lambda r: moved(r, (8.0, 0.0, 0.0)), "mask has the IoU"),
+    "pose too far": (lambda r: moved(r, (0.0, 0.0, 40.0)), "from where its pose puts it"),
+    "swapped masks": (swapped_masks, "mask has the IoU 0.00"),
+    "another model": (larger_model, "mask has the IoU"),
+    "eaten mask": (eaten_mask, "mask_visib has the IoU"),
+    "wrong counts": (wrong_counts, "px_count_visib"),
+}
+
+
+def test_exact_labels_agree(pristine: Path) -> None:
+    result = check(pristine)
+    assert result.exit_code == 0, result.output
+    assert "1 of 1 scenes agree" in result.output
+    (found,) = checked_scenes(pristine)
+    assert [o.name for o in found.objects] == ["box", "wedge"]
+    for o in found.objects:
+        # Masks and poses are exact; the table, which hides nothing here, is in neither.
+        assert o.mask_iou == 1.0 and o.visible_iou == 1.0
+        assert abs(o.depth_mm) < 0.1 and o.hidden == 0.0  # 0.1 mm is a count of depth
+
+
+@pytest.mark.parametrize("case", SPOILED)
+def test_what_was_spoiled_is_named(case: str, pristine: Path, tmp_path: Path) -> None:
+    root = tmp_path / "dataset"
+    shutil.copytree(pristine, root)
+    spoil, told = SPOILED[case]
+    spoil(root)
+    result = check(root)
+    assert result.exit_code == 1, result.output
+    assert told in " ".join(result.output.split())
+
+
+def test_json_says_the_same(pristine: Path, tmp_path: Path) -> None:
+    root = tmp_path / "dataset"
+    shutil.copytree(pristine, root)
+    moved(root, (8.0, 0.0, 0.0))
+    for folder, agrees in ((pristine, True), (root / "test", False), (root / SCENE, False)):
+        result = check(folder, "--json")
+        told = json.loads(result.output)
+        assert told["agrees"] is agrees and result.exit_code == (0 if agrees else 1)
+        box, wedge = told["scenes"][0]["objects"]
+        assert bool(box["faults"]) is not agrees and wedge["faults"] == []
+
+
+def test_a_broken_scene_is_a_finding(pristine: Path, tmp_path: Path) -> None:
+    root = tmp_path / "dataset"
+    shutil.copytree(pristine, root)
+    (root / SCENE / "depth/000003.png").write_bytes(b"no image")
+    result = check(root)
+    assert result.exit_code == 1 and "000003.png" in result.output
+
+
+def test_a_graspnet_tree_agrees_up_to_its_four_decimals(tmp_path: Path) -> None:
+    root = graspnet_dataset(tmp_path / "dataset")
+    result = check(root)
+    assert result.exit_code == 0, result.output
+    (found,) = checked_scenes(root)
+    for o in found.objects:
+        assert o.mask_iou is None, "GraspNet has no whole silhouettes"
+        assert o.visible_iou is not None and o.visible_iou > 0.97
+        assert o.depth_mm is not None and abs(o.depth_mm) < 1.0
+
+
+def test_a_data_set_is_not_repaired(pristine: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr("sys.argv", ["realsim", "check", str(pristine), "--repair"])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    assert end.value.code == 2 and "only sessions are repaired" in capsys.readouterr().err

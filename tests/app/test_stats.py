@@ -1,0 +1,172 @@
+"""Laws of the statistics: parts add up, order does not matter, figures are counted by hand."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from realsim.app.cli import commands
+from realsim.app.console import Console
+from realsim.app.stages import annotate_session
+from realsim.app.stats.collect import session_facts
+from realsim.app.stats.landscape import LANDSCAPE_HEADER
+from realsim.app.stats.run import document_of
+from realsim.app.stats.statistics import all_rows, statistics_of
+from realsim.errors import InputError
+from realsim.records import GraspSet
+from realsim.store import load_scene, save_grasps, save_scene
+from synthetic_scenes import captured_session
+
+QUIET = Console(quiet=True)
+#        (score, base score, reachable, closes at)
+GRASPS = {
+    0: [
+        (1.0, 1.0, True, 0.2), (0.75, 0.75, True, 0.4), (0.25, 0.5, True, 0.6),
+        (0.0, 0.0, False, np.nan),
+    ],
+    3: [(0.5, 0.5, True, np.inf), (0.2, 0.25, True, 0.2), (0.0, 0.0, True, 0.4)],
+}  # fmt: skip
+
+
+def grasp_set(instance, obj_id):
+    score, base, reachable, friction = (np.array(x) for x in zip(*GRASPS[instance], strict=True))
+    n = len(score)
+    stage = np.arange(4) / 4
+    slip = np.where(stage <= base[:, None], 1e-3, np.nan)
+    slip[~reachable.astype(bool)] = np.nan
+    return GraspSet(
+        obj_id=obj_id, instance=instance, Ts_obj_grasp=np.tile(np.eye(4), (n, 1, 1)),
+        widths_m=np.full(n, 0.04), scores=score, base_scores=base, slip_m=slip, slip_rad=slip,
+        reachable=reachable.astype(bool), failures=("",) * n,
+        measures={"closure_friction": friction},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    store = captured_session(tmp_path_factory.mktemp("stats") / "scene_000004", count=3)
+    scene = load_scene(store)
+    C = np.diag([4e-3, 2e-3, 1e-3, 3e-4, 2e-4, 1e-4]) ** 2
+    verdicts = ("accepted", "doubtful")
+    judged = zip(scene.objects, verdicts, strict=True)
+    objects = tuple(replace(o, covariance=C, verdict=v) for o, v in judged)
+    save_scene(store, replace(scene, objects=objects))
+    annotate_session(store, QUIET)
+    for o in scene.objects:
+        save_grasps(store, grasp_set(o.instance, o.obj_id))
+    return store.folder
+
+
+def rows_of(*folders):
+    return {name: here for name, here, _ in all_rows(statistics_of(map(session_facts, folders)))}
+
+
+def test_the_figures_are_those_counted_by_hand(session):
+    rows = rows_of(session)
+    assert rows["scenes"] == "1 simulated, 0 real"
+    assert rows["annotated frames in all"] == "3"
+    assert rows["objects per scene"] == "2.0 ± 0.0 (range 2 to 2)"
+    assert rows["candidates"] == "7"
+    assert rows["with trajectory"] == "6 (85.71 %)"
+    assert rows["good (s >= 0.5)"] == "3 (42.86 %)"
+    assert rows["penalized large slip (s < 0.5)"] == "1 (14.29 %)"
+    assert rows["fail lift (s <= 0.25)"] == "1 (14.29 %)"
+    assert rows["fail close (s = 0)"] == "1 (14.29 %)"
+    assert rows["fail horizontal (s = 0.50)"] == "1 (14.29 %)"
+    assert rows["full success (s = 1)"] == "1 (14.29 %)"
+    mean = np.mean([g[0] for part in GRASPS.values() for g in part])
+    assert rows["mean score"].startswith(f"{mean:.2f} ")
+    assert rows["poses accepted"] == rows["poses doubtful"] == "1 (50.0 %)"
+    assert rows["pose uncertainty [mm], median, p90, most"].startswith(
+        "0.300, 0.300, 0.300 (n = 2)"
+    )
+    sigma_deg = np.degrees(4e-3)
+    assert rows["pose uncertainty [deg], median, p90, most"].startswith(f"{sigma_deg:.3f}")
+
+
+def test_the_turn_about_an_axis_of_revolution_is_no_uncertainty(session, tmp_path):
+    import shutil
+
+    copy = shutil.copytree(session, tmp_path / "turned")
+    info = json.loads((copy / "models/models_info.json").read_text())
+    for entry in info.values():
+        entry["symmetries_continuous"] = [{"axis": [2, 0, 0], "offset": [0, 0, 0]}]
+    (copy / "models/models_info.json").write_text(json.dumps(info))
+    sigma_deg = np.degrees(2e-3)
+    assert all(abs(o.sigma_deg - sigma_deg) < 1e-9 for o in session_facts(copy).objects)
+
+
+def test_visibility_is_that_of_the_annotation(session):
+    infos = json.loads((session / "scene_gt_info.json").read_text())
+    for k, o in enumerate(session_facts(session).objects):
+        assert o.visibility.tolist() == [rows[k]["visib_fract"] for rows in infos.values()]
+
+
+def test_two_copies_count_twice_but_have_the_same_objects(session, tmp_path):
+    import shutil
+
+    copy = shutil.copytree(session, tmp_path / "other")
+    once, twice = rows_of(session), rows_of(session, copy)
+    assert twice["candidates"] == "14" and twice["annotated frames in all"] == "6"
+    assert twice["unique objects"] == once["unique objects"] == "2 simulated, 0 real"
+    assert twice["mean score"] == once["mean score"]
+    assert rows_of(copy, session) == twice
+
+
+def test_tables_and_page_say_the_same(session, tmp_path):
+    out = tmp_path / "out"
+    result = CliRunner().invoke(
+        commands, ["stats", str(session), "--out", str(out), "--quiet"], catch_exceptions=False
+    )
+    assert result.exit_code == 0
+    document = json.loads((out / "statistics.json").read_text())
+    with (out / "statistics.csv").open(newline="") as file:
+        table = {row["property"]: row["here"] for row in csv.DictReader(file)}
+    assert table == document["statistics"] == rows_of(session)
+    with (out / "objects.csv").open(newline="") as file:
+        objects = list(csv.DictReader(file))
+    assert [int(o["candidates"]) for o in objects] == [4, 3]
+    assert sum(o["good"] for o in document["objects"]) == document["sessions"][0]["good"] == 3
+    page = (out / "statistics.html").read_text()
+    assert page.count('src="data:') == 4
+    assert all(here in page for here in (table["mean score"], table["objects per scene"]))
+
+
+def test_the_landscape_says_what_is_there(session, tmp_path):
+    import shutil
+
+    row = document_of(statistics_of([session_facts(session)]))["landscape"]
+    assert tuple(row) == LANDSCAPE_HEADER
+    assert row["masks"] == row["depth"] == row["slip scores"] == "yes"
+    assert row["robot motions"] == "no"
+    bare = shutil.copytree(session, tmp_path / "bare")
+    shutil.rmtree(bare / "grasps")
+    both = document_of(statistics_of([session_facts(session), session_facts(bare)]))["landscape"]
+    assert both["slip scores"] == "partly" and both["masks"] == "yes"
+
+
+def test_a_damaged_session_of_many_is_named_and_left_out(session, tmp_path):
+    import shutil
+
+    for name in ("a", "b"):
+        shutil.copytree(session, tmp_path / name)
+    (tmp_path / "b/session.json").write_text("{")
+    (tmp_path / "b/session.begun.json").unlink()
+    result = CliRunner().invoke(commands, ["stats", str(tmp_path), "--quiet"])
+    assert result.exit_code == 0 and "b is left out" in result.output.replace("\n", " ")
+    assert "│ 7 " in result.output or " 7 │" in result.output
+
+
+def test_what_is_no_session_is_refused(session, tmp_path):
+    def refused(*args):
+        result = CliRunner().invoke(commands, ["stats", *map(str, args)])
+        assert isinstance(result.exception, InputError), result.output
+        return str(result.exception)
+
+    assert "holds no session" in refused(tmp_path)
+    assert "given twice" in refused(session, session)
+    (tmp_path / "file").write_text("")
+    assert "is a file" in refused(session, "--out", tmp_path / "file")

@@ -1,0 +1,349 @@
+"""BOP scenes with their labels: everything is read, and what contradicts itself is found."""
+
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from realsim.errors import InputError, UnitError
+from realsim.formats.bop.labels import rle_of
+from realsim.formats.bop.opening import open_labelled_bop, open_labelled_scene
+from realsim.formats.bop.run_lengths import uncompressed
+from realsim.formats.bop.scene import find_scenes, read_scene
+from realsim.formats.bop.source import open_bop
+from realsim.formats.bop.targets import read_targets
+from realsim.geometry import se3
+from tests.support.bop_scenes import HEIGHT, MODELS, WIDTH, K, edit, write_boxes
+
+# --- what is there is read ----------------------------------------------------------------------
+
+
+def test_a_scene_is_read_as_it_was_written(tmp_path):
+    folder = write_boxes(tmp_path)
+    scene = open_labelled_bop(tmp_path)
+    assert (scene.name, scene.number, scene.split, scene.camera) == ("test-000003", 3, "test", "")
+    assert scene.indices == (1, 5, 9, 13, 17) and scene.T_world_table is None
+    cameras = json.loads((folder / "scene_camera.json").read_text())
+    truth = json.loads((folder / "scene_gt.json").read_text())
+    infos = json.loads((folder / "scene_gt_info.json").read_text())
+    for k, i in enumerate(scene.indices):
+        frame = scene.frame(i)
+        # The principal point moves from image to image, as in T-LESS.
+        assert frame.intrinsics.cx == K[0, 2] + 0.5 * k and frame.entry == cameras[str(i)]
+        assert frame.depth_unit_m == 1e-4
+        assert [o.obj_id for o in frame.objects] == [1, 7, 1]
+        for n, o in enumerate(frame.objects):
+            assert o.entry == truth[str(i)][n] and o.gt_info == infos[str(i)][n]
+            assert o.visible_fraction == infos[str(i)][n]["visib_fract"]
+            np.testing.assert_allclose(1e3 * o.T_cam_obj[:3, 3], o.entry["cam_t_m2c"], rtol=1e-15)
+            for visible, name in ((False, "mask"), (True, "mask_visib")):
+                stored = cv2.imread(str(folder / f"{name}/{i:06d}_{n:06d}.png"), 0) > 0
+                assert np.array_equal(scene.mask(i, n, visible=visible), stored)
+    models = scene.models()
+    assert {i: m.name for i, m in models.items()} == {1: "box1", 7: "box7"}
+    np.testing.assert_allclose(models[7].mesh.extent, MODELS[7].mesh.extent, atol=1e-8)
+
+
+def test_alike_things_keep_their_numbers_from_view_to_view(tmp_path):
+    folder = write_boxes(tmp_path)
+
+    def swap(data):  # the rows of an image have no order to rely on
+        data["5"] = data["5"][::-1]
+
+    for name in ("scene_gt.json", "scene_gt_info.json"):
+        edit(folder / name, swap)
+    scene = open_labelled_bop(tmp_path)
+    world = {}
+    for i in scene.indices:
+        frame = scene.frame(i)
+        for o in frame.objects:
+            world.setdefault(o.instance, []).append((frame.T_world_cam @ o.T_cam_obj)[:3, 3])
+    assert len(world) == 3 and None not in world
+    for positions in world.values():
+        assert len(positions) == 5 and np.ptp(positions, axis=0).max() < 1e-5
+
+
+def test_without_camera_poses_only_single_things_have_numbers(tmp_path):
+    write_boxes(tmp_path, with_poses=False)
+    scene = open_labelled_bop(tmp_path)
+    numbers = [[o.instance for o in scene.frame(i).objects] for i in scene.indices]
+    assert numbers == [[None, 0, None]] * 5
+    assert any("instances of object 1 could not be told apart" in note for note in scene.notes)
+    assert any("no camera poses" in note for note in scene.notes)
+
+
+def test_several_cameras_of_one_scene_are_scenes(tmp_path):
+    write_boxes(tmp_path, camera="cam1", seed=3, colour="gray")
+    folder = write_boxes(tmp_path, camera="photoneo", seed=8, count=3)
+    assert [(r.scene_id, r.camera) for r in find_scenes(tmp_path)] == [
+        (3, "cam1"), (3, "photoneo"),
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="seen by 2 cameras: cam1, photoneo"):
+        open_labelled_bop(tmp_path)
+    with pytest.raises(InputError, match="camera 'cam9'"):
+        open_labelled_bop(tmp_path, camera="cam9")
+    one, other = (open_labelled_bop(tmp_path, camera=c) for c in ("cam1", "photoneo"))
+    assert (one.name, len(one.indices)) == ("test-000003-cam1", 5)
+    assert one.colour_file(1).parent.name == "gray_cam1" and len(other.indices) == 3
+    assert (
+        other.mask(1, 0, visible=True).sum() == other.frame(1).objects[0].gt_info["px_count_visib"]
+    )
+    alone = write_boxes(tmp_path / "other", camera="cam1", count=1)
+    assert len(open_bop(alone)) == len(open_bop(alone, camera="cam1")) == 1
+    # HOT3D's images of a camera are in a folder of its name.
+    for name in list(folder.glob("*_cam1*")):
+        name.rename(folder / name.name.replace("gray_cam1", "gray1").replace("_cam1", "_gray1"))
+    assert open_labelled_bop(tmp_path, camera="gray1").colour_file(1).parent.name == "gray1"
+
+
+def test_onboarding_folders_are_scenes(tmp_path):
+    write_boxes(tmp_path, split="onboarding_static", scene="obj_000007_up", things=[(7, 0, 0, 0)])
+    write_boxes(tmp_path, split="onboarding_dynamic", scene="obj_000001", things=[(1, 0, 0, 0)])
+    refs = find_scenes(tmp_path)
+    assert [(r.split, r.scene_id, r.name) for r in refs] == [
+        ("onboarding_dynamic", 1, "onboarding_dynamic-obj_000001"),
+        ("onboarding_static", 7, "onboarding_static-obj_000007_up"),
+    ]
+    assert open_labelled_scene(refs[1]).frame(1).objects[0].obj_id == 7
+    assert open_labelled_bop(tmp_path, split="onboarding_dynamic").number == 1
+    assert read_scene(refs[0], [1]).ground_truth[1][0].obj_id == 1
+
+
+def compressed(runs):
+    """COCO's rleToString, from its C source."""
+    text = ""
+    for k, run in enumerate(runs):
+        x = run - runs[k - 2] if k > 2 else run
+        more = True
+        while more:
+            c = x & 0x1F
+            x >>= 5
+            more = x != -1 if c & 0x10 else x != 0
+            text += chr((c | 0x20 if more else c) + 48)
+    return text
+
+
+def test_compressed_run_lengths_are_the_plain_ones():
+    rng = np.random.default_rng(0)
+    for share in (0.0, 0.01, 0.5, 1.0):
+        runs = rle_of(rng.random((40, 70)) < share)["counts"]
+        assert uncompressed(compressed(runs), "m").tolist() == runs
+    long = [0, 250_000, 3, 1, 90_000, 2]
+    assert uncompressed(compressed(long), "m").tolist() == long
+    for broken in ("P", "ab\x7f", "~" * 30):
+        with pytest.raises(InputError):
+            uncompressed(broken, "m")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_masks_come_from_run_lengths_where_there_are_no_files(tmp_path, packed):
+    folder = write_boxes(tmp_path)
+    scene = open_labelled_bop(tmp_path)
+    annotations, masks = [], {}
+    for i in scene.indices:
+        for k, o in enumerate(scene.frame(i).objects):
+            masks[i, k] = scene.mask(i, k, visible=True)
+            rle = rle_of(masks[i, k])
+            counts = compressed(rle["counts"]) if packed else rle["counts"]
+            if masks[i, k].any():
+                annotations.append({
+                    "image_id": i, "category_id": o.obj_id,
+                    "segmentation": {"counts": counts, "size": rle["size"]},
+                })  # fmt: skip
+    shutil.rmtree(folder / "mask_visib")
+    (folder / "scene_gt_coco.json").write_text(json.dumps({"annotations": annotations}))
+    again = open_labelled_bop(tmp_path)
+    for (i, k), mask in masks.items():
+        found = again.mask(i, k, visible=True)
+        assert np.array_equal(found, mask) if mask.any() else found is None
+    # One of two alike is missing, and nothing says which: then there is none.
+    infos = json.loads((folder / "scene_gt_info.json").read_text())
+    assert infos["1"][0]["px_count_visib"] and infos["1"][2]["px_count_visib"]
+    del annotations[0]
+    (folder / "scene_gt_coco.json").write_text(json.dumps({"annotations": annotations}))
+    less = open_labelled_bop(tmp_path)
+    assert less.mask(1, 0, visible=True) is None and less.mask(1, 2, visible=True) is None
+    assert any("could not be paired" in note for note in less.notes)
+
+
+def test_targets_choose_images(tmp_path):
+    write_boxes(tmp_path)
+    rows = [{"scene_id": 3, "im_id": 5, "obj_id": 1, "inst_count": 2}, {"scene_id": 4, "im_id": 1}]
+    (tmp_path / "test_targets_bop19.json").write_text(json.dumps(rows))
+    assert open_labelled_bop(tmp_path, targets_only=True).indices == (5,)
+    first, second = read_targets(tmp_path / "test_targets_bop19.json")
+    assert (first.image_ids, first.obj_id, first.count) == ((5,), 1, 2)
+    assert (second.obj_id, second.count) == (None, None)
+    several = tmp_path / "test_targets_multiview_bop25.json"
+    several.write_text(json.dumps([{"scene_id": 3, "im_ids": [5, 9]}]))
+    assert read_targets(several)[0].image_ids == (5, 9)
+    several.write_text(json.dumps([{"scene_id": 3}]))
+    with pytest.raises(InputError, match="im_id of target 0"):
+        read_targets(several)
+
+
+# --- what contradicts itself is found -----------------------------------------------------------
+
+
+def rows_of(data):
+    return [row for rows in data.values() for row in rows]
+
+
+def inverted(data):
+    for row in data.values():
+        T = se3.from_rt(np.reshape(row["cam_R_w2c"], (3, 3)), row["cam_t_w2c"])
+        T = se3.invert(T)
+        row.update(cam_R_w2c=T[:3, :3].ravel().tolist(), cam_t_w2c=T[:3, 3].tolist())
+
+
+def opengl(data):
+    for row in data.values():
+        G = np.diag([1.0, -1, -1])
+        row["cam_R_w2c"] = (G @ np.reshape(row["cam_R_w2c"], (3, 3))).ravel().tolist()
+        row["cam_t_w2c"] = (G @ row["cam_t_w2c"]).tolist()
+
+
+def columns(key, of=lambda d: list(d.values())):
+    def change(data):
+        for row in of(data):
+            row[key] = np.reshape(row[key], (3, 3)).T.ravel().tolist()
+
+    return change
+
+
+def scaled(key, factor, of=lambda d: list(d.values())):
+    def change(data):
+        for row in of(data):
+            row[key] = np.multiply(row[key], factor).tolist()
+
+    return change
+
+
+TRAPS = {
+    "camera to world": ("camera", inverted, InputError, r"camera to world is taken for world to"),
+    "OpenGL's axes": ("camera", opengl, InputError, "OpenGL's camera axes"),
+    "columns of w2c": ("camera", columns("cam_R_w2c"), InputError, "cam_R_w2c is written column"),
+    "columns of m2c": ("gt", columns("cam_R_m2c", rows_of), InputError, "cam_R_m2c is written col"),
+    "metres of w2c": ("camera", scaled("cam_t_w2c", 1e-3), UnitError, "cam_t_w2c is in metres"),
+    "w2c twice": ("camera", scaled("cam_t_w2c", 1e3), UnitError, "1000 once too often"),
+    "metres of m2c": ("gt", scaled("cam_t_m2c", 1e-3, rows_of), UnitError, "metres in a milli"),
+    "m2c twice": ("gt", scaled("cam_t_m2c", 1e3, rows_of), UnitError, "multiplied by 1000 again"),
+    "depth of 1 mm": ("camera", scaled("depth_scale", 10), UnitError, "with depth_scale 0.1 depth"),
+    "depth of 10 um": ("camera", scaled("depth_scale", 0.1), UnitError, "with depth_scale 0.1 dep"),
+    "a row of gt_info": ("gt_info", lambda d: d["5"].pop(), InputError, "has 2 objects in image 5"),
+    "object 0": ("gt", lambda d: d["5"][0].update(obj_id=0), InputError, "obj_id of object 0"),
+    "a fisheye": (
+        "camera", lambda d: d["5"].pop("cam_K"), InputError, "no cam_K but a cam_model",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("trap", TRAPS)
+def test_traps_are_found(tmp_path, trap):
+    name, change, error, says = TRAPS[trap]
+    folder = write_boxes(tmp_path)
+    open_labelled_bop(tmp_path)
+    edit(folder / f"scene_{name}.json", change)
+    with pytest.raises(error, match=says) as raised:
+        open_labelled_bop(tmp_path)
+    assert str(folder) in str(raised.value)
+
+
+def test_columns_are_found_by_boxes_where_cameras_have_no_poses(tmp_path):
+    folder = write_boxes(tmp_path, with_poses=False, count=8)
+    open_labelled_bop(tmp_path)
+    edit(folder / "scene_gt.json", columns("cam_R_m2c", rows_of))
+    with pytest.raises(InputError, match=r"boxes bbox_obj fit the projected models better"):
+        open_labelled_bop(tmp_path)
+
+
+def test_depth_is_checked_without_masks_too(tmp_path):
+    folder = write_boxes(tmp_path)
+    shutil.rmtree(folder / "mask_visib")
+    assert any("times as far" in note for note in open_labelled_bop(tmp_path).notes)
+    edit(folder / "scene_camera.json", scaled("depth_scale", 10))
+    with pytest.raises(UnitError, match=r"with depth_scale 0\.1 "):
+        open_labelled_bop(tmp_path)
+
+
+def test_moving_objects_are_told_not_refused(tmp_path):
+    folder = write_boxes(tmp_path)
+
+    def move(data):
+        rng = np.random.default_rng(0)
+        for row in rows_of(data):
+            row["cam_t_m2c"] = (np.array(row["cam_t_m2c"]) + rng.uniform(-90, 90, 3)).tolist()
+
+    edit(folder / "scene_gt.json", move)
+    notes = open_labelled_bop(tmp_path).notes
+    assert any("do not agree under any reading" in note for note in notes)
+
+
+def test_files_that_do_not_belong_together_are_named(tmp_path):
+    folder = write_boxes(tmp_path)
+    kept = (folder / "mask/000005_000002.png").read_bytes()
+    (folder / "mask/000005_000002.png").unlink()
+    with pytest.raises(InputError, match=r"has 2 masks of image 5 .* has 3 objects"):
+        open_labelled_bop(tmp_path)
+    (folder / "mask/000005_000002.png").write_bytes(kept)
+    cv2.imwrite(str(folder / "mask/000005_000002.png"), np.zeros((8, 9), np.uint8))
+    scene = open_labelled_bop(tmp_path)
+    with pytest.raises(InputError, match=rf"has 9x8 pixels; its image has {WIDTH}x{HEIGHT}"):
+        scene.mask(5, 2, visible=False)
+    cv2.imwrite(str(folder / "depth/000005.png"), np.ones((8, 9), np.uint16))
+    with pytest.raises(InputError, match="has 9x8 pixels of 16 bit"):
+        open_labelled_bop(tmp_path)
+    with pytest.raises(InputError, match="has no image 2; it has 1, 5, 9"):
+        scene.frame(2)
+
+
+def test_models_that_are_missing_are_named(tmp_path):
+    write_boxes(tmp_path)
+    (tmp_path / "models/obj_000007.ply").unlink()
+    scene = open_labelled_bop(tmp_path)
+    assert any("object 7 has no mesh" in note for note in scene.notes)
+    assert set(scene.models()) == {1}
+    given = open_labelled_bop(tmp_path, models=MODELS)
+    assert set(given.models()) == {1, 7} and not any("no mesh" in n for n in given.notes)
+    with pytest.raises(InputError, match="has no models"):
+        open_labelled_bop(tmp_path, models=tmp_path)
+
+
+BROKEN = {
+    "not JSON": "{", "a list": "[]", "words": '{"a": {}}', "NaN": '{"1": {"cam_K": [NaN]}}',
+    "a number": '{"1": 3}', "texts": '{"1": {"cam_K": ["a"], "depth_scale": 0.1}}',
+    "no scale": '{"1": {"cam_K": [90,0,47,0,91,35,0,0,1]}}',
+    "scale 0": '{"1": {"cam_K": [90,0,47,0,91,35,0,0,1], "depth_scale": 0}}',
+    "huge": '{"1": {"cam_K": [90,0,47,0,91,35,0,0,1], "depth_scale": 1e300}}',
+    "twice": '{"1": {}, "01": {}}', "nested": '{"1": {"cam_K": [[1,[2]],3]}}',
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", BROKEN)
+def test_broken_cameras_end_in_an_input_error(tmp_path, what):
+    folder = write_boxes(tmp_path, count=1)
+    (folder / "scene_camera.json").write_text(BROKEN[what])
+    for reader in (open_labelled_bop, lambda root: read_scene(find_scenes(root)[0])):
+        with pytest.raises(InputError):
+            reader(tmp_path)
+
+
+LABELS = (
+    '{"1": 3}', '{"1": [3]}', '{"1": [{}]}', '{"1": [{"obj_id": "1", "cam_R_m2c": [], '
+    '"cam_t_m2c": []}]}', '{"1": [{"obj_id": 1, "cam_R_m2c": null, "cam_t_m2c": {}}]}',
+    '{"1": [{"obj_id": 1, "cam_R_m2c": [1,0,0,0,1,0,0,0,"1"], "cam_t_m2c": [0,0,500]}]}',
+    '{"1": [{"obj_id": 1.5, "cam_R_m2c": [1,0,0,0,1,0,0,0,1], "cam_t_m2c": [0,0,500]}]}',
+    '{"1": [{"obj_id": 1, "cam_R_m2c": [1,0,0,0,1,0,0,0,1], "cam_t_m2c": [0,0,1'
+    + 350 * "0" + "]}]}",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", LABELS)
+def test_broken_labels_end_in_an_input_error(tmp_path, text):
+    folder = write_boxes(tmp_path, count=1)
+    (folder / "scene_gt.json").write_text(text)
+    for reader in (open_labelled_bop, lambda root: read_scene(find_scenes(root)[0])):
+        with pytest.raises(InputError):
+            reader(tmp_path)

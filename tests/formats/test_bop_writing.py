@@ -1,0 +1,428 @@
+"""BOP scenes written: the same numbers, the same pixels, the same bytes after a kill."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.formats.bop.check import check_bop_scene
+from realsim.formats.bop.exact import exact_mm
+from realsim.formats.bop.models import load_models
+from realsim.formats.bop.opening import open_labelled_bop, open_labelled_scene
+from realsim.formats.bop.root_files import write_bop_models, write_bop_root
+from realsim.formats.bop.run_lengths import decoded
+from realsim.formats.bop.scene import find_scenes
+from realsim.formats.bop.targets import read_targets
+from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.images import read_rgb
+from realsim.geometry import se3
+from tests.support.bop_scenes import MODELS, bbox, edit, write_boxes
+
+DOCUMENTS = ("scene_camera", "scene_gt", "scene_gt_info")
+
+
+def export(scene, out, config=None, **root):
+    folder = ExportFolder.begin(out, {"what": "a test"})
+    written = write_bop_scene(scene, folder, config)
+    infos = scene.models_info()
+    write_bop_models(scene.models(), folder, infos=infos)
+    write_bop_root(folder, name="copy", **root)
+    folder.finish({})
+    return written
+
+
+def content(folder):
+    return {
+        p.relative_to(folder).as_posix(): p.read_bytes()
+        for p in sorted(Path(folder).rglob("*"))
+        if p.is_file()
+    }
+
+
+# --- round trips --------------------------------------------------------------------------------
+
+
+def test_numbers_come_back_to_the_last_digit_and_unknown_keys_survive(tmp_path):
+    source = write_boxes(tmp_path / "a")
+    written = export(open_labelled_bop(tmp_path / "a"), tmp_path / "b")
+    assert (written.frames, written.frames_written, written.objects) == (5, 5, 15)
+    assert written.counts["masks"] == 30 and written.notes == ()
+    copy = tmp_path / "b/test/000003"
+    for name in DOCUMENTS:
+        before, after = (json.loads((f / f"{name}.json").read_text()) for f in (source, copy))
+        assert before == after
+    assert json.loads((copy / "scene_camera.json").read_text())["5"]["view_level"] == 2
+    for kind in ("rgb", "depth"):  # byte for byte
+        for file in (source / kind).iterdir():
+            assert (copy / kind / file.name).read_bytes() == file.read_bytes()
+    for kind in ("mask", "mask_visib"):  # pixel for pixel
+        assert len(list((copy / kind).iterdir())) == 15
+        for file in (source / kind).iterdir():
+            same = cv2.imread(str(copy / kind / file.name), -1)
+            assert np.array_equal(same, cv2.imread(str(file), -1))
+    # A second time round nothing changes any more.
+    export(open_labelled_bop(tmp_path / "b"), tmp_path / "c")
+    assert content(tmp_path / "b") == content(tmp_path / "c")
+
+
+def test_models_keep_their_numbers_and_their_own_keys(tmp_path):
+    write_boxes(tmp_path / "a")
+
+    def change(data):
+        data["1"].update(diameter=data["1"]["diameter"] + 1e-4, maker="somebody")
+        data["7"].update(symmetries_discrete=[[1, 0, 0, 0, 0, -1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1]])
+
+    edit(tmp_path / "a/models/models_info.json", change)
+    export(open_labelled_bop(tmp_path / "a"), tmp_path / "b")
+    infos = [json.loads((tmp_path / k / "models/models_info.json").read_text()) for k in "ab"]
+    assert infos[0] == infos[1] and infos[1]["1"]["maker"] == "somebody"
+    for i, model in load_models(tmp_path / "b/models_eval").items():
+        np.testing.assert_allclose(model.mesh.vertices, MODELS[i].mesh.vertices, atol=1e-8)
+    assert len(load_models(tmp_path / "b/models")[7].symmetries) == 2
+    # What no longer holds is not kept.
+    edit(tmp_path / "a/models/models_info.json", lambda d: d["1"].update(diameter=150.0))
+    export(open_labelled_bop(tmp_path / "a"), tmp_path / "c")
+    info = json.loads((tmp_path / "c/models/models_info.json").read_text())
+    assert info["1"]["diameter"] == pytest.approx(1e3 * np.sqrt(0.06**2 + 0.05**2 + 0.09**2))
+
+
+def test_a_camera_suffix_and_an_onboarding_folder_come_back(tmp_path):
+    write_boxes(tmp_path / "a", camera="cam1", colour="gray")
+    write_boxes(tmp_path / "a", split="onboarding_static", scene="obj_000007_up", things=[
+        (7, 0, 0, 0)])  # fmt: skip
+    folder = ExportFolder.begin(tmp_path / "b", {})
+    for ref in find_scenes(tmp_path / "a"):
+        write_bop_scene(open_labelled_scene(ref), folder)
+    write_bop_root(folder, name="two")
+    folder.finish({})
+    assert [r.name for r in find_scenes(tmp_path / "b")] == [
+        r.name for r in find_scenes(tmp_path / "a")
+    ]
+    for ref, other in zip(find_scenes(tmp_path / "a"), find_scenes(tmp_path / "b"), strict=True):
+        for name in DOCUMENTS:
+            assert json.loads(ref.layout.document(name).read_text()) == json.loads(
+                other.layout.document(name).read_text()
+            )
+    assert (tmp_path / "b/test/000003/gray_cam1/000001.png").is_file()
+    assert (tmp_path / "b/camera_cam1.json").is_file() and (tmp_path / "b/camera.json").is_file()
+    # Another name for scene, split and camera.
+    again = ExportFolder.begin(tmp_path / "c", {})
+    config = BopWriteConfig(split="val", number=12, camera="")
+    write_bop_scene(open_labelled_bop(tmp_path / "a", camera="cam1"), again, config)
+    assert (tmp_path / "c/val/000012/scene_gt.json").is_file()
+    for wrong in ({"split": "../x"}, {"number": -1}, {"jpeg_quality": 0}, {"camera": "a/b"}):
+        with pytest.raises(InputError):
+            BopWriteConfig(**wrong)
+
+
+def test_millimetres_of_up_to_15_digits_come_back():
+    rng = np.random.default_rng(0)
+    for digits in (1, 3, 9, 15):
+        for _ in range(2000):
+            d = float(f"{rng.normal() * 10 ** rng.uniform(-3, 4):.{digits}g}")
+            assert exact_mm(d / 1000) == d
+    assert exact_mm(0.0001) == 0.1 and exact_mm(0.0) == 0.0
+    for x in rng.normal(size=2000):  # any metres to their last bit, and then for good
+        back = exact_mm(x) / 1000
+        assert abs(back - x) <= np.spacing(abs(x)) and exact_mm(back) / 1000 == back
+
+
+class Moved:
+    """A scene whose objects were put elsewhere."""
+
+    def __init__(self, scene, by):
+        self.scene, self.by = scene, by
+
+    def __getattr__(self, name):
+        return getattr(self.scene, name)
+
+    def frame(self, index):
+        from dataclasses import replace
+
+        frame = self.scene.frame(index)
+        objects = tuple(replace(o, T_cam_obj=self.by @ o.T_cam_obj) for o in frame.objects)
+        return replace(frame, objects=objects)
+
+
+def test_a_pose_that_changed_is_written_and_the_rest_of_its_row_kept(tmp_path):
+    write_boxes(tmp_path / "a")
+    scene = open_labelled_bop(tmp_path / "a")
+    shift = se3.from_translation([0, 0, 0.004])
+    export(Moved(scene, shift), tmp_path / "b")
+    again = open_labelled_bop(tmp_path / "b")
+    for o, p in zip(scene.frame(5).objects, again.frame(5).objects, strict=True):
+        np.testing.assert_allclose(
+            (shift @ o.T_cam_obj)[:3, 3], p.T_cam_obj[:3, 3], rtol=3e-16, atol=0
+        )
+        assert p.entry["score"] == 0.25 and p.entry["cam_t_m2c"] != o.entry["cam_t_m2c"]
+
+
+class WithoutEntries(Moved):
+    """A scene of another format: no rows of BOP, but instances."""
+
+    def frame(self, index):
+        from dataclasses import replace
+
+        frame = self.scene.frame(index)
+        objects = tuple(replace(o, entry={"other": 1}, gt_info=None) for o in frame.objects)
+        return replace(frame, objects=objects, entry=None)
+
+
+def test_another_formats_scene_keeps_poses_and_instances(tmp_path):
+    write_boxes(tmp_path / "a")
+    scene = open_labelled_bop(tmp_path / "a")
+    export(WithoutEntries(scene, None), tmp_path / "b")
+    again = open_labelled_bop(tmp_path / "b")
+    for i in scene.indices:
+        a, b = scene.frame(i), again.frame(i)
+        assert set(b.entry) == {"cam_K", "depth_scale", "cam_R_w2c", "cam_t_w2c"}
+        assert a.depth_unit_m == b.depth_unit_m and np.array_equal(a.intrinsics.K, b.intrinsics.K)
+        np.testing.assert_allclose(a.T_world_cam, b.T_world_cam, atol=1e-15)
+        for o, p in zip(a.objects, b.objects, strict=True):
+            assert (o.obj_id, o.instance) == (p.obj_id, p.instance)
+            np.testing.assert_allclose(o.T_cam_obj, p.T_cam_obj, rtol=3e-16, atol=1e-16)
+            # The translations had few digits: they come back, digit by digit.
+            assert p.entry["cam_t_m2c"] == o.entry["cam_t_m2c"]
+
+
+# --- documents ----------------------------------------------------------------------------------
+
+
+def test_visibility_is_counted_as_bop_defines_it(tmp_path):
+    """The formulas of docs/bop_datasets_format.md and calc_gt_info.py, computed here again."""
+    source = write_boxes(tmp_path / "a")
+    (source / "scene_gt_info.json").unlink()
+    written = export(open_labelled_bop(tmp_path / "a"), tmp_path / "b")
+    assert "5 of 5 frames had no scene_gt_info: it was counted" in written.notes[0]
+    copy = tmp_path / "b/test/000003"
+    infos = json.loads((copy / "scene_gt_info.json").read_text())
+    for image, rows in infos.items():
+        depth = cv2.imread(str(copy / f"depth/{int(image):06d}.png"), -1)
+        for k, row in enumerate(rows):
+            name = f"{int(image):06d}_{k:06d}.png"
+            whole, visible = (
+                cv2.imread(str(copy / kind / name), -1) > 0 for kind in ("mask", "mask_visib")
+            )
+            assert row["px_count_all"] == whole.sum()
+            assert row["px_count_valid"] == (depth[whole] > 0).sum()
+            assert row["px_count_visib"] == visible.sum()
+            assert row["visib_fract"] == visible.sum() / whole.sum()
+            assert row["bbox_visib"] == bbox(visible)
+            assert row["bbox_obj"] == (bbox(whole) if visible.any() else [-1] * 4)
+
+
+def test_coco_has_the_visible_masks_and_the_whole_boxes(tmp_path):
+    write_boxes(tmp_path / "a")
+    scene = open_labelled_bop(tmp_path / "a")
+    export(scene, tmp_path / "b")
+    coco = json.loads((tmp_path / "b/test/000003/scene_gt_coco.json").read_text())
+    assert [c["name"] for c in coco["categories"]] == ["box1", "box7"]
+    assert [(i["id"], i["file_name"]) for i in coco["images"]] == [
+        (i, f"rgb/{i:06d}.png") for i in scene.indices
+    ]
+    assert [a["id"] for a in coco["annotations"]] == list(range(1, len(coco["annotations"]) + 1))
+    rows = [(i, k, o) for i in scene.indices for k, o in enumerate(scene.frame(i).objects)]
+    rows = [r for r in rows if scene.mask(*r[:2], visible=True).any()]
+    for a, (i, k, o) in zip(coco["annotations"], rows, strict=True):
+        visible, whole = scene.mask(i, k, visible=True), scene.mask(i, k, visible=False)
+        assert (a["image_id"], a["category_id"], a["area"]) == (i, o.obj_id, visible.sum())
+        assert np.array_equal(decoded(a["segmentation"], "a"), visible)
+        x, y, w, h = bbox(whole)
+        assert a["bbox"] == [x, y, w + 1, h + 1]
+        assert a["ignore"] == (o.visible_fraction < 0.1)
+
+
+def test_targets_are_the_visible_objects(tmp_path):
+    source = write_boxes(tmp_path / "a")
+
+    def hide(data):
+        data["5"][0]["visib_fract"] = 0.09
+
+    edit(source / "scene_gt_info.json", hide)
+    export(open_labelled_bop(tmp_path / "a"), tmp_path / "b")
+    targets = read_targets(tmp_path / "b/test_targets_bop19.json")
+    by_image = {t.image_ids[0]: {} for t in targets}
+    for t in targets:
+        assert t.scene_id == 3
+        by_image[t.image_ids[0]][t.obj_id] = t.count
+    scene = open_labelled_bop(tmp_path / "a")
+    for i in scene.indices:
+        seen = [o.obj_id for o in scene.frame(i).objects if o.visible_fraction >= 0.1]
+        assert by_image[i] == {k: seen.count(k) for k in set(seen)}
+    assert by_image[5][1] == 1
+    assert [t.image_ids[0] for t in read_targets(tmp_path / "b/test_targets_bop24.json")] == [
+        1, 5, 9, 13, 17,
+    ]  # fmt: skip
+    camera = json.loads((tmp_path / "b/camera.json").read_text())
+    assert (camera["width"], camera["height"], camera["depth_scale"]) == (96, 72, 0.1)
+    assert "cam_R_w2c" in (tmp_path / "b/dataset_info.md").read_text()
+    open_labelled_bop(tmp_path / "b", targets_only=True)
+
+
+def test_colour_may_be_jpeg_and_masks_left_out(tmp_path):
+    source = write_boxes(tmp_path / "a")
+    smooth = np.tile(np.arange(96, dtype=np.uint8), (72, 1))
+    cv2.imwrite(str(source / "rgb/000001.png"), np.dstack([smooth] * 3))
+    scene = open_labelled_bop(tmp_path / "a")
+    config = BopWriteConfig(colour="jpeg", masks=False)
+    written = export(scene, tmp_path / "b", config)
+    assert any("pixels changed" in note for note in written.notes) and written.counts["masks"] == 0
+    copy = open_labelled_bop(tmp_path / "b")
+    assert copy.colour_file(1).suffix == ".jpg"
+    off = np.abs(read_rgb(copy.colour_file(1)).astype(int) - read_rgb(scene.colour_file(1)))
+    assert off.mean() < 3
+    assert not (tmp_path / "b/test/000003/mask").exists()
+    # JPEG is copied as it is, and PNG made of it has its pixels.
+    export(copy, tmp_path / "c")
+    assert (tmp_path / "c/test/000003/rgb/000001.jpg").read_bytes() == copy.colour_file(
+        1
+    ).read_bytes()
+    export(copy, tmp_path / "d", BopWriteConfig(colour="png"))
+    assert np.array_equal(
+        read_rgb(tmp_path / "d/test/000003/rgb/000001.png"), read_rgb(copy.colour_file(1))
+    )
+
+
+def test_a_truncated_image_is_not_copied(tmp_path):
+    source = write_boxes(tmp_path / "a")
+    file = source / "rgb/000009.png"
+    scene = open_labelled_bop(tmp_path / "a")
+    file.write_bytes(file.read_bytes()[:-40])
+    folder = ExportFolder.begin(tmp_path / "b", {})
+    with pytest.raises(InputError, match=r"000009\.png is truncated"):
+        write_bop_scene(scene, folder)
+
+
+# --- interruption -------------------------------------------------------------------------------
+
+CHILD = """
+import os, signal, sys
+from realsim.formats.bop.opening import open_labelled_bop
+from realsim.formats.bop.root_files import write_bop_models, write_bop_root
+from realsim.formats.bop.writing import write_bop_scene
+from realsim.formats.export_folder import ExportFolder
+from realsim.store import atomic
+source, out, after = sys.argv[1], sys.argv[2], int(sys.argv[3])
+count = 0
+def counted(write):
+    def wrapper(*args, **more):
+        global count
+        count += 1
+        if count == after:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return write(*args, **more)
+    return wrapper
+os.replace = counted(os.replace)
+scene = open_labelled_bop(source)
+folder = ExportFolder.begin(out, {"what": "a test"})
+write_bop_scene(scene, folder)
+write_bop_models(scene.models(), folder, infos=scene.models_info())
+write_bop_root(folder, name="copy")
+folder.finish({})
+"""
+
+
+def run_child(source, out, after):
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, str(source), str(out), str(after)],
+        capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2],
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+    )  # fmt: skip
+    return done.returncode
+
+
+def test_a_killed_export_goes_on_and_ends_with_the_same_bytes(tmp_path):
+    write_boxes(tmp_path / "a", count=3)
+    scene = open_labelled_bop(tmp_path / "a")
+    export(scene, tmp_path / "whole")
+    sums = (tmp_path / "whole/SHA256SUMS").read_text().splitlines()
+    # In the first frame, in the second one's masks, between the documents.
+    for after in (4, 14, 31):
+        out = tmp_path / f"killed{after}"
+        assert run_child(tmp_path / "a", out, after) == -signal.SIGKILL
+        there = len((out / ".export/pieces.jsonl").read_text().splitlines()) if (
+            out / ".export/pieces.jsonl"
+        ).exists() else 0  # fmt: skip
+        folder = ExportFolder.begin(out, {"what": "a test"})
+        assert folder.resumed
+        written = write_bop_scene(scene, folder)
+        assert (written.frames, written.objects, written.counts["masks"]) == (3, 9, 18)
+        assert written.frames_written == 3 - min(there, 3)
+        write_bop_models(scene.models(), folder, infos=scene.models_info())
+        write_bop_root(folder, name="copy")
+        folder.finish({})
+        assert (out / "SHA256SUMS").read_text().splitlines() == sums
+        assert content(out) == content(tmp_path / "whole")
+
+
+# --- the check ----------------------------------------------------------------------------------
+
+
+def test_right_labels_agree(tmp_path):
+    write_boxes(tmp_path)
+    found = check_bop_scene(open_labelled_bop(tmp_path))
+    assert found.agrees, [str(f) for f in found.findings]
+    assert (found.frames, found.objects) == (5, 15)
+    for what in ("bbox_visib", "px_count_valid", "visib_fract", "mask_visib", "pose and mask"):
+        assert found.compared[what] == 15
+
+
+WRONG = {
+    "bbox_visib": lambda row: row["bbox_visib"].__setitem__(2, row["bbox_visib"][2] + 1),
+    "px_count_visib": lambda row: row.update(px_count_visib=row["px_count_visib"] + 3),
+    "px_count_valid": lambda row: row.update(px_count_valid=row["px_count_valid"] - 1),
+    "px_count_all": lambda row: row.update(px_count_all=row["px_count_all"] // 2),
+    "visib_fract": lambda row: row.update(visib_fract=0.5 * row["visib_fract"]),
+    "bbox_obj": lambda row: row["bbox_obj"].__setitem__(0, row["bbox_obj"][0] - 4),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_wrong_counts_are_found(tmp_path, what):
+    folder = write_boxes(tmp_path)
+    edit(folder / "scene_gt_info.json", lambda data: WRONG[what](data["5"][1]))
+    found = check_bop_scene(open_labelled_bop(tmp_path))
+    assert what in found.counts()
+    assert {(f.file, f.image, f.place, f.obj_id) for f in found.findings} == {
+        ("scene_gt_info.json", 5, 1, 7)
+    }
+
+
+def test_a_pose_that_is_off_and_a_mask_that_reaches_out_are_found(tmp_path):
+    folder = write_boxes(tmp_path)
+
+    def shift(data):
+        data["9"][1]["cam_t_m2c"][0] += 25
+
+    edit(folder / "scene_gt.json", shift)
+    counts = check_bop_scene(open_labelled_bop(tmp_path)).counts()
+    assert counts["pose and mask"] >= 1 and counts["pose and box"] >= 1
+    shutil.copy(folder / "mask_visib/000005_000001.png", folder / "mask_visib/000005_000000.png")
+    found = check_bop_scene(open_labelled_bop(tmp_path))
+    assert found.counts()["mask_visib"] == 1
+    assert "image 5, object 0 (id 1): mask_visib says within mask" in "\n".join(
+        map(str, found.findings)
+    )
+
+
+def test_depth_that_was_not_used_for_visibility_is_found(tmp_path):
+    folder = write_boxes(tmp_path)
+    path = folder / "depth/000005.png"
+    counts = cv2.imread(str(path), -1)
+    scene = open_labelled_bop(tmp_path)
+    mask = scene.mask(5, 1, visible=True)
+    near = 1e4 * scene.frame(5).objects[1].T_cam_obj[2, 3]
+    for factor, what in ((0.6, "depth in front"), (1.6, "depth behind")):
+        changed = counts.copy()
+        changed[mask] = int(factor * near)
+        cv2.imwrite(str(path), changed)
+        assert what in check_bop_scene(open_labelled_bop(tmp_path)).counts()

@@ -1,0 +1,193 @@
+"""Camera poses read wrongly are found out: by labelled objects and by depth; so is their unit."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.formats.camera_direction import (
+    depth_evidence,
+    objects_evidence,
+    readings,
+    require_direction,
+    things_of,
+)
+from realsim.formats.camera_scale import require_scale, scale_evidence
+from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
+from realsim.geometry import se3
+from realsim.geometry.camera import ray_table
+from realsim.rendering.rays import PlacedMesh, RayScene, rotated
+from tests.support.synthetic_scenes import INTRINSICS, MODELS, cameras, table, two_boxes
+
+WRONG = ("inverted", "other axes", "inverted, other axes")
+
+
+def labels(Ts, rng, noise_mm=2.0):
+    """Return five static objects as seen from every camera, with errors of public labels."""
+    things = []
+    for T_world_obj in se3.random_transform(rng, 5, 0.3):
+        rows = []
+        for k, T in enumerate(Ts):
+            xi = rng.normal(size=6) * np.r_[np.full(3, 0.01), np.full(3, noise_mm / 1e3)]
+            rows.append((k, se3.invert(T) @ T_world_obj @ se3.exp(xi)))
+        things.append(rows)
+    return things
+
+
+def depths_of(Ts):
+    meshes = [
+        PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in two_boxes().objects
+    ]
+    scene = RayScene([*meshes, table()])
+    rays = ray_table(INTRINSICS).reshape(-1, 3)
+    found = []
+    for T in Ts:
+        hit = scene.cast(T[:3, 3], rotated(rays, T[:3, :3])).t
+        found.append(np.where(np.isfinite(hit), hit, 0).astype(np.float32).reshape(120, 160))
+    return found
+
+
+@pytest.fixture(scope="module")
+def scanned():
+    Ts = np.stack(cameras(14, seed=2))
+    depths = depths_of(Ts)
+    return Ts, lambda k: (depths[k], INTRINSICS)
+
+
+def test_the_readings_are_a_group():
+    """Law: reading a reading again gives one of the four, up to a turn of the world."""
+    Ts = se3.random_transform(np.random.default_rng(0), 4)
+    for name, candidate in readings(Ts).items():
+        back = readings(candidate)[name if "," not in name else "inverted"]
+        relative = se3.invert(back[0]) @ back
+        expected = se3.invert(Ts[0]) @ Ts
+        np.testing.assert_allclose(relative, expected, atol=1e-12)
+
+
+def test_objects_agree_only_under_the_right_reading():
+    rng = np.random.default_rng(1)
+    Ts = np.stack(cameras(12, seed=3))
+    things = labels(Ts, rng)
+    right = objects_evidence(Ts, things)
+    assert right.decisive and right.best == "as stated" and not right.contradicts
+    assert right.spreads["as stated"].mm < 6 and right.spreads["as stated"].deg < 3
+    assert "5 objects in 12 views" in require_direction(right, "x")
+    for name in WRONG:
+        wrong = objects_evidence(readings(Ts)[name], things)
+        assert wrong.contradicts and wrong.decisive
+        with pytest.raises(InputError, match=r"not what they are said to be.*as stated: \d+"):
+            require_direction(wrong, "scene 3")
+
+
+def test_the_verdict_does_not_depend_on_the_world():
+    """Equivariance: another world frame changes no spread."""
+    rng = np.random.default_rng(2)
+    Ts = np.stack(cameras(6, seed=4))
+    things = labels(Ts, rng)
+    moved = objects_evidence(se3.random_transform(rng) @ Ts, things)
+    a = objects_evidence(Ts, things).spreads["as stated"]
+    assert moved.spreads["as stated"].mm == pytest.approx(a.mm, rel=0.5)
+    assert moved.decisive
+
+
+def test_a_camera_that_hardly_moves_decides_nothing():
+    rng = np.random.default_rng(3)
+    first = cameras(1, seed=5)[0]
+    Ts = np.stack([first @ se3.from_translation([0.0004 * k, 0.0, 0.0]) for k in range(6)])
+    things = labels(Ts, rng)
+    for T in readings(Ts).values():
+        evidence = objects_evidence(T, things)
+        assert not evidence.decisive and not evidence.contradicts
+        assert "moves too little" in require_direction(evidence, "x")
+    depths = depths_of(Ts)
+    by_depth = depth_evidence(readings(Ts)["inverted"], lambda k: (depths[k], INTRINSICS))
+    assert not by_depth.decisive and not by_depth.contradicts
+
+
+def test_things_that_move_decide_nothing():
+    rng = np.random.default_rng(4)
+    Ts = np.stack(cameras(8, seed=6))
+    things = [[(k, se3.random_transform(rng)) for k in range(8)] for _ in range(3)]
+    evidence = objects_evidence(Ts, things)
+    assert evidence.agreeing == () and "the scene moved" in require_direction(evidence, "x")
+    nothing = objects_evidence(Ts, [[(0, np.eye(4))]])
+    assert not nothing.contradicts and "could not be checked" in require_direction(nothing, "x")
+
+
+def test_two_alike_are_not_confused():
+    """Of an object that a frame shows twice without instances, nothing can be said."""
+    T = np.eye(4)
+
+    def frame(index, *objects):
+        rows = tuple(LabelledObject(obj_id=o, instance=i, T_cam_obj=T) for o, i in objects)
+        return LabelledFrame(
+            index=index, intrinsics=INTRINSICS, depth_unit_m=None, objects=rows, T_world_cam=T
+        )
+
+    frames = [
+        frame(0, (1, None), (1, None), (2, None), (3, 7)),
+        frame(4, (1, None), (2, None), (3, 7)),
+    ]
+    Ts, things = things_of(frames)
+    assert Ts.shape == (2, 4, 4) and [[k for k, _ in t] for t in things] == [[0, 1], [0, 1]]
+
+
+def test_depth_agrees_only_under_the_right_reading(scanned):
+    Ts, depth_of = scanned
+    right = depth_evidence(Ts, depth_of)
+    assert right.decisive and right.best == "as stated" and right.spreads["as stated"].mm < 3
+    for name in WRONG:
+        wrong = depth_evidence(readings(Ts)[name], depth_of)
+        assert wrong.contradicts, (name, wrong.numbers)
+
+
+@pytest.mark.parametrize("factor", [0.001, 0.25, 1.0, 2.0, 1000.0])
+def test_depth_tells_the_unit_of_the_poses(scanned, factor):
+    Ts, depth_of = scanned
+    Ts = Ts.copy()
+    Ts[:, :3, 3] /= factor
+    evidence = scale_evidence(Ts, depth_of)
+    assert evidence.decisive and evidence.best == pytest.approx(factor, rel=0.04)
+    if factor == 1.0:
+        assert "scale checked" in require_scale(evidence, "x")
+    else:
+        with pytest.raises(InputError, match="--scale"):
+            require_scale(evidence, "x")
+
+
+def test_a_camera_that_only_turns_has_no_scale():
+    Ts = np.stack(
+        [cameras(1, seed=5)[0] @ se3.exp([0.05 * k, 0, 0.04 * k, 0, 0, 0]) for k in range(5)]
+    )
+    depths = depths_of(Ts)
+    evidence = scale_evidence(Ts, lambda k: (depths[k], INTRINSICS))
+    assert "scale checked" not in require_scale(evidence, "x") or evidence.best == 1.0
+
+
+@pytest.mark.real
+def test_a_real_arm_with_a_camera():
+    """APC shelf: 15 views at the arm's own poses (camera to world), depth of an F200."""
+    root = Path(os.environ.get("REALSIM_DATA", "")) / "scenes/apc_shelf_multiview/scene-0000"
+    if not root.is_dir():
+        pytest.skip("REALSIM_DATA is not set")
+    from realsim.app.import_folder import FolderRequest, open_image_folder
+    from realsim.formats.folders import FolderChoice
+
+    source, _ = open_image_folder(root, FolderRequest(choice=FolderChoice(depth_unit_m=1e-4)))
+    frames = list(source.frames())
+    Ts = np.stack([f.T_world_cam for f in frames])
+
+    def depth_of(k):
+        return (frames[k].depth_counts * 1e-4).astype(np.float32), source.intrinsics
+
+    right = depth_evidence(Ts, depth_of)
+    assert right.decisive and right.best == "as stated"
+    for name in WRONG:
+        assert depth_evidence(readings(Ts)[name], depth_of).contradicts
+    scale = scale_evidence(Ts, depth_of)
+    assert not scale.contradicts
+    millimetres = Ts.copy()
+    millimetres[:, :3, 3] *= 1000
+    assert scale_evidence(millimetres, depth_of).contradicts

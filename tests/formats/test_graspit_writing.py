@@ -1,0 +1,209 @@
+"""GraspIT's scene.yaml and grasps.hdf5 written: what is written is read again as it was."""
+
+import dataclasses
+import os
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from pxr import Usd
+
+import placed_scenes
+from realsim.errors import InputError
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.graspit.grasps import WorldGrasps
+from realsim.formats.graspit.scene import read_graspit_grasps, read_graspit_scene
+from realsim.formats.graspit.writing import (
+    GraspitConfig,
+    paired_grasps,
+    table_mesh,
+    write_graspit,
+    yaml_text,
+)
+from realsim.formats.robot_scenes.placing import place_scene
+from realsim.geometry import se3
+from realsim.geometry.mesh import mass_properties
+from realsim.records import GraspSet
+
+DATA = Path(os.environ.get("REALSIM_DATA", "/nonexistent"))
+REAL = DATA / "school/graspit_assets"
+needs_real = pytest.mark.skipif(
+    not REAL.is_dir(), reason=f"no graspit_assets under {DATA} (set REALSIM_DATA)"
+)
+
+
+def tried(instance, obj_id, middle, n=12):
+    """Return grasps from above that close along the object's y about a point of it."""
+    z = np.array([0.0, 0.0, -1.0])
+    R = np.stack([np.cross([0.0, 1.0, 0.0], z), [0.0, 1.0, 0.0], z], axis=1)
+    at = np.asarray(middle) + np.linspace(-0.005, 0.005, n)[:, None] * [0, 0, 1]
+    return GraspSet(
+        obj_id=obj_id,
+        instance=instance,
+        Ts_obj_grasp=se3.from_rt(np.tile(R, (n, 1, 1)), at),
+        widths_m=np.full(n, 0.05),
+        scores=np.ones(n),
+        base_scores=np.ones(n),
+        slip_m=np.zeros((n, 4)),
+        slip_rad=np.zeros((n, 4)),
+        reachable=np.ones(n, dtype=bool),
+        failures=("",) * n,
+    )
+
+
+def grasps():
+    sets = (
+        tried(0, 1, [0.06, 0.02, 0.01]),
+        tried(1, 2, [0.0, 0.0, 0.02]),
+        tried(2, 1, [0.05, 0.02, 0.01], n=7),
+    )
+    return [paired_grasps(s) for s in sets]
+
+
+def write(scene, sets, folder, source=None, **config):
+    out = ExportFolder.begin(folder, {"scene": scene.name})
+    written = write_graspit(scene, sets, out, GraspitConfig(**config), source=source)
+    out.finish({})
+    return written
+
+
+def same(found, scene, sets):
+    """Assert that poses, meshes (float32 in STL) and grasps are those of the scene."""
+    assert found.order == "wxyz"
+    for o, p in zip(scene.objects, found.scene.objects, strict=True):
+        assert np.allclose(p.T_world_obj, o.T_world_obj, rtol=0, atol=1e-12)
+        seen, mesh = found.models[p.obj_id].mesh, scene.body(o).model.mesh
+        assert np.allclose(seen.vertices[seen.faces], mesh.vertices[mesh.faces], rtol=0, atol=1e-8)
+    back = read_graspit_grasps(found)
+    assert [g.instance for g in back] == [g.instance for g in sets]
+    for a, b in zip(sets, back, strict=True):
+        assert np.allclose(b.Ts_obj_grasp, a.Ts_obj_grasp, rtol=0, atol=1e-12)
+
+
+def test_what_is_written_is_read_again_with_the_grasps_of_each_instance(tmp_path):
+    scene = placed_scenes.placed_scene()
+    told = write(scene, grasps(), tmp_path / "s")
+    found = read_graspit_scene(tmp_path / "s")
+    same(found, scene, grasps())
+    assert list(found.names.values()) == ["bracket_0", "_2_box", "bracket_2"]
+    assert [o.obj_id for o in found.scene.objects] == [1, 2, 1]
+    assert told.counts == {"meshes": 2, "grasps": 31}
+    assert any("STL has no colours" in n for n in told.notes)
+    height = found.scene.plane.T_world_table[2, 3]
+    assert height == pytest.approx(scene.table.T_world_table[2, 3], abs=1e-6)
+
+
+def test_the_pairs_are_a_grasp_and_its_half_turn_in_world(tmp_path):
+    scene = placed_scenes.placed_scene()
+    write(scene, grasps(), tmp_path / "s")
+    with h5py.File(tmp_path / "s/grasps.hdf5") as file:
+        assert sorted(file) == ["_2_box", "bracket_0", "bracket_2"]
+        Ts = file["bracket_0"][()]
+    assert Ts.shape == (12, 2, 4, 4) and Ts.dtype == np.float64
+    half = se3.invert(Ts[:, 0]) @ Ts[:, 1]
+    assert np.allclose(half, np.diag([-1.0, -1.0, 1.0, 1.0]), atol=1e-12)
+    wanted = scene.objects[0].T_world_obj @ tried(0, 1, [0.06, 0.02, 0.01]).Ts_obj_grasp
+    assert np.allclose(Ts[:, 0], wanted, atol=1e-12)
+
+
+def test_the_usual_reader_of_yaml_finds_numbers_where_numbers_are(tmp_path):
+    """PyYAML takes 1e-05 for a text and `no` for false."""
+    yaml = pytest.importorskip("yaml")
+    rows = {"a": {"name": "no", "position": [1e-05, -2.5e-17, 3.0], "scale": [1, 1, 1]}, "p": "x/y"}
+    assert yaml.safe_load(yaml_text(rows)) == rows
+    scene = placed_scenes.placed_scene()
+    write(scene, grasps(), tmp_path / "s")
+    data = yaml.safe_load((tmp_path / "s/scene.yaml").read_text())
+    assert list(data) == ["grasp_path", "object1", "object2", "object3", "table"]
+    assert list(data["object1"]) == ["file_path", "name", "orientation", "position", "scale"]
+    assert data["object1"]["position"] == scene.objects[0].T_world_obj[:3, 3].tolist()
+
+
+def test_a_table_that_leans_in_world_becomes_level(tmp_path):
+    scene = placed_scenes.turned_to(placed_scenes.placed_scene())
+    told = write(scene, grasps(), tmp_path / "s")
+    found = read_graspit_scene(tmp_path / "s")
+    assert any("table's frame" in n for n in told.notes)
+    T = se3.invert(scene.table.T_world_table)
+    for o, p in zip(scene.objects, found.scene.objects, strict=True):
+        assert np.allclose(p.T_world_obj, T @ o.T_world_obj, atol=1e-12)
+    for a, b in zip(grasps(), read_graspit_grasps(found), strict=True):
+        assert np.allclose(b.Ts_obj_grasp, a.Ts_obj_grasp, atol=1e-12)
+
+
+def test_meshes_go_as_usd_too_where_it_is_asked_for(tmp_path):
+    scene = placed_scenes.placed_scene()
+    told = write(scene, grasps(), tmp_path / "s", with_usd=True)
+    assert "file_path: assets/bracket.usd" in (tmp_path / "s/scene.yaml").read_text()
+    stage = Usd.Stage.Open(str(tmp_path / "s/assets/bracket.usd"))
+    assert stage.GetDefaultPrim().GetName() == "bracket" and not told.notes
+    same(read_graspit_scene(tmp_path / "s"), scene, grasps())
+
+
+def test_the_same_scene_gives_the_same_bytes_and_several_go_into_one_export(tmp_path):
+    scene = placed_scenes.placed_scene()
+    write(scene, grasps(), tmp_path / "a")
+    write(scene, grasps(), tmp_path / "b")
+    sums = [(tmp_path / n / "SHA256SUMS").read_text() for n in "ab"]
+    assert sums[0] == sums[1]
+    out = ExportFolder.begin(tmp_path / "c", {})
+    for k in range(2):
+        write_graspit(scene, grasps(), out, GraspitConfig(under=f"scenes/scene_{k}"))
+    out.finish({})
+    same(read_graspit_scene(tmp_path / "c/scenes/scene_1"), scene, grasps())
+    text = (tmp_path / "c/scenes/scene_1/scene.yaml").read_text()
+    assert text.startswith("grasp_path: scenes/scene_1/grasps.hdf5\n")
+
+
+def test_what_the_source_says_survives_and_what_moved_is_new(tmp_path):
+    scene = placed_scenes.placed_scene()
+    write(scene, grasps(), tmp_path / "a")
+    path = tmp_path / "a/scene.yaml"
+    text = path.read_text().replace("  name: _2_box\n", "  name: _2_box\n  owner: lab\n")
+    path.write_text(text + "camera: left\n")
+    source = read_graspit_scene(tmp_path / "a")
+    again = place_scene(source.scene, source.models)
+    sets = read_graspit_grasps(source)
+    write(again, sets, tmp_path / "b", source)
+    copy = (tmp_path / "b/scene.yaml").read_text()
+    assert sorted(copy.splitlines()) == sorted(path.read_text().splitlines())
+    moved = dataclasses.replace(
+        again.objects[1],
+        T_world_obj=se3.from_translation([0.01, 0, 0]) @ again.objects[1].T_world_obj,
+    )
+    objects = (again.objects[0], moved, again.objects[2])
+    write(dataclasses.replace(again, objects=objects), sets, tmp_path / "c", source)
+    changed = set((tmp_path / "c/scene.yaml").read_text().splitlines()) - set(copy.splitlines())
+    assert [line.split(":")[0] for line in changed if "orientation" not in line] == ["  position"]
+    found = read_graspit_scene(tmp_path / "c")
+    assert np.allclose(found.scene.objects[1].T_world_obj, moved.T_world_obj, atol=1e-12)
+
+
+def test_the_table_is_a_closed_box_under_the_plane():
+    table = placed_scenes.placed_scene().table
+    solid = mass_properties(table_mesh(table), 1.0)
+    assert solid.is_watertight
+    assert np.isclose(solid.volume_m3, np.prod([*table.size_m, table.thickness_m]))
+    assert np.isclose(table_mesh(table).bounds[1, 2], table.T_world_table[2, 3])
+
+
+def test_grasps_of_nothing_are_refused(tmp_path):
+    stranger = dataclasses.replace(grasps()[0], instance=9)
+    assert isinstance(stranger, WorldGrasps)
+    with pytest.raises(InputError, match="instance 9"):
+        write(placed_scenes.placed_scene(), [stranger], tmp_path / "s")
+
+
+@pytest.mark.real
+@needs_real
+def test_the_authors_scene_is_written_again_letter_by_letter(tmp_path):
+    source = read_graspit_scene(REAL)
+    sets = read_graspit_grasps(source)
+    scene = place_scene(source.scene, source.models)
+    write(scene, sets, tmp_path / "s", source)
+    assert (tmp_path / "s/scene.yaml").read_bytes() == (REAL / "scene.yaml").read_bytes()
+    with h5py.File(REAL / "grasps.hdf5") as a, h5py.File(tmp_path / "s/grasps.hdf5") as b:
+        assert sorted(a) == sorted(b)
+        assert all(np.allclose(a[n][()], b[n][()], rtol=0, atol=1e-12) for n in a)
+    same(read_graspit_scene(tmp_path / "s"), scene, sets)

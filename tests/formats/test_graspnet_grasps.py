@@ -1,0 +1,383 @@
+"""GraspNet's grasps: the gripper frame, groups, labels, collisions, rectangles, broken files."""
+
+import io
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from realsim.errors import InputError
+from realsim.formats.graspnet import gripper_frame as frame
+from realsim.formats.graspnet.collision_labels import (
+    collision_points,
+    read_collision_labels,
+    write_collision_labels,
+)
+from realsim.formats.graspnet.grasp_group import (
+    GraspGroup,
+    grasp_group,
+    read_grasp_group,
+    write_grasp_group,
+)
+from realsim.formats.graspnet.grasp_labels import (
+    GraspLabels,
+    read_grasp_labels,
+    write_grasp_labels,
+)
+from realsim.formats.graspnet.rect import read_rect, rect_grasps, write_rect
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics
+from tried_grasps import assert_same, tried_set
+
+SINGLE = 2e-7
+"""Rounding of numbers about 1 to single precision, both ways."""
+
+
+def a_group(seed=0, n=20):
+    rng = np.random.default_rng(seed)
+    return GraspGroup(
+        Ts_a_grasp=se3.random_transform(rng, n, 0.5),
+        scores=rng.normal(size=n),
+        openings_m=rng.uniform(0, 0.1, n),
+        heights_m=np.full(n, 0.02),
+        depths_m=rng.choice(frame.DEPTHS_M, n),
+        obj_ids=rng.integers(0, 89, n),
+    )
+
+
+def some_labels(seed=0, points=20, n=150):
+    """Return labels of every level, some of them in the object, single precision throughout."""
+    rng = np.random.default_rng(seed)
+    grid = (points, frame.VIEWS, frame.ANGLES, frame.DEPTHS)
+    flat = np.sort(rng.choice(int(np.prod(grid)), n, replace=False))
+    index = np.stack(np.unravel_index(flat, grid), axis=1)
+    return GraspLabels(
+        points=rng.uniform(-0.1, 0.1, (points, 3)).astype(np.float32),
+        index=index,
+        angles_rad=frame.angles_rad()[index[:, 2]],
+        depths_m=np.array(frame.DEPTHS_M)[index[:, 3]],
+        openings_m=rng.uniform(0.01, 0.1, n),
+        friction=rng.integers(1, 11, n) / 10,
+        collision=rng.random(n) < 0.4,
+    )
+
+
+def matrix_as_documented(towards, angle):
+    """Return graspnetAPI's rotation of a viewpoint, written out anew from its definition."""
+    x = towards / np.sqrt(towards @ towards)
+    y = np.array([-towards[1], towards[0], 0.0])
+    y = y / np.sqrt(y @ y)
+    z = np.array([x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]])
+    turn = np.array(
+        [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]
+    )
+    return np.array([x, y, z]).T @ turn
+
+
+# --- laws -------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_to_graspnets_gripper_and_back_is_the_same_grasp(seed):
+    rng = np.random.default_rng(seed)
+    Ts, depths = se3.random_transform(rng, 10), rng.uniform(0, 0.04, 10)
+    there = frame.graspnet_poses(Ts, depths)
+    back = frame.grasp_poses(there, depths)
+    np.testing.assert_array_equal(back[:, :3, :3], Ts[:, :3, :3])  # signed permutations
+    np.testing.assert_allclose(back, Ts, rtol=0, atol=1e-15 * (1 + np.abs(Ts).max()))
+    np.testing.assert_allclose(np.linalg.det(there[:, :3, :3]), 1.0)
+    distance = np.linalg.norm(Ts[:, None, :3, 3] - Ts[None, :, :3, 3], axis=-1)
+    tips = there[:, :3, 3] + depths[:, None] * there[:, :3, 0]
+    np.testing.assert_allclose(
+        np.linalg.norm(tips[:, None] - tips[None], axis=-1), distance, atol=1e-12
+    )
+
+
+def test_graspnets_gripper_goes_with_the_object():
+    rng = np.random.default_rng(1)
+    Ts, T, d = se3.random_transform(rng, 10), se3.random_transform(rng), rng.uniform(0, 0.04, 10)
+    np.testing.assert_allclose(
+        T @ frame.graspnet_poses(Ts, d), frame.graspnet_poses(T @ Ts, d), atol=1e-14
+    )
+
+
+def test_a_group_that_is_written_is_read_to_single_precision(tmp_path):
+    group = a_group()
+    back = read_grasp_group(write_grasp_group(tmp_path / "g.npy", group))
+    np.testing.assert_allclose(back.Ts_a_grasp, group.Ts_a_grasp, rtol=0, atol=3 * SINGLE)
+    for name in ("scores", "openings_m", "heights_m", "depths_m"):
+        np.testing.assert_allclose(getattr(back, name), getattr(group, name), rtol=SINGLE)
+    np.testing.assert_array_equal(back.obj_ids, group.obj_ids)
+    again = write_grasp_group(tmp_path / "h.npy", back)
+    assert np.abs(np.load(again) - np.load(tmp_path / "g.npy")).max() < SINGLE
+
+
+def test_sets_in_a_view_and_back_are_the_same_grasps(tmp_path):
+    rng = np.random.default_rng(2)
+    sets = [tried_set(rng, 30, obj_id=3, instance=0), tried_set(rng, 20, obj_id=9, instance=1)]
+    Ts_cam_obj = {0: se3.random_transform(rng), 1: se3.random_transform(rng)}
+    group = grasp_group(sets, Ts_cam_obj)
+    back = read_grasp_group(write_grasp_group(tmp_path / "g.npy", group))
+    for s in sets:
+        found = back.of_object(s.obj_id, Ts_cam_obj[s.instance], s.instance)
+        rows = ~np.isnan(s.scores)
+        assert 0 < rows.sum() < len(s)
+        np.testing.assert_allclose(found.Ts_obj_grasp, s.Ts_obj_grasp[rows], rtol=0, atol=2e-6)
+        np.testing.assert_allclose(found.parameters["openings_m"], s.widths_m[rows], rtol=SINGLE)
+        np.testing.assert_allclose(
+            found.parameters["source"]["scores"], s.scores[rows], rtol=SINGLE
+        )
+        assert np.isnan(found.scores).all()  # another's score is not ours
+
+
+def test_moving_all_objects_moves_the_group():
+    rng = np.random.default_rng(3)
+    s, T_cam_obj, T = tried_set(rng, 30), se3.random_transform(rng), se3.random_transform(rng)
+    here = grasp_group([s], {s.instance: T_cam_obj}).moved(T)
+    there = grasp_group([s], {s.instance: T @ T_cam_obj})
+    np.testing.assert_allclose(here.Ts_a_grasp, there.Ts_a_grasp, atol=1e-13)
+
+
+def test_labels_that_are_written_are_read_to_the_last_bit(tmp_path):
+    labels = some_labels()
+    path = write_grasp_labels(tmp_path / "000_labels.npz", labels)
+    assert_same(read_grasp_labels(path, with_collision=True), labels)
+    few = read_grasp_labels(path, friction_at_most=0.4)
+    rows = (labels.friction <= np.float32(0.4)) & ~labels.collision
+    assert 0 < rows.sum() < len(labels)
+    assert_same(few, labels.rows(rows))
+    again = write_grasp_labels(tmp_path / "again.npz", read_grasp_labels(path, with_collision=True))
+    assert again.read_bytes() == path.read_bytes()
+
+
+def test_labels_as_grasps_in_a_group_are_the_labels(tmp_path):
+    labels = some_labels(4)
+    s = labels.as_set(5)
+    group = grasp_group([s], {0: np.eye(4)}, scores="friction")
+    np.testing.assert_allclose(group.scores, 1.1 - labels.friction, atol=1e-6)
+    path = write_grasp_group(tmp_path / "g.npy", group)
+    back = read_grasp_group(path).of_object(5, np.eye(4), from_labels=True)
+    np.testing.assert_allclose(back.measures["closure_friction"], labels.friction, atol=1e-6)
+    np.testing.assert_allclose(back.Ts_obj_grasp, labels.Ts_obj_grasp(), rtol=0, atol=1e-6)
+
+
+def test_which_views_were_looked_at_is_kept(tmp_path):
+    tried = np.arange(300) % 4 == 0
+    labels = some_labels(5)
+    labels = replace(labels.rows(tried[labels.index[:, 1]]), view_tried=tried)
+    back = read_grasp_labels(write_grasp_labels(tmp_path / "l.npz", labels), with_collision=True)
+    assert_same(back, labels)
+
+
+def test_collisions_belong_to_the_labels_they_were_written_of(tmp_path):
+    objects = [(some_labels(k, points=10 + 20 * k), None) for k in range(3)]
+    rng = np.random.default_rng(0)
+    objects = [(labels, rng.random(len(labels)) < 0.5) for labels, _ in objects]
+    path = write_collision_labels(tmp_path / "collision_labels.npz", objects)
+    assert collision_points(path) == (10, 30, 50)
+    for k, (labels, collides) in enumerate(objects):
+        np.testing.assert_array_equal(read_collision_labels(path, k, labels), collides)
+    with np.load(path) as file:
+        assert file["arr_1"].shape == (30, 300, 12, 4) and file["arr_1"].dtype == np.bool_
+    with pytest.raises(InputError, match="arr_1 is of 30 points"):
+        read_collision_labels(path, 1, objects[0][0])
+
+
+# --- known answers ----------------------------------------------------------------------------
+
+
+def test_a_grasp_straight_down_on_a_box_in_graspnets_numbers(tmp_path):
+    """A box of 40 mm at (0.1, 0, 0.5) in a camera that looks down on it, closed along image x."""
+    row = np.zeros((1, 17))
+    row[0, :4] = [0.9, 0.06, 0.02, 0.03]  # score, width, height, depth
+    # Columns: approach = camera z, closing = camera x, height = approach x closing = camera y.
+    row[0, 4:13] = np.array([[0, 1, 0], [0, 0, 1], [1, 0, 0]]).ravel()
+    row[0, 13:16] = [0.1, 0.0, 0.48]  # on the box's upper face
+    row[0, 16] = 4
+    np.save(tmp_path / "g.npy", row.astype(np.float32))
+    group = read_grasp_group(tmp_path / "g.npy")
+    T = group.Ts_a_grasp[0]
+    np.testing.assert_allclose(T[:3, 2], [0, 0, 1], atol=1e-7)  # approach
+    np.testing.assert_allclose(T[:3, 1], [1, 0, 0], atol=1e-7)  # closing
+    np.testing.assert_allclose(T[:3, 3], [0.1, 0.0, 0.51], atol=1e-7)  # 30 mm in
+    assert group.obj_ids[0] == 5 and group.openings_m[0] == pytest.approx(0.06)
+    T_cam_obj = se3.from_translation([0.1, 0.0, 0.5])
+    found = group.of_object(5, T_cam_obj)
+    np.testing.assert_allclose(found.Ts_obj_grasp[0, :3, 3], [0, 0, 0.01], atol=1e-7)
+    assert len(group.of_object(4, T_cam_obj)) == 0
+
+
+def test_the_views_and_turns_are_graspnets():
+    for i in (0, 1, 150, 299):
+        z = (2 * i + 1) / 300 - 1
+        turn = 2 * np.pi * i * (np.sqrt(5) - 1) / 2
+        view = [np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z]
+        np.testing.assert_allclose(frame.views()[i], view, atol=1e-12)
+        for k in (0, 5, 11):
+            R = matrix_as_documented(-np.array(view), k * np.pi / 12)
+            mine = frame.rotations(-frame.views()[i], frame.angles_rad()[k])
+            np.testing.assert_allclose(mine, R, atol=1e-12)
+    upright = frame.rotations([0.0, 0.0, -2.0], 0.0)  # no level axis is defined: y
+    np.testing.assert_allclose(upright, np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]]).T, atol=1e-15)
+    assert np.abs(np.linalg.norm(frame.views(), axis=1) - 1).max() < 1e-12
+
+
+def test_labels_are_read_as_graspnets_own_loader_reads_them(tmp_path):
+    """The steps of graspnetAPI's loadGrasp on the raw arrays give the same group."""
+    labels = some_labels(6)
+    path = write_grasp_labels(tmp_path / "004_labels.npz", labels)
+    with np.load(path) as file:
+        points, offsets, fric = file["points"], file["offsets"], file["scores"]
+        keep = (fric <= 0.4 + 1e-6) & (fric > 0) & ~file["collision"]
+    point, view, _, _ = np.nonzero(keep)
+    rows = []
+    for p, v, (angle, depth, width), mu in zip(point, view, offsets[keep], fric[keep], strict=True):
+        R = matrix_as_documented(-frame.views()[v], angle)
+        rows.append([1.1 - mu, width, 0.02, depth, *R.ravel(), *points[p], 4])
+    np.save(tmp_path / "theirs.npy", np.array(rows, dtype=np.float32))
+    ours = grasp_group(
+        [read_grasp_labels(path, friction_at_most=0.4).as_set(5)], {0: np.eye(4)},
+        scores="friction", depth_m=0.0,
+    )  # fmt: skip
+    theirs = read_grasp_group(tmp_path / "theirs.npy")
+    assert len(ours) == len(theirs) > 10
+    np.testing.assert_allclose(ours.Ts_a_grasp, theirs.Ts_a_grasp, rtol=0, atol=1e-6)
+    for name in ("scores", "openings_m", "obj_ids"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), atol=1e-6)
+
+
+def test_a_rectangle_has_the_grippers_opening_and_height_in_pixels(tmp_path):
+    """Seen from 0.5 m with f = 600 px: the palm's face, 20 mm nearer, is drawn."""
+    camera = CameraIntrinsics(width=640, height=480, fx=600, fy=600, cx=320, cy=240)
+    T = np.eye(4)[None].repeat(2, axis=0)
+    T[:, :3, 3] = [0.0, 0.0, 0.52]  # approach = camera z, closing = camera y
+    T[1] = T[1] @ se3.from_rt(se3.exp_so3([0.3, 0, 0]), [0, 0, 0])  # 17 deg: no rectangle
+    group = replace(
+        a_group(n=2), Ts_a_grasp=T, openings_m=np.full(2, 0.08), depths_m=np.full(2, 0.02),
+        obj_ids=np.array([1, 2]),
+    )  # fmt: skip
+    rect = rect_grasps(group, camera)
+    assert len(rect) == 1 and rect.obj_ids[0] == 1
+    np.testing.assert_allclose(rect.centers_px[0], [320, 240], atol=1e-9)
+    np.testing.assert_allclose(rect.open_px[0], [320, 240 - 600 * 0.04 / 0.48], atol=1e-9)
+    np.testing.assert_allclose(rect.heights_px[0], 600 * 0.02 / 0.48)
+    sides = np.linalg.norm(np.diff(rect.corners_px()[0], axis=0, append=rect.corners_px()[0][:1]),
+                           axis=1)  # fmt: skip
+    np.testing.assert_allclose(sides, [100, 25, 100, 25])
+    back = read_rect(write_rect(tmp_path / "0000.npy", rect))
+    np.testing.assert_allclose(back.corners_px(), rect.corners_px(), atol=1e-3)
+    assert np.load(tmp_path / "0000.npy")[0, 6] == 0
+
+
+# --- files that are broken ----------------------------------------------------------------------
+
+
+def broken_group(change):
+    rows = np.zeros((3, 17), dtype=np.float32)
+    rows[:, 4:13] = np.eye(3).ravel()
+    return change(rows)
+
+
+def put(at, value):
+    def change(rows):
+        rows[at] = value
+        return rows
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (put((1, 13), np.nan), "grasp 1 has nan"),
+        (put((2, 4), 2.0), "grasp 2 are no rotation"),
+        (put((2, 4), -1.0), "no rotation"),
+        (put((0, 1), 80.0), "metres"),
+        (put((0, 13), 450.0), "metres"),
+        (put((0, 16), 0.5), "no object id"),
+        (put((0, 1), -0.1), "negative"),
+        (lambda rows: rows[:, :16], "a GraspGroup is"),
+        (lambda rows: rows[0], "a GraspGroup is"),
+        (lambda rows: rows.astype(np.int64), "a GraspGroup is"),
+        (lambda rows: rows.astype(object), "never objects"),
+    ],
+)
+def test_a_broken_group_is_refused_with_the_reason(tmp_path, change, says):
+    np.save(tmp_path / "g.npy", broken_group(change), allow_pickle=True)
+    with pytest.raises(InputError, match=says):
+        read_grasp_group(tmp_path / "g.npy")
+
+
+def test_an_unknown_object_of_a_network_is_no_object(tmp_path):
+    np.save(tmp_path / "g.npy", broken_group(put((slice(None), 16), -1)))
+    assert read_grasp_group(tmp_path / "g.npy").obj_ids.tolist() == [0, 0, 0]
+
+
+def small_file(path, **changes):
+    """Write the labels of two points, with some arrays exchanged (None = left out)."""
+    grid = (2, 300, 12, 4)
+    arrays = {
+        "points": np.zeros((2, 3), np.float32), "offsets": np.full((*grid, 3), 0.01, np.float32),
+        "scores": np.full(grid, 0.5, np.float32), "collision": np.zeros(grid, bool),
+    }  # fmt: skip
+    arrays |= {name: a for name, a in changes.items() if a is not None}
+    np.savez_compressed(path, **{n: a for n, a in arrays.items() if changes.get(n, 0) is not None})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"points": np.full((2, 3), 80.0)}, "millimetres"),
+        ({"points": np.full((2, 3), np.nan)}, "metres"),
+        ({"points": np.zeros((3, 3))}, "the shape"),
+        ({"scores": None}, "no array 'scores'"),
+        ({"scores": np.full((2, 300, 12, 4), 90.0)}, "scores reach 90"),
+        ({"offsets": np.full((2, 300, 12, 4, 3), 3.0)}, "in the order angle, depth, width"),
+        ({"collision": np.zeros((2, 300, 12, 4))}, "of kind b or u"),
+        ({"collision": np.zeros((2, 300, 12, 4), object)}, r"of type \|O"),
+        ({"view_tried": np.ones(299, bool)}, "the shape"),
+    ],
+)
+def test_broken_labels_are_refused_with_the_reason(tmp_path, changes, says):
+    with pytest.raises(InputError, match=says):
+        read_grasp_labels(small_file(tmp_path / "l.npz", **changes))
+
+
+def test_a_header_that_claims_more_than_there_is_is_refused(tmp_path):
+    path = small_file(tmp_path / "l.npz")
+    header = io.BytesIO()
+    shape = (9999, 3)
+    np.lib.format.write_array_header_1_0(
+        header, {"descr": "<f4", "fortran_order": False, "shape": shape}
+    )
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(tmp_path / "n.npz", "w") as new:
+        for name in old.namelist():
+            new.writestr(name, header.getvalue() if name == "points.npy" else old.read(name))
+    with pytest.raises(InputError, match="claims the shape"):
+        read_grasp_labels(tmp_path / "n.npz")
+
+
+@given(st.data())
+@settings(max_examples=120, deadline=None)
+def test_damaged_files_are_refused_or_read(tmp_path_factory, data):
+    folder = tmp_path_factory.getbasetemp()
+    whole = folder / "whole.npz"
+    if not whole.exists():
+        write_grasp_labels(whole, some_labels(points=2, n=40))
+    content = bytearray(whole.read_bytes())
+    if data.draw(st.booleans()):
+        content = content[: data.draw(st.integers(0, len(content) - 1))]
+    for _ in range(data.draw(st.integers(1, 4))):
+        if content:
+            where = data.draw(st.integers(0, len(content) - 1))
+            content[where] = data.draw(st.integers(0, 255))
+    (folder / "damaged.npz").write_bytes(bytes(content))
+    try:
+        read_grasp_labels(folder / "damaged.npz", with_collision=True)
+    except InputError:
+        pass

@@ -1,0 +1,276 @@
+"""What GraspNet has no place for is converted and said, or refused; kills leave equal bytes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from labelled_scenes import INTRINSICS, MODELS, PLACES, labelled_scene
+from realsim import CameraIntrinsics
+from realsim.errors import InputError
+from realsim.formats import images
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.graspnet.opening import open_scene
+from realsim.formats.graspnet.tree import open_graspnet
+from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
+from realsim.geometry import se3
+from realsim.geometry.mesh import load_mesh
+from realsim.records import Mesh
+
+HOME = "scenes/scene_0003/realsense"
+
+
+def write(scene, out, **config):
+    return write_graspnet_scene(
+        scene, ExportFolder.begin(out, {"what": "test"}), GraspnetWriteConfig(**config)
+    )
+
+
+def opened(out):
+    (ref,) = open_graspnet(out).scenes
+    return open_scene(ref)
+
+
+def tree_bytes(folder):
+    files = [p for p in folder.rglob("*") if p.is_file()]
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
+
+
+@pytest.fixture
+def source(tmp_path):
+    return labelled_scene(tmp_path / "source", range(3))
+
+
+def test_an_interrupted_export_ends_with_the_same_bytes_and_notes(source, tmp_path):
+    class Kill(Exception):
+        pass
+
+    def killed_at(count):
+        ticks = []
+
+        def tick():
+            ticks.append(1)
+            if len(ticks) == count:
+                raise Kill
+
+        return tick
+
+    results = []
+    for out, kills in ((tmp_path / "whole", ()), (tmp_path / "killed", (1, 3))):
+        for count in kills:
+            folder = ExportFolder.begin(out, {"what": "test"})
+            with pytest.raises(Kill):
+                write_graspnet_scene(
+                    source, folder, GraspnetWriteConfig(), progress=killed_at(count)
+                )
+        folder = ExportFolder.begin(out, {"what": "test"})
+        results.append(write_graspnet_scene(source, folder, GraspnetWriteConfig()))
+        folder.finish({})
+    assert tree_bytes(tmp_path / "whole") == tree_bytes(tmp_path / "killed")
+    whole, killed = results
+    assert whole.notes == killed.notes and whole.counts == killed.counts
+    assert (whole.frames_written, killed.frames_written) == (3, 0)
+
+
+def test_images_with_gaps_are_numbered_from_zero_and_the_numbers_are_kept(tmp_path):
+    source = labelled_scene(tmp_path / "source", (4, 9, 1000))
+    result = write(source, tmp_path / "out")
+    assert any("frames.json" in n for n in result.notes)
+    text = (tmp_path / "out" / HOME / "frames.json").read_text()
+    assert '"0001": 9' in text and '"0002": 1000' in text
+    scene = opened(tmp_path / "out")
+    assert scene.indices == (0, 1, 2)
+    for k, index in enumerate((4, 9, 1000)):
+        a, b = source.frame(index).objects[2], scene.frame(k).objects[2]
+        assert np.abs(a.T_cam_obj - b.T_cam_obj).max() < 1e-6
+
+
+def test_a_lens_with_distortion_is_refused_with_its_pixels_unless_accepted(source, tmp_path):
+    lens = replace(INTRINSICS, distortion=np.array([-0.08, 0.02, 0.001, -0.001, 0.0]))
+    source.change_frames(intrinsics=lens)
+    with pytest.raises(InputError, match=r"moves pixels by up to \d+\.\d px"):
+        write(source, tmp_path / "out")
+    result = write(source, tmp_path / "accepted", ignore_distortion=True)
+    (note,) = [n for n in result.notes if "distortion" in n]
+    # Corner of the image: ideal x = (0 - 78.7) / 150 moved by k1 r^2 x and so on.
+    corner = np.array([0.0, 0.0])
+    from realsim.geometry.camera import undistort
+
+    xy, _ = undistort(lens, corner)
+    off = np.linalg.norm(xy * [lens.fx, lens.fy] + [lens.cx, lens.cy] - corner)
+    assert float(note.split("up to ")[1].split()[0]) >= round(float(off), 1) - 0.05
+
+
+def test_cameras_without_poses_follow_from_the_objects(source, tmp_path):
+    whole = write(source, tmp_path / "whole")
+    before = np.load(whole.folder / "camera_poses.npy")
+    source.change_frames(T_world_cam=None)
+    with pytest.raises(InputError, match="knows no table"):
+        write(source, tmp_path / "none")
+    result = write(source, tmp_path / "out", table_is_world=True)
+    after = np.load(result.folder / "camera_poses.npy")
+    assert np.abs(after - before).max() < 1e-9
+    assert any("NO TABLE IS KNOWN" in n for n in result.notes)
+    assert np.array_equal(np.load(result.folder / "cam0_wrt_table.npy"), np.eye(4))
+
+
+def test_one_known_camera_keeps_the_table(source, tmp_path):
+    whole = write(source, tmp_path / "whole")
+    source.change_frames(T_world_cam=lambda f: f.T_world_cam if f.index == 1 else None)
+    result = write(source, tmp_path / "out")
+    for name in ("camera_poses.npy", "cam0_wrt_table.npy"):
+        assert np.abs(np.load(result.folder / name) - np.load(whole.folder / name)).max() < 1e-9
+
+
+def test_cameras_that_share_no_object_or_that_disagree_are_refused(source, tmp_path):
+    source.change_frames(T_world_cam=None, objects=lambda f: f.objects[f.index : f.index + 1])
+    with pytest.raises(InputError, match="no object in common"):
+        write(source, tmp_path / "out", table_is_world=True)
+    moved = labelled_scene(tmp_path / "moved", range(2)).change_frames(T_world_cam=None)
+    first, *others = moved.frames[1].objects
+    T = first.T_cam_obj @ se3.from_translation([0.05, 0, 0])
+    moved.frames[1] = replace(moved.frames[1], objects=(replace(first, T_cam_obj=T), *others))
+    with pytest.raises(InputError, match=r"disagree by \d+ mm"):
+        write(moved, tmp_path / "out", table_is_world=True)
+
+
+def test_another_depth_unit_is_converted_and_the_rounding_said(tmp_path):
+    fine = labelled_scene(tmp_path / "source", range(2), unit_m=1e-4)
+    result = write(fine, tmp_path / "out")
+    assert any("rounded" in n and "0.50 mm" in n for n in result.notes)
+    scene = opened(tmp_path / "out")
+    before = images.read_depth(fine.depth_file(0), 1e-4)
+    after = images.read_depth(scene.depth_file(0), 1e-3)
+    assert np.array_equal(before > 0, after > 0)
+    assert np.abs(before - after).max() <= 0.5e-3 + 1e-7
+
+
+def test_grey_images_and_other_formats_become_colour_pngs(source, tmp_path):
+    grey = np.arange(120 * 160, dtype=np.uint32).reshape(120, 160).astype(np.uint8)
+    source.colour_file(0).write_bytes(images.png_bytes(grey))
+    write(source, tmp_path / "out")
+    assert np.array_equal(
+        images.read_image(tmp_path / "out" / HOME / "rgb/0000.png"), np.dstack([grey] * 3)
+    )
+
+
+def test_numbers_are_mapped_beyond_graspnets_noted_and_never_doubled(source, tmp_path):
+    result = write(source, tmp_path / "out", numbers={1: 5, 7: 300, 30: 0})
+    assert any("up to 300" in n for n in result.notes)
+    scene = opened(tmp_path / "out")
+    assert scene.object_numbers == (5, 300, 0) and scene.models().keys() == {1, 6, 301}
+    label = images.read_image(tmp_path / "out" / HOME / "label/0000.png")
+    assert label.dtype == np.uint16 and set(np.unique(label)) <= {0, 1, 6, 301}
+    assert np.array_equal(scene.mask(0, 1, visible=True), source.mask(0, 1, visible=True))
+    again = write(scene, tmp_path / "again", numbers={6: 0, 301: 6, 1: 29})
+    plain = write(source, tmp_path / "plain")
+    for index in range(3):
+        paths = [w.folder / f"label/{index:04d}.png" for w in (again, plain)]
+        assert np.array_equal(*(images.read_image(p) for p in paths))
+    with pytest.raises(InputError, match="object 7 has no number"):
+        write(source, tmp_path / "missing", numbers={1: 0})
+    with pytest.raises(InputError, match="would all be number 4"):
+        GraspnetWriteConfig(numbers={1: 4, 2: 4})
+
+
+def test_two_scenes_never_share_a_folder_and_both_cameras_share_the_object_list(tmp_path):
+    folder = ExportFolder.begin(tmp_path / "out", {})
+    one = labelled_scene(tmp_path / "one", range(1))
+    write_graspnet_scene(one, folder, GraspnetWriteConfig())
+    write_graspnet_scene(one, folder, GraspnetWriteConfig())
+    other = labelled_scene(tmp_path / "other", range(1))
+    other.name = "val-000003"
+    with pytest.raises(InputError, match="where train-000003 is"):
+        write_graspnet_scene(other, folder, GraspnetWriteConfig())
+    write_graspnet_scene(other, folder, GraspnetWriteConfig(camera="kinect"))
+    assert len(open_graspnet(tmp_path / "out").scenes) == 2
+    fewer = labelled_scene(tmp_path / "fewer", range(1), places=PLACES[:2])
+    fewer.number = 4
+    write_graspnet_scene(fewer, folder, GraspnetWriteConfig())
+    one.name, one.number = "train-000004", 4
+    with pytest.raises(InputError, match="do not show the same objects"):
+        write_graspnet_scene(one, folder, GraspnetWriteConfig(camera="kinect"))
+
+
+def test_missing_masks_and_depth_are_refused_with_what_to_do(source, tmp_path):
+    masks = source.masks
+    source.masks = {}
+    with pytest.raises(InputError, match="realsim upgrade"):
+        write(source, tmp_path / "out")
+    result = write(source, tmp_path / "bare", without_labels=True)
+    assert result.counts["labels"] == 0 and not (result.folder / "label").exists()
+    source.masks = masks
+    source.depth_file(1).unlink()
+    with pytest.raises(InputError, match="no depth image"):
+        write(source, tmp_path / "nothing")
+
+
+def test_a_pixel_of_two_masks_is_the_nearer_objects(source, tmp_path):
+    both = source.masks[0, 0, True] | source.masks[0, 1, True]
+    source.masks[0, 0, True] = source.masks[0, 1, True] = both
+    result = write(source, tmp_path / "out")
+    assert any(f"{both.sum()} pixels were in two masks" in n for n in result.notes)
+    objects = source.frame(0).objects
+    nearer = min(objects[:2], key=lambda o: o.T_cam_obj[2, 3])
+    label = images.read_image(result.folder / "label/0000.png")
+    assert np.array_equal(label == nearer.obj_id, both)
+
+
+def test_an_upgraded_pose_is_written_and_not_the_sources_old_text(source, tmp_path):
+    write(source, tmp_path / "out")
+    scene = opened(tmp_path / "out")
+    frame = scene.frame(0)
+    nudge = se3.from_translation([0.0004, 0.0, 0.0])
+    moved = [replace(o, T_cam_obj=nudge @ o.T_cam_obj) for o in frame.objects]
+    source.frames = {0: replace(frame, objects=tuple(moved), T_world_cam=frame.T_world_cam)}
+    write(source, tmp_path / "again")
+    after = opened(tmp_path / "again").frame(0)
+    for a, b in zip(frame.objects, after.objects, strict=True):
+        assert abs(b.T_cam_obj[0, 3] - a.T_cam_obj[0, 3] - 0.0004) < 1e-7
+
+
+def test_a_textured_model_comes_back_with_its_texture(source, tmp_path):
+    rng = np.random.default_rng(2)
+    plain = MODELS[1].mesh
+    mesh = Mesh(
+        vertices=plain.vertices, faces=plain.faces, uv=rng.uniform(0, 1, (8, 2)),
+        texture=rng.integers(0, 255, (16, 32, 3), dtype=np.uint8),
+    )  # fmt: skip
+    source.models_by_id = {1: replace(MODELS[1], mesh=mesh)}
+    result = write(source, tmp_path / "out")
+    assert any("no mesh of object(s) 006, 029" in n for n in result.notes)
+    found = load_mesh(tmp_path / "out/models/000/textured.obj", "m")
+    assert np.array_equal(found.texture, mesh.texture)
+    corners = np.abs(found.vertices[found.faces] - mesh.vertices[mesh.faces]).max()
+    assert corners < 1e-8
+    assert np.abs(found.uv[found.faces] - mesh.uv[mesh.faces]).max() < 1e-8
+
+
+def test_grasp_labels_go_along_with_a_graspnet_source_that_keeps_its_numbers(source, tmp_path):
+    write(source, tmp_path / "out")
+    rng = np.random.default_rng(3)
+    names = (
+        f"{HOME}/rect/0001.npy", "scenes/scene_0003/rs_wrt_kn.npy", "grasp_label/006_labels.npz",
+        "collision_label/scene_0003/collision_labels.npz",
+    )  # fmt: skip
+    for name in (*names, "grasp_label/050_labels.npz"):
+        path = tmp_path / "out" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(rng.bytes(100))
+    result = write(opened(tmp_path / "out"), tmp_path / "again", number=9)
+    assert result.counts["copied_labels"] == 3
+    for name in names:
+        after = tmp_path / "again" / name.replace("scene_0003", "scene_0009")
+        assert after.read_bytes() == (tmp_path / "out" / name).read_bytes()
+    assert not (tmp_path / "again/grasp_label/050_labels.npz").exists()
+    mapped = write(opened(tmp_path / "out"), tmp_path / "mapped", numbers={1: 0, 7: 7, 30: 29})
+    assert mapped.counts["copied_labels"] == 0 and not (mapped.folder / "rect").exists()
+
+
+def test_images_of_several_cameras_keep_their_own_matrix_in_the_meta_files(source, tmp_path):
+    other = CameraIntrinsics(width=160, height=120, fx=150.2, fy=151.2, cx=78.9, cy=60.2)
+    source.frames[1] = replace(source.frames[1], intrinsics=other)
+    result = write(source, tmp_path / "out")
+    assert any("different camera matrices (up to 0.20 px)" in n for n in result.notes)
+    scene = opened(tmp_path / "out")
+    assert scene.frame(1).intrinsics.cx == 78.9 and scene.frame(0).intrinsics.cx == 78.7

@@ -1,0 +1,226 @@
+"""Every format of grasps gives back what was written, moves with the object, and means one hand.
+
+`raw` reads a file without realsim: the hand's pose as any other program finds it there.
+"""
+
+import json
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from realsim.formats.graspit.grasps import read_grasp_file
+from realsim.formats.graspnet.grasp_group import grasp_group, read_grasp_group, write_grasp_group
+from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_acronym
+from realsim.formats.grasps.graspgen import read_graspgen, write_graspgen
+from realsim.formats.grasps.hdf5 import read_grasps_hdf5, write_grasps_hdf5
+from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
+from realsim.formats.grasps.parquet import read_grasps_parquet, write_grasps_parquet
+from realsim.formats.grasps.scene_grasps import SceneGrasps, executed
+from realsim.geometry import se3
+from tried_grasps import tried_set
+
+MOUNT, TIP = 0.1034, 0.1122
+"""Tool centre point and fingertips before the hand's mounting face [m] (franka_description)."""
+
+
+def from_rt(R, t):
+    out = np.tile(np.eye(4), (len(R), 1, 1))
+    out[:, :3, :3], out[:, :3, 3] = R, t
+    return out
+
+
+class Acronym:
+    rounding = 1e-15
+    approach, closing = 2, 0
+    tip = (0, 0, TIP)
+
+    def write(self, path, s):
+        return write_acronym(path, s, AcronymObject(file="a.obj"))
+
+    def read(self, path):
+        return read_acronym(path).Ts_obj_grasp
+
+    def raw(self, path):
+        with h5py.File(path) as file:
+            return file["grasps/transforms"][()]
+
+
+class GraspGen:
+    rounding = 1e-15
+    approach, closing = 2, 0
+    tip = (0, 0, TIP)
+
+    def write(self, path, s):
+        return write_graspgen(path, s, file="a.obj")
+
+    def read(self, path):
+        return read_graspgen(path).Ts_obj_grasp
+
+    def raw(self, path):
+        return np.array(json.loads(path.read_text())["grasps"]["transforms"])
+
+
+class IsaacGrasp:
+    rounding = 1e-14
+    approach, closing = 2, 1
+    tip = (0, 0, TIP)
+
+    def write(self, path, s):
+        return write_isaac_grasp(path, s, object_frame="a")
+
+    def read(self, path):
+        return read_isaac_grasp(path).Ts_obj_grasp
+
+    def raw(self, path):
+        rows = YAML(typ="safe").load(path)["grasps"].values()
+        w = np.array([r["orientation"]["w"] for r in rows])
+        x, y, z = np.array([r["orientation"]["xyz"] for r in rows]).T
+        R = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        return from_rt(R.transpose(2, 0, 1), np.array([r["position"] for r in rows]))
+
+
+class GraspGroupNpy:
+    rounding = 1e-6
+    approach, closing = 0, 1
+    tip = (0.02 + TIP - MOUNT, 0, 0)  # GraspNet's own fingers end at x = depth = 0.02
+
+    def write(self, path, s):
+        return write_grasp_group(path, grasp_group([s], {s.instance: np.eye(4)}))
+
+    def read(self, path):
+        return read_grasp_group(path).Ts_a_grasp
+
+    def raw(self, path):
+        rows = np.load(path).astype(float)
+        return from_rt(rows[:, 4:13].reshape(-1, 3, 3), rows[:, 13:16])
+
+
+class RealsimHdf5:
+    rounding = 0.0
+    approach, closing = 2, 1
+    tip = (0, 0, TIP - MOUNT)
+
+    def write(self, path, s):
+        return write_grasps_hdf5(path, SceneGrasps(sets=(s,)))
+
+    def read(self, path):
+        return read_grasps_hdf5(path).sets[0].Ts_obj_grasp[self.rows]
+
+    def raw(self, path):
+        return self.read(path)
+
+
+class RealsimParquet(RealsimHdf5):
+    def write(self, path, s):
+        write_grasps_parquet(path, SceneGrasps(sets=(s,)))
+        return path
+
+    def read(self, path):
+        return read_grasps_parquet(path).sets[0].Ts_obj_grasp[self.rows]
+
+
+class GraspitHdf5:
+    """Written here as the paper's authors write it: each grasp beside its half turn."""
+
+    rounding = 0.0
+    approach, closing = 2, 1
+    tip = (0, 0, TIP - MOUNT)
+
+    def write(self, path, s):
+        Ts = s.Ts_obj_grasp[executed(s)]
+        with h5py.File(path, "w") as file:
+            file["a"] = np.stack([Ts, Ts @ np.diag([-1.0, -1.0, 1.0, 1.0])], axis=1)
+        return path
+
+    def read(self, path):
+        return read_grasp_file(path)["a"][:, 0]
+
+    def raw(self, path):
+        with h5py.File(path) as file:
+            return file["a"][:, 0]
+
+
+FORMATS = [
+    Acronym, GraspGen, IsaacGrasp, GraspGroupNpy, RealsimHdf5, RealsimParquet, GraspitHdf5,
+]  # fmt: skip
+
+
+@pytest.fixture(params=FORMATS, ids=[f.__name__ for f in FORMATS])
+def form(request):
+    return request.param()
+
+
+def tried(seed=0, n=25):
+    """Return a set of which a part was tried; of those all have a score."""
+    s = tried_set(np.random.default_rng(seed), n, measures=())
+    return replace(s, scores=np.where(executed(s), np.nan_to_num(s.scores), np.nan))
+
+
+def written(form, folder, s):
+    """Write a set; return the file, and the poses that must be in it."""
+    form.rows = executed(s)
+    assert 0 < form.rows.sum() < len(s)
+    return form.write(folder, s), s.Ts_obj_grasp[form.rows]
+
+
+def test_what_is_written_is_read(form, tmp_path):
+    path, Ts = written(form, tmp_path / "grasps", tried())
+    np.testing.assert_allclose(form.read(path), Ts, rtol=0, atol=form.rounding)
+
+
+def test_the_hand_in_the_file_moves_with_the_object(form, tmp_path):
+    s, T = tried(1), se3.random_transform(np.random.default_rng(5))
+    here, _ = written(form, tmp_path / "here", s)
+    there, Ts = written(form, tmp_path / "there", replace(s, Ts_obj_grasp=T @ s.Ts_obj_grasp))
+    atol = 2 * form.rounding + 1e-14
+    np.testing.assert_allclose(form.raw(there), T @ form.raw(here), rtol=0, atol=atol)
+    np.testing.assert_allclose(form.read(there), Ts, rtol=0, atol=atol)
+
+
+def test_the_pose_in_the_file_is_that_of_a_rigid_hand(form, tmp_path):
+    """One and the same motion leads from every grasp to the hand in the file: no mirror, no scale.
+
+    Distances and angles between any two hands are then known, too.
+    """
+    path, Ts = written(form, tmp_path / "grasps", tried(2))
+    offsets = np.linalg.inv(Ts) @ form.raw(path)
+    np.testing.assert_allclose(offsets, np.tile(offsets[:1], (len(Ts), 1, 1)), atol=5e-6)
+    np.testing.assert_allclose(np.linalg.det(offsets[:, :3, :3]), 1.0, atol=5e-6)
+
+
+def test_a_hand_straight_down_has_its_fingertips_where_they_are_drawn(form, tmp_path):
+    """The hand hangs over the point (0.1, 0.02, 0.05) and closes along the object's x."""
+    down = np.array([[0.0, 1.0, 0.0, 0.1], [1.0, 0.0, 0.0, 0.02], [0.0, 0.0, -1.0, 0.05],
+                     [0.0, 0.0, 0.0, 1.0]])  # fmt: skip
+    s = tried(3)
+    path, Ts = written(form, tmp_path / "grasps",
+                       replace(s, Ts_obj_grasp=np.tile(down, (len(s), 1, 1))))  # fmt: skip
+    atol = form.rounding + 1e-12
+    for T in form.raw(path):
+        np.testing.assert_allclose(T[:3, form.approach], [0, 0, -1], atol=atol)
+        np.testing.assert_allclose(T[:3, form.closing], [1, 0, 0], atol=atol)
+        tip = T[:3, :3] @ form.tip + T[:3, 3]
+        np.testing.assert_allclose(tip, [0.1, 0.02, 0.05 - (TIP - MOUNT)], atol=atol)
+    assert len(form.raw(path)) == len(Ts)
+
+
+def test_every_format_reads_the_hand_of_every_other(tmp_path):
+    """Through all formats in a row, each reading what the one before wrote."""
+    s = tried(4)
+    keep = executed(s)
+    for k, kind in enumerate(FORMATS):
+        form = kind()
+        path, _ = written(form, tmp_path / str(k), s)
+        Ts = s.Ts_obj_grasp.copy()
+        Ts[keep] = form.read(path)
+        s = replace(s, Ts_obj_grasp=Ts)
+    np.testing.assert_allclose(s.Ts_obj_grasp, tried(4).Ts_obj_grasp, rtol=0, atol=2e-6)

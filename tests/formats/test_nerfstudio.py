@@ -1,0 +1,285 @@
+"""transforms.json: what is written has nerfstudio's rays and comes back; wrong files are found.
+
+nerfstudio itself is not needed: its rays are recomputed here by the formulas of its documentation.
+"""
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.nerfstudio.source import open_nerfstudio
+from realsim.formats.nerfstudio.writing import NerfstudioWriteConfig, write_nerfstudio
+from realsim.formats.session_scene import open_session_scene
+from realsim.geometry import se3
+from realsim.geometry.camera import project
+from tests.support.synthetic_scenes import DEPTH_UNIT_M, captured_session
+
+GL = np.diag([1.0, -1, -1, 1])
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return captured_session(tmp_path_factory.mktemp("session") / "s", 8)
+
+
+@pytest.fixture
+def data(store, tmp_path):
+    """Return a written data set, and a function that changes its file."""
+    write(store, tmp_path / "data", depth_unit_m=None)
+    path = tmp_path / "data/transforms.json"
+
+    def change(f):
+        top = json.loads(path.read_text())
+        f(top)
+        path.write_text(json.dumps(top))
+        return path.parent
+
+    return change
+
+
+def write(store, folder: Path, **config):
+    asked = ExportFolder.begin(folder, {"what": "nerfstudio"})
+    config = NerfstudioWriteConfig(**{"points": 2000} | config)
+    return write_nerfstudio(open_session_scene(store), asked, config)
+
+
+def counts_of(store, index):
+    return cv2.imread(str(store.folder / f"depth/{index:06d}.png"), cv2.IMREAD_UNCHANGED)
+
+
+def test_a_session_comes_back_to_the_last_bit(store, tmp_path):
+    said = write(store, tmp_path / "out", depth_unit_m=None)
+    assert said.frames == said.frames_written == 8 and 0 < said.counts["points"] <= 2000
+    assert any("--depth-unit-scale-factor 0.0001" in n for n in said.notes)
+    source = open_nerfstudio(tmp_path / "out")
+    ours = store.session.intrinsics
+    np.testing.assert_allclose(source.intrinsics.K, ours.K, rtol=1e-15)
+    assert np.array_equal(source.intrinsics.distortion, ours.distortion)
+    assert source.depth_unit_m == DEPTH_UNIT_M
+    for view, frame in zip(store.session.views, source.frames(), strict=True):
+        np.testing.assert_allclose(frame.T_world_cam, view.T_world_cam, atol=1e-15)
+        assert np.array_equal(frame.rgb, store.rgb(view.index))
+        assert np.array_equal(frame.depth_counts, counts_of(store, view.index))
+    assert any("camera poses checked" in n for n in source.notes)
+    assert any("scale checked" in n for n in source.notes)
+
+
+def test_nerfstudios_rays_meet_our_points(store, tmp_path):
+    """Its formulas: pixel (u, v) is at (u + 0.5 - cx) / fl_x, up is +y, forward is -z."""
+    write(store, tmp_path / "out")
+    top = json.loads((tmp_path / "out/transforms.json").read_text())
+    world = np.random.default_rng(0).uniform([0.4, -0.1, 0.1], [0.6, 0.1, 0.2], (40, 3))
+    for view, entry in zip(store.session.views, top["frames"], strict=True):
+        c2w = np.array(entry["transform_matrix"])
+        p = (world - c2w[:3, 3]) @ c2w[:3, :3]
+        x, y = p[:, 0] / -p[:, 2], -p[:, 1] / -p[:, 2]
+        r = x * x + y * y
+        d = 1 + r * (top["k1"] + r * (top["k2"] + r * top["k3"]))
+        xd = x * d + 2 * top["p1"] * x * y + top["p2"] * (r + 2 * x * x)
+        yd = y * d + 2 * top["p2"] * x * y + top["p1"] * (r + 2 * y * y)
+        theirs = np.stack([xd * top["fl_x"] + top["cx"], yd * top["fl_y"] + top["cy"]], -1) - 0.5
+        ours = project(store.session.intrinsics, se3.transform(se3.invert(view.T_world_cam), world))
+        np.testing.assert_allclose(theirs, ours, atol=1e-9)
+
+
+def test_depth_is_in_millimetres_unless_asked_otherwise(store, tmp_path):
+    said = write(store, tmp_path / "out")
+    top = json.loads((tmp_path / "out/transforms.json").read_text())
+    assert top["depth_unit_scale_factor"] == 0.001 and top["camera_model"] == "OPENCV"
+    counts = cv2.imread(str(tmp_path / "out" / top["frames"][0]["depth_file_path"]), -1)
+    exact = counts_of(store, 0) * (DEPTH_UNIT_M / 0.001)
+    assert counts.dtype == np.uint16 and np.abs(counts - exact).max() <= 0.5 + 1e-6
+    assert any("rounded" in n for n in said.notes)
+
+
+def test_the_cloud_lies_on_the_depth(store, tmp_path):
+    from realsim.interop import import_open3d
+
+    write(store, tmp_path / "out")
+    o3d = import_open3d()
+    cloud = o3d.io.read_point_cloud(str(tmp_path / "out/sparse_pc.ply"))
+    z = np.asarray(cloud.points)[:, 2]
+    assert cloud.has_colors() and np.median(np.abs(z - 0.1)) < 0.01
+
+
+def test_an_interrupted_export_is_finished(store, tmp_path):
+    write(store, tmp_path / "whole")
+    ticks = []
+
+    def stop():
+        ticks.append(1)
+        if len(ticks) == 4:
+            raise KeyboardInterrupt
+
+    folder = ExportFolder.begin(tmp_path / "cut", {"what": "nerfstudio"})
+    with pytest.raises(KeyboardInterrupt):
+        write_nerfstudio(
+            open_session_scene(store), folder, NerfstudioWriteConfig(points=2000), progress=stop
+        )
+    assert write(store, tmp_path / "cut").frames_written == 5
+    for name in ("transforms.json", "sparse_pc.ply"):
+        assert (tmp_path / "cut" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+# --- reading ----------------------------------------------------------------------------------
+
+
+def test_what_was_applied_to_the_world_is_undone(store, data):
+    """Law: p_file = s (A p); the poses come back as they were, however A and s are."""
+    A = se3.random_transform(np.random.default_rng(3))
+
+    def apply(top):
+        for f in top["frames"]:
+            T = A @ np.array(f["transform_matrix"])
+            T[:3, 3] *= 0.37
+            f["transform_matrix"] = T.tolist()
+        top["applied_transform"], top["applied_scale"] = A[:3].tolist(), 0.37
+
+    source = open_nerfstudio(data(apply))
+    for view, frame in zip(store.session.views, source.frames(), strict=True):
+        np.testing.assert_allclose(frame.T_world_cam, view.T_world_cam, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (np.linalg.inv, "world to camera"),
+        (lambda T: T @ GL, "OpenGL's camera axes"),
+        (lambda T: np.linalg.inv(T @ GL), "not what they are said to be"),
+    ],
+)
+def test_poses_of_another_convention_are_refused_with_the_evidence(data, wrong, said):
+    def change(top):
+        for f in top["frames"]:
+            f["transform_matrix"] = wrong(np.array(f["transform_matrix"])).tolist()
+
+    with pytest.raises(InputError, match=said) as error:
+        open_nerfstudio(data(change))
+    assert "mm" in str(error.value)
+
+
+def test_poses_in_another_unit_are_refused_unless_it_is_said(store, data):
+    def shrink(top):
+        for f in top["frames"]:
+            for row in f["transform_matrix"][:3]:
+                row[3] /= 4
+
+    folder = data(shrink)
+    with pytest.raises(InputError, match=r"--scale (3\.9|4)"):
+        open_nerfstudio(folder)
+    frame = next(iter(open_nerfstudio(folder, metres_per_unit=4.0).frames()))
+    np.testing.assert_allclose(frame.T_world_cam, store.session.views[0].T_world_cam, atol=1e-12)
+    source = open_nerfstudio(folder, use_depth=False)
+    assert source.depth_unit_m is None and any("scale unknown" in n for n in source.notes)
+
+
+def test_a_depth_unit_that_cannot_be_is_refused(data):
+    folder = data(lambda top: top.update(depth_unit_scale_factor=0.5))
+    with pytest.raises(InputError, match="median depth"):
+        open_nerfstudio(folder)
+
+
+def ngp(folder: Path, frames=None, **top):
+    folder.mkdir(exist_ok=True)
+    rows = []
+    for k in range(3):
+        cv2.imwrite(str(folder / f"r_{k}.png"), np.full((30, 40, 3), k, np.uint8))
+        T = se3.look_at([0.4 + 0.1 * k, 0, 0.5], [0, 0, 0]) @ GL
+        rows.append({"file_path": f"./r_{k}", "transform_matrix": T.tolist()})
+    rows = frames(rows) if callable(frames) else rows if frames is None else frames
+    top = {"frames": rows} | top
+    (folder / "transforms.json").write_text(json.dumps(top))
+    return folder
+
+
+def test_instant_ngp_and_nerf_by_hand(tmp_path):
+    """Known answer: f = w / (2 tan(angle / 2)), the centre is the middle of the image."""
+    angle = 2 * math.atan(0.5)
+    folder = ngp(tmp_path / "n", camera_angle_x=angle, aabb_scale=4, scale=0.33, offset=[0, 0, 0])
+    source = open_nerfstudio(folder, metres_per_unit=2.0)
+    K = source.intrinsics
+    assert (K.fx, K.fy) == (pytest.approx(40), pytest.approx(40))
+    assert (K.cx, K.cy) == (19.5, 14.5)
+    frames = list(source.frames())
+    assert [f.name for f in frames] == ["./r_0", "./r_1", "./r_2"]
+    np.testing.assert_allclose(frames[0].T_world_cam[:3, 3], [0.8, 0, 1.0], atol=1e-12)
+    assert any("aabb_scale, scale, offset" in n for n in source.notes)
+    degrees = open_nerfstudio(ngp(tmp_path / "d", x_fov=math.degrees(angle)))
+    assert degrees.intrinsics.fx == pytest.approx(40)
+
+
+def scaled(rows):
+    rows[1]["transform_matrix"] = (np.array(rows[1]["transform_matrix"]) * [1.01, 1, 1, 1]).tolist()
+    return rows
+
+
+def escaping(rows):
+    rows[1]["file_path"] = "../r_1.png"
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("top", "said"),
+    [
+        ({}, "no focal length"),
+        ({"fl_x": 40, "camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE"),
+        ({"fl_x": 40, "is_fisheye": True}, "fisheye"),
+        ({"fl_x": 40, "k4": 0.01}, "r\\^8"),
+        ({"fl_x": 40, "from_na": True}, "from_na"),
+        ({"fl_x": 40, "w": 80, "h": 60}, "80x60"),
+        ({"fl_x": 40, "camera_angle_x": 0.2}, "Remove the wrong one"),
+        ({"fl_x": 0.9}, "focal length fx"),
+        ({"fl_x": 40, "cx": 1e9}, "principal point"),
+        ({"fl_x": "40"}, "number"),
+        ({"fl_x": 40, "applied_scale": 0}, "applied_scale"),
+        ({"fl_x": 40, "applied_transform": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}, "rigid"),
+        ({"fl_x": 40, "frames": []}, "frames"),
+        ({"fl_x": 40, "frames": [3]}, "frame 1"),
+    ],
+)
+def test_a_file_that_cannot_be_is_refused(tmp_path, top, said):
+    with pytest.raises(InputError, match=said):
+        open_nerfstudio(ngp(tmp_path / "x", **top))
+
+
+@pytest.mark.parametrize(
+    ("frames", "said"),
+    [
+        (scaled, "not rigid"),
+        (escaping, "leads out"),
+        (lambda rows: [*rows, rows[0]], "two frames of the image"),
+        (lambda rows: [{"file_path": "./r_0"}], "matrix"),
+        (lambda rows: [r | {"fl_x": 41.0 + k} for k, r in enumerate(rows)], "takes the first"),
+        (lambda rows: [r | {"file_path": f"x{k}"} for k, r in enumerate(rows)], "--images"),
+    ],
+)
+def test_frames_that_cannot_be_are_refused(tmp_path, frames, said):
+    with pytest.raises(InputError, match=said):
+        open_nerfstudio(ngp(tmp_path / "x", frames, fl_x=40))
+
+
+def test_several_cameras_are_named_and_chosen(tmp_path):
+    folder = ngp(
+        tmp_path / "x", lambda rows: [r | {"fl_x": 40 + 5 * (k > 0)} for k, r in enumerate(rows)]
+    )
+    with pytest.raises(InputError, match=r"2 different cameras.*--camera-id"):
+        open_nerfstudio(folder)
+    source = open_nerfstudio(folder, camera_id=2)
+    assert len(source) == 2 and source.intrinsics.fx == 45
+    with pytest.raises(InputError, match="no camera 3"):
+        open_nerfstudio(folder, camera_id=3)
+
+
+def test_an_image_that_is_not_there_is_named(tmp_path):
+    folder = ngp(tmp_path / "x", fl_x=40)
+    (folder / "r_1.png").unlink()
+    source = open_nerfstudio(folder)
+    assert len(source) == 2 and any("r_1" in n for n in source.notes)
+    with pytest.raises(InputError, match=r"holds no transforms\.json"):
+        open_nerfstudio(tmp_path)

@@ -1,0 +1,183 @@
+"""Scenes as USD: Pixar's library finds everything that Isaac Sim needs."""
+
+import builtins
+import dataclasses
+import importlib
+
+import numpy as np
+import pytest
+from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdSemantics, UsdShade
+
+import placed_scenes
+from realsim.errors import MissingLibraryError
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.robot_scenes.convex_parts import collision_parts
+from realsim.formats.robot_scenes.usd_scene import UsdConfig, write_usd_scene
+from realsim.models.reading import read_scan
+
+
+def write(scene, folder, **config):
+    out = ExportFolder.begin(folder, {"scene": scene.name})
+    written = write_usd_scene(scene, out, UsdConfig(**config))
+    out.finish({})
+    return written
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return placed_scenes.placed_scene()
+
+
+@pytest.fixture(scope="module")
+def folder(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("usd") / "scene"
+    write(scene, folder)
+    return folder
+
+
+@pytest.fixture(scope="module", params=[True, False])
+def stage(scene, request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("usd") / "scene"
+    write(scene, folder, binary=request.param)
+    return Usd.Stage.Open(str(folder / "scene.usda"))
+
+
+def pose(prim):
+    """USD's matrices act on rows."""
+    return np.array(UsdGeom.Xformable(prim).ComputeLocalToWorldTransform(0)).T
+
+
+def of(stage, scene):
+    for o in scene.objects:
+        yield stage.GetPrimAtPath(f"/World/{o.name}"), o, scene.body(o)
+
+
+def test_the_stage_is_in_metres_and_kilograms_with_z_up_and_gravity(scene, stage):
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert UsdPhysics.GetStageKilogramsPerUnit(stage) == 1.0
+    assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+    physics = UsdPhysics.Scene(stage.GetPrimAtPath("/World/physics"))
+    down = np.array(physics.GetGravityDirectionAttr().Get())
+    assert np.allclose(down * physics.GetGravityMagnitudeAttr().Get(), scene.gravity)
+    assert stage.GetDefaultPrim().GetPath() == "/World"
+    assert not stage.GetCompositionErrors()
+
+
+def test_objects_stand_at_their_poses_with_their_matter(scene, stage):
+    for prim, o, body in of(stage, scene):
+        assert np.allclose(pose(prim), o.T_world_obj, rtol=0, atol=1e-14)
+        assert prim.HasAPI(UsdPhysics.RigidBodyAPI)
+        mass = UsdPhysics.MassAPI(prim)
+        assert np.isclose(mass.GetMassAttr().Get(), body.mass_kg, rtol=1e-6)
+        com = mass.GetCenterOfMassAttr().Get()
+        assert np.allclose(com, body.center_of_mass, rtol=0, atol=1e-8)
+        axes = Gf.Matrix3d(Gf.Rotation(Gf.Quatd(mass.GetPrincipalAxesAttr().Get())))
+        R, moments = np.array(axes).T, np.array(mass.GetDiagonalInertiaAttr().Get())
+        found = R @ np.diag(moments) @ R.T
+        assert np.allclose(found, body.inertia, rtol=0, atol=1e-6 * body.inertia.max())
+        labels = UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get()
+        assert list(labels) == [body.model.name]
+
+
+def test_what_is_seen_has_its_triangles_and_what_collides_its_convex_parts(scene, stage):
+    for prim, _, body in of(stage, scene):
+        visual = UsdGeom.Mesh(prim.GetChild("visual"))
+        counts = visual.GetFaceVertexCountsAttr().Get()
+        assert len(counts) == len(body.model.mesh.faces) and set(counts) == {3}
+        points = np.array(visual.GetPointsAttr().Get())
+        assert np.allclose(points, body.model.mesh.vertices, rtol=0, atol=1e-8)
+        assert visual.GetSubdivisionSchemeAttr().Get() == "none"
+        assert visual.ComputePurpose() == "default"
+        assert not visual.GetPrim().HasAPI(UsdPhysics.CollisionAPI)
+        parts = prim.GetChild("collision").GetChildren()
+        known = collision_parts(body)
+        assert len(parts) == len(known)
+        for part, mesh in zip(parts, known, strict=True):
+            assert part.HasAPI(UsdPhysics.CollisionAPI)
+            shape = UsdPhysics.MeshCollisionAPI(part).GetApproximationAttr().Get()
+            assert shape == "convexHull"
+            assert UsdGeom.Imageable(part).ComputePurpose() == "guide"
+            assert len(UsdGeom.Mesh(part).GetFaceVertexCountsAttr().Get()) == len(mesh.faces)
+
+
+def test_friction_holds_for_what_collides_and_is_multiplied(scene, stage):
+    shapes = [p for prim, *_ in of(stage, scene) for p in prim.GetChild("collision").GetChildren()]
+    for prim in [*shapes, stage.GetPrimAtPath("/World/table")]:
+        bound, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
+        friction = UsdPhysics.MaterialAPI(bound.GetPrim())
+        wanted = 1.0 if prim.GetName() == "table" else placed_scenes.FRICTION
+        assert np.isclose(friction.GetStaticFrictionAttr().Get(), wanted)
+        assert np.isclose(friction.GetDynamicFrictionAttr().Get(), wanted)
+        combine = bound.GetPrim().GetAttribute("physxMaterial:frictionCombineMode").Get()
+        assert combine == "multiply"
+
+
+def test_the_table_stands_still_and_its_top_is_the_plane(scene, stage):
+    prim = stage.GetPrimAtPath("/World/table")
+    assert prim.HasAPI(UsdPhysics.CollisionAPI) and not prim.HasAPI(UsdPhysics.RigidBodyAPI)
+    box, table = pose(prim), scene.table
+    top = box @ [0, 0, 0.5, 1]
+    assert np.allclose(top, table.T_world_table[:, 3])
+    sides = np.linalg.norm(box[:3, :3], axis=0)
+    assert np.allclose(sides, [*table.size_m, table.thickness_m])
+
+
+def test_a_point_is_seen_at_its_pixel(scene, stage):
+    view = scene.cameras[0]
+    frustum = UsdGeom.Camera(stage.GetPrimAtPath(f"/World/{view.name}")).GetCamera(0).frustum
+    projection = frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()
+    K = view.intrinsics
+    for X in np.random.default_rng(0).normal([0.5, 0.1, 0.75], 0.1, (20, 3)):
+        x, y, _ = projection.Transform(Gf.Vec3d(*X.tolist()))
+        seen = [(x + 1) / 2 * K.width - 0.5, (1 - y) / 2 * K.height - 0.5]
+        at = (np.linalg.inv(view.T_world_cam) @ [*X, 1])[:3]
+        assert np.allclose(seen, (K.K @ at)[:2] / at[2], atol=1e-3)
+
+
+def test_the_reader_of_scans_finds_the_same_surface_and_texture(scene, folder):
+    for obj_id, name in scene.body_names().items():
+        found = read_scan(folder / f"objects/{name}.usdc", unit=None).mesh
+        known = scene.bodies[obj_id].model.mesh
+        assert np.allclose(
+            found.vertices[found.faces], known.vertices[known.faces], rtol=0, atol=1e-7
+        )
+        assert found.texture is not None and found.uv is not None
+    box = scene.bodies[2].model.mesh
+    found = read_scan(folder / "objects/_2_box.usdc", unit=None).mesh
+    assert np.array_equal(found.texture, box.texture)
+    assert np.allclose(found.uv[found.faces], box.uv[box.faces], rtol=0, atol=1e-6)
+
+
+def test_an_object_that_stands_still_is_no_rigid_body_in_motion(scene, tmp_path):
+    fixed = (dataclasses.replace(scene.objects[0], is_fixed=True), *scene.objects[1:])
+    write(dataclasses.replace(scene, objects=fixed), tmp_path / "s")
+    stage = Usd.Stage.Open(str(tmp_path / "s/scene.usda"))
+    enabled = [
+        UsdPhysics.RigidBodyAPI(stage.GetPrimAtPath(f"/World/{o.name}"))
+        .GetRigidBodyEnabledAttr()
+        .Get()
+        for o in fixed
+    ]
+    assert enabled == [False, True, True]
+
+
+def test_the_same_scene_gives_the_same_bytes(scene, folder, tmp_path):
+    told = write(scene, tmp_path / "again")
+    sums = [(f / "SHA256SUMS").read_text() for f in (folder, tmp_path / "again")]
+    assert sums[0] == sums[1] and "objects/bracket.usdc" in sums[0]
+    assert told.objects == 3 and told.counts == {"bodies": 2, "cameras": 1}
+
+
+def test_without_the_extra_the_error_says_how_to_install_it(scene, tmp_path, monkeypatch):
+    """The import itself fails, as where the extra is not there."""
+    real = importlib.import_module
+
+    def without(name, package=None):
+        if name.startswith("pxr"):
+            raise ModuleNotFoundError(f"No module named '{name}'")
+        return real(name, package)
+
+    monkeypatch.setattr(importlib, "import_module", without)
+    with pytest.raises(MissingLibraryError, match=r"realsim\[usd\]"):
+        write_usd_scene(scene, ExportFolder.begin(tmp_path / "s", {}))
+    assert builtins.list((tmp_path / "s").iterdir()) == [tmp_path / "s/.export"]

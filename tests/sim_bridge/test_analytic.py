@@ -1,0 +1,283 @@
+"""Analytic labels: what closes, what the gripper hits, and how few of many are chosen."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from realsim.errors import InputError
+from realsim.formats.graspnet import gripper_frame as frame
+from realsim.formats.graspnet.grasp_labels import read_grasp_labels, write_grasp_labels
+from realsim.geometry import se3
+from realsim.records import Mesh
+from realsim_sim_bridge.grasping.analytic import analytic_labels, gripper_boxes, spread_points
+from realsim_sim_bridge.grasping.analytic_config import AnalyticConfig
+from realsim_sim_bridge.grasping.analytic_given import given_candidates, standing_labels
+from realsim_sim_bridge.grasping.analytic_select import select_analytic, select_rows
+from realsim_sim_bridge.grasping.candidates import (
+    CandidateConfig,
+    Surroundings,
+    sample_candidates,
+    standing_object,
+)
+from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from tried_grasps import assert_same
+
+HAND = HandGeometry()
+FEW = AnalyticConfig(points=12)
+
+
+def solid(shape):
+    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
+
+
+def box(*size):
+    return solid(trimesh.creation.box(size or (0.04, 0.06, 0.1)))
+
+
+def wedge(half_angle):
+    """Return a prism along z whose sides +y and -y open at +-half_angle along x."""
+    x, thin = np.array([-0.02, 0.02]), 0.008
+    end = thin + 0.04 * np.tan(half_angle)
+    outline = np.array([[x[0], -thin], [x[1], -end], [x[1], end], [x[0], thin]])
+    corners = np.concatenate([np.c_[outline, np.full(4, z)] for z in (-0.03, 0.03)])
+    return solid(trimesh.convex.convex_hull(corners))
+
+
+def labels_of(mesh, config=FEW, seed=0):
+    return analytic_labels(mesh, np.random.default_rng(seed), config)
+
+
+@pytest.fixture(scope="module")
+def of_box():
+    return box(), labels_of(box())
+
+
+# --- laws -------------------------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_labels(of_box):
+    mesh, labels = of_box
+    assert_same(labels_of(mesh), labels)
+
+
+def test_labels_and_their_file_are_the_same(tmp_path, of_box):
+    labels = of_box[1]
+    path = write_grasp_labels(tmp_path / "000_labels.npz", labels)
+    assert_same(read_grasp_labels(path, with_collision=True), labels)
+
+
+def test_a_coarser_look_is_part_of_the_finer_one(of_box):
+    mesh, labels = of_box
+    coarse = labels_of(mesh, AnalyticConfig(points=12, view_step=5))
+    assert coarse.view_tried.sum() == 60 and 0 < len(coarse) < len(labels)
+    fine = labels.rows(coarse.view_tried[labels.index[:, 1]])
+    np.testing.assert_array_equal(fine.index, coarse.index)
+    np.testing.assert_array_equal(fine.friction, coarse.friction)
+
+
+def inside_out(mesh):
+    return Mesh(vertices=mesh.vertices, faces=mesh.faces[:, ::-1])
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [box(), inside_out(box()), wedge(0.2), solid(trimesh.creation.icosphere(3, 0.03))],
+)
+def test_the_friction_is_that_of_the_measure_closure_friction(mesh):
+    """Two ways to the same number: rays of 14,400 lines a point, and the hand's closing axis."""
+    labels = labels_of(mesh)
+    some = labels.rows(np.arange(0, len(labels), max(1, len(labels) // 300)))
+    config = ClosureConfig(levels=AnalyticConfig().levels)
+    closure = force_closure(
+        mesh, some.Ts_obj_grasp(), some.openings_m.astype(np.float64), config, HAND
+    )
+    same = np.abs(closure.closure_friction - some.friction) < 1e-6
+    # Lines along an edge meet the one or the other face.
+    assert len(some) > 50 and same.mean() > 0.97
+
+
+def test_the_fingers_pass_the_contacts_with_the_clearance(of_box):
+    mesh, labels = of_box
+    labels = labels.rows(np.arange(0, len(labels), 12))
+    Ts = labels.Ts_obj_grasp()
+    contacts = force_closure(mesh, Ts, np.full(len(Ts), 0.08), ClosureConfig(), HAND).axis_contacts
+    along = np.sum((contacts.points - Ts[:, None, :3, 3]) * Ts[:, None, :3, 1], axis=-1)
+    tight = 0.5 * labels.openings_m - np.abs(along).max(axis=1)
+    assert np.nanmedian(np.abs(tight - 0.002)) < 1e-6
+    assert labels.openings_m.max() <= 0.08
+
+
+# --- known answers ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("half_angle", [0.08, 0.25, 0.55])
+def test_what_closes_on_a_wedge_needs_the_friction_of_its_slopes(half_angle):
+    """A line across slopes at +-a, itself tilted by any angle, written out by hand."""
+    labels = labels_of(wedge(half_angle), AnalyticConfig(points=30))
+    Ts = labels.Ts_obj_grasp()
+    middle, y = Ts[:, :3, 3], Ts[:, :3, 1]
+    y = y * np.sign(y[:, 1:2])
+    needed, on_slopes = [], np.ones(len(y), dtype=bool)
+    for side in (1, -1):
+        n = np.array([-np.sin(half_angle), side * np.cos(half_angle), 0.0])
+        edge = np.array([-0.02, side * 0.008, 0.0])
+        with np.errstate(divide="ignore"):
+            contact = middle + ((edge - middle) @ n / (y @ n))[:, None] * y
+        on_slopes &= (np.abs(contact[:, 0]) < 0.0199) & (np.abs(contact[:, 2]) < 0.0299)
+        needed.append(np.tan(np.arccos(np.clip(side * (y @ n), -1, 1))))
+    needed = np.max(needed, axis=0)[on_slopes]
+    level = np.ceil(needed * 10 - 1e-4) / 10
+    assert on_slopes.sum() > 200 and needed.min() >= np.tan(half_angle) - 1e-6
+    np.testing.assert_allclose(labels.friction[on_slopes], level, atol=1e-6)
+
+
+def test_a_box_wider_than_the_gripper_does_not_close_across():
+    labels = labels_of(box(0.2, 0.2, 0.03), AnalyticConfig(points=20))
+    y = labels.Ts_obj_grasp()[:, :3, 1]
+    assert len(labels) and np.all(np.abs(y[:, 2]) > 0.6)  # only across its 30 mm
+
+
+def test_a_box_that_nothing_can_hold_has_no_label():
+    labels = labels_of(box(0.3, 0.3, 0.3))
+    assert len(labels) == 0 and len(labels.points) == 12
+    assert len(select_analytic(labels, 10, np.random.default_rng(0), obj_id=1)) == 0
+
+
+def test_graspnets_gripper_has_the_boxes_of_its_collision_check():
+    boxes = gripper_boxes(np.array([0.03]), np.array([0.05]))[0]
+    np.testing.assert_allclose(boxes[0], [[-0.03, -0.035, -0.01], [-0.02, 0.035, 0.01]])
+    np.testing.assert_allclose(boxes[1], [[-0.02, -0.035, -0.01], [0.03, -0.025, 0.01]])
+    np.testing.assert_allclose(boxes[2], [[-0.02, 0.025, -0.01], [0.03, 0.035, 0.01]])
+
+
+def test_a_palm_in_the_object_collides_with_it():
+    """Wherever one of a dozen points of the gripper is in the box, the label says so."""
+    half = np.array([0.03, 0.1, 0.1])
+    labels = labels_of(box(*(2 * half)))
+    Ts = frame.graspnet_poses(labels.Ts_obj_grasp(), labels.depths_m)
+    boxes = gripper_boxes(labels.depths_m.astype(float), labels.openings_m.astype(float))
+    at = np.array([[a, b, c] for a in (0.1, 0.5, 0.9) for b in (0.1, 0.9) for c in (0.2, 0.8)])
+    p = boxes[:, :, :1] + at * (boxes[:, :, 1:] - boxes[:, :, :1])
+    inside = np.all(np.abs(se3.transform(Ts, p.reshape(len(Ts), -1, 3))) < half, axis=-1).any(1)
+    assert inside.sum() > 100 and labels.collision[inside].all()
+    assert (~labels.collision).sum() > 20
+
+
+def test_points_are_on_the_surface_and_apart():
+    mesh = box()
+    points = spread_points(mesh, np.random.default_rng(0), 100, 0.005)
+    off = np.abs(np.abs(points) - np.abs(mesh.vertices).max(axis=0)).min(axis=1)
+    assert len(points) == 100 and off.max() < 1e-7
+    distance = np.linalg.norm(points[:, None] - points[None], axis=-1) + np.eye(100)
+    assert distance.min() >= 0.005
+    small = spread_points(box(0.006, 0.006, 0.006), np.random.default_rng(0), 100, 0.005)
+    assert 3 < len(small) < 30  # no more fit
+
+
+# --- the choice -------------------------------------------------------------------------------
+
+
+def test_the_choice_is_free_spread_and_of_every_level(of_box):
+    labels = of_box[1]
+    rng = np.random.default_rng(1)
+    s = select_analytic(labels, 60, rng, obj_id=3, instance=2, file="grasp_label/002_labels.npz")
+    assert len(s) == 60 and (s.obj_id, s.instance) == (3, 2) and np.isnan(s.scores).all()
+    rows = select_rows(labels, 60, np.random.default_rng(1))
+    np.testing.assert_array_equal(s.parameters["label_index"], labels.index[rows])
+    np.testing.assert_array_equal(s.measures["closure_friction"], labels.friction[rows])
+    assert not labels.collision[rows].any()
+    there = np.unique(labels.friction[~labels.collision])
+    shares = [np.sum(labels.friction[rows] == f) for f in there]
+    assert min(shares) >= min(4, 60 // len(there))
+    chance = np.random.default_rng(2).choice(np.flatnonzero(~labels.collision), 60)
+
+    def nearest(Ts):
+        d = np.linalg.norm(Ts[:, None, :3, 3] - Ts[None, :, :3, 3], axis=-1)
+        return np.median((d + np.eye(len(d))).min(axis=1))
+
+    Ts = labels.Ts_obj_grasp()
+    assert nearest(Ts[rows]) > 1.3 * nearest(Ts[chance])
+
+
+def test_all_are_chosen_where_fewer_are_than_asked_for(of_box):
+    labels = of_box[1]
+    free = np.flatnonzero(~labels.collision)
+    np.testing.assert_array_equal(select_rows(labels, 10**6, np.random.default_rng(0)), free)
+    assert len(select_rows(labels, 7, np.random.default_rng(0))) == 7
+    with pytest.raises(InputError, match="are asked for"):
+        select_rows(labels, -1, np.random.default_rng(0))
+
+
+# --- given grasps -----------------------------------------------------------------------------
+
+
+def standing(mesh):
+    return se3.from_translation([0.3, 0.1, -mesh.vertices[:, 2].min()])
+
+
+def test_what_is_sampled_and_given_again_is_the_same():
+    mesh, config = box(), CandidateConfig(surface_points=100)
+    found = sample_candidates(
+        mesh, standing(mesh), Surroundings(), config, HAND, np.random.default_rng(0), 60
+    )
+    level = found.contact_depths_m == 0
+    again, rows = given_candidates(
+        mesh, standing(mesh), Surroundings(), found.Ts_obj_grasp[level], config, HAND
+    )
+    assert level.sum() > 10 and len(rows) == level.sum()
+    np.testing.assert_allclose(again.Ts_obj_grasp, found.Ts_obj_grasp[level], atol=1e-6)
+    np.testing.assert_allclose(again.widths_m, found.widths_m[level], atol=2e-6)
+    np.testing.assert_allclose(again.openings_m, found.openings_m[level], atol=1e-5)
+
+
+def test_given_grasps_keep_their_contacts_and_their_friction(of_box):
+    mesh, labels = of_box
+    s = select_analytic(labels, 80, np.random.default_rng(0), obj_id=1)
+    found, rows = given_candidates(
+        mesh, standing(mesh), Surroundings(), s.Ts_obj_grasp, CandidateConfig(), HAND
+    )
+    counts = found.counts
+    taken = ("without_contacts", "too_near", "too_wide", "hand_in_table", "hand_in_object",
+             "hand_in_neighbour", "free")  # fmt: skip
+    assert counts["given"] == 80 == sum(counts[name] for name in taken)
+    assert len(rows) == counts["kept"] > 5
+    closure = force_closure(
+        mesh, found.Ts_obj_grasp, found.openings_m, ClosureConfig(levels=FEW.levels), HAND,
+        contact_depths_m=found.contact_depths_m,
+    )  # fmt: skip
+    same = np.abs(closure.closure_friction - s.measures["closure_friction"][rows]) < 1e-6
+    assert same.mean() > 0.95
+    middle = closure.axis_contacts.points.mean(axis=1)
+    off = np.sum((middle - found.Ts_obj_grasp[:, :3, 3]) * found.Ts_obj_grasp[:, :3, 1], axis=1)
+    assert np.abs(off).max() < 1e-6  # both fingers touch at once
+    np.testing.assert_allclose(
+        found.Ts_obj_grasp[:, :3, :3], s.Ts_obj_grasp[rows, :3, :3], atol=1e-12
+    )
+
+
+def test_a_neighbour_takes_the_given_grasps_it_stands_in(of_box):
+    mesh, labels = of_box
+    s = select_analytic(labels, 60, np.random.default_rng(0), obj_id=1)
+    T = standing(mesh)
+    _, rows = given_candidates(mesh, T, Surroundings(), s.Ts_obj_grasp, CandidateConfig(), HAND)
+    beside = standing_object(mesh, se3.from_translation([0.05, 0, 0]) @ T, 1, 500)
+    fewer, left = given_candidates(mesh, T, beside, s.Ts_obj_grasp, CandidateConfig(), HAND)
+    assert set(left) < set(rows) and fewer.counts["hand_in_neighbour"] > 0
+    nothing, none = given_candidates(
+        mesh, T, Surroundings(), np.zeros((0, 4, 4)), CandidateConfig(), HAND
+    )
+    assert len(none) == 0 and nothing.counts["kept"] == 0
+
+
+def test_labels_that_stand_are_those_the_hand_can_take(of_box):
+    mesh, labels = of_box
+    T = standing(mesh)
+    config, rng = CandidateConfig(), np.random.default_rng(0)
+    found = standing_labels(labels, mesh, T, Surroundings(), config, HAND, rng)
+    assert 20 < len(found) < (~labels.collision).sum() and not found.collision.any()
+    s = select_analytic(found, 40, rng, obj_id=1)
+    again, rows = given_candidates(mesh, T, Surroundings(), s.Ts_obj_grasp, config, HAND)
+    assert len(rows) == len(s) == 40
+    lowest = np.min((T @ again.Ts_obj_grasp)[:, 2, 3])
+    assert lowest > 0 and again.counts["hand_in_table"] == 0

@@ -1,0 +1,141 @@
+"""Arrays of others: what numpy wrote is read back, what a header only claims is refused."""
+
+import io
+import tracemalloc
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from realsim.errors import InputError
+from realsim.untrusted.arrays import read_npy, read_npz
+
+NUMBERS = st.sampled_from(
+    ["?", "i1", "u1", ">i2", "u2", "i4", ">u4", "i8", "u8", "f2", "f4", ">f8"]
+)
+ARRAYS = NUMBERS.flatmap(
+    lambda kind: hnp.arrays(np.dtype(kind), hnp.array_shapes(min_dims=0, min_side=0, max_dims=4))
+)
+
+
+@given(array=ARRAYS, fortran=st.booleans())
+@settings(max_examples=80, deadline=None)
+def test_what_numpy_wrote_is_read_back_in_native_order(
+    tmp_path_factory: pytest.TempPathFactory, array: np.ndarray[Any, Any], fortran: bool
+) -> None:
+    folder = tmp_path_factory.getbasetemp()
+    given_array = np.asfortranarray(array) if fortran else array
+    np.save(folder / "a.npy", given_array)
+    np.savez_compressed(folder / "a.npz", x=given_array, y=np.arange(3))
+    for read in (read_npy(folder / "a.npy"), read_npz(folder / "a.npz")["x"]):
+        np.testing.assert_array_equal(read, given_array)
+        assert read.shape == given_array.shape
+        assert read.dtype == array.dtype.newbyteorder("=")
+        assert read.dtype.isnative
+
+
+def _header(text: str, version: tuple[int, int] = (1, 0)) -> bytes:
+    width = 2 if version == (1, 0) else 4
+    padded = text.encode("latin-1") + b"\n"
+    return b"\x93NUMPY" + bytes(version) + len(padded).to_bytes(width, "little") + padded
+
+
+CLAIMS = {
+    "terabytes": _header("{'descr': '<f8', 'fortran_order': False, 'shape': (10**0, 1<<40)}"),
+    "terabytes, plainly": _header(
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,)}"
+    )
+    + b"\0" * 64,
+    "negative": _header("{'descr': '<f8', 'fortran_order': False, 'shape': (-1, -8)}") + b"\0" * 64,
+    "yes as a size": _header("{'descr': '<f8', 'fortran_order': False, 'shape': (True,)}")
+    + b"\0" * 8,
+    "beyond 64 bits": _header(f"{{'descr': '<f8', 'fortran_order': False, 'shape': ({10**400},)}}"),
+    "empty times terabytes": _header(
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (0, 4611686018427387904, 9)}"
+    ),
+    "objects": _header("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}") + b"\x80\x04N.",
+    "text": _header("{'descr': '<U8', 'fortran_order': False, 'shape': (1,)}") + b"\0" * 32,
+    "fields": _header("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1,)}")
+    + b"\0" * 8,
+    "nested": _header("(" * 3000),
+    "a long header": _header(" " * 60_000),
+    "a longer one": b"\x93NUMPY\x02\x00\xff\xff\xff\xff",
+    "the future": _header("{}", (9, 0)),
+    "no keys": _header("{}"),
+    "half": _header("{'descr': '<f8', 'fortran_order': False, 'shape': (4,)}") + b"\0" * 31,
+    "more": _header("{'descr': '<f8', 'fortran_order': False, 'shape': (4,)}") + b"\0" * 33,
+    "nothing": b"",
+    "a pickle": b"\x80\x04\x95\x0b\x00\x00\x00\x00\x00\x00\x00\x8c\x02os\x94",
+}
+
+
+@pytest.mark.parametrize("claim", CLAIMS)
+def test_claims_of_a_header_are_refused_before_anything_is_allocated(
+    tmp_path: Path, claim: str
+) -> None:
+    path = tmp_path / "a.npy"
+    path.write_bytes(CLAIMS[claim])
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"a\.npy"):
+            read_npy(path)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("x.npy", CLAIMS[claim])
+    with pytest.raises(InputError, match=r"a\.npz"):
+        read_npz(tmp_path / "a.npz")
+
+
+def test_only_the_named_arrays_are_unpacked_and_a_missing_one_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, good=np.arange(3), bad=np.array([{}], dtype=object))
+    assert list(read_npz(path, ["good"])) == ["good"]
+    with pytest.raises(InputError, match="no array 'other'; it holds good, bad"):
+        read_npz(path, ["other"])
+    with pytest.raises(InputError, match="objects"):
+        read_npz(path)
+
+
+def test_an_archive_that_unfolds_a_thousandfold_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, x=np.zeros(3_000_000))
+    assert path.stat().st_size < 100_000
+    with pytest.raises(InputError, match="unpacks to 24"):
+        read_npz(path, most_bytes=1e6)
+
+
+def test_a_member_there_twice_or_of_a_size_that_lies_is_refused(tmp_path: Path) -> None:
+    data = io.BytesIO()
+    np.save(data, np.arange(1000))
+    twice = tmp_path / "twice.npz"
+    with zipfile.ZipFile(twice, "w") as archive, pytest.warns(UserWarning, match="Duplicate"):
+        archive.writestr("x.npy", data.getvalue())
+        archive.writestr("x.npy", data.getvalue())
+    with pytest.raises(InputError, match="twice"):
+        read_npz(twice)
+    lies = tmp_path / "lies.npz"
+    with zipfile.ZipFile(lies, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("x.npy", data.getvalue())
+        size = archive.getinfo("x.npy").file_size
+    raw = lies.read_bytes()
+    for claim in (size - 8, size + 8, 2**31):
+        lies.write_bytes(raw.replace(size.to_bytes(4, "little"), claim.to_bytes(4, "little")))
+        with pytest.raises(InputError, match=r"lies\.npz"):
+            read_npz(lies)
+
+
+def test_a_flipped_byte_fails_the_checksum(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, x=np.arange(100))
+    raw = bytearray(path.read_bytes())
+    raw[400] ^= 1
+    path.write_bytes(raw)
+    with pytest.raises(InputError, match="CRC-32"):
+        read_npz(path)
