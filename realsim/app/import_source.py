@@ -35,17 +35,17 @@ ACCEPTED = (
 )
 KINDS = ("auto", "bag", "folder", "bop", "graspnet", "colmap", "nerfstudio", "realsense")
 ONLY_FOR: dict[str, tuple[str, ...]] = {
-    "depth_unit": ("folder", "bag", "nerfstudio"),
+    "depth_unit": ("folder", "bag", "colmap", "nerfstudio"),
     "depth_coding": ("folder",),
     "poses": ("folder",),
     "reading": ("folder",),
     "key": ("folder",),
     "poses_of": ("folder",),
     "no_poses": ("folder",),
-    "depths": ("folder",),
+    "depths": ("folder", "colmap"),
     "images": ("folder", "colmap", "nerfstudio"),
     "camera": ("folder", "bag"),
-    "no_depth": ("folder", "bag", "bop", "graspnet", "nerfstudio"),
+    "no_depth": ("folder", "bag", "bop", "graspnet", "colmap", "nerfstudio"),
     "colour_topic": ("bag",),
     "depth_topic": ("bag",),
     "joints_topic": ("bag",),
@@ -391,6 +391,9 @@ def _open_colmap(request: ImportRequest, console: Console) -> FrameSource:
         images_folder=request.images or None,
         camera_id=request.camera_id,
         metres_per_unit=request.scale,
+        depth_folder=request.depths or None,
+        depth_unit_m=request.depth_unit,
+        use_depth=not request.no_depth,
     )
 
 

@@ -230,3 +230,16 @@ def test_a_lens_is_told_or_undone_but_not_forgotten(tmp_path):
         seen = label.shape[0] * label.shape[1]
         assert np.count_nonzero(found ^ true) < 0.002 * seen
     assert "contradict" in refused(*args, tmp_path / "x", "--undistort", "--ignore-distortion")
+
+
+def test_cameras_go_out_and_come_back(bop, tmp_path):
+    before = open_labelled_bop(bop)
+    for target, options in (("colmap", ("--scale", "1")), ("nerfstudio", ())):
+        out = tmp_path / target
+        done("export", bop, "--to", target, "--out", out, "--quiet")
+        scene = next(p for p in out.iterdir() if p.is_dir())
+        done("import", scene, tmp_path / f"{target}_session", *options, "--quiet")
+        views = SessionStore.open(tmp_path / f"{target}_session").session.views
+        assert len(views) == len(before.indices)
+        for v, i in zip(views, before.indices, strict=True):
+            np.testing.assert_allclose(v.T_world_cam, before.frame(i).T_world_cam, atol=1e-9)

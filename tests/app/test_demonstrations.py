@@ -1,0 +1,183 @@
+"""`realsim demonstrations`: what is streamed is what is written, and a page shows it."""
+
+import hashlib
+import json
+import re
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from school_sessions import registered, run
+
+from realsim.app import demonstrations
+from realsim.app.demonstrations import DemonstrationRequest, open_source
+from realsim.app.demonstrations_cli import demonstrations_command
+from realsim.errors import InputError
+from realsim.formats.lerobot import layout
+from realsim_sim_bridge.demonstrations import lerobot_episodes
+from realsim_sim_bridge.demonstrations.lerobot_episodes import episode_columns
+
+WEAK = ("--engine", "mujoco", "--grasps", "10", "--workers", "1", "--quiet", "--force", "4",
+        "--friction", "0.3")  # fmt: skip
+SMALL = ("--fps", "5", "--width", "64", "--height", "48", "--limit", "3", "--quiet",
+         "--episodes-per-file", "2")  # fmt: skip
+
+
+def demonstrate(*args):
+    return CliRunner().invoke(demonstrations_command, [str(a) for a in args])
+
+
+def refused(*args):
+    result = demonstrate(*args)
+    assert isinstance(result.exception, InputError), (result.output, result.exception)
+    return str(result.exception)
+
+
+@pytest.fixture(scope="module")
+def school(tmp_path_factory):
+    folder = registered(tmp_path_factory.mktemp("weak") / "session")
+    result = run("run", folder, *WEAK)
+    assert result.exception is None, result.output
+    return folder
+
+
+@pytest.fixture(scope="module")
+def written(school, tmp_path_factory):
+    out = tmp_path_factory.mktemp("out") / "demos"
+    result = demonstrate(school, "--out", out, *SMALL)
+    assert result.exception is None, result.output
+    return out
+
+
+def files_of(folder):
+    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest()
+            for p in sorted(folder.rglob("*")) if p.is_file()}  # fmt: skip
+
+
+def test_what_is_streamed_is_what_is_written(school, written):
+    import av
+    import pyarrow.parquet as pq
+
+    request = DemonstrationRequest(fps=5, width=64, height=48, limit=3)
+    source = open_source(school, request, demonstrations.Console(quiet=True))
+    chosen = demonstrations.chosen_attempts(source, request)
+    table = [r for f in sorted(written.glob("data/*/*.parquet"))
+             for r in pq.read_table(f).to_pylist()]  # fmt: skip
+    frames = {}
+    for camera in ("front", "wrist"):
+        frames[camera] = []
+        for path in sorted((written / f"videos/observation.images.{camera}").glob("*/*.mp4")):
+            with av.open(str(path)) as video:
+                frames[camera] += [f.to_ndarray(format="rgb24") for f in video.decode(video=0)]
+    at = 0
+    for episode, k in enumerate(chosen):
+        d = source[k]
+        rows = table[at : at + len(d)]
+        assert {r["episode_index"] for r in rows} == {episode}
+        for key, values in episode_columns(d).items():
+            found = np.array([r[key] for r in rows])
+            np.testing.assert_array_equal(found, np.asarray(values).astype(found.dtype))
+            if found.dtype == np.float64:
+                np.testing.assert_array_equal(
+                    found.astype(np.float32), np.asarray(values, np.float32)
+                )
+        for step in (d.step(0), d.step(len(d) - 1)):
+            for camera in ("front", "wrist"):
+                error = frames[camera][at + step.index].astype(float) - step.look(camera)
+                assert 10 * np.log10(255**2 / np.mean(error**2)) > 28
+        at += len(d)
+    assert at == len(table) == len(frames["front"]) == len(frames["wrist"])
+
+
+def test_actions_are_the_next_states(written):
+    import pyarrow.parquet as pq
+
+    rows = [
+        r for f in sorted(written.glob("data/*/*.parquet")) for r in pq.read_table(f).to_pylist()
+    ]
+    for now, after in zip(rows, rows[1:], strict=False):
+        if now["episode_index"] == after["episode_index"]:
+            assert now["action"][:7] == after["observation.state"][:7]
+            assert not now["next.done"]
+        else:
+            assert now["next.done"]
+    assert all(r["action"][7] <= r["observation.state"][7] + 1e-6 for r in rows)
+
+
+def test_the_notes_tell_how_each_attempt_ended(school, written):
+    notes = [json.loads(line) for line in (written / layout.NOTES).read_text().splitlines()]
+    assert len(notes) == 3
+    assert all(n["replay_agrees"] for n in notes)
+    assert all(n["success"] == (n["failure"] == "") for n in notes)
+
+
+def test_the_page_shows_pictures_and_points_at_the_videos(written):
+    page = (written / "demonstrations.html").read_text()
+    assert page.count("data:image/jpeg;base64,") == 3
+    sources = re.findall(r'src="(videos/[^"#]+)#t=', page)
+    assert len(sources) == 6
+    assert all((written / s).is_file() for s in sources)
+
+
+def test_checksums_and_card_are_there(written):
+    for line in (written / "SHA256SUMS").read_text().splitlines():
+        digest, name = line.split("  ", 1)
+        assert hashlib.sha256((written / name).read_bytes()).hexdigest() == digest, name
+    card = (written / "README.md").read_text()
+    assert "LeRobot v3.0" in card
+    assert lerobot_episodes.GOAL in card
+    assert not (written / ".export").exists()
+
+
+def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
+    school, written, tmp_path, monkeypatch
+):
+    asked, real = [], lerobot_episodes.LeRobotDemonstrations.episode
+
+    def dying(self, k):
+        if k == 1:
+            raise KeyboardInterrupt
+        asked.append(k)
+        return real(self, k)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(lerobot_episodes.LeRobotDemonstrations, "episode", dying)
+        assert demonstrate(school, "--out", tmp_path / "demos", *SMALL).exit_code != 0
+    other = (*SMALL[:1], "6", *SMALL[2:])
+    assert "another request" in refused(school, "--out", tmp_path / "demos", *other)
+
+    def counting(self, k):
+        asked.append(k)
+        return real(self, k)
+
+    monkeypatch.setattr(lerobot_episodes.LeRobotDemonstrations, "episode", counting)
+    result = demonstrate(school, "--out", tmp_path / "demos", *SMALL)
+    assert result.exception is None, result.output
+    assert asked == [0, 1, 2]
+    mine, theirs = files_of(tmp_path / "demos"), files_of(written)
+    assert mine == theirs
+
+
+def test_requests_that_cannot_be_are_refused(school, written, tmp_path):
+    out = ("--out", tmp_path / "demos")
+    assert "INSTANCE:GRASP" in refused(school, *out, "--grasp", "first")
+    assert "no grasp 77" in refused(school, *out, "--grasp", "0:77")
+    assert "even numbers" in refused(school, *out, "--width", "65")
+    assert "--view 3" in refused(school, *out, "--view", "3")
+    assert "no hand-eye calibration" in refused(school, *out, "--hand-eye")
+    assert "not empty" in refused(school, "--out", written)
+    assert "inside" in refused(school, "--out", school / "demos")
+    assert "weighs" in refused(school, *out, "--density", "500", "--limit", "1")
+
+
+def test_a_grasp_that_the_arm_does_not_reach_is_refused_with_its_reason(school, tmp_path):
+    request = DemonstrationRequest()
+    source = open_source(school, request, demonstrations.Console(quiet=True))
+    none = source.not_attempted[0]
+    words = refused(school, "--out", tmp_path / "d", "--grasp", f"{none.instance}:{none.grasp}")
+    assert none.why in words
+
+
+def test_a_session_without_grasps_says_what_to_run(tmp_path):
+    folder = registered(tmp_path / "session")
+    assert "realsim school" in refused(folder, "--out", tmp_path / "d")

@@ -1,0 +1,78 @@
+"""Grasps of a session in other programs' formats, through `realsim export`."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from realsim.app.cli import commands
+from realsim.app.console import Console
+from realsim.app.stages import annotate_session
+from realsim.errors import InputError
+from realsim.formats.graspnet.grasp_group import read_grasp_group
+from realsim.formats.grasps.acronym import read_acronym
+from realsim.formats.grasps.hdf5 import read_grasps_hdf5
+from realsim.formats.grasps.scene_grasps import executed
+from realsim.formats.session_scene import open_session_scene
+from realsim.store import SessionStore, load_grasps, load_scene, save_grasps
+from synthetic_scenes import captured_session
+from tried_grasps import tried_set
+
+
+def run(*args):
+    return CliRunner().invoke(commands, [str(a) for a in args])
+
+
+def done(*args):
+    result = run(*args)
+    assert result.exit_code == 0, (result.output, result.exception)
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    store = captured_session(tmp_path_factory.mktemp("grasps") / "scene_000002", count=2)
+    rng = np.random.default_rng(4)
+    for o in load_scene(store).objects:
+        save_grasps(store, tried_set(rng, 30, obj_id=o.obj_id, instance=o.instance))
+    annotate_session(store, Console(quiet=True))
+    return store.folder
+
+
+def test_grasps_of_a_frame_are_in_its_camera(session, tmp_path):
+    done("export", session, "--to", "grasp-group", "--out", tmp_path / "out", "--quiet")
+    sets = load_grasps(SessionStore.open(session))
+    scene = open_session_scene(SessionStore.open(session))
+    for index in scene.indices:
+        group = read_grasp_group(tmp_path / f"out/scene_000002/{index:06d}.npy")
+        poses = {o.instance: o.T_cam_obj for o in scene.frame(index).objects}
+        want = [
+            (poses[s.instance] @ T, score)
+            for s in sets
+            for T, score in zip(s.Ts_obj_grasp, s.scores, strict=True)
+            if np.isfinite(score)
+        ]
+        assert len(group) == len(want) > 10
+        np.testing.assert_allclose(group.Ts_a_grasp, [T for T, _ in want], atol=2e-6)
+        np.testing.assert_allclose(group.scores, [score for _, score in want], atol=1e-6)
+
+
+def test_files_of_objects_hold_what_was_tried(session, tmp_path):
+    done("export", session, "--to", "acronym", "--out", tmp_path / "a", "--quiet")
+    done("export", session, "--to", "hdf5", "--out", tmp_path / "h", "--quiet")
+    sets = {s.instance: s for s in load_grasps(SessionStore.open(session))}
+    files = sorted((tmp_path / "a/scene_000002").glob("*.h5"))
+    assert len(files) == len(sets)
+    for file, s in zip(files, sets.values(), strict=True):
+        again = read_acronym(file)
+        tried = executed(s)
+        np.testing.assert_allclose(again.Ts_obj_grasp, s.Ts_obj_grasp[tried], atol=1e-9)
+    whole = read_grasps_hdf5(tmp_path / "h/scene_000002/grasps.h5")
+    assert [len(s) for s in whole.sets] == [len(s) for s in sets.values()]
+
+
+def test_grasps_are_of_sessions(session, tmp_path):
+    done("export", session, "--to", "bop", "--out", tmp_path / "bop", "--quiet")
+    result = run("export", tmp_path / "bop", "--to", "hdf5", "--out", tmp_path / "o")
+    assert isinstance(result.exception, InputError) and "is no session" in str(result.exception)
+    assert not (tmp_path / "o").exists()
+    result = run("export", session, "--to", "hdf5", "--out", tmp_path / "o", "--least-score", "0.5")
+    assert "says nothing of realsim HDF5" in str(result.exception)
