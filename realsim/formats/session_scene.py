@@ -213,8 +213,6 @@ def open_session_scene(
         InputError: the labels that were asked for are not there, or are damaged.
     """
     views = [v.index for v in store.session.views]
-    if not views:
-        raise InputError(f"session '{store.folder}' has no views; there is nothing to export.")
     imported = load_imported(store)
     annotated = [i for i in views if store.has(f"annotations/{i:06d}.json")]
     chosen = labels

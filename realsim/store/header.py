@@ -1,6 +1,5 @@
 """`session.json`: who a session is, its camera, and where the camera stood."""
 
-import json
 import platform
 import shlex
 from datetime import UTC, datetime
@@ -11,6 +10,7 @@ from typing import Any
 from realsim.errors import InputError
 from realsim.records import CaptureSession
 from realsim.store import records_json
+from realsim.untrusted import json_text
 
 SESSION_FILE = "session.json"
 FORMAT = "realsim session"
@@ -66,6 +66,7 @@ def checked_header(path: Path) -> dict[str, Any]:
         records_json.intrinsics_from_json(header["camera"])
         float(header["depth_unit_m"])
         dict(header["T_world_cam"])
+        dict(header.get("extra", {}))
     except (TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path} has a camera, unit or pose that is none ({error}).") from error
     return header
@@ -91,10 +92,7 @@ def header_to_open(path: Path) -> dict[str, Any]:
 def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"{path} does not exist.")
-    try:
-        header: Any = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{path} is not valid JSON ({error}).") from error
+    header: Any = json_text.read_json(path)
     if not isinstance(header, dict):
         raise InputError(f"{path} holds a {type(header).__name__}; an object is expected.")
     return {str(key): item for key, item in header.items()}  # pyright: ignore[reportUnknownVariableType]

@@ -1,27 +1,26 @@
 """JSON files of a session, read with messages that say what to do."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 from realsim.errors import InputError
+from realsim.untrusted import json_text
 
 
 def read_json_file(path: Path | str) -> Any:
     """Return the values of a JSON file.
 
     Raises:
-        InputError: it is missing or not JSON.
+        InputError: it is missing, or not JSON by `realsim.untrusted.json_text`.
     """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} does not exist; has the step that writes it been run?")
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+        return json_text.read_json(path)
+    except InputError as error:
         raise InputError(
-            f"{path} is not valid JSON ({error}). Restore it, or delete it and run the step that "
-            "writes it again."
+            f"{error} Restore the file, or delete it and run the step that writes it again."
         ) from error
 
 

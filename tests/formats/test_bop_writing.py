@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.formats.bop.check import check_bop_scene
 from realsim.formats.bop.exact import exact_mm
 from realsim.formats.bop.models import load_models
 from realsim.formats.bop.opening import open_labelled_bop, open_labelled_scene
@@ -362,67 +360,3 @@ def test_a_killed_export_goes_on_and_ends_with_the_same_bytes(tmp_path):
         folder.finish({})
         assert (out / "SHA256SUMS").read_text().splitlines() == sums
         assert content(out) == content(tmp_path / "whole")
-
-
-# --- the check ----------------------------------------------------------------------------------
-
-
-def test_right_labels_agree(tmp_path):
-    write_boxes(tmp_path)
-    found = check_bop_scene(open_labelled_bop(tmp_path))
-    assert found.agrees, [str(f) for f in found.findings]
-    assert (found.frames, found.objects) == (5, 15)
-    for what in ("bbox_visib", "px_count_valid", "visib_fract", "mask_visib", "pose and mask"):
-        assert found.compared[what] == 15
-
-
-WRONG = {
-    "bbox_visib": lambda row: row["bbox_visib"].__setitem__(2, row["bbox_visib"][2] + 1),
-    "px_count_visib": lambda row: row.update(px_count_visib=row["px_count_visib"] + 3),
-    "px_count_valid": lambda row: row.update(px_count_valid=row["px_count_valid"] - 1),
-    "px_count_all": lambda row: row.update(px_count_all=row["px_count_all"] // 2),
-    "visib_fract": lambda row: row.update(visib_fract=0.5 * row["visib_fract"]),
-    "bbox_obj": lambda row: row["bbox_obj"].__setitem__(0, row["bbox_obj"][0] - 4),
-}
-
-
-@pytest.mark.parametrize("what", WRONG)
-def test_wrong_counts_are_found(tmp_path, what):
-    folder = write_boxes(tmp_path)
-    edit(folder / "scene_gt_info.json", lambda data: WRONG[what](data["5"][1]))
-    found = check_bop_scene(open_labelled_bop(tmp_path))
-    assert what in found.counts()
-    assert {(f.file, f.image, f.place, f.obj_id) for f in found.findings} == {
-        ("scene_gt_info.json", 5, 1, 7)
-    }
-
-
-def test_a_pose_that_is_off_and_a_mask_that_reaches_out_are_found(tmp_path):
-    folder = write_boxes(tmp_path)
-
-    def shift(data):
-        data["9"][1]["cam_t_m2c"][0] += 25
-
-    edit(folder / "scene_gt.json", shift)
-    counts = check_bop_scene(open_labelled_bop(tmp_path)).counts()
-    assert counts["pose and mask"] >= 1 and counts["pose and box"] >= 1
-    shutil.copy(folder / "mask_visib/000005_000001.png", folder / "mask_visib/000005_000000.png")
-    found = check_bop_scene(open_labelled_bop(tmp_path))
-    assert found.counts()["mask_visib"] == 1
-    assert "image 5, object 0 (id 1): mask_visib says within mask" in "\n".join(
-        map(str, found.findings)
-    )
-
-
-def test_depth_that_was_not_used_for_visibility_is_found(tmp_path):
-    folder = write_boxes(tmp_path)
-    path = folder / "depth/000005.png"
-    counts = cv2.imread(str(path), -1)
-    scene = open_labelled_bop(tmp_path)
-    mask = scene.mask(5, 1, visible=True)
-    near = 1e4 * scene.frame(5).objects[1].T_cam_obj[2, 3]
-    for factor, what in ((0.6, "depth in front"), (1.6, "depth behind")):
-        changed = counts.copy()
-        changed[mask] = int(factor * near)
-        cv2.imwrite(str(path), changed)
-        assert what in check_bop_scene(open_labelled_bop(tmp_path)).counts()

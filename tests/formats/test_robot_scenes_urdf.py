@@ -216,6 +216,7 @@ def test_a_mesh_in_millimetres_with_its_scale_is_read(tmp_path):
         ('<mesh filename="/m.stl"/>', joint("a"), "leads out"),
         ('<mesh filename="gone.stl"/>', joint("a"), "does not exist"),
         ('<mesh filename="out.obj"/>', joint("a"), "leads out"),
+        ('<mesh filename="two.obj"/>', joint("a"), "cannot be read as a mesh"),
         ('<mesh filename=""/>', joint("a"), "."),
         ('<box size="0.1 nan 0.1"/>', joint("a"), "finite"),
         ('<box size="0.1 0 0.1"/>', joint("a"), "positive"),
@@ -232,6 +233,7 @@ def test_what_cannot_be_read_is_named(tmp_path, shape, joints, what):
     (tmp_path / "out.obj").write_text("mtllib ../secret.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     inner = tmp_path / "in"
     inner.mkdir()
+    (inner / "two.obj").write_text("v 0 0\nv 1 0\nv 0 1\nv 1 1\nf 1 2 3\nf 2 3 4\n")
     (inner / "out.obj").write_text((tmp_path / "out.obj").read_text())
     links = f'<link name="a">{MATTER}<collision><geometry>{shape}</geometry></collision></link>'
     with pytest.raises(InputError, match=what):

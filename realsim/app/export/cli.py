@@ -9,8 +9,8 @@ from realsim.app.option_values import numbers_of
 
 FOLDER = click.Path(path_type=Path)
 FORMATS = (
-    "bop", "graspnet", "colmap", "nerfstudio", "grasp-group", "acronym", "graspgen", "isaac",
-    "hdf5", "parquet",
+    "bop", "graspnet", "colmap", "nerfstudio", "urdf", "mjcf", "usd", "graspit", "grasp-group",
+    "acronym", "graspgen", "isaac", "hdf5", "parquet",
 )  # fmt: skip
 
 

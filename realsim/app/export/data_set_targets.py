@@ -1,9 +1,6 @@
 """Data sets and cameras that `realsim export` writes."""
 
-from collections.abc import Sequence
-
-from realsim.app.export.request import ExportRequest
-from realsim.app.export.target import IMAGES, METRES, OPENCV, PIXEL, Models, SceneJob, Target
+from realsim.app.export.target import IMAGES, METRES, OPENCV, PIXEL, RootJob, SceneJob, Target
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 
@@ -18,13 +15,11 @@ def _bop(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenSc
     return write_bop_scene(scene, folder, config, progress=job.tick)
 
 
-def _bop_root(
-    _written: Sequence[WrittenScene], models: Models, folder: ExportFolder, request: ExportRequest
-) -> None:
+def _bop_root(folder: ExportFolder, job: RootJob) -> None:
     from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 
-    write_bop_models(models, folder)
-    write_bop_root(folder, name=request.name or folder.folder.resolve().name)
+    write_bop_models(job.models, folder, infos=job.infos)
+    write_bop_root(folder, name=job.request.name or folder.folder.resolve().name)
 
 
 def _graspnet(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
@@ -41,15 +36,10 @@ def _graspnet(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> Writ
     return write_graspnet_scene(scene, folder, config, progress=job.tick)
 
 
-def _graspnet_root(
-    _written: Sequence[WrittenScene],
-    models: Models,
-    folder: ExportFolder,
-    _request: ExportRequest,
-) -> None:
+def _graspnet_root(folder: ExportFolder, job: RootJob) -> None:
     from realsim.formats.graspnet.writing import write_graspnet_models
 
-    write_graspnet_models(models, folder)
+    write_graspnet_models(job.models, folder)
 
 
 def _colmap(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:

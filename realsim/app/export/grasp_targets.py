@@ -10,7 +10,7 @@ from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 from realsim.formats.session_scene import SessionScene
 
 
-def _session_of(scene: LabelledScene) -> SessionScene:
+def session_of(scene: LabelledScene) -> SessionScene:
     """Return the session that a scene is.
 
     Raises:
@@ -27,7 +27,7 @@ def _session_of(scene: LabelledScene) -> SessionScene:
 def _files(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
     from realsim.app.school_export import export
 
-    session, inner = _session_of(scene), folder.below(job.place.name)
+    session, inner = session_of(scene), folder.below(job.place.name)
     request = job.request
     written = not inner.has("grasps")
     if written:
@@ -50,7 +50,7 @@ def _grasp_groups(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> 
     """Write the grasps of every frame in its camera, as graspnetAPI's GraspGroup."""
     from realsim.formats.graspnet.grasp_group import grasp_group, grasp_group_bytes
 
-    session, inner = _session_of(scene), folder.below(job.place.name)
+    session, inner = session_of(scene), folder.below(job.place.name)
     grasps = session.grasps()
     if grasps is None:
         raise InputError(

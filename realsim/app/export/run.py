@@ -1,16 +1,18 @@
 """`realsim export`: scene by scene into one folder; interrupted, the same command goes on."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 from realsim.app.console import Console
 from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.sources import SourceScene, licence_files, source_scenes, trust_in
-from realsim.app.export.target import SceneJob, ScenePlace, Target
+from realsim.app.export.target import RootJob, SceneJob, ScenePlace, Target
 from realsim.app.export.targets import TARGETS
 from realsim.errors import InputError, RealsimError
+from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.export_folder import STATE, ExportFolder
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 from realsim.formats.session_scene import SessionScene
@@ -23,6 +25,8 @@ ALWAYS = ("sources", "target", "scenes", "name", "licence", "models_licence", "a
 STATED = ("name", "licence", "models_licence", "attribution")
 """Options that the card tells elsewhere."""
 OPTION_NAMES = {"models_licence": "models-licence", "masks": "no-masks"}
+HOLD_OBJECTS = ("dataset", "scene")
+"""Kinds of formats that have a place for objects and their poses."""
 LABELS = {"annotated": "computed by realsim", "imported": "as imported, unchecked", "none": "none"}
 OWN_LABELS = "the data set's own, unchecked"
 
@@ -52,11 +56,14 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
         console.say(f"going on with the export in {out}.")
     facts: list[SceneFacts] = []
     models: dict[int, ObjectModel] = {}
+    infos: dict[int, Mapping[str, Any]] = {}
     with only_run_in(out):
         try:
             for source, place in zip(scenes, places, strict=True):
                 opened = source.open()
                 _add_models(models, opened, source)
+                if isinstance(opened, BopLabelledScene):
+                    infos |= opened.models_info()
                 kept = out / STATE / "undistorted"
                 given = UndistortedScene(opened, kept) if request.undistort else opened
                 written = _write(given, place, target, folder, request, console)
@@ -66,7 +73,7 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
             raise
         if target.write_root is not None:
             with console.stage("models and root"):
-                target.write_root([f.written for f in facts], models, folder, request)
+                target.write_root(folder, RootJob(request=request, models=models, infos=infos))
         licences = licence_files(request.sources)
         folder.write_piece("licences", licences)
         card = _card(request, out, target, facts, models, licences)
@@ -140,6 +147,8 @@ def _write(
     console: Console,
 ) -> WrittenScene:
     total, done = len(scene.indices), 0
+    if not total and target.kind in ("dataset", "cameras"):
+        raise InputError(f"{scene.name} has no views; there is nothing to write as {target.name}.")
     with console.stage("export", f"{scene.name} to {target.name}") as tick:
 
         def one_more() -> None:
@@ -154,7 +163,8 @@ def _write(
     if target.kind == "dataset":
         return replace(written, notes=notes)
     # It has a folder of its own, and no place for objects and their poses.
-    return replace(written, notes=notes, folder=folder.folder / place.name, objects=0)
+    objects = written.objects if target.kind in HOLD_OBJECTS else 0
+    return replace(written, notes=notes, folder=folder.folder / place.name, objects=objects)
 
 
 def _add_models(models: dict[int, ObjectModel], scene: LabelledScene, source: SourceScene) -> None:
@@ -218,7 +228,9 @@ def _card(
         format=target.name,
         conventions=target.conventions,
         scenes=[replace(f, written=_inside(f.written, out)) for f in facts],
-        objects={i: m.name for i, m in models.items()} if target.kind == "dataset" else {},
+        objects={i: m.name for i, m in models.items()}
+        if target.kind in ("dataset", "scene")
+        else {},
         loading=target.loading.replace("{scene}", inside.as_posix()),
         command=command,
         sources=[s.resolve().name for s in request.sources],

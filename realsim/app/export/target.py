@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from realsim.app.export.request import ExportRequest
 from realsim.formats.export_folder import ExportFolder
@@ -34,9 +34,20 @@ class SceneJob:
 
 
 WriteScene = Callable[[LabelledScene, ExportFolder, SceneJob], WrittenScene]
-Models = Mapping[int, ObjectModel]
-WriteRoot = Callable[[Sequence[WrittenScene], Models, ExportFolder, ExportRequest], None]
-"""What belongs to the whole data set: (scenes, models of all scenes, folder, request)."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class RootJob:
+    """What a writer is told of the whole data set, when all scenes are there."""
+
+    request: ExportRequest
+    models: Mapping[int, ObjectModel]
+    """Of all scenes, by object id."""
+    infos: Mapping[int, Mapping[str, Any]]
+    """BOP's own rows of models_info.json, where the sources have them."""
+
+
+WriteRoot = Callable[[ExportFolder, RootJob], None]
 Conventions = Sequence[tuple[str, str]]
 
 

@@ -293,7 +293,7 @@ def _mesh(e: _Entry, notes: list[str]) -> Mesh:
     unit, metres = ("mm", 1e-3) if scale.max() <= LARGEST_MM_SCALE else ("m", 1.0)
     try:
         mesh = load_mesh(e.mesh_file, unit, notes)
-    except InputError as error:
+    except (InputError, ValueError, IndexError, TypeError) as error:
         raise InputError(
             f"the object '{e.name}' of the scene cannot be read from {e.mesh_file}: {error} In a "
             "scene.yaml meshes are in metres; one in millimetres needs `scale: [0.001, 0.001, "

@@ -59,6 +59,9 @@ def scene_mesh(folder: Path, name: str, scale: Array, where: str, notes: list[st
             f"{where}: with the scale {scale.tolist()} the mesh {path.name} cannot be in metres: "
             f'{error} In a scene, scale="0.001 0.001 0.001" says that a mesh is in millimetres.'
         ) from error
+    except (ValueError, IndexError, TypeError) as error:
+        # Vertices of two numbers, and what else the reader of the format lets pass.
+        raise InputError(f"{where}: {path.name} cannot be read as a mesh ({error}).") from error
     vertices = mesh.vertices * (scale / (1e-3 if is_mm else 1.0))
     faces = mesh.faces[:, ::-1] if np.prod(np.sign(scale)) < 0 else mesh.faces
     return Mesh(

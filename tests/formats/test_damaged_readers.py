@@ -1,0 +1,183 @@
+"""Damage that readers of files of others once did not expect: each is refused with its place."""
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.formats.bags import open_bag
+from realsim.formats.bags.realsense import FrameTimes
+from realsim.formats.folders import read_cam_info
+from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_acronym
+from realsim.formats.grasps.graspgen import read_graspgen, write_graspgen
+from realsim.formats.grasps.hdf5 import read_grasps_hdf5, write_grasps_hdf5
+from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
+from realsim.geometry import mesh_files
+from realsim.geometry.mesh_files import load_mesh
+from realsim.models import mesh_loading
+from realsim.models.reading import read_scan
+from realsim.store.json_files import read_json_file
+from tried_grasps import tried_scene, tried_set
+from written_bags import recorded
+from written_meshes import as_trimesh, textured_box
+
+
+def a_set():
+    return tried_set(np.random.default_rng(3), 8)
+
+
+@pytest.mark.parametrize("text", ['{"a": NaN}', '{"a": 1, "a": 2}', "[" * 100_000, '{"a": 1e999}'])
+def test_a_sessions_json_holds_numbers_and_every_key_once(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(InputError, match=r"a\.json is .*Restore the file"):
+        read_json_file(tmp_path / "a.json")
+
+
+@pytest.mark.parametrize("word", ["nan", "inf", "1e999", "-inf"])
+def test_a_camera_matrix_is_of_numbers(tmp_path: Path, word: str) -> None:
+    path = tmp_path / "cam.info.txt"
+    path.write_text(f"# Color camera intrinsic matrix\n35 0 {word}\n0 35 15\n0 0 1\n")
+    with pytest.raises(InputError, match="line 2"):
+        read_cam_info(path)
+
+
+def test_a_missing_camera_file_and_a_folder_are_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        read_cam_info(tmp_path / "cam.info.txt")
+    with pytest.raises(InputError, match="is a folder"):
+        read_cam_info(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["scale", "transforms"])
+def test_numbers_beyond_doubles_are_no_grasps_of_graspgen(tmp_path: Path, key: str) -> None:
+    path = write_graspgen(tmp_path / "a.json", a_set(), file="mug.obj")
+    data = json.loads(path.read_text())
+    if key == "scale":
+        data["object"]["scale"] = 10**350
+    else:
+        data["grasps"]["transforms"][0][0][0] = 10**350
+    path.write_text(json.dumps(data))
+    with pytest.raises(InputError, match=r"a\.json"):
+        read_graspgen(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("confidence: ", "confidence: 1" + "0" * 350 + " #"),
+        ("position: [", "position: [.nan, "),
+        ("position: [", "position: [1.0, "),
+        ("w: ", "w: x"),
+        ("panda_finger_joint1: ", "panda_finger_joint1: .inf #"),
+        ("panda_finger_joint1: ", "panda_finger_joint1: 1e300, x: "),
+        ("format_version: ", "format_version: 1" + "0" * 350 + " #"),
+    ],
+)
+def test_what_is_no_number_is_no_isaac_grasp(tmp_path: Path, old: str, new: str) -> None:
+    path = write_isaac_grasp(tmp_path / "a.yaml", a_set(), object_frame="mug")
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=r"a\.yaml"):
+        read_isaac_grasp(path)
+
+
+@pytest.mark.parametrize("name", ["volume", "friction", "mass", "density", "com", "inertia"])
+def test_acronyms_object_has_finite_numbers(tmp_path: Path, name: str) -> None:
+    obj = AcronymObject(
+        file="mug.obj", density=150.0, friction=1.0, mass_kg=0.1, volume_m3=1e-4,
+        center_of_mass=np.zeros(3), inertia=np.eye(3),
+    )  # fmt: skip
+    path = write_acronym(tmp_path / "a.h5", a_set(), obj)
+    assert read_acronym(path).obj.friction == 1.0
+    with h5py.File(path, "r+") as file:
+        file[f"object/{name}"][...] = np.nan
+    with pytest.raises(InputError, match=f"'{name}' holds a number that is not finite"):
+        read_acronym(path)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": NaN}', '{"a": 1, "a": 2}'])
+def test_parameters_in_hdf5_are_plain_json(tmp_path: Path, text: str) -> None:
+    path = write_grasps_hdf5(tmp_path / "g.h5", tried_scene(1))
+    with h5py.File(path, "r+") as file:
+        group = next(iter(file["sets"].values()))
+        del group["parameters"]
+        group["parameters"] = text
+    with pytest.raises(InputError, match="'parameters' is not JSON"):
+        read_grasps_hdf5(path)
+
+
+# --- recordings -----------------------------------------------------------------------------------
+
+
+def edited_metadata(tmp_path: Path, old: str, new: str) -> Path:
+    path = recorded(tmp_path, "mcap", 3).path
+    file = path / "metadata.yaml"
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [("message_count: ", "message_count: x"), ("name: /camera", "name: [/camera] #")],
+)
+def test_a_damaged_table_of_contents_is_refused(tmp_path: Path, old: str, new: str) -> None:
+    with pytest.raises(InputError, match="recording"):
+        open_bag(edited_metadata(tmp_path, old, new))
+
+
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
+def test_lengths_of_gigabytes_in_recordings_are_refused_or_not_believed(
+    tmp_path: Path, kind: str
+) -> None:
+    path = recorded(tmp_path, kind, 3).path
+    file = path if path.is_file() else next(path.glob("*.mcap"))
+    raw = file.read_bytes()
+    for at in range(8, 120, 3):
+        file.write_bytes(raw[:at] + b"\xff\xff\xff\x7f" + raw[at + 4 :])
+        try:
+            source = open_bag(path)
+            assert len(list(source.frames())) <= 3
+        except InputError as error:
+            assert "recording" in str(error)
+
+
+@pytest.mark.parametrize("text", ["timestamp=x;", "timestamp=nan;", "depth_units=inf;"])
+def test_a_realsenses_numbers_are_numbers(text: str) -> None:
+    with pytest.raises(InputError, match="damaged"):
+        FrameTimes().add(0, text)
+
+
+# --- textures -------------------------------------------------------------------------------------
+
+
+def test_a_texture_of_absurd_size_is_left_out_and_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.glb"
+    path.write_bytes(as_trimesh(textured_box()).export(file_type="glb"))
+    assert load_mesh(path, "m", []).texture is not None
+    monkeypatch.setattr(mesh_files, "MOST_TEXELS", 100)
+    monkeypatch.setattr(mesh_loading, "MOST_TEXELS", 100)
+    notes: list[str] = []
+    assert load_mesh(path, "m", notes).texture is None
+    assert any("cannot be decoded" in note for note in notes)
+    scan = read_scan(path, "m")
+    assert any("32x32 pixels" in note for note in scan.notes)
+
+
+def test_a_texture_that_is_damaged_inside_a_glb_is_not_made_up(tmp_path: Path) -> None:
+    path = tmp_path / "a.glb"
+    path.write_bytes(as_trimesh(textured_box()).export(file_type="glb"))
+    data = bytearray(path.read_bytes())
+    at = data.index(b"IDAT")
+    data[at + 4 : at + 40] = bytes(36)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"a\.glb cannot be read"):
+        load_mesh(path, "m")
+    assert any("cannot be decoded" in note for note in read_scan(path, "m").notes)

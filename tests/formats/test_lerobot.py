@@ -1,0 +1,289 @@
+"""LeRobot v3.0 data sets: what is written is what was given, wherever it was interrupted."""
+
+import itertools
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.lerobot import layout
+from realsim.formats.lerobot.episodes import LeRobotEpisode, LeRobotFeature
+from realsim.formats.lerobot.writer import LeRobotConfig, write_lerobot
+
+LENGTHS = (3, 7, 4, 1, 5)
+FPS = 10
+SIZE = (32, 48)
+CAMERAS = {"observation.images.a": SIZE, "observation.images.b": SIZE}
+FEATURES = {
+    "observation.state": LeRobotFeature(dtype="float32", names=("x", "y")),
+    "action": LeRobotFeature(dtype="float32", names=("x", "y")),
+    "phase": LeRobotFeature(dtype="int64"),
+    "next.done": LeRobotFeature(dtype="bool"),
+}
+
+
+def pictures(k: int, steps: int) -> Iterator[dict[str, np.ndarray]]:
+    """Yield smooth pictures whose brightness tells episode, step and camera."""
+    ramp = np.linspace(0, 60, SIZE[1])[None, :, None]
+    for s in range(steps):
+        yield {
+            key: np.broadcast_to(20 + 25 * k + 8 * s + 60 * c + ramp * [1, 0.5, 0], (*SIZE, 3))
+            .clip(0, 255)
+            .astype(np.uint8)
+            for c, key in enumerate(CAMERAS)
+        }
+
+
+def numbers(k: int) -> dict[str, np.ndarray]:
+    rng, n = np.random.default_rng(k), LENGTHS[k]
+    return {
+        "observation.state": rng.normal(size=(n, 2)),
+        "action": rng.normal(size=(n, 2)),
+        "phase": np.arange(n) // 2,
+        "next.done": np.arange(n) == n - 1,
+    }
+
+
+@dataclass
+class Source:
+    """Five short episodes of two tasks."""
+
+    asked: list[int] = field(default_factory=list)
+    dies_at: int | None = None
+    cameras: dict = field(default_factory=lambda: dict(CAMERAS))
+    change: dict = field(default_factory=dict)
+    name = "small"
+    robot_type = "panda"
+    fps = FPS
+    features = FEATURES
+    tasks = ("grasp the a", "grasp the b")
+
+    def __len__(self) -> int:
+        return len(LENGTHS)
+
+    def episode(self, k: int) -> LeRobotEpisode:
+        if k == self.dies_at:
+            raise KeyboardInterrupt
+        self.asked.append(k)
+        whole = LeRobotEpisode(
+            task=self.tasks[k % 2], columns=numbers(k), frames=pictures(k, LENGTHS[k]),
+            notes={"number": k, "notes": []},
+        )  # fmt: skip
+        return replace(whole, **self.change)
+
+
+def write(folder, source=None, per_file=2):
+    export = ExportFolder.begin(folder, {"what": "test"})
+    written = write_lerobot(source or Source(), export, LeRobotConfig(episodes_per_file=per_file))
+    export.finish({})
+    return written
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("lerobot") / "set"
+    write(path)
+    return path
+
+
+def rows_of(folder, pattern):
+    import pyarrow.parquet as pq
+
+    files = sorted(folder.glob(pattern))
+    return [row for f in files for row in pq.read_table(f).to_pylist()]
+
+
+def decoded(path):
+    """Return times [s] and pictures of a video, read by PyAV alone."""
+    import av
+
+    with av.open(str(path)) as file:
+        assert file.streams.video[0].codec_context.name == "h264"
+        frames = [(float(f.time), f.to_ndarray(format="rgb24")) for f in file.decode(video=0)]
+    return np.array([t for t, _ in frames]), [rgb for _, rgb in frames]
+
+
+def files_of(folder):
+    return {p.relative_to(folder).as_posix(): p.read_bytes()
+            for p in sorted(folder.rglob("*")) if p.is_file()}  # fmt: skip
+
+
+def test_the_steps_are_those_that_were_given(folder):
+    rows = rows_of(folder, "data/*/*.parquet")
+    assert len(rows) == sum(LENGTHS)
+    at = 0
+    for k, n in enumerate(LENGTHS):
+        mine, given = rows[at : at + n], numbers(k)
+        for key in ("observation.state", "action"):
+            found = np.array([r[key] for r in mine], np.float32)
+            np.testing.assert_array_equal(found, given[key].astype(np.float32))
+        assert [r["phase"] for r in mine] == given["phase"].tolist()
+        assert [r["next.done"] for r in mine] == given["next.done"].tolist()
+        assert [r["index"] for r in mine] == list(range(at, at + n))
+        assert [r["frame_index"] for r in mine] == list(range(n))
+        assert {r["episode_index"] for r in mine} == {k}
+        assert {r["task_index"] for r in mine} == {k % 2}
+        np.testing.assert_array_equal([r["timestamp"] for r in mine],
+                                      (np.arange(n) / FPS).astype(np.float32))  # fmt: skip
+        at += n
+
+
+def test_the_episodes_windows_tile_the_tables_and_the_videos(folder):
+    episodes = rows_of(folder, "meta/episodes/*/*.parquet")
+    assert [e["length"] for e in episodes] == list(LENGTHS)
+    assert [e["data/file_index"] for e in episodes] == [0, 0, 1, 1, 2]
+    edge = 0
+    for e in episodes:
+        assert (e["dataset_from_index"], e["dataset_to_index"]) == (edge, edge + e["length"])
+        edge += e["length"]
+    for camera in CAMERAS:
+        for number in (0, 1, 2):
+            mine = [e for e in episodes if e[f"videos/{camera}/file_index"] == number]
+            edge = 0.0
+            for e in mine:
+                assert e[f"videos/{camera}/from_timestamp"] == edge
+                edge = e[f"videos/{camera}/to_timestamp"]
+                assert edge - e[f"videos/{camera}/from_timestamp"] == pytest.approx(
+                    e["length"] / FPS, abs=1e-12
+                )
+            path = layout.VIDEO_PATH.format(video_key=camera, chunk_index=0, file_index=number)
+            times, _ = decoded(folder / path)
+            np.testing.assert_allclose(times, np.arange(round(edge * FPS)) / FPS, atol=1e-9)
+
+
+def test_a_frame_at_its_episodes_time_is_its_picture(folder):
+    for e in rows_of(folder, "meta/episodes/*/*.parquet"):
+        k = e["episode_index"]
+        for camera in CAMERAS:
+            place = {n: e[f"videos/{camera}/{n}"] for n in ("chunk_index", "file_index")}
+            times, frames = decoded(folder / layout.VIDEO_PATH.format(video_key=camera, **place))
+            for s, given in enumerate(pictures(k, LENGTHS[k])):
+                at = np.argmin(abs(times - (e[f"videos/{camera}/from_timestamp"] + s / FPS)))
+                error = frames[at].astype(float) - given[camera]
+                psnr = 10 * np.log10(255**2 / np.mean(error**2))
+                assert psnr > 35, (k, s, camera, psnr)
+
+
+def test_every_second_frame_can_be_jumped_to(folder):
+    import av
+
+    path = folder / layout.VIDEO_PATH.format(
+        video_key="observation.images.a", chunk_index=0, file_index=0
+    )
+    with av.open(str(path)) as file:
+        keys = [f.key_frame for f in file.decode(video=0)]
+    edges = np.cumsum([0, *LENGTHS[:2]])
+    for first, end in itertools.pairwise(edges):
+        assert all(keys[first:end:2])
+
+
+def test_statistics_are_those_of_all_steps_and_pictures(folder):
+    stats = json.loads((folder / layout.STATS).read_text())
+    for key in ("observation.state", "action"):
+        whole = np.concatenate([numbers(k)[key] for k in range(len(LENGTHS))]).astype(np.float32)
+        for name, of in (("min", np.min), ("max", np.max), ("mean", np.mean), ("std", np.std)):
+            np.testing.assert_allclose(
+                stats[key][name], of(whole.astype(np.float64), axis=0), atol=1e-12
+            )
+        assert stats[key]["count"] == [sum(LENGTHS)]
+    for camera in CAMERAS:
+        seen = np.stack([p[camera] for k, n in enumerate(LENGTHS) for p in pictures(k, n)]) / 255
+        for name, of in (("min", np.min), ("max", np.max), ("mean", np.mean), ("std", np.std)):
+            found = np.array(stats[camera][name])
+            assert found.shape == (3, 1, 1)
+            np.testing.assert_allclose(found[:, 0, 0], of(seen, axis=(0, 1, 2)), atol=1e-9)
+
+
+def test_info_says_what_the_tables_hold(folder):
+    import pyarrow.parquet as pq
+
+    info = json.loads((folder / layout.INFO).read_text())
+    assert info["codebase_version"] == "v3.0"
+    assert (info["total_episodes"], info["total_frames"], info["total_tasks"]) == (5, 20, 2)
+    assert info["splits"] == {"train": "0:5"}
+    schema = pq.read_schema(folder / info["data_path"].format(chunk_index=0, file_index=0))
+    numeric = {k: f for k, f in info["features"].items() if f["dtype"] != "video"}
+    assert list(numeric) == schema.names
+    for key, feature in numeric.items():
+        kind = str(schema.field(key).type).replace("item:", "element:")
+        plain = {"float32": "float", "int64": "int64", "bool": "bool"}[feature["dtype"]]
+        n = feature["shape"][0]
+        assert kind == (plain if n == 1 else f"fixed_size_list<element: {plain}>[{n}]")
+        assert feature["names"] is None or len(feature["names"]) == n
+    assert {k for k, f in info["features"].items() if f["dtype"] == "video"} == set(CAMERAS)
+
+
+def test_tasks_are_a_pandas_frame_indexed_by_their_words(folder):
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(folder / layout.TASKS)
+    assert table.to_pydict() == {"task_index": [0, 1], "task": ["grasp the a", "grasp the b"]}
+    assert json.loads(table.schema.metadata[b"pandas"])["index_columns"] == ["task"]
+
+
+def test_the_same_episodes_give_the_same_bytes(folder, tmp_path):
+    write(tmp_path / "again")
+    assert files_of(tmp_path / "again") == files_of(folder)
+
+
+@pytest.mark.parametrize("dies_at", [0, 1, 2, 3, 4])
+def test_a_killed_export_goes_on_at_the_next_episode(folder, tmp_path, dies_at):
+    first = Source(dies_at=dies_at)
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "set", first)
+    second = Source()
+    written = write(tmp_path / "set", second)
+    assert first.asked + second.asked == list(range(len(LENGTHS)))
+    assert written.frames == sum(LENGTHS)
+    assert written.frames_written == sum(LENGTHS[dies_at:])
+    assert files_of(tmp_path / "set") == files_of(folder)
+
+
+def test_an_episode_that_was_torn_is_begun_anew(folder, tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "set", Source(dies_at=1))
+    kept = tmp_path / "set/.export/episodes/000000/episode.npz"
+    kept.write_bytes(kept.read_bytes()[:-20])
+    second = Source()
+    write(tmp_path / "set", second)
+    assert second.asked == [0, 1, 2, 3, 4]
+    assert files_of(tmp_path / "set") == files_of(folder)
+
+
+def test_columns_without_pictures_are_a_data_set(tmp_path):
+    written = write(tmp_path / "set", Source(cameras={}))
+    assert written.counts["videos"] == 0
+    assert json.loads((tmp_path / "set" / layout.INFO).read_text())["video_path"] is None
+    assert not (tmp_path / "set/videos").exists()
+
+
+@pytest.mark.parametrize(
+    ("source", "words"),
+    [
+        (Source(cameras={"a/b": SIZE}), "no '/'"),
+        (Source(cameras={"observation.images.a": (31, 48)}), "even numbers"),
+        (Source(cameras={"timestamp": SIZE}), "cannot be called"),
+        (Source(change={"task": "another"}), "not among its tasks"),
+        (Source(change={"columns": {**numbers(0), "action": np.full((3, 2), np.nan)}}), "finite"),
+        (Source(change={"columns": {"action": np.zeros((3, 2))}}), "differs from the features"),
+        (Source(change={"frames": iter(())}), "0 pictures for 3 steps"),
+        (Source(change={"frames": iter([dict.fromkeys(CAMERAS, np.zeros((8, 8, 3), np.uint8))])}),
+         "does not fit"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused(tmp_path, source, words):
+    with pytest.raises(InputError, match=words):
+        write(tmp_path / "set", source)
+
+
+def test_a_missing_pyav_is_said_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    source = Source()
+    with pytest.raises(InputError, match=r"realsim\[lerobot\]"):
+        write(tmp_path / "set", source)
+    assert source.asked == []
