@@ -1,10 +1,15 @@
-"""`realsim check`: what of a session is sound, missing or damaged; taking out what is damaged."""
+"""`realsim check`: what of a session is sound, missing or damaged; taking out what is damaged.
+
+A data set (BOP, GraspNet, or what `realsim upgrade` made) is checked for whether its labels agree.
+"""
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
 
 from realsim.app.console import Console
+from realsim.app.dataset_check import is_dataset
+from realsim.app.dataset_check_tables import run_dataset_check
 from realsim.errors import InputError
 from realsim.store.lock import only_run_in
 from realsim.store.session_check import CheckReport, check_session, is_session
@@ -17,20 +22,28 @@ NAMED = 6
 
 
 def run_check(folder: Path, *, repair: bool, decode: bool, as_json: bool) -> bool:
-    """Check a session, repair it if asked, and print what was found.
+    """Check a session or a data set, repair a session if asked, and print what was found.
 
     Returns:
-        Whether the session is sound (after the repair, if one was asked for).
+        Whether the session is sound (after the repair, if one was asked for), or the data set's
+        labels agree with its poses and depth.
 
     Raises:
-        InputError: not a session, or another run is working in it (repair).
+        InputError: neither, a data set is to be repaired, or another run is working in the session.
     """
+    if not is_session(folder) and is_dataset(folder):
+        if repair:
+            raise InputError(
+                f"'{folder}' is a data set; only sessions are repaired. Labels that disagree are "
+                "made anew by `realsim upgrade`."
+            )
+        return run_dataset_check(folder, as_json=as_json, console=Console(quiet=as_json))
     if not folder.is_dir() or not is_session(folder):
         inner = sorted(p.parent.name for p in folder.glob("*/session.json"))
         hint = f" Did you mean {', '.join(str(folder / n) for n in inner)}?" if inner else ""
         raise InputError(
             f"'{folder}' is not a session: it has none of session.json, manifest.jsonl and "
-            f"robot.jsonl.{hint}"
+            f"robot.jsonl; and it is no annotated data set of BOP or GraspNet.{hint}"
         )
     if not repair:
         report = check_session(folder, decode=decode)

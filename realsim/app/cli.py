@@ -12,14 +12,15 @@ from realsim import __version__
 from realsim.app.annotate_cli import annotate_command
 from realsim.app.cli_capture import CAPTURE_COMMANDS
 from realsim.app.cli_scan import SCAN
+from realsim.app.demonstrations_cli import demonstrations_command
 from realsim.app.depth_fit_cli import depth_fit
 from realsim.app.export.cli import export_command
 from realsim.app.generate_cli import generate_command
-from realsim.app.option_values import numbers_of
 from realsim.app.register_cli import register_command
 from realsim.app.render_cli import render_command
 from realsim.app.school_cli import SCHOOL
 from realsim.app.stats.cli import stats_command
+from realsim.app.upgrade_cli import upgrade_command
 from realsim.errors import RealsimError
 
 FOLDER = click.Path(path_type=Path)
@@ -61,42 +62,6 @@ def demo(
     )
     console = Console(quiet=quiet)
     show_demo(run_demo(config, out, console), console)
-
-
-@commands.command()
-@click.argument("dataset", type=FOLDER)
-@click.option("--out", type=FOLDER, required=True, help="Folder for the upgraded BOP dataset.")
-@click.option(
-    "--start",
-    default="gt",
-    show_default=True,
-    help="Start poses: 'gt' (scene_gt.json) or a folder under keyframe_poses/.",
-)
-@click.option("--scenes", default="", help="Scene numbers, such as 1-3,7; all by default.")
-@click.option("--models", type=FOLDER, default=None, help="Models folder, if not DATASET/models.")
-@click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000))
-@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 64))
-@click.option("--quiet", is_flag=True, help="No progress bars.")
-def upgrade(
-    dataset: Path, out: Path, start: str, scenes: str, models: Path | None, grasps: int,
-    workers: int, quiet: bool,
-) -> None:  # fmt: skip
-    """Refine the poses of a BOP dataset, try grasps on it, and write it out with labels.
-
-    DATASET is a BOP root, a split, or one scene folder; nothing in it is changed.
-    """
-    from realsim.app.console import Console
-    from realsim.app.upgrade import UpgradeConfig, run_upgrade, show_upgrade
-
-    config = UpgradeConfig(
-        start=start, scenes=numbers_of(scenes), models=models, grasps_per_object=grasps,
-        workers=workers,
-    )  # fmt: skip
-    console = Console(quiet=quiet)
-    result = run_upgrade(config, dataset, out, console)
-    show_upgrade(result, console)
-    if result.failed:
-        sys.exit(1)
 
 
 @commands.command()
@@ -199,8 +164,10 @@ commands.add_command(annotate_command)
 commands.add_command(render_command)
 commands.add_command(generate_command)
 commands.add_command(depth_fit)
+commands.add_command(demonstrations_command)
 commands.add_command(export_command)
 commands.add_command(stats_command)
+commands.add_command(upgrade_command)
 
 
 def main() -> None:

@@ -1,57 +1,50 @@
-"""A BOP scene read and checked whole before an upgrade writes anything: poses, models, images."""
+"""A scene read and checked whole before an upgrade writes anything: poses, models, images."""
 
+import hashlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.app.upgrade_config import GT, UpgradeConfig
+from realsim.app.upgrade_dataset import SceneRef
+from realsim.app.upgrade_instances import Seen, told_apart
 from realsim.errors import InputError, UnitError
-from realsim.formats.bop.scene import BopScene, BopSceneRef
+from realsim.formats import images
+from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.geometry import se3
-from realsim.records import ObjectModel, ObjectPose
+from realsim.records import CameraIntrinsics, ObjectModel
 
 Array = NDArray[np.float64]
 DEPTH_UNIT_FACTOR = 1.5
 """The objects may be so much nearer or farther than all measured depth; units differ by 10."""
 CAMERA_SPREAD_LIMIT_M = 0.010
 """Camera poses taken from the annotations of several objects may differ by so much, no more."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class UpgradeConfig:
-    """How a dataset is upgraded."""
-
-    start: str = "gt"
-    """'gt' = the dataset's own annotations, else a folder name under keyframe_poses/."""
-    scenes: tuple[int, ...] = ()
-    """Scene numbers; none = all."""
-    models: Path | None = None
-    """Folder of the models, when it is not DATASET/models."""
-    grasps_per_object: int = 60
-    """Grasp candidates tried on each object, at most."""
-    seed: int = 0
-    """Seed of everything random."""
-    workers: int = 2
-    """Processes in the Robot School."""
+SAME_CAMERA_PX = 1e-6
+"""Camera matrices that differ by less are the same camera, written by another program."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class SceneSource:
     """A scene that has been read and checked whole, before anything is written."""
 
-    bop: BopScene
-    annotations: dict[int, list[tuple[int, Array]]]
-    """Image -> [(obj_id, T_cam_obj)] to start from."""
+    scene: LabelledScene
+    indices: tuple[int, ...]
+    """Of the images that are used."""
+    intrinsics: CameraIntrinsics
+    depth_unit_m: float
+    digests: dict[int, str]
+    """Image -> hash of its colour and depth files."""
+    seen: dict[int, list[Seen]]
+    """Image -> where it says that things are: the poses to start from."""
     Ts_world_cam: dict[int, Array]
     models: dict[int, ObjectModel]
     """The models that the scene needs."""
     notes: list[str]
 
 
-def prepare(
-    ref: BopSceneRef, root: Path, models: dict[int, ObjectModel], config: UpgradeConfig
-) -> SceneSource:
+def prepare(scene: LabelledScene, ref: SceneRef, config: UpgradeConfig) -> SceneSource:
     """Read a scene and check all of it: poses, models, cameras, every image.
 
     Raises:
@@ -59,106 +52,165 @@ def prepare(
         UnitError: something has another unit than it claims.
     """
     from realsim.formats.bop.models import require_meshes
-    from realsim.formats.bop.scene import read_scene
 
-    bop = read_scene(ref)
-    annotations, notes = _start_poses(bop, root, config)
-    used = sorted({obj for rows in annotations.values() for obj, _ in rows})
-    require_meshes(used, models, str(config.models or root / "models"))
-    Ts_world_cam = camera_poses(bop, annotations)
-    for view in bop.session.views:
-        bop.rgb(view.index)
-        if not bop.has_depth(view.index):
-            raise InputError(
-                f"image {view.index} of {ref.folder} has no depth image; poses are refined against "
-                "the depth, so each image needs one."
-            )
-        _check_depth(bop, view.index, annotations.get(view.index, []))
+    indices = _chosen(scene.indices, config.views)
+    frames = {i: scene.frame(i) for i in indices}
+    intrinsics, depth_unit_m = _one_camera(frames, scene.name)
+    poses = _start_poses(scene, frames, ref, config)
+    used = sorted({obj_id for rows in poses.values() for obj_id, _, _ in rows})
+    models = scene.models()
+    require_meshes(used, models, str(ref.models))
+    Ts_world_cam = camera_poses(frames, poses, scene.name)
+    seen, notes = told_apart(poses, Ts_world_cam, models)
+    digests: dict[int, str] = {}
+    for index in indices:
+        depths = [float(T[2, 3]) for _, _, T in poses[index]]
+        digests[index] = _checked_images(scene, frames[index], depths)
     return SceneSource(
-        bop=bop, annotations=annotations, Ts_world_cam=Ts_world_cam,
-        models={k: models[k] for k in used}, notes=notes,
+        scene=scene, indices=indices, intrinsics=intrinsics, depth_unit_m=depth_unit_m,
+        digests=digests, seen=seen, Ts_world_cam=Ts_world_cam,
+        models={k: models[k] for k in used}, notes=[*scene.notes, *notes],
     )  # fmt: skip
 
 
-def _check_depth(bop: BopScene, index: int, rows: list[tuple[int, Array]]) -> None:
-    """Raise if the depth cannot have the unit that scene_camera.json claims for it.
+def _chosen(indices: Sequence[int], views: int | None) -> tuple[int, ...]:
+    """Return at most so many images, spread evenly."""
+    if views is None or views >= len(indices):
+        return tuple(indices)
+    pick = np.unique(np.linspace(0, len(indices) - 1, views).round().astype(int))
+    return tuple(indices[k] for k in pick)
 
-    The annotated objects say how far the scene is: measured depth around them is compared.
+
+def _one_camera(frames: Mapping[int, LabelledFrame], name: str) -> tuple[CameraIntrinsics, float]:
+    """Return the camera and the depth unit that all images have.
+
+    Raises:
+        InputError: an image without depth, or two cameras or units: a session has one.
     """
-    depth = bop.depth_m(index)
-    measured = depth[depth > 0]
-    if not len(measured):
-        raise InputError(f"the depth image of image {index} of {bop.ref.folder} is empty.")
-    if not rows:
-        return
-    distance = float(np.median([T[2, 3] for _, T in rows]))
-    near, far = np.percentile(measured, [1, 99])
-    if not near / DEPTH_UNIT_FACTOR < distance < far * DEPTH_UNIT_FACTOR:
-        raise UnitError(
-            f"image {index} of {bop.ref.folder}: the objects are {distance:.3g} m away, but the "
-            f"measured depth lies between {near:.3g} and {far:.3g} m with depth_scale "
-            f"{1e3 * bop.session.depth_unit_m:g}. Correct depth_scale in scene_camera.json (mm per "
-            "count), or the translations in scene_gt.json (mm)."
+    first = frames[next(iter(frames))]
+    for index, frame in frames.items():
+        if frame.depth_unit_m is None:
+            raise InputError(
+                f"image {index} of {name} has no depth image; poses are refined against the "
+                "depth, so each image needs one."
+            )
+        a, b = first.intrinsics, frame.intrinsics
+        same = (a.width, a.height) == (b.width, b.height) and np.array_equal(
+            a.distortion, b.distortion
         )
+        if not same or np.abs(a.K - b.K).max() > SAME_CAMERA_PX:
+            raise InputError(
+                f"images {first.index} and {index} of {name} have different cameras, and a session "
+                "has one. Upgrade the images of one camera at a time."
+            )
+        if frame.depth_unit_m != first.depth_unit_m:
+            raise InputError(
+                f"images {first.index} and {index} of {name} have different depth_scale, and a "
+                "session has one. Convert the depth images to one scale."
+            )
+    assert first.depth_unit_m is not None
+    return first.intrinsics, first.depth_unit_m
 
 
 def _start_poses(
-    bop: BopScene, root: Path, config: UpgradeConfig
-) -> tuple[dict[int, list[tuple[int, Array]]], list[str]]:
-    """Return {image: [(obj_id, T_cam_obj)]} to start from, and what must be said about it."""
-    from realsim.formats.bop.scene import read_keyframe_poses
-
-    notes: list[str] = []
-    if config.start == "gt":
-        if not any(bop.ground_truth.values()):
+    scene: LabelledScene, frames: Mapping[int, LabelledFrame], ref: SceneRef, config: UpgradeConfig
+) -> dict[int, list[tuple[int, int | None, Array]]]:
+    """Return {image: [(obj_id, instance, T_cam_obj)]} to start from."""
+    if config.start == GT:
+        if not any(frame.objects for frame in frames.values()):
             raise InputError(
-                f"scene {bop.ref.scene_id} has no annotated object; nothing to start from. Give "
+                f"scene {scene.number} has no annotated object; nothing to start from. Give "
                 "--start a folder of estimates under keyframe_poses/."
             )
-        if bop.approximate:
-            notes.append(
-                f"its annotations come from {bop.ground_truth_file}, which calls itself "
-                "approximate: they serve as a rough start only, and are not a reference."
+        return {
+            k: [(o.obj_id, o.instance, o.T_cam_obj) for o in f.objects] for k, f in frames.items()
+        }
+    from realsim.formats.bop.keyframes import read_keyframe_poses
+
+    rows: dict[int, list[tuple[int, int | None, Array]]] = {}
+    for index in frames:
+        found = read_keyframe_poses(ref.root, scene.number, index, source=config.start)
+        rows[index] = [(obj_id, None, T) for obj_id, T in sorted(found.items())]
+    if not any(rows.values()):
+        raise InputError(
+            f"'{config.start}' found no object in the images of scene {scene.number}; there is "
+            "nothing to start from. Leave --start away to start from the annotations."
+        )
+    return rows
+
+
+def _checked_images(scene: LabelledScene, frame: LabelledFrame, distances_m: list[float]) -> str:
+    """Return the hash of an image's files, both of which can be read and fit to the poses.
+
+    The annotated objects say how far the scene is: measured depth around them is compared.
+
+    Raises:
+        InputError: an image that is missing, broken, empty, or of another size.
+        UnitError: the depth cannot have the unit that is claimed for it.
+    """
+    index, unit_m = frame.index, frame.depth_unit_m
+    colour, depth_file = scene.colour_file(index), scene.depth_file(index)
+    if depth_file is None or unit_m is None:
+        raise InputError(f"image {index} of {scene.name} has no depth image.")
+    size = (frame.intrinsics.height, frame.intrinsics.width)
+    rgb, depth = images.read_rgb(colour), images.read_depth(depth_file, unit_m)
+    for file, shape in ((colour, rgb.shape[:2]), (depth_file, depth.shape)):
+        if shape != size:
+            raise InputError(
+                f"{file} has {shape[1]}x{shape[0]} pixels, and its camera {size[1]}x{size[0]}."
             )
-        rows = {k: [(a.obj_id, a.T_cam_obj) for a in v] for k, v in bop.ground_truth.items()}
-        return rows, notes
-    rows = {}
-    for view in bop.session.views:
-        found = read_keyframe_poses(root, bop.ref.scene_id, view.index, source=config.start)
-        rows[view.index] = sorted(found.items())
-    return rows, notes
+    measured = depth[depth > 0]
+    if not len(measured):
+        raise InputError(f"the depth image of image {index} of {scene.name} is empty.")
+    if distances_m:
+        distance = float(np.median(distances_m))
+        near, far = np.percentile(measured, [1, 99])
+        if not near / DEPTH_UNIT_FACTOR < distance < far * DEPTH_UNIT_FACTOR:
+            raise UnitError(
+                f"image {index} of {scene.name}: the objects are {distance:.3g} m away, but the "
+                f"measured depth lies between {near:.3g} and {far:.3g} m with {1e3 * unit_m:g} mm "
+                "per count. Correct the depth unit (depth_scale in scene_camera.json, factor_depth "
+                "of GraspNet), or the translations (mm in scene_gt.json)."
+            )
+    digest = hashlib.sha256(colour.read_bytes())
+    digest.update(depth_file.read_bytes())
+    return digest.hexdigest()
 
 
 def camera_poses(
-    bop: BopScene, annotations: dict[int, list[tuple[int, Array]]]
+    frames: Mapping[int, LabelledFrame],
+    poses: Mapping[int, list[tuple[int, int | None, Array]]],
+    name: str,
 ) -> dict[int, Array]:
-    """Return T_world_cam of every image: the dataset's own, or from objects that stand still.
+    """Return T_world_cam of every image: the data set's own, or from objects that stand still.
 
-    Without camera poses in the dataset, world is the first image's camera, and the others follow
-    from the objects seen in both images: T_first_cam = T_first_obj @ T_obj_cam, averaged.
+    Without camera poses in the data set, world is the first image's camera, and the others follow
+    from the objects seen in both images: T_first_cam = T_first_obj @ T_obj_cam, averaged. Objects
+    that an image shows twice say nothing of it.
 
     Raises:
         InputError: the objects of two images do not agree on how the camera moved.
     """
-    if bop.Ts_world_cam is not None:
-        return bop.Ts_world_cam
-    indices = [v.index for v in bop.session.views]
-    first = dict(annotations[indices[0]])
+    known = {k: f.T_world_cam for k, f in frames.items() if f.T_world_cam is not None}
+    if len(known) == len(frames):
+        return known
+    indices = list(frames)
+    first = _single(poses[indices[0]])
     cameras = {indices[0]: np.eye(4)}
     for index in indices[1:]:
-        shared = [(o, T) for o, T in annotations[index] if o in first]
+        shared = [(o, T) for o, T in _single(poses[index]).items() if o in first]
         if not shared:
             raise InputError(
-                f"image {index} of scene {bop.ref.scene_id} has no camera pose (cam_R_w2c) and no "
-                f"object in common with image {indices[0]}; its place cannot be found."
+                f"image {index} of {name} has no camera pose (cam_R_w2c) and no object in common "
+                f"with image {indices[0]}; its place cannot be found."
             )
         Ts = np.stack([first[o] @ se3.invert(T) for o, T in shared])
         centre = np.median(Ts[:, :3, 3], axis=0)
         spread = float(np.max(np.linalg.norm(Ts[:, :3, 3] - centre, axis=1)))
         if spread > CAMERA_SPREAD_LIMIT_M:
             raise InputError(
-                f"the annotations of images {indices[0]} and {index} of scene {bop.ref.scene_id} "
-                f"disagree by {1e3 * spread:.0f} mm about how the camera moved (at most "
+                f"the annotations of images {indices[0]} and {index} of {name} disagree by "
+                f"{1e3 * spread:.0f} mm about how the camera moved (at most "
                 f"{1e3 * CAMERA_SPREAD_LIMIT_M:.0f} mm): the objects were moved between them, or "
                 "an annotation is wrong. Upgrade such images as scenes of their own."
             )
@@ -166,20 +218,7 @@ def camera_poses(
     return cameras
 
 
-def world_starts(
-    annotations: dict[int, list[tuple[int, Array]]], Ts_world_cam: dict[int, Array]
-) -> list[ObjectPose]:
-    """Return one start per object of the scene, from the first image that shows it."""
-    starts: list[ObjectPose] = []
-    first = next(iter(annotations))
-    for k, (obj_id, T_cam_obj) in enumerate(annotations[first]):
-        T = Ts_world_cam[first] @ T_cam_obj
-        starts.append(ObjectPose(obj_id=obj_id, instance=k, T_world_obj=T))
-    known = {s.obj_id for s in starts}
-    for index, rows in annotations.items():
-        for obj_id, T_cam_obj in rows:
-            if obj_id not in known:
-                known.add(obj_id)
-                T = Ts_world_cam[index] @ T_cam_obj
-                starts.append(ObjectPose(obj_id=obj_id, instance=len(starts), T_world_obj=T))
-    return starts
+def _single(rows: Sequence[tuple[int, int | None, Array]]) -> dict[tuple[int, int | None], Array]:
+    """Return the objects that an image shows once, by id and instance."""
+    keys = [(obj_id, instance) for obj_id, instance, _ in rows]
+    return {(o, i): T for o, i, T in rows if keys.count((o, i)) == 1}

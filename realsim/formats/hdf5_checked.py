@@ -5,6 +5,7 @@ for plugins to be loaded (filters), and unfold a kilobyte into a terabyte. None 
 hold grasps, so none of it is followed.
 """
 
+import mmap
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +21,10 @@ MOST_ARRAY_BYTES = 4 << 30
 """Largest array that is read [bytes]: 30 million grasps, or 70 million samples of an arm."""
 KNOWN_FILTERS = (1, 2, 3)
 """Deflate, shuffle and checksum, which the library itself has (H5Z_FILTER_*)."""
+HEAP = b"GCOL\x01\0\0\0"
+"""How a global heap begins: signature, version 1, reserved."""
+HEAP_HEAD = 16
+"""Bytes of the head of a heap, and of each object in it."""
 Shape = tuple[int | None, ...]
 
 
@@ -167,6 +172,32 @@ class CheckedGroup:
             raise self.wrong(f"'{name}' is no UTF-8 text ({error}).") from error
 
 
+def _require_sound_heaps(path: Path) -> None:
+    """Refuse heaps of texts in which the HDF5 library would go round for ever.
+
+    A global heap is a row of objects; the one with the index 0 is free space, and its size says
+    where the next one is. At a size of 0 the library (2.0) reads the same one again and again.
+    Layout: HDF5 File Format Specification, III.E.
+    """
+    if path.stat().st_size == 0:
+        return
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        at = data.find(HEAP)
+        while at >= 0:
+            end = min(at + int.from_bytes(data[at + 8 : at + 16], "little"), len(data))
+            place = at + HEAP_HEAD
+            while place + HEAP_HEAD <= end:
+                index = int.from_bytes(data[place : place + 2], "little")
+                size = int.from_bytes(data[place + 8 : place + 16], "little")
+                if index == 0 and size < HEAP_HEAD:
+                    raise InputError(
+                        f"{path} is damaged: a heap of texts at byte {at} has free space of {size} "
+                        "bytes. Copy the file again, or write it again from the session."
+                    )
+                place += size if index == 0 else HEAP_HEAD + size + -size % 8
+            at = data.find(HEAP, at + 1)
+
+
 @contextmanager
 def opened(path: Path | str) -> Generator[CheckedGroup]:
     """Open an HDF5 file for reading.
@@ -179,6 +210,7 @@ def opened(path: Path | str) -> Generator[CheckedGroup]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path} does not exist; give an HDF5 file.")
+    _require_sound_heaps(path)
     try:
         file = h5py.File(path, "r")
     except OSError as error:

@@ -203,9 +203,9 @@ def open_session_scene(
 
     Args:
         store: the session.
-        labels: 'annotated' = what `realsim annotate` wrote; 'imported' = what the data set said that
-            the session was imported from; 'auto' = the former where it is there, else the latter;
-            'none' = images and cameras only.
+        labels: 'annotated' = what `realsim annotate` wrote; 'imported' = what the data set said
+            that the session was imported from; 'auto' = the former where it is there, else the
+            latter; 'none' = images and cameras only.
         number: of the scene; None = that of its data set, or of its folder, or 0.
         split: of the scene; '' = that of its data set, or 'train'.
 

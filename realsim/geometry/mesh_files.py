@@ -27,6 +27,8 @@ FORMATS = (".ply", ".obj", ".stl", ".glb")
 SMALLEST_M = 0.002
 """A 'millimetre' file whose largest extent is below 2 mm holds metres: nothing that a gripper
 grasps is so small."""
+MOST_TEXELS = 100_000_000
+"""Pixels of a texture; a header can claim any number, and decoders allocate what it claims."""
 LARGEST_M = 3.0
 """A 'metre' file whose largest extent is above 3 m holds millimetres: nothing on a table is so
 large."""
@@ -97,7 +99,7 @@ def load_mesh(path: Path | str, unit: Unit, notes: list[str] | None = None) -> M
             "not a point cloud."
         )
     check_unit(float(np.ptp(vertices, axis=0).max()), unit, str(path))
-    colors, uv, texture = _appearance(loaded, len(vertices))
+    colors, uv, texture = _appearance(loaded, len(vertices), beside.broken)
     has_pictures = bool(beside.pictures) or path.suffix.lower() == ".glb"
     if texture is not None and not has_pictures:
         # The reader makes a grey picture up where the file's own is missing.
@@ -155,6 +157,8 @@ def _is_picture(data: bytes) -> bool:
 
     try:
         with Image.open(io.BytesIO(data)) as image:
+            if image.width * image.height > MOST_TEXELS:
+                return False
             image.load()
     except Exception:  # a broken picture raises whatever its decoder trips over
         return False
@@ -204,21 +208,36 @@ def _missing_looks(
 
 
 def _appearance(
-    loaded: Any, n: int
+    loaded: Any, n: int, broken: list[str]
 ) -> tuple[NDArray[np.uint8] | None, Array | None, NDArray[np.uint8] | None]:
-    """Return colours, texture coordinates and texture of a trimesh mesh, where it has them."""
+    """Return colours, texture coordinates and texture of a trimesh mesh, where it has them.
+
+    A texture that cannot be decoded is added to `broken`.
+    """
     visual = loaded.visual
     if visual.kind == "texture":
         material = visual.material
         image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-        if image is not None and visual.uv is not None and len(visual.uv) == n:
-            uv = np.asarray(visual.uv, dtype=np.float64)[:, :2]
-            return None, uv, np.asarray(image.convert("RGB"), dtype=np.uint8)
+        has_uv = visual.uv is not None and len(visual.uv) == n
+        texture = _texels(image, broken) if image is not None and has_uv else None
+        if texture is not None:
+            return None, np.asarray(visual.uv, dtype=np.float64)[:, :2], texture
         color = np.asarray(material.main_color, dtype=np.uint8)[:3]
         return np.tile(color, (n, 1)), None, None
     if visual.kind in ("vertex", "face"):
         return np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3], None, None
     return None, None, None
+
+
+def _texels(image: Any, broken: list[str]) -> NDArray[np.uint8] | None:
+    """Return a picture that lies in the mesh file, or was opened by its reader, as RGB."""
+    try:
+        if image.width * image.height > MOST_TEXELS:
+            raise ValueError(f"{image.width}x{image.height} pixels")
+        return np.asarray(image.convert("RGB"), dtype=np.uint8)
+    except Exception:  # pillow decodes late: a broken picture shows only here
+        broken.append("the texture of its material")
+        return None
 
 
 def ply_bytes(mesh: Mesh, unit: Unit, *, ascii: bool = False, texture_file: str = "") -> bytes:

@@ -10,6 +10,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from realsim.errors import InputError
+from realsim.geometry.mesh_files import MOST_TEXELS
 from realsim.models.mesh_pieces import (
     FileContent,
     Piece,
@@ -180,6 +181,8 @@ def _piece(
     uv = None if visual.uv is None else np.asarray(visual.uv, dtype=np.float64)[:, :2]
     if image is not None and uv is not None and len(uv) == len(vertices):
         try:
+            if image.width * image.height > MOST_TEXELS:
+                raise ValueError(f"it claims {image.width}x{image.height} pixels")
             texture = image_array(image)
         except Exception as error:  # pillow decodes late: a broken or huge picture shows only here
             notes.append(f"the texture of '{name}' cannot be decoded ({error}); it is left out.")

@@ -14,7 +14,7 @@ from realsim.app.register_results import NEXT_FILE, SCENE_FILE, cameras_now
 from realsim.app.register_tables import as_json, odometry_line
 from realsim.app.report import write_report
 from realsim.app.stages import annotate_session, judged_scene, registered_views
-from realsim.app.upgrade import _registration_notes  # pyright: ignore[reportPrivateUsage]
+from realsim.app.upgrade_scene import registration_notes  # pyright: ignore[reportPrivateUsage]
 from realsim.records import CaptureSession, Mesh, View
 from realsim.registration.odometry.cross_check import Fault, KinematicsCheck, ViewDifference
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
@@ -91,7 +91,7 @@ def test_notes_of_a_registration_that_could_not_tell_everything(
     }
     report = {} if missing == "all" else {k: v for k, v in told.items() if k != missing}
     store.write_json("registration/report.json", report)
-    words = " ".join(_registration_notes(store))
+    words = " ".join(registration_notes(store))
     expected = {
         "common_offset_mm": "moved together", "common_sinking": "sink into the table by 5.0 %",
         "objects": "can (12 deg)",

@@ -66,12 +66,11 @@ def test_analytic_grasps_are_tried_and_kept_beside_the_schools_own(tmp_path: Pat
         assert 0 < len(s) <= 8
         labels = read_grasp_labels(out / f"grasp_label/{s.obj_id - 1:03d}_labels.npz")
         index = [tuple(row) for row in labels.index.tolist()]
-        for row, friction in zip(
-            s.parameters["label_index"], s.measures["closure_friction"], strict=True
-        ):
+        chosen = s.parameters["analytic"]["label_index"]
+        for row, friction in zip(chosen, s.measures["closure_friction"], strict=True):
             assert labels.friction[index.index(tuple(row))] == pytest.approx(friction)
         # Every grasp is its label's, moved at most along the closing axis and back.
-        Ts = labels.Ts_obj_grasp()[[index.index(tuple(r)) for r in s.parameters["label_index"]]]
+        Ts = labels.Ts_obj_grasp()[[index.index(tuple(r)) for r in chosen]]
         np.testing.assert_allclose(Ts[:, :3, :3], s.Ts_obj_grasp[:, :3, :3], atol=1e-6)
         along_x = (se3.invert(Ts) @ s.Ts_obj_grasp)[:, 0, 3]
         np.testing.assert_allclose(along_x, 0, atol=1e-6)
@@ -98,6 +97,6 @@ def _a_graspnet_roots_own_labels_are_taken(tmp_path: Path, labels: Path) -> None
     run_upgrade(UpgradeConfig(grasps_per_object=2, analytic=4, workers=1), dataset, out, QUIET)
     assert not (out / "grasp_label").exists()
     sets = load_grasps(out / "test_kinect/000100" / FOLDER)
-    assert all("of the data set" in s.parameters["source"]["file"] for s in sets)
+    assert {s.parameters["analytic"]["from"] for s in sets} <= {p.name for p in labels.glob("*")}
     source = json.loads((out / "test_kinect/000100/imported/source.json").read_text())
     assert source["grasp_labels"] == sorted(f"grasp_label/{p.name}" for p in labels.glob("*.npz"))

@@ -110,6 +110,18 @@ def test_parameters_in_hdf5_are_plain_json(tmp_path: Path, text: str) -> None:
         read_grasps_hdf5(path)
 
 
+def test_a_heap_in_which_the_library_would_go_round_for_ever_is_refused(tmp_path: Path) -> None:
+    obj = AcronymObject(file="mug.obj")
+    path = write_acronym(tmp_path / "a.h5", a_set(), obj)
+    assert read_acronym(path).obj.file == "mug.obj"
+    raw = path.read_bytes()
+    at = raw.index(b"GCOL\x01\0\0\0") + 16
+    for zeros in (16, 40):
+        path.write_bytes(raw[:at] + bytes(zeros) + raw[at + zeros :])
+        with pytest.raises(InputError, match="heap of texts"):
+            read_acronym(path)
+
+
 # --- recordings -----------------------------------------------------------------------------------
 
 
@@ -124,7 +136,11 @@ def edited_metadata(tmp_path: Path, old: str, new: str) -> Path:
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [("message_count: ", "message_count: x"), ("name: /camera", "name: [/camera] #")],
+    [
+        ("message_count: ", "message_count: x"),
+        ("name: /camera", "name: [/camera] #"),
+        ("name: /camera", "name: 3 #"),
+    ],
 )
 def test_a_damaged_table_of_contents_is_refused(tmp_path: Path, old: str, new: str) -> None:
     with pytest.raises(InputError, match="recording"):

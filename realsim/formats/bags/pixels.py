@@ -167,10 +167,10 @@ def _decompressed(message: ImageMessage, name: str = "image") -> NDArray[Any]:
     skip = DEPTH_HEADER_BYTES if _is_depth_transport(message) else 0
     data = message.pixels[skip:]
     image: Any = None
-    if len(data):
+    # cv2.error: of images that end within a header.
+    with contextlib.suppress(InputError, cv2.error):
         require_decodable(data.tobytes(), name)
-        with contextlib.suppress(cv2.error):  # of images that end within a header
-            image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if image is None:
         raise InputError(
             f"{name}: a compressed image of format '{message.encoding}' and {len(data)} bytes "

@@ -77,6 +77,8 @@ class Recording:
             reader.open()
             self._reader = reader
             for c in reader.connections:
+                if not (isinstance(c.topic, str) and isinstance(c.msgtype, str)):  # pyright: ignore[reportUnnecessaryIsInstance]
+                    raise TypeError(f"a topic named {c.topic!r:.40} of type {c.msgtype!r:.40}")
                 known = self.topics.get(c.topic)
                 count = c.msgcount + (known.count if known else 0)
                 self.topics[c.topic] = Topic(c.topic, c.msgtype, count)

@@ -81,6 +81,8 @@ class VideoFile:
                 f"{self._size}, uint8."
             )
         frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
+        # Left to the encoder, the conversion gives other bytes in one video of a hundred.
+        frame = frame.reformat(format=PIXELS)
         frame.pts, frame.time_base = self.frames, self._stream.codec_context.time_base
         self._file.mux(self._stream.encode(frame))
         self.frames += 1

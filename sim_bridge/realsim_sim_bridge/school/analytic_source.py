@@ -31,7 +31,8 @@ class AnalyticGrasps:
     closure_friction: Array
     """(N,) of the label: the smallest of its friction levels that closes."""
     counts: dict[str, Any]
-    """How many labels there were after each step, and where they came from."""
+    """How many labels there were after each step, where they came from, and which label each
+    grasp is (point, view, angle, depth)."""
 
 
 def analytic_grasps(
@@ -63,6 +64,7 @@ def analytic_grasps(
             "labels": len(labels.friction),
             "labels_standing": len(standing.friction),
             "labels_chosen": len(chosen.friction),
+            "label_index": chosen.index[rows].tolist(),
         },
     )
 

@@ -1,0 +1,192 @@
+"""A grasp of the Robot School tried again, with the object's motion in the hand.
+
+The slip test is run with the settings of then (`slip.slip_test`), for one grasp, by an engine that
+writes poses down (`recorded_worlds`). What comes out is compared with what is stored: a replay
+that ends otherwise says so.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import STAGES, GraspSet
+from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.demonstrations.recorded_worlds import RecordedEngine, StageRecord
+from realsim_sim_bridge.school.config import SchoolConfig
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.score import score_stages
+from realsim_sim_bridge.slip.slip_test import SlipTrial, run_slip_test
+
+Array = NDArray[np.float64]
+SAME = 1e-9
+"""Largest difference of a slip [m, rad] and score that is rounding: a replay that agrees this well
+is the attempt itself."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class HeldStage:
+    """What the object did in the hand during one stage."""
+
+    times_s: Array
+    """(S,) since the stage began [s]; the first is 0."""
+    Ts_grasp_obj: Array
+    """(S, 4, 4) object in the grasp frame [m]."""
+    touched_s: float
+    """When both fingers first pressed on the object [s]; NaN = never."""
+    lost_s: float
+    """When the object was lost [s]; NaN = it was not."""
+    duration_s: float
+    """Until the stage ended or the object was lost [s]."""
+    opening_m: float
+    """Distance of the finger faces at its end [m]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SlipReplay:
+    """One grasp, tried again."""
+
+    stages: tuple[HeldStage, ...]
+    """Those that were executed, from `close` on."""
+    opening_m: float
+    """Distance of the finger faces from which the test let them close [m]."""
+    score: float
+    base_score: float
+    failure: str
+    """Where and why it stopped; '' = it passed all."""
+    agrees: bool
+    """Whether it ended as it is stored: in the same stage, with the same score."""
+    disagreement: str
+    """How it differs from what is stored; '' = it does not."""
+
+
+def replay_grasp(
+    grasps: GraspSet,
+    row: int,
+    joints_lifted: Array,
+    T_table_obj: Array,
+    body: SlipBody,
+    config: SchoolConfig,
+    engine: RecordedEngine,
+) -> SlipReplay:
+    """Return a grasp tried again.
+
+    Args:
+        grasps: the set.
+        row: which of its grasps.
+        joints_lifted: (7,) the arm after the lift [rad]: the axis of the swing depends on it.
+        T_table_obj: (4, 4) where the object stands [m].
+        body: its convex parts and matter.
+        config: what the set was made with.
+        engine: made of the same settings.
+
+    Raises:
+        InputError: the set does not hold the openings of its grasps.
+    """
+    trial = _trial(grasps, row, joints_lifted, T_table_obj, body)
+    engine.begin()
+    slips = run_slip_test(trial, config.slip, config.score, config.hand, engine)
+    base, score = score_stages(
+        slips.slip_m, slips.slip_rad, np.ones(1, dtype=np.bool_), config.score
+    )
+    T_table_grasp = trial.Ts_table_grasp[0]
+    T_grasp_world = se3.from_rt(T_table_grasp[:3, :3].T, np.zeros(3))
+    T_body_obj = se3.invert(body.principal_frame()[0])
+    stages: list[HeldStage] = []
+    before = se3.invert(trial.Ts_obj_grasp[0])
+    for number, played in enumerate(engine.stages):
+        stage = _held(played, T_grasp_world, T_body_obj, before, number == 0, config)
+        stages.append(stage)
+        before = stage.Ts_grasp_obj[-1]
+    if np.isinf(slips.slip_m[0, len(stages) - 1]) and np.isnan(stages[-1].lost_s):
+        # It is between the fingers, but they do not both touch it: nothing holds it.
+        stages[-1] = replace(stages[-1], lost_s=stages[-1].duration_s)
+    apart = _disagreement(grasps, row, slips.slip_m[0], slips.slip_rad[0], base[0], score[0])
+    return SlipReplay(
+        stages=tuple(stages),
+        opening_m=float(trial.grips(config.slip.headroom_m).openings_m[0]),
+        score=float(score[0]),
+        base_score=float(base[0]),
+        failure=slips.failures[0],
+        agrees=bool(
+            base[0] == grasps.base_scores[row] and abs(score[0] - grasps.scores[row]) <= SAME
+        ),
+        disagreement=apart,
+    )
+
+
+def _trial(
+    grasps: GraspSet, row: int, joints_lifted: Array, T_table_obj: Array, body: SlipBody
+) -> SlipTrial:
+    """Return one grasp, ready for the slip test; as `school.object_slips.trial_of`."""
+    openings = grasps.parameters.get("openings_m")
+    if not isinstance(openings, list) or len(openings) != len(grasps):  # pyright: ignore[reportUnknownArgumentType]
+        raise InputError(
+            f"the grasps of instance {grasps.instance} do not say how far the hand was open "
+            "(parameters.openings_m), so that none can be replayed; run `realsim school` again."
+        )
+    axes, points = panda.joint5_in_grasp(joints_lifted[None])
+    Ts = grasps.Ts_obj_grasp[[row]]
+    return SlipTrial(
+        body=body,
+        Ts_obj_grasp=Ts,
+        Ts_table_grasp=T_table_obj @ Ts,
+        openings_m=np.array([openings[row]], dtype=np.float64),
+        joint5_axes=axes,
+        joint5_points=points,
+        joint5_ranges=np.array([[panda.LOWER[4], panda.UPPER[4]]]) - joints_lifted[4],
+    )
+
+
+def _held(
+    played: StageRecord,
+    T_grasp_world: Array,
+    T_body_obj: Array,
+    before: Array,
+    closing: bool,
+    config: SchoolConfig,
+) -> HeldStage:
+    """Return a stage in the grasp frame, from where the stage before left the object."""
+    Ts_world_body, forces = played.motion.Ts_world_body[0], played.motion.finger_n[0]
+    times = played.speed * played.motion.times_s
+    seen = ~np.isnan(Ts_world_body[:, 0, 0])
+    Ts = T_grasp_world @ Ts_world_body[seen] @ T_body_obj
+    times, forces = times[seen], np.nan_to_num(forces[seen])
+    # The rules of the slip test: too far from where the stage began, or between no fingers.
+    centers = Ts @ se3.invert(T_body_obj)[:, 3]
+    far = np.linalg.norm((centers - before @ se3.invert(T_body_obj)[:, 3])[:, :3], axis=1)
+    gone = far > config.slip.lost_m
+    if not closing:
+        gone |= forces.sum(axis=1) <= 0
+    both = np.all(forces > config.slip.physics.contact_n, axis=1)
+    lost = float(times[np.argmax(gone)]) if gone.any() else np.nan
+    if gone.any():
+        Ts, times = Ts[: np.argmax(gone) + 1], times[: np.argmax(gone) + 1]
+    return HeldStage(
+        times_s=np.concatenate([[0.0], times]),
+        Ts_grasp_obj=np.concatenate([before[None], Ts]),
+        touched_s=float(played.motion.times_s[seen][np.argmax(both)]) if both.any() else np.nan,
+        lost_s=lost,
+        duration_s=float(times[-1]) if len(times) else 0.0,
+        opening_m=max(float(np.nan_to_num(played.fingers_m).sum()), 0.0),
+    )
+
+
+def _disagreement(
+    grasps: GraspSet, row: int, slip_m: Array, slip_rad: Array, base: float, score: float
+) -> str:
+    """Return how a replay differs from what is stored; '' = it does not."""
+    if base != grasps.base_scores[row]:
+        passed = round(len(STAGES) * float(base)), round(len(STAGES) * grasps.base_scores[row])
+        return f"{passed[0]} stages were passed in the replay, {passed[1]} are stored"
+    if abs(score - grasps.scores[row]) > SAME:
+        return f"the replay scores {score:.4f}, {grasps.scores[row]:.4f} is stored"
+    stored = np.concatenate([grasps.slip_m[row], grasps.slip_rad[row]])
+    found = np.concatenate([slip_m, slip_rad])
+    if not np.allclose(found, stored, rtol=0.0, atol=SAME, equal_nan=True):
+        both = np.isfinite(stored) & np.isfinite(found)
+        worst = float(np.abs(found - stored)[both].max()) if both.any() else np.inf
+        return f"slips differ from the stored ones by up to {worst:.2g} (m, rad)"
+    return ""

@@ -1,0 +1,31 @@
+"""One school whose attempts succeed, slip and are lost, for all tests of demonstrations."""
+
+from pathlib import Path
+
+import pytest
+
+from realsim.app.school_files import stored_grasps
+from realsim_sim_bridge.demonstrations.cameras import front_camera, wrist_camera
+from realsim_sim_bridge.demonstrations.source import DemonstrationSource
+from school_sessions import registered, run
+
+WEAK = ("--engine", "mujoco", "--grasps", "14", "--workers", "1", "--quiet", "--force", "4",
+        "--friction", "0.3")  # fmt: skip
+SMALL = (64, 48)
+
+
+@pytest.fixture(scope="session")
+def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session that was tried with a weak hand."""
+    folder = registered(tmp_path_factory.mktemp("weak") / "session")
+    result = run("run", folder, *WEAK)
+    assert result.exception is None, result.output
+    return folder
+
+
+@pytest.fixture(scope="session")
+def source(school: Path) -> DemonstrationSource:
+    """Its attempts, with small pictures."""
+    grasps, models = stored_grasps(school)
+    cameras = (front_camera((0.0, 0.0), SMALL), wrist_camera(None, SMALL))
+    return DemonstrationSource(grasps, models, cameras=cameras, cache=school / "grasps/cache")

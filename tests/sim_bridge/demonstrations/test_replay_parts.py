@@ -1,0 +1,117 @@
+"""What a replay is made of: the configuration read back, the watched engine, the fall."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.mesh import mass_properties
+from realsim.records import GraspSet
+from realsim_sim_bridge.demonstrations.falling import FallConfig, fall
+from realsim_sim_bridge.demonstrations.recorded_worlds import RecordedEngine
+from realsim_sim_bridge.demonstrations.school_settings import school_config_of
+from realsim_sim_bridge.demonstrations.slip_replay import replay_grasp
+from realsim_sim_bridge.demonstrations.tried_bodies import tried_body
+from realsim_sim_bridge.school import run_school_results
+from realsim_sim_bridge.school.sweep import SweepConfig
+from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.engines import make_engine, settings_of
+from school_scenes import CONFIG, at, model, scene, small_worlds
+
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.025
+
+
+def grasps_with(parameters):
+    nothing = np.zeros((0, 4))
+    return GraspSet(
+        obj_id=1, instance=0, Ts_obj_grasp=np.zeros((0, 4, 4)), widths_m=np.zeros(0),
+        scores=np.zeros(0), base_scores=np.zeros(0), slip_m=nothing, slip_rad=nothing,
+        reachable=np.zeros(0, bool), failures=(), parameters=parameters,
+    )  # fmt: skip
+
+
+def box_body(half=0.025, mass=0.1):
+    inertia = np.eye(3) * mass * (2 * half) ** 2 / 6
+    return SlipBody(
+        parts=(CORNERS * half / 0.025,), mass_kg=mass, center_of_mass=np.zeros(3), inertia=inertia
+    )
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+def test_a_configuration_comes_back_from_the_parameters(engine):
+    base = dataclasses.replace(
+        CONFIG,
+        slip=dataclasses.replace(CONFIG.slip, engine=settings_of(engine)),
+        second_engine=settings_of("mujoco"),
+        sweep=SweepConfig(),
+    )
+    stored = json.loads(json.dumps(dataclasses.asdict(base)))
+    assert school_config_of(grasps_with({"config": stored})) == base
+
+
+@pytest.mark.parametrize("change", ["gone", "new", "type"])
+def test_a_configuration_of_another_version_is_refused(change):
+    stored = json.loads(json.dumps(dataclasses.asdict(CONFIG)))
+    if change == "gone":
+        del stored["slip"]
+    elif change == "new":
+        stored["slip"]["physics"]["glue"] = 1.0
+    else:
+        stored["slip"]["physics"]["friction"] = "much"
+    with pytest.raises(InputError, match=r"slip is not there|glue|friction is str"):
+        school_config_of(grasps_with({"config": stored}))
+
+
+def test_a_field_that_a_version_did_not_have_takes_its_default():
+    stored = json.loads(json.dumps(dataclasses.asdict(CONFIG)))
+    del stored["slip"]["headroom_m"], stored["sweep"]
+    assert school_config_of(grasps_with({"config": stored})) == CONFIG
+
+
+def test_a_box_that_is_dropped_lands_on_its_face():
+    T = se3.from_translation([0.0, 0.0, 0.12])
+    Ts = fall(box_body(), T, np.zeros(6), [], np.array([0.0, 0.1, 1.0]), FallConfig())
+    np.testing.assert_allclose(Ts[0], T, atol=1e-6)
+    assert Ts[1, 2, 3] == pytest.approx(0.12 - 0.5 * 9.81 * 0.1**2, abs=3e-3)
+    assert Ts[2, 2, 3] == pytest.approx(0.025, abs=1e-3)
+    np.testing.assert_allclose(Ts[2, :3, :3], np.eye(3), atol=0.02)
+
+
+def test_a_thrown_box_flies_on_and_lands_on_what_stands_there():
+    twist = np.array([0, 0, 0, 0.5, 0, 0.0])
+    block = CORNERS * [4, 4, 1] + [0.07, 0, 0.025]
+    Ts = fall(
+        box_body(), se3.from_translation([0.0, 0, 0.2]), twist, [block], np.array([0.1, 1.0]),
+        FallConfig(),
+    )  # fmt: skip
+    assert Ts[0, 0, 3] == pytest.approx(0.05, abs=2e-3)
+    assert Ts[1, 2, 3] == pytest.approx(0.075, abs=2e-3)
+
+
+def test_a_replay_in_bullet_ends_as_the_school_did():
+    config = small_worlds(dataclasses.replace(CONFIG, max_candidates=4))
+    physics = dataclasses.replace(config.slip.physics, friction=0.3, force_n=6.0)
+    config = dataclasses.replace(config, slip=dataclasses.replace(config.slip, physics=physics))
+    (result,) = run_school_results(scene(at(0.0, 0.0)), {1: model()}, config, workers=1)
+    s, attempts = result.grasp_set, result.trajectories
+    assert attempts is not None
+    T_table_obj = se3.from_translation([0, 0, 0.025])
+    engine = RecordedEngine(make_engine(config.slip.engine))
+    body = tried_body(s, model(), T_table_obj, school_config_of(s), None, None)
+    assert body.mass_kg == pytest.approx(mass_properties(model().mesh, 1000.0).mass_kg)
+    for row in attempts.rows.tolist():
+        lifted = attempts.joints_rad[attempts.attempt(row)][-1]
+        replay = replay_grasp(s, row, lifted, T_table_obj, body, config, engine)
+        assert replay.agrees, replay.disagreement
+        assert replay.base_score == s.base_scores[row]
+        executed = int((~np.isnan(s.slip_m[row])).sum())
+        assert len(replay.stages) == executed
+        for stage in replay.stages:
+            assert np.all(np.diff(stage.times_s) > 0)
+            np.testing.assert_allclose(np.linalg.det(stage.Ts_grasp_obj[:, :3, :3]), 1.0, atol=1e-6)
+        ends = [st.Ts_grasp_obj[-1] for st in replay.stages[:-1]]
+        for end, stage in zip(ends, replay.stages[1:], strict=True):
+            np.testing.assert_array_equal(end, stage.Ts_grasp_obj[0])

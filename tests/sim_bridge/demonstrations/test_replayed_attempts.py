@@ -1,0 +1,198 @@
+"""Attempts of the school as demonstrations: they are the attempts, and arm and object agree."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from realsim.app.school_files import stored_grasps
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records.trajectories import PHASES
+from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.demonstrations.records import DemonstrationConfig
+from realsim_sim_bridge.demonstrations.source import DemonstrationSource, in_words
+
+CLOSE, LIFT = PHASES.index("close"), PHASES.index("lift")
+
+
+@pytest.fixture(scope="module")
+def all_of_them(source):
+    return list(source)
+
+
+@pytest.fixture(scope="module")
+def good(all_of_them):
+    return next(d for d in all_of_them if d.outcome.success)
+
+
+@pytest.fixture(scope="module")
+def lost(all_of_them):
+    return [d for d in all_of_them if "lost" in d.outcome.failure or "touch" in d.outcome.failure]
+
+
+def lowest_m(d, k):
+    """Return the height of the object's lowest vertex over the table."""
+    mesh = d.scenery.models[d.name.instance].mesh
+    return float(se3.transform(d.motion.Ts_table_obj[k], mesh.vertices)[:, 2].min())
+
+
+def test_every_attempt_is_there_and_ends_as_it_is_stored(source, all_of_them, school):
+    grasps = stored_grasps(school)[0]
+    assert len(all_of_them) == len(source) == sum(len(t) for t in grasps.trajectories.values())
+    for d in all_of_them:
+        assert d.outcome.agrees, d.name
+        assert d.outcome.disagreement == "", d.name
+    kinds = {d.outcome.failure.partition(":")[0] for d in all_of_them}
+    assert kinds == {"", "close", "lift"}, "the school holds successes and two kinds of failures"
+
+
+def test_the_hand_is_at_the_goal_when_the_fingers_close(all_of_them):
+    for d in all_of_them:
+        closing = d.motion.phase == CLOSE
+        assert closing.any()
+        T = d.motion.Ts_base_ee[closing]
+        np.testing.assert_allclose(T, np.broadcast_to(d.goal.T_base_grasp, T.shape), atol=1e-5)
+        np.testing.assert_array_equal(T, panda.forward(d.motion.joints_rad[closing]))
+
+
+def test_an_action_is_what_the_next_step_has(good):
+    steps = list(good)
+    for now, after in itertools.pairwise(steps):
+        np.testing.assert_array_equal(now.action.joints_rad, after.joints_rad)
+        assert now.action.opening_m == good.motion.command_m[after.index]
+        np.testing.assert_allclose(
+            now.T_base_ee @ now.action.T_ee_next, after.T_base_ee, atol=1e-12
+        )
+    np.testing.assert_array_equal(steps[-1].action.joints_rad, steps[-1].joints_rad)
+
+
+def test_an_object_that_is_held_moves_with_the_hand_and_is_lifted(good):
+    m = good.motion
+    held = np.nonzero(m.held & (m.phase >= LIFT))[0]
+    in_hand = se3.invert(good.scenery.T_table_base @ m.Ts_base_ee[held]) @ m.Ts_table_obj[held]
+    spread = np.linalg.norm(in_hand[:, :3, 3] - in_hand[0, :3, 3], axis=1)
+    assert spread.max() < 0.02
+    lifted = m.Ts_table_obj[m.phase > LIFT][0, 2, 3] - m.Ts_table_obj[0, 2, 3]
+    assert lifted == pytest.approx(0.20, abs=0.01)
+
+
+def test_fingers_stop_at_the_cube_and_are_told_to_press(good):
+    assert good.goal.name == "cube"
+    m = good.motion
+    assert m.opening_m[m.held].min() == pytest.approx(0.05, abs=1.5e-3)
+    assert np.all(m.command_m[m.phase > LIFT] == 0.0)
+    assert np.all(m.command_m <= m.opening_m + 1e-12)
+    assert np.all(np.diff(m.opening_m) < 1e-3)
+
+
+def test_a_lost_object_falls_onto_the_table_and_stays_there(lost):
+    assert lost
+    for d in lost:
+        m = d.motion
+        assert not m.held[-1]
+        assert lowest_m(d, -1) == pytest.approx(0.0, abs=2e-3)
+        assert min(lowest_m(d, k) for k in range(len(m))) > -4e-3
+
+
+def test_a_failed_attempt_ends_where_it_failed(all_of_them):
+    for d in all_of_them:
+        if d.outcome.success or "lost" in d.outcome.failure or "touch" in d.outcome.failure:
+            continue
+        assert PHASES[d.motion.phase[-2]] == d.outcome.failure.partition(":")[0]
+    good = [d for d in all_of_them if d.outcome.success]
+    assert all(PHASES[d.motion.phase[-1]] == "pendulum" for d in good)
+
+
+def test_nothing_jumps(school):
+    grasps, models = stored_grasps(school)
+    fast = DemonstrationSource(
+        grasps, models, DemonstrationConfig(rate_hz=100), cache=school / "grasps/cache"
+    )
+    for d in fast:
+        m = d.motion
+        center = models[d.goal.obj_id].mesh.vertices.mean(axis=0)
+        moved = np.diff(se3.transform(m.Ts_table_obj, center[None])[:, 0], axis=0)
+        assert np.linalg.norm(moved, axis=1).max() * 100 < 3.0, d.name
+        assert np.abs(np.diff(m.joints_rad, axis=0)).max() * 100 < 5.0
+
+
+def test_half_the_rate_is_every_second_step(school, source):
+    grasps, models = stored_grasps(school)
+    slow = DemonstrationSource(
+        grasps, models, DemonstrationConfig(rate_hz=10), cache=school / "grasps/cache"
+    )
+    for k in (1, 4):
+        a, b = slow[k].motion, source[k].motion
+        for name in ("time_s", "joints_rad", "opening_m", "command_m", "phase", "held"):
+            np.testing.assert_allclose(getattr(a, name), getattr(b, name)[::2], atol=1e-12)
+        np.testing.assert_allclose(a.Ts_table_obj, b.Ts_table_obj[::2], atol=1e-9)
+
+
+def test_the_others_stand_still_and_everything_is_told_in_the_base(good):
+    other = next(i for i in good.scenery.Ts_table_obj if i != good.name.instance)
+    T = np.stack([s.Ts_base_obj[other] for s in good])
+    np.testing.assert_array_equal(T, np.broadcast_to(T[0], T.shape))
+    start = good.step(0)
+    goal = start.Ts_base_obj[good.name.instance] @ np.linalg.inv(
+        good.scenery.T_table_base @ start.Ts_base_obj[good.name.instance]
+    )
+    np.testing.assert_allclose(goal, se3.invert(good.scenery.T_table_base), atol=1e-9)
+
+
+def test_a_step_is_seen_the_same_each_time_and_steps_are_seen_differently(good):
+    middle = len(good) // 2
+    for camera in ("front", "wrist"):
+        first, again = good.step(middle).look(camera), good.step(middle).look(camera)
+        assert first.shape == (48, 64, 3)
+        assert first.tobytes() == again.tobytes()
+        assert np.abs(first.astype(int) - good.step(0).look(camera)).mean() > 2.0
+
+
+def test_the_hand_sees_the_cube_between_its_fingers_once_it_is_held(good):
+    k = int(np.nonzero(good.motion.held)[0][-1])
+    picture = good.step(k).look("wrist").astype(int)
+    around = picture[20:44, 24:40].reshape(-1, 3)
+    # The cube is violet and beige; table, fingers and room have no pixel that is more red and
+    # blue than green.
+    violet = (around[:, 0] > around[:, 1] + 20) & (around[:, 2] > around[:, 1] + 10)
+    assert violet.mean() > 0.3
+    before = good.step(0).look("wrist").astype(int)[20:44, 24:40].reshape(-1, 3)
+    assert ((before[:, 0] > before[:, 1] + 20) & (before[:, 2] > before[:, 1] + 10)).mean() < 0.05
+
+
+def test_a_grasp_without_an_attempt_is_refused_with_its_reason(source):
+    none = source.not_attempted[0]
+    with pytest.raises(InputError, match=r"collides|kinematics"):
+        source.number_of(none.instance, none.grasp)
+    with pytest.raises(InputError, match="no grasp 99"):
+        source.number_of(0, 99)
+    for k, name in enumerate(source.attempts):
+        assert source.number_of(name.instance, name.grasp) == k
+
+
+def test_a_scene_that_was_moved_or_weighed_since_is_refused(school):
+    grasps, models = stored_grasps(school)
+    moved = {i: T @ se3.from_translation([0.01, 0, 0]) for i, T in grasps.Ts_world_obj.items()}
+    with pytest.raises(InputError, match=r"moved by 10\.0 mm"):
+        DemonstrationSource(replace(grasps, Ts_world_obj=moved), models)[0]
+    cut = {i: replace(m, mesh=replace(m.mesh, vertices=m.mesh.vertices * 1.05))
+           for i, m in models.items()}  # fmt: skip
+    with pytest.raises(InputError, match="weighs"):
+        DemonstrationSource(grasps, cut)[0]
+
+
+def test_grasps_that_do_not_say_how_they_were_tried_are_refused(school):
+    grasps, models = stored_grasps(school)
+    bare = tuple(replace(s, parameters={}) for s in grasps.sets)
+    with pytest.raises(InputError, match="do not say what they were tried with"):
+        DemonstrationSource(replace(grasps, sets=bare), models)
+    with pytest.raises(InputError, match="without trajectories"):
+        DemonstrationSource(replace(grasps, trajectories={}), models)
+
+
+def test_names_are_spoken():
+    assert in_words("003_cracker_box") == "cracker box"
+    assert in_words("cube") == "cube"
+    assert in_words("042") == "042"
