@@ -61,14 +61,22 @@ def load_usd(path: Path) -> FileContent:
         except InputError:
             raise
         except Exception as error:  # Tf.ErrorException and whatever its arrays trip over
-            reason = str(error).strip().splitlines()[-1].strip() or type(error).__name__
             raise InputError(
-                f"{path} cannot be read as a USD file ({reason}). Export it again; meshes with "
-                "points and faces are needed."
+                f"{path} cannot be read as a USD file ({_reason(error)}). Export it again; meshes "
+                "with points and faces are needed."
             ) from error
     return FileContent(
         pieces=tuple(pieces), declared=declared, notes=tuple(notes), up=up, unit=unit
     )
+
+
+def _reason(error: Exception) -> str:
+    """Return what an exception says in its last line; its own text may not be text at all."""
+    try:
+        lines = str(error).strip().splitlines()
+    except UnicodeDecodeError:
+        lines = []
+    return lines[-1].strip() if lines and lines[-1].strip() else type(error).__name__
 
 
 class _Pxr:

@@ -45,6 +45,8 @@ class CameraIntrinsics:
         if not (np.isfinite(self.cx) and np.isfinite(self.cy)):
             raise InputError(f"the principal point ({self.cx}, {self.cy}) is not finite.")
         d = np.asarray(self.distortion, dtype=np.float64).ravel()
+        if not np.all(np.isfinite(d)):
+            raise InputError(f"the distortion {d.tolist()} is not of finite numbers.")
         if len(d) > DISTORTION_TERMS and np.any(d[DISTORTION_TERMS:] != 0):
             raise InputError(
                 f"{len(d)} distortion coefficients were given; the Brown (5) and the rational (8) "

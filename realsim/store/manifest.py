@@ -74,7 +74,7 @@ def entry_from(line: str) -> Entry:
         entry = Entry(
             path=str(record["path"]), sha256=str(record["sha256"]), bytes=int(record["bytes"])
         )
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ValueError(f"is not a manifest entry ({line[:SHOWN]!r})") from error
     if check is not None and check != _check_of(json.dumps(record)):
         raise ValueError(f"has another checksum than was written ({line[:SHOWN]!r})")

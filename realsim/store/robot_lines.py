@@ -36,7 +36,7 @@ def record_of(line: str) -> dict[str, Any]:
         record: dict[str, Any] = json.loads(line)
         check = record.pop(CHECK, None)
         known = record | {"index": int(record["index"]), "depth": bool(record["depth"])}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ValueError(f"is not a view ({line[:SHOWN]!r})") from error
     if check is not None and hashlib.sha256(json.dumps(record).encode()).hexdigest() != check:
         raise ValueError(f"has another checksum than was written ({line[:SHOWN]!r})")

@@ -252,7 +252,9 @@ def _beside(folder: Path, name: str) -> Path | None:
 
 
 def _mesh_file(name: str, folder: Path, meshes: Path | None, where: str) -> Path:
-    stl = Path(name).with_suffix(".stl").name
+    if not Path(name).stem:
+        raise InputError(f"the mesh of {where} is {name!r}, which names no file.")
+    stl = f"{Path(name).stem}.stl"
     places = [p for p in (meshes, folder, folder / "assets") if p is not None]
     for place in places:
         if (place / stl).is_file():
