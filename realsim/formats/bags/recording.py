@@ -87,7 +87,9 @@ class Recording:
     def __exit__(self, *_: object) -> None:
         """Close the files."""
         if self._reader is not None:
-            self._reader.close()
+            # Damaged metadata can make closing fail when everything has been read.
+            with contextlib.suppress(Exception):
+                self._reader.close()
             self._reader = None
 
     def of_type(self, *msgtypes: str) -> list[Topic]:

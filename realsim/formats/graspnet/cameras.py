@@ -78,6 +78,8 @@ def read_camera_files(folder: Path) -> CameraFiles:
         raise InputError(f"{folder / POSES} holds {len(poses)} poses; 1 to {MOST_VIEWS} are read.")
     if K is not None and K.shape != (3, 3):
         raise InputError(f"{folder / MATRIX} has the shape {K.shape}; (3, 3) is needed.")
+    if K is not None and not np.all(np.isfinite(K)):
+        raise InputError(f"{folder / MATRIX} holds numbers that are not finite.")
     for name, Ts in ((FIRST, first), (POSES, poses)):
         if Ts is None:
             continue
