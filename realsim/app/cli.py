@@ -9,18 +9,18 @@ from pathlib import Path
 import click
 
 from realsim import __version__
-from realsim.app.annotate_cli import annotate_command
+from realsim.app.annotate.cli import annotate_command
 from realsim.app.cli_capture import CAPTURE_COMMANDS
-from realsim.app.cli_scan import SCAN
-from realsim.app.demonstrations_cli import demonstrations_command
-from realsim.app.depth_fit_cli import depth_fit
+from realsim.app.demonstrations.cli import demonstrations_command
+from realsim.app.depth_fit.cli import depth_fit
 from realsim.app.export.cli import export_command
-from realsim.app.generate_cli import generate_command
-from realsim.app.register_cli import register_command
-from realsim.app.render_cli import render_command
-from realsim.app.school_cli import SCHOOL
+from realsim.app.generate.cli import generate_command
+from realsim.app.register.cli import register_command
+from realsim.app.render.cli import render_command
+from realsim.app.scan.cli import SCAN
+from realsim.app.school.cli import SCHOOL
 from realsim.app.stats.cli import stats_command
-from realsim.app.upgrade_cli import upgrade_command
+from realsim.app.upgrade.cli import upgrade_command
 from realsim.errors import RealsimError
 
 FOLDER = click.Path(path_type=Path)
@@ -111,7 +111,7 @@ def calibrate(source: Path, quiet: bool, live: bool, **options: object) -> None:
 
     Ends with exit code 1 when a check of the result is bad.
     """
-    from realsim.app.calibrate import run_calibrate
+    from realsim.app.calibrate.run import run_calibrate
 
     if not run_calibrate(source, live=live, quiet=quiet, **options):
         sys.exit(1)
@@ -123,7 +123,7 @@ def calibrate(source: Path, quiet: bool, live: bool, **options: object) -> None:
 def report(session: Path, truth: Path | None) -> None:
     """Write SESSION/reports/report.html: one self-contained page with pictures."""
     from realsim.app.console import Console
-    from realsim.app.report import write_report
+    from realsim.app.report.session import write_report
     from realsim.app.stages import open_session
     from realsim.app.truth import loop_errors
 

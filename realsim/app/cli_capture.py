@@ -38,8 +38,8 @@ def plan(advise: bool, quiet: bool, **options: Any) -> None:
 
     Writes the plan file and pictures beside it. Ends with exit code 1 when a move of it collides.
     """
-    from realsim.app.plan import run_plan
-    from realsim.app.plan_request import PlanRequest
+    from realsim.app.plan.request import PlanRequest
+    from realsim.app.plan.run import run_plan
 
     if not run_plan(PlanRequest.of(options), advise=advise, quiet=quiet):
         sys.exit(1)
@@ -65,7 +65,7 @@ def plan_show(
     PLAN is a plan file, or shipped:ur5_d405_hemisphere_256. Ends with exit code 1 when a move
     collides.
     """
-    from realsim.app.plan import run_show
+    from realsim.app.plan.run import run_show
     from realsim.errors import InputError
 
     if replay_file is not None and replay_file.exists() and not overwrite:
@@ -112,8 +112,8 @@ def plan_convert(
     Robot, units and tool offset of a path are proven from its tool poses. Ends with exit code 1
     when a move of an imported path collides.
     """  # noqa: D301 - click's own mark for lines that stay as they are
-    from realsim.app.plan import run_convert
-    from realsim.app.plan_request import Place
+    from realsim.app.plan.request import Place
+    from realsim.app.plan.run import run_convert
 
     where = Place(robot=robot or "", **place)
     if not run_convert(source, dest, where, joints_unit=joints_unit, overwrite=overwrite):
@@ -144,7 +144,7 @@ def capture_command(
     Keys: p pause, r redo the last view, s skip, q stop, space go on. Ends with exit code 1 when
     views are missing at the end.
     """
-    from realsim.app.capture import CaptureRequest, run_capture
+    from realsim.app.capture.run import CaptureRequest, run_capture
     from realsim.app.console import Console
 
     request = CaptureRequest(
@@ -167,7 +167,7 @@ def check(session: Path, repair: bool, decode: bool, as_json: bool) -> None:
 
     Exit codes: 0 sound, 1 damaged, 2 not a session.
     """
-    from realsim.app.check import run_check
+    from realsim.app.check.session import run_check
 
     if not run_check(session, repair=repair, decode=decode, as_json=as_json):
         sys.exit(1)
@@ -226,8 +226,8 @@ def import_command(
     name, never by order; what is missing is named. Poses, masks and models of a data set come too.
     """
     from realsim.app.console import Console
-    from realsim.app.import_listing import list_source
-    from realsim.app.import_source import request_of, run_import
+    from realsim.app.importing.listing import list_source
+    from realsim.app.importing.source import request_of, run_import
 
     console = Console(quiet=quiet)
     request = request_of(source, **options)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from realsim.app.calibrate import show_hand_eye
+from realsim.app.calibrate.run import show_hand_eye
 from realsim.app.console import Console, StageTime
-from realsim.app.register import register_session
+from realsim.app.register.run import register_session
 from realsim.app.show import show_grasps, show_scene
 from realsim.app.stages import (
     BOARD_VIEWS,
@@ -75,7 +75,7 @@ def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
     """
     from threadpoolctl import threadpool_limits
 
-    from realsim.app.report import write_report
+    from realsim.app.report.session import write_report
     from realsim.app.truth import loop_errors
     from realsim_capture_plans.lab import LabConfig, SimulatedLab
 

@@ -16,8 +16,8 @@ def show_scene(store: SessionStore, scene: Scene, console: Console) -> None:
 
     What only the session knows (pixels, cameras, findings) is left out where its scene is another.
     """
-    from realsim.app.register_results import REPORT_FILE, load_registered, stand_alone
-    from realsim.app.register_tables import show_registered
+    from realsim.app.register.results import REPORT_FILE, load_registered, stand_alone
+    from realsim.app.register.tables import show_registered
 
     stored = load_registered(store) if store.has(REPORT_FILE) else None
     known = stored is not None and stored.scene.name == scene.name

@@ -97,7 +97,7 @@ def calibrate_session(store: SessionStore, console: Console) -> HandEye:
         InputError: there are no board views, or no calibration/board.json.
         DegenerateError: the views do not determine the hand-eye.
     """
-    from realsim.app.board_views import read_board_views, write_results
+    from realsim.app.calibrate.board_views import read_board_views, write_results
     from realsim.store import load_hand_eye, save_hand_eye
     from realsim_calibration import calibrate_hand_eye_report
 
@@ -133,7 +133,7 @@ def place_cameras(store: SessionStore, hand_eye: HandEye) -> None:
 
     Cameras that a registration has refined stay refined where the calibration says the same again.
     """
-    from realsim.app.register_results import keep_refined
+    from realsim.app.register.results import keep_refined
 
     cameras = {
         v.index: hand_eye.camera_poses(v.T_base_ee, v.joints)
@@ -198,7 +198,7 @@ def judged_scene(store: SessionStore) -> Scene:
     Raises:
         InputError: the session has not been registered.
     """
-    from realsim.app.register_files import finish_interrupted
+    from realsim.app.register.files import finish_interrupted
     from realsim.review import replay, reviewed_scene
     from realsim.review.journal import JOURNAL_FILE, read
     from realsim.store import load_scene
@@ -214,7 +214,7 @@ def judged_scene(store: SessionStore) -> Scene:
 
 def registered_views(store: SessionStore) -> list[int] | None:
     """Return the views in which the objects were registered; None = nothing says it of any."""
-    from realsim.app.register_results import load_cameras
+    from realsim.app.register.results import load_cameras
 
     record = load_cameras(store)
     return sorted(record.refined) if record is not None and record.refined else None
@@ -238,8 +238,8 @@ def school_session(
         InputError: the session has not been registered, or has no supporting plane, or holds
             unfinished results of other parameters.
     """
-    from realsim.app.school_inputs import SchoolRequest
-    from realsim.app.school_run import run_in_session
+    from realsim.app.school.inputs import SchoolRequest
+    from realsim.app.school.run import run_in_session
 
     request = SchoolRequest(
         grasps=grasps_per_object, seed=seed, workers=workers, restart="finished"

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from realsim.app.annotate import SHEET_FILE, sheet_views
-from realsim.app.annotate_cli import annotate_command
-from realsim.app.annotate_page import PAGE_FILE
-from realsim.app.register_files import write_result
+from realsim.app.annotate.cli import annotate_command
+from realsim.app.annotate.page import PAGE_FILE
+from realsim.app.annotate.run import SHEET_FILE, sheet_views
+from realsim.app.register.files import write_result
 from realsim.errors import InputError
 from realsim.formats import images
 from realsim.store import SessionStore, load_scene, save_scene

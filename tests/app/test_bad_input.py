@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from realsim.app import cli, stages
 from realsim.app.console import Console
-from realsim.app.register import register_session
+from realsim.app.register.run import register_session
 from realsim.errors import RealsimError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3

@@ -8,7 +8,7 @@ import pytest
 
 from realsim.app import stages
 from realsim.app.console import Console
-from realsim.app.register import register_session
+from realsim.app.register.run import register_session
 from realsim.errors import InputError, UnitError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3

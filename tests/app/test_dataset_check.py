@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from realsim.app import cli
-from realsim.app.dataset_check import checked_scenes
+from realsim.app.check.dataset import checked_scenes
 from realsim.geometry.mesh import load_mesh, save_ply
 from realsim.records import Mesh
 from upgradable_datasets import bop_dataset, graspnet_dataset

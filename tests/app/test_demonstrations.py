@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from realsim.app import demonstrations
-from realsim.app.demonstrations import DemonstrationRequest, open_source
-from realsim.app.demonstrations_cli import demonstrations_command
+from realsim.app.demonstrations import run as demonstrations
+from realsim.app.demonstrations.cli import demonstrations_command
+from realsim.app.demonstrations.run import DemonstrationRequest, open_source
 from realsim.errors import InputError
 from realsim.formats.lerobot import layout
 from realsim_sim_bridge.demonstrations import lerobot_episodes

@@ -8,8 +8,8 @@ import pytest
 from click.testing import CliRunner, Result
 
 from realsim.app.cli import commands
-from realsim.app.depth_fit_cli import CAMERAS, depth_fit
-from realsim.app.depth_fit_run import DepthFitRequest, read_frames
+from realsim.app.depth_fit.cli import CAMERAS, depth_fit
+from realsim.app.depth_fit.run import DepthFitRequest, read_frames
 from realsim.errors import InputError
 from realsim.formats.images import depth_counts, png_bytes
 from realsim.records import CameraIntrinsics

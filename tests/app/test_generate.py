@@ -14,10 +14,10 @@ from typing import Any
 import pytest
 from click.testing import CliRunner, Result
 
-from realsim.app.generate_cli import generate_command
-from realsim.app.generate_page import sheet_views
-from realsim.app.generate_request import range_of, size_of
-from realsim.app.generate_scene import stored_costs
+from realsim.app.generate.cli import generate_command
+from realsim.app.generate.page import sheet_views
+from realsim.app.generate.request import range_of, size_of
+from realsim.app.generate.scene import stored_costs
 from realsim.errors import InputError
 from realsim.store import atomic
 
@@ -133,7 +133,7 @@ def test_a_scene_depends_on_seed_and_number_only(dataset: Path, tmp_path: Path) 
 
 @pytest.mark.slow
 def test_a_run_that_is_killed_goes_on_to_the_same_bytes(tmp_path: Path) -> None:
-    script = "from realsim.app.generate_cli import generate_command as g; g()"
+    script = "from realsim.app.generate.cli import generate_command as g; g()"
     arguments = [*SMALL, "--scenes", "1", "--views", "5"]
     command = [sys.executable, "-c", script]
     with subprocess.Popen([*command, str(tmp_path / "killed"), *arguments]) as process:

@@ -16,9 +16,9 @@ import pycolmap
 import pytest
 
 from realsim.app.console import Console
-from realsim.app.import_listing import list_source
-from realsim.app.import_session import import_session
-from realsim.app.import_source import (
+from realsim.app.importing.listing import list_source
+from realsim.app.importing.session import import_session
+from realsim.app.importing.source import (
     ImportRequest,
     kinds_of,
     open_source,

@@ -11,10 +11,10 @@ from click.testing import CliRunner, Result
 from realsim.app import stages
 from realsim.app.cli import commands
 from realsim.app.console import Console
-from realsim.app.register import register_session
-from realsim.app.register_config import RegisterRequest, config_of, load_depth_bias
-from realsim.app.register_inputs import read_inputs
-from realsim.app.register_results import cameras_now, claimed_cameras, load_registered
+from realsim.app.register.config import RegisterRequest, config_of, load_depth_bias
+from realsim.app.register.inputs import read_inputs
+from realsim.app.register.results import cameras_now, claimed_cameras, load_registered
+from realsim.app.register.run import register_session
 from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3

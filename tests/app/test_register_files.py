@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from realsim.app.register_files import documents, finish_interrupted, write_result
-from realsim.app.register_results import (
+from realsim.app.register.files import documents, finish_interrupted, write_result
+from realsim.app.register.results import (
     CAMERAS_FILE,
     NEXT_FILE,
     SCENE_FILE,

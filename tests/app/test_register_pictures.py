@@ -8,19 +8,19 @@ import pytest
 from PIL import Image
 
 from realsim.app.first_surfaces import FirstSurfaces
-from realsim.app.register import pixel_sigma, without_free_turns
-from realsim.app.register_gain import camera_shifts_px, gain_picture, zoomed_camera
-from realsim.app.register_map import footprint_mm, place_covariance_mm2
-from realsim.app.register_page import page_bytes
-from realsim.app.register_pictures import (
+from realsim.app.register.gain import camera_shifts_px, gain_picture, zoomed_camera
+from realsim.app.register.map import footprint_mm, place_covariance_mm2
+from realsim.app.register.page import page_bytes
+from realsim.app.register.pictures import (
     PictureConfig,
     bias_of,
     draw_pictures,
     placed_objects,
     window_of,
 )
-from realsim.app.register_results import CameraChange, Registered
-from realsim.app.register_tables import object_rows, worst_first
+from realsim.app.register.results import CameraChange, Registered
+from realsim.app.register.run import pixel_sigma, without_free_turns
+from realsim.app.register.tables import object_rows, worst_first
 from realsim.geometry import camera, se3
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, ObjectPose

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from realsim.app.console import Console
-from realsim.app.register_colour import colour_remark
-from realsim.app.register_files import documents, remark_of, write_result
-from realsim.app.register_results import NEXT_FILE, SCENE_FILE, cameras_now
-from realsim.app.register_tables import as_json, odometry_line
-from realsim.app.report import write_report
+from realsim.app.register.colour import colour_remark
+from realsim.app.register.files import documents, remark_of, write_result
+from realsim.app.register.results import NEXT_FILE, SCENE_FILE, cameras_now
+from realsim.app.register.tables import as_json, odometry_line
+from realsim.app.report.session import write_report
 from realsim.app.stages import annotate_session, judged_scene, registered_views
-from realsim.app.upgrade_scene import registration_notes  # pyright: ignore[reportPrivateUsage]
+from realsim.app.upgrade.scene import registration_notes  # pyright: ignore[reportPrivateUsage]
 from realsim.records import CaptureSession, Mesh, View
 from realsim.registration.odometry.cross_check import Fault, KinematicsCheck, ViewDifference
 from realsim.rendering.labels import LabelRenderer, PlacedMesh

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from realsim.app.annotate import run_annotate
+from realsim.app.annotate.run import run_annotate
 from realsim.app.console import Console
-from realsim.app.register_files import write_result
-from realsim.app.report import write_report
+from realsim.app.register.files import write_result
+from realsim.app.report.session import write_report
 from realsim.store import SessionStore
 from registered_sessions import models_of, registered_by_hand, table_session
 

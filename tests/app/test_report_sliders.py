@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from realsim import CameraIntrinsics, CaptureSession, Mesh, ObjectModel, ObjectPose, Scene, View
-from realsim.app.report import write_report
-from realsim.app.report_sliders import registration_pairs
+from realsim.app.report.session import write_report
+from realsim.app.report.sliders import registration_pairs
 from realsim.app.stages import save_starts
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3

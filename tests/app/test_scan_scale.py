@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from realsim.app.console import Console
-from realsim.app.scan_scale import run_scale, view_poses, with_rough_size
-from realsim.app.scan_scale_box import box_mm_of, smallest_box
-from realsim.app.scan_scale_cli import point_of, request_of, scale
-from realsim.app.scan_scale_files import Place, model_files, write_result
-from realsim.app.scan_scale_inputs import (
+from realsim.app.scan.scale.box import box_mm_of, smallest_box
+from realsim.app.scan.scale.cli import point_of, request_of, scale
+from realsim.app.scan.scale.files import Place, model_files, write_result
+from realsim.app.scan.scale.inputs import (
     NamedMesh,
     ScaleRequest,
     fit_config,
@@ -24,7 +23,8 @@ from realsim.app.scan_scale_inputs import (
     read_mesh,
     usable_views,
 )
-from realsim.app.scan_scale_show import limit_rows, limits_title, model_lines, show_fit, view_rows
+from realsim.app.scan.scale.run import run_scale, view_poses, with_rough_size
+from realsim.app.scan.scale.show import limit_rows, limits_title, model_lines, show_fit, view_rows
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh, save_ply

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from realsim.app.console import Console
-from realsim.app.scan_sfm import SfmRequest, run_scan_sfm
+from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm
 from realsim.errors import DegenerateError, InputError
 from realsim.formats.images import png_bytes
 

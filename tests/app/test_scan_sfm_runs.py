@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from realsim.app.console import Console
-from realsim.app.scan_sfm import SfmRequest, run_scan_sfm
+from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm
 from realsim.formats.images import png_bytes
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, View
@@ -147,7 +147,7 @@ def test_a_killed_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
     whole = report(tmp_path / "whole", poses="unknown")
     code = (
         "import sys; from pathlib import Path; from realsim.app.console import Console\n"
-        "from realsim.app.scan_sfm import SfmRequest, run_scan_sfm\n"
+        "from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm\n"
         "run_scan_sfm(SfmRequest(images=Path(sys.argv[1]), poses='unknown'), Console(quiet=True))"
     )
     out = tmp_path / "killed/scans/sfm"

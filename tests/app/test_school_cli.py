@@ -10,9 +10,9 @@ import pytest
 from click.testing import Result
 
 from realsim.app.console import Console
-from realsim.app.school_files import stored_grasps
-from realsim.app.school_inputs import SchoolRequest
-from realsim.app.school_run import config_of, run_in_session
+from realsim.app.school.files import stored_grasps
+from realsim.app.school.inputs import SchoolRequest
+from realsim.app.school.run import config_of, run_in_session
 from realsim.formats.grasps.acronym import read_acronym
 from realsim.formats.grasps.hdf5 import read_grasps_hdf5
 from realsim.formats.grasps.parquet import read_grasps_parquet

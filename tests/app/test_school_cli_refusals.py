@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from click.testing import Result
 
-from realsim.app.school_inputs import SchoolRequest, base_on_table, masses_of
-from realsim.app.school_run import config_of
+from realsim.app.school.inputs import SchoolRequest, base_on_table, masses_of
+from realsim.app.school.run import config_of
 from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3

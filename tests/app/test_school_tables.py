@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from realsim.app.school_page import page_bytes
-from realsim.app.school_tables import (
+from realsim.app.school.page import page_bytes
+from realsim.app.school.tables import (
     agreement_line,
     doubts,
     level_tables,

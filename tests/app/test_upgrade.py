@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from realsim.app.upgrade_cli import upgrade_command
-from realsim.app.upgrade_config import UpgradeConfig
-from realsim.app.upgrade_dataset import scenes_of
-from realsim.app.upgrade_instances import told_apart, world_starts
-from realsim.app.upgrade_pool import remaining_s
+from realsim.app.upgrade.cli import upgrade_command
+from realsim.app.upgrade.config import UpgradeConfig
+from realsim.app.upgrade.dataset import scenes_of
+from realsim.app.upgrade.instances import told_apart, world_starts
+from realsim.app.upgrade.pool import remaining_s
 from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.geometry.parts import part

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from realsim.app.console import Console
-from realsim.app.upgrade import UpgradeConfig, run_upgrade
-from realsim.app.upgrade_analytic import FOLDER, agreement_of
+from realsim.app.upgrade.analytic import FOLDER, agreement_of
+from realsim.app.upgrade.run import UpgradeConfig, run_upgrade
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels
 from realsim.formats.grasps.hdf5 import read_grasps_hdf5
 from realsim.formats.grasps.scene_grasps import untried_set

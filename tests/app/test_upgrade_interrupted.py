@@ -15,7 +15,7 @@ from realsim.store import SessionStore
 from upgradable_datasets import bop_dataset
 
 pytestmark = pytest.mark.slow
-PROGRAM = "from realsim.app.upgrade_cli import upgrade_command as c; c()"
+PROGRAM = "from realsim.app.upgrade.cli import upgrade_command as c; c()"
 LIMIT_S = 300.0
 
 

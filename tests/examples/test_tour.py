@@ -9,7 +9,7 @@ import click
 import pytest
 
 from realsim.app.cli import commands
-from realsim.app.school_cli import RunByDefault
+from realsim.app.school.cli import RunByDefault
 
 ROOT = Path(__file__).parents[2]
 CHAPTERS = sorted((ROOT / "docs" / "tour").glob("*.md"))

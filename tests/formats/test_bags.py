@@ -344,7 +344,7 @@ def test_a_bag_without_index_says_reindex(tmp_path: Path) -> None:
 
 def test_an_import_is_a_session_with_the_same_pixels(tmp_path: Path) -> None:
     from realsim.app.console import Console
-    from realsim.app.import_session import import_session
+    from realsim.app.importing.session import import_session
     from realsim.store.session_store import SessionStore
 
     sent = recorded(tmp_path, "mcap", without=(2,))

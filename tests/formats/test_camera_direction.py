@@ -172,7 +172,7 @@ def test_a_real_arm_with_a_camera():
     root = Path(os.environ.get("REALSIM_DATA", "")) / "scenes/apc_shelf_multiview/scene-0000"
     if not root.is_dir():
         pytest.skip("REALSIM_DATA is not set")
-    from realsim.app.import_folder import FolderRequest, open_image_folder
+    from realsim.app.importing.folder import FolderRequest, open_image_folder
     from realsim.formats.folders import FolderChoice
 
     source, _ = open_image_folder(root, FolderRequest(choice=FolderChoice(depth_unit_m=1e-4)))

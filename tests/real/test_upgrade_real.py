@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 import pytest
 
+from realsim.app.check.dataset import checked_scenes
 from realsim.app.console import Console
-from realsim.app.dataset_check import checked_scenes
-from realsim.app.upgrade import UpgradeConfig, run_upgrade
+from realsim.app.upgrade.run import UpgradeConfig, run_upgrade
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 YCBV = DATA / "scenes/ycbv_mini"

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.app.register_results import CameraChange, Registered, Remark
+from realsim.app.register.results import CameraChange, Registered, Remark
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from click.testing import CliRunner, Result
 
-from realsim.app.school_cli import SCHOOL
+from realsim.app.school.cli import SCHOOL
 from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3

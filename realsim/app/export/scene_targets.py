@@ -31,7 +31,7 @@ def placed_scene(session: SessionScene) -> "PlacedScene":
     Raises:
         InputError: the session is not registered, or a mesh has no volume.
     """
-    from realsim.app.school_inputs import CACHE, SchoolRequest, session_inputs
+    from realsim.app.school.inputs import CACHE, SchoolRequest, session_inputs
     from realsim.formats.robot_scenes.placed_scene import SceneCamera
     from realsim.formats.robot_scenes.placing import Matter, place_scene
     from realsim_sim_bridge.scenes.school_scene import Matter as Cut

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.app.report_plots import BAD, GOOD, INK, MUTED, VERDICT_COLORS, WARN
+from realsim.app.report.plots import BAD, GOOD, INK, MUTED, VERDICT_COLORS, WARN
 from realsim.app.stats.statistics import VERDICTS, Statistics
 from realsim.formats.grasps.scene_grasps import executed
 from realsim_sim_bridge.school.summary import GOOD as GOOD_OUTCOMES

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from realsim.app.school_files import stored_grasps
+from realsim.app.school.files import stored_grasps
 from realsim_sim_bridge.demonstrations.cameras import front_camera, wrist_camera
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource
 from school_sessions import registered, run

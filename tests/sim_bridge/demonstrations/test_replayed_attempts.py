@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from realsim.app.school_files import stored_grasps
+from realsim.app.school.files import stored_grasps
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records.trajectories import PHASES

@@ -8,7 +8,7 @@ import pytest
 
 from realsim import InputError, Mesh
 from realsim.app.console import Console
-from realsim.app.school_inputs import SchoolRequest, session_inputs
+from realsim.app.school.inputs import SchoolRequest, session_inputs
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer
 from realsim.store import SessionStore, load_scene

@@ -1,0 +1,36 @@
+"""`realsim annotate`: masks, maps, poses, visibility and grasps on every frame of a session."""
+
+from pathlib import Path
+
+import click
+
+FOLDER = click.Path(path_type=Path)
+
+
+@click.command("annotate")
+@click.argument("session", type=FOLDER)
+@click.option("--maps", default="instance,depth", show_default=True,
+              metavar="all|none|LIST",
+              help="Maps of each frame: instance, depth, coordinates, normals.")  # fmt: skip
+@click.option("--workers", default=1, show_default=True, type=click.IntRange(1, 256))
+@click.option("--no-depth-check", is_flag=True,
+              help="Do not look for unknown things in the measured depth.")  # fmt: skip
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def annotate_command(
+    session: Path, maps: str, workers: int, no_depth_check: bool, quiet: bool
+) -> None:
+    """Write masks, maps, poses, visibility and grasps for every frame of SESSION.
+
+    Where the measured depth shows something in front of an object that is not in the scene (a hand,
+    a cable), it leaves the object's visible mask, and the frame is named. Frames whose inputs are
+    the same as of an earlier run are kept.
+
+    SESSION/reports/annotated.html shows the frames, those that need a look first; annotated.png
+    beside it is a contact sheet of them.
+    """
+    from realsim.app.annotate.run import run_annotate
+    from realsim.app.console import Console
+
+    run_annotate(
+        session, Console(quiet=quiet), maps=maps, workers=workers, check_depth=not no_depth_check
+    )

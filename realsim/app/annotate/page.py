@@ -1,0 +1,167 @@
+"""The page of an annotated session: photographs under their labels, maps, and who saw what."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.annotate.table import HEADER, object_row
+from realsim.app.picture_pages import (
+    LayeredView,
+    Layers,
+    Pair,
+    Picture,
+    Section,
+    Sliders,
+    Table,
+    picture_page,
+)
+from realsim.app.report.sliders import registration_pairs
+from realsim.rendering.overlay import VERDICT_RGB
+from realsim.store import SessionStore
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.annotation.annotate import AnnotationSummary
+
+Image = NDArray[np.uint8]
+PAGE_FILE = "reports/annotated.html"
+MAP_VIEWS = 6
+"""Views whose maps are shown: four pictures each."""
+MOST_NOTES = 40
+"""So many notes are on the page; all are in the annotations."""
+LEGEND = (
+    "Outlines and names: green accepted, amber doubtful, red rejected, grey unchecked. Axes: x "
+    "red, y green, z blue. Grippers: score 0 red, 0.5 yellow, 1 green. Magenta hatching: something "
+    "that is not in the scene stands in front, and the object's mask ends there."
+)
+MAP_TITLES = {
+    "instance": "instances", "depth": "exact depth", "coordinates": "object coordinates",
+    "normals": "normals",
+}  # fmt: skip
+
+
+def write_page(
+    store: SessionStore,
+    summary: "AnnotationSummary",
+    views: Sequence[int],
+    overlays: Sequence[Image],
+) -> Path:
+    """Write reports/annotated.html.
+
+    Args:
+        store: the annotated session.
+        summary: of its annotation.
+        views: those that are shown, flagged ones first.
+        overlays: their pictures with everything that was annotated.
+
+    Returns:
+        Where it is.
+    """
+    flagged = set(summary.flagged_views)
+    pairs = [
+        Pair(
+            before=partial(store.rgb, view), after=picture, before_label="photo",
+            after_label="labels", caption=_caption(view, flagged) + _unseen(store, view),
+        )
+        for view, picture in zip(views, overlays, strict=True)
+    ]  # fmt: skip
+    path = store.path(PAGE_FILE)
+    path.parent.mkdir(exist_ok=True)
+    photographs = Sliders(
+        title="Photographs and labels", pairs=pairs, text=_which(summary, views) + LEGEND
+    )
+    picture_page(
+        path, f"Annotation of {store.session.name}",
+        [photographs, *_sections(store, summary, views)],
+        about=str(summary), notes=_notes(summary),
+    )  # fmt: skip
+    return path
+
+
+def _caption(view: int, flagged: set[int]) -> str:
+    """Return the name of a view."""
+    return f"view {view}" + (": look here" if view in flagged else "")
+
+
+def _which(summary: "AnnotationSummary", views: Sequence[int]) -> str:
+    """Return which views are shown, where it is not all of them."""
+    if len(views) == summary.views:
+        return ""
+    first = "those that need a look first, the others" if summary.flagged_views else "these"
+    return f"Of {summary.views} views {len(views)} are here, {first} spread over the session. "
+
+
+def _unseen(store: SessionStore, view: int) -> str:
+    """Return which objects a view does not show, for its caption."""
+    from realsim_sim_bridge.annotation.files import part_path
+
+    part: Any = store.read_json(part_path(view))
+    names = [str(e["name"]) for e in part["objects"] if not e["px_count_visib"]]
+    return f" (not visible: {', '.join(names)})" if names else ""
+
+
+def _notes(summary: "AnnotationSummary") -> list[str]:
+    """Return what the reader must know first."""
+    notes = list(summary.notes[:MOST_NOTES])
+    if len(summary.notes) > MOST_NOTES:
+        notes.append(f"And {len(summary.notes) - MOST_NOTES} more, in annotations/.")
+    return notes
+
+
+def _sections(
+    store: SessionStore, summary: "AnnotationSummary", views: Sequence[int]
+) -> list[Section]:
+    """Return what stands below the sliders: the objects, the maps, and what registration did."""
+    sections: list[Section] = []
+    if summary.by_object:
+        sections.append(
+            Table(
+                title="Objects", header=HEADER, rows=[object_row(o) for o in summary.by_object],
+                colors=[VERDICT_RGB[o.verdict] for o in summary.by_object],
+            )
+        )  # fmt: skip
+    layered = [_map_view(store, view, set(summary.flagged_views)) for view in views[:MAP_VIEWS]]
+    layered = [view for view in layered if len(view.layers) > 1]
+    if layered:
+        sections.append(Layers(title="Maps", views=layered))
+    if summary.objects:
+        registered, before = registration_pairs(store)
+        if registered:
+            sections.append(
+                Sliders(title="Before and after registration", pairs=registered, text=before)
+            )
+    return sections
+
+
+def _map_view(store: SessionStore, view: int, flagged: set[int]) -> LayeredView:
+    """Return the maps of a view that have been written, under its photograph."""
+    from realsim_sim_bridge.annotation.frame_maps import map_path
+
+    layers: dict[str, Picture] = {"photo": partial(store.rgb, view)}
+    for name, title in MAP_TITLES.items():
+        if store.has(map_path(name, view)):
+            layers[title] = partial(_map_picture, store, name, view)
+    return LayeredView(layers=layers, caption=_caption(view, flagged))
+
+
+def _map_picture(store: SessionStore, name: str, view: int) -> Image:
+    """Return a map of a view as a picture for people."""
+    from realsim.formats import label_maps
+    from realsim.rendering.map_pictures import NOTHING, instance_picture, normals_picture
+    from realsim.rendering.overlay import depth_picture
+    from realsim_sim_bridge.annotation.frame_maps import map_path
+
+    counts: Any = store.read_image(map_path(name, view))
+    if name == "instance":
+        return instance_picture(label_maps.instances_of(counts), store.rgb(view))
+    if name == "depth":
+        return depth_picture(counts * np.float32(store.session.depth_unit_m))
+    if name == "normals":
+        return normals_picture(label_maps.normals_of(counts))
+    # Counts run over each object's own box already: their upper bytes are its colours.
+    picture = (counts >> 8).astype(np.uint8)
+    picture[~counts.any(axis=-1)] = NOTHING
+    return picture

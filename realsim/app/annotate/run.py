@@ -1,0 +1,133 @@
+"""Annotating a session, telling what was found, and drawing what a person should look at."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.annotate.page import write_page
+from realsim.app.annotate.table import HEADER, object_row
+from realsim.app.console import Console
+from realsim.app.stages import (
+    annotate_session,
+    judged_scene,
+    open_session,
+    registered_views,
+    session_models,
+)
+from realsim.store import SessionStore
+from realsim.store.lock import only_run_in
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.annotation.annotate import AnnotationSummary
+
+Image = NDArray[np.uint8]
+MOST_NOTES = 12
+"""So many notes are shown; the rest are in the annotations."""
+PAGE_PICTURES = 12
+"""Frames on the page."""
+PICTURES = 8
+"""Of these, frames on the contact sheet."""
+SHEET_GRASPS = 9
+"""Grasps drawn in a frame of the sheet: few, so that the outlines can be judged."""
+SHEET_FILE = "reports/annotated.png"
+SHEET_WIDTH_PX = 960
+"""Width of a frame on the sheet [px]: names and grasps are legible."""
+
+
+def run_annotate(
+    session: Path, console: Console, *, maps: str, workers: int, check_depth: bool
+) -> "AnnotationSummary":
+    """Annotate a session, show the summary, and draw the contact sheet and the page.
+
+    Args:
+        session: the session's folder.
+        console: where it is told.
+        maps: 'all', 'none', or a list of maps.
+        workers: processes that compute frames.
+        check_depth: whether the measured depth may take pixels out of the masks.
+
+    Raises:
+        InputError: no session there, it is not registered, there is no such map, or another run
+            is working there.
+    """
+    store = open_session(session)
+    with only_run_in(store.folder):
+        summary = annotate_session(
+            store, console, maps=maps, workers=workers, check_depth=check_depth
+        )
+        show_summary(summary, console)
+        sheet, page = draw(store, summary, console)
+    console.say(f"pictures  {sheet}")
+    console.say(f"page      {page}")
+    return summary
+
+
+def show_summary(summary: "AnnotationSummary", console: Console) -> None:
+    """Print what was annotated: one line, a row per object, and what was noticed."""
+    console.say(str(summary))
+    if summary.by_object:
+        console.table("objects", HEADER, [object_row(o) for o in summary.by_object])
+    for note in summary.notes[:MOST_NOTES]:
+        console.say(f"note: {note}")
+    if len(summary.notes) > MOST_NOTES:
+        console.say(f"note: and {len(summary.notes) - MOST_NOTES} more, in annotations/.")
+
+
+def draw(store: SessionStore, summary: "AnnotationSummary", console: Console) -> tuple[Path, Path]:
+    """Write the contact sheet and the page: flagged frames first, others spread over the session.
+
+    Returns:
+        Where they are.
+    """
+    from realsim.store import load_grasps
+    from realsim_sim_bridge.annotation.pictures import overlay_pictures
+
+    known = registered_views(store)
+    views = [v.index for v in store.session.views if known is None or v.index in known]
+    chosen = sheet_views(views, summary.flagged_views, PAGE_PICTURES)
+    pictures: list[Image] = []
+    drawn = overlay_pictures(
+        store, chosen, judged_scene(store), session_models(store, console),
+        load_grasps(store.folder / "grasps"), SHEET_GRASPS,
+    )  # fmt: skip
+    with console.stage("pictures", f"{len(chosen)} frames") as tick:
+        for picture in drawn:
+            pictures.append(picture)
+            tick(len(pictures), len(chosen))
+    on_sheet = sheet_views(chosen, summary.flagged_views)
+    _write_sheet(store, summary, on_sheet, [pictures[chosen.index(v)] for v in on_sheet])
+    return store.path(SHEET_FILE), write_page(store, summary, chosen, pictures)
+
+
+def _write_sheet(
+    store: SessionStore,
+    summary: "AnnotationSummary",
+    views: Sequence[int],
+    pictures: Sequence[Image],
+) -> None:
+    """Write the contact sheet of these pictures."""
+    import cv2
+
+    from realsim.rendering.overlay import contact_sheet
+
+    small: list[Image] = []
+    for picture in pictures:
+        height = round(picture.shape[0] * SHEET_WIDTH_PX / picture.shape[1])
+        size = (SHEET_WIDTH_PX, height)
+        fitted = cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+        small.append(np.asarray(fitted, dtype=np.uint8))
+    captions = [f"view {v}" + (": look here" if v in summary.flagged_views else "") for v in views]
+    store.write_image(SHEET_FILE, contact_sheet(small, columns=2, captions=captions))
+
+
+def sheet_views(views: Sequence[int], flagged: Sequence[int], most: int = PICTURES) -> list[int]:
+    """Return the views on the sheet: at most half of them flagged, the rest evenly spread."""
+    first = [v for v in views if v in set(flagged)]
+    others = [v for v in views if v not in set(flagged)]
+    shown = first[: most if not others else max(most // 2, most - len(others))]
+    free = min(most - len(shown), len(others))
+    pick = np.linspace(0, len(others) - 1, free).round().astype(int) if free else []
+    return shown + [others[k] for k in sorted(set(pick))]

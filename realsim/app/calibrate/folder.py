@@ -1,0 +1,373 @@
+"""`realsim calibrate` on plain folders: images with a pose file, or pose files alone.
+
+Nothing is guessed in silence: how images and poses were paired, and how the poses were read, is
+said; where the file leaves several readings open, the images decide, or nothing is calibrated.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.calibrate.board_views import arm_of
+from realsim.app.console import Console
+from realsim.errors import InputError
+from realsim.geometry.dh import ARMS, DhArm
+from realsim.records import CameraIntrinsics, Target
+from realsim.store.atomic import write_json
+from realsim_calibration import (
+    BoardView,
+    Calibration,
+    CalibrationConfig,
+    TargetDetection,
+    calibrate,
+    calibrate_from_poses,
+    calibrate_intrinsics,
+    diagnose,
+    estimate_board_pose,
+    find_target,
+    prove_reading,
+)
+
+if TYPE_CHECKING:
+    from realsim_calibration.inputs import FolderInput, PoseReading, RawPoses
+
+Array = NDArray[np.float64]
+MIN_POSE_POINTS = 6
+"""Fewest points of a board pose that may speak for a reading."""
+MIN_DIAGNOSED = 6
+"""Fewer views do not tell a fault of the pairing from a wrong reading."""
+USUAL_READINGS = 2
+"""Readings under which faults are looked for where none fits; the commonest come first."""
+NAMED_FAULTS = ("shifted_pairing", "robot_unit", "board_size", "board_unit", "tool_change",
+                "board_moved", "camera_moved")  # fmt: skip
+"""Faults of a whole set that explain why no reading fits."""
+PROOF_VIEWS = 40
+"""Views that decide on a reading: more do not change the verdict."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FolderRequest:
+    """What `realsim calibrate` was asked for."""
+
+    images: Path
+    out: Path
+    board: str = ""
+    """One-line target, or the path of a target file."""
+    poses: Path | None = None
+    """Pose file or folder; the images' folder where None."""
+    board_poses: Path | None = None
+    """Camera poses of the board instead of images."""
+    reading: str = ""
+    """How the pose file is to be read; empty = what the file states, or what the images prove."""
+    key: str = ""
+    """Which entry of the pose file holds the poses."""
+    camera: Path | None = None
+    """File with known intrinsics."""
+    mode: Literal["eye_in_hand", "eye_to_hand"] = "eye_in_hand"
+    robot: str = ""
+    """Name of the arm; empty = the one that joints and poses prove, if any."""
+
+
+def calibrate_folder(request: FolderRequest, console: Console) -> tuple[Calibration, list[Path]]:
+    """Return the calibration of a folder and the files that were written.
+
+    Raises:
+        InputError: something cannot be read, paired or proven; says what to give.
+        UnitError: a length is in another unit.
+        DegenerateError: the views do not determine the calibration.
+    """
+    config = CalibrationConfig()
+    config = replace(config, hand_eye=replace(config.hand_eye, mode=request.mode))
+    if request.board_poses is not None:
+        return _from_pose_files(request, config, console)
+    from realsim_calibration.inputs import read_image_folder, reading_from_text
+
+    target = target_of(request.board)
+    reading = reading_from_text(request.reading) if request.reading else None
+    folder = read_image_folder(
+        request.images, request.poses or request.images, reading=reading, key=request.key or None
+    )
+    console.say(f"{len(folder)} images with poses: {folder.pairing}")
+    for note in (*folder.warnings, *folder.poses.notes):
+        console.warn(note)
+    for name, reason in (*folder.unpaired_images, *folder.unpaired_poses):
+        console.warn(f"{name} was left out: {reason}")
+    detections = _detections(folder.images, target, request.out, console)
+    _require_target(folder, detections, target)
+    camera = _camera_of(request.camera)
+    reading = reading or _stated_or_proven(folder, detections, target, camera, request, console)
+    Ts, joints = folder.Ts_base_ee(reading), folder.joints
+    views = [
+        BoardView(
+            index=k, T_base_ee=Ts[k], detection=found, name=folder.labels[k],
+            joints=None if joints is None or joints.shape[1] != 6 else joints[k],
+        )
+        for k, found in enumerate(detections)
+    ]  # fmt: skip
+    arm = _arm(request.robot, views, console)
+    with console.stage("calibrate", f"{len(views)} views"):
+        result = calibrate(views, target, intrinsics0=camera, arm=arm, config=config)
+    return result, write_calibration(result, request.out, folder.images, console)
+
+
+def target_of(text: str) -> Target:
+    """Return the target of a one-line description or of a file.
+
+    Raises:
+        InputError: neither; says what is accepted.
+    """
+    from realsim_calibration.targets.target_file import read_target
+    from realsim_calibration.targets.target_text import parse_target, target_usage
+
+    if not text:
+        raise InputError(
+            "which target is in the images was not said: give --board, a file that `realsim board` "
+            f"wrote, or one line:\n{target_usage()}"
+        )
+    path = Path(text)
+    return read_target(path) if path.is_file() else parse_target(text)
+
+
+def _camera_of(path: Path | None) -> CameraIntrinsics | None:
+    from realsim_calibration.lens.camera_files import read_camera
+
+    return None if path is None else read_camera(path)
+
+
+def _detections(
+    images: Sequence[Path], target: Target, out: Path, console: Console
+) -> list[TargetDetection]:
+    """Return the points found in every image; what was found before is not looked for again."""
+    from realsim_calibration.inputs import load_image
+    from realsim_calibration.targets.target_text import format_target
+
+    found: list[TargetDetection] = []
+    with console.stage("find the target", f"{len(images)} images") as tick:
+        for k, path in enumerate(images):
+            key = hashlib.sha256(path.read_bytes() + format_target(target).encode()).hexdigest()
+            note = out / "detections" / f"{key[:24]}.json"
+            seen = _noted(note)
+            if seen is None:
+                seen = find_target(load_image(path), target)
+                write_json(note, _detection_json(seen))
+            found.append(seen)
+            tick(k + 1, len(images))
+    return found
+
+
+def _detection_json(found: TargetDetection) -> dict[str, Any]:
+    return {
+        "point_ids": found.point_ids.tolist(),
+        "uv": found.uv.tolist(),
+        "image_size": list(found.image_size),
+        "sd_px": None if found.sd_px is None else found.sd_px.tolist(),
+        "rejected": list(found.rejected),
+    }
+
+
+def _noted(path: Path) -> TargetDetection | None:
+    """Return a detection noted earlier; a damaged note is no note."""
+    import json
+
+    try:
+        d = json.loads(path.read_text())
+        return TargetDetection(
+            point_ids=np.array(d["point_ids"], dtype=np.int64),
+            uv=np.array(d["uv"], dtype=np.float64),
+            image_size=(int(d["image_size"][0]), int(d["image_size"][1])),
+            sd_px=None if d["sd_px"] is None else np.array(d["sd_px"], dtype=np.float64),
+            rejected=tuple(d["rejected"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, InputError):
+        return None
+
+
+def _require_target(
+    folder: "FolderInput", detections: Sequence[TargetDetection], target: Target
+) -> None:
+    """Raise if the target was found nowhere, saying what the pictures show instead."""
+    if any(len(d) for d in detections):
+        return
+    from realsim_calibration.detect.visible import what_is_visible
+    from realsim_calibration.inputs import load_image
+    from realsim_calibration.targets.target_text import format_target
+
+    shown = what_is_visible(load_image(folder.images[0]))
+    raise InputError(
+        f"the target '{format_target(target)}' was found in none of the {len(detections)} images. "
+        f"{folder.labels[0]}: {shown} Give --board as it was printed."
+    )
+
+
+def _stated_or_proven(
+    folder: "FolderInput", detections: Sequence[TargetDetection], target: Target,
+    camera: CameraIntrinsics | None, request: FolderRequest, console: Console,
+) -> "PoseReading":  # fmt: skip
+    """Return how the poses are to be read: as the file states, or as the images prove."""
+    if folder.poses.stated is not None:
+        console.say(f"poses read as the file states: {folder.poses.stated}")
+        return folder.poses.stated
+    names = list(folder.labels)
+    lens = camera or calibrate_intrinsics(list(detections), target, names=names).intrinsics
+    rows: list[int] = []
+    boards: list[Array] = []
+    for k, found in enumerate(detections):
+        if len(found) < MIN_POSE_POINTS or len(rows) == PROOF_VIEWS:
+            continue
+        pose = estimate_board_pose(found.points(target), found.uv, lens)
+        if pose is not None:
+            rows.append(k)
+            boards.append(pose.T_cam_board)
+    return _proven(folder.poses.subset(rows), np.array(boards), target, request, console)
+
+
+def _proven(
+    poses: "RawPoses", boards: Array, target: Target | None, request: FolderRequest,
+    console: Console,
+) -> "PoseReading":  # fmt: skip
+    """Return the reading that the board poses prove.
+
+    Raises:
+        InputError: none fits, or several do.
+    """
+    from realsim_calibration.inputs import reading_from_text
+
+    if not len(boards):
+        raise InputError(
+            "no image shows enough of the target to decide how the poses are to be read: give "
+            "--reading, such as --reading rotvec,m."
+        )
+    candidates = [(str(r), poses.poses(r)) for r in poses.possible]
+    proof = prove_reading(candidates, boards, target=target)
+    if not proof.decisive:
+        usual = _fault_under_usual_readings(poses, boards, target, request)
+        if usual is not None:
+            console.warn(
+                f"no reading fits all views, and as {usual} only single views are at fault: the "
+                "poses are read so; give --reading to be sure."
+            )
+            return usual
+        raise InputError(
+            f"how the poses are to be read is not clear from the file, and the images do not "
+            f"decide: {proof.sentence} Give --reading, such as --reading rotvec,m."
+        )
+    best = reading_from_text(proof.best)
+    if proof.best_mode != request.mode:
+        # The same equation with the poses the other way round: the user must say that they are.
+        other = replace(best, inverted=not best.inverted)
+        remedy = "Leave --eye-to-hand out" if request.mode == "eye_to_hand" else "Say --eye-to-hand"
+        raise InputError(
+            f"the poses fit as {proof.best} with the camera {_place(proof.best_mode)}, not "
+            f"{_place(request.mode)}. {proof.sentence} {remedy}; or, if the file really holds the "
+            f"poses the other way round, say --reading {other}."
+        )
+    console.say(f"poses read as the images prove: {best}. {proof.sentence}")
+    return best
+
+
+def _fault_under_usual_readings(
+    poses: "RawPoses", boards: Array, target: Target | None, request: FolderRequest
+) -> "PoseReading | None":
+    """Return a usual reading under which only single views are at fault, None where none is.
+
+    Raises:
+        InputError: under a usual reading the whole set has a fault that explains everything, such
+            as a shifted pairing.
+    """
+    from realsim_calibration.faults.consequences import SINGLE_VIEWS, told
+
+    if len(boards) < MIN_DIAGNOSED:
+        return None
+    for reading in [r for r in poses.possible if not r.inverted][:USUAL_READINGS]:
+        Ts = poses.poses(reading)
+        found = diagnose(Ts, boards, labels=poses.where, target=target, mode=request.mode)
+        if found.fault in SINGLE_VIEWS:
+            return reading
+        if found.fault in NAMED_FAULTS:
+            raise InputError(f"with the poses read as {reading}: {told(found)}")
+    return None
+
+
+def _place(mode: str) -> str:
+    return "in the hand" if mode == "eye_in_hand" else "standing still"
+
+
+def _arm(name: str, views: Sequence[BoardView], console: Console) -> DhArm | None:
+    """Return the arm that was named, or the one that joints and poses prove.
+
+    Raises:
+        InputError: an arm that is not known, or one without joints.
+    """
+    has_joints = bool(views) and all(v.joints is not None for v in views)
+    if name:
+        by_name = {arm_name.lower(): arm for arm_name, arm in ARMS.items()}
+        if name.lower() not in by_name:
+            raise InputError(f"the arm '{name}' is not known; {', '.join(ARMS)} are.")
+        if not has_joints:
+            raise InputError(f"--robot {name} needs joint angles with every pose; there are none.")
+        return by_name[name.lower()]
+    arm = arm_of(views) if has_joints else None
+    if arm is not None:
+        console.say(f"joints and poses are those of a {arm.name}: its own errors are modelled.")
+    return arm
+
+
+def _from_pose_files(
+    request: FolderRequest, config: CalibrationConfig, console: Console
+) -> tuple[Calibration, list[Path]]:
+    """Return the calibration of robot poses and board poses without images."""
+    from realsim_calibration.inputs import read_board_poses, reading_from_text
+
+    if request.poses is None or request.board_poses is None:
+        raise InputError("--board-poses needs --poses as well: the robot's pose file.")
+    given = read_board_poses(request.poses, request.board_poses, robot_key=request.key or None)
+    console.say(f"{len(given.robot)} pose pairs: {given.pairing}")
+    board_reading = given.board.stated
+    if board_reading is None:
+        raise InputError(
+            f"{request.board_poses}: how the board poses are to be read is not clear. Give 4x4 "
+            "matrices or named columns (x, y, z, qx, qy, qz, qw)."
+        )
+    boards = given.board.poses(board_reading)
+    reading = reading_from_text(request.reading) if request.reading else given.robot.stated
+    if reading is None:
+        reading = _proven(given.robot, boards, None, request, console)
+    Ts, joints = given.robot.poses(reading), given.robot.joints
+    labels = [where or str(k) for k, where in enumerate(given.robot.where)]
+    arm = ARMS.get(request.robot) if request.robot else None
+    with console.stage("calibrate", f"{len(Ts)} pose pairs"):
+        report = calibrate_from_poses(
+            Ts, boards, labels=labels, joints=joints, config=config.hand_eye, arm=arm
+        )
+    console.warn(
+        "there are no images: figures in px are those of a nominal camera (f = 900 px) that looks "
+        "at the measured poses, and no lens is exported."
+    )
+    console.say(f"robot poses read as {reading}, board poses as {board_reading}")
+    result = Calibration(hand_eye=report, lens=None)
+    return result, write_calibration(result, request.out, (), console)
+
+
+def write_calibration(
+    result: Calibration, out: Path, images: Sequence[Path], console: Console
+) -> list[Path]:
+    """Write report, pictures and exports; return the paths, the page first."""
+    from realsim_calibration.exports import FrameNames, write_exports
+    from realsim_calibration.inputs import load_image
+    from realsim_calibration.report import write_calibration_report
+
+    with console.stage("report", str(out)):
+        exports = write_exports(
+            result.hand_eye, out / "exports", frames=FrameNames(), with_camera=bool(images)
+        )
+        pages = write_calibration_report(
+            result.hand_eye, out,
+            images=(lambda k: load_image(images[k])) if images else None,
+            intrinsics_report=result.lens,
+        )  # fmt: skip
+    return [*pages, *exports]

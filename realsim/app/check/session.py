@@ -1,0 +1,146 @@
+"""`realsim check`: what of a session is sound, missing or damaged; taking out what is damaged.
+
+A data set (BOP, GraspNet, or what `realsim upgrade` made) is checked for whether its labels agree.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from realsim.app.check.dataset import is_dataset
+from realsim.app.check.dataset_tables import run_dataset_check
+from realsim.app.console import Console
+from realsim.errors import InputError
+from realsim.store.lock import only_run_in
+from realsim.store.session_check import CheckReport, check_session, is_session
+from realsim.store.session_repair import RepairReport, repair_session
+
+SHOWN = 40
+"""Rows of a table; the rest is counted (`--json` has all)."""
+NAMED = 6
+"""Names in a line; `--json` has all."""
+
+
+def run_check(folder: Path, *, repair: bool, decode: bool, as_json: bool) -> bool:
+    """Check a session or a data set, repair a session if asked, and print what was found.
+
+    Returns:
+        Whether the session is sound (after the repair, if one was asked for), or the data set's
+        labels agree with its poses and depth.
+
+    Raises:
+        InputError: neither, a data set is to be repaired, or another run is working in the session.
+    """
+    if not is_session(folder) and is_dataset(folder):
+        if repair:
+            raise InputError(
+                f"'{folder}' is a data set; only sessions are repaired. Labels that disagree are "
+                "made anew by `realsim upgrade`."
+            )
+        return run_dataset_check(folder, as_json=as_json, console=Console(quiet=as_json))
+    if not folder.is_dir() or not is_session(folder):
+        inner = sorted(p.parent.name for p in folder.glob("*/session.json"))
+        hint = f" Did you mean {', '.join(str(folder / n) for n in inner)}?" if inner else ""
+        raise InputError(
+            f"'{folder}' is not a session: it has none of session.json, manifest.jsonl and "
+            f"robot.jsonl; and it is no annotated data set of BOP or GraspNet.{hint}"
+        )
+    if not repair:
+        report = check_session(folder, decode=decode)
+        if as_json:
+            print(json.dumps(report.to_json(), indent=1))
+        else:
+            show_check(report, Console())
+        return report.sound
+    with only_run_in(folder):
+        repaired = repair_session(folder)
+    if as_json:
+        print(json.dumps(repaired.to_json(), indent=1))
+    else:
+        show_repair(repaired, Console())
+    return repaired.after.sound
+
+
+def show_check(report: CheckReport, console: Console) -> None:
+    """Print what was found in a session and in those inside it, and what to do."""
+    _show_tables(report, console)
+    if report.sound:
+        console.say("sound: every listed file has the bytes that were written")
+        if count := _unproven(report):
+            console.say(
+                f"{count} files of the session have no checksum: whether they are as they were "
+                "written, nothing can tell."
+            )
+    else:
+        console.say(
+            "damaged: `realsim check --repair` takes out what is damaged, and only that; files "
+            "move to damaged/, and the views concerned can be captured again."
+        )
+
+
+def _show_tables(report: CheckReport, console: Console) -> None:
+    views = f"{len(report.views)}"
+    if report.planned is not None:
+        views += f" of {report.planned} planned"
+    rows = [["views sound", views]]
+    if report.damaged_views:
+        rows.append(["views damaged", _numbers(report.damaged_views)])
+    if report.planned is not None and report.not_captured:
+        rows.append(["views not captured", _numbers(report.not_captured)])
+    rows.append(["files as written", f"{report.files_ok}"])
+    if report.unproven:
+        rows.append(["files without checksum", _names(report.unproven)])
+    if report.beside:
+        others = ", ".join(f"{name} {count}" for name, count in report.beside[:NAMED])
+        more = ", ..." if len(report.beside) > NAMED else ""
+        rows.append(["files beside it", f"{others}{more} (no checksum is kept of these)"])
+    console.table(f"Session {report.folder}", ["", ""], rows)
+    found = sorted(report.findings, key=lambda f: not f.is_damage)
+    if found:
+        header = ["file", "", "found"]
+        console.table(
+            "Damage and notes",
+            header,
+            [
+                [f.path, f.kind if f.is_damage else f"note: {f.kind}", f.found]
+                for f in found[:SHOWN]
+            ],
+        )
+        if len(found) > SHOWN:
+            console.say(f"... and {len(found) - SHOWN} more (--json has them all)")
+    for inner in report.inner:
+        _show_tables(inner, console)
+
+
+def show_repair(report: RepairReport, console: Console) -> None:
+    """Print what a repair did."""
+    if report.before.sound:
+        console.say(f"{report.before.folder}: nothing was damaged, nothing was taken out")
+    for path, place in report.moved:
+        console.say(f"{path} -> {place}")
+    for note in report.notes:
+        console.say(note)
+    for inner in report.inner:
+        show_repair(inner, console)
+    if not report.after.sound:
+        show_check(report.after, console)
+
+
+def _unproven(report: CheckReport) -> int:
+    return len(report.unproven) + sum(_unproven(inner) for inner in report.inner)
+
+
+def _names(paths: Sequence[str]) -> str:
+    """Return how many files, and the names of the first."""
+    return f"{len(paths)}: {', '.join(paths[:NAMED])}{', ...' if len(paths) > NAMED else ''}"
+
+
+def _numbers(views: Sequence[int]) -> str:
+    """Return view numbers as ranges: 3, 7-9."""
+    ranges: list[list[int]] = []
+    for k in sorted(views):
+        if ranges and ranges[-1][1] == k - 1:
+            ranges[-1][1] = k
+        else:
+            ranges.append([k, k])
+    return ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in ranges)

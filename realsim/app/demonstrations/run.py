@@ -1,0 +1,353 @@
+"""`realsim demonstrations`: attempts of the school as a LeRobot data set with pictures."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from realsim.app.console import Console
+from realsim.app.school.files import stored_grasps
+from realsim.app.school.inputs import CACHE, SchoolInputs, SchoolRequest, is_session, weighed
+from realsim.errors import InputError
+from realsim.formats.export_folder import ExportFolder
+from realsim.formats.grasps.scene_grasps import SceneGrasps
+from realsim.formats.labelled_scene import WrittenScene
+from realsim.geometry import se3
+from realsim.models.library_records import KnownSolid
+from realsim.records import ObjectModel, Scene
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.demonstrations.records import DemonstrationCamera
+    from realsim_sim_bridge.demonstrations.source import DemonstrationSource
+
+OUTCOMES = ("all", "success", "failure")
+PAGE = "demonstrations.html"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DemonstrationRequest:
+    """What the user asked for."""
+
+    fps: int = 20
+    """Steps per second."""
+    outcome: str = "all"
+    """'all', 'success' or 'failure'."""
+    grasps: tuple[str, ...] = ()
+    """INSTANCE:GRASP each; () = every attempt."""
+    limit: int | None = None
+    """Attempts at most, spread over all that are left; None = all."""
+    width: int = 320
+    height: int = 240
+    """Of the pictures [px]."""
+    view: int | None = None
+    """View of the session that the fixed camera stands at; None = beside the table."""
+    hand_eye: bool = False
+    """Whether the hand's camera is mounted as the session's hand-eye calibration says."""
+    masses: tuple[str, ...] = ()
+    """NAME=KG, as the school was told; the density it was told is kept with the grasps."""
+    episodes_per_file: int = 50
+    name: str = ""
+    licence: str = ""
+    models_licence: str = ""
+    attribution: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises:
+            InputError: one that cannot be; its option is named.
+        """
+        if self.outcome not in OUTCOMES:
+            raise InputError(
+                f"--outcome '{self.outcome}' is unknown; there are {', '.join(OUTCOMES)}."
+            )
+        for option, value in (("width", self.width), ("height", self.height)):
+            if value % 2 or not 16 <= value <= 4096:
+                raise InputError(
+                    f"a {option} of {value} px cannot be: a video takes even numbers, here from "
+                    "16 to 4096."
+                )
+        if self.limit is not None and self.limit < 1:
+            raise InputError(f"--limit {self.limit} leaves nothing; 1 or more is accepted.")
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DemonstrationsResult:
+    """What was written."""
+
+    folder: Path
+    page: Path
+    written: WrittenScene
+    successes: int
+    not_attempted: int
+    """Grasps that there is no attempt of."""
+
+
+def open_source(
+    source: Path, request: DemonstrationRequest, console: Console
+) -> "DemonstrationSource":
+    """Return the attempts of a session, or of a folder of the school's results.
+
+    Raises:
+        InputError: no results there, or they cannot be replayed.
+    """
+    from realsim_sim_bridge.demonstrations.records import DemonstrationConfig
+    from realsim_sim_bridge.demonstrations.source import DemonstrationSource
+
+    grasps, models = stored_grasps(source)
+    solids: Mapping[int, KnownSolid] = {}
+    models_folder = source / "models"
+    if models_folder.is_dir():
+        from realsim.models.library_session import known_solids
+
+        solids = known_solids(models_folder, [s.obj_id for s in grasps.sets])[0]
+    given = SchoolInputs(
+        scene=Scene(name=grasps.name, objects=()), models=dict(models), solids=dict(solids),
+        folder=source, store=None,
+    )  # fmt: skip
+    if request.masses:
+        given = _weighed(given, grasps, request)
+    return DemonstrationSource(
+        grasps,
+        given.models,
+        DemonstrationConfig(rate_hz=request.fps),
+        cameras=_cameras(source, grasps, request, console),
+        solids=given.solids,
+        cache=source / CACHE,
+    )
+
+
+def _weighed(
+    given: SchoolInputs, grasps: SceneGrasps, request: DemonstrationRequest
+) -> SchoolInputs:
+    """Return the objects with the masses that the school was told."""
+    from realsim.records import ObjectPose
+
+    objects = tuple(
+        ObjectPose(obj_id=s.obj_id, instance=s.instance, T_world_obj=np.eye(4)) for s in grasps.sets
+    )
+    asked = SchoolRequest(masses=request.masses)
+    return weighed(replace(given, scene=Scene(name=grasps.name, objects=objects)), asked)
+
+
+def _cameras(
+    source: Path, grasps: SceneGrasps, request: DemonstrationRequest, console: Console
+) -> "list[DemonstrationCamera]":
+    """Return a fixed camera and one in the hand.
+
+    Raises:
+        InputError: a view or a calibration is asked for that there is not.
+    """
+    from realsim_sim_bridge.demonstrations.cameras import (
+        FRONT,
+        front_camera,
+        sees_fingertips,
+        view_camera,
+        wrist_camera,
+    )
+
+    size = request.width, request.height
+    if (request.view is not None or request.hand_eye) and not is_session(source):
+        raise InputError(
+            f"'{source}' is no session, so that it has neither views nor a hand-eye calibration; "
+            "leave --view and --hand-eye away."
+        )
+    middle = _middle(grasps)
+    fixed = front_camera(middle, size)
+    if request.view is not None:
+        intrinsics, T_world_cam = _view(source, request.view)
+        assert grasps.T_world_table is not None, "a session's school has had a table"
+        T_table_cam = se3.invert(grasps.T_world_table) @ T_world_cam
+        fixed = view_camera(FRONT, intrinsics, T_table_cam, request.width)
+    wrist = wrist_camera(None, size)
+    if request.hand_eye:
+        from realsim.app.stages import open_session
+        from realsim.store import load_hand_eye
+
+        store = open_session(source)
+        if not store.has("calibration/hand_eye.json"):
+            raise InputError(
+                f"session '{source}' has no hand-eye calibration; leave --hand-eye away."
+            )
+        wrist = wrist_camera(load_hand_eye(store).T_ee_cam, size)
+        if not sees_fingertips(wrist):
+            console.warn(
+                "mounted on the Panda's flange as the session's hand-eye calibration says, the "
+                "hand's camera does not see its fingertips: the session's robot or tool frame is "
+                "another one. Without --hand-eye it is on the usual mount."
+            )
+    return [fixed, wrist]
+
+
+def _middle(grasps: SceneGrasps) -> tuple[float, float]:
+    """Return the middle of the scene on the table [m]."""
+    assert grasps.T_world_table is not None or not grasps.sets, "checked by the source"
+    given: Any = grasps.sets[0].parameters.get("middle_xy_m") if grasps.sets else None
+    if isinstance(given, list) and len(given) == 2:  # pyright: ignore[reportUnknownArgumentType]
+        return float(given[0]), float(given[1])  # pyright: ignore[reportUnknownArgumentType]
+    return 0.0, 0.0
+
+
+def _view(source: Path, index: int) -> tuple[Any, Any]:
+    """Return intrinsics and T_world_cam of a view of the session."""
+    from realsim.app.stages import open_session
+
+    store = open_session(source)
+    views = store.session.views
+    if not 0 <= index < len(views):
+        raise InputError(
+            f"--view {index} is not among the {len(views)} views of session '{source}'."
+        )
+    T_world_cam = views[index].T_world_cam
+    if T_world_cam is None:
+        raise InputError(f"it is not known where view {index} of '{source}' was taken from.")
+    return store.session.intrinsics, T_world_cam
+
+
+def chosen_attempts(source: "DemonstrationSource", request: DemonstrationRequest) -> list[int]:
+    """Return the numbers of the attempts that are asked for.
+
+    Raises:
+        InputError: a grasp that there is no attempt of is asked for, or nothing is left.
+    """
+    numbers = list(range(len(source)))
+    if request.grasps:
+        numbers = [source.number_of(*_named(text)) for text in dict.fromkeys(request.grasps)]
+    if request.outcome != "all":
+        wanted = request.outcome == "success"
+        numbers = [k for k in numbers if source.succeeded(k) is wanted]
+    if not numbers:
+        raise InputError(
+            f"no attempt is a {request.outcome} among the {len(source)} that there are; ask for "
+            "--outcome all."
+        )
+    if request.limit is not None and request.limit < len(numbers):
+        at = np.linspace(0, len(numbers) - 1, request.limit).round().astype(int)
+        numbers = [numbers[k] for k in np.unique(at)]
+    return numbers
+
+
+def _named(text: str) -> tuple[int, int]:
+    """Return instance and grasp of INSTANCE:GRASP."""
+    instance, mark, grasp = text.partition(":")
+    if not (mark and instance.isdecimal() and grasp.isdecimal()):
+        raise InputError(f"--grasp '{text}' is none; INSTANCE:GRASP is expected, such as 0:12.")
+    return int(instance), int(grasp)
+
+
+def export_demonstrations(
+    source: Path, out: Path, request: DemonstrationRequest, console: Console
+) -> DemonstrationsResult:
+    """Write attempts of the school as a LeRobot v3.0 data set with a page and a card.
+
+    Args:
+        source: a session, or a folder of the school's results.
+        out: a new or empty folder, or one that the same request has begun to fill.
+        request: which attempts, seen from where.
+        console: progress and notes go there.
+
+    Raises:
+        InputError: something given cannot be used, PyAV is missing, or `out` holds something else.
+    """
+    from realsim.app.demonstrations.card import demonstrations_card
+    from realsim.app.demonstrations.page import page_file
+    from realsim.app.export.card import CARD_FILE
+    from realsim.formats.lerobot.video import import_av
+    from realsim.formats.lerobot.writer import LeRobotConfig, write_lerobot
+    from realsim.store.lock import only_run_in
+    from realsim_sim_bridge.demonstrations.lerobot_episodes import LeRobotDemonstrations
+
+    import_av()
+    _require_outside(source, out)
+    attempts = open_source(source, request, console)
+    episodes = LeRobotDemonstrations(
+        attempts, source.resolve().name, chosen_attempts(attempts, request)
+    )
+    folder = ExportFolder.begin(out, _asked(source, attempts, request))
+    if folder.resumed:
+        console.say(f"going on with the demonstrations in {out}.")
+    with only_run_in(out):
+        with console.stage("demonstrations", f"{len(episodes)} attempts") as tick:
+            written = write_lerobot(
+                episodes, folder, LeRobotConfig(episodes_per_file=request.episodes_per_file),
+                progress=_counter(tick, len(episodes)),
+            )  # fmt: skip
+        with console.stage("page"):
+            folder.write_piece("page", page_file(folder.folder, attempts.config.rate_hz, PAGE))
+        chosen = chosen_attempts(attempts, request)
+        successes = sum(attempts.succeeded(k) for k in chosen)
+        card = demonstrations_card(request, written, _names(attempts), successes, out)
+        folder.finish({CARD_FILE: card})
+    return DemonstrationsResult(
+        folder=out,
+        page=out / PAGE,
+        written=written,
+        successes=successes,
+        not_attempted=len(attempts.not_attempted),
+    )
+
+
+def _require_outside(source: Path, out: Path) -> None:
+    """Raise if the data set would be written into what is only read."""
+    place, root = out.resolve(), source.resolve()
+    if place == root or root in place.parents:
+        raise InputError(
+            f"--out '{out}' lies inside '{source}', which is only read; give a folder outside it."
+        )
+
+
+def _counter(tick: Any, total: int) -> Any:
+    """Return what is called once an episode."""
+    done = 0
+
+    def one_more() -> None:
+        nonlocal done
+        done += 1
+        tick(done, total)
+
+    return one_more
+
+
+def _asked(
+    source: Path, attempts: "DemonstrationSource", request: DemonstrationRequest
+) -> dict[str, Any]:
+    """Return what a data set is told by: the request, and the very grasps."""
+    digest = hashlib.sha256()
+    for k, name in enumerate(attempts.attempts):
+        digest.update(attempts.goal(k).language.encode())
+        digest.update(np.ascontiguousarray(attempts.stored_joints(name)).tobytes())
+    return {
+        "what": "demonstrations",
+        "source": source.resolve().name,
+        "attempts": digest.hexdigest(),
+        "request": asdict(request),
+    }
+
+
+def _names(attempts: "DemonstrationSource") -> dict[int, str]:
+    """Return the names of the objects by id."""
+    models: Sequence[ObjectModel] = tuple(attempts.scenery.models.values())
+    return {m.obj_id: m.name for m in models}
+
+
+def show_demonstrations(result: DemonstrationsResult, console: Console) -> None:
+    """Print what was written."""
+    w = result.written
+    console.table(
+        f"demonstrations in {result.folder}",
+        ("from", "attempts", "successful", "steps", "steps written now", "tasks"),
+        [[w.name, w.counts["episodes"], result.successes, w.frames, w.frames_written,
+          w.counts["tasks"]]],
+    )  # fmt: skip
+    if result.not_attempted:
+        console.say(
+            f"{result.not_attempted} grasps were not attempted: the arm does not get there."
+        )
+    for note in w.notes[:10]:
+        console.warn(note.replace("[", r"\["))
+    if len(w.notes) > 10:
+        console.warn(f"and {len(w.notes) - 10} more notes, in realsim/episodes.jsonl.")
+    console.say(f"page      {result.page}")

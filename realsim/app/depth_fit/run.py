@@ -1,0 +1,215 @@
+"""Runs `realsim depth-fit`: frames of a session or a folder in; a sensor's JSON and picture out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.records import CameraIntrinsics
+from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
+
+Item = TypeVar("Item")
+CAMERA_NAMES = ("camera.json", "intrinsics.json", "cam_K.txt", "camera.yaml", "intrinsics.yaml")
+"""Files beside depth images that may hold their camera."""
+MOST_FRAMES = 12
+"""More frames take longer and say little more."""
+OUT = {"disparity": Path("depth_sensor.json"), "stereo": Path("stereo_sensor.json")}
+"""What is written where `--out` is not given."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class DepthFrames:
+    """The depth images that a sensor is fitted to."""
+
+    depths_m: tuple[NDArray[np.float32], ...]
+    names: tuple[str, ...]
+    intrinsics: CameraIntrinsics
+    unit_m: float
+    """Metres per count of their files."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class DepthFitRequest:
+    """The options of `realsim depth-fit`."""
+
+    profile_name: str = "d405"
+    simulator: Literal["disparity", "stereo"] = "disparity"
+    out: Path | None = None
+    views: str = ""
+    camera: Path | None = None
+    unit_m: float | None = None
+    baseline_m: float | None = None
+
+
+def run_depth_fit(source: Path, request: DepthFitRequest, console: Any) -> None:
+    """Fit, say what was found, and write the sensor and its picture.
+
+    Raises:
+        InputError: the frames, the camera or an option cannot be used.
+    """
+    from realsim.store.atomic import write_bytes, write_json
+
+    simulator = request.simulator
+    out = OUT[simulator] if request.out is None else request.out
+    if out.suffix.lower() == ".png" or out.is_dir():
+        raise InputError(
+            f"--out {out} cannot be the JSON; give a file name such as {OUT[simulator]}."
+        )
+    kind = profile(request.profile_name)
+    if request.baseline_m is not None:
+        kind = replace(kind, baseline_m=request.baseline_m)
+    unit_m = kind.depth_unit_m if request.unit_m is None else request.unit_m
+    if not 1e-7 <= unit_m <= 0.02:
+        raise InputError(
+            f"--unit {unit_m:g} m a count is refused; 1e-7 to 0.02 is accepted (0.001 where the "
+            "counts are millimetres)."
+        )
+    frames = read_frames(source, request.views, request.camera, unit_m)
+    fitted = _fitted_stereo if simulator == "stereo" else _fitted_disparity
+    document, picture = fitted(frames, kind, console)
+    write_json(out, document)
+    write_bytes(out.with_suffix(".png"), picture)
+    console.say(f"sensor    {out}")
+    console.say(f"picture   {out.with_suffix('.png')}")
+
+
+def _fitted_disparity(
+    frames: DepthFrames, kind: DepthProfile, console: Any
+) -> tuple[dict[str, Any], bytes]:
+    """Fit the disparity-space model; return its JSON and its picture."""
+    from realsim.rendering.depth_sensors.fit import fit_depth_model
+    from realsim.rendering.depth_sensors.fit_picture import fit_picture
+
+    with console.stage(f"fitting {len(frames.names)} frames") as tick:
+        fit = fit_depth_model(
+            frames.depths_m, frames.intrinsics, kind, unit_m=frames.unit_m, names=frames.names,
+            tick=tick,
+        )  # fmt: skip
+        picture = fit_picture(fit)
+    rows = [
+        (name, f"{e.value:.4g}", f"{e.uncertainty:.2g}")
+        if e.determined
+        else (name, f"{getattr(fit.model, name, e.value):.4g}", "not determined: kept")
+        for name, e in fit.estimates.items()
+    ]
+    console.table("the sensor", ("parameter", "value", "uncertainty"), rows)
+    for note in fit.notes:
+        console.say(note)
+    return fit.document(), picture
+
+
+def _fitted_stereo(
+    frames: DepthFrames, kind: DepthProfile, console: Any
+) -> tuple[dict[str, Any], bytes]:
+    """Fit the stereo simulator; return its JSON and its picture."""
+    from realsim.rendering.stereo.fit import SEARCHED, fit_stereo
+    from realsim.rendering.stereo.fit_picture import stereo_fit_picture
+
+    with console.stage(f"fitting {len(frames.names)} frames") as tick:
+        fit = fit_stereo(
+            frames.depths_m, frames.intrinsics, kind, unit_m=frames.unit_m, names=frames.names,
+            tick=tick,
+        )  # fmt: skip
+        picture = stereo_fit_picture(fit)
+    rows = [(name, f"{getattr(fit.config, name):.4g}") for name in SEARCHED[kind.second_eye]]
+    console.table("the simulator", ("setting", "value"), rows)
+    rows = [
+        (f.name, f"{f.distance_m:.3f}", f"{f.measured.sigma_px:.3f}", f"{f.simulated.sigma_px:.3f}",
+         f"{100 * f.measured.hole_share:.1f}", f"{100 * f.simulated.hole_share:.1f}")
+        for f in fit.frames
+    ]  # fmt: skip
+    head = ("frame", "distance [m]", "noise [px]", "simulated", "holes [%]", "simulated")
+    console.table("the frames and their twins", head, rows)
+    for note in fit.notes:
+        console.say(note)
+    return fit.document(), picture
+
+
+def read_frames(source: Path, views: str, camera: Path | None, unit_m: float) -> DepthFrames:
+    """Return the depth images of a session or of a folder.
+
+    Raises:
+        InputError: there are none, or the camera is not known.
+    """
+    if (source / "session.json").is_file():
+        return _of_session(source, views)
+    if not source.is_dir():
+        raise InputError(
+            f"'{source}' is no folder; a session (it holds session.json) or a folder of 16-bit "
+            "depth PNGs is taken."
+        )
+    return _of_folder(source, views, camera, unit_m)
+
+
+def _of_session(source: Path, views: str) -> DepthFrames:
+    from realsim.app.option_values import numbers_of
+    from realsim.store import SessionStore
+
+    with SessionStore.open(source) as store:
+        wanted = numbers_of(views)
+        indices = [
+            i for i in sorted(store.completed) if store.has_depth(i) and (not wanted or i in wanted)
+        ]
+        if not indices:
+            raise InputError(
+                f"{source} has no views with depth{' among ' + views if views else ''}."
+            )
+        indices = _spread(indices, bool(wanted))
+        return DepthFrames(
+            depths_m=tuple(store.depth_m(i) for i in indices),
+            names=tuple(f"view {i}" for i in indices),
+            intrinsics=store.session.intrinsics,
+            unit_m=store.session.depth_unit_m,
+        )
+
+
+def _of_folder(source: Path, views: str, camera: Path | None, unit_m: float) -> DepthFrames:
+    from realsim.app.importing.folder import camera_of_file
+    from realsim.app.option_values import numbers_of
+    from realsim.formats.images import image_size, read_depth
+
+    place = source / "depth" if (source / "depth").is_dir() else source
+    paths = sorted(place.glob("*.png"))
+    if not paths:
+        raise InputError(f"{place} holds no PNG; 16-bit depth images of a plane are looked for.")
+    wanted = numbers_of(views)
+    if wanted:
+        paths = [p for k, p in enumerate(paths) if k in wanted]
+        if not paths:
+            raise InputError(f"--views {views} names none of the images of {place} (from 0 on).")
+    paths = _spread(paths, bool(wanted))
+    if camera is None:
+        beside = [f / n for f in (source, place) for n in CAMERA_NAMES if (f / n).is_file()]
+        if not beside:
+            raise InputError(
+                f"the camera of {source} is not known: give --camera FILE, or put a camera.json "
+                "beside the images."
+            )
+        camera = beside[0]
+    intrinsics = camera_of_file(camera, image_size(paths[0]))
+    for path in paths:
+        width, height = image_size(path)
+        if (width, height) != (intrinsics.width, intrinsics.height):
+            raise InputError(
+                f"{path.name} is {width}x{height}, and the camera of {camera.name} is "
+                f"{intrinsics.width}x{intrinsics.height}: the intrinsics of another resolution or "
+                "stream do not fit. Give those of the depth images."
+            )
+    return DepthFrames(
+        depths_m=tuple(read_depth(p, unit_m) for p in paths),
+        names=tuple(p.name for p in paths),
+        intrinsics=intrinsics,
+        unit_m=unit_m,
+    )
+
+
+def _spread(items: Sequence[Item], chosen: bool) -> list[Item]:
+    """Return all items that were asked for, otherwise at most MOST_FRAMES evenly among them."""
+    if chosen or len(items) <= MOST_FRAMES:
+        return list(items)
+    places = np.linspace(0, len(items) - 1, MOST_FRAMES).round().astype(int)
+    return [items[k] for k in places]

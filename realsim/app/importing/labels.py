@@ -1,0 +1,144 @@
+"""What a data set knows beside its images: kept in the session, and made ready to be registered."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from realsim.app.console import Console
+from realsim.app.stages import save_starts
+from realsim.errors import InputError
+from realsim.formats.bop.models import save_models
+from realsim.formats.bop.source import BopSource
+from realsim.formats.frame_source import FrameSource
+from realsim.formats.graspnet.placed_cameras import CameraPlacer
+from realsim.formats.imported_labels import load_imported, save_imported
+from realsim.formats.labelled_frames import LabelledFrames
+from realsim.formats.labelled_scene import LabelledScene
+from realsim.records import ObjectPose
+from realsim.records.checked_arrays import Array
+from realsim.store import SessionStore
+from realsim.store.lock import only_run_in
+
+if TYPE_CHECKING:
+    from realsim.app.importing.source import ImportRequest
+
+SAME_PLACE_M = 0.02
+"""Objects of one id that the data set does not number, and that lie this near in two frames, are
+one thing: annotations are a few millimetres off, things of one kind stand farther apart."""
+
+
+def labels_of(
+    request: "ImportRequest", source: FrameSource
+) -> tuple[LabelledScene, tuple[int, ...]] | None:
+    """Return the labelled scene of an opened source and the numbers of its frames, if it is one.
+
+    Raises:
+        InputError: its labels contradict each other, or the images.
+    """
+    if isinstance(source, LabelledFrames):
+        return source.scene, source.indices
+    if not isinstance(source, BopSource):
+        return None
+    from realsim.formats.bop.opening import open_labelled_bop
+
+    scene = open_labelled_bop(
+        request.source, scene=request.scene, camera=request.camera_name, models=request.models
+    )
+    has_any = any(scene.frame(i).objects for i in source.indices)
+    return (scene, source.indices) if has_any else None
+
+
+def import_labels(
+    scene: LabelledScene, indices: tuple[int, ...], folder: Path, console: Console
+) -> None:
+    """Keep the labels and models of a data set in the session that its images were imported into.
+
+    The labels lie in SESSION/imported, untouched by what realsim computes. Where the cameras'
+    places are known, the poses become the starts that `realsim register` begins from.
+
+    Args:
+        scene: the data set's scene.
+        indices: numbers of its images, in the order of the session's views.
+        folder: the session.
+        console: where progress goes.
+
+    Raises:
+        InputError: a pose, a mask or a model cannot be used.
+    """
+    with only_run_in(folder), SessionStore.open(folder) as store:
+        if load_imported(store) is not None:
+            return
+        models = scene.models()
+        if models:
+            save_models(folder / "models", models)
+        _place_cameras(store, scene, indices, console)
+        starts = starts_of(scene, indices, {v.index: v.T_world_cam for v in store.session.views})
+        if starts:
+            save_starts(store, starts, f"labels of {scene.name}")
+        with console.stage("labels", scene.name) as tick:
+            save_imported(store, scene, dict(enumerate(indices)), tick)
+    poses = sum(len(scene.frame(i).objects) for i in indices)
+    console.say(
+        f"labels    {poses} poses in {len(indices)} frames, {len(models)} models: kept in "
+        f"{folder / 'imported'} as they are, not checked. `realsim register {folder}` refines and "
+        "judges them."
+    )
+
+
+def _place_cameras(
+    store: SessionStore, scene: LabelledScene, indices: tuple[int, ...], console: Console
+) -> None:
+    """Place the cameras of a scene that does not tell by the objects, which stand still.
+
+    World is then the first image's camera.
+    """
+    if any(v.T_world_cam is not None for v in store.session.views):
+        return
+    placer = CameraPlacer()
+    try:
+        for index in indices:
+            placer.add(scene.frame(index))
+        placer.require_all(scene.name)
+    except InputError as error:
+        console.warn(f"{scene.name}: the cameras could not be placed by the objects: {error}")
+        return
+    views = {index: view for view, index in enumerate(indices)}
+    store.set_cameras(store.session.intrinsics, {views[i]: T for i, T in placer.Ts_0_cam.items()})
+    if len(indices) > 1:
+        console.warn(
+            f"{scene.name} has no camera poses: they were taken from the poses of its objects, "
+            f"which agree within {1e3 * placer.worst_m:.1f} mm. World is the camera of image "
+            f"{indices[0]}."
+        )
+
+
+def starts_of(
+    scene: LabelledScene, indices: tuple[int, ...], Ts_world_cam: Mapping[int, Array | None]
+) -> list[ObjectPose]:
+    """Return each thing's pose in world, from the first frame that shows it.
+
+    Args:
+        scene: the data set's scene.
+        indices: numbers of its images, in the order of the session's views.
+        Ts_world_cam: the session's view -> (4, 4) camera in world [m]; None = not known.
+    """
+    starts: list[ObjectPose] = []
+    known: set[tuple[int, int]] = set()
+    for view, index in enumerate(indices):
+        T_world_cam = Ts_world_cam.get(view)
+        if T_world_cam is None:
+            continue
+        for o in scene.frame(index).objects:
+            T = T_world_cam @ o.T_cam_obj
+            if o.instance is not None:
+                is_known = (o.obj_id, o.instance) in known
+                known.add((o.obj_id, o.instance))
+            else:
+                alike = [s for s in starts if s.obj_id == o.obj_id]
+                gaps = [np.linalg.norm(s.T_world_obj[:3, 3] - T[:3, 3]) for s in alike]
+                is_known = any(gap < SAME_PLACE_M for gap in gaps)
+            if not is_known:
+                starts.append(ObjectPose(obj_id=o.obj_id, instance=len(starts), T_world_obj=T))
+    return starts

@@ -1,0 +1,112 @@
+"""`realsim import --list`: what a recording, folder or data set holds."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from realsim.app.console import Console
+from realsim.app.importing.archive import is_archive
+from realsim.app.importing.folder import describe_folder
+from realsim.app.importing.source import (
+    ImportRequest,
+    folder_request,
+    kind_of,
+    require_fitting,
+)
+from realsim.errors import InputError
+
+
+def list_source(request: ImportRequest, console: Console) -> None:
+    """Print what a recording, folder or data set holds, without importing it.
+
+    Raises:
+        InputError: what it is is not known, or it cannot be read.
+    """
+    rows: Sequence[Sequence[object]]
+    if is_archive(request.source):
+        from realsim.untrusted.archives import members
+
+        rows = [(m.name, m.size) for m in members(request.source)]
+        console.table(str(request.source), ("file", "bytes"), rows)
+        return
+    kind = kind_of(request, console)
+    require_fitting(request, kind)
+    if kind == "bag":
+        from realsim.formats.bags.recording import Recording
+
+        with Recording(request.source) as recording:
+            topics = sorted(recording.topics.values(), key=lambda t: t.name)
+        rows = [(t.name, t.msgtype, t.count) for t in topics]
+        console.table(str(request.source), ("topic", "type", "messages"), rows)
+        return
+    if kind == "folder":
+        rows = describe_folder(request.source, folder_request(request))
+        for what, text in rows:
+            console.say(f"{what}: {text}")
+        return
+    if kind == "bop":
+        header, rows = _bop_rows(request)
+    elif kind == "graspnet":
+        header, rows = _graspnet_rows(request.source)
+    elif kind == "nerfstudio":
+        header, rows = _nerfstudio_rows(request.source)
+    else:
+        header, rows = _colmap_rows(request.source)
+    console.table(str(request.source), header, rows)
+
+
+def _bop_rows(request: ImportRequest) -> tuple[Sequence[str], list[Sequence[object]]]:
+    from realsim.formats.bop.scene import find_scenes, read_scene
+
+    rows: list[Sequence[object]] = []
+    for ref in find_scenes(request.source):
+        place = f"{ref.split}/{ref.folder.name}"
+        try:
+            scene = read_scene(ref)
+        except InputError as error:
+            rows.append((ref.scene_id, place, "-", "-", "-", str(error)))
+            continue
+        camera = scene.session.intrinsics
+        posed = sum(v.T_world_cam is not None for v in scene.session.views)
+        rows.append(
+            (ref.scene_id, place, len(scene.session.views), len(scene.depth_files), posed,
+             f"{camera.width}x{camera.height}, fx {camera.fx:.2f}")
+        )  # fmt: skip
+    return ("scene", "folder", "images", "with depth", "with camera pose", "camera"), rows
+
+
+def _colmap_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
+    from realsim.formats.colmap.model import find_model, read_model
+
+    model = read_model(find_model(root) or root)
+    rows: list[Sequence[object]] = []
+    for k, camera in sorted(model.cameras.items()):
+        count = sum(i.camera_id == k for i in model.images)
+        size = f"{camera.width}x{camera.height}"
+        rows.append((k, count, size, f"{camera.fx:.3f}", f"{camera.fy:.3f}"))
+    return ("camera", "images", "size [px]", "fx [px]", "fy [px]"), rows
+
+
+def _graspnet_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
+    from realsim.formats.graspnet.opening import open_scene
+    from realsim.formats.graspnet.tree import open_graspnet
+
+    rows: list[Sequence[object]] = []
+    for ref in open_graspnet(root).scenes:
+        try:
+            scene = open_scene(ref)
+        except InputError as error:
+            rows.append((ref.number, ref.camera, "-", str(error)))
+            continue
+        objects = len(scene.frame(scene.indices[0]).objects)
+        rows.append((ref.number, ref.camera, len(scene.indices), objects))
+    return ("scene", "camera", "images", "objects in the first"), rows
+
+
+def _nerfstudio_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
+    from realsim.formats.nerfstudio.transforms import find_transforms, read_transforms
+
+    path = find_transforms(root)
+    if path is None:
+        raise InputError(f"{root} has no transforms.json.")
+    found = read_transforms(path)
+    return ("file", "frames"), [(path.name, len(found.frames))]

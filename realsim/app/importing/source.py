@@ -1,0 +1,438 @@
+"""`realsim import`: what kind of recording a path is, by its content, and opening it as such."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from realsim.app.console import Console
+from realsim.app.importing.folder import (
+    FolderRequest,
+    camera_of_file,
+    open_image_folder,
+)
+from realsim.app.importing.session import ImportSummary, import_session
+from realsim.errors import InputError
+from realsim.formats.folders import FolderChoice
+from realsim.formats.folders.listing import ENDINGS, shown
+from realsim.formats.frame_source import FrameSource
+from realsim.store.session_store import CAMERA_FILE, SESSION_FILE
+
+ROS1_MAGIC = b"#ROSBAG V"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+SQLITE_MAGIC = b"SQLite format 3\x00"
+MAGIC = ((ROS1_MAGIC, "a ROS1 bag"), (MCAP_MAGIC, "an MCAP file"), (SQLITE_MAGIC, "a sqlite3 bag"))
+"""First bytes of recordings."""
+BAG_ENDINGS = (".bag", ".mcap", ".db3")
+HEAD_SHOWN = 16
+"""First bytes of a file that is no bag, shown to a person."""
+ACCEPTED = (
+    "accepted are a ROS1 .bag, a ROS2 .mcap or .db3 or its folder, a RealSense recording, a BOP "
+    "scene (scene_camera.json), a GraspNet scene (annotations/0000.xml), a COLMAP project (cameras "
+    "and images), a nerfstudio folder (transforms.json), a folder of images, or one of these in a "
+    "zip or tar archive."
+)
+KINDS = ("auto", "bag", "folder", "bop", "graspnet", "colmap", "nerfstudio", "realsense")
+ONLY_FOR: dict[str, tuple[str, ...]] = {
+    "depth_unit": ("folder", "bag", "colmap", "nerfstudio"),
+    "depth_coding": ("folder",),
+    "poses": ("folder",),
+    "reading": ("folder",),
+    "key": ("folder",),
+    "poses_of": ("folder",),
+    "no_poses": ("folder",),
+    "depths": ("folder", "colmap"),
+    "images": ("folder", "colmap", "nerfstudio"),
+    "camera": ("folder", "bag"),
+    "no_depth": ("folder", "bag", "bop", "graspnet", "colmap", "nerfstudio"),
+    "colour_topic": ("bag",),
+    "depth_topic": ("bag",),
+    "joints_topic": ("bag",),
+    "camera_info_topic": ("bag",),
+    "depth_camera_info_topic": ("bag",),
+    "joint_prefix": ("bag",),
+    "base_frame": ("bag",),
+    "ee_frame": ("bag",),
+    "world_frame": ("bag",),
+    "clock": ("bag",),
+    "max_pair_gap": ("bag",),
+    "only_still": ("bag",),
+    "scene": ("bop", "graspnet"),
+    "camera_name": ("bop", "graspnet"),
+    "models": ("bop", "graspnet"),
+    "no_labels": ("bop", "graspnet"),
+    "camera_id": ("colmap", "nerfstudio"),
+    "scale": ("colmap", "nerfstudio"),
+}
+"""Options that say something of some kinds only; with another they are refused, not ignored."""
+BAG_OPTIONS = {
+    "colour": "--colour-topic ",
+    "depth": "--depth-topic ",
+    "joints": "--joints-topic ",
+    "camera_info": "--camera-info-topic ",
+    "depth_camera_info": "--depth-camera-info-topic ",
+    "intrinsics": "--camera ",
+    "depth_unit_m": "--depth-unit ",
+    "without_depth": "--no-depth ",
+    "joint_prefix": "--joint-prefix ",
+    "base_frame": "--base-frame ",
+    "ee_frame": "--ee-frame ",
+    "world_frame": "--world-frame ",
+    "clock": "--clock ",
+    "max_pair_gap_s": "--max-pair-gap ",
+    "only_still": "--only-still ",
+}
+"""What the fields of BagChoice are called on the command line."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ImportRequest:
+    """What `realsim import` was asked for."""
+
+    source: Path
+    kind: str = "auto"
+    camera: Path | None = None
+    """File with the intrinsics."""
+    depth_unit: float | None = None
+    """Metres per count of the depth."""
+    depth_coding: str = "auto"
+    no_depth: bool = False
+    images: str = ""
+    """Folder of the colour images, in the source."""
+    depths: str = ""
+    """Folder of the depth images, in the source."""
+    poses: Path | None = None
+    no_poses: bool = False
+    reading: str = ""
+    key: str = ""
+    poses_of: str = "tool"
+    colour_topic: str | None = None
+    depth_topic: str | None = None
+    joints_topic: str | None = None
+    camera_info_topic: str | None = None
+    depth_camera_info_topic: str | None = None
+    joint_prefix: str | None = None
+    base_frame: str | None = None
+    ee_frame: str | None = None
+    world_frame: str | None = None
+    clock: Literal["header", "receive"] = "header"
+    max_pair_gap: float | None = None
+    """Greatest time between colour and its depth [s]."""
+    only_still: bool = False
+    scene: int | None = None
+    camera_name: str = ""
+    """Of a data set with several cameras: kinect, cam1 ..."""
+    models: Path | None = None
+    """Folder of the models, when it is not in the data set."""
+    no_labels: bool = False
+    """Leave poses, masks and models of a data set where they are."""
+    camera_id: int | None = None
+    scale: float | None = None
+    """Metres per unit of a COLMAP model or of a transforms.json."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class KindFit:
+    """A kind that a path may be, and what speaks for it."""
+
+    kind: str
+    why: str
+
+
+def run_import(
+    request: ImportRequest, out: Path, console: Console, *, overwrite: bool = False
+) -> ImportSummary:
+    """Import a recording, a folder or a data set into a session.
+
+    Raises:
+        InputError: it is not known what it is, or it cannot be read or joined.
+    """
+    from realsim.app.importing.archive import unpacked
+    from realsim.app.importing.labels import import_labels, labels_of
+
+    if out.resolve() == request.source.resolve():
+        raise InputError(f"{out} is the source itself: give another folder for the session.")
+    with unpacked(request, out, console) as given:
+        source = open_source(given, console)
+        labels = None if request.no_labels else labels_of(given, source)
+        summary = import_session(source, out, console, overwrite=overwrite)
+        if labels is not None:
+            import_labels(*labels, out, console)
+    return summary
+
+
+def kinds_of(path: Path) -> list[KindFit]:
+    """Return every kind that a path's content fits, with the evidence.
+
+    Raises:
+        InputError: there is no such path.
+    """
+    if not path.exists():
+        raise InputError(f"{path} does not exist; a recording, a folder or a data set is expected.")
+    if path.is_file():
+        return _of_file(path)
+    fits: list[KindFit] = []
+    bags = sorted(p.name for p in path.iterdir() if p.suffix.lower() in BAG_ENDINGS)
+    if (path / "metadata.yaml").is_file() and bags:
+        fits.append(KindFit(kind="bag", why=f"it has metadata.yaml and {shown(bags)}"))
+    elif bags:
+        fits.append(KindFit(kind="bag", why=f"it holds {shown(bags)}"))
+    for pattern in (CAMERA_FILE, f"*/{CAMERA_FILE}", f"*/*/{CAMERA_FILE}"):
+        if any(path.glob(pattern)):
+            fits.append(KindFit(kind="bop", why=f"it has {pattern}"))
+            break
+    if _is_graspnet(path):
+        fits.append(KindFit(kind="graspnet", why="it has rgb/ beside annotations/*.xml"))
+    from realsim.formats.colmap.model import find_model
+    from realsim.formats.nerfstudio.transforms import find_transforms
+
+    if find_transforms(path) is not None:
+        fits.append(KindFit(kind="nerfstudio", why="it has transforms.json"))
+    model = find_model(path)
+    if model is not None:
+        place = model.relative_to(path).as_posix()
+        where = "in it" if place == "." else f"in {place}"
+        fits.append(KindFit(kind="colmap", why=f"cameras and images of a model are {where}"))
+    if not fits:
+        found = _images_below(path)
+        if found:
+            fits.append(KindFit(kind="folder", why=f"it holds image files ({found})"))
+    return fits
+
+
+def _is_graspnet(path: Path) -> bool:
+    """Return whether a folder is a GraspNet data set, one of its scenes, or a scene's camera."""
+    return any(
+        any(path.glob(f"{above}annotations/*.xml")) and any(path.glob(f"{above}rgb"))
+        for above in ("", "*/", "*/*/", "*/*/*/")
+    )
+
+
+def _of_file(path: Path) -> list[KindFit]:
+    with path.open("rb") as file:
+        head = file.read(max(len(magic) for magic, _ in MAGIC))
+    return [
+        KindFit(kind="bag", why=f"its first bytes are those of {what}")
+        for magic, what in MAGIC
+        if head.startswith(magic)
+    ]
+
+
+def _check_bag_file(path: Path) -> None:
+    """Refuse a file that does not begin as a recording does.
+
+    Raises:
+        InputError: it is empty, or no bag by its first bytes.
+    """
+    if _of_file(path):
+        return
+    with path.open("rb") as file:
+        head = file.read(HEAD_SHOWN)
+    if not head:
+        raise InputError(f"{path} is empty; {ACCEPTED}")
+    begins = ", ".join(f"{magic!r} ({what})" for magic, what in MAGIC)
+    raise InputError(
+        f"{path} is no bag: its first bytes are {head!r}; a bag begins with {begins}. Is the copy "
+        "complete, and is it the recording itself?"
+    )
+
+
+def _images_below(path: Path) -> str:
+    """Return an example of an image in a folder or one level below, "" where there is none."""
+    for pattern in ("*", "*/*"):
+        for p in sorted(path.glob(pattern)):
+            if p.suffix.lower() in ENDINGS and p.is_file():
+                return p.relative_to(path).as_posix()
+    return ""
+
+
+def kind_of(request: ImportRequest, console: Console) -> str:
+    """Return the kind that was said, or the only one that fits; says why.
+
+    Raises:
+        InputError: none fits, or several do.
+    """
+    path = request.source
+    if request.kind not in KINDS:
+        raise InputError(f"the kind '{request.kind}' is not known; {', '.join(KINDS)} are.")
+    if request.kind != "auto":
+        if not path.exists():
+            raise InputError(f"{path} does not exist.")
+        if request.kind in ("bag", "realsense") and path.is_file():
+            _check_bag_file(path)
+        return "bag" if request.kind == "realsense" else request.kind
+    fits = kinds_of(path)
+    if path.is_dir() and (path / SESSION_FILE).is_file():
+        raise InputError(
+            f"{path} is a session already ({SESSION_FILE}): use it as it is. To import its images "
+            "and cameras as a BOP scene, say --kind bop."
+        )
+    if not fits:
+        if path.is_dir() and not any(path.iterdir()):
+            raise InputError(f"{path} is empty; {ACCEPTED}")
+        if path.is_file() and (path.suffix.lower() in BAG_ENDINGS or not path.stat().st_size):
+            _check_bag_file(path)
+        what = "a file" if path.is_file() else "a folder"
+        raise InputError(f"{path} is {what} of no known kind; {ACCEPTED}")
+    if len(fits) > 1:
+        listed = "; ".join(f"{f.kind}: {f.why}" for f in fits)
+        raise InputError(f"{path} may be several things ({listed}). Say which: --kind KIND.")
+    console.say(f"{path} is read as {fits[0].kind}: {fits[0].why}.")
+    return fits[0].kind
+
+
+def require_fitting(request: ImportRequest, kind: str) -> None:
+    """Raise if an option was given that says nothing of this kind."""
+    defaults = ImportRequest(source=request.source)
+    given = [
+        f.name
+        for f in fields(request)
+        if f.name in ONLY_FOR and getattr(request, f.name) != getattr(defaults, f.name)
+    ]
+    wrong = [name for name in given if kind not in ONLY_FOR[name]]
+    if wrong:
+        options = ", ".join(
+            f"--{name.replace('_', '-')} (for {' and '.join(ONLY_FOR[name])})" for name in wrong
+        )
+        raise InputError(
+            f"{request.source} is read as {kind}, where these options say nothing: {options}. "
+            "Leave them out, or give the right --kind."
+        )
+
+
+def open_source(request: ImportRequest, console: Console) -> FrameSource:
+    """Return the source of a request, opened and checked.
+
+    Raises:
+        InputError: what it is is not known, or it cannot be read or joined.
+    """
+    kind = kind_of(request, console)
+    require_fitting(request, kind)
+    openers: dict[str, Callable[[ImportRequest, Console], FrameSource]] = {
+        "bag": _open_bag, "folder": _open_folder, "bop": _open_bop, "colmap": _open_colmap,
+        "graspnet": _open_graspnet, "nerfstudio": _open_nerfstudio,
+    }  # fmt: skip
+    return openers[kind](request, console)
+
+
+def folder_request(request: ImportRequest) -> FolderRequest:
+    """Return what is asked of a folder of images."""
+    return FolderRequest(
+        choice=FolderChoice(
+            colour=request.images,
+            depth=request.depths,
+            use_depth=not request.no_depth,
+            depth_unit_m=request.depth_unit,
+            depth_coding=request.depth_coding,
+        ),
+        camera=request.camera,
+        poses=request.poses,
+        use_poses=not request.no_poses,
+        reading=request.reading,
+        key=request.key,
+        poses_of=request.poses_of,
+    )
+
+
+def _open_folder(request: ImportRequest, console: Console) -> FrameSource:
+    source, notes = open_image_folder(request.source, folder_request(request))
+    for note in notes:
+        console.say(note)
+    return source
+
+
+def _open_bop(request: ImportRequest, console: Console) -> FrameSource:
+    from realsim.formats.bop.source import open_bop
+
+    return open_bop(
+        request.source, scene=request.scene, camera=request.camera_name,
+        use_depth=not request.no_depth,
+    )  # fmt: skip
+
+
+def _open_graspnet(request: ImportRequest, _: Console) -> FrameSource:
+    from realsim.formats.graspnet.opening import open_scene
+    from realsim.formats.graspnet.tree import open_graspnet
+    from realsim.formats.labelled_frames import LabelledFrames
+
+    tree = open_graspnet(
+        request.source,
+        scenes=None if request.scene is None else (request.scene,),
+        cameras=(request.camera_name,) if request.camera_name else None,
+        models=request.models,
+    )
+    if len(tree.scenes) > 1:
+        listed = shown([r.name for r in tree.scenes], 12)
+        raise InputError(
+            f"{request.source} has {len(tree.scenes)} scenes: {listed}, and a session holds one by "
+            "one camera. Choose with --scene N and --camera-name kinect or realsense."
+        )
+    return LabelledFrames(
+        open_scene(next(iter(tree.scenes))), "graspnet", use_depth=not request.no_depth
+    )
+
+
+def _open_nerfstudio(request: ImportRequest, _: Console) -> FrameSource:
+    from realsim.formats.nerfstudio.source import open_nerfstudio
+
+    return open_nerfstudio(
+        request.source, images_folder=request.images or None, camera_id=request.camera_id,
+        metres_per_unit=request.scale, depth_unit_m=request.depth_unit,
+        use_depth=not request.no_depth,
+    )  # fmt: skip
+
+
+def _open_colmap(request: ImportRequest, console: Console) -> FrameSource:
+    from realsim.formats.colmap.source import open_colmap
+
+    return open_colmap(
+        request.source,
+        images_folder=request.images or None,
+        camera_id=request.camera_id,
+        metres_per_unit=request.scale,
+        depth_folder=request.depths or None,
+        depth_unit_m=request.depth_unit,
+        use_depth=not request.no_depth,
+    )
+
+
+def _open_bag(request: ImportRequest, console: Console) -> FrameSource:
+    from realsim.formats.bags import BagChoice, open_bag
+
+    camera = None if request.camera is None else camera_of_file(request.camera, None)
+    choice = BagChoice(
+        colour=request.colour_topic,
+        depth=request.depth_topic,
+        joints=request.joints_topic,
+        camera_info=request.camera_info_topic,
+        depth_camera_info=request.depth_camera_info_topic,
+        joint_prefix=request.joint_prefix,
+        base_frame=request.base_frame,
+        ee_frame=request.ee_frame,
+        world_frame=request.world_frame,
+        clock=request.clock,
+        max_pair_gap_s=request.max_pair_gap,
+        only_still=request.only_still,
+        without_depth=request.no_depth,
+        intrinsics=camera,
+        depth_unit_m=request.depth_unit,
+    )
+    try:
+        return open_bag(request.source, choice)
+    except InputError as error:
+        raise type(error)(option_names(str(error))) from error
+
+
+def option_names(message: str) -> str:
+    """Return a message in which the fields of BagChoice are called as on the command line."""
+    names = "|".join(sorted(BAG_OPTIONS, key=len, reverse=True))
+    message = re.sub(r"\bwithout_depth\b(?!=)", "--no-depth", message)
+    said = re.sub(rf"(?<![\w-])({names})=(True\b)?", lambda m: BAG_OPTIONS[m[1]], message)
+    return re.sub(r" +([),.;]| )", r"\1", said)
+
+
+def request_of(source: Path, **options: Any) -> ImportRequest:
+    """Return the request of command-line options; those that were not given keep their default."""
+    request = ImportRequest(source=source)
+    return replace(request, **{k: v for k, v in options.items() if v is not None})

@@ -1,0 +1,363 @@
+"""`realsim plan`, `plan-show` and `plan-convert`: make, look at and exchange capture plans."""
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from realsim.app.console import Console, Tick
+from realsim.app.plan.request import Place, PlanRequest
+from realsim.errors import InputError
+from realsim_capture_plans.arms.kinematics import CHAINS, DhChain
+from realsim_capture_plans.collision.shapes import Mount
+from realsim_capture_plans.plan_files.evidence import JointUnit
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+if TYPE_CHECKING:
+    from realsim_capture_plans.pictures.replay import PlanReplay
+
+PICTURES = "_pictures"
+"""Added to a plan's name: the folder of its pictures beside it."""
+ODD_ROW_M = 0.010
+"""A tool pose that is farther than this from its joints' is named [m]; arms leave 1 to 3 mm."""
+ODD_ROW_TIMES = 5.0
+"""And that is this many times the median's distance."""
+LOOKING_BACK = -0.2
+"""Cosine between optical axis and tool z below which a camera looks back."""
+NO_PLAN_DEG = 180.0
+"""The advice's hole where a place has fewer reachable views than were asked for [deg]."""
+NAMED_LEGS = 12
+"""Colliding pieces of moves that are printed one by one."""
+Progress = Callable[[str, int, int], None]
+"""Called with (what, done, total)."""
+
+
+def run_plan(request: PlanRequest, *, advise: bool, quiet: bool) -> bool:
+    """Make a plan and write it with its pictures; return whether all its moves are free.
+
+    Raises:
+        InputError: something given cannot be used, or the plan is there already.
+        DegenerateError: fewer views are reachable than asked for.
+    """
+    console = Console(quiet=quiet)
+    place, config = request.place, request.config()
+    chain, mount = place.chain() or CHAINS["UR5"], place.camera_mount()
+    if advise:
+        show_advice(request, chain, mount, config, console)
+        return True
+    out, pictures = request.out, not request.no_pictures
+    _check_free_name(out, request.overwrite, pictures)
+    plan = make_plan(request, chain, mount, config, console)
+    plan = replace(plan, metrics=plan.metrics | _metrics(plan))
+    from realsim_capture_plans.plan_files.plan_json import save_plan
+
+    save_plan(plan, out)
+    show_plan(plan, plan.metrics, console)
+    free = show_colliding(plan, console)
+    console.say(f"plan: {out}")
+    if pictures:
+        _write_pictures(plan, plan.metrics, picture_folder(out), console)
+    return free
+
+
+def make_plan(
+    request: PlanRequest, chain: DhChain, mount: Mount, config: PlanConfig, console: Console
+) -> CapturePlan:
+    """Return the plan, with a progress bar for each of the planner's steps."""
+    from realsim_capture_plans.planning.make import calibration_plan, hemisphere_plan
+
+    boxes = request.place.boxes()
+    maker = calibration_plan if request.board else hemisphere_plan
+    rng = np.random.default_rng(request.seed)
+    with ExitStack() as stack:
+        return maker(
+            request.count, request.center(config), mount, config, rng, chain=chain,
+            obstacles=boxes, progress=_progress(console, stack),
+        )  # fmt: skip
+
+
+def _progress(console: Console, stack: ExitStack) -> Progress:
+    """Return a function that draws one bar after the other."""
+    bars: dict[str, Tick] = {}
+
+    def tell(what: str, done: int, total: int) -> None:
+        if what not in bars:
+            stack.close()  # the bar before is done
+            bars.clear()
+            bars[what] = stack.enter_context(console.stage("plan", what))
+        bars[what](done, total)
+
+    return tell
+
+
+def show_advice(
+    request: PlanRequest, chain: DhChain, mount: Mount, config: PlanConfig, console: Console
+) -> None:
+    """Print where the scene's centre is best put."""
+    from realsim_capture_plans.planning.advise import advice, advise
+
+    center = request.center(config)
+    z = center[2]
+    n = request.count
+    with console.stage("advise", "places for the scene") as tick:
+        places = advise(chain, mount, config, n, z - config.table_height_m, tick=tick)
+    rows = [
+        (
+            ",".join(f"{v:.3f}" for v in p.center),
+            f"{p.table_height_m:.2f}",
+            f"{100 * p.reachable_share:.1f} %",
+            *(
+                f"{hole:.1f} deg" if hole < NO_PLAN_DEG else f"fewer than {n} views"
+                for hole in (p.hole_deg, p.one_elbow_hole_deg)
+            ),
+        )
+        for p in places
+    ]
+    header = ("--center (in base, m)", "--table-height", "reachable", "largest hole", "one elbow")
+    console.table(f"Places for {n} views with a {chain.name}, best first", header, rows)
+    console.say(advice(places, center, config.table_height_m))
+    console.say(
+        "The base turns the arm to any side alike: only the distance from its axis and the heights "
+        "matter here. Obstacles and the table's edges are looked at by the plan itself."
+    )
+
+
+def run_show(
+    text: str, *, pictures: bool, replay: bool, replay_file: Path | None, host: str, port: int
+) -> bool:
+    """Show a plan: its metrics, its pictures, its replay; return whether all moves are free.
+
+    Raises:
+        InputError: no such plan.
+    """
+    from realsim_capture_plans.plan_files.shipped_plans import PREFIX, resolve_plan
+
+    console = Console()
+    plan = resolve_plan(text)
+    metrics = plan.metrics | _metrics(plan)
+    show_plan(plan, metrics, console)
+    free = show_colliding(plan, console)
+    if pictures:
+        folder = picture_folder(Path(text.removeprefix(PREFIX)))
+        _write_pictures(plan, metrics, folder, console)
+    if replay_file is not None:
+        from realsim_capture_plans.pictures.replay import write_replay
+
+        write_replay(plan, replay_file)
+        console.say(f"replay: {replay_file}")
+    if replay:
+        from realsim_capture_plans.pictures.replay import serve_replay
+
+        _serve(serve_replay(plan, host, port), console)
+    return free
+
+
+def _serve(replay: "PlanReplay", console: Console) -> None:
+    """Keep the replay running until the user ends it."""
+    console.say(f"replay at {replay.url} (Ctrl-C ends)")
+    try:
+        while True:
+            time.sleep(1.0)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        replay.stop()
+
+
+def run_convert(
+    source: str, dest: Path, place: Place, *, joints_unit: JointUnit | None, overwrite: bool
+) -> bool:
+    """Write a plan or a joint path in another form; return whether all its moves are free.
+
+    Raises:
+        InputError: the source is neither, the target has no known form or is there already.
+    """
+    console = Console()
+    writer = _writer(dest)
+    if dest.exists() and not overwrite:
+        raise InputError(f"{dest} is there already; --overwrite replaces it, or name another.")
+    plan = _source_plan(source, place, joints_unit, console)
+    files = writer(plan, dest)
+    free = show_colliding(plan, console) if plan.kind == "imported" else True
+    for path in files:
+        console.say(str(path))
+    return free
+
+
+def _source_plan(
+    source: str, place: Place, joints_unit: JointUnit | None, console: Console
+) -> CapturePlan:
+    """Return the plan that a file holds, or the one that a joint path makes."""
+    from realsim_capture_plans.plan_files.imported import plan_of_path
+    from realsim_capture_plans.plan_files.joint_paths import read_path
+    from realsim_capture_plans.plan_files.plan_json import SCHEMA, read_json
+    from realsim_capture_plans.plan_files.shipped_plans import PREFIX, resolve_plan
+
+    path = Path(source)
+    is_plan = source.startswith(PREFIX)
+    if path.suffix.lower() == ".json" and path.is_file():
+        data = read_json(path, "a plan or a joint path")
+        is_plan = isinstance(data, dict) and data.get("schema") == SCHEMA
+    if is_plan or not path.exists():
+        if is_plan and (place != Place() or joints_unit):
+            raise InputError(
+                f"{source} is a realsim plan: its robot, mount and scene are in it and cannot be "
+                "changed by options. Make it anew with `realsim plan`."
+            )
+        return resolve_plan(source)
+    chain = place.chain()
+    found = read_path(path, chain, joints_unit)
+    if found.reading is not None:
+        tool = 1e3 * found.reading.T_ee_tcp[:3, 3]
+        console.say(f"{source} fits {found.reading.text()} are left with one constant tool offset")
+        console.say(f"tool offset: {', '.join(f'{v:.1f}' for v in tool)} mm in the flange")
+        if found.reading.worst_m > max(ODD_ROW_M, ODD_ROW_TIMES * found.reading.gap_m):
+            console.warn(
+                f"the tool pose of row {found.reading.worst} (counted from 0) is "
+                f"{1e3 * found.reading.worst_m:.0f} mm from where its joints put the tool, and the "
+                "worst of all rows. Its joints are driven all the same: look which of the two is "
+                "wrong before you drive it."
+            )
+        chain = chain or found.reading.chain
+    if chain is None:
+        raise InputError(
+            f"{source} does not say which robot it is for; choose --robot ({', '.join(CHAINS)})."
+        )
+    plan = plan_of_path(
+        found,
+        chain=chain,
+        mount=place.camera_mount(),
+        config=place.config(),
+        center=place.given_center() if place.center else None,
+        obstacles=place.boxes(),
+    )
+    return replace(plan, metrics=_metrics(plan) | plan.metrics)
+
+
+def _writer(dest: Path) -> Callable[[CapturePlan, Path], list[Path]]:
+    """Return what writes a file of this suffix."""
+    from realsim_capture_plans.plan_files.exported import export_csv, export_urscript
+    from realsim_capture_plans.plan_files.graspnet import export_graspnet
+    from realsim_capture_plans.plan_files.plan_json import save_plan
+
+    writers: dict[str, Callable[[CapturePlan, Path], None]] = {
+        ".json": save_plan,
+        ".csv": export_csv,
+        ".script": export_urscript,
+    }
+    suffix = dest.suffix.lower()
+    if suffix in writers:
+
+        def one(plan: CapturePlan, path: Path) -> list[Path]:
+            writers[suffix](plan, path)
+            return [path]
+
+        return one
+    if not suffix and not dest.is_file():
+        return export_graspnet
+    raise InputError(
+        f"'{dest}' has no form that is written: .json (realsim plan), .csv (table), .script "
+        "(URScript), or a folder without a suffix (GraspNet's camera_poses.npy)."
+    )
+
+
+def _metrics(plan: CapturePlan) -> dict[str, float]:
+    from realsim_capture_plans.planning.metrics import plan_metrics
+
+    return plan_metrics(plan)
+
+
+def show_plan(plan: CapturePlan, metrics: dict[str, float], console: Console) -> None:
+    """Print what the plan is for, and its metrics beside what is good."""
+    from realsim_capture_plans.plan_files.imported import IMPORT_MEANINGS
+    from realsim_capture_plans.planning.metric_meanings import goal_of
+    from realsim_capture_plans.planning.metrics import METRIC_MEANINGS
+
+    meanings = METRIC_MEANINGS | IMPORT_MEANINGS
+    x, y, z = plan.center_world.tolist()
+    own = any(np.any(getattr(plan.chain, f"delta_{p}")) for p in ("a", "d", "alpha", "theta"))
+    arm = f"{plan.robot}, {'with its own calibration' if own else 'nominal'}"
+    console.say(
+        f"{plan.kind} plan: {len(plan)} views of ({x:.3f}, {y:.3f}, {z:.3f}) m; {arm}; "
+        f"{plan.mount.name}; sha256 {plan.content_hash[:12]}"
+    )
+    rows: list[tuple[str, str, str, str]] = []
+    missed: list[str] = []
+    for name in [*meanings, *sorted(set(metrics) - set(meanings))]:
+        if name not in metrics:
+            continue
+        meaning, value = meanings.get(name), metrics[name]
+        if meaning is None:
+            rows.append((name, f"{value:.4g}", "", ""))
+            continue
+        goal = goal_of(name, meaning, value, plan)
+        rows.append(
+            (
+                meaning.text,
+                f"{value:.4g} {meaning.unit}".strip(),
+                goal.text,
+                {True: "", False: "MISSED", None: ""}[goal.met],
+            )
+        )
+        if goal.met is False:
+            missed.append(f"{meaning.text}: {value:.4g} {meaning.unit}, good is {goal.text}")
+    console.table("How good it is", ("metric", "value", "good", ""), rows)
+    for line in missed:
+        console.warn(line)
+    if plan.mount.T_ee_cam[2, 2] < LOOKING_BACK:
+        console.warn(
+            f"the camera of mount '{plan.mount.name}' looks back along the arm. If it looks away "
+            "from the flange as usual, the mount's rotation is wrong."
+        )
+
+
+def show_colliding(plan: CapturePlan, console: Console) -> bool:
+    """Name the moves that collide in the model; return whether there are none."""
+    from realsim_capture_plans.plan_files.imported import colliding_legs
+
+    legs = colliding_legs(plan)
+    for line in legs[:NAMED_LEGS]:
+        console.warn(f"not free: {line}")
+    if len(legs) > NAMED_LEGS:
+        console.warn(f"not free: {len(legs) - NAMED_LEGS} more")
+    if legs:
+        console.warn(
+            f"{len(legs)} straight pieces of moves do not keep {1e3 * plan.config.clearance_m:g} "
+            "mm to everything. Check mount, table height and keep-out box; do not drive them "
+            "before they are."
+        )
+    return not legs
+
+
+def picture_folder(out: Path) -> Path:
+    """Return the folder beside a plan that its pictures go to."""
+    return out.with_name(out.stem + PICTURES)
+
+
+def _check_free_name(out: Path, overwrite: bool, pictures: bool) -> None:
+    """Raise before the work is done if its result could not be written."""
+    if out.suffix.lower() != ".json":
+        raise InputError(f"--out '{out}': a plan is a .json file; plan-convert writes other forms.")
+    if out.is_dir():
+        raise InputError(f"--out '{out}' is a folder; name a .json file.")
+    folder = picture_folder(out)
+    there = [p for p in (out, folder) if p.exists() and (pictures or p is out)]
+    if there and not overwrite:
+        raise InputError(
+            f"{there[0]} is there already, and a plan that was driven must not be lost. Name "
+            "another with --out, or replace it with --overwrite."
+        )
+
+
+def _write_pictures(
+    plan: CapturePlan, metrics: dict[str, float], folder: Path, console: Console
+) -> None:
+    from realsim_capture_plans.pictures.plan_pictures import plan_pictures
+
+    with console.stage("pictures"):
+        files = plan_pictures(plan, folder, metrics)
+    console.say(f"{len(files)} pictures: {folder}")

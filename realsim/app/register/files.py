@@ -1,0 +1,253 @@
+"""What `realsim register` leaves in SESSION/registration, and how other stages read it.
+
+    scene.json          objects in world with covariance, checks and verdict; the table
+    scene_table.json    the same in the table's frame: the one reference frame of the scene
+    views.json          every object in every view: pose, covariance, sigma in mm and px
+    cameras.json        where the cameras were said to be, and where they are
+    scene_gt.json, scene_camera.json      the views in BOP's form [mm]
+    single_view.json    the baseline: one view from above
+    report.json         how it came about, what was not placed, what is wrong with views
+    next.json           only while a result is being put in place
+
+A result is many files, and a kill may come between two of them. So all values are first written to
+next.json, whole or not at all; from then on the new result counts, and whoever comes next puts it
+in place.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from realsim.app.register.results import (
+    CAMERAS_FILE,
+    FOLDER,
+    FORMAT_VERSION,
+    NEXT_FILE,
+    REPORT_FILE,
+    SCENE_FILE,
+    SINGLE_FILE,
+    STAGE_FILE,
+    TABLE_FILE,
+    VIEWS_FILE,
+    Array,
+    CameraChange,
+    Json,
+    Registered,
+    Remark,
+    cameras_from_json,
+    cameras_now,
+    is_same_cameras,
+    poses_from_json,
+    sigmas_of,
+)
+from realsim.formats.bop import units as bop_units
+from realsim.geometry import se3
+from realsim.records import ObjectModel, Scene
+from realsim.store import SessionStore, atomic, records_json
+from realsim.store.records_json import array_to_json, number_to_json
+
+# --- to JSON ----------------------------------------------------------------------------------
+
+
+def plain(value: Any) -> Any:
+    """Return JSON values with NaN and infinity, which JSON has not, as null."""
+    if isinstance(value, Mapping):
+        items: Any = value.items()  # pyright: ignore[reportUnknownVariableType, reportUnknownMemberType]
+        return {str(k): plain(v) for k, v in items}
+    if isinstance(value, list | tuple):
+        return [plain(v) for v in value]  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, np.generic | np.ndarray):
+        return plain(value.tolist())  # pyright: ignore[reportUnknownMemberType]
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value
+
+
+def documents(
+    result: Registered, store: SessionStore, models: Mapping[int, ObjectModel]
+) -> dict[str, Any]:
+    """Return the values of every file of a registration, by its path in the session."""
+    report = result.report | {
+        "not_placed": [
+            {"obj_id": n.obj_id, "instance": n.instance, "reason": n.reason}
+            for n in result.not_placed
+        ],
+        "findings": [{"view": r.view, "kind": r.kind, "words": r.words} for r in result.remarks],
+    }
+    return {
+        CAMERAS_FILE: _cameras_to_json(result.cameras),
+        VIEWS_FILE: _seen_to_json(result, models),
+        TABLE_FILE: _table_to_json(result.scene, models),
+        f"{FOLDER}/scene_gt.json": _bop_objects(result),
+        f"{FOLDER}/scene_camera.json": _bop_cameras(result, store),
+        SINGLE_FILE: records_json.scene_to_json(result.single_view),
+        REPORT_FILE: plain(report),
+        SCENE_FILE: records_json.scene_to_json(result.scene),
+    }
+
+
+def _cameras_to_json(cameras: CameraChange) -> Json:
+    """Return the cameras before and after."""
+    return {
+        "format_version": FORMAT_VERSION,
+        "claimed": _poses_to_json(cameras.claimed),
+        "refined": _poses_to_json(cameras.refined),
+    }
+
+
+def _poses_to_json(poses: Mapping[int, Array]) -> Json:
+    """Return poses by view."""
+    return {str(k): array_to_json(poses[k]) for k in sorted(poses)}
+
+
+def _seen_to_json(result: Registered, models: Mapping[int, ObjectModel]) -> Json:
+    """Return every object in every view."""
+    views: Json = {}
+    seen, scene = result.seen, result.scene
+    for index in sorted(seen):
+        rows: Json = {}
+        for instance, pose in sorted(seen[index].items()):
+            mm, deg = sigmas_of(pose.covariance, models.get(scene.object(instance).obj_id))
+            rows[str(instance)] = {
+                "sigma_px": number_to_json(pose.sigma_px),
+                "sigma_mm": number_to_json(mm),
+                "sigma_deg": number_to_json(deg),
+                "T_cam_obj": array_to_json(pose.T_cam_obj),
+                "covariance": array_to_json(pose.covariance),
+            }
+        views[str(index)] = rows
+    return {
+        "format_version": FORMAT_VERSION,
+        "covariance_of": "right perturbation of T_cam_obj, rotation first [rad, m]",
+        "views": views,
+    }
+
+
+def _table_to_json(scene: Scene, models: Mapping[int, ObjectModel]) -> Json:
+    """Return the scene in the table's frame; in world where no table was found.
+
+    A covariance is of the right perturbation, in the object's own frame: it does not change.
+    """
+    plane = scene.plane
+    T_world_table = np.eye(4) if plane is None else plane.T_world_table
+    rows: list[Json] = []
+    for o in scene.objects:
+        row = records_json.object_pose_to_json(o)
+        T_world_obj = row.pop("T_world_obj")
+        T = se3.invert(T_world_table) @ np.asarray(T_world_obj)
+        name = models[o.obj_id].name if o.obj_id in models else ""
+        rows.append({"name": name} | row | {"T_table_obj": array_to_json(T)})
+    return {
+        "format_version": FORMAT_VERSION,
+        "name": scene.name,
+        "frame": "world" if plane is None else "table",
+        "T_world_table": array_to_json(T_world_table),
+        "rms_m": None if plane is None else number_to_json(plane.rms_m),
+        "inliers": None if plane is None else int(plane.inliers),
+        "objects": rows,
+    }
+
+
+def _bop_objects(result: Registered) -> Json:
+    """Return BOP's scene_gt [mm] of the views that took part, rejected objects left out."""
+    scene: Json = {}
+    for index, T_world_cam in sorted(result.cameras.refined.items()):
+        rows: list[Json] = []
+        for o in result.scene.objects:
+            T_cam_obj = se3.invert(T_world_cam) @ o.T_world_obj
+            if o.verdict == "rejected" or T_cam_obj[2, 3] <= 0:
+                continue
+            rotation, translation = bop_units.lists_from_rigid(T_cam_obj)
+            bop_units.object_in_camera(rotation, translation, f"instance {o.instance}")
+            rows.append({"cam_R_m2c": rotation, "cam_t_m2c": translation, "obj_id": o.obj_id})
+        scene[str(index)] = rows
+    return scene
+
+
+def _bop_cameras(result: Registered, store: SessionStore) -> Json:
+    """Return BOP's scene_camera [mm] of the views that took part."""
+    session = store.session
+    return {
+        str(k): bop_units.camera_entry(session.intrinsics, session.depth_unit_m, T)
+        for k, T in sorted(result.cameras.refined.items())
+    }
+
+
+class FoundThing(Protocol):
+    """A finding; that of a view has an `index` as well, that of a robot pose a `view`."""
+
+    @property
+    def kind(self) -> str: ...  # noqa: D102
+
+    @property
+    def words(self) -> str: ...  # noqa: D102
+
+
+def remark_of(finding: FoundThing) -> Remark:
+    """Return a finding as it is stored."""
+    view: int | None = getattr(finding, "index", getattr(finding, "view", None))
+    return Remark(view=view, kind=str(finding.kind), words=finding.words)
+
+
+# --- writing ----------------------------------------------------------------------------------
+
+
+def write_result(
+    store: SessionStore,
+    result: Registered,
+    models: Mapping[int, ObjectModel],
+    pictures: Mapping[str, bytes],
+) -> None:
+    """Put a registration into its session; a kill leaves the old one or the new one.
+
+    Args:
+        store: the session; its cameras become the refined ones.
+        result: what was found.
+        models: obj_id -> model, for the names.
+        pictures: path -> bytes of pictures and page.
+    """
+    before = cameras_now(store)
+    value = {
+        "before": _poses_to_json(before),
+        "files": documents(result, store, models),
+    }
+    store.remove(STAGE_FILE)  # from here on the old result is not known to be whole
+    store.write_bytes(NEXT_FILE, atomic.json_bytes(value, indent=None))
+    finish_interrupted(store)
+    for path, data in pictures.items():
+        store.write_bytes(path, data)
+
+
+def write_claims(store: SessionStore, claimed: Mapping[int, Array]) -> None:
+    """Give a session without cameras those that were found for it, before any refinement."""
+    change = CameraChange(claimed=dict(claimed), refined={})
+    store.write_json(CAMERAS_FILE, _cameras_to_json(change))
+    store.set_cameras(store.session.intrinsics, claimed)
+
+
+def finish_interrupted(store: SessionStore) -> bool:
+    """Put a result in place that a kill left in next.json; return whether there was one.
+
+    Not where the cameras have been calibrated anew since: the result is of the old ones.
+    """
+    if not store.has(NEXT_FILE):
+        return False
+    value = store.read_json(NEXT_FILE)
+    files: Json = value["files"]
+    change = cameras_from_json(files[CAMERAS_FILE])
+    now = cameras_now(store)
+    known = any(
+        is_same_cameras(now, cameras)
+        for cameras in (poses_from_json(value["before"]), change.session)
+    )
+    if known:
+        # The order is that of trust: the scene comes last, when its cameras are in place.
+        for path, content in files.items():
+            if path == SCENE_FILE:
+                store.set_cameras(store.session.intrinsics, change.session)
+            # On one line: covariances, a number a line, would be a hundred thousand lines.
+            indent = None if path in (VIEWS_FILE, f"{FOLDER}/scene_gt.json") else 1
+            store.write_bytes(path, atomic.json_bytes(content, indent=indent))
+    store.remove(NEXT_FILE)
+    return known

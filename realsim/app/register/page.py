@@ -1,0 +1,143 @@
+"""The page of one registration: tables and pictures in one file that prints well."""
+
+import base64
+import html
+from collections.abc import Mapping
+from importlib.resources import files
+from string import Template
+
+from realsim import __version__
+from realsim.app.register.pictures import GAIN, MAP, OVERLAY, RESIDUALS
+from realsim.app.register.results import Registered
+from realsim.app.register.tables import (
+    MISSING_HEADER,
+    OBJECT_HEADER,
+    VIEW_HEADER,
+    Rows,
+    camera_line,
+    depth_line,
+    missing_rows,
+    object_rows,
+    odometry_line,
+    summary_line,
+    table_line,
+    view_rows,
+)
+from realsim.app.report.session import Page
+from realsim.records import ObjectModel
+from realsim.scanning.scale.pictures import VERDICT_COLORS
+from realsim.store import SessionStore
+
+STYLE = """<style>
+.tag { color: white; padding: .05em .5em; border-radius: 3px; font-size: 12px; }
+td:last-child { max-width: 34em; }
+@media print {
+  body { max-width: none; margin: 0; font-size: 11px; }
+  figure, table { break-inside: avoid; }
+  h2 { break-after: avoid; margin-top: 1.2em; }
+  .tag { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
+}
+</style>"""
+CAPTIONS: dict[str, tuple[str, str]] = {
+    OVERLAY: (
+        "In the photographs",
+        "Outlines through the refined cameras, in the colour of the verdict: green accepted, amber "
+        "doubtful, red rejected. One sigma of each view is that of its median object.",
+    ),
+    GAIN: (
+        "What refining the cameras gained",
+        "The same edge of the same object, much enlarged: through the camera as robot and "
+        "calibration claim it, and as it was refined.",
+    ),
+    RESIDUALS: (
+        "Measured depth against the scene",
+        "Red: measured in front of the model; blue: behind. Speckle is the sensor's noise. An "
+        "object of one colour is in the wrong place; a slope on the table is a tilted camera.",
+    ),
+    MAP: ("The table from above", "Frame of the table: z is up, out of the paper."),
+}
+"""Title and caption of every picture, in the order of the page."""
+
+
+def page_bytes(
+    store: SessionStore,
+    result: Registered,
+    models: Mapping[int, ObjectModel],
+    pictures: Mapping[str, bytes],
+) -> bytes:
+    """Return the page.
+
+    Args:
+        store: the session.
+        result: what was found.
+        models: obj_id -> model.
+        pictures: file name -> JPEG or PNG; those that are missing are left out.
+    """
+    page = Page(parts=[STYLE])
+    page.section("Objects", f"{summary_line(result)}. {table_line(result)}")
+    if result.scene.objects:
+        page.parts.append(_verdict_table(OBJECT_HEADER, object_rows(result, models)))
+    if result.not_placed:
+        page.section("Not placed")
+        page.table(MISSING_HEADER, missing_rows(result, models))
+    if result.remarks:
+        page.section("Views and scene")
+        page.table(VIEW_HEADER, view_rows(result))
+    lines = (camera_line(result), depth_line(result), odometry_line(result))
+    page.section("Cameras", " ".join(t for t in lines if t))
+    for file, (title, caption) in CAPTIONS.items():
+        if file in pictures:
+            page.section(title)
+            page.parts.append(_figure(file, pictures[file], caption))
+    page.section("Checks without ground truth")
+    page.table(*_checks(result, models))
+    template = Template((files("realsim.app") / "report_page.html").read_text())
+    n, taken = len(store.session.views), len(result.cameras.refined)
+    text = template.substitute(
+        title=html.escape(f"Registration of {result.scene.name}"),
+        about=html.escape(f"{taken} of {n} views, method {_method(result)}"),
+        body="\n".join(page.parts),
+        version=__version__,
+    )
+    return text.encode("utf-8")
+
+
+def _method(result: Registered) -> str:
+    """Return the method by name."""
+    return str(result.report.get("asked", {}).get("method", "joint"))
+
+
+def _verdict_table(header: list[str], rows: Rows) -> str:
+    """Return a table whose second column is a verdict in its colour."""
+    head = "".join(f"<th>{html.escape(h)}</th>" for h in header)
+    body = ""
+    for row in rows:
+        cells = [html.escape(c) for c in row]
+        cells[1] = (
+            f'<span class="tag" style="background:{VERDICT_COLORS[row[1]]}">{cells[1]}</span>'
+        )
+        body += "<tr>" + "".join(f"<td>{c}</td>" for c in cells) + "</tr>"
+    return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _figure(file: str, data: bytes, caption: str) -> str:
+    """Return a picture inside the page itself."""
+    kind = "jpeg" if file.endswith(".jpg") else "png"
+    text = html.escape(caption)
+    code = base64.b64encode(data).decode()
+    return (
+        f'<figure><img src="data:image/{kind};base64,{code}" alt="{text}">'
+        f"<figcaption>{text}</figcaption></figure>"
+    )
+
+
+def _checks(result: Registered, models: Mapping[int, ObjectModel]) -> tuple[list[str], Rows]:
+    """Return every check of every object: one row a check, one column an object."""
+    objects = result.scene.objects
+    checks = sorted({name for o in objects for name in o.checks})
+    header = ["check", *[f"{o.instance} {models[o.obj_id].name}" for o in objects]]
+    rows = [
+        [name, *[f"{o.checks[name]:.3g}" if name in o.checks else "-" for o in objects]]
+        for name in checks
+    ]
+    return header, rows

@@ -1,0 +1,289 @@
+"""Pictures of a registration: outlines on the photographs, depth residuals, gain, a map."""
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.first_surfaces import FirstSurfaces
+from realsim.app.register.results import Registered
+from realsim.geometry import se3
+from realsim.records import Mesh, ObjectModel, ObjectPose
+from realsim.records.depth_bias import DepthBias
+from realsim.rendering.overlay import INK, PAPER, VERDICT_RGB, contact_sheet, draw_outlines
+from realsim.rendering.overlay_words import write_names
+from realsim.rendering.rays import BACKGROUND, PlacedMesh
+from realsim.scanning.scale.picture_shading import diverging
+from realsim.store import SessionStore
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int32]
+Image = NDArray[np.uint8]
+Color = tuple[int, int, int]
+Window = tuple[slice, slice]
+OUTLINE: Color = (70, 78, 88)
+"""Of objects under depth residuals: neither red nor blue."""
+OVERLAY, GAIN, RESIDUALS, MAP = "overlay.jpg", "cameras.jpg", "residuals.jpg", "map.png"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PictureConfig:
+    """How pictures are drawn."""
+
+    views: int = 6
+    """Photographs of a contact sheet."""
+    columns: int = 2
+    """Of a contact sheet: on three, names are too small to read."""
+    width_px: int = 960
+    """Width of one photograph in a contact sheet [px]."""
+    margin: float = 0.3
+    """Surroundings shown on each side of the objects [share of their size in the picture]."""
+    least_share: float = 0.4
+    """At least so much of a photograph's width is shown: one small object alone says little."""
+    range_mm: float = 1.5
+    """The strongest colour of depth residuals [mm]: an object that is off by more is not used."""
+    smooth_px: int = 21
+    """Residuals are averaged over so many pixels of the same object: noise is not the question."""
+    wild_mm: float = 6.0
+    """Residuals beyond this count as this much: one flying pixel is not a patch [mm]."""
+    table_m: float = 0.25
+    """Half the side of the piece of table that residuals are drawn on, beyond the objects [m]."""
+    quality: int = 88
+    """Of JPEG files [percent]."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Look:
+    """One view as it should be by the result."""
+
+    index: int
+    ids: Ids
+    """(H, W) instance; -1 = table or nothing."""
+    depth_m: Array
+    """(H, W) of objects and table [m]; NaN = nothing."""
+    window: Window
+    """The part around the objects."""
+
+
+def draw_pictures(
+    store: SessionStore,
+    result: Registered,
+    models: Mapping[int, ObjectModel],
+    config: PictureConfig | None = None,
+) -> dict[str, bytes]:
+    """Return file name -> bytes of every picture that can be drawn of a registration.
+
+    Args:
+        store: the session, for photographs and depth.
+        result: what was found.
+        models: obj_id -> model.
+        config: how they are drawn.
+    """
+    from realsim.app.register.gain import gain_picture
+    from realsim.app.register.map import map_png
+
+    config = config or PictureConfig()
+    if not result.scene.objects or not result.cameras.refined:
+        return {}
+    scene = FirstSurfaces([*placed_objects(result, models), *_table(result, config)])
+    looks: list[_Look] = []
+    for index in spread_views(result, config.views):
+        ids, depth = scene.look(store.session.intrinsics, result.cameras.refined[index])
+        looks.append(_Look(index=index, ids=ids, depth_m=depth, window=window_of(ids, config)))
+    pictures = {
+        OVERLAY: jpeg(_overlay_sheet(store, result, models, looks, config), config.quality),
+        RESIDUALS: jpeg(_residual_sheet(store, result, looks, config), config.quality),
+        MAP: map_png(result, models),
+    }
+    gain = gain_picture(store, result, models)
+    if gain is not None:
+        pictures[GAIN] = jpeg(gain, config.quality)
+    return pictures
+
+
+def spread_views(result: Registered, n: int) -> list[int]:
+    """Return at most n of the views that took part, spread evenly."""
+    views = sorted(result.cameras.refined)
+    pick = np.unique(np.linspace(0, len(views) - 1, min(n, len(views))).round().astype(int))
+    return [views[k] for k in pick]
+
+
+def placed_objects(result: Registered, models: Mapping[int, ObjectModel]) -> list[PlacedMesh]:
+    """Return the objects as they stand in world."""
+    return [
+        PlacedMesh(o.instance, models[o.obj_id].mesh, o.T_world_obj) for o in result.scene.objects
+    ]
+
+
+def window_of(ids: Ids, config: PictureConfig) -> Window:
+    """Return the part of a picture around all objects, of the picture's own proportions.
+
+    The whole picture where no object is in it.
+    """
+    height, width = ids.shape
+    rows, columns = np.nonzero(ids >= 0)
+    if len(rows) == 0:
+        return slice(0, height), slice(0, width)
+    low, high = np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1
+    size = np.array([width, height])
+    share = float(np.max((high - low) * (1 + 2 * config.margin) / size))
+    wide = np.round(np.clip(share, config.least_share, 1.0) * size).astype(int)
+    x, y = np.clip(np.round((low + high - wide) / 2).astype(int), 0, size - wide)
+    return slice(int(y), int(y + wide[1])), slice(int(x), int(x + wide[0]))
+
+
+def jpeg(rgb: Image, quality: int) -> bytes:
+    """Return a picture as JPEG."""
+    from PIL import Image as Pil
+
+    buffer = io.BytesIO()
+    Pil.fromarray(rgb).save(buffer, "JPEG", quality=quality)
+    return buffer.getvalue()
+
+
+def _table(result: Registered, config: PictureConfig) -> list[PlacedMesh]:
+    """Return a piece of the table around the objects."""
+    plane = result.scene.plane
+    if plane is None:
+        return []
+    places = np.stack([o.T_world_obj[:3, 3] for o in result.scene.objects])
+    local = se3.transform(se3.invert(plane.T_world_table), places)[:, :2]
+    (x0, y0), (x1, y1) = local.min(0) - config.table_m, local.max(0) + config.table_m
+    corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    return [PlacedMesh(BACKGROUND, Mesh(vertices=corners, faces=faces), plane.T_world_table)]
+
+
+def _resized(rgb: Image, config: PictureConfig) -> Image:
+    """Return a picture at the width of the sheet."""
+    import cv2
+
+    height = round(rgb.shape[0] * config.width_px / rgb.shape[1])
+    kind = cv2.INTER_AREA if rgb.shape[1] > config.width_px else cv2.INTER_CUBIC
+    sized = cv2.resize(rgb, (config.width_px, height), interpolation=kind)
+    return np.ascontiguousarray(np.asarray(sized, dtype=np.uint8))
+
+
+def _resized_ids(ids: Ids, config: PictureConfig) -> Ids:
+    """Return instances (H, W) at the width of the sheet."""
+    import cv2
+
+    height = round(ids.shape[0] * config.width_px / ids.shape[1])
+    sized = cv2.resize(ids, (config.width_px, height), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(sized, dtype=np.int32)
+
+
+# --- outlines ---------------------------------------------------------------------------------
+
+
+def _overlay_sheet(
+    store: SessionStore,
+    result: Registered,
+    models: Mapping[int, ObjectModel],
+    looks: Sequence[_Look],
+    config: PictureConfig,
+) -> Image:
+    """Return photographs with every object's outline and name in the colour of its verdict."""
+    colors = {o.instance: VERDICT_RGB[o.verdict] for o in result.scene.objects}
+    names = {o.instance: _name_of(o, models) for o in result.scene.objects}
+    pictures: list[Image] = []
+    for look in looks:
+        ids = _resized_ids(look.ids[look.window], config)
+        photo = _resized(store.rgb(look.index)[look.window], config)
+        picture = draw_outlines(photo, ids, colors, 2)
+        pictures.append(write_names(picture, ids, names, colors))
+    captions = [_view_caption(result, look.index) for look in looks]
+    return contact_sheet(pictures, config.columns, captions)
+
+
+def _name_of(o: ObjectPose, models: Mapping[int, ObjectModel]) -> str:
+    """Return number and name of an object, with its verdict where it is not accepted."""
+    name = f"{o.instance} {models[o.obj_id].name}"
+    return name if o.verdict == "accepted" else f"{name} ({o.verdict})"
+
+
+def _view_caption(result: Registered, index: int) -> str:
+    """Return the number of a view and how well it is known where its objects are."""
+    sigmas = [p.sigma_px for p in result.seen.get(index, {}).values() if np.isfinite(p.sigma_px)]
+    return f"view {index}" + (f": 1 sigma {np.median(sigmas):.2f} px" if sigmas else "")
+
+
+# --- depth ------------------------------------------------------------------------------------
+
+
+def _residual_sheet(
+    store: SessionStore, result: Registered, looks: Sequence[_Look], config: PictureConfig
+) -> Image:
+    """Return by how much the measured depth is nearer than the scene's, in colours."""
+    bias = bias_of(result)
+    pictures: list[Image] = []
+    captions: list[str] = []
+    for look in looks:
+        measured = bias.corrected(store.depth_m(look.index).astype(np.float64))
+        nearer = np.where(measured > 0, 1e3 * (look.depth_m - measured), np.nan)
+        smooth = _averaged(nearer, look.ids, config)[look.window]
+        photo = store.rgb(look.index)[look.window]
+        grey = 0.4 * photo.mean(-1, keepdims=True).repeat(3, -1) + 0.6 * 255
+        colored = np.where(np.isfinite(smooth)[..., None], diverging(smooth, config.range_mm), grey)
+        picture = _resized(np.clip(np.round(colored), 0, 255).astype(np.uint8), config)
+        ids = _resized_ids(look.ids[look.window], config)
+        outlines = dict.fromkeys(np.unique(ids[ids >= 0]).tolist(), OUTLINE)
+        pictures.append(draw_outlines(picture, ids, outlines, 1))
+        captions.append(_residual_caption(look.index, nearer[look.ids >= 0]))
+    sheet = contact_sheet(pictures, config.columns, captions)
+    return np.concatenate([sheet, _color_bar(sheet.shape[1], config.range_mm)], axis=0)
+
+
+def _averaged(values: Array, ids: Ids, config: PictureConfig) -> Array:
+    """Return values (H, W) averaged over the pixels around that see the same thing; NaN stays."""
+    import cv2
+
+    out = np.full(values.shape, np.nan)
+    side = (config.smooth_px, config.smooth_px)
+    held = np.clip(values, -config.wild_mm, config.wild_mm)
+    for instance in np.unique(ids):
+        mine = (ids == instance) & np.isfinite(values)
+        total = cv2.boxFilter(np.where(mine, held, 0.0), -1, side, normalize=False)
+        count = cv2.boxFilter(mine.astype(np.float64), -1, side, normalize=False)
+        out[mine] = np.asarray(total)[mine] / np.asarray(count)[mine]
+    return out
+
+
+def _residual_caption(index: int, nearer_mm: Array) -> str:
+    """Return the number of a view and its median residual on the objects."""
+    known = nearer_mm[np.isfinite(nearer_mm)]
+    if len(known) == 0:
+        return f"view {index}: no object measured"
+    return f"view {index}: median on the objects {np.median(known):+.2f} mm"
+
+
+def bias_of(result: Registered) -> DepthBias:
+    """Return the depth's whole bias: the calibration's, and what the refinement found beyond it."""
+    first: dict[str, Any] = result.report.get("asked", {}).get("depth_bias_taken_out", {})
+    then: dict[str, Any] = result.report.get("refinement", {})
+    s1, o1 = float(first.get("scale", 1.0)), float(first.get("offset_per_m", 0.0))
+    s2, o2 = float(then.get("depth_scale", 1.0)), float(then.get("depth_offset_per_m", 0.0))
+    # 1 / z2 = s2 (s1 / z + o1) + o2
+    return DepthBias(scale=s1 * s2, offset_per_m=s2 * o1 + o2)
+
+
+def _color_bar(width_px: int, range_mm: float) -> Image:
+    """Return a strip with the colours of the residuals and their numbers."""
+    import cv2
+
+    size = float(np.clip(width_px / 1900, 0.4, 0.9))
+    height = round(64 * size)
+    strip = np.full((height, width_px, 3), PAPER, np.uint8)
+    low, high = round(0.34 * width_px), round(0.66 * width_px)
+    ramp = diverging(np.linspace(-range_mm, range_mm, high - low), range_mm)
+    strip[round(10 * size) : round(34 * size), low:high] = np.round(ramp).astype(np.uint8)
+    left = f"-{range_mm:g} mm: measured behind the model"
+    right = f"+{range_mm:g} mm: measured in front"
+    (w, _), _ = cv2.getTextSize(left, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+    y = round(30 * size)
+    for text, x in ((left, low - w - 12), (right, high + 12)):
+        cv2.putText(strip, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, INK, 1, cv2.LINE_AA)
+    return strip

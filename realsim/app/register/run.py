@@ -1,0 +1,213 @@
+"""The registration of a session: read what is there, find the objects, write, draw."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.console import Console
+from realsim.app.register.colour import colour_remark
+from realsim.app.register.config import RegisterRequest
+from realsim.app.register.files import finish_interrupted, remark_of, write_result
+from realsim.app.register.inputs import RegisterInputs, read_inputs
+from realsim.app.register.results import (
+    PAGE_FILE,
+    PICTURES,
+    SCENE_FILE,
+    CameraChange,
+    Registered,
+    Remark,
+    cameras_now,
+    is_same_cameras,
+    load_cameras,
+    load_registered,
+)
+from realsim.app.stages import is_current, mark_current, require_sound, take_models
+from realsim.geometry import camera, se3
+from realsim.records import CameraIntrinsics, ObjectModel, Scene
+from realsim.registration.refinement.uncertainty import SeenPose
+from realsim.registration.result import Registration
+from realsim.store import SessionStore
+
+Array = NDArray[np.float64]
+STAGE = "register"
+PIXEL_POINTS = 40
+"""Vertices of a mesh over which the pixel uncertainty is averaged."""
+STEP = 1e-6
+"""Of the numerical derivative [rad, m]."""
+
+
+def register_session(
+    store: SessionStore,
+    console: Console,
+    library: Path | None = None,
+    request: RegisterRequest | None = None,
+) -> Scene:
+    """Register the objects of a session and return the scene; see `run_register`."""
+    return run_register(store, console, request or RegisterRequest(library=library)).scene
+
+
+def run_register(store: SessionStore, console: Console, request: RegisterRequest) -> Registered:
+    """Find the pose of every object in every view, and leave it in the session.
+
+    The session's cameras become the refined ones; where they were claimed to be is kept, and a
+    second run starts from there. With the same inputs nothing is computed again.
+
+    Args:
+        store: the session.
+        console: where progress is shown.
+        request: what was asked for.
+
+    Raises:
+        InputError: no camera poses, nothing says what is there, or an object without a mesh.
+        UnitError: a start is in other units than metres.
+    """
+    require_sound(store)
+    finish_interrupted(store)
+    with console.stage("register", "cameras" if request.hand_held else "inputs") as tick:
+        inputs = read_inputs(store, request, tick)
+    if is_current(store, STAGE, inputs.key) and store.has(SCENE_FILE):
+        return _as_it_was(store)
+    result = _registered(store, console, request, inputs)
+    models = inputs.models
+    if request.library is not None:
+        found = sorted({o.obj_id for o in result.scene.objects})
+        copied = take_models(store, request.library, found) if found else ()
+        if copied:
+            console.say(f"models {', '.join(map(str, copied))} copied from {request.library}")
+    with console.stage("register", "pictures and page"):
+        write_result(store, result, models, _pictures(store, result, models))
+    mark_current(store, STAGE, inputs.key)
+    return result
+
+
+def _as_it_was(store: SessionStore) -> Registered:
+    """Return the registration that is there, its cameras in place."""
+    record = load_cameras(store)
+    if record is not None and not is_same_cameras(cameras_now(store), record.session):
+        store.set_cameras(store.session.intrinsics, record.session)
+    return load_registered(store)
+
+
+def _registered(
+    store: SessionStore, console: Console, request: RegisterRequest, inputs: RegisterInputs
+) -> Registered:
+    """Return the result of the registration."""
+    from realsim.registration.register import register_scene
+
+    n = "what is there" if inputs.wanted is None else f"{len(inputs.wanted)} objects"
+    up = store.extra.get("gravity_up_world")
+    with console.stage("register", f"{n}, {len(inputs.views)} views") as tick:
+        found = register_scene(
+            store.session.name, store.session.intrinsics, inputs.frames(store), inputs.models,
+            inputs.wanted, inputs.config,
+            gravity_up_world=None if up is None else np.array(up), progress=tick,
+        )  # fmt: skip
+    result = as_registered(found, inputs, store.session.intrinsics, request)
+    off = colour_remark(store, sorted(found.cameras))
+    return result if off is None else replace(result, remarks=(*result.remarks, off))
+
+
+def as_registered(
+    found: Registration,
+    inputs: RegisterInputs,
+    intrinsics: CameraIntrinsics,
+    request: RegisterRequest,
+) -> Registered:
+    """Return what a registration found with what was asked of it."""
+    seen = found.seen or seen_at_their_word(found, inputs.models, intrinsics)
+    remarks = [Remark(view=k, kind="left_out", words=why) for k, why in inputs.left_out]
+    remarks += [remark_of(f) for f in found.findings]
+    asked = {
+        "method": request.method,
+        "cameras_refined": bool(found.seen),
+        "hand_held": request.hand_held,
+        "views": list(inputs.views),
+        "depth_bias_taken_out": {
+            "scale": inputs.config.bias.scale,
+            "offset_per_m": inputs.config.bias.offset_per_m,
+        },
+    }
+    return Registered(
+        scene=found.scene, single_view=found.single_view,
+        cameras=CameraChange(claimed=dict(inputs.claimed), refined=dict(found.cameras)),
+        seen={k: dict(poses) for k, poses in seen.items()}, not_placed=found.not_placed,
+        remarks=tuple(remarks), report={"asked": asked} | dict(found.report),
+    )  # fmt: skip
+
+
+def seen_at_their_word(
+    found: Registration, models: dict[int, ObjectModel], intrinsics: CameraIntrinsics
+) -> dict[int, dict[int, SeenPose]]:
+    """Return the objects in every view whose cameras were not refined.
+
+    The cameras count as exact: an object's uncertainty is its own, seen from there.
+    """
+    out: dict[int, dict[int, SeenPose]] = {}
+    unknown = np.full((6, 6), np.nan)
+    for index, T_world_cam in found.cameras.items():
+        out[index] = {}
+        for o in found.scene.objects:
+            T_cam_obj = se3.invert(T_world_cam) @ o.T_world_obj
+            covariance = unknown if o.covariance is None else o.covariance
+            vertices = models[o.obj_id].mesh.vertices
+            points = vertices[:: max(1, len(vertices) // PIXEL_POINTS)]
+            shown = without_free_turns(covariance, models[o.obj_id], points)
+            sigma = pixel_sigma(intrinsics, T_cam_obj, shown, points)
+            out[index][o.instance] = SeenPose(
+                T_cam_obj=T_cam_obj, covariance=covariance, sigma_px=sigma
+            )
+    return out
+
+
+def without_free_turns(covariance: Array, model: ObjectModel, points: Array) -> Array:
+    """Return a covariance (6, 6) without turns about axes of continuous symmetry.
+
+    Nothing is seen of such a turn. Of a twist x, the part P x is left that moves the points (N, 3)
+    least: P = I - s s^T M / (s^T M s), s the turn, M the mean of the points' squared motion.
+    """
+    G = np.concatenate([-se3.hat(points), np.tile(np.eye(3), (len(points), 1, 1))], axis=2)
+    M = np.mean(np.swapaxes(G, 1, 2) @ G, axis=0)
+    out = covariance
+    for axis, place in model.symmetry_axes:
+        turn = np.concatenate([axis, -np.cross(axis, place)])
+        P = np.eye(6) - np.outer(turn, turn @ M) / (turn @ M @ turn)
+        out = P @ out @ P.T
+    return out
+
+
+def pixel_sigma(
+    intrinsics: CameraIntrinsics, T_cam_obj: Array, covariance: Array, points: Array
+) -> float:
+    """Return the RMS 1-sigma in the image of points (N, 3) of an object [px]; NaN = not known.
+
+    sigma^2 = mean over the points of tr(J C J^T), J = d(u, v) / d(twist) by central differences.
+    """
+    columns: list[Array] = []
+    for k in range(6):
+        twist = STEP * np.eye(6)[k]
+        ends = [
+            camera.project(intrinsics, se3.transform(T_cam_obj @ se3.exp(s * twist), points))
+            for s in (1.0, -1.0)
+        ]
+        columns.append((ends[0] - ends[1]) / (2 * STEP))
+    J = np.stack(columns, axis=-1)
+    J = J[np.isfinite(J).all((1, 2))]
+    if len(J) == 0 or not np.all(np.isfinite(covariance)):
+        return float("nan")
+    return float(
+        np.sqrt(np.mean(np.trace(J @ covariance @ np.swapaxes(J, 1, 2), axis1=1, axis2=2)))
+    )
+
+
+def _pictures(
+    store: SessionStore, result: Registered, models: dict[int, ObjectModel]
+) -> dict[str, bytes]:
+    """Return every picture and the page, by path in the session."""
+    from realsim.app.register.page import page_bytes
+    from realsim.app.register.pictures import draw_pictures
+
+    pictures = draw_pictures(store, result, models)
+    named = {f"{PICTURES}/{name}": data for name, data in pictures.items()}
+    return named | {PAGE_FILE: page_bytes(store, result, models, pictures)}

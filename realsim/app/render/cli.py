@@ -1,0 +1,54 @@
+"""`realsim render`: its options."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+FOLDER = click.Path(path_type=Path)
+
+
+@click.command("render")
+@click.argument("session", type=FOLDER)
+@click.option("--views", default="real", show_default=True, metavar="real|N",
+              help="Twins of the real frames, or N new views.")  # fmt: skip
+@click.option("--out", type=FOLDER, default=None, help="Folder.  [SESSION/synthetic/...]")
+@click.option("--renderer", default="embedded", show_default=True,
+              type=click.Choice(["embedded", "photoreal"]))  # fmt: skip
+@click.option("--depth", default="disparity", show_default=True,
+              type=click.Choice(["stereo", "disparity", "clean"]),
+              help="How the depth camera is simulated.")  # fmt: skip
+@click.option("--camera", default="", metavar="NAME",
+              help="d405, d415, d435, structured_light.  [the session's, else d405]")  # fmt: skip
+@click.option("--depth-model", type=FOLDER, default=None, metavar="FILE",
+              help="Of `realsim depth-fit`: noise and holes as your own camera's.")  # fmt: skip
+@click.option("--radius", default="", metavar="A-B",
+              help="Distance of new views [m].  [as the real ones]")  # fmt: skip
+@click.option("--size", default="", metavar="WxH", help="Of new views [px].  [the session's]")
+@click.option("--hdri", type=FOLDER, default=None, help="Panorama (.hdr, .exr) around the scene.")
+@click.option("--material", "materials", multiple=True, metavar="table=KIND",
+              help="Another table: oak, marble, ...  [as in the photographs]")  # fmt: skip
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
+@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 256))
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def render_command(session: Path, quiet: bool, **options: Any) -> None:
+    """Render the registered scene of SESSION: every real frame's twin, or new views.
+
+    \b
+      realsim render SESSION                 at the real cameras, raw distortion included
+      realsim render SESSION --views 256     new views over the hemisphere
+      realsim render SESSION --renderer photoreal --depth stereo
+
+    The result is a session of its own, with every label, exact depth and the depth that the camera
+    would report; `realsim school`, `annotate`, `review` and `report` open it. Light and table are
+    matched to the photographs. A run that was interrupted goes on where it stopped.
+
+    Exit codes: 0 done, 2 bad input.
+    """  # noqa: D301 - click's own mark for lines that stay as they are
+    from realsim.app.console import Console
+    from realsim.app.render.request import RenderRequest
+    from realsim.app.render.run import run_render, show_render
+
+    request = RenderRequest(**options)
+    console = Console(quiet=quiet)
+    show_render(run_render(session, request, console), console)

@@ -1,0 +1,221 @@
+"""`realsim render`: from a registered session to synthetic views, their figures and pictures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from realsim.app.console import Console, Tick
+from realsim.app.render.compare import TwinFigures, compare_twins
+from realsim.app.render.pictures import PAGE_FILE, SHEET_FILE, layers, pairs, sheet
+from realsim.app.render.request import RenderRequest, WantedViews, wanted_views
+from realsim.app.render.scene import TwinScene, require_shown, twin_scene
+from realsim.errors import InputError
+from realsim.formats.images import image_size
+from realsim.records import GraspSet, ObjectModel, Scene
+from realsim.store import SessionStore
+from realsim.store.session_store import rgb_path
+from realsim_sim_bridge.synthetic.write import SyntheticSummary, write_session
+
+FIGURES_HEADER = ["figure", "real", "synthetic", "together"]
+MOST_NAMED = 8
+"""So many views are named in a message."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class RenderOutcome:
+    """What a run rendered."""
+
+    store: SessionStore
+    """The real session."""
+    twin: SessionStore
+    """The synthetic one."""
+    scene: Scene
+    models: dict[int, ObjectModel]
+    summary: SyntheticSummary
+    figures: TwinFigures | None
+    """Real against synthetic; None = new views."""
+    look: TwinScene
+    real: tuple[int, ...] | None
+    """Real view of each synthetic one; None = new views."""
+    sheet: Path
+    """Contact sheet."""
+    page: Path
+    """Page with sliders."""
+
+
+def run_render(session: Path, request: RenderRequest, console: Console) -> RenderOutcome:
+    """Render the registered scene of a session.
+
+    Raises:
+        InputError: no registered session, an option that cannot be, photographs of another size
+            than the camera's, or another run works there.
+    """
+    from threadpoolctl import threadpool_limits
+
+    from realsim.app.stages import judged_scene, open_session, require_sound, session_models
+    from realsim.rendering.overlay import save_png
+    from realsim.store import load_grasps
+
+    store = open_session(session)
+    scene = judged_scene(store)
+    require_sound(store)
+    models = session_models(store)
+    require_shown(store, scene, models)
+    grasps = load_grasps(store.folder / "grasps")
+    folder = request.folder(store.folder)
+    _refuse_folder(folder, store.folder)
+    with threadpool_limits(limits=1):
+        wanted = wanted_views(store, scene, request)
+        _require_sizes(store, wanted)
+        with console.stage("light and table", "from the photographs"):
+            look = twin_scene(store, scene, models, request)
+        with console.stage("render", f"{len(wanted.Ts_world_cam)} views") as tick:
+            summary = _written(store, folder, look, wanted, request, grasps, tick)
+        twin = SessionStore.open(folder)
+        figures = None
+        if wanted.real is not None:
+            with console.stage("compare", "real and synthetic"):
+                figures = compare_twins(store, twin, wanted.real, request.config(store).profile)
+        twin.path("reports").mkdir(exist_ok=True)
+        save_png(twin.path(SHEET_FILE), sheet(twin, store, wanted.real))
+        outcome = RenderOutcome(
+            store=store, twin=twin, scene=scene, models=models, summary=summary, figures=figures,
+            look=look, real=wanted.real, sheet=twin.path(SHEET_FILE), page=twin.path(PAGE_FILE),
+        )  # fmt: skip
+        write_page(outcome)
+    return outcome
+
+
+def _written(
+    store: SessionStore,
+    folder: Path,
+    look: TwinScene,
+    wanted: WantedViews,
+    request: RenderRequest,
+    grasps: Sequence[GraspSet],
+    tick: Tick,
+) -> SyntheticSummary:
+    """Render and label the views in a folder of their own."""
+    return write_session(
+        folder, look.synthetic, wanted.intrinsics, wanted.Ts_world_cam, request.config(store),
+        request.seed, grasps, tick, request.workers, models_from=store.folder / "models",
+    )  # fmt: skip
+
+
+def _require_sizes(store: SessionStore, wanted: WantedViews) -> None:
+    """Raise if a photograph that is looked at is not of the camera's size.
+
+    Raises:
+        InputError: it is not; it is named.
+    """
+    camera = store.session.intrinsics
+    known = [v.index for v in store.session.views if v.T_world_cam is not None]
+    for index in known if wanted.real is None else wanted.real:
+        path = store.path(rgb_path(index))
+        width, height = image_size(path)
+        if (width, height) != (camera.width, camera.height):
+            raise InputError(
+                f"{path} is {width}x{height} pixels, the session's camera "
+                f"{camera.width}x{camera.height}: nothing rendered would lie on the picture. "
+                "Calibrate at the size of the images, or bring the images back to the camera's "
+                "size."
+            )
+
+
+def _refuse_folder(folder: Path, session: Path) -> None:
+    """Raise if the views would fall on the session itself or on something that is no session.
+
+    Raises:
+        InputError: the folder is the session, a file, or holds something else.
+    """
+    if folder.resolve() == session.resolve():
+        raise InputError(
+            f"--out '{folder}' is the session itself, which is only read; choose a folder of its "
+            f"own, or leave --out away: {session / 'synthetic'}/... is taken."
+        )
+    if folder.exists() and not folder.is_dir():
+        raise InputError(
+            f"--out '{folder}' is a file; a folder that may be made or filled is taken."
+        )
+    begun = any((folder / name).is_file() for name in ("session.json", "session.begun.json"))
+    if folder.is_dir() and any(folder.iterdir()) and not begun:
+        raise InputError(
+            f"--out '{folder}' is not empty and holds no session. Choose another folder: nothing "
+            "of yours is overwritten."
+        )
+
+
+def show_render(outcome: RenderOutcome, console: Console) -> None:
+    """Print what was rendered, what it cost, how like the real frames it is, and what is odd."""
+    console.table("Synthetic views", ["what", "value"], summary_rows(outcome))
+    if outcome.figures is not None:
+        console.table(_figures_title(outcome.figures), FIGURES_HEADER, outcome.figures.rows())
+    for note in notes_of(outcome):
+        console.warn(note)
+    console.say(f"picture   {outcome.sheet}")
+    console.say(f"page      {outcome.page}")
+    console.say(f"session   {outcome.twin.folder}")
+
+
+def summary_rows(outcome: RenderOutcome) -> list[list[str]]:
+    """Return the table's rows: what was rendered, and its cost per frame by part."""
+    summary, look = outcome.summary, outcome.look
+    rows = [
+        ["views", f"{summary.views} ({summary.rendered} rendered now)"],
+        ["objects", str(len(summary.labels.objects))],
+        ["table", str(look.synthetic.provenance["table_material"])],
+        ["light", look.synthetic.environment.name],
+    ]
+    return rows + [
+        [f"{part} of a frame", f"{cpu:.2f} CPU s"] for part, cpu in summary.cpu_s.items()
+    ]
+
+
+def _figures_title(figures: TwinFigures) -> str:
+    return f"Real frames and their twins ({figures.views} views)"
+
+
+def write_page(outcome: RenderOutcome) -> None:
+    """Write the page: real against synthetic under sliders, the layers, the figures."""
+    from realsim.app.picture_pages import Layers, Section, Sliders, Table, picture_page
+
+    sections: list[Section] = []
+    if outcome.real is not None:
+        sections.append(
+            Sliders(
+                title="Real and synthetic", pairs=pairs(outcome.store, outcome.twin, outcome.real)
+            )
+        )
+    sections.append(Layers(title="Synthetic views", views=layers(outcome.twin)))
+    if outcome.figures is not None:
+        sections.append(
+            Table(title=_figures_title(outcome.figures), header=FIGURES_HEADER,
+                  rows=outcome.figures.rows())
+        )  # fmt: skip
+    sections.append(Table(title="The run", header=["what", "value"], rows=summary_rows(outcome)))
+    picture_page(
+        outcome.page, f"Synthetic views of {outcome.store.session.name}", sections,
+        about=str(outcome.summary), notes=notes_of(outcome),
+    )  # fmt: skip
+
+
+def notes_of(outcome: RenderOutcome) -> list[str]:
+    """Return what the user must know: objects and views that are not as they should be."""
+    notes = [*outcome.look.notes, *outcome.summary.notes]
+    for instance in outcome.summary.left_out:
+        placed = outcome.scene.object(instance)
+        model = outcome.models.get(placed.obj_id)
+        name = f"object {placed.obj_id}" if model is None else model.name
+        notes.append(f"{name} (instance {instance}) is rejected and was left out.")
+    for view, instances in outcome.summary.camera_inside.items():
+        names = ", ".join(outcome.models[outcome.scene.object(i).obj_id].name for i in instances)
+        notes.append(
+            f"the camera of view {view} stands inside of {names}: the view shows inner walls. It "
+            "is written, and named in synthetic/scene.json."
+        )
+    empty = outcome.summary.empty_views
+    if empty:
+        which = ", ".join(map(str, empty[:MOST_NAMED]))
+        which += ", ..." if len(empty) > MOST_NAMED else ""
+        notes.append(f"{len(empty)} views show no object: {which}.")
+    return notes

@@ -1,0 +1,104 @@
+"""Outlines in the photographs before and after registration, for sliders in the report.
+
+Before: the poses that registration started from, through the cameras as robot and calibration
+claim them. After: the registered poses, through the refined cameras. A pose or a camera that
+registration did not change is the same in both.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.picture_pages import Pair
+from realsim.app.register.inputs import STARTS_FILE
+from realsim.app.register.results import claimed_cameras, is_same_pose
+from realsim.app.stages import registered_views, session_models
+from realsim.geometry import se3
+from realsim.records import ObjectModel, ObjectPose
+from realsim.store import SessionStore
+
+Array = NDArray[np.float64]
+VIEWS = 3
+"""Sliders in a report, spread over the session."""
+
+
+def registration_pairs(store: SessionStore, views: int = VIEWS) -> tuple[list[Pair], str]:
+    """Return before/after pairs of registered views, and in words what 'before' is.
+
+    Both are empty where nothing tells what was before: no rough poses, no camera refined.
+
+    Args:
+        store: a session with a registered scene.
+        views: how many pairs, at most.
+    """
+    from realsim.store import load_scene
+
+    scene, models = load_scene(store), session_models(store)
+    after = [o for o in scene.objects if o.obj_id in models]
+    started = _starts(store)
+    claimed = claimed_cameras(store)
+    told = registered_views(store)
+    seen = [
+        v
+        for v in store.session.views
+        if v.T_world_cam is not None and v.index in claimed and (told is None or v.index in told)
+    ]
+    moved = [o for o in after if o.instance in started]
+    refined = [
+        v
+        for v in seen
+        if v.T_world_cam is not None and not is_same_pose(claimed[v.index], v.T_world_cam)
+    ]
+    if not seen or not after or not (moved or refined):
+        return [], ""
+    what = [f"{len(moved)} of {len(after)} objects at the rough pose they started from"] * bool(
+        moved
+    ) + [f"{len(refined)} of {len(seen)} cameras as robot and calibration claim them"] * bool(
+        refined
+    )
+    before: list[tuple[ObjectPose, Array]] = [
+        (o, started.get(o.instance, o.T_world_obj)) for o in after
+    ]
+    kept: list[tuple[ObjectPose, Array]] = [(o, o.T_world_obj) for o in after]
+    pick = np.unique(np.linspace(0, len(seen) - 1, views).round().astype(int))
+    pairs: list[Pair] = []
+    for view in (seen[k] for k in pick):
+        assert view.T_world_cam is not None
+        pairs.append(
+            Pair(
+                before=_outlined(store, view.index, claimed[view.index], before, models),
+                after=_outlined(store, view.index, view.T_world_cam, kept, models),
+                caption=f"view {view.index}",
+                after_label="registered",
+            )
+        )
+    return pairs, f"Before: {', and '.join(what)}."
+
+
+def _starts(store: SessionStore) -> dict[int, Array]:
+    """Return the rough pose of every instance that was given one as a pose.
+
+    Clicks, boxes and masks are no poses; they are left out.
+    """
+    told: Any = store.read_json(STARTS_FILE) if store.has(STARTS_FILE) else {}
+    rows: list[Any] = told.get("starts", []) if isinstance(told, dict) else []
+    found = [r for r in rows if isinstance(r, dict) and {"instance", "T_world_obj"} <= r.keys()]
+    return {int(r["instance"]): se3.check_rigid(r["T_world_obj"], STARTS_FILE) for r in found}
+
+
+def _outlined(
+    store: SessionStore,
+    index: int,
+    T_world_cam: Array,
+    poses: Sequence[tuple[ObjectPose, Array]],
+    models: Mapping[int, ObjectModel],
+) -> NDArray[np.uint8]:
+    """Return a photograph with the outlines of objects at given poses, by instance colours."""
+    from realsim.rendering.labels import LabelRenderer, PlacedMesh
+    from realsim.rendering.overlay import draw_outlines
+
+    placed = [PlacedMesh(o.instance, models[o.obj_id].mesh, T) for o, T in poses]
+    ids = LabelRenderer(placed).render(store.session.intrinsics, T_world_cam).ids
+    return draw_outlines(store.rgb(index), ids)

@@ -1,0 +1,155 @@
+"""The commands of `realsim scan`: object models into a library, to metric scale, and looked at.
+
+`scale` and `sfm` live in modules of their own and are loaded when they are asked for.
+"""
+
+import sys
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import click
+
+FOLDER = click.Path(path_type=Path)
+LATE = {
+    "scale": ("realsim.app.scan.scale.cli", "scale"),
+    "sfm": ("realsim.app.scan.sfm.cli", "sfm"),
+}
+"""Commands by the module and the name where they are defined."""
+
+
+class ScanCommands(click.Group):
+    """The group of all `scan` commands, some of which are loaded late."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of all commands that are there."""
+        late = [name for name, (module, _) in LATE.items() if find_spec(module) is not None]
+        return [*super().list_commands(ctx), *late]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return the command of this name."""
+        module, name = LATE.get(cmd_name, ("", ""))
+        if module and find_spec(module) is not None:
+            command: click.Command = getattr(import_module(module), name)
+            return command
+        return super().get_command(ctx, cmd_name)
+
+
+SCAN = ScanCommands(
+    "scan",
+    help="""Object models: meshes and scans into a library, at metric scale.
+
+    A library is a folder of models as BOP has them (obj_000001.ply in millimetres and
+    models_info.json), with convex parts, properties and pictures beside them; every stage reads it.
+    """,
+)
+LIBRARY = click.option(
+    "--library", type=FOLDER, default=Path("models"), show_default=True, help="Folder of models."
+)
+
+
+@SCAN.command("import")
+@click.argument("meshes", metavar="MESH...", nargs=-1, required=True, type=FOLDER)
+@LIBRARY
+@click.option("--name", default="", help="Name of the model.  [the file's]")
+@click.option("--id", "obj_id", type=int, default=None, help="Its BOP id.  [the next free one]")
+@click.option(
+    "--unit",
+    default=None,
+    type=click.Choice(["m", "cm", "mm", "inch", "none"]),
+    help="What one unit of the file is; none: no metric scale.  [as the file states]",
+)
+@click.option(
+    "--up",
+    default=None,
+    type=click.Choice(["x", "y", "z", "-x", "-y", "-z"]),
+    help="The file's axis that points up.  [as the format says]",
+)
+@click.option("--density", type=float, default=None, help="[kg/m^3].  [1000]")
+@click.option("--mass", type=float, default=None, help="As weighed [kg], instead of a density.")
+@click.option(
+    "--faces",
+    type=click.IntRange(min=100),
+    default=200_000,
+    show_default=True,
+    help="Faces to keep at most.",
+)
+@click.option("--no-parts", is_flag=True, help="No convex parts; the School makes them itself.")
+@click.option("--overwrite", is_flag=True, help="Replace the model of this name or id.")
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def import_command(meshes: tuple[Path, ...], quiet: bool, **options: Any) -> None:
+    """Read, repair and measure meshes, and add them to the library.
+
+    MESH is a GLB, OBJ, PLY, STL, OFF or USD file. Its unit is stated by the file or by --unit,
+    never guessed; a generated mesh has none: --unit none puts it into LIBRARY/unscaled, and
+    `realsim scan scale` finds its size.
+
+    Exit codes: 0 done, 1 done but a person should look at a model, 2 a mesh cannot be used.
+    """
+    from realsim.app.console import Console
+    from realsim.app.scan.importing import ImportRequest, run_scan_import
+
+    code = run_scan_import(ImportRequest(meshes=meshes, **options), Console(quiet=quiet))
+    if code:
+        sys.exit(code)
+
+
+@SCAN.command("list")
+@click.argument("library", type=FOLDER, default=Path("models"))
+def list_command(library: Path) -> None:
+    """List the models of a library: the folder `models` by default."""
+    from realsim.app.console import Console
+    from realsim.app.scan.library import list_library
+
+    list_library(library, Console())
+
+
+@SCAN.command("show")
+@click.argument("library", type=FOLDER)
+@click.argument("name")
+def show_command(library: Path, name: str) -> None:
+    """Show everything that is known of a model: NAME is its name, its id, or its file.
+
+    Its picture is made where the library has none.
+    """
+    from realsim.app.console import Console
+    from realsim.app.scan.library import show_model
+
+    show_model(library, name, Console())
+
+
+@SCAN.command("check")
+@click.argument("library", type=FOLDER, default=Path("models"))
+@click.option("--json", "as_json", is_flag=True, help="The findings as JSON on stdout.")
+def check_command(library: Path, as_json: bool) -> None:
+    """Say what of a library is missing, damaged, changed, or left over; nothing is changed.
+
+    Exit codes: 0 sound, 1 not, 2 no library.
+    """
+    from realsim.app.console import Console
+    from realsim.app.scan.library import run_library_check
+
+    if not run_library_check(library, Console(), as_json=as_json):
+        sys.exit(1)
+
+
+@SCAN.command("complete")
+@click.argument("library", type=FOLDER)
+@click.argument("names", nargs=-1)
+@click.option("--mass", type=float, default=None, help="As weighed [kg], of one model.")
+@click.option("--density", type=float, default=None, help="[kg/m^3].  [as the library says]")
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def complete_command(
+    library: Path, names: tuple[str, ...], mass: float | None, density: float | None, quiet: bool
+) -> None:
+    """Compute properties, convex parts and pictures for models of another program.
+
+    NAMES are those without properties by default. Meshes and models_info.json are not changed.
+    Convex parts take up to a minute of CPU time for each model.
+    """
+    from realsim.app.console import Console
+    from realsim.app.scan.complete import run_complete
+
+    if not run_complete(library, names, Console(quiet=quiet), mass_kg=mass, density=density):
+        sys.exit(1)

@@ -1,0 +1,184 @@
+"""`realsim scan import`: meshes into the library, with everything that was found said."""
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from realsim.app.console import Console
+from realsim.app.scan.library import say_model, verdict_row
+from realsim.errors import InputError, RealsimError
+from realsim.models.model_records import ScanUnit, UpAxis
+
+if TYPE_CHECKING:
+    from realsim.models.library_prepare import PrepareConfig
+
+DONE, LOOK, UNUSABLE = 0, 1, 2
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ImportRequest:
+    """What `realsim scan import` was told."""
+
+    meshes: tuple[Path, ...]
+    library: Path = Path("models")
+    name: str = ""
+    obj_id: int | None = None
+    unit: ScanUnit | None = None
+    """None: what the file states."""
+    up: UpAxis | None = None
+    density: float | None = None
+    """[kg/m^3]."""
+    mass: float | None = None
+    """[kg]."""
+    faces: int = 200_000
+    no_parts: bool = False
+    overwrite: bool = False
+
+
+def run_scan_import(request: ImportRequest, console: Console) -> int:
+    """Import every mesh; one that cannot be used does not keep the others out.
+
+    Returns:
+        The exit code: 0 done, 1 a person should look at a model, 2 a mesh cannot be used.
+
+    Raises:
+        InputError: options that contradict each other, or one file that cannot be used.
+    """
+    _require_consistent(request)
+    verdicts: list[str] = []
+    rows: list[tuple[str, ...]] = []
+    for path in request.meshes:
+        try:
+            verdict, row = _import_one(path, request, console)
+        except RealsimError as error:
+            if len(request.meshes) == 1:
+                raise
+            console.warn(f"[red]{_escaped(str(path))}: not imported:[/red] {_escaped(str(error))}")
+            verdict, row = "unusable", (path.name, "", "", "", "", "unusable")
+        verdicts.append(verdict)
+        rows.append(row)
+    if len(rows) > 1:
+        header = ("model", "id", "size [mm]", "mass [g]", "parts", "verdict")
+        console.table(f"{len(rows)} meshes", header, rows)
+    if "unusable" in verdicts:
+        return UNUSABLE
+    return LOOK if "doubtful" in verdicts else DONE
+
+
+def _escaped(text: str) -> str:
+    from rich.markup import escape
+
+    return escape(text)
+
+
+def _require_consistent(request: ImportRequest) -> None:
+    """Raise if the options contradict each other.
+
+    Raises:
+        InputError: names the options.
+    """
+    if len(request.meshes) > 1 and (request.name or request.obj_id or request.mass is not None):
+        raise InputError(
+            f"--name, --id and --mass are of one model, but {len(request.meshes)} meshes are "
+            "given; import them one by one."
+        )
+    if request.mass is not None and request.density is not None:
+        raise InputError("--mass and --density were both given; one follows from the other.")
+    for option, value in (("--mass", request.mass), ("--density", request.density)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise InputError(f"{option} is {value:g}; a positive number is needed.")
+    if request.unit == "none" and (request.mass is not None or request.obj_id is not None):
+        raise InputError(
+            "--mass and --id are of models with a metric scale; give them to `realsim scan scale`."
+        )
+    for path in request.meshes:
+        if not path.is_file():
+            kind = "is a folder" if path.is_dir() else "does not exist"
+            raise InputError(f"{path} {kind}; a mesh file (glb, obj, ply, stl, usd) is expected.")
+
+
+def _import_one(
+    path: Path, request: ImportRequest, console: Console
+) -> tuple[str, tuple[str, ...]]:
+    """Import one mesh, say what was found, and return its verdict and its row."""
+    from realsim.models.library import ModelLibrary
+    from realsim.models.library_prepare import (
+        STEPS,
+        Matter,
+        Step,
+        prepare_mesh,
+        prepare_unscaled,
+        source_of,
+    )
+    from realsim.models.pictures import sheet_png
+    from realsim.models.reading import read_scan
+
+    name = _name(path, request)
+    _check_place(name, request)
+    config = _config(request)
+    steps = ("read", *STEPS, "picture")
+    with console.stage("import", path.name) as tick:
+
+        def step(which: Step) -> None:
+            tick(steps.index(which), len(steps))
+
+        tick(0, len(steps))
+        scan = read_scan(path, request.unit, request.up)
+        source, metric = source_of(scan, path.name), scan.unit != "none"
+        if metric:
+            matter = Matter(density=request.density, mass_kg=request.mass)
+            made = prepare_mesh(scan.mesh, config, matter, source=source, step=step)
+        else:
+            made = prepare_unscaled(scan.mesh, config, source=source, step=step)
+        tick(len(steps) - 1, len(steps))
+        picture = sheet_png(made.mesh, made.properties, made.parts, name)
+        library = ModelLibrary.create(request.library)
+        if metric:
+            kept = library.add(
+                made, name, obj_id=request.obj_id, overwrite=request.overwrite, picture=picture
+            )
+            obj_id = kept.model.obj_id
+        else:
+            library.add_unscaled(made, name, overwrite=request.overwrite, picture=picture)
+            obj_id = None
+    say_model(console, library.folder, name, obj_id, made.mesh, made.properties)
+    return made.properties.verdict, verdict_row(name, obj_id, made.properties)
+
+
+def _config(request: ImportRequest) -> "PrepareConfig":
+    from realsim.models.library_prepare import PrepareConfig
+
+    return PrepareConfig(most_faces=request.faces, with_parts=not request.no_parts)
+
+
+def _name(path: Path, request: ImportRequest) -> str:
+    """Return the model's name: as said, or of the file, with what a name cannot have as '_'."""
+    from realsim.models.library_files import require_name
+
+    if request.name:
+        return require_name(request.name)
+    name = re.sub(r"[^A-Za-z0-9_.+-]+", "_", path.stem).strip("._-+")
+    return require_name(f"model_{name}" if name.isdigit() or not name else name)
+
+
+def _check_place(name: str, request: ImportRequest) -> None:
+    """Raise before the long work if the library will not take the model.
+
+    Raises:
+        InputError: the name or the id is taken, or the folder is no library.
+    """
+    from realsim.models.library import ModelLibrary
+
+    folder = request.library
+    if not folder.exists():
+        return
+    library = ModelLibrary.create(folder)
+    if request.unit != "none":
+        library.place_for(name, request.obj_id, overwrite=request.overwrite)
+    else:
+        library.unscaled_place_for(name, overwrite=request.overwrite)
+
+
+__all__ = ["ImportRequest", "run_scan_import"]

@@ -1,0 +1,248 @@
+"""`realsim scan scale`: the metric scale of a mesh from a session, or from a measured length.
+
+The result lies in SESSION/scans/NAME: scale.json is written last, so where it is, everything is.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from realsim.app.console import Console
+from realsim.app.scan.scale.box import box_mm_of
+from realsim.app.scan.scale.files import (
+    FILE,
+    MODEL_FILE,
+    Place,
+    model_files,
+    result_bytes,
+    write_file,
+    write_result,
+)
+from realsim.app.scan.scale.inputs import (
+    NamedMesh,
+    ScaleRequest,
+    fit_config,
+    inputs_of,
+    read_mesh,
+    usable_views,
+)
+from realsim.app.scan.scale.library import FoundScale, promote
+from realsim.app.scan.scale.show import CALIPER, model_lines, show_fit, show_measured
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import Mesh, Verdict, View
+from realsim.scanning.scale.files import (
+    ScaleRecord,
+    installed_versions,
+    json_lines,
+)
+from realsim.scanning.scale.result import ScaleFit
+from realsim.store import SessionStore
+
+FOLDER = "scans"
+"""Where in a session the results lie."""
+ROUGH = 0.3
+"""A rough size may be off by this share; beyond, one of both is wrong."""
+MEASURED_FORMAT = "realsim scale by measurement"
+
+
+def run_scale(request: ScaleRequest, console: Console) -> bool:
+    """Find the scale, show it, write it; return whether it is accepted.
+
+    Raises:
+        InputError: the mesh, the session or what was typed cannot be used.
+        DegenerateError: the session does not determine a scale.
+    """
+    from realsim.app.stages import open_session, require_sound
+
+    if request.session is None:
+        return _by_measurement(request, console)
+    store = open_session(request.session)
+    views = usable_views(store, request.views)
+    named = read_mesh(request)
+    require_sound(store)
+    inputs = inputs_of(request, named, store, views, fit_config(store))
+    place = Place(store, request.out or store.folder / FOLDER / named.name)
+    known = None if request.overwrite else place.record(inputs["key"])
+    record = known or _fitted(request, named, store, views, inputs, console)
+    if known is None:
+        write_result(place, record, named, store)
+    fit, box_mm = record.fit, box_mm_of(named.mesh, record.fit.scale)
+    show_fit(named.name, fit, record.measured, box_mm, console)
+    for note in named.notes:
+        console.say(f"note: {note}")
+    _say_of_model(named, fit, console)
+    if known is not None:
+        console.say(f"nothing has changed since {place.folder / FILE} was written; --overwrite "
+                    "does it again.")  # fmt: skip
+    console.say(f"result    {place.folder}")
+    if request.json is not None:
+        write_file(request.json, result_bytes(record, box_mm))
+    _say_where(request, named, place.folder / MODEL_FILE, fit.verdict, console)
+    found = FoundScale(
+        scale=fit.scale, sigma_percent=fit.sigma_percent, verdict=fit.verdict, reasons=fit.reasons,
+        session=store.session.name, how="fit and measured" if record.measured else "fit",
+    )  # fmt: skip
+    promote(request, named, found, console)
+    if is_accepted(fit) and not record.measured:
+        console.say(CALIPER)
+    return is_accepted(fit)
+
+
+def is_accepted(fit: ScaleFit) -> bool:
+    """Whether the scale can be used as it is."""
+    return fit.verdict == "accepted"
+
+
+# --- the fit ----------------------------------------------------------------------------------
+
+
+def _fitted(
+    request: ScaleRequest,
+    named: NamedMesh,
+    store: SessionStore,
+    views: Sequence[View],
+    inputs: Mapping[str, Any],
+    console: Console,
+) -> ScaleRecord:
+    """Fit the scale, and take in what was measured by hand."""
+    from realsim.registration.evidence import DepthFrame
+    from realsim.scanning.scale.fit import fit_scale
+    from realsim.scanning.scale.measured_check import with_measurements
+
+    config = fit_config(store)
+    frames = [
+        DepthFrame(index=v.index, depth_m=store.depth_m(v.index), T_world_cam=v.T_world_cam)
+        for v in views
+        if v.T_world_cam is not None
+    ]
+    with console.stage("scale", f"{named.name}, {len(frames)} views") as tick:
+        fit = fit_scale(
+            named.mesh, store.session.intrinsics, frames, config,
+            start=request.start, at=request.at, size_m=request.size_m, progress=tick,
+        )  # fmt: skip
+    fit = with_rough_size(fit, named.mesh, request.size_m)
+    fit, checks = with_measurements(fit, named.mesh, request.measured)
+    return ScaleRecord(
+        fit=fit, inputs=dict(inputs), config=asdict(config), measured=checks,
+        poses=view_poses(fit, views), versions=installed_versions(),
+    )  # fmt: skip
+
+
+def with_rough_size(fit: ScaleFit, mesh: Mesh, size_m: float | None) -> ScaleFit:
+    """Return the fit, doubtful where it contradicts the rough size that was typed."""
+    from realsim.scanning.scale.measured import Measurement, length_of, typo
+
+    if size_m is None:
+        return fit
+    rough = Measurement(kind="longest", value_m=size_m, sigma_m=ROUGH * size_m)
+    fitted_m = fit.scale * length_of(mesh, rough)
+    ratio = size_m / fitted_m
+    if abs(np.log(ratio)) <= np.log1p(ROUGH):
+        return fit
+    slip = typo(ratio)
+    reason = (
+        f"the longest side was said to be about {1e3 * size_m:.4g} mm and was fitted as "
+        f"{1e3 * fitted_m:.4g} mm{f' ({slip})' if slip else ''}."
+    )
+    verdict = "doubtful" if fit.verdict == "accepted" else fit.verdict
+    return replace(fit, verdict=verdict, reasons=(*fit.reasons, reason))
+
+
+def view_poses(fit: ScaleFit, views: Sequence[View]) -> tuple[dict[str, Any], ...]:
+    """Return per view where the camera stood, and the scaled mesh in it, for other programs."""
+    return tuple(
+        {
+            "index": v.index,
+            "T_world_cam": v.T_world_cam.tolist(),
+            "T_cam_obj": (se3.invert(v.T_world_cam) @ fit.T_world_obj).tolist(),
+        }
+        for v in views
+        if v.T_world_cam is not None
+    )
+
+
+def _say_of_model(named: NamedMesh, fit: ScaleFit, console: Console) -> None:
+    """Say what the fit means for a model that has a scale already."""
+    if named.origin != "model":
+        return
+    off, sigmas = 100 * (fit.scale - 1), abs(fit.scale - 1) / fit.sigma
+    console.say(
+        f"the library's model {named.where} has a metric scale: by this session its size is "
+        f"{off:+.2f} % off ({sigmas:.1f} sigma). It was not changed."
+    )
+
+
+def _say_where(
+    request: ScaleRequest, named: NamedMesh, model: Path | None, verdict: Verdict, console: Console
+) -> None:
+    """Say where the scaled model lies, and how it gets into a library if it does not."""
+    stored = request.library is not None or named.origin == "model"
+    for line in model_lines(named, model, verdict, is_stored=stored):
+        console.say(line)
+
+
+# --- without a session ------------------------------------------------------------------------
+
+
+def _by_measurement(request: ScaleRequest, console: Console) -> bool:
+    """Take the scale from measured lengths alone; it is 'unchecked' and never accepted."""
+    from realsim.scanning.scale.measured import scale_from
+
+    if not request.measured:
+        raise InputError(
+            f"'{request.mesh}' needs something that knows metres: a SESSION with depth images, or "
+            "a measured length such as --measured longest=120.4mm."
+        )
+    for option, value in (("--start", request.start), ("--at", request.at),
+                          ("--views", request.views), ("--size", request.size_m)):  # fmt: skip
+        if value:
+            raise InputError(f"{option} speaks of a session; give SESSION, or leave it away.")
+    named = read_mesh(request)
+    scale, sigma, each = scale_from(named.mesh, request.measured)
+    size_mm = [1e3 * scale * float(e) for e in named.mesh.extent]
+    box_mm = [float(side) for side in box_mm_of(named.mesh, scale)]
+    show_measured(named.name, (scale, sigma), each, (box_mm, size_mm), console)
+    for note in named.notes:
+        console.say(f"note: {note}")
+    reason = "the scale rests on a length measured by hand; no session has checked it."
+    values: dict[str, Any] = {
+        "format": MEASURED_FORMAT, "format_version": 1, "verdict": "unchecked",
+        "reasons": [reason], "scale": scale, "sigma": sigma,
+        "interval_95": [scale - 1.96 * sigma, scale + 1.96 * sigma], "extent_mm": size_mm,
+        "smallest_box_mm": box_mm,
+        "measured": [asdict(e) | {"text": e.measurement.text} for e in each],
+        "mesh": {"name": named.name, "where": named.where, "sha256": named.sha256},
+        "versions": installed_versions(),
+    }  # fmt: skip
+    text = json_lines(_lists(values)).encode("utf-8")
+    if request.out is not None:
+        if (request.out / FILE).exists() and not request.overwrite:
+            raise InputError(f"{request.out / FILE} exists; --overwrite replaces it.")
+        for name, data in model_files(named.mesh, scale).items():
+            write_file(request.out / name, data)
+        write_file(request.out / FILE, text)
+        console.say(f"result    {request.out}")
+    if request.json is not None:
+        write_file(request.json, text)
+    model = None if request.out is None else request.out / MODEL_FILE
+    _say_where(request, named, model, "unchecked", console)
+    found = FoundScale(
+        scale=scale, sigma_percent=100 * sigma / scale, verdict="unchecked", reasons=(reason,),
+        session="", how="measured",
+    )  # fmt: skip
+    promote(request, named, found, console)
+    return False
+
+
+def _lists(value: Any) -> Any:
+    """Return values with tuples as lists, as JSON has them."""
+    if isinstance(value, dict):
+        items: Any = value.items()  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
+        return {k: _lists(v) for k, v in items}
+    if isinstance(value, list | tuple):
+        return [_lists(v) for v in value]  # pyright: ignore[reportUnknownVariableType]
+    return value

@@ -1,0 +1,46 @@
+"""The command `realsim scan sfm`."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+FOLDER = click.Path(path_type=Path)
+
+
+@click.command("sfm")
+@click.argument("images", type=FOLDER)
+@click.option("--out", type=FOLDER, default=None, help="Folder.  [SESSION/scans/sfm, IMAGES/sfm]")
+@click.option(
+    "--poses",
+    type=click.Choice(["unknown", "known", "refined"]),
+    default=None,
+    help="How the robot's camera poses are used.  [refined where there are any]",
+)
+@click.option("--camera", type=FOLDER, default=None, help="File with known intrinsics.")
+@click.option("--masks", type=FOLDER, default=None, help="Folder of masks, white = use.")
+@click.option("--dense/--no-dense", default=None, help="Fuse depth into a mesh.  [if there is any]")
+@click.option("--at", default="", help="The object whose mesh is wanted: x,y in world [m].")
+@click.option("--text", is_flag=True, help="The COLMAP model as text, too.")
+@click.option("--seed", default=0, show_default=True, help="Of every random choice.")
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def sfm(images: Path, quiet: bool, **options: Any) -> None:
+    """Structure from motion at metric scale, and a mesh from the depth images.
+
+    IMAGES is a session folder, or a folder of photographs. A session's camera poses bring the
+    result to metres: 'refined' starts at them and adjusts them to the pictures, unless two halves
+    of the scene would do so differently; 'known' keeps them; 'unknown' maps without them and
+    aligns the result, which shows whether robot and pictures agree. Photographs alone have no
+    metric scale.
+
+    \b
+    Exit codes: 0 accepted, 1 done but doubtful or rejected, 2 something given cannot be used.
+    """  # noqa: D301 - click's own mark for lines that stay as they are
+    from realsim.app.console import Console
+    from realsim.app.option_values import point_of
+    from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm
+
+    at = point_of(options.pop("at"))
+    if not run_scan_sfm(SfmRequest(images=images, at=at, **options), Console(quiet=quiet)):
+        sys.exit(1)

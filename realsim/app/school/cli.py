@@ -1,0 +1,190 @@
+"""`realsim school`: try grasps by physics, check the physics, check a scene, export, sum up."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+FOLDER = click.Path(path_type=Path)
+ENGINES = ("pybullet", "mujoco")
+FORMATS = ("acronym", "graspgen", "isaac", "hdf5", "parquet")
+
+
+class RunByDefault(click.Group):
+    """A group whose command `run` needs no name: `realsim school SESSION` runs the school."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Put `run` before arguments that begin with no command and do not ask for help."""
+        if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
+            args = ["run", *args]
+        return super().parse_args(ctx, args)
+
+
+@click.group("school", cls=RunByDefault)
+def SCHOOL() -> None:
+    """Try grasps by physics: reach, close, lift, shake, swing.
+
+    \b
+      realsim school SESSION              try grasps on the registered objects of a session
+      realsim school SCENE --out FOLDER   of a BOP scene, GraspNet scene or scene.yaml
+      realsim school validate             is the physics right on this machine?
+      realsim school settle SCENE         do the objects stand, or jump and fall?
+      realsim school export SESSION --to acronym --out FOLDER
+      realsim school summary SESSION ...  the paper's statistics over many sessions
+
+    `realsim school run --help` lists what a run can be told. What the labels mean: the guide
+    docs/how-to/grasps-tried-by-physics.md.
+    """  # noqa: D301 - click's own mark for lines that stay as they are
+
+
+@SCHOOL.command("run")
+@click.argument("source", type=FOLDER)
+@click.option("--out", type=FOLDER, default=None, help="Folder, where SOURCE is no session.")
+@click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000),
+              help="Candidates to try on each object, at most.")  # fmt: skip
+@click.option("--engine", default="pybullet", show_default=True, type=click.Choice(ENGINES))
+@click.option("--cross-check", is_flag=True, help="The other engine tries them, too.")
+@click.option("--sweep", is_flag=True, help="Least friction and force that each survives.")
+@click.option("--force", "force_n", type=float, default=None, help="Of each finger [N].  [70]")
+@click.option("--friction", type=float, default=None, help="Coulomb coefficient.  [1.0]")
+@click.option("--density", type=float, default=None,
+              help="Of objects that are not weighed [kg/m^3].  [the models' own]")  # fmt: skip
+@click.option(
+    "--mass", "masses", multiple=True, metavar="NAME=KG", help="A weighed object; repeat."
+)
+@click.option("--base-pose", type=FOLDER, default=None,
+              help="JSON with T_world_base or T_table_base.  [above the table]")  # fmt: skip
+@click.option("--points", type=click.IntRange(1, 1_000_000), default=None,
+              help="Surface points that candidates start from.  [1000]")  # fmt: skip
+@click.option("--rotations", type=click.IntRange(1, 360), default=None,
+              help="Approaches tried for each pair of contacts.")  # fmt: skip
+@click.option("--models", type=FOLDER, default=None, help="Models of a SOURCE that is no session.")
+@click.option("--quaternions", type=click.Choice(("wxyz", "xyzw")), default=None,
+              help="Their order in a scene.yaml that does not tell it.")  # fmt: skip
+@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 256))
+@click.option("--address", default="", metavar="RAY", help="HOST:PORT of a Ray cluster, or local.")
+@click.option("--restart", is_flag=True, help="Throw away results of other parameters.")
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
+@click.option("--json", "json_file", type=FOLDER, default=None, help="Write the counts there, too.")
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def run_command(
+    source: Path, out: Path | None, json_file: Path | None, quiet: bool, **options: Any
+) -> None:
+    """Try grasps on every object of SOURCE.
+
+    SOURCE is a registered session, or a BOP scene, a GraspNet scene or a scene.yaml with --out.
+    A run that was interrupted goes on where it stopped.
+
+    Writes grasps/ (every set as npz and JSON, grasps.h5, grasps.parquet) and
+    reports/school.html.
+
+    Exit codes: 0 done, 1 no grasp could be tried, 2 bad input.
+    """
+    from realsim.app.console import Console
+    from realsim.app.school.files import PAGE
+    from realsim.app.school.inputs import SchoolRequest, require_file_name
+    from realsim.app.school.run import run
+    from realsim.app.school.tables import as_json, show_school
+    from realsim.store import atomic
+
+    request = SchoolRequest(**options)
+    require_file_name(json_file)
+    console = Console(quiet=quiet)
+    outcome = run(source, out, request, console)
+    show_school(outcome.sets, outcome.models, console)
+    for instance, gave_up in outcome.unfinished.items():
+        console.warn(f"instance {instance}: given up: {'; '.join(gave_up)}. Run it again.")
+    console.say(f"page      {outcome.inputs.folder / PAGE}")
+    if (outcome.inputs.folder / "grasps/views").is_dir():
+        console.warn(
+            "the frames still show the grasps of before; write them anew with "
+            f"`realsim annotate {outcome.inputs.folder}`."
+        )
+    if json_file is not None:
+        atomic.write_json(json_file, as_json(outcome.sets, outcome.models))
+    if not any(s.reachable.any() for s in outcome.sets):
+        console.warn("no grasp could be tried; the table above and the page say why.")
+        sys.exit(1)
+
+
+@SCHOOL.command("validate")
+@click.option("--engine", default="both", show_default=True,
+              type=click.Choice([*ENGINES, "both"]), help="Which physics.")  # fmt: skip
+@click.option("--quick", is_flag=True, help="Every part with fewer samples: about a minute.")
+@click.option("--json", "json_file", type=FOLDER, default=None, help="Write the reports there.")
+@click.option("--out", type=FOLDER, default=None, help="Folder for reports and pictures.")
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def validate_command(
+    engine: str, quick: bool, json_file: Path | None, out: Path | None, quiet: bool
+) -> None:
+    """Check that the physics obeys Coulomb's law and does not depend on its solver's settings.
+
+    Exit codes: 0 all checks are green, 1 one is red, 2 an engine is not installed.
+    """
+    from realsim.app.console import Console
+    from realsim.app.school.validate import validate_engines
+
+    names = ENGINES if engine == "both" else (engine,)
+    if not validate_engines(names, quick, json_file, out, Console(quiet=quiet)):
+        sys.exit(1)
+
+
+@SCHOOL.command("settle")
+@click.argument("source", type=FOLDER)
+@click.option("--models", type=FOLDER, default=None, help="Models of a SOURCE that is no session.")
+@click.option("--quaternions", type=click.Choice(("wxyz", "xyzw")), default=None,
+              help="Their order in a scene.yaml that does not tell it.")  # fmt: skip
+@click.option(
+    "--mass", "masses", multiple=True, metavar="NAME=KG", help="A weighed object; repeat."
+)
+@click.option("--density", type=float, default=None, help="Of the others [kg/m^3].")
+@click.option("--support", "supports", multiple=True, type=FOLDER, metavar="URDF",
+              help="A bin or shelf, in the table's frame; repeat.")  # fmt: skip
+@click.option("--out", type=FOLDER, default=None, help="Folder for the picture.")
+@click.option("--json", "json_file", type=FOLDER, default=None, help="Write the table there, too.")
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def settle_command(
+    source: Path, out: Path | None, json_file: Path | None, quiet: bool, **options: Any
+) -> None:
+    """Let physics act on SOURCE and name the objects that jump or fall.
+
+    Poses that are millimetres off put objects into one another or into the air; grasps tried on
+    such a scene mean little.
+
+    Exit codes: 0 everything stands, 1 an object does not, 2 bad input.
+    """
+    from realsim.app.console import Console
+    from realsim.app.school.inputs import SchoolRequest
+    from realsim.app.school.settle import settle
+
+    request = SchoolRequest(**options)
+    if not settle(source, request, out, json_file, Console(quiet=quiet)):
+        sys.exit(1)
+
+
+@SCHOOL.command("export")
+@click.argument("source", type=FOLDER)
+@click.option("--to", "target", required=True, type=click.Choice(FORMATS), help="Format.")
+@click.option("--out", type=FOLDER, required=True, help="Folder to write into.")
+@click.option("--least-score", default=0.0, show_default=True, type=click.FloatRange(0, 1),
+              help="Leave out worse grasps (isaac).")  # fmt: skip
+def export_command(source: Path, target: str, out: Path, least_score: float) -> None:
+    """Write the grasps of SOURCE (a session, or a folder of results) for other programs."""
+    from realsim.app.console import Console
+    from realsim.app.school.export import export
+
+    console = Console()
+    for path in export(source, target, out, least_score):
+        console.say(str(path))
+
+
+@SCHOOL.command("summary")
+@click.argument("sources", type=FOLDER, nargs=-1, required=True, metavar="SESSION...")
+@click.option("--json", "json_file", type=FOLDER, default=None, help="Write the counts there, too.")
+def summary_command(sources: tuple[Path, ...], json_file: Path | None) -> None:
+    """Sum up the results of many sessions, row by row as in the paper's table."""
+    from realsim.app.console import Console
+    from realsim.app.school.export import summarise
+
+    summarise(sources, json_file, Console())

@@ -1,0 +1,132 @@
+"""One run of Robot School: from what the user asked for to its outcome."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from realsim.app.console import Console
+from realsim.app.school.files import SchoolOutcome, write_outcome
+from realsim.app.school.inputs import (
+    CACHE,
+    SchoolInputs,
+    SchoolRequest,
+    base_on_table,
+    read_inputs,
+    session_inputs,
+)
+from realsim.app.school.settle import warn_of_falls
+from realsim.records import Scene
+from realsim.store import SessionStore
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.school import SchoolConfig
+
+LOCAL_CLUSTER = "local"
+"""Address that starts a cluster of this machine alone."""
+
+
+def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
+    """Return the school's config for a request.
+
+    Raises:
+        InputError: an engine that there is not or that is not installed, or a base pose that
+            cannot be read.
+    """
+    from realsim_sim_bridge.school import SchoolConfig
+    from realsim_sim_bridge.school.sweep import SweepConfig
+    from realsim_sim_bridge.slip.engines import make_engine, settings_of
+
+    config = SchoolConfig(seed=request.seed, max_candidates=request.grasps)
+    physics = config.slip.physics
+    if request.force_n is not None:
+        physics = replace(physics, force_n=request.force_n)
+    if request.friction is not None:
+        physics = replace(physics, friction=request.friction)
+    engine = settings_of(request.engine)
+    make_engine(engine)  # not in a worker, minutes later: what is not installed is said at once
+    config = replace(config, slip=replace(config.slip, physics=physics, engine=engine))
+    candidates = config.candidates
+    if request.points is not None:
+        candidates = replace(candidates, surface_points=request.points)
+    if request.rotations is not None:
+        candidates = replace(candidates, rotations=request.rotations)
+    config = replace(config, candidates=candidates)
+    if request.cross_check:
+        second = settings_of("mujoco" if request.engine == "pybullet" else "pybullet")
+        make_engine(second)
+        config = replace(config, second_engine=second)
+    if request.sweep:
+        config = replace(config, sweep=SweepConfig())
+    if request.base_pose is not None:
+        rows = tuple(tuple(row) for row in base_on_table(request.base_pose, scene).tolist())
+        config = replace(config, reach=replace(config.reach, T_table_base=rows))
+    return config
+
+
+def run(source: Path, out: Path | None, request: SchoolRequest, console: Console) -> SchoolOutcome:
+    """Try grasps on a scene and write everything that comes out of it.
+
+    Args:
+        source: a session, or a BOP scene, GraspNet scene or scene.yaml.
+        out: folder for the results of a source that is no session.
+        request: what is asked for.
+        console: progress and notes go there.
+
+    Raises:
+        InputError: something given cannot be used, or the folder holds results of other parameters.
+    """
+    from realsim.store.lock import only_run_in
+
+    inputs = read_inputs(source, out, request, console)
+    inputs.folder.mkdir(parents=True, exist_ok=True)
+    config = config_of(request, inputs.scene)
+    with only_run_in(inputs.folder):
+        return try_grasps(inputs, config, request, console)
+
+
+def run_in_session(store: SessionStore, request: SchoolRequest, console: Console) -> SchoolOutcome:
+    """Try grasps on the registered objects of a session that is open and held by the caller.
+
+    Raises:
+        InputError: as `run`.
+    """
+    inputs = session_inputs(store, request, console)
+    return try_grasps(inputs, config_of(request, inputs.scene), request, console)
+
+
+def try_grasps(
+    inputs: SchoolInputs, config: "SchoolConfig", request: SchoolRequest, console: Console
+) -> SchoolOutcome:
+    """Run the school and write everything that comes out of it."""
+    warn_of_falls(inputs, console)
+    outcome = _tried(inputs, config, request, console)
+    with console.stage("write", "files and pictures"):
+        write_outcome(outcome)
+    return outcome
+
+
+def _tried(
+    inputs: SchoolInputs, config: "SchoolConfig", request: SchoolRequest, console: Console
+) -> SchoolOutcome:
+    """Run the school."""
+    from realsim_sim_bridge.school.cluster import ClusterConfig
+    from realsim_sim_bridge.school.school import run_school_results
+
+    workers: int | ClusterConfig = request.workers
+    if request.address == LOCAL_CLUSTER:
+        workers = ClusterConfig(workers=request.workers)
+    elif request.address:
+        workers = ClusterConfig(address=request.address)
+    with console.stage("school", f"up to {request.grasps} grasps an object") as tick:
+        results = run_school_results(
+            inputs.scene, inputs.models, config, workers=workers, cache=inputs.folder / CACHE,
+            progress=tick, solids=inputs.solids, restart=request.restart,
+        )  # fmt: skip
+    return SchoolOutcome(
+        inputs=inputs,
+        sets=[r.grasp_set for r in results],
+        trajectories={
+            r.grasp_set.instance: r.trajectories for r in results if r.trajectories is not None
+        },
+        unfinished={r.grasp_set.instance: r.unfinished for r in results if r.unfinished},
+    )

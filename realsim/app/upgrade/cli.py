@@ -1,0 +1,62 @@
+"""`realsim upgrade`: the command line."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from realsim.app.option_values import numbers_of
+
+FOLDER = click.Path(path_type=Path)
+
+
+@click.command("upgrade")
+@click.argument("dataset", type=FOLDER)
+@click.option("--out", type=FOLDER, required=True, help="Folder for the upgraded BOP dataset.")
+@click.option("--kind", default="auto", show_default=True,
+              type=click.Choice(["auto", "bop", "graspnet"]))  # fmt: skip
+@click.option("--camera", default="", help="kinect or realsense, of GraspNet.  [both]",
+              type=click.Choice(["", "kinect", "realsense"]))  # fmt: skip
+@click.option(
+    "--start",
+    default="gt",
+    show_default=True,
+    help="Start poses: 'gt' (the annotations) or a folder under keyframe_poses/.",
+)
+@click.option("--scenes", default="", help="Scene numbers, such as 1-3,7; all by default.")
+@click.option("--views", type=click.IntRange(1), default=None,
+              help="At most so many images of each scene, spread evenly.  [all]")  # fmt: skip
+@click.option("--models", type=FOLDER, default=None, help="Models folder, if not DATASET/models.")
+@click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000),
+              help="Candidates to try on each object, at most.")  # fmt: skip
+@click.option("--analytic", default=0, show_default=True, type=click.IntRange(0, 2000),
+              help="Analytic grasps to try on each object beside these.")  # fmt: skip
+@click.option("--scene-workers", default=None, type=click.IntRange(1, 256),
+              help="Scenes at a time.  [one a core]")  # fmt: skip
+@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 64),
+              help="Processes of one scene, where it is upgraded alone.")  # fmt: skip
+@click.option("--quiet", is_flag=True, help="No progress bars.")
+def upgrade_command(dataset: Path, out: Path, scenes: str, quiet: bool, **options: Any) -> None:
+    """Refine the poses of a BOP or GraspNet data set, try grasps, write it out with labels.
+
+    DATASET is a BOP root, a split or one scene; or a GraspNet root, a scene or one camera of it.
+    Nothing in it is changed: what it had goes along to OUT/SPLIT/SCENE/imported. Run again, it goes
+    on where it stopped; finished scenes are not done again.
+
+    Writes OUT/upgrade.html (before and after, worst objects first), upgrade.json and upgrade.csv.
+
+    Exit codes: 0 done, 1 a scene was left out, 2 bad input.
+    """
+    from realsim.app.console import Console
+    from realsim.app.upgrade.config import UpgradeConfig
+    from realsim.app.upgrade.run import run_upgrade, show_upgrade
+
+    config = UpgradeConfig(
+        scenes=numbers_of(scenes), grasps_per_object=options.pop("grasps"), **options
+    )
+    console = Console(quiet=quiet)
+    result = run_upgrade(config, dataset, out, console)
+    show_upgrade(result, console)
+    if result.failed:
+        sys.exit(1)

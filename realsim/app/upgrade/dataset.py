@@ -1,0 +1,148 @@
+"""The scenes of a data set that is to be upgraded: what it is, where they are, how they open."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from realsim.app.upgrade.config import Kind, UpgradeConfig
+from realsim.errors import InputError
+from realsim.formats.bop.scene import BopSceneRef, find_scenes
+from realsim.formats.graspnet.labelled import FIRST_TEST_SCENE, GraspnetSceneRef
+from realsim.formats.graspnet.scene import CAMERAS, cameras_of
+from realsim.formats.labelled_scene import LabelledScene
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneRef:
+    """One scene seen by one camera, not opened yet."""
+
+    kind: Literal["bop", "graspnet"]
+    root: Path
+    """Of the data set."""
+    folder: Path
+    """Of the scene; GraspNet: of its camera."""
+    number: int
+    camera: str
+    """Which of several; '' = the scene has one."""
+    place: str
+    """SPLIT/SCENE, where the upgraded scene goes under OUT."""
+    models: Path
+    """Folder of the models."""
+
+
+def scenes_of(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
+    """Return the scenes that are asked for.
+
+    Args:
+        dataset: BOP root, split or scene; GraspNet root, scenes folder, scene or camera.
+        config: kind, camera, scene numbers and models folder.
+
+    Raises:
+        InputError: there are none, or not those asked for.
+    """
+    kind = _kind_of(dataset, config.kind)
+    refs = _graspnet(dataset, config) if kind == "graspnet" else _bop(dataset, config)
+    missing = sorted(set(config.scenes) - {r.number for r in refs})
+    if missing:
+        there = ", ".join(map(str, sorted({r.number for r in refs})))
+        raise InputError(
+            f"scene {', '.join(map(str, missing))} is not in '{dataset}'; it has {there}."
+        )
+    chosen = [r for r in refs if not config.scenes or r.number in config.scenes]
+    _require_places(chosen)
+    return chosen
+
+
+def _kind_of(dataset: Path, asked: Kind) -> Kind:
+    """Return what a data set is; BOP where nothing says GraspNet (BOP's reader says what lacks)."""
+    if asked != "auto":
+        return asked
+    return "graspnet" if _graspnet_cameras(dataset) else "bop"
+
+
+def _require_places(refs: Sequence[SceneRef]) -> None:
+    """Raise if two scenes would be written to one folder."""
+    seen: dict[str, Path] = {}
+    for ref in refs:
+        if ref.place in seen:
+            raise InputError(
+                f"{seen[ref.place]} and {ref.folder} would both go to {ref.place}; upgrade them "
+                "one by one into two folders."
+            )
+        seen[ref.place] = ref.folder
+
+
+def _bop(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
+    refs = find_scenes(dataset)
+    return [
+        SceneRef(
+            kind="bop", root=_root(r), folder=r.folder, number=r.scene_id,
+            camera=r.camera, place=f"{r.split}{'_' * bool(r.camera)}{r.camera}/{r.folder.name}",
+            models=config.models or _root(r) / "models",
+        )
+        for r in refs
+    ]  # fmt: skip
+
+
+def _root(ref: BopSceneRef) -> Path:
+    """Return the folder that holds the splits (and usually the models)."""
+    return ref.folder.parent.parent
+
+
+def _graspnet_cameras(dataset: Path) -> list[Path]:
+    """Return the camera folders of a GraspNet root, scenes folder, scene or camera folder."""
+    if not dataset.is_dir():
+        return []
+    if dataset.name in CAMERAS and dataset.name in cameras_of(dataset.resolve().parent):
+        return [dataset.resolve()]
+    homes = [dataset, *sorted(dataset.glob("scene_*")), *sorted(dataset.glob("scenes/scene_*"))]
+    return [(home / camera).resolve() for home in homes for camera in cameras_of(home)]
+
+
+def _graspnet(dataset: Path, config: UpgradeConfig) -> list[SceneRef]:
+    """Return the scenes of a GraspNet tree; each camera's images are a scene of their own."""
+    folders = _graspnet_cameras(dataset)
+    if config.camera:
+        folders = [f for f in folders if f.name == config.camera]
+    if not folders:
+        raise InputError(
+            f"'{dataset}' holds no GraspNet scene"
+            + (f" of the camera {config.camera}" if config.camera else "")
+            + ": scenes/scene_0000/{kinect,realsense}/camera_poses.npy is expected."
+        )
+    refs: list[SceneRef] = []
+    for folder in folders:
+        scene = folder.parent
+        digits = scene.name.removeprefix("scene_")
+        if not digits.isdecimal():
+            raise InputError(f"{scene} is not named scene_NUMBER, as GraspNet's scenes are.")
+        root = scene.parent.parent
+        split = "train" if int(digits) < FIRST_TEST_SCENE else "test"
+        refs.append(
+            SceneRef(
+                kind="graspnet", root=root, folder=folder, number=int(digits), camera=folder.name,
+                place=f"{split}_{folder.name}/{int(digits):06d}",
+                models=config.models or root / "models",
+            )
+        )  # fmt: skip
+    return refs
+
+
+def open_scene(ref: SceneRef) -> LabelledScene:
+    """Open a scene; its images and models are read when they are asked for.
+
+    Raises:
+        InputError: something of it is missing or broken.
+    """
+    if ref.kind == "graspnet":
+        from realsim.formats.graspnet.opening import open_scene as open_graspnet
+
+        models = ref.models if ref.models.is_dir() else None
+        return open_graspnet(
+            GraspnetSceneRef(number=ref.number, camera=ref.camera, folder=ref.folder, models=models)
+        )
+    from realsim.formats.bop.opening import open_labelled_scene
+
+    wanted = [r for r in find_scenes(ref.folder) if r.camera == ref.camera]
+    return open_labelled_scene(wanted[0], models=ref.models)

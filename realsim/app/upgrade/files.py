@@ -1,0 +1,148 @@
+"""What an upgrade leaves beside its scenes: what the data set had, records, models, BOP's files.
+
+OUT/SPLIT/SCENE/imported/     the data set's own annotations, byte by byte, and source.json
+OUT/SPLIT/SCENE/stages/upgrade.json   what came of the scene, and the key of its inputs
+OUT/models/                   the models of all scenes
+OUT/camera.json, OUT/SPLIT_targets_bop19.json
+"""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from realsim import __version__
+from realsim.app.upgrade.config import UpgradeConfig
+from realsim.app.upgrade.dataset import SceneRef
+from realsim.errors import InputError
+from realsim.store import SessionStore, atomic
+from realsim.store.json_files import read_object
+
+IMPORTED = "imported"
+NOTE = "stages/upgrade.json"
+IMAGE_FOLDERS = ("mask", "mask_visib", "label", "rect", "meta")
+"""Of a scene: not read, and no reason to upgrade it again."""
+DOCUMENTS = {
+    "bop": ("scene_gt*.json", "scene_camera*.json"),
+    "graspnet": ("annotations/*.xml", "*.npy"),
+}
+"""Copied to imported/: small, and all that before and after can be compared by."""
+LABELS = "grasp_label/{:03d}_labels.npz"
+COLLISIONS = "collision_label/scene_{:04d}/collision_labels.npz"
+
+
+def key_of(ref: SceneRef, config: UpgradeConfig) -> str:
+    """Return a hash of everything a scene's result depends on: files by name, size and time.
+
+    Contents are compared by every stage itself; this is to know in no time that nothing changed.
+    """
+    digest = hashlib.sha256(json.dumps([__version__, config.result_key()]).encode())
+    files = [p for p in sorted(ref.folder.rglob("*")) if p.is_file()]
+    files = [p for p in files if p.relative_to(ref.folder).parts[0] not in IMAGE_FOLDERS]
+    if ref.models.is_dir():
+        files += [p for p in sorted(ref.models.rglob("*")) if p.is_file()]
+    for path in files:
+        about = path.stat()
+        digest.update(f"{path.name} {about.st_size} {about.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
+
+
+def finished_record(folder: Path, key: str) -> dict[str, Any] | None:
+    """Return what came of a scene, where it has been upgraded with these inputs."""
+    path = folder / NOTE
+    try:
+        note: Any = json.loads(path.read_text(encoding="utf-8"))
+        is_current = note["key"] == key and (folder / "session.json").is_file()
+        return dict(note["record"]) if is_current else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None  # a damaged note is no note: the stages are gone through again
+
+
+def all_records(out: Path) -> list[dict[str, Any]]:
+    """Return what came of every scene that has been upgraded into a folder."""
+    records: list[dict[str, Any]] = []
+    for path in sorted(out.glob(f"*/*/{NOTE}")):
+        try:
+            records.append(dict(read_object(path)["record"]))
+        except (InputError, KeyError, TypeError, ValueError):
+            continue
+    return records
+
+
+def keep_imported(store: SessionStore, ref: SceneRef, digests: dict[int, str]) -> None:
+    """Copy the data set's annotations beside the new ones, and say where they came from.
+
+    Raises:
+        InputError: the session was made from other images.
+    """
+    source = f"{IMPORTED}/source.json"
+    said = {str(k): digests[k] for k in sorted(digests)}
+    if store.has(source):
+        before = store.read_json(source).get("images", {})
+        differing = [k for k in before if said.get(k) != before[k]]
+        if differing:
+            raise InputError(
+                f"'{store.folder}' holds an upgrade of other images (image {differing[0]} has "
+                "changed, or is not asked for). Give another --out, or delete that folder."
+            )
+    files = [p for pattern in DOCUMENTS[ref.kind] for p in sorted(ref.folder.glob(pattern))]
+    for path in files:
+        relative = f"{IMPORTED}/{path.relative_to(ref.folder).as_posix()}"
+        data = path.read_bytes()
+        if not store.has(relative) or store.path(relative).read_bytes() != data:
+            store.write_bytes(relative, data)
+    labels: list[Path] = []
+    if ref.kind == "graspnet":
+        labels = [ref.root / COLLISIONS.format(ref.number)]
+        labels += sorted((ref.root / "grasp_label").glob("*_labels.npz"))
+    record = {
+        "kind": ref.kind, "dataset": str(ref.root), "scene": str(ref.folder),
+        "grasp_labels": [str(p.relative_to(ref.root)) for p in labels if p.is_file()],
+        "images": said,
+    }  # fmt: skip
+    if not store.has(source) or store.read_json(source) != record:
+        store.write_json(source, record)
+
+
+def gather_models(out: Path, places: Sequence[str]) -> None:
+    """Copy the models of all scenes into one models folder, as BOP has it."""
+    info: dict[str, Any] = {}
+    home = out / "models"
+    for place in places:
+        models = out / place / "models"
+        if not (models / "models_info.json").is_file():
+            continue
+        for obj_id, entry in read_object(models / "models_info.json").items():
+            if obj_id in info:
+                continue
+            info[obj_id] = entry
+            for path in sorted(models.glob(f"obj_{int(obj_id):06d}.*")):
+                data = path.read_bytes()
+                if not (home / path.name).is_file() or (home / path.name).read_bytes() != data:
+                    atomic.write_bytes(home / path.name, data)
+    ordered = {k: info[k] for k in sorted(info, key=int)}
+    atomic.write_json(home / "models_info.json", ordered)
+
+
+def write_root_files(out: Path, places: Sequence[str]) -> None:
+    """Write what BOP's tools look for at a data set's root: the camera and each split's targets."""
+    targets: dict[str, list[dict[str, int]]] = {}
+    for k, place in enumerate(places):
+        store = SessionStore.open(out / place)
+        session, i = store.session, store.session.intrinsics
+        if k == 0:
+            camera = {"fx": i.fx, "fy": i.fy, "cx": i.cx, "cy": i.cy, "width": i.width,
+                      "height": i.height, "depth_scale": 1e3 * session.depth_unit_m}  # fmt: skip
+            atomic.write_json(out / "camera.json", camera)
+        name = store.folder.name
+        number = int(name) if name.isdecimal() else 0
+        for image, rows in store.read_json("scene_gt.json").items():
+            counts = Counter(int(row["obj_id"]) for row in rows)
+            targets.setdefault(store.folder.parent.name, []).extend(
+                {"scene_id": number, "im_id": int(image), "obj_id": o, "inst_count": n}
+                for o, n in sorted(counts.items())
+            )
+    for split, rows in targets.items():
+        atomic.write_json(out / f"{split}_targets_bop19.json", rows)

@@ -1,0 +1,145 @@
+"""The page of an upgrade: where every object was said to be, where it is, worst first."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.app.first_surfaces import FirstSurfaces
+from realsim.app.picture_pages import PageSummary, Pair, Section, Sliders, Table, picture_page
+from realsim.app.upgrade.analytic import LEVEL_HEADER, correlation_line, level_rows
+from realsim.app.upgrade.scene import Record
+from realsim.app.upgrade.tables import (
+    HEADER,
+    objects_of,
+    row_of,
+    summary_line,
+    summary_of,
+    worst_first,
+)
+from realsim.records import ObjectModel
+from realsim.rendering.overlay import VERDICT_RGB, draw_outlines
+from realsim.rendering.rays import PlacedMesh
+from realsim.store import SessionStore
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+PAGE = "upgrade.html"
+PAIRS = 60
+"""Objects with pictures, the worst; a page of more is not looked at."""
+ROWS = 400
+"""Objects in the page's table; upgrade.csv has all."""
+CROP_WIDTH_PX = 560
+"""Of a picture: an object's outline is seen in single pixels."""
+MARGIN = 0.35
+"""Surroundings on each side of the object [share of its size in the picture]."""
+LEAST_SIDE_PX = 96
+"""Of what is cut out: a small object alone does not show where it stands."""
+BEFORE_RGB = (245, 60, 200)
+"""Of the pose that was given: a colour that no verdict has."""
+
+
+def write_page(
+    out: Path,
+    records: Sequence[Record],
+    failed: Mapping[str, str],
+    analytic: Record | None,
+) -> PageSummary:
+    """Write OUT/upgrade.html."""
+    summary = summary_of(records)
+    ranked = worst_first(objects_of(records))
+    pictured = [(r, o) for r, o in ranked if o["shown"] is not None]
+    sections: list[Section] = []
+    pairs = [_pair(out, r, o) for r, o in pictured[:PAIRS]]
+    if pairs:
+        more = "" if len(pairs) == len(pictured) else f" The worst {PAIRS} of {len(pictured)}."
+        sections.append(
+            Sliders(
+                title="Before and after", pairs=pairs,
+                text="Left of the handle the pose as the data set has it (magenta), right of it "
+                f"the refined one in the colour of its verdict; whole outlines, as if nothing "
+                f"stood in front. Worst first.{more}",
+            )
+        )  # fmt: skip
+    sections.append(
+        Table(
+            title="Objects", header=HEADER, rows=[row_of(r, o) for r, o in ranked[:ROWS]],
+            colors=[VERDICT_RGB.get(o["verdict"], (150, 150, 150)) for _, o in ranked[:ROWS]],
+            text="Worst first." if len(ranked) <= ROWS else
+            f"The worst {ROWS} of {len(ranked)}; upgrade.csv has all.",
+        )
+    )  # fmt: skip
+    if analytic is not None:
+        rows = level_rows(analytic)
+        text = f"By the label's friction; {correlation_line(analytic)}."
+        sections.append(
+            Table(title="Analytic grasps, tried", header=LEVEL_HEADER, rows=rows, text=text)
+        )
+    notes = [f"{place} was left out: {why}" for place, why in failed.items()]
+    notes += [f"{r['place']}: {note}" for r in records for note in r["notes"]]
+    return picture_page(
+        out / PAGE, "Upgraded data set", sections, about=summary_line(summary), notes=notes[:60]
+    )
+
+
+def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> Pair:
+    """Return the two pictures of an object, drawn when the page asks for them."""
+    before, after = _pictures(out, str(record["place"]), o)
+    return Pair(
+        before=before, after=after, before_label="as given", after_label="refined",
+        caption=f"{record['place']} image {o['shown']['image']}, {o['name']}: {o['verdict']}, "
+        f"moved by {o['moved_mm']:.1f} mm and {o['moved_deg']:.1f} deg"
+        + (f"; {'; '.join(o['reasons'])}" if o["reasons"] else ""),
+    )  # fmt: skip
+
+
+def _pictures(
+    out: Path, place: str, o: Mapping[str, Any]
+) -> tuple[Callable[[], Image], Callable[[], Image]]:
+    """Return what draws the pose as given and the refined one, in the same window."""
+    shown = o["shown"]
+    Ts = (np.array(shown["T_cam_obj_before"]), np.array(shown["T_cam_obj"]))
+
+    def drawn(k: int) -> Image:
+        store, models = _scene(out / place)
+        mesh = models[int(o["obj_id"])].mesh
+        masks = [
+            FirstSurfaces([PlacedMesh(0, mesh, T)]).look(store.session.intrinsics, np.eye(4))[0]
+            for T in Ts
+        ]
+        color = BEFORE_RGB if k == 0 else VERDICT_RGB.get(o["verdict"], (255, 255, 255))
+        return _cropped(store.rgb(int(shown["image"])), masks, k, color)
+
+    return (lambda: drawn(0)), (lambda: drawn(1))
+
+
+@lru_cache(maxsize=1)
+def _scene(folder: Path) -> tuple[SessionStore, dict[int, ObjectModel]]:
+    """Return a scene's session and models; the pictures of one scene are drawn together."""
+    from realsim.formats.bop.models import load_models
+
+    return SessionStore.open(folder), load_models(folder / "models", notes=[])
+
+
+def _cropped(
+    rgb: Image, masks: Sequence[NDArray[np.int32]], k: int, color: tuple[int, int, int]
+) -> Image:
+    """Return the part of a photograph around both outlines, enlarged, with the k-th drawn."""
+    import cv2
+
+    height, width = rgb.shape[:2]
+    rows, columns = np.nonzero(np.logical_or(*(m >= 0 for m in masks)))
+    if len(rows) == 0:  # both outside the picture
+        rows, columns = np.array([0, height - 1]), np.array([0, width - 1])
+    centre = np.array([columns.min() + columns.max(), rows.min() + rows.max()]) / 2
+    size = max(np.ptp(columns), np.ptp(rows)) * (1 + 2 * MARGIN)
+    side = int(min(max(size, LEAST_SIDE_PX), width, height))
+    x, y = np.clip(np.round(centre - side / 2).astype(int), 0, [width - side, height - side])
+    window = slice(int(y), int(y) + side), slice(int(x), int(x) + side)
+    big = (CROP_WIDTH_PX, CROP_WIDTH_PX)
+    picture = np.asarray(cv2.resize(rgb[window], big, interpolation=cv2.INTER_CUBIC), np.uint8)
+    ids = np.asarray(cv2.resize(masks[k][window], big, interpolation=cv2.INTER_NEAREST), np.int32)
+    return draw_outlines(picture, ids, colors={0: color})

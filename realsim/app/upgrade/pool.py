@@ -1,0 +1,123 @@
+"""Scenes upgraded in processes beside this one: one that breaks or is killed harms no other."""
+
+import time
+from collections.abc import Generator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
+from realsim.errors import RealsimError
+
+ATTEMPTS = 2
+"""Times that a scene is begun: a process that was killed is gone on with once."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SceneEnd:
+    """How a scene ended."""
+
+    job: SceneJob
+    record: Record | None
+    """None = it was left out."""
+    error: str = ""
+    """Why."""
+
+
+class Told(Protocol):
+    """Called when a scene has ended, with those that are under way."""
+
+    def __call__(self, ended: SceneEnd | None, under_way: Sequence[str]) -> None:
+        """Show it."""
+        ...
+
+
+def upgrade_in_processes(
+    jobs: Sequence[SceneJob], processes: int, tell: Told
+) -> Generator[SceneEnd]:
+    """Upgrade scenes, so many at a time, and yield each as it ends.
+
+    A scene with broken input ends with its reason. A scene whose process was killed is gone on with
+    once, from the stage where it was; what its stages had finished is not done again.
+    """
+    from realsim_sim_bridge.school.workers import WorkerDiedError, local_workers
+
+    waiting = [(job, 1) for job in reversed(jobs)]
+    running: dict[Future[SceneEnd], tuple[SceneJob, int]] = {}
+    with local_workers(processes) as pool:
+        while waiting or running:
+            while waiting and len(running) < pool.capacity():
+                job, attempt = waiting.pop()
+                running[pool.submit(upgraded, job)] = job, attempt
+            tell(None, [job.ref.place for job, _ in running.values()])
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                job, attempt = running.pop(future)
+                try:
+                    end = future.result()
+                except WorkerDiedError as died:
+                    if attempt < ATTEMPTS:
+                        waiting.append((job, attempt + 1))
+                        continue
+                    end = SceneEnd(
+                        job=job, record=None,
+                        error=f"{died}; {ATTEMPTS} times. Run the same again with fewer "
+                        "--scene-workers.",
+                    )  # fmt: skip
+                tell(end, [job.ref.place for job, _ in running.values()])
+                yield end
+
+
+def upgraded(job: SceneJob) -> SceneEnd:
+    """Upgrade a scene quietly; whatever breaks it is told, not raised."""
+    try:
+        return SceneEnd(job=job, record=upgrade_scene(job, read_source(job), None))
+    except (RealsimError, OSError) as error:
+        return SceneEnd(job=job, record=None, error=str(error))
+    except Exception as error:  # a fault of the program in one scene of many
+        return SceneEnd(
+            job=job, record=None, error=f"the program failed: {type(error).__name__}: {error}"
+        )
+
+
+@contextmanager
+def scene_progress(total: int, finished: int, *, quiet: bool) -> Generator[Told]:
+    """Show a bar over scenes with the remaining time and those under way.
+
+    Args:
+        total: scenes in all.
+        finished: of them, upgraded by an earlier run.
+        quiet: whether nothing is shown.
+    """
+    from rich.console import Console as RichConsole
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("scenes"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn(),
+        TextColumn("{task.description}"),
+    )  # fmt: skip
+    start, done = time.monotonic(), 0
+    with Progress(*columns, console=RichConsole(stderr=True), disable=quiet) as bar:
+        task = bar.add_task("", total=total, completed=finished)
+
+        def tell(ended: SceneEnd | None, under_way: Sequence[str]) -> None:
+            nonlocal done
+            done += ended is not None
+            left = remaining_s(time.monotonic() - start, done, total - finished)
+            words = f"{_words(left)} left" if left is not None else ""
+            names = ", ".join(under_way)
+            bar.update(task, completed=finished + done, description=f"{words}  {names}".strip())
+
+        yield tell
+
+
+def remaining_s(elapsed_s: float, done: int, of: int) -> float | None:
+    """Return how long the rest takes at the rate of what is done [s]; None = nothing is done."""
+    return None if done == 0 else elapsed_s / done * (of - done)
+
+
+def _words(seconds: float) -> str:
+    """Return a time as a person says it."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

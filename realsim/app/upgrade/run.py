@@ -1,0 +1,208 @@
+"""Upgrade a data set: find the table, refine the poses, try grasps, write labels and pictures.
+
+The data set itself is only read. Every scene becomes a session (which is a BOP scene) under
+OUT/SPLIT/SCENE, so that all later commands (`realsim review`, `realsim report`) work on it; what
+the data set said of it goes along in OUT/SPLIT/SCENE/imported.
+"""
+
+import contextlib
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from realsim.app.console import Console
+from realsim.app.upgrade.analytic import agreement_of, all_sets
+from realsim.app.upgrade.config import UpgradeConfig
+from realsim.app.upgrade.dataset import SceneRef, scenes_of
+from realsim.app.upgrade.files import (
+    all_records,
+    finished_record,
+    gather_models,
+    key_of,
+    write_root_files,
+)
+from realsim.app.upgrade.pool import SceneEnd, scene_progress, upgrade_in_processes
+from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
+from realsim.app.upgrade.tables import show_upgrade, write_tables
+from realsim.errors import InputError
+from realsim.store.lock import only_run_in
+
+__all__ = ["UpgradeConfig", "UpgradeResult", "run_upgrade", "show_upgrade"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class UpgradeResult:
+    """All scenes of an upgrade."""
+
+    out: Path
+    scenes: list[Record]
+    """What came of each scene that was asked for, in their order."""
+    failed: dict[str, str]
+    """Place of a scene -> why it was left out."""
+    skipped: int
+    """Scenes that an earlier run had finished with the same inputs."""
+    analytic: Record | None
+    """How the School's scores and the analytic labels of all scenes go together."""
+
+
+def run_upgrade(config: UpgradeConfig, dataset: Path, out: Path, console: Console) -> UpgradeResult:
+    """Upgrade the scenes of a BOP or GraspNet data set into `out`.
+
+    Raises:
+        InputError: no data set, no such scene, unwritable or foreign output, another run working
+            there, or broken content of the only scene (of many, a broken one is left out).
+    """
+    refs = scenes_of(dataset, config)
+    _refuse_inside(out, refs)
+    _refuse_what_cannot_be_written(out)
+    done: dict[str, Record] = {}
+    todo: list[SceneRef] = []
+    for ref in refs:
+        record = finished_record(out / ref.place, key_of(ref, config))
+        if record is None:
+            todo.append(ref)
+        else:
+            done[ref.place] = record
+    skipped = len(done)
+    if skipped:
+        console.say(f"{skipped} of {len(refs)} scenes are upgraded already, with the same inputs")
+    with contextlib.ExitStack() as lock:
+        if len(refs) == 1 and todo:
+            failed = _alone(_job(todo[0], config, out, config.workers), lock, console, done)
+        else:
+            failed = _many(todo, config, out, lock, console, done)
+        if not done:
+            _remove_empty(out)
+            reasons = "; ".join(f"{place}: {why}" for place, why in list(failed.items())[:3])
+            raise InputError(f"none of the {len(refs)} scenes can be used: {reasons}")
+        analytic = _write_together(out, failed, console)
+    scenes = [done[r.place] for r in refs if r.place in done]
+    return UpgradeResult(out=out, scenes=scenes, failed=failed, skipped=skipped, analytic=analytic)
+
+
+def _job(ref: SceneRef, config: UpgradeConfig, out: Path, workers: int) -> SceneJob:
+    return SceneJob(ref=ref, config=config, out=out, workers=workers)
+
+
+def _alone(
+    job: SceneJob, lock: contextlib.ExitStack, console: Console, done: dict[str, Record]
+) -> dict[str, str]:
+    """Upgrade the only scene in this process; nothing is written before it has been read whole."""
+    from threadpoolctl import threadpool_limits
+
+    console.say(f"scene {job.ref.number} ({job.ref.place})")
+    with threadpool_limits(limits=1):
+        source = read_source(job)
+        job.out.mkdir(parents=True, exist_ok=True)
+        lock.enter_context(only_run_in(job.out))
+        done[job.ref.place] = upgrade_scene(job, source, console)
+    return {}
+
+
+def _many(
+    refs: Sequence[SceneRef],
+    config: UpgradeConfig,
+    out: Path,
+    lock: contextlib.ExitStack,
+    console: Console,
+    done: dict[str, Record],
+) -> dict[str, str]:
+    """Upgrade scenes in processes; add those that ended well to `done`, return why others did not.
+
+    Raises:
+        InputError: another run is working in the folder.
+    """
+    from realsim_sim_bridge.school.workers import cores
+
+    out.mkdir(parents=True, exist_ok=True)
+    lock.enter_context(only_run_in(out))
+    if not refs:
+        return {}
+    failed: dict[str, str] = {}
+    processes = min(config.scene_workers or cores(), len(refs))
+    workers = config.workers if processes == 1 else 1
+    jobs = [_job(ref, config, out, workers) for ref in refs]
+    with (
+        scene_progress(len(refs) + len(done), len(done), quiet=console.quiet) as tell,
+        contextlib.closing(upgrade_in_processes(jobs, processes, tell)) as ends,
+    ):
+        for end in ends:
+            _take(end, done, failed, console)
+    return failed
+
+
+def _take(end: SceneEnd, done: dict[str, Record], failed: dict[str, str], console: Console) -> None:
+    """Note how a scene ended."""
+    place = end.job.ref.place
+    if end.record is not None:
+        done[place] = end.record
+    else:
+        failed[place] = end.error
+        console.say(f"scene {place} is left out: {end.error}")
+
+
+def _write_together(out: Path, failed: dict[str, str], console: Console) -> Record | None:
+    """Write what speaks of all scenes: models, root files, tables and the page.
+
+    Returns:
+        How the School's scores and the analytic labels go together.
+    """
+    from realsim.app.upgrade.page import write_page
+
+    records = all_records(out)
+    places = [str(r["place"]) for r in records]
+    with console.stage("together", f"{len(records)} scenes"):
+        gather_models(out, places)
+        write_root_files(out, places)
+        analytic = agreement_of(all_sets(out, places))
+        write_tables(out, records, failed, analytic)
+        write_page(out, records, failed, analytic)
+    return analytic
+
+
+def _refuse_inside(out: Path, refs: Sequence[SceneRef]) -> None:
+    """Raise if the output would be written into the data set."""
+    for root in sorted({r.root.resolve() for r in refs}):
+        if out.resolve() == root or root in out.resolve().parents:
+            raise InputError(
+                f"--out '{out}' lies inside the dataset '{root}', which is only read; choose a "
+                "folder outside it."
+            )
+
+
+def _refuse_what_cannot_be_written(out: Path) -> None:
+    """Raise if the output folder cannot be made or filled; nothing is left behind."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out '{out}' is a file; give a folder that may be made or filled.")
+    # What a kill left before it wrote anything is folders, and files under temporary names.
+    is_empty = not any(p.is_file() and not p.name.startswith(".") for p in out.rglob("*"))
+    if not is_empty and not any(out.glob("*/*/session.json")):
+        raise InputError(
+            f"--out '{out}' is not empty and holds no upgrade. Choose another folder: nothing of "
+            "yours is overwritten."
+        )
+    made = [p for p in (out, *out.parents) if not p.exists()]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"--out '{out}' cannot be written ({error.strerror}); choose another folder or change "
+            "its permissions."
+        ) from error
+    finally:
+        for path in made:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+
+
+def _remove_empty(out: Path) -> None:
+    """Remove the folders that scenes without a result left empty."""
+    for path in sorted(out.rglob("*"), reverse=True):
+        if path.is_dir():
+            with contextlib.suppress(OSError):
+                path.rmdir()
+    with contextlib.suppress(OSError):
+        out.rmdir()

@@ -1,0 +1,275 @@
+"""One scene of an upgrade: a session made of it, taken through every stage, and what came of it."""
+
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from realsim import __version__
+from realsim.app.console import Console, Tick
+from realsim.app.register.run import register_session
+from realsim.app.show import why_no_grasp
+from realsim.app.stages import annotate_session, save_starts, school_session
+from realsim.app.upgrade.analytic import AnalyticJob, agreement_of, try_analytic
+from realsim.app.upgrade.config import UpgradeConfig
+from realsim.app.upgrade.dataset import SceneRef, open_scene
+from realsim.app.upgrade.files import NOTE, keep_imported, key_of
+from realsim.app.upgrade.instances import moved_from_start, world_starts
+from realsim.app.upgrade.source import SceneSource, prepare
+from realsim.formats import images
+from realsim.geometry import se3
+from realsim.records import CaptureSession, GraspSet, ObjectPose, Scene, View
+from realsim.store import SessionStore
+from realsim.store.lock import only_run_in
+from realsim.store.session_store import read_json_file
+
+Record = dict[str, Any]
+"""What came of a scene, as plain JSON values."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneJob:
+    """One scene to be upgraded; goes to another process as it is."""
+
+    ref: SceneRef
+    config: UpgradeConfig
+    out: Path
+    """Of the whole upgrade."""
+    workers: int
+    """Processes that the scene may use."""
+
+    @property
+    def folder(self) -> Path:
+        """Where the upgraded scene goes."""
+        return self.out / self.ref.place
+
+
+class SceneConsole(Console):
+    """Shows the stages of a scene where another console does, and keeps what the user must know."""
+
+    def __init__(self, shown: Console | None) -> None:
+        """Open the console; None shows nothing."""
+        super().__init__(quiet=True)
+        self.told: list[str] = []
+        self._shown = shown
+
+    @contextmanager
+    def stage(self, name: str, note: str = "") -> Generator[Tick]:
+        """Show a stage."""
+        with (
+            super().stage(name, note)
+            if self._shown is None
+            else self._shown.stage(name, note) as tick
+        ):
+            yield tick
+
+    def say(self, text: str) -> None:
+        """Leave it out: the record and the session have it."""
+
+    def warn(self, text: str) -> None:
+        """Keep one line that the user must not miss."""
+        self.told.append(text)
+
+    def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+        """Leave it out, likewise."""
+
+
+def read_source(job: SceneJob) -> SceneSource:
+    """Read a scene and check all of it; nothing is written.
+
+    Raises:
+        InputError: something is missing or broken.
+    """
+    return prepare(open_scene(job.ref), job.ref, job.config)
+
+
+def upgrade_scene(job: SceneJob, source: SceneSource, shown: Console | None) -> Record:
+    """Upgrade one scene, going on where an earlier run stopped.
+
+    Args:
+        job: what and where.
+        source: the scene, read and checked.
+        shown: where progress is shown; None = nowhere.
+
+    Raises:
+        InputError: it cannot be registered or tried, another run is working on it, or its folder
+            holds something else.
+    """
+    from realsim.app.report.session import write_report
+    from realsim.formats.bop.models import save_models
+
+    key, console = key_of(job.ref, job.config), SceneConsole(shown)
+    job.folder.mkdir(parents=True, exist_ok=True)
+    with only_run_in(job.folder):
+        store = _session_of(job, source)
+        save_models(store.folder / "models", source.models)
+        starts = world_starts(source.seen, source.Ts_world_cam)
+        save_starts(store, starts, f"{job.config.start} of {job.ref.place}")
+        scene = register_session(store, console)
+        grasps = school_session(
+            store, console, grasps_per_object=job.config.grasps_per_object, seed=job.config.seed,
+            workers=job.workers,
+        )  # fmt: skip
+        analytic: list[GraspSet] = []
+        if job.config.analytic:
+            asked = AnalyticJob(ref=job.ref, config=job.config, out=job.out, workers=job.workers)
+            analytic = try_analytic(store, asked, console)
+        annotate_session(store, console)
+        notes = [*source.notes, *registration_notes(store), *console.told]
+        with console.stage("report"):
+            write_report(store, None, notes=notes)
+        record = _record(job, source, store, scene, starts, grasps, notes)
+        record["analytic"] = agreement_of(analytic)
+        store.write_json(NOTE, {"key": key, "record": record})
+    return record
+
+
+def _session_of(job: SceneJob, source: SceneSource) -> SessionStore:
+    """Copy the images of a scene into a session (only those that are not there yet)."""
+    scene, folder = source.scene, job.folder
+    if (folder / "session.json").is_file():
+        store = SessionStore.open(folder)
+    else:
+        session = CaptureSession(
+            name=job.ref.place.replace("/", " "), intrinsics=source.intrinsics, views=(),
+            depth_unit_m=source.depth_unit_m,
+        )  # fmt: skip
+        extra: dict[str, Any] = {"source": f"{job.ref.kind} scene {scene.number}"}
+        if scene.T_world_table is not None:
+            extra["gravity_up_world"] = scene.T_world_table[:3, 2].tolist()
+        store = SessionStore.create(folder, session, extra)
+    keep_imported(store, job.ref, source.digests)
+    for index in source.indices:
+        depth_file = scene.depth_file(index)
+        if index not in store.completed and depth_file is not None:
+            rgb = images.read_rgb(scene.colour_file(index))
+            depth_m = images.read_depth(depth_file, source.depth_unit_m)
+            store.add_view(View(index=index), rgb, depth_m)
+    store.set_cameras(source.intrinsics, source.Ts_world_cam)
+    return store
+
+
+def _record(
+    job: SceneJob,
+    source: SceneSource,
+    store: SessionStore,
+    scene: Scene,
+    starts: Sequence[ObjectPose],
+    grasps: Sequence[GraspSet],
+    notes: Sequence[str],
+) -> Record:
+    """Return what came of a scene."""
+    sets = {s.instance: s for s in grasps}
+    objects: list[Record] = []
+    for o in scene.objects:
+        moved_mm, moved_deg = moved_from_start(o, starts, source.models)
+        found = sets.get(o.instance)
+        objects.append(
+            {
+                "instance": o.instance, "obj_id": o.obj_id, "name": source.models[o.obj_id].name,
+                "verdict": o.verdict, "reasons": list(o.reasons),
+                "agree": _number(o.checks.get("agree")),
+                "probability": _number(o.checks.get("probability")),
+                "moved_mm": round(moved_mm, 3), "moved_deg": round(moved_deg, 3),
+                "grasps": _grasp_counts(found), "shown": _shown(source, store, o),
+            }
+        )  # fmt: skip
+    plane = scene.plane
+    return {
+        "place": job.ref.place, "version": __version__, "frames": len(source.indices),
+        "start": job.config.start,
+        "plane": None if plane is None else {
+            "rms_mm": round(1e3 * plane.rms_m, 3), "points": plane.inliers,
+        },
+        "objects": objects, "notes": list(notes),
+        "pictures": sorted(
+            p.relative_to(job.out).as_posix() for p in (store.folder / "reports").glob("*.png")
+        ),
+    }  # fmt: skip
+
+
+def _number(value: float | None) -> float | None:
+    """Return a number that JSON can hold."""
+    return None if value is None or not np.isfinite(value) else round(float(value), 4)
+
+
+def _grasp_counts(found: GraspSet | None) -> Record:
+    """Return how many grasps of an object were tried and are good, and why none was."""
+    if found is None:
+        return {"candidates": 0, "tried": 0, "good": 0, "why_none": "its pose was rejected"}
+    return {
+        "candidates": len(found),
+        "tried": int(np.isfinite(found.scores).sum()),
+        "good": int(found.good.sum()),
+        "why_none": why_no_grasp(found) if len(found) == 0 else "",
+    }
+
+
+def _shown(source: SceneSource, store: SessionStore, pose: ObjectPose) -> Record | None:
+    """Return the image that shows an object best, with its pose there before and after.
+
+    None = the images that it was registered in have no annotation of it.
+    """
+    cameras = {v.index: v.T_world_cam for v in store.session.views if v.T_world_cam is not None}
+    visible = _visible_fractions(store, pose)
+    best: tuple[float, int] | None = None
+    for index, rows in source.seen.items():
+        if index in cameras and any(s.instance == pose.instance for s in rows):
+            best = max(best or (-1.0, -1), (visible.get(index, 0.0), index))
+    if best is None:
+        return None
+    index = best[1]
+    before = next(s for s in source.seen[index] if s.instance == pose.instance)
+    T_now = se3.invert(cameras[index]) @ pose.T_world_obj
+    return {
+        "image": index, "T_cam_obj_before": before.T_cam_obj.tolist(),
+        "T_cam_obj": T_now.tolist(),
+    }  # fmt: skip
+
+
+def _visible_fractions(store: SessionStore, pose: ObjectPose) -> dict[int, float]:
+    """Return how much of an object each image shows; rejected ones have no label to tell it."""
+    truth: Mapping[str, Any] = read_json_file(store.path("scene_gt.json"))
+    info: Mapping[str, Any] = read_json_file(store.path("scene_gt_info.json"))
+    out: dict[int, float] = {}
+    for image, rows in truth.items():
+        for row, about in zip(rows, info.get(image, ()), strict=False):
+            if int(row["obj_id"]) == pose.obj_id:
+                out[int(image)] = max(out.get(int(image), 0.0), float(about["visib_fract"]))
+    return out
+
+
+def registration_notes(store: SessionStore) -> list[str]:
+    """Return what the registration found out about the scene as a whole."""
+    report: dict[str, Any] = store.read_json("registration/report.json")
+    notes: list[str] = []
+    offset = report.get("common_offset_mm")  # only of objects that all had starts
+    if offset is not None and offset["consistent"]:
+        x, y, z = offset["offset_mm"]
+        notes.append(
+            f"all objects moved together by ({x:.1f}, {y:.1f}, {z:.1f}) mm from their start poses, "
+            f"agreeing within {offset['spread_mm']:.1f} mm: the given poses are off as a whole, as "
+            "those of a neighbouring frame, of a moved camera, or with a common depth error."
+        )
+    sinking = report.get("common_sinking")
+    if sinking is not None and sinking["consistent"]:
+        notes.append(
+            f"the objects sink into the table by {-100 * sinking['share_of_height']:.1f} % of "
+            "their height, all alike: the depth reads short, or the models are too large."
+        )
+    kept = [
+        f"{o['name']} ({axis['fit_deg']:.0f} deg)"
+        for o in report.get("objects", ())
+        if o.get("blind", {}).get("start_kept")
+        for axis in o["blind"]["axes"]
+        if not axis["declared"] and abs(axis.get("fit_deg", 0.0)) >= 1.0
+    ]
+    if kept:
+        notes.append(
+            f"the depth cannot see how these are turned about their own axis: {', '.join(kept)}; "
+            "the start's turn was kept (in brackets: what the fit alone would have turned)."
+        )
+    return notes

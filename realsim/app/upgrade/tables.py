@@ -1,0 +1,158 @@
+"""What an upgrade found, scene by scene and object by object: on the console, as JSON and CSV."""
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from realsim import __version__
+from realsim.app.console import Console
+from realsim.app.upgrade.analytic import LEVEL_HEADER, correlation_line, level_rows
+from realsim.app.upgrade.scene import Record
+from realsim.store import atomic
+
+if TYPE_CHECKING:
+    from realsim.app.upgrade.run import UpgradeResult
+
+JSON_FILE, CSV_FILE = "upgrade.json", "upgrade.csv"
+VERDICTS = ("rejected", "doubtful", "unchecked", "accepted")
+"""Worst first."""
+COLUMNS = (
+    "scene", "instance", "obj_id", "name", "verdict", "agree", "probability", "moved_mm",
+    "moved_deg", "candidates", "tried", "good", "reasons",
+)  # fmt: skip
+HEADER = ["scene, object", "verdict", "agrees", "moved [mm]", "turned [deg]", "good grasps"]
+MOST_ROWS = 60
+"""Objects in the console's table, worst first where there are more; upgrade.csv has all."""
+MOST_NOTES = 30
+
+
+def objects_of(records: Iterable[Record]) -> list[tuple[Record, dict[str, Any]]]:
+    """Return (scene, object) of all scenes."""
+    return [(record, o) for record in records for o in record["objects"]]
+
+
+def worst_first(
+    objects: Iterable[tuple[Record, dict[str, Any]]],
+) -> list[tuple[Record, dict[str, Any]]]:
+    """Return objects by verdict, then by how little of them agrees with the depth."""
+
+    def rank(entry: tuple[Record, dict[str, Any]]) -> tuple[int, float]:
+        verdict, agree = entry[1]["verdict"], entry[1]["agree"]
+        place = VERDICTS.index(verdict) if verdict in VERDICTS else len(VERDICTS)
+        return place, -1.0 if agree is None else float(agree)
+
+    return sorted(objects, key=rank)
+
+
+def row_of(record: Record, o: Mapping[str, Any]) -> list[str]:
+    """Return an object's row of the table."""
+    agree, grasps = o["agree"], o["grasps"]
+    return [
+        f"{record['place']} {o['name']}",
+        str(o["verdict"]),
+        "-" if agree is None else f"{agree:.2f}",
+        f"{o['moved_mm']:.1f}",
+        f"{o['moved_deg']:.1f}",
+        f"{grasps['good']} of {grasps['tried']}",
+    ]
+
+
+def summary_of(records: Sequence[Record]) -> dict[str, Any]:
+    """Return the counts and medians over all scenes."""
+    objects = [o for _, o in objects_of(records)]
+    verdicts = {v: sum(o["verdict"] == v for o in objects) for v in reversed(VERDICTS)}
+
+    def middle(values: list[float]) -> float | None:
+        return round(float(np.median(values)), 3) if values else None
+
+    return {
+        "scenes": len(records),
+        "objects": len(objects),
+        "frames": sum(int(r["frames"]) for r in records),
+        "verdicts": {v: n for v, n in verdicts.items() if n},
+        "median_moved_mm": middle([o["moved_mm"] for o in objects]),
+        "median_moved_deg": middle([o["moved_deg"] for o in objects]),
+        "median_agree": middle([o["agree"] for o in objects if o["agree"] is not None]),
+        "grasps_tried": sum(int(o["grasps"]["tried"]) for o in objects),
+        "grasps_good": sum(int(o["grasps"]["good"]) for o in objects),
+    }
+
+
+def summary_line(summary: Mapping[str, Any]) -> str:
+    """Return the summary as a sentence."""
+    verdicts = ", ".join(f"{n} {v}" for v, n in summary["verdicts"].items()) or "no verdict"
+    moved = summary["median_moved_mm"]
+    far = "" if moved is None else (
+        f"; moved by {moved:.1f} mm and {summary['median_moved_deg']:.1f} deg in the median"
+    )  # fmt: skip
+    return (
+        f"{summary['scenes']} scenes, {summary['frames']} frames, {summary['objects']} objects: "
+        f"{verdicts}{far}; {summary['grasps_good']} of {summary['grasps_tried']} grasps are good"
+    )
+
+
+def write_tables(
+    out: Path,
+    records: Sequence[Record],
+    failed: Mapping[str, str],
+    analytic: Record | None,
+) -> None:
+    """Write upgrade.json and upgrade.csv."""
+    document = {
+        "version": __version__, "summary": summary_of(records), "scenes": list(records),
+        "left_out": dict(failed), "analytic": analytic,
+    }  # fmt: skip
+    atomic.write_json(out / JSON_FILE, document)
+    text = io.StringIO(newline="")
+    table = csv.writer(text)
+    table.writerow(COLUMNS)
+    for record, o in objects_of(records):
+        flat = {**o, **o["grasps"], "scene": record["place"], "reasons": "; ".join(o["reasons"])}
+        table.writerow(["" if flat[c] is None else flat[c] for c in COLUMNS])
+    atomic.write_bytes(out / CSV_FILE, text.getvalue().encode("utf-8"))
+
+
+def show_upgrade(result: "UpgradeResult", console: Console) -> None:
+    """Print one table over all scenes, the notes, and where pictures and tables are."""
+    from realsim.app.upgrade.page import PAGE
+
+    objects = objects_of(result.scenes)
+    shown = objects if len(objects) <= MOST_ROWS else worst_first(objects)[:MOST_ROWS]
+    console.table("Upgraded scenes", HEADER, [row_of(r, o) for r, o in shown])
+    if len(shown) < len(objects):
+        console.say(f"the worst {len(shown)} of {len(objects)} objects; {CSV_FILE} has all")
+    notes = list(_notes(result.scenes))
+    for note in notes[:MOST_NOTES]:
+        console.warn(note)
+    if len(notes) > MOST_NOTES:
+        console.warn(f"and {len(notes) - MOST_NOTES} more notes, in {JSON_FILE}")
+    for place, reason in result.failed.items():
+        console.warn(f"scene {place} was left out: {reason}")
+    if result.analytic is not None:
+        rows = level_rows(result.analytic)
+        console.table("Analytic grasps, tried by the School", LEVEL_HEADER, rows)
+        console.say(correlation_line(result.analytic))
+    if len(result.scenes) > 1:
+        console.say(summary_line(summary_of(result.scenes)))
+    console.say(f"page      {result.out / PAGE}")
+    console.say(f"tables    {result.out / JSON_FILE}, {CSV_FILE}")
+    console.say(f"dataset   {result.out}")
+
+
+def _notes(records: Sequence[Record]) -> Iterable[str]:
+    """Yield what a person must know, scene by scene."""
+    for record in records:
+        place = record["place"]
+        if record["plane"] is None:
+            yield f"scene {place}: no supporting plane was found"
+        for o in record["objects"]:
+            if o["grasps"]["why_none"]:
+                yield f"{place} {o['name']}: no grasp: {o['grasps']['why_none']}"
+            if o["reasons"]:
+                yield f"{place} {o['name']}: {'; '.join(o['reasons'])}"
+        for note in record["notes"]:
+            yield f"scene {place}: {note}"
