@@ -25,6 +25,8 @@ from realsim.store.json_files import read_object
 STATE = ".export"
 ASKED, PIECES, ROWS = f"{STATE}/asked.json", f"{STATE}/pieces.jsonl", f"{STATE}/rows"
 SUMS_FILE = "SHA256SUMS"
+CONTENT = "content"
+"""Key of a request: a digest of the sources, which must not change while they are exported."""
 CHUNK = 1 << 20
 """[bytes] read at a time when a file is copied."""
 
@@ -246,6 +248,11 @@ def _require_same(before: Mapping[str, Any], asked: Mapping[str, Any], folder: P
     differing = [k for k in {**before, **now} if before.get(k) != now.get(k)]
     if differing:
         k = differing[0]
+        if differing == [CONTENT]:
+            raise InputError(
+                f"'{folder}' holds an unfinished export, and its sources have changed since it was "
+                "begun: old and new frames would be mixed. Give a new folder."
+            )
         raise InputError(
             f"'{folder}' holds an unfinished export of another request ({k}: {before.get(k)!r} "
             f"there, {now.get(k)!r} asked for). Run the same command again to finish it, or give a "

@@ -243,3 +243,22 @@ def test_cameras_go_out_and_come_back(bop, tmp_path):
         assert len(views) == len(before.indices)
         for v, i in zip(views, before.indices, strict=True):
             np.testing.assert_allclose(v.T_world_cam, before.frame(i).T_world_cam, atol=1e-9)
+
+
+def test_sources_that_have_changed_are_not_mixed(bop, tmp_path, monkeypatch):
+    import shutil
+
+    from realsim.formats.export_folder import ExportFolder
+
+    source = shutil.copytree(bop, tmp_path / "bop")
+    args = ("export", source, "--to", "bop", "--out", tmp_path / "out", "--quiet")
+
+    def stopped(self, files):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ExportFolder, "finish", stopped)
+        assert run(*args).exit_code != 0
+    file = next(source.glob("*/*/depth/*.png"))
+    file.write_bytes(file.read_bytes() + b" ")
+    assert "sources have changed" in refused(*args)

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 FEW = 300
-MOST_KB = 4.0
-"""[kB] a frame: 100,000 frames grow by less than half of a gigabyte. Names of pieces and poses of
-cameras are 1 to 2; the rows of a frame as Python has them are 7, its two masks 20."""
+MOST_KB = 3.0
+"""[kB] a frame: 100,000 frames grow by less than a third of a gigabyte. Names of pieces and poses
+of cameras are 0.7 to 1.4; the rows of a frame as Python has them are 7, its two masks 20."""
 
 WORKER = """
 import json, sys
@@ -108,7 +108,7 @@ print(json.dumps([level, with_few, memory_kb("VmHWM")]))
 
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peaks are read from /proc")
-@pytest.mark.parametrize(("form", "frames"), [("bop", 3000), ("graspnet", 1500)])
+@pytest.mark.parametrize(("form", "frames"), [("bop", 2200), ("graspnet", 1000)])
 def test_a_frame_more_needs_no_more_memory(form, frames, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", WORKER, form, str(frames), str(FEW), str(tmp_path)],
@@ -116,6 +116,5 @@ def test_a_frame_more_needs_no_more_memory(form, frames, tmp_path):
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     level, with_few, peak = json.loads(done.stdout.splitlines()[-1])
-    print(level,with_few,peak,(peak - with_few) / (frames - FEW))
     assert (peak - with_few) / (frames - FEW) < MOST_KB
     assert peak - level < 60_000

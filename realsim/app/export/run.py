@@ -8,12 +8,18 @@ from typing import Any
 from realsim.app.console import Console
 from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes
 from realsim.app.export.request import ExportRequest
-from realsim.app.export.sources import SourceScene, licence_files, source_scenes, trust_in
+from realsim.app.export.sources import (
+    SourceScene,
+    content_of,
+    licence_files,
+    source_scenes,
+    trust_in,
+)
 from realsim.app.export.target import RootJob, SceneJob, ScenePlace, Target
 from realsim.app.export.targets import TARGETS
 from realsim.errors import InputError, RealsimError
 from realsim.formats.bop.labelled import BopLabelledScene
-from realsim.formats.export_folder import STATE, ExportFolder
+from realsim.formats.export_folder import CONTENT, STATE, ExportFolder
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 from realsim.formats.session_scene import SessionScene
 from realsim.formats.undistorted import UndistortedScene
@@ -51,7 +57,8 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
     scenes = source_scenes(request)
     _require_outside(request, out)
     places = scene_places(scenes, target)
-    folder = ExportFolder.begin(out, request.asked())
+    asked = request.asked() | {CONTENT: content_of(scenes)}
+    folder = ExportFolder.begin(out, asked)
     if folder.resumed:
         console.say(f"going on with the export in {out}.")
     facts: list[SceneFacts] = []

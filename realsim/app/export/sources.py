@@ -1,6 +1,7 @@
 """What an export can be made of: sessions, folders of them, BOP and GraspNet data sets."""
 
-from collections.abc import Callable, Iterator, Mapping
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -165,6 +166,20 @@ def _graspnet(source: Path, request: ExportRequest) -> Iterator[SourceScene]:
             name=ref.name, source=source, folder=ref.folder, kind="graspnet", number=ref.number,
             camera=ref.camera, open=lambda ref=ref: open_scene(ref),
         )  # fmt: skip
+
+
+def content_of(scenes: Sequence[SourceScene]) -> str:
+    """Return a digest of names, sizes and times of all files of scenes: what they are made of.
+
+    An export that is gone on with must find its sources as they were.
+    """
+    digest = hashlib.sha256()
+    for scene in scenes:
+        for path in sorted(p for p in scene.folder.rglob("*") if p.is_file()):
+            state = path.stat()
+            name = path.relative_to(scene.folder).as_posix()
+            digest.update(f"{name} {state.st_size} {state.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
 
 
 def trust_in(scene: SourceScene) -> SceneTrust:

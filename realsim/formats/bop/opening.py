@@ -254,7 +254,8 @@ def _check(scene: BopLabelledScene, infos: Mapping[int, Sequence[Json]]) -> None
         )
     if len(posed) > 1:
         Ts = np.stack([T for T in (poses[i] for i in posed) if T is not None])
-        scene.notes_found.append(evidence.check_camera_poses(Ts, _things(truth, posed), where))
+        said = evidence.check_camera_poses(Ts, _things(truth, posed), where)
+        scene.notes_found.append(said.removeprefix(f"{where}: "))
     _check_boxes(scene, truth, infos, where)
     _check_depth(scene, where)
     _tell_apart(scene, truth, poses)
@@ -313,7 +314,8 @@ def _check_depth(scene: BopLabelledScene, where: str) -> None:
             mask = scene.mask(i, k, visible=True)
             ratio = evidence.depth_ratio(depth_m, mask, scene.intrinsics(i), o.T_cam_obj)
             ratios += [] if ratio is None else [ratio]
-    scene.notes_found.append(evidence.require_depth_unit(ratios, unit_m, where))
+    said = evidence.require_depth_unit(ratios, unit_m, where)
+    scene.notes_found.append(said.removeprefix(f"{where}: "))
 
 
 def _tell_apart(
