@@ -175,7 +175,7 @@ def peak_mb() -> float:
 def child(bag: Path, session: Path) -> None:
     """Import in this process and print what it took; run by `measured`."""
     from realsim.app.console import Console
-    from realsim.app.import_session import import_session
+    from realsim.app.importing.session import import_session
     from realsim.formats.bags import open_bag
 
     start, wall = time.process_time(), time.perf_counter()

@@ -270,7 +270,7 @@ def make_camera_files(folder: Path) -> None:
 
 def read_camera_files(folder: Path) -> Any:
     """Read all of them; a file that is refused does not keep the next one from being read."""
-    from realsim.app.import_folder import camera_of_file
+    from realsim.app.importing.folder import camera_of_file
     from realsim.errors import InputError
     from realsim_calibration.inputs import read_pose_file
 

@@ -7,7 +7,9 @@ origins. Labels, depth and cameras agree, so that every reader accepts what is w
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,6 @@ from realsim.formats import images
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
 from realsim.geometry import se3
-from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Mesh, ObjectModel
 
 Array = NDArray[np.float64]
@@ -40,6 +41,8 @@ class LongScene:
     frames: int
     objects: int
     number: int = 0
+    with_info: bool = False
+    """Whether objects bring a row of scene_gt_info.json, so that no mask need be counted."""
     intrinsics: CameraIntrinsics = field(
         default_factory=lambda: CameraIntrinsics(
             width=WIDTH, height=HEIGHT, fx=FOCAL_PX, fy=FOCAL_PX, cx=WIDTH / 2, cy=HEIGHT / 2
@@ -65,18 +68,20 @@ class LongScene:
         return np.eye(4)
 
     def frame(self, index: int) -> LabelledFrame:
-        """Return one frame; the camera turns by the golden angle from one to the next."""
-        turn = 2.399963 * index
-        R = se3.exp_so3([np.pi, 0.0, 0.0]) @ se3.exp_so3([0.0, 0.0, 0.05 * np.sin(turn)])
-        eye = [0.01 * np.cos(turn), 0.01 * np.sin(turn), HEIGHT_M]
-        T_world_cam = se3.from_rt(R, eye)
+        """Return one frame."""
+        T_world_cam = _camera(index)
         T_cam_world = se3.invert(T_world_cam)
         return LabelledFrame(
             index=index,
             intrinsics=self.intrinsics,
             depth_unit_m=DEPTH_UNIT_M,
             objects=tuple(
-                LabelledObject(obj_id=k + 1, T_cam_obj=T_cam_world @ _stand(k), instance=k)
+                LabelledObject(
+                    obj_id=k + 1,
+                    T_cam_obj=T_cam_world @ _stand(k),
+                    instance=k,
+                    gt_info=self._info(index, k) if self.with_info else None,
+                )
                 for k in range(self.objects)
             ),
             T_world_cam=T_world_cam,
@@ -92,13 +97,33 @@ class LongScene:
 
     def mask(self, index: int, k: int, *, visible: bool) -> Mask | None:
         """Return a square at the object's origin (H, W)."""
-        u, v = project(self.intrinsics, self.frame(index).objects[k].T_cam_obj[:3, 3])
-        column, row = round(float(u)), round(float(v))
+        column, row = self._pixel(index, k)
         mask = np.zeros((self.intrinsics.height, self.intrinsics.width), np.bool_)
         last = row + HALF_PX + (0 if visible else 1)
         mask[max(row - HALF_PX, 0) : max(last, 0),
              max(column - HALF_PX, 0) : max(column + HALF_PX + 1, 0)] = True  # fmt: skip
         return mask
+
+    def _pixel(self, index: int, k: int) -> tuple[int, int]:
+        """Return column and row of an object's origin."""
+        T_world_cam = _camera(index)
+        x, y, z = T_world_cam[:3, :3].T @ (_stand(k)[:3, 3] - T_world_cam[:3, 3])
+        return round(WIDTH / 2 + FOCAL_PX * float(x / z)), round(
+            HEIGHT / 2 + FOCAL_PX * float(y / z)
+        )
+
+    def _info(self, index: int, k: int) -> dict[str, Any]:
+        column, row = self._pixel(index, k)
+        side = 2 * HALF_PX + 1
+        box = [column - HALF_PX, row - HALF_PX, side, side]
+        return {
+            "bbox_obj": box,
+            "bbox_visib": [*box[:3], side - 1],
+            "px_count_all": side * side,
+            "px_count_valid": side * side,
+            "px_count_visib": side * (side - 1),
+            "visib_fract": (side - 1) / side,
+        }
 
     def models(self) -> Mapping[int, ObjectModel]:
         """Return boxes."""
@@ -109,9 +134,13 @@ class LongScene:
         return None
 
 
-def long_scene(folder: Path, frames: int, objects: int, *, number: int = 0) -> LongScene:
+def long_scene(
+    folder: Path, frames: int, objects: int, *, number: int = 0, with_info: bool = False
+) -> LongScene:
     """Return the scene; its two images are written to a folder."""
-    scene = LongScene(folder=folder, frames=frames, objects=objects, number=number)
+    scene = LongScene(
+        folder=folder, frames=frames, objects=objects, number=number, with_info=with_info
+    )
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(0)
     rgb = rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
@@ -121,6 +150,15 @@ def long_scene(folder: Path, frames: int, objects: int, *, number: int = 0) -> L
     return scene
 
 
+@lru_cache(maxsize=4)
+def _camera(index: int) -> Array:
+    """Return where the camera is (4, 4) [m]: turned by the golden angle from frame to frame."""
+    turn = 2.399963 * index
+    R = se3.exp_so3([np.pi, 0.0, 0.0]) @ se3.exp_so3([0.0, 0.0, 0.05 * np.sin(turn)])
+    return se3.from_rt(R, [0.01 * np.cos(turn), 0.01 * np.sin(turn), HEIGHT_M])
+
+
+@lru_cache(maxsize=64)
 def _stand(k: int) -> Array:
     """Return where an object stands in the world (4, 4) [m]."""
     row, column = divmod(k, COLUMNS)
@@ -131,7 +169,9 @@ def _stand(k: int) -> Array:
 def _model(k: int) -> ObjectModel:
     size = np.array([0.03, 0.04, 0.03 + 0.001 * k])
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
-    faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-                      [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
-    mesh = Mesh(vertices=corners * size / 2, faces=faces)
+    faces = [
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ]  # fmt: skip
+    mesh = Mesh(vertices=corners * size / 2, faces=np.array(faces))
     return ObjectModel(obj_id=k + 1, name=f"box {k + 1}", mesh=mesh)

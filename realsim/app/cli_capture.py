@@ -162,6 +162,9 @@ def capture_command(
 def check(session: Path, repair: bool, decode: bool, as_json: bool) -> None:
     """Verify every checksum of SESSION and say what is missing or damaged.
 
+    SESSION may also be a BOP or GraspNet data set: then masks, boxes, counts, poses and depth are
+    held against each other and against the rendered models.
+
     Sessions inside it (calibration/capture) are checked, too. Nothing is changed without --repair,
     which takes out what is damaged, and only that: the views concerned can be captured again.
 

@@ -169,12 +169,22 @@ class ExportFolder:
         """Write the rows of a document as one JSON object, a line a row."""
         self.write_document(relative, _object_text(self.rows(relative), layout))
 
-    def abandon_if_empty(self) -> None:
-        """Take the export's notes away where nothing was written: a refusal leaves no trace."""
-        if not self._done and (self.folder / STATE).is_dir():
-            shutil.rmtree(self.folder / STATE)
-            with contextlib.suppress(OSError):
-                self.folder.rmdir()
+    def abandon(self) -> None:
+        """Take away what this run wrote into a new folder: a refusal leaves no trace.
+
+        What an earlier run wrote stays; it may be gone on with.
+        """
+        if self.resumed:
+            return
+        for line in _lines(self.folder / PIECES):
+            for relative in json.loads(line)["files"]:
+                (self.folder / relative).unlink(missing_ok=True)
+        shutil.rmtree(self.folder / STATE, ignore_errors=True)
+        for path in sorted((p for p in self.folder.rglob("*") if p.is_dir()), reverse=True):
+            with contextlib.suppress(OSError):  # not empty: something that is not ours
+                path.rmdir()
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
 
     def finish(self, files: Mapping[str, bytes]) -> None:
         """Write the last files (the card) and SHA256SUMS, and take the export's own notes away."""

@@ -55,7 +55,8 @@ def encode_png(image: NDArray[Any]) -> bytes:
     """
     from isal import isal_zlib
 
-    if image.dtype == np.bool_ and image.ndim == 2:
+    is_mask = image.dtype == np.bool_ and image.ndim == 2
+    if is_mask:
         image = image.astype(np.uint8) * np.uint8(MASK_VALUE)
     bits = 8 * image.dtype.itemsize if image.dtype.kind == "u" else 0
     is_rgb = image.ndim == 3 and image.shape[2] == RGB_CHANNELS and bits == 8
@@ -67,7 +68,7 @@ def encode_png(image: NDArray[Any]) -> bytes:
     height, width = image.shape[:2]
     if not (1 <= height <= LONGEST_SIDE and 1 <= width <= LONGEST_SIDE):
         raise InputError(f"an image of {width}x{height} pixels cannot be written as PNG.")
-    coding = _coding(image)
+    coding = MASK if is_mask else _coding(image)
     rows = _filtered(_bytes_of(image), _bytes_per_pixel(image), coding.row_filter)
     deflate = isal_zlib.compressobj(coding.level, isal_zlib.DEFLATED, coding.window_bits)
     data = deflate.compress(rows) + deflate.flush()

@@ -142,10 +142,21 @@ def test_files_are_copied_byte_for_byte(tmp_path):
     assert (tmp_path / "export/copied.bin").read_bytes() == big.read_bytes()
 
 
-def test_a_refusal_before_the_first_piece_leaves_nothing(tmp_path):
-    ExportFolder.begin(tmp_path / "export", ASKED).abandon_if_empty()
+def test_a_refusal_leaves_nothing_of_a_new_export_and_all_of_an_old_one(tmp_path):
+    begun = ExportFolder.begin(tmp_path / "export", ASKED)
+    begun.write_piece("one", {"a/b/1": b"x"}, {"a/all.json": ("1", 1)})
+    begun.abandon()
     assert not (tmp_path / "export").exists()
     begun = ExportFolder.begin(tmp_path / "export", ASKED)
     begun.write_piece("one", {"1": b"x"})
-    begun.abandon_if_empty()
+    again = ExportFolder.begin(tmp_path / "export", ASKED)
+    again.abandon()
     assert ExportFolder.begin(tmp_path / "export", ASKED).has("one")
+
+
+def test_files_of_others_stay(tmp_path):
+    begun = ExportFolder.begin(tmp_path / "export", ASKED)
+    begun.write_piece("one", {"a/1": b"x"})
+    (tmp_path / "export/a/mine").write_text("mine")
+    begun.abandon()
+    assert [p.name for p in (tmp_path / "export").rglob("*")] == ["a", "mine"]

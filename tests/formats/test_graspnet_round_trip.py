@@ -6,6 +6,7 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from labelled_scenes import MODELS, PLACES, TABLE, labelled_scene
+from realsim.errors import InputError
 from realsim.formats import images
 from realsim.formats.bop.models import save_models
 from realsim.formats.bop.opening import open_labelled_bop
@@ -215,3 +216,11 @@ def test_graspnet_to_bop_to_graspnet_gives_the_same_cameras_annotations_and_labe
         path = f"annotations/{index:04d}.xml"
         for a, b in zip(read_objects(before / path), read_objects(after / path), strict=True):
             assert a.fields == b.fields
+
+
+def test_a_table_that_is_upside_down_is_named(tmp_path):
+    written(labelled_scene(tmp_path / "images"), tmp_path / "tree")
+    file = next((tmp_path / "tree").glob("scenes/*/*/cam0_wrt_table.npy"))
+    np.save(file, np.linalg.inv(np.load(file)))
+    with pytest.raises(InputError, match="seems to be inverted: as the pose of camera 0"):
+        open_scene(open_graspnet(tmp_path / "tree").scenes[0])

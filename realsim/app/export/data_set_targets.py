@@ -8,9 +8,12 @@ from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 def _bop(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
     from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 
+    request, place = job.request, job.place
     config = BopWriteConfig(
-        colour=job.request.colour, jpeg_quality=job.request.jpeg_quality, masks=job.request.masks,
-        number=job.place.number, split=job.request.split or scene.split, camera=job.place.camera,
+        colour=request.colour, jpeg_quality=request.jpeg_quality, masks=request.masks,
+        # None keeps a name that says more than the number: obj_000008_up.
+        number=None if place.number == scene.number else place.number,
+        split=request.split or scene.split, camera=place.camera,
     )  # fmt: skip
     return write_bop_scene(scene, folder, config, progress=job.tick)
 

@@ -17,7 +17,7 @@ from realsim.app.export.sources import (
 )
 from realsim.app.export.target import RootJob, SceneJob, ScenePlace, Target
 from realsim.app.export.targets import TARGETS
-from realsim.errors import InputError, RealsimError
+from realsim.errors import InputError
 from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.export_folder import CONTENT, STATE, ExportFolder
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
@@ -75,8 +75,8 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
                 given = UndistortedScene(opened, kept) if request.undistort else opened
                 written = _write(given, place, target, folder, request, console)
                 facts.append(_facts(source, opened, written))
-        except RealsimError:
-            folder.abandon_if_empty()
+        except InputError:
+            folder.abandon()
             raise
         if target.write_root is not None:
             with console.stage("models and root"):
@@ -101,12 +101,17 @@ def target_of(request: ExportRequest) -> Target:
     given = [f.name for f in fields(request) if getattr(request, f.name) != getattr(plain, f.name)]
     wrong = [name for name in given if name not in (*ALWAYS, *target.options)]
     if wrong:
-        options = ", ".join("--" + OPTION_NAMES.get(n, n).replace("_", "-") for n in wrong)
+        options = ", ".join(map(option_name, wrong))
         raise InputError(
             f"{options} says nothing of {target.name}; leave it away. Options of this format: "
-            f"{', '.join('--' + OPTION_NAMES.get(n, n).replace('_', '-') for n in target.options)}."
+            f"{', '.join(map(option_name, target.options)) or 'none'}."
         )
     return target
+
+
+def option_name(field: str) -> str:
+    """Return what a field of the request is called on the command line."""
+    return "--" + OPTION_NAMES.get(field, field).replace("_", "-")
 
 
 def scene_places(scenes: Sequence[SourceScene], target: Target) -> list[ScenePlace]:

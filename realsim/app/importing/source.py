@@ -178,7 +178,8 @@ def kinds_of(path: Path) -> list[KindFit]:
         fits.append(KindFit(kind="bag", why=f"it has metadata.yaml and {shown(bags)}"))
     elif bags:
         fits.append(KindFit(kind="bag", why=f"it holds {shown(bags)}"))
-    for pattern in (CAMERA_FILE, f"*/{CAMERA_FILE}", f"*/*/{CAMERA_FILE}"):
+    cameras = f"{Path(CAMERA_FILE).stem}*.json"
+    for pattern in (cameras, f"*/{cameras}", f"*/*/{cameras}"):
         if any(path.glob(pattern)):
             fits.append(KindFit(kind="bop", why=f"it has {pattern}"))
             break

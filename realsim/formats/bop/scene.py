@@ -238,7 +238,7 @@ def _read_session(
         if np.abs(other.K - intrinsics.K).max() > SAME_K_PX or not same_lens:
             raise InputError(
                 f"{path}: images {first} and {i} have different cameras, and a session has one. "
-                f"Read the images of one camera at a time (image_ids=[{first}])."
+                "`realsim export` converts such data sets without a session."
             )
         if bop_units.depth_unit_of(entry, names[i]) != unit_m:
             raise InputError(

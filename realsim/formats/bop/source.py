@@ -131,7 +131,7 @@ def choose_scene(
             raise InputError(
                 f"{chosen[0].folder} was seen by {len(chosen)} cameras: "
                 f"{', '.join(s.camera or '(none)' for s in chosen)}. Choose one of them by its "
-                "name (camera)."
+                "name (--camera-name)."
             )
         raise InputError(
             f"{root} has {len(chosen)} {what}: {listed}, and a session holds one. Choose with "
@@ -177,11 +177,6 @@ def open_bop(
         notes.append(
             f"{len(indices) - posed} of {len(indices)} images have no camera pose (cam_R_w2c, "
             "cam_t_w2c): these views cannot be registered together."
-        )
-    if found.ground_truth_file:
-        notes.append(
-            f"the annotations of {found.ground_truth_file} stay where they are: a session holds "
-            "what was captured."
         )
     median = _median_depth_m(found, indices)
     if median is not None:

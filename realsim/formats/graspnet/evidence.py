@@ -17,6 +17,8 @@ from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
 
 Array = NDArray[np.float64]
+ON_TABLE_M = 0.25
+"""Origins of things on a table are not farther from its plane than this."""
 STANDS_M = 0.010
 """Objects that wander less stand still."""
 WANDERS_M = 0.030
@@ -84,6 +86,41 @@ def check_camera_poses(images: Sequence[PosedImage], where: str) -> list[str]:
     if apart > STANDS_M:
         return [f"camera poses and annotations disagree: {figures}."]
     return _worst_annotation(images)
+
+
+def check_table(images: Sequence[PosedImage], T_table_0: Array, where: str) -> None:
+    """Check by where cameras and objects are that cam0_wrt_table.npy maps camera 0 to the table.
+
+    Cameras look at a table from above, and things lie on it.
+
+    Raises:
+        InputError: a camera would be below the table, or all things far from it, and the inverse
+            makes both right.
+    """
+    stated, inverse = _above_table(images, T_table_0), _above_table(images, se3.invert(T_table_0))
+    if not _is_scene(*stated) and _is_scene(*inverse):
+        raise InputError(
+            f"{where} seems to be inverted: as the pose of camera 0 in the table's frame the "
+            f"cameras are {1e3 * stated[0]:.0f} mm above the table and the objects "
+            f"{1e3 * stated[1]:.0f} mm (medians); inverted, {1e3 * inverse[0]:.0f} and "
+            f"{1e3 * inverse[1]:.0f} mm. Invert the matrix."
+        )
+
+
+def _above_table(images: Sequence[PosedImage], T_table_0: Array) -> tuple[float, float]:
+    """Return the median height [m] of cameras and of objects above the table; NaN of none."""
+    cameras = [float((T_table_0 @ i.T_0_cam)[2, 3]) for i in images]
+    objects = [
+        float((T_table_0 @ i.T_0_cam @ o.T_cam_obj)[2, 3]) for i in images for o in i.objects
+    ]
+    return (
+        float(np.median(cameras)) if cameras else float("nan"),
+        float(np.median(objects)) if objects else float("nan"),
+    )
+
+
+def _is_scene(camera_m: float, object_m: float) -> bool:
+    return camera_m > object_m and abs(object_m) < ON_TABLE_M
 
 
 def _wandering(images: Sequence[PosedImage], Ts: Sequence[Array]) -> dict[int, float]:

@@ -189,7 +189,7 @@ def _label(
                 f"object {frame.objects[k].obj_id} of image {frame.index} of {scene.name} has no "
                 "mask of its visible pixels, of which GraspNet's label images are made. Compute "
                 "the masks first (realsim upgrade), or ask for a tree without labels "
-                "(GraspnetWriteConfig.without_labels)."
+                "(--no-masks)."
             )
         if mask.shape != size:
             raise InputError(

@@ -50,7 +50,7 @@ def open_scene(ref: GraspnetSceneRef) -> GraspnetLabelledScene:
     if poses is None:
         notes.append(f"there is no {POSES}: where the camera stood is not known.")
     else:
-        _check_movement(found, poses, ref.folder, notes)
+        _check_movement(found, cameras, ref.folder, notes)
         if cameras.first is None:
             notes.append(f"there is no {FIRST}: world is the first camera, no table is known.")
     standing = [
@@ -122,14 +122,19 @@ def _compare_matrices(found: dict[int, ImageObjects], cameras: CameraFiles, fold
 
 
 def _check_movement(
-    found: dict[int, ImageObjects], poses: Array, folder: Path, notes: list[str]
+    found: dict[int, ImageObjects], cameras: CameraFiles, folder: Path, notes: list[str]
 ) -> None:
+    poses = cameras.poses
+    if poses is None:
+        return
     rigid = se3.check_rigid(poses, str(folder / POSES))
     posed = [
         evidence.PosedImage(index=i, T_0_cam=rigid[i], objects=f.objects) for i, f in found.items()
     ]
     notes += evidence.check_camera_poses(posed, str(folder / POSES))
     evidence.check_quaternions(posed, str(folder / ANNOTATIONS))
+    if cameras.first is not None:
+        evidence.check_table(posed, cameras.first, str(folder / FIRST))
 
 
 def _missing_models(ref: GraspnetSceneRef, numbers: set[int]) -> list[str]:

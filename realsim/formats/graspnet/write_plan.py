@@ -123,8 +123,8 @@ def plan_scene(scene: LabelledScene, config: GraspnetWriteConfig) -> WritePlan:
     order, places = _object_list(scene, survey, numbers)
     if tuple(range(len(scene.indices))) != tuple(scene.indices):
         notes.append(
-            f"images are numbered from 0 without gaps; the source has {len(scene.indices)}, "
-            f"{scene.indices[0]} to {scene.indices[-1]} (frames.json says which is which)."
+            "images are numbered from 0 without gaps; frames.json says which number of the "
+            "source is which."
         )
     own_K = own_values(survey.first.entry).get("camK")
     K = survey.first.intrinsics.K
@@ -278,7 +278,7 @@ def _require_table(scene: LabelledScene, config: GraspnetWriteConfig) -> None:
         raise InputError(
             f"{scene.name} knows no table in the frame of its cameras, and GraspNet's "
             "cam0_wrt_table.npy needs one. Register the scene first (realsim register), or take "
-            "the world's z = 0 for it (GraspnetWriteConfig.table_is_world)."
+            "the world's z = 0 for it (--table-is-world)."
         )
 
 
