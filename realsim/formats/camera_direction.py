@@ -241,7 +241,7 @@ def require_direction(evidence: DirectionEvidence, where: str, *, remedy: str = 
             f"{where}: the direction of the camera poses could not be checked, the camera moves "
             f"too little ({evidence.compared}; {evidence.numbers})."
         )
-    return f"{where}: camera poses checked by {evidence.compared}: {evidence.numbers}."
+    return f"checked: camera poses agree by {evidence.compared}: {evidence.numbers}."
 
 
 def _meaning(direction: Direction) -> str:

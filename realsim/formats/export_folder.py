@@ -23,6 +23,8 @@ from realsim.store import atomic
 from realsim.store.json_files import read_object
 
 STATE = ".export"
+FINISHED = ".export.json"
+"""The request of an export that is whole, so that asking for it again is known."""
 ASKED, PIECES, ROWS = f"{STATE}/asked.json", f"{STATE}/pieces.jsonl", f"{STATE}/rows"
 SUMS_FILE = "SHA256SUMS"
 CONTENT = "content"
@@ -48,6 +50,17 @@ class ExportFolder:
         self._done = done
         self._prefix = ""
         self._mended: set[Path] = set()
+
+    @staticmethod
+    def is_finished(folder: Path | str, asked: Mapping[str, Any]) -> bool:
+        """Return whether a folder holds the finished export of this very request."""
+        path = Path(folder) / FINISHED
+        if not path.is_file() or (Path(folder) / ASKED).is_file():
+            return False
+        try:
+            return read_object(path) == _request(asked)
+        except InputError:
+            return False
 
     def below(self, relative: str) -> "ExportFolder":
         """Return a folder of this export as a writer sees it that fills a folder of its own."""
@@ -192,6 +205,7 @@ class ExportFolder:
             for relative, data in files.items():
                 atomic.write_bytes(self.folder / _inside(relative), data)
             self._stream(SUMS_FILE, self._sums(files))
+            atomic.write_json(self.folder / FINISHED, _request(self.asked))
             shutil.rmtree(self.folder / STATE)
 
     def _sums(self, files: Mapping[str, bytes]) -> Iterator[bytes]:
@@ -229,6 +243,11 @@ class ExportFolder:
             temporary.unlink(missing_ok=True)
             raise
         return [size, digest.hexdigest()]
+
+
+def _request(asked: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a request is known by without telling its paths to whoever gets the export."""
+    return {"request": hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()}
 
 
 def _inside(relative: str) -> str:

@@ -47,6 +47,8 @@ class ImportedLabels:
     number_of_view: Mapping[int, int]
     """The session's view -> the data set's number of the image."""
     T_world_table: Array | None
+    notes: tuple[str, ...]
+    """What was said of them when they were imported."""
     rows: Mapping[str, Any]
     infos: Mapping[str, Any]
     cameras: Mapping[str, Any]
@@ -99,6 +101,7 @@ def load_imported(store: SessionStore) -> ImportedLabels | None:
             camera=str(head["camera"]),
             number_of_view={int(k): int(v) for k, v in head["number_of_view"].items()},
             T_world_table=None if table is None else rigid(np.asarray(table), "T_world_table"),
+            notes=tuple(str(note) for note in head.get("notes", ())),
             rows=dict(store.read_json(GT)),
             infos=dict(store.read_json(INFO)),
             cameras=dict(store.read_json(CAMERA)),

@@ -6,6 +6,7 @@
 Frames keep the numbers that they had in the data set they were imported from.
 """
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -26,6 +27,7 @@ from realsim.store.session_store import depth_path, rgb_path
 from realsim.store.trajectories import load_trajectories
 
 Labels = Literal["auto", "annotated", "imported", "none"]
+SPLIT = re.compile(r"(train|val|test)(_\w+)?")
 GT_INFO_KEYS = (
     "bbox_obj", "bbox_visib", "px_count_all", "px_count_valid", "px_count_visib", "visib_fract"
 )  # fmt: skip
@@ -124,7 +126,12 @@ class SessionScene:
             objects = self._imported.objects(index)
             entry = self._imported.camera_entry(index)
         T = view.T_world_cam
-        if entry is not None and T is not None and not _says(entry, T):
+        is_bop = entry is not None and "cam_K" in entry
+        if is_bop and not self.store.has("registration/scene.json"):
+            # The data set's own word, where it said nothing as well: what the import made up for it
+            # is a place to begin from, not a label.
+            T = units.T_world_cam_of(dict(entry or {}), f"image {index} of {self.name}")
+        elif entry is not None and T is not None and not _says(entry, T):
             entry = None  # the camera was refined since
         return LabelledFrame(
             index=index, intrinsics=session.intrinsics, depth_unit_m=unit_m, objects=objects,
@@ -233,15 +240,16 @@ def open_session_scene(
         notes.append(
             f"{len(views) - len(taken)} of {len(views)} views are not annotated and stay out."
         )
-    if labels == "auto" and chosen == "imported":
+    if chosen == "imported" and imported is not None:
         notes.append("the labels are those it was imported with: realsim has not checked them.")
+        notes += imported.notes
     if chosen == "none" and labels != "none":
         notes.append("it has no labels: images and cameras only.")
     numbers = {i: i for i in views} if imported is None else imported.number_of_view
     return SessionScene(
         store,
         number=_number(store, imported) if number is None else number,
-        split=split or (imported.split if imported is not None else "train"),
+        split=split or (imported.split if imported is not None else _split_of(store)),
         imported=imported if chosen != "none" else None,
         views={numbers.get(i, i): i for i in taken},
         notes=tuple(notes),
@@ -254,6 +262,12 @@ def _number(store: SessionStore, imported: ImportedLabels | None) -> int:
         return imported.number
     digits = store.folder.resolve().name.rpartition("_")[2]
     return int(digits) if digits.isdecimal() else 0
+
+
+def _split_of(store: SessionStore) -> str:
+    """Return the split that a session lies in, as `realsim upgrade` writes them; else 'train'."""
+    above = store.folder.resolve().parent.name
+    return above if SPLIT.fullmatch(above) else "train"
 
 
 def _says(entry: Mapping[str, Any], T_world_cam: Array) -> bool:

@@ -184,7 +184,7 @@ def test_the_sums_and_counts_on_the_card_are_those_of_the_folder(bop, tmp_path):
     assert "1 scene, 4 frames, 12 object poses in them, 3 object models" in card
     sums = dict(reversed(x.split("  ")) for x in (out / "SHA256SUMS").read_text().splitlines())
     files = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
-    assert set(sums) == files - {"SHA256SUMS"}
+    assert set(sums) == files - {"SHA256SUMS", ".export.json"}
     assert all(hashlib.sha256((out / f).read_bytes()).hexdigest() == d for f, d in sums.items())
 
 
@@ -262,3 +262,36 @@ def test_sources_that_have_changed_are_not_mixed(bop, tmp_path, monkeypatch):
     file = next(source.glob("*/*/depth/*.png"))
     file.write_bytes(file.read_bytes() + b" ")
     assert "sources have changed" in refused(*args)
+
+
+def test_a_finished_export_is_known_and_not_written_again(bop, tmp_path):
+    args = ("export", bop, "--to", "bop", "--out", tmp_path / "out", "--quiet")
+    done(*args)
+    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("*")}
+    assert "finished already" in done(*args)
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("*")} == before
+    assert "not empty" in refused(*args, "--no-masks")
+    assert str(tmp_path) not in (tmp_path / "out/.export.json").read_text()
+
+
+def test_labels_that_are_no_reference_say_so_wherever_they_go(bop, tmp_path):
+    import shutil
+
+    rough = shutil.copytree(bop, tmp_path / "rough")
+    for file in rough.glob("*/*/scene_gt.json"):
+        file.rename(file.with_name("scene_gt_approximate.json"))
+    result = run("import", rough, tmp_path / "session", "--quiet")
+    assert result.exit_code == 0 and "only a rough start" in " ".join(result.output.split())
+    for source, out in ((tmp_path / "session", "a"), (rough, "b")):
+        done("export", source, "--to", "bop", "--out", tmp_path / out, "--quiet")
+        assert "only a rough start" in (tmp_path / out / "README.md").read_text()
+
+
+def test_an_import_makes_up_no_camera_pose_for_the_data_set(bop, tmp_path):
+    scene = labelled_scene(tmp_path / "images", [4])
+    scene.change_frames(T_world_cam=None)
+    written_bop(tmp_path / "bop", scene)
+    done("import", tmp_path / "bop", tmp_path / "session", "--quiet")
+    done("export", tmp_path / "session", "--to", "bop", "--out", tmp_path / "again", "--quiet")
+    assert_same_scene(tmp_path / "bop", tmp_path / "again")
+    assert "cam_R_w2c" not in next(tmp_path.glob("again/*/*/scene_camera.json")).read_text()

@@ -69,6 +69,21 @@ def test_files_of_objects_hold_what_was_tried(session, tmp_path):
     assert [len(s) for s in whole.sets] == [len(s) for s in sets.values()]
 
 
+def test_the_card_counts_what_the_files_hold(session, tmp_path):
+    sets = load_grasps(SessionStore.open(session))
+    tried = sum(int(executed(s).sum()) for s in sets)
+    good = sum(int((np.nan_to_num(s.scores, nan=-1) >= 0.5)[executed(s)].sum()) for s in sets)
+    done("export", session, "--to", "acronym", "--out", tmp_path / "a", "--quiet")
+    done("export", session, "--to", "isaac", "--out", tmp_path / "i", "--least-score", "0.5",
+         "--quiet")  # fmt: skip
+    for name, count in (("a", tried), ("i", good)):
+        card = (tmp_path / name / "README.md").read_text()
+        assert f"| scene_000002 | scene_000002 | 2 | {count} | {tried} |" in card, card
+    assert "grasps are left out" in (tmp_path / "i/README.md").read_text()
+    first = sorted((tmp_path / "a/scene_000002").glob("*.h5"))[0].name
+    assert f'h5py.File("scene_000002/{first}")' in (tmp_path / "a/README.md").read_text()
+
+
 def test_grasps_are_of_sessions(session, tmp_path):
     done("export", session, "--to", "bop", "--out", tmp_path / "bop", "--quiet")
     result = run("export", tmp_path / "bop", "--to", "hdf5", "--out", tmp_path / "o")

@@ -262,7 +262,7 @@ def test_columns_are_found_by_boxes_where_cameras_have_no_poses(tmp_path):
 def test_depth_is_checked_without_masks_too(tmp_path):
     folder = write_boxes(tmp_path)
     shutil.rmtree(folder / "mask_visib")
-    assert any("times as far" in note for note in open_labelled_bop(tmp_path).notes)
+    assert any("checked: depth" in note for note in open_labelled_bop(tmp_path).notes)
     edit(folder / "scene_camera.json", scaled("depth_scale", 10))
     with pytest.raises(UnitError, match=r"with depth_scale 0\.1 "):
         open_labelled_bop(tmp_path)

@@ -160,7 +160,7 @@ def test_depth_of_real_scenes_lies_just_before_the_labelled_origins():
     for number in (50, 51, 54):
         scene = open_labelled_bop(YCBV, scene=number)
         assert all(o.instance is not None for o in scene.frame(1).objects)
-        (note,) = (n for n in scene.notes if "times as far" in n)
+        (note,) = (n for n in scene.notes if "checked: depth" in n)
         assert 0.9 < float(note.split(" is ")[1].split()[0]) < 1.0
 
 

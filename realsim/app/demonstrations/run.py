@@ -20,6 +20,7 @@ from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, Scene
 
 if TYPE_CHECKING:
+    from realsim_sim_bridge.demonstrations.front_view import FrontView
     from realsim_sim_bridge.demonstrations.records import DemonstrationCamera
     from realsim_sim_bridge.demonstrations.source import DemonstrationSource
 
@@ -135,7 +136,7 @@ def _weighed(
 
 def _cameras(
     source: Path, grasps: SceneGrasps, request: DemonstrationRequest, console: Console
-) -> "list[DemonstrationCamera]":
+) -> "list[DemonstrationCamera | FrontView]":
     """Return a fixed camera and one in the hand.
 
     Raises:
@@ -143,11 +144,11 @@ def _cameras(
     """
     from realsim_sim_bridge.demonstrations.cameras import (
         FRONT,
-        front_camera,
         sees_fingertips,
         view_camera,
         wrist_camera,
     )
+    from realsim_sim_bridge.demonstrations.front_view import FrontView
 
     size = request.width, request.height
     if (request.view is not None or request.hand_eye) and not is_session(source):
@@ -155,8 +156,7 @@ def _cameras(
             f"'{source}' is no session, so that it has neither views nor a hand-eye calibration; "
             "leave --view and --hand-eye away."
         )
-    middle = _middle(grasps)
-    fixed = front_camera(middle, size)
+    fixed: DemonstrationCamera | FrontView = FrontView(size_px=size)
     if request.view is not None:
         intrinsics, T_world_cam = _view(source, request.view)
         assert grasps.T_world_table is not None, "a session's school has had a table"
@@ -180,15 +180,6 @@ def _cameras(
                 "another one. Without --hand-eye it is on the usual mount."
             )
     return [fixed, wrist]
-
-
-def _middle(grasps: SceneGrasps) -> tuple[float, float]:
-    """Return the middle of the scene on the table [m]."""
-    assert grasps.T_world_table is not None or not grasps.sets, "checked by the source"
-    given: Any = grasps.sets[0].parameters.get("middle_xy_m") if grasps.sets else None
-    if isinstance(given, list) and len(given) == 2:  # pyright: ignore[reportUnknownArgumentType]
-        return float(given[0]), float(given[1])  # pyright: ignore[reportUnknownArgumentType]
-    return 0.0, 0.0
 
 
 def _view(source: Path, index: int) -> tuple[Any, Any]:
@@ -319,6 +310,9 @@ def _asked(
     for k, name in enumerate(attempts.attempts):
         digest.update(attempts.goal(k).language.encode())
         digest.update(np.ascontiguousarray(attempts.stored_joints(name)).tobytes())
+    for camera in attempts.scenery.cameras.values():
+        # All episodes are seen from the same place, whichever version goes on with them.
+        digest.update(np.round(camera.T_frame_cam, 6).tobytes())
     return {
         "what": "demonstrations",
         "source": source.resolve().name,

@@ -13,6 +13,13 @@ from realsim.formats.labelled_scene import WrittenScene
 
 CARD_FILE = "README.md"
 NOT_STATED = "not stated: ask the source before publishing"
+CHECKED = "checked:"
+"""How notes begin that say what was held against what, and agreed."""
+LICENCE_IDS = (
+    "mit", "apache-2.0", "bsd-2-clause", "bsd-3-clause", "gpl-3.0", "lgpl-3.0", "cc0-1.0",
+    "cc-by-4.0", "cc-by-sa-4.0", "cc-by-nc-4.0", "cc-by-nc-sa-4.0", "cc-by-nd-4.0",
+)  # fmt: skip
+"""Licences that Hugging Face knows by name."""
 SIZES = (
     (1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"),
     (10_000_000, "1M<n<10M"),
@@ -31,6 +38,8 @@ class SceneFacts:
     """Things that stand in it."""
     verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
     """Verdict of registration and review -> objects."""
+    findings: Sequence[str] = ()
+    """What registration found out about the scene as a whole."""
     pose_sigma_mm: float | None = None
     """Median standard deviation of the objects' positions [mm]."""
     grasps_tried: int = 0
@@ -69,7 +78,12 @@ def card_bytes(card: DatasetCard) -> bytes:
     parts.append(_section("Counts", _counts(card)))
     parts.append(_section("Conventions", _table(("what", "convention"), card.conventions)))
     parts.append(_section("How far to trust it", _trust(card)))
-    notes = [f"- {s.written.name}: {n}" for s in card.scenes for n in s.written.notes]
+    notes = [
+        f"- {s.written.name}: {n}"
+        for s in card.scenes
+        for n in s.written.notes
+        if not n.startswith(CHECKED)
+    ]
     parts.append(_section("What was changed or lost on the way", _shortened(notes)))
     if card.objects:
         parts.append(_section("Objects", _table(("id", "name"), sorted(card.objects.items()))))
@@ -87,16 +101,22 @@ def card_bytes(card: DatasetCard) -> bytes:
 
 def _head(card: DatasetCard, frames: int) -> str:
     size = next((name for limit, name in SIZES if frames < limit), "n>10M")
-    fields = {
+    fields: dict[str, object] = {
         "pretty_name": card.name,
-        "license": "other",
-        "license_name": card.licence or "not stated",
+        **_licence_fields(card.licence),
         "size_categories": [size],
         "tags": ["robotics", "grasping", "6d-pose", "rgb-d", card.format.lower()],
     }
     # JSON is YAML, and quotes what YAML would take for something else.
     lines = [f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in fields.items()]
     return "\n".join(["---", *lines, "---", ""])
+
+
+def _licence_fields(licence: str) -> dict[str, str]:
+    known = licence.strip().lower().replace(" ", "-")
+    if known in LICENCE_IDS:
+        return {"license": known}
+    return {"license": "other", "license_name": licence or "not stated"}
 
 
 def _summary(card: DatasetCard, frames: int) -> str:
@@ -126,19 +146,22 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
 
 def _counts(card: DatasetCard) -> str:
     extra = sorted({k for s in card.scenes for k in s.written.counts})
-    header = ["scene", "folder", "frames", "things", "poses", *extra, "grasps tried", "good"]
-    rows = [
-        [
-            s.written.name, s.written.folder.as_posix(), s.written.frames, s.instances,
-            s.written.objects, *(s.written.counts.get(k, 0) for k in extra), s.grasps_tried,
-            s.grasps_good,
-        ]
-        for s in card.scenes
-    ]  # fmt: skip
+    columns: list[tuple[str, list[int]]] = [
+        ("frames", [s.written.frames for s in card.scenes]),
+        ("things", [s.instances for s in card.scenes]),
+        ("poses", [s.written.objects for s in card.scenes]),
+        *((k, [s.written.counts.get(k, 0) for s in card.scenes]) for k in extra),
+        ("grasps tried", [s.grasps_tried for s in card.scenes]),
+        ("good", [s.grasps_good for s in card.scenes]),
+    ]
+    shown = [(name, values) for name, values in columns if any(values)]
+    rows: list[list[object]] = [
+        [s.written.name, s.written.folder.as_posix(), *(values[k] for _, values in shown)]
+        for k, s in enumerate(card.scenes)
+    ]
     if len(rows) > 1:
-        total = [sum(r[k] for r in rows) for k in range(2, len(header))]  # pyright: ignore[reportArgumentType, reportCallIssue]
-        rows.append(["all", "", *total])
-    return _table(header, rows)
+        rows.append(["all", "", *(sum(values) for _, values in shown)])
+    return _table(["scene", "folder", *(name for name, _ in shown)], rows)
 
 
 def _trust(card: DatasetCard) -> str:
@@ -148,11 +171,23 @@ def _trust(card: DatasetCard) -> str:
         sigma = "not known" if s.pose_sigma_mm is None else f"{s.pose_sigma_mm:.2f}"
         rows.append([s.written.name, s.labels, verdicts, sigma])
     text = _table(("scene", "labels", "verdicts", "1 sigma of positions [mm], median"), rows)
-    return (
-        text
-        + "\nA verdict is that of the registration's own checks, or of the person who reviewed "
+    found = [f"- {s.written.name}: {n}" for s in card.scenes for n in s.findings]
+    checked = [
+        f"- {s.written.name}: {n.removeprefix(CHECKED).strip()}"
+        for s in card.scenes
+        for n in s.written.notes
+        if n.startswith(CHECKED)
+    ]
+    meaning = (
+        "\nA verdict is that of the registration's own checks, or of the person who reviewed "
         "it: `accepted`, `doubtful` (somebody should look), `unchecked` (nothing was asked).\n"
     )
+    more = _listed("Found by the registration", found) + _listed("Checked on reading", checked)
+    return text + meaning + more
+
+
+def _listed(title: str, lines: Sequence[str]) -> str:
+    return f"\n{title}:\n\n{_shortened(lines)}\n" if lines else ""
 
 
 def _shortened(notes: Sequence[str], most: int = 60) -> str:

@@ -1,6 +1,16 @@
 """Data sets and cameras that `realsim export` writes."""
 
-from realsim.app.export.target import IMAGES, METRES, OPENCV, PIXEL, RootJob, SceneJob, Target
+from realsim.app.export.target import (
+    IMAGES,
+    METRES,
+    OPENCV,
+    PIXEL,
+    TABLE,
+    TRIED,
+    RootJob,
+    SceneJob,
+    Target,
+)
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 
@@ -84,6 +94,7 @@ DATA_SETS: dict[str, Target] = {
         ),
         write_scene=_bop,
         write_root=_bop_root,
+        no_place=(TABLE, TRIED),
         options=(
             "labels",
             "split",
@@ -113,6 +124,7 @@ DATA_SETS: dict[str, Target] = {
         ),
         write_scene=_graspnet,
         write_root=_graspnet_root,
+        no_place=(TRIED,),
         options=(
             "labels",
             "camera",
@@ -135,6 +147,7 @@ DATA_SETS: dict[str, Target] = {
         ),
         loading='import pycolmap\nmodel = pycolmap.Reconstruction("{scene}/sparse/0")',
         write_scene=_colmap,
+        no_place=(TABLE, TRIED),
         options=(*IMAGES, "points"),
     ),
     "nerfstudio": Target(
@@ -149,6 +162,7 @@ DATA_SETS: dict[str, Target] = {
         ),
         loading='import json\nframes = json.load(open("{scene}/transforms.json"))["frames"]',
         write_scene=_nerfstudio,
+        no_place=(TABLE, TRIED),
         options=IMAGES,
     ),
 }

@@ -3,11 +3,17 @@
 import tempfile
 from pathlib import Path
 
+import numpy as np
+
 from realsim.app.export.target import METRES, SceneJob, Target
 from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
+from realsim.formats.grasps.scene_grasps import executed
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 from realsim.formats.session_scene import SessionScene
+
+LABELLED_ONLY = ("acronym", "graspgen", "isaac")
+"""Formats of grasps that have a label by physics."""
 
 
 def session_of(scene: LabelledScene) -> SessionScene:
@@ -38,11 +44,23 @@ def _files(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> Written
             inner.write_piece("grasps", {name: p for name, p in found.items() if p.is_file()})
     job.tick()
     sets = () if (grasps := session.grasps()) is None else grasps.sets
+    all_of_them, count, notes = sum(len(s) for s in sets), 0, list[str]()
+    for s in sets:
+        rows = np.ones(len(s), dtype=np.bool_)
+        if request.target in LABELLED_ONLY:
+            rows = executed(s)
+        if request.target == "isaac":
+            rows &= np.nan_to_num(s.scores, nan=-1.0) >= request.least_score
+        count += int(rows.sum())
+    if request.target in LABELLED_ONLY and count < all_of_them:
+        score = f", or that have a score below {request.least_score:g}," * (request.least_score > 0)
+        notes.append(
+            f"{all_of_them - count} of {all_of_them} grasps are left out: those that physics did "
+            f"not try{score} are no grasps to this format."
+        )
     return WrittenScene(
         name=session.name, folder=inner.place, frames=0, frames_written=0, objects=len(sets),
-        notes=("grasps that physics did not try have no label and are left out.",)
-        if request.target in ("acronym", "graspgen", "isaac") else (),
-        counts={"grasps": sum(len(s) for s in sets)},
+        notes=tuple(notes), counts={"grasps": count},
     )  # fmt: skip
 
 
@@ -80,7 +98,7 @@ def _target(name: str, what: str, conventions: tuple[tuple[str, str], ...], load
             options: tuple[str, ...] = ()) -> Target:  # fmt: skip
     return Target(
         name=name, kind="grasps", help=what, conventions=(METRES, *conventions), loading=loading,
-        write_scene=_files, options=options,
+        write_scene=_files, holds_grasps=True, options=options,
     )  # fmt: skip
 
 
@@ -97,26 +115,27 @@ GRASPS: dict[str, Target] = {
             ("score", "of the slip test, 0 to 1, higher is better; not GraspNet's friction"),
             ("object", "GraspNet's number: realsim's id - 1"),
         ),
-        loading='import numpy as np\ngrasps = np.load("{scene}/000000.npy")',
+        loading='import numpy as np\ngrasps = np.load("{scene}/{file:*.npy}")',
         write_scene=_grasp_groups,
+        holds_grasps=True,
         options=("labels",),
     ),
     "acronym": _target(
         "ACRONYM", "HDF5, one file an object",
         (("frame", "mounting face, 0.1034 m behind the contacts; z = approach, x = closing"),
          ("label", "1 = still held after all four stages; scores under qualities/realsim")),
-        'import h5py\nfile = h5py.File("{scene}/000000_obj000001.h5")',
+        'import h5py\nfile = h5py.File("{scene}/{file:*.h5}")',
     ),
     "graspgen": _target(
         "GraspGen", "JSON, one file an object",
         (("frame", "as ACRONYM's"), ("label", "1 = still held after all four stages")),
-        'import json\ngrasps = json.load(open("{scene}/000000_obj000001.json"))["grasps"]',
+        'import json\ngrasps = json.load(open("{scene}/{file:*.json}"))["grasps"]',
     ),
     "isaac": _target(
         "isaac_grasp", "YAML, one file an object",
         (("frame", "panda_hand: mounting face; z = approach, y = closing"),
          ("confidence", "the score")),
-        'import yaml\ngrasps = yaml.safe_load(open("{scene}/000000_obj000001.yaml"))["grasps"]',
+        'import yaml\ngrasps = yaml.safe_load(open("{scene}/{file:*.yaml}"))["grasps"]',
         ("least_score",),
     ),
     "hdf5": _target(

@@ -1,5 +1,6 @@
 """`realsim export`: scene by scene into one folder; interrupted, the same command goes on."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -15,11 +16,12 @@ from realsim.app.export.sources import (
     source_scenes,
     trust_in,
 )
-from realsim.app.export.target import RootJob, SceneJob, ScenePlace, Target
+from realsim.app.export.target import TABLE, TRIED, RootJob, SceneJob, ScenePlace, Target
 from realsim.app.export.targets import TARGETS
 from realsim.errors import InputError
 from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.export_folder import CONTENT, STATE, ExportFolder
+from realsim.formats.grasps.scene_grasps import executed
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 from realsim.formats.session_scene import SessionScene
 from realsim.formats.undistorted import UndistortedScene
@@ -44,6 +46,8 @@ class ExportResult:
     folder: Path
     card: Path
     scenes: tuple[WrittenScene, ...]
+    was_finished: bool = False
+    """Whether all of it was there already."""
 
 
 def run_export(request: ExportRequest, out: Path, console: Console) -> ExportResult:
@@ -58,6 +62,8 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
     _require_outside(request, out)
     places = scene_places(scenes, target)
     asked = request.asked() | {CONTENT: content_of(scenes)}
+    if ExportFolder.is_finished(out, asked):
+        return ExportResult(folder=out, card=out / CARD_FILE, scenes=(), was_finished=True)
     folder = ExportFolder.begin(out, asked)
     if folder.resumed:
         console.say(f"going on with the export in {out}.")
@@ -74,7 +80,7 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
                 kept = out / STATE / "undistorted"
                 given = UndistortedScene(opened, kept) if request.undistort else opened
                 written = _write(given, place, target, folder, request, console)
-                facts.append(_facts(source, opened, written))
+                facts.append(_facts(source, opened, written, target))
         except InputError:
             folder.abandon()
             raise
@@ -171,7 +177,10 @@ def _write(
         written = target.write_scene(
             scene, folder, SceneJob(request=request, place=place, tick=one_more)
         )
-    notes = tuple(dict.fromkeys((*scene.notes, *written.notes)))
+    has = {TABLE: scene.T_world_table is not None, TRIED: scene.grasps() is not None}
+    lost = [what for what in target.no_place if has[what]]
+    told = [f"{target.name} has no place for {' and '.join(lost)}: left out."] if lost else []
+    notes = tuple(dict.fromkeys((*scene.notes, *written.notes, *told)))
     if target.kind == "dataset":
         return replace(written, notes=notes)
     # It has a folder of its own, and no place for objects and their poses.
@@ -200,8 +209,10 @@ def _add_models(models: dict[int, ObjectModel], scene: LabelledScene, source: So
             )
 
 
-def _facts(source: SourceScene, scene: LabelledScene, written: WrittenScene) -> SceneFacts:
-    trust = trust_in(source)
+def _facts(
+    source: SourceScene, scene: LabelledScene, written: WrittenScene, target: Target
+) -> SceneFacts:
+    trust, holds_grasps = trust_in(source), target.holds_grasps
     grasps = scene.grasps()
     sets = () if grasps is None else grasps.sets
     words = LABELS[scene.labels] if isinstance(scene, SessionScene) else OWN_LABELS
@@ -215,8 +226,9 @@ def _facts(source: SourceScene, scene: LabelledScene, written: WrittenScene) -> 
         instances=len(things) if trust.instances is None else trust.instances,
         verdicts=trust.verdicts,
         pose_sigma_mm=trust.pose_sigma_mm,
-        grasps_tried=sum(int((s.base_scores == s.base_scores).sum()) for s in sets),
-        grasps_good=sum(int(s.good.sum()) for s in sets),
+        findings=trust.findings,
+        grasps_tried=sum(int(executed(s).sum()) for s in sets) if holds_grasps else 0,
+        grasps_good=sum(int(s.good.sum()) for s in sets) if holds_grasps else 0,
     )
 
 
@@ -243,7 +255,7 @@ def _card(
         objects={i: m.name for i, m in models.items()}
         if target.kind in ("dataset", "scene")
         else {},
-        loading=target.loading.replace("{scene}", inside.as_posix()),
+        loading=_loading(target, out, inside),
         command=command,
         sources=[s.resolve().name for s in request.sources],
         licence=request.licence,
@@ -253,12 +265,25 @@ def _card(
     )
 
 
+def _loading(target: Target, out: Path, scene: Path) -> str:
+    """Return Python that opens what was written: its first scene, the first file of a kind."""
+
+    def first(pattern: re.Match[str]) -> str:
+        found = sorted((out / scene).glob(pattern[1]))
+        return found[0].name if found else pattern[1]
+
+    return re.sub(r"\{file:([^}]+)\}", first, target.loading.replace("{scene}", scene.as_posix()))
+
+
 def _inside(written: WrittenScene, out: Path) -> WrittenScene:
     return replace(written, folder=written.folder.relative_to(out))
 
 
 def show_export(result: ExportResult, console: Console) -> None:
     """Print what was written, and what was lost on the way."""
+    if result.was_finished:
+        console.say(f"this export is finished already: {result.folder}; nothing was written.")
+        return
     rows = [
         [
             s.name,

@@ -2,12 +2,13 @@
 
 import shutil
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from realsim.app.console import Console
 from realsim.app.export.grasp_targets import session_of
-from realsim.app.export.target import METRES, SceneJob, Target
+from realsim.app.export.target import METRES, TRIED, SceneJob, Target
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 from realsim.formats.session_scene import SessionScene
@@ -66,21 +67,27 @@ def _urdf(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenS
     from realsim.formats.robot_scenes.urdf import UrdfConfig, write_urdf_scene
 
     config = UrdfConfig(under=job.place.name)
-    return write_urdf_scene(placed_scene(session_of(scene)), folder, config, progress=job.tick)
+    session = session_of(scene)
+    written = write_urdf_scene(placed_scene(session), folder, config, progress=job.tick)
+    return _told(written, session)
 
 
 def _mjcf(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
     from realsim.formats.robot_scenes.mjcf import MjcfConfig, write_mjcf_scene
 
     config = MjcfConfig(under=job.place.name)
-    return write_mjcf_scene(placed_scene(session_of(scene)), folder, config, progress=job.tick)
+    session = session_of(scene)
+    written = write_mjcf_scene(placed_scene(session), folder, config, progress=job.tick)
+    return _told(written, session)
 
 
 def _usd(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
     from realsim.formats.robot_scenes.usd_scene import UsdConfig, write_usd_scene
 
     config = UsdConfig(under=job.place.name)
-    return write_usd_scene(placed_scene(session_of(scene)), folder, config, progress=job.tick)
+    session = session_of(scene)
+    written = write_usd_scene(placed_scene(session), folder, config, progress=job.tick)
+    return _told(written, session)
 
 
 def _graspit(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
@@ -90,7 +97,20 @@ def _graspit(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> Writt
     grasps = session.grasps()
     pairs = [] if grasps is None else [paired_grasps(s) for s in grasps.sets]
     config = GraspitConfig(under=job.place.name)
-    return write_graspit(placed_scene(session), pairs, folder, config, progress=job.tick)
+    written = write_graspit(placed_scene(session), pairs, folder, config, progress=job.tick)
+    tried = sum(len(s) for s in (grasps.sets if grasps is not None else ()))
+    bad = sum(int((~s.good).sum()) for s in (grasps.sets if grasps is not None else ()))
+    note = f"all {tried} grasps are there, the {bad} that failed among them: scores have no place."
+    return replace(written, name=session.name, notes=(*written.notes, note))
+
+
+def _told(written: WrittenScene, session: SessionScene) -> WrittenScene:
+    """Return what was written under the session's own name, with the views that stayed out."""
+    posed = sum(v.T_world_cam is not None for v in session.store.session.views)
+    notes = list(written.notes)
+    if posed > CAMERAS:
+        notes.append(f"{CAMERAS} of {posed} views are there as cameras.")
+    return replace(written, name=session.name, notes=tuple(notes))
 
 
 SCENES: dict[str, Target] = {
@@ -101,6 +121,7 @@ SCENES: dict[str, Target] = {
         conventions=(METRES, UP, BODIES, WORLD_FRAME, ("quaternions in scene.json", "x y z w")),
         loading='import json\nscene = json.load(open("{scene}/scene.json"))',
         write_scene=_urdf,
+        no_place=(TRIED,),
     ),
     "mjcf": Target(
         name="MJCF (MuJoCo)",
@@ -109,6 +130,7 @@ SCENES: dict[str, Target] = {
         conventions=(METRES, UP, BODIES, WORLD_FRAME, ("quaternions", "w x y z")),
         loading='import mujoco\nmodel = mujoco.MjModel.from_xml_path("{scene}/scene.xml")',
         write_scene=_mjcf,
+        no_place=(TRIED,),
     ),
     "usd": Target(
         name="USD (Isaac Sim)",
@@ -121,6 +143,7 @@ SCENES: dict[str, Target] = {
         ),
         loading='from pxr import Usd\nstage = Usd.Stage.Open("{scene}/scene.usda")',
         write_scene=_usd,
+        no_place=(TRIED,),
     ),
     "graspit": Target(
         name="GraspIT (the paper's authors)",
@@ -129,6 +152,7 @@ SCENES: dict[str, Target] = {
         conventions=(METRES, ("axes", "z up out of the table"), ("quaternions", "w x y z")),
         loading='import yaml\nscene = yaml.safe_load(open("{scene}/scene.yaml"))',
         write_scene=_graspit,
+        holds_grasps=True,
     ),
 }  # fmt: skip
 """By the name that the command line gives them."""

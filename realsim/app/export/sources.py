@@ -11,6 +11,7 @@ from realsim.app.export.request import ExportRequest
 from realsim.errors import InputError
 from realsim.formats.labelled_scene import LabelledScene
 from realsim.records import Scene
+from realsim.store import SessionStore
 from realsim.store.session_store import SESSION_FILE
 
 ACCEPTED = (
@@ -44,6 +45,8 @@ class SceneTrust:
 
     verdicts: Mapping[str, int] = field(default_factory=dict[str, int])
     pose_sigma_mm: float | None = None
+    findings: tuple[str, ...] = ()
+    """What registration found out about the scene as a whole."""
     instances: int | None = None
 
 
@@ -203,8 +206,15 @@ def trust_in(scene: SourceScene) -> SceneTrust:
     return SceneTrust(
         verdicts=verdicts,
         pose_sigma_mm=float(np.median(sigmas)) if sigmas else None,
+        findings=tuple(_findings(store)),
         instances=len(judged.objects),
     )
+
+
+def _findings(store: SessionStore) -> list[str]:
+    from realsim.app.upgrade.scene import registration_notes
+
+    return registration_notes(store) if store.has("registration/report.json") else []
 
 
 def licence_files(sources: tuple[Path, ...]) -> dict[str, Path]:

@@ -64,6 +64,10 @@ class Target:
     """Python that opens it; {scene} is the folder of the first scene."""
     write_scene: WriteScene
     write_root: WriteRoot | None = None
+    no_place: tuple[str, ...] = ()
+    """What the format has no place for, of THINGS: it is told where a scene has it."""
+    holds_grasps: bool = False
+    """Whether grasps tried by physics go along."""
     options: tuple[str, ...] = ()
     """Fields of the request that say something of this format; others are refused."""
 
@@ -73,3 +77,6 @@ IMAGES = ("labels", "camera", "undistort")
 METRES = ("units", "metres")
 OPENCV = ("camera axes", "OpenCV: x right, y down, z forward")
 PIXEL = ("pixels", "integer coordinates are pixel centres")
+TABLE, TRIED = "the table's pose", "grasps tried by physics"
+THINGS = (TABLE, TRIED)
+"""What a scene may have beside images, poses and models."""

@@ -79,6 +79,9 @@ def import_labels(
             save_starts(store, starts, f"labels of {scene.name}")
         with console.stage("labels", scene.name) as tick:
             save_imported(store, scene, dict(enumerate(indices)), tick)
+    for note in scene.notes:
+        if note.startswith("the labels"):  # what they are worth must not be missed
+            console.warn(f"{scene.name}: {note}".replace("[", r"\["))
     poses = sum(len(scene.frame(i).objects) for i in indices)
     console.say(
         f"labels    {poses} poses in {len(indices)} frames, {len(models)} models: kept in "

@@ -88,9 +88,16 @@ def _colmap_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
 
 def _graspnet_rows(root: Path) -> tuple[Sequence[str], list[Sequence[object]]]:
     from realsim.formats.graspnet.opening import open_scene
+    from realsim.formats.graspnet.single_frame import open_graspnet_frame
     from realsim.formats.graspnet.tree import open_graspnet
 
     rows: list[Sequence[object]] = []
+    if (root / "meta.mat").is_file():
+        frame = open_graspnet_frame(root)
+        objects = len(frame.frame(frame.indices[0]).objects)
+        return ("scene", "camera", "images", "objects in the first"), [
+            (frame.number, frame.camera, len(frame.indices), objects)
+        ]
     for ref in open_graspnet(root).scenes:
         try:
             scene = open_scene(ref)

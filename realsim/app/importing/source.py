@@ -184,7 +184,7 @@ def kinds_of(path: Path) -> list[KindFit]:
             fits.append(KindFit(kind="bop", why=f"it has {pattern}"))
             break
     if _is_graspnet(path):
-        fits.append(KindFit(kind="graspnet", why="it has rgb/ beside annotations/*.xml"))
+        fits.append(KindFit(kind="graspnet", why="it has annotations/*.xml, or meta.mat"))
     from realsim.formats.colmap.model import find_model
     from realsim.formats.nerfstudio.transforms import find_transforms
 
@@ -204,10 +204,15 @@ def kinds_of(path: Path) -> list[KindFit]:
 
 def _is_graspnet(path: Path) -> bool:
     """Return whether a folder is a GraspNet data set, one of its scenes, or a scene's camera."""
-    return any(
+    return _is_graspnet_frame(path) or any(
         any(path.glob(f"{above}annotations/*.xml")) and any(path.glob(f"{above}rgb"))
         for above in ("", "*/", "*/*/", "*/*/*/")
     )
+
+
+def _is_graspnet_frame(path: Path) -> bool:
+    """Return whether a folder is one frame as GraspNet's demo has it."""
+    return all((path / name).is_file() for name in ("color.png", "depth.png", "meta.mat"))
 
 
 def _of_file(path: Path) -> list[KindFit]:
@@ -354,9 +359,13 @@ def _open_bop(request: ImportRequest, console: Console) -> FrameSource:
 
 def _open_graspnet(request: ImportRequest, _: Console) -> FrameSource:
     from realsim.formats.graspnet.opening import open_scene
+    from realsim.formats.graspnet.single_frame import open_graspnet_frame
     from realsim.formats.graspnet.tree import open_graspnet
     from realsim.formats.labelled_frames import LabelledFrames
 
+    if _is_graspnet_frame(request.source):
+        frame = open_graspnet_frame(request.source, models=request.models)
+        return LabelledFrames(frame, "graspnet", use_depth=not request.no_depth)
     tree = open_graspnet(
         request.source,
         scenes=None if request.scene is None else (request.scene,),

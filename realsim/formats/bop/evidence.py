@@ -154,7 +154,10 @@ def require_depth_unit(ratios: Sequence[float], unit_m: float, where: str) -> st
             f"another unit: with depth_scale {scale * power:g} depth would be {ratio * power:.3g} "
             "times as far. Correct the wrong one."
         )
-    return f"{where}: {said}."
+    return (
+        f"checked: depth fits the labels, surfaces of {len(ratios)} objects are measured at "
+        f"{ratio:.3g} of the distance of their origins."
+    )
 
 
 def depth_ratio(

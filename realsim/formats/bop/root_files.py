@@ -141,8 +141,12 @@ def write_bop_root(
         if scene["split"] == chosen:
             seen.setdefault(scene["folder"], scene)
     listed = list(seen.values())
-    folder.write_document(BOP19, _json_list(_localisation(folder, listed)))
-    folder.write_document(BOP24, _json_list(_detection(folder, listed)))
+    # BOP's own lists are of tests; those of another split say which.
+    first = "" if chosen.startswith("test") else chosen
+    lists = ((BOP19, _localisation(folder, listed)), (BOP24, _detection(folder, listed)))
+    for usual, rows in lists:
+        file = usual.replace("test", first, 1) if first else usual
+        folder.write_document(file, _json_list(rows))
 
 
 def _localisation(folder: ExportFolder, scenes: Sequence[Json]) -> Iterator[Json]:

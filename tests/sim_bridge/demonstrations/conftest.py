@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 
 from realsim.app.school.files import stored_grasps
-from realsim_sim_bridge.demonstrations.cameras import front_camera, wrist_camera
+from realsim_sim_bridge.demonstrations.cameras import wrist_camera
+from realsim_sim_bridge.demonstrations.front_view import FrontView
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource
 from school_sessions import registered, run
 
@@ -27,5 +28,5 @@ def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def source(school: Path) -> DemonstrationSource:
     """Its attempts, with small pictures."""
     grasps, models = stored_grasps(school)
-    cameras = (front_camera((0.0, 0.0), SMALL), wrist_camera(None, SMALL))
+    cameras = (FrontView(size_px=SMALL), wrist_camera(None, SMALL))
     return DemonstrationSource(grasps, models, cameras=cameras, cache=school / "grasps/cache")

@@ -1,0 +1,91 @@
+"""What a check of a data set's labels finds, and when labels and poses disagree."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class AgreementConfig:
+    """When labels and poses disagree."""
+
+    least_mask_iou: float = 0.90
+    """Median over the frames, of the silhouette: renderers differ along the outline only, which is
+    a twentieth of an object 80 px wide."""
+    least_visible_iou: float = 0.80
+    """Likewise of the visible part: there BOP asks the measured depth, which is noisy."""
+    least_single_iou: float = 0.50
+    """Of one frame, of silhouette and visible part: below it the mask is another thing's."""
+    least_pixels: int = 200
+    """Smaller silhouettes are not judged: their outline is too much of them [px]."""
+    depth_mm: float = 15.0
+    """Median difference of measured and rendered depth: BOP's own tolerance of visibility [mm]."""
+    most_hidden: float = 0.10
+    """Share of an object's visible pixels that are measured nearer than it by `depth_mm`: BOP calls
+    such pixels hidden. A stereo camera spreads a near edge over 4 px of what lies behind it, which
+    along one side is a twentieth of an object 80 px wide; realsim's masks keep these pixels."""
+    least_measured: int = 50
+    """Pixels with depth that a median is taken over."""
+    stray_mm: float = 5.0
+    """One image against the others, of an object's place and of depth: labels and camera poses of
+    public data sets are good to some millimetres, and so is depth averaged over objects [mm]."""
+    stray_spreads: float = 5.0
+    """... and this many times what the others differ by (median distance from their median): where
+    all images differ, none stands off."""
+    stray_iou: float = 0.05
+    """One image against the others, of an IoU: by which it may be less ..."""
+    stray_iou_times: float = 3.0
+    """... beside so many times what the others lack: a smaller or half hidden silhouette has more
+    outline for its area."""
+    stray_outline_px: float = 1.5
+    """... and where the outline is not off by so much all round, it is no finding [px]: of a mask
+    of 15 px width a rounded pose costs a tenth."""
+    fewest_images: int = 3
+    """From which on one image of places or depth can be told to be the one that is off."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ObjectAgreement:
+    """How the labels of one object agree with its poses, over the frames of a scene."""
+
+    obj_id: int
+    name: str
+    frames: int
+    """In which it is annotated."""
+    mask_iou: float | None
+    """Median; None = the data set has no such masks."""
+    mask_iou_worst: float | None
+    mask_worst_image: int | None
+    visible_iou: float | None
+    visible_iou_worst: float | None
+    visible_worst_image: int | None
+    depth_mm: float | None
+    """Median over the frames of measured minus rendered depth [mm]; None = nothing measured."""
+    hidden: float | None
+    """Median share of the visible, measured pixels that lie nearer than the object by BOP's 15 mm;
+    None likewise."""
+    faults: tuple[str, ...]
+    """What disagrees; empty = nothing."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SceneAgreement:
+    """How one scene agrees with itself."""
+
+    place: str
+    frames: int
+    objects: tuple[ObjectAgreement, ...]
+    findings: tuple[str, ...]
+    """What its files contradict each other in, or why it could not be read."""
+    notes: tuple[str, ...] = ()
+    """What could not be compared, and what the reader says."""
+    approximate: bool = False
+    """Whether the data set itself calls its labels a rough start only."""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether nothing disagrees."""
+        return not self.findings and not any(o.faults for o in self.objects)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return asdict(self) | {"agrees": self.agrees}
