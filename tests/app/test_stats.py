@@ -10,12 +10,13 @@ from click.testing import CliRunner
 
 from realsim.app.cli import commands
 from realsim.app.console import Console
-from realsim.app.stages import annotate_session
+from realsim.app.stages import annotate_session, open_session
 from realsim.app.stats.collect import session_facts
 from realsim.app.stats.landscape import LANDSCAPE_HEADER
 from realsim.app.stats.run import document_of
-from realsim.app.stats.statistics import all_rows, statistics_of
+from realsim.app.stats.statistics import all_rows, same_content, statistics_of
 from realsim.errors import InputError
+from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.store import load_scene, save_grasps, save_scene
 from synthetic_scenes import captured_session
@@ -79,6 +80,9 @@ def test_the_figures_are_those_counted_by_hand(session):
     assert rows["full success (s = 1)"] == "1 (14.29 %)"
     mean = np.mean([g[0] for part in GRASPS.values() for g in part])
     assert rows["mean score"].startswith(f"{mean:.2f} ")
+    assert rows["without a score"] == "0"
+    # Of the six that were tried, one closes at no level.
+    assert rows["closure_friction: closed at some level up to 0.6: good, bad"] == "2, 3"
     assert rows["poses accepted"] == rows["poses doubtful"] == "1 (50.0 %)"
     assert rows["pose uncertainty [mm], median, p90, most"].startswith(
         "0.300, 0.300, 0.300 (n = 2)"
@@ -99,6 +103,47 @@ def test_the_turn_about_an_axis_of_revolution_is_no_uncertainty(session, tmp_pat
     assert all(abs(o.sigma_deg - sigma_deg) < 1e-9 for o in session_facts(copy).objects)
 
 
+def turned_sigma_deg(session, tmp_path, covariance, axes):
+    """Return the sigma of the session's first object with this covariance of its rotation."""
+    import shutil
+
+    copy = shutil.copytree(session, tmp_path / "turned")
+    info = json.loads((copy / "models/models_info.json").read_text())
+    for entry in info.values():
+        entry["symmetries_continuous"] = [{"axis": a, "offset": [0, 0, 0]} for a in axes]
+    (copy / "models/models_info.json").write_text(json.dumps(info))
+    store = open_session(copy)
+    scene = load_scene(store)
+    C = np.diag(np.full(6, 1e-8))
+    C[:3, :3] = covariance
+    save_scene(
+        store, replace(scene, objects=tuple(replace(o, covariance=C) for o in scene.objects))
+    )
+    return session_facts(copy).objects[0].sigma_deg
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 0.26, 3.0])
+def test_a_free_turn_does_not_leak_from_an_axis_that_is_a_bit_off(session, tmp_path, tilt_deg):
+    R = se3.exp_so3(np.radians([tilt_deg, 0.0, 0.0]))
+    free, sure = np.radians(18.0), np.radians(0.029)
+    covariance = R @ np.diag([sure, 0.5 * sure, free]) ** 2 @ R.T
+    found = turned_sigma_deg(session, tmp_path, covariance, [[0, 0, 1]])
+    assert found == pytest.approx(0.029, rel=1e-6)
+
+
+def test_an_axis_that_no_principal_axis_is_near_is_projected_away(session, tmp_path):
+    R = se3.exp_so3(np.radians([45.0, 0.0, 0.0]))
+    covariance = R @ np.diag([1e-3, 2e-3, 4e-3]) ** 2 @ R.T
+    found = turned_sigma_deg(session, tmp_path, covariance, [[0, 0, 1]])
+    across = covariance[:2, :2]
+    assert found == pytest.approx(np.degrees(np.sqrt(np.linalg.eigvalsh(across)[-1])))
+
+
+def test_of_a_ball_no_turn_is_uncertain(session, tmp_path):
+    covariance = np.diag([0.3, 0.3, 0.3]) ** 2
+    assert turned_sigma_deg(session, tmp_path, covariance, [[0, 0, 1], [1, 0, 0]]) == 0.0
+
+
 def test_visibility_is_that_of_the_annotation(session):
     infos = json.loads((session / "scene_gt_info.json").read_text())
     for k, o in enumerate(session_facts(session).objects):
@@ -114,6 +159,24 @@ def test_two_copies_count_twice_but_have_the_same_objects(session, tmp_path):
     assert twice["unique objects"] == once["unique objects"] == "2 simulated, 0 real"
     assert twice["mean score"] == once["mean score"]
     assert rows_of(copy, session) == twice
+
+
+def test_copies_are_told_on_console_page_and_in_the_json(session, tmp_path):
+    import shutil
+
+    sessions, out = tmp_path / "sessions", tmp_path / "out"
+    for name in ("first", "again", "third"):
+        shutil.copytree(session, sessions / name)
+    assert same_content(statistics_of([session_facts(session)])) == []
+    photograph = sessions / "third/rgb/000000.png"
+    photograph.write_bytes(photograph.read_bytes() + b"\0")  # another capture
+    result = CliRunner().invoke(commands, ["stats", str(sessions), "--out", str(out), "--quiet"])
+    assert result.exit_code == 0, result.output
+    (note,) = json.loads((out / "statistics.json").read_text())["notes"]
+    assert "first" in note and "again" in note and "third" not in note
+    assert note.endswith("counts twice.")
+    assert "counts twice" in " ".join(result.output.split())
+    assert "counts twice" in (out / "statistics.html").read_text()
 
 
 def test_tables_and_page_say_the_same(session, tmp_path):

@@ -230,6 +230,10 @@ def test_only_tried_grasps_are_compared_with_force_closure():
     assert found.closures[1].closed_good + found.closures[1].closed_bad == int(
         np.sum(tried & np.isfinite(s.measures["closure_friction"]))
     )
+    assert [c.friction for c in found.closures] == [None, 0.4]
+    names = [name for name, _, _ in found.to_rows()]
+    assert "dexnet_closure: closed: good, bad" in names
+    assert "closure_friction: closed at some level up to 0.4: good, bad" in names
     assert found == summarise([s])  # the same draws
 
 

@@ -33,12 +33,11 @@ class AgreementConfig:
     all images differ, none stands off."""
     stray_iou: float = 0.05
     """One image against the others, of an IoU: by which it may be less ..."""
-    stray_iou_times: float = 3.0
-    """... beside so many times what the others lack: a smaller or half hidden silhouette has more
-    outline for its area."""
-    stray_outline_px: float = 1.5
-    """... and where the outline is not off by so much all round, it is no finding [px]: of a mask
-    of 15 px width a rounded pose costs a tenth."""
+    stray_times: float = 3.0
+    """... beside so many times what the others lack."""
+    stray_outline_px: float = 0.5
+    """... while the outline, too, is off by so much [px] more than so many times the others': half
+    hidden things are all outline, so that a rounded pose costs a tenth of them."""
     fewest_images: int = 3
     """From which on one image of places or depth can be told to be the one that is off."""
 

@@ -7,6 +7,7 @@ poses takes the models, rendered where the poses put them.
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,8 +196,19 @@ def _overlap(given: Mask, rendered: Mask, image: int, config: AgreementConfig) -
     union = int(np.count_nonzero(given | rendered))
     if union < config.least_pixels:
         return []
-    iou = int(np.count_nonzero(given & rendered)) / union
-    return [MaskOverlap(image=image, iou=iou, union=union)]
+    both = int(np.count_nonzero(given & rendered))
+    iou = both / union
+    return [
+        MaskOverlap(image=image, iou=iou, outline_px=(union - both) / _outline(given | rendered))
+    ]
+
+
+def _outline(mask: Mask) -> int:
+    """Return how many pixels of a mask have a neighbour outside of it; 1 of a whole image."""
+    import cv2
+
+    inside: Any = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8))
+    return max(1, int(np.count_nonzero(mask)) - int(np.count_nonzero(inside)))
 
 
 def _depth_difference(

@@ -4,7 +4,9 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from realsim.app.check.dataset import ObjectAgreement, SceneAgreement, checked_scenes
+from realsim.app.check.agreement import ObjectAgreement, SceneAgreement
+from realsim.app.check.checksums import ChecksumReport, check_checksums, checksum_list
+from realsim.app.check.dataset import checked_scenes, is_dataset
 from realsim.app.console import Console
 
 HEADER = [
@@ -17,35 +19,66 @@ MOST_FINDINGS = 40
 
 
 def run_dataset_check(folder: Path, *, as_json: bool, console: Console) -> bool:
-    """Check a data set and print what was found.
+    """Check a data set and print what was found: its labels, and its files by their checksums.
+
+    Any other folder that has a list of checksums is checked by it alone.
 
     Returns:
         Whether everything agrees.
 
     Raises:
-        InputError: no data set there.
+        InputError: no data set there, and no checksums.
     """
-    with console.stage("check", "masks, poses, depth") as tick:
-        scenes = list(checked_scenes(folder, progress=tick))
-    agrees = all(s.agrees for s in scenes)
+    sums = checksum_list(folder)
+    scenes: list[SceneAgreement] = []
+    has_labels = sums is None or is_dataset(folder)
+    if has_labels:
+        with console.stage("check", "masks, poses, depth") as tick:
+            scenes = list(checked_scenes(folder, progress=tick))
+    report: ChecksumReport | None = None
+    if sums is not None:
+        with console.stage("check", "checksums") as tick:
+            report = check_checksums(sums, folder, progress=tick)
+    agrees = all(s.agrees for s in scenes) and (report is None or report.agrees)
     if as_json:
-        print(json.dumps({"agrees": agrees, "scenes": [s.to_json() for s in scenes]}, indent=1))
-    else:
+        told = {
+            "agrees": agrees,
+            "scenes": [s.to_json() for s in scenes],
+            "checksums": None if report is None else report.to_json(),
+        }
+        print(json.dumps(told, indent=1))
+        return agrees
+    if has_labels:
         show_agreement(folder, scenes, console)
+    if report is not None:
+        show_checksums(report, console)
+        if not has_labels:
+            console.say("no annotated scenes of BOP or GraspNet here: only checksums were compared")
     return agrees
+
+
+def show_checksums(report: ChecksumReport, console: Console) -> None:
+    """Print which files are not as they were written."""
+    faults = report.faults()
+    for line in faults[:MOST_FINDINGS]:
+        console.say(f"damaged: {line}")
+    if len(faults) > MOST_FINDINGS:
+        console.say(f"... and {len(faults) - MOST_FINDINGS} more (--json has them all)")
+    good = report.listed - len(faults)
+    console.say(f"{good} of {report.listed} files are as they were written ({report.file})")
 
 
 def show_agreement(folder: Path, scenes: Sequence[SceneAgreement], console: Console) -> None:
     """Print a table of all objects, what disagrees first, and what was found."""
-    rows = [(s.place, o) for s in scenes for o in s.objects]
+    rows = [(s, o) for s in scenes for o in s.objects]
     rows.sort(key=lambda row: not row[1].faults)
-    shown = [_row(place, o) for place, o in rows[:MOST_ROWS]]
+    shown = [_row(s, o) for s, o in rows[:MOST_ROWS]]
     if shown:
         console.table(f"Data set {folder}", HEADER, shown)
     if len(rows) > MOST_ROWS:
         console.say(f"... and {len(rows) - MOST_ROWS} more objects (--json has them all)")
     lines = [f"{s.place}: {f}" for s in scenes for f in s.findings]
-    lines += [f"{place} object {o.obj_id} {o.name}: {f}" for place, o in rows for f in o.faults]
+    lines += [f"{s.place} object {o.obj_id} {o.name}: {f}" for s, o in rows for f in o.faults]
     for line in lines[:MOST_FINDINGS]:
         console.say(f"disagrees: {line}")
     if len(lines) > MOST_FINDINGS:
@@ -53,13 +86,17 @@ def show_agreement(folder: Path, scenes: Sequence[SceneAgreement], console: Cons
     for note in dict.fromkeys(f"{s.place}: {n}" for s in scenes for n in s.notes):
         console.say(f"note: {note}")
     good = sum(s.agrees for s in scenes)
-    console.say(f"{good} of {len(scenes)} scenes agree with themselves")
+    rough = sum(s.approximate for s in scenes)
+    console.say(
+        f"{good} of {len(scenes)} scenes agree with themselves"
+        + (f"; {rough} have approximate labels only" if rough else "")
+    )
 
 
-def _row(place: str, o: ObjectAgreement) -> list[str]:
+def _row(s: SceneAgreement, o: ObjectAgreement) -> list[str]:
     """Return an object's row."""
     return [
-        f"{place} {o.obj_id} {o.name}",
+        f"{s.place} {o.obj_id} {o.name}",
         str(o.frames),
         _figure(o.mask_iou),
         _figure(o.mask_iou_worst),
@@ -67,9 +104,16 @@ def _row(place: str, o: ObjectAgreement) -> list[str]:
         _figure(o.visible_iou_worst),
         "-" if o.depth_mm is None else f"{o.depth_mm:+.1f}",
         "-" if o.hidden is None else f"{100 * o.hidden:.1f} %",
-        "no" if o.faults else "yes",
+        _verdict(s, o),
     ]
 
 
 def _figure(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
+
+
+def _verdict(s: SceneAgreement, o: ObjectAgreement) -> str:
+    """Return whether an object's labels agree, and whether they are meant to."""
+    if s.approximate:
+        return "no, approximate" if o.faults else "approximate"
+    return "no" if o.faults else "yes"

@@ -1,12 +1,14 @@
 """`realsim check`: what of a session is sound, missing or damaged; taking out what is damaged.
 
-A data set (BOP, GraspNet, or what `realsim upgrade` made) is checked for whether its labels agree.
+A data set (BOP, GraspNet, or what `realsim upgrade` made) is checked for whether its labels agree;
+whatever `realsim export` wrote, for whether its files are as they were written.
 """
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
 
+from realsim.app.check.checksums import checksum_list
 from realsim.app.check.dataset import is_dataset
 from realsim.app.check.dataset_tables import run_dataset_check
 from realsim.app.console import Console
@@ -26,16 +28,16 @@ def run_check(folder: Path, *, repair: bool, decode: bool, as_json: bool) -> boo
 
     Returns:
         Whether the session is sound (after the repair, if one was asked for), or the data set's
-        labels agree with its poses and depth.
+        labels agree with its poses and depth, and its files with their checksums.
 
     Raises:
         InputError: neither, a data set is to be repaired, or another run is working in the session.
     """
-    if not is_session(folder) and is_dataset(folder):
+    if not is_session(folder) and (is_dataset(folder) or _has_checksums(folder)):
         if repair:
             raise InputError(
                 f"'{folder}' is a data set; only sessions are repaired. Labels that disagree are "
-                "made anew by `realsim upgrade`."
+                "made anew by `realsim upgrade`, damaged files by `realsim export`."
             )
         return run_dataset_check(folder, as_json=as_json, console=Console(quiet=as_json))
     if not folder.is_dir() or not is_session(folder):
@@ -43,7 +45,8 @@ def run_check(folder: Path, *, repair: bool, decode: bool, as_json: bool) -> boo
         hint = f" Did you mean {', '.join(str(folder / n) for n in inner)}?" if inner else ""
         raise InputError(
             f"'{folder}' is not a session: it has none of session.json, manifest.jsonl and "
-            f"robot.jsonl; and it is no annotated data set of BOP or GraspNet.{hint}"
+            f"robot.jsonl; it is no annotated data set of BOP or GraspNet, and no SHA256SUMS lists "
+            f"its files.{hint}"
         )
     if not repair:
         report = check_session(folder, decode=decode)
@@ -59,6 +62,10 @@ def run_check(folder: Path, *, repair: bool, decode: bool, as_json: bool) -> boo
     else:
         show_repair(repaired, Console())
     return repaired.after.sound
+
+
+def _has_checksums(folder: Path) -> bool:
+    return folder.is_dir() and checksum_list(folder) is not None
 
 
 def show_check(report: CheckReport, console: Console) -> None:

@@ -15,8 +15,6 @@ from realsim.app.check.agreement import AgreementConfig, ObjectAgreement
 Array = NDArray[np.float64]
 LISTED = 5
 """Images that are told one by one; more of one kind are told in one line."""
-OUTLINE = 4.0
-"""Perimeter of a square / root of its area: an outline is not shorter but for round things."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -25,8 +23,9 @@ class MaskOverlap:
 
     image: int
     iou: float
-    union: int
-    """Pixels of either."""
+    outline_px: float
+    """Pixels that only one of them has, by the length of the outline of both together [px]: by so
+    much the outline is off on average, about half of what one is shifted."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -106,15 +105,17 @@ def _stray_masks(
 ) -> Iterator[tuple[float, str]]:
     """Yield the images whose IoU is far below that of the others, or too small for any."""
     iou = np.array([o.iou for o in found])
+    outline_px = np.array([o.outline_px for o in found])
     for k, o in enumerate(found):
         others = np.delete(iou, k)
-        usual = float(np.median(others)) if len(others) else 1.0
+        usual, is_stray = 1.0, False
         lacking = 1.0 - o.iou
-        allowed = max(
-            config.stray_iou_times * (1.0 - usual) + config.stray_iou,
-            0.5 * config.stray_outline_px * OUTLINE / float(np.sqrt(o.union)),
-        )
-        if o.iou < config.least_single_iou or (len(others) and lacking > allowed):
+        if len(others):
+            usual = float(np.median(others))
+            usual_px = float(np.median(np.delete(outline_px, k)))
+            is_stray = lacking > config.stray_times * (1.0 - usual) + config.stray_iou
+            is_stray &= o.outline_px > config.stray_times * usual_px + config.stray_outline_px
+        if o.iou < config.least_single_iou or is_stray:
             told = f"{what} of image {o.image} has the IoU {o.iou:.2f} with its pose"
             yield lacking, told + (f", the others {usual:.2f}" if len(others) else "")
 
@@ -146,13 +147,8 @@ def _stray_places(
             spread = float(np.median(np.linalg.norm(others - middle, axis=1)))
             off = float(np.linalg.norm(point - middle))
             if off > max(config.stray_mm, config.stray_spreads * spread):
-                yield (
-                    off,
-                    (
-                        f"image {images[k]}: object {obj_id} stands {off:.1f} mm from where the other "
-                        f"{len(others)} images see it"
-                    ),
-                )
+                told = f"image {images[k]}: object {obj_id} stands {off:.1f} mm from where the "
+                yield off, told + f"other {len(others)} images see it"
 
 
 def stray_depth(tallies: Sequence[Tally], config: AgreementConfig) -> list[str]:

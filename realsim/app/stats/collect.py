@@ -1,7 +1,7 @@
 """What one session holds: frames, objects with verdict, uncertainty, visibility, and grasps."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -16,11 +16,16 @@ from realsim.formats.imported_labels import FOLDER as IMPORTED
 from realsim.records import GraspSet, ObjectPose
 from realsim.store import SessionStore, load_grasps
 from realsim.store.results import GRASP_FOLDER
+from realsim.store.session_store import rgb_path
 
 Array = NDArray[np.float64]
 Kind = Literal["real", "simulated"]
 SIMULATED = "synthetic"
 """Key of a session's `extra` that only rendered ones have; the simulated lab's camera says it."""
+FREE_TURN_DEG = 10.0
+"""Within which a principal axis of the rotation's covariance is the axis of revolution [deg]: the
+turn about it is free, so its variance is far the greatest, and a registration that is sure to a
+degree tells its axis to that. Beyond, what is least certain is another thing."""
 SCORED = ("mask", "mask_visib", "labels", "grasps", "trajectories", "objects", "depth", "models")
 
 
@@ -54,6 +59,9 @@ class SessionFacts:
     height: int
     frames: int
     frames_annotated: int
+    content: str
+    """Digest of the first photograph and of the registered scene: sessions that have the same are
+    copies of one; '' = there is no photograph."""
     objects: tuple[ObjectFacts, ...]
     sets: tuple[GraspSet, ...]
     """Tried grasps, without their poses, which no figure needs."""
@@ -95,6 +103,7 @@ def session_facts(folder: Path) -> SessionFacts:
         height=session.intrinsics.height,
         frames=len(session.views),
         frames_annotated=len(infos),
+        content=_content(store),
         objects=objects,
         sets=tuple(_without_poses(s) for s in load_grasps(store)),
         has=_present(store),
@@ -104,6 +113,19 @@ def session_facts(folder: Path) -> SessionFacts:
 def _kind(store: SessionStore) -> Kind:
     camera = str(store.extra.get("camera", ""))
     return "simulated" if SIMULATED in store.extra or camera.startswith("simulated") else "real"
+
+
+def _content(store: SessionStore) -> str:
+    """Return the digest of what no two captures have in common; '' without a photograph."""
+    if not store.session.views:
+        return ""
+    photograph = store.folder / rgb_path(store.session.views[0].index)
+    if not photograph.is_file():
+        return ""
+    scene = store.folder / "registration/scene.json"
+    digest = hashlib.sha256(photograph.read_bytes())
+    digest.update(scene.read_bytes() if scene.is_file() else b"")
+    return digest.hexdigest()
 
 
 def _sigma_mm(pose: ObjectPose) -> float:
@@ -116,13 +138,30 @@ def _sigma_deg(pose: ObjectPose, info: Mapping[str, Any]) -> float:
     """Return the sigma of the rotation; turns about an axis of revolution change nothing."""
     if pose.covariance is None:
         return float("nan")
-    free = np.eye(3)
-    for symmetry in info.get("symmetries_continuous", ()):
-        axis = np.asarray(symmetry["axis"], dtype=np.float64)
-        axis /= np.linalg.norm(axis)
-        free = free @ (np.eye(3) - np.outer(axis, axis))
-    largest = np.linalg.eigvalsh(free @ pose.covariance[:3, :3] @ free.T)[-1]
-    return float(np.degrees(np.sqrt(max(largest, 0.0))))
+    axes = [np.asarray(s["axis"], np.float64) for s in info.get("symmetries_continuous", ())]
+    axes = [axis / np.linalg.norm(axis) for axis in axes]
+    variance = _free_of_turns(pose.covariance[:3, :3], axes)
+    return float(np.degrees(np.sqrt(max(variance, 0.0))))
+
+
+def _free_of_turns(covariance: Array, axes: Sequence[Array]) -> float:
+    """Return the greatest variance of a rotation [rad^2] beside turns about axes of revolution.
+
+    The free turn's variance is thousands of times the others': projected along the declared axis,
+    a thousandth of it would be left where the covariance's own axis is a degree or two off. So its
+    principal axis is left out instead.
+    """
+    if not axes:
+        return float(np.linalg.eigvalsh(covariance)[-1])
+    if any(np.linalg.norm(np.cross(axes[0], axis)) > 1e-3 for axis in axes[1:]):
+        return 0.0  # a ball: turns about two axes make every turn
+    variances, principal = np.linalg.eigh(covariance)
+    along = np.abs(axes[0] @ principal)
+    nearest = int(along.argmax())
+    if along[nearest] >= np.cos(np.radians(FREE_TURN_DEG)):
+        return float(np.delete(variances, nearest).max())
+    across = np.eye(3) - np.outer(axes[0], axes[0])
+    return float(np.linalg.eigvalsh(across @ covariance @ across)[-1])
 
 
 def _infos(store: SessionStore) -> dict[int, Mapping[str, Any]]:

@@ -19,8 +19,8 @@ LANDSCAPE = (
 """GraspIT, table "Dataset Landscape"; its column of photorealistic assets, which no count can tell,
 and the data sets of demonstrations are left out."""
 GRASPS_HEADER = (
-    "data set", "objects", "grasps", "by physics", "reach", "score levels", "images",
-    "real and simulated",
+    "data set", "objects", "grasps", "by physics", "reach", "score levels (possible)",
+    "images", "real and simulated",
 )  # fmt: skip
 GRASPS = (
     ("Cornell", "240", "5.1k", NO, NO, "1", YES, NO),
@@ -30,6 +30,11 @@ GRASPS = (
     ("GraspIT", "7.4k", "2.3M", YES, YES, "5", YES, YES),
 )
 """GraspIT, table "Grasping Dataset Comparison"."""
+AS_PRINTED = "The other data sets' rows are as the paper has them; its two tables differ in places."
+LANDSCAPE_TEXT = f"yes: all sessions have it; partly: some have it. {AS_PRINTED}"
+GRASPS_TEXT = f"Score levels: how many base scores there can be, not how many occur. {AS_PRINTED}"
+BASE_SCORES = 5
+"""0, 1/4, 1/2, 3/4 and 1: one for each stage of physics that a grasp stands."""
 
 
 def landscape_row(stats: Statistics) -> tuple[str, ...]:
@@ -47,7 +52,7 @@ def landscape_row(stats: Statistics) -> tuple[str, ...]:
 def grasps_row(stats: Statistics) -> tuple[str, ...]:
     """Return our row of the comparison of grasps."""
     school = stats.school
-    levels = 5 if school.judged else 0
+    levels = BASE_SCORES if school.judged else 0
     return (
         "these sessions", f"{school.objects:,}", f"{school.candidates:,}", _all(stats, "grasps"),
         _all(stats, "trajectories"), str(levels), _of([s.frames > 0 for s in stats.sessions]),

@@ -15,6 +15,10 @@ from realsim_sim_bridge.school.summary_rows import OUTCOME_NAMES, PAPER_CANDIDAT
 
 Image = NDArray[np.uint8]
 BINS = 20
+LEAST_BINS = 5
+"""Numbers that an axis of counts spans at least: one bar alone would be as wide as the plot."""
+WIDE = 0.3
+"""Room beside the first and the last bar [bars]."""
 VIOLIN_LEAST = 3
 """Fewer scores make no distribution: they are drawn as points."""
 
@@ -148,6 +152,8 @@ def _scenes(stats: Statistics) -> Image:
     counts = np.array([len(s.objects) for s in stats.sessions])
     edges = np.arange(counts.min(), counts.max() + 2) - 0.5
     left.hist(counts, edges.tolist(), color=GOOD, rwidth=0.9)
+    spare = max(0.0, 0.5 * (LEAST_BINS - (edges[-1] - edges[0])))
+    left.set_xlim(edges[0] - spare - 0.1, edges[-1] + spare + 0.1)
     _titled(left, "Objects per scene", "objects", "scenes")
     kinds = Counter({s.kind: 0 for s in stats.sessions})
     annotated = Counter(kinds)
@@ -158,7 +164,9 @@ def _scenes(stats: Statistics) -> Image:
     middle.bar(places, list(kinds.values()), 0.6, color=MUTED, alpha=0.5, label="all")
     middle.bar(places, [annotated[k] for k in kinds], 0.4, color=GOOD, label="annotated")
     middle.set_xticks(list(places), list(kinds))
-    middle.legend(fontsize=7, frameon=False)
+    middle.set_xlim(-0.5 - WIDE, len(kinds) - 0.5 + WIDE)
+    middle.set_ylim(0, 1.25 * max(1, *kinds.values()))  # the legend stands above the bars
+    middle.legend(fontsize=7, frameon=False, loc="upper right", ncols=2)
     _titled(middle, "Frames", "", "frames")
     verdicts = Counter(o.verdict for o in stats.objects)
     right.bar(VERDICTS, [verdicts.get(v, 0) for v in VERDICTS],

@@ -20,6 +20,7 @@ from realsim.app.stats.statistics import (
     Statistics,
     all_rows,
     object_table,
+    same_content,
     session_table,
     statistics_of,
 )
@@ -61,16 +62,17 @@ def run_stats(
                     raise
                 left_out.append(f"{folder} is left out: {error}")
             tick(k + 1, len(folders))
-    for line in left_out:
-        console.warn(line.replace("[", r"\["))
     stats = statistics_of(facts)
+    notes = [*left_out, *same_content(stats)]
     rows = all_rows(stats)
     console.table(f"Statistics of {_sessions(stats)}", HEADER, rows)
-    document = document_of(stats)
+    for line in notes:
+        console.warn(line.replace("[", r"\["))
+    document = document_of(stats, left_out)
     if json_file is not None:
         atomic.write_json(json_file, document)
     if out is not None:
-        _write_all(out, stats, document, left_out, console)
+        _write_all(out, stats, document, notes, console)
     return stats
 
 
@@ -96,9 +98,15 @@ def _folders(sources: Sequence[Path]) -> list[Path]:
     return list(found.values())
 
 
-def document_of(stats: Statistics) -> dict[str, Any]:
-    """Return everything as plain JSON values; null = not known."""
+def document_of(stats: Statistics, left_out: Sequence[str] = ()) -> dict[str, Any]:
+    """Return everything as plain JSON values; null = not known.
+
+    Args:
+        stats: of all sessions that could be read.
+        left_out: what is said of the others.
+    """
     return {
+        "notes": [*left_out, *same_content(stats)],
         "statistics": {name: here for name, here, _ in all_rows(stats)},
         "school": stats.school.to_json(),
         "sessions": _records(SESSION_HEADER, session_table(stats)),
@@ -132,7 +140,7 @@ def csv_bytes(header: Sequence[str], rows: Sequence[Sequence[Cell]]) -> bytes:
 
 
 def _write_all(
-    out: Path, stats: Statistics, document: dict[str, Any], left_out: list[str], console: Console
+    out: Path, stats: Statistics, document: dict[str, Any], notes: list[str], console: Console
 ) -> None:
     out.mkdir(parents=True, exist_ok=True)
     tables: tuple[tuple[Sequence[str], Sequence[Sequence[Cell]]], ...] = (
@@ -143,12 +151,12 @@ def _write_all(
     for name, (header, rows) in zip(TABLES, tables, strict=True):
         atomic.write_bytes(out / name, csv_bytes(header, rows))
     atomic.write_json(out / DOCUMENT, document)
-    _write_page(out / PAGE, stats, left_out)
+    _write_page(out / PAGE, stats, notes)
     for name in (*TABLES, DOCUMENT, PAGE):
         console.say(f"written   {out / name}")
 
 
-def _write_page(path: Path, stats: Statistics, left_out: list[str]) -> None:
+def _write_page(path: Path, stats: Statistics, notes: list[str]) -> None:
     from realsim.app.stats.plots import figures
 
     sections: list[Section] = [
@@ -161,19 +169,20 @@ def _write_page(path: Path, stats: Statistics, left_out: list[str]) -> None:
             title="Beside other data sets",
             header=landscape.LANDSCAPE_HEADER,
             rows=[*landscape.LANDSCAPE, landscape.landscape_row(stats)],
-            text="yes: all sessions have it; partly: some have it.",
+            text=landscape.LANDSCAPE_TEXT,
         ),
         Table(
             title="Grasps beside those of other data sets",
             header=landscape.GRASPS_HEADER,
             rows=[*landscape.GRASPS, landscape.grasps_row(stats)],
+            text=landscape.GRASPS_TEXT,
         ),
         Table(title="Sessions", header=SESSION_HEADER, rows=_shown(session_table(stats))),
         Table(title="Objects", header=OBJECT_HEADER, rows=_shown(object_table(stats))),
     ]
     frames = sum(s.frames for s in stats.sessions)
     about = f"{_sessions(stats)}, {frames:,} frames, {stats.school.candidates:,} grasps"
-    picture_page(path, "Statistics", sections, about=about, notes=left_out)
+    picture_page(path, "Statistics", sections, about=about, notes=notes)
 
 
 def _shown(rows: Sequence[Sequence[Cell]]) -> list[list[str]]:

@@ -52,6 +52,20 @@ def statistics_of(sessions: Iterable[SessionFacts]) -> Statistics:
     return Statistics(sessions=taken, school=summarise(by_scene))
 
 
+def same_content(stats: Statistics) -> list[str]:
+    """Return a note for every two or more sessions that are copies of one: they count each."""
+    groups: dict[str, list[str]] = {}
+    for s in stats.sessions:
+        if s.content:
+            groups.setdefault(s.content, []).append(str(s.folder))
+    return [
+        f"{', '.join(group)}: the same first photograph and registration; what they hold counts "
+        f"{'twice' if len(group) == 2 else f'{len(group)} times'}."
+        for group in groups.values()
+        if len(group) > 1
+    ]
+
+
 def scene_rows(stats: Statistics) -> list[Row]:
     """Return the upper part of the paper's table of statistics: scenes, frames, objects."""
     by_kind = {k: [s for s in stats.sessions if s.kind == k] for k in ("simulated", "real")}
@@ -127,14 +141,12 @@ def _mean(values: Array) -> str:
 # --- one row a session, one row a thing -----------------------------------------------------------
 
 SESSION_HEADER = (
-    "session", "kind", "frames", "annotated", "width", "height", "objects", *VERDICTS,
-    "sigma_mm_median", "visibility_mean", "candidates", "with_trajectory", "good", "bad",
-    "score_mean",
+    "session", "kind", "frames", "annotated", "objects", "candidates", "good", "bad", "score_mean",
+    "with_trajectory", *VERDICTS, "sigma_mm_median", "visibility_mean", "width", "height",
 )  # fmt: skip
 OBJECT_HEADER = (
-    "session", "instance", "obj_id", "name", "verdict", "sigma_mm", "sigma_deg", "frames",
-    "visibility_mean", "visibility_most", "candidates", "with_trajectory", "good", "bad",
-    "score_mean",
+    "session", "instance", "name", "verdict", "sigma_mm", "sigma_deg", "candidates", "good", "bad",
+    "score_mean", "with_trajectory", "frames", "visibility_mean", "visibility_most", "obj_id",
 )  # fmt: skip
 Cell = str | int | float
 
@@ -148,9 +160,9 @@ def session_table(stats: Statistics) -> list[list[Cell]]:
         seen = np.concatenate([np.zeros(0), *(o.visibility for o in s.objects)])
         rows.append(
             [
-                s.name, s.kind, s.frames, s.frames_annotated, s.width, s.height, len(s.objects),
-                *(verdicts.get(v, 0) for v in VERDICTS), _median(sigma), _average(seen),
-                *_school_cells(summarise(s.sets)),
+                s.name, s.kind, s.frames, s.frames_annotated, len(s.objects),
+                *_school_cells(summarise(s.sets)), *(verdicts.get(v, 0) for v in VERDICTS),
+                _median(sigma), _average(seen), s.width, s.height,
             ]
         )  # fmt: skip
     return rows
@@ -166,9 +178,9 @@ def object_table(stats: Statistics) -> list[list[Cell]]:
             most = float(o.visibility.max()) if len(o.visibility) else math.nan
             rows.append(
                 [
-                    s.name, o.instance, o.obj_id, o.name, o.verdict, o.sigma_mm, o.sigma_deg,
-                    len(o.visibility), _average(o.visibility), most,
-                    *_school_cells(summarise(tried)),
+                    s.name, o.instance, o.name, o.verdict, o.sigma_mm, o.sigma_deg,
+                    *_school_cells(summarise(tried)), len(o.visibility), _average(o.visibility),
+                    most, o.obj_id,
                 ]
             )  # fmt: skip
     return rows
@@ -176,7 +188,7 @@ def object_table(stats: Statistics) -> list[list[Cell]]:
 
 def _school_cells(summary: SchoolSummary) -> Sequence[Cell]:
     return (
-        summary.candidates, summary.with_trajectory, summary.good, summary.bad, summary.score.mean
+        summary.candidates, summary.good, summary.bad, summary.score.mean, summary.with_trajectory
     )  # fmt: skip
 
 

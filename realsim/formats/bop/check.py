@@ -231,7 +231,8 @@ def check_info(
     if shape is not None and shape.box is not None and count_visible:
         off = _box_difference(info["bbox_obj"], shape.box)
         agree = off is not None and off <= BOX_PX
-        found = [round(float(v), 1) for v in shape.box]
+        x0, y0, x1, y1 = (float(v) for v in shape.box)
+        found = [round(v, 1) for v in (x0, y0, x1 - x0, y1 - y0)]
         compare("bbox_obj", f"{found} of projected vertices", agree=agree)
 
 

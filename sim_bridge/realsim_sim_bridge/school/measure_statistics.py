@@ -52,6 +52,10 @@ class ClosureConfusion:
     closed_bad: int
     open_good: int
     open_bad: int
+    friction: float | None = None
+    """Of closure_friction: the greatest level at which a grasp closes; those that close at any
+    level count as closed, also above the friction that physics tried them with. None = of a measure
+    that has one friction only, or no grasp closes."""
 
     @property
     def grasps(self) -> int:
@@ -104,9 +108,11 @@ def closure_confusions(sets: Sequence[GraspSet]) -> tuple[ClosureConfusion, ...]
             continue
         closed = value > 0.5 if name == "dexnet_closure" else np.isfinite(value)
         good = score >= 0.5
+        levels = value[known & closed] if name == "closure_friction" else value[:0]
         found.append(
             ClosureConfusion(
                 closure=name,
+                friction=float(levels.max()) if len(levels) else None,
                 closed_good=int(np.sum(known & closed & good)),
                 closed_bad=int(np.sum(known & closed & ~good)),
                 open_good=int(np.sum(known & ~closed & good)),

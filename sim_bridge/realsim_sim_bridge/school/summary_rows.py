@@ -45,7 +45,7 @@ def rows_of(summary: "SchoolSummary") -> list[tuple[str, str, str]]:
         ("scenes", f"{summary.scenes:,}", "1,035"),
         ("objects", f"{summary.objects:,}", "7,396"),
         ("candidates", f"{summary.candidates:,}", f"{PAPER_CANDIDATES:,}"),
-        ("not tried by physics", f"{summary.outcomes['not_tried']:,}", NOTHING),
+        ("without a score", f"{summary.outcomes['not_tried']:,}", NOTHING),
         ("with trajectory", here(summary.with_trajectory), paper(PAPER_WITH_TRAJECTORY)),
         ("good (s >= 0.5)", here(summary.good), paper(PAPER_GOOD)),
         ("bad (s < 0.5)", here(summary.bad), paper(PAPER_BAD)),
@@ -89,8 +89,9 @@ def _measured_rows(summary: "SchoolSummary") -> list[tuple[str, str, str]]:
     ]
     for c in summary.closures:
         of = f"{c.closure}: "
+        closed = "closed" if c.friction is None else f"closed at some level up to {c.friction:g}"
         rows += [
-            (of + "closed: good, bad", f"{c.closed_good:,}, {c.closed_bad:,}", NOTHING),
+            (of + f"{closed}: good, bad", f"{c.closed_good:,}, {c.closed_bad:,}", NOTHING),
             (of + "not closed: good, bad", f"{c.open_good:,}, {c.open_bad:,}", NOTHING),
             (of + "agrees with good", f"{100 * c.agree:.1f} % of {c.grasps:,}", NOTHING),
         ]

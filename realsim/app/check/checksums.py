@@ -1,0 +1,123 @@
+"""Files against the list of checksums that an export wrote beside them (SHA256SUMS)."""
+
+import hashlib
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from realsim.errors import InputError
+from realsim.formats.export_folder import SUMS_FILE
+
+ABOVE = 2
+"""Folders above the given one that may hold the list: a scene of BOP stands in a split of a root,
+one of GraspNet in scenes/ of it."""
+LINE = re.compile(r"([0-9a-f]{64}) [ *](.+)")
+"""As sha256sum writes it: 64 digits, a space, a mode and the path."""
+LONGEST_LINE = 5000
+"""Characters; a path has 4096 at most."""
+CHUNK = 1 << 20
+"""[bytes] read at a time."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ChecksumReport:
+    """How the files of a folder agree with the list of their checksums."""
+
+    file: str
+    """The list."""
+    listed: int
+    """Files that it lists of the folder."""
+    changed: tuple[str, ...]
+    """Those that hold other bytes, or cannot be read; by their paths beside the list."""
+    missing: tuple[str, ...]
+
+    @property
+    def agrees(self) -> bool:
+        """Whether every listed file is as it was written."""
+        return not self.changed and not self.missing
+
+    def faults(self) -> list[str]:
+        """Return one line for each file that is not as it was written."""
+        return [f"{p}: the file is missing" for p in self.missing] + [
+            f"{p}: other bytes than were written (SHA-256 differs)" for p in self.changed
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return asdict(self) | {"agrees": self.agrees}
+
+
+def checksum_list(folder: Path) -> Path | None:
+    """Return the SHA256SUMS of a folder, or of one up to two levels above that lists its files."""
+    folder = folder.resolve()
+    for home in (folder, *folder.parents[:ABOVE]):
+        path = home / SUMS_FILE
+        if path.is_file() and next(_listed(path, folder), None) is not None:
+            return path
+    return None
+
+
+def check_checksums(
+    path: Path, folder: Path, *, progress: Callable[[int, int], None] | None = None
+) -> ChecksumReport:
+    """Compare the files of a folder with a list of checksums.
+
+    Args:
+        path: the list, of this folder or of one above.
+        folder: files outside it are not looked at.
+        progress: called with (files done, files in all).
+
+    Raises:
+        InputError: the list is none, or names files outside its folder.
+    """
+    folder = folder.resolve()
+    listed = list(_listed(path, folder))
+    changed: list[str] = []
+    missing: list[str] = []
+    for k, (relative, digest) in enumerate(listed):
+        file = path.parent / relative
+        if not file.is_file():
+            missing.append(relative)
+        elif _digest(file) != digest:
+            changed.append(relative)
+        if progress is not None:
+            progress(k + 1, len(listed))
+    return ChecksumReport(
+        file=str(path), listed=len(listed), changed=tuple(changed), missing=tuple(missing)
+    )
+
+
+def _listed(path: Path, folder: Path) -> Iterator[tuple[str, str]]:
+    """Yield (path beside the list, checksum) of every listed file below a folder."""
+    prefix = folder.relative_to(path.parent.resolve()).parts
+    with path.open(encoding="utf-8", errors="surrogateescape", newline="\n") as lines:
+        number = 0
+        while line := lines.readline(LONGEST_LINE):
+            number += 1
+            match = LINE.fullmatch(line.rstrip("\r\n"))
+            if match is None:
+                raise InputError(
+                    f"line {number} of {path} is no checksum as sha256sum writes them (64 "
+                    "hexadecimal digits, two spaces, a path)."
+                )
+            relative = PurePosixPath(match[2])
+            if relative.is_absolute() or ".." in relative.parts or "\0" in match[2]:
+                raise InputError(
+                    f"line {number} of {path} names {match[2]!r}, which is not below its folder."
+                )
+            if relative.parts[: len(prefix)] == prefix:
+                yield str(relative), match[1]
+
+
+def _digest(file: Path) -> str:
+    """Return a file's SHA-256; '' where it cannot be read."""
+    digest = hashlib.sha256()
+    try:
+        with file.open("rb") as stream:
+            while chunk := stream.read(CHUNK):
+                digest.update(chunk)
+    except OSError:
+        return ""
+    return digest.hexdigest()

@@ -1,0 +1,271 @@
+"""One damaged image among sound ones is found and named, whatever the median of all says."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app import cli
+from realsim.app.check.agreement import AgreementConfig, ObjectAgreement, SceneAgreement
+from realsim.app.check.checksums import check_checksums, checksum_list
+from realsim.app.check.dataset import checked_scenes
+from realsim.app.check.tally import (
+    DepthDifference,
+    MaskOverlap,
+    Tally,
+    agreement_of,
+    stray_depth,
+)
+from realsim.errors import InputError
+from tests.support.bop_scenes import edit, write_boxes
+
+IMAGES = (1, 5, 9, 13, 17, 21)
+CONFIG = AgreementConfig()
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A scene with visible masks only and no scene_gt_info.json."""
+    folder = write_boxes(tmp_path / "dataset", count=len(IMAGES))
+    for file in folder.glob("mask/*"):
+        file.unlink()
+    (folder / "mask").rmdir()
+    (folder / "scene_gt_info.json").unlink()
+    return folder
+
+
+def checked(scene: Path) -> SceneAgreement:
+    (found,) = checked_scenes(scene)
+    return found
+
+
+def faulty(found: SceneAgreement) -> dict[int, ObjectAgreement]:
+    return {o.obj_id: o for o in found.objects if o.faults}
+
+
+def check(folder: Path, *more: str) -> Result:
+    return CliRunner().invoke(cli.commands, ["check", str(folder), *more])
+
+
+def test_sound_images_give_no_finding(scene: Path) -> None:
+    found = checked(scene)
+    assert found.agrees, (found.findings, faulty(found))
+    assert found.frames == len(IMAGES) and all(o.visible_iou is not None for o in found.objects)
+
+
+def test_an_object_that_one_image_sees_elsewhere_is_found(scene: Path) -> None:
+    def shift(rows: dict) -> None:
+        t = np.array(rows["9"][1]["cam_t_m2c"])
+        rows["9"][1]["cam_t_m2c"] = np.add(
+            t, [0, 0, 12.0]
+        ).tolist()  # along the view: no mask tells
+
+    edit(scene / "scene_gt.json", shift)
+    found = faulty(checked(scene))
+    assert set(found) == {7}
+    assert "image 9: object 7 stands 12.0 mm from where the other 5 images see it" in " ".join(
+        found[7].faults
+    )
+
+
+def test_one_shifted_mask_is_found(scene: Path) -> None:
+    path = scene / "mask_visib/000013_000001.png"
+    cv2.imwrite(str(path), np.roll(cv2.imread(str(path), 0), 6, axis=1))
+    found = faulty(checked(scene))
+    assert set(found) == {7} and len(found[7].faults) >= 1
+    assert "mask_visib of image 13 has the IoU 0." in found[7].faults[0]
+
+
+@pytest.mark.parametrize(("factor", "way"), [(1.03, "farther"), (0.97, "nearer")])
+def test_one_scaled_depth_image_is_found(scene: Path, factor: float, way: str) -> None:
+    path = scene / "depth/000005.png"
+    cv2.imwrite(str(path), np.round(cv2.imread(str(path), -1) * factor).astype(np.uint16))
+    found = checked(scene)
+    (told,) = found.findings
+    assert told.startswith("depth of image 5 is ") and f"mm {way} than that of the others" in told
+    assert told.endswith(f"scale {factor:.3f}")
+
+
+def test_a_hand_in_front_is_no_damage(scene: Path) -> None:
+    """What has no model but is measured in front hides an object, as BOP's masks say."""
+    visible = scene / "mask_visib/000009_000001.png"
+    mask = cv2.imread(str(visible), 0)
+    columns = np.flatnonzero(mask.any(0))
+    hand = np.zeros(mask.shape, bool)
+    hand[:, columns[: len(columns) // 2]] = True
+    for file in scene.glob("mask_visib/000009_*.png"):
+        cv2.imwrite(str(file), np.where(hand, 0, cv2.imread(str(file), 0)))
+    depth = cv2.imread(str(scene / "depth/000009.png"), -1)
+    cv2.imwrite(str(scene / "depth/000009.png"), np.where(hand, depth // 2, depth))
+    assert faulty(checked(scene)) == {}
+    cv2.imwrite(str(scene / "depth/000009.png"), depth)
+    assert 7 in faulty(checked(scene)), "half a mask that nothing hides is damage"
+
+
+def test_table_json_and_exit_code_say_the_same(scene: Path) -> None:
+    edit(scene / "scene_gt.json", lambda rows: rows["9"][1]["cam_t_m2c"].__setitem__(0, 400.0))
+    result = check(scene, "--json")
+    told = json.loads(result.output)
+    assert result.exit_code == 1 and told["agrees"] is False and told["checksums"] is None
+    by_id = {o["obj_id"]: o["faults"] for o in told["scenes"][0]["objects"]}
+    # Also what the format's own check finds of an object stands with the object.
+    assert any(f.startswith("scene_gt.json, image 9, object 1 (id 7)") for f in by_id[7])
+    assert any("stands" in f for f in by_id[7])
+    table = [line for line in check(scene).output.splitlines() if "│" in line and " 7 " in line]
+    assert table and table[0].rstrip(" │").endswith("no")
+
+
+def test_boxes_are_told_in_one_form(tmp_path: Path) -> None:
+    folder = write_boxes(tmp_path / "dataset")
+    edit(folder / "scene_gt_info.json", lambda d: d["5"][1]["bbox_obj"].__setitem__(0, 3))
+    (fault,) = [f for f in faulty(checked(folder))[7].faults if "projected vertices" in f]
+    said, found = (json.loads(f"[{part.split(']')[0]}]") for part in fault.split("[")[1:3])
+    assert np.abs(np.subtract(said, found))[1:].max() <= 4, "x y w h of both"
+
+
+def test_approximate_labels_are_called_so(scene: Path) -> None:
+    (scene / "scene_gt.json").rename(scene / "scene_gt_rough.json")
+    found = checked(scene)
+    assert found.approximate and any("only a rough start" in n for n in found.notes)
+    shown = " ".join(check(scene).output.split())
+    assert "approximate" in shown and "1 have approximate labels only" in shown
+
+
+# --- laws of the comparison of images -------------------------------------------------------------
+
+
+def seen_at(points_mm: np.ndarray) -> Tally:
+    tally = Tally()
+    for k, p in enumerate(points_mm):
+        tally.note_places(k, [0], [1e-3 * np.asarray(p, float)])
+    return tally
+
+
+def strays(tally: Tally) -> tuple[str, ...]:
+    return agreement_of(8, "", tally, CONFIG).faults
+
+
+def test_images_that_all_differ_have_no_stray_among_them() -> None:
+    rng = np.random.default_rng(0)
+    spread = rng.normal(0, 8.0, (40, 3))
+    assert strays(seen_at(spread)) == ()
+    spread[7] += [150.0, 0, 0]
+    (told,) = strays(seen_at(spread))
+    assert told.startswith("image 7:")
+
+
+def test_it_does_not_matter_where_the_world_begins_or_which_image_comes_first() -> None:
+    points = np.random.default_rng(1).normal(0, 0.5, (9, 3))
+    points[4] += [0, 7.0, 0]
+    told = strays(seen_at(points))
+    assert len(told) == 1 and strays(seen_at(np.add(points, [5e3, -2e3, 10.0]))) == told
+    (turned,) = strays(seen_at(points[::-1]))
+    assert turned == told[0]  # image 4 is the middle one of nine
+
+
+def test_of_two_images_neither_is_accused() -> None:
+    (told,) = strays(seen_at(np.array([[0.0, 0, 0], [9.0, 0, 0]])))
+    assert told == "images 0 and 1: object 8 stands 9.0 mm apart in them"
+    assert strays(seen_at(np.array([[0.0, 0, 0], [4.0, 0, 0]]))) == ()
+
+
+def test_alike_things_that_nothing_tells_apart_are_not_compared() -> None:
+    tally = Tally()
+    for k in range(4):
+        tally.note_places(k, [None, None], [np.zeros(3), np.array([0.3, 0, 0])])
+    assert strays(tally) == ()
+
+
+def test_a_bias_of_one_surface_is_no_bias_of_an_image() -> None:
+    def tally(bias: float, off: dict[int, float]) -> Tally:
+        rows = [
+            DepthDifference(image=k, off_mm=bias + off.get(k, 0.0), scale=1.0, hidden=0.0)
+            for k in range(6)
+        ]
+        return Tally(depth=rows)
+
+    # A shiny thing that is measured 14 mm too far always, and is in some images only.
+    some = tally(14.0, {})
+    some.depth = some.depth[:3]
+    assert stray_depth([tally(0.0, {}), some], CONFIG) == []
+    (told,) = stray_depth([tally(b, {2: -8.0}) for b in (0.0, 3.0, 14.0)], CONFIG)
+    assert told.startswith("depth of image 2 is 8 mm nearer")
+
+
+@pytest.mark.parametrize(("outline_px", "strays_told"), [(0.6, 0), (2.4, 1)])
+def test_a_half_hidden_thing_is_all_outline(outline_px: float, strays_told: int) -> None:
+    """The same IoU is a rounded pose of a sliver, or a wrong mask of something large."""
+    sound = [MaskOverlap(image=k, iou=0.98, outline_px=0.2) for k in range(6)]
+    tally = Tally(visible=[*sound, MaskOverlap(image=6, iou=0.8, outline_px=outline_px)])
+    assert len(strays(tally)) == strays_told
+
+
+def test_masks_that_differ_in_all_images_have_no_stray_among_them() -> None:
+    rng = np.random.default_rng(2)
+    lacking = rng.uniform(0.04, 0.12, 30)
+    found = [MaskOverlap(image=k, iou=1 - x, outline_px=15 * x) for k, x in enumerate(lacking)]
+    assert strays(Tally(mask=found)) == ()
+    (told,) = strays(Tally(mask=[*found, MaskOverlap(image=30, iou=0.6, outline_px=6.0)]))
+    assert told.startswith("mask of image 30 has the IoU 0.60")
+
+
+def test_many_strays_are_counted_not_listed() -> None:
+    points = np.zeros((40, 3))
+    points[:12, 0] = 50.0 + np.arange(12)
+    told = strays(seen_at(points))
+    assert len(told) == 6 and told[0].startswith("image 11:") and "7 images more" in told[-1]
+
+
+# --- checksums ------------------------------------------------------------------------------------
+
+
+def summed(root: Path) -> Path:
+    """Write SHA256SUMS of a folder, as `realsim export` does."""
+    files = sorted(p for p in root.rglob("*") if p.is_file())
+    lines = [f"{hashlib.sha256(p.read_bytes()).hexdigest()}  {p.relative_to(root)}" for p in files]
+    (root / "SHA256SUMS").write_text("\n".join(lines) + "\n")
+    return root
+
+
+def test_files_are_held_against_their_checksums(scene: Path) -> None:
+    root = summed(scene.parents[1])
+    for folder in (root, scene.parent, scene):
+        told = json.loads(check(folder, "--json").output)
+        assert told["agrees"] and told["checksums"]["listed"] > 0
+    colour = scene / "rgb/000009.png"
+    colour.write_bytes(colour.read_bytes() + b"\0")
+    (scene / "rgb/000013.png").unlink()
+    result = check(scene, "--json")
+    report = json.loads(result.output)["checksums"]
+    assert result.exit_code == 1
+    assert report["changed"] == ["test/000003/rgb/000009.png"]
+    assert report["missing"] == ["test/000003/rgb/000013.png"]
+    shown = " ".join(check(root).output.split())
+    assert "rgb/000009.png: other bytes" in shown and "rgb/000013.png: the file is" in shown
+    # What lies beside the given folder is not its matter.
+    assert check(root / "models").exit_code == 0
+
+
+def test_an_export_of_another_format_is_checked_by_its_sums(tmp_path: Path) -> None:
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "sparse/cameras.txt").write_text("1 PINHOLE")
+    assert isinstance(check(tmp_path).exception, InputError)
+    summed(tmp_path)
+    result = check(tmp_path)
+    assert result.exit_code == 0 and "only checksums were compared" in result.output
+    (tmp_path / "sparse/cameras.txt").write_text("1 SIMPLE")
+    assert check(tmp_path).exit_code == 1
+
+
+@pytest.mark.parametrize("line", ["a" * 64 + "  ../secret", "b" * 64 + "  /etc/hosts", "no sum"])
+def test_a_list_that_is_none_or_leads_out_is_refused(tmp_path: Path, line: str) -> None:
+    (tmp_path / "file").write_text("x")
+    (summed(tmp_path) / "SHA256SUMS").open("a").write(line + "\n")
+    path = checksum_list(tmp_path)
+    assert path is not None
+    with pytest.raises(InputError, match="line 2 of"):
+        check_checksums(path, tmp_path)
