@@ -162,13 +162,14 @@ def capture_command(
 def check(session: Path, repair: bool, decode: bool, as_json: bool) -> None:
     """Verify every checksum of SESSION and say what is missing or damaged.
 
-    SESSION may also be a BOP or GraspNet data set: then masks, boxes, counts, poses and depth are
-    held against each other and against the rendered models.
-
     Sessions inside it (calibration/capture) are checked, too. Nothing is changed without --repair,
     which takes out what is damaged, and only that: the views concerned can be captured again.
 
-    Exit codes: 0 sound, 1 damaged, 2 not a session.
+    SESSION may also be a BOP or GraspNet data set: masks, boxes, counts, poses and depth are held
+    against each other, image against image, and against the rendered models; or any export of
+    `realsim export`: its SHA256SUMS are verified.
+
+    Exit codes: 0 sound, 1 damaged or contradictory, 2 none of these.
     """
     from realsim.app.check.session import run_check
 
