@@ -111,7 +111,8 @@ def test_the_notes_tell_how_each_attempt_ended(school, written):
 
 def test_the_page_shows_pictures_and_points_at_the_videos(written):
     page = (written / "demonstrations.html").read_text()
-    assert page.count("data:image/jpeg;base64,") == 3
+    assert page.count('<img alt="steps" src="data:image/jpeg;base64,') == 3
+    assert page.count('poster="data:image/jpeg;base64,') == page.count("<video ") == 6
     sources = re.findall(r'src="(videos/[^"#]+)#t=', page)
     assert len(sources) == 6
     assert all((written / s).is_file() for s in sources)
@@ -127,6 +128,7 @@ def test_checksums_and_card_are_there(written):
     assert not (written / ".export").exists()
 
 
+@pytest.mark.slow
 def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
     school, written, tmp_path, monkeypatch
 ):

@@ -2,7 +2,7 @@
 
 import html
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -22,6 +22,8 @@ COLUMNS = 8
 """Pictures of a row."""
 PICTURE_PX = 200
 """Width of a picture."""
+POSTER_PX = 240
+"""Width of what a video shows before it is played: its middle, as large as the player."""
 _PAGE = Template("""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>Demonstrations</title><style>
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 1700px; padding: 0 1em }
@@ -98,37 +100,53 @@ def _section(
         place = {n: row[f"videos/{camera}/{n}"] for n in ("chunk_index", "file_index")}
         path = layout.VIDEO_PATH.format(video_key=camera, **place)
         begin = row[f"videos/{camera}/from_timestamp"]
-        strips.append(_strip(folder / path, round(begin * fps), times))
+        middle = int(row["length"]) // 2
+        seen = _pictures(folder / path, round(begin * fps), {*times.tolist(), middle})
+        strips.append(
+            np.concatenate([_scaled(seen[k], PICTURE_PX) for k in times.tolist()], axis=1)
+        )
         span = f"#t={begin:g},{row[f'videos/{camera}/to_timestamp']:g}"
-        videos.append(f'<video controls muted preload="none" src="{html.escape(path + span)}">'
-                      "</video>")  # fmt: skip
-    picture = _inline(np.concatenate(strips)) if strips else ""
+        videos.append(
+            f'<video controls muted preload="none" src="{html.escape(path + span)}" '
+            f'poster="{_inline(_scaled(seen[middle], POSTER_PX))}"></video>'
+        )
+    picture = f'<img alt="steps" src="{_inline(np.concatenate(strips))}">' if strips else ""
     return (
         f"<h2>{html.escape(title)}</h2><p>{html.escape(said)}</p>{picture}<p>{''.join(videos)}</p>"
     )
 
 
-def _strip(path: Path, first: int, times: NDArray[np.int64]) -> Rgb:
-    """Return the pictures of some steps side by side."""
-    import cv2
+def _pictures(path: Path, first: int, steps: Collection[int]) -> dict[int, Rgb]:
+    """Return the pictures (H, W, 3) of some steps of an episode, by step.
 
-    wanted = (first + times).tolist()
+    Args:
+        path: of the video.
+        first: frame that the episode begins with.
+        steps: which.
+    """
     found: dict[int, Rgb] = {}
     for k, (_, rgb) in enumerate(read_video(path)):
-        if k in wanted:
-            size = PICTURE_PX, round(PICTURE_PX * rgb.shape[0] / rgb.shape[1])
-            found[k] = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-        if k >= wanted[-1]:
+        if k - first in steps:
+            found[k - first] = rgb
+        if k - first >= max(steps):
             break
-    return np.concatenate([found[k] for k in wanted], axis=1)
+    return found
+
+
+def _scaled(rgb: Rgb, width_px: int) -> Rgb:
+    """Return a picture of another width."""
+    import cv2
+
+    size = width_px, round(width_px * rgb.shape[0] / rgb.shape[1])
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _inline(rgb: Rgb) -> str:
-    """Return a picture as part of the page."""
+    """Return a picture as an address that holds it."""
     import base64
 
     import cv2
 
     quality = [cv2.IMWRITE_JPEG_QUALITY, 85]
     data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), quality)[1].tobytes()
-    return f'<img alt="steps" src="data:image/jpeg;base64,{base64.b64encode(data).decode()}">'
+    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"

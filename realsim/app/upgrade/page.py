@@ -38,6 +38,8 @@ MARGIN = 0.35
 """Surroundings on each side of the object [share of its size in the picture]."""
 LEAST_SIDE_PX = 96
 """Of what is cut out: a small object alone does not show where it stands."""
+THICKNESS_PX = (1, 2)
+"""Of the outlines of the given pose and of the refined one, which is drawn over it."""
 BEFORE_RGB = (245, 60, 200)
 """Of the pose that was given: a colour that no verdict has."""
 
@@ -59,9 +61,9 @@ def write_page(
         sections.append(
             Sliders(
                 title="Before and after", pairs=pairs,
-                text="Left of the handle the pose as the data set has it (magenta), right of it "
-                f"the refined one in the colour of its verdict; whole outlines, as if nothing "
-                f"stood in front. Worst first.{more}",
+                text="Magenta and thin, on both sides of the handle: the pose as the data set has "
+                "it. Right of the handle also the refined one, in the colour of its verdict. "
+                f"Whole outlines, as if nothing stood in front. Worst first.{more}",
             )
         )  # fmt: skip
     sections.append(
@@ -78,11 +80,33 @@ def write_page(
         sections.append(
             Table(title="Analytic grasps, tried", header=LEVEL_HEADER, rows=rows, text=text)
         )
-    notes = [f"{place} was left out: {why}" for place, why in failed.items()]
-    notes += [f"{r['place']}: {note}" for r in records for note in r["notes"]]
+    notes = [(place, f"was left out: {why}") for place, why in failed.items()]
+    notes += [(str(r["place"]), str(note)) for r in records for note in r["notes"]]
+    if notes:
+        sections.append(
+            Table(
+                title="Notes", header=["scene", "note"], rows=notes[:ROWS],
+                text="" if len(notes) <= ROWS else
+                f"The first {ROWS} of {len(notes)}; upgrade.json has all.",
+            )
+        )  # fmt: skip
     return picture_page(
-        out / PAGE, "Upgraded data set", sections, about=summary_line(summary), notes=notes[:60]
-    )
+        out / PAGE, "Upgraded data set", sections, about=summary_line(summary),
+        notes=notes_line(notes, len(failed)),
+    )  # fmt: skip
+
+
+def notes_line(notes: Sequence[tuple[str, str]], left_out: int) -> list[str]:
+    """Return the banner that says that there are notes (scene, note); none without any."""
+    if not notes:
+        return []
+    scenes = len({place for place, _ in notes})
+    lost = f"{_counted(left_out, 'scene')} left out; " if left_out else ""
+    return [f"{lost}{_counted(len(notes), 'note')} on {_counted(scenes, 'scene')}: see below."]
+
+
+def _counted(n: int, word: str) -> str:
+    return f"{n} {word}" if n == 1 else f"{n} {word}s"
 
 
 def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> Pair:
@@ -110,8 +134,8 @@ def _pictures(
             FirstSurfaces([PlacedMesh(0, mesh, T)]).look(store.session.intrinsics, np.eye(4))[0]
             for T in Ts
         ]
-        color = BEFORE_RGB if k == 0 else VERDICT_RGB.get(o["verdict"], (255, 255, 255))
-        return _cropped(store.rgb(int(shown["image"])), masks, k, color)
+        refined = VERDICT_RGB.get(o["verdict"], (255, 255, 255))
+        return _cropped(store.rgb(int(shown["image"])), masks, [BEFORE_RGB, refined][: k + 1])
 
     return (lambda: drawn(0)), (lambda: drawn(1))
 
@@ -125,9 +149,15 @@ def _scene(folder: Path) -> tuple[SessionStore, dict[int, ObjectModel]]:
 
 
 def _cropped(
-    rgb: Image, masks: Sequence[NDArray[np.int32]], k: int, color: tuple[int, int, int]
+    rgb: Image, masks: Sequence[NDArray[np.int32]], colors: Sequence[tuple[int, int, int]]
 ) -> Image:
-    """Return the part of a photograph around both outlines, enlarged, with the k-th drawn."""
+    """Return the part of a photograph around all outlines, enlarged.
+
+    Args:
+        rgb: (H, W, 3).
+        masks: (H, W) each, negative beside the object.
+        colors: of the first outlines; those without one are not drawn.
+    """
     import cv2
 
     height, width = rgb.shape[:2]
@@ -141,5 +171,9 @@ def _cropped(
     window = slice(int(y), int(y) + side), slice(int(x), int(x) + side)
     big = (CROP_WIDTH_PX, CROP_WIDTH_PX)
     picture = np.asarray(cv2.resize(rgb[window], big, interpolation=cv2.INTER_CUBIC), np.uint8)
-    ids = np.asarray(cv2.resize(masks[k][window], big, interpolation=cv2.INTER_NEAREST), np.int32)
-    return draw_outlines(picture, ids, colors={0: color})
+    for mask, color, thickness in zip(masks, colors, THICKNESS_PX, strict=False):
+        # Linear between pixels, or an enlarged outline would be stairs.
+        covered = cv2.resize((mask[window] >= 0).astype(np.float32), big)
+        ids = np.where(np.asarray(covered) >= 0.5, 0, -1).astype(np.int32)
+        picture = draw_outlines(picture, ids, colors={0: color}, thickness=thickness)
+    return picture

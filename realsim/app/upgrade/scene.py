@@ -20,6 +20,7 @@ from realsim.app.upgrade.files import NOTE, keep_imported, key_of
 from realsim.app.upgrade.instances import moved_from_start, world_starts
 from realsim.app.upgrade.source import SceneSource, prepare
 from realsim.formats import images
+from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry import se3
 from realsim.records import CaptureSession, GraspSet, ObjectPose, Scene, View
 from realsim.store import SessionStore
@@ -197,12 +198,15 @@ def _number(value: float | None) -> float | None:
 
 
 def _grasp_counts(found: GraspSet | None) -> Record:
-    """Return how many grasps of an object were tried and are good, and why none was."""
+    """Return how many grasps of an object physics tried and are good, and why there is none.
+
+    Grasps that collide or that the arm cannot reach are candidates, but were not tried.
+    """
     if found is None:
         return {"candidates": 0, "tried": 0, "good": 0, "why_none": "its pose was rejected"}
     return {
         "candidates": len(found),
-        "tried": int(np.isfinite(found.scores).sum()),
+        "tried": int(executed(found).sum()),
         "good": int(found.good.sum()),
         "why_none": why_no_grasp(found) if len(found) == 0 else "",
     }

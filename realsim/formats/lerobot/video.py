@@ -19,8 +19,12 @@ from realsim.formats.lerobot.layout import PIXELS
 
 Rgb = NDArray[np.uint8]
 ENCODER = "libx264"
-OPTIONS = {"g": "2", "crf": "23", "bf": "0"}
-"""Key frames, quality (x264's own default), and no frames that refer to later ones."""
+OPTIONS = {"g": "2", "crf": "23", "bf": "0", "mbtree": "0"}
+"""Key frames, quality (x264's own default), and no frames that refer to later ones.
+
+x264's tree of macroblocks, which weighs blocks by what later frames take from them, gives other
+bytes from the same pictures in one video of a hundred (64 x 48 px); without it 1200 were alike. Its
+use ends at the next key frame: files are 5 % larger without it, and 0.15 dB better."""
 
 
 def import_av() -> Any:

@@ -1,7 +1,7 @@
-"""Where demonstrations are seen from: beside the table, from a view of the session, from the hand.
+"""Where demonstrations are seen from: from a view of the session, from the hand.
 
-Pictures have square pixels and no distortion. The hand's camera is on Franka's usual mount unless
-another pose is given.
+The camera beside the table is placed in `front_view`. Pictures have square pixels and no
+distortion. The hand's camera is on Franka's usual mount unless another pose is given.
 """
 
 from dataclasses import replace
@@ -19,12 +19,6 @@ Array = NDArray[np.float64]
 SIZE_PX = (320, 240)
 """Width and height of the pictures: what policies are fed with, or a little more."""
 FRONT, WRIST = "front", "wrist"
-FRONT_VIEW_DEG = 50.0
-"""Horizontal angle of view of the camera beside the table: arm and scene fill the picture."""
-FRONT_FROM = (0.78, -0.5, 0.5)
-"""Where it stands from the middle of the scene, in metres; the arm's base is towards -x."""
-FRONT_AT_M = 0.14
-"""Height over the table of what it looks at [m]: half of the lift."""
 WRIST_VIEW_DEG = 69.0
 """Horizontal angle of view of the hand's camera: a RealSense D435's colour camera."""
 WRIST_AT_M = (0.075, 0.0, -0.055)
@@ -39,19 +33,6 @@ def view_intrinsics(view_deg: float, size_px: tuple[int, int] = SIZE_PX) -> Came
     f = width / 2.0 / np.tan(np.radians(view_deg) / 2.0)
     return CameraIntrinsics(
         width=width, height=height, fx=f, fy=f, cx=(width - 1) / 2.0, cy=(height - 1) / 2.0
-    )
-
-
-def front_camera(
-    middle_xy: tuple[float, float], size_px: tuple[int, int] = SIZE_PX
-) -> DemonstrationCamera:
-    """Return a camera beside the table that sees the scene, the lifted object and the arm."""
-    at = np.array([*middle_xy, 0.0])
-    eye = at + FRONT_FROM
-    return DemonstrationCamera(
-        name=FRONT,
-        intrinsics=view_intrinsics(FRONT_VIEW_DEG, size_px),
-        T_frame_cam=se3.look_at(eye, np.array([*middle_xy, FRONT_AT_M])),
     )
 
 

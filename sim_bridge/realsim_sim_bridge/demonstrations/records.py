@@ -71,7 +71,7 @@ class AttemptOutcome:
     agrees: bool
     """Whether the replay ended in the stored stage with the stored score."""
     disagreement: str
-    """How the replay differs from what is stored; '' = in nothing."""
+    """How the replay differs from what is stored, in words; '' = in nothing that is seen."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 SAME = 1e-9
 """Largest difference of a slip [m, rad] and score that is rounding: a replay that agrees this well
 is the attempt itself."""
+ALIKE_M, ALIKE_RAD = 1e-3, np.radians(1.0)
+"""Differences of a slip that nobody sees in the pictures [m, rad]; stage and score being the same,
+nothing is said of them."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -177,16 +180,32 @@ def _held(
 def _disagreement(
     grasps: GraspSet, row: int, slip_m: Array, slip_rad: Array, base: float, score: float
 ) -> str:
-    """Return how a replay differs from what is stored; '' = it does not."""
+    """Return in words how a replay differs from what is stored; '' = in nothing that is seen."""
     if base != grasps.base_scores[row]:
         passed = round(len(STAGES) * float(base)), round(len(STAGES) * grasps.base_scores[row])
-        return f"{passed[0]} stages were passed in the replay, {passed[1]} are stored"
+        return (
+            f"the replay ends otherwise than the school's attempt: it passes {passed[0]} of "
+            f"{len(STAGES)} stages, the attempt passed {passed[1]}"
+        )
     if abs(score - grasps.scores[row]) > SAME:
-        return f"the replay scores {score:.4f}, {grasps.scores[row]:.4f} is stored"
-    stored = np.concatenate([grasps.slip_m[row], grasps.slip_rad[row]])
-    found = np.concatenate([slip_m, slip_rad])
-    if not np.allclose(found, stored, rtol=0.0, atol=SAME, equal_nan=True):
-        both = np.isfinite(stored) & np.isfinite(found)
-        worst = float(np.abs(found - stored)[both].max()) if both.any() else np.inf
-        return f"slips differ from the stored ones by up to {worst:.2g} (m, rad)"
-    return ""
+        return (
+            "the replay passes as many stages as the school's attempt, but is scored "
+            f"{score:.4f}, the attempt {grasps.scores[row]:.4f}"
+        )
+    slipped, far = _largest_difference(slip_m, grasps.slip_m[row])
+    turned, wide = _largest_difference(slip_rad, grasps.slip_rad[row])
+    if far or wide:
+        return "the object is lost in only one of the replay and the school's attempt"
+    if slipped <= ALIKE_M and turned <= ALIKE_RAD:
+        return ""
+    return (
+        "stage and score are those of the school's attempt, but the object's slip differs by up to "
+        f"{1e3 * slipped:.1f} mm and {np.degrees(turned):.1f} deg"
+    )
+
+
+def _largest_difference(found: Array, stored: Array) -> tuple[float, bool]:
+    """Return by how much slips (4,) differ at most, and whether one has another without end."""
+    both = np.isfinite(stored) & np.isfinite(found)
+    largest = float(np.abs(found[both] - stored[both]).max()) if both.any() else 0.0
+    return largest, not np.array_equal(found[~both], stored[~both], equal_nan=True)

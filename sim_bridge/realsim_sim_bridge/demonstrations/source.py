@@ -24,8 +24,9 @@ from realsim.records import Mesh, ObjectModel
 from realsim.records.trajectories import PHASES
 from realsim_sim_bridge.arm.reach_config import base_on_table
 from realsim_sim_bridge.demonstrations.attempt_motion import Attempt, AttemptMotion, attempt_motion
-from realsim_sim_bridge.demonstrations.cameras import front_camera, wrist_camera
+from realsim_sim_bridge.demonstrations.cameras import wrist_camera
 from realsim_sim_bridge.demonstrations.falling import FallConfig
+from realsim_sim_bridge.demonstrations.front_view import FrontView, happening, placed_front
 from realsim_sim_bridge.demonstrations.pictures import StepPictures, drawn_mesh
 from realsim_sim_bridge.demonstrations.recorded_worlds import RecordedEngine
 from realsim_sim_bridge.demonstrations.records import (
@@ -101,7 +102,7 @@ class Demonstration:
         """What a person should know of it."""
         notes = list(self.motion.notes)
         if self.outcome.disagreement:
-            notes.append(f"the replay is not the attempt: {self.outcome.disagreement}.")
+            notes.append(f"{self.outcome.disagreement}.")
         for camera in self.scenery.cameras.values():
             if camera.on_hand:
                 Ts = self.scenery.T_table_base @ self.motion.Ts_base_ee @ camera.T_frame_cam
@@ -161,7 +162,7 @@ class DemonstrationSource(Sequence[Demonstration]):
         models: Mapping[int, ObjectModel],
         config: DemonstrationConfig | None = None,
         *,
-        cameras: Sequence[DemonstrationCamera] | None = None,
+        cameras: Sequence[DemonstrationCamera | FrontView] | None = None,
         solids: Mapping[int, KnownSolid] | None = None,
         cache: Path | None = None,
     ) -> None:
@@ -171,7 +172,8 @@ class DemonstrationSource(Sequence[Demonstration]):
             grasps: the sets with their trajectories and poses (`app.school_files.stored_grasps`).
             models: the objects by id.
             config: rate of the steps.
-            cameras: None = one beside the table, one in the hand.
+            cameras: None = one beside the table, one in the hand. A `FrontView` is placed where
+                it sees what happens.
             solids: convex parts and matter by object id, as far as a library knew them when the
                 school was run.
             cache: folder of the school's convex parts (grasps/cache); None = they are computed.
@@ -288,7 +290,7 @@ class DemonstrationSource(Sequence[Demonstration]):
                     "scene since the school was run. Run `realsim school` again."
                 )
 
-    def _scenery(self, cameras: Sequence[DemonstrationCamera] | None) -> Scenery:
+    def _scenery(self, cameras: Sequence[DemonstrationCamera | FrontView] | None) -> Scenery:
         assert self._grasps.T_world_table is not None, "the constructor has looked"
         T_table_world = se3.invert(self._grasps.T_world_table)
         first = next(iter(self._sets.values()))
@@ -299,17 +301,21 @@ class DemonstrationSource(Sequence[Demonstration]):
                 "(parameters.middle_xy_m); run `realsim school` again."
             )
         middle = (float(given[0]), float(given[1]))  # pyright: ignore[reportUnknownArgumentType]
-        chosen = (front_camera(middle), wrist_camera()) if cameras is None else tuple(cameras)
-        named = {c.name: c for c in chosen}
-        if len(named) != len(chosen):
+        models = {i: self._models[s.obj_id] for i, s in self._sets.items()}
+        Ts_table_obj = {i: T_table_world @ self._grasps.Ts_world_obj[i] for i in self._sets}
+        T_table_base = base_on_table(middle, self._configs[first.instance].reach)
+        asked = (FrontView(), wrist_camera()) if cameras is None else tuple(cameras)
+        if len({c.name for c in asked}) != len(asked):
             raise InputError("two cameras have the same name; pictures would be mixed up.")
+        seen = happening(self._grasps, models, Ts_table_obj, T_table_base)
+        chosen = [placed_front(c, seen) if isinstance(c, FrontView) else c for c in asked]
         drawn = {o: drawn_mesh(self._models[o].mesh) for o in {s.obj_id for s in self._grasps.sets}}
         return Scenery(
-            cameras=named,
+            cameras={c.name: c for c in chosen},
             looks={i: drawn[s.obj_id] for i, s in self._sets.items()},
-            models={i: self._models[s.obj_id] for i, s in self._sets.items()},
-            Ts_table_obj={i: T_table_world @ self._grasps.Ts_world_obj[i] for i in self._sets},
-            T_table_base=base_on_table(middle, self._configs[first.instance].reach),
+            models=models,
+            Ts_table_obj=Ts_table_obj,
+            T_table_base=T_table_base,
             middle_xy=middle,
         )
 

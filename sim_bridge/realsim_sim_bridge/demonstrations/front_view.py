@@ -1,0 +1,201 @@
+"""Where the camera beside the table stands: as near as what happens lets it.
+
+Its picture holds the objects where they stand, and fingers and object from the pre-grasps to the
+ends of the lifts of all attempts; in the swings that follow, a wide one may leave it. The hand
+behind the fingers is not asked for, or the objects would be a fifth smaller.
+
+Of the directions from which a person would look, from opposite the arm's base and to the sides,
+the one is taken that shows most: the share of grasps that the arm does not hide, times the size of
+the objects in the picture.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.formats.grasps.scene_grasps import SceneGrasps
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, ObjectModel
+from realsim.records.trajectories import PHASES
+from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.demonstrations.cameras import FRONT, SIZE_PX, view_intrinsics
+from realsim_sim_bridge.demonstrations.records import DemonstrationCamera
+
+Array = NDArray[np.float64]
+VIEW_DEG = 40.0
+"""Horizontal angle of view: as a person's that looks at a table from an arm's length or two."""
+AZIMUTHS_DEG = (0.0, -30.0, 30.0, -60.0, 60.0)
+"""Directions that are tried, from opposite the arm's base; of equal ones the first is taken."""
+ELEVATIONS_DEG = (25.0, 35.0, 45.0)
+"""Heights that are tried: lower, objects hide one another; higher, a lift is hardly seen."""
+BORDER = 0.04
+"""Share of the picture that stays free along each side."""
+FINGERS_M = np.array(
+    [[x, y, z] for x in (-0.012, 0.012) for y in (-0.05, 0.05) for z in (-0.0584, 0.0)]
+)
+"""(8, 3) corners of the opened fingers in the grasp frame [m]."""
+HAND_RADIUS_M, ARM_RADIUS_M = 0.035, 0.06
+"""Half the thickness of the hand over its fingers, and of the arm's links [m]."""
+PALM_M = np.array([[0.0, y, -0.075] for y in np.linspace(-0.1, 0.1, 9)])
+"""(9, 3) points of the hand over its fingers, in the grasp frame [m]."""
+ON_A_LINK = 8
+"""Points between two joints that stand for a link."""
+APPROACH, CLOSE, LIFT = (PHASES.index(name) for name in ("approach", "close", "lift"))
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class FrontView:
+    """A fixed camera that a source places where it sees what happens."""
+
+    size_px: tuple[int, int] = SIZE_PX
+    """Width and height of its pictures."""
+    name: str = FRONT
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Happening:
+    """What is to be seen; points in the table's frame [m]."""
+
+    standing: Array
+    """(N, 3) extreme points of the objects where they stand."""
+    moving: Array
+    """(M, 3) extreme points of the fingers, and of the object that they hold, on their ways."""
+    grasps: Array
+    """(A, 3) between the fingertips as they close."""
+    hands: Array
+    """(A, H, 3) points in the hand over its fingers, then."""
+    arms: Array
+    """(A, L, 3) points in the arm, then."""
+    away_from_base: Array
+    """(2,) horizontal direction from the arm's base over the scene, of length 1."""
+
+
+def placed_front(view: FrontView, seen: Happening) -> DemonstrationCamera:
+    """Return the camera that shows most of what happens."""
+    intrinsics = view_intrinsics(VIEW_DEG, view.size_px)
+    best: tuple[float, Array] | None = None
+    for azimuth in np.radians(AZIMUTHS_DEG).tolist():
+        for elevation in np.radians(ELEVATIONS_DEG).tolist():
+            ahead = np.append(se3.exp_so3([0, 0, azimuth])[:2, :2] @ seen.away_from_base, 0.0)
+            towards = np.cos(elevation) * ahead + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
+            T = nearest_camera(np.concatenate([seen.standing, seen.moving]), towards, intrinsics)
+            size = float(np.mean(1.0 / se3.transform(se3.invert(T), seen.standing)[:, 2]))
+            worth = size * float(np.mean(~hidden(seen, T[:3, 3])))
+            # Equal up to rounding: the first stays.
+            if best is None or worth > best[0] * (1.0 + 1e-6):
+                best = worth, T
+    assert best is not None, "directions are tried"
+    return DemonstrationCamera(name=view.name, intrinsics=intrinsics, T_frame_cam=best[1])
+
+
+def nearest_camera(points: Array, towards: Array, intrinsics: CameraIntrinsics) -> Array:
+    """Return T_table_cam (4, 4) of the nearest camera of a direction that sees all points [m].
+
+    Turned into the camera's axes, a point p is in the picture of a camera at c where
+    |p_x - c_x| <= s_x (p_z - c_z), and likewise in y: bounds that are linear in c. The largest c_z
+    that they leave follows from the extremes of p_x + s_x p_z and p_x - s_x p_z.
+
+    Args:
+        points: (N, 3) table frame.
+        towards: (3,) direction from the scene to the camera, not upright.
+        intrinsics: of the camera.
+    """
+    R = se3.look_at(towards, np.zeros(3))[:3, :3]
+    x, y, z = (points @ R).T
+    c_z, low_high = np.inf, list[tuple[float, float, float]]()
+    for p, half, f in ((x, intrinsics.width, intrinsics.fx), (y, intrinsics.height, intrinsics.fy)):
+        s = (0.5 - BORDER) * half / f
+        low, high = float(np.max(p - s * z)), float(np.min(p + s * z))
+        low_high.append((low, high, s))
+        c_z = min(c_z, (high - low) / (2.0 * s))
+    c = [(low + high) / 2.0 for low, high, _ in low_high]
+    return se3.from_rt(R, R @ np.array([*c, c_z]))
+
+
+def hidden(seen: Happening, eye: Array) -> NDArray[np.bool_]:
+    """Return (A,) which grasps are behind hand or arm for a camera at `eye` (3,) [m]."""
+    out = np.zeros(len(seen.grasps), dtype=np.bool_)
+    ways = eye - seen.grasps
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    for parts, radius in ((seen.hands, HAND_RADIUS_M), (seen.arms, ARM_RADIUS_M)):
+        offsets = parts - seen.grasps[:, None]
+        along = np.einsum("apk,ak->ap", offsets, ways)
+        beside = np.linalg.norm(offsets - along[..., None] * ways[:, None], axis=2)
+        out |= np.any((along > 0) & (beside < radius), axis=1)
+    return out
+
+
+def happening(
+    grasps: SceneGrasps,
+    models: Mapping[int, ObjectModel],
+    Ts_table_obj: Mapping[int, Array],
+    T_table_base: Array,
+) -> Happening:
+    """Return what happens in all attempts of a scene.
+
+    Args:
+        grasps: the sets with their trajectories.
+        models: the objects, by instance.
+        Ts_table_obj: (4, 4) where they stand [m], by instance.
+        T_table_base: (4, 4) the arm's base [m].
+    """
+    extremes = {i: _extremes(model) for i, model in models.items()}
+    standing = [se3.transform(T, extremes[i]) for i, T in Ts_table_obj.items()]
+    moving: list[Array] = []
+    closed: list[Array] = []
+    for s in grasps.sets:
+        attempts = grasps.trajectories.get(s.instance)
+        for row in [] if attempts is None else attempts.rows.tolist():
+            assert attempts is not None
+            rows = attempts.attempt(row)
+            joints, phase = attempts.joints_rad[rows], attempts.phase[rows]
+            at = _turning_points(phase)
+            Ts = T_table_base @ panda.forward(joints[at])
+            moving.append(_placed(Ts, FINGERS_M))
+            in_hand = se3.transform(se3.invert(s.Ts_obj_grasp[row]), extremes[s.instance])
+            moving.append(_placed(Ts[phase[at] >= CLOSE], in_hand))
+            closed.append(joints[np.argmax(phase >= CLOSE)])
+    frames = T_table_base @ panda.link_frames(np.array(closed))
+    origins = np.concatenate([frames[:, :-1, :3, 3], _flange(frames[:, -1])[:, None]], axis=1)
+    share = np.linspace(0.0, 1.0, ON_A_LINK)[:, None, None, None]
+    links = (1.0 - share) * origins[None, :, :-1] + share * origins[None, :, 1:]
+    stand = np.concatenate(standing)
+    away = stand.mean(axis=0)[:2] - T_table_base[:2, 3]
+    length = float(np.linalg.norm(away))
+    return Happening(
+        standing=stand,
+        moving=np.concatenate(moving),
+        grasps=frames[:, -1, :3, 3],
+        hands=np.stack([se3.transform(T, PALM_M) for T in frames[:, -1]]),
+        arms=np.moveaxis(links, 0, 1).reshape(len(closed), -1, 3),
+        away_from_base=away / length if length > 1e-6 else np.array([1.0, 0.0]),
+    )
+
+
+def _turning_points(phase: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the samples of an attempt at the ends of its straight ways: pre-grasp to lift.
+
+    On its way to the pre-grasp the hand comes from wherever the arm rests.
+    """
+    ways = np.nonzero((phase >= APPROACH) & (phase <= LIFT))[0]
+    ends = ways[np.nonzero(np.diff(phase[ways]))[0]]
+    return np.unique(np.concatenate([ways[:1], ends, ways[-1:]]))
+
+
+def _flange(Ts_table_grasp: Array) -> Array:
+    """Return where the hand is mounted (A, 3) [m]."""
+    return Ts_table_grasp[:, :3, 3] - panda.TCP_M * Ts_table_grasp[:, :3, 2]
+
+
+def _placed(Ts: Array, points: Array) -> Array:
+    """Return points (P, 3) at each of the poses (S, 4, 4), as one list (S * P, 3)."""
+    return (points @ np.swapaxes(Ts[:, :3, :3], 1, 2) + Ts[:, None, :3, 3]).reshape(-1, 3)
+
+
+def _extremes(model: ObjectModel) -> Array:
+    """Return the outermost vertices of an object in some directions (P, 3) [m]."""
+    steps = np.array(np.meshgrid(*[(-1.0, 0.0, 1.0)] * 3)).reshape(3, -1).T
+    v = model.mesh.vertices
+    return v[np.unique(np.argmax(v @ steps[np.any(steps != 0, axis=1)].T, axis=0))]
