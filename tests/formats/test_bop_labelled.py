@@ -347,3 +347,15 @@ def test_broken_labels_end_in_an_input_error(tmp_path, text):
     for reader in (open_labelled_bop, lambda root: read_scene(find_scenes(root)[0])):
         with pytest.raises(InputError):
             reader(tmp_path)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1 / 640])
+def test_a_camera_of_another_image_size_is_named(tmp_path, scale):
+    def shrink(cameras):
+        for row in cameras.values():
+            row["cam_K"] = [x * scale if k < 6 else x for k, x in enumerate(row["cam_K"])]
+
+    folder = write_boxes(tmp_path)
+    edit(folder / "scene_camera.json", shrink)
+    with pytest.raises(InputError, match="not seen where cam_K"):
+        open_labelled_bop(tmp_path)

@@ -48,6 +48,11 @@ BOX_VOTES = 0.8
 """Share of them that must fit better with columns first."""
 BOX_GAIN = 0.1
 """... and their median gain of overlap (intersection over union)."""
+LEAST_SEEN = 4
+"""Objects that must be looked at before their places say anything."""
+SEEN_SHARE = 0.5
+SEEN_ROOM = 0.1
+"""Of the projected box's size: annotations are some pixels off."""
 MOST_BOXES = 300
 FIT_MARGIN = 0.02
 """Overlaps that differ by less do not tell rows from columns."""
@@ -228,6 +233,44 @@ def require_boxes(
             f"bbox_obj fit the projected models better with it transposed (median overlap "
             f"{np.median(other):.2f} instead of {np.median(stated):.2f}). Write it row by row."
         )
+
+
+def require_projection(found: Sequence[bool], where: str) -> None:
+    """Raise if the objects do not project to where they are seen.
+
+    Args:
+        found: of each object: whether the middle of its visible mask lies in the projection of its
+            box.
+        where: for messages.
+
+    Raises:
+        InputError: most of them lie elsewhere.
+    """
+    if len(found) >= LEAST_SEEN and np.mean(found) < SEEN_SHARE:
+        raise InputError(
+            f"{where}: {len(found) - sum(found)} of {len(found)} objects are not seen where cam_K "
+            "and their poses project them to. cam_K belongs to another image size or is "
+            "normalised, the masks belong to other objects, or the poses to other images. Correct "
+            "what is wrong."
+        )
+
+
+def is_seen_in_box(
+    mask: NDArray[np.bool_], intrinsics: CameraIntrinsics, T: Array, corners: Array
+) -> bool:
+    """Return whether the middle of a visible mask (H, W) lies in the projected box of a model.
+
+    Args:
+        mask: of the visible part; not empty.
+        intrinsics: of the image.
+        T: (4, 4) object in camera [m].
+        corners: (8, 3) of the model's box [m].
+    """
+    rows, columns = np.nonzero(mask)
+    x0, y0, x1, y1 = _box(intrinsics, T, corners)
+    room = SEEN_ROOM * max(x1 - x0, y1 - y0)
+    inside_x = x0 - room <= columns.mean() <= x1 + room
+    return bool(inside_x and y0 - room <= rows.mean() <= y1 + room)
 
 
 def _box(intrinsics: CameraIntrinsics, T: Array, points: Array) -> Array:

@@ -257,6 +257,7 @@ def _check(scene: BopLabelledScene, infos: Mapping[int, Sequence[Json]]) -> None
         said = evidence.check_camera_poses(Ts, _things(truth, posed), where)
         scene.notes_found.append(said.removeprefix(f"{where}: "))
     _check_boxes(scene, truth, infos, where)
+    _check_masks(scene, where)
     _check_depth(scene, where)
     _tell_apart(scene, truth, poses)
     _name_missing_models(scene, truth)
@@ -277,14 +278,7 @@ def _things(truth: GroundTruth, posed: Sequence[int]) -> list[evidence.Thing]:
 def _check_boxes(
     scene: BopLabelledScene, truth: GroundTruth, infos: Mapping[int, Sequence[Json]], where: str
 ) -> None:
-    corners: dict[int, Array] = {}
-    for obj_id, row in scene.models_info().items():
-        if all(f"{side}_{axis}" in row for side in ("min", "size") for axis in "xyz"):
-            name = f"object {obj_id} of models_info.json"
-            low = np.array([number(row[f"min_{a}"], f"min_{a} of {name}") for a in "xyz"])
-            size = np.array([number(row[f"size_{a}"], f"size_{a} of {name}") for a in "xyz"])
-            grid = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(-1, 3)
-            corners[obj_id] = (low + grid * size) / units.MM_PER_M
+    corners = _corners(scene)
     boxes: list[Any] = []
     for i in evidence.sampled(scene.indices, evidence.MOST_BOXES):
         Ts = truth.Ts_cam_obj[truth.places(i)]
@@ -295,6 +289,32 @@ def _check_boxes(
                 obj_id = int(truth.obj_ids[truth.places(i)][k])
                 boxes.append((numbers, obj_id, Ts[k], scene.intrinsics(i)))
     evidence.require_boxes(boxes, corners, where)
+
+
+def _corners(scene: BopLabelledScene) -> dict[int, Array]:
+    """Return the corners (8, 3) [m] of the objects' boxes, as models_info.json has them."""
+    corners: dict[int, Array] = {}
+    for obj_id, row in scene.models_info().items():
+        if all(f"{side}_{axis}" in row for side in ("min", "size") for axis in "xyz"):
+            name = f"object {obj_id} of models_info.json"
+            low = np.array([number(row[f"min_{a}"], f"min_{a} of {name}") for a in "xyz"])
+            size = np.array([number(row[f"size_{a}"], f"size_{a} of {name}") for a in "xyz"])
+            grid = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(-1, 3)
+            corners[obj_id] = (low + grid * size) / units.MM_PER_M
+    return corners
+
+
+def _check_masks(scene: BopLabelledScene, where: str) -> None:
+    """Check that the objects are seen where camera and poses project them to."""
+    corners = _corners(scene)
+    found: list[bool] = []
+    for i in evidence.sampled(scene.indices, DEPTH_SAMPLES):
+        for k, o in enumerate(scene.frame(i).objects):
+            mask = scene.mask(i, k, visible=True) if o.obj_id in corners else None
+            if mask is not None and np.any(mask):
+                camera, box = scene.intrinsics(i), corners[o.obj_id]
+                found.append(evidence.is_seen_in_box(mask, camera, o.T_cam_obj, box))
+    evidence.require_projection(found, where)
 
 
 def _check_depth(scene: BopLabelledScene, where: str) -> None:

@@ -73,6 +73,8 @@ def image_header(path: Path) -> ImageFile:
     """
     from PIL import Image
 
+    if not path.is_file():  # opening a pipe would wait for ever
+        raise InputError(f"{path} is not a regular file; an image is expected there.")
     size = path.stat().st_size
     try:
         with Image.open(path) as image:
