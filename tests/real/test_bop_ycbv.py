@@ -161,7 +161,7 @@ def test_depth_of_real_scenes_lies_just_before_the_labelled_origins():
         scene = open_labelled_bop(YCBV, scene=number)
         assert all(o.instance is not None for o in scene.frame(1).objects)
         (note,) = (n for n in scene.notes if "checked: depth" in n)
-        assert 0.9 < float(note.split(" is ")[1].split()[0]) < 1.0
+        assert 0.9 < float(note.split(" measured at ")[1].split()[0]) < 1.0
 
 
 @needs_ycbv
