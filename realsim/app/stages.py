@@ -157,7 +157,9 @@ _told: set[str] = set()
 
 
 def session_models(store: SessionStore, console: Console | None = None) -> dict[int, ObjectModel]:
-    """Read the object models of a session; what is missing of their looks is told once.
+    """Read the object models of a session, symmetric as its reviewers marked them.
+
+    What is missing of their looks is told once.
 
     Args:
         store: the session.
@@ -165,10 +167,12 @@ def session_models(store: SessionStore, console: Console | None = None) -> dict[
     """
     from rich.markup import escape
 
+    from realsim.app.reviewed import review_of
     from realsim.formats.bop.models import load_models
+    from realsim.review.symmetric import marked_models
 
     notes: list[str] = []
-    models = load_models(store.folder / "models", notes=notes)
+    models = marked_models(load_models(store.folder / "models", notes=notes), review_of(store))
     for note in notes:
         if note not in _told:
             _told.add(note)
@@ -191,7 +195,7 @@ def take_models(store: SessionStore, library: Path, obj_ids: Sequence[int]) -> t
 
 
 def judged_scene(store: SessionStore) -> Scene:
-    """Return the registered scene with the reviewers' decisions in place of computed verdicts.
+    """Return the registered scene as its reviewers left it: their poses, their verdicts.
 
     A registration that was killed while it was put in place is put in place first.
 
@@ -199,8 +203,8 @@ def judged_scene(store: SessionStore) -> Scene:
         InputError: the session has not been registered.
     """
     from realsim.app.register.files import finish_interrupted
-    from realsim.review import replay, reviewed_scene
-    from realsim.review.journal import JOURNAL_FILE, read
+    from realsim.app.reviewed import review_of
+    from realsim.review import reviewed_scene
     from realsim.store import load_scene
 
     finish_interrupted(store)
@@ -209,15 +213,24 @@ def judged_scene(store: SessionStore) -> Scene:
             f"session '{store.folder}' is not registered yet: run "
             f"`realsim register {store.folder}` first."
         )
-    return reviewed_scene(load_scene(store), replay(read(store.path(JOURNAL_FILE)).entries))
+    return reviewed_scene(load_scene(store), review_of(store))
 
 
 def registered_views(store: SessionStore) -> list[int] | None:
-    """Return the views in which the objects were registered; None = nothing says it of any."""
+    """Return the views in which the objects are known; None = all.
+
+    Those that took part in the registration, but for what a reviewer excluded since.
+    """
     from realsim.app.register.results import load_cameras
+    from realsim.app.reviewed import review_of
 
     record = load_cameras(store)
-    return sorted(record.refined) if record is not None and record.refined else None
+    excluded = review_of(store).excluded_views()
+    if record is not None and record.refined:
+        return sorted(set(record.refined) - set(excluded))
+    if not excluded:
+        return None
+    return [v.index for v in store.session.views if v.index not in excluded]
 
 
 def school_session(

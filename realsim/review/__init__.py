@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from realsim.review.journal import ReviewState, replay, reviewed_scene
+from realsim.review.corrections import reviewed_scene
+from realsim.review.journal import ReviewState, replay
 
 if TYPE_CHECKING:
     from realsim.review.scene_nodes import SceneConfig

@@ -8,23 +8,36 @@ journals (their lines one after the other) can lose nothing.
 import json
 import os
 import uuid
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim.records import ObjectPose, Scene, Verdict
+from realsim.geometry import se3
+from realsim.records import ObjectPose
+
+Array = NDArray[np.float64]
 
 JOURNAL_FILE = "review/journal.jsonl"
 """Where in a session the decisions stand."""
-Action = Literal["accept", "reject", "comment", "undo"]
-FORMAT = 1
+Action = Literal[
+    "accept", "reject", "comment", "undo", "move", "swap", "symmetric", "exclude", "include"
+]
+PLACED_ACTIONS = ("accept", "reject", "comment", "move", "swap")
+"""About one object as it stands in the scene."""
+VIEW_ACTIONS = ("exclude", "include")
+"""About one view."""
+FORMAT = 2
 """Version of the line format; a reader refuses a newer one."""
+READABLE = (1, FORMAT)
+"""Format 1 has decisions and comments only, without the pose that was looked at."""
+Rows = tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -37,16 +50,29 @@ class Entry:
     """When [ISO 8601, UTC]."""
     reviewer: str
     action: Action
-    instance: int
+    instance: int | None = None
     """Object instance in the scene; for an undo, that of the line taken back."""
-    subject: str
+    subject: str = ""
     """Digest of the pose that was looked at (see `subject_of`): a later registration is new."""
     comment: str = ""
     undoes: str = ""
     """For an undo: the id of the line it takes back; else empty."""
+    T_world_obj: Rows | None = None
+    """(4, 4) [m]: for a move or a swap the new pose; for a decision the pose looked at."""
+    obj_id: int | None = None
+    """For a swap: the object that it really is; for a decision: the object that was judged; for a
+    mark of symmetry: whose it is."""
+    view: int | None = None
+    """For exclude and include: the view."""
+    symmetry: str = ""
+    """For a mark of symmetry: what `symmetric.symmetry_of` reads, such as z, x:2 or none."""
+    how: str = ""
+    """For a move: by what, such as gizmo, keyboard, icp or points."""
+    checks: dict[str, float] = field(default_factory=dict[str, float])
+    """For a move: what was measured of the new pose, such as agree."""
 
     def __post_init__(self) -> None:
-        """Check the action, and that undo and only undo names a line."""
+        """Check that the action has what it needs, and nothing else."""
         if self.action not in get_args(Action):
             raise InputError(
                 f"the journal's action is '{self.action}'; it must be one of "
@@ -59,6 +85,29 @@ class Entry:
             )
         if self.action == "comment" and not self.comment.strip():
             raise InputError("the comment is empty; write it first.")
+        self._check_fields()
+
+    def _check_fields(self) -> None:
+        needed = {
+            "instance": self.action in PLACED_ACTIONS and self.instance is None,
+            "view": self.action in VIEW_ACTIONS and self.view is None,
+            "obj_id": self.action in ("swap", "symmetric") and self.obj_id is None,
+            "symmetry": self.action == "symmetric" and not self.symmetry,
+            "T_world_obj": self.action in ("move", "swap") and self.T_world_obj is None,
+        }
+        missing = [name for name, is_missing in needed.items() if is_missing]
+        if missing:
+            raise InputError(
+                f"a journal line with the action '{self.action}' has no {' and no '.join(missing)}."
+            )
+        if self.T_world_obj is not None:
+            T = se3.check_rigid(np.array(self.T_world_obj, dtype=np.float64), "the journal's pose")
+            object.__setattr__(self, "T_world_obj", tuple(tuple(r) for r in T.tolist()))
+
+    @property
+    def pose(self) -> Array | None:
+        """(4, 4) the pose that the line names [m]."""
+        return None if self.T_world_obj is None else np.array(self.T_world_obj)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -83,17 +132,31 @@ class ReviewState:
                 kept.append(entry)
         return tuple(reversed(kept))
 
+    def of(self, instance: int) -> tuple[Entry, ...]:
+        """Return the standing lines on this instance, in order."""
+        return tuple(e for e in self.standing if e.instance == instance)
+
     def decision(self, instance: int, subject: str) -> Entry | None:
         """Return the last standing accept or reject of this pose of this instance."""
         found = None
-        for e in self.standing:
-            if (e.instance, e.subject) == (instance, subject) and e.action != "comment":
+        for e in self.of(instance):
+            if e.subject == subject and e.action in ("accept", "reject"):
                 found = e
         return found
 
     def comments(self, instance: int) -> tuple[Entry, ...]:
         """Return the standing comments on this instance, on any of its poses."""
-        return tuple(e for e in self.standing if e.instance == instance and e.comment.strip())
+        return tuple(e for e in self.of(instance) if e.comment.strip())
+
+    def excluded_views(self) -> dict[int, Entry]:
+        """Return view -> the line that excludes it, of the views that are excluded."""
+        last = {e.view: e for e in self.standing if e.action in VIEW_ACTIONS and e.view is not None}
+        return {k: e for k, e in sorted(last.items()) if e.action == "exclude"}
+
+    def marks(self) -> dict[int, Entry]:
+        """Return obj_id -> the line that says how it is symmetric."""
+        marks = (e for e in self.standing if e.action == "symmetric")
+        return {e.obj_id: e for e in marks if e.obj_id is not None}
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -113,24 +176,47 @@ def subject_of(placed: ObjectPose) -> str:
 
 
 def new_entry(
-    action: Action, placed: ObjectPose, reviewer: str, *, comment: str = "", undoes: str = ""
+    action: Action,
+    placed: ObjectPose | None,
+    reviewer: str,
+    *,
+    comment: str = "",
+    undoes: str = "",
+    pose: ArrayLike | None = None,
+    **said: Any,
 ) -> Entry:
     """Return a line for the journal, stamped with the time and a unique id.
+
+    Args:
+        action: what is decided.
+        placed: the object as it stands now; None for what is about a view or a model.
+        reviewer: who decides.
+        comment: why.
+        undoes: for an undo, the id of the line that is taken back.
+        pose: (4, 4) T_world_obj [m], the new pose of a move or a swap.
+        said: the entry's other fields: obj_id, view, symmetry, how, checks.
 
     Raises:
         InputError: no reviewer is named, or the action and the other fields do not fit.
     """
     if not reviewer.strip():
         raise InputError("the reviewer's name is empty; a decision is signed: fill in your name.")
+    T = None if placed is None or action in ("undo", "comment") else placed.T_world_obj
+    if pose is not None:
+        T = np.asarray(pose, dtype=np.float64)
+    if placed is not None and action in ("accept", "reject"):
+        said = {"obj_id": placed.obj_id} | said
     return Entry(
         id=uuid.uuid4().hex,
         time=datetime.now(UTC).isoformat(timespec="milliseconds"),
         reviewer=reviewer.strip(),
         action=action,
-        instance=placed.instance,
-        subject=subject_of(placed),
+        instance=None if placed is None else placed.instance,
+        subject="" if placed is None else subject_of(placed),
         comment=comment.strip(),
         undoes=undoes,
+        T_world_obj=None if T is None else tuple(tuple(row) for row in T.tolist()),
+        **said,
     )
 
 
@@ -148,11 +234,17 @@ def replay(entries: Sequence[Entry], start: ReviewState | None = None) -> Review
     return ReviewState(entries=tuple(once.values()))
 
 
-def append(path: Path, entry: Entry) -> None:
+def append(path: Path, entry: Entry, *, check: Callable[[ReviewState], None] | None = None) -> None:
     """Add one line to the journal; when this returns, the line is on the disk.
 
     An exclusive lock (fcntl) lets several processes write to the same journal. A fragment that a
     killed process left without its line end is closed first, so that it spoils no other line.
+
+    Args:
+        path: the journal.
+        entry: the line.
+        check: called, nobody else writing, with what the journal adds up to; what it raises keeps
+            the line out (see `corrections.check_is_current`).
     """
     import fcntl
 
@@ -162,6 +254,8 @@ def append(path: Path, entry: Entry) -> None:
     handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
+        if check is not None:
+            check(replay(read(path).entries))
         size = os.fstat(handle).st_size
         torn = size > 0 and os.pread(handle, 1, size - 1) != b"\n"
         rest = (b"\n" if torn else b"") + line.encode()
@@ -207,34 +301,15 @@ def read(path: Path) -> JournalContent:
 
 def _entry(fields: Any, where: str) -> Entry:
     """Return the record of one parsed line."""
-    if not isinstance(fields, dict) or fields.get("format") != FORMAT:
+    if not isinstance(fields, dict) or fields.get("format") not in READABLE:
         raise InputError(
-            f"{where}: this is no journal line of format {FORMAT}; was it written by a newer "
+            f"{where}: this is no journal line of format 1 or {FORMAT}; was it written by a newer "
             "version? Update, or look at the line by hand."
         )
     named = {str(k): v for k, v in fields.items() if k != "format"}
     try:
         return Entry(**named)
-    except TypeError as error:
+    except (TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{where}: the fields do not fit a journal line ({error}).") from error
-
-
-def reviewed_scene(scene: Scene, state: ReviewState) -> Scene:
-    """Return the scene with the reviewers' decisions in place of the computed verdicts.
-
-    A decision counts only for the very pose it was made about; an object that was registered
-    anew since keeps its computed verdict.
-    """
-    verdicts: dict[str, Verdict] = {"accept": "accepted", "reject": "rejected"}
-
-    def judged(placed: ObjectPose) -> ObjectPose:
-        decision = state.decision(placed.instance, subject_of(placed))
-        if decision is None:
-            return placed
-        reason = f"{decision.action}ed by {decision.reviewer}"
-        if decision.comment:
-            reason += f": {decision.comment}"
-        reasons = (*placed.reasons, reason)
-        return replace(placed, verdict=verdicts[decision.action], reasons=reasons)
-
-    return replace(scene, objects=tuple(judged(o) for o in scene.objects))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from error

@@ -10,7 +10,7 @@ import pytest
 
 from realsim import InputError, ObjectPose, Scene
 from realsim.geometry import se3
-from realsim.review import journal
+from realsim.review import journal, reviewed_scene
 
 
 def placed(instance: int = 0, x: float = 0.0) -> ObjectPose:
@@ -72,9 +72,9 @@ def test_a_decision_is_about_one_pose_only() -> None:
     state = journal.replay([journal.new_entry("reject", placed(x=0.0), "ada", comment="floats")])
     here = Scene(name="s", objects=(placed(x=0.0),))
     moved = Scene(name="s", objects=(placed(x=0.001),))
-    assert journal.reviewed_scene(here, state).objects[0].verdict == "rejected"
-    assert "floats" in journal.reviewed_scene(here, state).objects[0].reasons[-1]
-    assert journal.reviewed_scene(moved, state).objects[0].verdict == "unchecked"
+    assert reviewed_scene(here, state).objects[0].verdict == "rejected"
+    assert "floats" in reviewed_scene(here, state).objects[0].reasons[-1]
+    assert reviewed_scene(moved, state).objects[0].verdict == "unchecked"
 
 
 def test_file_round_trip(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ def views_of(text: str) -> int | None:
 @click.option("--object", "objects", metavar="SPEC", multiple=True,
               help="What is there, and where, as far as you know; repeat it.")  # fmt: skip
 @click.option("--find-all", is_flag=True, help="Find out which of the models are there.")
+@click.option("--from-review", is_flag=True, help="Start from what reviewers moved and decided.")
 @click.option("--library", type=FOLDER, default=None, help="Models the session has not: see scan.")
 @click.option("--method", default="joint", show_default=True,
               type=click.Choice(["joint", "top-down"]),
@@ -45,11 +46,13 @@ def register_command(session: Path, as_json: bool, quiet: bool, **options: Any) 
     """Find the pose of every object of SESSION in every view, with its uncertainty.
 
     \b
-    What is on the table is said in one of three ways:
+    What is on the table is said in one of four ways:
       --object SPEC    5 or mug (anywhere), 5x2 (two of them),
                        5@view3:640,360 (a click), 5@view3:100,80,60x40 (a box)
       SESSION/registration/starts.json   rough poses, clicks, boxes or masks
       --find-all       it is found out which of the models are there
+      --from-review    the reviewed scene: moved objects from where they were moved to, rejected
+                       ones left out; the earlier scene stays in registration/earlier/
 
     Writes registration/ with scene.json, register.html and pictures, and replaces the session's
     camera poses by refined ones (the claimed ones are kept in registration/cameras.json). With the
@@ -68,6 +71,7 @@ def register_command(session: Path, as_json: bool, quiet: bool, **options: Any) 
 
     request = RegisterRequest(
         method=options["method"], objects=options["objects"], find_all=options["find_all"],
+        from_review=options["from_review"],
         library=options["library"], views=views_of(options["views"]),
         refine_cameras=not options["no_cameras"], hand_held=options["hand_held"],
         depth_bias=options["depth_bias"], odometry=options["odometry"],

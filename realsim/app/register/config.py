@@ -33,6 +33,8 @@ class RegisterRequest:
     """What is there, and where; empty = as the session's starts say."""
     find_all: bool = False
     """Whether to find out which of the models are there."""
+    from_review: bool = False
+    """Whether to start from the scene as its reviewers left it."""
     library: Path | None = None
     """Models that the session has not; None = there are no others."""
     views: int | None = None

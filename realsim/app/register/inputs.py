@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from realsim import __version__
 from realsim.app.register.config import RegisterRequest, config_of
 from realsim.app.register.files import write_claims
+from realsim.app.register.from_review import review_starts
 from realsim.app.register.results import claimed_cameras, load_cameras
+from realsim.app.reviewed import exclusion_words, review_of
 from realsim.app.stages import content_key, session_models, take_models
 from realsim.errors import InputError, UnitError
 from realsim.records import ObjectModel, View
@@ -135,6 +137,13 @@ def _wanted(
     """
     from realsim.registration.hints import parse_objects, read_starts
 
+    if request.from_review:
+        if request.objects or request.find_all:
+            raise InputError(
+                "--from-review takes the objects from the reviewed scene: leave --object and "
+                "--find-all away."
+            )
+        return review_starts(store, models).wanted(models)
     if request.find_all and request.objects:
         raise InputError(
             "--find-all finds out what is there, and --object says it: give one of both."
@@ -158,6 +167,8 @@ def _said(store: SessionStore, request: RegisterRequest) -> list[Any]:
 
     Not the regions that were made of it: they move a little when cameras are refined.
     """
+    if request.from_review:
+        return ["review", review_starts(store, None).rows]
     if request.objects or request.find_all:
         return [list(request.objects), request.find_all]
     files = [store.path(STARTS_FILE), *sorted(store.path(MASKS).glob("*"))]
@@ -255,17 +266,21 @@ def _views(
     """
     left_out: list[tuple[int, str]] = []
     usable: list[int] = []
+    excluded = review_of(store).excluded_views()
     for view in store.session.views:
-        if view.index not in claimed:
+        if view.index in excluded:
+            left_out.append((view.index, exclusion_words(excluded[view.index])))
+        elif view.index not in claimed:
             left_out.append((view.index, "it has no camera pose."))
         elif not store.has_depth(view.index):
             left_out.append((view.index, "it was recorded without depth."))
         else:
             usable.append(view.index)
     if not usable:
+        and_excluded = f" ({len(excluded)} are excluded by a reviewer)" if excluded else ""
         raise InputError(
-            f"session '{store.folder}' has {len(store.session.views)} views, and none with depth "
-            "and a camera pose; registration needs at least one."
+            f"session '{store.folder}' has {len(store.session.views)} views{and_excluded}, and "
+            "none with depth and a camera pose; registration needs at least one."
         )
     if request.views is not None and request.views < len(usable):
         pick = np.unique(np.linspace(0, len(usable) - 1, request.views).round().astype(int))

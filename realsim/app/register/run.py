@@ -10,6 +10,12 @@ from realsim.app.console import Console
 from realsim.app.register.colour import colour_remark
 from realsim.app.register.config import RegisterRequest
 from realsim.app.register.files import finish_interrupted, remark_of, write_result
+from realsim.app.register.from_review import (
+    REVIEW_FILE,
+    keep_earlier,
+    moved_since_accepted,
+    review_starts,
+)
 from realsim.app.register.inputs import RegisterInputs, read_inputs
 from realsim.app.register.results import (
     PAGE_FILE,
@@ -23,6 +29,7 @@ from realsim.app.register.results import (
     load_cameras,
     load_registered,
 )
+from realsim.app.reviewed import review_of
 from realsim.app.stages import is_current, mark_current, require_sound, take_models
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel, Scene
@@ -69,7 +76,8 @@ def run_register(store: SessionStore, console: Console, request: RegisterRequest
         inputs = read_inputs(store, request, tick)
     if is_current(store, STAGE, inputs.key) and store.has(SCENE_FILE):
         return _as_it_was(store)
-    result = _registered(store, console, request, inputs)
+    starts = review_starts(store, None) if request.from_review else None
+    result = _with_review(store, _registered(store, console, request, inputs))
     models = inputs.models
     if request.library is not None:
         found = sorted({o.obj_id for o in result.scene.objects})
@@ -77,9 +85,30 @@ def run_register(store: SessionStore, console: Console, request: RegisterRequest
         if copied:
             console.say(f"models {', '.join(map(str, copied))} copied from {request.library}")
     with console.stage("register", "pictures and page"):
-        write_result(store, result, models, _pictures(store, result, models))
+        pictures = _pictures(store, result, models)
+        if review_of(store).standing:
+            kept = keep_earlier(store)
+            if kept is not None:
+                console.say(f"the scene that was reviewed stays in {kept}")
+        write_result(store, result, models, pictures)
+        if starts is not None:
+            store.write_json(REVIEW_FILE, starts.to_json())
+        else:
+            store.remove(REVIEW_FILE)
     mark_current(store, STAGE, inputs.key)
     return result
+
+
+def _with_review(store: SessionStore, result: Registered) -> Registered:
+    """Return the result with what it means for decisions that were made of the scene before."""
+    remarks = [
+        Remark(view=None, kind="review", words=(
+            f"instance {placed.instance} was accepted by {entry.reviewer}, {mm:.2g} mm and "
+            f"{deg:.2g} deg from here: that decision counts no longer, look at it again."
+        ))
+        for placed, entry, mm, deg in moved_since_accepted(result.scene.objects, review_of(store))
+    ]  # fmt: skip
+    return replace(result, remarks=(*result.remarks, *remarks)) if remarks else result
 
 
 def _as_it_was(store: SessionStore) -> Registered:

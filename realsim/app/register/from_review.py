@@ -1,0 +1,154 @@
+"""A registration that starts from the reviewed scene: moved objects moved, rejected ones left out.
+
+`registration/review.json` keeps from which lines of the journal the present registration was made
+and where it started, so that a second run with nothing new computes nothing. Scenes that are
+replaced stay in `registration/earlier/`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from realsim.app.reviewed import review_of
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import ObjectModel, ObjectPose
+from realsim.registration.search.records import Region, Wanted
+from realsim.review.corrections import DECIDED, corrected_scene, decision_on, pending
+from realsim.review.journal import Entry, ReviewState
+from realsim.store import SessionStore, load_scene
+from realsim.store.records_json import array_to_json
+
+SCENE_FILE = "registration/scene.json"
+REVIEW_FILE = "registration/review.json"
+EARLIER = "registration/earlier"
+FORMAT = 1
+HELD_RADIUS_M, HELD_TURN_DEG = 0.005, 5.0
+"""How far an object that a person accepted, or that nobody touched, is looked for."""
+MOVED_RADIUS_M, MOVED_TURN_DEG = 0.015, 15.0
+"""How far one that a person moved is looked for: a mouse is good to a centimetre."""
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReviewStarts:
+    """What the reviewed scene says of the objects."""
+
+    rows: list[Row]
+    """A row an object: obj_id, instance, T_world_obj, radius_m, turn_deg."""
+    applied: tuple[str, ...]
+    """The lines of the journal that they come from."""
+
+    def wanted(self, models: Mapping[int, ObjectModel]) -> list[Wanted]:
+        """Return the objects as the registration wants them.
+
+        Raises:
+            InputError: a model is missing.
+        """
+        return [_wanted(row, models) for row in self.rows]
+
+    def to_json(self) -> Row:
+        """Return what is kept of them."""
+        return {"format_version": FORMAT, "applied": list(self.applied), "starts": self.rows}
+
+
+def review_starts(store: SessionStore, models: Mapping[int, ObjectModel] | None) -> ReviewStarts:
+    """Return where objects start from: those of the last such run if nothing has been said since.
+
+    Args:
+        store: the session.
+        models: if given, that everything has a model is checked.
+
+    Raises:
+        InputError: nothing is registered, nobody has reviewed it, everything is rejected, or an
+            object was said to be one that has no model.
+    """
+    if not store.has(SCENE_FILE):
+        raise InputError(
+            f"session '{store.folder}' is not registered yet, so there is nothing to review: run "
+            f"`realsim register {store.folder}` first."
+        )
+    state, scene = review_of(store), load_scene(store)
+    if not state.standing:
+        raise InputError(
+            f"nobody has reviewed session '{store.folder}': its journal is empty. Run "
+            f"`realsim review {store.folder}` first, or leave --from-review away."
+        )
+    lines = pending(scene, state)
+    kept = store.read_json(REVIEW_FILE) if store.has(REVIEW_FILE) else None
+    if kept is not None and {e.id for e in lines} <= set(kept["applied"]):
+        return ReviewStarts(rows=kept["starts"], applied=tuple(kept["applied"]))
+    rows: list[Row] = []
+    for placed in corrected_scene(scene, state).objects:
+        decision = decision_on(placed, state)
+        if decision is not None and DECIDED[decision.action] == "rejected":
+            continue
+        if models is not None and placed.obj_id not in models:
+            raise InputError(
+                f"instance {placed.instance} was said to be object {placed.obj_id}, and there is "
+                f"no model of it; there are {', '.join(map(str, sorted(models))) or 'none'}. "
+                "Give the --library that has it."
+            )
+        rows.append(_row(placed, is_moved=any(e.instance == placed.instance for e in lines)))
+    if not rows:
+        raise InputError(
+            f"the reviewers rejected every object of session '{store.folder}'; there is nothing to "
+            "register. Move one to where it is, or say what is there with --object."
+        )
+    before = () if kept is None else tuple(kept["applied"])
+    return ReviewStarts(rows=rows, applied=(*before, *(e.id for e in lines if e.id not in before)))
+
+
+def _row(placed: ObjectPose, is_moved: bool) -> Row:
+    return {
+        "obj_id": placed.obj_id,
+        "instance": placed.instance,
+        "T_world_obj": array_to_json(placed.T_world_obj),
+        "radius_m": MOVED_RADIUS_M if is_moved else HELD_RADIUS_M,
+        "turn_deg": MOVED_TURN_DEG if is_moved else HELD_TURN_DEG,
+    }
+
+
+def _wanted(row: Row, models: Mapping[int, ObjectModel]) -> Wanted:
+    obj_id, T = row["obj_id"], np.array(row["T_world_obj"], dtype=np.float64)
+    if obj_id not in models:
+        raise InputError(
+            f"there is no model of object {obj_id}, which the review placed. Give the --library "
+            "that has it."
+        )
+    region = Region(
+        center_world=T[:3, :3] @ models[obj_id].mesh.bounds.mean(0) + T[:3, 3],
+        radius_m=row["radius_m"], R_world_obj=T[:3, :3].copy(), turn_deg=row["turn_deg"],
+    )  # fmt: skip
+    return Wanted(obj_id=obj_id, instance=row["instance"], region=region, T_start=T)
+
+
+def keep_earlier(store: SessionStore) -> str | None:
+    """Keep the present scene beside those that were replaced before it; return where, if new."""
+    if not store.has(SCENE_FILE):
+        return None
+    data = store.path(SCENE_FILE).read_bytes()
+    kept = sorted(store.path(EARLIER).glob("scene_*.json"))
+    if kept and kept[-1].read_bytes() == data:
+        return None
+    name = f"{EARLIER}/scene_{len(kept) + 1:03d}.json"
+    store.write_bytes(name, data)
+    return name
+
+
+def moved_since_accepted(
+    objects: Sequence[ObjectPose], state: ReviewState
+) -> list[tuple[ObjectPose, Entry, float, float]]:
+    """Return the objects whose last acceptance was of another place, and how far [mm, deg]."""
+    found: list[tuple[ObjectPose, Entry, float, float]] = []
+    for placed in objects:
+        last = [e for e in state.of(placed.instance) if e.action in DECIDED]
+        if not last or last[-1].action != "accept" or last[-1].pose is None:
+            continue
+        if decision_on(placed, state) is None and last[-1].obj_id == placed.obj_id:
+            step = se3.invert(last[-1].pose) @ placed.T_world_obj
+            mm = 1e3 * float(np.linalg.norm(last[-1].pose[:3, 3] - placed.T_world_obj[:3, 3]))
+            found.append((placed, last[-1], mm, float(np.rad2deg(se3.angle(step[:3, :3])))))
+    return found
