@@ -1,0 +1,130 @@
+"""`realsim register --from-review`: what reviewers said is where the registration starts from."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app import stages
+from realsim.app.register.cli import register_command
+from realsim.geometry import se3
+from realsim.records import ObjectPose
+from realsim.review import journal
+from realsim.review.corrections import decision_on
+from realsim.store import SessionStore, load_scene
+from registered_sessions import table_session, true_poses
+
+OFF = se3.exp(np.array([0.05, -0.05, 0.1, 0.004, -0.003, 0.005]))
+
+
+def run(*args: object) -> Result:
+    return CliRunner().invoke(register_command, [*map(str, args), "--quiet"])
+
+
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A session that was registered from the truth, nobody has reviewed it."""
+    store = table_session(tmp_path_factory.mktemp("reviewed") / "s")
+    stages.save_starts(store, true_poses(), "test")
+    assert run(store.folder).exit_code == 0
+    return store.folder
+
+
+@pytest.fixture
+def session(pristine: Path, tmp_path: Path) -> SessionStore:
+    return SessionStore.open(Path(shutil.copytree(pristine, tmp_path / "s")))
+
+
+def say(store: SessionStore, action: journal.Action, placed: ObjectPose | None, **said: object):
+    entry = journal.new_entry(action, placed, "ada", **said)  # type: ignore[arg-type]
+    journal.append(store.path(journal.JOURNAL_FILE), entry)
+    return entry
+
+
+def test_without_a_review_the_command_says_how_to_get_one(session: SessionStore) -> None:
+    result = run(session.folder, "--from-review")
+    assert "journal is empty" in str(result.exception) and "realsim review" in str(result.exception)
+    assert "leave --object" in str(run(session.folder, "--from-review", "--object", "1").exception)
+
+
+def test_moved_rejected_and_excluded_are_what_comes_out(session: SessionStore) -> None:
+    before = load_scene(session)
+    first, second = before.objects[:2]
+    data = session.path("registration/scene.json").read_bytes()
+    move = say(session, "move", first, pose=first.T_world_obj @ OFF, how="gizmo")
+    reject = say(session, "reject", second, comment="it is gone")
+    exclude = say(session, "exclude", None, view=2, comment="blurred")
+    result = run(session.folder, "--from-review", "--json")
+    assert result.exit_code == 0, result.output
+    said = json.loads(result.stdout[result.stdout.index("{") :])
+    assert {o["instance"] for o in said["objects"]} == {
+        o.instance for o in before.objects if o.instance != second.instance
+    }
+    assert said["views"] == [0, 1, 3, 4, 5, 6, 7]
+    assert any("excluded by ada: blurred" in f["words"] for f in said["findings"])
+    # The depth pulls what a person moved back to where it stands.
+    now = load_scene(session).object(first.instance)
+    assert 1e3 * np.linalg.norm(now.T_world_obj[:3, 3] - first.T_world_obj[:3, 3]) < 0.5
+    # Nothing is lost: the earlier scene, the journal, and what was taken in.
+    assert session.path("registration/earlier/scene_001.json").read_bytes() == data
+    kept = session.read_json("registration/review.json")
+    assert set(kept["applied"]) == {move.id, reject.id, exclude.id}
+    assert SessionStore.open(session.folder).verify() == []
+    scene = session.path("registration/scene.json").read_bytes()
+    assert run(session.folder, "--from-review").exit_code == 0
+    assert session.path("registration/scene.json").read_bytes() == scene
+    assert len(list(session.path("registration/earlier").iterdir())) == 1
+    assert stages.registered_views(session) == [0, 1, 3, 4, 5, 6, 7]
+
+
+def test_the_scene_that_other_commands_use_is_the_reviewed_one(session: SessionStore) -> None:
+    first, second = load_scene(session).objects[:2]
+    T = first.T_world_obj @ OFF
+    say(session, "move", first, pose=T, how="keyboard")
+    say(session, "exclude", None, view=0)
+    say(session, "symmetric", None, obj_id=second.obj_id, symmetry="z:3")
+    judged = stages.judged_scene(session)
+    np.testing.assert_allclose(judged.object(first.instance).T_world_obj, T, atol=1e-9)
+    assert judged.object(first.instance).verdict == "unchecked"
+    assert stages.registered_views(session) == list(range(1, 8))
+    assert len(stages.session_models(session)[second.obj_id].symmetries) == 3
+
+
+def test_an_acceptance_outlives_a_registration_to_the_same_place_and_no_other(
+    session: SessionStore,
+) -> None:
+    first, second = load_scene(session).objects[:2]
+    say(session, "accept", first)
+    far = ObjectPose(
+        obj_id=second.obj_id, instance=second.instance, T_world_obj=second.T_world_obj @ OFF
+    )
+    say(session, "move", second, pose=far.T_world_obj, how="gizmo")
+    say(session, "accept", far)
+    result = run(session.folder, "--from-review", "--json")
+    words = [f["words"] for f in json.loads(result.stdout[result.stdout.index("{") :])["findings"]]
+    told = [w for w in words if f"instance {second.instance} was accepted by ada" in w]
+    assert len(told) == 1 and "look at it again" in told[0]
+    state = journal.replay(journal.read(session.path(journal.JOURNAL_FILE)).entries)
+    now = load_scene(session)
+    assert decision_on(now.object(first.instance), state) is not None
+    assert decision_on(now.object(second.instance), state) is None
+
+
+def test_a_swap_to_an_object_without_a_model_is_refused_before_anything_is_written(
+    session: SessionStore,
+) -> None:
+    first = load_scene(session).objects[0]
+    before = session.path("registration/scene.json").read_bytes()
+    say(session, "swap", first, pose=first.T_world_obj, obj_id=999)
+    assert "999" in str(run(session.folder, "--from-review").exception)
+    assert session.path("registration/scene.json").read_bytes() == before
+    assert not session.path("registration/earlier").exists()
+
+
+def test_all_rejected_is_said(session: SessionStore) -> None:
+    for placed in load_scene(session).objects:
+        say(session, "reject", placed)
+    assert "rejected every object" in str(run(session.folder, "--from-review").exception)
