@@ -280,6 +280,7 @@ def annotate_session(
     Raises:
         InputError: the session has not been registered, or there is no such map.
     """
+    from realsim.app.annotate.current import grasps_of_scene
     from realsim.store import load_grasps
     from realsim_sim_bridge.annotation.annotate import annotate
     from realsim_sim_bridge.annotation.config import (
@@ -299,10 +300,12 @@ def annotate_session(
     damaged = require_sound(store)
     scene = judged_scene(store)
     models = session_models(store, console)
+    sets = load_grasps(store.folder / "grasps")
+    grasps = grasps_of_scene(store, scene, sets, console)
     only = registered_views(store)
     n = len(store.session.views) if only is None else len(only)
     with console.stage("annotate", f"{n} frames") as tick:
         return annotate(
-            store, scene, models, load_grasps(store.folder / "grasps"), config,
+            store, scene, models, grasps, config,
             only=only, progress=tick, workers=workers, surroundings=surroundings, damaged=damaged,
         )  # fmt: skip

@@ -85,13 +85,15 @@ def draw(store: SessionStore, summary: "AnnotationSummary", console: Console) ->
     from realsim.store import load_grasps
     from realsim_sim_bridge.annotation.pictures import overlay_pictures
 
-    known = registered_views(store)
+    known, scene = registered_views(store), judged_scene(store)
     views = [v.index for v in store.session.views if known is None or v.index in known]
+    there = {(o.instance, o.obj_id) for o in scene.objects}
+    sets = load_grasps(store.folder / "grasps")
     chosen = sheet_views(views, summary.flagged_views, PAGE_PICTURES)
     pictures: list[Image] = []
     drawn = overlay_pictures(
-        store, chosen, judged_scene(store), session_models(store, console),
-        load_grasps(store.folder / "grasps"), SHEET_GRASPS,
+        store, chosen, scene, session_models(store, console),
+        [g for g in sets if (g.instance, g.obj_id) in there], SHEET_GRASPS,
     )  # fmt: skip
     with console.stage("pictures", f"{len(chosen)} frames") as tick:
         for picture in drawn:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from realsim.app.annotate.current import refresh_labels
 from realsim.app.console import Console
 from realsim.app.export.card import CARD_FILE, DatasetCard, SceneFacts, card_bytes
 from realsim.app.export.request import ExportRequest
@@ -18,6 +19,7 @@ from realsim.app.export.sources import (
 )
 from realsim.app.export.target import TABLE, TRIED, RootJob, SceneJob, ScenePlace, Target
 from realsim.app.export.targets import TARGETS
+from realsim.app.stages import open_session
 from realsim.errors import InputError
 from realsim.formats.bop.labelled import BopLabelledScene
 from realsim.formats.export_folder import CONTENT, STATE, ExportFolder
@@ -61,6 +63,10 @@ def run_export(request: ExportRequest, out: Path, console: Console) -> ExportRes
     scenes = source_scenes(request)
     _require_outside(request, out)
     places = scene_places(scenes, target)
+    if request.labels in ("auto", "annotated"):
+        for source in scenes:
+            if source.kind == "session":
+                refresh_labels(open_session(source.folder), console)
     asked = request.asked() | {CONTENT: content_of(scenes)}
     if ExportFolder.is_finished(out, asked):
         return ExportResult(folder=out, card=out / CARD_FILE, scenes=(), was_finished=True)

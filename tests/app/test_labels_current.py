@@ -1,0 +1,93 @@
+"""Labels follow the reviewed scene: an export never hands out those of before the review."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.app import stages
+from realsim.app.annotate.current import refresh_labels, what_is_stale
+from realsim.app.console import Console
+from realsim.app.export.request import ExportRequest
+from realsim.app.export.run import run_export
+from realsim.formats.bop.scene import find_scenes, read_scene
+from realsim.geometry import se3
+from realsim.records import ObjectPose, Scene, SupportPlane
+from realsim.review import journal
+from realsim.store import SessionStore, load_scene, save_scene
+from registered_sessions import table_session, true_poses
+
+QUIET = Console(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def labelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    store = table_session(tmp_path_factory.mktemp("labelled") / "s")
+    save_scene(
+        store,
+        Scene(name="s", objects=tuple(true_poses()), plane=SupportPlane(T_world_table=np.eye(4))),
+    )
+    stages.annotate_session(store, QUIET, maps="instance")
+    return store.folder
+
+
+@pytest.fixture
+def session(labelled: Path, tmp_path: Path) -> SessionStore:
+    return SessionStore.open(Path(shutil.copytree(labelled, tmp_path / "s")))
+
+
+def say(store: SessionStore, action: journal.Action, placed: ObjectPose | None, **said: object):
+    entry = journal.new_entry(action, placed, "ada", **said)  # type: ignore[arg-type]
+    journal.append(store.path(journal.JOURNAL_FILE), entry)
+
+
+def test_what_nobody_touched_is_current_and_not_computed_again(session: SessionStore) -> None:
+    assert what_is_stale(session) == ""
+    assert not refresh_labels(session, QUIET)
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        ("move", "was moved"),
+        ("reject", "is rejected"),
+        ("swap", "is object"),
+        ("exclude", "view 2"),
+    ],
+)
+def test_every_decision_that_changes_labels_is_noticed(
+    session: SessionStore, action: journal.Action, words: str
+) -> None:
+    first, second = load_scene(session).objects[:2]
+    T = first.T_world_obj @ se3.from_translation([0.004, 0, 0])
+    said = {
+        "move": {"pose": T}, "reject": {}, "exclude": {"view": 2},
+        "swap": {"pose": first.T_world_obj, "obj_id": second.obj_id},
+    }[action]  # fmt: skip
+    say(session, action, None if action == "exclude" else first, **said)
+    assert words in what_is_stale(session)
+    say(session, "comment", second, comment="nothing changes by this")
+    assert refresh_labels(session, QUIET)
+    again = SessionStore.open(session.folder)
+    assert what_is_stale(again) == ""
+    assert not refresh_labels(again, QUIET)
+
+
+def test_an_export_carries_the_reviewed_poses_and_leaves_out_what_was_rejected(
+    session: SessionStore, tmp_path: Path
+) -> None:
+    first, second = load_scene(session).objects[:2]
+    T = first.T_world_obj @ se3.exp([0, 0, 0.1, 0.004, 0, 0])
+    say(session, "move", first, pose=T)
+    say(session, "reject", second)
+    request = ExportRequest(sources=(session.folder,), target="bop")
+    run_export(request, tmp_path / "out", QUIET)
+    (ref,) = find_scenes(tmp_path / "out")
+    scene = read_scene(ref)
+    view = session.session.view(0)
+    assert view.T_world_cam is not None
+    expected = se3.invert(view.T_world_cam) @ T
+    labels = {a.obj_id: a.T_cam_obj for a in scene.ground_truth[0]}
+    np.testing.assert_allclose(labels[first.obj_id], expected, atol=1e-6)
+    assert second.obj_id not in labels
