@@ -1,0 +1,1 @@
+"""The command `realsim review`, and what it brings to the review from the other packages."""

@@ -1,0 +1,121 @@
+"""What the school found out about one grasp, in words: score, slips stage by stage, why it failed.
+
+The texts are markdown for the review's panel; names and failures that come from files are escaped.
+"""
+
+import html
+import re
+
+import numpy as np
+
+from realsim.records import STAGES, GraspSet
+
+MEASURE_WORDS = {
+    "margin": "share of the tried frictions and forces that hold",
+    "least_friction": "least friction",
+    "least_force_n": "least finger force [N]",
+    "confidence": "agreement of the two engines",
+    "second_score": "score of the second engine",
+    "ferrari_canny": "Ferrari-Canny quality",
+    "closure_friction": "friction at which it closes",
+    "dexnet_closure": "force closure (Dex-Net)",
+}
+"""The measures that are one value a grasp, in the order of the panel."""
+NOT_TRIED, LOST = "not tried", "lost"
+
+
+def grasp_words(grasps: GraspSet, row: int, name: str = "") -> str:
+    """Return what is known of a grasp as markdown.
+
+    Args:
+        grasps: the set.
+        row: which of its grasps.
+        name: of the object; '' = its number alone.
+
+    Raises:
+        IndexError: the set has no such row.
+    """
+    if not 0 <= row < len(grasps):
+        raise IndexError(f"row {row} of {len(grasps)} grasps")
+    of = f"{escaped(name)} (instance {grasps.instance})" if name else f"instance {grasps.instance}"
+    lines = [f"**Grasp {row}** of {len(grasps)}, {of}", "", _score(grasps, row)]
+    why = failure_words(grasps, row)
+    if why:
+        lines.append(f"- {why}")
+    lines.append(f"- {_reach(grasps, row)}")
+    lines.append(f"- distance of the contacts {1e3 * grasps.widths_m[row]:.1f} mm")
+    lines += ["", *slip_table(grasps, row)]
+    measured = measure_lines(grasps, row)
+    if measured:
+        lines += ["", "| measure | value |", "|:--|--:|", *measured]
+    return "\n".join(lines)
+
+
+def slip_table(grasps: GraspSet, row: int) -> list[str]:
+    """Return the lines of the table of slips: one row a stage."""
+    lines = ["| stage | slip [mm] | turn [deg] |", "|:--|--:|--:|"]
+    for k, stage in enumerate(STAGES):
+        slip = slip_words(1e3 * float(grasps.slip_m[row, k]))
+        turn = slip_words(float(np.degrees(grasps.slip_rad[row, k])))
+        lines.append(f"| {stage} | {slip} | {turn} |")
+    return lines
+
+
+def slip_words(value: float) -> str:
+    """Return a slip as it is read: a number, 'not tried' (NaN), or 'lost' (infinite)."""
+    if np.isnan(value):
+        return NOT_TRIED
+    return f"{value:.2f}" if np.isfinite(value) else LOST
+
+
+def measure_lines(grasps: GraspSet, row: int) -> list[str]:
+    """Return the table lines of what was measured of a grasp besides its slips."""
+    lines: list[str] = []
+    for name, words in MEASURE_WORDS.items():
+        values = grasps.measures.get(name)
+        if values is None or np.isnan(values[row]):
+            continue
+        value = float(values[row])
+        text = f"{value:.3g}" if np.isfinite(value) else "none of those tried"
+        lines.append(f"| {words} | {text} |")
+    forces = grasps.measures.get("force_n")
+    if forces is not None and np.isfinite(forces[row]).any():
+        lines.append(f"| least finger force over the stages [N] | {np.nanmin(forces[row]):.3g} |")
+    return lines
+
+
+def failure_words(grasps: GraspSet, row: int) -> str:
+    """Return why a grasp stopped where it stopped; '' = it passed all four stages."""
+    why = grasps.failures[row]
+    if why:
+        return f"stopped at {escaped(why)}" if why.split(":")[0] in STAGES else escaped(why)
+    if np.isnan(grasps.scores[row]):
+        return "not tried"
+    return ""
+
+
+def escaped(text: str) -> str:
+    """Return text from a file or a person with nothing that HTML or markdown would take for its."""
+    return re.sub(r"([\\`*_{}\[\]|#~])", r"\\\1", html.escape(text, quote=False))
+
+
+def _score(grasps: GraspSet, row: int) -> str:
+    score, base = float(grasps.scores[row]), float(grasps.base_scores[row])
+    if np.isnan(score):
+        return "- score: not tried"
+    passed = "" if np.isnan(base) else f" (base {base:.2f}: {_stages(base)})"
+    return f"- score **{score:.2f}**{passed}"
+
+
+def _stages(base: float) -> str:
+    """Return which stages a base score says were passed."""
+    passed = round(base * len(STAGES))
+    if passed == len(STAGES):
+        return "all four stages passed"
+    return f"passed {', '.join(STAGES[:passed])}" if passed else "no stage passed"
+
+
+def _reach(grasps: GraspSet, row: int) -> str:
+    if grasps.reachable[row]:
+        return "the arm reaches it without a collision"
+    return "the arm does not reach it"

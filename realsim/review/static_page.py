@@ -1,0 +1,288 @@
+"""A reviewed scene as one HTML file that opens from the disk: no server, no network.
+
+    write_static(SceneContent.load(store, SceneConfig()), state, "scene.html", title="Table 3")
+
+The scene is viser's own page, in a frame; beside it stands a panel with the objects, worst first,
+what the reviewers said of them, and what is shown. A policy in the page forbids the browser to
+load anything from anywhere, so that nothing in it can.
+"""
+
+import base64
+import html
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim import __version__
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import ObjectModel, ObjectPose, Scene
+from realsim.review.content import SceneContent
+from realsim.review.content_views import spread
+from realsim.review.corrections import reviewed_scene
+from realsim.review.journal import ReviewState
+from realsim.review.static_page_nodes import (
+    SCORE_EDGES,
+    StaticSize,
+    drawn_grasps,
+    score_class,
+    viewer_html,
+)
+from realsim.review.static_page_text import caption_html, counts_words, object_items, photo_items
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+POLICY = (
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:; "
+    "style-src 'unsafe-inline'; img-src data: blob:; font-src data:; connect-src data: blob:; "
+    "worker-src blob: data:; frame-src 'self'; form-action 'none'; base-uri 'none'"
+)
+"""What the browser may load: what is in the file, and nothing else. Viser unpacks its program and
+its decoder from the page itself, for which it needs `eval` and addresses of the kind blob and
+data."""
+TRIES = 6
+"""How often the scene is halved to fit; 64 times smaller is no scene."""
+LEAST_CLASS = 2
+"""The class of scores from which grasps are shown at first: half of the stages passed."""
+ASIDE_M = 0.25
+"""How far before a camera the point is that one looks at from it [m]."""
+MADE_WITH = (
+    "Made with realsim {version} (Apache-2.0). The viewer in this file is Viser (Apache-2.0) with "
+    "three.js (MIT)."
+)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PageWords:
+    """What a person adds to a static page."""
+
+    caption: str = ""
+    """A few words below the title, as under a figure."""
+    licence: str = ""
+    """On what terms the data may be used; '' = nothing is said of it."""
+    made: datetime | None = None
+    """The date on the page, with its time zone; None = now."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StaticSummary:
+    """What a static page came out as."""
+
+    path: Path
+    size_bytes: int
+    points: int
+    """Points of the cloud in the file."""
+    points_in_all: int
+    cameras: int
+    cameras_in_all: int
+    grasps: int
+    grasps_in_all: int
+    texels: int
+    """Longest side of a texture [px]."""
+
+
+def write_static(
+    content: SceneContent,
+    state: ReviewState,
+    path: Path | str,
+    *,
+    title: str,
+    words: PageWords | None = None,
+    most_points: int = 300_000,
+    most_bytes: float = 25e6,
+    progress: Progress | None = None,
+) -> StaticSummary:
+    """Write a reviewed scene as one HTML file.
+
+    What is too large is drawn with less: fewer points, cameras and grasps, smaller textures.
+
+    Args:
+        content: the session.
+        state: what its journal adds up to.
+        path: the file; its folder must exist.
+        title: of the page.
+        words: caption, licence and date.
+        most_points: points of the cloud.
+        most_bytes: of the file.
+        progress: called with (steps done, steps).
+
+    Raises:
+        InputError: the title is empty, the folder is not there, or the scene cannot be made small
+            enough.
+    """
+    from realsim.store import atomic
+
+    path = Path(path)
+    _check(path, title, most_points, most_bytes)
+    scene = reviewed_scene(content.scene, state)
+    size, page = StaticSize(points=most_points), b""
+    for tried in range(TRIES):
+        if progress is not None:
+            progress(tried, TRIES + 1)
+        size = size.smaller() if tried else size
+        page = _page(content, scene, state, size, title, words or PageWords())
+        if len(page) <= most_bytes:
+            break
+    if len(page) > most_bytes:
+        raise InputError(
+            f"the scene cannot be made smaller than {len(page) / 1e6:.1f} MB; a file of "
+            f"{most_bytes / 1e6:.1f} MB was asked for. The viewer alone needs 1 MB; allow more."
+        )
+    atomic.write_bytes(path, page)
+    if progress is not None:
+        progress(TRIES + 1, TRIES + 1)
+    return _summary(content, size, path, len(page))
+
+
+def _check(path: Path, title: str, most_points: int, most_bytes: float) -> None:
+    """Raise if the page cannot be written."""
+    if not title.strip():
+        raise InputError("the page has no title; give it one: it is what a reader sees first.")
+    if not path.parent.is_dir():
+        raise InputError(f"the folder '{path.parent}' for the page is not there; make it first.")
+    if most_points < 1 or not most_bytes > 0:
+        raise InputError(
+            f"{most_points} points in {most_bytes:g} bytes were asked for; both must be positive."
+        )
+
+
+def _page(
+    content: SceneContent,
+    scene: Scene,
+    state: ReviewState,
+    size: StaticSize,
+    title: str,
+    words: PageWords,
+) -> bytes:
+    """Return the page's bytes."""
+    here = files("realsim.review")
+    has_grasps = any(len(g) for g in content.grasp_sets)
+    fields = {
+        "policy": html.escape(POLICY),
+        "version": html.escape(__version__),
+        "title": html.escape(title.strip()),
+        "about": html.escape(counts_words(content, scene, state)),
+        "caption": caption_html(words.caption),
+        "objects": object_items(content, scene, state),
+        "photos": photo_items(
+            {v.index: _data_url(content.thumbnails[v.index]) for v in _cameras(content, size)},
+            state.excluded_views(),
+        ),
+        "grasp_switches": GRASP_SWITCHES if has_grasps else "",
+        "grasp_slider": GRASP_SLIDER if has_grasps else "",
+        "footer": _footer(content, size, words),
+        "viewer": html.escape(viewer_html(content, scene, size), quote=True),
+        "data": _json(_data(content, scene, size)),
+        "script": (here / "static_page.js").read_text(encoding="utf-8"),
+    }
+    template = (here / "static_page.html").read_text(encoding="utf-8")
+    return Template(template).substitute(fields).encode()
+
+
+GRASP_SWITCHES = """<label><input type="checkbox" data-show="grasps" checked> Grasps</label>
+<label><input type="checkbox" id="own" checked> of the chosen only</label>"""
+GRASP_SLIDER = f"""<div class="row"><label for="least">Score</label>
+<input type="range" id="least" min="0" max="{len(SCORE_EDGES) - 1}" step="1" value="{LEAST_CLASS}">
+<span class="soft" id="least-word"></span></div>"""
+
+
+def _cameras(content: SceneContent, size: StaticSize) -> list[Any]:
+    """Return the views that are drawn."""
+    return spread(content.shown_views, size.cameras)
+
+
+def _data(content: SceneContent, scene: Scene, size: StaticSize) -> dict[str, Any]:
+    """Return what the page's script must know."""
+    look = content.look
+    away = look.position - look.look_at
+    distance = float(np.linalg.norm(away))
+    across = away - look.up * float(look.up @ away)
+    objects: list[dict[str, Any]] = []
+    for placed in scene.objects:
+        middle, diagonal = _middle(placed, content.models[placed.obj_id])
+        objects.append({"instance": placed.instance, "middle": _short(middle), "size": diagonal})
+    cameras: list[dict[str, Any]] = []
+    for view in _cameras(content, size):
+        T = np.asarray(view.T_world_cam)
+        target = T[:3, 3] + ASIDE_M * T[:3, 2]
+        cameras.append({"view": view.index, "position": _short(T[:3, 3]), "target": _short(target)})
+    grasps = [
+        [g.instance, k]
+        for g in content.grasp_sets
+        for k in sorted(set(score_class(g.scores)[drawn_grasps(g, size.grasps)].tolist()))
+    ]
+    # A camera exactly above has no way up; a hundredth beside it has.
+    top = look.look_at + distance * (look.up + 0.01 * across / max(distance, 1e-9))
+    return {
+        "objects": objects,
+        "cameras": cameras,
+        "grasps": grasps,
+        "edges": SCORE_EDGES,
+        "least": LEAST_CLASS,
+        "cloud": len(content.cloud) > 0,
+        "table": scene.plane is not None,
+        "nodes": [f"/objects/{o.instance}" for o in scene.objects]
+        + [f"/grasps/{i}/{k}" for i, k in grasps],
+        "look": {
+            "position": _short(look.position),
+            "target": _short(look.look_at),
+            "top": _short(top),
+            "back": _short(look.position - 2.0 * across),
+        },
+    }
+
+
+def _middle(placed: ObjectPose, model: ObjectModel) -> tuple[Array, float]:
+    """Return the middle (3,) of an object in world and its diagonal [m]."""
+    low, high = model.mesh.bounds
+    middle = se3.transform(placed.T_world_obj, (low + high)[None] / 2.0)[0]
+    return middle, float(np.linalg.norm(high - low))
+
+
+def _short(values: Array) -> list[float]:
+    """Return numbers to the micrometre: the page need not carry more."""
+    return [round(float(v), 6) for v in values]
+
+
+def _json(data: dict[str, Any]) -> str:
+    """Return JSON that no HTML parser takes for the end of its script."""
+    return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _data_url(jpeg: bytes) -> str:
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
+
+
+def _footer(content: SceneContent, size: StaticSize, words: PageWords) -> str:
+    made, licence = words.made or datetime.now(UTC), words.licence.strip()
+    found = _summary(content, size, Path(), 0)
+    lines = [
+        f"Drawn: {found.points:,} of {found.points_in_all:,} points, {found.cameras} of "
+        f"{found.cameras_in_all} cameras, {found.grasps} of {found.grasps_in_all} grasps.",
+        f"{made.astimezone(UTC):%Y-%m-%d %H:%M} UTC",
+        *([f"Data: {licence}"] if licence else []),
+        MADE_WITH.format(version=__version__),
+    ]
+    return "\n".join(f"<span>{html.escape(line)}</span>" for line in lines)
+
+
+def _summary(content: SceneContent, size: StaticSize, path: Path, count: int) -> StaticSummary:
+    return StaticSummary(
+        path=path,
+        size_bytes=count,
+        points=min(size.points, len(content.cloud)),
+        points_in_all=len(content.cloud),
+        cameras=len(_cameras(content, size)),
+        cameras_in_all=len(content.views),
+        grasps=sum(min(len(g), size.grasps) for g in content.grasp_sets),
+        grasps_in_all=sum(len(g) for g in content.grasp_sets),
+        texels=size.texels,
+    )

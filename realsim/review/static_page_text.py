@@ -1,0 +1,153 @@
+"""The words of the static page: what people wrote comes from people, so everything is escaped."""
+
+import html
+from collections.abc import Mapping
+
+import numpy as np
+
+from realsim.records import GraspSet, ObjectModel, ObjectPose, Scene
+from realsim.rendering.overlay import VERDICT_RGB
+from realsim.review.content import SceneContent
+from realsim.review.content_views import VERDICT_ORDER, worst_first
+from realsim.review.corrections import corrected_scene, decision_on
+from realsim.review.ellipsoid import rotation_sigmas_deg
+from realsim.review.journal import Entry, ReviewState
+
+NOT_KNOWN = "not known"
+DECISION_WORDS = {"accept": "accepted", "reject": "rejected"}
+
+
+def counts_words(content: SceneContent, scene: Scene, state: ReviewState) -> str:
+    """Return the line under the title: scene, verdicts, reviewers, views."""
+    found = {v: sum(o.verdict == v for o in scene.objects) for v in VERDICT_ORDER}
+    verdicts = ", ".join(f"{n} {v}" for v, n in found.items() if n)
+    count = _counted(len(scene.objects), "object")
+    words = [scene.name, f"{count}: {verdicts}" if verdicts else count]
+    words.append(_counted(len(content.views), "view"))
+    excluded = len(state.excluded_views())
+    if excluded:
+        words[-1] += f" ({excluded} left out by the reviewers)"
+    names = sorted({e.reviewer for e in state.standing})
+    words.append(f"reviewed by {', '.join(names)}" if names else "not reviewed yet")
+    return "; ".join(w for w in words if w) + "."
+
+
+def caption_html(caption: str) -> str:
+    """Return the caption's paragraph; '' = none."""
+    if not caption.strip():
+        return ""
+    return f'<p class="caption">{html.escape(caption.strip())}</p>'
+
+
+def object_items(content: SceneContent, scene: Scene, state: ReviewState) -> str:
+    """Return the list's items, worst first."""
+    corrected = corrected_scene(content.scene, state)
+    sets = {g.instance: g for g in content.grasp_sets}
+    return "\n".join(
+        _item(
+            placed,
+            corrected.object(placed.instance),
+            content.models[placed.obj_id],
+            sets.get(placed.instance),
+            state,
+        )
+        for placed in worst_first(scene.objects)
+    )
+
+
+def photo_items(urls: Mapping[int, str], excluded: Mapping[int, Entry]) -> str:
+    """Return the section of the photographs; a click on one goes to its camera."""
+    if not urls:
+        return ""
+    buttons: list[str] = []
+    for view, url in urls.items():
+        out = view in excluded
+        named = f"view {view}" + (", left out" if out else "")
+        style = ' class="left-out"' if out else ""
+        buttons.append(
+            f'<button type="button" data-view="{view}"{style} title="{named}">'
+            f'<img src="{url}" alt="{named}" loading="lazy"><span>{view}</span></button>'
+        )
+    return (
+        f"<details><summary>Photographs ({len(urls)})</summary>\n"
+        f'<div class="photos">\n{chr(10).join(buttons)}\n</div></details>'
+    )
+
+
+# --- one object ---------------------------------------------------------------------------------
+
+
+def _item(
+    placed: ObjectPose,
+    corrected: ObjectPose,
+    model: ObjectModel,
+    grasps: GraspSet | None,
+    state: ReviewState,
+) -> str:
+    color = "#{:02x}{:02x}{:02x}".format(*VERDICT_RGB[placed.verdict])
+    decision = decision_on(corrected, state)
+    head = (
+        f'<span class="dot" style="background:{color}"></span>'
+        f'<span class="name">{html.escape(model.name)}</span>'
+        f'<span class="verdict">{html.escape(placed.verdict)}</span>'
+    )
+    lines = [f"<p>{_said(line)}</p>" for line in _judged(corrected, decision)]
+    lines += [f"<p>{_said(reason)}</p>" for reason in corrected.reasons]
+    lines.append(_table(placed, corrected, model, grasps))
+    lines += [_quote(e) for e in state.comments(placed.instance)]
+    return (
+        f'<li class="object" data-instance="{placed.instance}">'
+        f'<button type="button" aria-expanded="false">{head}</button>'
+        f'<div class="detail">{"".join(lines)}</div></li>'
+    )
+
+
+def _judged(corrected: ObjectPose, decision: Entry | None) -> list[str]:
+    """Return who judged, and what the program had computed."""
+    if decision is None:
+        return [f"computed: {corrected.verdict}; judged by nobody"]
+    word = DECISION_WORDS.get(decision.action, decision.action)
+    return [
+        f"{word} by {decision.reviewer}, {decision.time[:10]}",
+        f"computed: {corrected.verdict}",
+    ]
+
+
+def _table(
+    placed: ObjectPose, corrected: ObjectPose, model: ObjectModel, grasps: GraspSet | None
+) -> str:
+    rows = [("instance", str(placed.instance)), ("object id", str(placed.obj_id))]
+    rows += sigma_rows(corrected, model)
+    agree = corrected.checks.get("agree")
+    if agree is not None and np.isfinite(agree):
+        rows.append(("pixels that agree with the depth", f"{100 * agree:.1f} %"))
+    if grasps is not None and len(grasps):
+        rows.append(("grasps, good of all", f"{int(grasps.good.sum())} of {len(grasps)}"))
+    cells = (f"<tr><td>{html.escape(a)}</td><td>{html.escape(b)}</td></tr>" for a, b in rows)
+    return f"<table>{''.join(cells)}</table>"
+
+
+def sigma_rows(placed: ObjectPose, model: ObjectModel) -> list[tuple[str, str]]:
+    """Return how sure position and turn are: words and figures."""
+    turns = rotation_sigmas_deg(placed, model)
+    C = placed.covariance
+    if C is None or turns is None or not np.all(np.isfinite(C)):
+        return [("1 sigma of the pose", NOT_KNOWN)]
+    worst = float(np.sqrt(max(float(np.linalg.eigvalsh(C[3:, 3:])[-1]), 0.0)))
+    rows = [("1 sigma, position", f"{1e3 * worst:.2g} mm")]
+    if turns.sigmas_deg:
+        rows.append(("1 sigma, turn", f"{max(turns.sigmas_deg):.2g} deg"))
+    return rows
+
+
+def _quote(entry: Entry) -> str:
+    cite = f"{entry.reviewer}, {entry.time[:10]}"
+    return f"<blockquote>{_said(entry.comment)}<cite>{_said(cite)}</cite></blockquote>"
+
+
+def _said(text: str) -> str:
+    return html.escape(text.strip())
+
+
+def _counted(count: int, thing: str) -> str:
+    return f"{count} {thing}" if count == 1 else f"{count} {thing}s"

@@ -1,0 +1,202 @@
+"""Motions of a session's grasps: the school's own arm, home to the end, in world."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim import InputError
+from realsim.app.review.motions import FIXED_IN_HAND, NO_TRAJECTORY, SessionMotions
+from realsim.app.school.files import stored_grasps
+from realsim.formats.grasps.scene_grasps import SceneGrasps
+from realsim.geometry import se3
+from realsim.records import ObjectModel
+from realsim.records.trajectories import PHASES
+from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.arm.reach_config import base_on_table, home_joints
+from realsim_sim_bridge.demonstrations.school_settings import school_config_of
+from school_sessions import registered, run
+
+WEAK = ("--engine", "mujoco", "--grasps", "8", "--workers", "1", "--quiet", "--force", "4",
+        "--friction", "0.3")  # fmt: skip
+CLOSE = PHASES.index("close")
+SAME = 1e-5
+"""The school follows poses to 1e-6 m; files round."""
+
+
+@pytest.fixture(scope="module")
+def school(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = registered(tmp_path_factory.mktemp("motions") / "session")
+    result = run("run", folder, *WEAK)
+    assert result.exception is None, result.output
+    return folder
+
+
+@pytest.fixture(scope="module")
+def stored(school: Path) -> tuple[SceneGrasps, dict[int, ObjectModel]]:
+    return stored_grasps(school)
+
+
+@pytest.fixture(scope="module")
+def motions(school: Path) -> SessionMotions:
+    return SessionMotions.of_session(school, with_arm=False)
+
+
+def attempts(grasps: SceneGrasps) -> list[tuple[int, int]]:
+    """Return some instances and rows with a trajectory."""
+    pairs = [(i, int(r)) for i, t in grasps.trajectories.items() for r in t.rows]
+    assert pairs, "the school has reached nothing"
+    return pairs[:3]
+
+
+def as_stored(
+    stored: tuple[SceneGrasps, dict[int, ObjectModel]], grasps: SceneGrasps | None = None
+) -> SessionMotions:
+    """Return motions of a school whose attempts cannot be tried again: its matter is another."""
+    models = {i: replace(m, density=2.0 * m.density) for i, m in stored[1].items()}
+    sets = tuple(
+        replace(s, parameters={k: v for k, v in s.parameters.items() if k != "density"})
+        for s in stored[0].sets
+    )
+    return SessionMotions(replace(grasps or stored[0], sets=sets), models, with_arm=False)
+
+
+@pytest.mark.parametrize("kind", ["tried again", "as stored"])
+def test_the_hand_closes_in_the_grasp_and_comes_from_home(
+    kind: str, motions: SessionMotions, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
+) -> None:
+    grasps, _ = stored
+    source = motions if kind == "tried again" else as_stored(stored)
+    sets = {s.instance: s for s in grasps.sets}
+    for instance, row in attempts(grasps):
+        motion, s = source.motion(instance, row), sets[instance]
+        assert motion is not None
+        assert any(FIXED_IN_HAND in n for n in motion.notes) is (kind == "as stored")
+        assert np.all(np.diff(motion.time_s) > 0)
+        closing = motion.phase == CLOSE
+        T_world_grasp = grasps.Ts_world_obj[instance] @ s.Ts_obj_grasp[row]
+        np.testing.assert_allclose(
+            motion.Ts_world_hand[closing], np.tile(T_world_grasp, (closing.sum(), 1, 1)), atol=SAME
+        )
+        x, y = s.parameters["middle_xy_m"]
+        reach = school_config_of(s).reach
+        T_world_base = grasps.T_world_table @ base_on_table((x, y), reach)
+        home = T_world_base @ panda.forward(home_joints(reach, (x, y)))
+        np.testing.assert_allclose(motion.Ts_world_hand[0], home, atol=SAME)
+        assert motion.phase_name(0) == "reach"
+
+
+@pytest.mark.parametrize("kind", ["tried again", "as stored"])
+def test_the_object_stands_still_until_the_fingers_close_and_goes_along_after(
+    kind: str, motions: SessionMotions, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
+) -> None:
+    grasps, _ = stored
+    source = motions if kind == "tried again" else as_stored(stored)
+    carried = 0
+    for instance, row in attempts(grasps):
+        motion = source.motion(instance, row)
+        assert motion is not None
+        before = motion.phase < CLOSE
+        T = grasps.Ts_world_obj[instance]
+        np.testing.assert_allclose(
+            motion.Ts_world_obj[before], np.tile(T, (before.sum(), 1, 1)), atol=1e-9
+        )
+        carried += float(np.ptp(motion.Ts_world_obj[:, 2, 3])) > 0.05
+        if kind == "as stored":
+            lifted = motion.phase > CLOSE
+            Ts_hand_obj = se3.invert(motion.Ts_world_hand[lifted]) @ motion.Ts_world_obj[lifted]
+            assert np.ptp(Ts_hand_obj, axis=0).max() < 1e-9 if lifted.any() else True
+    assert carried, "no attempt lifts its object: the law was not tried"
+
+
+@pytest.mark.parametrize("kind", ["tried again", "as stored"])
+def test_the_replay_moves_with_the_world(
+    kind: str, motions: SessionMotions, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
+) -> None:
+    grasps, models = stored
+    T = se3.random_transform(np.random.default_rng(8))
+    assert grasps.T_world_table is not None
+    moved = replace(
+        grasps,
+        Ts_world_obj={i: T @ P for i, P in grasps.Ts_world_obj.items()},
+        T_world_table=T @ grasps.T_world_table,
+    )
+    if kind == "tried again":
+        here, there = motions, SessionMotions(moved, models, with_arm=False)
+    else:
+        here, there = as_stored(stored), as_stored(stored, moved)
+    instance, row = attempts(grasps)[0]
+    a, b = here.motion(instance, row), there.motion(instance, row)
+    assert a is not None and b is not None
+    np.testing.assert_array_equal(a.time_s, b.time_s)
+    np.testing.assert_array_equal(a.phase, b.phase)
+    np.testing.assert_allclose(b.Ts_world_hand, T @ a.Ts_world_hand, atol=1e-9)
+    # The engine's last bits depend on those of the pose; contacts make them larger.
+    np.testing.assert_allclose(b.Ts_world_obj, T @ a.Ts_world_obj, atol=1e-3)
+
+
+def test_a_grasp_without_a_trajectory_shows_the_approach_and_says_so(
+    stored: tuple[SceneGrasps, dict[int, ObjectModel]],
+) -> None:
+    grasps, models = stored
+    bare = SessionMotions(replace(grasps, trajectories={}), models, with_arm=False)
+    s = grasps.sets[0]
+    motion = bare.motion(s.instance, 0)
+    assert motion is not None and motion.notes == (NO_TRAJECTORY,)
+    T_world_grasp = grasps.Ts_world_obj[s.instance] @ s.Ts_obj_grasp[0]
+    np.testing.assert_allclose(motion.Ts_world_hand[-1], T_world_grasp, atol=1e-12)
+    assert bare.motion(s.instance, len(s)) is None and bare.motion(99, 0) is None
+
+
+def test_an_object_that_was_moved_since_is_approached_where_it_stands(
+    stored: tuple[SceneGrasps, dict[int, ObjectModel]],
+) -> None:
+    grasps, models = stored
+    instance, row = attempts(grasps)[0]
+    poses = dict(grasps.Ts_world_obj)
+    poses[instance] = se3.from_translation([0.01, 0.0, 0.0]) @ poses[instance]
+    motion = SessionMotions(replace(grasps, Ts_world_obj=poses), models, with_arm=False).motion(
+        instance, row
+    )
+    assert motion is not None and "moved since" in motion.notes[0]
+    s = next(s for s in grasps.sets if s.instance == instance)
+    np.testing.assert_allclose(
+        motion.Ts_world_hand[-1], poses[instance] @ s.Ts_obj_grasp[row], atol=1e-12
+    )
+
+
+def test_an_object_without_a_model_is_named(
+    stored: tuple[SceneGrasps, dict[int, ObjectModel]],
+) -> None:
+    grasps, _ = stored
+    bare = SessionMotions(grasps, {}, with_arm=False)
+    with pytest.raises(InputError, match="no model"):
+        bare.motion(grasps.sets[0].instance, 0)
+
+
+def test_a_motion_that_was_seen_is_kept(
+    motions: SessionMotions, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
+) -> None:
+    instance, row = attempts(stored[0])[0]
+    assert motions.motion(instance, row) is motions.motion(instance, row)
+
+
+def test_arm_and_hand_are_drawn_where_the_kinematics_have_them(
+    school: Path, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
+) -> None:
+    instance, row = attempts(stored[0])[0]
+    motion = SessionMotions.of_session(school).motion(instance, row)
+    assert motion is not None
+    assert len(motion.link_meshes) == 11, "links 0 to 7, hand, two fingers"
+    assert motion.arm_links == 8
+    assert motion.Ts_world_link.shape == (len(motion), 11, 4, 4)
+    base = motion.Ts_world_link[:, 0]
+    np.testing.assert_allclose(base, np.tile(base[0], (len(motion), 1, 1)), atol=1e-12)
+    Ts_grasp_hand = se3.invert(motion.Ts_world_hand) @ motion.Ts_world_link[:, 8]
+    expected = se3.from_translation([0.0, 0.0, -panda.TCP_M])
+    np.testing.assert_allclose(Ts_grasp_hand, np.tile(expected, (len(motion), 1, 1)), atol=1e-9)
+    apart = np.linalg.norm(
+        motion.Ts_world_link[:, 9, :3, 3] - motion.Ts_world_link[:, 10, :3, 3], axis=1
+    )
+    np.testing.assert_allclose(apart, motion.opening_m, atol=1e-9)

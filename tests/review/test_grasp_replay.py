@@ -1,0 +1,288 @@
+"""The replay of a grasp: its record, the approach made from the grasp, the player, the words."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import viser
+
+from realsim import InputError, Mesh
+from realsim.geometry import se3
+from realsim.records import STAGES
+from realsim.records.trajectories import PHASES
+from realsim.review.grasp_replay import (
+    GraspMotion,
+    HandApproach,
+    Motions,
+    ReplayConfig,
+    ReplayPlayer,
+    hand_approach,
+)
+from realsim.review.grasp_words import (
+    LOST,
+    NOT_TRIED,
+    escaped,
+    failure_words,
+    grasp_words,
+    slip_table,
+    slip_words,
+)
+from realsim.review.replay_nodes import BOX_FACES, HandShape
+from tried_grasps import tried_set
+
+WIDTH_M = 0.03
+TRIANGLE = Mesh(vertices=np.eye(3), faces=np.array([[0, 1, 2]], dtype=np.int32))
+
+
+def approach(seed: int = 0, width_m: float = WIDTH_M) -> GraspMotion:
+    rng = np.random.default_rng(seed)
+    T_world_obj, T_obj_grasp = se3.random_transform(rng), se3.random_transform(rng)
+    return hand_approach(4, 2, T_world_obj, T_obj_grasp, width_m, HandApproach())
+
+
+def carried(seconds: float = 0.4, rate_hz: float = 50.0) -> GraspMotion:
+    """A motion whose object is lifted in its second half."""
+    n = round(seconds * rate_hz)
+    lift = np.maximum(np.arange(n) - n // 2, 0) * 0.01
+    Ts = np.tile(np.eye(4), (n, 1, 1))
+    Ts[:, 2, 3] = lift
+    return GraspMotion(
+        instance=1, row=0, time_s=np.arange(n) / rate_hz, Ts_world_hand=Ts,
+        opening_m=np.full(n, 0.02), phase=np.where(lift > 0, 3, 2), Ts_world_obj=Ts,
+        obj_mesh=TRIANGLE, notes=("a note",),
+    )  # fmt: skip
+
+
+# --- the record and the approach ----------------------------------------------------------------
+
+
+def test_the_approach_ends_in_the_grasp_with_closed_fingers() -> None:
+    rng = np.random.default_rng(3)
+    T_world_obj, T_obj_grasp = se3.random_transform(rng), se3.random_transform(rng)
+    motion = hand_approach(0, 0, T_world_obj, T_obj_grasp, WIDTH_M, HandApproach())
+    closing = motion.phase == PHASES.index("close")
+    np.testing.assert_allclose(
+        motion.Ts_world_hand[closing],
+        np.tile(T_world_obj @ T_obj_grasp, (closing.sum(), 1, 1)), atol=1e-12,
+    )  # fmt: skip
+    assert motion.opening_m[-1] == pytest.approx(WIDTH_M, abs=1e-12)
+    assert motion.opening_m[0] == HandApproach().opening_m
+
+
+def test_the_hand_comes_straight_along_the_approach_axis() -> None:
+    motion = approach()
+    Ts_grasp_hand = se3.invert(motion.Ts_world_hand[-1]) @ motion.Ts_world_hand
+    np.testing.assert_allclose(Ts_grasp_hand[:, :2, 3], 0.0, atol=1e-12)
+    np.testing.assert_allclose(Ts_grasp_hand[0, 2, 3], -HandApproach().approach_m, atol=1e-12)
+    assert np.all(np.diff(Ts_grasp_hand[:, 2, 3]) >= -1e-12)
+    np.testing.assert_array_equal(np.ptp(motion.Ts_world_obj, axis=0), np.zeros((4, 4)))
+
+
+@pytest.mark.parametrize("width_m", [0.0, 0.0123, 0.08, 0.11])
+def test_time_increases_and_fingers_only_close(width_m: float) -> None:
+    motion = approach(1, width_m)
+    assert np.all(np.diff(motion.time_s) > 0)
+    assert np.all(np.diff(motion.opening_m) <= 1e-12) and motion.opening_m.min() >= width_m
+
+
+def test_the_approach_moves_with_the_world() -> None:
+    rng = np.random.default_rng(5)
+    T, T_world_obj, T_obj_grasp = (se3.random_transform(rng) for _ in range(3))
+    a = hand_approach(0, 0, T_world_obj, T_obj_grasp, WIDTH_M, HandApproach())
+    b = hand_approach(0, 0, T @ T_world_obj, T_obj_grasp, WIDTH_M, HandApproach())
+    np.testing.assert_allclose(b.Ts_world_hand, T @ a.Ts_world_hand, atol=1e-12)
+    np.testing.assert_allclose(b.Ts_world_obj, T @ a.Ts_world_obj, atol=1e-12)
+    np.testing.assert_array_equal(a.time_s, b.time_s)
+
+
+def test_a_time_belongs_to_the_sample_before_it() -> None:
+    motion = carried()
+    assert [motion.at(t) for t in (-1.0, 0.0, 0.0199, 0.02, 9.0)] == [0, 0, 0, 1, len(motion) - 1]
+    assert motion.phase_name(0) == "close" and motion.phase_name(len(motion) - 1) == "lift"
+
+
+def test_motions_that_are_none_are_refused() -> None:
+    good = carried()
+    for broken in (
+        {"time_s": np.zeros(len(good))},
+        {"opening_m": np.zeros(3)},
+        {"phase": np.full(len(good), 17)},
+        {"Ts_world_obj": good.Ts_world_obj[:2]},
+        {"link_meshes": (TRIANGLE,), "Ts_world_link": np.zeros((len(good), 2, 4, 4))},
+    ):
+        with pytest.raises(InputError):
+            replace(good, **broken)
+    with pytest.raises(InputError, match="no sample"):
+        replace(good, time_s=np.zeros(0))
+
+
+def test_the_plain_hand_is_open_by_its_opening() -> None:
+    hand = HandShape()
+    (left_low, left_high), (right_low, right_high) = hand.finger(1), hand.finger(-1)
+    assert left_low[1] == 0.0 == right_high[1], "closed, the faces touch"
+    assert left_high[1] == -right_low[1] == hand.finger_m[1]
+    assert hand.palm()[1][2] <= left_low[2] + 0.01, "the fingers begin at the palm"
+    assert len(np.unique(BOX_FACES)) == 8 and BOX_FACES.shape == (12, 3)
+
+
+# --- the player ---------------------------------------------------------------------------------
+
+
+class Given:
+    """Motions that are handed over; those of row 9 are not known."""
+
+    def __init__(self, motion: GraspMotion) -> None:
+        self.given = motion
+
+    def motion(self, instance: int, row: int) -> GraspMotion | None:
+        return None if row == 9 else replace(self.given, instance=instance, row=row)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[viser.ViserServer]:
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield server
+    server.stop()
+
+
+def player_of(server: viser.ViserServer, motions: Motions, **kwargs: object) -> ReplayPlayer:
+    return ReplayPlayer(server.scene, server.gui, motions, atomic=server.atomic, **kwargs)  # pyright: ignore[reportArgumentType]
+
+
+def wait(until: object, seconds: float = 20.0) -> bool:
+    assert callable(until)
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if until():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def test_a_replay_runs_to_its_end_and_carries_the_object(server: viser.ViserServer) -> None:
+    told: list[tuple[int, bool]] = []
+    motion = carried()
+    player = player_of(server, Given(motion), on_carried=lambda i, c: told.append((i, c)))
+    shown = player.show(1, 0)
+    assert shown is not None and shown.row == 0 and player.playing
+    assert wait(lambda: not player.playing)
+    assert player.time_s == pytest.approx(motion.time_s[-1])
+    assert told == [(1, True)]
+    node = player._nodes._object  # pyright: ignore[reportPrivateUsage]
+    assert node.visible
+    np.testing.assert_allclose(node.position, motion.Ts_world_obj[-1, :3, 3], atol=1e-6)
+    player.clear()
+    assert told[-1] == (1, False) and player.motion is None
+
+
+def test_seeking_puts_the_hand_where_the_motion_says(server: viser.ViserServer) -> None:
+    motion = approach()
+    player = player_of(server, Given(motion))
+    player.show(4, 2, play=False)
+    assert not player.playing
+    for k in (0, len(motion) // 2, len(motion) - 1):
+        player.seek(float(motion.time_s[k]))
+        palm, left, right = player._nodes._boxes  # pyright: ignore[reportPrivateUsage]
+        T = motion.Ts_world_hand[k]
+        np.testing.assert_allclose(palm.position, T[:3, 3], atol=1e-6)
+        apart = np.linalg.norm(np.array(left.position) - np.array(right.position))
+        assert apart == pytest.approx(motion.opening_m[k], abs=1e-6)
+        np.testing.assert_allclose(
+            (np.array(left.position) + np.array(right.position)) / 2, T[:3, 3], atol=1e-6
+        )
+    player.clear()
+
+
+def test_another_grasp_ends_the_thread_of_the_one_before(server: viser.ViserServer) -> None:
+    import threading
+
+    def threads() -> int:
+        return sum(t.name == "grasp-replay" for t in threading.enumerate())
+
+    player = player_of(server, Given(carried(60.0, 5.0)))
+    for row in range(5):
+        player.show(0, row)
+    assert wait(lambda: threads() == 1)
+    assert player.motion is not None and player.motion.row == 4
+    player.pause()
+    assert wait(lambda: threads() == 0)
+    assert player.show(0, 9) is None and player.motion is None, "nothing is known of row 9"
+
+
+def test_a_browser_that_is_gone_ends_the_replay(server: viser.ViserServer) -> None:
+    there = [True]
+    config = ReplayConfig(rate_hz=50.0)
+    player = player_of(server, Given(carried(60.0, 5.0)), config=config, connected=lambda: there[0])
+    player.show(0, 0)
+    assert player.playing
+    there[0] = False
+    assert wait(lambda: not player.playing)
+    player.clear()
+
+
+def test_play_at_the_end_begins_again(server: viser.ViserServer) -> None:
+    player = player_of(server, Given(carried()))
+    player.show(0, 0, play=False)
+    player.seek(99.0)
+    assert player.time_s == pytest.approx(carried().time_s[-1])
+    player.play()
+    assert player.time_s < carried().time_s[-1]
+    player.clear()
+
+
+def test_the_arm_can_be_hidden_and_the_hand_stays(server: viser.ViserServer) -> None:
+    given = carried()
+    Ts = np.stack([given.Ts_world_hand] * 3, axis=1)
+    given = replace(given, link_meshes=(TRIANGLE,) * 3, Ts_world_link=Ts, arm_links=2)
+    player = player_of(server, Given(given))
+    player.show(0, 0, play=False)
+    nodes = player._nodes  # pyright: ignore[reportPrivateUsage]
+    assert [n.visible for n in nodes._links] == [True] * 3  # pyright: ignore[reportPrivateUsage]
+    nodes.show_arm(False)
+    player.seek(0.2)
+    assert [n.visible for n in nodes._links] == [False, False, True]  # pyright: ignore[reportPrivateUsage]
+    np.testing.assert_allclose(nodes._links[2].position, Ts[given.at(0.2), 2, :3, 3], atol=1e-6)  # pyright: ignore[reportPrivateUsage]
+    player.clear()
+
+
+# --- words --------------------------------------------------------------------------------------
+
+
+def test_slips_are_read_as_numbers_lost_or_not_tried() -> None:
+    assert [slip_words(v) for v in (np.nan, np.inf, 1.234)] == [NOT_TRIED, LOST, "1.23"]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_words_of_every_grasp_say_stage_by_stage_what_is_stored(seed: int) -> None:
+    grasps = tried_set(np.random.default_rng(seed))
+    for row in range(len(grasps)):
+        table = slip_table(grasps, row)
+        assert [line.split("|")[1].strip() for line in table[2:]] == list(STAGES)
+        for line, slip in zip(table[2:], grasps.slip_m[row], strict=True):
+            cell = line.split("|")[2].strip()
+            if np.isfinite(slip):
+                assert float(cell) == pytest.approx(1e3 * slip, abs=0.006)
+            else:
+                assert cell == (LOST if np.isinf(slip) else NOT_TRIED)
+        text = grasp_words(grasps, row, "mug")
+        assert f"Grasp {row}" in text and "mug" in text
+        assert escaped(grasps.failures[row]) in text
+        assert ("does not reach" in text) is not bool(grasps.reachable[row])
+        assert "nan" not in text and "inf" not in text.replace("instance", "")
+
+
+def test_a_failure_names_the_stage_where_it_stopped() -> None:
+    grasps = tried_set(np.random.default_rng(0), 4)
+    words = ("lift: the object slipped", "the approach leaves the limits", "", "close: lost")
+    grasps = replace(grasps, failures=words, scores=np.array([0.2, np.nan, 1.0, 0.0]))
+    assert failure_words(grasps, 0).startswith("stopped at lift")
+    assert failure_words(grasps, 1) == words[1]
+    assert failure_words(grasps, 2) == ""
+    with pytest.raises(IndexError):
+        grasp_words(grasps, 4)
+
+
+def test_names_of_people_are_neither_html_nor_markdown() -> None:
+    assert escaped("<b>*a*|`x`</b>") == "&lt;b&gt;\\*a\\*\\|\\`x\\`&lt;/b&gt;"
