@@ -1,0 +1,122 @@
+"""Distances of measured points from the models: zero on them, signed, the same after a detour."""
+
+import time
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.mesh_shape import sample_surface
+from realsim.geometry.parts import part
+from realsim.review.depth_residuals import CloudResiduals, legend, residual_rgb, residuals
+
+Array = NDArray[np.float64]
+WEDGE = part("wedge").mesh
+FLANGE = part("flange").mesh
+T_WEDGE = se3.from_translation([0.5, 0.1, 0.0]) @ se3.exp(np.array([0.1, -0.3, 0.5, 0, 0, 0]))
+T_FLANGE = se3.from_translation([0.65, 0.1, 0.0])
+
+
+def surface(offset_m: float = 0.0, seed: int = 0) -> Array:
+    """Return points of the wedge in world, moved along their normals."""
+    points, normals = sample_surface(WEDGE, 4000, np.random.default_rng(seed))
+    return se3.transform(T_WEDGE, points + offset_m * normals)
+
+
+def test_points_on_the_surface_have_no_residual() -> None:
+    r = residuals(surface(), T_WEDGE[None], [WEDGE])
+    assert np.all(np.isfinite(r))
+    assert np.quantile(np.abs(r), 0.99) < 1e-4 and np.abs(r).max() < 4e-4
+
+
+@pytest.mark.parametrize("offset_mm", [-2.0, 1.0, 3.0])
+def test_the_sign_tells_front_from_inside(offset_mm: float) -> None:
+    r = residuals(surface(1e-3 * offset_mm), T_WEDGE[None], [WEDGE])
+    assert np.median(r) == pytest.approx(1e-3 * offset_mm, abs=5e-5)
+    assert np.mean(np.sign(r) == np.sign(offset_mm)) > 0.97
+
+
+def test_residuals_do_not_depend_on_where_the_world_is() -> None:
+    W = se3.random_transform(np.random.default_rng(1))
+    points = surface(0.001)
+    a = residuals(points, np.stack([T_WEDGE, T_FLANGE]), [WEDGE, FLANGE])
+    b = residuals(se3.transform(W, points), np.stack([W @ T_WEDGE, W @ T_FLANGE]), [WEDGE, FLANGE])
+    np.testing.assert_allclose(a, b, atol=2e-6)
+
+
+def test_points_far_from_all_have_none() -> None:
+    points = np.concatenate([surface()[:10], [[0.5, 0.1, 0.5], [0.0, 0.0, 0.0]]])
+    r = residuals(points, T_WEDGE[None], [WEDGE])
+    assert list(np.isnan(r)) == [False] * 10 + [True] * 2
+    assert np.all(np.isnan(residuals(points, np.zeros((0, 4, 4)), [])))
+
+
+def test_of_several_models_the_nearest_counts_whatever_their_order() -> None:
+    points = np.concatenate([surface(0.002), surface(-0.001, 1)])
+    T_near = T_WEDGE @ se3.from_translation([0.0, 0.0, 0.004])
+    pair = residuals(points, np.stack([T_WEDGE, T_near]), [WEDGE, WEDGE])
+    swapped = residuals(points, np.stack([T_near, T_WEDGE]), [WEDGE, WEDGE])
+    np.testing.assert_array_equal(np.abs(pair), np.abs(swapped))
+    alone = [residuals(points, T[None], [WEDGE]) for T in (T_WEDGE, T_near)]
+    np.testing.assert_array_equal(np.abs(pair), np.nanmin(np.abs(alone), axis=0))
+
+
+def test_a_move_there_and_back_leaves_the_residuals() -> None:
+    cloud = CloudResiduals(surface(0.001))
+    here, there = np.stack([T_WEDGE, T_FLANGE]), np.stack([T_FLANGE, T_WEDGE])
+    first = cloud.against(here, [WEDGE, FLANGE])
+    assert not np.array_equal(cloud.against(there, [WEDGE, FLANGE]), first, equal_nan=True)
+    np.testing.assert_array_equal(cloud.against(here, [WEDGE, FLANGE]), first)
+
+
+def test_200_000_points_and_15_objects_take_less_than_a_second_and_one_moved_object_a_tenth() -> (
+    None
+):
+    rng = np.random.default_rng(2)
+    meshes = [(WEDGE, FLANGE)[k % 2] for k in range(15)]
+    Ts = np.stack([se3.from_translation([0.1 * (k % 5), 0.1 * (k // 5), 0]) for k in range(15)])
+    points = rng.uniform([-0.1, -0.1, -0.02], [0.5, 0.3, 0.06], size=(200_000, 3))
+    CloudResiduals(points[:10]).against(Ts, meshes)  # fields are made once in a session
+    cloud = CloudResiduals(points)
+    begun = time.process_time()
+    first = cloud.against(Ts, meshes)
+    all_s = time.process_time() - begun
+    Ts[3, 0, 3] += 0.002
+    begun = time.process_time()
+    second = cloud.against(Ts, meshes)
+    one_s = time.process_time() - begun
+    assert all_s < 1.0
+    assert one_s < 0.2
+    np.testing.assert_array_equal(second, residuals(points, Ts, meshes))
+    assert not np.array_equal(first, second, equal_nan=True)
+
+
+def test_colours_tell_inside_from_outside_also_without_red_green_vision() -> None:
+    rgb = residual_rgb(np.array([-0.02, -0.005, 0.0, 0.005, 0.02, np.nan])).astype(int)
+    np.testing.assert_array_equal(rgb[0], rgb[1])
+    np.testing.assert_array_equal(rgb[3], rgb[4])
+    # Who sees no red-green still sees blue against yellow: the blue channel and the sum differ.
+    inside, on, outside, none = rgb[1], rgb[2], rgb[3], rgb[5]
+    assert inside[2] > outside[2] + 80 and outside[0] > inside[0] + 80
+    assert on.sum() > inside.sum() + 200 and on.sum() > outside.sum() + 200
+    assert none[0] == none[1] == none[2]
+
+
+def test_the_legend_is_of_the_same_colours() -> None:
+    shown = legend(0.004, 0.02)
+    assert shown.values_mm == (-4.0, -2.0, 0.0, 2.0, 4.0)
+    np.testing.assert_array_equal(residual_rgb(1e-3 * np.array(shown.values_mm), 0.004), shown.rgb)
+    assert "4 mm" in shown.words and "20 mm" in shown.words
+
+
+def test_what_is_no_cloud_is_refused() -> None:
+    with pytest.raises(InputError, match=r"\(N, 3\)"):
+        CloudResiduals(np.zeros((4, 2)))
+    with pytest.raises(InputError, match="positive"):
+        CloudResiduals(np.zeros((4, 3)), within_m=0.0)
+    with pytest.raises(InputError, match="one of each"):
+        residuals(np.zeros((4, 3)), np.eye(4)[None], [])
+    with pytest.raises(InputError, match="positive"):
+        residual_rgb([0.0], 0.0)
