@@ -1,6 +1,7 @@
 """One object instance as the fit sees it: distance field, surface samples, ray-casting scene."""
 
 from dataclasses import dataclass
+from dataclasses import field as derived
 from pathlib import Path
 from typing import Any
 
@@ -32,21 +33,21 @@ class Body:
     """(S, 3) outward normals of the samples."""
     ray_scene: Any
     """Open3D RaycastingScene of the mesh in its own frame."""
+    center_obj: Array = derived(init=False)
+    """(3,) centre of the bounding box in the object's frame [m]."""
+    radius_m: float = derived(init=False)
+    """Half the diagonal of the bounding box [m]."""
+
+    def __post_init__(self) -> None:
+        """Measure the box once: a fit asks for it thousands of times."""
+        low, high = self.model.mesh.bounds
+        object.__setattr__(self, "center_obj", 0.5 * (low + high))
+        object.__setattr__(self, "radius_m", float(0.5 * np.linalg.norm(high - low)))
 
     @property
     def T_start(self) -> Array:
         """(4, 4) the start pose T_world_obj."""
         return self.start.T_world_obj
-
-    @property
-    def center_obj(self) -> Array:
-        """(3,) centre of the bounding box in the object's frame [m]."""
-        return self.model.mesh.bounds.mean(0)
-
-    @property
-    def radius_m(self) -> float:
-        """Half the diagonal of the bounding box [m]."""
-        return float(0.5 * np.linalg.norm(self.model.mesh.extent))
 
     def center(self, T_world_obj: Array) -> Array:
         """Return the centre of the bounding box (3,) in world [m]."""
