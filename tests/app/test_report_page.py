@@ -11,7 +11,9 @@ import pytest
 from realsim.app.annotate.run import run_annotate
 from realsim.app.console import Console
 from realsim.app.register.files import write_result
+from realsim.app.report.compare_page import comparison_html, comparison_of
 from realsim.app.report.session import write_report
+from realsim.app.report.sources import sources_of
 from realsim.store import SessionStore
 from registered_sessions import models_of, registered_by_hand, table_session
 
@@ -25,8 +27,12 @@ def pages(tmp_path: Path) -> dict[str, Path]:
     write_result(store, registered_by_hand(store), models_of(), {})
     store = SessionStore.open(store.folder)
     run_annotate(store.folder, Console(quiet=True), maps="all", workers=1, check_depth=True)
+    comparison = tmp_path / "comparison.html"
+    sources = sources_of([store.folder, store.folder])
+    comparison.write_text(comparison_html(comparison_of(sources)), "utf-8")
     return {
         "report": write_report(store, None),
+        "comparison": comparison,
         "annotation": store.path("reports/annotated.html"),
     }
 
@@ -41,7 +47,7 @@ def test_tables_scroll_inside_the_page_and_every_check_is_in_one(pages: dict[str
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-@pytest.mark.parametrize("width", [1100, 390])
+@pytest.mark.parametrize("width", [1280, 600, 390])
 def test_in_chromium_no_page_scrolls_sideways(
     pages: dict[str, Path], tmp_path: Path, width: int
 ) -> None:

@@ -1,0 +1,255 @@
+"""The comparison of reports: a table for the console, a document for programs, a page."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from realsim.app.report import plots_compare
+from realsim.app.report.catalogue import CATALOGUE
+from realsim.app.report.compare import (
+    OUTCOMES,
+    SIGMAS,
+    Difference,
+    ObjectDifference,
+    differences,
+    object_differences,
+)
+from realsim.app.report.figures import figures_to_json
+from realsim.app.report.page import Cell, Page
+from realsim.app.report.plots import WIDTH_PX
+from realsim.app.report.session import filled
+from realsim.app.report.sources import Source
+from realsim.app.report.summary import SCHEMA_VERSION, VERDICTS
+
+SCHEMA = "realsim report comparison"
+KINDS = {"better": "good", "worse": "bad", "same": "", "other": "", "unknown": "off"}
+SIGNS = {"better": "▲ better", "worse": "▼ worse", "same": "same", "other": "differs",
+         "unknown": "?"}  # fmt: skip
+"""Words as well as colours: both are read."""
+EXPLAINED = (
+    f"A difference counts where it is more than {SIGMAS:g} sigma of both together. Counts are "
+    "exact. Where a sigma is not known, a difference may be noise and is marked with '?'."
+)
+WORLD_NOTE = (
+    "Poses are compared in the robot's world: objects that were moved, or a robot that stands "
+    "elsewhere, show here as well as errors. MSSD: largest distance of a point of the surface, the "
+    "object's symmetries considered."
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Comparison:
+    """The first of several sessions against each of the others."""
+
+    sources: tuple[Source, ...]
+    figures: tuple[tuple[Difference, ...], ...]
+    """Of every other session."""
+    objects: tuple[tuple[ObjectDifference, ...], ...]
+
+    @property
+    def worse(self) -> list[tuple[Source, Difference]]:
+        """Return the figures that are worse by more than noise."""
+        return [
+            (other, d)
+            for other, found in zip(self.sources[1:], self.figures, strict=True)
+            for d in found
+            if d.outcome == "worse"
+        ]
+
+
+def comparison_of(sources: Sequence[Source]) -> Comparison:
+    """Compare the first of several sessions with each of the others."""
+    first, others = sources[0], sources[1:]
+    return Comparison(
+        sources=tuple(sources),
+        figures=tuple(tuple(differences(first, other)) for other in others),
+        objects=tuple(tuple(object_differences(first, other)) for other in others),
+    )
+
+
+def figure_header(c: Comparison) -> list[str]:
+    """Return the header of the table of figures."""
+    first = c.sources[0].letter
+    header = ["figure", "unit", *[s.letter for s in c.sources]]
+    for other in c.sources[1:]:
+        header += [f"{other.letter} - {first}", "means"]
+    return header
+
+
+def figure_rows(c: Comparison, *, all_figures: bool = True) -> list[list[object]]:
+    """Return the rows of the table of figures.
+
+    Args:
+        c: the comparison.
+        all_figures: False leaves out those that are the same in all.
+    """
+    rows: list[list[object]] = []
+    by = [{d.name: d for d in found} for found in c.figures]
+    for name, meaning in CATALOGUE.items():
+        mine = [found[name] for found in by if name in found]
+        if not mine or (not all_figures and all(d.value == 0 for d in mine)):
+            continue
+        row: list[object] = [Cell(text=name, hover=meaning.text), meaning.unit]
+        for s in c.sources:
+            row.append(s.figures[name].shown if name in s.figures else "-")
+        for found, other in zip(by, c.sources[1:], strict=True):
+            row += _outcome(found.get(name), c.sources[0], other)
+        rows.append(row)
+    return rows
+
+
+def _outcome(d: Difference | None, first: Source, other: Source) -> list[object]:
+    """Return difference and meaning of one figure."""
+    if d is None:
+        return ["-", "in neither"]
+    if d.outcome is None:
+        where = first.letter if d.second is None else other.letter
+        return ["-", f"only in {where}"]
+    text = SIGNS[d.outcome]
+    if d.outcome == "unknown" and d.tends:
+        text = f"? ({d.tends})"
+    return [d.shown, Cell(text=text, kind=KINDS[d.outcome], hover=OUTCOMES[d.outcome])]
+
+
+OBJECT_HEADER = [
+    "object", "verdict", "then", "MSSD [mm]", "shift [mm]", "turn [deg]", "2 sigma [mm]", "moved",
+    "note",
+]  # fmt: skip
+
+
+def object_rows(found: Sequence[ObjectDifference]) -> list[list[object]]:
+    """Return the rows of the table of objects."""
+    rows: list[list[object]] = []
+    for o in found:
+        moved = {None: "not known", True: "yes", False: "within noise"}[o.is_moved]
+        moved = "no" if o.shift_mm == 0 and o.turn_deg == 0 else moved
+        noise = None if o.sigma_mm is None else SIGMAS * o.sigma_mm
+        rows.append(
+            [
+                o.name,
+                "-" if o.first is None else o.first["verdict"],
+                "-" if o.second is None else o.second["verdict"],
+                *[_number(v, 3) for v in (o.mssd_mm, o.shift_mm, o.turn_deg, noise)],
+                moved if o.shift_mm is not None else "-",
+                o.note,
+            ]
+        )
+    return rows
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def as_json(c: Comparison) -> dict[str, Any]:
+    """Return the comparison as plain JSON values."""
+    others: list[dict[str, Any]] = []
+    for other, figures, objects in zip(c.sources[1:], c.figures, c.objects, strict=True):
+        others.append(
+            {
+                "with": other.label,
+                "figures": {
+                    d.name: {
+                        "difference": d.value, "sigma": d.sigma, "outcome": d.outcome,
+                        "better": CATALOGUE[d.name].better, "unit": CATALOGUE[d.name].unit,
+                    }
+                    for d in figures
+                },
+                "objects": [
+                    {
+                        "name": o.name, "note": o.note, "mssd_mm": o.mssd_mm,
+                        "shift_mm": o.shift_mm, "turn_deg": o.turn_deg, "sigma_mm": o.sigma_mm,
+                        "moved": o.is_moved,
+                        "verdicts": [None if s is None else s["verdict"]
+                                     for s in (o.first, o.second)],
+                    }
+                    for o in objects
+                ],
+            }
+        )  # fmt: skip
+    return {
+        "schema": SCHEMA,
+        "schema_version": SCHEMA_VERSION,
+        "sessions": [
+            {"label": s.label, "verdict": s.verdict, "figures": figures_to_json(s.figures)}
+            for s in c.sources
+        ],
+        "against": c.sources[0].label,
+        "differences": others,
+    }
+
+
+def comparison_html(c: Comparison) -> str:
+    """Return the comparison as one self-contained page."""
+    page = Page()
+    _summary(page, c)
+    plots = plots_compare.overlaid([(s.label, s.series) for s in c.sources])
+    for other, found in zip(c.sources[1:], c.objects, strict=True):
+        labels = f"{c.sources[0].letter} and {other.letter}"
+        page.section(f"Objects, {labels}", WORLD_NOTE)
+        if found:
+            page.table(OBJECT_HEADER, object_rows(found))
+            picture = plots_compare.moves(found, labels)
+            if picture is not None:
+                page.plots(
+                    [
+                        (
+                            picture,
+                            "Bars: shift. Marks: 2 sigma: a bar beyond is more than noise.",
+                        )
+                    ],
+                    WIDTH_PX,
+                )
+        else:
+            page.text("Neither has objects.")
+    page.section("Plots")
+    if plots:
+        page.plots(plots, WIDTH_PX)
+    else:
+        page.text("There is nothing that two of them have measured.")
+    page.section("All figures", EXPLAINED)
+    page.table(figure_header(c), figure_rows(c))
+    names = " and ".join(s.label for s in c.sources[:2]) + " ..." * (len(c.sources) > 2)
+    return filled(page, title=f"Comparison: {names}", about="", document=as_json(c))
+
+
+def _summary(page: Page, c: Comparison) -> None:
+    """Add what is worse and what is better, for the first screen."""
+    for other, found in zip(c.sources[1:], c.figures, strict=True):
+        worse = [d for d in found if d.outcome == "worse"]
+        better = [d for d in found if d.outcome == "better"]
+        kind = "bad" if worse else "good" if better else "off"
+        page.parts.append(
+            f'<div class="verdict {kind}"><b>{page.escaped(other.label)}</b> against '
+            f"{page.escaped(c.sources[0].label)}: {len(worse)} figures worse, "
+            f"{len(better)} better, by more than noise.</div>"
+        )
+        rows: list[list[object]] = []
+        for d in [*worse, *better]:
+            sign = Cell(text=SIGNS[d.outcome or "same"], kind=KINDS[d.outcome or "same"])
+            values = [f.shown if f is not None else "-" for f in (d.first, d.second)]
+            unit = CATALOGUE[d.name].unit
+            rows.append([sign, CATALOGUE[d.name].text, *values, f"{d.shown} {unit}".strip()])
+        if rows:
+            header = ["", "what", c.sources[0].letter, other.letter, "difference"]
+            page.table(header, rows)
+        only = [d for d in found if d.value is None]
+        if only:
+            page.text(_uncompared(only, c.sources[0], other))
+    rows = [
+        [Cell(text=s.label), Cell(text=VERDICTS[s.verdict][0], kind=VERDICTS[s.verdict][1]),
+         len(s.objects), len(s.figures)]
+        for s in c.sources
+    ]  # fmt: skip
+    page.table(["session", "its report says", "objects", "figures"], rows)
+
+
+def _uncompared(only: Sequence[Difference], first: Source, other: Source) -> str:
+    """Return which stages one side alone has."""
+    told: list[str] = []
+    for letter, missing in ((first.letter, "second"), (other.letter, "first")):
+        names = sorted({d.name.split(".")[0] for d in only if getattr(d, missing) is None})
+        if names:
+            told.append(f"{len([d for d in only if getattr(d, missing) is None])} figures are only "
+                        f"in {letter} ({', '.join(names)})")  # fmt: skip
+    return f"Not compared: {'; '.join(told)}."

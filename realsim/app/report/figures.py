@@ -1,0 +1,119 @@
+"""The figures of a report: every number with its unit, its sigma, and which way is better.
+
+Names are stable: scripts, limits and comparisons are written against them.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from realsim.app.report.catalogue import CATALOGUE, Meaning
+from realsim.errors import InputError
+
+NOT_A_FIGURE = "has no figure of this name"
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Figure:
+    """One figure of one session."""
+
+    name: str
+    value: float
+    sigma: float | None = None
+    """1 sigma in the same unit; 0 = exact (a count); None = not known."""
+
+    def __post_init__(self) -> None:
+        """Check that there is such a figure and that it has a value.
+
+        Raises:
+            InputError: an unknown name, or no finite number.
+        """
+        if self.name not in CATALOGUE:
+            raise InputError(f"a report {NOT_A_FIGURE}: '{self.name}'.")
+        if not math.isfinite(self.value):
+            raise InputError(f"the figure {self.name} is {self.value}; a number is needed.")
+
+    @property
+    def meaning(self) -> Meaning:
+        """Return unit, direction and text."""
+        return CATALOGUE[self.name]
+
+    @property
+    def shown(self) -> str:
+        """Return the value with its sigma, without the unit."""
+        return shown(self.value, self.sigma)
+
+
+def count(name: str, value: int) -> Figure:
+    """Return an exact figure."""
+    return Figure(name=name, value=float(value), sigma=0.0)
+
+
+def share(name: str, part: int, whole: int) -> Figure:
+    """Return a share with the sigma of its binomial, by Agresti and Coull with z = 1.
+
+    sigma = sqrt(p (1 - p) / n') with p = (k + 1/2) / n', n' = n + 1: not 0 where all or none did.
+    (Agresti and Coull, The American Statistician 52, 1998.)
+    """
+    p = (part + 0.5) / (whole + 1)
+    return Figure(name=name, value=part / whole, sigma=math.sqrt(p * (1 - p) / (whole + 1)))
+
+
+def shown(value: float, sigma: float | None) -> str:
+    """Return a value with its sigma, both to the digits that say something."""
+    if sigma is not None and sigma > 0 and math.isfinite(sigma):
+        digits = max(0, min(9, 1 - math.floor(math.log10(sigma))))
+        return f"{value:.{digits}f} ± {sigma:.{digits}f}"
+    if value == int(value) and abs(value) < 1e15 and sigma == 0:
+        return f"{int(value)}"
+    return f"{value:.4g}"
+
+
+def require_known(name: str) -> None:
+    """Raise if there is no such figure.
+
+    Raises:
+        InputError: unknown; lists those that there are.
+    """
+    if name not in CATALOGUE:
+        raise InputError(
+            f"a report {NOT_A_FIGURE}: '{name}'. There are: {', '.join(sorted(CATALOGUE))}."
+        )
+
+
+def figures_to_json(figures: Mapping[str, Figure]) -> dict[str, Any]:
+    """Return name -> value, unit, sigma (null = not known), better, meaning."""
+    return {
+        name: {
+            "value": f.value,
+            "unit": f.meaning.unit,
+            "sigma": f.sigma,
+            "better": f.meaning.better,
+            "meaning": f.meaning.text,
+        }
+        for name, f in figures.items()
+    }
+
+
+def figures_from_json(value: Any) -> dict[str, Figure]:
+    """Return the figures of a stored report; names that this version does not know are left out.
+
+    Raises:
+        InputError: not the figures of a report.
+    """
+    if not isinstance(value, dict):
+        raise InputError("the report has no figures; write it again with `realsim report`.")
+    found: dict[str, Figure] = {}
+    for name, row in value.items():
+        if name not in CATALOGUE:
+            continue
+        try:
+            sigma = None if row["sigma"] is None else float(row["sigma"])
+            found[name] = Figure(name=name, value=float(row["value"]), sigma=sigma)
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"the figure {name} of the report cannot be read ({error!r}); write the report "
+                "again with `realsim report`."
+            ) from error
+    return found

@@ -1,0 +1,146 @@
+"""`realsim report`: one session's report, or several compared; checked against limits."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from realsim.app.console import Console
+from realsim.app.report.compare_page import (
+    OBJECT_HEADER,
+    Comparison,
+    as_json,
+    comparison_html,
+    comparison_of,
+    figure_header,
+    figure_rows,
+    object_rows,
+)
+from realsim.app.report.limits import Limit, broken, limit_of, read_limits
+from realsim.app.report.page import Page
+from realsim.app.report.session import hidden_of, page_html, report_of, write_report_of
+from realsim.app.report.sources import sources_of
+from realsim.app.report.summary import VERDICTS
+from realsim.errors import InputError
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ReportRequest:
+    """What was asked for."""
+
+    sources: tuple[Path, ...]
+    truth: Path | None = None
+    out: Path | None = None
+    limits: Path | None = None
+    fail_on: tuple[str, ...] = ()
+    fail_if_worse: bool = False
+    as_json: bool = False
+    quiet: bool = False
+
+
+def run_report(request: ReportRequest) -> bool:
+    """Write a report, or compare several; return whether nothing failed.
+
+    Raises:
+        InputError: something given cannot be used.
+    """
+    limits = [limit_of(text) for text in request.fail_on]
+    limits += read_limits(request.limits) if request.limits is not None else []
+    if request.out is not None and request.out.is_dir():
+        raise InputError(f"--out '{request.out}' is a folder; give the HTML file to be written.")
+    if len(request.sources) == 1:
+        if request.fail_if_worse:
+            raise InputError("--fail-if-worse compares: give two sessions or more.")
+        return _one(request, limits)
+    if request.truth is not None:
+        raise InputError("--truth belongs to one session; leave it out of a comparison.")
+    return _several(request, limits)
+
+
+def _one(request: ReportRequest, limits: Sequence[Limit]) -> bool:
+    """Report one session."""
+    from realsim.app.stages import open_session
+    from realsim.app.truth import loop_errors
+
+    store = open_session(request.sources[0])
+    errors = None if request.truth is None else loop_errors(store, request.truth)
+    console = Console(quiet=request.quiet, as_json=request.as_json)
+    if request.out is None:
+        report = report_of(store, errors, "kept")
+        path = write_report_of(store, report)
+    else:
+        report = report_of(store, errors, "shown")
+        path = _written(request.out, page_html(store, report))
+    page = Page(hidden=hidden_of(store))
+    failed = [f"bad: {page.plain(f.text)}" for f in report.findings if f.severity == "bad"]
+    failed += [f"limit: {text}" for text in broken(limits, report.figures)]
+    document = report.document(page) | {"failed": failed}
+    console.result(document)
+    if not (request.as_json or request.quiet):
+        _say_one(console, document)
+        console.say(f"report    {path}")
+    _tell(console, failed)
+    return not failed
+
+
+def _say_one(console: Console, document: dict[str, Any]) -> None:
+    """Print the verdict, what to look at, and what is missing."""
+    console.say(f"{document['session']}: {VERDICTS[document['verdict']][0].lower()}")
+    for f in document["findings"]:
+        if f["severity"] == "warn":
+            console.say(f"look at   {f['text']}")
+    for command in document["missing"].values():
+        console.say(f"missing   {command}")
+
+
+def _several(request: ReportRequest, limits: Sequence[Limit]) -> bool:
+    """Compare several sessions."""
+    console = Console(quiet=request.quiet, as_json=request.as_json)
+    with console.stage("report", f"{len(request.sources)} sessions"):
+        comparison = comparison_of(sources_of(request.sources))
+    failed = [
+        f"limit: {s.label}: {text}"
+        for s in comparison.sources
+        for text in broken(limits, s.figures)
+    ]
+    if request.fail_if_worse:
+        for other, d in comparison.worse:
+            unit = f" {d.first.meaning.unit}".rstrip() if d.first is not None else ""
+            failed.append(f"worse: {other.label}: {d.name} by {d.shown}{unit}")
+    if request.out is not None:
+        _written(request.out, comparison_html(comparison))
+    console.result(as_json(comparison) | {"failed": failed})
+    if not (request.as_json or request.quiet):
+        _say_several(console, comparison)
+        if request.out is not None:
+            console.say(f"page      {request.out}")
+    _tell(console, failed)
+    return not failed
+
+
+def _say_several(console: Console, c: Comparison) -> None:
+    """Print the tables."""
+    for s in c.sources:
+        console.say(f"{s.label}: {VERDICTS[s.verdict][0].lower()}")
+    rows = figure_rows(c, all_figures=False)
+    if rows:
+        console.table("Figures that differ", figure_header(c), rows)
+    else:
+        console.say("every figure is the same.")
+    for other, found in zip(c.sources[1:], c.objects, strict=True):
+        if found:
+            title = f"Objects of {c.sources[0].letter} and {other.letter}"
+            console.table(title, OBJECT_HEADER, object_rows(found))
+
+
+def _written(path: Path, text: str) -> Path:
+    from realsim.store import atomic
+
+    atomic.write_bytes(path, text.encode("utf-8"))
+    return path
+
+
+def _tell(console: Console, failed: Sequence[str]) -> None:
+    """Print what failed; never on the standard output, which may be a program's."""
+    for line in failed:
+        console.warn(line.replace("[", r"\["))

@@ -1,0 +1,129 @@
+"""The section on the Robot School: stages, scores, slips, failures."""
+
+from collections import Counter
+
+import numpy as np
+
+from realsim.app.report import plots_objects
+from realsim.app.report.figures import Figure, count, share
+from realsim.app.report.plots import WIDTH_PX
+from realsim.app.report.section import Section, drawn
+from realsim.app.show import GRASP_HEADER, grasp_rows, why_no_grasp
+from realsim.records import GraspSet
+from realsim.store import SessionStore
+
+SLIPS_NOTE = (
+    "Score: 0.25 for each stage passed, less 1/12 for each stage in which the object slipped by "
+    "more than the bound. Shares: of the tried grasps, ± 1 sigma of the binomial."
+)
+MEASURED = ("school.mean_score", "school.slip_mm")
+SHEET, SETTLED = "reports/school.html", "reports/settle.png"
+
+
+def school_section(section: Section, store: SessionStore) -> None:
+    """Fill the section on the Robot School."""
+    from realsim.app.stages import session_models
+    from realsim.store import load_grasps
+
+    if not any((store.folder / "grasps").glob("*_obj*.npz")):
+        section.missing("No grasp has been tried.")
+        return
+    sets, models = load_grasps(store), session_models(store)
+    _figures(section, sets)
+    f = section.figures
+    if "school.good_share" in f:
+        good, tried = f["school.good"].value, sum(int(np.isfinite(s.scores).sum()) for s in sets)
+        section.headline = f"{good:.0f} good of {tried} tried grasps"
+    else:
+        section.headline = "no grasp could be tried"
+        section.say("warn", "Robot School: no grasp could be tried.")
+    for s in sets:
+        if not s.good.any():
+            name = models[s.obj_id].name if s.obj_id in models else f"object {s.obj_id}"
+            why = "none of them is good" if np.isfinite(s.scores).any() else why_no_grasp(s)
+            section.say("note", f"Robot School: {s.instance} {name} has no good grasp: {why}.")
+    section.page.text(SLIPS_NOTE)
+    known = [s for s in sets if s.obj_id in models]
+    section.page.table(GRASP_HEADER, grasp_rows(known, models))
+    shares = [x for n, x in f.items() if n.endswith("_share") or n in MEASURED]
+    rows = [[x.meaning.text, f"{x.shown} {x.meaning.unit}".strip()] for x in shares]
+    if rows:
+        section.page.table(["figure", "value"], rows)
+    drawn(section, "the plots", lambda: _plots(section, sets))
+    drawn(section, "the pictures", lambda: _pictures(section, store))
+
+
+def _kept(sets: list[GraspSet]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest slip [mm] and turn [deg] of every grasp that never lost its object."""
+    mm = np.concatenate([1e3 * s.slip_m for s in sets]) if sets else np.zeros((0, 4))
+    deg = np.concatenate([np.degrees(s.slip_rad) for s in sets]) if sets else np.zeros((0, 4))
+    whole = np.isfinite(mm).all(1) & np.isfinite(deg).all(1)
+    return mm[whole].max(1, initial=0.0), deg[whole].max(1, initial=0.0)
+
+
+def _figures(section: Section, sets: list[GraspSet]) -> None:
+    scores = np.concatenate([s.scores for s in sets])
+    base = np.concatenate([s.base_scores for s in sets])
+    reach = np.concatenate([s.reachable for s in sets])
+    tried = np.isfinite(scores)
+    good = int(np.sum(scores[tried] >= 0.5))
+    section.add(
+        count("school.candidates", len(scores)),
+        count("school.good", good),
+        count("school.objects_without_grasp", sum(not s.good.any() for s in sets)),
+    )
+    n = int(tried.sum())
+    if n == 0:
+        return
+    scores, base, reach = scores[tried], base[tried], reach[tried]
+    section.add(
+        share("school.reachable_share", int(reach.sum()), n),
+        share("school.close_share", int(np.sum(base >= 0.25)), n),
+        share("school.pendulum_share", int(np.sum(base >= 1.0)), n),
+        share("school.good_share", good, n),
+        Figure(name="school.mean_score", value=float(scores.mean()), sigma=_mean_error(scores)),
+    )
+    mm, _ = _kept(sets)
+    if len(mm):
+        sigma = _mean_error(mm)
+        # The median of n normal values scatters 1.2533 times as much as their mean.
+        section.add(
+            Figure(
+                name="school.slip_mm", value=float(np.median(mm)),
+                sigma=None if sigma is None else 1.2533 * sigma,
+            )
+        )  # fmt: skip
+    section.series["school.scores"] = [round(float(v), 4) for v in scores]
+
+
+def _mean_error(values: np.ndarray) -> float | None:
+    """Return the standard error of a mean; None of fewer than two."""
+    return float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
+
+
+def _plots(section: Section, sets: list[GraspSet]) -> None:
+    scores = np.concatenate([s.scores for s in sets])
+    base = np.concatenate([s.base_scores for s in sets])
+    reach = np.concatenate([s.reachable for s in sets])
+    tried = np.isfinite(scores)
+    if not tried.any():
+        return
+    failed = Counter(f.partition(":")[0] for s in sets for f in s.failures if f)
+    picture = plots_objects.stages(int(tried.sum()), int(reach[tried].sum()), base[tried])
+    plots = [
+        (picture, "A grasp is tried even where the arm does not reach it."),
+        (plots_objects.scores(scores[tried]), "Red: score below 0.5."),
+    ]
+    mm, deg = _kept(sets)
+    if len(mm):
+        plots.append((plots_objects.slips(mm, deg), "Linear below 0.1, logarithmic above."))
+    if failed:
+        plots.append((plots_objects.failures(failed), "The first thing that stopped each grasp."))
+    section.page.plots(plots, WIDTH_PX)
+
+
+def _pictures(section: Section, store: SessionStore) -> None:
+    if store.has(SHEET):
+        section.page.text(f"The grasps of every object, drawn: {SHEET}.")
+    if store.path(SETTLED).is_file():
+        section.page.picture(store.path(SETTLED), "How the objects settled in the simulation.")

@@ -1,0 +1,184 @@
+"""The first screen: can this session be trusted, what speaks against it, what is missing."""
+
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from realsim.app.report.figures import Figure, count, figures_to_json
+from realsim.app.report.page import Cell, Page
+from realsim.app.report.section import SEVERITIES, Finding, Section
+
+SCHEMA, SCHEMA_VERSION = "realsim report", 1
+SHOWN = 6
+"""Findings on the first screen; all of them stand in the sections, and in report.json."""
+NOTES_SHOWN = 3
+"""Notes of the run there; the others open when they are asked for."""
+LONGEST = 260
+"""Characters of a finding there."""
+STATE_KIND = {"done": "good", "missing": "off", "damaged": "bad"}
+NEEDED = ("calibration", "capture", "registration", "labels")
+"""Stages without which a session is not finished."""
+VERDICTS = {
+    "bad": ("Do not use it yet", "bad"),
+    "look": ("Look first", "warn"),
+    "unfinished": ("Not finished", "off"),
+    "sound": ("Nothing speaks against it", "good"),
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Report:
+    """A report of one session: what stands on its page, and what a program reads of it."""
+
+    name: str
+    about: str
+    sections: tuple[Section, ...]
+
+    @property
+    def findings(self) -> list[Finding]:
+        """Return all findings, worst first, then in the order of the sections."""
+        found = [f for s in self.sections for f in s.findings]
+        return sorted(found, key=lambda f: SEVERITIES.index(f.severity))
+
+    @property
+    def missing(self) -> list[Section]:
+        """Return the stages that have not been run and can be."""
+        return [s for s in self.sections if s.state == "missing" and s.command]
+
+    @property
+    def verdict(self) -> str:
+        """Return one of VERDICTS."""
+        severities = {f.severity for f in self.findings}
+        if "bad" in severities:
+            return "bad"
+        if "warn" in severities:
+            return "look"
+        unfinished = any(s.key in NEEDED for s in self.missing)
+        return "unfinished" if unfinished else "sound"
+
+    @property
+    def figures(self) -> dict[str, Figure]:
+        """Return all figures by name, in the order of the sections."""
+        severities = [f.severity for f in self.findings]
+        found = {
+            "report.bad": count("report.bad", severities.count("bad")),
+            "report.warnings": count("report.warnings", severities.count("warn")),
+        }
+        for s in self.sections:
+            found |= s.figures
+        return found
+
+    @property
+    def objects(self) -> list[dict[str, Any]]:
+        """Return the placed objects as plain JSON values."""
+        return [o for s in self.sections for o in s.objects]
+
+    def document(self, page: Page) -> dict[str, Any]:
+        """Return everything as plain JSON values.
+
+        Args:
+            page: whose rules on private text hold for the findings, too.
+        """
+        return {
+            "schema": SCHEMA,
+            "schema_version": SCHEMA_VERSION,
+            "session": page.plain(self.name),
+            "verdict": self.verdict,
+            "figures": figures_to_json(self.figures),
+            "missing": {s.key: s.command for s in self.missing},
+            "stages": {s.key: s.state for s in self.sections},
+            "findings": [
+                {"severity": f.severity, "section": f.section, "text": page.plain(f.text)}
+                for f in self.findings
+            ],
+            "objects": self.objects,
+            "series": {name: v for s in self.sections for name, v in s.series.items()},
+        }
+
+
+def write_summary(page: Page, report: Report, notes: Sequence[str] = ()) -> None:
+    """Write the first screen.
+
+    Args:
+        page: to write on.
+        report: what was found.
+        notes: what the reader must know first.
+    """
+    found = [f for f in report.findings if f.severity != "note"]
+    title, kind = VERDICTS[report.verdict]
+    page.parts.append(
+        f'<div class="verdict {kind}"><b>{html.escape(title)}.</b> {page.escaped(_why(report))}'
+        "</div>"
+    )
+    if found:
+        page.parts.append('<ul class="findings">')
+        for f in found[:SHOWN]:
+            text = f.text if len(f.text) <= LONGEST else f"{f.text[: LONGEST - 1]}…"
+            page.parts.append(
+                f'<li><span class="tag {f.severity}">{f.severity}</span> {page.escaped(text)} '
+                f'<a href="#{html.escape(f.section)}">more</a></li>'
+            )
+        page.parts.append("</ul>")
+        if len(found) > SHOWN:
+            page.text(f"... and {len(found) - SHOWN} more, in the sections below.")
+    rows: list[list[object]] = []
+    for s in report.sections:
+        run = f"run {s.command}" if s in report.missing else ""
+        state = _state(s)
+        rows.append([Cell(text=s.title, href=s.key), state, s.headline, run])
+    page.table(["stage", "state", "in short", "next"], rows)
+    _notes(page, notes)
+
+
+def _notes(page: Page, notes: Sequence[str]) -> None:
+    """Add what the run itself has to say: the first ones in sight, the rest one click away."""
+    for note in notes[:NOTES_SHOWN]:
+        page.text(note, "note")
+    if len(notes) > NOTES_SHOWN:
+        rest = [[note] for note in notes[NOTES_SHOWN:]]
+        page.folded(f"{len(rest)} more notes of the run", ["note"], rest)
+
+
+def _state(section: Section) -> Cell:
+    """Return the worst that is to be said of a stage, in one word."""
+    severities = {f.severity for f in section.findings}
+    if section.state == "done" and "bad" in severities:
+        return Cell(text="bad", kind="bad")
+    if section.state == "done" and "warn" in severities:
+        return Cell(text="look", kind="warn")
+    return Cell(text=section.state, kind=STATE_KIND[section.state])
+
+
+def _why(report: Report) -> str:
+    """Return in words why the verdict is what it is."""
+    severities = [f.severity for f in report.findings]
+    bad, warn = severities.count("bad"), severities.count("warn")
+    told = [f"{bad} {'thing speaks' if bad == 1 else 'things speak'} against it"] * bool(bad)
+    told += [f"{warn} {'thing' if warn == 1 else 'things'} to look at"] * bool(warn)
+    missing = [s.title.lower() for s in report.missing if s.key in NEEDED]
+    if missing:
+        told.append(f"missing: {', '.join(missing)}")
+    if not told:
+        return "No check says that anything is wrong."
+    text = "; ".join(told)
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def truth_section(
+    section: Section, rows: Sequence[Sequence[str]], found: Mapping[str, float]
+) -> None:
+    """Fill the section on errors against a known truth.
+
+    Args:
+        section: to fill.
+        rows: figure, measured, goal.
+        found: figure's name without `truth.` -> value.
+    """
+    section.page.text("The simulated lab knows the truth; none of the stages was told it.")
+    section.page.table(["figure", "measured", "goal"], rows)
+    section.add(*[Figure(name=f"truth.{n}", value=float(v)) for n, v in found.items()])
+    section.headline = (
+        f"hand-eye {found['handeye_mm']:.2f} mm / {found['handeye_deg']:.3f} deg, objects "
+        f"{found['object_mssd_mm']:.2f} mm, masks {found['mask_iou']:.3f}"
+    )
