@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from realsim.app.console import Console
-from realsim.app.demo import DemoConfig, DemoResult, run_demo
+from realsim.app.demo.run import DemoConfig, DemoResult, run_demo
 from realsim.app.truth import GOALS
 from realsim_sim_bridge.slip.bullet_settings import BulletSettings
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages

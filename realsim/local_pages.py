@@ -1,23 +1,84 @@
-"""Pages in the browser for this machine only: who may look and press buttons.
+"""Pages in the browser: who may look and press buttons.
 
-Viser has no login: whoever can open its websocket sees the scene and can press every button. So
-the server listens on the loopback interface, refuses websockets that a foreign web page opened in
-the operator's own browser (their Origin tells), and cannot be asked for a public tunnel.
+Viser has no login: whoever can open its websocket sees the scene and can press every button. So a
+door stands before it, and asks of every request, the page's as well as the websocket's:
+
+- Host: the browser meant this machine. A name of somebody else's that was made to point here (DNS
+  rebinding) would let a foreign page pass for ours.
+- Origin: the websocket is opened by the page that was served here, not by another page in the
+  reviewer's browser.
+- Token: where other machines can reach the port, a secret that was printed on the terminal. It
+  comes in the address once and stays as a cookie that no script can read.
+
+Nothing is encrypted; over a network that is not one's own, forward the port with ssh instead.
 """
 
 import contextlib
+import hmac
+import http
+import inspect
 import ipaddress
-import re
+import secrets
+import socket
+import stat
 import threading
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
+from urllib.parse import parse_qs, urlsplit
 
 from realsim.errors import InputError
 
-LOCAL_ORIGIN = re.compile(r"https?://(localhost|127(\.\d{1,3}){3}|\[::1\])(:\d{1,5})?")
-"""The pages that this machine itself serves."""
+LEAST_TOKEN = 16
+"""Characters of a token from a file: 16 of letters and digits are beyond guessing."""
+PORTS_TRIED = 20
+"""How many ports after the wished one are tried."""
+COOKIE_AGE_S = 14 * 24 * 3600
+"""How long a browser that was let in stays so [s]: two weeks, the length of a review."""
 _patching = threading.Lock()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Door:
+    """Who may enter."""
+
+    token: str = ""
+    """The secret; '' = none is asked for: only this machine can reach the port."""
+    names: tuple[str, ...] = ()
+    """Names of this machine that a browser may have been given, besides its addresses."""
+
+    def __post_init__(self) -> None:
+        """Check the token."""
+        if self.token and len(self.token) < LEAST_TOKEN:
+            raise InputError(
+                f"the token has {len(self.token)} characters; at least {LEAST_TOKEN} are needed. "
+                "Leave --token-file out, and one is made."
+            )
+
+    @property
+    def pass_value(self) -> str:
+        """What the cookie holds: it lets in, and does not tell the token."""
+        return hmac.new(self.token.encode(), b"realsim page cookie", "sha256").hexdigest()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Answer:
+    """What the door says instead of the page."""
+
+    status: http.HTTPStatus
+    text: str
+    cookie: str = ""
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine reaches what listens on this host."""
+    if host == "localhost":
+        return True
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return False
 
 
 def check_host(host: str, what: str) -> str:
@@ -30,11 +91,8 @@ def check_host(host: str, what: str) -> str:
     Raises:
         InputError: other machines could reach it.
     """
-    if host == "localhost":
+    if is_loopback(host):
         return host
-    with contextlib.suppress(ValueError):
-        if ipaddress.ip_address(host).is_loopback:
-            return host
     raise InputError(
         f"{what} may not listen on '{host}': it has no login, so anybody who reaches it could "
         "watch it and press its buttons. Use 127.0.0.1, ::1 or localhost; from "
@@ -42,24 +100,264 @@ def check_host(host: str, what: str) -> str:
     )
 
 
-@contextlib.contextmanager
-def local_origins_only() -> Generator[None]:
-    """Make websocket servers started inside this block refuse pages of other origins.
+def new_token() -> str:
+    """Return a secret of 256 bits for an address."""
+    return secrets.token_urlsafe(32)
 
-    Viser checks no Origin and offers no setting for it, but the websockets library it calls does;
-    so the check is put into that call. Programs that are no browsers send no Origin and may enter:
-    they run on this machine, and could read the files as well.
+
+def token_of_file(path: Path) -> str:
+    """Return the token in a file: its one line.
+
+    Raises:
+        InputError: there is no such file, others may read it, or it holds no good token.
+    """
+    try:
+        text = path.read_text(encoding="utf-8").strip()
+        mode = path.stat().st_mode
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"the token file {path} cannot be read: {error}.") from error
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise InputError(
+            f"the token file {path} may be read by others (mode {stat.filemode(mode)}): "
+            f"chmod 600 {path}."
+        )
+    if not text.isascii() or any(c.isspace() for c in text) or len(text) < LEAST_TOKEN:
+        raise InputError(
+            f"the token file {path} must hold one line of at least {LEAST_TOKEN} letters and "
+            f"digits; it holds {len(text)} characters."
+        )
+    return text
+
+
+def names_of_this_machine(host: str) -> tuple[str, ...]:
+    """Return the names by which other machines may call this one, and the host to bind."""
+    full = socket.gethostname()
+    short = full.split(".")[0]
+    return tuple(dict.fromkeys(n.lower() for n in (host, full, short, f"{short}.local") if n))
+
+
+def free_port(host: str, port: int) -> int:
+    """Return the first port from the wished one on that can be listened on; 0 stays 0.
+
+    Raises:
+        InputError: the host is none of this machine, or the ports are all in use.
+    """
+    last: OSError | None = None
+    for wished in range(port, min(port + PORTS_TRIED, 65536)):
+        try:
+            found = socket.getaddrinfo(host, wished, type=socket.SOCK_STREAM)
+            family, kind, protocol, _, address = found[0]
+            with socket.socket(family, kind, protocol) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                probe.bind(address)
+            return wished
+        except socket.gaierror as error:
+            last = error
+            break
+        except OSError as error:
+            last = error
+    raise InputError(
+        f"cannot listen on '{host}', port {port}: {last}. Give --host 127.0.0.1 or an address of "
+        "this machine, and another --port (0 = any that is free)."
+    )
+
+
+# --- what the door says ---------------------------------------------------------------------------
+
+
+def answer_to(door: Door, path: str, headers: Any) -> Answer | None:
+    """Return what is said instead of the page or the websocket, or None: come in.
+
+    Args:
+        door: who may enter.
+        path: of the request, with its query.
+        headers: of the request, `get_all(name)` -> list of values.
+    """
+    authority = _only(headers, "Host")
+    if authority is None or not _is_ours(authority, door):
+        return Answer(
+            status=http.HTTPStatus.FORBIDDEN,
+            text="This page was asked for under a name that is not this machine's. Open the "
+            "address that the terminal shows.",
+        )
+    origin = _only(headers, "Origin")
+    if headers.get_all("Origin") and (origin is None or not _same_place(origin, authority)):
+        return Answer(status=http.HTTPStatus.FORBIDDEN, text="Not from a page of another site.")
+    query = parse_qs(urlsplit(path).query, keep_blank_values=True)
+    # Viser's page takes orders from its address, such as which server's messages it shows.
+    if set(query) - {"token"}:
+        return Answer(
+            status=http.HTTPStatus.FORBIDDEN, text="The address has more in it than the page's."
+        )
+    return _answer_about_token(door, query.get("token", []), authority, headers)
+
+
+def _answer_about_token(
+    door: Door, tokens: Sequence[str], authority: str, headers: Any
+) -> Answer | None:
+    if not door.token:
+        return None
+    cookie_name = f"realsim_{_port_of(authority)}"
+    if tokens and not _upgrades(headers):
+        if hmac.compare_digest(tokens[0].encode(), door.token.encode()):
+            value = f"{cookie_name}={door.pass_value}; Path=/; Max-Age={COOKIE_AGE_S}"
+            return Answer(
+                status=http.HTTPStatus.OK, text="", cookie=f"{value}; HttpOnly; SameSite=Strict"
+            )
+    elif hmac.compare_digest(_cookie(headers, cookie_name).encode(), door.pass_value.encode()):
+        return None
+    return Answer(
+        status=http.HTTPStatus.UNAUTHORIZED,
+        text="Not without the token: open the whole address that the terminal shows, with what "
+        "stands behind '?token='.",
+    )
+
+
+def _only(headers: Any, name: str) -> str | None:
+    """Return the one value of a header; None if there is none, or several."""
+    values: list[str] = headers.get_all(name)
+    return values[0] if len(values) == 1 else None
+
+
+def _upgrades(headers: Any) -> bool:
+    return any("websocket" in v.lower() for v in headers.get_all("Upgrade"))
+
+
+def _split_authority(authority: str) -> tuple[str, str]:
+    """Return name and port of a Host header; the name is '' where it is none."""
+    try:
+        parts = urlsplit(f"//{authority}")
+        port = parts.port or 80
+    except ValueError:
+        return "", ""
+    if parts.path or parts.query or parts.username is not None or parts.hostname is None:
+        return "", ""
+    return parts.hostname.lower(), str(port)
+
+
+def _port_of(authority: str) -> str:
+    return _split_authority(authority)[1]
+
+
+def _is_ours(authority: str, door: Door) -> bool:
+    """Return whether a Host header names this machine: no foreign name can be made to do so."""
+    name, _ = _split_authority(authority)
+    if is_loopback(name):
+        return True
+    if not door.names:
+        return False
+    with contextlib.suppress(ValueError):
+        ipaddress.ip_address(name)
+        return True  # an address is no name that somebody could point elsewhere
+    return name in door.names
+
+
+def _same_place(origin: str, authority: str) -> bool:
+    scheme, _, place = origin.partition("://")
+    return scheme in ("http", "https") and place.lower() == authority.lower()
+
+
+def _cookie(headers: Any, name: str) -> str:
+    for line in headers.get_all("Cookie"):
+        for pair in line.split(";"):
+            key, _, value = pair.strip().partition("=")
+            if key == name:
+                return value
+    return ""
+
+
+# --- the door before viser ------------------------------------------------------------------------
+
+WELCOME = (
+    "<!doctype html><meta charset=utf-8><title>realsim</title>"
+    '<meta http-equiv="refresh" content="0; url=/"><p><a href="/">Go on</a></p>'
+)
+"""A page of our own goes on to the review: the browser gives a strict cookie only to such."""
+
+
+@contextlib.contextmanager
+def guarded(door: Door) -> Generator[None]:
+    """Put a door before the websocket servers that are started inside this block.
+
+    Viser checks nothing and offers no setting for it, but the websockets library that it calls
+    asks a function about every request; the door is put before that function.
     """
     from websockets.asyncio import server
 
     module: Any = server
     with _patching:
         serve = module.serve
-        module.serve = partial(serve, origins=[None, LOCAL_ORIGIN])
+        module.serve = partial(_serve_behind, door, serve)
         try:
             yield
         finally:
             module.serve = serve
+
+
+def _serve_behind(door: Door, serve: Any, *args: Any, **kwargs: Any) -> Any:
+    inner = kwargs.pop("process_request", None)
+
+    async def process_request(connection: Any, request: Any) -> Any:
+        said = answer_to(door, request.path, request.headers)
+        if said is not None:
+            return _response(said)
+        response = None if inner is None else inner(connection, request)
+        if inspect.isawaitable(response):
+            response = await response
+        if response is not None:
+            for name, value in _page_headers(request.headers["Host"]).items():
+                response.headers[name] = value
+        return response
+
+    return serve(*args, process_request=process_request, **kwargs)
+
+
+def _response(said: Answer) -> Any:
+    from websockets import Headers
+    from websockets.http11 import Response
+
+    body = WELCOME if said.cookie else said.text + "\n"
+    kind = "text/html" if said.cookie else "text/plain"
+    headers = Headers()
+    headers["Content-Type"] = f"{kind}; charset=utf-8"
+    headers["Content-Length"] = str(len(body.encode()))
+    headers["Cache-Control"] = "no-store"
+    headers["Referrer-Policy"] = "no-referrer"
+    headers["X-Content-Type-Options"] = "nosniff"
+    if said.cookie:
+        headers["Set-Cookie"] = said.cookie
+    return Response(said.status.value, said.status.phrase, headers, body.encode())
+
+
+def _page_headers(authority: str) -> dict[str, str]:
+    """Return what the page may do: talk to this server only, and stand in no other page's frame."""
+    rules = (
+        "default-src 'none'",
+        "script-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:",
+        "worker-src 'self' blob: data:",
+        "style-src 'self' 'unsafe-inline'",
+        "img-src 'self' data: blob:",
+        "font-src 'self' data:",
+        f"connect-src 'self' ws://{authority} wss://{authority} data: blob:",
+        "frame-ancestors 'none'",
+        "base-uri 'none'",
+        "form-action 'none'",
+    )
+    return {
+        "Content-Security-Policy": "; ".join(rules),
+        "Referrer-Policy": "no-referrer",
+        "X-Content-Type-Options": "nosniff",
+        "Cache-Control": "no-cache",
+    }
+
+
+def local_origins_only() -> contextlib.AbstractContextManager[None]:
+    """Return the door of a page for this machine only, see `guarded`.
+
+    Programs that are no browsers send no Origin and may enter: they run on this machine, and could
+    read the files as well.
+    """
+    return guarded(Door())
 
 
 def refuse_share(server: Any) -> None:
@@ -69,4 +367,5 @@ def refuse_share(server: Any) -> None:
     """
     from viser import _messages as viser_messages
 
-    server._websock_server.unregister_handler(viser_messages.ShareUrlRequest)
+    for message in (viser_messages.ShareUrlRequest, viser_messages.ShareUrlDisconnect):
+        server._websock_server.unregister_handler(message)

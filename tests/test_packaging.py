@@ -1,11 +1,16 @@
 """What the packages promise: every exported name exists, and importing realsim stays light."""
 
 import importlib
+import re
+import shutil
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("realsim", "realsim_calibration", "realsim_capture_plans", "realsim_sim_bridge")
 
 
@@ -24,3 +29,41 @@ def test_importing_realsim_loads_numpy_and_nothing_heavier() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "[]", done.stdout + done.stderr
+
+
+# --- the container ------------------------------------------------------------------------------
+
+
+def dockerfile() -> list[str]:
+    """Return the instructions of the Dockerfile, one a line."""
+    text = re.sub(r"\\\n", " ", (ROOT / "Dockerfile").read_text())
+    return [line for line in text.splitlines() if line and not line.startswith("#")]
+
+
+def test_the_dockerfile_has_nothing_to_complain_about() -> None:
+    hadolint = shutil.which("hadolint", path=Path(sys.executable).parent)
+    assert hadolint is not None, "uv sync installs it with the group dev"
+    done = subprocess.run(
+        [hadolint, "--no-color", str(ROOT / "Dockerfile")], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_container_runs_as_nobody_in_particular() -> None:
+    user = [line.split()[1] for line in dockerfile() if line.startswith("USER ")]
+    assert user and all(int(part) >= 1000 for part in user[-1].split(":"))
+    assert dockerfile()[-2:] == ['ENTRYPOINT ["realsim"]', 'CMD ["demo"]']
+
+
+def test_the_image_gets_all_that_the_wheel_is_made_of_and_no_more() -> None:
+    kept = {
+        line[1:].strip("/")
+        for line in (ROOT / ".dockerignore").read_text().splitlines()
+        if line.startswith("!")
+    }
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    packages = project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+    needed = {"pyproject.toml", project["project"]["readme"], *project["project"]["license-files"]}
+    assert kept == needed | {p.split("/")[0] for p in packages}
+    copied = [w for line in dockerfile() if line.startswith("COPY ") for w in line.split()[1:-1]]
+    assert {w for w in copied if not w.startswith("--")} - {"/opt/realsim"} == kept

@@ -1,4 +1,8 @@
-"""What the user sees while a stage runs: progress bars, tables, and the time each stage took."""
+"""What the user sees while a stage runs: progress, tables, and the time each stage took.
+
+Progress and notes go to stderr, results to stdout. Where a result is asked for as JSON, stdout
+holds that document and nothing else.
+"""
 
 import os
 import sys
@@ -6,9 +10,17 @@ import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console as RichConsole
 
 Tick = Callable[[int, int], None]
 """Called with (done, total)."""
+SECONDS_BETWEEN_LINES = 10.0
+"""Least time between two lines of progress in a log [s]: one can see that it goes on, no more."""
+PIPED_WIDTH = 120
+"""Columns of output that is piped: it has no width of its own, and 120 keep most rows whole."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -31,63 +43,202 @@ def cpu_seconds() -> float:
 class Console:
     """Progress on stderr, results on stdout, and a record of what each stage cost."""
 
-    def __init__(self, *, quiet: bool = False) -> None:
-        """Open the console; a quiet one draws no progress."""
-        from rich.console import Console as RichConsole
+    def __init__(self, *, quiet: bool = False, as_json: bool = False) -> None:
+        """Open the console.
 
+        Args:
+            quiet: show no progress.
+            as_json: stdout is for the document of `result` alone: lines go to stderr, tables
+                (whose figures are in the document) nowhere.
+        """
         self.quiet = quiet
+        self.as_json = as_json
         self.times: list[StageTime] = []
-        # Output that is piped has no width of its own: 120 columns keep a table's rows whole.
-        width = None if sys.stdout.isatty() else 120
-        self._out = RichConsole(highlight=False, width=width)
-        self._err = RichConsole(stderr=True, highlight=False)
+        self._out = _rich(stderr=as_json)
+        self._err = _rich(stderr=True)
+        self._last_line = time.monotonic()
 
     @contextmanager
     def stage(self, name: str, note: str = "") -> Generator[Tick]:
-        """Show a progress bar for one stage and record its cost when it ends.
+        """Show the progress of one stage and record its cost when it ends.
+
+        A terminal gets a bar with the remaining time; a log gets a line now and then.
 
         Yields:
             A function to call with (done, total).
         """
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-        from rich.progress import TimeElapsedColumn as Elapsed
-
         cpu, wall = cpu_seconds(), time.perf_counter()
-        columns = (
-            TextColumn("{task.description:<34}"),
-            BarColumn(bar_width=30),
-            MofNCompleteColumn(),
-            Elapsed(),
-        )
         label = f"{name}: {note}" if note else name
-        with Progress(*columns, console=self._err, disable=self.quiet) as bar:
+        if self.quiet:
+            yield _no_tick
+        elif sys.stderr.isatty() and not self._err.is_dumb_terminal:
+            with self._bar(label) as tick:
+                yield tick
+        else:
+            yield self._lines(label)
+        self.times.append(
+            StageTime(name=name, cpu_s=cpu_seconds() - cpu, wall_s=time.perf_counter() - wall)
+        )
+
+    @contextmanager
+    def _bar(self, label: str) -> Generator[Tick]:
+        """Draw a progress bar on the terminal."""
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+        from rich.table import Column
+
+        columns = (
+            TextColumn(
+                "{task.description}",
+                markup=False,
+                # The label gives way where the terminal is narrow, the figures never.
+                table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis"),
+            ),
+            BarColumn(bar_width=20),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+        )
+        with Progress(*columns, console=self._err, expand=self._err.width < 100) as bar:
             task = bar.add_task(label, total=None)
 
             def tick(done: int, total: int) -> None:
                 bar.update(task, completed=done, total=total)
 
             yield tick
-            bar.update(task, total=bar.tasks[0].total or 1, completed=bar.tasks[0].total or 1)
-        self.times.append(
-            StageTime(name=name, cpu_s=cpu_seconds() - cpu, wall_s=time.perf_counter() - wall)
-        )
+            total = bar.tasks[0].total or 1
+            bar.update(task, total=total, completed=total)
+
+    def _lines(self, label: str) -> Tick:
+        """Return what writes a line of progress into a log, at most every ten seconds."""
+        begun = time.monotonic()
+
+        def tick(done: int, total: int) -> None:
+            at = time.monotonic()
+            if total <= 0 or at - self._last_line < SECONDS_BETWEEN_LINES:
+                return
+            self._last_line = at
+            left = f", {duration((at - begun) * (total - done) / done)} left" if done > 0 else ""
+            share = f"{100 * done // total} %"
+            self._err.print(
+                f"{label}: {share} ({done} of {total}){left}", soft_wrap=True, markup=False
+            )
+
+        return tick
 
     def say(self, text: str) -> None:
         """Print one line of result."""
-        self._out.print(text, soft_wrap=True, markup=False)
+        if not (self.as_json and self.quiet):
+            self._out.print(text, soft_wrap=True, markup=False)
 
     def warn(self, text: str) -> None:
         """Print one line that the user must not miss."""
         self._err.print(f"[yellow]note:[/yellow] {text}", soft_wrap=True)
 
+    def result(self, document: object) -> None:
+        """Print the command's whole result as JSON, if it was asked for; once in a command.
+
+        Args:
+            document: a mapping or a record (see `json_values`).
+        """
+        if self.as_json:
+            from realsim.app.json_values import json_document
+
+            # Not through rich: no colour, no wrapping, nothing but the document.
+            sys.stdout.write(json_document(document) + "\n")
+            sys.stdout.flush()
+
     def table(self, title: str, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-        """Print a table; the first column is text, the others are right-aligned."""
+        """Print a table: text is left-aligned (the first column, and sentences), figures right.
+
+        Where it is too wide for its words, each row becomes a block of lines instead: no number is
+        cut in two.
+        """
+        if self.as_json:
+            return
+        cells = [[str(cell) for cell in row] for row in rows]
+        if _least_width(header, cells) > self._out.width:
+            self._blocks(title, header, cells)
+        else:
+            self._grid(title, header, cells)
+
+    def _grid(self, title: str, header: Sequence[str], cells: list[list[str]]) -> None:
         from rich.table import Table
         from rich.text import Text
 
         table = Table(title=title, title_justify="left", title_style="bold")
         for k, name in enumerate(header):
-            table.add_column(Text(name), justify="left" if k == 0 else "right", overflow="fold")
-        for row in rows:
-            table.add_row(*[Text(str(cell)) for cell in row])
+            table.add_column(
+                Text(name),
+                justify="left" if k == 0 or _is_text(k, cells) else "right",
+                overflow="fold",
+                min_width=min(_column_width(k, header, cells), self._out.width),
+            )
+        for row in cells:
+            table.add_row(*[Text(cell) for cell in row])
         self._out.print(table)
+
+    def _blocks(self, title: str, header: Sequence[str], cells: list[list[str]]) -> None:
+        """Print each row as lines of `name  value`."""
+        from rich.text import Text
+
+        self._out.print(Text(title, style="bold"))
+        for row in cells:
+            self._out.print(Text(row[0] if row else ""))
+            for name, cell in zip(header[1:], row[1:], strict=False):
+                if cell:
+                    self._out.print(Text(f"  {name}: {cell}" if name else f"  {cell}"))
+
+
+def duration(seconds: float) -> str:
+    """Return a time as people say it: 40 s, 12 min, 3 h 20 min."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _no_tick(done: int, total: int) -> None:
+    """Take notice of nothing."""
+
+
+def _rich(*, stderr: bool) -> "RichConsole":
+    """Return rich's console of one stream: colours for terminals that want them.
+
+    NO_COLOR (not empty) wins over FORCE_COLOR, and a file gets no control characters unless
+    FORCE_COLOR asks for them.
+    """
+    from rich.console import Console as RichConsole
+
+    stream = sys.stderr if stderr else sys.stdout
+    plain = bool(os.environ.get("NO_COLOR"))
+    forced = False if plain and not stream.isatty() else None
+    width = None if sys.stdout.isatty() or stderr else PIPED_WIDTH
+    return RichConsole(stderr=stderr, highlight=False, width=width, force_terminal=forced)
+
+
+def _is_text(k: int, cells: list[list[str]]) -> bool:
+    """Return whether a column holds sentences, which wrapped lines would tear at the right."""
+    return any(len(row[k]) > LONGEST_WORD for row in cells if k < len(row))
+
+
+def _column_width(k: int, header: Sequence[str], cells: list[list[str]]) -> int:
+    """Return the characters of the longest word in a column; a path may be folded."""
+    words = " ".join([header[k], *(row[k] for row in cells if k < len(row))]).split()
+    return max((min(len(w), LONGEST_WORD) for w in words), default=0)
+
+
+LONGEST_WORD = 24
+"""Longer words are paths and hashes, which may be folded; numbers are not that long."""
+
+
+def _least_width(header: Sequence[str], cells: list[list[str]]) -> int:
+    """Return the columns that a table takes with a word in a line: content, padding, lines."""
+    return 1 + sum(_column_width(k, header, cells) + 3 for k in range(len(header)))

@@ -1,230 +1,345 @@
-"""The review's scene in the browser: meshes, cloud, cameras, table and grasps as viser nodes."""
+"""The review's scene in one browser: meshes, cloud, cameras, table and grasps as viser nodes.
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+Every object is a frame with its meshes, its box and its ellipsoid below it, so that an object moves
+by one message; all cameras and all pieces of the cloud stand below one frame each, so that they are
+switched by one message. What is rarely looked at is sent when it is first asked for.
+"""
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Literal
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from realsim.geometry import mesh as mesh_tools
+from realsim.errors import InputError
 from realsim.interop import viser_wxyz_position
-from realsim.records import GraspSet, Mesh, ObjectModel, ObjectPose, SupportPlane, View
+from realsim.records import ObjectModel
 from realsim.rendering.overlay import VERDICT_RGB
-from realsim.review import content
-from realsim.store import SessionStore
+from realsim.review.content import SceneContent
+from realsim.review.content_config import SceneConfig
+from realsim.review.ellipsoid import Ellipsoid, unit_sphere
+from realsim.review.grasp_drawing import GraspFilter, chosen_grasps
+from realsim.review.scene_nodes_cloud import CloudNodes
+from realsim.review.scene_nodes_grasps import GraspNodes
 
-PLAIN_RGB = (176, 182, 190)
-"""Colour of a mesh without colours of its own."""
+__all__ = ["GraspFilter", "SceneConfig", "SceneNodes"]
+
+Array = NDArray[np.float64]
+Look = Literal["appearance", "verdict", "hidden"]
+OnInstance = Callable[[int], None]
+OnGrasp = Callable[[int, int], None]
 FRUSTUM_RGB = (70, 96, 140)
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SceneConfig:
-    """How much is shown; a browser without a graphics card should still turn the scene."""
-
-    voxel_m: float = 0.002
-    """Edge of the cloud's voxels [m]: the depth noise of the camera at 0.4 m."""
-    most_points: int = 200_000
-    """Points of the cloud; ten times more still load, but turn at 1 frame/s without a GPU."""
-    most_fused_views: int = 24
-    """Views fused into the cloud: more add noise, not surface."""
-    most_cameras: int = 64
-    """Cameras drawn, evenly spread over the session."""
-    thumbnail_px: int = 160
-    """Width of the photographs in the frustums [px]."""
-    most_grasps: int = 100
-    """Grasps drawn per object; the filters choose among all."""
-    frustum_m: float = 0.025
-    """Length of a camera's frustum [m]."""
-    margin_m: float = 0.2
-    """How far about the objects the cloud is shown [m]: enough to see what they stand on."""
-    grid_m: float = 1.2
-    """Edge of the table's grid [m]."""
-    gripper: content.GripperDrawing = field(default_factory=content.GripperDrawing)
-    """How a grasp is drawn."""
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class GraspFilter:
-    """Which grasps are drawn."""
-
-    min_score: float = 0.0
-    """Least score in [0, 1]."""
-    reachable_only: bool = False
-    """Only those the arm reaches without a collision."""
-    instance: int | None = None
-    """Only those of this object; None = of all."""
-    show: bool = True
-    """Whether any are drawn."""
+HIGHLIGHT_RGB = (255, 120, 0)
+ELLIPSOID_RGB = (130, 80, 220)
+BOX_MARGIN_M = 0.004
+"""The box about a highlighted object keeps so far off it [m], not to be lost in its faces."""
+FRUSTUM_LINE_M = 0.001
+"""Thickness of a frustum's lines [m]."""
 
 
 class SceneNodes:
-    """The nodes of one session in a viser server."""
+    """The nodes of one scene in one browser, or in all browsers of a server."""
 
-    def __init__(self, server: viser.ViserServer, config: SceneConfig) -> None:
-        """Start with an empty scene."""
-        self._scene = server.scene
-        self._config = config
-        self._appearance: dict[int, Any] = {}
+    def __init__(self, api: viser.SceneApi, content: SceneContent, config: SceneConfig) -> None:
+        """Start with an empty scene.
+
+        Args:
+            api: `client.scene` of one browser, or `server.scene` of all.
+            content: what is shown.
+            config: how much of it.
+        """
+        self._api, self._content, self._config = api, content, config
+        self._models = {o.instance: o.obj_id for o in content.scene.objects}
+        self._verdicts: dict[int, str] = {o.instance: o.verdict for o in content.scene.objects}
+        self._look: Look = "appearance"
+        self._roots: dict[int, viser.FrameHandle] = {}
+        self._appearance: dict[int, viser.GlbHandle] = {}
         self._judged: dict[int, viser.MeshHandle] = {}
-        self._cameras: list[viser.CameraFrustumHandle] = []
-        self._cloud: viser.PointCloudHandle | None = None
+        self._ellipsoids: dict[int, viser.MeshHandle] = {}
+        self._cameras: viser.FrameHandle | None = None
+        self._frustums: dict[int, viser.CameraFrustumHandle] = {}
         self._grid: viser.GridHandle | None = None
+        self._box: viser.LineSegmentsHandle | None = None
+        self._cloud = CloudNodes(api, content.cloud, config)
+        self._grasps = GraspNodes(api, config)
+        self._on_object: list[OnInstance] = []
+        self._on_camera: list[OnInstance] = []
+        # The pieces of the cloud come from a thread of their own while buttons are pressed.
+        self._lock = threading.RLock()
 
-    def add_objects(self, objects: Sequence[ObjectPose], models: Mapping[int, ObjectModel]) -> None:
-        """Add every object twice: as it looks, and in the colour of its verdict."""
-        for placed in objects:
-            wxyz, position = viser_wxyz_position(placed.T_world_obj)
-            mesh = models[placed.obj_id].mesh
-            pose: dict[str, Any] = {"wxyz": wxyz, "position": position, "cast_shadow": False}
-            self._appearance[placed.instance] = self._scene.add_mesh_trimesh(
-                f"/objects/{placed.instance}/appearance", _colored_trimesh(mesh), **pose
+    def build(self) -> None:
+        """Send the scene, what is seen at once first; the finer cloud follows in the background."""
+        with self._lock:
+            self._api.set_up_direction(self._content.look.up)
+            if self._content.scene.plane is not None:
+                self._add_table(self._content.scene.plane.T_world_table)
+            for placed in self._content.scene.objects:
+                self._add_object(placed.instance, placed.T_world_obj)
+            self._cloud.build()
+            self._add_cameras()
+        self._cloud.refine(self._config.shown_points)
+
+    def clear(self) -> None:
+        """Take everything away, and stop sending."""
+        self._cloud.clear()
+        with self._lock:
+            self._grasps.clear()
+            for handle in (*self._roots.values(), *self._ellipsoids.values(), self._cameras,
+                           self._grid):  # fmt: skip
+                if handle is not None:
+                    handle.remove()
+            for nodes in (self._roots, self._appearance, self._judged, self._ellipsoids,
+                          self._frustums):  # fmt: skip
+                nodes.clear()
+            self._cameras = self._grid = self._box = None
+
+    # --- objects ------------------------------------------------------------------------------
+
+    def place(self, instance: int, T_world_obj: Array) -> None:
+        """Move an object, with all that belongs to it but its grasps, to a pose (4, 4).
+
+        Raises:
+            InputError: there is no such object.
+        """
+        root = self._root(instance)
+        root.wxyz, root.position = viser_wxyz_position(T_world_obj)
+
+    def swap(self, instance: int, model: ObjectModel | int) -> None:
+        """Show another model in an object's place.
+
+        Raises:
+            InputError: there is no such object or model.
+        """
+        self._root(instance)
+        obj_id = model if isinstance(model, int) else model.obj_id
+        _ = self._content.meshes[obj_id]
+        with self._lock:
+            self._models[instance] = obj_id
+            for nodes in (self._appearance, self._judged):
+                handle = nodes.pop(instance, None)
+                if handle is not None:
+                    handle.remove()
+            self._show(instance)
+
+    def color_verdict(self, instance: int, verdict: str) -> None:
+        """Give an object the colour of a verdict.
+
+        Raises:
+            InputError: there is no such object or verdict.
+        """
+        self._root(instance)
+        if verdict not in VERDICT_RGB:
+            raise InputError(f"'{verdict}' is no verdict; there are {', '.join(VERDICT_RGB)}.")
+        self._verdicts[instance] = verdict
+        if instance in self._judged:
+            self._judged[instance].color = VERDICT_RGB[verdict]
+
+    def show_objects(self, look: Look) -> None:
+        """Show the objects as they look, in the colours of their verdicts, or not at all.
+
+        Raises:
+            InputError: another look is asked for.
+        """
+        if look not in ("appearance", "verdict", "hidden"):
+            raise InputError(
+                f"objects cannot be shown as '{look}'; 'appearance', 'verdict' or 'hidden' can."
             )
-            self._judged[placed.instance] = self._scene.add_mesh_simple(
-                f"/objects/{placed.instance}/verdict",
-                mesh.vertices.astype(np.float32),
-                mesh.faces.astype(np.uint32),
-                color=VERDICT_RGB[placed.verdict],
-                flat_shading=True,
-                side="double",
-                **pose,
+        with self._lock:
+            self._look = look
+            for instance in self._roots:
+                self._show(instance)
+
+    def highlight(self, instance: int | None) -> None:
+        """Draw a box about one object; None = about none.
+
+        Raises:
+            InputError: there is no such object.
+        """
+        with self._lock:
+            if self._box is not None:
+                self._box.remove()
+                self._box = None
+            if instance is None:
+                return
+            name = self._root(instance).name
+            mesh = self._content.meshes[self._models[instance]]
+            lines = _box_lines(mesh.low - BOX_MARGIN_M, mesh.high + BOX_MARGIN_M)
+            self._box = self._api.add_line_segments(
+                f"{name}/box", lines, HIGHLIGHT_RGB, thickness=2.0, thickness_units="screen"
             )
 
-    def show_objects(self, visible: bool, by_verdict: bool) -> None:
-        """Show the objects as they look, or in the colours of their verdicts, or not at all."""
-        for handle in self._appearance.values():
-            handle.visible = visible and not by_verdict
-        for handle in self._judged.values():
-            handle.visible = visible and by_verdict
+    def ellipsoids(self, shapes: Mapping[int, Ellipsoid | None]) -> None:
+        """Draw how sure the positions are, instead of what was drawn before.
 
-    def color_object(self, instance: int, verdict: str) -> None:
-        """Give an object the colour of its verdict."""
-        self._judged[instance].color = VERDICT_RGB[verdict]
+        Args:
+            shapes: instance -> ellipsoid in world; None = nothing is known of it.
+        """
+        with self._lock:
+            for handle in self._ellipsoids.values():
+                handle.remove()
+            self._ellipsoids.clear()
+            sphere = unit_sphere()
+            for instance, shape in shapes.items():
+                if shape is None:
+                    continue
+                wxyz, position = viser_wxyz_position(shape.T_world_ellipsoid)
+                self._ellipsoids[instance] = self._api.add_mesh_simple(
+                    f"/ellipsoids/{instance}",
+                    (sphere.vertices * shape.radii_m).astype(np.float32),
+                    sphere.faces.astype(np.uint32),
+                    color=ELLIPSOID_RGB, opacity=0.45, cast_shadow=False, receive_shadow=False,
+                    wxyz=wxyz, position=position,
+                )  # fmt: skip
 
-    def add_cloud(self, points: NDArray[np.float32], colors: NDArray[np.uint8]) -> None:
-        """Add the fused depth; in float32, because viser's float16 has steps of 1 mm at 1 m."""
-        self._cloud = self._scene.add_point_cloud(
-            "/cloud",
-            points,
-            colors,
-            point_size=0.8 * self._config.voxel_m,
-            point_shape="circle",
-            precision="float32",
+    def _root(self, instance: int) -> viser.FrameHandle:
+        if instance not in self._roots:
+            listed = ", ".join(map(str, sorted(self._roots))) or "none"
+            raise InputError(f"instance {instance} is not in the scene; there are {listed}.")
+        return self._roots[instance]
+
+    def _add_object(self, instance: int, T_world_obj: Array) -> None:
+        wxyz, position = viser_wxyz_position(T_world_obj)
+        self._roots[instance] = self._api.add_frame(
+            f"/objects/{instance}", show_axes=False, wxyz=wxyz, position=position
         )
+        self._show(instance)
+
+    def _show(self, instance: int) -> None:
+        """Bring what is seen of an object in line with the look that is asked for."""
+        if self._look == "appearance" and instance not in self._appearance:
+            self._add_appearance(instance)
+        if self._look == "verdict" and instance not in self._judged:
+            self._add_judged(instance)
+        if instance in self._appearance:
+            self._appearance[instance].visible = self._look == "appearance"
+        if instance in self._judged:
+            self._judged[instance].visible = self._look == "verdict"
+
+    def _add_appearance(self, instance: int) -> None:
+        mesh = self._content.meshes[self._models[instance]]
+        handle = self._api.add_glb(
+            f"/objects/{instance}/appearance", mesh.glb, cast_shadow=False, receive_shadow=False
+        )
+        handle.on_click(lambda _: self._tell(self._on_object, instance))
+        self._appearance[instance] = handle
+
+    def _add_judged(self, instance: int) -> None:
+        mesh = self._content.meshes[self._models[instance]]
+        handle = self._api.add_mesh_simple(
+            f"/objects/{instance}/verdict", mesh.vertices, mesh.faces,
+            color=VERDICT_RGB[self._verdicts[instance]], flat_shading=True, side="double",
+            cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        handle.on_click(lambda _: self._tell(self._on_object, instance))
+        self._judged[instance] = handle
+
+    # --- cloud, cameras, table ----------------------------------------------------------------
 
     def show_cloud(self, visible: bool) -> None:
-        """Show or hide the cloud."""
-        if self._cloud is not None:
-            self._cloud.visible = visible
+        """Show or hide the measured points."""
+        self._cloud.show(visible)
 
-    def add_cameras(self, store: SessionStore, views: Sequence[View]) -> None:
-        """Add a frustum with its photograph per view; a click moves the browser's camera there."""
-        i = store.session.intrinsics
-        fov = 2 * float(np.arctan2(i.height / 2, i.fy))
-        for view in views:
-            assert view.T_world_cam is not None
-            wxyz, position = viser_wxyz_position(view.T_world_cam)
-            handle = self._scene.add_camera_frustum(
-                f"/cameras/{view.index:06d}",
-                fov,
-                i.width / i.height,
-                scale=self._config.frustum_m,
-                thickness=0.001,
-                color=FRUSTUM_RGB,
-                image=content.thumbnail(store.rgb(view.index), self._config.thumbnail_px),
-                format="jpeg",
-                jpeg_quality=70,
-                wxyz=wxyz,
-                position=position,
-                cast_shadow=False,
-            )
-            handle.on_click(_go_to(view))
-            self._cameras.append(handle)
+    def refine_cloud(self, points: int | None = None) -> None:
+        """Send finer levels in the background, up to so many points in all; None = all."""
+        self._cloud.refine(len(self._content.cloud) if points is None else points)
+
+    def wait_for_cloud(self, timeout_s: float | None = None) -> bool:
+        """Wait until what was asked for of the cloud is sent; return whether it is."""
+        return self._cloud.wait(timeout_s)
+
+    def set_cloud_colors(self, colors: NDArray[np.uint8] | None) -> None:
+        """Colour the points; None = as photographed.
+
+        Args:
+            colors: (N, 3) of all points of `content.cloud`, in its order.
+
+        Raises:
+            InputError: another number of colours.
+        """
+        self._cloud.color(colors)
 
     def show_cameras(self, visible: bool) -> None:
         """Show or hide the cameras."""
-        for handle in self._cameras:
-            handle.visible = visible
-
-    def add_table(self, plane: SupportPlane) -> None:
-        """Add the support plane as a grid of 5 cm, and 25 cm in bold."""
-        wxyz, position = viser_wxyz_position(plane.T_world_table)
-        self._grid = self._scene.add_grid(
-            "/table",
-            self._config.grid_m,
-            self._config.grid_m,
-            cell_size=0.05,
-            section_size=0.25,
-            cell_color=(205, 205, 205),
-            section_color=(150, 150, 150),
-            plane_color=(235, 235, 235),
-            plane_opacity=0.35,
-            wxyz=wxyz,
-            position=position,
-        )
+        if self._cameras is not None:
+            self._cameras.visible = visible
 
     def show_table(self, visible: bool) -> None:
         """Show or hide the table."""
         if self._grid is not None:
             self._grid.visible = visible
 
+    def _add_cameras(self) -> None:
+        """Add a frustum with its photograph per shown view."""
+        i = self._content.intrinsics
+        fov = 2 * float(np.arctan2(i.height / 2, i.fy))
+        self._cameras = self._api.add_frame("/cameras", show_axes=False)
+        for view in self._content.shown_views:
+            wxyz, position = viser_wxyz_position(np.asarray(view.T_world_cam))
+            handle = self._api.add_camera_frustum(
+                f"/cameras/{view.index:06d}", fov, i.width / i.height,
+                scale=self._config.frustum_m, thickness=FRUSTUM_LINE_M, color=FRUSTUM_RGB,
+                format="jpeg", wxyz=wxyz, position=position, cast_shadow=False,
+                receive_shadow=False,
+            )  # fmt: skip
+            jpeg = self._content.thumbnails.get(view.index)
+            if jpeg is not None:
+                # The JPEG itself: `image` would be encoded again for every browser.
+                handle._image_data = jpeg  # pyright: ignore[reportPrivateUsage]
+            handle.on_click(lambda _, index=view.index: self._tell(self._on_camera, index))
+            self._frustums[view.index] = handle
+
+    def _add_table(self, T_world_table: Array) -> None:
+        """Add the support plane as a grid of 5 cm, and 25 cm in bold."""
+        wxyz, position = viser_wxyz_position(T_world_table)
+        self._grid = self._api.add_grid(
+            "/table", self._config.grid_m, self._config.grid_m, cell_size=0.05, section_size=0.25,
+            cell_color=(205, 205, 205), section_color=(150, 150, 150),
+            plane_color=(235, 235, 235), plane_opacity=0.35, wxyz=wxyz, position=position,
+        )  # fmt: skip
+
+    # --- grasps -------------------------------------------------------------------------------
+
     def draw_grasps(
-        self, objects: Sequence[ObjectPose], sets: Sequence[GraspSet], chosen: GraspFilter
+        self, chosen: GraspFilter, Ts_world_obj: Mapping[int, Array] | None = None
     ) -> int:
-        """Draw the grasps that pass the filter in place of those drawn before; return how many."""
-        poses = {o.instance: o.T_world_obj for o in objects}
-        drawn = 0
-        for grasps in sets:
-            name = f"/grasps/{grasps.instance}"
-            kept = content.chosen_grasps(
-                grasps, chosen.min_score, chosen.reachable_only, self._config.most_grasps
-            )
-            other = chosen.instance is not None and chosen.instance != grasps.instance
-            if not chosen.show or other or len(kept) == 0:
-                self._scene.remove_by_name(name)
-                continue
-            Ts = poses[grasps.instance] @ grasps.Ts_obj_grasp[kept]
-            lines = content.gripper_segments(Ts, grasps.widths_m[kept], self._config.gripper)
-            colors = content.linear_rgb(content.score_rgb(grasps.scores[kept]))
-            per_end = np.broadcast_to(colors[:, None, None], lines.shape).reshape(-1, 2, 3)
-            self._scene.add_line_segments(
-                name, lines.reshape(-1, 2, 3).astype(np.float32), per_end, thickness=0.0012
-            )
-            drawn += len(kept)
-        return drawn
+        """Draw the grasps that pass a filter in place of those drawn before.
+
+        Args:
+            chosen: the filter.
+            Ts_world_obj: instance -> pose (4, 4) where objects were moved; others stand as
+                registered.
+
+        Returns:
+            how many are drawn: at most `SceneConfig.most_grasps` of those that pass.
+        """
+        poses = {o.instance: o.T_world_obj for o in self._content.scene.objects}
+        found = chosen_grasps(self._content.grasp_sets, chosen, self._config.most_grasps)
+        with self._lock:
+            return self._grasps.draw(found, poses | dict(Ts_world_obj or {}))
+
+    # --- clicks -------------------------------------------------------------------------------
+
+    def on_object(self, callback: OnInstance) -> None:
+        """Call back with the instance of an object that is clicked."""
+        self._on_object.append(callback)
+
+    def on_camera(self, callback: OnInstance) -> None:
+        """Call back with the number of the view whose frustum is clicked."""
+        self._on_camera.append(callback)
+
+    def on_grasp(self, callback: OnGrasp) -> None:
+        """Call back with instance and row of a grasp that is clicked."""
+        self._grasps.on_click(callback)
+
+    def _tell(self, callbacks: list[OnInstance], number: int) -> None:
+        for callback in callbacks:
+            callback(number)
 
 
-def _colored_trimesh(mesh: Mesh) -> Any:
-    """Return the mesh with its texture, its vertex colours, or plain grey."""
-    from trimesh.visual import ColorVisuals, TextureVisuals
-    from trimesh.visual.material import PBRMaterial
-
-    shape = mesh_tools.to_trimesh(mesh)
-    if mesh.texture is not None and mesh.uv is not None:
-        from PIL import Image
-
-        # A rough, non-metallic material: the default one of glTF is a mirror in viser's light.
-        material = PBRMaterial(
-            baseColorTexture=Image.fromarray(mesh.texture), metallicFactor=0.0, roughnessFactor=0.9
-        )
-        shape.visual = TextureVisuals(uv=mesh.uv, material=material)
-        return shape
-    colors = mesh_tools.vertex_colors(mesh)
-    if colors is None:
-        colors = np.tile(np.array(PLAIN_RGB, dtype=np.uint8), (len(mesh.vertices), 1))
-    shape.visual = ColorVisuals(shape, vertex_colors=colors)
-    return shape
-
-
-def _go_to(view: View) -> Any:
-    """Return the callback that moves the camera of the clicking browser to a view."""
-    wxyz, position = viser_wxyz_position(np.asarray(view.T_world_cam))
-
-    def go(event: Any) -> None:
-        with event.client.atomic():
-            event.client.camera.wxyz = wxyz
-            event.client.camera.position = position
-
-    return go
+def _box_lines(low: Array, high: Array) -> NDArray[np.float32]:
+    """Return the edges (12, 2, 3) of a box of these corners (3,)."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    edges = [(a, b) for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1]
+    return (low + corners[np.array(edges)] * (high - low)).astype(np.float32)

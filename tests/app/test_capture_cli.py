@@ -3,8 +3,6 @@
 import json
 import shutil
 import socket
-import subprocess
-import sys
 from functools import lru_cache
 from pathlib import Path
 
@@ -26,6 +24,7 @@ from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from realsim_capture_plans.lab.arm import HOME
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from typed_commands import realsim
 
 BOARD = "aprilgrid:7x5,tag=30mm,gap=10mm"
 """What lies in the simulated lab."""
@@ -67,13 +66,6 @@ def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_plan(made_plan("calibration", 12), folder / "board_plan.json")
     save_plan(made_plan("hemisphere", 4, UR5E), folder / "ur5e.json")
     return folder
-
-
-def realsim(*args: object) -> subprocess.CompletedProcess[str]:
-    code = "from realsim.app.cli import main; main()"
-    return subprocess.run(
-        [sys.executable, "-c", code, *map(str, args)], capture_output=True, text=True, timeout=300
-    )
 
 
 @lru_cache(maxsize=1)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from realsim.app.console import Console
-from realsim.app.demo import DemoConfig, run_demo
+from realsim.app.demo.run import DemoConfig, run_demo
 
 SMALL = ["--views", "6", "--objects", "2", "--grasps", "8", "--quiet"]
 

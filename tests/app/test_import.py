@@ -31,6 +31,7 @@ from realsim.interop import rigid3d_from_T
 from realsim.records import CaptureSession
 from realsim.store import SessionStore
 from sources_in_memory import CAMERA, Recording, frame_of, ten
+from typed_commands import realsim
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 QUIET = Console(quiet=True)
@@ -357,12 +358,6 @@ def test_a_real_bag_becomes_a_session(tmp_path):
 
 
 # --- the command ------------------------------------------------------------------------------
-
-
-def realsim(*args: object) -> subprocess.CompletedProcess[str]:
-    code = "from realsim.app.cli import main; main()"
-    command = [sys.executable, "-c", code, *map(str, args)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
 
 
 def test_the_command_names_what_is_missing_and_then_imports(tmp_path):

@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,6 +36,7 @@ from realsim.scanning.scale.measured import length_of, parse_measurement
 from realsim.scanning.scale.result import Limit
 from realsim.store import SessionStore
 from scale_fits import UNIT_M, fit_of, known_scan
+from typed_commands import realsim
 
 CONSOLE = Console(quiet=True)
 
@@ -267,12 +266,9 @@ def test_help_names_every_option(capsys):
         assert option in text
 
 
-def test_bad_input_ends_with_exit_code_2_and_one_paragraph(tmp_path):
-    code = "from realsim.app.cli import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "scan", "scale", "none.glb", "--library", str(tmp_path)],
-        capture_output=True, text=True, timeout=120, cwd=tmp_path,
-    )  # fmt: skip
+def test_bad_input_ends_with_exit_code_2_and_one_paragraph(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = realsim("scan", "scale", "none.glb", "--library", tmp_path)
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert "--measured" in done.stderr and list(tmp_path.iterdir()) == []
 
@@ -439,7 +435,7 @@ def test_the_scale_by_a_caliper_alone_is_unchecked(known, mesh_file, tmp_path, c
     with pytest.raises(SystemExit) as stop:
         scale.main(
             [str(mesh_file), "--measured", f"longest={1e3 * longest}mm", "--out",
-             str(tmp_path / "out"), "--json", str(tmp_path / "s.json"), "--quiet"],
+             str(tmp_path / "out"), "--json-file", str(tmp_path / "s.json"), "--quiet"],
             standalone_mode=False,
         )  # fmt: skip
     assert stop.value.code == 1

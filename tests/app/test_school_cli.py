@@ -40,7 +40,7 @@ def tried(pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     """The same session after a school, and what the command said."""
     folder = tmp_path_factory.mktemp("tried") / "s"
     shutil.copytree(pristine, folder)
-    return folder, run(folder, *QUICK, "--json", folder.parent / "counts.json")
+    return folder, run(folder, *QUICK, "--json-file", folder.parent / "counts.json")
 
 
 # --- a run --------------------------------------------------------------------------------------
@@ -186,7 +186,7 @@ def test_grasps_are_exported(tried: tuple[Path, Result], tmp_path: Path, target:
 def test_the_summary_counts_every_session_once(tried: tuple[Path, Result], tmp_path: Path) -> None:
     other = shutil.copytree(tried[0], tmp_path / "s")
     file = tmp_path / "summary.json"
-    result = run("summary", tried[0], other, "--json", file)
+    result = run("summary", tried[0], other, "--json-file", file)
     assert result.exit_code == 0 and "2,275,352" in result.output
     found = json.loads(file.read_text())
     assert found["scenes"] == 2 and found["candidates"] == 4 * GRASPS
@@ -207,7 +207,7 @@ def test_things_that_stand_settle_and_one_in_the_air_does_not(
     save_scene(
         SessionStore.open(folder), Scene(name="two", objects=(lifted, wedge), plane=there.plane)
     )
-    result = run("settle", folder, "--quiet", "--json", tmp_path / "settle.json")
+    result = run("settle", folder, "--quiet", "--json-file", tmp_path / "settle.json")
     assert result.exit_code == 1 and "floats" in result.output
     verdicts = [o["verdict"] for o in json.loads((tmp_path / "settle.json").read_text())["objects"]]
     assert verdicts == ["floats", "stands"]
@@ -216,7 +216,7 @@ def test_things_that_stand_settle_and_one_in_the_air_does_not(
 @pytest.mark.slow
 def test_the_physics_is_validated(tmp_path: Path) -> None:
     result = run("validate", "--engine", "mujoco", "--quick", "--quiet", "--out", tmp_path,
-                 "--json", tmp_path / "all.json")  # fmt: skip
+                 "--json-file", tmp_path / "all.json")  # fmt: skip
     report = json.loads((tmp_path / "validation_mujoco.json").read_text())
     assert result.exit_code == (0 if report["passed"] else 1)
     assert json.loads((tmp_path / "all.json").read_text())["mujoco"]["checks"] == report["checks"]

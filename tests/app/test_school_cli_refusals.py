@@ -33,7 +33,7 @@ def tried(pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pat
     """The same session after a school, and what the command said."""
     folder = tmp_path_factory.mktemp("tried") / "s"
     shutil.copytree(pristine, folder)
-    return folder, run(folder, *QUICK, "--json", folder.parent / "counts.json")
+    return folder, run(folder, *QUICK, "--json-file", folder.parent / "counts.json")
 
 
 @pytest.mark.parametrize("option", ["--force", "--friction", "--density"])
@@ -169,7 +169,7 @@ def test_a_file_needs_a_folder_for_its_results_and_no_file_is_one(tmp_path: Path
 def test_what_cannot_be_written_in_the_end_is_refused_at_once(
     pristine: Path, tmp_path: Path
 ) -> None:
-    assert "is a folder" in refused(pristine, *QUICK, "--json", tmp_path)
+    assert "is a folder" in refused(pristine, *QUICK, "--json-file", tmp_path)
 
 
 SLAB = """<robot name="slab"><link name="base"><inertial><mass value="1"/>

@@ -91,6 +91,8 @@ class Terminal:
 
         def take_the_terminal() -> None:
             os.setsid()
+            # Whoever runs the tests in the background hands on that interrupts are ignored.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
             fcntl.ioctl(self.theirs, termios.TIOCSCTTY, 0)
 
         self.child = subprocess.Popen(

@@ -109,7 +109,7 @@ print(json.dumps([level, with_few, memory_kb("VmHWM")]))
 
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peaks are read from /proc")
-@pytest.mark.parametrize(("form", "frames"), [("bop", 2200), ("graspnet", 1000)])
+@pytest.mark.parametrize(("form", "frames"), [("bop", 1500), ("graspnet", 1000)])
 def test_a_frame_more_needs_no_more_memory(form, frames, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", WORKER, form, str(frames), str(FEW), str(tmp_path)],

@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import cache
 
 import numpy as np
 import pytest
@@ -56,6 +57,7 @@ def room() -> Environment:
     return Environment(panorama=panorama, sun=(0.5, 0.5, 0.4), sun_direction=(0.4, 0.3, 0.8))
 
 
+@cache
 def digests() -> list[str]:
     """Digests of the noisy picture in the even room and under an environment."""
     out = []

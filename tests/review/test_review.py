@@ -1,201 +1,93 @@
-"""The review server: what it shows, who may enter, and that decisions only ever add lines."""
+"""Who may enter the review page: host, origin, token, tunnel; asked with raw sockets."""
 
-import base64
-import json
+import http.client
 import re
-import shutil
-import subprocess
-import time
-import urllib.request
+import socket
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 import viser
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
+from websockets.typing import Origin, Subprotocol
 
-from realsim import (
-    CameraIntrinsics,
-    CaptureSession,
-    GraspSet,
-    InputError,
-    Mesh,
-    ObjectModel,
-    ObjectPose,
-    Scene,
-    SupportPlane,
-    View,
-    local_pages,
-)
-from realsim.formats.bop.models import save_models
-from realsim.geometry import se3
-from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from realsim.review import ReviewServer, content, journal
-from realsim.review.scene_nodes import GraspFilter
-from realsim.store import SessionStore, save_grasps, save_scene
+from realsim import CaptureSession, InputError, local_pages
+from realsim.local_pages import Door
+from realsim.review import ReviewServer
+from realsim.store import SessionStore
+from tests.support.review_browser import SMALL
+from tests.support.reviewed_boxes import boxes_session
 
-INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
-SOCKET = viser.__name__ + "-v" + viser.__version__
-
-
-def box(size: tuple[float, float, float]) -> Mesh:
-    s = (
-        np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        * np.array(size)
-        / 2
-    )
-    faces = [
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ]  # fmt: skip
-    return Mesh(vertices=s, faces=np.array(faces, np.int32))
-
-
-MODELS = {
-    1: ObjectModel(obj_id=1, name="tall", mesh=box((0.04, 0.04, 0.12))),
-    7: ObjectModel(obj_id=7, name="flat", mesh=box((0.08, 0.06, 0.03))),
-}
-SCENE = Scene(
-    name="two boxes",
-    objects=(
-        ObjectPose(
-            obj_id=1, instance=0, T_world_obj=se3.from_translation([0.46, 0.0, 0.06]),
-            verdict="accepted", checks={"agree": 0.98},
-        ),
-        ObjectPose(
-            obj_id=7, instance=3, T_world_obj=se3.from_translation([0.55, 0.02, 0.015]),
-            verdict="doubtful", reasons=("seen by one view",), checks={"agree": 0.71},
-        ),
-    ),
-    plane=SupportPlane(T_world_table=se3.from_translation([0.5, 0.0, 0.0])),
-)  # fmt: skip
-CAMERAS = [
-    se3.look_at([0.5 + 0.4 * np.cos(a), 0.4 * np.sin(a), 0.3], [0.5, 0.0, 0.03])
-    for a in (0.0, 2.0, 4.0)
-]
-
-
-def grasp_set(n: int = 40) -> GraspSet:
-    rng = np.random.default_rng(0)
-    Ts = se3.from_rt(np.diag([1.0, -1.0, -1.0]), rng.normal(scale=0.01, size=(n, 3)))
-    nan4 = np.full((n, 4), np.nan)
-    return GraspSet(
-        obj_id=1, instance=0, Ts_obj_grasp=Ts, widths_m=np.full(n, 0.05),
-        scores=np.append(np.linspace(0, 1, n - 1), np.nan), base_scores=np.zeros(n), slip_m=nan4,
-        slip_rad=nan4, reachable=np.arange(n) % 2 == 0, failures=("",) * n,
-    )  # fmt: skip
+SOCKET = Subprotocol(f"{viser.__name__}-v{viser.__version__}")
+TOKEN = "a-secret-of-more-than-16"
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
-    session = CaptureSession(name="boxes", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(tmp_path_factory.mktemp("review") / "boxes", session)
-    table = PlacedMesh(-1, box((1.0, 1.0, 0.02)), se3.from_translation([0.5, 0.0, -0.01]))
-    placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
-    renderer = LabelRenderer([*placed, table])
-    for index, T in enumerate(CAMERAS):
-        labels = renderer.render(INTRINSICS, T)
-        rgb = np.stack([np.where(labels.ids == 0, 200, 90)] * 3, -1).astype(np.uint8)
-        store.add_view(View(index=index, T_world_cam=T), rgb, labels.depth_m)
-    save_scene(store, SCENE)
-    save_grasps(store, grasp_set())
-    save_models(store.folder / "models", MODELS)
-    return store
+    return boxes_session(tmp_path_factory.mktemp("review") / "boxes")
 
 
 @pytest.fixture(scope="module")
 def server(store: SessionStore) -> Iterator[ReviewServer]:
-    review = ReviewServer(store, port=0)
+    review = ReviewServer(store, port=0, config=SMALL)
     review.start()
     yield review
     review.stop()
 
 
-# --- content ----------------------------------------------------------------------------------
+@pytest.fixture(scope="module")
+def locked(store: SessionStore) -> Iterator[ReviewServer]:
+    """Return a server that asks for a token, listening on all interfaces."""
+    review = ReviewServer(store, host="0.0.0.0", port=0, token=TOKEN, config=SMALL)
+    review.start()
+    yield review
+    review.stop()
 
 
-def test_worst_comes_first() -> None:
-    assert [o.instance for o in content.worst_first(SCENE.objects)] == [3, 0]
+def port_of(server: ReviewServer) -> int:
+    return int(server.url.rsplit(":", 1)[1])
 
 
-def test_the_fused_cloud_lies_on_the_surfaces(store: SessionStore) -> None:
-    views = content.placed_views(store)
-    region = content.region_of(SCENE.objects, views, 0.2)
-    points, colors = content.fused_cloud(store, views, 0.002, 50_000, region)
-    assert points.dtype == np.float32 and len(points) == len(colors) > 2000
-    assert np.all(region.holds(points))
-    on_table = np.abs(points[:, 2]) < 2e-4
-    # Everything above the table is on the shell of one of the boxes.
-    d = np.min(
-        [
-            np.abs(np.abs(points - o.T_world_obj[:3, 3]) - MODELS[o.obj_id].mesh.extent / 2).min(1)
-            for o in SCENE.objects
-        ],
-        axis=0,
-    )
-    # A voxel that holds points of two faces averages across the edge.
-    assert np.mean(on_table | (d < 5e-4)) > 0.97
-    fewer, _ = content.fused_cloud(store, views, 0.002, 500, region)
-    assert len(fewer) <= 500
+def asked(server: ReviewServer, path: str = "/", **headers: str) -> tuple[int, dict[str, str]]:
+    """Return status and headers of a GET with these headers besides or instead of its own."""
+    connection = http.client.HTTPConnection("127.0.0.1", port_of(server), timeout=20)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    body = answer.read()
+    assert (b"<html" in body.lower()) == (len(body) > 100_000)
+    return answer.status, dict(answer.headers) | {"body": body.decode(errors="replace")[:400]}
 
 
-def test_a_strided_camera_sees_the_same_points() -> None:
-    from realsim.geometry import camera
-
-    lens = CameraIntrinsics(
-        width=161, height=121, fx=150.0, fy=152.0, cx=80.2, cy=59.1,
-        distortion=np.array([-0.05, 0.06, 3e-4, 5e-4, -0.02]),
-    )  # fmt: skip
-    for stride in (1, 2, 3, 7):
-        small = content.strided(lens, stride)
-        rays = camera.ray_table(lens)[::stride, ::stride]
-        np.testing.assert_allclose(camera.ray_table(small), rays, atol=1e-6)
+def raw(server: ReviewServer, request: str) -> str:
+    """Return the first line of the answer to these bytes."""
+    with socket.create_connection(("127.0.0.1", port_of(server)), timeout=20) as line:
+        line.sendall(request.replace("\n", "\r\n").encode())
+        return line.recv(200).decode(errors="replace").split("\r\n")[0]
 
 
-def test_grippers_are_drawn_where_the_contacts_are() -> None:
-    rng = np.random.default_rng(1)
-    Ts, widths = se3.random_transform(rng, 9), rng.uniform(0.01, 0.1, 9)
-    lines = content.gripper_segments(Ts, widths, content.GripperDrawing())
-    tips = lines[:, :2, 0]
-    np.testing.assert_allclose(np.linalg.norm(tips[:, 1] - tips[:, 0], axis=1), widths, atol=1e-12)
-    np.testing.assert_allclose(tips.mean(1), Ts[:, :3, 3], atol=1e-12)
-    fingers = lines[:, 0, 0] - lines[:, 0, 1]  # from palm to tip: the approach
-    np.testing.assert_allclose(fingers / 0.035, Ts[:, :3, 2], atol=1e-12)
+def handshake(server: ReviewServer, origin: str | None = None, **headers: str) -> int:
+    """Return 101 if the websocket is opened and the page's messages come, else the refusal."""
+    address = f"ws://127.0.0.1:{port_of(server)}"
+    try:
+        with connect(
+            address,
+            origin=None if origin is None else Origin(origin),
+            subprotocols=[SOCKET],
+            additional_headers=headers,
+            max_size=None,
+        ) as line:
+            assert len(line.recv(timeout=20)) > 0
+            return 101
+    except InvalidStatus as refused:
+        return refused.response.status_code
 
 
-def test_filters_nest_and_keep_the_spread_of_scores() -> None:
-    grasps = grasp_set()
-    every = set(content.chosen_grasps(grasps, 0.0, False, 1000).tolist())
-    assert every == set(range(40))
-    for reachable in (False, True):
-        tighter = [
-            set(content.chosen_grasps(grasps, s, reachable, 1000).tolist()) for s in (0, 0.3, 0.8)
-        ]
-        assert tighter[2] < tighter[1] < tighter[0]
-        assert all(grasps.scores[i] >= 0.8 for i in tighter[2])
-    few = content.chosen_grasps(grasps, 0.0, False, 5)
-    assert len(few) == 5 and np.nanmin(grasps.scores[few]) < 0.3 and grasps.scores[few].max() != 0
-
-
-def test_without_objects_the_region_is_where_the_cameras_look() -> None:
-    views = [View(index=i, T_world_cam=T) for i, T in enumerate(CAMERAS)]
-    region = content.region_of([], views, 0.2)
-    np.testing.assert_allclose(region.center, [0.5, 0.0, 0.03], atol=1e-9)
-
-
-def test_linear_light_of_known_colours() -> None:
-    rgb = np.array([[0, 128, 255]], np.uint8)
-    np.testing.assert_array_equal(content.linear_rgb(rgb), [[0, 55, 255]])
-
-
-# --- who may enter ----------------------------------------------------------------------------
+# --- where it listens -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "example.org", ""])
-def test_other_machines_are_refused(store: SessionStore, host: str) -> None:
+def test_other_machines_are_refused_without_a_token(store: SessionStore, host: str) -> None:
     with pytest.raises(InputError, match="no login"):
         ReviewServer(store, host=host)
 
@@ -205,29 +97,77 @@ def test_loopback_is_accepted(host: str) -> None:
     assert local_pages.check_host(host, "the review") == host
 
 
-def test_the_page_is_served(server: ReviewServer) -> None:
-    with urllib.request.urlopen(server.url, timeout=10) as page:
-        assert page.status == 200 and b"<html" in page.read().lower()
+def test_a_host_that_is_not_here_is_told_before_anything_listens() -> None:
+    with pytest.raises(InputError, match="cannot listen on"):
+        local_pages.free_port("203.0.113.77", 8080)
+    with pytest.raises(InputError, match="cannot listen on"):
+        local_pages.free_port("no.such.machine.invalid", 8080)
 
 
-def test_foreign_pages_are_refused_and_own_pages_get_the_scene(server: ReviewServer) -> None:
-    address = server.url.replace("http", "ws", 1)
-    for origin in ("https://evil.example", "http://127.0.0.1.evil.example", "null"):
-        with pytest.raises(InvalidStatus) as refused:
-            connect(address, origin=origin, subprotocols=[SOCKET])  # type: ignore[list-item]
-        assert refused.value.response.status_code == 403
-    own = server.url
-    with connect(address, origin=own, subprotocols=[SOCKET], max_size=None) as socket:  # type: ignore
-        assert len(socket.recv(timeout=10)) > 0
+def test_a_port_in_use_is_passed_over() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert port < local_pages.free_port("127.0.0.1", port) < port + local_pages.PORTS_TRIED
 
 
-def test_other_servers_are_not_touched_by_the_guard() -> None:
-    from websockets.asyncio import server as module
+# --- the page of this machine only ------------------------------------------------------------
 
-    before: Any = module.serve
-    with local_pages.local_origins_only():
-        assert module.serve is not before
-    assert module.serve is before
+
+def test_the_page_is_served_under_the_names_of_this_machine(server: ReviewServer) -> None:
+    port = port_of(server)
+    for host in (f"127.0.0.1:{port}", "localhost", "LOCALHOST:9000", "[::1]:8080"):
+        assert asked(server, Host=host)[0] == 200
+
+
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:8080", "10.0.0.5",
+             "127.0.0.1@evil.example", "evil.example#127.0.0.1", "", "["]
+)  # fmt: skip
+def test_a_foreign_host_gets_neither_page_nor_socket(server: ReviewServer, host: str) -> None:
+    """A name that somebody else made to point here is DNS rebinding."""
+    assert asked(server, Host=host)[0] == 403
+    upgrade = "Upgrade: websocket\nConnection: Upgrade\nSec-WebSocket-Version: 13\n"
+    key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\n"
+    assert " 403 " in raw(server, f"GET / HTTP/1.1\nHost: {host}\n{upgrade}{key}\n")
+
+
+def test_no_host_and_two_hosts_are_refused(server: ReviewServer) -> None:
+    assert " 403 " in raw(server, "GET / HTTP/1.1\n\n")
+    assert " 403 " in raw(server, "GET / HTTP/1.1\nHost: localhost\nHost: evil.example\n\n")
+
+
+@pytest.mark.parametrize(
+    "origin", ["https://evil.example", "http://127.0.0.1.evil.example", "null",
+               "http://localhost:1", "file://"]
+)  # fmt: skip
+def test_foreign_pages_are_refused(server: ReviewServer, origin: str) -> None:
+    """Even a page of another server of this machine is a foreign one."""
+    assert handshake(server, origin) == 403
+
+
+def test_own_pages_get_the_scene_and_so_do_programs_of_this_machine(server: ReviewServer) -> None:
+    assert handshake(server, server.url) == 101
+    assert handshake(server, None) == 101
+
+
+def test_a_forwarded_port_is_our_own_page(server: ReviewServer) -> None:
+    """With `ssh -L 9000:127.0.0.1:8080` the browser calls us localhost:9000."""
+    assert asked(server, Host="localhost:9000", Origin="http://localhost:9000")[0] == 200
+    assert asked(server, Host="localhost:9000", Origin="http://localhost:9001")[0] == 403
+
+
+def test_no_link_can_give_the_page_orders(server: ReviewServer) -> None:
+    """Viser's page would show the messages of any server that its address names."""
+    assert asked(server, "/?websocket=wss://evil.example")[0] == 403
+    assert asked(server, "/?playbackPath=https://evil.example/x")[0] == 403
+    policy = asked(server)[1]["Content-Security-Policy"]
+    assert "frame-ancestors 'none'" in policy
+    sources = re.search("connect-src ([^;]*)", policy)
+    port = port_of(server)
+    assert sources is not None
+    assert sources[1] == f"'self' ws://127.0.0.1:{port} wss://127.0.0.1:{port} data: blob:"
 
 
 def test_nobody_can_ask_for_a_public_tunnel(server: ReviewServer) -> None:
@@ -235,150 +175,96 @@ def test_nobody_can_ask_for_a_public_tunnel(server: ReviewServer) -> None:
 
     handlers = server._running()._websock_server._incoming_handlers  # type: ignore[reportPrivateUsage]
     assert _messages.ShareUrlRequest not in handlers
+    assert _messages.ShareUrlDisconnect not in handlers
+    called: list[bool] = []
+    running = server._running()  # type: ignore[reportPrivateUsage]
+    running.request_share_url = lambda verbose=True: called.append(True)  # type: ignore[method-assign]
+    import msgspec
+
+    with connect(f"ws://127.0.0.1:{port_of(server)}", subprotocols=[SOCKET], max_size=None) as line:
+        line.recv(timeout=20)
+        line.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
+        line.recv(timeout=20)
+        line.ping().wait(20)
+    assert called == []
 
 
-# --- decisions --------------------------------------------------------------------------------
+def test_other_servers_are_not_touched_by_the_guard() -> None:
+    from websockets.asyncio import server as module
+
+    before: object = module.serve
+    with local_pages.local_origins_only():
+        assert module.serve is not before
+    assert module.serve is before
 
 
-def test_decisions_are_replayed_shown_and_undone(store: SessionStore, server: ReviewServer) -> None:
-    everything_else = {
-        p: p.read_bytes()
-        for p in store.folder.rglob("*")
-        if p.is_file() and "review" not in p.parts
-    }
-    start = len(server.state.entries)
-    server.reject(3, "ada", "it floats")
-    judged = journal.reviewed_scene(server.scene, server.state)
-    assert judged.object(3).verdict == "rejected" and judged.object(0).verdict == "accepted"
-    assert "rejected" in server._cards[3].folder.label  # type: ignore[reportPrivateUsage]
-    assert "it floats" in server._cards[3].text.content  # type: ignore[reportPrivateUsage]
-    server.undo(3, "ada")
-    assert journal.reviewed_scene(server.scene, server.state).object(3).verdict == "doubtful"
-    server.accept(3, "bob")
-    server.comment(0, "bob", "nice")
-    assert [e.action for e in server.state.entries[start:]] == [
-        "reject", "undo", "accept", "comment",
-    ]  # fmt: skip
-    for path, data in everything_else.items():
-        assert path.read_bytes() == data
-    again = ReviewServer(store, port=0)
-    assert again.state == server.state
+# --- with a token -----------------------------------------------------------------------------
 
 
-def test_unsigned_presses_record_nothing_and_say_why(server: ReviewServer) -> None:
-    before = server.state
-    card = server._cards[0]  # type: ignore[reportPrivateUsage]
-    server._press(lambda: server.accept(0, "  "), card)  # type: ignore[reportPrivateUsage]
-    assert "name" in server._message.content and server.state == before  # type: ignore
-    with pytest.raises(InputError, match="instance 99"):
-        server.accept(99, "ada")
+def test_without_the_token_neither_page_nor_socket_answers(locked: ReviewServer) -> None:
+    assert asked(locked)[0] == 401
+    assert handshake(locked) == 401
+    for wrong in ("", "x", TOKEN[:-1], TOKEN + "x", TOKEN.upper(), "\u00fc" * 20):
+        from urllib.parse import quote
+
+        assert asked(locked, f"/?token={quote(wrong)}")[0] == 401
+    cookie = f"realsim_{port_of(locked)}={TOKEN}"
+    assert asked(locked, Cookie=cookie)[0] == 401  # the token itself is no cookie
+    assert handshake(locked, Cookie=cookie) == 401
 
 
-def test_a_decision_of_another_server_shows_up(store: SessionStore, server: ReviewServer) -> None:
-    other = ReviewServer(store, port=0)
-    other.reject(0, "carol")
-    server.refresh()
-    assert "rejected" in server._cards[0].folder.label  # type: ignore[reportPrivateUsage]
-    other.undo(0, "carol")
+def test_the_token_comes_once_in_the_address_and_stays_as_a_cookie(locked: ReviewServer) -> None:
+    path = locked.address.split("/", 3)[3]
+    assert path == f"?token={TOKEN}"
+    status, headers = asked(locked, f"/{path}")
+    assert status == 200 and 'url=/"' in headers["body"]
+    assert headers["Referrer-Policy"] == "no-referrer" and headers["Cache-Control"] == "no-store"
+    cookie = headers["Set-Cookie"]
+    assert {"HttpOnly", "SameSite=Strict", "Path=/"} <= set(cookie.split("; "))
+    assert TOKEN not in cookie
+    value = cookie.split(";")[0]
+    assert asked(locked, Cookie=value)[0] == 200
+    assert asked(locked, Cookie=f"a=b; {value}; c=d")[0] == 200
+    assert handshake(locked, Cookie=value) == 101
+    assert handshake(locked, f"http://127.0.0.1:{port_of(locked)}", Cookie=value) == 101
+    # A page of another site that has the browser's cookie sent along is still a foreign page.
+    assert handshake(locked, "https://evil.example", Cookie=value) == 403
+    assert asked(locked, Cookie=value, Host="evil.example")[0] == 403
 
 
-def test_grasp_filters_draw_what_passes(server: ReviewServer) -> None:
-    assert server.filter_grasps(GraspFilter()) == 40
-    assert server.filter_grasps(GraspFilter(min_score=0.5)) == np.sum(grasp_set().scores >= 0.5)
-    assert server.filter_grasps(GraspFilter(reachable_only=True)) == 20
-    assert server.filter_grasps(GraspFilter(instance=3)) == 0
-    assert server.filter_grasps(GraspFilter(show=False)) == 0
-    assert server.filter_grasps(GraspFilter()) == 40
+def test_an_open_server_answers_to_its_addresses_and_names_only(locked: ReviewServer) -> None:
+    headers = asked(locked, f"/?token={TOKEN}", Host="192.0.2.7:8080")[1]
+    cookie = headers["Set-Cookie"].split(";")[0]
+    assert cookie.startswith("realsim_8080=")
+    name = socket.gethostname()
+    for host in ("192.0.2.7:8080", f"{name}:8080"):
+        assert asked(locked, Host=host, Cookie=cookie)[0] == 200
+    assert asked(locked, Host="somewhere.example:8080", Cookie=cookie)[0] == 403
 
 
-def test_an_unregistered_session_is_refused(tmp_path: Path) -> None:
-    session = CaptureSession(name="raw", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
+def test_a_token_file_must_be_ones_own_and_long(tmp_path: Path) -> None:
+    path = tmp_path / "token"
+    with pytest.raises(InputError, match="cannot be read"):
+        local_pages.token_of_file(path)
+    path.write_text(TOKEN + "\n")
+    path.chmod(0o644)
+    with pytest.raises(InputError, match="chmod 600"):
+        local_pages.token_of_file(path)
+    path.chmod(0o600)
+    assert local_pages.token_of_file(path) == TOKEN
+    for bad in ("short", "two words of a long token", "\u00fcmlaut-in-a-long-token"):
+        path.write_text(bad)
+        with pytest.raises(InputError, match="at least 16"):
+            local_pages.token_of_file(path)
+    with pytest.raises(InputError, match="at least 16"):
+        Door(token="short")
+    assert len({local_pages.new_token() for _ in range(8)}) == 8
+
+
+def test_an_unregistered_session_is_refused(store: SessionStore, tmp_path: Path) -> None:
+    given = store.session
+    raw_session = CaptureSession(
+        name="raw", intrinsics=given.intrinsics, views=(), depth_unit_m=1e-4
+    )
     with pytest.raises(InputError, match=r"scene\.json"):
-        ReviewServer(SessionStore.create(tmp_path / "s", session))
-
-
-# --- in a real browser ------------------------------------------------------------------------
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-BROWSER_ARGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--disable-background-networking",
-    "--disable-dev-shm-usage", "--window-size=1200,800", "--remote-debugging-port=0",
-)  # fmt: skip
-
-
-class Page:
-    """A page of a headless browser, steered over the DevTools protocol."""
-
-    def __init__(self, folder: Path, url: str) -> None:
-        command = [str(CHROMIUM), *BROWSER_ARGS, f"--user-data-dir={folder}", "about:blank"]
-        self.process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-        assert self.process.stderr is not None
-        port = next(
-            m[1]
-            for line in self.process.stderr
-            if (m := re.search(r"ws://127\.0\.0\.1:(\d+)/", line))
-        )
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=20) as answer:
-            page = next(p for p in json.load(answer) if p["type"] == "page")
-        self.socket = connect(page["webSocketDebuggerUrl"], max_size=None)
-        self.calls = 0
-        self.call("Page.navigate", url=url)
-
-    def call(self, method: str, **params: Any) -> Any:
-        self.calls += 1
-        self.socket.send(json.dumps({"id": self.calls, "method": method, "params": params}))
-        while True:
-            answer = json.loads(self.socket.recv(timeout=60))
-            if answer.get("id") == self.calls:
-                return answer["result"]
-
-    def run(self, script: str) -> Any:
-        result = self.call("Runtime.evaluate", expression=script, returnByValue=True)
-        return result["result"].get("value")
-
-    def wait_for(self, text: str, seconds: float = 60.0) -> str:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            shown = self.run("document.body ? document.body.innerText : ''") or ""
-            if text in shown:
-                return shown
-            time.sleep(0.3)
-        raise AssertionError(f"'{text}' did not appear; the page shows: {shown}")
-
-    def close(self) -> None:
-        self.socket.close()
-        self.process.kill()
-        self.process.wait()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_in_chromium_the_panel_decides(server: ReviewServer, tmp_path: Path) -> None:
-    page = Page(tmp_path / "profile", server.url)
-    try:
-        page.wait_for("Your name")
-        page.wait_for("3 flat")
-        shown = page.wait_for("0 tall")
-        assert shown.index("3 flat") < shown.index("0 tall")  # worst first
-        page.run(
-            "[...document.querySelectorAll('button')].find(b => b.innerText == 'Accept').click()"
-        )
-        page.wait_for("Not recorded")
-        server._reviewer.value = "dora"  # type: ignore[reportPrivateUsage]
-        page.run(
-            "[...document.querySelectorAll('button')].find(b => b.innerText == 'Reject').click()"
-        )
-        page.wait_for("Recorded: reject by dora")
-        assert server.state.entries[-1].reviewer == "dora"
-        assert server.state.entries[-1].instance == 3
-        picture = base64.b64decode(page.call("Page.captureScreenshot", format="png")["data"])
-        (tmp_path / "page.png").write_bytes(picture)
-        server.undo(3, "dora")
-    finally:
-        page.close()
-    import cv2
-
-    image = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)
-    left = np.asarray(image)[150:, :700].astype(int)
-    assert left.std() > 5  # the scene is drawn, not a blank canvas
+        ReviewServer(SessionStore.create(tmp_path / "s", raw_session))

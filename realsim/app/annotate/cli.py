@@ -4,20 +4,25 @@ from pathlib import Path
 
 import click
 
-FOLDER = click.Path(path_type=Path)
+from realsim.app.command import Command
+from realsim.app.options import FOLDER, JSON, QUIET, workers
 
 
-@click.command("annotate")
+@click.command(
+    "annotate", cls=Command,
+    examples=("realsim annotate demo/session", "realsim annotate demo/session --maps all --json"),
+)  # fmt: skip
 @click.argument("session", type=FOLDER)
 @click.option("--maps", default="instance,depth", show_default=True,
               metavar="all|none|LIST",
               help="Maps of each frame: instance, depth, coordinates, normals.")  # fmt: skip
-@click.option("--workers", default=1, show_default=True, type=click.IntRange(1, 256))
+@workers(1, "Processes that compute frames.")
 @click.option("--no-depth-check", is_flag=True,
               help="Do not look for unknown things in the measured depth.")  # fmt: skip
-@click.option("--quiet", is_flag=True, help="No progress bars.")
+@JSON
+@QUIET
 def annotate_command(
-    session: Path, maps: str, workers: int, no_depth_check: bool, quiet: bool
+    session: Path, maps: str, workers: int, no_depth_check: bool, as_json: bool, quiet: bool
 ) -> None:
     """Write masks, maps, poses, visibility and grasps for every frame of SESSION.
 
@@ -31,6 +36,8 @@ def annotate_command(
     from realsim.app.annotate.run import run_annotate
     from realsim.app.console import Console
 
-    run_annotate(
-        session, Console(quiet=quiet), maps=maps, workers=workers, check_depth=not no_depth_check
+    console = Console(quiet=quiet, as_json=as_json)
+    summary = run_annotate(
+        session, console, maps=maps, workers=workers, check_depth=not no_depth_check
     )
+    console.result(summary)

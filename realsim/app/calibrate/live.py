@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from realsim.app.calibrate.folder import FolderRequest, target_of, write_calibration
-from realsim.app.calibrate.run import show_report
+from realsim.app.calibrate.run import report_document, show_report
 from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim_calibration import (
@@ -56,4 +56,5 @@ def run_live(request: FolderRequest, console: Console) -> bool:
         files = write_calibration(Calibration(hand_eye=report, lens=None), request.out, (), console)
         show_report(report, report.checks, console)
         console.say(f"report: {files[0]}")
+        console.result(report_document(report, report.checks, files))
     return done

@@ -17,21 +17,23 @@ NEXT_VIEWS = 3
 ORDER = ("bad", "warn", "unknown", "good")
 
 
-def run_calibrate(source: Path, *, live: bool, quiet: bool, **options: Any) -> bool:
+def run_calibrate(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     """Calibrate what `source` holds; return whether no check is bad.
 
     Raises:
         InputError: source or options cannot be used.
     """
-    console = Console(quiet=quiet)
     if (source / "session.json").is_file():
         _refuse_folder_options(options)
         from realsim.app.stages import calibrate_session, open_session
+        from realsim.store.records_json import hand_eye_to_json
 
         hand_eye = calibrate_session(open_session(source), console)
         show_hand_eye(hand_eye, console)
         console.say(f"report and pictures: {source / 'calibration' / 'report'}")
-        return not any(c.verdict == "bad" for c in hand_eye.checks)
+        passed = not any(c.verdict == "bad" for c in hand_eye.checks)
+        console.result({"passed": passed, **hand_eye_to_json(hand_eye)})
+        return passed
     if not source.is_dir():
         raise InputError(
             f"'{source}' is not a folder; a session (it holds session.json) or a folder of images "
@@ -57,7 +59,34 @@ def run_calibrate(source: Path, *, live: bool, quiet: bool, **options: Any) -> b
     show_next_views(result.hand_eye, console)
     console.say(f"report: {files[0]}")
     console.say(f"{len(files) - 1} pictures and files for other tools beside it, in {request.out}")
+    console.result(report_document(result.hand_eye, result.checks, files))
     return not any(c.verdict == "bad" for c in result.checks)
+
+
+def report_document(
+    report: HandEyeReport, checks: Sequence[Check], files: Sequence[Path]
+) -> dict[str, object]:
+    """Return what a program wants to know of a calibrated folder, for `--json`."""
+    from realsim.store.records_json import check_to_json, intrinsics_to_json
+
+    in_hand = report.mode == "eye_in_hand"
+    return {
+        "passed": not any(c.verdict == "bad" for c in checks),
+        "mode": report.mode,
+        "T_ee_cam" if in_hand else "T_base_cam": report.X,
+        "T_base_board" if in_hand else "T_ee_board": report.Z,
+        "sigma_mm": report.sigma_mm,
+        "sigma_deg": report.sigma_deg,
+        "covariance": report.X_covariance,
+        "held_out_px": report.held_out_px,
+        "held_out_mm": report.held_out_mm,
+        "held_out_deg": report.held_out_deg,
+        "intrinsics": intrinsics_to_json(report.intrinsics),
+        "view_indices": [v.index for v in report.used],
+        "rejected": report.rejected,
+        "checks": [check_to_json(c) for c in checks],
+        "files": files,
+    }
 
 
 def _refuse_folder_options(options: dict[str, Any]) -> None:

@@ -149,6 +149,7 @@ def _carry_out(
         if lab is not None and target is None:
             _give_models(lab, store)
         show_summary(summary, console)
+        console.result(_document(store.folder, summary, len(store.completed), len(plan)))
     finally:
         if taken.images:  # a run that was refused changes nothing
             title = f"{request.out.resolve().name}, {arm.name}, {camera.name}"
@@ -179,6 +180,7 @@ def _rehearse(
         )
         summary = dry_run(plan, arm, camera, config=config, job=job)
     show_summary(summary, console, dry=True)
+    console.result(_document(None, summary, 0, len(plan)))
     return summary.complete
 
 
@@ -393,6 +395,13 @@ def _give_models(lab: "SimulatedLab", store: SessionStore) -> None:
 
 
 # --- what is shown ----------------------------------------------------------------------------
+
+
+def _document(
+    folder: Path | None, summary: CaptureSummary, stored: int, planned: int
+) -> dict[str, object]:
+    """Return what a program wants to know, for `--json`; no folder in a dry run."""
+    return {"session": folder, "stored": stored, "planned": planned, "summary": summary}
 
 
 def show_summary(summary: CaptureSummary, console: Console, *, dry: bool = False) -> None:

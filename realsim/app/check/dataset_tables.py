@@ -1,6 +1,5 @@
 """`realsim check` of a data set, as a person and a program read it."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,7 +17,7 @@ MOST_FINDINGS = 40
 """Lines on the console; `--json` has all."""
 
 
-def run_dataset_check(folder: Path, *, as_json: bool, console: Console) -> bool:
+def run_dataset_check(folder: Path, *, console: Console) -> bool:
     """Check a data set and print what was found: its labels, and its files by their checksums.
 
     Any other folder that has a list of checksums is checked by it alone.
@@ -40,13 +39,13 @@ def run_dataset_check(folder: Path, *, as_json: bool, console: Console) -> bool:
         with console.stage("check", "checksums") as tick:
             report = check_checksums(sums, folder, progress=tick)
     agrees = all(s.agrees for s in scenes) and (report is None or report.agrees)
-    if as_json:
-        told = {
-            "agrees": agrees,
-            "scenes": [s.to_json() for s in scenes],
-            "checksums": None if report is None else report.to_json(),
-        }
-        print(json.dumps(told, indent=1))
+    told = {
+        "agrees": agrees,
+        "scenes": [s.to_json() for s in scenes],
+        "checksums": None if report is None else report.to_json(),
+    }
+    console.result(told)
+    if console.as_json:
         return agrees
     if has_labels:
         show_agreement(folder, scenes, console)

@@ -4,7 +4,6 @@ A data set (BOP, GraspNet, or what `realsim upgrade` made) is checked for whethe
 whatever `realsim export` wrote, for whether its files are as they were written.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,7 +22,7 @@ NAMED = 6
 """Names in a line; `--json` has all."""
 
 
-def run_check(folder: Path, *, repair: bool, decode: bool, as_json: bool) -> bool:
+def run_check(folder: Path, console: Console, *, repair: bool, decode: bool) -> bool:
     """Check a session or a data set, repair a session if asked, and print what was found.
 
     Returns:
@@ -39,7 +38,7 @@ def run_check(folder: Path, *, repair: bool, decode: bool, as_json: bool) -> boo
                 f"'{folder}' is a data set; only sessions are repaired. Labels that disagree are "
                 "made anew by `realsim upgrade`, damaged files by `realsim export`."
             )
-        return run_dataset_check(folder, as_json=as_json, console=Console(quiet=as_json))
+        return run_dataset_check(folder, console=console)
     if not folder.is_dir() or not is_session(folder):
         inner = sorted(p.parent.name for p in folder.glob("*/session.json"))
         hint = f" Did you mean {', '.join(str(folder / n) for n in inner)}?" if inner else ""
@@ -50,17 +49,15 @@ def run_check(folder: Path, *, repair: bool, decode: bool, as_json: bool) -> boo
         )
     if not repair:
         report = check_session(folder, decode=decode)
-        if as_json:
-            print(json.dumps(report.to_json(), indent=1))
-        else:
-            show_check(report, Console())
+        console.result(report.to_json())
+        if not console.as_json:
+            show_check(report, console)
         return report.sound
     with only_run_in(folder):
         repaired = repair_session(folder)
-    if as_json:
-        print(json.dumps(repaired.to_json(), indent=1))
-    else:
-        show_repair(repaired, Console())
+    console.result(repaired.to_json())
+    if not console.as_json:
+        show_repair(repaired, console)
     return repaired.after.sound
 
 

@@ -5,35 +5,49 @@ from typing import Any
 
 import click
 
-FOLDER = click.Path(path_type=Path)
+from realsim.app.command import Command
+from realsim.app.options import FOLDER, JSON, QUIET
 
 
-@click.command("demonstrations")
+@click.command(
+    "demonstrations",
+    cls=Command,
+    examples=(
+        "realsim demonstrations demo/session --out demonstrations --limit 2",
+        "realsim demonstrations demo/session --out good --outcome success --fps 10 --limit 1",
+    ),
+)
 @click.argument("source", type=FOLDER)
 @click.option("--out", type=FOLDER, required=True, help="Folder to fill; new, or to go on in.")
 @click.option("--fps", default=20, show_default=True, type=click.IntRange(1, 240),
               help="Steps per second.")  # fmt: skip
 @click.option("--outcome", default="all", show_default=True,
-              type=click.Choice(("all", "success", "failure")))  # fmt: skip
+              type=click.Choice(("all", "success", "failure")),
+              help="Of the attempts.")  # fmt: skip
 @click.option("--grasp", "grasps", multiple=True, metavar="INSTANCE:GRASP",
               help="Only this attempt; repeat.")  # fmt: skip
 @click.option("--limit", type=click.IntRange(1), default=None,
               help="So many attempts, spread over all.")  # fmt: skip
 @click.option("--width", default=320, show_default=True, type=click.IntRange(16, 4096),
               help="Of the pictures [px].")  # fmt: skip
-@click.option("--height", default=240, show_default=True, type=click.IntRange(16, 4096))
+@click.option("--height", default=240, show_default=True, type=click.IntRange(16, 4096),
+              help="Of the pictures [px].")  # fmt: skip
 @click.option("--view", type=click.IntRange(0), default=None,
               help="View of the session for the fixed camera.  [beside the table]")  # fmt: skip
 @click.option("--hand-eye", is_flag=True,
               help="Mount the hand's camera as the session's calibration says.")  # fmt: skip
 @click.option("--mass", "masses", multiple=True, metavar="NAME=KG", help="As the school was told.")
-@click.option("--episodes-per-file", default=50, show_default=True, type=click.IntRange(1, 10_000))
+@click.option("--episodes-per-file", default=50, show_default=True, type=click.IntRange(1, 10_000),
+              help="Attempts in one file of data/ and videos/.")  # fmt: skip
 @click.option("--name", default="", help="Of the data set, on its card.")
 @click.option("--licence", default="", help="Of the pictures, on the card.")
 @click.option("--models-licence", default="", help="Of the object models, on the card.")
 @click.option("--attribution", default="", help="Whom to name, on the card.")
-@click.option("--quiet", is_flag=True, help="No progress bars.")
-def demonstrations_command(source: Path, out: Path, quiet: bool, **options: Any) -> None:
+@JSON
+@QUIET
+def demonstrations_command(
+    source: Path, out: Path, as_json: bool, quiet: bool, **options: Any
+) -> None:
     """Replay the school's attempts on SOURCE and write them as a LeRobot v3.0 data set.
 
     SOURCE is a session, or a folder of results of `realsim school`. Every attempt that the arm
@@ -49,6 +63,7 @@ def demonstrations_command(source: Path, out: Path, quiet: bool, **options: Any)
         show_demonstrations,
     )
 
-    console = Console(quiet=quiet)
-    request = DemonstrationRequest(**options)
-    show_demonstrations(export_demonstrations(source, out, request, console), console)
+    console = Console(quiet=quiet, as_json=as_json)
+    result = export_demonstrations(source, out, DemonstrationRequest(**options), console)
+    show_demonstrations(result, console)
+    console.result(result)

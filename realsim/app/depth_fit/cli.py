@@ -5,13 +5,22 @@ from typing import Any
 
 import click
 
-FOLDER = click.Path(path_type=Path)
+from realsim.app.command import Command
+from realsim.app.options import FOLDER, JSON, QUIET
+
 CAMERAS = ("d405", "d415", "d435", "structured_light")
 """The depth cameras by name; a test holds them equal to the profiles', which are not imported
 here."""
 
 
-@click.command("depth-fit")
+@click.command(
+    "depth-fit",
+    cls=Command,
+    examples=(
+        "realsim depth-fit wall --camera camera.json --unit 0.0001",
+        "realsim depth-fit demo/session --views 0-3 --out table.json --json",
+    ),
+)
 @click.argument("source", type=FOLDER)
 @click.option("--profile", "profile_name", default="d405", show_default=True,
               type=click.Choice(CAMERAS), help="The kind of camera.")  # fmt: skip
@@ -27,8 +36,9 @@ here."""
               help="Metres per count of a FOLDER's depth images.  [the profile's]")  # fmt: skip
 @click.option("--baseline", "baseline_m", type=float, default=None,
               help="Distance of the eyes [m].  [the profile's]")  # fmt: skip
-@click.option("--quiet", is_flag=True, help="No progress bars.")
-def depth_fit(source: Path, quiet: bool, **options: Any) -> None:
+@JSON
+@QUIET
+def depth_fit(source: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Fit the depth camera's noise and holes to frames of a wall or a bare table.
 
     \b
@@ -41,4 +51,4 @@ def depth_fit(source: Path, quiet: bool, **options: Any) -> None:
     from realsim.app.console import Console
     from realsim.app.depth_fit.run import DepthFitRequest, run_depth_fit
 
-    run_depth_fit(source, DepthFitRequest(**options), Console(quiet=quiet))
+    run_depth_fit(source, DepthFitRequest(**options), Console(quiet=quiet, as_json=as_json))

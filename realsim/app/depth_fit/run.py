@@ -75,6 +75,7 @@ def run_depth_fit(source: Path, request: DepthFitRequest, console: Any) -> None:
     write_bytes(out.with_suffix(".png"), picture)
     console.say(f"sensor    {out}")
     console.say(f"picture   {out.with_suffix('.png')}")
+    console.result(document | {"file": out, "picture": out.with_suffix(".png")})
 
 
 def _fitted_disparity(

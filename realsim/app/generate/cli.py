@@ -7,16 +7,25 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from realsim.app.command import Command
+from realsim.app.options import FOLDER, JSON, QUIET, seed, workers
+
 if TYPE_CHECKING:
     from realsim.app.generate.request import GenerateRequest
 
-FOLDER = click.Path(path_type=Path)
 
-
-@click.command("generate")
+@click.command(
+    "generate",
+    cls=Command,
+    examples=(
+        "realsim generate scenes --scenes 1 --views 2 --objects 3-4 --size 320x240 --no-maps",
+        "realsim generate near --scenes 1 --views 2 --objects 2 --size 320x240 --range d405",
+    ),
+)
 @click.argument("out", type=FOLDER)
-@click.option("--scenes", default=10, show_default=True, type=click.IntRange(1, 1_000_000))
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
+@click.option("--scenes", default=10, show_default=True, type=click.IntRange(1, 1_000_000),
+              help="So many in all.")  # fmt: skip
+@seed("The same seed, the same scenes.")
 @click.option("--views", default=256, show_default=True, type=click.IntRange(1, 100_000),
               help="Of each scene.")  # fmt: skip
 @click.option("--size", default="1920x1080", show_default=True, metavar="WxH", help="Of images.")
@@ -37,7 +46,8 @@ FOLDER = click.Path(path_type=Path)
               type=click.Choice(("far", "d405")), help="1 to 2 m, or 0.25 to 0.5 m.")  # fmt: skip
 @click.option("--radius", default=None, metavar="A-B", help="Distance of cameras [m], instead.")
 @click.option("--renderer", default="embedded", show_default=True,
-              type=click.Choice(("embedded", "photoreal")))  # fmt: skip
+              type=click.Choice(("embedded", "photoreal")),
+              help="Rasterised here, or ray-traced by Mitsuba.")  # fmt: skip
 @click.option("--depth", default="disparity", show_default=True,
               type=click.Choice(("stereo", "disparity", "clean")),
               help="Simulated sensor.")  # fmt: skip
@@ -50,9 +60,12 @@ FOLDER = click.Path(path_type=Path)
 @click.option("--textures", type=FOLDER, default=None,
               help="Folder of own textures: pictures, or a folder for each material.")  # fmt: skip
 @click.option("--no-maps", is_flag=True, help="No label maps (coordinates, normals, ...).")
-@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 256))
-@click.option("--quiet", is_flag=True, help="No progress bar.")
-def generate_command(out: Path, scenes: int, workers: int, quiet: bool, **options: Any) -> None:
+@workers(help="Processes: scenes at a time.")
+@JSON
+@QUIET
+def generate_command(
+    out: Path, scenes: int, workers: int, as_json: bool, quiet: bool, **options: Any
+) -> None:
     """Make tabletop scenes in OUT: objects dropped by physics, rendered, with every label.
 
     Each scene is a session (OUT/scene_000000, ...) that annotate, school, review and report open;
@@ -78,7 +91,7 @@ def generate_command(out: Path, scenes: int, workers: int, quiet: bool, **option
     from realsim.store.atomic import storing
 
     request = _request(**options)
-    console = Console(quiet=quiet)
+    console = Console(quiet=quiet, as_json=as_json)
     outcome = generate(out, scenes, request, workers, console)
     layouts = finished_layouts(out, scenes, request)
     dataset = dataset_of(out, request, layouts)
@@ -93,6 +106,8 @@ def generate_command(out: Path, scenes: int, workers: int, quiet: bool, **option
     if sheet is not None:
         console.say(f"pictures  {sheet}")
         console.say(f"page      {page}")
+    told = {"made": [c.number for c in outcome.made], "kept": outcome.kept}
+    console.result(dataset | {"out": out, "page": page, "failed": outcome.failed} | told)
     if outcome.failed:
         sys.exit(1)
 

@@ -26,7 +26,7 @@ def list_source(request: ImportRequest, console: Console) -> None:
         from realsim.untrusted.archives import members
 
         rows = [(m.name, m.size) for m in members(request.source)]
-        console.table(str(request.source), ("file", "bytes"), rows)
+        _show(request, "archive", ("file", "bytes"), rows, console)
         return
     kind = kind_of(request, console)
     require_fitting(request, kind)
@@ -36,12 +36,13 @@ def list_source(request: ImportRequest, console: Console) -> None:
         with Recording(request.source) as recording:
             topics = sorted(recording.topics.values(), key=lambda t: t.name)
         rows = [(t.name, t.msgtype, t.count) for t in topics]
-        console.table(str(request.source), ("topic", "type", "messages"), rows)
+        _show(request, kind, ("topic", "type", "messages"), rows, console)
         return
     if kind == "folder":
         rows = describe_folder(request.source, folder_request(request))
         for what, text in rows:
             console.say(f"{what}: {text}")
+        console.result({"source": request.source, "kind": kind, "holds": dict(rows)})
         return
     if kind == "bop":
         header, rows = _bop_rows(request)
@@ -51,7 +52,20 @@ def list_source(request: ImportRequest, console: Console) -> None:
         header, rows = _nerfstudio_rows(request.source)
     else:
         header, rows = _colmap_rows(request.source)
+    _show(request, kind, header, rows, console)
+
+
+def _show(
+    request: ImportRequest,
+    kind: str,
+    header: Sequence[str],
+    rows: Sequence[Sequence[object]],
+    console: Console,
+) -> None:
+    """Print the table, and give it to a program by the names of its columns."""
     console.table(str(request.source), header, rows)
+    holds = [dict(zip(header, row, strict=True)) for row in rows]
+    console.result({"source": request.source, "kind": kind, "holds": holds})
 
 
 def _bop_rows(request: ImportRequest) -> tuple[Sequence[str], list[Sequence[object]]]:

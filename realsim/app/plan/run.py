@@ -36,14 +36,13 @@ Progress = Callable[[str, int, int], None]
 """Called with (what, done, total)."""
 
 
-def run_plan(request: PlanRequest, *, advise: bool, quiet: bool) -> bool:
+def run_plan(request: PlanRequest, console: Console, *, advise: bool) -> bool:
     """Make a plan and write it with its pictures; return whether all its moves are free.
 
     Raises:
         InputError: something given cannot be used, or the plan is there already.
         DegenerateError: fewer views are reachable than asked for.
     """
-    console = Console(quiet=quiet)
     place, config = request.place, request.config()
     chain, mount = place.chain() or CHAINS["UR5"], place.camera_mount()
     if advise:
@@ -59,8 +58,10 @@ def run_plan(request: PlanRequest, *, advise: bool, quiet: bool) -> bool:
     show_plan(plan, plan.metrics, console)
     free = show_colliding(plan, console)
     console.say(f"plan: {out}")
+    files: list[Path] = []
     if pictures:
-        _write_pictures(plan, plan.metrics, picture_folder(out), console)
+        files = _write_pictures(plan, plan.metrics, picture_folder(out), console)
+    console.result(_document(plan, plan.metrics) | {"plan": out, "pictures": files})
     return free
 
 
@@ -119,7 +120,9 @@ def show_advice(
     ]
     header = ("--center (in base, m)", "--table-height", "reachable", "largest hole", "one elbow")
     console.table(f"Places for {n} views with a {chain.name}, best first", header, rows)
-    console.say(advice(places, center, config.table_height_m))
+    said = advice(places, center, config.table_height_m)
+    console.say(said)
+    console.result({"robot": chain.name, "views": n, "places": places, "advice": said})
     console.say(
         "The base turns the arm to any side alike: only the distance from its axis and the heights "
         "matter here. Obstacles and the table's edges are looked at by the plan itself."
@@ -127,8 +130,9 @@ def show_advice(
 
 
 def run_show(
-    text: str, *, pictures: bool, replay: bool, replay_file: Path | None, host: str, port: int
-) -> bool:
+    text: str, console: Console, *, pictures: bool, replay: bool, replay_file: Path | None,
+    host: str, port: int,
+) -> bool:  # fmt: skip
     """Show a plan: its metrics, its pictures, its replay; return whether all moves are free.
 
     Raises:
@@ -136,19 +140,21 @@ def run_show(
     """
     from realsim_capture_plans.plan_files.shipped_plans import PREFIX, resolve_plan
 
-    console = Console()
     plan = resolve_plan(text)
     metrics = plan.metrics | _metrics(plan)
     show_plan(plan, metrics, console)
     free = show_colliding(plan, console)
+    files: list[Path] = []
     if pictures:
         folder = picture_folder(Path(text.removeprefix(PREFIX)))
-        _write_pictures(plan, metrics, folder, console)
+        files = _write_pictures(plan, metrics, folder, console)
     if replay_file is not None:
         from realsim_capture_plans.pictures.replay import write_replay
 
         write_replay(plan, replay_file)
         console.say(f"replay: {replay_file}")
+    document = {"plan": text, "pictures": files, "replay": replay_file}
+    console.result(_document(plan, metrics) | document)
     if replay:
         from realsim_capture_plans.pictures.replay import serve_replay
 
@@ -169,14 +175,14 @@ def _serve(replay: "PlanReplay", console: Console) -> None:
 
 
 def run_convert(
-    source: str, dest: Path, place: Place, *, joints_unit: JointUnit | None, overwrite: bool
-) -> bool:
+    source: str, dest: Path, place: Place, console: Console, *, joints_unit: JointUnit | None,
+    overwrite: bool,
+) -> bool:  # fmt: skip
     """Write a plan or a joint path in another form; return whether all its moves are free.
 
     Raises:
         InputError: the source is neither, the target has no known form or is there already.
     """
-    console = Console()
     writer = _writer(dest)
     if dest.exists() and not overwrite:
         raise InputError(f"{dest} is there already; --overwrite replaces it, or name another.")
@@ -185,6 +191,7 @@ def run_convert(
     free = show_colliding(plan, console) if plan.kind == "imported" else True
     for path in files:
         console.say(str(path))
+    console.result(_document(plan, plan.metrics) | {"files": files})
     return free
 
 
@@ -263,6 +270,22 @@ def _writer(dest: Path) -> Callable[[CapturePlan, Path], list[Path]]:
         f"'{dest}' has no form that is written: .json (realsim plan), .csv (table), .script "
         "(URScript), or a folder without a suffix (GraspNet's camera_poses.npy)."
     )
+
+
+def _document(plan: CapturePlan, metrics: dict[str, float]) -> dict[str, object]:
+    """Return what a program wants to know of a plan, for `--json`."""
+    from realsim_capture_plans.plan_files.imported import colliding_legs
+
+    return {
+        "kind": plan.kind,
+        "robot": plan.robot,
+        "mount": plan.mount.name,
+        "views": len(plan),
+        "center_world_m": plan.center_world,
+        "sha256": plan.content_hash,
+        "metrics": metrics,
+        "colliding": list(colliding_legs(plan)),
+    }
 
 
 def _metrics(plan: CapturePlan) -> dict[str, float]:
@@ -355,9 +378,10 @@ def _check_free_name(out: Path, overwrite: bool, pictures: bool) -> None:
 
 def _write_pictures(
     plan: CapturePlan, metrics: dict[str, float], folder: Path, console: Console
-) -> None:
+) -> list[Path]:
     from realsim_capture_plans.pictures.plan_pictures import plan_pictures
 
     with console.stage("pictures"):
         files = plan_pictures(plan, folder, metrics)
     console.say(f"{len(files)} pictures: {folder}")
+    return list(files)

@@ -6,7 +6,9 @@ from typing import Any
 
 import click
 
-FOLDER = click.Path(path_type=Path)
+from realsim.app.command import Command
+from realsim.app.options import FOLDER, JSON, QUIET
+
 LARGEST = 100_000
 """More views than this are a typing error."""
 
@@ -24,7 +26,15 @@ def views_of(text: str) -> int | None:
     raise click.BadParameter(f"'{text}' is no number of views; a number from 1 on, or all, is one.")
 
 
-@click.command("register")
+@click.command(
+    "register",
+    cls=Command,
+    examples=(
+        "realsim register demo/session --views 4",
+        "realsim register demo/session --object mug --object wedge --json",
+        "realsim register demo/session --from-review",
+    ),
+)
 @click.argument("session", type=FOLDER)
 @click.option("--object", "objects", metavar="SPEC", multiple=True,
               help="What is there, and where, as far as you know; repeat it.")  # fmt: skip
@@ -40,8 +50,8 @@ def views_of(text: str) -> int | None:
 @click.option("--odometry", is_flag=True, help="Check the robot's poses by the depth alone.")
 @click.option("--depth-bias", default="", metavar="FILE|off",
               help="Depth camera's bias.  [that of the session's calibration]")  # fmt: skip
-@click.option("--json", "as_json", is_flag=True, help="The result as JSON on stdout.")
-@click.option("--quiet", is_flag=True, help="No progress bars.")
+@JSON
+@QUIET
 def register_command(session: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Find the pose of every object of SESSION in every view, with its uncertainty.
 
@@ -51,8 +61,9 @@ def register_command(session: Path, as_json: bool, quiet: bool, **options: Any) 
                        5@view3:640,360 (a click), 5@view3:100,80,60x40 (a box)
       SESSION/registration/starts.json   rough poses, clicks, boxes or masks
       --find-all       it is found out which of the models are there
-      --from-review    the reviewed scene: moved objects from where they were moved to, rejected
-                       ones left out; the earlier scene stays in registration/earlier/
+      --from-review    the reviewed scene: moved objects from where they were
+                       moved to, rejected ones left out; the earlier scene
+                       stays in registration/earlier/
 
     Writes registration/ with scene.json, register.html and pictures, and replaces the session's
     camera poses by refined ones (the claimed ones are kept in registration/cameras.json). With the
@@ -66,7 +77,6 @@ def register_command(session: Path, as_json: bool, quiet: bool, **options: Any) 
     from realsim.app.register.tables import as_json as json_of
     from realsim.app.register.tables import show_registered
     from realsim.app.stages import open_session, session_models
-    from realsim.store.atomic import json_bytes
     from realsim.store.lock import only_run_in
 
     request = RegisterRequest(
@@ -76,14 +86,13 @@ def register_command(session: Path, as_json: bool, quiet: bool, **options: Any) 
         refine_cameras=not options["no_cameras"], hand_held=options["hand_held"],
         depth_bias=options["depth_bias"], odometry=options["odometry"],
     )  # fmt: skip
-    console = Console(quiet=quiet or as_json)
+    console = Console(quiet=quiet, as_json=as_json)
     store = open_session(session)
     with only_run_in(session):
         result = run_register(store, console, request)
     models = session_models(store)
-    if as_json:
-        click.echo(json_bytes(json_of(result, models)), nl=False)
-    else:
+    console.result(json_of(result, models))
+    if not as_json:
         show_registered(session, result, models, console)
     if not result.is_usable:
         sys.exit(1)

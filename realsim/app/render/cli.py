@@ -5,16 +5,25 @@ from typing import Any
 
 import click
 
-FOLDER = click.Path(path_type=Path)
+from realsim.app.command import Command
+from realsim.app.options import FOLDER, JSON, QUIET, seed, workers
 
 
-@click.command("render")
+@click.command(
+    "render",
+    cls=Command,
+    examples=(
+        "realsim render demo/session",
+        "realsim render demo/session --views 3 --size 320x240 --seed 1",
+    ),
+)
 @click.argument("session", type=FOLDER)
 @click.option("--views", default="real", show_default=True, metavar="real|N",
               help="Twins of the real frames, or N new views.")  # fmt: skip
 @click.option("--out", type=FOLDER, default=None, help="Folder.  [SESSION/synthetic/...]")
 @click.option("--renderer", default="embedded", show_default=True,
-              type=click.Choice(["embedded", "photoreal"]))  # fmt: skip
+              type=click.Choice(["embedded", "photoreal"]),
+              help="Rasterised here, or ray-traced by Mitsuba.")  # fmt: skip
 @click.option("--depth", default="disparity", show_default=True,
               type=click.Choice(["stereo", "disparity", "clean"]),
               help="How the depth camera is simulated.")  # fmt: skip
@@ -28,27 +37,26 @@ FOLDER = click.Path(path_type=Path)
 @click.option("--hdri", type=FOLDER, default=None, help="Panorama (.hdr, .exr) around the scene.")
 @click.option("--material", "materials", multiple=True, metavar="table=KIND",
               help="Another table: oak, marble, ...  [as in the photographs]")  # fmt: skip
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
-@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 256))
-@click.option("--quiet", is_flag=True, help="No progress bars.")
-def render_command(session: Path, quiet: bool, **options: Any) -> None:
+@seed("Of new views and of the camera's noise.")
+@workers()
+@JSON
+@QUIET
+def render_command(session: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Render the registered scene of SESSION: every real frame's twin, or new views.
 
-    \b
-      realsim render SESSION                 at the real cameras, raw distortion included
-      realsim render SESSION --views 256     new views over the hemisphere
-      realsim render SESSION --renderer photoreal --depth stereo
-
-    The result is a session of its own, with every label, exact depth and the depth that the camera
+    Without --views at the real cameras, raw distortion included; with it, over the hemisphere. The
+    result is a session of its own, with every label, exact depth and the depth that the camera
     would report; `realsim school`, `annotate`, `review` and `report` open it. Light and table are
     matched to the photographs. A run that was interrupted goes on where it stopped.
 
     Exit codes: 0 done, 2 bad input.
-    """  # noqa: D301 - click's own mark for lines that stay as they are
+    """
     from realsim.app.console import Console
     from realsim.app.render.request import RenderRequest
-    from realsim.app.render.run import run_render, show_render
+    from realsim.app.render.run import render_document, run_render, show_render
 
     request = RenderRequest(**options)
-    console = Console(quiet=quiet)
-    show_render(run_render(session, request, console), console)
+    console = Console(quiet=quiet, as_json=as_json)
+    outcome = run_render(session, request, console)
+    show_render(outcome, console)
+    console.result(render_document(outcome))

@@ -157,6 +157,20 @@ def show_render(outcome: RenderOutcome, console: Console) -> None:
     console.say(f"session   {outcome.twin.folder}")
 
 
+def render_document(outcome: RenderOutcome) -> dict[str, object]:
+    """Return what a program wants to know, for `--json`."""
+    return {
+        "session": outcome.twin.folder,
+        "views": outcome.summary.views,
+        "rendered": outcome.summary.rendered,
+        "cpu_s": outcome.summary.cpu_s,
+        "figures": outcome.figures,
+        "notes": notes_of(outcome),
+        "picture": outcome.sheet,
+        "page": outcome.page,
+    }
+
+
 def summary_rows(outcome: RenderOutcome) -> list[list[str]]:
     """Return the table's rows: what was rendered, and its cost per frame by part."""
     summary, look = outcome.summary, outcome.look

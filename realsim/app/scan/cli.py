@@ -4,40 +4,21 @@
 """
 
 import sys
-from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import click
 
-FOLDER = click.Path(path_type=Path)
-LATE = {
-    "scale": ("realsim.app.scan.scale.cli", "scale"),
-    "sfm": ("realsim.app.scan.sfm.cli", "sfm"),
-}
-"""Commands by the module and the name where they are defined."""
+from realsim.app.command import Command, Group
+from realsim.app.options import FOLDER, JSON, QUIET, overwrite
 
-
-class ScanCommands(click.Group):
-    """The group of all `scan` commands, some of which are loaded late."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names of all commands that are there."""
-        late = [name for name, (module, _) in LATE.items() if find_spec(module) is not None]
-        return [*super().list_commands(ctx), *late]
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return the command of this name."""
-        module, name = LATE.get(cmd_name, ("", ""))
-        if module and find_spec(module) is not None:
-            command: click.Command = getattr(import_module(module), name)
-            return command
-        return super().get_command(ctx, cmd_name)
-
-
-SCAN = ScanCommands(
+SCAN = Group(
     "scan",
+    late={
+        "scale": "realsim.app.scan.scale.cli:scale",
+        "sfm": "realsim.app.scan.sfm.cli:sfm",
+    },
+    examples=("realsim scan import mug.stl --unit mm", "realsim scan list"),
     help="""Object models: meshes and scans into a library, at metric scale.
 
     A library is a folder of models as BOP has them (obj_000001.ply in millimetres and
@@ -49,7 +30,14 @@ LIBRARY = click.option(
 )
 
 
-@SCAN.command("import")
+@SCAN.command(
+    "import",
+    cls=Command,
+    examples=(
+        "realsim scan import mug.stl --unit mm",
+        "realsim scan import generated.obj --unit none --no-parts",
+    ),
+)
 @click.argument("meshes", metavar="MESH...", nargs=-1, required=True, type=FOLDER)
 @LIBRARY
 @click.option("--name", default="", help="Name of the model.  [the file's]")
@@ -76,9 +64,10 @@ LIBRARY = click.option(
     help="Faces to keep at most.",
 )
 @click.option("--no-parts", is_flag=True, help="No convex parts; the School makes them itself.")
-@click.option("--overwrite", is_flag=True, help="Replace the model of this name or id.")
-@click.option("--quiet", is_flag=True, help="No progress bars.")
-def import_command(meshes: tuple[Path, ...], quiet: bool, **options: Any) -> None:
+@overwrite("Replace the model of this name or id.")
+@JSON
+@QUIET
+def import_command(meshes: tuple[Path, ...], as_json: bool, quiet: bool, **options: Any) -> None:
     """Read, repair and measure meshes, and add them to the library.
 
     MESH is a GLB, OBJ, PLY, STL, OFF or USD file. Its unit is stated by the file or by --unit,
@@ -90,25 +79,32 @@ def import_command(meshes: tuple[Path, ...], quiet: bool, **options: Any) -> Non
     from realsim.app.console import Console
     from realsim.app.scan.importing import ImportRequest, run_scan_import
 
-    code = run_scan_import(ImportRequest(meshes=meshes, **options), Console(quiet=quiet))
+    console = Console(quiet=quiet, as_json=as_json)
+    code = run_scan_import(ImportRequest(meshes=meshes, **options), console)
     if code:
         sys.exit(code)
 
 
-@SCAN.command("list")
+@SCAN.command(
+    "list", cls=Command, examples=("realsim scan list", "realsim scan list demo/session/models")
+)
 @click.argument("library", type=FOLDER, default=Path("models"))
-def list_command(library: Path) -> None:
+@JSON
+@QUIET
+def list_command(library: Path, as_json: bool, quiet: bool) -> None:
     """List the models of a library: the folder `models` by default."""
     from realsim.app.console import Console
     from realsim.app.scan.library import list_library
 
-    list_library(library, Console())
+    list_library(library, Console(quiet=quiet, as_json=as_json))
 
 
-@SCAN.command("show")
+@SCAN.command("show", cls=Command, examples=("realsim scan show models mug",))
 @click.argument("library", type=FOLDER)
 @click.argument("name")
-def show_command(library: Path, name: str) -> None:
+@JSON
+@QUIET
+def show_command(library: Path, name: str, as_json: bool, quiet: bool) -> None:
     """Show everything that is known of a model: NAME is its name, its id, or its file.
 
     Its picture is made where the library has none.
@@ -116,13 +112,14 @@ def show_command(library: Path, name: str) -> None:
     from realsim.app.console import Console
     from realsim.app.scan.library import show_model
 
-    show_model(library, name, Console())
+    show_model(library, name, Console(quiet=quiet, as_json=as_json))
 
 
-@SCAN.command("check")
+@SCAN.command("check", cls=Command, examples=("realsim scan check models",))
 @click.argument("library", type=FOLDER, default=Path("models"))
-@click.option("--json", "as_json", is_flag=True, help="The findings as JSON on stdout.")
-def check_command(library: Path, as_json: bool) -> None:
+@JSON
+@QUIET
+def check_command(library: Path, as_json: bool, quiet: bool) -> None:
     """Say what of a library is missing, damaged, changed, or left over; nothing is changed.
 
     Exit codes: 0 sound, 1 not, 2 no library.
@@ -130,19 +127,21 @@ def check_command(library: Path, as_json: bool) -> None:
     from realsim.app.console import Console
     from realsim.app.scan.library import run_library_check
 
-    if not run_library_check(library, Console(), as_json=as_json):
+    if not run_library_check(library, Console(quiet=quiet, as_json=as_json)):
         sys.exit(1)
 
 
-@SCAN.command("complete")
+@SCAN.command("complete", cls=Command, examples=("realsim scan complete demo/session/models",))
 @click.argument("library", type=FOLDER)
 @click.argument("names", nargs=-1)
 @click.option("--mass", type=float, default=None, help="As weighed [kg], of one model.")
 @click.option("--density", type=float, default=None, help="[kg/m^3].  [as the library says]")
-@click.option("--quiet", is_flag=True, help="No progress bars.")
+@JSON
+@QUIET
 def complete_command(
-    library: Path, names: tuple[str, ...], mass: float | None, density: float | None, quiet: bool
-) -> None:
+    library: Path, names: tuple[str, ...], mass: float | None, density: float | None,
+    as_json: bool, quiet: bool,
+) -> None:  # fmt: skip
     """Compute properties, convex parts and pictures for models of another program.
 
     NAMES are those without properties by default. Meshes and models_info.json are not changed.
@@ -151,5 +150,6 @@ def complete_command(
     from realsim.app.console import Console
     from realsim.app.scan.complete import run_complete
 
-    if not run_complete(library, names, Console(quiet=quiet), mass_kg=mass, density=density):
+    console = Console(quiet=quiet, as_json=as_json)
+    if not run_complete(library, names, console, mass_kg=mass, density=density):
         sys.exit(1)

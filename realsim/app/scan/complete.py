@@ -34,6 +34,7 @@ def run_complete(
         raise InputError(f"--mass is of one model, but {len(wanted)} are completed.")
     if not wanted:
         console.say(f"every model in {folder} has its properties: there is nothing to complete.")
+        console.result({"library": folder, "completed": [], "look": []})
         return True
     matter = None
     if mass_kg is not None or density is not None:
@@ -62,6 +63,7 @@ def run_complete(
     console.table(f"{len(rows)} of {len(wanted)} completed in {folder}", header, rows)
     for text in looks:
         console.say(f"LOOK: {text}")
+    console.result({"library": folder, "completed": [row[0] for row in rows], "look": looks})
     return fine and len(rows) == len(wanted)
 
 

@@ -49,16 +49,20 @@ def run_scan_import(request: ImportRequest, console: Console) -> int:
     _require_consistent(request)
     verdicts: list[str] = []
     rows: list[tuple[str, ...]] = []
+    told: list[dict[str, object]] = []
     for path in request.meshes:
         try:
-            verdict, row = _import_one(path, request, console)
+            verdict, row, document = _import_one(path, request, console)
         except RealsimError as error:
             if len(request.meshes) == 1:
                 raise
             console.warn(f"[red]{_escaped(str(path))}: not imported:[/red] {_escaped(str(error))}")
             verdict, row = "unusable", (path.name, "", "", "", "", "unusable")
+            document = {"verdict": verdict, "why": str(error)}
         verdicts.append(verdict)
         rows.append(row)
+        told.append({"file": path, **document})
+    console.result({"library": request.library, "meshes": told})
     if len(rows) > 1:
         header = ("model", "id", "size [mm]", "mass [g]", "parts", "verdict")
         console.table(f"{len(rows)} meshes", header, rows)
@@ -101,8 +105,8 @@ def _require_consistent(request: ImportRequest) -> None:
 
 def _import_one(
     path: Path, request: ImportRequest, console: Console
-) -> tuple[str, tuple[str, ...]]:
-    """Import one mesh, say what was found, and return its verdict and its row."""
+) -> tuple[str, tuple[str, ...], dict[str, object]]:
+    """Import one mesh, say what was found, and return its verdict, its row and its document."""
     from realsim.models.library import ModelLibrary
     from realsim.models.library_prepare import (
         STEPS,
@@ -112,6 +116,7 @@ def _import_one(
         prepare_unscaled,
         source_of,
     )
+    from realsim.models.library_records import to_json
     from realsim.models.pictures import sheet_png
     from realsim.models.reading import read_scan
 
@@ -144,7 +149,10 @@ def _import_one(
             library.add_unscaled(made, name, overwrite=request.overwrite, picture=picture)
             obj_id = None
     say_model(console, library.folder, name, obj_id, made.mesh, made.properties)
-    return made.properties.verdict, verdict_row(name, obj_id, made.properties)
+    p = made.properties
+    document: dict[str, object] = {"verdict": p.verdict, "name": name, "obj_id": obj_id}
+    document["properties"] = to_json(p)
+    return p.verdict, verdict_row(name, obj_id, p), document
 
 
 def _config(request: ImportRequest) -> "PrepareConfig":

@@ -1,6 +1,5 @@
 """`realsim scan list`, `show` and `check`: what a model library holds."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -34,6 +33,7 @@ def list_library(folder: Path, console: Console) -> None:
     from realsim.models.library_reading import LibraryReader, unscaled_sources
 
     entries = LibraryReader.open(folder).entries()
+    console.result({"library": folder, "models": [_entry_document(e) for e in entries]})
     if not entries:
         console.say(f"{folder} holds no models yet; `realsim scan import MESH --library {folder}`.")
         return
@@ -59,6 +59,14 @@ def list_library(folder: Path, console: Console) -> None:
             f"{len(unknown)} of them have no properties (not imported by realsim): "
             f"`realsim scan complete {folder}` computes them."
         )
+
+
+def _entry_document(e: "LibraryEntry") -> dict[str, object]:
+    """Return what a program wants to know of a model in the list."""
+    from realsim.models.library_records import to_json
+
+    known = None if e.properties is None else to_json(e.properties)
+    return {"name": e.name, "obj_id": e.obj_id, "info": e.info, "properties": known}
 
 
 def _entry_row(e: "LibraryEntry", *, has_source: bool) -> tuple[str, ...]:
@@ -121,6 +129,7 @@ def show_model(folder: Path, name: str, console: Console) -> None:
     """
     from realsim.models import library_files as files
     from realsim.models.library_reading import LibraryReader
+    from realsim.models.library_records import to_json
     from realsim.models.pictures import sheet_png
     from realsim.store import atomic
 
@@ -129,10 +138,15 @@ def show_model(folder: Path, name: str, console: Console) -> None:
     names = {e.name for e in library.entries() if e.obj_id is not None}
     if unscaled and name not in names:
         raw = library.load_unscaled(name)
+        console.result({"name": name, "obj_id": None, "properties": to_json(raw.properties)})
         say_model(console, folder, name, None, raw.mesh, raw.properties)
         return
     found = library.load(name)
     model = found.model
+    known = None if found.properties is None else to_json(found.properties)
+    console.result(
+        {"name": model.name, "obj_id": model.obj_id, "notes": found.notes, "properties": known}
+    )
     for note in found.notes:
         console.say(f"note: {note}")
     if found.properties is None:
@@ -151,7 +165,7 @@ def show_model(folder: Path, name: str, console: Console) -> None:
     say_model(console, folder, model.name, model.obj_id, model.mesh, found.properties)
 
 
-def run_library_check(folder: Path, console: Console, *, as_json: bool) -> bool:
+def run_library_check(folder: Path, console: Console) -> bool:
     """Print what of a library is not as it should be; return whether every model can be used.
 
     Raises:
@@ -163,8 +177,8 @@ def run_library_check(folder: Path, console: Console, *, as_json: bool) -> bool:
     library = LibraryReader.open(folder)
     findings = check_library(library)
     sound = all(f.is_harmless for f in findings)
-    if as_json:
-        print(json.dumps({"sound": sound, "findings": [asdict(f) for f in findings]}, indent=1))
+    console.result({"sound": sound, "findings": [asdict(f) for f in findings]})
+    if console.as_json:
         return sound
     for f in findings[:SHOWN]:
         console.say(f"{f.kind:<9} {f.path}: {f.text}")

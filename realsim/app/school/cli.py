@@ -6,12 +6,14 @@ from typing import Any
 
 import click
 
-FOLDER = click.Path(path_type=Path)
+from realsim.app.command import Command, Group
+from realsim.app.options import FOLDER, JSON, QUIET, json_file, seed, workers
+
 ENGINES = ("pybullet", "mujoco")
 FORMATS = ("acronym", "graspgen", "isaac", "hdf5", "parquet")
 
 
-class RunByDefault(click.Group):
+class RunByDefault(Group):
     """A group whose command `run` needs no name: `realsim school SESSION` runs the school."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -21,7 +23,11 @@ class RunByDefault(click.Group):
         return super().parse_args(ctx, args)
 
 
-@click.group("school", cls=RunByDefault)
+@click.group(
+    "school",
+    cls=RunByDefault,
+    examples=("realsim school demo/session", "realsim school validate --quick"),
+)
 def SCHOOL() -> None:
     """Try grasps by physics: reach, close, lift, shake, swing.
 
@@ -38,12 +44,20 @@ def SCHOOL() -> None:
     """  # noqa: D301 - click's own mark for lines that stay as they are
 
 
-@SCHOOL.command("run")
+@SCHOOL.command(
+    "run",
+    cls=Command,
+    examples=(
+        "realsim school demo/session --grasps 8",
+        "realsim school run demo/session --grasps 4 --force 20 --restart --json",
+    ),
+)
 @click.argument("source", type=FOLDER)
 @click.option("--out", type=FOLDER, default=None, help="Folder, where SOURCE is no session.")
 @click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000),
               help="Candidates to try on each object, at most.")  # fmt: skip
-@click.option("--engine", default="pybullet", show_default=True, type=click.Choice(ENGINES))
+@click.option("--engine", default="pybullet", show_default=True, type=click.Choice(ENGINES),
+              help="Which physics.")  # fmt: skip
 @click.option("--cross-check", is_flag=True, help="The other engine tries them, too.")
 @click.option("--sweep", is_flag=True, help="Least friction and force that each survives.")
 @click.option("--force", "force_n", type=float, default=None, help="Of each finger [N].  [70]")
@@ -62,15 +76,17 @@ def SCHOOL() -> None:
 @click.option("--models", type=FOLDER, default=None, help="Models of a SOURCE that is no session.")
 @click.option("--quaternions", type=click.Choice(("wxyz", "xyzw")), default=None,
               help="Their order in a scene.yaml that does not tell it.")  # fmt: skip
-@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 256))
+@workers()
 @click.option("--address", default="", metavar="RAY", help="HOST:PORT of a Ray cluster, or local.")
 @click.option("--restart", is_flag=True, help="Throw away results of other parameters.")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0))
-@click.option("--json", "json_file", type=FOLDER, default=None, help="Write the counts there, too.")
-@click.option("--quiet", is_flag=True, help="No progress bars.")
+@seed()
+@json_file("Write the counts there, too.")
+@JSON
+@QUIET
 def run_command(
-    source: Path, out: Path | None, json_file: Path | None, quiet: bool, **options: Any
-) -> None:
+    source: Path, out: Path | None, json_file: Path | None, as_json: bool, quiet: bool,
+    **options: Any,
+) -> None:  # fmt: skip
     """Try grasps on every object of SOURCE.
 
     SOURCE is a registered session, or a BOP scene, a GraspNet scene or a scene.yaml with --out.
@@ -85,12 +101,13 @@ def run_command(
     from realsim.app.school.files import PAGE
     from realsim.app.school.inputs import SchoolRequest, require_file_name
     from realsim.app.school.run import run
-    from realsim.app.school.tables import as_json, show_school
+    from realsim.app.school.tables import as_json as json_of
+    from realsim.app.school.tables import show_school
     from realsim.store import atomic
 
     request = SchoolRequest(**options)
     require_file_name(json_file)
-    console = Console(quiet=quiet)
+    console = Console(quiet=quiet, as_json=as_json)
     outcome = run(source, out, request, console)
     show_school(outcome.sets, outcome.models, console)
     for instance, gave_up in outcome.unfinished.items():
@@ -101,22 +118,31 @@ def run_command(
             "the frames still show the grasps of before; write them anew with "
             f"`realsim annotate {outcome.inputs.folder}`."
         )
+    document = json_of(outcome.sets, outcome.models)
     if json_file is not None:
-        atomic.write_json(json_file, as_json(outcome.sets, outcome.models))
+        atomic.write_json(json_file, document)
+    page = outcome.inputs.folder / PAGE
+    console.result(document | {"folder": outcome.inputs.folder, "page": page})
     if not any(s.reachable.any() for s in outcome.sets):
         console.warn("no grasp could be tried; the table above and the page say why.")
         sys.exit(1)
 
 
-@SCHOOL.command("validate")
+@SCHOOL.command(
+    "validate",
+    cls=Command,
+    examples=("realsim school validate --quick --engine pybullet",
+              "realsim school validate --quick --out physics"),
+)  # fmt: skip
 @click.option("--engine", default="both", show_default=True,
               type=click.Choice([*ENGINES, "both"]), help="Which physics.")  # fmt: skip
 @click.option("--quick", is_flag=True, help="Every part with fewer samples: about a minute.")
-@click.option("--json", "json_file", type=FOLDER, default=None, help="Write the reports there.")
+@json_file("Write the reports there, too.")
 @click.option("--out", type=FOLDER, default=None, help="Folder for reports and pictures.")
-@click.option("--quiet", is_flag=True, help="No progress bars.")
+@JSON
+@QUIET
 def validate_command(
-    engine: str, quick: bool, json_file: Path | None, out: Path | None, quiet: bool
+    engine: str, quick: bool, json_file: Path | None, out: Path | None, as_json: bool, quiet: bool
 ) -> None:
     """Check that the physics obeys Coulomb's law and does not depend on its solver's settings.
 
@@ -126,11 +152,14 @@ def validate_command(
     from realsim.app.school.validate import validate_engines
 
     names = ENGINES if engine == "both" else (engine,)
-    if not validate_engines(names, quick, json_file, out, Console(quiet=quiet)):
+    if not validate_engines(names, quick, json_file, out, Console(quiet=quiet, as_json=as_json)):
         sys.exit(1)
 
 
-@SCHOOL.command("settle")
+@SCHOOL.command(
+    "settle", cls=Command,
+    examples=("realsim school settle demo/session", "realsim school settle demo/session --json"),
+)  # fmt: skip
 @click.argument("source", type=FOLDER)
 @click.option("--models", type=FOLDER, default=None, help="Models of a SOURCE that is no session.")
 @click.option("--quaternions", type=click.Choice(("wxyz", "xyzw")), default=None,
@@ -142,11 +171,13 @@ def validate_command(
 @click.option("--support", "supports", multiple=True, type=FOLDER, metavar="URDF",
               help="A bin or shelf, in the table's frame; repeat.")  # fmt: skip
 @click.option("--out", type=FOLDER, default=None, help="Folder for the picture.")
-@click.option("--json", "json_file", type=FOLDER, default=None, help="Write the table there, too.")
-@click.option("--quiet", is_flag=True, help="No progress bars.")
+@json_file("Write the table there, too.")
+@JSON
+@QUIET
 def settle_command(
-    source: Path, out: Path | None, json_file: Path | None, quiet: bool, **options: Any
-) -> None:
+    source: Path, out: Path | None, json_file: Path | None, as_json: bool, quiet: bool,
+    **options: Any,
+) -> None:  # fmt: skip
     """Let physics act on SOURCE and name the objects that jump or fall.
 
     Poses that are millimetres off put objects into one another or into the air; grasps tried on
@@ -159,32 +190,52 @@ def settle_command(
     from realsim.app.school.settle import settle
 
     request = SchoolRequest(**options)
-    if not settle(source, request, out, json_file, Console(quiet=quiet)):
+    if not settle(source, request, out, json_file, Console(quiet=quiet, as_json=as_json)):
         sys.exit(1)
 
 
-@SCHOOL.command("export")
+@SCHOOL.command(
+    "export",
+    cls=Command,
+    examples=(
+        "realsim school export demo/session --to acronym --out acronym",
+        "realsim school export demo/session --to isaac --out isaac --least-score 0.5",
+    ),
+)
 @click.argument("source", type=FOLDER)
 @click.option("--to", "target", required=True, type=click.Choice(FORMATS), help="Format.")
 @click.option("--out", type=FOLDER, required=True, help="Folder to write into.")
 @click.option("--least-score", default=0.0, show_default=True, type=click.FloatRange(0, 1),
               help="Leave out worse grasps (isaac).")  # fmt: skip
-def export_command(source: Path, target: str, out: Path, least_score: float) -> None:
+@JSON
+@QUIET
+def export_command(
+    source: Path, target: str, out: Path, least_score: float, as_json: bool, quiet: bool
+) -> None:
     """Write the grasps of SOURCE (a session, or a folder of results) for other programs."""
     from realsim.app.console import Console
     from realsim.app.school.export import export
 
-    console = Console()
-    for path in export(source, target, out, least_score):
+    console = Console(quiet=quiet, as_json=as_json)
+    files = export(source, target, out, least_score)
+    for path in files:
         console.say(str(path))
+    console.result({"format": target, "files": files})
 
 
-@SCHOOL.command("summary")
+@SCHOOL.command(
+    "summary", cls=Command,
+    examples=("realsim school summary demo/session", "realsim school summary demo/session --json"),
+)  # fmt: skip
 @click.argument("sources", type=FOLDER, nargs=-1, required=True, metavar="SESSION...")
-@click.option("--json", "json_file", type=FOLDER, default=None, help="Write the counts there, too.")
-def summary_command(sources: tuple[Path, ...], json_file: Path | None) -> None:
+@json_file("Write the counts there, too.")
+@JSON
+@QUIET
+def summary_command(
+    sources: tuple[Path, ...], json_file: Path | None, as_json: bool, quiet: bool
+) -> None:
     """Sum up the results of many sessions, row by row as in the paper's table."""
     from realsim.app.console import Console
     from realsim.app.school.export import summarise
 
-    summarise(sources, json_file, Console())
+    summarise(sources, json_file, Console(quiet=quiet, as_json=as_json))

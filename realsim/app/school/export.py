@@ -149,3 +149,4 @@ def summarise(sources: Sequence[Path], json_file: Path | None, console: Console)
             console.say(line)
     if json_file is not None:
         atomic.write_json(json_file, summary.to_json())
+    console.result(summary.to_json())

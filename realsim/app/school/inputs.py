@@ -80,7 +80,7 @@ def require_file_name(path: Path | None) -> None:
         InputError: a folder stands there.
     """
     if path is not None and path.is_dir():
-        raise InputError(f"--json '{path}' is a folder; the name of a file is expected.")
+        raise InputError(f"--json-file '{path}' is a folder; the name of a file is expected.")
 
 
 def _require_positive(

@@ -59,8 +59,10 @@ def settle(
     elif out is not None:
         atomic.write_bytes(out / PICTURE, picture)
         console.say(f"picture   {out / PICTURE}")
+    document = as_json(report)
     if json_file is not None:
-        atomic.write_json(json_file, as_json(report))
+        atomic.write_json(json_file, document)
+    console.result(document)
     return report.stable
 
 

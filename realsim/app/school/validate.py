@@ -44,8 +44,10 @@ def validate_engines(
         show_report(report, console)
         if out is not None:
             _write(report, name, out, console)
+    document = {name: r.to_json() for name, r in reports.items()}
     if json_file is not None:
-        atomic.write_json(json_file, {name: r.to_json() for name, r in reports.items()})
+        atomic.write_json(json_file, document)
+    console.result(document)
     return all(r.passed for r in reports.values())
 
 

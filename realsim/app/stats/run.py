@@ -69,6 +69,7 @@ def run_stats(
     for line in notes:
         console.warn(line.replace("[", r"\["))
     document = document_of(stats, left_out)
+    console.result(document)
     if json_file is not None:
         atomic.write_json(json_file, document)
     if out is not None:

@@ -6,16 +6,23 @@ from typing import Any
 
 import click
 
+from realsim.app.command import Command
 from realsim.app.option_values import numbers_of
+from realsim.app.options import FOLDER, JSON, QUIET, workers
 
-FOLDER = click.Path(path_type=Path)
 
-
-@click.command("upgrade")
+@click.command(
+    "upgrade",
+    cls=Command,
+    examples=(
+        "realsim upgrade dataset --out upgraded --scenes 1 --grasps 4",
+        "realsim upgrade dataset --out upgraded_gt --views 1 --grasps 2 --workers 1 --json",
+    ),
+)
 @click.argument("dataset", type=FOLDER)
 @click.option("--out", type=FOLDER, required=True, help="Folder for the upgraded BOP dataset.")
 @click.option("--kind", default="auto", show_default=True,
-              type=click.Choice(["auto", "bop", "graspnet"]))  # fmt: skip
+              type=click.Choice(["auto", "bop", "graspnet"]), help="What DATASET is.")  # fmt: skip
 @click.option("--camera", default="", help="kinect or realsense, of GraspNet.  [both]",
               type=click.Choice(["", "kinect", "realsense"]))  # fmt: skip
 @click.option(
@@ -34,10 +41,12 @@ FOLDER = click.Path(path_type=Path)
               help="Analytic grasps to try on each object beside these.")  # fmt: skip
 @click.option("--scene-workers", default=None, type=click.IntRange(1, 256),
               help="Scenes at a time.  [one a core]")  # fmt: skip
-@click.option("--workers", default=2, show_default=True, type=click.IntRange(1, 64),
-              help="Processes of one scene, where it is upgraded alone.")  # fmt: skip
-@click.option("--quiet", is_flag=True, help="No progress bars.")
-def upgrade_command(dataset: Path, out: Path, scenes: str, quiet: bool, **options: Any) -> None:
+@workers(help="Processes of one scene, where it is upgraded alone.")
+@JSON
+@QUIET
+def upgrade_command(
+    dataset: Path, out: Path, scenes: str, as_json: bool, quiet: bool, **options: Any
+) -> None:
     """Refine the poses of a BOP or GraspNet data set, try grasps, write it out with labels.
 
     DATASET is a BOP root, a split or one scene; or a GraspNet root, a scene or one camera of it.
@@ -55,8 +64,9 @@ def upgrade_command(dataset: Path, out: Path, scenes: str, quiet: bool, **option
     config = UpgradeConfig(
         scenes=numbers_of(scenes), grasps_per_object=options.pop("grasps"), **options
     )
-    console = Console(quiet=quiet)
+    console = Console(quiet=quiet, as_json=as_json)
     result = run_upgrade(config, dataset, out, console)
     show_upgrade(result, console)
+    console.result(result)
     if result.failed:
         sys.exit(1)

@@ -1,5 +1,6 @@
 """Scenes upgraded in processes beside this one: one that breaks or is killed harms no other."""
 
+import sys
 import time
 from collections.abc import Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -7,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
+from realsim.app.console import Console
 from realsim.app.upgrade.scene import Record, SceneJob, read_source, upgrade_scene
 from realsim.errors import RealsimError
 
@@ -89,6 +91,18 @@ def scene_progress(total: int, finished: int, *, quiet: bool) -> Generator[Told]
         finished: of them, upgraded by an earlier run.
         quiet: whether nothing is shown.
     """
+    if not quiet and not sys.stderr.isatty():
+        with Console().stage("upgrade", "scenes") as tick:
+            ended_now = 0
+
+            def note(ended: SceneEnd | None, under_way: Sequence[str]) -> None:
+                nonlocal ended_now
+                ended_now += ended is not None
+                # Those of an earlier run took no time of this one.
+                tick(ended_now, total - finished)
+
+            yield note
+        return
     from rich.console import Console as RichConsole
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 

@@ -6,13 +6,21 @@ from typing import Any
 
 import click
 
+from realsim.app.command import Command
 from realsim.app.option_values import numbers_of, point_of
+from realsim.app.options import FOLDER, JSON, QUIET, json_file, overwrite
 
-FOLDER = click.Path(path_type=Path)
 UP = click.Choice(["x", "y", "z", "-x", "-y", "-z"])
 
 
-@click.command()
+@click.command(
+    "scale",
+    cls=Command,
+    examples=(
+        "realsim scan scale mug demo/session",
+        "realsim scan scale generated.obj --measured longest=120.4mm+-0.3mm --out scaled",
+    ),
+)
 @click.argument("mesh")
 @click.argument("session", type=FOLDER, required=False)
 @click.option("--library", type=FOLDER, default=None, help="Put the scaled model there.  [nowhere]")
@@ -25,21 +33,23 @@ UP = click.Choice(["x", "y", "z", "-x", "-y", "-z"])
 @click.option("--between", multiple=True, help="Two points and a length: 'x,y,z x,y,z=95mm'.")
 @click.option("--views", default="", help="Only these views, such as 1-24.")
 @click.option("--out", type=FOLDER, default=None, help="Folder.  [SESSION/scans/NAME]")
-@click.option("--json", "json_file", type=FOLDER, default=None, help="scale.json once more.")
+@json_file("scale.json once more.")
 @click.option("--id", "obj_id", type=int, default=None, help="BOP id in the library.")
 @click.option("--density", type=float, default=None, help="For the library [kg/m^3].  [1000]")
 @click.option("--mass", type=float, default=None, help="As weighed [kg], instead of a density.")
-@click.option("--overwrite", is_flag=True, help="Do it again, and replace what is there.")
+@overwrite("Do it again, and replace what is there.")
 @click.option("--accept-doubtful", is_flag=True, help="Into the library whatever the verdict.")
-@click.option("--quiet", is_flag=True, help="No progress bars.")
-def scale(mesh: str, session: Path | None, quiet: bool, **options: Any) -> None:
+@JSON
+@QUIET
+def scale(mesh: str, session: Path | None, as_json: bool, quiet: bool, **options: Any) -> None:
     """Find the metric scale of MESH in the depth images of SESSION.
 
     \b
     MESH     a mesh file of any unit, a mesh of the library without scale (NAME, or
              LIBRARY/unscaled/NAME), or the name or id of a model at metric scale,
              which is then checked
-    SESSION  a calibrated session with depth; without one, --measured gives the scale
+    SESSION  a calibrated session with depth; without one, --measured gives
+             the scale
 
     \b
     What can be measured: longest (side of the smallest box), diameter (greatest
@@ -52,7 +62,7 @@ def scale(mesh: str, session: Path | None, quiet: bool, **options: Any) -> None:
     from realsim.app.scan.scale.run import run_scale
 
     request = request_of(mesh, session, options)
-    if not run_scale(request, Console(quiet=quiet)):
+    if not run_scale(request, Console(quiet=quiet, as_json=as_json)):
         sys.exit(1)
 
 

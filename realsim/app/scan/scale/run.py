@@ -3,6 +3,7 @@
 The result lies in SESSION/scans/NAME: scale.json is written last, so where it is, everything is.
 """
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -81,6 +82,7 @@ def run_scale(request: ScaleRequest, console: Console) -> bool:
     console.say(f"result    {place.folder}")
     if request.json is not None:
         write_file(request.json, result_bytes(record, box_mm))
+    console.result(json.loads(result_bytes(record, box_mm)))
     _say_where(request, named, place.folder / MODEL_FILE, fit.verdict, console)
     found = FoundScale(
         scale=fit.scale, sigma_percent=fit.sigma_percent, verdict=fit.verdict, reasons=fit.reasons,
@@ -228,6 +230,7 @@ def _by_measurement(request: ScaleRequest, console: Console) -> bool:
         console.say(f"result    {request.out}")
     if request.json is not None:
         write_file(request.json, text)
+    console.result(json.loads(text))
     model = None if request.out is None else request.out / MODEL_FILE
     _say_where(request, named, model, "unchecked", console)
     found = FoundScale(

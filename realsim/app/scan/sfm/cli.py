@@ -6,10 +6,15 @@ from typing import Any
 
 import click
 
-FOLDER = click.Path(path_type=Path)
+from realsim.app.command import Command
+from realsim.app.options import FOLDER, JSON, QUIET, seed
 
 
-@click.command("sfm")
+@click.command(
+    "sfm",
+    cls=Command,
+    examples=("realsim scan sfm demo/session --no-dense", "realsim scan sfm photographs --text"),
+)
 @click.argument("images", type=FOLDER)
 @click.option("--out", type=FOLDER, default=None, help="Folder.  [SESSION/scans/sfm, IMAGES/sfm]")
 @click.option(
@@ -23,9 +28,10 @@ FOLDER = click.Path(path_type=Path)
 @click.option("--dense/--no-dense", default=None, help="Fuse depth into a mesh.  [if there is any]")
 @click.option("--at", default="", help="The object whose mesh is wanted: x,y in world [m].")
 @click.option("--text", is_flag=True, help="The COLMAP model as text, too.")
-@click.option("--seed", default=0, show_default=True, help="Of every random choice.")
-@click.option("--quiet", is_flag=True, help="No progress bars.")
-def sfm(images: Path, quiet: bool, **options: Any) -> None:
+@seed("Of every random choice.")
+@JSON
+@QUIET
+def sfm(images: Path, as_json: bool, quiet: bool, **options: Any) -> None:
     """Structure from motion at metric scale, and a mesh from the depth images.
 
     IMAGES is a session folder, or a folder of photographs. A session's camera poses bring the
@@ -34,13 +40,13 @@ def sfm(images: Path, quiet: bool, **options: Any) -> None:
     aligns the result, which shows whether robot and pictures agree. Photographs alone have no
     metric scale.
 
-    \b
     Exit codes: 0 accepted, 1 done but doubtful or rejected, 2 something given cannot be used.
-    """  # noqa: D301 - click's own mark for lines that stay as they are
+    """
     from realsim.app.console import Console
     from realsim.app.option_values import point_of
     from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm
 
     at = point_of(options.pop("at"))
-    if not run_scan_sfm(SfmRequest(images=images, at=at, **options), Console(quiet=quiet)):
+    console = Console(quiet=quiet, as_json=as_json)
+    if not run_scan_sfm(SfmRequest(images=images, at=at, **options), console):
         sys.exit(1)

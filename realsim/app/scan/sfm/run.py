@@ -31,7 +31,7 @@ def run_scan_sfm(request: SfmRequest, console: Console) -> bool:
     """
     from threadpoolctl import threadpool_limits
 
-    from realsim.scanning.sfm.files import write_result
+    from realsim.scanning.sfm.files import result_json, write_result
     from realsim.scanning.sfm.photographs import images_digest
     from realsim.scanning.sfm.pictures import write_pictures
     from realsim.store.lock import only_run_in
@@ -58,6 +58,7 @@ def run_scan_sfm(request: SfmRequest, console: Console) -> bool:
             _write_text_model(out)
         show_sfm(result, console)
         dense_good = mesh_from_depth(request, inputs, result, out, console)
+    console.result(result_json(result, config) | {"folder": out, "dense_accepted": dense_good})
     console.say(f"cameras   {out / 'cameras.json'}")
     console.say(f"points    {out / 'sparse.ply'}")
     console.say(f"model     {out / 'model'} (COLMAP)")

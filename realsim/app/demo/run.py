@@ -193,6 +193,17 @@ def _open_or_create(
     return SessionStore.create(folder, session, about | extra)
 
 
+def demo_document(result: DemoResult) -> dict[str, object]:
+    """Return what a program wants to know, for `--json`: errors, places, times."""
+    return {
+        "session": result.store.folder,
+        "report": result.report,
+        "errors": result.errors,
+        "figures": result.errors.figures(),
+        "times": result.times,
+    }
+
+
 def show_demo(result: DemoResult, console: Console) -> None:
     """Print the tables, the errors against the truth, the pictures, and what to do next."""
     show_hand_eye(result.hand_eye, console)

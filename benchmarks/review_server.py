@@ -1,0 +1,35 @@
+"""The process that is measured: the review's own server on a session.
+
+    python review_server.py SESSION VOXEL_M MOST_POINTS SHOWN_POINTS
+
+It says its address in one line of JSON, answers every line of its standard input with what it has
+cost so far, and ends when that input does.
+"""
+
+import json
+import resource
+import sys
+import time
+
+from realsim.review import ReviewServer
+from realsim.review.content_config import SceneConfig
+from realsim.store import SessionStore
+
+KB_PER_MB = 1024
+
+
+def main() -> None:
+    """Serve until nobody holds the other end of the standard input."""
+    folder, voxel_m, most, shown = sys.argv[1:]
+    config = SceneConfig(voxel_m=float(voxel_m), most_points=int(most), shown_points=int(shown))
+    server = ReviewServer(SessionStore.open(folder), port=0, reviewer="bench", config=config)
+    server.start()
+    print(json.dumps({"url": server.url}), flush=True)
+    for _ in sys.stdin:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / KB_PER_MB
+        print(json.dumps({"cpu_s": time.process_time(), "peak_mb": peak}), flush=True)
+    server.stop()
+
+
+if __name__ == "__main__":
+    main()

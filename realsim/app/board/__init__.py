@@ -1,0 +1,1 @@
+"""`realsim board`: calibration targets to print."""

@@ -1,0 +1,45 @@
+"""`realsim calibrate`: its options."""
+
+import sys
+from pathlib import Path
+
+import click
+
+from realsim.app.command import Command
+from realsim.app.options import FOLDER, JSON, QUIET
+
+
+@click.command(
+    "calibrate",
+    cls=Command,
+    examples=(
+        "realsim calibrate demo/session",
+        "realsim calibrate photos --board aprilgrid:7x5,tag=30mm,gap=10mm --poses poses.csv",
+    ),
+)
+@click.argument("source", type=FOLDER)
+@click.option("--board", default="", help="Target: one line (see `realsim board`) or a file.")
+@click.option("--poses", type=FOLDER, default=None, help="Pose file or folder.  [SOURCE]")
+@click.option("--reading", default="", help="How poses are read: rotvec,m  quat_xyzw,mm  ...")
+@click.option("--key", default="", help="Entry of the pose file, where there are several.")
+@click.option("--board-poses", type=FOLDER, default=None, help="Camera poses instead of images.")
+@click.option("--camera", type=FOLDER, default=None, help="File with known intrinsics.")
+@click.option("--eye-to-hand", is_flag=True, help="The camera stands still, the target moves.")
+@click.option("--robot", default="", help="UR5 or UR5e; found out where joints are given.")
+@click.option("--out", type=FOLDER, default=Path("calibration"), show_default=True, help="Folder.")
+@click.option("--live", is_flag=True, help="Watch SOURCE for new views and say when to stop.")
+@JSON
+@QUIET
+def calibrate_command(
+    source: Path, live: bool, as_json: bool, quiet: bool, **options: object
+) -> None:
+    """Calibrate lens and hand-eye: SOURCE is a session, or a folder of images with poses.
+
+    Exit codes: 0 done, 1 a check of the result is bad, 2 bad input.
+    """
+    from realsim.app.calibrate.run import run_calibrate
+    from realsim.app.console import Console
+
+    console = Console(quiet=quiet, as_json=as_json)
+    if not run_calibrate(source, console, live=live, **options):
+        sys.exit(1)

@@ -1,0 +1,184 @@
+"""What all commands have in common: late loading, examples, settings from the environment."""
+
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from typing import Any
+
+import click
+from click.core import ParameterSource
+
+LONGEST_SENTENCE = 200
+"""Characters of a command's first sentence in the list of commands: it is wrapped, not cut."""
+ENVIRONMENT = "REALSIM"
+"""Begins the names of all variables: REALSIM_SCHOOL_RUN_FORCE is --force of `school run`."""
+
+
+class Command(click.Command):
+    """A command whose help ends with examples."""
+
+    def __init__(self, name: str | None, *, examples: Sequence[str] = (), **attrs: Any) -> None:
+        """Take click's arguments and the examples: lines that begin with `realsim`."""
+        super().__init__(name, **attrs)
+        self.examples = tuple(examples)
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Read the arguments; a value that a variable gave is refused with the variable's name."""
+        try:
+            return super().parse_args(ctx, args)
+        except click.BadParameter as error:
+            option = error.param
+            if not isinstance(option, click.Option) or option.name is None:
+                raise
+            if ctx.get_parameter_source(option.name) is not ParameterSource.ENVIRONMENT:
+                raise
+            told = f"{error.message} The variable {option.envvar} says so."
+            raise click.BadParameter(told, ctx=ctx, param=option) from error
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the examples as they are typed, unwrapped."""
+        super().format_epilog(ctx, formatter)
+        write_examples(self.examples, formatter)
+
+
+class Group(click.Group):
+    """A group whose commands are imported when they are asked for."""
+
+    def __init__(
+        self,
+        name: str | None = None,
+        *,
+        late: Mapping[str, str] | None = None,
+        examples: Sequence[str] = (),
+        **attrs: Any,
+    ) -> None:
+        """Take click's arguments, and the commands that are loaded late.
+
+        Args:
+            name: of the group.
+            late: `module:attribute` of a command by its name, in the order of the help.
+            examples: lines of the help.
+            attrs: click's.
+        """
+        super().__init__(name, **attrs)
+        self.late = dict(late or {})
+        self.examples = tuple(examples)
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the names of all commands, in the order in which they are used."""
+        return [*(name for name in self.commands if name not in self.late), *self.late]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Return a command; the first time it is imported and its variables are named."""
+        known = self.commands.get(cmd_name)
+        if known is None and cmd_name in self.late:
+            module, attribute = self.late[cmd_name].split(":")
+            known = getattr(import_module(module), attribute)
+            assert isinstance(known, click.Command)
+            self.commands[cmd_name] = known
+        if known is not None:
+            _name_variables(known, (*_path(ctx), cmd_name))
+        return known
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command, or say which one may be meant."""
+        try:
+            return super().resolve_command(ctx, args)
+        except click.exceptions.NoSuchCommand as error:
+            # click knows only the commands that are loaded.
+            names = self.list_commands(ctx)
+            raise click.exceptions.NoSuchCommand(
+                error.command_name, possibilities=names, ctx=ctx
+            ) from None
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the names of the commands with the first sentence of each."""
+        loaded = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        rows = [
+            (name, command.get_short_help_str(limit=LONGEST_SENTENCE))
+            for name, command in loaded
+            if command is not None and not command.hidden
+        ]
+        if rows:
+            with formatter.section("Commands"):
+                formatter.write_dl(rows)
+
+    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the examples as they are typed, unwrapped."""
+        super().format_epilog(ctx, formatter)
+        write_examples(self.examples, formatter)
+
+
+def write_examples(examples: Sequence[str], formatter: click.HelpFormatter) -> None:
+    """Write the block of examples, if there are any."""
+    if examples:
+        with formatter.section("Examples"):
+            formatter.write("".join(f"  {line}\n" for line in examples))
+
+
+def variable(path: Sequence[str], option: click.Option) -> str:
+    """Return the name of the environment variable of a command's option."""
+    words = [ENVIRONMENT, *path, spelling(option)]
+    return "_".join(words).replace("-", "_").upper()
+
+
+def spelling(option: click.Option) -> str:
+    """Return the name of an option as it is typed, without dashes: `depth-bias`."""
+    return max(option.opts, key=len).lstrip("-")
+
+
+def settable(command: click.Command) -> list[click.Option]:
+    """Return the options of a command that a file or the environment may set."""
+    return [
+        p
+        for p in command.params
+        if isinstance(p, click.Option) and not p.is_eager and p.name not in ("help", "version")
+    ]
+
+
+def default_of(option: click.Option) -> Any:
+    """Return the default of an option, None where there is none."""
+    value = option.to_info_dict().get("default")
+    if option.multiple and value is None:
+        return []
+    return list(value) if isinstance(value, tuple) else value  # pyright: ignore[reportUnknownArgumentType]
+
+
+def walk(group: Group, path: tuple[str, ...] = ()) -> dict[tuple[str, ...], click.Command]:
+    """Return every command below a group by its path, groups left out."""
+    found: dict[tuple[str, ...], click.Command] = {}
+    ctx = context_of(group, path)
+    for name in group.list_commands(ctx):
+        command = group.get_command(ctx, name)
+        here = (*path, name)
+        if isinstance(command, Group):
+            found |= walk(command, here)
+        elif command is not None:
+            found[here] = command
+    return found
+
+
+def context_of(group: click.Group, path: Sequence[str]) -> click.Context:
+    """Return a context as if the words of `path` had been typed before."""
+    ctx = click.Context(group, info_name="realsim")
+    for name in path:
+        ctx = click.Context(group, info_name=name, parent=ctx)
+    return ctx
+
+
+def _path(ctx: click.Context) -> tuple[str, ...]:
+    """Return the words that lead to a group, without the program's name."""
+    if ctx.parent is None:
+        return ()
+    return (*_path(ctx.parent), ctx.info_name or "")
+
+
+def _name_variables(command: click.Command, path: tuple[str, ...]) -> None:
+    for option in settable(command):
+        if option.envvar is None:
+            option.envvar = variable(path, option)
+
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+"""What click.option returns."""

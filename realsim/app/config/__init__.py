@@ -1,0 +1,1 @@
+"""`realsim config`: settings from a file, and where each came from."""

@@ -1,0 +1,91 @@
+"""`realsim config`: show what is in force, print a template."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import click
+
+from realsim.app.command import Command, Group, walk
+from realsim.app.options import JSON, QUIET
+from realsim.errors import InputError
+
+CONFIG = Group(
+    "config",
+    examples=("realsim config show register", "realsim config template"),
+    help="""Settings from a file: every option of every command.
+
+    \b
+    The first of these that is there is read:
+      realsim --config FILE ...
+      the file that REALSIM_CONFIG names (empty: none)
+      ./realsim.toml
+      ~/.config/realsim/config.toml
+
+    Variables (REALSIM_REGISTER_VIEWS=64) go over the file, the command line over both.
+    """,
+)
+
+
+@CONFIG.command(
+    "show", cls=Command,
+    examples=("realsim config show", "realsim config show school run", "realsim config show --all"),
+)  # fmt: skip
+@click.argument("command", nargs=-1, metavar="[COMMAND]")
+@click.option("--all", "show_all", is_flag=True, help="Options that have their default, too.")
+@JSON
+@QUIET
+@click.pass_context
+def show_command(
+    ctx: click.Context, command: tuple[str, ...], show_all: bool, as_json: bool, quiet: bool
+) -> None:
+    """Show what is in force, and where each value came from.
+
+    Without COMMAND only what is set somewhere; of a COMMAND, every option.
+    """
+    from realsim.app.config.applied import config_file
+    from realsim.app.config.in_force import DEFAULT, in_force, strange_variables
+    from realsim.app.console import Console
+
+    console = Console(quiet=quiet, as_json=as_json)
+    file = config_file(ctx)
+    root = ctx.find_root()
+    assert isinstance(root.command, Group)
+    every = walk(root.command)
+    chosen = {path: c for path, c in every.items() if path[: len(command)] == command}
+    if not chosen:
+        known = ", ".join(" ".join(path) for path in every)
+        raise InputError(f"there is no command '{' '.join(command)}'; there are: {known}.")
+    settings: Mapping[str, Any] = root.default_map or {}
+    rows = in_force(chosen, settings, file)
+    shown = [r for r in rows if command or show_all or r.origin != DEFAULT]
+    console.say(f"file: {'none' if file is None else file.path}")
+    if shown:
+        table = [[f"{r.command} --{r.option}", _text(r.value), r.origin] for r in shown]
+        console.table("In force", ["option", "value", "from"], table)
+    else:
+        console.say("every option has its default; `realsim config show COMMAND` lists them.")
+    for line in strange_variables(every):
+        console.warn(line)
+    console.result({"file": None if file is None else file.path, "options": shown})
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "not set"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+@CONFIG.command(
+    "template", cls=Command,
+    examples=("realsim config template", "realsim config template > realsim.toml"),
+)  # fmt: skip
+@click.pass_context
+def template_command(ctx: click.Context) -> None:
+    """Print a file of settings with every option, its meaning and its default, commented out."""
+    from realsim.app.config.template import template
+
+    root = ctx.find_root().command
+    assert isinstance(root, Group)
+    click.echo(template(walk(root)), nl=False)

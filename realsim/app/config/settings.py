@@ -1,0 +1,147 @@
+"""What a file of settings may say, held against the commands' own options."""
+
+from collections.abc import Mapping
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, cast
+
+import click
+
+from realsim.app.command import Group, context_of, default_of, settable, spelling
+from realsim.app.config.files import ConfigFile
+from realsim.errors import InputError
+
+Settings = dict[str, Any]
+"""Values by click's name of a parameter; of a group, Settings by the name of a command."""
+
+
+def settings_of(root: Group, file: ConfigFile) -> Settings:
+    """Return the defaults that a file gives, as click's `default_map` has them.
+
+    Raises:
+        InputError: a table or key that there is not, or a value of another kind; names the line.
+    """
+    return _of_group(root, (), file.tables, file)
+
+
+def _of_group(
+    group: Group, path: tuple[str, ...], tables: Mapping[str, Any], file: ConfigFile
+) -> Settings:
+    ctx = context_of(group, path)
+    names = group.list_commands(ctx)
+    found: Settings = {}
+    for name, value in tables.items():
+        command = group.get_command(ctx, name) if name in names else None
+        if command is None:
+            raise _unknown_table(path, name, value, names, file)
+        here = (*path, name)
+        if not isinstance(value, dict):
+            raise InputError(
+                f"{file.place(path, name)}: '{name}' is a command, and its settings are a table: "
+                f"[{'.'.join(here)}]."
+            )
+        inner = cast("dict[str, Any]", value)
+        if isinstance(command, Group):
+            found[name] = _of_group(command, here, inner, file)
+        else:
+            found[name] = _of_command(command, here, inner, file)
+    return found
+
+
+def _unknown_table(
+    path: tuple[str, ...], name: str, value: Any, names: list[str], file: ConfigFile
+) -> InputError:
+    """Return the error of a table, or a key outside of a command's table."""
+    is_table = isinstance(value, dict)
+    where = file.place((*path, name)) if is_table else file.place(path, name)
+    before = f"'{'.'.join(path)}'" if path else "realsim"
+    what = f"[{'.'.join((*path, name))}] is no command of {before}"
+    if not is_table:
+        what = f"'{name}' stands outside of a command's table"
+    tables = [".".join((*path, n)) for n in names]
+    return InputError(f"{where}: {what}{_perhaps(name, names)}. Tables are: {', '.join(tables)}.")
+
+
+def _of_command(
+    command: click.Command, path: tuple[str, ...], table: Mapping[str, Any], file: ConfigFile
+) -> Settings:
+    options = {spelling(option): option for option in settable(command)}
+    found: Settings = {}
+    for key, value in table.items():
+        name = key.replace("_", "-")
+        option = options.get(name)
+        where = f"{file.place(path, key)}: [{'.'.join(path)}]"
+        if option is None:
+            raise InputError(
+                f"{where} has no option '{key}'{_perhaps(name, list(options))}. Its options are: "
+                f"{', '.join(options)}."
+            )
+        assert option.name is not None
+        if option.name in found:
+            raise InputError(f"{where} sets '{name}' twice; keep one of them.")
+        if value == "" and default_of(option) is None:
+            continue  # "not set", as the template writes it
+        found[option.name] = _value(option, value, f"{where} {key}")
+    return found
+
+
+def _value(option: click.Option, value: Any, where: str) -> Any:
+    """Return a value as click takes it, checked.
+
+    Raises:
+        InputError: it is of another kind, or out of range.
+    """
+    if option.multiple:
+        several = cast("list[Any]", value) if isinstance(value, list) else [value]
+        return [_one(option, each, where) for each in several]
+    return _one(option, value, where)
+
+
+def _one(option: click.Option, value: Any, where: str) -> Any:
+    kind = kind_of(option)
+    accepted: tuple[type, ...] = {
+        "true or false": (bool,),
+        "a whole number": (int,),
+        "a number": (int, float),
+    }.get(kind, (str, int, float))
+    is_flag = kind == "true or false"
+    if not isinstance(value, accepted) or isinstance(value, bool) != is_flag:
+        raise InputError(f"{where} = {_shown(value)} cannot be used; {kind} is accepted.")
+    if is_flag:
+        return value
+    text = str(value)
+    if isinstance(option.type, click.Path):
+        text = str(Path(text).expanduser())  # on the command line the shell does it
+    ctx = click.Context(click.Command("settings"))
+    try:
+        option.type.convert(text, option, ctx)
+    except click.BadParameter as error:
+        raise InputError(f"{where} = {_shown(value)} cannot be used: {error.message}") from error
+    return text
+
+
+def kind_of(option: click.Option) -> str:
+    """Return in words what an option takes."""
+    kind = option.type
+    if option.is_flag:
+        return "true or false"
+    if isinstance(kind, click.Choice):
+        return f"one of {', '.join(str(c) for c in kind.choices if c)}"
+    if isinstance(kind, click.Path):
+        return "a path in quotes"
+    if isinstance(kind, click.IntRange) or kind is click.INT:
+        return "a whole number"
+    if isinstance(kind, click.FloatRange) or kind is click.FLOAT:
+        return "a number"
+    return "a text in quotes"
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return f'"{value}"' if isinstance(value, str) else str(value)
+
+
+def _perhaps(name: str, names: list[str]) -> str:
+    close = get_close_matches(name, names, n=2)
+    return f"; did you mean {' or '.join(close)}?" if close else ""

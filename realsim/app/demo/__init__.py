@@ -1,0 +1,1 @@
+"""`realsim demo`: the whole loop in the simulated lab."""

@@ -1,0 +1,71 @@
+"""The options that many commands have, spelled and explained alike."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from realsim.app.command import Decorator
+
+FOLDER = click.Path(path_type=Path)
+"""A file or folder as a pathlib.Path; whoever opens it says what is wrong with it."""
+
+QUIET = click.option("--quiet", is_flag=True, help="No progress; only the result and trouble.")
+JSON = click.option("--json", "as_json", is_flag=True, help="The result as JSON on stdout.")
+
+
+def json_file(what: str) -> Decorator:
+    """Return the option that writes the JSON into a file as well."""
+    return click.option("--json-file", type=FOLDER, default=None, metavar="FILE", help=what)
+
+
+def overwrite(what: str) -> Decorator:
+    """Return the option that allows to replace what is there."""
+    return click.option("--overwrite", is_flag=True, help=what)
+
+
+def workers(default: int | None = 2, help: str = "Processes.") -> Decorator:
+    """Return the option for how many processes work at a time."""
+    return click.option(
+        "--workers", default=default, show_default=True, type=click.IntRange(1, 256), help=help
+    )
+
+
+def seed(what: str = "Of everything random: the same seed, the same result.") -> Decorator:
+    """Return the option that chooses the random numbers."""
+    return click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help=what)
+
+
+class PlanName(click.ParamType[str]):
+    """A plan file, or one that comes with realsim: `shipped:NAME`."""
+
+    name = "plan"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the text; whether there is such a plan is seen when it is opened."""
+        return str(value)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[Any]:
+        """Return shipped plans and JSON files that begin so, or let the shell find files."""
+        from click.shell_completion import CompletionItem
+
+        names = [f"shipped:{name}" for name in shipped_names()]
+        if not any(name.startswith(incomplete) for name in names):
+            return [CompletionItem(incomplete, type="file")]
+        names += sorted(p.name for p in Path().glob("*.json"))
+        return [CompletionItem(name) for name in names if name.startswith(incomplete)]
+
+
+def shipped_names() -> list[str]:
+    """Return the names of the plans that come with realsim, without loading their package."""
+    from importlib.util import find_spec
+
+    spec = find_spec("realsim_capture_plans")
+    places = spec.submodule_search_locations if spec is not None else None
+    return sorted(
+        file.stem
+        for place in places or ()
+        for file in (Path(place) / "plan_files" / "shipped").glob("*.json")
+    )

@@ -1,0 +1,221 @@
+"""The measured depth of many views as one cloud, in levels of detail that nest."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry.camera import ray_table
+from realsim.records import CameraIntrinsics, View
+from realsim.review import quick_png
+from realsim.review.content_views import Region, strided
+from realsim.store import SessionStore
+from realsim.store.session_store import depth_path, rgb_path
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+Rgb = NDArray[np.uint8]
+SAMPLES_PER_POINT = 4
+"""Depth samples fused per point wanted: on overlapping views about as many fall into one voxel."""
+MOST_SAMPLES = 4_000_000
+"""Depth samples taken in all: 60 bytes each while they are sorted into voxels."""
+BLOCK = 500_000
+"""Samples averaged at a time: 70 bytes each."""
+TRIED_PER_POINT = 10
+"""Points that are looked at per point of the coarse level: hardly a cell is missed."""
+LEVEL_GROWTH = 4
+"""Points of a level over those of the next coarser one: half the distance between neighbours."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class LeveledCloud:
+    """A coloured cloud in levels: level k is `points[: ends[k]]`, and so holds those before it."""
+
+    points: Floats
+    """(N, 3) in world [m]."""
+    colors: Rgb
+    """(N, 3) as photographed."""
+    ends: tuple[int, ...]
+    """Points of every level, coarse first; the last is N."""
+    voxel_m: float
+    """Edge of the voxels of the finest level [m]."""
+
+    def __len__(self) -> int:
+        """Return the number of points of the finest level."""
+        return len(self.points)
+
+    def level(self, k: int) -> slice:
+        """Return what of the points level k is; -1 = the finest."""
+        return slice(0, self.ends[k])
+
+    def pieces(self, most: int, piece: int) -> list[slice]:
+        """Return the levels up to about `most` points as messages carry them.
+
+        The first piece is the coarse level; the others add to it, in order, and hold at most
+        `piece` points each.
+        """
+        most = min(most, len(self))
+        at = min(self.ends[0], most)
+        cuts = [0, at, *range(at + piece, most, piece), most]
+        return [slice(a, b) for a, b in pairwise(cuts) if b > a]
+
+
+def fused_cloud(
+    store: SessionStore,
+    views: Sequence[View],
+    region: Region,
+    *,
+    voxel_m: float,
+    most: int,
+    coarse: int,
+    on_photograph: Callable[[int, Rgb], None] | None = None,
+) -> LeveledCloud:
+    """Return the measured depth of several views as one coloured cloud in world.
+
+    Every view gives an even share of the samples, so that the cost does not grow with the number
+    of views. A point is the mean of the samples in its voxel, or the sample nearest to that mean
+    where the mean is more than half a voxel from each.
+
+    Args:
+        store: the session.
+        views: views with a camera pose and depth.
+        region: points outside are left out.
+        voxel_m: samples are averaged in voxels of this edge [m].
+        most: no more points than this are returned; those seen most often stay.
+        coarse: points of the coarse level, about.
+        on_photograph: called with every photograph (H, W, 3) that is decoded on the way, and the
+            number of its view.
+    """
+    intrinsics = store.session.intrinsics
+    share = min(SAMPLES_PER_POINT * most, MOST_SAMPLES) / max(1, len(views))
+    stride = max(1, round(float(np.sqrt(intrinsics.width * intrinsics.height / share))))
+    small = strided(intrinsics, stride)
+    parts = [np.zeros((0, 3), np.float32)]
+    colors = [np.zeros((0, 3), np.uint8)]
+    for view in views:
+        rgb = quick_png.read_rgb(store.path(rgb_path(view.index)))
+        if on_photograph is not None:
+            on_photograph(view.index, rgb)
+        depth_m = quick_png.read_depth(
+            store.path(depth_path(view.index)), store.session.depth_unit_m
+        )
+        points, at = _seen(depth_m[::stride, ::stride], small, view, region)
+        parts.append(points)
+        colors.append(rgb[::stride, ::stride][at[1], at[0]])
+    samples, sampled = np.concatenate(parts), np.concatenate(colors)
+    del parts, colors
+    points, rgb, counts = _voxel_points(samples, sampled, voxel_m)
+    del samples, sampled
+    if len(points) > most:
+        kept = np.sort(np.argpartition(-counts, most)[:most])
+        points, rgb = points[kept], rgb[kept]
+    order, ends = _coarse_first(points, voxel_m, coarse)
+    points, rgb = points[order], rgb[order]
+    points.setflags(write=False)
+    rgb.setflags(write=False)
+    return LeveledCloud(points=points, colors=rgb, ends=ends, voxel_m=voxel_m)
+
+
+def _seen(
+    depth_m: Floats, camera: CameraIntrinsics, view: View, region: Region
+) -> tuple[Floats, tuple[Ints, Ints]]:
+    """Return the points (N, 3) of a view in the region [m], and their pixels (x, y)."""
+    rays = ray_table(camera)
+    v, u = np.nonzero((depth_m > 0) & np.isfinite(depth_m) & np.isfinite(rays[..., 0]))
+    T = np.asarray(view.T_world_cam)
+    # Relative to the region, whose size float32 resolves to a hundredth of a micrometre.
+    R, t = T[:3, :3].astype(np.float32), (T[:3, 3] - region.center).astype(np.float32)
+    offset = (rays[v, u] * depth_m[v, u, None]) @ R.T + t
+    near = np.einsum("nk,nk->n", offset, offset) <= np.float32(region.radius_m) ** 2
+    points = (offset[near] + region.center).astype(np.float32)
+    return points, (u[near], v[near])
+
+
+def _cells(points: Floats, size_m: float) -> Ints:
+    """Return the number (N,) of the grid cell that holds each point."""
+    key = np.zeros(len(points), np.int64)
+    for axis in range(3):
+        # In double: single would put points near a wall on either side of it.
+        cell = np.floor(points[:, axis] / np.float64(size_m)).astype(np.int64)
+        cell -= cell.min()
+        key *= int(cell.max()) + 1
+        key += cell
+    return key
+
+
+def _voxel_points(points: Floats, rgb: Rgb, voxel_m: float) -> tuple[Floats, Rgb, Ints]:
+    """Return a point and a colour per occupied voxel, and how many samples it had."""
+    if len(points) == 0:
+        return points, rgb, np.zeros(0, np.int64)
+    key = _cells(points, voxel_m)
+    order = np.argsort(key)
+    key = key[order]
+    first = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+    del key
+    points, rgb = points[order], rgb[order]
+    del order
+    counts = np.diff(np.append(first, len(points)))
+    means, colors = np.empty((len(first), 3), np.float32), np.empty((len(first), 3), np.uint8)
+    ends = [*np.searchsorted(first, np.arange(BLOCK, len(points), BLOCK)).tolist(), len(first)]
+    begin = 0
+    for end in ends:
+        if end == begin:
+            continue
+        samples = slice(int(first[begin]), int(first[end]) if end < len(first) else len(points))
+        means[begin:end], colors[begin:end] = _means(
+            points[samples], rgb[samples], first[begin:end] - first[begin], voxel_m
+        )
+        begin = end
+    return means, colors, counts
+
+
+def _means(points: Floats, rgb: Rgb, first: Ints, voxel_m: float) -> tuple[Floats, Rgb]:
+    """Return point and colour of every voxel.
+
+    Args:
+        points: (N, 3) samples, those of a voxel in a row [m].
+        rgb: (N, 3) their colours.
+        first: (V,) the first sample of every voxel.
+        voxel_m: its edge [m].
+    """
+    counts = np.diff(np.append(first, len(points)))
+    voxel = np.repeat(np.arange(len(first)), counts)
+    # Relative to the first sample of the voxel: sums of coordinates would lose digits in float32.
+    offset = points - points[first][voxel]
+    mean = np.add.reduceat(offset, first, axis=0) / counts[:, None].astype(np.float32)
+    offset -= mean[voxel]
+    distance = np.einsum("nk,nk->n", offset, offset)
+    least = np.minimum.reduceat(distance, first)
+    means = (points[first] + mean).astype(np.float32)
+    apart = np.flatnonzero(least > (voxel_m / 2) ** 2)
+    if len(apart):
+        nearest = np.flatnonzero(distance == least[voxel])
+        _, at = np.unique(voxel[nearest], return_index=True)
+        means[apart] = points[nearest[at[apart]]]
+    colors = np.add.reduceat(rgb.astype(np.float32), first, axis=0) / counts[:, None]
+    return means, np.rint(colors).astype(np.uint8)
+
+
+def _coarse_first(points: Floats, voxel_m: float, coarse: int) -> tuple[Ints, tuple[int, ...]]:
+    """Return an order of the points in which the first ones are spread evenly, and its levels.
+
+    The coarse level has one point in each cell of a grid that leaves about so many. The others
+    follow in random order: of points that are one to a voxel any choice is spread evenly enough.
+    """
+    n = len(points)
+    order = np.random.default_rng(0).permutation(n)
+    if n <= coarse:
+        return order, (n,)
+    # On a surface the cells of a grid grow fewer with the square of its edge.
+    some = order[: TRIED_PER_POINT * coarse]
+    size = voxel_m * float(np.sqrt(n / coarse))
+    _, at = np.unique(_cells(points[some], size), return_index=True)
+    at = np.sort(at)[:coarse]
+    rest = np.ones(n, np.bool_)
+    rest[at] = False
+    ends = [len(at)]
+    while LEVEL_GROWTH * ends[-1] < n:
+        ends.append(LEVEL_GROWTH * ends[-1])
+    return np.concatenate([order[at], order[rest]]), (*ends, n)

@@ -1,0 +1,133 @@
+"""Where a scene is looked at from: the views, the region about the objects, the first look."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from realsim.errors import InputError
+from realsim.records import CameraIntrinsics, ObjectPose, View
+from realsim.store import SessionStore
+
+Array = NDArray[np.float64]
+VERDICT_ORDER = ("rejected", "doubtful", "unchecked", "accepted")
+"""Worst first."""
+LOOK_NEARER = 0.8
+"""Distance of the first look, as a share of the cameras' own."""
+LOOK_DOWN_RAD = 0.6
+"""Angle under which the first look sees the table [rad]."""
+
+
+def worst_first(objects: Sequence[ObjectPose]) -> list[ObjectPose]:
+    """Return the objects, worst verdict first, then by the smallest agreement with the depth."""
+
+    def badness(placed: ObjectPose) -> tuple[int, float, int]:
+        agree = placed.checks.get("agree", 0.0)
+        return VERDICT_ORDER.index(placed.verdict), agree, placed.instance
+
+    return sorted(objects, key=badness)
+
+
+def spread(views: Sequence[View], most: int) -> list[View]:
+    """Return at most `most` of the views, evenly spread over their order."""
+    if len(views) <= most:
+        return list(views)
+    return [views[k] for k in np.linspace(0, len(views) - 1, most).round().astype(int)]
+
+
+def strided(intrinsics: CameraIntrinsics, stride: int) -> CameraIntrinsics:
+    """Return the camera of an image's every `stride`-th row and column; exact, lens included."""
+    return CameraIntrinsics(
+        width=-(-intrinsics.width // stride),
+        height=-(-intrinsics.height // stride),
+        fx=intrinsics.fx / stride,
+        fy=intrinsics.fy / stride,
+        cx=intrinsics.cx / stride,
+        cy=intrinsics.cy / stride,
+        distortion=intrinsics.distortion,
+    )
+
+
+def placed_views(store: SessionStore) -> list[View]:
+    """Return the views whose camera is known.
+
+    Raises:
+        InputError: none is.
+    """
+    views = [v for v in store.session.views if v.T_world_cam is not None]
+    if not views:
+        raise InputError(
+            f"no view of session '{store.session.name}' has a camera pose; calibrate first."
+        )
+    return views
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Region:
+    """The ball of world that is looked at."""
+
+    center: Array
+    """(3,) [m]."""
+    radius_m: float
+
+    def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Return (N,) which points (N, 3) [m] are inside."""
+        offset = np.asarray(points, dtype=np.float64) - self.center
+        return np.sum(offset * offset, axis=-1) <= self.radius_m**2
+
+
+def region_of(objects: Sequence[ObjectPose], views: Sequence[View], margin_m: float) -> Region:
+    """Return the region about the objects; without objects, about where the cameras look.
+
+    Args:
+        objects: the objects.
+        views: views with a camera pose.
+        margin_m: how far beyond the outermost object's origin it reaches [m].
+    """
+    if objects:
+        origins = np.array([o.T_world_obj[:3, 3] for o in objects])
+        center = origins.mean(0)
+        return Region(center, float(np.linalg.norm(origins - center, axis=1).max()) + margin_m)
+    Ts = np.array([v.T_world_cam for v in views])
+    # The point nearest to all optical axes, in the least-squares sense.
+    across = np.eye(3) - Ts[:, :3, 2, None] * Ts[:, None, :3, 2]
+    A, b = across.sum(0), (across @ Ts[:, :3, 3:4]).sum(0)[:, 0]
+    center = np.linalg.lstsq(A, b, rcond=None)[0]
+    distance = float(np.median(np.linalg.norm(Ts[:, :3, 3] - center, axis=1)))
+    return Region(center, distance)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FirstLook:
+    """Where a new browser's camera stands."""
+
+    position: Array
+    """(3,) [m]."""
+    look_at: Array
+    """(3,) what it looks at [m]."""
+    up: Array
+    """(3,) unit vector out of the table."""
+
+
+def first_look(region: Region, views: Sequence[View], up: Array) -> FirstLook:
+    """Return where a new browser's camera stands and what it looks at.
+
+    It stands where the cameras stand, on the side of the first one, but nearer, so that no frustum
+    is in the way.
+
+    Args:
+        region: what to look at.
+        views: views with a camera pose.
+        up: (3,) unit vector out of the table, in world.
+    """
+    Ts = np.array([v.T_world_cam for v in views])
+    offset = Ts[0, :3, 3] - region.center
+    horizontal = offset - up * (up @ offset)
+    length = float(np.linalg.norm(horizontal))
+    side = horizontal / length if length > 1e-6 else np.linalg.svd(up[None])[2][1]
+    distance = LOOK_NEARER * float(np.median(np.linalg.norm(Ts[:, :3, 3] - region.center, axis=1)))
+    direction = np.cos(LOOK_DOWN_RAD) * side + np.sin(LOOK_DOWN_RAD) * up
+    return FirstLook(
+        position=region.center + distance * direction, look_at=region.center.copy(), up=up
+    )

@@ -1,0 +1,188 @@
+"""The panel of the grasps: which are drawn, what is known of a clicked one, and its replay."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import viser
+
+from realsim.errors import InputError
+from realsim.records import GraspSet
+from realsim.review.grasp_drawing import GraspFilter, failure_choices, score_rgb, visible_grasps
+from realsim.review.grasp_replay import GraspMotion, ReplayPlayer
+from realsim.review.grasp_words import grasp_words
+
+if TYPE_CHECKING:
+    from realsim.review.window import Window
+
+STAGES = {
+    "any": 0,
+    "closed": 1,
+    "closed and lifted": 2,
+    "and shaken": 3,
+    "and swung: all four": 4,
+}
+"""What a grasp has passed at least."""
+THIS, EVERY = "this object", "all objects"
+ANY = "any, or none"
+GOOD_SCORE = 0.5
+"""Grasps drawn at first: the good ones; all of them hide the objects."""
+
+
+class GraspsPanel:
+    """Filters, words and replay; the filters are this reviewer's own."""
+
+    def __init__(self, window: "Window") -> None:
+        """Build it in the container that is open.
+
+        Args:
+            window: whose panel it is.
+        """
+        self._window = window
+        self._is_closed = False
+        gui = window.client.gui
+        self._show = gui.add_checkbox("Show grasps", False)
+        self._of = gui.add_dropdown("Of", (THIS, EVERY))
+        self._stage = gui.add_dropdown("Passed", tuple(STAGES))
+        self._score = gui.add_slider("Least score", 0.0, 1.0, 0.05, GOOD_SCORE)
+        self._reachable = gui.add_checkbox("The arm reaches it", False)
+        self._seen = gui.add_checkbox(
+            "The chosen view sees it", False, hint="The view that is chosen under Views."
+        )
+        self._failure: viser.GuiDropdownHandle[str] = gui.add_dropdown("Failed by", [ANY])
+        self._drawn = gui.add_markdown("")
+        gui.add_html(_legend_html())
+        self._words = gui.add_markdown("")
+        self._player = ReplayPlayer(
+            window.client.scene, gui, self, atomic=window.client.atomic,
+            connected=lambda: not self._is_closed, on_carried=window.hide_object,
+        )  # fmt: skip
+        self._show.on_update(window.guarded(lambda _: self.draw()))
+        for control in (self._of, self._stage, self._score, self._reachable, self._seen,
+                        self._failure):  # fmt: skip
+            control.on_update(window.guarded(lambda _: self._filtered()))
+
+    # --- where the player has its motions from ----------------------------------------------------
+
+    def motion(self, instance: int, row: int) -> GraspMotion | None:
+        """Return what is replayed of a grasp; None = nothing is known."""
+        motions = self._window.server.motions_of(self._window.session)
+        return None if motions is None else motions.motion(instance, row)
+
+    # --- what is drawn ----------------------------------------------------------------------------
+
+    def draw(self) -> int:
+        """Draw the grasps that pass; return how many."""
+        window = self._window
+        sets = window.content.grasp_sets
+        every = sum(len(s) for s in sets)
+        if every == 0:
+            self._drawn.content = "This scene has no grasps; `realsim school` tries them."
+            return 0
+        poses = {o.instance: o.T_world_obj for o in window.standing.scene.objects}
+        count = window.nodes.draw_grasps(self._filter(sets), poses)
+        self._drawn.content = f"**{count}** of {every} grasps drawn. Click one to see how it went."
+        return count
+
+    def clicked(self, instance: int, row: int) -> None:
+        """Tell what is known of a grasp, and replay it."""
+        window = self._window
+        if instance != window.selected:
+            window.select(instance)
+        grasps = window.content.grasps_of(instance)
+        if grasps is None:
+            raise InputError(f"instance {instance} has no grasps.")
+        name = window.model_of(window.placed).name
+        self._words.content = grasp_words(grasps, row, name)
+        with window.working("Preparing the replay", f"grasp {row} of {name}"):
+            motion = self._player.show(instance, row)
+        if motion is not None and len(motion.link_meshes):
+            window.views.look_past(motion.Ts_world_link[0, 0, :3, 3])
+        if motion is None:
+            self._words.content += "\n\nThere is no motion to replay."
+
+    # --- the window's events ----------------------------------------------------------------------
+
+    def opened(self) -> None:
+        """Offer the filters of another scene."""
+        self._failure.options = (ANY, *failure_choices(self._window.content.grasp_sets))
+        self._words.content = ""
+
+    def closed(self) -> None:
+        """The scene is left."""
+        self._player.clear()
+
+    def selected(self) -> None:
+        """Another object is looked at."""
+        motion = self._player.motion
+        if motion is not None and motion.instance != self._window.selected:
+            self._player.clear()
+            self._words.content = ""
+        if self._window.is_open and self._of.value == THIS:
+            self.draw()
+
+    def refresh(self) -> None:
+        """Objects may stand elsewhere."""
+        if self._show.value:
+            self.draw()
+
+    def stood_in(self, view: int | None) -> None:
+        """The reviewer stands in another camera, or in none."""
+        if self._seen.value and self._window.is_open:
+            self.draw()
+
+    def close(self) -> None:
+        """Play no more: the browser is gone."""
+        self._is_closed = True
+        self._player.pause()
+
+    # --- how --------------------------------------------------------------------------------------
+
+    def _filtered(self) -> None:
+        """Whoever sets a filter wants to see what passes it."""
+        self._show.value = True
+        self.draw()
+
+    def _filter(self, sets: tuple[GraspSet, ...]) -> GraspFilter:
+        failure = "" if self._failure.value == ANY else self._failure.value
+        return GraspFilter(
+            stage=STAGES[self._stage.value],
+            # Whoever asks for failures does not mean the good ones.
+            min_score=0.0 if failure else float(self._score.value),
+            reachable_only=self._reachable.value,
+            visible=self._rows(sets),
+            instance=self._window.selected if self._of.value == THIS else None,
+            failure=failure,
+            show=self._show.value,
+        )
+
+    def _rows(self, sets: tuple[GraspSet, ...]) -> Mapping[int, frozenset[int]] | None:
+        """Return the rows that may be drawn: of objects that are what they were, and that are seen.
+
+        None = all.
+        """
+        window = self._window
+        objects = {o.instance: o for o in window.standing.scene.objects}
+        swapped = {s.instance for s in sets if objects[s.instance].obj_id != s.obj_id}
+        seen: Mapping[int, frozenset[int]] | None = None
+        if self._seen.value and self._show.value:
+            poses = {k: o.T_world_obj for k, o in objects.items()}
+            seen = visible_grasps(window.content, window.views.chosen, poses)
+        if seen is None and not swapped:
+            return None
+        every = {s.instance: frozenset(range(len(s))) for s in sets}
+        return {k: v for k, v in (every if seen is None else seen).items() if k not in swapped}
+
+
+def _legend_html() -> str:
+    """Return the legend of the scores."""
+    scores = (0.0, 0.25, 0.5, 0.75, 1.0, float("nan"))
+    words = ("0", "0.25", "0.5", "0.75", "1", "not tried")
+    cells = "".join(
+        f'<div style="flex:1;background:rgb({r},{g},{b});text-align:center;padding:3px 0">'
+        f"{word}</div>"
+        for (r, g, b), word in zip(score_rgb(scores).tolist(), words, strict=True)
+    )
+    return (
+        '<div style="margin:4px 12px;font-size:12px;color:#000">score'
+        f'<div style="display:flex">{cells}</div></div>'
+    )

@@ -1,0 +1,117 @@
+"""The list of all scenes and objects, worst first."""
+
+from typing import TYPE_CHECKING, Any
+
+import viser
+
+from realsim.review import scene_list, window_text
+from realsim.review.scene_list import ObjectRow
+
+if TYPE_CHECKING:
+    from realsim.review.window import Window
+
+ROWS = 16
+"""Objects on one page of the list: as many as stand one above the other on a laptop's screen."""
+ALL_SCENES = "all scenes"
+SHOWN: dict[str, scene_list.Which] = {
+    "all objects": "all",
+    "waiting for a person": "undecided",
+    "judged": "decided",
+}
+
+
+class ListPanel:
+    """The left panel: a button an object, and how far the review has come."""
+
+    def __init__(self, window: "Window") -> None:
+        """Build it.
+
+        Args:
+            window: whose list it is.
+        """
+        self._window = window
+        gui = window.client.gui
+        panel = gui.add_panel()
+        panel.dock_left()
+        panel.set_width(290)
+        self._page = 0
+        self._rows: list[ObjectRow] = []
+        names = [s.name for s in window.server.sessions]
+        self._numbers = {_scene_label(k, n, names): k for k, n in enumerate(names)}
+        with panel.add_tab("Scenes and objects"):
+            self._head = gui.add_markdown("")
+            self._scene = gui.add_dropdown(
+                "Scene", (ALL_SCENES, *self._numbers), visible=len(names) > 1
+            )
+            self._which = gui.add_dropdown("Show", tuple(SHOWN))
+            self._step = gui.add_button_group(
+                "Undecided", ("\u25c0 Previous", "Next \u25b6"), hint="Keys P and N."
+            )
+            self._buttons = [gui.add_button("-", visible=False) for _ in range(ROWS)]
+            self._pages = gui.add_button_group("Page", ("\u2191 worse", "\u2193 better"))
+            self._remarks = gui.add_markdown("")
+        # Names that begin at one place are read faster than names in the middle.
+        ids = ", ".join(f"[id='{b._impl.uuid}'] .mantine-Button-inner" for b in self._buttons)  # pyright: ignore[reportPrivateUsage]
+        gui.add_html(f"<style>{ids} {{ justify-content: flex-start; }}</style>")
+        for k, button in enumerate(self._buttons):
+            button.on_click(window.guarded(lambda _, k=k: self._open(k)))
+        self._scene.on_update(window.guarded(lambda _: self._filtered()))
+        self._which.on_update(window.guarded(lambda _: self._filtered()))
+        self._step.on_click(window.guarded(lambda _: self._stepped()))
+        self._pages.on_click(window.guarded(lambda _: self._turned()))
+
+    def refresh(self) -> None:
+        """Show the list as the journals have it."""
+        window, every = self._window, self._window.rows()
+        judged, total = scene_list.counts(every)
+        scenes = len(window.server.sessions)
+        more = f" in {scenes} scenes" if scenes > 1 else ""
+        self._head.content = f"**{judged} of {total}** objects judged{more}"
+        chosen = every
+        if self._scene.value in self._numbers:
+            number = self._numbers[self._scene.value]
+            chosen = [r for r in every if r.session == number]
+        self._rows = scene_list.worst_first(scene_list.of_kind(chosen, SHOWN[self._which.value]))
+        pages = max(1, -(-len(self._rows) // ROWS))
+        self._page = min(self._page, pages - 1)
+        self._pages.visible = pages > 1
+        for k, button in enumerate(self._buttons):
+            self._show(button, self._page * ROWS + k)
+        lines = [f"- {window_text.escaped(text)}" for text in window.server.remarks]
+        if pages > 1:
+            lines.insert(0, f"page {self._page + 1} of {pages}")
+        self._remarks.content = "\n".join(lines)
+
+    def _show(self, button: viser.GuiButtonHandle, at: int) -> None:
+        if at >= len(self._rows):
+            button.visible = False
+            return
+        row, window = self._rows[at], self._window
+        scene = window.server.sessions[row.session].name
+        label = window_text.list_label(row, scene, with_scene=len(self._numbers) > 1)
+        is_here = window.is_open and row.key == (window.session.number, window.selected)
+        button.label = f"\u25b6 {label}" if is_here else label
+        button.color = window_text.verdict_rgb(row.verdict)
+        button.visible = True
+
+    def _open(self, k: int) -> None:
+        at = self._page * ROWS + k
+        if at < len(self._rows):
+            self._window.go_to(*self._rows[at].key)
+
+    def _filtered(self) -> None:
+        self._page = 0
+        self._window.refresh(force=True)
+
+    def _stepped(self) -> None:
+        step = 1 if "Next" in self._step.value else -1
+        self._window.next_undecided(step)
+
+    def _turned(self) -> None:
+        self._page = max(0, self._page + (1 if "better" in self._pages.value else -1))
+        self._window.refresh(force=True)
+
+
+def _scene_label(number: int, name: str, names: list[Any]) -> str:
+    """Return a scene's name; with its number where two scenes have one name."""
+    return name if names.count(name) == 1 else f"{name} ({number + 1})"

@@ -1,0 +1,91 @@
+"""The panel of the object that is looked at: what was computed of it, and what a person decides."""
+
+from typing import TYPE_CHECKING
+
+import viser
+
+from realsim.review import corrections, window_text
+from realsim.review.journal import Action, Entry
+
+if TYPE_CHECKING:
+    from realsim.review.window import Window
+
+
+class ObjectPanel:
+    """Verdict, checks, certainty and history of the selected object, and the buttons to judge."""
+
+    def __init__(self, window: "Window") -> None:
+        """Build it in the container that is open.
+
+        Args:
+            window: whose panel it is.
+        """
+        self._window = window
+        self._last: Entry | None = None
+        """The line that Undo takes back, as the reviewer sees it."""
+        gui = window.client.gui
+        self._text = gui.add_markdown("Click an object in the scene or in the list.")
+        self._comment = gui.add_text("Comment", "", multiline=True, hint="Goes with the decision.")
+        accept = gui.add_button(
+            "Accept",
+            color=window_text.verdict_rgb("accepted"),
+            icon=viser.Icon.CHECK,
+            hint="Key Y.",
+        )
+        reject = gui.add_button(
+            "Reject", color=window_text.verdict_rgb("rejected"), icon=viser.Icon.X, hint="Key X."
+        )
+        comment = gui.add_button("Comment only", color=(73, 80, 87), icon=viser.Icon.MESSAGE)
+        self._undo = gui.add_button("Undo", color=(134, 142, 150), icon=viser.Icon.ARROW_BACK_UP)
+        self._certainty = gui.add_markdown("")
+        self._checks = gui.add_markdown("")
+        with gui.add_folder("All checks", expand_by_default=False):
+            self._rest = gui.add_markdown("")
+        with gui.add_folder("Journal of this object"):
+            self._history = gui.add_markdown("")
+        accept.on_click(window.guarded(lambda _: self.decide("accept")))
+        reject.on_click(window.guarded(lambda _: self.decide("reject")))
+        comment.on_click(window.guarded(lambda _: self.decide("comment")))
+        self._undo.on_click(window.guarded(lambda _: self.undo()))
+
+    def decide(self, action: Action) -> None:
+        """Append a decision about the object as it stands here."""
+        window = self._window
+        window.correct.require_saved()
+        placed = window.placed
+        comment = self._comment.value
+        entry = window.session.decide(action, placed, window.reviewer, comment=comment)
+        self._comment.value = ""
+        word = window_text.ACTION_WORDS[action]
+        window.decided(entry, f"{window.model_of(placed).name} {word}")
+
+    def undo(self) -> None:
+        """Take back the last line on this object."""
+        window = self._window
+        entry = window.session.undo(window.placed, self._last, window.reviewer)
+        window.decided(entry, "the last line on this object is taken back")
+
+    def selected(self) -> None:
+        """Begin with another object."""
+        self._comment.value = ""
+
+    def refresh(self) -> None:
+        """Show the object as the journal has it."""
+        window = self._window
+        if window.selected is None:
+            return
+        standing, placed = window.standing, window.placed
+        corrected = corrections.corrected_scene(window.session.registered, standing.state).object(
+            placed.instance
+        )
+        model = window.model_of(placed)
+        decision = corrections.decision_on(corrected, standing.state)
+        lines = standing.state.of(placed.instance)
+        self._last = lines[-1] if lines else None
+        self._text.content = window_text.object_text(placed, corrected, model, decision)
+        self._certainty.content = window_text.certainty_text(placed, model)
+        self._checks.content = window_text.checks_table(placed, main=True)
+        self._rest.content = window_text.checks_table(placed, main=False) or "no others"
+        self._history.content = window_text.history_text(lines)
+        self._undo.label = window_text.undo_label(self._last)
+        self._undo.disabled = self._last is None

@@ -1,0 +1,139 @@
+"""The panel of what is shown: colours of the points, looks of the objects, how sure a pose is."""
+
+from typing import TYPE_CHECKING, Literal
+
+import viser
+
+from realsim.review import depth_residuals
+from realsim.review.ellipsoid import ellipsoid_of
+from realsim.review.reviewed_session import Standing
+from realsim.review.window_latest import LatestOnly
+
+if TYPE_CHECKING:
+    from realsim.review.window import Window
+
+Look = Literal["appearance", "verdict", "hidden"]
+LOOKS: dict[str, Look] = {
+    "as they look": "appearance",
+    "in the colour of the verdict": "verdict",
+    "hidden": "hidden",
+}
+PHOTO, RESIDUAL = "as photographed", "distance from the models"
+FACTORS = ("1", "10", "100", "1000")
+SIGMAS = 2.0
+"""Half axes of the ellipsoids, in standard deviations."""
+
+
+class ShowPanel:
+    """Switches; they are this reviewer's own."""
+
+    def __init__(self, window: "Window") -> None:
+        """Build it in the container that is open.
+
+        Args:
+            window: whose panel it is.
+        """
+        self._window = window
+        self._is_in_camera = False
+        self._colored: object = None
+        self._painter = LatestOnly(self._paint)
+        gui = window.client.gui
+        self._look = gui.add_dropdown("Objects", tuple(LOOKS))
+        self._cloud = gui.add_checkbox("Measured points", True)
+        self._colors = gui.add_dropdown("Points", (PHOTO, RESIDUAL))
+        self._legend = gui.add_html(_legend_html(), visible=False)
+        every = gui.add_button(
+            "Load all points", icon=viser.Icon.DOTS, hint="More detail, slower to turn."
+        )
+        self._cameras = gui.add_checkbox("Cameras", True)
+        self._table = gui.add_checkbox("Table", True)
+        with gui.add_folder("How sure the positions are"):
+            self._sure = gui.add_checkbox("Show ellipsoids", False)
+            self._factor = gui.add_dropdown("Times", FACTORS, initial_value="100")
+            self._said = gui.add_markdown("")
+        for switch in (self._look, self._cloud, self._cameras, self._table):
+            switch.on_update(window.guarded(lambda _: self._switch()))
+        self._colors.on_update(window.guarded(lambda _: self._color()))
+        for control in (self._sure, self._factor):
+            control.on_update(window.guarded(lambda _: self._draw_ellipsoids()))
+        every.on_click(window.guarded(lambda _: window.nodes.refine_cloud()))
+
+    def opened(self) -> None:
+        """Show another scene as the switches say."""
+        self._colored = None
+        self._switch()
+
+    def refresh(self) -> None:
+        """Objects may stand elsewhere: colours and ellipsoids follow."""
+        self._color()
+        self._draw_ellipsoids()
+
+    def in_camera(self, is_in: bool) -> None:
+        """Clear the view for the photograph, or show everything again."""
+        self._is_in_camera = is_in
+        self._switch()
+
+    def _switch(self) -> None:
+        nodes, free = self._window.nodes, not self._is_in_camera
+        with self._window.client.atomic():
+            nodes.show_objects(LOOKS[self._look.value] if free else "hidden")
+            nodes.show_cloud(self._cloud.value and free)
+            nodes.show_cameras(self._cameras.value and free)
+            nodes.show_table(self._table.value and free)
+
+    def _color(self) -> None:
+        """Colour the points, if what their colours depend on has changed; returns at once."""
+        is_residual = self._colors.value == RESIDUAL
+        self._legend.visible = is_residual
+        wanted = self._window.standing if is_residual else None
+        if wanted is not self._colored:
+            self._colored = wanted
+            self._painter.ask()
+
+    def _paint(self) -> None:
+        window, wanted = self._window, self._colored
+        if not window.is_open:
+            return
+
+        def paint() -> None:
+            colors = None
+            if isinstance(wanted, Standing):
+                colors = window.session.residual_rgb(wanted.scene.objects)
+            if self._colored is wanted:
+                window.nodes.set_cloud_colors(colors)
+
+        window.attempt(paint)
+
+    def _draw_ellipsoids(self) -> None:
+        window = self._window
+        objects = window.standing.scene.objects if self._sure.value else ()
+        factor = float(self._factor.value)
+        shapes = {o.instance: ellipsoid_of(o, SIGMAS, factor, window.model_of(o)) for o in objects}
+        window.nodes.ellipsoids(shapes)
+        times = "" if factor == 1 else f", drawn {self._factor.value} times as large to be seen"
+        text = f"{SIGMAS:g} sigma of the position of an object's middle{times}."
+        unknown = [str(i) for i, shape in shapes.items() if shape is None]
+        if unknown:
+            text += f" Not known of instance {', '.join(unknown)}."
+        self._said.content = text
+
+
+def _legend_html() -> str:
+    """Return the legend of the residuals."""
+    legend = depth_residuals.legend()
+    cells = "".join(
+        f'<div style="flex:1;background:rgb({r},{g},{b});color:{_ink(r, g, b)};'
+        f'text-align:center;padding:3px 0">{value:+g}</div>'
+        for value, (r, g, b) in zip(legend.values_mm, legend.rgb.tolist(), strict=True)
+    )
+    return (
+        '<div style="margin:4px 12px;font-size:12px;line-height:1.3">'
+        f'<div style="display:flex;margin-bottom:4px">{cells}'
+        '<div style="padding:3px 6px">mm</div></div>'
+        f"{legend.words}</div>"
+    )
+
+
+def _ink(r: int, g: int, b: int) -> str:
+    """Return the colour of letters that can be read on this one."""
+    return "#000" if 0.3 * r + 0.6 * g + 0.1 * b > 140 else "#fff"

@@ -1,0 +1,383 @@
+"""One reviewer's browser: its own name, scene, selection, filters and camera.
+
+Everything is built on the client's own gui and scene, so that two reviewers do not get into one
+another's way. What they share is the journal on the disk, and what was read of a session.
+"""
+
+import contextlib
+import logging
+import threading
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import viser
+
+from realsim.errors import InputError, RealsimError
+from realsim.records import ObjectModel, ObjectPose
+from realsim.review import scene_list, window_text
+from realsim.review.content import SceneContent
+from realsim.review.grasp_replay import Motions
+from realsim.review.journal import Entry
+from realsim.review.panels_correct import CorrectPanel
+from realsim.review.panels_grasps import GraspsPanel
+from realsim.review.panels_list import ListPanel
+from realsim.review.panels_object import ObjectPanel
+from realsim.review.panels_show import ShowPanel
+from realsim.review.panels_views import ViewsPanel
+from realsim.review.reviewed_session import ReviewedSession, Standing
+from realsim.review.scene_nodes import SceneNodes
+from realsim.review.window_keys import bind_keys
+
+LIST_PX, PANEL_PX = 290, 400
+"""Widths of the list on the left and of the panel on the right [px]."""
+NAME_KEY = "realsim reviewer"
+"""Under which the browser keeps the reviewer's name."""
+NAME_WAIT_S = 60.0
+"""How long a browser is waited for that does not tell the name it keeps [s]; nothing else waits."""
+log = logging.getLogger(__name__)
+
+
+class Sessions(Protocol):
+    """What a window needs of the server: all sessions, and whom to tell."""
+
+    @property
+    def sessions(self) -> Sequence[ReviewedSession]:
+        """All sessions under review; their `number` is their place here."""
+        ...
+
+    @property
+    def remarks(self) -> Sequence[str]:
+        """What the reviewer should know of the sessions, such as which cannot be opened."""
+        ...
+
+    def motions_of(self, session: ReviewedSession) -> Motions | None:
+        """Return where the motions of a session's grasps come from; None = there are none."""
+        ...
+
+    def tell(self) -> None:
+        """Show a decision in all windows at once."""
+        ...
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Opened:
+    """The scene that a window shows."""
+
+    session: ReviewedSession
+    content: SceneContent
+    nodes: SceneNodes
+    models: dict[int, int]
+    """instance -> obj_id as it is drawn."""
+
+
+class Window:
+    """What one connected browser shows; the methods may be called from any thread."""
+
+    def __init__(self, client: viser.ClientHandle, server: Sessions, reviewer: str = "") -> None:
+        """Build the panels; `start` opens the first scene.
+
+        Args:
+            client: the browser.
+            server: all sessions.
+            reviewer: the name to begin with; '' = what this browser keeps.
+        """
+        self.client, self.server = client, server
+        self.lock = threading.RLock()
+        self.selected: int | None = None
+        """Instance of the object that is looked at."""
+        self._opened: Opened | None = None
+        self._busy = threading.Lock()
+        self._seen: object = None
+        self._standing: Standing | None = None
+        self._is_closed = False
+        gui = client.gui
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(PANEL_PX)
+        self._name = gui.add_text("Your name", reviewer, hint="Decisions are signed with it.")
+        self._message = gui.add_html("")
+        self.list = ListPanel(self)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Object"):
+            self.object = ObjectPanel(self)
+        with tabs.add_tab("Correct"):
+            self.correct = CorrectPanel(self)
+        with tabs.add_tab("Views"):
+            self.views = ViewsPanel(self)
+        with tabs.add_tab("Grasps"):
+            self.grasps = GraspsPanel(self)
+        with tabs.add_tab("Show"):
+            self.show = ShowPanel(self)
+        self._name.on_update(self.guarded(lambda _: self._keep_name()))
+        bind_keys(self)
+
+    def start(self) -> None:
+        """Open the scene of the worst object that nobody judged, and recall the reviewer's name."""
+        rows = scene_list.worst_first(self.rows())
+        first = scene_list.next_undecided(rows, None, 1) or (rows[0] if rows else None)
+        if first is not None:
+            self.go_to(*first.key)
+        elif self.server.sessions:
+            self.go_to(0, None)
+        self._recall_name()
+
+    def close(self) -> None:
+        """Forget the browser: it is gone."""
+        self._is_closed = True
+        self.views.close()
+        self.grasps.close()
+
+    # --- what is looked at ------------------------------------------------------------------------
+
+    @property
+    def reviewer(self) -> str:
+        """Who decides here."""
+        return self._name.value
+
+    @property
+    def opened(self) -> Opened:
+        """The scene that is shown.
+
+        Raises:
+            InputError: none is yet.
+        """
+        if self._opened is None:
+            raise InputError("no scene is open yet; wait until it is loaded, or choose one.")
+        return self._opened
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a scene is shown."""
+        return self._opened is not None
+
+    @property
+    def session(self) -> ReviewedSession:
+        """The session whose scene is shown."""
+        return self.opened.session
+
+    @property
+    def nodes(self) -> SceneNodes:
+        """The scene's nodes."""
+        return self.opened.nodes
+
+    @property
+    def content(self) -> SceneContent:
+        """What is shown of it."""
+        return self.opened.content
+
+    @property
+    def standing(self) -> Standing:
+        """The journal as this reviewer sees it, which may be older than that on the disk."""
+        return self._standing or self.session.standing
+
+    @property
+    def placed(self) -> ObjectPose:
+        """The selected object as it stands, with the reviewers' verdict.
+
+        Raises:
+            InputError: none is selected.
+        """
+        if self.selected is None:
+            raise InputError("no object is selected; click one in the scene or in the list.")
+        return self.standing.scene.object(self.selected)
+
+    def model_of(self, placed: ObjectPose) -> ObjectModel:
+        """Return an object's model, symmetric as it was marked."""
+        return self.session.model(placed.obj_id)
+
+    def rows(self) -> list[scene_list.ObjectRow]:
+        """Return all objects of all sessions."""
+        return [row for session in self.server.sessions for row in session.rows()]
+
+    def go_to(self, number: int, instance: int | None) -> None:
+        """Show an object, and its scene if another one is shown."""
+        session = self.server.sessions[number]
+        if self._opened is None or self._opened.session is not session:
+            self._open(session)
+        self.select(instance)
+        if instance is not None:
+            self.views.look_at_object()
+
+    def renew(self, session: ReviewedSession) -> None:
+        """Show a session that was registered anew in place of what is shown of it."""
+        instance = self.selected
+        self._open(session)
+        known = {o.instance for o in session.registered.objects}
+        self.select(instance if instance in known else None)
+        self.say(f"{session.name} was registered anew; this is how it stands.")
+
+    def select(self, instance: int | None) -> None:
+        """Look at an object of this scene."""
+        with self.lock:
+            if instance != self.selected:
+                self.correct.put_back()
+                self.selected = instance
+                if self._opened is not None:
+                    self._opened.nodes.highlight(instance)
+            self.refresh(force=True)
+            for panel in (self.object, self.correct, self.grasps):
+                panel.selected()
+
+    def next_undecided(self, step: Literal[1, -1]) -> None:
+        """Go to the next object that waits for a person, or the one before."""
+        rows = scene_list.worst_first(self.rows())
+        now = None
+        if self._opened is not None and self.selected is not None:
+            now = (self._opened.session.number, self.selected)
+        row = scene_list.next_undecided(rows, now, step)
+        if row is None:
+            self.say("All objects are judged. Thank you.")
+            return
+        self.go_to(*row.key)
+
+    def _open(self, session: ReviewedSession) -> None:
+        """Load a session's scene and show it in place of the one before."""
+        with self.working("Opening the scene", session.name) as progress:
+            content = session.content(progress)
+            with self.lock:
+                if self._opened is not None:
+                    self.views.leave()
+                    self.correct.put_back()
+                    self.grasps.closed()
+                    self._opened.nodes.clear()
+                nodes = SceneNodes(self.client.scene, content, session.config)
+                with self.client.atomic():
+                    nodes.build()
+                nodes.on_object(self._guarded_call(self.select))
+                nodes.on_camera(self._guarded_call(self.views.stand_in))
+                nodes.on_grasp(self._guarded_call(self.grasps.clicked))
+                models = {o.instance: o.obj_id for o in content.scene.objects}
+                self._opened = Opened(session, content, nodes, models)
+                self.selected, self._seen, self._standing = None, None, None
+                for panel in (self.views, self.grasps, self.show):
+                    panel.opened()
+                self.views.first_look()
+
+    # --- what changed -----------------------------------------------------------------------------
+
+    def refresh(self, *, force: bool = False) -> None:
+        """Show the journals as they stand on disk; nothing is sent where nothing changed."""
+        if self._is_closed:
+            return
+        with self.lock:
+            seen = tuple(id(s.standing) for s in self.server.sessions)
+            if seen == self._seen and not force:
+                return
+            self._seen = seen
+            if self._opened is not None:
+                self._standing = self._opened.session.standing
+            with self.client.atomic():
+                self.list.refresh()
+                if self._opened is not None:
+                    self._place_all()
+                    for panel in (self.object, self.correct, self.views, self.grasps, self.show):
+                        panel.refresh()
+
+    def _place_all(self) -> None:
+        """Put every object where the reviewers left it, in the colour of its verdict."""
+        opened = self.opened
+        for placed in self.standing.scene.objects:
+            if opened.models[placed.instance] != placed.obj_id:
+                opened.nodes.swap(placed.instance, placed.obj_id)
+                opened.models[placed.instance] = placed.obj_id
+            opened.nodes.place(placed.instance, placed.T_world_obj)
+            opened.nodes.color_verdict(placed.instance, placed.verdict)
+
+    def hide_object(self, instance: int, is_hidden: bool) -> None:
+        """Hide one object, because a copy of it is moved or carried; or show it again."""
+        node = self.client.scene.get_handle_by_name(f"/objects/{instance}")
+        if node is not None:
+            node.visible = not is_hidden
+
+    def decided(self, entry: Entry, words: str = "") -> None:
+        """Say that a line is in the journal, and show it everywhere."""
+        done = words or f"{window_text.ACTION_WORDS.get(entry.action, 'taken back')}"
+        self.say(f"Recorded: {done}, signed {entry.reviewer}.")
+        self.server.tell()
+
+    # --- answers ----------------------------------------------------------------------------------
+
+    def say(self, text: str) -> None:
+        """Answer that something was done."""
+        self._message.content = window_text.message_html(text, "ok")
+
+    def refuse(self, text: str) -> None:
+        """Answer why something was not done."""
+        self._message.content = window_text.message_html(text, "refused")
+
+    def guarded(self, action: Callable[[Any], object]) -> Callable[[Any], None]:
+        """Return a callback that never ends silently: what goes wrong is said in the panel."""
+
+        def callback(event: Any) -> None:
+            # What the server itself changes comes with no client; only a person's hand counts.
+            if getattr(event, "client", self) is None or self._is_closed:
+                return
+            self.attempt(lambda: action(event))
+
+        return callback
+
+    def attempt(self, action: Callable[[], object]) -> bool:
+        """Do something; say what went wrong. Return whether it was done."""
+        try:
+            action()
+        except RealsimError as error:
+            self.refuse(str(error))
+        except Exception as error:
+            log.exception("the review page failed")
+            text = f"This is a bug in realsim, please report it with the log: {error!r}"
+            self._message.content = window_text.message_html(text, "bug")
+        else:
+            return True
+        self.refresh(force=True)
+        return False
+
+    def _guarded_call(self, action: Callable[..., object]) -> Callable[..., None]:
+        def callback(*given: Any) -> None:
+            if not self._is_closed:
+                self.attempt(lambda: action(*given))
+
+        return callback
+
+    @contextlib.contextmanager
+    def working(self, title: str, body: str) -> Generator[Callable[[int, int], None]]:
+        """Show that something takes long; a second such thing is refused meanwhile.
+
+        Yields:
+            A function to call with (done, total).
+
+        Raises:
+            InputError: something else is still under way.
+        """
+        if not self._busy.acquire(blocking=False):
+            raise InputError("something else is still under way; wait until it is done.")
+        note = self.client.add_notification(title, body, loading=True, with_close_button=False)
+        self.correct.enable(False)
+        try:
+            yield partial(_tell, note, body)
+        finally:
+            note.remove()
+            self._busy.release()
+            self.correct.enable(True)
+
+    # --- the reviewer's name ----------------------------------------------------------------------
+
+    def _recall_name(self) -> None:
+        """Take the name that this browser keeps, unless one was given."""
+        if self.reviewer:
+            return
+        try:
+            kept = self.client.local_storage.get_item(NAME_KEY, timeout=NAME_WAIT_S)
+        except (RuntimeError, TimeoutError):
+            return  # a browser that keeps nothing: the reviewer writes the name
+        if kept and not self.reviewer:
+            self._name.value = kept
+
+    def _keep_name(self) -> None:
+        self.client.local_storage.set_item(NAME_KEY, self.reviewer.strip())
+
+
+def _tell(note: Any, body: str, done: int, total: int) -> None:
+    share = np.clip(done / max(total, 1), 0.0, 1.0)
+    note.body = f"{body}: {100 * share:.0f} %"

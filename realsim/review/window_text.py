@@ -1,0 +1,208 @@
+"""What the review page says of an object, as the markdown of its panels.
+
+Names and comments come from other people and from files: they are escaped, so that a comment can
+neither look like a button nor bring a script along.
+"""
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.records import ObjectModel, ObjectPose
+from realsim.rendering.overlay import VERDICT_RGB
+from realsim.review.ellipsoid import rotation_sigmas_deg
+from realsim.review.grasp_words import escaped
+from realsim.review.journal import Entry
+from realsim.review.scene_list import ObjectRow
+
+LEAST_CONTRAST = 4.5
+"""Of letters to their ground: what WCAG 2.1 asks for at the size of the panel's text."""
+ACTION_WORDS = {
+    "accept": "accepted",
+    "reject": "rejected",
+    "comment": "commented",
+    "move": "moved it",
+    "swap": "swapped its id",
+    "symmetric": "marked it symmetric",
+    "exclude": "left the view out",
+    "include": "took the view in",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class CheckWords:
+    """How a check is shown."""
+
+    words: str
+    unit: str = ""
+    scale: float = 1.0
+
+
+MAIN_CHECKS = {
+    "agree": CheckWords("pixels that agree with the measured depth", "%", 100),
+    "cover": CheckWords("its seen surface that was measured", "%", 100),
+    "free_space_violation": CheckWords("pixels where the camera looked through it", "%", 100),
+    "residual_median_mm": CheckWords("median distance to the measured points", "mm"),
+    "held_out_shift_mm": CheckWords("shift when views are left out", "mm"),
+    "plane_gap_mm": CheckWords("gap to the table (negative: sunk in)", "mm"),
+    "penetration_mm": CheckWords("sunk into a neighbour", "mm"),
+    "wrong_surface": CheckWords("surface in the wrong place", "%", 100),
+    "views": CheckWords("views that see it"),
+    "n_pixels": CheckWords("pixels compared"),
+}
+"""What decides most often, in the order of the table."""
+
+
+def verdict_rgb(verdict: str) -> tuple[int, int, int]:
+    """Return the colour of a verdict, so dark that white letters can be read on it."""
+    rgb = np.array(VERDICT_RGB.get(verdict, VERDICT_RGB["unchecked"]), dtype=np.float64)
+    while 1.05 / (_luminance(rgb) + 0.05) < LEAST_CONTRAST:
+        rgb *= 0.97
+    r, g, b = (int(c) for c in rgb)
+    return r, g, b
+
+
+def _luminance(rgb: NDArray[np.float64]) -> float:
+    """Return the relative luminance of an sRGB colour, white = 1 (WCAG 2.1)."""
+    c = rgb / 255.0
+    linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def color_dot(verdict: str) -> str:
+    """Return a coloured dot for a verdict."""
+    return f'<span style="color:rgb{verdict_rgb(verdict)}">&#9679;</span>'
+
+
+def object_text(
+    shown: ObjectPose, corrected: ObjectPose, model: ObjectModel, decision: Entry | None
+) -> str:
+    """Return the head of an object's panel: what was computed, and what a person said of it.
+
+    Args:
+        shown: with the reviewers' verdict.
+        corrected: where the reviewers left it, with the computed verdict.
+        model: its model.
+        decision: the last standing accept or reject; None = nobody has judged it.
+    """
+    lines = [f"### {escaped(model.name)}", f"instance {shown.instance}, object {shown.obj_id}", ""]
+    lines.append(f"{color_dot(corrected.verdict)} computed: **{corrected.verdict}**")
+    lines += [f"- {escaped(reason)}" for reason in corrected.reasons]
+    lines.append("")
+    if decision is None:
+        lines.append("nobody has judged it yet")
+    else:
+        word = ACTION_WORDS[decision.action]
+        lines.append(f"{color_dot(shown.verdict)} **{word}** by {signed(decision)}")
+        if decision.comment:
+            lines.append(f"> {escaped(decision.comment)}")
+    return "\n".join(lines)
+
+
+def certainty_text(placed: ObjectPose, model: ObjectModel) -> str:
+    """Return how sure the pose is: probability, sigma in mm and in degrees."""
+    lines: list[str] = []
+    probability = placed.checks.get("probability")
+    if probability is not None and np.isfinite(probability):
+        lines.append(f"- right with a probability of {percent(probability)}")
+    turns = rotation_sigmas_deg(placed, model)
+    C = placed.covariance
+    if C is None or turns is None or not np.all(np.isfinite(C)):
+        lines.append("- how sure the pose is, is not known: nothing was computed of it")
+        return "\n".join(lines)
+    sigma = float(np.sqrt(max(float(np.linalg.eigvalsh(C[3:, 3:])[-1]), 0.0)))
+    lines.append(f"- 1 sigma of the position: {1e3 * sigma:.2g} mm along its worst axis")
+    lines.append(f"- 1 sigma of the turn: {turns.words}")
+    return "\n".join(lines)
+
+
+def checks_table(placed: ObjectPose, *, main: bool) -> str:
+    """Return the table of the checks that decide, or of all the others."""
+    rows: list[str] = []
+    if main:
+        for name, shown in MAIN_CHECKS.items():
+            if name in placed.checks:
+                rows.append(f"| {shown.words} | {figure(placed.checks[name], shown)} |")
+    else:
+        rest = {k: v for k, v in placed.checks.items() if k not in MAIN_CHECKS}
+        for name, value in rest.items():
+            rows.append(f"| {escaped(name)} | {value:.4g} |")
+    if not rows:
+        return "nothing was measured" if main else ""
+    return "\n".join(["| check | value |", "|:--|--:|", *rows])
+
+
+def figure(value: float, shown: CheckWords) -> str:
+    """Return a check's value with its unit."""
+    if not np.isfinite(value):
+        return "not measured"
+    scaled = shown.scale * value
+    if shown.unit == "%":
+        return percent(value)
+    if not shown.unit:
+        return f"{scaled:,.0f}"
+    return f"{scaled:.2g} {shown.unit}" if abs(scaled) < 100 else f"{scaled:.0f} {shown.unit}"
+
+
+def percent(share: float) -> str:
+    """Return a share as per cent; 100 % only where nothing is missing."""
+    value = 100.0 * share
+    if value >= 100.0 or value <= 0.0:
+        return f"{value:.0f} %"
+    return f"{min(value, 99.99):.2f} %" if value > 99.0 else f"{value:.1f} %"
+
+
+def history_text(entries: Sequence[Entry]) -> str:
+    """Return the standing lines on an object, the newest first."""
+    if not entries:
+        return "no lines in the journal"
+    lines: list[str] = []
+    for entry in reversed(entries):
+        word = ACTION_WORDS.get(entry.action, entry.action)
+        how = f" ({escaped(entry.how)})" if entry.how else ""
+        line = f"- {clock(entry)} **{escaped(entry.reviewer)}** {word}{how}"
+        lines.append(f"{line}: {escaped(entry.comment)}" if entry.comment else line)
+    return "\n".join(lines)
+
+
+def undo_label(last: Entry | None) -> str:
+    """Return what the undo button says: whose line it takes back."""
+    if last is None:
+        return "Undo"
+    return f"Undo: {last.reviewer} {ACTION_WORDS.get(last.action, last.action)}"[:48]
+
+
+def signed(entry: Entry) -> str:
+    """Return who wrote a line, and when."""
+    return f"{escaped(entry.reviewer)}, {clock(entry)}"
+
+
+def clock(entry: Entry) -> str:
+    """Return when a line was written, to the minute, in UTC."""
+    return f"{entry.time[:10]} {entry.time[11:16]} UTC"
+
+
+def list_label(row: ObjectRow, scene: str, *, with_scene: bool) -> str:
+    """Return one line of the list."""
+    parts = [f"{row.instance} {row.name}"]
+    if with_scene:
+        parts.insert(0, scene)
+    parts.append(row.verdict + (" (moved)" if row.is_changed else ""))
+    if not row.is_decided and np.isfinite(row.agree):
+        parts.append(percent(row.agree))
+    mark = "\u2713 " if row.is_decided else ""
+    return mark + " \u00b7 ".join(parts)
+
+
+def message_html(text: str, kind: str) -> str:
+    """Return the line that answers the last thing done: kind is ok, refused or bug."""
+    colors = {"ok": ("#ebfbee", "#2b8a3e"), "refused": ("#fff4e6", "#d9480f")}
+    back, edge = colors.get(kind, ("#fff5f5", "#c92a2a"))
+    style = (
+        f"background:{back};border-left:3px solid {edge};padding:6px 9px;margin:4px 10px;"
+        "font-size:13px;line-height:1.35;border-radius:3px;color:#212529;overflow-wrap:anywhere"
+    )
+    return f'<div class="realsim-message" style="{style}">{html.escape(text)}</div>'

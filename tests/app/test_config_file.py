@@ -1,0 +1,329 @@
+"""Settings: the command line over variables over the file over defaults, and errors that help."""
+
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from click.testing import CliRunner, Result
+
+from realsim.app.cli import commands
+from realsim.app.command import default_of, settable, spelling, walk
+from realsim.app.config.files import find_config, line_of, read_config
+from realsim.app.config.settings import settings_of
+from realsim.app.config.template import template, toml_value
+from realsim.errors import InputError
+
+EVERY = walk(commands)
+
+
+@pytest.fixture(autouse=True)
+def alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder, and no settings of the person who runs the tests."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "home"))
+    for name in ("REALSIM_CONFIG", "REALSIM_REGISTER_VIEWS"):
+        monkeypatch.delenv(name, raising=False)
+    return tmp_path
+
+
+def written(text: str, path: str = "settings.toml") -> Path:
+    file = Path(path)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text)
+    return file
+
+
+def read(text: str) -> dict[str, Any]:
+    return settings_of(commands, read_config(written(text), "", is_named=True))
+
+
+def refusal(text: str) -> str:
+    with pytest.raises(InputError) as error:
+        read(text)
+    return str(error.value)
+
+
+def show(*args: str) -> dict[str, Any]:
+    result = CliRunner().invoke(commands, [*args, "--json"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def in_force(command: str, option: str, *before: str) -> tuple[Any, str]:
+    told = show(*before, "config", "show", *command.split())
+    (row,) = [o for o in told["options"] if (o["command"], o["option"]) == (command, option)]
+    return row["value"], row["origin"]
+
+
+# --- the template is the whole truth ------------------------------------------------------------
+
+
+def uncommented() -> str:
+    return re.sub(r"^# (?=[a-z0-9-]+ = )", "", template(EVERY), flags=re.MULTILINE)
+
+
+def test_the_template_is_toml_and_says_nothing() -> None:
+    assert all(not keys for keys in _leaves(tomllib.loads(template(EVERY))))
+
+
+def _leaves(tables: dict[str, Any]) -> list[list[str]]:
+    keys = [k for k, v in tables.items() if not isinstance(v, dict)]
+    inner = [leaf for v in tables.values() if isinstance(v, dict) for leaf in _leaves(v)]
+    return [keys, *inner]
+
+
+def test_the_template_without_its_comment_marks_sets_every_option_to_its_default() -> None:
+    settings = read(uncommented())
+    for path, command in EVERY.items():
+        here: Any = settings
+        for name in path:
+            here = here.get(name, {})
+        for option in settable(command):
+            assert option.name is not None
+            default = default_of(option)
+            if option.name not in here:
+                assert default is None, (path, option.name)
+                continue
+            ctx = click.Context(command)
+            found = option.type_cast_value(ctx, here[option.name])
+            wanted = option.type_cast_value(ctx, default)
+            assert found == wanted, (path, option.name)
+
+
+def test_every_option_of_every_command_is_in_the_template() -> None:
+    tables = tomllib.loads(uncommented())
+    for path, command in EVERY.items():
+        here: Any = tables
+        for name in path:
+            here = here.get(name, {})
+        assert set(here) == {spelling(option) for option in settable(command)}, path
+
+
+@pytest.mark.parametrize("value", ["", 'a "quoted" \\ text', "Grüße", 3, 2.5, True, False, [1, 2]])
+def test_values_are_written_as_toml_reads_them(value: Any) -> None:
+    assert tomllib.loads(f"x = {toml_value(value)}")["x"] == value
+
+
+# --- who wins -----------------------------------------------------------------------------------
+
+
+def test_the_command_line_wins_over_variables_over_the_file_over_the_default(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    written("[register]\nviews = 64\n[school.run]\nforce = 20\n", "realsim.toml")
+    assert in_force("register", "views") == ("64", "realsim.toml, line 2")
+    assert in_force("school run", "force") == (20.0, "realsim.toml, line 4")
+    assert in_force("register", "method") == ("joint", "default")
+    monkeypatch.setenv("REALSIM_REGISTER_VIEWS", "32")
+    assert in_force("register", "views") == ("32", "REALSIM_REGISTER_VIEWS")
+    assert views_of_a_run() == "32"
+    assert views_of_a_run("--views", "16") == "16"
+    monkeypatch.delenv("REALSIM_REGISTER_VIEWS")
+    assert views_of_a_run() == "64"
+    Path("realsim.toml").unlink()
+    assert views_of_a_run() == "all"
+
+
+def views_of_a_run(*more: str) -> str:
+    """Return what `realsim register` would get as --views."""
+    seen: list[str] = []
+    command = commands.get_command(click.Context(commands), "register")
+    assert command is not None
+    kept, command.callback = command.callback, lambda **options: seen.append(options["views"])
+    try:
+        result = CliRunner().invoke(commands, ["register", "s", *more], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+    finally:
+        command.callback = kept
+    return seen[0]
+
+
+def test_every_option_can_be_set_in_the_file_and_by_its_variable(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each to another value than its default, by the place that the option has in the tree."""
+    for path, command in EVERY.items():
+        for option in settable(command):
+            other = another_value(option)
+            text = f"[{'.'.join(path)}]\n{spelling(option)} = {toml_value(other)}\n"
+            here: Any = read(text)
+            for name in path:
+                here = here[name]
+            ctx = click.Context(command, default_map=here)
+            wanted = option.type_cast_value(click.Context(command), other)
+            value, source = option.consume_value(ctx, {})
+            assert source is click.core.ParameterSource.DEFAULT_MAP, (path, option.name)
+            assert option.type_cast_value(ctx, value) == wanted
+            assert isinstance(option.envvar, str)
+            single = other[0] if isinstance(other, list) else other
+            monkeypatch.setenv(
+                option.envvar, str(single).lower() if single is True else str(single)
+            )
+            value, source = option.consume_value(ctx, {})
+            assert source is click.core.ParameterSource.ENVIRONMENT
+            assert option.type_cast_value(ctx, value) == wanted, (path, option.name)
+            monkeypatch.delenv(option.envvar)
+
+
+def another_value(option: click.Option) -> Any:
+    kind = option.type
+    if option.is_flag:
+        return True
+    if isinstance(kind, click.Choice):
+        value: Any = list(kind.choices)[-1]
+    elif isinstance(kind, click.IntRange):
+        value = int(kind.max if kind.max is not None else (kind.min or 0) + 7)
+    elif isinstance(kind, click.FloatRange):
+        value = 0.75
+    elif kind is click.INT:
+        value = 11
+    elif kind is click.FLOAT:
+        value = 0.125
+    else:
+        value = "another"
+    return [value] if option.multiple else value
+
+
+# --- which file ---------------------------------------------------------------------------------
+
+
+def test_the_first_file_that_is_there_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    def views(*before: str) -> Any:
+        return in_force("register", "views", *before)[0]
+
+    assert views() == "all"
+    written("[register]\nviews = 1\n", "home/realsim/config.toml")
+    assert views() == "1"
+    written("[register]\nviews = 2\n", "realsim.toml")
+    assert views() == "2"
+    written("[register]\nviews = 3\n", "variable.toml")
+    monkeypatch.setenv("REALSIM_CONFIG", "variable.toml")
+    assert views() == "3"
+    written("[register]\nviews = 4\n", "named.toml")
+    assert views("--config", "named.toml") == "4"
+    monkeypatch.setenv("REALSIM_CONFIG", "")
+    assert views() == "all"
+    assert find_config(None) is None
+
+
+def run(*args: str) -> subprocess.CompletedProcess[str]:
+    code = "from realsim.app.cli import main; main()"
+    return subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True)
+
+
+def test_a_file_in_the_current_folder_is_told_once_and_not_to_the_quiet() -> None:
+    written("[board]\npaper = 'A3'\n", "realsim.toml")
+    loud = run("board", "tag:7,size=80mm", "--out", "a", "--json")
+    assert loud.returncode == 0 and loud.stderr.count("realsim.toml") == 1
+    assert json.loads(loud.stdout)["paper"] == "A3"
+    quiet = run("board", "tag:7,size=80mm", "--out", "b", "--quiet")
+    assert quiet.returncode == 0 and quiet.stderr == ""
+    named = run("--config", "realsim.toml", "board", "tag:7,size=80mm", "--out", "c")
+    assert named.returncode == 0 and named.stderr == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("--config", "gone.toml"), ("REALSIM_CONFIG", "gone.toml")]
+)
+def test_a_named_file_that_is_not_there_is_an_error(
+    name: str, value: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    args = ["--config", value] if name.startswith("--") else []
+    if not args:
+        monkeypatch.setenv(name, value)
+    done = run(*args, "scan", "list")
+    assert done.returncode == 2 and "gone.toml" in done.stderr and name in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+# --- what it refuses ----------------------------------------------------------------------------
+
+REFUSED = {
+    "[registre]\nviews = 3": ["settings.toml, line 1", "[registre]", "did you mean register"],
+    "\n[register]\nmethod = 'joint'\nview = 3": [
+        "settings.toml, line 4", "no option 'view'", "did you mean views", "depth-bias",
+    ],
+    "[register]\nmethod = 'both'": ["line 2", '"both"', "joint", "top-down"],
+    "[demo]\nviews = 'many'": ["line 2", "a whole number"],
+    "[demo]\nviews = 2": ["line 2", "2", "4<=x<=1024"],
+    "[demo]\nviews = true": ["line 2", "true", "a whole number"],
+    "[demo]\nviews = 4.5": ["line 2", "4.5", "a whole number"],
+    "[demo]\nviews = [4]": ["line 2", "a whole number"],
+    "[demo]\nquiet = 1": ["line 2", "true or false"],
+    "[demo]\nquiet = 'yes'": ["line 2", "true or false"],
+    "[register]\ndepth-bias = 'off'\ndepth_bias = 'off'": ["twice"],
+    "[school]\nforce = 20": ["line 2", "'force'", "school.run"],
+    "[school.rum]\nforce = 20": ["line 1", "did you mean run"],
+    "workers = 8": ["line 1", "'workers'", "outside of a command's table"],
+    "register = 3": ["line 1", "[register]"],
+    "[register]\nsession = 'a'": ["no option 'session'"],
+    "[register]\nhelp = true": ["no option 'help'"],
+    "[register\nviews = 1": ["settings.toml is not TOML", "line 1"],
+    "[register]\nviews = ": ["settings.toml is not TOML"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_what_cannot_be_used_is_named_with_its_line_and_what_would_do(text: str) -> None:
+    said = refusal(text)
+    for words in REFUSED[text]:
+        assert words in said, said
+    assert "\n" not in said
+
+
+def test_a_wrong_file_stops_work_but_not_help_doctor_and_config_template() -> None:
+    written("[registre]\n", "realsim.toml")
+    assert run("scan", "list").returncode == 2
+    assert run("config", "show").returncode == 2
+    for args in (["--help"], ["config", "template"], ["completion", "bash"]):
+        assert run(*args).returncode == 0
+
+
+@pytest.mark.parametrize("data", [b"\xff\xfe\x00", b"\x00" * 9, b"[a]" * 3])
+def test_bytes_that_are_no_text_are_named(data: bytes) -> None:
+    Path("realsim.toml").write_bytes(data)
+    done = run("config", "show")
+    assert done.returncode == 2 and "realsim.toml" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_variable_that_cannot_be_used_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("REALSIM_DEMO_VIEWS", "many")
+    done = run("demo")
+    assert done.returncode == 2 and "REALSIM_DEMO_VIEWS" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_variable_of_no_option_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("REALSIM_REGISTER_VIEW", "3")
+    result: Result = CliRunner().invoke(commands, ["config", "show"])
+    assert "REALSIM_REGISTER_VIEW is of no option" in result.output
+    assert "REALSIM_REGISTER_VIEWS?" in result.output.replace("\n", "")
+
+
+def test_both_spellings_of_a_key_and_empty_texts() -> None:
+    assert read("[register]\ndepth_bias = 'off'") == {"register": {"depth_bias": "off"}}
+    assert read("[register]\ndepth-bias = 'off'") == {"register": {"depth_bias": "off"}}
+    assert read('[register]\nlibrary = ""') == {"register": {}}
+
+
+@pytest.mark.parametrize(
+    ("text", "tables", "key", "line"),
+    [
+        ("[a]\nx = 1\n[b]\nx = 2", ("b",), "x", 4),
+        ("[a.b]\n\n# x = 3\nx = 1", ("a", "b"), "x", 4),
+        ("a.b.x = 1", ("a", "b"), "x", 1),
+        ("[a]\nb = {x = 1}", ("a", "b"), "", 2),
+        ("[a]\nx = 1", ("a",), "y", None),
+    ],
+)
+def test_lines_are_those_of_the_file(
+    text: str, tables: tuple[str, ...], key: str, line: int | None
+) -> None:
+    assert line_of(text, tables, key) == line

@@ -1,0 +1,208 @@
+"""The console: colours and progress only where a terminal wants them, one document for programs."""
+
+import json
+import os
+import pty
+import re
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim.app import console as module
+from realsim.app.console import Console, duration
+from realsim.app.json_values import json_document, json_value
+
+HEADER = ["object", "tried", "reach of the arm [mm]", "place [m]", "sentence"]
+ROWS = [["a mug of twenty words", 123456.789, 98765.4321, "0.123 0.456", "half of it is hidden"]]
+SCRIPT = f"""
+import time
+from realsim.app.console import Console
+console = Console()
+console.table("Objects", {HEADER!r}, {ROWS!r})
+console.warn("look here")
+with console.stage("capture", "many views") as tick:
+    for k in range(5):
+        tick(k + 1, 5)
+        time.sleep(0.03)
+"""
+PLAIN_ENVIRONMENT = {
+    k: v for k, v in os.environ.items() if k not in ("NO_COLOR", "FORCE_COLOR", "TERM", "COLUMNS")
+}
+
+
+def on_a_terminal(columns: int = 100, **environment: str) -> str:
+    """Return what the script writes to a terminal."""
+    parent, child = pty.openpty()
+    env = PLAIN_ENVIRONMENT | {"TERM": "xterm-256color", "COLUMNS": str(columns)} | environment
+    process = subprocess.Popen(
+        [sys.executable, "-c", SCRIPT], stdout=child, stderr=child, stdin=child, env=env
+    )
+    os.close(child)
+    said = b""
+    while True:
+        try:
+            part = os.read(parent, 65536)
+        except OSError:
+            break
+        if not part:
+            break
+        said += part
+    os.close(parent)
+    assert process.wait() == 0
+    return said.decode()
+
+
+def piped(**environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True,
+        env=PLAIN_ENVIRONMENT | {"TERM": "xterm-256color"} | environment,
+    )  # fmt: skip
+
+
+COLOUR = re.compile(r"\x1b\[[0-9;]*3[0-9]")
+"""An escape sequence that sets a colour."""
+
+
+def test_a_terminal_gets_colours_and_a_bar_with_the_time_that_is_left() -> None:
+    said = on_a_terminal()
+    assert COLOUR.search(said) and "5/5" in said and "left" in said
+
+
+def test_a_pipe_gets_no_escape_sequence_and_no_bar() -> None:
+    done = piped()
+    assert "\x1b" not in done.stdout + done.stderr and "\r" not in done.stdout + done.stderr
+    assert "Objects" in done.stdout and "note: look here" in done.stderr
+    assert "5/5" not in done.stderr
+
+
+@pytest.mark.parametrize("variables", [{"NO_COLOR": "1"}, {"TERM": "dumb"}])
+def test_a_terminal_may_refuse_colours(variables: dict[str, str]) -> None:
+    assert not COLOUR.search(on_a_terminal(**variables))
+
+
+def test_a_dumb_terminal_gets_no_escape_sequence() -> None:
+    assert "\x1b" not in on_a_terminal(TERM="dumb")
+
+
+def test_colours_can_be_forced_into_a_pipe_but_bars_cannot() -> None:
+    done = piped(FORCE_COLOR="1")
+    assert "\x1b[" in done.stdout and "\r" not in done.stderr and "5/5" not in done.stderr
+
+
+def test_no_color_wins_over_force_color() -> None:
+    done = piped(FORCE_COLOR="1", NO_COLOR="1")
+    assert "\x1b" not in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("columns", [40, 60, 80, 100, 200])
+def test_no_number_is_cut_in_two_and_no_line_is_too_wide(columns: int) -> None:
+    said = re.sub(r"\x1b\[[0-9;]*m", "", on_a_terminal(columns))
+    table = said.partition("note:")[0]
+    for word in ("123456.789", "98765.4321", "0.123", "0.456", "hidden", "twenty"):
+        assert word in table, word
+    assert all(len(line) <= columns for line in table.replace("\r", "").splitlines())
+
+
+def test_a_log_gets_a_line_at_most_every_ten_seconds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter(float(s) for s in range(10_000))
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    console = Console()
+    for name in ("first", "second"):
+        with console.stage(name) as tick:
+            for k in range(50):
+                tick(k + 1, 50)
+    lines = capsys.readouterr().err.splitlines()
+    assert 8 <= len(lines) <= 10  # a second each tick, a hundred ticks
+    assert re.fullmatch(r"first: 16 % \(8 of 50\), \d+ s left", lines[0]) or "left" in lines[0]
+    shares = [int(re.findall(r"(\d+) %", line)[0]) for line in lines]
+    assert shares[:4] == sorted(shares[:4])
+
+
+def test_the_time_that_is_left_is_the_time_that_it_takes(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    clock = iter([0.0, 0.0, 20.0])  # console, stage, tick
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    with Console().stage("render") as tick:
+        tick(1, 4)
+    assert capsys.readouterr().err == "render: 25 % (1 of 4), 60 s left\n"
+
+
+def test_a_quiet_console_shows_no_progress_but_every_note(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(module, "SECONDS_BETWEEN_LINES", 0.0)
+    console = Console(quiet=True)
+    with console.stage("render") as tick:
+        tick(1, 2)
+    console.warn("look here")
+    console.say("result")
+    told = capsys.readouterr()
+    assert told.err == "note: look here\n" and told.out == "result\n"
+
+
+def test_json_has_stdout_for_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    console = Console(as_json=True)
+    console.table("Objects", HEADER, ROWS)
+    console.say("written")
+    console.warn("look here")
+    console.result({"a": 1})
+    told = capsys.readouterr()
+    assert json.loads(told.out) == {"a": 1}
+    assert "written" in told.err and "look here" in told.err
+
+
+def test_without_json_there_is_no_document(capsys: pytest.CaptureFixture[str]) -> None:
+    Console().result({"a": 1})
+    assert capsys.readouterr().out == ""
+
+
+def test_a_stage_costs_what_it_costs() -> None:
+    console = Console(quiet=True)
+    with console.stage("work"):
+        time.sleep(0.02)
+        sum(range(200_000))
+    (cost,) = console.times
+    assert cost.name == "work" and cost.wall_s >= 0.02 and cost.cpu_s <= cost.wall_s + 0.05
+
+
+@dataclass(frozen=True)
+class Record:
+    folder: Path
+    values: np.ndarray
+    share: float
+
+
+def test_json_has_records_arrays_paths_and_no_nan() -> None:
+    record = Record(Path("a/b"), np.array([[1.5, np.nan], [np.inf, 0.1]]), float("nan"))
+    told = json.loads(json_document({"r": record, "n": np.int64(3), "k": {2: (1, None, True)}}))
+    assert told == {
+        "r": {"folder": "a/b", "values": [[1.5, None], [None, 0.1]], "share": None},
+        "n": 3,
+        "k": {"2": [1, None, True]},
+    }
+
+
+def test_json_of_json_is_the_same() -> None:
+    value = {"a": [1, 2.5, "x", None, {"b": True}]}
+    assert json_value(value) == value == json_value(json_value(value))
+
+
+def test_what_is_no_json_is_refused() -> None:
+    with pytest.raises(TypeError, match="object"):
+        json_value({"a": object()})
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (89, "89 s"), (90, "2 min"), (5399, "1 h 30 min"),
+                          (12_000, "3 h 20 min")]
+)  # fmt: skip
+def test_a_time_is_said_as_people_say_it(seconds: float, text: str) -> None:
+    assert duration(seconds) == text

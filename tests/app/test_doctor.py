@@ -1,0 +1,256 @@
+"""`realsim doctor`: what it finds is so, a crash is a finding, and it names the way out."""
+
+import json
+import socket
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from realsim.app.console import Console
+from realsim.app.doctor import devices, isolation, machine, software
+from realsim.app.doctor.finding import Finding
+from realsim.app.doctor.isolation import Outcome, isolated
+from realsim.app.doctor.packages import EXTRAS, REQUIRED
+from realsim.app.doctor.run import show
+from realsim_capture_plans.devices.ur_loopback import LoopbackController
+
+PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+OK = Outcome(ok=True, told="")
+
+
+def no_tick(done: int, total: int) -> None:
+    """Nothing is shown."""
+
+
+def outcomes(**changed: Outcome) -> Mapping[str, Outcome]:
+    found = dict.fromkeys([*software.software_probes(), "import:pyrealsense2"], OK)
+    return found | {name.replace("__", ":").replace("_so", ".so"): o for name, o in changed.items()}
+
+
+def named(findings: list[Finding], name: str) -> Finding:
+    return next(f for f in findings if f.name == name)
+
+
+# --- the packages are those of the project ------------------------------------------------------
+
+
+def test_every_package_of_the_project_is_looked_at_and_no_other() -> None:
+    wanted = {Requirement(line).name for line in PROJECT["dependencies"]}
+    assert {p.name for p in REQUIRED} == wanted
+    extras = {
+        (extra, Requirement(line).name)
+        for extra, lines in PROJECT["optional-dependencies"].items()
+        for line in lines
+    }
+    assert {(p.extra, p.name) for p in EXTRAS} == extras
+
+
+@pytest.mark.parametrize("extra", sorted({p.extra for p in EXTRAS}))
+def test_a_missing_extra_is_a_note_with_the_command_that_gets_it(
+    extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(software, "_version", lambda p: None if p.extra == extra else "1.0")
+    found = software.software_findings(outcomes())
+    missing = [f for f in found if f.kind != "ok" and f.group.startswith("Extras")]
+    assert {f.name for f in missing} == {p.name for p in EXTRAS if p.extra == extra}
+    assert all(f.kind == "note" and f"realsim[{extra}]" in f.todo for f in missing)
+
+
+def test_a_missing_required_package_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(software, "_version", lambda p: None if p.name == "gtsam" else "1.0")
+    found = named(software.software_findings(outcomes()), "gtsam")
+    assert found.kind == "problem" and "pip install" in found.todo
+
+
+def test_a_package_that_cannot_be_loaded_says_why() -> None:
+    bad = Outcome(ok=False, told="crashed (SIGSEGV)")
+    found = named(software.software_findings(outcomes(import__open3d=bad)), "open3d-cpu")
+    assert found.kind == "problem" and "SIGSEGV" in found.found
+
+
+@pytest.mark.parametrize(
+    ("library", "package"), [("libEGL.so.1", "libegl1"), ("libGL.so.1", "libgl1")]
+)
+def test_a_missing_library_is_a_problem_with_its_debian_package(library: str, package: str) -> None:
+    told = dict(outcomes()) | {f"library:{library}": Outcome(ok=False, told="no such file")}
+    found = named(software.software_findings(told), library)
+    assert found.kind == "problem" and f"apt-get install --no-install-recommends {package}" in (
+        found.todo
+    )
+
+
+def test_libusb_may_come_with_the_wheel() -> None:
+    missing = {"library:libusb-1.0.so.0": Outcome(ok=False, told="")}
+    told = dict(outcomes()) | missing
+    assert named(software.software_findings(told), "libusb-1.0.so.0").kind == "ok"
+    told |= {"import:pyrealsense2": Outcome(ok=False, told="")}
+    assert named(software.software_findings(told), "libusb-1.0.so.0").kind == "problem"
+
+
+# --- isolation ----------------------------------------------------------------------------------
+
+CRASHING = """
+import os, signal, sys, time
+from realsim.app.doctor import probe
+def crash(what):
+    if what == "slow": time.sleep(60)
+    if what == "exit": os._exit(3)
+    os.kill(os.getpid(), getattr(signal, what))
+probe.PROBES["crash"] = crash
+probe.PROBES["loud"] = lambda what: os.write(1, b'{"probe": "loud:x"}') and "done"
+probe.main(sys.argv[1:])
+"""
+
+
+@pytest.fixture
+def crashing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the probes' program have probes that crash, in real processes."""
+    real = subprocess.Popen
+
+    def popen(command: list[str], **options: object) -> object:
+        assert command[1:3] == ["-m", "realsim.app.doctor.probe"]
+        return real([sys.executable, "-c", CRASHING, *command[3:]], **options)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(isolation.subprocess, "Popen", popen)
+
+
+@pytest.mark.usefixtures("crashing")
+def test_a_crash_takes_only_its_own_probe_along() -> None:
+    names = ["import:json", "crash:SIGSEGV", "import:csv", "crash:exit", "crash:SIGABRT",
+             "import:no_such_module_here", "loud:x", "import:math"]  # fmt: skip
+    ticks: list[tuple[int, int]] = []
+    found = isolated(names, lambda done, total: ticks.append((done, total)))
+    assert list(found) and set(found) == set(names)
+    assert {n for n, o in found.items() if o.ok} == {
+        "import:json", "import:csv", "loud:x", "import:math"
+    }  # fmt: skip
+    assert found["crash:SIGSEGV"].told == "crashed (SIGSEGV)"
+    assert found["crash:SIGABRT"].told == "crashed (SIGABRT)"
+    assert "exit code 3" in found["crash:exit"].told
+    assert "No module named 'no_such_module_here'" in found["import:no_such_module_here"].told
+    assert found["loud:x"].told == "done"  # what libraries print is no answer
+    assert ticks[-1][1] == len(names)
+
+
+@pytest.mark.usefixtures("crashing")
+def test_what_hangs_is_ended() -> None:
+    begun = time.monotonic()
+    found = isolated(["crash:slow", "import:json"], no_tick, timeout_s=8.0)
+    assert not found["crash:slow"].ok and "8 s" in found["crash:slow"].told
+    assert found["import:json"].ok and time.monotonic() - begun < 40
+
+
+# --- the machine --------------------------------------------------------------------------------
+
+
+def test_what_the_store_needs_works_here_and_nothing_is_left(tmp_path: Path) -> None:
+    found = machine.machine_findings(tmp_path, OK)
+    assert named(found, "locks and atomic writing").kind == "ok"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_is_a_problem() -> None:
+    found = machine.machine_findings(Path("/proc"), OK)
+    bad = named(found, "locks and atomic writing")
+    assert bad.kind == "problem" and "/proc" in bad.found and "local disk" in bad.todo
+
+
+def test_a_full_disk_is_a_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = machine.shutil.disk_usage(tmp_path)
+    for free, kind in ((4e8, "problem"), (4e9, "note"), (4e10, "ok")):
+        monkeypatch.setattr(machine.shutil, "disk_usage", lambda _, f=free: usage._replace(free=f))
+        assert named(machine.machine_findings(tmp_path, OK), "disk of the session").kind == kind
+
+
+def test_the_filesystem_is_that_of_the_deepest_mount() -> None:
+    assert machine.filesystem_of(Path("/proc/self")) == "proc"
+    assert machine.filesystem_of(Path("/")) not in ("", "proc")
+
+
+def test_a_clock_in_the_past_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine.time, "time", lambda: 1e9)
+    assert named(machine.machine_findings(None, OK), "clock").kind == "problem"
+
+
+def test_a_cache_that_cannot_be_written_names_the_variable() -> None:
+    bad = Outcome(ok=False, told="RuntimeError: no locator available")
+    found = named(machine.machine_findings(None, bad), "numba's cache")
+    assert found.kind == "problem" and "NUMBA_CACHE_DIR" in found.todo
+
+
+# --- devices ------------------------------------------------------------------------------------
+
+
+def test_no_camera_is_a_note_and_one_at_usb_2_too() -> None:
+    assert [f.kind for f in devices.camera_findings(Outcome(ok=True, told=[]))] == ["note"]
+    for usb, kind in (("2.1", "note"), ("3.2", "ok")):
+        device = {"name": "Intel RealSense D405", "serial": "12", "usb": usb}
+        (found,) = devices.camera_findings(Outcome(ok=True, told=[device]))
+        assert found.kind == kind and "12" in found.found and "D405" in found.found
+
+
+def test_a_robot_that_answers_is_found_and_a_silent_one_within_the_time() -> None:
+    with LoopbackController.start(robot="UR5", speedup=10) as controller:
+        found = devices.robot_findings(controller.host)
+        assert [f.kind for f in found] == ["ok", "ok"], found
+    begun = time.monotonic()
+    found = devices.robot_findings("192.0.2.1", timeout_s=0.3)  # TEST-NET: nobody answers there
+    assert [f.kind for f in found] == ["problem", "problem"]
+    assert time.monotonic() - begun < 5 and all("network" in f.todo for f in found)
+
+
+def test_a_host_that_is_none_is_named() -> None:
+    found = devices.robot_findings("robot.invalid")
+    assert all(f.kind == "problem" and "robot.invalid" in f.name for f in found)
+
+
+# --- the command --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "fine"), [("ok", True), ("note", True), ("problem", False)])
+def test_only_a_problem_fails(kind: str, fine: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    finding = Finding(group="Machine", name="clock", kind=kind, found="x", todo="set it")  # type: ignore[arg-type]
+    assert show([finding], Console()) is fine
+    assert "set it" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_the_whole_examination_is_quick_and_right_about_this_machine(tmp_path: Path) -> None:
+    code = (
+        "import resource, sys\nfrom realsim.app.cli import main\n"
+        "try: main()\nfinally:\n"
+        " t = [resource.getrusage(w) for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]\n"
+        " sys.stderr.write(f'CPU {sum(u.ru_utime + u.ru_stime for u in t)}')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "doctor", str(tmp_path), "--json"],
+        capture_output=True, text=True, timeout=600,
+    )  # fmt: skip
+    told = json.loads(done.stdout)
+    kinds = {f["name"]: f["kind"] for f in told["findings"]}
+    assert done.returncode == (0 if told["ok"] else 1)
+    assert all(kinds[p.name] == "ok" for p in REQUIRED)  # these tests run with all of them
+    assert float(done.stderr.rpartition("CPU ")[2]) < 10.0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_session_that_is_none_is_refused(tmp_path: Path) -> None:
+    code = "from realsim.app.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "doctor", str(tmp_path / "gone")],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2 and "gone" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_port_that_is_refused_is_no_answer() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        assert devices._port("127.0.0.1", port, "test", 1.0).kind == "ok"
+    assert devices._port("127.0.0.1", port, "test", 1.0).kind == "problem"

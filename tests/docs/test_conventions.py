@@ -1,0 +1,188 @@
+"""What docs/conventions.md states is what the code does: a statement, and the law behind it."""
+
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+import trimesh
+from documents import ROOT
+from scipy.spatial.transform import Rotation
+
+from realsim import CameraIntrinsics, Mesh, ObjectModel, TagBoard
+from realsim.formats import images, label_maps
+from realsim.formats.bop.models import load_models, save_models
+from realsim.formats.grasps.hand_frames import grasp_poses, hand_poses
+from realsim.geometry import camera, se3
+from realsim.geometry.parts import part
+from realsim.interop import T_world_cam_from_gl, colmap_from_opencv_px
+from realsim.records import MEASURES, STAGES, Verdict
+from realsim.records.depth_bias import DepthBias
+from realsim.registration.judging.probability import CONTRAST_DECIDED
+from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim_sim_bridge.annotation.config import SightConfig
+from realsim_sim_bridge.slip.score import ScoreLimits, recompute_scores
+
+PAGE = " ".join((ROOT / "docs/conventions.md").read_text(encoding="utf-8").split())
+LENS = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.0, cy=23.0)
+RNG = np.random.default_rng(0)
+T = se3.random_transform(RNG)
+
+
+def states(*words: str) -> None:
+    missing = [w for w in words if " ".join(w.split()) not in PAGE]
+    assert not missing, f"conventions.md does not say: {missing}"
+
+
+def test_transforms_map_b_to_a() -> None:
+    states("`p_a = T_a_b @ p_b`")
+    p = RNG.normal(size=3)
+    assert np.allclose(se3.transform(T, p), (T @ [*p, 1.0])[:3])
+
+
+def test_a_twist_has_its_rotation_first_and_perturbs_on_the_right() -> None:
+    states("`[wx wy wz vx vy vz]`", "perturbs on the right: `T @ exp(xi)`")
+    assert np.allclose(se3.exp([0, 0, 0.3, 0, 0, 0])[:3, 3], 0)
+    assert np.allclose(se3.exp([0, 0, 0, 1, 2, 3])[:3, 3], [1, 2, 3])
+    xi = 0.1 * RNG.normal(size=6)
+    assert np.allclose(se3.log(se3.invert(T) @ (T @ se3.exp(xi))), xi)
+
+
+def test_cameras_look_along_z_with_y_down() -> None:
+    states("OpenCV: x right, y down, z forward")
+    T_world_cam = se3.look_at([0.0, -1.0, 0.0], [0.0, 0.0, 0.0])
+    assert np.allclose(T_world_cam[:3, 2], [0, 1, 0]) and T_world_cam[2, 1] < -0.99
+
+
+def test_the_board_begins_at_its_first_tags_corner() -> None:
+    states("origin at the first tag's top-left corner, x along the columns, y down the page")
+    points = TagBoard(rows=2, columns=3, tag_size_m=0.03, gap_m=0.01).points_board
+    assert np.allclose(points.min(0), 0) and np.allclose(points.max(0), [0.11, 0.07, 0])
+    states("z into the paper")
+    # Seen from the front, x right and y down: z points away from the camera that sees it upright.
+    T_cam_board = se3.from_translation([0, 0, 0.5])
+    uv = camera.project(LENS, se3.transform(T_cam_board, points))
+    assert uv[:, 0].argmax() == points[:, 0].argmax() and T_cam_board[2, 2] > 0
+
+
+def test_an_integer_pixel_is_a_pixels_centre() -> None:
+    states("an integer coordinate is a pixel's centre", "extra half pixel")
+    assert np.allclose(camera.project(LENS, [[0.0, 0.0, 1.0]]), [[31.0, 23.0]])
+    assert np.allclose(camera.pixel_grid(2, 1).reshape(-1, 2), [[0, 0], [1, 0]])
+    assert np.allclose(colmap_from_opencv_px([[0.0, 0.0]]), [[0.5, 0.5]])
+
+
+def wall() -> tuple[LabelRenderer, np.ndarray]:
+    v = np.array([[-1.0, -1, 0.8], [1, -1, 0.8], [1, 1, 0.8], [-1, 1, 0.8]])
+    mesh = Mesh(vertices=v, faces=np.array([[0, 1, 2], [0, 2, 3]]))
+    v = 0.25 * (v - [0, 0, 0.8]) + [0, 0, 0.4]
+    front = Mesh(vertices=v - [0.2, 0, 0], faces=np.array([[0, 1, 2], [0, 2, 3]]))
+    return LabelRenderer([PlacedMesh(0, mesh, np.eye(4)), PlacedMesh(1, front, np.eye(4))]), v
+
+
+def test_depth_is_along_z_and_silhouettes_are_amodal() -> None:
+    states("float32 metres along z (not along the ray), 0 = no measurement", "`mask/` is amodal")
+    labels = wall()[0].render(LENS, np.eye(4))
+    assert labels.depth_m.dtype == np.float32
+    behind = labels.visible(0)
+    assert np.allclose(labels.depth_m[behind], 0.8, atol=1e-6)
+    assert labels.amodal[0].all() and not behind.all()
+    states("visible pixels / all pixels of the object's silhouette")
+    share = labels.px_count_visib[0] / labels.px_count_all[0]
+    assert labels.visible_fraction[0] == share < 1
+    away = wall()[0].render(LENS, se3.from_rt(se3.exp_so3([np.pi, 0, 0]), np.zeros(3)))
+    assert not away.depth_m.any()
+
+
+def test_a_quaternion_has_its_order_in_its_name() -> None:
+    states("`quaternion_wxyz`, `quaternion_xyzw`")
+    assert np.allclose(se3.quaternion_wxyz(np.eye(3)), [1, 0, 0, 0])
+    R = Rotation.from_rotvec([0.1, 0.2, 0.3])
+    assert np.allclose(np.roll(R.as_quat(), 1), se3.quaternion_wxyz(R.as_matrix()))
+
+
+def test_verdicts_are_the_four() -> None:
+    states("`accepted`, `doubtful` (a person looks), `rejected`", "`unchecked`")
+    assert set(get_args(Verdict)) == {"accepted", "doubtful", "rejected", "unchecked"}
+
+
+def test_label_maps_are_coded_as_the_table_says() -> None:
+    states("instance + 1; 0 = no object")
+    assert label_maps.instance_counts(np.array([[-1, 0, 6]], np.int32)).tolist() == [[0, 1, 7]]
+    states("0 to 65535 over the model's box", "the box's own corner is 1 1 1")
+    low, high = np.zeros(3), np.array([0.1, 0.2, 0.3])
+    counts = label_maps.coordinate_counts([low, high], low, high)
+    assert counts.tolist() == [[1, 1, 1], [65535, 65535, 65535]]
+    states("round((n + 1) * 32767.5)")
+    n = np.array([[0.6, 0.0, -0.8]], np.float32)
+    assert np.abs(label_maps.normal_counts(n) - np.round((n + 1) * 32767.5)).max() <= 1
+
+
+def test_models_are_millimetres_on_disk_and_metres_in_memory(tmp_path: Path) -> None:
+    states("m in memory", "mm in a library's `obj_*.ply`")
+    mesh = part("box").mesh
+    save_models(tmp_path, {3: ObjectModel(obj_id=3, name="box", mesh=mesh)})
+    there = trimesh.load(tmp_path / "obj_000003.ply", process=False)
+    assert np.allclose(there.bounds, 1e3 * mesh.bounds, atol=1e-3)
+    assert np.allclose(load_models(tmp_path)[3].mesh.bounds, mesh.bounds, atol=1e-6)
+
+
+def test_depth_images_are_counts_of_the_stated_unit() -> None:
+    states("png * `depth_scale` = mm")
+    counts = images.depth_counts(np.array([[0.5, 0.0]]), 1e-4)  # depth_scale 0.1
+    assert counts.tolist() == [[5000, 0]]
+
+
+def test_the_bias_of_depth_is_that_of_its_inverse() -> None:
+    states("`1 / z_true = scale / z + offset`")
+    bias = DepthBias(scale=1.02, offset_per_m=-0.01)
+    z = 0.4
+    assert np.isclose(1 / bias.corrected(np.array([z]))[0], 1.02 / z - 0.01)
+
+
+def test_contrast_is_undecided_below_a_tenth() -> None:
+    states("below 0.1 it is undecided")
+    assert CONTRAST_DECIDED == 0.1
+
+
+def test_stages_and_measures_are_those_of_the_table() -> None:
+    states("close, lift, oscillate, pendulum")
+    assert STAGES == ("close", "lift", "oscillate", "pendulum")
+    states(*(f"`{name}`" for name in MEASURES))
+
+
+def test_contacts_are_in_sight_two_millimetres_above() -> None:
+    states("the straight line from the camera to 2 mm outside it is free")
+    assert SightConfig().clearance_m == 0.002
+
+
+@pytest.mark.parametrize(("frame", "closing"), [("grasp", 1), ("panda_hand", 1), ("acronym", 0)])
+def test_frames_of_the_hand_are_those_of_the_table(frame: str, closing: int) -> None:
+    states("mounting face (0.1034 m behind `grasp`), approach z, closing x")
+    hand = hand_poses(np.eye(4), frame)
+    assert np.allclose(hand[:3, 2], [0, 0, 1]) and np.allclose(np.abs(hand[:3, closing]), [0, 1, 0])
+    assert np.isclose(hand[2, 3], 0.0 if frame == "grasp" else -0.1034)
+    assert np.allclose(grasp_poses(hand, frame), np.eye(4))
+
+
+def test_opengl_cameras_have_y_up_and_z_backward() -> None:
+    states("OpenGL: y up, z backward")
+    assert np.allclose(T_world_cam_from_gl(np.eye(4)), np.diag([1, -1, -1, 1]))
+
+
+def test_a_quarter_of_the_base_score_is_a_stage() -> None:
+    states("a quarter for each stage passed in a row", "a grasp is good from 0.5")
+    from tried_grasps import tried_set
+
+    grasps = tried_set(np.random.default_rng(0))
+    base, _ = recompute_scores(grasps, ScoreLimits())
+    assert np.allclose(4 * base[np.isfinite(base)] % 1, 0)
+    assert np.array_equal(grasps.good, np.nan_to_num(grasps.scores, nan=-1) >= 0.5)
+
+
+def test_files_that_the_page_names_are_those_that_the_code_names() -> None:
+    from realsim.review.journal import JOURNAL_FILE
+
+    states("`SESSION/imported/`", f"`{JOURNAL_FILE}`", "`hdri.py`", "`realsim/interop.py`")
+    assert (ROOT / "realsim/interop.py").is_file()
+    assert (ROOT / "realsim/rendering/procedural/hdri.py").is_file()

@@ -1,0 +1,188 @@
+"""The tour is true: its commands run in order on one data set and print what the text says."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+from documents import ROOT, Block, blocks, prose
+from printed import agrees, missing_lines
+
+TOUR = (ROOT / "docs/tour/README.md", *sorted((ROOT / "docs/tour").glob("[0-9]*.md")))
+API = sorted((ROOT / "docs/api").glob("*.md"))
+GUIDES = [
+    p
+    for p in sorted((ROOT / "docs/how-to").glob("*.md"))
+    if any(b.kind == "sh" for b in blocks(p.read_text(encoding="utf-8")))
+]
+STAGES = ("plan", "capture", "calibrate", "register", "school", "annotate", "review")
+SERVER = "# Ctrl-C ends it"
+START_S = 60.0
+ENVIRONMENT = {
+    **os.environ, "COLUMNS": "120", "NO_COLOR": "1", "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1", "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
+}  # fmt: skip
+ENVIRONMENT.pop("REALSIM_CONFIG", None)
+
+
+def read(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def run(words: list[str], folder: Path) -> str:
+    """Run to the end and return what was printed; it must end with 0."""
+    done = subprocess.run(
+        words, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=1500
+    )
+    assert done.returncode == 0, f"{words} ended with {done.returncode}:\n{done.stderr[-3000:]}"
+    return done.stdout
+
+
+def serve(line: str, folder: Path) -> str:
+    """Run a server until its page can be had, end it as Ctrl-C does, return what it printed."""
+    log = folder / "server.txt"
+    with log.open("w") as out:
+        server = subprocess.Popen(
+            ["bash", "-c", f"exec {line} --port 0"], cwd=folder, env=ENVIRONMENT,
+            stdout=out, stderr=subprocess.STDOUT,
+        )  # fmt: skip
+        try:
+            until, found = time.monotonic() + START_S, None
+            while found is None and time.monotonic() < until and server.poll() is None:
+                time.sleep(0.2)
+                found = re.search(r"http://\S+", read(log))
+            assert found is not None, read(log)
+            with urllib.request.urlopen(found[0], timeout=START_S) as page:
+                assert page.status == 200 and b"<html" in page.read().lower()
+            server.send_signal(signal.SIGINT)
+            assert server.wait(START_S) in (0, 130), read(log)
+        finally:
+            server.kill()
+    return read(log)
+
+
+def printed_by(block: Block, folder: Path) -> str:
+    """Run a block of the tour and return what it printed."""
+    if block.kind == "python":
+        return run([sys.executable, "-c", block.text], folder)
+    out: list[str] = []
+    for line in block.text.splitlines():
+        if SERVER in line:
+            out.append(serve(line.partition("#")[0].strip(), folder))
+        elif line.strip():
+            out.append(run(["bash", "-c", line], folder))
+    return "\n".join(out)
+
+
+# --- the comparison ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("said", "printed", "same"),
+    [
+        ("│ tube │ 60 │ 0.50 │", "| tube".replace("|", "│") + "  │  60 │ 0.49 │", True),
+        ("camera 0.308 mm", "camera 0.31 mm", True),
+        ("camera 0.308 mm", "camera 0.41 mm", False),
+        ("views 24", "views 20", False),
+        ("views 24", "views 25", True),
+        ("faults 0", "faults 1", False),
+        ("1 sigma 0.03 mm", "1 sigma 0.05 mm", True),
+        ("1 sigma 0.03 mm", "1 sigma 0.06 mm", False),
+        ("verdict accepted", "verdict doubtful", False),
+        ("moved 0.02 mm", "moved -0.03 mm", False),
+    ],
+)
+def test_lines_are_compared_as_the_first_page_says(said: str, printed: str, same: bool) -> None:
+    assert agrees(said, printed) is same
+
+
+def test_lines_must_come_in_their_order() -> None:
+    assert missing_lines("a 1\n...\nb 2", "x\na 1\ny\nb 2\n") == []
+    assert missing_lines("b 2\na 1", "a 1\nb 2\n") == ["a 1"]
+
+
+# --- the text ----------------------------------------------------------------------------------
+
+
+def test_seven_chapters_follow_the_loop() -> None:
+    chapters = TOUR[1:]
+    assert len(chapters) == len(STAGES)
+    for k, (chapter, stage) in enumerate(zip(chapters, STAGES, strict=True), start=1):
+        assert stage in chapter.stem and read(chapter).startswith(f"# {k}. ")
+        assert chapter.name in read(TOUR[0])
+        assert any(b.kind == "sh" for b in blocks(read(chapter)))
+
+
+@pytest.mark.parametrize("chapter", TOUR, ids=lambda p: p.stem)
+def test_figures_of_the_text_stand_beside_the_command_that_makes_them(chapter: Path) -> None:
+    shown = "\n".join(b.text for page in (TOUR[0], chapter) for b in blocks(read(page)))
+    text = re.sub(r"\]\([^)]*\)", "]", prose(read(chapter)))
+    told = set(re.findall(r"(?<![\w.])\d+\.\d{2,}", text))
+    assert not [figure for figure in told if figure not in shown]
+
+
+@pytest.mark.parametrize("chapter", TOUR, ids=lambda p: p.stem)
+def test_output_stands_below_what_prints_it(chapter: Path) -> None:
+    kinds = [b.kind for b in blocks(read(chapter)) if b.kind]
+    for before, kind in zip(["", *kinds], kinds, strict=False):
+        assert kind in ("sh", "python", "text", "json")
+        assert kind != "text" or before in ("sh", "python")
+
+
+@pytest.mark.parametrize("chapter", TOUR, ids=lambda p: p.stem)
+def test_chapters_stay_short(chapter: Path) -> None:
+    assert read(chapter).count("\n") <= 90
+
+
+# --- all of it, run ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which everything is typed; the first test fills it."""
+    path = tmp_path_factory.mktemp("tour")
+    (path / "examples").symlink_to(ROOT / "examples")
+    return path
+
+
+def play(page: Path, folder: Path) -> list[str]:
+    """Run the blocks of a page in order and return what was not printed."""
+    wrong, printed = list[str](), ""
+    for block in blocks(read(page)):
+        if block.kind in ("sh", "python"):
+            printed = printed_by(block, folder)
+        elif block.kind == "text":
+            wrong += [
+                f"{page.name}: not printed: {line}\n{printed[-2500:]}"
+                for line in missing_lines(block.text, printed)
+            ]
+    return wrong
+
+
+@pytest.mark.slow
+def test_the_tour_prints_what_it_says(folder: Path) -> None:
+    wrong = [line for chapter in TOUR for line in play(chapter, folder)]
+    assert not wrong, "\n\n".join(wrong)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", API, ids=lambda p: p.stem)
+def test_snippets_of_the_reference_run_on_the_tours_data(page: Path, folder: Path) -> None:
+    if not (folder / "demo/demo.json").is_file():
+        run(["realsim", "demo"], folder)
+    snippets = [b for b in blocks(read(page)) if b.kind == "python"]
+    assert all(printed_by(b, folder).strip() for b in snippets)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("guide", GUIDES, ids=lambda p: p.stem)
+def test_guides_that_can_be_typed_print_what_they_say(guide: Path, folder: Path) -> None:
+    if not (folder / "demo/demo.json").is_file():
+        run(["realsim", "demo"], folder)
+    wrong = play(Path(guide), folder)
+    assert not wrong, "\n\n".join(wrong)

@@ -1,0 +1,300 @@
+"""What the review shows: the cloud's levels, the models as they are sent, the grasps that pass."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim import CameraIntrinsics, InputError, Mesh, View
+from realsim.geometry import camera, depth, se3
+from realsim.rendering import overlay
+from realsim.review import clouds, content, grasp_drawing
+from realsim.review.content import SceneContent
+from realsim.review.content_config import GripperDrawing, SceneConfig
+from realsim.review.grasp_drawing import GraspFilter, passing
+from realsim.store import SessionStore
+from tests.support.reviewed_boxes import CAMERAS, MODELS, SCENE, boxes_session, grasp_set
+
+CONFIG = SceneConfig(voxel_m=0.004, coarse_points=200, piece_points=700, thumbnail_px=40)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> SessionStore:
+    return boxes_session(tmp_path_factory.mktemp("content") / "boxes")
+
+
+@pytest.fixture(scope="module")
+def shown(store: SessionStore) -> SceneContent:
+    return SceneContent.load(store, CONFIG)
+
+
+def measured(store: SessionStore, region: content.Region) -> np.ndarray:
+    """All measured points in world, in double."""
+    parts = []
+    for view in store.session.views:
+        points, _ = depth.points_from_depth(store.depth_m(view.index), store.session.intrinsics)
+        parts.append(se3.transform(np.asarray(view.T_world_cam), points))
+    points = np.concatenate(parts)
+    return points[region.holds(points)]
+
+
+def nearest_m(points: np.ndarray, to: np.ndarray) -> np.ndarray:
+    from scipy.spatial import KDTree
+
+    return np.asarray(KDTree(to).query(points)[0])
+
+
+# --- the cloud --------------------------------------------------------------------------------
+
+
+def test_every_point_of_every_level_is_within_half_a_voxel_of_a_measured_one(
+    store: SessionStore, shown: SceneContent
+) -> None:
+    cloud = shown.cloud
+    assert len(cloud) > 3000 and cloud.points.dtype == np.float32
+    distances = nearest_m(cloud.points.astype(np.float64), measured(store, shown.region))
+    assert distances.max() <= CONFIG.voxel_m / 2 + 1e-6
+    assert shown.region.holds(cloud.points.astype(np.float64) * (1 - 1e-7)).mean() > 0.999
+
+
+def test_positions_agree_with_the_session_to_a_micrometre(
+    store: SessionStore, shown: SceneContent
+) -> None:
+    # Voxels so small that each holds one sample: the cloud is the samples themselves.
+    fine = clouds.fused_cloud(
+        store, shown.views, shown.region, voxel_m=2e-5, most=1_000_000, coarse=100
+    )
+    points = measured(store, shown.region)
+    assert len(fine) > 0.95 * len(points)
+    # Where two samples fell into a voxel of 20 um the mean is between them.
+    distances = nearest_m(fine.points.astype(np.float64), points)
+    assert np.quantile(distances, 0.98) < 1e-6 and distances.max() < 1e-5
+
+
+def test_levels_nest_and_grow(shown: SceneContent) -> None:
+    cloud = shown.cloud
+    assert list(cloud.ends) == sorted(set(cloud.ends)) and cloud.ends[-1] == len(cloud)
+    assert 100 <= cloud.ends[0] <= CONFIG.coarse_points
+    levels = [cloud.points[cloud.level(k)] for k in range(len(cloud.ends))]
+    for coarse, fine in pairwise(levels):
+        np.testing.assert_array_equal(fine[: len(coarse)], coarse)
+    assert len(np.unique(cloud.points, axis=0)) == len(cloud)
+
+
+def test_the_coarse_level_is_spread_over_all_that_was_measured(shown: SceneContent) -> None:
+    cloud = shown.cloud
+    gaps = nearest_m(cloud.points, cloud.points[cloud.level(0)])
+    rng = np.random.default_rng(0)
+    some = rng.choice(len(cloud), cloud.ends[0], replace=False)
+    at_random = nearest_m(cloud.points, cloud.points[some])
+    assert gaps.max() < at_random.max() and gaps.mean() < at_random.mean()
+
+
+@pytest.mark.parametrize("most", [1, 150, 1000, 10**9])
+def test_pieces_are_the_cloud_in_order_and_no_message_is_large(
+    shown: SceneContent, most: int
+) -> None:
+    pieces = shown.cloud.pieces(most, 700)
+    together = np.concatenate([np.arange(len(shown.cloud))[p] for p in pieces])
+    np.testing.assert_array_equal(together, np.arange(min(most, len(shown.cloud))))
+    assert pieces[0].stop <= shown.cloud.ends[0]
+    assert all(0 < p.stop - p.start <= 700 for p in pieces)
+
+
+def test_the_cloud_is_the_same_each_time_and_holds_no_more_than_asked(
+    store: SessionStore, shown: SceneContent
+) -> None:
+    again = SceneContent.load(store, CONFIG).cloud
+    np.testing.assert_array_equal(again.points, shown.cloud.points)
+    np.testing.assert_array_equal(again.colors, shown.cloud.colors)
+    few = clouds.fused_cloud(store, shown.views, shown.region, voxel_m=0.004, most=500, coarse=100)
+    assert len(few) == 500
+
+
+def test_without_depth_there_is_an_empty_cloud(store: SessionStore, shown: SceneContent) -> None:
+    none = clouds.fused_cloud(store, [], shown.region, voxel_m=0.004, most=500, coarse=100)
+    assert len(none) == 0 and none.pieces(100, 10) == []
+
+
+# --- the scene --------------------------------------------------------------------------------
+
+
+def test_worst_comes_first() -> None:
+    assert [o.instance for o in content.worst_first(SCENE.objects)] == [3, 0]
+
+
+def test_without_objects_the_region_is_where_the_cameras_look() -> None:
+    views = [View(index=i, T_world_cam=T) for i, T in enumerate(CAMERAS)]
+    region = content.region_of([], views, 0.2)
+    np.testing.assert_allclose(region.center, [0.5, 0.0, 0.03], atol=1e-9)
+
+
+def test_a_strided_camera_sees_the_same_points() -> None:
+    lens = CameraIntrinsics(
+        width=161, height=121, fx=150.0, fy=152.0, cx=80.2, cy=59.1,
+        distortion=np.array([-0.05, 0.06, 3e-4, 5e-4, -0.02]),
+    )  # fmt: skip
+    for stride in (1, 2, 3, 7):
+        small = content.strided(lens, stride)
+        rays = camera.ray_table(lens)[::stride, ::stride]
+        np.testing.assert_allclose(camera.ray_table(small), rays, atol=1e-6)
+
+
+def test_a_missing_model_is_named(tmp_path: Path) -> None:
+    store = boxes_session(tmp_path / "boxes")
+    (store.folder / "models/obj_000007.ply").unlink()
+    with pytest.raises(InputError, match=r"objects 7.*it has 1, 9"):
+        SceneContent.load(store, CONFIG)
+
+
+def test_models_that_nobody_asked_for_are_not_read(tmp_path: Path) -> None:
+    store = boxes_session(tmp_path / "boxes")
+    (store.folder / "models/obj_000009.ply").write_bytes(b"spoiled")
+    shown = SceneContent.load(store, CONFIG)
+    assert list(shown.models) == [1, 7, 9] and 9 in shown.models and 8 not in shown.models
+    with pytest.raises(InputError):
+        _ = shown.models[9]
+
+
+def test_an_unknown_view_or_model_is_named(shown: SceneContent) -> None:
+    with pytest.raises(InputError, match=r"view 77.*0, 1, 2, 3"):
+        shown.pose_of(77)
+    with pytest.raises(InputError, match="8"):
+        _ = shown.meshes[8]
+    np.testing.assert_array_equal(shown.pose_of(2), CAMERAS[2])
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"voxel_m": 0.0}, {"coarse_points": 0}, {"thumbnail_quality": 101}]
+)
+def test_settings_that_show_nothing_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError):
+        SceneConfig(**wrong)  # type: ignore[arg-type]
+
+
+# --- grasps -----------------------------------------------------------------------------------
+
+TIGHTER = [
+    ("stage", [0, 1, 2, 3, 4]), ("min_score", [0.0, 0.3, 0.8, 1.0]),
+    ("reachable_only", [False, True]), ("failure", ["", "t", "turned"]),
+    ("visible", [None, {0: frozenset(range(0, 40, 3))}, {0: frozenset([3])}, {}]),
+    ("instance", [None, 0]), ("show", [True, False]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "values"), TIGHTER)
+def test_the_rows_shrink_when_the_filter_tightens(name: str, values: list[object]) -> None:
+    grasps = grasp_set(1, 0)
+    loosest = GraspFilter(min_score=0.1, stage=0)
+    kept = [set(passing(grasps, replace(loosest, **{name: v})).tolist()) for v in values]
+    assert kept[0]
+    for loose, tight in pairwise(kept):
+        assert tight <= loose
+    if name not in ("instance", "min_score"):
+        assert len(kept[-1]) < len(kept[0])
+
+
+def test_what_passes_is_what_was_asked_for() -> None:
+    grasps = grasp_set(1, 0)
+    every = passing(grasps, GraspFilter())
+    np.testing.assert_array_equal(every, np.arange(40))
+    rows = passing(grasps, GraspFilter(stage=3, min_score=0.4, reachable_only=True))
+    expected = [
+        r for r in range(40)
+        if grasps.base_scores[r] >= 0.75 and grasps.scores[r] >= 0.4 and grasps.reachable[r]
+    ]  # fmt: skip
+    assert rows.tolist() == expected and expected
+    assert len(passing(grasps, GraspFilter(instance=5))) == 0
+    lost = passing(grasps, GraspFilter(failure="LIFT"))
+    assert len(lost) and all("lift" in grasps.failures[r] for r in lost)
+
+
+def test_too_many_grasps_are_thinned_evenly_over_scores_and_objects() -> None:
+    sets = [grasp_set(1, 0, 400), grasp_set(7, 3, 100)]
+    found = dict((g.instance, rows) for g, rows in grasp_drawing.chosen_grasps(
+        sets, GraspFilter(), 50))  # fmt: skip
+    assert len(found[0]) == 40 and len(found[3]) == 10
+    scores = sets[0].scores[found[0]]
+    assert np.nanmin(scores) < 0.05 and np.nanmax(scores) > 0.95
+    assert grasp_drawing.failure_choices(sets)[:2] == ("close", "lift")
+
+
+@pytest.mark.parametrize("wrong", [{"stage": 5}, {"stage": -1}, {"min_score": 1.5}])
+def test_a_filter_of_nothing_is_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(InputError):
+        GraspFilter(**wrong)  # type: ignore[arg-type]
+
+
+def test_visible_grasps_are_those_with_a_contact_before_the_measured_surface(
+    shown: SceneContent,
+) -> None:
+    truth = LabelledPoints(shown)
+    for view in range(len(CAMERAS)):
+        seen = grasp_drawing.visible_grasps(shown, view)
+        assert set(seen) == {0, 3}
+        for grasps in shown.grasp_sets:
+            for row in range(len(grasps)):
+                margins = truth.margins(view, grasps.instance, row)
+                if any(m < 0.008 for m in margins):
+                    assert row in seen[grasps.instance]
+                if all(m > 0.02 for m in margins):
+                    assert row not in seen[grasps.instance]
+
+
+class LabelledPoints:
+    """How far behind the first surface the contacts of a grasp are, by casting rays."""
+
+    def __init__(self, shown: SceneContent) -> None:
+        self.shown = shown
+
+    def margins(self, view: int, instance: int, row: int) -> list[float]:
+        grasps = self.shown.grasps_of(instance)
+        assert grasps is not None
+        T = self.shown.scene.object(instance).T_world_obj @ grasps.Ts_obj_grasp[row]
+        half = grasps.widths_m[row] / 2 * T[:3, 1]
+        depth_m = self.shown.store.depth_m(view)
+        found: list[float] = []
+        for contact in (T[:3, 3] - half, T[:3, 3] + half):
+            p = se3.transform(se3.invert(CAMERAS[view]), contact[None])[0]
+            u, v = np.rint(camera.project(self.shown.intrinsics, p[None])[0]).astype(int)
+            found.append(float(p[2] - depth_m[v, u]))
+        return found
+
+
+def test_a_moved_object_takes_its_grasps_out_of_sight(shown: SceneContent) -> None:
+    away = se3.from_translation([0.5, 0.0, -1.0])
+    seen = grasp_drawing.visible_grasps(shown, 0, {0: away})
+    assert len(seen[0]) == 0 and len(seen[3]) > 0
+
+
+def test_the_gripper_is_as_wide_as_the_grasp() -> None:
+    vertices, faces = grasp_drawing.gripper_mesh(GripperDrawing())
+    assert len(faces) <= 24 and faces.max() < len(vertices)
+    rng = np.random.default_rng(1)
+    for width in rng.uniform(0.01, 0.1, 5):
+        scaled = vertices * grasp_drawing.gripper_scales([width])[0]
+        tips = scaled[np.isclose(scaled[:, 2], 0.0)]
+        inner = np.abs(tips[:, 1]).min()
+        assert inner == pytest.approx(width / 2, rel=1e-5)
+        assert scaled[:, 2].max() == pytest.approx(0.0, abs=1e-9)
+        assert scaled[:, 2].min() == pytest.approx(-0.065, abs=1e-6)
+
+
+def test_score_colours_are_those_of_the_pictures() -> None:
+    scores = np.append(np.linspace(0, 1, 101), np.nan)
+    expected = [overlay.score_color(float(s)) for s in scores]
+    np.testing.assert_array_equal(grasp_drawing.score_rgb(scores), expected)
+
+
+def test_linear_light_of_known_colours() -> None:
+    rgb = np.array([[0, 128, 255]], np.uint8)
+    np.testing.assert_array_equal(grasp_drawing.linear_rgb(rgb), [[0, 55, 255]])
+
+
+def test_a_mesh_within_the_budget_is_sent_as_it_is(shown: SceneContent) -> None:
+    sent = shown.meshes[7]
+    np.testing.assert_allclose(sent.vertices, MODELS[7].mesh.vertices, atol=1e-7)
+    assert isinstance(MODELS[7].mesh, Mesh) and sent.triangles_given == 12
+    assert shown.meshes[7] is sent

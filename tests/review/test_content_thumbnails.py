@@ -1,0 +1,213 @@
+"""Small photographs that are kept, and the quick decoder: always what the slow way gives."""
+
+import re
+import struct
+import zlib
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from realsim import InputError
+from realsim.formats import images
+from realsim.review import quick_png
+from realsim.review.thumbnails import FOLDER, Thumbnails, thumbnail
+from realsim.store import SessionStore
+from tests.support.reviewed_boxes import boxes_session
+
+INDICES = (0, 1, 2, 3)
+FILTERS = (0, 1, 2, 3, 4)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> SessionStore:
+    return boxes_session(tmp_path / "boxes")
+
+
+def opened(store: SessionStore, width_px: int = 40, quality: int = 70) -> Thumbnails:
+    return Thumbnails(SessionStore.open(store.folder), width_px, quality)
+
+
+def fresh(store: SessionStore, index: int, width_px: int = 40, quality: int = 70) -> bytes:
+    return thumbnail(store.rgb(index), width_px, quality)
+
+
+# --- what is kept -----------------------------------------------------------------------------
+
+
+def test_the_kept_ones_equal_fresh_ones_and_nothing_is_decoded_for_them(
+    store: SessionStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = dict(opened(store).of(INDICES))
+    assert first == {i: fresh(store, i) for i in INDICES}
+    before = {p: p.stat().st_mtime_ns for p in (store.folder / FOLDER).iterdir()}
+    assert len(before) == len(INDICES)
+    for index in INDICES:  # a photograph that were read would be an error
+        (store.folder / f"rgb/{index:06d}.png").write_bytes(b"gone")
+    assert dict(Thumbnails(store, 40, 70).of(INDICES)) == first
+    assert {p: p.stat().st_mtime_ns for p in (store.folder / FOLDER).iterdir()} == before
+
+
+def test_they_are_small_pictures_that_any_reader_opens(store: SessionStore) -> None:
+    opened(store).of(INDICES)
+    file = store.folder / FOLDER / "000002.jpg"
+    picture = cv2.imread(str(file))
+    assert picture is not None and picture.shape == (30, 40, 3)
+    expected = cv2.resize(store.rgb(2), (40, 30), interpolation=cv2.INTER_AREA)
+    assert np.abs(picture[..., ::-1].astype(int) - expected).mean() < 4
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "emptied", "other", "unsigned", "swapped"])
+def test_a_damaged_or_foreign_one_is_made_anew(store: SessionStore, damage: str) -> None:
+    opened(store).of(INDICES)
+    file = store.folder / FOLDER / "000001.jpg"
+    whole = file.read_bytes()
+    data = bytearray(whole)
+    data[len(data) // 3] ^= 0x10
+    spoiled = {
+        "cut": whole[: len(whole) // 2], "flipped": bytes(data), "emptied": b"",
+        "other": b"not a picture", "unsigned": whole[: whole.rfind(b"\nrealsim ")],
+        "swapped": (store.folder / FOLDER / "000002.jpg").read_bytes(),
+    }  # fmt: skip
+    file.write_bytes(spoiled[damage])
+    assert opened(store).of([1])[1] == fresh(store, 1)
+    assert file.read_bytes() == whole
+
+
+def test_one_of_another_photograph_size_or_quality_is_made_anew(store: SessionStore) -> None:
+    opened(store).of(INDICES)
+    assert opened(store, 20).of([0])[0] == fresh(store, 0, 20)
+    assert opened(store, 20, 90).of([0])[0] == fresh(store, 0, 20, 90)
+    darker = (store.rgb(3) // 2).astype(np.uint8)
+    store.write_bytes("rgb/000003.png", images.png_bytes(darker))
+    assert opened(store).of([3])[3] == thumbnail(darker, 40, 70)
+
+
+def test_a_photograph_off_the_manifest_is_told_by_its_own_bytes(store: SessionStore) -> None:
+    lines = (store.folder / "manifest.jsonl").read_text().splitlines()
+    kept = [line for line in lines if "rgb/000000.png" not in line]
+    (store.folder / "manifest.jsonl").write_text("\n".join(kept) + "\n")
+    one = Thumbnails(store, 40, 70)
+    assert one.of([0])[0] == fresh(store, 0)
+    other = np.roll(store.rgb(0), 30, axis=1)
+    (store.folder / "rgb/000000.png").write_bytes(images.png_bytes(other))
+    assert Thumbnails(store, 40, 70).of([0])[0] == thumbnail(other, 40, 70)
+
+
+def test_the_folder_can_be_deleted_and_need_not_be_written(store: SessionStore) -> None:
+    first = dict(opened(store).of(INDICES))
+    for path in (store.folder / FOLDER).iterdir():
+        path.unlink()
+    (store.folder / FOLDER).rmdir()
+    # A file where the folder should be: nothing can be kept, as on a disk that may not be written.
+    (store.folder / FOLDER).write_bytes(b"")
+    assert dict(opened(store).of(INDICES)) == first
+
+
+def test_the_session_is_sound_and_unchanged_but_for_the_review(store: SessionStore) -> None:
+    def others() -> dict[Path, bytes]:
+        files = (p for p in store.folder.rglob("*") if p.is_file() and "review" not in p.parts)
+        return {p: p.read_bytes() for p in files}
+
+    before = others()
+    opened(store).of(INDICES)
+    assert others() == before
+    assert SessionStore.open(store.folder).verify() == []
+
+
+def test_one_made_on_the_way_is_not_made_again(store: SessionStore) -> None:
+    thumbnails = opened(store)
+    marked = np.zeros((120, 160, 3), np.uint8)
+    thumbnails.take(0, marked)
+    assert thumbnails.of([0])[0] == thumbnail(marked, 40, 70)
+    thumbnails.take(0, store.rgb(0))  # there is one already
+    assert thumbnails.of([0])[0] == thumbnail(marked, 40, 70)
+
+
+def test_progress_comes_to_its_end_and_a_missing_photograph_is_named(store: SessionStore) -> None:
+    steps: list[tuple[int, int]] = []
+    thumbnails = opened(store)
+    thumbnails.of(INDICES, lambda done, of: steps.append((done, of)))
+    assert steps == [(k, 4) for k in (1, 2, 3, 4)]
+    (store.folder / "rgb/000002.png").write_bytes(b"\x89PNG\r\n\x1a\n damaged")
+    (store.folder / FOLDER / "000002.jpg").unlink()
+    with pytest.raises(InputError, match=r"000002\.png"):
+        Thumbnails(store, 40, 70).of(INDICES)
+
+
+# --- the quick decoder ------------------------------------------------------------------------
+
+
+def chunk(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+
+def png_of(rows: np.ndarray, width: int, bits: int, colour: int, parts: int = 1) -> bytes:
+    """Return a PNG of rows that are filtered already: whatever they mean, it is a valid file."""
+    header = struct.pack(">IIBBBBB", width, len(rows), bits, colour, 0, 0, 0)
+    data = zlib.compress(rows.tobytes(), 6)
+    cuts = np.linspace(0, len(data), parts + 1).astype(int)
+    idat = b"".join(chunk(b"IDAT", data[a:b]) for a, b in pairwise(cuts))
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + idat + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize("row_filter", [*FILTERS, None])
+def test_all_row_filters_are_undone_as_opencv_does(tmp_path: Path, row_filter: int | None) -> None:
+    rng = np.random.default_rng(0)
+    for width, height, bits, colour, step in ((7, 9, 8, 2, 3), (1, 1, 8, 2, 3), (33, 5, 16, 0, 2)):
+        rows = rng.integers(0, 256, (height, 1 + width * step), dtype=np.uint8)
+        rows[:, 0] = rng.integers(0, 5, height) if row_filter is None else row_filter
+        path = tmp_path / f"{width}_{bits}.png"
+        path.write_bytes(png_of(rows, width, bits, colour, parts=1 + width % 3))
+        assert quick_png._rows(path, (bits, colour), step) is not None  # type: ignore[reportPrivateUsage]
+        if bits == 8:
+            np.testing.assert_array_equal(quick_png.read_rgb(path), images.read_rgb(path))
+        else:
+            ours = quick_png.read_depth(path, 2.5e-4)
+            np.testing.assert_array_equal(ours, images.read_depth(path, 2.5e-4))
+            assert ours.dtype == np.float32
+
+
+@pytest.mark.parametrize("kind", ["grey", "alpha", "palette", "jpeg", "depth"])
+def test_other_files_come_out_as_the_ordinary_reader_has_them(tmp_path: Path, kind: str) -> None:
+    from PIL import Image
+
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    path = tmp_path / "image.png"
+    if kind == "depth":
+        path.write_bytes(images.png_bytes(rgb[..., 0].astype(np.uint16)))
+    else:
+        mode = {"grey": "L", "alpha": "RGBA", "palette": "P", "jpeg": "RGB"}[kind]
+        Image.fromarray(rgb).convert(mode).save(path, "JPEG" if kind == "jpeg" else "PNG")
+    np.testing.assert_array_equal(quick_png.read_rgb(path), images.read_rgb(path))
+
+
+@pytest.mark.parametrize("damage", ["cut", "flipped", "filter", "claim", "empty", "text", "gone"])
+def test_damaged_files_are_the_ordinary_readers_errors(tmp_path: Path, damage: str) -> None:
+    rng = np.random.default_rng(0)
+    rows = rng.integers(0, 256, (20, 91), dtype=np.uint8)
+    rows[:, 0] = 9 if damage == "filter" else 3
+    data = png_of(rows, 30, 8, 2)
+    flipped = bytearray(data)
+    flipped[len(data) // 2] ^= 0x40
+    claim = bytearray(data)
+    claim[16:24] = struct.pack(">II", 200_000, 400)
+    spoiled = {
+        "cut": data[:-30], "flipped": bytes(flipped), "filter": data, "claim": bytes(claim),
+        "empty": b"", "text": b"hello",
+    }  # fmt: skip
+    path = tmp_path / "image.png"
+    if damage != "gone":
+        path.write_bytes(spoiled[damage])
+    try:
+        expected = images.read_rgb(path)
+    except InputError as error:
+        with pytest.raises(InputError) as ours:
+            quick_png.read_rgb(path)
+        address = r"0x[0-9a-f]+"
+        assert re.sub(address, "", str(ours.value)) == re.sub(address, "", str(error))
+    else:  # OpenCV shows what it could read of it
+        np.testing.assert_array_equal(quick_png.read_rgb(path), expected)

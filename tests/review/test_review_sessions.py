@@ -1,0 +1,217 @@
+"""The list of scenes, and decisions on one session: nothing is lost, the slower one is told."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from realsim import InputError, ObjectPose
+from realsim.geometry import se3
+from realsim.review import ReviewServer, journal, scene_list
+from realsim.review.reviewed_session import ReviewedSession
+from realsim.review.scene_list import ObjectRow
+from realsim.store import SessionStore, save_scene
+from tests.support.review_browser import SMALL
+from tests.support.reviewed_boxes import SCENE, boxes_session
+
+TALL, FLAT, SPARE = 1, 7, 9
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> ReviewedSession:
+    return ReviewedSession(boxes_session(tmp_path / "boxes"), config=SMALL)
+
+
+def seen(session: ReviewedSession, instance: int) -> ObjectPose:
+    return session.standing.scene.object(instance)
+
+
+def row(key: int, verdict: str, agree: float, *, decided: bool = False) -> ObjectRow:
+    return ObjectRow(
+        session=key // 10, instance=key % 10, name="x", computed=verdict, verdict=verdict,
+        agree=agree, is_decided=decided,
+    )  # fmt: skip
+
+
+# --- the list ---------------------------------------------------------------------------------
+
+
+def test_worst_comes_first_whatever_the_order() -> None:
+    rows = [
+        row(1, "accepted", 0.1), row(2, "rejected", 0.9), row(13, "doubtful", 0.5),
+        row(4, "doubtful", 0.4), row(25, "unchecked", 0.0),
+    ]  # fmt: skip
+    expected = [(0, 2), (0, 4), (1, 3), (2, 5), (0, 1)]
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        shuffled = [rows[k] for k in rng.permutation(len(rows))]
+        assert [r.key for r in scene_list.worst_first(shuffled)] == expected
+
+
+def test_stepping_through_the_undecided_meets_each_once_and_comes_round() -> None:
+    rows = [row(k, "doubtful", 0.1 * k, decided=k in (2, 5)) for k in range(7)]
+    for step, order in ((1, [0, 1, 3, 4, 6]), (-1, [6, 4, 3, 1, 0])):
+        now, met = None, []
+        for _ in range(5):
+            found = scene_list.next_undecided(rows, now, step)  # type: ignore[arg-type]
+            assert found is not None
+            met.append(found.instance)
+            now = found.key
+        assert met == order
+        again = scene_list.next_undecided(rows, now, step)  # type: ignore[arg-type]
+        assert again is not None and again.instance == order[0]
+    done = [row(k, "doubtful", 0.1, decided=True) for k in range(3)]
+    assert scene_list.next_undecided(done, (0, 1), 1) is None
+    assert scene_list.next_undecided([], None, 1) is None
+    last = [*done, row(3, "doubtful", 0.1)]
+    assert scene_list.next_undecided(last, (0, 3), 1) == last[3]
+
+
+def test_sessions_are_found_below_a_folder_and_once(tmp_path: Path) -> None:
+    for name in ("root/test/000002", "root/test/000001", "root/other"):
+        (tmp_path / name).mkdir(parents=True)
+        (tmp_path / name / "session.json").write_text("{}")
+    inner = tmp_path / "root/other/calibration/capture"
+    inner.mkdir(parents=True)
+    (inner / "session.json").write_text("{}")
+    root = tmp_path / "root"
+    found = [root / "other", root / "test/000001", root / "test/000002"]
+    assert scene_list.sessions_under([root]) == found
+    assert scene_list.sessions_under([found[2], root, root / "test"]) == [found[2], *found[:2]]
+    with pytest.raises(InputError, match="not a folder"):
+        scene_list.sessions_under([tmp_path / "nothing"])
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="nothing to review"):
+        scene_list.sessions_under([tmp_path / "empty"])
+
+
+# --- decisions --------------------------------------------------------------------------------
+
+
+def test_decisions_change_the_journal_and_no_other_file(session: ReviewedSession) -> None:
+    files = [p for p in session.store.folder.rglob("*") if p.is_file()]
+    before = {p: p.read_bytes() for p in files}
+    session.decide("reject", seen(session, 3), "ada", comment="it floats")
+    assert seen(session, 3).verdict == "rejected" and seen(session, 0).verdict == "accepted"
+    assert [r.is_decided for r in session.rows()] == [False, True]
+    session.undo(seen(session, 3), session.standing.state.of(3)[-1], "ada")
+    assert seen(session, 3).verdict == "doubtful"
+    T = se3.from_translation([0.5, 0.1, 0.015])
+    session.decide("move", seen(session, 3), "bob", pose=T, how="steps")
+    session.decide("swap", seen(session, 3), "bob", pose=T, obj_id=SPARE)
+    session.set_view(1, True, "ada", "blurred")
+    session.mark_symmetric(TALL, "z:4", "ada")
+    actions = [e.action for e in session.standing.state.entries]
+    assert actions == ["reject", "undo", "move", "swap", "exclude", "symmetric"]
+    assert {p: p.read_bytes() for p in files} == before
+    moved = session.rows()[1]
+    assert moved.is_changed and moved.name == "spare" and moved.verdict == "unchecked"
+    assert len(session.model(TALL).symmetries) == 4
+    again = ReviewedSession(session.store, config=SMALL)
+    assert again.standing.state == session.standing.state
+
+
+def test_the_slower_of_two_movers_is_told_and_nothing_is_lost(session: ReviewedSession) -> None:
+    """Two servers on one session: whoever saves second decided about another pose."""
+    other = ReviewedSession(SessionStore.open(session.store.folder), config=SMALL)
+    mine, theirs = seen(session, 3), seen(other, 3)
+    session.decide("move", mine, "ada", pose=se3.from_translation([0.5, 0.1, 0.015]))
+    for action, said in (
+        ("move", {"pose": se3.from_translation([0.4, 0, 0.015])}), ("accept", {}), ("reject", {}),
+        ("swap", {"pose": mine.T_world_obj, "obj_id": SPARE}),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match="changed by ada"):
+            other.decide(action, theirs, "bob", **said)  # type: ignore[arg-type]
+    other.decide("comment", theirs, "bob", comment="I saw it elsewhere")  # a remark fits any pose
+    np.testing.assert_allclose(seen(other, 3).T_world_obj[:3, 3], [0.5, 0.1, 0.015])
+    other.decide("accept", seen(other, 3), "bob")
+    assert seen(session, 3).verdict == "accepted"
+
+
+def test_undo_takes_back_only_what_was_seen(session: ReviewedSession) -> None:
+    with pytest.raises(InputError, match="nothing to undo"):
+        session.undo(seen(session, 3), None, "ada")
+    mine = session.decide("accept", seen(session, 3), "ada")
+    session.decide("reject", seen(session, 3), "bob")
+    with pytest.raises(InputError, match="bob was faster"):
+        session.undo(seen(session, 3), mine, "ada")
+    assert seen(session, 3).verdict == "rejected"
+
+
+def test_views_are_left_out_once(session: ReviewedSession) -> None:
+    session.set_view(1, True, "ada")
+    with pytest.raises(InputError, match="left out already, by ada"):
+        session.set_view(1, True, "bob")
+    session.set_view(1, False, "bob")
+    with pytest.raises(InputError, match="is in already"):
+        session.set_view(1, False, "ada")
+    assert session.standing.state.excluded_views() == {}
+
+
+def test_unsigned_and_senseless_decisions_are_refused(session: ReviewedSession) -> None:
+    with pytest.raises(InputError, match="name is empty"):
+        session.decide("accept", seen(session, 0), "  ")
+    with pytest.raises(InputError, match="comment is empty"):
+        session.decide("comment", seen(session, 0), "ada")
+    with pytest.raises(InputError, match="is no symmetry"):
+        session.mark_symmetric(TALL, "round", "ada")
+    with pytest.raises(InputError, match="no model of object 55"):
+        session.model(55)
+    assert session.standing.state.entries == ()
+
+
+def test_the_journal_is_read_again_only_when_it_changed(session: ReviewedSession) -> None:
+    first = session.standing
+    assert session.standing is first
+    journal.append(
+        session.journal_path, journal.new_entry("accept", seen(session, 0), "somebody else")
+    )
+    assert session.standing is not first
+    assert session.standing.state.entries[-1].reviewer == "somebody else"
+
+
+def test_a_session_that_is_registered_anew_is_noticed(session: ReviewedSession) -> None:
+    assert not session.is_stale and not session.has_pending
+    session.decide("reject", seen(session, 3), "ada")
+    assert session.has_pending and not session.is_stale
+    save_scene(session.store, SCENE)
+    assert session.is_stale
+
+
+def test_a_missing_model_is_named(session: ReviewedSession) -> None:
+    info = session.store.read_json("models/models_info.json")
+    del info[str(FLAT)]
+    session.store.write_json("models/models_info.json", info)
+    with pytest.raises(InputError, match=r"no model of them"):
+        ReviewedSession(session.store)
+
+
+def test_the_summary_counts_what_was_decided_in_this_run(session: ReviewedSession) -> None:
+    session.decide("accept", seen(session, 0), "ada")
+    server = ReviewServer(session.store, port=0, config=SMALL)
+    assert server.decisions() == []
+    session.decide("reject", seen(session, 3), "ada")
+    session.decide("comment", seen(session, 3), "ada", comment="floats")
+    from realsim.review.server import counted, words_of
+
+    assert words_of(server.decisions()) == "1 reject, 1 comment"
+    assert counted(server.sessions) == (2, 2)
+
+
+# --- colours and words ------------------------------------------------------------------------
+
+
+def test_residual_colours_follow_the_objects(session: ReviewedSession) -> None:
+    objects = list(session.standing.scene.objects)
+    right = session.residual_rgb(objects)
+    assert len(right) == len(session.content().cloud)
+    again = session.residual_rgb(objects)
+    np.testing.assert_array_equal(right, again)
+    away = [
+        ObjectPose(
+            obj_id=o.obj_id, instance=o.instance, T_world_obj=se3.from_translation([9, 9, 9])
+        )
+        for o in objects
+    ]
+    grey = session.residual_rgb(away)
+    assert len(np.unique(grey, axis=0)) == 1 < len(np.unique(right, axis=0))

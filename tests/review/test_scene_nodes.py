@@ -1,0 +1,403 @@
+"""The scene's nodes on a real viser server, and what a client of its protocol is sent of them."""
+
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+import pytest
+import viser
+import zstandard
+from websockets.sync.client import connect
+from websockets.typing import Subprotocol
+
+from realsim import InputError
+from realsim.geometry import se3
+from realsim.review.content import SceneContent
+from realsim.review.content_config import SceneConfig
+from realsim.review.ellipsoid import ellipsoid_of
+from realsim.review.scene_nodes import GraspFilter, SceneNodes
+from tests.support.reviewed_boxes import CAMERAS, SCENE, boxes_session
+
+CONFIG = SceneConfig(
+    voxel_m=0.004, coarse_points=200, piece_points=700, shown_points=1000, thumbnail_px=40
+)
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": (0.0, 1.0, 0.0, 0.0), "position": (0.0, 0.0, 1.0),
+    "fov": 1.0, "near": 0.01, "far": 100.0, "image_height": 800, "image_width": 1200,
+    "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0),
+}  # fmt: skip
+
+
+class Client:
+    """A client of viser's protocol, which keeps every message with its arrays."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.socket = connect(
+            f"ws://127.0.0.1:{server.get_port()}", max_size=None, compression=None,
+            subprotocols=[Subprotocol(f"viser-v{viser.__version__}")],
+        )  # fmt: skip
+        self.messages: list[dict[str, Any]] = []
+        self.buffers: dict[int, list[bytes]] = {}
+        self.send(CAMERA)
+
+    def send(self, message: dict[str, Any]) -> None:
+        self.socket.send(msgspec.msgpack.encode(message))
+
+    def receive(self, quiet_s: float = 0.5) -> list[dict[str, Any]]:
+        """Take messages until nothing comes for a while; return the new ones."""
+        start = len(self.messages)
+        while True:
+            try:
+                data = cast(bytes, self.socket.recv(timeout=quiet_s))
+            except TimeoutError:
+                return self.messages[start:]
+            length = int.from_bytes(data[8:16], "little")
+            window = msgspec.msgpack.decode(
+                zstandard.ZstdDecompressor().decompress(data[16 : 16 + length])
+            )
+            at, buffers = 16 + length, []
+            for n in window["binaryBufferLengths"]:
+                at += -at % 8
+                buffers.append(data[at : at + n])
+                at += n
+            for message in window["messages"]:
+                self.buffers[id(message)] = buffers
+            self.messages += window["messages"]
+
+    def of(self, kind: str, name: str = "") -> list[dict[str, Any]]:
+        found = [m for m in self.messages if m["type"] == kind]
+        return [m for m in found if str(m.get("name", "")).startswith(name)]
+
+    def array(self, message: dict[str, Any], key: str, dtype: Any) -> np.ndarray:
+        index = message["props"][key]["__binary_index"]
+        return np.frombuffer(self.buffers[id(message)][index], dtype)
+
+    def click(self, name: str, owner: str, instance_index: int | None = None) -> None:
+        self.send({
+            "type": "SceneNodeClickMessage", "name": name, "instance_index": instance_index,
+            "ray_origin": (0.0, 0.0, 1.0), "ray_direction": (0.0, 0.0, -1.0),
+            "screen_pos": (0.5, 0.5), "modifier": None, "owner": owner,
+        })  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> SceneContent:
+    return SceneContent.load(boxes_session(tmp_path_factory.mktemp("nodes") / "boxes"), CONFIG)
+
+
+@pytest.fixture
+def server() -> Iterator[viser.ViserServer]:
+    made = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    yield made
+    made.stop()
+
+
+@pytest.fixture
+def nodes(server: viser.ViserServer, shown: SceneContent) -> SceneNodes:
+    built = SceneNodes(server.scene, shown, CONFIG)
+    built.build()
+    assert built.wait_for_cloud(20)
+    return built
+
+
+def states(server: viser.ViserServer) -> dict[str, tuple[Any, ...]]:
+    """Name -> pose, visibility and type of every node of the server."""
+    handles = server.scene._handle_from_node_name  # type: ignore[reportPrivateUsage]
+    return {
+        name: (*h.wxyz.tolist(), *h.position.tolist(), h.visible, type(h).__name__)
+        for name, h in handles.items()
+    }
+
+
+def test_a_client_is_sent_the_very_points_photographs_and_poses(
+    server: viser.ViserServer, nodes: SceneNodes, shown: SceneContent
+) -> None:
+    client = Client(server)
+    client.receive()
+    pieces = client.of("PointCloudMessage")
+    points = np.concatenate([client.array(m, "points", np.float32) for m in pieces])
+    colors = np.concatenate([client.array(m, "colors", np.uint8) for m in pieces])
+    n = len(points) // 3
+    assert 1000 <= n < 1000 + CONFIG.piece_points
+    np.testing.assert_array_equal(points.reshape(-1, 3), shown.cloud.points[:n])
+    np.testing.assert_array_equal(colors.reshape(-1, 3), shown.cloud.colors[:n])
+    assert len(client.array(pieces[0], "points", np.float32)) == 3 * shown.cloud.ends[0]
+    positions = {m["name"]: m["position"] for m in client.of("SetPositionMessage")}
+    for index, T in enumerate(CAMERAS):
+        np.testing.assert_allclose(positions[f"/cameras/{index:06d}"], T[:3, 3], atol=1e-6)
+    for placed in SCENE.objects:
+        np.testing.assert_allclose(
+            positions[f"/objects/{placed.instance}"], placed.T_world_obj[:3, 3], atol=1e-6
+        )
+    sent = [m["updates"].get("_image_data") for m in client.of("SceneNodeUpdateMessage")]
+    photographs = {bytes(b) for b in sent if isinstance(b, bytes | memoryview)}
+    assert photographs == set(shown.thumbnails.values())
+    glbs = {bytes(m["props"]["glb_data"]) for m in client.of("GlbMessage")}
+    assert glbs == {shown.meshes[1].glb, shown.meshes[7].glb}
+
+
+def test_place_and_place_back_leaves_every_node_as_it_was(
+    server: viser.ViserServer, nodes: SceneNodes
+) -> None:
+    before = states(server)
+    T = SCENE.object(0).T_world_obj
+    moved = se3.random_transform(np.random.default_rng(0))
+    nodes.place(0, moved)
+    during = states(server)
+    changed = {name for name in before if during[name] != before[name]}
+    assert changed == {"/objects/0"}
+    np.testing.assert_allclose(during["/objects/0"][4:7], moved[:3, 3], atol=1e-9)
+    nodes.place(0, T)
+    after = states(server)
+    assert after.keys() == before.keys()
+    for name, state in after.items():
+        np.testing.assert_allclose(state[:7], before[name][:7], atol=1e-9)
+        assert state[7:] == before[name][7:]
+
+
+def test_an_object_moves_by_two_small_messages(
+    server: viser.ViserServer, nodes: SceneNodes
+) -> None:
+    client = Client(server)
+    client.receive()
+    nodes.place(3, se3.random_transform(np.random.default_rng(1)))
+    new = client.receive()
+    assert {m["type"] for m in new} == {"SetPositionMessage", "SetOrientationMessage"}
+    assert {m["name"] for m in new} == {"/objects/3"}
+
+
+def test_switches_show_one_look_at_a_time_and_colours_follow_the_verdict(
+    server: viser.ViserServer, nodes: SceneNodes
+) -> None:
+    def seen(instance: int) -> tuple[bool, bool]:
+        now = states(server)
+        return tuple(
+            now.get(f"/objects/{instance}/{k}", (False, ""))[-2] for k in ("appearance", "verdict")
+        )  # type: ignore[return-value]
+
+    assert seen(0) == (True, False)
+    nodes.color_verdict(0, "rejected")  # before it was ever shown so
+    nodes.show_objects("verdict")
+    assert seen(0) == seen(3) == (False, True)
+    handles = server.scene._handle_from_node_name  # type: ignore[reportPrivateUsage]
+    judged = cast(Any, handles["/objects/0/verdict"])
+    assert tuple(judged.color) == (222, 76, 10)
+    nodes.color_verdict(0, "accepted")
+    assert tuple(judged.color) == (0, 170, 130)
+    nodes.show_objects("hidden")
+    assert seen(0) == (False, False)
+    nodes.show_objects("appearance")
+    assert seen(0) == (True, False)
+    for switch, name in (
+        (nodes.show_cloud, "/cloud"), (nodes.show_cameras, "/cameras"), (nodes.show_table, "/table")
+    ):  # fmt: skip
+        switch(False)
+        assert not states(server)[name][-2]
+        switch(True)
+        assert states(server)[name][-2]
+
+
+def test_a_swapped_object_stands_where_it_stood(
+    server: viser.ViserServer, nodes: SceneNodes, shown: SceneContent
+) -> None:
+    before = states(server)
+    nodes.swap(0, shown.models[9])
+    client = Client(server)
+    client.receive()
+    glbs = {m["name"]: bytes(m["props"]["glb_data"]) for m in client.of("GlbMessage")}
+    assert glbs["/objects/0/appearance"] == shown.meshes[9].glb
+    assert states(server) == before
+    nodes.swap(0, 1)
+    assert states(server) == before
+
+
+def test_colours_of_the_cloud_are_set_in_its_order_and_taken_back(
+    server: viser.ViserServer, nodes: SceneNodes, shown: SceneContent
+) -> None:
+    rng = np.random.default_rng(0)
+    colors = rng.integers(0, 256, shown.cloud.points.shape, dtype=np.uint8)
+
+    def sent() -> np.ndarray:
+        handles = server.scene._handle_from_node_name  # type: ignore[reportPrivateUsage]
+        names = sorted((n for n in handles if n.startswith("/cloud/")), key=lambda n: int(n[7:]))
+        return np.concatenate([cast(Any, handles[n]).colors for n in names])
+
+    nodes.set_cloud_colors(colors)
+    n = len(sent())
+    np.testing.assert_array_equal(sent(), colors[:n])
+    nodes.refine_cloud()  # pieces that come later are coloured likewise
+    assert nodes.wait_for_cloud(20)
+    np.testing.assert_array_equal(sent(), colors)
+    nodes.set_cloud_colors(None)
+    np.testing.assert_array_equal(sent(), shown.cloud.colors)
+    with pytest.raises(InputError, match="colours"):
+        nodes.set_cloud_colors(colors[:-1])
+
+
+def test_grasps_are_one_node_at_their_poses_and_a_click_tells_the_row(
+    server: viser.ViserServer, nodes: SceneNodes, shown: SceneContent
+) -> None:
+    clicked: list[tuple[int, int]] = []
+    done = threading.Event()
+    nodes.on_grasp(lambda instance, row: (clicked.append((instance, row)), done.set()))
+    moved = se3.random_transform(np.random.default_rng(2))
+    chosen = GraspFilter(stage=4)
+    drawn = nodes.draw_grasps(chosen, {3: moved})
+    expected = [
+        (g.instance, int(r)) for g in shown.grasp_sets for r in np.flatnonzero(g.base_scores == 1)
+    ]
+    assert drawn == len(expected) > 10
+    client = Client(server)
+    client.receive()
+    (message,) = client.of("BatchedMeshesMessage")
+    positions = client.array(message, "batched_positions", np.float32).reshape(-1, 3)
+    scales = client.array(message, "batched_scales", np.float32).reshape(-1, 3)
+    for k, (instance, row) in enumerate(expected):
+        grasps = shown.grasps_of(instance)
+        assert grasps is not None
+        T = moved if instance == 3 else SCENE.object(instance).T_world_obj
+        np.testing.assert_allclose(positions[k], (T @ grasps.Ts_obj_grasp[row])[:3, 3], atol=1e-6)
+        assert scales[k, 1] == pytest.approx(grasps.widths_m[row], rel=1e-6)
+    for index in (0, drawn - 1):
+        done.clear()
+        client.click("/grasps", message["owner"], index)
+        assert done.wait(10)
+        assert clicked[-1] == expected[index]
+    assert nodes.draw_grasps(GraspFilter(show=False)) == 0
+    assert "/grasps" not in states(server)
+
+
+def test_no_more_grasps_are_drawn_than_the_browser_can_turn(
+    server: viser.ViserServer, shown: SceneContent
+) -> None:
+    few = SceneNodes(server.scene, shown, SceneConfig(most_grasps=7))
+    assert few.draw_grasps(GraspFilter()) <= 7
+
+
+def test_clicks_on_objects_and_cameras_tell_which(
+    server: viser.ViserServer, nodes: SceneNodes
+) -> None:
+    told: list[tuple[str, int]] = []
+    done = threading.Semaphore(0)
+
+    def hear(kind: str, number: int) -> None:
+        told.append((kind, number))
+        done.release()
+
+    nodes.on_object(lambda i: hear("object", i))
+    nodes.on_camera(lambda i: hear("camera", i))
+    client = Client(server)
+    client.receive()
+    owner = client.of("GlbMessage")[0]["owner"]
+    for name in ("/objects/3/appearance", "/cameras/000002", "/objects/0/appearance"):
+        client.click(name, owner)
+        assert done.acquire(timeout=10)
+    assert told == [("object", 3), ("camera", 2), ("object", 0)]
+
+
+def test_highlight_and_ellipsoids_come_and_go(server: viser.ViserServer, nodes: SceneNodes) -> None:
+    before = states(server)
+    nodes.highlight(3)
+    assert set(states(server)) - set(before) == {"/objects/3/box"}
+    nodes.highlight(0)
+    assert set(states(server)) - set(before) == {"/objects/0/box"}
+    nodes.highlight(None)
+    shape = ellipsoid_of(SCENE.object(0), 2.0, 10.0)
+    assert shape is not None
+    nodes.ellipsoids({0: shape, 3: None})
+    assert {n for n in states(server) if n.startswith("/ellipsoids/")} == {"/ellipsoids/0"}
+    nodes.ellipsoids({})
+    assert {n for n in states(server) if "ellipsoids/" in n} == set()
+
+
+def test_unknown_objects_are_named(nodes: SceneNodes) -> None:
+    for call in (
+        lambda: nodes.place(9, np.eye(4)), lambda: nodes.highlight(9), lambda: nodes.swap(9, 1),
+        lambda: nodes.color_verdict(9, "accepted"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match="0, 3"):
+            call()
+    with pytest.raises(InputError, match="verdict"):
+        nodes.color_verdict(0, "fine")
+    with pytest.raises(InputError, match="no mesh"):
+        nodes.swap(0, 77)
+    with pytest.raises(InputError, match="hidden"):
+        nodes.show_objects("upside down")  # type: ignore[arg-type]
+
+
+def test_clear_takes_everything_away_and_stops_the_background(
+    server: viser.ViserServer, shown: SceneContent
+) -> None:
+    empty = set(states(server))
+    built = SceneNodes(server.scene, shown, CONFIG)
+    built.build()
+    built.refine_cloud()
+    built.draw_grasps(GraspFilter())
+    built.highlight(0)
+    built.ellipsoids({0: ellipsoid_of(SCENE.object(0))})
+    built.clear()
+    assert built.wait_for_cloud(20)
+    left = {n for n in states(server) if n not in empty}
+    assert left <= {"/objects", "/ellipsoids"}  # empty anchors that viser made itself
+    built.clear()
+    built.build()
+    assert built.wait_for_cloud(20) and "/cloud/1" in states(server)
+
+
+def test_each_browser_has_its_own_scene_and_the_coarse_cloud_comes_first(
+    server: viser.ViserServer, shown: SceneContent
+) -> None:
+    made: list[SceneNodes] = []
+    ready = threading.Semaphore(0)
+
+    def opened(client: viser.ClientHandle) -> None:
+        nodes = SceneNodes(client.scene, shown, CONFIG)
+        nodes.build()
+        nodes.refine_cloud()
+        made.append(nodes)
+        ready.release()
+
+    server.on_client_connect(opened)
+    first, second = Client(server), Client(server)
+    assert ready.acquire(timeout=20) and ready.acquire(timeout=20)
+    end = time.monotonic() + 20
+    while time.monotonic() < end and not all(n.wait_for_cloud(0.1) for n in made):
+        first.receive(0.05), second.receive(0.05)
+    for client in (first, second):
+        client.receive()
+        pieces = client.of("PointCloudMessage")
+        assert [m["name"] for m in pieces] == [f"/cloud/{k}" for k in range(len(pieces))]
+        points = np.concatenate([client.array(m, "points", np.float32) for m in pieces])
+        np.testing.assert_array_equal(points.reshape(-1, 3), shown.cloud.points)
+        names = [
+            m["name"] for m in client.messages if m["type"].endswith("Message") and "name" in m
+        ]
+        assert names.index("/cloud/0") < names.index("/cameras/000003") < names.index("/cloud/2")
+    made[0].place(0, se3.random_transform(np.random.default_rng(0)))
+    told = [bool([m for m in c.receive() if m["type"] == "SetPositionMessage"])
+            for c in (first, second)]  # fmt: skip
+    assert sorted(told) == [False, True]
+
+
+def test_a_browser_that_leaves_stops_its_own_background(
+    server: viser.ViserServer, shown: SceneContent
+) -> None:
+    config = SceneConfig(voxel_m=0.004, coarse_points=50, piece_points=20, thumbnail_px=40)
+    made: list[SceneNodes] = []
+    ready = threading.Event()
+
+    def opened(client: viser.ClientHandle) -> None:
+        nodes = SceneNodes(client.scene, shown, config)
+        nodes.build()
+        made.append(nodes)
+        ready.set()
+
+    server.on_client_connect(opened)
+    client = Client(server)
+    assert ready.wait(20)
+    client.socket.close()
+    assert made[0].wait_for_cloud(20)
+    made[0].clear()

@@ -1,0 +1,120 @@
+"""The words of the review page: units, whose decision it is, and nothing that a browser obeys."""
+
+import re
+
+import numpy as np
+import pytest
+
+from realsim import ObjectModel, ObjectPose
+from realsim.geometry import se3
+from realsim.review import journal, window_text
+from realsim.review.scene_list import ObjectRow
+from tests.support.reviewed_boxes import MODELS, SCENE
+
+TALL = 1
+PLACED = SCENE.objects[1]
+NASTY = '<img src=x onerror=alert(1)> [a](javascript:alert(1)) `x` | **b** & "q"'
+
+
+def entry(comment: str = "", reviewer: str = "ada") -> journal.Entry:
+    return journal.new_entry("reject", PLACED, reviewer, comment=comment)
+
+
+def test_what_people_write_is_never_taken_for_mark_up() -> None:
+    line = entry(NASTY, f"eve {NASTY}")
+    model = ObjectModel(obj_id=7, name=NASTY, mesh=MODELS[7].mesh)
+    shown = ObjectPose(
+        obj_id=7, instance=3, T_world_obj=PLACED.T_world_obj, verdict="rejected", reasons=(NASTY,)
+    )
+    text = window_text.object_text(shown, shown, model, line)
+    texts = [text, window_text.history_text([line]), window_text.signed(line)]
+    for found in texts:
+        assert "<img" not in found and "[a](" not in found and "**b**" not in found
+    assert "<img" not in window_text.message_html(NASTY, "refused")
+    # Our own mark-up is there all the same.
+    assert "<span style" in text and "**rejected**" in text
+
+
+def test_the_panel_says_what_was_computed_and_who_said_what() -> None:
+    text = window_text.object_text(PLACED, PLACED, MODELS[7], None)
+    assert "computed: **doubtful**" in text and "- seen by one view" in text
+    assert "nobody has judged it yet" in text
+    said = window_text.object_text(PLACED, PLACED, MODELS[7], entry("it floats"))
+    assert "**rejected** by ada" in said and "> it floats" in said
+
+
+def test_certainty_is_in_mm_and_deg_and_leaves_out_the_own_axis() -> None:
+    C = np.diag([1.0, 4e-6, 4e-6, 1e-6, 1e-6, 9e-6])
+    placed = ObjectPose(
+        obj_id=TALL, instance=0, T_world_obj=np.eye(4), covariance=C,
+        checks={"probability": 0.987},
+    )  # fmt: skip
+    mesh = MODELS[TALL].mesh
+    round_ = ObjectModel(
+        obj_id=TALL, name="round", mesh=mesh, symmetry_axes=(((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)),)
+    )
+    text = window_text.certainty_text(placed, round_)
+    assert "98.7 %" in text and "3 mm along its worst axis" in text
+    assert "0.11 deg" in text and "left out" in text
+    assert "57" in window_text.certainty_text(placed, MODELS[TALL])  # 1 rad, with its own axis
+    unknown = ObjectPose(obj_id=TALL, instance=0, T_world_obj=np.eye(4))
+    assert "not known" in window_text.certainty_text(unknown, round_)
+
+
+def test_every_check_is_in_one_of_the_two_tables_with_its_unit() -> None:
+    checks = {"agree": 0.71, "residual_median_mm": 0.35, "n_pixels": 92452.0, "gain": 0.9}
+    placed = ObjectPose(obj_id=7, instance=3, T_world_obj=np.eye(4), checks=checks)
+    main = window_text.checks_table(placed, main=True)
+    rest = window_text.checks_table(placed, main=False)
+    assert "| 71.0 % |" in main and "| 0.35 mm |" in main and "| 92,452 |" in main
+    assert "gain" in rest and "agree" not in rest
+    assert main.count("\n") + rest.count("\n") == len(checks) + 2
+    empty = ObjectPose(obj_id=7, instance=3, T_world_obj=np.eye(4))
+    assert window_text.checks_table(empty, main=True) == "nothing was measured"
+
+
+@pytest.mark.parametrize(
+    ("share", "words"),
+    [(0.0, "0 %"), (0.5, "50.0 %"), (0.9994, "99.94 %"), (0.999999, "99.99 %"), (1.0, "100 %")],
+)
+def test_100_per_cent_means_that_nothing_is_missing(share: float, words: str) -> None:
+    assert window_text.percent(share) == words
+
+
+def test_undo_names_whose_line_it_takes_back() -> None:
+    assert window_text.undo_label(entry()) == "Undo: ada rejected"
+    assert window_text.undo_label(None) == "Undo"
+    assert len(window_text.undo_label(entry(reviewer="a" * 200))) <= 48
+
+
+def test_the_list_tells_the_judged_from_the_waiting() -> None:
+    row = ObjectRow(
+        session=0, instance=3, name="flat", computed="doubtful", verdict="doubtful", agree=0.71,
+        is_decided=False,
+    )  # fmt: skip
+    assert window_text.list_label(row, "000001", with_scene=False) == (
+        "3 flat \u00b7 doubtful \u00b7 71.0 %"
+    )
+    assert window_text.list_label(row, "000001", with_scene=True).startswith("000001 \u00b7 3 flat")
+
+
+def test_letters_on_the_colours_of_the_verdicts_can_be_read() -> None:
+    def luminance(rgb: tuple[int, int, int]) -> float:
+        c = np.array(rgb) / 255
+        linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+        return float(linear @ [0.2126, 0.7152, 0.0722])
+
+    colors = [window_text.verdict_rgb(v) for v in ("accepted", "doubtful", "rejected", "unchecked")]
+    for rgb in colors:
+        assert 1.05 / (luminance(rgb) + 0.05) > 4.4
+    assert len(set(colors)) == 4
+    assert re.search(r"color:rgb\(\d+, \d+, \d+\)", window_text.color_dot("accepted"))
+
+
+def test_a_line_in_the_history_has_time_name_and_how() -> None:
+    T = se3.from_translation([0.5, 0.0, 0.015])
+    moved = journal.new_entry("move", PLACED, "bob", pose=T, how="steps+icp")
+    text = window_text.history_text([entry("it floats"), moved])
+    first, second = text.split("\n")
+    assert "**bob** moved it (steps+icp)" in first and "**ada** rejected: it floats" in second
+    assert re.search(r"\d{4}-\d\d-\d\d \d\d:\d\d UTC", first)

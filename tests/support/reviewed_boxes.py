@@ -1,0 +1,102 @@
+"""A small registered session of two boxes on a table, with grasps: what a review is opened on."""
+
+from pathlib import Path
+
+import numpy as np
+
+from realsim import (
+    CameraIntrinsics,
+    CaptureSession,
+    GraspSet,
+    Mesh,
+    ObjectModel,
+    ObjectPose,
+    Scene,
+    SupportPlane,
+    View,
+)
+from realsim.formats.bop.models import save_models
+from realsim.geometry import se3
+from realsim.rendering.labels import LabelRenderer, PlacedMesh
+from realsim.store import SessionStore, save_grasps, save_scene
+
+INTRINSICS = CameraIntrinsics(
+    width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5,
+    distortion=np.array([-0.05, 0.02, 1e-3, -1e-3, 0.0]),
+)  # fmt: skip
+DEPTH_UNIT_M = 1e-4
+CAMERAS = [
+    se3.look_at([0.5 + 0.4 * np.cos(a), 0.4 * np.sin(a), 0.3], [0.5, 0.0, 0.03])
+    for a in (0.0, 1.6, 3.1, 4.7)
+]
+
+
+def box(size: tuple[float, float, float], rgb: tuple[int, int, int] = (180, 60, 40)) -> Mesh:
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    faces = [
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ]  # fmt: skip
+    return Mesh(
+        vertices=corners * np.array(size) / 2, faces=np.array(faces, np.int32),
+        colors=np.tile(np.array(rgb, np.uint8), (8, 1)),
+    )  # fmt: skip
+
+
+MODELS = {
+    1: ObjectModel(obj_id=1, name="tall", mesh=box((0.04, 0.04, 0.12))),
+    7: ObjectModel(obj_id=7, name="flat", mesh=box((0.08, 0.06, 0.03))),
+    9: ObjectModel(obj_id=9, name="spare", mesh=box((0.05, 0.05, 0.05))),
+}
+SCENE = Scene(
+    name="two boxes",
+    objects=(
+        ObjectPose(
+            obj_id=1, instance=0, T_world_obj=se3.from_translation([0.46, 0.0, 0.06]),
+            verdict="accepted", checks={"agree": 0.98}, covariance=1e-6 * np.eye(6),
+        ),
+        ObjectPose(
+            obj_id=7, instance=3, T_world_obj=se3.from_translation([0.55, 0.02, 0.015]),
+            verdict="doubtful", reasons=("seen by one view",), checks={"agree": 0.71},
+        ),
+    ),
+    plane=SupportPlane(T_world_table=se3.from_translation([0.5, 0.0, 0.0])),
+)  # fmt: skip
+
+
+def grasp_set(obj_id: int, instance: int, n: int = 40) -> GraspSet:
+    rng = np.random.default_rng(instance)
+    Ts = se3.from_rt(np.diag([1.0, -1.0, -1.0]), rng.normal(scale=0.01, size=(n, 3)))
+    stages = np.append(np.arange(n - 1) % 5, np.nan) / 4
+    words = {0.0: "close: the object slipped 7.5 mm", 0.25: "lift: the object was lost",
+             0.5: "oscillate: it turned", 0.75: "pendulum: it turned", 1.0: ""}  # fmt: skip
+    nan4 = np.full((n, 4), np.nan)
+    return GraspSet(
+        obj_id=obj_id, instance=instance, Ts_obj_grasp=Ts, widths_m=rng.uniform(0.02, 0.08, n),
+        scores=np.append(np.linspace(0, 1, n - 1), np.nan), base_scores=stages, slip_m=nan4,
+        slip_rad=nan4, reachable=np.arange(n) % 2 == 0,
+        failures=tuple(words.get(float(s), "no inverse kinematics") for s in stages),
+    )  # fmt: skip
+
+
+def boxes_session(folder: Path) -> SessionStore:
+    """Return a session whose depth is exact to half a count."""
+    session = CaptureSession(
+        name="boxes", intrinsics=INTRINSICS, views=(), depth_unit_m=DEPTH_UNIT_M
+    )
+    store = SessionStore.create(folder, session)
+    table = PlacedMesh(-1, box((1.0, 1.0, 0.02)), se3.from_translation([0.5, 0.0, -0.01]))
+    placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
+    renderer = LabelRenderer([*placed, table])
+    rng = np.random.default_rng(1)
+    for index, T in enumerate(CAMERAS):
+        labels = renderer.render(INTRINSICS, T)
+        rgb = np.stack([np.where(labels.ids == 0, 200, 90)] * 3, -1)
+        rgb = (rgb + rng.integers(0, 20, rgb.shape)).astype(np.uint8)
+        store.add_view(View(index=index, T_world_cam=T), rgb, labels.depth_m)
+    save_scene(store, SCENE)
+    for placed_object in SCENE.objects:
+        save_grasps(store, grasp_set(placed_object.obj_id, placed_object.instance))
+    save_models(store.folder / "models", MODELS)
+    store.close()
+    return store
