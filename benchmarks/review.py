@@ -19,6 +19,8 @@ Parts and the figures they give (keys of the JSON's "figures"):
                                dozen, median of its repetitions; 100,000 points, 256 frustums
            click_median_ms     the median kind
            click_wall_ms       until the first bytes of the answer, the slowest kind
+           click_first_wall_ms    the same of the first click of every kind, which also starts
+                               preparing in the background for those that follow
 """
 
 import os

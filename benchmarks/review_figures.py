@@ -7,6 +7,7 @@ FIGURES = {
     "click_ms": Figure(unit="ms", goal=Goal(high=150.0)),
     "click_median_ms": Figure(unit="ms"),
     "click_wall_ms": Figure(unit="ms"),
+    "click_first_wall_ms": Figure(unit="ms"),
     "open_cpu_s": Figure(unit="s", goal=Goal(high=5.0)),
     "open_over_decoding": Figure(unit="x", goal=Goal(high=1.0)),
     "open_warm_cpu_s": Figure(unit="s"),

@@ -27,7 +27,7 @@ class Command(click.Command):
             return super().parse_args(ctx, args)
         except click.BadParameter as error:
             option = error.param
-            if not isinstance(option, click.Option) or option.name is None:
+            if not isinstance(option, click.Option):
                 raise
             if ctx.get_parameter_source(option.name) is not ParameterSource.ENVIRONMENT:
                 raise

@@ -73,6 +73,11 @@ class ShowPanel:
         self._is_in_camera = is_in
         self._switch()
 
+    def hide_cameras(self) -> None:
+        """Switch the cameras off, as the reviewer could: an arm is to be seen among them."""
+        self._cameras.value = False
+        self._switch()
+
     def _switch(self) -> None:
         nodes, free = self._window.nodes, not self._is_in_camera
         with self._window.client.atomic():

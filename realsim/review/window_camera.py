@@ -31,10 +31,10 @@ LOOK_DOWN_RAD = 0.7
 """Angle under which an object is looked at [rad]."""
 LOOK_RADII, LOOK_M = 3.0, 0.1
 """Distance from which it is looked at: radii of its ball, and metres."""
-BESIDE_RAD, BESIDE_DOWN_RAD = 0.9, 0.45
+BESIDE_RAD, BESIDE_DOWN_RAD = -0.7, 0.5
 """An arm at work is looked at from the far side of the object, and so much round and down."""
-BEHIND_CAMERAS = 1.6
-"""Distance of that look over the cameras' own: their frustums stay in front, and small."""
+BEHIND_CAMERAS = 1.25
+"""Distance of that look over the cameras' own: hand, object and forearm are seen."""
 OUTSIDE = "Click a camera in the scene, or choose one: you stand in it, before its photograph."
 log = logging.getLogger(__name__)
 

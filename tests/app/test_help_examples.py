@@ -38,7 +38,7 @@ MAY_FAIL_A_CHECK = ("scan scale", "scan sfm", "scan import", "scan complete", "s
 def printed_examples(command: click.Command, path: tuple[str, ...]) -> list[str]:
     """Return the lines under `Examples:`, the last block of a command's help."""
     text = command.get_help(click.Context(command, info_name=" ".join(("realsim", *path))))
-    head, found, block = text.rpartition("Examples:\n")
+    _, found, block = text.rpartition("Examples:\n")
     assert found, f"realsim {' '.join(path)} --help has no examples"
     return [line.strip() for line in block.splitlines()]
 

@@ -24,6 +24,7 @@ HEADING = re.compile(r"^#+ +(.*?) *$", re.M)
 COMMAND = re.compile(r"^(?:\$ )?(?:uv run (?:--\S+ )*)?realsim(?= |$)")
 TYPED = ("", "sh", "bash", "shell", "console")
 """Kinds of blocks whose lines are typed; in a console's, those behind a dollar sign."""
+REDIRECTION = re.compile(r"(?<=\s)\d?>{1,2}\s?\S+")
 NAMED = re.compile(r"(?<!from )(?<!import )\brealsim ([a-z][a-z-]*)\b([^`#\n]*)")
 
 
@@ -61,7 +62,8 @@ def typed_commands(text: str) -> list[str]:
     for block in blocks(text):
         if block.kind in TYPED:
             for line in block.text.replace("\\\n", " ").splitlines():
-                for part in re.split(r"\s&&\s|;\s", line):
+                for part in re.split(r"\s(?:&&|\|\||\||;)\s|;\s", line):
+                    part = REDIRECTION.sub("", part)
                     if COMMAND.match(part.strip()):
                         lines.append(COMMAND.sub("realsim", part.strip()))
     return lines

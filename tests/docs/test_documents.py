@@ -41,8 +41,10 @@ def test_commands_are_found_in_code_only() -> None:
         "realsim turns\n\n    uv run realsim demo --out x  # realsim\n\nand `realsim fly --high`.\n"
         "```sh\nrealsim check A && realsim check B\n```\n    from realsim import View\n"
     )
+    text += "    realsim check C --json > c.json || echo bad | realsim demo 2> log\n"
     assert typed_commands(text) == [
         "realsim demo --out x  # realsim", "realsim check A", "realsim check B",
+        "realsim check C --json", "realsim demo",
     ]  # fmt: skip
     names = [name for name, _ in named_commands(text)]
     assert names[0] == "fly" and sorted(set(names)) == ["check", "demo", "fly"]

@@ -37,7 +37,7 @@ def read(path: Path) -> str:
 def run(words: list[str], folder: Path) -> str:
     """Run to the end and return what was printed; it must end with 0."""
     done = subprocess.run(
-        words, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=1500
+        words, cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=3600
     )
     assert done.returncode == 0, f"{words} ended with {done.returncode}:\n{done.stderr[-3000:]}"
     return done.stdout

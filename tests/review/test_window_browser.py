@@ -138,6 +138,7 @@ def test_keys_move_a_copy_and_saving_writes_one_line(
     np.testing.assert_allclose(step, [0.015, 0, 0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_two_reviewers_see_each_other_and_the_slower_mover_is_told(
     browser: ReviewBrowser, server: ReviewServer
 ) -> None:

@@ -1,0 +1,84 @@
+"""`realsim review` as it is typed: what it opens, how it ends, what a script reads of it."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from realsim import InputError
+from realsim.app.review.cli import review_command
+from realsim.app.review.run import ReviewRequest, open_all, run_review, write_page
+from realsim.review.reviewed_session import ReviewedSession
+from realsim.store import SessionStore
+from tests.support.reviewed_boxes import boxes_session
+
+
+def test_sessions_that_cannot_be_reviewed_are_told_and_the_others_opened(tmp_path: Path) -> None:
+    boxes_session(tmp_path / "root/a").close()
+    raw = boxes_session(tmp_path / "root/b")
+    raw.remove("registration/scene.json")
+    stores, remarks = open_all((tmp_path / "root",))
+    assert [s.folder.name for s in stores] == ["a"]
+    assert len(remarks) == 1 and "b is left out" in remarks[0] and "realsim register" in remarks[0]
+    with pytest.raises(InputError, match="not registered yet"):
+        open_all((tmp_path / "root/b",))
+
+
+def test_ctrl_c_ends_with_a_summary_and_exit_code_0(tmp_path: Path) -> None:
+    folder = boxes_session(tmp_path / "boxes").folder
+    process = subprocess.Popen(
+        [sys.executable, "-m", "realsim.app.cli", "review", str(folder), "--port", "0",
+         "--no-browser", "--json"],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    assert process.stderr is not None
+    assert "http://127.0.0.1:" in process.stderr.readline()
+    session = ReviewedSession(SessionStore.open(folder))
+    session.decide("reject", session.standing.scene.object(3), "ada", comment="floats")
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 0, err
+    said = json.loads(out)
+    assert (said["judged"], said["objects"]) == (1, 2)
+    assert [(d["action"], d["reviewer"]) for d in said["decisions"]] == [("reject", "ada")]
+    assert said["to_register"] == [str(folder)]
+    assert "1 reject" in err and "--from-review" in err
+
+
+def test_the_static_page_is_of_one_scene(tmp_path: Path) -> None:
+    from realsim.app.console import Console
+
+    boxes_session(tmp_path / "root/a").close()
+    boxes_session(tmp_path / "root/b").close()
+    console = Console(quiet=True, as_json=True)
+    request = ReviewRequest(folders=(tmp_path / "root",))
+    with pytest.raises(InputError, match="writes one scene, and there are 2"):
+        write_page(request, tmp_path / "page.html", console)
+    write_page(ReviewRequest(folders=(tmp_path / "root/a",)), tmp_path / "page.html", console)
+    assert (tmp_path / "page.html").read_bytes().lstrip()[:15].lower() == b"<!doctype html>"
+
+
+def test_other_machines_need_a_token_that_is_not_readable_by_others(tmp_path: Path) -> None:
+    from realsim.app.console import Console
+
+    path = tmp_path / "token"
+    path.write_text("a-secret-of-more-than-16")
+    path.chmod(0o644)
+    request = ReviewRequest(folders=(tmp_path,), host="0.0.0.0", token_file=path)
+    with pytest.raises(InputError, match="chmod 600"):
+        run_review(request, Console(quiet=True))
+
+
+def test_the_help_ends_with_examples() -> None:
+    text = CliRunner().invoke(review_command, ["--help"]).output
+    assert text.rstrip().splitlines()[-3:] == [
+        "Examples:",
+        "  realsim review demo/session",
+        "  realsim review demo/session --static scene.html",
+    ]
