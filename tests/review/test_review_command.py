@@ -17,6 +17,8 @@ from realsim.review.reviewed_session import ReviewedSession
 from realsim.store import SessionStore
 from tests.support.reviewed_boxes import boxes_session
 
+MAIN = "from realsim.app.cli import main; main()"
+
 
 def test_sessions_that_cannot_be_reviewed_are_told_and_the_others_opened(tmp_path: Path) -> None:
     boxes_session(tmp_path / "root/a").close()
@@ -32,7 +34,7 @@ def test_sessions_that_cannot_be_reviewed_are_told_and_the_others_opened(tmp_pat
 def test_ctrl_c_ends_with_a_summary_and_exit_code_0(tmp_path: Path) -> None:
     folder = boxes_session(tmp_path / "boxes").folder
     process = subprocess.Popen(
-        [sys.executable, "-m", "realsim.app.cli", "review", str(folder), "--port", "0",
+        [sys.executable, "-c", MAIN, "review", str(folder), "--port", "0",
          "--no-browser", "--json"],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},

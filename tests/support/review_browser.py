@@ -160,15 +160,21 @@ class ReviewPage:
 
     def choose(self, label: str, option: str) -> None:
         """Choose from the list of this label."""
-        self._field(label, "e.focus(); e.click();")
-        self.wait_until(lambda: self._option(option), f"the choice '{option}'", 20.0)
+        for _ in range(4):  # a list that opens while its field is scrolled out of sight is hidden
+            self._field(label, "e.focus(); e.click();")
+            for _ in range(50):
+                if self._option(option):
+                    return
+                self.page.wait_for_timeout(100)
+        raise AssertionError(f"no choice '{option}' of '{label}'; the page shows:\n{self.text()}")
 
     def _field(self, label: str, script: str, value: str = "") -> Any:
         """Run a script on the field e beside a label; viser ties only some of them to it."""
         return self.page.evaluate(
             "([label, value]) => { let e = [...document.querySelectorAll('label')]"
             ".find(l => l.textContent === label); while (!e.querySelector('input, textarea'))"
-            f" e = e.parentElement; e = e.querySelector('input, textarea'); {script} }}",
+            f" e = e.parentElement; e = e.querySelector('input, textarea');"
+            f" e.scrollIntoView({{block: 'center'}}); {script} }}",
             [label, value],
         )
 
