@@ -32,9 +32,10 @@ CLICK_QUIET_S = 0.3
 """Nothing is sent for so long after a click: it is answered."""
 IMPORTS = (
     "import trimesh, scipy.spatial, cv2, isal.isal_zlib, viser, realsim.review, "
-    "realsim.review.window, realsim.review.content, realsim.review.scene_nodes, "
-    "realsim.models.mesh_clustering, realsim.registration, numba, sys, pathlib; "
-    "from realsim.review import quick_png; "
+    "realsim.review.window.window, realsim.review.content.content, "
+    "realsim.review.drawing.scene_nodes, realsim.models.mesh_clustering, realsim.registration, "
+    "numba, sys, pathlib; "
+    "from realsim.review.content import quick_png; "
     "quick_png.read_rgb(pathlib.Path(sys.argv[1]) / 'rgb/000000.png'); "
     "quick_png.read_depth(pathlib.Path(sys.argv[1]) / 'depth/000000.png', 1e-4)"
 )

@@ -12,7 +12,7 @@ import sys
 import time
 
 from realsim.review import ReviewServer
-from realsim.review.content_config import SceneConfig
+from realsim.review.content.config import SceneConfig
 from realsim.store import SessionStore
 
 KB_PER_MB = 1024

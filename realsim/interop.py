@@ -28,7 +28,9 @@ from realsim.geometry import se3
 
 Array = NDArray[np.float64]
 
-APT_PACKAGES = {"libEGL": "libegl1", "libGL": "libgl1", "libusb": "libusb-1.0-0"}
+APT_PACKAGES = {
+    "libEGL": "libegl1", "libGL": "libgl1", "libusb": "libusb-1.0-0", "libgomp": "libgomp1",
+}  # fmt: skip
 """Debian/Ubuntu package of each shared library that the wheels expect from the system."""
 T_CAM_GL = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL camera axes (x right, y up, z backward) in OpenCV's; its own inverse."""
@@ -72,7 +74,7 @@ def quiet_output() -> Generator[None]:
             os.close(copy)
 
 
-def _missing_library(module: str, error: Exception) -> MissingLibraryError:
+def missing_library(module: str, error: Exception) -> MissingLibraryError:
     """Return the error that names what to install, from what the loader said."""
     text = str(error)
     packages = [package for library, package in APT_PACKAGES.items() if library in text]
@@ -82,7 +84,7 @@ def _missing_library(module: str, error: Exception) -> MissingLibraryError:
             "(`uv sync`, or `pip install realsim`)."
         )
     # The loader names only the first missing library; libEGL and libGL go together.
-    if "libusb-1.0-0" not in packages:
+    if "libegl1" in packages or "libgl1" in packages:
         packages = ["libegl1", "libgl1"]
     return MissingLibraryError(
         f"{module} is installed, but a library of the system is missing: {text}. It comes with "
@@ -101,7 +103,7 @@ def import_open3d() -> Any:
         _preload_libusb()
         import open3d  # pyright: ignore[reportMissingTypeStubs]
     except (ImportError, OSError) as error:
-        raise _missing_library("open3d", error) from error
+        raise missing_library("open3d", error) from error
     module: ModuleType = open3d
     return module
 
@@ -116,7 +118,7 @@ def import_pyrealsense2() -> Any:
         _preload_libusb()
         import pyrealsense2
     except (ImportError, OSError) as error:
-        raise _missing_library("pyrealsense2", error) from error
+        raise missing_library("pyrealsense2", error) from error
     module: ModuleType = pyrealsense2
     return module
 

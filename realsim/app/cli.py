@@ -111,6 +111,13 @@ def main() -> None:
     except RealsimError as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(2)
+    except ImportError as error:
+        if "cannot open shared object file" not in str(error):
+            raise  # a bug: its place is wanted
+        from realsim.interop import missing_library
+
+        click.echo(f"error: {missing_library(error.name or 'a library', error)}", err=True)
+        sys.exit(2)
     except BrokenPipeError:
         # Python writes what is left when it ends; nobody reads it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -6,7 +6,7 @@ from realsim.review.corrections import reviewed_scene
 from realsim.review.journal import ReviewState, replay
 
 if TYPE_CHECKING:
-    from realsim.review.scene_nodes import SceneConfig
+    from realsim.review.drawing.scene_nodes import SceneConfig
     from realsim.review.server import ReviewServer
 
 __all__ = ["ReviewServer", "ReviewState", "SceneConfig", "replay", "reviewed_scene"]

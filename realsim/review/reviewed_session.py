@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.records import ObjectModel, ObjectPose, Scene
 from realsim.review import corrections, journal, scene_list
-from realsim.review.content_config import SceneConfig
+from realsim.review.content.config import SceneConfig
 from realsim.review.journal import JOURNAL_FILE, Entry, ReviewState
 from realsim.store import SessionStore, load_scene
 
 if TYPE_CHECKING:
-    from realsim.review.camera_view import CameraViews
-    from realsim.review.content import SceneContent
-    from realsim.review.depth_residuals import CloudResiduals
-    from realsim.review.snapping import Snapper
+    from realsim.review.content.content import SceneContent
+    from realsim.review.placing.camera_view import CameraViews
+    from realsim.review.placing.depth_residuals import CloudResiduals
+    from realsim.review.placing.snapping import Snapper
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -221,7 +221,7 @@ class ReviewedSession:
 
     def content(self, progress: Progress | None = None) -> "SceneContent":
         """Return what is shown, loaded once; a second window waits for the first one's loading."""
-        from realsim.review.content import SceneContent
+        from realsim.review.content.content import SceneContent
 
         with self._loading:
             if self._content is None:
@@ -248,7 +248,7 @@ class ReviewedSession:
 
     def camera_views(self) -> "CameraViews":
         """Return who draws outlines over the photographs; made once."""
-        from realsim.review.camera_view import CameraViews
+        from realsim.review.placing.camera_view import CameraViews
 
         content = self.content()
         with self._loading:
@@ -258,7 +258,7 @@ class ReviewedSession:
 
     def snapper(self) -> "Snapper":
         """Return who snaps objects onto the measured depth; made once for the same views."""
-        from realsim.review.snapping import Snapper
+        from realsim.review.placing.snapping import Snapper
 
         content, standing = self.content(), self.standing
         excluded = tuple(standing.state.excluded_views())
@@ -275,7 +275,7 @@ class ReviewedSession:
         Args:
             objects: where they stand.
         """
-        from realsim.review.depth_residuals import CloudResiduals, residual_rgb
+        from realsim.review.placing.depth_residuals import CloudResiduals, residual_rgb
 
         content = self.content()
         with self._measuring:

@@ -22,11 +22,11 @@ from realsim import local_pages
 from realsim.errors import InputError, RealsimError
 from realsim.local_pages import Door
 from realsim.review import journal, scene_list
-from realsim.review.content_config import SceneConfig
-from realsim.review.grasp_replay import Motions
+from realsim.review.content.config import SceneConfig
 from realsim.review.journal import Entry
+from realsim.review.replay.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession
-from realsim.review.window import Window
+from realsim.review.window.window import Window
 from realsim.store import SessionStore
 
 __all__ = ["ReviewServer", "SceneConfig"]

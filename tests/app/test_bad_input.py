@@ -20,7 +20,7 @@ from realsim.geometry.mesh import load_mesh, save_ply
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from realsim.review import ReviewServer
+from realsim.review.reviewed_session import ReviewedSession
 from realsim.store import SessionStore
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=160.0, cy=120.0)
@@ -210,7 +210,8 @@ def test_the_pristine_dataset_is_upgraded(pristine: Path, tmp_path: Path) -> Non
 def _reviewed_session_follows_the_reviewer(store: SessionStore) -> None:
     """A person's rejection takes the object out of the school and out of every label."""
     console = Console(quiet=True)
-    ReviewServer(store, port=0).reject(0, "anna", "wrong side up")
+    reviewed = ReviewedSession(store)
+    reviewed.decide("reject", reviewed.standing.scene.object(0), "anna", comment="wrong side up")
     sets = stages.school_session(store, console, grasps_per_object=4, workers=1)
     assert [s.instance for s in sets] == [1]
     assert [p.name for p in (store.folder / "grasps").glob("*.npz")] == ["000001_obj000008.npz"]

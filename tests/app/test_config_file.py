@@ -162,9 +162,7 @@ def test_every_option_can_be_set_in_the_file_and_by_its_variable(
             assert option.type_cast_value(ctx, value) == wanted
             assert isinstance(option.envvar, str)
             single = other[0] if isinstance(other, list) else other
-            monkeypatch.setenv(
-                option.envvar, str(single)
-            )
+            monkeypatch.setenv(option.envvar, str(single))
             value, source = option.consume_value(ctx, {})
             assert source is click.core.ParameterSource.ENVIRONMENT
             assert option.type_cast_value(ctx, value) == wanted, (path, option.name)

@@ -13,7 +13,7 @@ from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, CaptureSession, ObjectPose, View
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.rendering.overlay import VERDICT_RGB
-from realsim.review.camera_view import CameraViews, pinhole_of, straightened
+from realsim.review.placing.camera_view import CameraViews, pinhole_of, straightened
 from realsim.store import SessionStore
 from tests.support.synthetic_scenes import MODELS, TABLE, placed
 

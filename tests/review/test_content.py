@@ -10,10 +10,11 @@ import pytest
 from realsim import CameraIntrinsics, InputError, Mesh, View
 from realsim.geometry import camera, depth, se3
 from realsim.rendering import overlay
-from realsim.review import clouds, content, grasp_drawing
-from realsim.review.content import SceneContent
-from realsim.review.content_config import GripperDrawing, SceneConfig
-from realsim.review.grasp_drawing import GraspFilter, passing
+from realsim.review.content import clouds, content
+from realsim.review.content.config import GripperDrawing, SceneConfig
+from realsim.review.content.content import SceneContent
+from realsim.review.drawing import grasp_drawing
+from realsim.review.drawing.grasp_drawing import GraspFilter, passing
 from realsim.store import SessionStore
 from tests.support.reviewed_boxes import CAMERAS, MODELS, SCENE, boxes_session, grasp_set
 

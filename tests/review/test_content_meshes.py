@@ -10,8 +10,8 @@ from realsim import CameraIntrinsics, Mesh
 from realsim.geometry import se3
 from realsim.models.simplify import deviation
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from realsim.review.content_config import SceneConfig
-from realsim.review.content_meshes import display_mesh, glb_of, within_budget
+from realsim.review.content.config import SceneConfig
+from realsim.review.content.meshes import display_mesh, glb_of, within_budget
 from tests.support.reviewed_boxes import box
 
 CAMERA = CameraIntrinsics(width=400, height=300, fx=900.0, fy=900.0, cx=199.5, cy=149.5)

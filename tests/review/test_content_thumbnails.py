@@ -12,8 +12,8 @@ import pytest
 
 from realsim import InputError
 from realsim.formats import images
-from realsim.review import quick_png
-from realsim.review.thumbnails import FOLDER, Thumbnails, thumbnail
+from realsim.review.content import quick_png
+from realsim.review.content.thumbnails import FOLDER, Thumbnails, thumbnail
 from realsim.store import SessionStore
 from tests.support.reviewed_boxes import boxes_session
 

@@ -10,7 +10,12 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh_shape import sample_surface
 from realsim.geometry.parts import part
-from realsim.review.depth_residuals import CloudResiduals, legend, residual_rgb, residuals
+from realsim.review.placing.depth_residuals import (
+    CloudResiduals,
+    legend,
+    residual_rgb,
+    residuals,
+)
 
 Array = NDArray[np.float64]
 WEDGE = part("wedge").mesh

@@ -10,7 +10,12 @@ from realsim.errors import InputError
 from realsim.geometry import mesh_shape, se3
 from realsim.geometry.parts import part
 from realsim.records import ObjectPose
-from realsim.review.ellipsoid import ellipsoid_of, middle_of, rotation_sigmas_deg, unit_sphere
+from realsim.review.placing.ellipsoid import (
+    ellipsoid_of,
+    middle_of,
+    rotation_sigmas_deg,
+    unit_sphere,
+)
 
 Array = NDArray[np.float64]
 MUG = part("mug")

@@ -12,7 +12,7 @@ from realsim import InputError, Mesh
 from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim.records.trajectories import PHASES
-from realsim.review.grasp_replay import (
+from realsim.review.replay.grasp_replay import (
     GraspMotion,
     HandApproach,
     Motions,
@@ -20,7 +20,7 @@ from realsim.review.grasp_replay import (
     ReplayPlayer,
     hand_approach,
 )
-from realsim.review.grasp_words import (
+from realsim.review.replay.grasp_words import (
     LOST,
     NOT_TRIED,
     escaped,
@@ -29,7 +29,7 @@ from realsim.review.grasp_words import (
     slip_table,
     slip_words,
 )
-from realsim.review.replay_nodes import BOX_FACES, HandShape
+from realsim.review.replay.replay_nodes import BOX_FACES, HandShape
 from tried_grasps import tried_set
 
 WIDTH_M = 0.03

@@ -12,7 +12,7 @@ from realsim.geometry.distance_field import raycasting_scene
 from realsim.geometry.parts import part
 from realsim.interop import import_open3d
 from realsim.records import ObjectPose
-from realsim.review.picking import ray_on_cloud, ray_on_mesh, ray_on_objects
+from realsim.review.placing.picking import ray_on_cloud, ray_on_mesh, ray_on_objects
 
 Array = NDArray[np.float64]
 MUG = part("mug")

@@ -8,7 +8,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import SupportPlane
-from realsim.review import placing
+from realsim.review.placing import placing
 
 Array = NDArray[np.float64]
 MUG = part("mug").mesh

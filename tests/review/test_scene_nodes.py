@@ -15,10 +15,10 @@ from websockets.typing import Subprotocol
 
 from realsim import InputError
 from realsim.geometry import se3
-from realsim.review.content import SceneContent
-from realsim.review.content_config import SceneConfig
-from realsim.review.ellipsoid import ellipsoid_of
-from realsim.review.scene_nodes import GraspFilter, SceneNodes
+from realsim.review.content.config import SceneConfig
+from realsim.review.content.content import SceneContent
+from realsim.review.drawing.scene_nodes import GraspFilter, SceneNodes
+from realsim.review.placing.ellipsoid import ellipsoid_of
 from tests.support.reviewed_boxes import CAMERAS, SCENE, boxes_session
 
 CONFIG = SceneConfig(

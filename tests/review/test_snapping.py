@@ -14,9 +14,9 @@ from realsim.geometry.parts import part
 from realsim.records import CaptureSession, ObjectPose, Scene, SupportPlane, View
 from realsim.records.depth_bias import DepthBias
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from realsim.review.measured_views import depth_bias_of, usable_views
-from realsim.review.placing import middle_of, moved
-from realsim.review.snapping import Snapped, Snapper
+from realsim.review.placing.measured_views import depth_bias_of, usable_views
+from realsim.review.placing.placing import middle_of, moved
+from realsim.review.placing.snapping import Snapped, Snapper
 from realsim.store import SessionStore
 from tests.support.registered_sessions import (
     CAMERA,

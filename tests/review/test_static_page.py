@@ -15,16 +15,16 @@ import pytest
 from realsim import GraspSet, InputError
 from realsim.geometry import se3
 from realsim.review import journal
-from realsim.review.content import SceneContent
-from realsim.review.content_config import SceneConfig
-from realsim.review.static_page import PageWords, StaticSummary, write_static
-from realsim.review.static_page_nodes import (
+from realsim.review.content.config import SceneConfig
+from realsim.review.content.content import SceneContent
+from realsim.review.static.page_nodes import (
     SCORE_EDGES,
     StaticSize,
     box_edges,
     drawn_grasps,
     score_class,
 )
+from realsim.review.static.static_page import PageWords, StaticSummary, write_static
 from realsim.store import save_grasps, save_scene
 from registered_sessions import registered_by_hand, table_session
 

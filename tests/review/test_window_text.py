@@ -7,8 +7,9 @@ import pytest
 
 from realsim import ObjectModel, ObjectPose
 from realsim.geometry import se3
-from realsim.review import journal, window_text
+from realsim.review import journal
 from realsim.review.scene_list import ObjectRow
+from realsim.review.window import window_text
 from tests.support.reviewed_boxes import MODELS, SCENE
 
 TALL = 1

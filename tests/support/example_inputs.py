@@ -11,17 +11,19 @@ from realsim.app.console import Console
 from realsim.app.register.files import write_result
 from realsim.app.school.inputs import SchoolRequest
 from realsim.app.school.run import run_in_session
+from realsim.app.stages import save_starts
 from realsim.formats.images import depth_counts, png_bytes
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.depth_sensors.model import DepthSensorModel
-from realsim.store import SessionStore
+from realsim.review.journal import append, new_entry
+from realsim.store import SessionStore, load_scene
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.plan_files.plan_json import save_plan
 from realsim_capture_plans.planning.make import hemisphere_plan
 from realsim_capture_plans.planning.record import PlanConfig
-from registered_sessions import CAMERA, models_of, registered_by_hand, table_session
+from registered_sessions import CAMERA, models_of, registered_by_hand, table_session, true_poses
 from upgradable_datasets import bop_dataset
 
 GRASPS = 4
@@ -32,7 +34,10 @@ def make_inputs(root: Path, *, grasps: bool) -> None:
     """Write the inputs of the examples into a folder; grasps and labels take a few seconds."""
     session = root / "demo/session"
     store = table_session(session, views=4)
+    save_starts(store, true_poses(), "by hand")
     write_result(store, registered_by_hand(store), models_of(), {})
+    accepted = new_entry("accept", load_scene(store).objects[0], "anna")
+    append(session / "review/journal.jsonl", accepted)
     if grasps:
         add_grasps(session)
     for name in ("monday", "tuesday"):

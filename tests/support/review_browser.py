@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from realsim.review.content_config import SceneConfig
+from realsim.review.content.config import SceneConfig
 
 Rgb = NDArray[np.uint8]
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

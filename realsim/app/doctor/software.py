@@ -19,6 +19,7 @@ LEAST_GLIBC = (2, 35)
 LIBRARIES = {
     "libEGL.so.1": ("libegl1", "open3d"),
     "libGL.so.1": ("libgl1", "open3d"),
+    "libgomp.so.1": ("libgomp1", "pinocchio, which plans the arm's moves"),
     "libusb-1.0.so.0": ("libusb-1.0-0", "RealSense cameras"),
 }
 """Shared library -> Debian's package, and what needs it."""

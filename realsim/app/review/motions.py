@@ -22,7 +22,7 @@ from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet, Mesh, ObjectModel
 from realsim.records.trajectories import PHASES, GraspTrajectories
-from realsim.review.grasp_replay import GraspMotion, HandApproach, hand_approach
+from realsim.review.replay.grasp_replay import GraspMotion, HandApproach, hand_approach
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.reach_config import base_on_table
 from realsim_sim_bridge.demonstrations.panda_looks import panda_meshes
@@ -45,7 +45,7 @@ CLOSE = PHASES.index("close")
 
 
 class SessionMotions:
-    """`realsim.review.grasp_replay.Motions` of a school's results."""
+    """`realsim.review.replay.grasp_replay.Motions` of a school's results."""
 
     def __init__(
         self,

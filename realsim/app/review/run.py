@@ -90,9 +90,9 @@ def write_page(request: ReviewRequest, path: Path, console: Console) -> None:
         InputError: there are several sessions, or the file cannot be made.
     """
     from realsim.review import journal
-    from realsim.review.content import SceneConfig, SceneContent
+    from realsim.review.content.content import SceneConfig, SceneContent
     from realsim.review.journal import JOURNAL_FILE
-    from realsim.review.static_page import write_static
+    from realsim.review.static.static_page import write_static
 
     folders = scene_list.sessions_under(request.folders)
     if len(folders) != 1:

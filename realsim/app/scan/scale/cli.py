@@ -17,7 +17,7 @@ UP = click.Choice(["x", "y", "z", "-x", "-y", "-z"])
     "scale",
     cls=Command,
     examples=(
-        "realsim scan scale mug demo/session",
+        "realsim scan scale tube.ply captured --at 0.50,-0.03",
         "realsim scan scale generated.obj --measured longest=120.4mm+-0.3mm --out scaled",
     ),
 )
@@ -45,9 +45,9 @@ def scale(mesh: str, session: Path | None, as_json: bool, quiet: bool, **options
     """Find the metric scale of MESH in the depth images of SESSION.
 
     \b
-    MESH     a mesh file of any unit, a mesh of the library without scale (NAME, or
-             LIBRARY/unscaled/NAME), or the name or id of a model at metric scale,
-             which is then checked
+    MESH     a mesh file of any unit, a mesh of the library without scale
+             (NAME, or LIBRARY/unscaled/NAME), or the name or id of a model at
+             metric scale, which is then checked
     SESSION  a calibrated session with depth; without one, --measured gives
              the scale
 

@@ -13,7 +13,10 @@ from realsim.app.options import FOLDER, JSON, QUIET, seed
 @click.command(
     "sfm",
     cls=Command,
-    examples=("realsim scan sfm demo/session --no-dense", "realsim scan sfm photographs --text"),
+    examples=(
+        "realsim scan sfm demo/session --no-dense",
+        "realsim scan sfm demo/session --poses known --no-dense --text --out sfm",
+    ),
 )
 @click.argument("images", type=FOLDER)
 @click.option("--out", type=FOLDER, default=None, help="Folder.  [SESSION/scans/sfm, IMAGES/sfm]")

@@ -25,18 +25,18 @@ from realsim import __version__
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, Scene
-from realsim.review.content import SceneContent
-from realsim.review.content_views import spread
+from realsim.review.content.content import SceneContent
+from realsim.review.content.views import spread
 from realsim.review.corrections import reviewed_scene
 from realsim.review.journal import ReviewState
-from realsim.review.static_page_nodes import (
+from realsim.review.static.page_nodes import (
     SCORE_EDGES,
     StaticSize,
     drawn_grasps,
     score_class,
     viewer_html,
 )
-from realsim.review.static_page_text import caption_html, counts_words, object_items, photo_items
+from realsim.review.static.page_text import caption_html, counts_words, object_items, photo_items
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -163,7 +163,7 @@ def _page(
     words: PageWords,
 ) -> bytes:
     """Return the page's bytes."""
-    here = files("realsim.review")
+    here = files("realsim.review.static")
     has_grasps = any(len(g) for g in content.grasp_sets)
     fields = {
         "policy": html.escape(POLICY),

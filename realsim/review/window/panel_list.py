@@ -4,11 +4,12 @@ from typing import TYPE_CHECKING, Any
 
 import viser
 
-from realsim.review import scene_list, window_text
+from realsim.review import scene_list
 from realsim.review.scene_list import ObjectRow
+from realsim.review.window import window_text
 
 if TYPE_CHECKING:
-    from realsim.review.window import Window
+    from realsim.review.window.window import Window
 
 ROWS = 16
 """Objects on one page of the list: as many as stand one above the other on a laptop's screen."""

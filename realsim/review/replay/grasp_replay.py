@@ -22,7 +22,7 @@ from realsim.errors import InputError
 from realsim.records import Mesh
 from realsim.records.checked_arrays import Array, frozen
 from realsim.records.trajectories import PHASES
-from realsim.review.replay_nodes import HandShape, ReplayNodes
+from realsim.review.replay.replay_nodes import HandShape, ReplayNodes
 
 SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x")
 PHASE_WORDS = {

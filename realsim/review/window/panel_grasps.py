@@ -7,12 +7,17 @@ import viser
 
 from realsim.errors import InputError
 from realsim.records import GraspSet
-from realsim.review.grasp_drawing import GraspFilter, failure_choices, score_rgb, visible_grasps
-from realsim.review.grasp_replay import GraspMotion, ReplayPlayer
-from realsim.review.grasp_words import grasp_words
+from realsim.review.drawing.grasp_drawing import (
+    GraspFilter,
+    failure_choices,
+    score_rgb,
+    visible_grasps,
+)
+from realsim.review.replay.grasp_replay import GraspMotion, ReplayPlayer
+from realsim.review.replay.grasp_words import grasp_words
 
 if TYPE_CHECKING:
-    from realsim.review.window import Window
+    from realsim.review.window.window import Window
 
 STAGES = {
     "any": 0,

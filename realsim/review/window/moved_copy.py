@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.interop import viser_wxyz_position
 from realsim.records import ObjectModel, ObjectPose
-from realsim.review import placing
+from realsim.review.placing import placing
 
 if TYPE_CHECKING:
-    from realsim.review.window import Window
+    from realsim.review.window.window import Window
 
 Array = NDArray[np.float64]
 NODE = "/correction"

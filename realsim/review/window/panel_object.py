@@ -4,11 +4,12 @@ from typing import TYPE_CHECKING
 
 import viser
 
-from realsim.review import corrections, window_text
+from realsim.review import corrections
 from realsim.review.journal import Action, Entry
+from realsim.review.window import window_text
 
 if TYPE_CHECKING:
-    from realsim.review.window import Window
+    from realsim.review.window.window import Window
 
 
 class ObjectPanel:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from realsim.errors import DegenerateError
 from realsim.geometry import mesh as mesh_tools
 from realsim.records import Mesh
-from realsim.review.content_config import SceneConfig
+from realsim.review.content.config import SceneConfig
 
 Floats = NDArray[np.float32]
 PLAIN_RGB = (176, 182, 190)

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim.review import picking, placing
+from realsim.review.placing import picking, placing
 
 if TYPE_CHECKING:
-    from realsim.review.window import Window
+    from realsim.review.window.window import Window
 
 Array = NDArray[np.float64]
 PAIRS = 3

@@ -9,8 +9,8 @@ import viser
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.review.clouds import LeveledCloud
-from realsim.review.content_config import SceneConfig
+from realsim.review.content.clouds import LeveledCloud
+from realsim.review.content.config import SceneConfig
 
 Rgb = NDArray[np.uint8]
 POINT_SHARE = 0.8

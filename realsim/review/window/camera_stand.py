@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.interop import viser_wxyz_position
-from realsim.review.window_latest import LatestOnly
+from realsim.review.window.latest import LatestOnly
 
 if TYPE_CHECKING:
-    from realsim.review.camera_view import CameraPicture
-    from realsim.review.window import Window
+    from realsim.review.placing.camera_view import CameraPicture
+    from realsim.review.window.window import Window
 
 Array = NDArray[np.float64]
 JPEG_QUALITY = 85

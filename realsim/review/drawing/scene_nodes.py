@@ -17,12 +17,12 @@ from realsim.errors import InputError
 from realsim.interop import viser_wxyz_position
 from realsim.records import ObjectModel
 from realsim.rendering.overlay import VERDICT_RGB
-from realsim.review.content import SceneContent
-from realsim.review.content_config import SceneConfig
-from realsim.review.ellipsoid import Ellipsoid, unit_sphere
-from realsim.review.grasp_drawing import GraspFilter, chosen_grasps
-from realsim.review.scene_nodes_cloud import CloudNodes
-from realsim.review.scene_nodes_grasps import GraspNodes
+from realsim.review.content.config import SceneConfig
+from realsim.review.content.content import SceneContent
+from realsim.review.drawing.cloud_nodes import CloudNodes
+from realsim.review.drawing.grasp_drawing import GraspFilter, chosen_grasps
+from realsim.review.drawing.grasp_nodes import GraspNodes
+from realsim.review.placing.ellipsoid import Ellipsoid, unit_sphere
 
 __all__ = ["GraspFilter", "SceneConfig", "SceneNodes"]
 

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.formats.bop.models import require_meshes
 from realsim.records import CameraIntrinsics, GraspSet, ObjectModel, Scene, View
-from realsim.review import clouds
-from realsim.review.clouds import LeveledCloud
-from realsim.review.content_config import SceneConfig
-from realsim.review.content_meshes import DisplayMesh, display_mesh
-from realsim.review.content_models import SessionModels
-from realsim.review.content_views import (
+from realsim.review.content import clouds
+from realsim.review.content.clouds import LeveledCloud
+from realsim.review.content.config import SceneConfig
+from realsim.review.content.meshes import DisplayMesh, display_mesh
+from realsim.review.content.models import SessionModels
+from realsim.review.content.thumbnails import Thumbnails
+from realsim.review.content.views import (
     FirstLook,
     Region,
     first_look,
@@ -27,7 +28,6 @@ from realsim.review.content_views import (
     strided,
     worst_first,
 )
-from realsim.review.thumbnails import Thumbnails
 from realsim.store import SessionStore, load_grasps, load_scene
 
 __all__ = [

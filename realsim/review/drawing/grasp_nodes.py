@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from realsim.interop import viser_wxyz_position
 from realsim.records import GraspSet
-from realsim.review.content_config import SceneConfig
-from realsim.review.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb, score_rgb
+from realsim.review.content.config import SceneConfig
+from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb, score_rgb
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

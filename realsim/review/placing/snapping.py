@@ -29,8 +29,13 @@ from realsim.registration.refinement.config import CameraPrior, RefineConfig
 from realsim.registration.refinement.refine import refine
 from realsim.registration.solver import FreeSpace, solve_pose
 from realsim.registration.verify import verify_objects
-from realsim.review.measured_views import MOST_VIEWS, MeasuredViews, measured_views, usable_views
-from realsim.review.placing import moved
+from realsim.review.placing.measured_views import (
+    MOST_VIEWS,
+    MeasuredViews,
+    measured_views,
+    usable_views,
+)
+from realsim.review.placing.placing import moved
 from realsim.store import SessionStore
 
 Array = NDArray[np.float64]

@@ -4,13 +4,13 @@ from typing import TYPE_CHECKING, Literal
 
 import viser
 
-from realsim.review import depth_residuals
-from realsim.review.ellipsoid import ellipsoid_of
+from realsim.review.placing import depth_residuals
+from realsim.review.placing.ellipsoid import ellipsoid_of
 from realsim.review.reviewed_session import Standing
-from realsim.review.window_latest import LatestOnly
+from realsim.review.window.latest import LatestOnly
 
 if TYPE_CHECKING:
-    from realsim.review.window import Window
+    from realsim.review.window.window import Window
 
 Look = Literal["appearance", "verdict", "hidden"]
 LOOKS: dict[str, Look] = {

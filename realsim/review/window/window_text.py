@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from realsim.records import ObjectModel, ObjectPose
 from realsim.rendering.overlay import VERDICT_RGB
-from realsim.review.ellipsoid import rotation_sigmas_deg
-from realsim.review.grasp_words import escaped
 from realsim.review.journal import Entry
+from realsim.review.placing.ellipsoid import rotation_sigmas_deg
+from realsim.review.replay.grasp_words import escaped
 from realsim.review.scene_list import ObjectRow
 
 LEAST_CONTRAST = 4.5

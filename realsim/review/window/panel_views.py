@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.review import window_text
-from realsim.review.window_camera import StandIn
+from realsim.review.window import window_text
+from realsim.review.window.camera_stand import StandIn
 
 if TYPE_CHECKING:
-    from realsim.review.window import Window
+    from realsim.review.window.window import Window
 
 NONE = "-"
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.review import quick_png
+from realsim.review.content import quick_png
 from realsim.store import SessionStore, atomic
 from realsim.store.manifest import Manifest
 from realsim.store.session_store import rgb_path

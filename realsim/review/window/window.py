@@ -17,19 +17,20 @@ import viser
 
 from realsim.errors import InputError, RealsimError
 from realsim.records import ObjectModel, ObjectPose
-from realsim.review import scene_list, window_text
-from realsim.review.content import SceneContent
-from realsim.review.grasp_replay import Motions
+from realsim.review import scene_list
+from realsim.review.content.content import SceneContent
+from realsim.review.drawing.scene_nodes import SceneNodes
 from realsim.review.journal import Entry
-from realsim.review.panels_correct import CorrectPanel
-from realsim.review.panels_grasps import GraspsPanel
-from realsim.review.panels_list import ListPanel
-from realsim.review.panels_object import ObjectPanel
-from realsim.review.panels_show import ShowPanel
-from realsim.review.panels_views import ViewsPanel
+from realsim.review.replay.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession, Standing
-from realsim.review.scene_nodes import SceneNodes
-from realsim.review.window_keys import bind_keys
+from realsim.review.window import window_text
+from realsim.review.window.keys import bind_keys
+from realsim.review.window.panel_correct import CorrectPanel
+from realsim.review.window.panel_grasps import GraspsPanel
+from realsim.review.window.panel_list import ListPanel
+from realsim.review.window.panel_object import ObjectPanel
+from realsim.review.window.panel_show import ShowPanel
+from realsim.review.window.panel_views import ViewsPanel
 
 LIST_PX, PANEL_PX = 290, 400
 """Widths of the list on the left and of the panel on the right [px]."""

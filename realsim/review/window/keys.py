@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import viser
 
-from realsim.review.placing import Axis, Kind
+from realsim.review.placing.placing import Axis, Kind
 
 if TYPE_CHECKING:
-    from realsim.review.window import Window
+    from realsim.review.window.window import Window
 
 Letter = Literal[
     "H",

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.records import ObjectModel, ObjectPose
-from realsim.review import placing, window_text
-from realsim.review.window_copy import MovedCopy
-from realsim.review.window_points import PointPlacer
+from realsim.review.placing import placing
+from realsim.review.window import window_text
+from realsim.review.window.moved_copy import MovedCopy
+from realsim.review.window.three_points import PointPlacer
 
 if TYPE_CHECKING:
-    from realsim.review.window import Window
+    from realsim.review.window.window import Window
 
 Array = NDArray[np.float64]
 STEPS_MM, STEPS_DEG = ("1", "5", "20"), ("1", "5", "90")

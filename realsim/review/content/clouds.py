@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, View
-from realsim.review import quick_png
-from realsim.review.content_views import Region, strided
+from realsim.review.content import quick_png
+from realsim.review.content.views import Region, strided
 from realsim.store import SessionStore
 from realsim.store.session_store import depth_path, rgb_path
 

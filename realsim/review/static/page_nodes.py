@@ -16,11 +16,11 @@ from realsim import local_pages
 from realsim.interop import viser_wxyz_position
 from realsim.records import GraspSet, Scene
 from realsim.rendering.overlay import VERDICT_RGB
-from realsim.review.content import SceneContent
-from realsim.review.content_config import SceneConfig
-from realsim.review.content_meshes import glb_of, within_budget
-from realsim.review.content_views import spread
-from realsim.review.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb, score_rgb
+from realsim.review.content.config import SceneConfig
+from realsim.review.content.content import SceneContent
+from realsim.review.content.meshes import glb_of, within_budget
+from realsim.review.content.views import spread
+from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb, score_rgb
 
 Array = NDArray[np.float64]
 SCORE_EDGES = (0.0, 0.25, 0.5, 0.75)

@@ -11,12 +11,12 @@ from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import STAGES, GraspSet
 from realsim.rendering import overlay
-from realsim.review import quick_png
-from realsim.review.content_config import GripperDrawing
+from realsim.review.content import quick_png
+from realsim.review.content.config import GripperDrawing
 from realsim.store.session_store import depth_path
 
 if TYPE_CHECKING:
-    from realsim.review.content import SceneContent
+    from realsim.review.content.content import SceneContent
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

@@ -1,0 +1,1 @@
+"""Content as nodes of a viser scene."""

@@ -1,0 +1,1 @@
+"""A grasp replayed: what its hand did, in words and in the scene."""

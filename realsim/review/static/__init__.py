@@ -1,0 +1,1 @@
+"""A reviewed scene as one file that opens without a server."""

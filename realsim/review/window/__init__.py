@@ -1,0 +1,1 @@
+"""One browser: its scene, its panels, its keys."""
