@@ -1,4 +1,4 @@
-"""A library of the system that is missing is named with its Debian package, not with a traceback."""
+"""A missing library of the system is named with its Debian package, not with a traceback."""
 
 import sys
 
