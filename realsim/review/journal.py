@@ -38,6 +38,10 @@ FORMAT = 2
 READABLE = (1, FORMAT)
 """Format 1 has decisions and comments only, without the pose that was looked at."""
 Rows = tuple[tuple[float, ...], ...]
+MOST_COMMENT, MOST_NAME = 2000, 80
+"""Characters of a comment, of a name or another short text."""
+MOST_BYTES = 64_000_000
+"""Of a journal: a line has about 500, so this is more than a hundred thousand decisions."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -73,6 +77,7 @@ class Entry:
 
     def __post_init__(self) -> None:
         """Check that the action has what it needs, and nothing else."""
+        self._check_types()
         if self.action not in get_args(Action):
             raise InputError(
                 f"the journal's action is '{self.action}'; it must be one of "
@@ -83,9 +88,44 @@ class Entry:
                 f"a journal line with the action '{self.action}' names the line "
                 f"'{self.undoes}' to take back; undo needs one and no other action has one."
             )
+        if self.undoes and self.undoes == self.id:
+            raise InputError("an undo names itself; it takes back another line.")
         if self.action == "comment" and not self.comment.strip():
             raise InputError("the comment is empty; write it first.")
         self._check_fields()
+
+    def _check_types(self) -> None:
+        """Raise if a field is of another type, too long, or a number that cannot be meant."""
+        texts = (
+            "id",
+            "time",
+            "reviewer",
+            "action",
+            "subject",
+            "comment",
+            "undoes",
+            "symmetry",
+            "how",
+        )
+        for name in texts:
+            value, most = getattr(self, name), MOST_COMMENT if name == "comment" else MOST_NAME
+            if not isinstance(value, str) or len(value) > most:
+                what = f"{len(value)} characters" if isinstance(value, str) else repr(value)[:60]
+                raise InputError(f"'{name}' is {what}; a text of at most {most} is accepted.")
+        if not self.id:
+            raise InputError("a journal line has no id.")
+        for name in ("instance", "obj_id", "view"):
+            value = getattr(self, name)
+            whole = isinstance(value, int) and not isinstance(value, bool)
+            if value is not None and not (whole and 0 <= value < 2**31):
+                raise InputError(
+                    f"'{name}' is {value!r:.60}; a whole number from 0 on is accepted."
+                )
+        said: Any = self.checks
+        if not isinstance(said, dict) or not all(
+            isinstance(k, str) and isinstance(v, int | float) for k, v in self.checks.items()
+        ):
+            raise InputError("'checks' is no mapping of names to numbers.")
 
     def _check_fields(self) -> None:
         needed = {
@@ -197,7 +237,8 @@ def new_entry(
         said: the entry's other fields: obj_id, view, symmetry, how, checks.
 
     Raises:
-        InputError: no reviewer is named, or the action and the other fields do not fit.
+        InputError: no reviewer is named, a text is too long, or the action and the other fields do
+            not fit.
     """
     if not reviewer.strip():
         raise InputError("the reviewer's name is empty; a decision is signed: fill in your name.")
@@ -228,9 +269,19 @@ def replay(entries: Sequence[Entry], start: ReviewState | None = None) -> Review
     Args:
         entries: lines in their order.
         start: the state they are added to; none = an empty journal.
+
+    Raises:
+        InputError: two lines have one id and say different things.
     """
     before = () if start is None else start.entries
-    once = {e.id: e for e in (*before, *entries)}
+    once: dict[str, Entry] = {}
+    for entry in (*before, *entries):
+        if once.setdefault(entry.id, entry) != entry:
+            raise InputError(
+                f"two lines of the journal have the id '{entry.id}' and say different things "
+                f"({once[entry.id].action} by {once[entry.id].reviewer}, {entry.action} by "
+                f"{entry.reviewer}): was it merged or edited by hand? Keep the right one."
+            )
     return ReviewState(entries=tuple(once.values()))
 
 
@@ -259,9 +310,13 @@ def append(path: Path, entry: Entry, *, check: Callable[[ReviewState], None] | N
         size = os.fstat(handle).st_size
         torn = size > 0 and os.pread(handle, 1, size - 1) != b"\n"
         rest = (b"\n" if torn else b"") + line.encode()
-        while rest:
-            rest = rest[os.write(handle, rest) :]
-        os.fsync(handle)
+        try:
+            while rest:
+                rest = rest[os.write(handle, rest) :]
+            os.fsync(handle)
+        except OSError:
+            os.ftruncate(handle, size)  # the disk is full: nothing of the line stays
+            raise
     finally:
         os.close(handle)
     if created:
@@ -281,10 +336,15 @@ def read(path: Path) -> JournalContent:
     """Return the lines of a journal; none if there is no file yet.
 
     Raises:
-        InputError: a line is of a newer format, or is whole JSON that is no journal line.
+        InputError: it is no file or far too large, a line is of a newer format, or is whole JSON
+            that is no journal line.
     """
     if not path.exists():
         return JournalContent(entries=(), damaged=())
+    if not path.is_file() or path.stat().st_size > MOST_BYTES:
+        raise InputError(
+            f"'{path}' is no journal: a file of at most {MOST_BYTES / 1e6:.0f} MB is expected."
+        )
     entries: list[Entry] = []
     damaged: list[int] = []
     for number, line in enumerate(path.read_bytes().split(b"\n"), start=1):
@@ -292,7 +352,7 @@ def read(path: Path) -> JournalContent:
             continue
         try:
             fields = json.loads(line)
-        except (json.JSONDecodeError, UnicodeDecodeError):
+        except (ValueError, RecursionError):
             damaged.append(number)
             continue
         entries.append(_entry(fields, f"{path.name}, line {number}"))
@@ -309,7 +369,7 @@ def _entry(fields: Any, where: str) -> Entry:
     named = {str(k): v for k, v in fields.items() if k != "format"}
     try:
         return Entry(**named)
-    except (TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{where}: the fields do not fit a journal line ({error}).") from error
     except InputError as error:
         raise InputError(f"{where}: {error}") from error
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise InputError(f"{where}: the fields do not fit a journal line ({error}).") from error

@@ -128,3 +128,26 @@ def test_all_rejected_is_said(session: SessionStore) -> None:
     for placed in load_scene(session).objects:
         say(session, "reject", placed)
     assert "rejected every object" in str(run(session.folder, "--from-review").exception)
+
+
+def test_lines_about_what_is_not_there_and_damaged_ones_are_told(session: SessionStore) -> None:
+    first = load_scene(session).objects[0]
+    say(session, "accept", first)
+    say(session, "exclude", None, view=99)
+    say(session, "symmetric", None, obj_id=9999, symmetry="z")
+    stranger = ObjectPose(obj_id=1, instance=77, T_world_obj=np.eye(4))
+    say(session, "reject", stranger)
+    with session.path(journal.JOURNAL_FILE).open("ab") as file:
+        file.write(b'{"torn\n')
+    result = run(session.folder, "--from-review", "--json")
+    told = json.loads(result.stdout[result.stdout.index("{") :])["findings"]
+    words = " ".join(f["words"] for f in told)
+    for part in ("no view 99", "no model 9999", "no instance 77", "line 5 of", "not whole"):
+        assert part in words, part
+
+
+def test_a_journal_of_damage_alone_is_not_taken_for_none(session: SessionStore) -> None:
+    session.path("review").mkdir()
+    session.path(journal.JOURNAL_FILE).write_bytes(b"\x00\xff\n\x01\n")
+    said = str(run(session.folder, "--from-review").exception)
+    assert "line 1, 2 of" in said and "empty" not in said

@@ -1,7 +1,9 @@
 """Corrections form a chain from the registered pose, undo takes them back, nothing is lost."""
 
 import json
-from dataclasses import asdict
+import subprocess
+import sys
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +188,64 @@ def test_lines_of_the_first_format_are_read(tmp_path: Path) -> None:
 def test_a_line_without_what_its_action_needs_is_refused(said: dict[str, Any], word: str) -> None:
     with pytest.raises(InputError, match=word):
         journal.Entry(id="1", time="t", reviewer="ada", **said)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {"id": ["x"]}, {"reviewer": 7}, {"comment": ["a"]}, {"comment": "x" * 5000}, {"time": 5},
+        {"instance": "0"}, {"instance": 0.5}, {"instance": True}, {"instance": -1},
+        {"instance": 10**30}, {"instance": [0]}, {"checks": [1]}, {"checks": {"a": "b"}},
+        {"undoes": ["x"]}, {"T_world_obj": [[1, 2], [3]]}, {"T_world_obj": "x"}, {"id": ""},
+        {"T_world_obj": [[float("nan")] * 4] * 4}, {"symmetry": {}}, {"action": "undo"},
+        {"action": "undo", "undoes": "1"}, {"surprise": 1},
+    ],
+)  # fmt: skip
+def test_fields_of_another_kind_are_refused_with_the_line(
+    said: dict[str, Any], tmp_path: Path
+) -> None:
+    whole = {"format": 2, "id": "1", "time": "t", "reviewer": "ada", "action": "accept",
+             "instance": 0, "subject": "s"}  # fmt: skip
+    (tmp_path / "j.jsonl").write_text(json.dumps(whole | said) + "\n")
+    with pytest.raises(InputError, match=r"j\.jsonl, line 1"):
+        journal.read(tmp_path / "j.jsonl")
+
+
+@pytest.mark.parametrize("line", [b"[" * 5000, b"1" * 6000, b"\x00\xff", b'{"a":'])
+def test_what_is_no_json_is_damage_and_spoils_no_other_line(line: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    journal.append(path, journal.new_entry("accept", placed(), "ada"))
+    path.write_bytes(line + b"\n" + path.read_bytes())
+    found = journal.read(path)
+    assert (found.damaged, len(found.entries)) == ((1,), 1)
+
+
+def test_one_id_with_two_meanings_is_refused() -> None:
+    yes = journal.new_entry("accept", placed(), "ada")
+    with pytest.raises(InputError, match="say different things"):
+        journal.replay([yes, replace(yes, action="reject")])
+
+
+def test_a_folder_in_place_of_the_journal_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is no journal"):
+        journal.read(tmp_path)
+
+
+def test_a_full_disk_leaves_the_journal_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "j.jsonl"
+    journal.append(path, journal.new_entry("accept", placed(), "ada"))
+    before = path.read_bytes()
+    program = (
+        "import resource, signal, sys; from pathlib import Path; "
+        "from realsim.review import journal; from realsim import ObjectPose; import numpy as np; "
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({len(before) + 20},) * 2); "
+        "o = ObjectPose(obj_id=3, instance=0, T_world_obj=np.eye(4)); "
+        "journal.append(Path(sys.argv[1]), journal.new_entry('accept', o, 'ada'))"
+    )
+    ended = subprocess.run([sys.executable, "-c", program, path], capture_output=True, text=True)
+    assert "File too large" in ended.stderr
+    assert path.read_bytes() == before
 
 
 def test_a_pose_that_is_no_rigid_motion_is_refused() -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from realsim.app.reviewed import review_of
+from realsim.app.reviewed import damage_words, review_of
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose
@@ -71,6 +71,8 @@ def review_starts(store: SessionStore, models: Mapping[int, ObjectModel] | None)
             f"`realsim register {store.folder}` first."
         )
     state, scene = review_of(store), load_scene(store)
+    if not state.standing and damage_words(store):
+        raise InputError(f"nothing of the review can be read: {damage_words(store)}")
     if not state.standing:
         raise InputError(
             f"nobody has reviewed session '{store.folder}': its journal is empty. Run "
@@ -136,6 +138,13 @@ def keep_earlier(store: SessionStore) -> str | None:
     name = f"{EARLIER}/scene_{len(kept) + 1:03d}.json"
     store.write_bytes(name, data)
     return name
+
+
+def instances_ever(store: SessionStore) -> set[int]:
+    """Return the instances of the present scene and of those that reviews replaced."""
+    files = [SCENE_FILE] if store.has(SCENE_FILE) else []
+    files += [f"{EARLIER}/{p.name}" for p in store.path(EARLIER).glob("scene_*.json")]
+    return {o.instance for name in files for o in load_scene(store, name).objects}
 
 
 def moved_since_accepted(

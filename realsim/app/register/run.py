@@ -12,6 +12,7 @@ from realsim.app.register.config import RegisterRequest
 from realsim.app.register.files import finish_interrupted, remark_of, write_result
 from realsim.app.register.from_review import (
     REVIEW_FILE,
+    instances_ever,
     keep_earlier,
     moved_since_accepted,
     review_starts,
@@ -29,7 +30,7 @@ from realsim.app.register.results import (
     load_cameras,
     load_registered,
 )
-from realsim.app.reviewed import review_of
+from realsim.app.reviewed import damage_words, review_of, stray_words
 from realsim.app.stages import is_current, mark_current, require_sound, take_models
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel, Scene
@@ -77,7 +78,7 @@ def run_register(store: SessionStore, console: Console, request: RegisterRequest
     if is_current(store, STAGE, inputs.key) and store.has(SCENE_FILE):
         return _as_it_was(store)
     starts = review_starts(store, None) if request.from_review else None
-    result = _with_review(store, _registered(store, console, request, inputs))
+    result = _with_review(store, inputs, _registered(store, console, request, inputs))
     models = inputs.models
     if request.library is not None:
         found = sorted({o.obj_id for o in result.scene.objects})
@@ -99,7 +100,7 @@ def run_register(store: SessionStore, console: Console, request: RegisterRequest
     return result
 
 
-def _with_review(store: SessionStore, result: Registered) -> Registered:
+def _with_review(store: SessionStore, inputs: RegisterInputs, result: Registered) -> Registered:
     """Return the result with what it means for decisions that were made of the scene before."""
     remarks = [
         Remark(view=None, kind="review", words=(
@@ -108,6 +109,14 @@ def _with_review(store: SessionStore, result: Registered) -> Registered:
         ))
         for placed, entry, mm, deg in moved_since_accepted(result.scene.objects, review_of(store))
     ]  # fmt: skip
+    state = review_of(store)
+    instances = instances_ever(store) | {o.instance for o in result.scene.objects}
+    views = {v.index for v in store.session.views}
+    models = {int(p.stem[4:]) for p in store.path("models").glob("obj_[0-9]*.*")}
+    told = stray_words(state, instances, views, models | set(inputs.models))
+    remarks += [
+        Remark(view=None, kind="review", words=w) for w in (*told, damage_words(store)) if w
+    ]
     return replace(result, remarks=(*result.remarks, *remarks)) if remarks else result
 
 
