@@ -90,6 +90,12 @@ class ExportFolder:
                 left.unlink()
             done = {str(json.loads(line)["piece"]) for line in _lines(folder / PIECES)}
             return cls(folder, asked, done, resumed=True)
+        if (folder / FINISHED).is_file():
+            raise InputError(
+                f"'{folder}' holds a finished export, of another request or of sources as they "
+                "were before they changed. It is not mixed with this one: give a new folder, or "
+                "delete that one first."
+            )
         if folder.is_dir() and any(folder.iterdir()):
             raise InputError(
                 f"'{folder}' is not empty; what is there would be mixed with the export. Give a "

@@ -238,7 +238,8 @@ def open_session_scene(
     taken = annotated if chosen == "annotated" else views
     if len(taken) < len(views):
         notes.append(
-            f"{len(views) - len(taken)} of {len(views)} views are not annotated and stay out."
+            f"{len(views) - len(taken)} of {len(views)} views have no labels and stay out: they "
+            "were not registered, or a reviewer left them out."
         )
     if chosen == "imported" and imported is not None:
         notes.append("the labels are those it was imported with: realsim has not checked them.")

@@ -11,6 +11,7 @@ from realsim.app.annotate.current import refresh_labels, what_is_stale
 from realsim.app.console import Console
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.run import run_export
+from realsim.errors import InputError
 from realsim.formats.bop.scene import find_scenes, read_scene
 from realsim.geometry import se3
 from realsim.records import ObjectPose, Scene, SupportPlane
@@ -91,3 +92,25 @@ def test_an_export_carries_the_reviewed_poses_and_leaves_out_what_was_rejected(
     labels = {a.obj_id: a.T_cam_obj for a in scene.ground_truth[0]}
     np.testing.assert_allclose(labels[first.obj_id], expected, atol=1e-6)
     assert second.obj_id not in labels
+
+
+def test_pictures_and_thumbnails_do_not_make_it_another_export(
+    session: SessionStore, tmp_path: Path
+) -> None:
+    request = ExportRequest(sources=(session.folder,), target="bop")
+    run_export(request, tmp_path / "out", QUIET)
+    for name in ("reports/a.html", "review/thumbnails/000000.jpg"):
+        path = session.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"x")
+    assert run_export(request, tmp_path / "out", QUIET).was_finished
+
+
+def test_a_finished_export_is_not_mixed_with_what_a_review_changed_since(
+    session: SessionStore, tmp_path: Path
+) -> None:
+    request = ExportRequest(sources=(session.folder,), target="bop")
+    run_export(request, tmp_path / "out", QUIET)
+    say(session, "reject", load_scene(session).objects[0])
+    with pytest.raises(InputError, match=r"finished export.*delete that one first"):
+        run_export(request, tmp_path / "out", QUIET)

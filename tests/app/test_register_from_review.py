@@ -65,6 +65,9 @@ def test_moved_rejected_and_excluded_are_what_comes_out(session: SessionStore) -
     }
     assert said["views"] == [0, 1, 3, 4, 5, 6, 7]
     assert any("excluded by ada: blurred" in f["words"] for f in said["findings"])
+    words = " ".join(f["words"] for f in said["findings"])
+    assert f"instance {second.instance}" in words and "rejected by ada: it is gone" in words
+    assert f"instance {first.instance}" in words and "starts from where it was put" in words
     # The depth pulls what a person moved back to where it stands.
     now = load_scene(session).object(first.instance)
     assert 1e3 * np.linalg.norm(now.T_world_obj[:3, 3] - first.T_world_obj[:3, 3]) < 0.5

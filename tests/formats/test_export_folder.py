@@ -109,7 +109,7 @@ def test_another_request_is_not_mixed_in(tmp_path):
     with pytest.raises(InputError, match=r"another request \(scenes: \[1, 2\] there, \[3\]"):
         ExportFolder.begin(tmp_path, {**ASKED, "scenes": [3]})
     fill(tmp_path)
-    with pytest.raises(InputError, match="not empty"):
+    with pytest.raises(InputError, match="holds a finished export"):
         ExportFolder.begin(tmp_path, ASKED)
     with pytest.raises(InputError, match="is a file"):
         ExportFolder.begin(tmp_path / "README.md", ASKED)

@@ -125,3 +125,21 @@ def test_what_is_no_cloud_is_refused() -> None:
         residuals(np.zeros((4, 3)), np.eye(4)[None], [])
     with pytest.raises(InputError, match="positive"):
         residual_rgb([0.0], 0.0)
+
+
+def test_points_of_the_table_are_no_residual_of_what_stands_on_it() -> None:
+    mesh = part("box").mesh
+    half = -float(mesh.bounds[0, 2])
+    reach = float(mesh.bounds[1, 0])
+    T = se3.from_translation([0.0, 0.0, half])
+    beside, side = [reach + 0.006, 0.0, 0.0005], [reach + 0.006, 0.0, 0.02]
+    points = np.array([beside, side], np.float32)
+    alone = CloudResiduals(points).against(T[None], [mesh])
+    assert np.all(np.isfinite(alone))
+    with_table = CloudResiduals(points, T_world_table=np.eye(4)).against(T[None], [mesh])
+    assert np.isnan(with_table[0]) and with_table[1] == alone[1]
+    # The law holds wherever world is.
+    M = se3.random_transform(np.random.default_rng(1))
+    moved = se3.transform(M, points).astype(np.float32)
+    again = CloudResiduals(moved, T_world_table=M).against((M @ T)[None], [mesh])
+    assert np.isnan(again[0]) and np.isclose(again[1], alone[1], atol=1e-5)

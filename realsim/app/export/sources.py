@@ -171,6 +171,10 @@ def _graspnet(source: Path, request: ExportRequest) -> Iterator[SourceScene]:
         )  # fmt: skip
 
 
+BESIDE = ("reports/", "review/thumbnails/", "registration/cache/", "registration/pictures/")
+"""What a session has for people to look at, or to be quicker: nothing of it is exported."""
+
+
 def content_of(scenes: Sequence[SourceScene]) -> str:
     """Return a digest of names, sizes and times of all files of scenes: what they are made of.
 
@@ -181,6 +185,8 @@ def content_of(scenes: Sequence[SourceScene]) -> str:
         for path in sorted(p for p in scene.folder.rglob("*") if p.is_file()):
             state = path.stat()
             name = path.relative_to(scene.folder).as_posix()
+            if scene.kind == "session" and name.startswith(BESIDE):
+                continue
             digest.update(f"{name} {state.st_size} {state.st_mtime_ns}\n".encode())
     return digest.hexdigest()
 

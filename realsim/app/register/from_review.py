@@ -40,6 +40,8 @@ class ReviewStarts:
     """A row an object: obj_id, instance, T_world_obj, radius_m, turn_deg."""
     applied: tuple[str, ...]
     """The lines of the journal that they come from."""
+    words: tuple[str, ...] = ()
+    """What was made of them, object by object."""
 
     def wanted(self, models: Mapping[int, ObjectModel]) -> list[Wanted]:
         """Return the objects as the registration wants them.
@@ -51,7 +53,10 @@ class ReviewStarts:
 
     def to_json(self) -> Row:
         """Return what is kept of them."""
-        return {"format_version": FORMAT, "applied": list(self.applied), "starts": self.rows}
+        return {
+            "format_version": FORMAT, "applied": list(self.applied), "starts": self.rows,
+            "words": list(self.words),
+        }  # fmt: skip
 
 
 def review_starts(store: SessionStore, models: Mapping[int, ObjectModel] | None) -> ReviewStarts:
@@ -81,11 +86,17 @@ def review_starts(store: SessionStore, models: Mapping[int, ObjectModel] | None)
     lines = pending(scene, state)
     kept = store.read_json(REVIEW_FILE) if store.has(REVIEW_FILE) else None
     if kept is not None and {e.id for e in lines} <= set(kept["applied"]):
-        return ReviewStarts(rows=kept["starts"], applied=tuple(kept["applied"]))
+        return ReviewStarts(
+            rows=kept["starts"], applied=tuple(kept["applied"]), words=tuple(kept["words"])
+        )
     rows: list[Row] = []
+    words: list[str] = []
     for placed in corrected_scene(scene, state).objects:
         decision = decision_on(placed, state)
+        name = f"instance {placed.instance} (object {placed.obj_id})"
         if decision is not None and DECIDED[decision.action] == "rejected":
+            why = f": {decision.comment}" if decision.comment else ""
+            words.append(f"{name} was rejected by {decision.reviewer}{why}. It is left out.")
             continue
         if models is not None and placed.obj_id not in models:
             raise InputError(
@@ -93,14 +104,18 @@ def review_starts(store: SessionStore, models: Mapping[int, ObjectModel] | None)
                 f"no model of it; there are {', '.join(map(str, sorted(models))) or 'none'}. "
                 "Give the --library that has it."
             )
-        rows.append(_row(placed, is_moved=any(e.instance == placed.instance for e in lines)))
+        is_moved = any(e.instance == placed.instance for e in lines)
+        if is_moved:
+            words.append(f"{name} starts from where it was put: {'; '.join(placed.reasons)}.")
+        rows.append(_row(placed, is_moved))
     if not rows:
         raise InputError(
             f"the reviewers rejected every object of session '{store.folder}'; there is nothing to "
             "register. Move one to where it is, or say what is there with --object."
         )
     before = () if kept is None else tuple(kept["applied"])
-    return ReviewStarts(rows=rows, applied=(*before, *(e.id for e in lines if e.id not in before)))
+    applied = (*before, *(e.id for e in lines if e.id not in before))
+    return ReviewStarts(rows=rows, applied=applied, words=tuple(words))
 
 
 def _row(placed: ObjectPose, is_moved: bool) -> Row:

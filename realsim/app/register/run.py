@@ -1,5 +1,6 @@
 """The registration of a session: read what is there, find the objects, write, draw."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -78,7 +79,8 @@ def run_register(store: SessionStore, console: Console, request: RegisterRequest
     if is_current(store, STAGE, inputs.key) and store.has(SCENE_FILE):
         return _as_it_was(store)
     starts = review_starts(store, None) if request.from_review else None
-    result = _with_review(store, inputs, _registered(store, console, request, inputs))
+    told = () if starts is None else starts.words
+    result = _with_review(store, inputs, told, _registered(store, console, request, inputs))
     models = inputs.models
     if request.library is not None:
         found = sorted({o.obj_id for o in result.scene.objects})
@@ -100,9 +102,12 @@ def run_register(store: SessionStore, console: Console, request: RegisterRequest
     return result
 
 
-def _with_review(store: SessionStore, inputs: RegisterInputs, result: Registered) -> Registered:
-    """Return the result with what it means for decisions that were made of the scene before."""
-    remarks = [
+def _with_review(
+    store: SessionStore, inputs: RegisterInputs, told: Sequence[str], result: Registered
+) -> Registered:
+    """Return the result with what came of the review, and what it means for its decisions."""
+    remarks = [Remark(view=None, kind="review", words=w) for w in told]
+    remarks += [
         Remark(view=None, kind="review", words=(
             f"instance {placed.instance} was accepted by {entry.reviewer}, {mm:.2g} mm and "
             f"{deg:.2g} deg from here: that decision counts no longer, look at it again."
@@ -113,9 +118,9 @@ def _with_review(store: SessionStore, inputs: RegisterInputs, result: Registered
     instances = instances_ever(store) | {o.instance for o in result.scene.objects}
     views = {v.index for v in store.session.views}
     models = {int(p.stem[4:]) for p in store.path("models").glob("obj_[0-9]*.*")}
-    told = stray_words(state, instances, views, models | set(inputs.models))
+    strays = stray_words(state, instances, views, models | set(inputs.models))
     remarks += [
-        Remark(view=None, kind="review", words=w) for w in (*told, damage_words(store)) if w
+        Remark(view=None, kind="review", words=w) for w in (*strays, damage_words(store)) if w
     ]
     return replace(result, remarks=(*result.remarks, *remarks)) if remarks else result
 

@@ -25,6 +25,8 @@ FIELD_CELLS = 96
 """Cells of a distance field along the longest side: those of the registration, which keeps them."""
 FULL_M = 0.005
 """Distance at which the colours are full [m]: what tells a wrong pose from a right one."""
+TABLE_M = 0.004
+"""How far from the plane points may be the table's [m]: twice the depth's noise at 0.4 m."""
 STOPS_RGB = np.array(
     [[49, 54, 149], [116, 173, 209], [255, 255, 191], [253, 141, 60], [165, 0, 38]], np.float64
 )
@@ -58,7 +60,12 @@ class CloudResiduals:
     """The residuals of one cloud against objects that are moved one at a time."""
 
     def __init__(
-        self, points: ArrayLike, *, within_m: float = 0.01, folder: Path | None = None
+        self,
+        points: ArrayLike,
+        *,
+        within_m: float = 0.01,
+        folder: Path | None = None,
+        T_world_table: ArrayLike | None = None,
     ) -> None:
         """Take the cloud.
 
@@ -66,6 +73,8 @@ class CloudResiduals:
             points: (N, 3) in world [m].
             within_m: points farther from every model than this belong to none [m].
             folder: where the registration keeps distance fields; None = in memory only.
+            T_world_table: (4, 4) the supporting plane; points on it are the table's, not a part
+                of an object that is missing. None = there is none.
 
         Raises:
             InputError: the points have another shape, or the distance is not positive.
@@ -78,6 +87,10 @@ class CloudResiduals:
         self._points, self._within_m, self._folder = p, float(within_m), folder
         self._near: dict[tuple[int, int], _Near] = {}
         self._fields: dict[int, tuple[Mesh, DistanceField]] = {}
+        self._height_m = np.full(len(p), np.inf, np.float32)
+        if T_world_table is not None:
+            T = se3.check_rigid(T_world_table, "T_world_table").astype(np.float32)
+            self._height_m = np.abs((p - T[:3, 3]) @ T[:3, 2])
 
     def against(self, T_world_objs: ArrayLike, meshes: Sequence[Mesh]) -> Array32:
         """Return the signed distance (N,) [m] of every point to the model it is nearest to.
@@ -108,6 +121,8 @@ class CloudResiduals:
             nearer = d < least[near.which]
             mine = near.which[nearer]
             least[mine], out[mine] = d[nearer], near.distance_m[nearer]
+        # What is nearer to the table than to any model is the table.
+        out[(self._height_m < TABLE_M) & (self._height_m < least)] = np.nan
         self._near = kept
         used = {id(mesh) for mesh in meshes}
         self._fields = {key: field for key, field in self._fields.items() if key in used}
