@@ -95,7 +95,9 @@ def commands(ctx: click.Context, config_file: Path | None, no_color: bool) -> No
 def main() -> None:
     """Run the command line; end with exit code 2 and one paragraph on bad input."""
     from realsim.app.completion import add_bash_completion
+    from realsim.app.console import open_missing_streams
 
+    open_missing_streams()
     add_bash_completion()
     try:
         commands(prog_name="realsim", standalone_mode=False)

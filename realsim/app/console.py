@@ -205,6 +205,29 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
+def open_missing_streams() -> None:
+    """Lead streams that whoever started this process has closed (`>&-`) to the null device.
+
+    Python has None for them, which every library that writes a line would stumble over. Their
+    numbers are taken, too: the next file that is opened would get number 1 or 2, and what a library
+    in C prints, or a process that is started, would be written into it.
+    """
+    streams = (("stdin", "r"), ("stdout", "w"), ("stderr", "w"))
+    missing = [(k, *stream) for k, stream in enumerate(streams) if getattr(sys, stream[0]) is None]
+    # All numbers first: a stream that is opened before would take the next one's.
+    for number, _, _ in missing:
+        try:
+            os.fstat(number)
+        except OSError:
+            null = os.open(os.devnull, os.O_RDWR)
+            if null != number:
+                os.dup2(null, number)
+                os.close(null)
+            os.set_inheritable(number, True)  # a process that is started has it, too
+    for _, name, mode in missing:
+        setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))
+
+
 def _no_tick(done: int, total: int) -> None:
     """Take notice of nothing."""
 

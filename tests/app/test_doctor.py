@@ -210,6 +210,13 @@ def test_a_host_that_is_none_is_named() -> None:
     assert all(f.kind == "problem" and "robot.invalid" in f.name for f in found)
 
 
+@pytest.mark.parametrize("host", ["a" * 70, "a..b", "\udcff", "a\0b"])
+def test_a_text_that_can_be_no_name_is_one_problem_that_can_be_printed(host: str) -> None:
+    (found,) = devices.robot_findings(host)
+    assert found.kind == "problem" and "no host name" in found.found
+    found.found.encode("utf-8")
+
+
 # --- the command --------------------------------------------------------------------------------
 
 

@@ -41,8 +41,12 @@ def test_a_figure_that_nobody_knows_or_that_is_no_number_is_refused() -> None:
         Figure(name="calibration.nonsense", value=1.0)
     with pytest.raises(InputError, match="a number is needed"):
         Figure(name=NAME, value=math.nan)
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match=rf"figures.{NAME}'.value is 'much'"):
         figures_from_json({NAME: {"value": "much", "sigma": None}})
+    with pytest.raises(InputError, match="unit 'mm'; 'px' is expected"):
+        figures_from_json({NAME: {"value": 1, "sigma": None, "unit": "mm"}})
+    with pytest.raises(InputError, match=r"'figures\.a'\.value"):
+        figures_from_json({"a": {"b": 1}})
     # A name of a newer version is no reason to refuse the rest.
     assert figures_from_json({"future.figure": {"value": 1, "sigma": None}}) == {}
 
@@ -110,7 +114,9 @@ def test_quoted_names_and_tables_of_toml_mean_the_same(tmp_path: Path) -> None:
         ("calibration.held_out_px = {min = 2, max = 1}", "min above max"),
         ("calibration.held_out_px = {most = 2}", "no figure"),
         ("calibration.held_out_px = {}", "neither"),
-        ("", "names no figure"), ("= 3", "no TOML"),
+        ("", "names no figure"), ("= 3", "not TOML"),
+        ("calibration.held_out_px = {max = inf}", "finite"),
+        ("a = " + "[" * 5000, "nested deeper"),
     ],
 )  # fmt: skip
 def test_a_file_of_limits_that_says_something_else_is_refused(
@@ -122,7 +128,8 @@ def test_a_file_of_limits_that_says_something_else_is_refused(
         read_limits(path)
 
 
-@pytest.mark.parametrize("rule", ["", "held_out", "plan.views<=3", "plan.views<x", "nothing<3"])
+@pytest.mark.parametrize("rule", ["", "held_out", "plan.views<=3", "plan.views<x", "nothing<3",
+                                  "plan.views<inf"])  # fmt: skip
 def test_a_rule_that_cannot_be_read_is_refused(rule: str) -> None:
     with pytest.raises(InputError):
         limit_of(rule)

@@ -2,12 +2,12 @@
 
 import os
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from realsim.app.config.toml_text import read_toml
 from realsim.errors import InputError
 
 VARIABLE = "REALSIM_CONFIG"
@@ -62,24 +62,14 @@ def read_config(path: Path, who: str, *, is_named: bool) -> ConfigFile:
     """Read a file of settings.
 
     Raises:
-        InputError: it is not there, cannot be read, or is not TOML.
+        InputError: it is not there, cannot be read, or is not TOML that `read_toml` takes.
     """
     if not path.is_file():
         raise InputError(
             f"{who} {path}, which is {'no file' if path.exists() else 'not there'}. Give a TOML "
             "file; `realsim config template` prints one."
         )
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read as text ({error}); UTF-8 is expected.") from error
-    try:
-        tables = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(
-            f"{path} is not TOML: {error}. Texts stand in quotes, tables in brackets: "
-            "`realsim config template` prints an example."
-        ) from error
+    text, tables = read_toml(path)
     return ConfigFile(path=path, text=text, tables=tables, is_named=is_named)
 
 

@@ -111,7 +111,10 @@ def _one(option: click.Option, value: Any, where: str) -> Any:
         return value
     text = str(value)
     if isinstance(option.type, click.Path):
-        text = str(Path(text).expanduser())  # on the command line the shell does it
+        try:
+            text = str(Path(text).expanduser())  # on the command line the shell does it
+        except RuntimeError as error:
+            raise InputError(f"{where} = {_shown(value)} cannot be used: {error}") from error
     ctx = click.Context(click.Command("settings"))
     try:
         option.type.convert(text, option, ctx)

@@ -44,7 +44,23 @@ def _camera(name: str, device: dict[str, Any]) -> Finding:
 
 def robot_findings(host: str, timeout_s: float = TIMEOUT_S) -> list[Finding]:
     """Return whether the robot's controller answers at its ports."""
+    if not _is_host(host):
+        shown = host.encode("utf-8", "backslashreplace").decode()
+        return [Finding(
+            group=GROUP, name="robot", kind="problem",
+            found=f"'{shown:.60}' is no host name: between dots there are 1 to 63 characters",
+            todo="give the address from the robot's network settings, such as 192.168.1.10",
+        )]  # fmt: skip
     return [_port(host, port, use, timeout_s) for port, use in PORTS.items()]
+
+
+def _is_host(host: str) -> bool:
+    """Return whether a name can be asked for at all; an IPv6 address can."""
+    try:
+        host.encode("idna")
+    except UnicodeError:
+        return False
+    return "\0" not in host
 
 
 def _port(host: str, port: int, use: str, timeout_s: float) -> Finding:

@@ -10,6 +10,7 @@ from typing import Any
 
 from realsim.app.report.catalogue import CATALOGUE, Meaning
 from realsim.errors import InputError
+from realsim.untrusted.values import mapping, number
 
 NOT_A_FIGURE = "has no figure of this name"
 
@@ -100,20 +101,19 @@ def figures_from_json(value: Any) -> dict[str, Figure]:
     """Return the figures of a stored report; names that this version does not know are left out.
 
     Raises:
-        InputError: not the figures of a report.
+        InputError: not the figures of a report, or in other units; names the field.
     """
-    if not isinstance(value, dict):
-        raise InputError("the report has no figures; write it again with `realsim report`.")
     found: dict[str, Figure] = {}
-    for name, row in value.items():
+    for name, told in mapping(value, "'figures'").items():
+        where = f"'figures.{name:.60}'"
+        row = {"value": None, "sigma": math.nan, "unit": None} | mapping(told, where)
+        figure_value = number(row["value"], f"{where}.value")
+        sigma = row["sigma"]
+        sigma = None if sigma is None else number(sigma, f"{where}.sigma", 0.0)
         if name not in CATALOGUE:
             continue
-        try:
-            sigma = None if row["sigma"] is None else float(row["sigma"])
-            found[name] = Figure(name=name, value=float(row["value"]), sigma=sigma)
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"the figure {name} of the report cannot be read ({error!r}); write the report "
-                "again with `realsim report`."
-            ) from error
+        unit = CATALOGUE[name].unit
+        if row["unit"] != unit:
+            raise InputError(f"{where} has the unit {row['unit']!r:.60}; '{unit}' is expected.")
+        found[name] = Figure(name=name, value=figure_value, sigma=sigma)
     return found

@@ -2,12 +2,12 @@
 
 import math
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from realsim.app.config.toml_text import read_toml
 from realsim.app.report.figures import Figure, require_known, shown
 from realsim.errors import InputError
 
@@ -28,7 +28,7 @@ def limit_of(text: str) -> Limit:
     """Return the limit of `--fail-on NAME<VALUE` or `NAME>VALUE`: the figure must not be so.
 
     Raises:
-        InputError: not of this form, or no such figure.
+        InputError: not of this form, no such figure, or a value that is no finite number.
     """
     found = FAIL_ON.fullmatch(text)
     if found is None:
@@ -48,14 +48,13 @@ def read_limits(path: Path) -> list[Limit]:
     Names with dots may be quoted, or written as TOML's own tables: both mean the same.
 
     Raises:
-        InputError: no such file, no TOML, an unknown figure, or a limit of another form.
+        InputError: no such file, no TOML, an unknown figure, or a limit of another form or not
+            finite.
     """
     try:
-        told = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise InputError(f"--limits '{path}' cannot be read: {error.strerror}.") from error
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise InputError(f"--limits '{path}' is no TOML: {error}.") from error
+        _, told = read_toml(path)
+    except InputError as error:
+        raise InputError(f"--limits: {error}") from error
     limits = list(_limits(told, "", path))
     if not limits:
         raise InputError(
@@ -98,9 +97,12 @@ def _number(value: Any, what: str) -> float:
             raise ValueError
         number = float(value)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{what}: '{value}' is no number.") from error
-    if math.isnan(number):
-        raise InputError(f"{what}: '{value}' is no limit.")
+        raise InputError(f"{what}: '{value!s:.60}' is no number.") from error
+    if not math.isfinite(number):
+        raise InputError(
+            f"{what}: '{value!s:.60}' is no limit; a finite number is expected. Leave out the end "
+            "that has none."
+        )
     return number
 
 

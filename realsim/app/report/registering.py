@@ -28,7 +28,8 @@ from realsim.app.report.section import Section, counted, drawn
 from realsim.app.report.uncertainty import sigmas
 from realsim.records import ObjectModel, ObjectPose
 from realsim.registration.judging.verdict import VerdictConfig
-from realsim.review.journal import ReviewState, subject_of
+from realsim.review.corrections import decision_on
+from realsim.review.journal import ReviewState
 from realsim.store import SessionStore
 
 VERDICT_KIND = {"accepted": "good", "doubtful": "warn", "rejected": "bad", "unchecked": "off"}
@@ -105,7 +106,7 @@ def _object(
 ) -> dict[str, Any]:
     """Return an object as plain JSON values."""
     mm, deg = sigmas(o.covariance, models.get(o.obj_id))
-    decision = state.decision(o.instance, subject_of(o))
+    decision = decision_on(o, state)
     views = o.checks.get("views", float("nan"))
     p, agree = (o.checks.get(k, float("nan")) for k in ("probability", "agree"))
     px = [p_[o.instance].sigma_px for p_ in result.seen.values() if o.instance in p_]

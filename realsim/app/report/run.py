@@ -16,6 +16,7 @@ from realsim.app.report.compare_page import (
     figure_rows,
     object_rows,
 )
+from realsim.app.report.destination import require_destination
 from realsim.app.report.limits import Limit, broken, limit_of, read_limits
 from realsim.app.report.page import Page
 from realsim.app.report.session import hidden_of, page_html, report_of, write_report_of
@@ -46,8 +47,9 @@ def run_report(request: ReportRequest) -> bool:
     """
     limits = [limit_of(text) for text in request.fail_on]
     limits += read_limits(request.limits) if request.limits is not None else []
-    if request.out is not None and request.out.is_dir():
-        raise InputError(f"--out '{request.out}' is a folder; give the HTML file to be written.")
+    if request.out is not None:
+        inputs = [p for p in (*request.sources, request.limits, request.truth) if p is not None]
+        require_destination(request.out, inputs)
     if len(request.sources) == 1:
         if request.fail_if_worse:
             raise InputError("--fail-if-worse compares: give two sessions or more.")
@@ -62,6 +64,8 @@ def _one(request: ReportRequest, limits: Sequence[Limit]) -> bool:
     from realsim.app.stages import open_session
     from realsim.app.truth import loop_errors
 
+    if request.sources[0].suffix.lower() == ".json" and not request.sources[0].is_dir():
+        raise InputError(_not_alone(request.sources[0]))
     store = open_session(request.sources[0])
     errors = None if request.truth is None else loop_errors(store, request.truth)
     console = Console(quiet=request.quiet, as_json=request.as_json)
@@ -81,6 +85,16 @@ def _one(request: ReportRequest, limits: Sequence[Limit]) -> bool:
         console.say(f"report    {path}")
     _tell(console, failed)
     return not failed
+
+
+def _not_alone(path: Path) -> str:
+    """Return what is said of one file where a session is expected."""
+    if not path.exists():
+        return f"the file '{path}' is not there; give a session's folder, such as demo/session."
+    return (
+        f"'{path}' is a file; one report is made of a session's folder. A stored report.json can "
+        "be compared: give a second one, or a session."
+    )
 
 
 def _say_one(console: Console, document: dict[str, Any]) -> None:

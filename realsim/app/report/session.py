@@ -29,6 +29,8 @@ from realsim.store import SessionStore
 __all__ = ["Page", "page_html", "report_of", "write_report", "write_report_of"]
 
 PAGE, DOCUMENT = "reports/report.html", "reports/report.json"
+DOCUMENT_SCRIPT = '<script type="application/json" id="report">'
+"""In every page: what holds its figures, and what tells it from other pages."""
 Build = Callable[[Section], None]
 
 
@@ -161,7 +163,7 @@ def filled(page: Page, *, title: str, about: str, document: Any, style: str = ""
     # "</" would end the script, "<!--" would begin a comment in it.
     data = json.dumps(document, allow_nan=False, ensure_ascii=True).replace("<", "\\u003c")
     markup = f"<style>{style}</style>" if style else ""
-    script = f'<script type="application/json" id="report">{data}</script>'
+    script = f"{DOCUMENT_SCRIPT}{data}</script>"
     return template.substitute(
         title=html.escape(page.plain(title)),
         about=html.escape(page.plain(about)),

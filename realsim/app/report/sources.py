@@ -5,18 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from realsim.app.report.figures import Figure, figures_from_json
+from realsim.app.report.figures import Figure
 from realsim.app.report.page import Page
 from realsim.app.report.section import READING
 from realsim.app.report.session import DOCUMENT, hidden_of, report_of
-from realsim.app.report.summary import SCHEMA, SCHEMA_VERSION, VERDICTS
+from realsim.app.report.stored import read_stored
 from realsim.app.stages import open_session, session_models
 from realsim.errors import InputError
-from realsim.geometry import se3
 from realsim.records import ObjectModel
-from realsim.store.json_files import read_json_file
 
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
@@ -44,7 +40,8 @@ def sources_of(paths: Sequence[Path]) -> list[Source]:
     """Return what is to be compared.
 
     Raises:
-        InputError: too many, neither session nor report, or a report of a newer version.
+        InputError: too many, neither session nor report, or a report that is damaged or of a
+            newer version.
     """
     if len(paths) > len(LETTERS):
         raise InputError(f"{len(paths)} sessions: at most {len(LETTERS)} are compared at once.")
@@ -68,7 +65,13 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 def _source(path: Path, label: str) -> Source:
     if path.is_file():
-        return _stored(path, label)
+        stored = read_stored(path)
+        return Source(
+            label=label, verdict=stored.verdict, figures=stored.figures, objects=stored.objects,
+            series=stored.series, models={},
+        )  # fmt: skip
+    if path.suffix.lower() == ".json" and not path.exists():
+        raise InputError(f"the stored report '{path}' is not there.")
     store = open_session(path)
     report = report_of(store)
     document = report.document(Page(hidden=hidden_of(store)))
@@ -80,40 +83,3 @@ def _source(path: Path, label: str) -> Source:
         label=label, verdict=report.verdict, figures=report.figures, objects=report.objects,
         series=document["series"], models=models,
     )  # fmt: skip
-
-
-def _stored(path: Path, label: str) -> Source:
-    """Read a stored report.
-
-    Raises:
-        InputError: it is none, or one of a newer version, or damaged.
-    """
-    told: Any = read_json_file(path)
-    if not isinstance(told, dict) or told.get("schema") != SCHEMA:
-        raise InputError(
-            f"'{path}' is no stored report; a session's folder, or its {DOCUMENT}, is expected."
-        )
-    version = told.get("schema_version")
-    if not isinstance(version, int) or not 1 <= version <= SCHEMA_VERSION:
-        raise InputError(
-            f"'{path}' has the version {version!r}; this realsim reads 1 to {SCHEMA_VERSION}."
-        )
-    try:
-        objects = [_checked(o) for o in told["objects"]]
-        verdict, series = str(told["verdict"]), dict(told["series"])
-    except READING as error:
-        raise InputError(f"'{path}' is damaged ({error!r}); write the report again.") from error
-    if verdict not in VERDICTS:
-        raise InputError(f"'{path}' has the verdict '{verdict}'; write the report again.")
-    return Source(
-        label=label, verdict=verdict, figures=figures_from_json(told.get("figures")),
-        objects=objects, series=series, models={},
-    )  # fmt: skip
-
-
-def _checked(row: Any) -> dict[str, Any]:
-    """Return an object's row with a rigid pose."""
-    T = se3.check_rigid(np.asarray(row["T_world_obj"], dtype=np.float64), "T_world_obj")
-    named = {k: row[k] for k in ("name", "verdict", "sigma_mm", "sigma_deg", "probability")}
-    ids = {"instance": int(row["instance"]), "obj_id": int(row["obj_id"])}
-    return {**named, **ids, "T_world_obj": T.tolist()}

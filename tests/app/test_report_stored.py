@@ -1,0 +1,105 @@
+"""Stored reports are files of others: what is not as `realsim report` writes it is named."""
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from realsim.app.report import plots_compare
+from realsim.app.report.cli import report_command
+from realsim.app.report.session import write_report
+from realsim.app.report.stored import SERIES_BY_VIEW, SERIES_OF_SHARES, read_stored
+from realsim.errors import InputError
+from registered_sessions import models_of, registered_by_hand, table_session
+
+
+@pytest.fixture(scope="module")
+def document(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    from realsim.app.register.files import write_result
+
+    store = table_session(tmp_path_factory.mktemp("stored") / "s", views=2)
+    write_result(store, registered_by_hand(store), models_of(), {})
+    page = write_report(store, None)
+    return json.loads((page.parent / "report.json").read_text("utf-8"))
+
+
+def test_what_a_report_says_is_read_as_it_was_written(
+    document: dict[str, Any], tmp_path: Path
+) -> None:
+    path = tmp_path / "r.json"
+    path.write_text(json.dumps(document))
+    read = read_stored(path)
+    assert read.verdict == document["verdict"] and set(read.figures) == set(document["figures"])
+    assert [o["T_world_obj"] for o in read.objects] == [
+        o["T_world_obj"] for o in document["objects"]
+    ]
+    assert set(read.series) == set(document["series"])
+
+
+def test_the_plots_know_the_series_that_are_checked() -> None:
+    assert tuple(row[0] for row in plots_compare.BY_VIEW) == SERIES_BY_VIEW
+    assert tuple(row[0] for row in plots_compare.SHARES) == SERIES_OF_SHARES
+
+
+FIGURE = "registration.accepted"
+Change = Callable[[dict[str, Any]], Any]
+DAMAGES: list[tuple[Change, str]] = [
+    (lambda d: d.update(session=[]), "session"),
+    (lambda d: d.pop("session"), "session"),
+    (lambda d: d.update(missing=["school"]), "missing"),
+    (lambda d: d.update(missing={"school": 3}), "missing.school"),
+    (lambda d: d.update(stages="done"), "stages"),
+    (lambda d: d.update(stages={"plan": "perhaps"}), "stages.plan"),
+    (lambda d: d.update(findings={}), "findings"),
+    (lambda d: d.update(findings=[{"severity": "bad"}]), "section"),
+    (lambda d: d.update(findings=[{"severity": [], "section": "a", "text": ""}]), "severity"),
+    (lambda d: d.update(figures={}), "report.bad"),
+    (lambda d: d.update(figures={"a": {"b": 1}}), "figures.a"),
+    (lambda d: d["figures"][FIGURE].update(value="7"), FIGURE),
+    (lambda d: d["figures"][FIGURE].update(sigma=-1), FIGURE),
+    (lambda d: d["figures"][FIGURE].update(unit="km"), FIGURE),
+    (lambda d: d.update(verdict=["sound"]), "verdict"),
+    (lambda d: d.update(series=[]), "series"),
+    (lambda d: d["series"].update({"school.scores": {"view": 1}}), "school.scores"),
+    (
+        lambda d: d["series"].update({"calibration.view_rms_px": {"view": [0], "value": []}}),
+        "view_rms_px",
+    ),
+    (lambda d: d["objects"][0].update(verdict="good"), "objects[0]"),
+    (lambda d: d["objects"][0].update(sigma_mm="0.1"), "sigma_mm"),
+    (lambda d: d["objects"][0].update(T_world_obj=[[1, 0], [0, 1]]), "T_world_obj"),
+    (lambda d: d["objects"].append(d["objects"][0]), "2 times"),
+]
+
+
+@pytest.mark.parametrize("k", range(len(DAMAGES)))
+def test_a_damaged_field_is_named_with_its_file(
+    document: dict[str, Any], tmp_path: Path, k: int
+) -> None:
+    change, named = DAMAGES[k]
+    damaged = copy.deepcopy(document)
+    change(damaged)
+    good, bad = tmp_path / "good.json", tmp_path / "bad.json"
+    good.write_text(json.dumps(document))
+    bad.write_text(json.dumps(damaged))
+    done = CliRunner().invoke(report_command, [str(good), str(bad), "--quiet"])
+    assert isinstance(done.exception, InputError), done.output
+    assert "bad.json" in str(done.exception) and named in str(done.exception)
+
+
+def test_a_stored_report_that_is_missing_is_told_as_a_file(tmp_path: Path) -> None:
+    for arguments in (["x.json"], ["x.json", "x.json"]):
+        done = CliRunner().invoke(report_command, [str(tmp_path / a) for a in arguments])
+        assert isinstance(done.exception, InputError)
+        assert "x.json' is not there" in str(done.exception)
+
+
+@pytest.mark.parametrize("value", ["inf", "-inf", "nan", "1e999"])
+def test_a_limit_is_finite(value: str, tmp_path: Path) -> None:
+    rule = f"{FIGURE}<{value}"
+    done = CliRunner().invoke(report_command, [str(tmp_path), "--fail-on", rule])
+    assert isinstance(done.exception, InputError) and "finite" in str(done.exception)
