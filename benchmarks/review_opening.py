@@ -18,7 +18,7 @@ import numpy as np
 from figures import Found
 from review_session import GRASPS, make_session
 
-from review_browser import Browser
+from review_client import Browser
 
 VIEWS = 256
 SERVER = Path(__file__).with_name("review_server.py")
