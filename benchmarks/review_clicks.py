@@ -5,9 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 from figures import Found
-from review_opening import CLICK_QUIET_S, QUIET_S, USUAL, Server, scene_of, serving
-
 from review_client import Browser
+from review_opening import CLICK_QUIET_S, QUIET_S, USUAL, Server, scene_of, serving
 
 IDLE_S = 1.0
 """How long the server is watched doing nothing."""

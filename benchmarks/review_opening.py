@@ -16,9 +16,8 @@ from typing import IO, Any
 
 import numpy as np
 from figures import Found
-from review_session import GRASPS, make_session
-
 from review_client import Browser
+from review_session import GRASPS, make_session
 
 VIEWS = 256
 SERVER = Path(__file__).with_name("review_server.py")

@@ -1,7 +1,8 @@
 """The board views of a session: read them for the calibration, leave its results beside them."""
 
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -28,8 +29,29 @@ RESULTS = "calibration"
 """Folder of the session that takes report, pictures and exports."""
 
 
+class SessionFiles(Protocol):
+    """Files of a session by their paths inside it: a `SessionStore`, or a session not begun yet."""
+
+    @property
+    def folder(self) -> Path:
+        """The session's folder."""
+        ...
+
+    def has(self, relative: str) -> bool:
+        """Return whether there is this file."""
+        ...
+
+    def read_json(self, relative: str) -> Any:
+        """Return the values of a JSON file."""
+        ...
+
+    def write_json(self, relative: str, value: Any) -> None:
+        """Write plain JSON values."""
+        ...
+
+
 def read_board_views(
-    store: SessionStore, views_store: SessionStore, tick: Tick
+    store: SessionFiles, views_store: SessionStore, tick: Tick
 ) -> tuple[list[BoardView], Target, DhArm | None]:
     """Return the board views with the points found, the target, and the arm if it can be told.
 
@@ -69,7 +91,7 @@ def arm_of(views: Sequence[BoardView]) -> DhArm | None:
 
 
 def write_results(
-    report: HandEyeReport, seen: Sequence[BoardView], store: SessionStore, views_store: SessionStore
+    report: HandEyeReport, seen: Sequence[BoardView], store: SessionFiles, views_store: SessionStore
 ) -> None:
     """Write report, pictures, depth bias and the files for other tools into the session."""
     from realsim_calibration.exports import FrameNames, write_exports
@@ -82,7 +104,7 @@ def write_results(
 
 
 def _depth_bias(
-    report: HandEyeReport, seen: Sequence[BoardView], store: SessionStore, views_store: SessionStore
+    report: HandEyeReport, seen: Sequence[BoardView], store: SessionFiles, views_store: SessionStore
 ) -> DepthBiasReport | None:
     """Return the depth camera's bias and note it in the session; None where it cannot be told."""
     used = {v.index for v in report.used}

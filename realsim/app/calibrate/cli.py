@@ -35,6 +35,9 @@ def calibrate_command(
 ) -> None:
     """Calibrate lens and hand-eye: SOURCE is a session, or a folder of images with poses.
 
+    A session may have board views only: calibrate before the board is taken away, and once more
+    when the objects are captured, which places the cameras of their views.
+
     Exit codes: 0 done, 1 a check of the result is bad, 2 bad input.
     """
     from realsim.app.calibrate.run import run_calibrate

@@ -23,17 +23,11 @@ def run_calibrate(source: Path, console: Console, *, live: bool, **options: Any)
     Raises:
         InputError: source or options cannot be used.
     """
-    if (source / "session.json").is_file():
-        _refuse_folder_options(options)
-        from realsim.app.stages import calibrate_session, open_session
-        from realsim.store.records_json import hand_eye_to_json
+    from realsim.app.calibrate.board_only import has_board_views_only
 
-        hand_eye = calibrate_session(open_session(source), console)
-        show_hand_eye(hand_eye, console)
-        console.say(f"report and pictures: {source / 'calibration' / 'report'}")
-        passed = not any(c.verdict == "bad" for c in hand_eye.checks)
-        console.result({"passed": passed, **hand_eye_to_json(hand_eye)})
-        return passed
+    if (source / "session.json").is_file() or has_board_views_only(source):
+        _refuse_folder_options(options)
+        return _run_session(source, console)
     if not source.is_dir():
         raise InputError(
             f"'{source}' is not a folder; a session (it holds session.json) or a folder of images "
@@ -61,6 +55,29 @@ def run_calibrate(source: Path, console: Console, *, live: bool, **options: Any)
     console.say(f"{len(files) - 1} pictures and files for other tools beside it, in {request.out}")
     console.result(report_document(result.hand_eye, result.checks, files))
     return not any(c.verdict == "bad" for c in result.checks)
+
+
+def _run_session(source: Path, console: Console) -> bool:
+    """Calibrate a session, also one that has board views only; return whether no check is bad."""
+    from realsim.app.calibrate.board_only import calibrate_board_only, has_board_views_only
+    from realsim.app.stages import calibrate_session, open_session
+    from realsim.store.records_json import hand_eye_to_json
+
+    board_only = has_board_views_only(source)
+    if board_only:
+        hand_eye = calibrate_board_only(source, console)
+    else:
+        hand_eye = calibrate_session(open_session(source), console)
+    show_hand_eye(hand_eye, console)
+    console.say(f"report and pictures: {source / 'calibration' / 'report'}")
+    if board_only:
+        console.say(
+            "There are no views of objects yet: their cameras are placed by the same command, once "
+            "they are captured."
+        )
+    passed = not any(c.verdict == "bad" for c in hand_eye.checks)
+    console.result({"passed": passed, **hand_eye_to_json(hand_eye)})
+    return passed
 
 
 def report_document(

@@ -1,0 +1,200 @@
+"""A new lab checks its hand-eye while the board still lies there: no view of objects is needed."""
+
+import json
+import shutil
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from numpy.typing import NDArray
+
+from realsim.app.cli import commands
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.records import CameraIntrinsics, CaptureSession, TagBoard, View
+from realsim.store import SessionStore, load_hand_eye
+from realsim.store.atomic import json_bytes
+from realsim_calibration.targets.target_file import target_to_json
+from stored_sessions import bytes_of, flip
+
+CAMERA = CameraIntrinsics(width=640, height=400, fx=440.0, fy=440.0, cx=319.5, cy=199.5)
+BOARD = TagBoard(rows=3, columns=4, tag_size_m=0.04, gap_m=0.01)
+T_EE_CAM = se3.from_rt(se3.exp_so3([0.02, -0.03, 0.9]), [0.01, -0.065, 0.035])
+VIEWS = 14
+MODULES, TEXTURE, FINE = 8, 10, 4
+"""Modules of a tag with its border, texture pixels a module, supersampling."""
+Array = NDArray[np.float64]
+
+
+@cache
+def printed_sheet() -> tuple[NDArray[np.uint8], float, int]:
+    """Return the sheet, its pixels per metre, and the width of its margin [pixels]."""
+    from cv2 import aruco
+
+    tag = MODULES * TEXTURE
+    per_m, margin = tag / BOARD.tag_size_m, tag // 2
+    pitch = round((BOARD.tag_size_m + BOARD.gap_m) * per_m)
+    width, height = (round(v * per_m) + 2 * margin for v in BOARD.size_m)
+    sheet = np.full((height, width), 215, np.uint8)
+    dictionary = aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11)
+    for k, number in enumerate(BOARD.ids):
+        row, column = divmod(k, BOARD.columns)
+        y, x = margin + row * pitch, margin + column * pitch
+        marker = aruco.generateImageMarker(dictionary, int(number), MODULES)
+        large = np.kron(marker, np.ones((TEXTURE, TEXTURE), np.uint8))
+        sheet[y : y + tag, x : x + tag] = np.where(large > 0, 215, 30)
+    return sheet, per_m, margin
+
+
+def photograph(T_cam_board: Array, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Return a picture (H, W, 3) of the board on grey."""
+    import cv2
+
+    sheet, per_m, margin = printed_sheet()
+    to_sheet = np.array([[per_m, 0, margin - 0.5], [0, per_m, margin - 0.5], [0, 0, 1.0]])
+    half = (FINE - 1) / 2
+    finer = np.array([[FINE, 0, half], [0, FINE, half], [0, 0, 1.0]])
+    H = finer @ CAMERA.K @ T_cam_board[:3, [0, 1, 3]] @ np.linalg.inv(to_sheet)
+    size = (CAMERA.width * FINE, CAMERA.height * FINE)
+    fine = cv2.warpPerspective(sheet, H, size, flags=cv2.INTER_LINEAR, borderValue=(120.0,))
+    image = cv2.resize(fine, (CAMERA.width, CAMERA.height), interpolation=cv2.INTER_AREA)
+    noisy = image + rng.normal(scale=1.5, size=image.shape)
+    return np.repeat(np.clip(np.rint(noisy), 0, 255).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def hand_poses(rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return T_base_ee and T_cam_board (n, 4, 4) of tilted, rolled views of the board."""
+    width, height = BOARD.size_m
+    middle = np.array([width / 2, height / 2, 0.0])
+    T_base_board = se3.from_rt(np.diag([1.0, -1.0, -1.0]), [0.35, 0.1, 0.0])
+    hands, seen = [], []
+    for k in range(VIEWS):
+        tilt, azimuth = np.radians(rng.uniform(10, 40)), 2 * np.pi * k * 0.618
+        away = [np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)]
+        eye = middle + rng.uniform(0.28, 0.38) * np.array(away)
+        T_board_cam = se3.look_at(eye, middle, -np.pi + 2 * np.pi * k / VIEWS)
+        hands.append(T_base_board @ T_board_cam @ se3.invert(T_EE_CAM))
+        seen.append(se3.invert(T_board_cam))
+    return np.array(hands), np.array(seen)
+
+
+def board_views(folder: Path) -> Path:
+    """Write what `realsim capture --board` leaves in a new session's folder; return that."""
+    rng = np.random.default_rng(0)
+    session = CaptureSession(name="lab", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    store = SessionStore.create(folder / "calibration/capture", session)
+    depth = np.zeros((CAMERA.height, CAMERA.width), np.uint16)
+    for k, (hand, T_cam_board) in enumerate(zip(*hand_poses(rng), strict=True)):
+        view = View(index=k, T_base_ee=hand, time_s=float(k))
+        store.add_view(view, photograph(T_cam_board, rng), depth_counts=depth)
+    store.close()
+    (folder / "calibration/board.json").write_bytes(json_bytes(target_to_json(BOARD)))
+    return folder
+
+
+def calibrate(folder: Path, *options: str) -> Result:
+    return CliRunner().invoke(commands, ["calibrate", str(folder), *options])
+
+
+@pytest.fixture(scope="module")
+def captured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return board_views(tmp_path_factory.mktemp("captured") / "lab")
+
+
+@pytest.fixture(scope="module")
+def calibrated(captured: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    lab = tmp_path_factory.mktemp("calibrated") / "lab"
+    shutil.copytree(captured, lab)
+    return lab, calibrate(lab, "--json")
+
+
+@pytest.fixture
+def lab(captured: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(captured, tmp_path / "lab"))
+
+
+def test_the_hand_eye_is_known_before_there_is_a_view_of_objects(
+    calibrated: tuple[Path, Result],
+) -> None:
+    folder, done = calibrated
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert told["passed"] and len(told["view_indices"]) == VIEWS
+    off = se3.invert(T_EE_CAM) @ np.array(told["T_ee_cam"])
+    assert np.linalg.norm(off[:3, 3]) < 0.5e-3
+    assert np.degrees(np.linalg.norm(se3.log_so3(off[:3, :3]))) < 0.05
+    assert (folder / "calibration/report/calibration_report.html").is_file()
+    assert "same command" in done.stderr
+
+
+def test_no_session_is_begun_by_it(calibrated: tuple[Path, Result], captured: Path) -> None:
+    folder, _ = calibrated
+    assert [p.name for p in folder.iterdir()] == ["calibration"]
+    assert bytes_of(folder / "calibration/capture") == bytes_of(captured / "calibration/capture")
+
+
+def test_with_objects_the_same_command_says_the_same_and_places_their_cameras(
+    calibrated: tuple[Path, Result], tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(calibrated[0], tmp_path / "lab"))
+    before = (folder / "calibration/hand_eye.json").read_bytes()
+    session = CaptureSession(name="lab", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
+    rng = np.random.default_rng(1)
+    store = SessionStore.create(folder, session)
+    hand = hand_poses(rng)[0][3]
+    grey = np.full((CAMERA.height, CAMERA.width, 3), 120, np.uint8)
+    store.add_view(View(index=0, T_base_ee=hand, time_s=0.0), grey)
+    store.close()
+
+    done = calibrate(folder, "--quiet")
+    assert done.exit_code == 0, done.output
+    assert "same command" not in done.stderr
+    assert (folder / "calibration/hand_eye.json").read_bytes() == before
+    after = SessionStore.open(folder)
+    placed = after.session.view(0).T_world_cam
+    assert placed is not None
+    np.testing.assert_allclose(placed, load_hand_eye(after).camera_poses(hand, None), atol=1e-12)
+    np.testing.assert_allclose(placed, hand @ T_EE_CAM, atol=1e-3)
+    assert '"calibration/hand_eye.json"' in (folder / "manifest.jsonl").read_text()
+    assert after.verify() == []
+
+
+@pytest.mark.slow
+def test_a_bad_check_is_told_while_the_board_still_lies_there(lab: Path) -> None:
+    longer = TagBoard(rows=3, columns=4, tag_size_m=0.0412, gap_m=0.0103)
+    (lab / "calibration/board.json").write_bytes(json_bytes(target_to_json(longer)))
+    done = calibrate(lab, "--json")
+    assert done.exit_code == 1, done.output
+    told = json.loads(done.stdout)
+    assert not told["passed"]
+    assert "board size" in [c["name"] for c in told["checks"] if c["verdict"] == "bad"]
+
+
+def refused(folder: Path, *options: str) -> str:
+    """Calibrate what cannot be, and return why; nothing may be written."""
+    before = bytes_of(folder)
+    done = calibrate(folder, *options)
+    assert isinstance(done.exception, InputError), done.output
+    assert bytes_of(folder) == before
+    return str(done.exception)
+
+
+def test_what_the_board_views_say_themselves_is_not_said_twice(lab: Path) -> None:
+    assert "--board" in refused(lab, "--board", "aprilgrid:4x3,tag=40mm,gap=10mm")
+
+
+def test_a_damaged_board_view_is_no_board_view(lab: Path) -> None:
+    flip(lab / "calibration/capture/rgb/000003.png", 900)
+    assert "rgb/000003.png" in refused(lab)
+
+
+def test_without_its_target_file_the_board_is_not_guessed(lab: Path) -> None:
+    (lab / "calibration/board.json").unlink()
+    assert "realsim board" in refused(lab)
+
+
+def test_a_session_that_lost_its_header_is_not_taken_for_one_of_board_views(lab: Path) -> None:
+    (lab / "manifest.jsonl").write_text("")
+    assert "session.json" in refused(lab)
