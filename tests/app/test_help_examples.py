@@ -43,25 +43,6 @@ def printed_examples(command: click.Command, path: tuple[str, ...]) -> list[str]
     return [line.strip() for line in block.splitlines()]
 
 
-def examples_of(keep: Callable[[str, str], bool]) -> list[str]:
-    return [
-        line
-        for path, command in COMMANDS.items()
-        for line in printed_examples(command, path)
-        if keep(" ".join(path), line)
-    ]
-
-
-def is_run(line: str) -> bool:
-    return line not in SERVES and not any(word in line for word in HARDWARE)
-
-
-EVERY = examples_of(lambda _, line: True)
-
-
-# --- that they are there, and are real ----------------------------------------------------------
-
-
 def groups(group: Group, path: tuple[str, ...] = ()) -> dict[tuple[str, ...], Group]:
     found = {path: group}
     ctx = click.Context(group, info_name="realsim")
@@ -70,6 +51,39 @@ def groups(group: Group, path: tuple[str, ...] = ()) -> dict[tuple[str, ...], Gr
         if isinstance(command, Group):
             found |= groups(command, (*path, name))
     return found
+
+
+def words_of(line: str) -> list[str]:
+    """Return the arguments of a line without the shell's `> FILE`."""
+    words = shlex.split(line)
+    assert words[0] == "realsim"
+    return words[1 : words.index(">") if ">" in words else None]
+
+
+def name_of(line: str) -> str:
+    """Return the command that a line runs."""
+    args = words_of(line)
+    paths = [p for p in COMMANDS if tuple(args[: len(p)]) == p]
+    return " ".join(max(paths, key=len)) if paths else f"{args[0]} run"  # of `realsim school`
+
+
+EVERY = list(dict.fromkeys(
+    line
+    for path, command in (COMMANDS | groups(commands)).items()
+    for line in printed_examples(command, path)
+))  # fmt: skip
+
+
+def examples_of(keep: Callable[[str, str], bool]) -> list[str]:
+    """Return the examples to keep, by the name of the command and by the line."""
+    return [line for line in EVERY if keep(name_of(line), line)]
+
+
+def is_run(line: str) -> bool:
+    return line not in SERVES and not any(word in line for word in HARDWARE)
+
+
+# --- that they are there, and are real ----------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", [*COMMANDS, *groups(commands)], ids=" ".join)
@@ -97,13 +111,6 @@ def test_every_example_has_options_and_arguments_that_there_are(line: str) -> No
             ctx = command.make_context(name, left, parent=ctx)
     except click.exceptions.Exit as end:  # --help
         assert end.exit_code == 0
-
-
-def words_of(line: str) -> list[str]:
-    """Return the arguments of a line without the shell's `> FILE`."""
-    words = shlex.split(line)
-    assert words[0] == "realsim"
-    return words[1 : words.index(">") if ">" in words else None]
 
 
 # --- that they run ------------------------------------------------------------------------------
@@ -160,12 +167,7 @@ def run_in(folder: Path, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setenv("REALSIM_CONFIG", "")
     result = CliRunner().invoke(commands, args)
-    name = next(
-        " ".join(p)
-        for p in sorted(COMMANDS, key=len, reverse=True)
-        if args[: len(p)] == list(p) or (p == ("school", "run") and args[0] == "school")
-    )
-    allowed = {0, 1} if name in MAY_FAIL_A_CHECK else {0}
+    allowed = {0, 1} if name_of(line) in MAY_FAIL_A_CHECK else {0}
     said = f"{result.output[-2000:]}\n{result.exception!r}"
     assert result.exception is None or isinstance(result.exception, SystemExit), said
     assert result.exit_code in allowed, said
@@ -188,7 +190,7 @@ def test_the_other_examples_run(
     line: str, tried: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shutil.copytree(tried, tmp_path, dirs_exist_ok=True)
-    if line.startswith("realsim demo"):
+    if name_of(line) == "demo":
         shutil.rmtree(tmp_path / "demo")
     run_in(tmp_path, line, monkeypatch)
 

@@ -26,7 +26,10 @@ class RunByDefault(Group):
 @click.group(
     "school",
     cls=RunByDefault,
-    examples=("realsim school demo/session", "realsim school validate --quick"),
+    examples=(
+        "realsim school demo/session --restart",
+        "realsim school validate --quick --engine pybullet",
+    ),
 )
 def SCHOOL() -> None:
     """Try grasps by physics: reach, close, lift, shake, swing.
@@ -48,7 +51,7 @@ def SCHOOL() -> None:
     "run",
     cls=Command,
     examples=(
-        "realsim school demo/session --grasps 8",
+        "realsim school demo/session --grasps 8 --restart",
         "realsim school run demo/session --grasps 4 --force 20 --restart --json",
     ),
 )
