@@ -18,6 +18,8 @@ import hmac
 import http
 import inspect
 import ipaddress
+import logging
+import re
 import secrets
 import socket
 import stat
@@ -27,7 +29,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from realsim.errors import InputError
 
@@ -37,7 +39,17 @@ PORTS_TRIED = 20
 """How many ports after the wished one are tried."""
 COOKIE_AGE_S = 14 * 24 * 3600
 """How long a browser that was let in stays so [s]: two weeks, the length of a review."""
+MOST_TOKEN_BYTES = 4096
+"""A token file is no longer: who names a photograph by mistake is told so at once."""
+TOKEN_LETTERS = re.compile(r"[A-Za-z0-9_-]*")
+"""What an address takes as it is: of any other letter, browsers and people make something else."""
+AUTHORITY = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9._-]+))(?::([0-9]{1,5}))?", re.IGNORECASE)
+"""What a Host header may be, for it is copied into the page's policy: an IPv6 address in brackets,
+or a name or IPv4 address; and a port."""
 _patching = threading.Lock()
+log = logging.getLogger(__name__)
+_sockets_log = logging.getLogger(f"{__name__}.sockets")
+"""Of the websocket servers behind a door."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -50,12 +62,13 @@ class Door:
     """Names of this machine that a browser may have been given, besides its addresses."""
 
     def __post_init__(self) -> None:
-        """Check the token."""
-        if self.token and len(self.token) < LEAST_TOKEN:
-            raise InputError(
-                f"the token has {len(self.token)} characters; at least {LEAST_TOKEN} are needed. "
-                "Leave --token-file out, and one is made."
-            )
+        """Check the token.
+
+        Raises:
+            InputError: it is too short, or holds what an address does not take as it is.
+        """
+        if self.token:
+            _check_token(self.token, "the token")
 
     @property
     def pass_value(self) -> str:
@@ -112,21 +125,38 @@ def token_of_file(path: Path) -> str:
         InputError: there is no such file, others may read it, or it holds no good token.
     """
     try:
-        text = path.read_text(encoding="utf-8").strip()
         mode = path.stat().st_mode
-    except (OSError, UnicodeDecodeError) as error:
+        if not stat.S_ISREG(mode):
+            raise InputError(
+                f"the token file {path} is no regular file (mode {stat.filemode(mode)}); a pipe or "
+                "a device may never end. Write the token into a file that only you can read."
+            )
+        with path.open("rb") as file:
+            text = file.read(MOST_TOKEN_BYTES).decode().strip()
+    except (OSError, ValueError) as error:
         raise InputError(f"the token file {path} cannot be read: {error}.") from error
     if mode & (stat.S_IRWXG | stat.S_IRWXO):
         raise InputError(
             f"the token file {path} may be read by others (mode {stat.filemode(mode)}): "
             f"chmod 600 {path}."
         )
-    if not text.isascii() or any(c.isspace() for c in text) or len(text) < LEAST_TOKEN:
-        raise InputError(
-            f"the token file {path} must hold one line of at least {LEAST_TOKEN} letters and "
-            f"digits; it holds {len(text)} characters."
-        )
+    _check_token(text, f"the token file {path}")
     return text
+
+
+def _check_token(text: str, what: str) -> None:
+    """Raise if a token can be guessed, or would not stay what it is in an address."""
+    foreign = sorted({c for c in text if not TOKEN_LETTERS.fullmatch(c)})
+    if len(text) >= LEAST_TOKEN and not foreign:
+        return
+    found = f"{len(text)} characters"
+    if foreign:
+        found += f", and among them {' '.join(repr(c) for c in foreign[:8])}"
+    raise InputError(
+        f"{what} must hold one line of at least {LEAST_TOKEN} letters (a to z, A to Z), digits, "
+        f"'-' and '_', and nothing else; it holds {found}. Leave --token-file out, and a token is "
+        "made."
+    )
 
 
 def names_of_this_machine(host: str) -> tuple[str, ...]:
@@ -142,7 +172,7 @@ def free_port(host: str, port: int) -> int:
     Raises:
         InputError: the host is none of this machine, or the ports are all in use.
     """
-    last: OSError | None = None
+    last: OSError | ValueError | None = None
     for wished in range(port, min(port + PORTS_TRIED, 65536)):
         try:
             found = socket.getaddrinfo(host, wished, type=socket.SOCK_STREAM)
@@ -151,13 +181,14 @@ def free_port(host: str, port: int) -> int:
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
             return wished
-        except socket.gaierror as error:
+        except (socket.gaierror, ValueError) as error:  # ValueError: no name of the internet's
             last = error
             break
         except OSError as error:
             last = error
+    name = host if len(host) <= 80 else f"{host[:60]}... ({len(host)} characters)"
     raise InputError(
-        f"cannot listen on '{host}', port {port}: {last}. Give --host 127.0.0.1 or an address of "
+        f"cannot listen on '{name}', port {port}: {last}. Give --host 127.0.0.1 or an address of "
         "this machine, and another --port (0 = any that is free)."
     )
 
@@ -183,7 +214,9 @@ def answer_to(door: Door, path: str, headers: Any) -> Answer | None:
     origin = _only(headers, "Origin")
     if headers.get_all("Origin") and (origin is None or not _same_place(origin, authority)):
         return Answer(status=http.HTTPStatus.FORBIDDEN, text="Not from a page of another site.")
-    query = parse_qs(urlsplit(path).query, keep_blank_values=True)
+    if not path.startswith("/") or path.startswith("//"):
+        return Answer(status=http.HTTPStatus.BAD_REQUEST, text="This is no address of the page.")
+    query = parse_qs(path.partition("?")[2], keep_blank_values=True)
     # Viser's page takes orders from its address, such as which server's messages it shows.
     if set(query) - {"token"}:
         return Answer(
@@ -199,18 +232,23 @@ def _answer_about_token(
         return None
     cookie_name = f"realsim_{_port_of(authority)}"
     if tokens and not _upgrades(headers):
-        if hmac.compare_digest(tokens[0].encode(), door.token.encode()):
+        if _is_same(tokens[0], door.token):
             value = f"{cookie_name}={door.pass_value}; Path=/; Max-Age={COOKIE_AGE_S}"
             return Answer(
                 status=http.HTTPStatus.OK, text="", cookie=f"{value}; HttpOnly; SameSite=Strict"
             )
-    elif hmac.compare_digest(_cookie(headers, cookie_name).encode(), door.pass_value.encode()):
+    elif _is_same(_cookie(headers, cookie_name), door.pass_value):
         return None
     return Answer(
         status=http.HTTPStatus.UNAUTHORIZED,
         text="Not without the token: open the whole address that the terminal shows, with what "
         "stands behind '?token='.",
     )
+
+
+def _is_same(given: str, secret: str) -> bool:
+    """Compare in a time that does not tell where they differ; any bytes may have been given."""
+    return hmac.compare_digest(given.encode(errors="surrogatepass"), secret.encode())
 
 
 def _only(headers: Any, name: str) -> str | None:
@@ -225,14 +263,10 @@ def _upgrades(headers: Any) -> bool:
 
 def _split_authority(authority: str) -> tuple[str, str]:
     """Return name and port of a Host header; the name is '' where it is none."""
-    try:
-        parts = urlsplit(f"//{authority}")
-        port = parts.port or 80
-    except ValueError:
+    found = AUTHORITY.fullmatch(authority)
+    if found is None or int(found[3] or 80) > 65535:
         return "", ""
-    if parts.path or parts.query or parts.username is not None or parts.hostname is None:
-        return "", ""
-    return parts.hostname.lower(), str(port)
+    return (found[1] or found[2]).lower(), str(int(found[3] or 80))
 
 
 def _port_of(authority: str) -> str:
@@ -298,18 +332,40 @@ def _serve_behind(door: Door, serve: Any, *args: Any, **kwargs: Any) -> Any:
     inner = kwargs.pop("process_request", None)
 
     async def process_request(connection: Any, request: Any) -> Any:
-        said = answer_to(door, request.path, request.headers)
-        if said is not None:
-            return _response(said)
-        response = None if inner is None else inner(connection, request)
-        if inspect.isawaitable(response):
-            response = await response
+        try:
+            said = answer_to(door, request.path, request.headers)
+            if said is not None:
+                return _response(said)
+            response = None if inner is None else inner(connection, request)
+            if inspect.isawaitable(response):
+                response = await response
+        except Exception as error:
+            # Anybody can send any bytes: what nobody understands is refused, and fills no terminal.
+            log.debug("a request was refused: %r", error)
+            status = http.HTTPStatus.BAD_REQUEST
+            return _response(Answer(status=status, text="The request was not understood."))
         if response is not None:
             for name, value in _page_headers(request.headers["Host"]).items():
                 response.headers[name] = value
         return response
 
+    kwargs.setdefault("logger", _sockets_log)
     return serve(*args, process_request=process_request, **kwargs)
+
+
+def _without_failed_handshakes(record: logging.LogRecord) -> bool:
+    """Keep tracebacks of connections that were never opened off the terminal.
+
+    Port scanners, health checks and browsers that think better of it connect and go.
+    """
+    if record.getMessage() != "opening handshake failed":
+        return True
+    error = record.exc_info[1] if record.exc_info else None
+    log.debug("a connection ended before it was open: %s", error)
+    return False
+
+
+_sockets_log.addFilter(_without_failed_handshakes)
 
 
 def _response(said: Answer) -> Any:

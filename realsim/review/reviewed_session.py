@@ -6,18 +6,20 @@ The server only ever appends to review/journal.jsonl; it changes no other file o
 import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.errors import InputError
+from realsim.errors import InputError, RealsimError
+from realsim.formats.bop.models import model_file
 from realsim.records import ObjectModel, ObjectPose, Scene
 from realsim.review import corrections, journal, scene_list
 from realsim.review.content.config import SceneConfig
 from realsim.review.journal import JOURNAL_FILE, Entry, ReviewState
+from realsim.review.refusals import SessionGone, disk_words
 from realsim.store import SessionStore, load_scene
 
 if TYPE_CHECKING:
@@ -45,13 +47,20 @@ class Standing:
 class ReviewedSession:
     """A registered session and its journal; everything here may be called from any thread."""
 
-    def __init__(self, store: SessionStore, number: int = 0, config: SceneConfig | None = None):
+    def __init__(
+        self,
+        store: SessionStore,
+        number: int = 0,
+        config: SceneConfig | None = None,
+        before: "ReviewedSession | None" = None,
+    ) -> None:
         """Read the registered scene; pictures and depth are read when somebody opens it.
 
         Args:
             store: a registered session.
             number: its number in the list of sessions.
             config: how much of it is shown.
+            before: the same session as it was registered before: no line that was read may be lost.
 
         Raises:
             InputError: the session is not registered, or a model of an object is missing.
@@ -72,6 +81,8 @@ class ReviewedSession:
         self._lock = threading.RLock()
         self._stamp: tuple[int, int] | None = None
         self._standing: Standing | None = None
+        self._known: dict[str, Entry] = {} if before is None else dict(before._known)
+        """Every line that was read or written, by id, whatever became of the file."""
         self._loading = threading.Lock()
         self._content: SceneContent | None = None
         self._views: CameraViews | None = None
@@ -97,26 +108,90 @@ class ReviewedSession:
     @property
     def has_pending(self) -> bool:
         """Whether the next `realsim register --from-review` has something to do."""
-        return bool(corrections.pending(self.registered, self.standing.state))
+        return bool(corrections.pending(self.registered, self.latest.state))
 
     # --- what stands in the journal ---------------------------------------------------------------
 
     @property
     def standing(self) -> Standing:
-        """What the journal adds up to as it is on disk now; read again only when it changed."""
+        """What the journal adds up to as it is on disk now; read again only when it changed.
+
+        Raises:
+            SessionGone: lines that were read are gone.
+            InputError: the journal cannot be read.
+        """
         with self._lock:
-            stamp = _stamp(self.journal_path)
-            if self._standing is None or stamp != self._stamp:
+            try:
+                stamp = _stamp(self.journal_path)
+                if self._standing is not None and stamp == self._stamp:
+                    return self._standing
                 found = journal.read(self.journal_path)
-                state = journal.replay(found.entries)
-                scene = corrections.reviewed_scene(self.registered, state)
-                self._stamp = stamp
-                self._standing = Standing(state=state, scene=scene, damaged=found.damaged)
+            except OSError as error:
+                raise InputError(f"the journal cannot be read: {disk_words(error)}.") from error
+            state = journal.replay(found.entries)
+            self._check_whole(state)
+            scene = corrections.reviewed_scene(self.registered, state)
+            self._stamp = stamp
+            self._standing = Standing(state=state, scene=scene, damaged=found.damaged)
+            self._known |= {e.id: e for e in state.entries}
             return self._standing
 
-    def rows(self) -> list[scene_list.ObjectRow]:
-        """Return the objects as the list shows them."""
-        standing = self.standing
+    @property
+    def latest(self) -> Standing:
+        """What the journal added up to when it could be read last; for a summary at the end."""
+        try:
+            return self.standing
+        except RealsimError:
+            with self._lock:
+                state = journal.replay(tuple(self._known.values()))
+                scene = corrections.reviewed_scene(self.registered, state)
+                return Standing(state=state, scene=scene, damaged=())
+
+    def trouble(self) -> str:
+        """Return what keeps the journal from being read; '' = nothing."""
+        try:
+            self.check_folder()
+            _ = self.standing
+        except RealsimError as error:
+            return str(error)
+        return ""
+
+    def entries_seen(self) -> list[Entry]:
+        """Return all lines that were read or written, also those whose file is gone since."""
+        with self._lock:
+            return list(
+                {e.id: e for e in (*self.latest.state.entries, *self._known.values())}.values()
+            )
+
+    def _check_whole(self, state: ReviewState) -> None:
+        """Raise if a journal lacks a line that was read from it before: none is ever removed."""
+        lost = len(self._known.keys() - {e.id for e in state.entries})
+        if lost:
+            raise SessionGone(
+                f"the journal that was read is gone: {self.journal_path} lacks {lost} of its "
+                f"{len(self._known)} lines. Nothing is recorded meanwhile. Put the file back, or "
+                "end `realsim review` and start it again to go on without them."
+            )
+
+    def check_folder(self) -> None:
+        """Check that the session is where it was.
+
+        Raises:
+            SessionGone: it is not.
+        """
+        if not self.store.folder.is_dir():
+            raise SessionGone(
+                f"the folder of the session is gone: {self.store.folder}. Nothing is recorded "
+                "meanwhile. Put it back, or end `realsim review` and start it again where it is."
+            )
+
+    def rows(self, standing: Standing | None = None) -> list[scene_list.ObjectRow]:
+        """Return the objects as the list shows them.
+
+        Args:
+            standing: what the journal adds up to; None = as it is on disk now.
+        """
+        standing = standing or self.standing
         corrected = corrections.corrected_scene(self.registered, standing.state)
         rows: list[scene_list.ObjectRow] = []
         for placed, computed in zip(standing.scene.objects, corrected.objects, strict=True):
@@ -125,7 +200,7 @@ class ReviewedSession:
                 scene_list.ObjectRow(
                     session=self.number,
                     instance=placed.instance,
-                    name=self.names[placed.obj_id],
+                    name=self.names.get(placed.obj_id, f"object {placed.obj_id} (no model)"),
                     computed=computed.verdict,
                     verdict=placed.verdict,
                     agree=placed.checks.get("agree", float("nan")),
@@ -155,8 +230,7 @@ class ReviewedSession:
         check = None
         if action != "comment":
             check = corrections.check_is_current(self.registered, placed)
-        journal.append(self.journal_path, entry, check=check)
-        return entry
+        return self._record(entry, check)
 
     def undo(self, placed: ObjectPose, last: Entry | None, reviewer: str) -> Entry:
         """Take back the last standing line on an object, if it still is the last one.
@@ -182,8 +256,7 @@ class ReviewedSession:
                     "this object. Look at it as it stands, then decide."
                 )
 
-        journal.append(self.journal_path, entry, check=still_last)
-        return entry
+        return self._record(entry, still_last)
 
     def set_view(self, view: int, is_excluded: bool, reviewer: str, comment: str = "") -> Entry:
         """Append: the next registration leaves this view out, or takes it in again.
@@ -201,8 +274,7 @@ class ReviewedSession:
                 word = f"left out already, by {by.reviewer}" if by is not None else "in already"
                 raise InputError(f"view {view} is {word}.")
 
-        journal.append(self.journal_path, entry, check=differs)
-        return entry
+        return self._record(entry, differs)
 
     def mark_symmetric(self, obj_id: int, symmetry: str, reviewer: str) -> Entry:
         """Append: all objects of this model are symmetric like this.
@@ -214,7 +286,30 @@ class ReviewedSession:
 
         symmetry_of(symmetry, self.model(obj_id).mesh)
         entry = journal.new_entry("symmetric", None, reviewer, obj_id=obj_id, symmetry=symmetry)
-        journal.append(self.journal_path, entry)
+        return self._record(entry)
+
+    def _record(self, entry: Entry, check: Callable[[ReviewState], None] | None = None) -> Entry:
+        """Append a line to the journal that was read, and to no other.
+
+        Raises:
+            SessionGone: folder or journal are not what was read.
+            InputError: the check refuses the line, or the disk does.
+        """
+        self.check_folder()
+        _ = self.standing  # A journal that is gone is not begun anew.
+
+        def check_all(state: ReviewState) -> None:
+            self._check_whole(state)
+            if check is not None:
+                check(state)
+
+        try:
+            journal.append(self.journal_path, entry, check=check_all)
+        except OSError as error:
+            raise InputError(f"Not recorded: {disk_words(error)}.") from error
+        with self._lock:
+            self._known[entry.id] = entry
+            self._stamp = None  # What was read is older than this line.
         return entry
 
     # --- what is shown ----------------------------------------------------------------------------
@@ -237,8 +332,36 @@ class ReviewedSession:
         models = self.models()
         if obj_id not in models:
             known = ", ".join(str(i) for i in sorted(models))
-            raise InputError(f"there is no model of object {obj_id}; there are: {known}.")
+            raise InputError(
+                f"there is no model of object {obj_id}; there are: {known}. "
+                f"{self.model_wanted(obj_id)}"
+            )
         return models[obj_id]
+
+    def has_model(self, obj_id: int) -> bool:
+        """Return whether there is a model: a swap may name an object that has none here."""
+        return obj_id in self.content().models
+
+    def model_wanted(self, obj_id: int) -> str:
+        """Return what is to be done about a model that is missing."""
+        path = self.store.folder / "models" / model_file(obj_id)
+        return f"Copy it to {path} and start `realsim review` again, or undo the swap."
+
+    def shown_model(self, placed: ObjectPose) -> ObjectModel:
+        """Return what is shown of an object: its model, or that which it was registered as.
+
+        The second where its own is missing; the name says so.
+        """
+        models = self.models()
+        if placed.obj_id in models:
+            return models[placed.obj_id]
+        registered = models[self.registered.object(placed.instance).obj_id]
+        name = f"object {placed.obj_id} (its model is missing)"
+        return ObjectModel(obj_id=placed.obj_id, name=name, mesh=registered.mesh)
+
+    def with_models(self, objects: Sequence[ObjectPose]) -> tuple[ObjectPose, ...]:
+        """Return the objects whose models are there: no other can be drawn or measured."""
+        return tuple(o for o in objects if self.has_model(o.obj_id))
 
     def models(self) -> Mapping[int, ObjectModel]:
         """Return all models, symmetric as the reviewers marked them."""
@@ -262,11 +385,12 @@ class ReviewedSession:
 
         content, standing = self.content(), self.standing
         excluded = tuple(standing.state.excluded_views())
+        scene = replace(standing.scene, objects=self.with_models(standing.scene.objects))
         with self._loading:
             if self._snapper is None or self._snapper[0] != excluded:
                 made = Snapper(self.store, self.registered, content.models, excluded_views=excluded)
                 self._snapper = (excluded, made)
-            self._snapper[1].scene = standing.scene
+            self._snapper[1].scene = scene
             return self._snapper[1]
 
     def residual_rgb(self, objects: Sequence[ObjectPose]) -> NDArray[np.uint8]:
@@ -283,6 +407,7 @@ class ReviewedSession:
                 cache = self.store.folder / "registration" / "cache"
                 folder = cache if cache.is_dir() and os.access(cache, os.W_OK) else None
                 self._residuals = CloudResiduals(content.cloud.points, folder=folder)
+            objects = self.with_models(objects)
             Ts = np.array([o.T_world_obj for o in objects]).reshape(-1, 4, 4)
             meshes = [content.models[o.obj_id].mesh for o in objects]
             return residual_rgb(self._residuals.against(Ts, meshes))

@@ -78,6 +78,7 @@ class ReviewServer:
         self._motions: dict[int, Motions | None] = {}
         self._sessions = [ReviewedSession(s, k, self._config) for k, s in enumerate(given)]
         self._remarks = tuple(remarks)
+        self._warned: set[str] = set()
         self._begun = {e.id for s in self._sessions for e in s.standing.state.entries}
         self._server: viser.ViserServer | None = None
         self._windows: dict[int, Window] = {}
@@ -179,10 +180,11 @@ class ReviewServer:
             self._windows.clear()
 
     def decisions(self) -> list[Entry]:
-        """Return the lines that were written to the journals since the server was made."""
-        return [
-            e for s in self._sessions for e in s.standing.state.entries if e.id not in self._begun
-        ]
+        """Return the lines that were written to the journals since the server was made.
+
+        They are remembered: a session that was moved meanwhile does not make them none.
+        """
+        return [e for s in self._sessions for e in s.entries_seen() if e.id not in self._begun]
 
     # --- browsers come and go ---------------------------------------------------------------------
 
@@ -210,21 +212,30 @@ class ReviewServer:
         while not self._stop.is_set():
             self._is_told.wait(POLL_S)
             self._is_told.clear()
-            self._renew()
+            troubles = self._renew()
             for window in self.windows:
                 if not self._stop.is_set():
-                    _refresh(window)
+                    number = window.session.number if window.is_open else 0
+                    window.follow(troubles.get(number))
 
-    def _renew(self) -> None:
-        """Read sessions again that were registered anew, and show them so."""
+    def _renew(self) -> dict[int, Exception]:
+        """Read sessions again that were registered anew, and show them so.
+
+        Returns:
+            Number of a session -> why it cannot be read.
+        """
+        troubles: dict[int, Exception] = {}
         for number, session in enumerate(self._sessions):
             try:
+                session.check_folder()
                 if not session.is_stale:
+                    _ = session.standing  # Read also while no window is open, to be remembered.
                     continue
                 store = SessionStore.open(session.store.folder)
-                renewed = ReviewedSession(store, number, self._config)
-            except RealsimError as error:
-                log.warning("%s was registered anew and cannot be read: %s", session.name, error)
+                renewed = ReviewedSession(store, number, self._config, before=session)
+            except (RealsimError, OSError) as error:
+                troubles[number] = error
+                self._warn_once(f"{session.name} cannot be read: {error}")
                 continue
             self._sessions[number] = renewed
             with self._motions_lock:
@@ -232,21 +243,18 @@ class ReviewServer:
             for window in self.windows:
                 if window.is_open and window.session is session:
                     window.attempt(partial(window.renew, renewed))
+        return troubles
 
-
-def _refresh(window: Window) -> None:
-    """Refresh one window; what goes wrong in one must not keep the others from the news."""
-    try:
-        window.refresh()
-    except RealsimError as error:
-        window.refuse(str(error))
-    except Exception:
-        log.exception("a window could not be refreshed")
+    def _warn_once(self, text: str) -> None:
+        """Say on the terminal what is looked at once a second, but say it once."""
+        if text not in self._warned:
+            self._warned.add(text)
+            log.warning("%s", text)
 
 
 def counted(sessions: Sequence[ReviewedSession]) -> tuple[int, int]:
     """Return how many objects a person has judged, and how many there are."""
-    return scene_list.counts([row for s in sessions for row in s.rows()])
+    return scene_list.counts([row for s in sessions for row in s.rows(s.latest)])
 
 
 def words_of(entries: Sequence[journal.Entry]) -> str:

@@ -239,12 +239,33 @@ def test_the_arm_can_be_hidden_and_the_hand_stays(server: viser.ViserServer) -> 
     player = player_of(server, Given(given))
     player.show(0, 0, play=False)
     nodes = player._nodes  # pyright: ignore[reportPrivateUsage]
-    assert [n.visible for n in nodes._links] == [True] * 3  # pyright: ignore[reportPrivateUsage]
+
+    def visible() -> list[bool]:
+        return [n.visible for n in nodes._links]  # pyright: ignore[reportPrivateUsage]
+
+    assert visible() == [False, False, True], "an arm hides what it grasps"
+    nodes.show_arm(True)
+    assert visible() == [True] * 3
     nodes.show_arm(False)
     player.seek(0.2)
-    assert [n.visible for n in nodes._links] == [False, False, True]  # pyright: ignore[reportPrivateUsage]
+    assert visible() == [False, False, True]
     np.testing.assert_allclose(nodes._links[2].position, Ts[given.at(0.2), 2, :3, 3], atol=1e-6)  # pyright: ignore[reportPrivateUsage]
     player.clear()
+
+
+def test_closing_is_told_once_for_each_motion_that_was_shown(server: viser.ViserServer) -> None:
+    told: list[int] = []
+    player = player_of(server, Given(carried()))
+    player.on_closed(lambda: told.append(1))
+    player.clear()
+    assert told == []
+    player.show(0, 0, play=False)
+    assert told == []
+    player.show(0, 1, play=False)
+    assert len(told) == 1, "the one before was taken away"
+    player.clear()
+    player.clear()
+    assert len(told) == 2
 
 
 # --- words --------------------------------------------------------------------------------------
@@ -285,4 +306,5 @@ def test_a_failure_names_the_stage_where_it_stopped() -> None:
 
 
 def test_names_of_people_are_neither_html_nor_markdown() -> None:
+    assert escaped("a\r\nb\x00\u2029c") == "a b c"
     assert escaped("<b>*a*|`x`</b>") == "&lt;b&gt;\\*a\\*\\|\\`x\\`&lt;/b&gt;"

@@ -1,8 +1,10 @@
 """Who may enter the review page: host, origin, token, tunnel; asked with raw sockets."""
 
 import http.client
+import os
 import re
 import socket
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -62,7 +64,7 @@ def asked(server: ReviewServer, path: str = "/", **headers: str) -> tuple[int, d
 def raw(server: ReviewServer, request: str) -> str:
     """Return the first line of the answer to these bytes."""
     with socket.create_connection(("127.0.0.1", port_of(server)), timeout=20) as line:
-        line.sendall(request.replace("\n", "\r\n").encode())
+        line.sendall(request.replace("\n", "\r\n").encode(errors="surrogateescape"))
         return line.recv(200).decode(errors="replace").split("\r\n")[0]
 
 
@@ -102,6 +104,8 @@ def test_a_host_that_is_not_here_is_told_before_anything_listens() -> None:
         local_pages.free_port("203.0.113.77", 8080)
     with pytest.raises(InputError, match="cannot listen on"):
         local_pages.free_port("no.such.machine.invalid", 8080)
+    with pytest.raises(InputError, match=r"300 characters"):
+        local_pages.free_port("a" * 300, 8080)
 
 
 def test_a_port_in_use_is_passed_over() -> None:
@@ -123,7 +127,9 @@ def test_the_page_is_served_under_the_names_of_this_machine(server: ReviewServer
 
 @pytest.mark.parametrize(
     "host", ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:8080", "10.0.0.5",
-             "127.0.0.1@evil.example", "evil.example#127.0.0.1", "", "["]
+             "127.0.0.1@evil.example", "evil.example#127.0.0.1", "", "[", "[::1]; script-src *",
+             "[::1] x", "[::1]:80;x", "localhost:99999", "localhost:x", "localhost,evil.example",
+             "[::1]x", "127.0.0.1;a"]
 )  # fmt: skip
 def test_a_foreign_host_gets_neither_page_nor_socket(server: ReviewServer, host: str) -> None:
     """A name that somebody else made to point here is DNS rebinding."""
@@ -197,6 +203,39 @@ def test_other_servers_are_not_touched_by_the_guard() -> None:
     assert module.serve is before
 
 
+@pytest.mark.parametrize(
+    "head", ["GET //[bad/ HTTP/1.1\nHost: localhost\n", "GET /%00 HTTP/1.1\nHost: localhost\n",
+             "GET http://[x/ HTTP/1.1\nHost: localhost\n"]
+)  # fmt: skip
+def test_addresses_that_are_none_are_answered_without_a_traceback(
+    server: ReviewServer, head: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    status = raw(server, f"{head}\n").split(" ")[1]
+    assert status in ("400", "404")
+    assert [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")] == []
+
+
+def test_who_connects_and_goes_leaves_one_quiet_line(
+    store: SessionStore, caplog: pytest.LogCaptureFixture
+) -> None:
+    review = ReviewServer(store, port=0, config=SMALL)
+    caplog.set_level("DEBUG", "realsim.local_pages")
+    review.start()  # Nobody has asked for the page yet: viser quiets its log only then.
+    try:
+        for sent in (b"", b"\x16\x03\x01\r\n\r\n"):
+            with socket.create_connection(("127.0.0.1", port_of(review)), timeout=20) as line:
+                line.sendall(sent)
+        asked(review)
+        until = time.monotonic() + 10
+        while caplog.text.count("ended before it was open") < 2 and time.monotonic() < until:
+            time.sleep(0.02)
+    finally:
+        review.stop()
+    lines = [r for r in caplog.records if "ended before it was open" in r.getMessage()]
+    assert len(lines) == 2 and all(r.levelname == "DEBUG" and r.exc_info is None for r in lines)
+    assert [r for r in caplog.records if r.levelname in ("WARNING", "ERROR")] == []
+
+
 # --- with a token -----------------------------------------------------------------------------
 
 
@@ -207,6 +246,10 @@ def test_without_the_token_neither_page_nor_socket_answers(locked: ReviewServer)
         from urllib.parse import quote
 
         assert asked(locked, f"/?token={quote(wrong)}")[0] == 401
+    host = f"Host: localhost:{port_of(locked)}"
+    bytes_cookie = f"Cookie: realsim_{port_of(locked)}=\udcff\udcfe"
+    assert " 401 " in raw(locked, f"GET / HTTP/1.1\n{host}\n{bytes_cookie}\n\n")
+    assert " 401 " in raw(locked, f"GET /?token=\udcff HTTP/1.1\n{host}\n\n")
     cookie = f"realsim_{port_of(locked)}={TOKEN}"
     assert asked(locked, Cookie=cookie)[0] == 401  # the token itself is no cookie
     assert handshake(locked, Cookie=cookie) == 401
@@ -255,9 +298,24 @@ def test_a_token_file_must_be_ones_own_and_long(tmp_path: Path) -> None:
         path.write_text(bad)
         with pytest.raises(InputError, match="at least 16"):
             local_pages.token_of_file(path)
+    for letter in "+%&#/=?.~ \u00fc\x00":
+        path.write_text(f"{TOKEN}{letter}{TOKEN}")
+        with pytest.raises(InputError, match="and among them") as refused:
+            local_pages.token_of_file(path)
+        assert repr(letter) in str(refused.value) and TOKEN not in str(refused.value)
+        with pytest.raises(InputError, match="letters"):
+            Door(token=f"{TOKEN}{letter}{TOKEN}")
     with pytest.raises(InputError, match="at least 16"):
         Door(token="short")
     assert len({local_pages.new_token() for _ in range(8)}) == 8
+
+
+def test_a_token_file_that_never_ends_is_refused(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe, 0o600)
+    for path in (pipe, Path("/dev/zero"), tmp_path):
+        with pytest.raises(InputError, match="no regular file"):
+            local_pages.token_of_file(path)
 
 
 def test_an_unregistered_session_is_refused(store: SessionStore, tmp_path: Path) -> None:

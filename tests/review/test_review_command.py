@@ -14,6 +14,7 @@ from realsim import InputError
 from realsim.app.review.cli import review_command
 from realsim.app.review.run import ReviewRequest, open_all, run_review, write_page
 from realsim.review.reviewed_session import ReviewedSession
+from realsim.review.server import counted
 from realsim.store import SessionStore
 from tests.support.reviewed_boxes import boxes_session
 
@@ -64,6 +65,30 @@ def test_the_static_page_is_of_one_scene(tmp_path: Path) -> None:
         write_page(request, tmp_path / "page.html", console)
     write_page(ReviewRequest(folders=(tmp_path / "root/a",)), tmp_path / "page.html", console)
     assert (tmp_path / "page.html").read_bytes().lstrip()[:15].lower() == b"<!doctype html>"
+
+
+def test_where_the_static_page_cannot_be_is_told_before_anything_is_read(tmp_path: Path) -> None:
+    from realsim.app.console import Console
+
+    request, console = ReviewRequest(folders=(tmp_path / "no session",)), Console(quiet=True)
+    for path, words in (
+        (tmp_path, f"{tmp_path}\\) is a folder"),
+        (tmp_path / "no/page.html", f"{tmp_path / 'no'}\\) for the page is not there"),
+    ):
+        with pytest.raises(InputError, match=words):
+            write_page(request, path, console)
+
+
+def test_a_session_that_was_moved_is_told_at_the_end_and_its_decisions_counted(
+    tmp_path: Path,
+) -> None:
+    folder = boxes_session(tmp_path / "boxes").folder
+    session = ReviewedSession(SessionStore.open(folder))
+    session.decide("reject", session.standing.scene.object(3), "ada", comment="floats")
+    folder.rename(tmp_path / "elsewhere")
+    assert [e.action for e in session.entries_seen()] == ["reject"]
+    assert counted([session]) == (1, 2) and session.has_pending
+    assert "is gone" in session.trouble() and str(folder) in session.trouble()
 
 
 def test_other_machines_need_a_token_that_is_not_readable_by_others(tmp_path: Path) -> None:

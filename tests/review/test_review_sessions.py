@@ -1,5 +1,7 @@
 """The list of scenes, and decisions on one session: nothing is lost, the slower one is told."""
 
+import errno
+import os
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from realsim import InputError, ObjectPose
 from realsim.geometry import se3
 from realsim.review import ReviewServer, journal, scene_list
+from realsim.review.refusals import SessionGone
 from realsim.review.reviewed_session import ReviewedSession
 from realsim.review.scene_list import ObjectRow
 from realsim.store import SessionStore, save_scene
@@ -196,6 +199,92 @@ def test_the_summary_counts_what_was_decided_in_this_run(session: ReviewedSessio
 
     assert words_of(server.decisions()) == "1 reject, 1 comment"
     assert counted(server.sessions) == (2, 2)
+
+
+# --- what keeps a line out ----------------------------------------------------------------------
+
+
+def test_a_journal_that_is_gone_is_not_begun_anew(session: ReviewedSession) -> None:
+    session.decide("accept", seen(session, 0), "ada")
+    session.decide("reject", seen(session, 3), "ada")
+    looked_at = seen(session, 3)
+    kept = session.journal_path.read_bytes()
+    session.journal_path.unlink()
+    first_line = kept.split(b"\n")[0] + b"\n"
+    for left in (None, b"", first_line):
+        if left is not None:
+            session.journal_path.write_bytes(left)
+        with pytest.raises(SessionGone, match="journal that was read is gone"):
+            _ = session.standing
+        with pytest.raises(SessionGone, match="Put the file back"):
+            session.decide("accept", looked_at, "bob")
+        again = ReviewedSession(session.store, config=SMALL, before=session)
+        with pytest.raises(SessionGone):
+            _ = again.standing
+        assert (session.journal_path.read_bytes() if left is not None else None) == left
+    assert not session.journal_path.with_suffix(".tmp").exists()
+    session.journal_path.write_bytes(kept)
+    session.decide("accept", looked_at, "bob")
+    assert [e.reviewer for e in session.standing.state.entries] == ["ada", "ada", "bob"]
+
+
+def test_a_folder_that_is_gone_is_not_made_anew(session: ReviewedSession) -> None:
+    looked_at = seen(session, 3)
+    folder = session.store.folder
+    folder.rename(folder.with_name("elsewhere"))
+    with pytest.raises(SessionGone, match="folder of the session is gone"):
+        session.decide("accept", looked_at, "ada")
+    assert not folder.exists()
+    folder.with_name("elsewhere").rename(folder)
+    session.decide("accept", looked_at, "ada")
+
+
+@pytest.mark.parametrize(
+    ("number", "words"),
+    [(errno.ENOSPC, "the disk is full"), (errno.EROFS, "can only be read"),
+     (errno.EACCES, "this user may not"), (errno.EIO, "the system refused it")],
+)  # fmt: skip
+def test_a_disk_that_takes_nothing_is_told_in_plain_words(
+    session: ReviewedSession, monkeypatch: pytest.MonkeyPatch, number: int, words: str
+) -> None:
+    looked_at = seen(session, 3)
+
+    def refused(*_: object) -> int:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "write", refused)
+        with pytest.raises(InputError, match=f"Not recorded: .*{words}"):
+            session.decide("accept", looked_at, "ada")
+    assert session.standing.state.entries == () and session.entries_seen() == []
+
+
+def test_too_long_names_and_comments_are_refused(session: ReviewedSession) -> None:
+    for said in ({"comment": "x" * 2001}, {"reviewer": "x" * 81}):
+        with pytest.raises(InputError, match="at most"):
+            session.decide("reject", seen(session, 3), **({"reviewer": "ada"} | said))
+    session.decide("reject", seen(session, 3), "x" * 80, comment="x" * 2000)
+    assert len(session.standing.state.entries) == 1
+
+
+def test_a_swap_to_a_missing_model_is_shown_and_can_be_undone(session: ReviewedSession) -> None:
+    """The line may have been written where the model was."""
+    placed = seen(session, 3)
+    session.decide("swap", placed, "ada", pose=placed.T_world_obj, obj_id=99)
+    swapped = seen(session, 3)
+    assert [r.name for r in session.rows()] == ["tall", "object 99 (no model)"]
+    assert not session.has_model(99) and session.has_model(SPARE)
+    model = session.shown_model(swapped)
+    assert "object 99 (its model is missing)" == model.name
+    np.testing.assert_array_equal(model.mesh.vertices, session.model(FLAT).mesh.vertices)
+    with pytest.raises(InputError, match=r"obj_000099\.ply"):
+        session.model(99)
+    objects = session.standing.scene.objects
+    assert [o.instance for o in session.with_models(objects)] == [0]
+    assert len(session.residual_rgb(objects)) == len(session.content().cloud)
+    assert [o.instance for o in session.snapper().scene.objects] == [0]
+    session.undo(swapped, session.standing.state.of(3)[-1], "ada")
+    assert seen(session, 3).obj_id == FLAT
 
 
 # --- colours and words ------------------------------------------------------------------------

@@ -114,6 +114,26 @@ def test_what_people_wrote_is_text(written: StaticSummary) -> None:
     assert [o["instance"] for o in data["objects"]] == [0, 1]
 
 
+def test_texts_of_people_stay_on_their_line(content: SceneContent, tmp_path: Path) -> None:
+    first = content.scene.objects[0]
+    line = journal.new_entry("reject", first, "eve\nbob", comment="no\r\nbob, 2026: accepted")
+    path = tmp_path / "scene.html"
+    write_static(content, journal.replay([line]), path, title="Scene")
+    page = path.read_text()
+    assert "no bob, 2026: accepted" in page and "reviewed by eve bob" in page
+    assert "<p>rejected by eve bob, " in page
+
+
+def test_a_swap_to_a_missing_model_is_refused_with_the_file(
+    content: SceneContent, tmp_path: Path
+) -> None:
+    first = content.scene.objects[0]
+    line = journal.new_entry("swap", first, "ada", pose=first.T_world_obj, obj_id=99)
+    with pytest.raises(InputError, match=r"instance 0 .* object 99, .*obj_000099\.ply"):
+        write_static(content, journal.replay([line]), tmp_path / "scene.html", title="Scene")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_verdicts_are_the_reviewers(written: StaticSummary) -> None:
     page = written.path.read_text()
     assert "2 objects: 1 rejected, 1 doubtful" in page

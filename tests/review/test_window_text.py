@@ -36,6 +36,26 @@ def test_what_people_write_is_never_taken_for_mark_up() -> None:
     assert "<span style" in text and "**rejected**" in text
 
 
+def test_a_comment_cannot_fake_the_line_of_another_reviewer() -> None:
+    fake = "ok\r\n- 2026-01-01 10:00 UTC **bob** accepted\u2028# bob\x1b[2J\u202eaccepted"
+    for made in (fake, fake.replace("\r\n", "\n"), fake.replace("\r\n", "\x85")):
+        line = entry(made, f"eve{made[2:40]}")
+        assert window_text.history_text([line]).count("\n") == 0
+        plain = window_text.object_text(PLACED, PLACED, MODELS[7], entry("x", "eve"))
+        said = window_text.object_text(PLACED, PLACED, MODELS[7], line)
+        assert said.count("\n") == plain.count("\n")
+        shown = (said.replace("\n", ""), window_text.undo_label(line), window_text.signed(line),
+                 window_text.message_html(made, "ok"))  # fmt: skip
+        for text in shown:
+            assert not any(ord(c) < 32 or c in "\x85\u2028\u202e" for c in text)
+
+
+def test_a_missing_model_is_told_in_the_panel() -> None:
+    text = window_text.object_text(PLACED, PLACED, MODELS[7], None, "Copy it to models/obj_9.ply.")
+    assert "Its model is missing" in text and "obj\\_9.ply" in text
+    assert "model is missing" not in window_text.object_text(PLACED, PLACED, MODELS[7], None)
+
+
 def test_the_panel_says_what_was_computed_and_who_said_what() -> None:
     text = window_text.object_text(PLACED, PLACED, MODELS[7], None)
     assert "computed: **doubtful**" in text and "- seen by one view" in text
@@ -85,7 +105,7 @@ def test_100_per_cent_means_that_nothing_is_missing(share: float, words: str) ->
 def test_undo_names_whose_line_it_takes_back() -> None:
     assert window_text.undo_label(entry()) == "Undo: ada rejected"
     assert window_text.undo_label(None) == "Undo"
-    assert len(window_text.undo_label(entry(reviewer="a" * 200))) <= 48
+    assert len(window_text.undo_label(entry(reviewer="a" * 80))) <= 48
 
 
 def test_the_list_tells_the_judged_from_the_waiting() -> None:

@@ -64,7 +64,10 @@ def run_review(request: ReviewRequest, console: Console) -> None:
             decisions = server.decisions()
             judged, objects = counted(server.sessions)
             url = server.url
+            gone = [t for t in (s.trouble() for s in server.sessions) if t]
             server.stop()
+    for text in gone:
+        console.warn(_plain(text))
     console.say(f"decisions in this run: {words_of(decisions)}")
     console.say(f"judged by people: {judged} of {objects} objects in {len(stores)} session(s)")
     changed = sorted({str(s.store.folder) for s in server.sessions if s.has_pending})
@@ -87,13 +90,15 @@ def write_page(request: ReviewRequest, path: Path, console: Console) -> None:
     """Write the reviewed scene as one HTML file that needs no server.
 
     Raises:
-        InputError: there are several sessions, or the file cannot be made.
+        InputError: the file cannot be made there, there are several sessions, or a model is
+            missing.
     """
     from realsim.review import journal
     from realsim.review.content.content import SceneConfig, SceneContent
     from realsim.review.journal import JOURNAL_FILE
-    from realsim.review.static.static_page import write_static
+    from realsim.review.static.static_page import check_page_path, write_static
 
+    check_page_path(path)
     folders = scene_list.sessions_under(request.folders)
     if len(folders) != 1:
         raise InputError(

@@ -22,6 +22,7 @@ from realsim.errors import InputError
 from realsim.records import Mesh
 from realsim.records.checked_arrays import Array, frozen
 from realsim.records.trajectories import PHASES
+from realsim.review.replay.grasp_words import escaped
 from realsim.review.replay.replay_nodes import HandShape, ReplayNodes
 
 SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x")
@@ -221,6 +222,7 @@ class ReplayPlayer:
         """
         self._motions, self._config = motions, config or ReplayConfig()
         self._atomic, self._connected, self._on_carried = atomic, connected, on_carried
+        self._closed: list[Callable[[], None]] = []
         self._nodes = ReplayNodes(scene, name, self._config.hand)
         self._lock = threading.RLock()
         self._motion: GraspMotion | None = None
@@ -234,10 +236,15 @@ class ReplayPlayer:
             self._slider = gui.add_slider("Time [s]", 0.0, 1.0, 0.01, 0.0)
             self._buttons = gui.add_button_group("Replay", ("Play", "Pause", "Close"))
             self._speed = gui.add_dropdown("Speed", SPEEDS, initial_value="1x")
-            self._arm = gui.add_checkbox("Show the arm", True, visible=False)
+            # An arm stands between the object and whoever looks from its side.
+            self._arm = gui.add_checkbox("Show the arm", False, visible=False)
         self._slider.on_update(self._slid)
         self._buttons.on_click(self._pressed)
         self._arm.on_update(lambda _: self._nodes.show_arm(self._arm.value))
+
+    def on_closed(self, callback: Callable[[], None]) -> None:
+        """Have a function called when a motion that was shown is taken away."""
+        self._closed.append(callback)
 
     @property
     def motion(self) -> GraspMotion | None:
@@ -312,10 +319,13 @@ class ReplayPlayer:
         """Take everything away; what was carried stands again."""
         self.pause()
         with self._lock:
+            was_shown = self._motion is not None
             self._carry(False)
             self._motion = None
             self._nodes.clear()
             self._folder.visible = False
+        for told in self._closed if was_shown else ():
+            told()
 
     # --- how ----------------------------------------------------------------------------------
 
@@ -398,5 +408,5 @@ CARRIED = 1e-5
 def _text(motion: GraspMotion, sample: int) -> str:
     """Return what stands over the controls."""
     lines = [f"**{PHASE_WORDS[motion.phase_name(sample)]}**"]
-    lines += [f"- {note}" for note in motion.notes]
+    lines += [f"- {escaped(note)}" for note in motion.notes]
     return "\n".join(lines)

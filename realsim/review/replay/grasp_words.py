@@ -21,6 +21,7 @@ MEASURE_WORDS = {
     "dexnet_closure": "force closure (Dex-Net)",
 }
 """The measures that are one value a grasp, in the order of the panel."""
+NOT_SEEN = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff]+")
 NOT_TRIED, LOST = "not tried", "lost"
 
 
@@ -95,8 +96,19 @@ def failure_words(grasps: GraspSet, row: int) -> str:
 
 
 def escaped(text: str) -> str:
-    """Return text from a file or a person with nothing that HTML or markdown would take for its."""
-    return re.sub(r"([\\`*_{}\[\]|#~])", r"\\\1", html.escape(text, quote=False))
+    """Return text from a file or a person with nothing that HTML or markdown would take for its.
+
+    It stays one line: the next one could look like somebody else's.
+    """
+    return re.sub(r"([\\`*_{}\[\]|#~])", r"\\\1", html.escape(one_line(text), quote=False))
+
+
+def one_line(text: str) -> str:
+    """Return text with spaces in place of line breaks and of what is not seen.
+
+    Line breaks, control characters, and those that turn the direction of writing.
+    """
+    return NOT_SEEN.sub(" ", text)
 
 
 def _score(grasps: GraspSet, row: int) -> str:

@@ -12,6 +12,7 @@ from realsim.review.content.views import VERDICT_ORDER, worst_first
 from realsim.review.corrections import corrected_scene, decision_on
 from realsim.review.journal import Entry, ReviewState
 from realsim.review.placing.ellipsoid import rotation_sigmas_deg
+from realsim.review.replay.grasp_words import one_line
 
 NOT_KNOWN = "not known"
 DECISION_WORDS = {"accept": "accepted", "reject": "rejected"}
@@ -27,7 +28,7 @@ def counts_words(content: SceneContent, scene: Scene, state: ReviewState) -> str
     excluded = len(state.excluded_views())
     if excluded:
         words[-1] += f" ({excluded} left out by the reviewers)"
-    names = sorted({e.reviewer for e in state.standing})
+    names = sorted({one_line(e.reviewer) for e in state.standing})
     words.append(f"reviewed by {', '.join(names)}" if names else "not reviewed yet")
     return "; ".join(w for w in words if w) + "."
 
@@ -88,7 +89,7 @@ def _item(
     decision = decision_on(corrected, state)
     head = (
         f'<span class="dot" style="background:{color}"></span>'
-        f'<span class="name">{html.escape(model.name)}</span>'
+        f'<span class="name">{_said(model.name)}</span>'
         f'<span class="verdict">{html.escape(placed.verdict)}</span>'
     )
     lines = [f"<p>{_said(line)}</p>" for line in _judged(corrected, decision)]
@@ -146,7 +147,7 @@ def _quote(entry: Entry) -> str:
 
 
 def _said(text: str) -> str:
-    return html.escape(text.strip())
+    return html.escape(one_line(text).strip())
 
 
 def _counted(count: int, thing: str) -> str:

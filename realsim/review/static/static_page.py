@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from realsim import __version__
 from realsim.errors import InputError
+from realsim.formats.bop.models import model_file
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, Scene
 from realsim.review.content.content import SceneContent
@@ -115,14 +116,15 @@ def write_static(
         progress: called with (steps done, steps).
 
     Raises:
-        InputError: the title is empty, the folder is not there, or the scene cannot be made small
-            enough.
+        InputError: the title is empty, the file cannot be made there, a model is missing, or the
+            scene cannot be made small enough.
     """
     from realsim.store import atomic
 
     path = Path(path)
     _check(path, title, most_points, most_bytes)
     scene = reviewed_scene(content.scene, state)
+    _check_models(content, scene)
     size, page = StaticSize(points=most_points), b""
     for tried in range(TRIES):
         if progress is not None:
@@ -142,12 +144,44 @@ def write_static(
     return _summary(content, size, path, len(page))
 
 
+def check_page_path(path: Path) -> None:
+    """Check that a page can be made there, before anything is read for it.
+
+    Raises:
+        InputError: its folder is not there, or it is a folder itself.
+    """
+    real = path.absolute()
+    if real.is_dir():
+        raise InputError(
+            f"'{path}' ({real}) is a folder; the page is one file: give its name, such as "
+            f"{path / 'scene.html'}."
+        )
+    if not real.parent.is_dir():
+        raise InputError(
+            f"the folder '{path.parent}' ({real.parent}) for the page is not there; make it first."
+        )
+
+
+def _check_models(content: SceneContent, scene: Scene) -> None:
+    """Raise if an object cannot be drawn: a swap may name one that has no model here."""
+    folder = content.store.folder / "models"
+    missing = [
+        f"instance {o.instance} was said to be object {o.obj_id}, but "
+        f"{folder / model_file(o.obj_id)} is not there"
+        for o in scene.objects
+        if o.obj_id not in content.models
+    ]
+    if missing:
+        raise InputError(
+            f"{'; '.join(missing)}. Copy it there, or undo the swap in `realsim review`."
+        )
+
+
 def _check(path: Path, title: str, most_points: int, most_bytes: float) -> None:
     """Raise if the page cannot be written."""
     if not title.strip():
         raise InputError("the page has no title; give it one: it is what a reader sees first.")
-    if not path.parent.is_dir():
-        raise InputError(f"the folder '{path.parent}' for the page is not there; make it first.")
+    check_page_path(path)
     if most_points < 1 or not most_bytes > 0:
         raise InputError(
             f"{most_points} points in {most_bytes:g} bytes were asked for; both must be positive."

@@ -1,6 +1,5 @@
 """Standing in a camera: the browser looks from where the camera was, before the real photograph."""
 
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -8,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.interop import viser_wxyz_position
 from realsim.review.window.latest import LatestOnly
@@ -36,7 +34,6 @@ BESIDE_RAD, BESIDE_DOWN_RAD = -0.7, 0.5
 BEHIND_CAMERAS = 1.25
 """Distance of that look over the cameras' own: hand, object and forearm are seen."""
 OUTSIDE = "Click a camera in the scene, or choose one: you stand in it, before its photograph."
-log = logging.getLogger(__name__)
 
 
 class StandIn:
@@ -180,15 +177,12 @@ class StandIn:
                 objects = [replace(o, reasons=()) for o in now]
             camera = window.client.camera
             picture = window.session.camera_views().picture(
-                view, objects, aspect=camera.aspect, highlight=window.selected,
+                view, window.session.with_models(objects), aspect=camera.aspect,
+                highlight=window.selected,
                 width_px=int(np.clip(camera.image_width, *WIDTH_PX)),
             )  # fmt: skip
-        except RealsimError as error:
-            window.refuse(str(error))
-            return
         except Exception as error:
-            log.exception("the view of a camera failed")
-            window.refuse(f"This is a bug in realsim, please report it with the log: {error!r}")
+            window.fail(error)
             return
         with window.lock:
             if self.view == view and not self._is_closed:

@@ -127,11 +127,10 @@ class CorrectPanel:
         with self._window.lock:
             if self._now is None:
                 placed = self._window.placed
+                model = self._window.session.model(placed.obj_id)
+                self._copy.show(model, placed, self._axes(placed.T_world_obj))
                 self._now = Correction(
                     start=placed, T_world_obj=placed.T_world_obj, obj_id=placed.obj_id
-                )
-                self._copy.show(
-                    self._window.model_of(placed), placed, self._axes(placed.T_world_obj)
                 )
                 self.in_camera()
                 self._tell()
@@ -246,8 +245,9 @@ class CorrectPanel:
         if window.selected is None:
             return
         names = [_choice(i, m) for i, m in sorted(window.content.models.items())]
-        self._object.options = tuple(names)
-        self._object.value = _choice(window.placed.obj_id, window.model_of(window.placed))
+        now = _choice(window.placed.obj_id, window.model_of(window.placed))
+        self._object.options = tuple(dict.fromkeys((*names, now)))
+        self._object.value = now
         self._tell()
 
     def refresh(self) -> None:

@@ -61,6 +61,7 @@ class GraspsPanel:
             window.client.scene, gui, self, atomic=window.client.atomic,
             connected=lambda: not self._is_closed, on_carried=window.hide_object,
         )  # fmt: skip
+        self._player.on_closed(self._replay_closed)
         self._show.on_update(window.guarded(lambda _: self.draw()))
         for control in (self._of, self._stage, self._score, self._reachable, self._seen,
                         self._failure):  # fmt: skip
@@ -142,6 +143,11 @@ class GraspsPanel:
         self._player.pause()
 
     # --- how --------------------------------------------------------------------------------------
+
+    def _replay_closed(self) -> None:
+        """What was put out of the replay's way comes back."""
+        if self._window.is_open and not self._is_closed:
+            self._window.show.bring_back_cameras()
 
     def _filtered(self) -> None:
         """Whoever sets a filter wants to see what passes it."""

@@ -83,7 +83,10 @@ class ObjectPanel:
         decision = corrections.decision_on(corrected, standing.state)
         lines = standing.state.of(placed.instance)
         self._last = lines[-1] if lines else None
-        self._text.content = window_text.object_text(placed, corrected, model, decision)
+        missing = ""
+        if not window.session.has_model(placed.obj_id):
+            missing = window.session.model_wanted(placed.obj_id)
+        self._text.content = window_text.object_text(placed, corrected, model, decision, missing)
         self._certainty.content = window_text.certainty_text(placed, model)
         self._checks.content = window_text.checks_table(placed, main=True)
         self._rest.content = window_text.checks_table(placed, main=False) or "no others"

@@ -35,6 +35,8 @@ class ShowPanel:
         """
         self._window = window
         self._is_in_camera = False
+        self._has_hidden_cameras = False
+        """Whether the cameras are off because a replay began, and not by the reviewer's hand."""
         self._colored: object = None
         self._painter = LatestOnly(self._paint)
         gui = window.client.gui
@@ -75,8 +77,16 @@ class ShowPanel:
 
     def hide_cameras(self) -> None:
         """Switch the cameras off, as the reviewer could: an arm is to be seen among them."""
+        self._has_hidden_cameras = self._has_hidden_cameras or self._cameras.value
         self._cameras.value = False
         self._switch()
+
+    def bring_back_cameras(self) -> None:
+        """Switch the cameras on again, if it was `hide_cameras` that switched them off."""
+        if self._has_hidden_cameras:
+            self._has_hidden_cameras = False
+            self._cameras.value = True
+            self._switch()
 
     def _switch(self) -> None:
         nodes, free = self._window.nodes, not self._is_in_camera

@@ -21,9 +21,11 @@ from realsim.review import scene_list
 from realsim.review.content.content import SceneContent
 from realsim.review.drawing.scene_nodes import SceneNodes
 from realsim.review.journal import Entry
+from realsim.review.refusals import SessionGone, disk_words
 from realsim.review.replay.grasp_replay import Motions
 from realsim.review.reviewed_session import ReviewedSession, Standing
 from realsim.review.window import window_text
+from realsim.review.window.gui_values import refuse_foreign_values
 from realsim.review.window.keys import bind_keys
 from realsim.review.window.panel_correct import CorrectPanel
 from realsim.review.window.panel_grasps import GraspsPanel
@@ -94,6 +96,8 @@ class Window:
         self._seen: object = None
         self._standing: Standing | None = None
         self._is_closed = False
+        self._trouble: Exception | None = None
+        """What kept the journals from being shown when they were looked at last."""
         gui = client.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(PANEL_PX)
@@ -113,6 +117,7 @@ class Window:
             self.show = ShowPanel(self)
         self._name.on_update(self.guarded(lambda _: self._keep_name()))
         bind_keys(self)
+        refuse_foreign_values(gui, self.refuse)
 
     def start(self) -> None:
         """Open the scene of the worst object that nobody judged, and recall the reviewer's name."""
@@ -185,8 +190,8 @@ class Window:
         return self.standing.scene.object(self.selected)
 
     def model_of(self, placed: ObjectPose) -> ObjectModel:
-        """Return an object's model, symmetric as it was marked."""
-        return self.session.model(placed.obj_id)
+        """Return an object's model, symmetric as it was marked; a stand-in where it is missing."""
+        return self.session.shown_model(placed)
 
     def rows(self) -> list[scene_list.ObjectRow]:
         """Return all objects of all sessions."""
@@ -276,13 +281,35 @@ class Window:
                     for panel in (self.object, self.correct, self.views, self.grasps, self.show):
                         panel.refresh()
 
+    def follow(self, trouble: Exception | None) -> None:
+        """Show what is new in the journals, or what keeps them from being read.
+
+        Args:
+            trouble: why the session that is shown cannot be read; None = it can.
+        """
+        try:
+            self.refresh()
+        except Exception as error:
+            trouble = trouble or error
+        # It is looked at once a second; a bug is logged once.
+        if trouble is not None and repr(trouble) != repr(self._trouble):
+            self.fail(trouble)
+        elif isinstance(trouble, SessionGone):
+            self.alarm(str(trouble))
+        elif trouble is None and self._trouble is not None:
+            self.say("The session can be read again.")
+        self._trouble = trouble
+
     def _place_all(self) -> None:
         """Put every object where the reviewers left it, in the colour of its verdict."""
-        opened = self.opened
+        opened, session = self.opened, self.session
         for placed in self.standing.scene.objects:
-            if opened.models[placed.instance] != placed.obj_id:
-                opened.nodes.swap(placed.instance, placed.obj_id)
-                opened.models[placed.instance] = placed.obj_id
+            drawn = placed.obj_id
+            if not session.has_model(drawn):
+                drawn = session.registered.object(placed.instance).obj_id
+            if opened.models[placed.instance] != drawn:
+                opened.nodes.swap(placed.instance, drawn)
+                opened.models[placed.instance] = drawn
             opened.nodes.place(placed.instance, placed.T_world_obj)
             opened.nodes.color_verdict(placed.instance, placed.verdict)
 
@@ -308,6 +335,24 @@ class Window:
         """Answer why something was not done."""
         self._message.content = window_text.message_html(text, "refused")
 
+    def alarm(self, text: str) -> None:
+        """Say in red that decisions may be lost, or that the page itself failed."""
+        content = window_text.message_html(text, "alarm")
+        if self._message.content != content:
+            self._message.content = content
+
+    def fail(self, error: Exception) -> None:
+        """Answer what went wrong."""
+        if isinstance(error, SessionGone):
+            self.alarm(str(error))
+        elif isinstance(error, RealsimError):
+            self.refuse(str(error))
+        elif isinstance(error, OSError):
+            self.refuse(f"Not done: {disk_words(error)}.")
+        else:
+            log.error("the review page failed", exc_info=error)
+            self.alarm(f"This is a bug in realsim, please report it with the log: {error!r}")
+
     def guarded(self, action: Callable[[Any], object]) -> Callable[[Any], None]:
         """Return a callback that never ends silently: what goes wrong is said in the panel."""
 
@@ -323,15 +368,15 @@ class Window:
         """Do something; say what went wrong. Return whether it was done."""
         try:
             action()
-        except RealsimError as error:
-            self.refuse(str(error))
         except Exception as error:
-            log.exception("the review page failed")
-            text = f"This is a bug in realsim, please report it with the log: {error!r}"
-            self._message.content = window_text.message_html(text, "bug")
+            self.fail(error)
         else:
             return True
-        self.refresh(force=True)
+        try:
+            self.refresh(force=True)
+        except Exception as error:
+            # What is said of the action itself stays; `follow` says the rest.
+            log.debug("after a failure, the page could not be shown anew: %r", error)
         return False
 
     def _guarded_call(self, action: Callable[..., object]) -> Callable[..., None]:

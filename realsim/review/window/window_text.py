@@ -15,9 +15,11 @@ from realsim.records import ObjectModel, ObjectPose
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.review.journal import Entry
 from realsim.review.placing.ellipsoid import rotation_sigmas_deg
-from realsim.review.replay.grasp_words import escaped
+from realsim.review.replay.grasp_words import escaped, one_line
 from realsim.review.scene_list import ObjectRow
 
+ALARM = "#c92a2a"
+"""The red of what is amiss."""
 LEAST_CONTRAST = 4.5
 """Of letters to their ground: what WCAG 2.1 asks for at the size of the panel's text."""
 ACTION_WORDS = {
@@ -78,7 +80,11 @@ def color_dot(verdict: str) -> str:
 
 
 def object_text(
-    shown: ObjectPose, corrected: ObjectPose, model: ObjectModel, decision: Entry | None
+    shown: ObjectPose,
+    corrected: ObjectPose,
+    model: ObjectModel,
+    decision: Entry | None,
+    missing: str = "",
 ) -> str:
     """Return the head of an object's panel: what was computed, and what a person said of it.
 
@@ -87,8 +93,12 @@ def object_text(
         corrected: where the reviewers left it, with the computed verdict.
         model: its model.
         decision: the last standing accept or reject; None = nobody has judged it.
+        missing: what is to be done about its model, which is not there; '' = it is.
     """
     lines = [f"### {escaped(model.name)}", f"instance {shown.instance}, object {shown.obj_id}", ""]
+    if missing:
+        said = f"Its model is missing; drawn is the one that it was registered as. {missing}"
+        lines += [f'<span style="color:{ALARM}">{escaped(said)}</span>', ""]
     lines.append(f"{color_dot(corrected.verdict)} computed: **{corrected.verdict}**")
     lines += [f"- {escaped(reason)}" for reason in corrected.reasons]
     lines.append("")
@@ -172,7 +182,7 @@ def undo_label(last: Entry | None) -> str:
     """Return what the undo button says: whose line it takes back."""
     if last is None:
         return "Undo"
-    return f"Undo: {last.reviewer} {ACTION_WORDS.get(last.action, last.action)}"[:48]
+    return f"Undo: {one_line(last.reviewer)} {ACTION_WORDS.get(last.action, last.action)}"[:48]
 
 
 def signed(entry: Entry) -> str:
@@ -182,7 +192,7 @@ def signed(entry: Entry) -> str:
 
 def clock(entry: Entry) -> str:
     """Return when a line was written, to the minute, in UTC."""
-    return f"{entry.time[:10]} {entry.time[11:16]} UTC"
+    return f"{escaped(entry.time[:10])} {escaped(entry.time[11:16])} UTC"
 
 
 def list_label(row: ObjectRow, scene: str, *, with_scene: bool) -> str:
@@ -194,15 +204,15 @@ def list_label(row: ObjectRow, scene: str, *, with_scene: bool) -> str:
     if not row.is_decided and np.isfinite(row.agree):
         parts.append(percent(row.agree))
     mark = "\u2713 " if row.is_decided else ""
-    return mark + " \u00b7 ".join(parts)
+    return one_line(mark + " \u00b7 ".join(parts))
 
 
 def message_html(text: str, kind: str) -> str:
-    """Return the line that answers the last thing done: kind is ok, refused or bug."""
+    """Return the line that answers the last thing done: kind is ok, refused or alarm."""
     colors = {"ok": ("#ebfbee", "#2b8a3e"), "refused": ("#fff4e6", "#d9480f")}
-    back, edge = colors.get(kind, ("#fff5f5", "#c92a2a"))
+    back, edge = colors.get(kind, ("#fff5f5", ALARM))
     style = (
         f"background:{back};border-left:3px solid {edge};padding:6px 9px;margin:4px 10px;"
         "font-size:13px;line-height:1.35;border-radius:3px;color:#212529;overflow-wrap:anywhere"
     )
-    return f'<div class="realsim-message" style="{style}">{html.escape(text)}</div>'
+    return f'<div class="realsim-message" style="{style}">{html.escape(one_line(text))}</div>'

@@ -1,0 +1,212 @@
+"""What the review page answers when something is amiss; asked by a program, without a browser."""
+
+import errno
+import os
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+import viser
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
+from websockets.typing import Subprotocol
+
+from realsim import InputError
+from realsim.review import ReviewServer
+from realsim.review.window.gui_values import check_update
+from realsim.review.window.window import Window
+from tests.support.review_browser import SMALL
+from tests.support.reviewed_boxes import boxes_session
+
+SOCKET = Subprotocol(f"{viser.__name__}-v{viser.__version__}")
+RED, ORANGE = "#c92a2a", "#d9480f"
+CAMERA = {
+    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 1], "fov": 1.0,
+    "near": 0.01, "far": 100.0, "image_height": 480, "image_width": 640, "look_at": [0, 0, 0],
+    "up_direction": [0, 1, 0],
+}  # fmt: skip
+
+
+class Page:
+    """A client that speaks as the page does, and the window that the server made for it."""
+
+    def __init__(self, server: ReviewServer, line: Connection) -> None:
+        self.server, self._line = server, line
+        # Who does not read what comes is not let go for 10 s.
+        threading.Thread(target=lambda: [None for _ in line], daemon=True).start()
+        self.send(CAMERA)
+        self.wait(lambda: bool(server.windows) and server.windows[0].selected is not None)
+        self.window: Window = server.windows[0]
+
+    def send(self, message: dict[str, Any]) -> None:
+        self._line.send(msgspec.msgpack.encode(message))
+
+    def set(self, handle: Any, value: Any, prop: str = "value") -> None:
+        """Set a control, whatever it offers."""
+        updates = {prop: value}
+        self.send({"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": updates})
+
+    @property
+    def message(self) -> str:
+        return self.window._message.content  # pyright: ignore[reportPrivateUsage]
+
+    def wait(self, until: Callable[[], bool], seconds: float = 30.0) -> None:
+        end = time.monotonic() + seconds
+        while not until():
+            assert time.monotonic() < end, "it did not come about"
+            time.sleep(0.02)
+
+    def wait_message(self, words: str, color: str) -> None:
+        try:
+            self.wait(lambda: re.search(words, self.message) is not None)
+        except AssertionError:
+            raise AssertionError(f"'{words}' was not said, but: {self.message}") from None
+        assert color in self.message
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[ReviewServer]:
+    review = ReviewServer(boxes_session(tmp_path / "boxes"), port=0, reviewer="ada", config=SMALL)
+    review.start()
+    yield review
+    review.stop()
+
+
+@pytest.fixture
+def page(server: ReviewServer) -> Iterator[Page]:
+    address = server.url.replace("http", "ws")
+    with connect(address, subprotocols=[SOCKET], max_size=None, ping_interval=None) as line:
+        yield Page(server, line)
+
+
+def test_a_choice_that_is_not_offered_is_refused_and_never_held(
+    page: Page, caplog: pytest.LogCaptureFixture
+) -> None:
+    window = page.window
+    panels: Any = (window.list, window.show, window.correct, window.grasps, window.views)
+    show, listed, correct = panels[1], panels[0], panels[2]
+    for handle in (show._look, listed._which, listed._scene, correct._mm, correct._object,
+                   correct._symmetry, panels[3]._stage, panels[4]._view):  # fmt: skip
+        held = handle.value
+        for value in ("<b>nothing</b>", "", 3, None, [held]):
+            window.say("so far")
+            page.set(handle, value)
+            page.wait_message("is not one of the choices", ORANGE)
+            assert handle.value == held
+    assert "<b>" not in page.message
+    page.set(show._look, "hidden")
+    page.wait(lambda: show._look.value == "hidden")
+    window.say("so far")
+    page.set(show._look, ["x"], "update_cb")
+    page.wait_message("may set the value", ORANGE)
+    assert callable(show._look._impl.update_cb[0])
+    assert [r for r in caplog.records if r.levelname == "ERROR"] == []
+
+
+def test_numbers_and_texts_are_what_they_say() -> None:
+    class Held:
+        def __init__(self, value: object) -> None:
+            self.value = value
+
+    for held, good, bad in (
+        (0.5, [1, 0.25], [float("nan"), float("inf"), 10**400, "1", True, None]),
+        (True, [False], ["False", 1, None]),
+        ("text", ["", "x" * 20_000], [3, None, "x" * 20_001]),
+    ):
+        for value in good:
+            check_update(Held(held), {"value": value})
+        for value in bad:
+            with pytest.raises(InputError):
+                check_update(Held(held), {"value": value})
+
+
+def test_a_full_disk_is_told_and_is_no_bug(
+    page: Page, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    window = page.window
+
+    def refused(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr("realsim.review.journal.os.write", refused)
+        assert not window.attempt(lambda: window.object.decide("accept"))
+    page.wait_message("Not recorded: the disk is full", ORANGE)
+    window.attempt(refused)
+    page.wait_message("Not done: the disk is full", ORANGE)
+    assert "bug" not in page.message
+    assert [r for r in caplog.records if r.levelname == "ERROR"] == []
+    assert window.attempt(lambda: window.object.decide("accept"))
+
+
+def test_a_failure_whose_refresh_fails_too_does_not_raise(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise KeyError("on purpose")
+
+    monkeypatch.setattr(page.window, "refresh", broken)
+    assert page.window.attempt(broken) is False
+    assert "This is a bug in realsim" in page.message and RED in page.message
+
+
+def test_a_journal_that_vanishes_is_told_in_red_until_it_is_back(page: Page) -> None:
+    window, server = page.window, page.server
+    window.attempt(lambda: window.object.decide("reject"))
+    page.wait_message("Recorded", "#2b8a3e")
+    path = server.sessions[0].journal_path
+    path.rename(path.with_name("aside"))
+    page.wait_message("the journal that was read is gone", RED)
+    window.attempt(lambda: window.object.decide("accept"))
+    assert not path.exists() and RED in page.message
+    assert [e.action for e in server.decisions()] == ["reject"]
+    path.with_name("aside").rename(path)
+    page.wait_message("can be read again", "#2b8a3e")
+
+
+def test_a_folder_that_vanishes_is_told_in_red_and_decisions_are_remembered(page: Page) -> None:
+    window, server = page.window, page.server
+    window.attempt(lambda: window.object.decide("reject"))
+    folder = server.sessions[0].store.folder
+    folder.rename(folder.with_name("elsewhere"))
+    page.wait_message("folder of the session is gone", RED)
+    window.attempt(lambda: window.object.decide("accept"))
+    assert not folder.exists() and RED in page.message
+    assert [e.action for e in server.decisions()] == ["reject"]
+    folder.with_name("elsewhere").rename(folder)
+    page.wait_message("can be read again", "#2b8a3e")
+
+
+def test_a_page_with_a_swap_to_a_missing_model_stays_usable(page: Page) -> None:
+    window, session = page.window, page.server.sessions[0]
+    placed = session.standing.scene.object(3)
+    session.decide("swap", placed, "bob", pose=placed.T_world_obj, obj_id=99)
+    panel: Any = window.object
+    page.wait(lambda: "object 99 (its model is missing)" in panel._text.content)
+    assert "obj\\_000099.ply" in panel._text.content
+    assert window.attempt(lambda: window.select(0)) and window.attempt(lambda: window.select(3))
+    assert window.attempt(window.views.look_at_object)
+    assert not window.attempt(window.correct.begin) and "obj_000099.ply" in page.message
+    assert window.attempt(window.correct.require_saved), "nothing was begun"
+    assert window.attempt(lambda: window.object.decide("reject"))
+    for _ in range(2):
+        assert window.attempt(lambda: (window.refresh(force=True), window.object.undo()))
+    assert session.standing.scene.object(3).obj_id == 7
+
+
+def test_cameras_come_back_after_a_replay_unless_they_were_off_before(page: Page) -> None:
+    show: Any = page.window.show
+    show.hide_cameras()
+    show.hide_cameras()
+    assert show._cameras.value is False
+    show.bring_back_cameras()
+    assert show._cameras.value is True
+    show._cameras.value = False
+    show.hide_cameras()
+    show.bring_back_cameras()
+    assert show._cameras.value is False
