@@ -123,7 +123,8 @@ class Entry:
                 )
         said: Any = self.checks
         if not isinstance(said, dict) or not all(
-            isinstance(k, str) and isinstance(v, int | float) for k, v in self.checks.items()
+            isinstance(k, str) and isinstance(v, int | float)
+            for k, v in dict[Any, Any](said).items()
         ):
             raise InputError("'checks' is no mapping of names to numbers.")
 

@@ -406,7 +406,11 @@ class ReviewedSession:
             if self._residuals is None:
                 cache = self.store.folder / "registration" / "cache"
                 folder = cache if cache.is_dir() and os.access(cache, os.W_OK) else None
-                self._residuals = CloudResiduals(content.cloud.points, folder=folder)
+                plane = self.registered.plane
+                self._residuals = CloudResiduals(
+                    content.cloud.points, folder=folder,
+                    T_world_table=None if plane is None else plane.T_world_table,
+                )  # fmt: skip
             objects = self.with_models(objects)
             Ts = np.array([o.T_world_obj for o in objects]).reshape(-1, 4, 4)
             meshes = [content.models[o.obj_id].mesh for o in objects]

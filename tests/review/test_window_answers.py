@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 import viser
 from websockets.sync.client import connect
@@ -210,3 +211,25 @@ def test_cameras_come_back_after_a_replay_unless_they_were_off_before(page: Page
     show.hide_cameras()
     show.bring_back_cameras()
     assert show._cameras.value is False
+
+
+def test_keys_change_and_save_nothing_while_a_snap_is_computed(page: Page) -> None:
+    window, session = page.window, page.server.sessions[0]
+    window.correct.nudge("x", 1, "move")
+    moved = window.correct.moved
+    assert moved is not None
+    window.correct.enable(False)
+    for act in (
+        lambda: window.correct.nudge("x", 1, "move"), window.correct.save, window.correct.to_table
+    ):  # fmt: skip
+        assert not window.attempt(act) and "wait until it is" in page.message
+    assert window.correct.moved is not None
+    assert np.array_equal(window.correct.moved.T_world_obj, moved.T_world_obj)
+    assert not session.standing.state.entries
+    window.correct.enable(True)
+    assert window.attempt(lambda: window.correct.nudge("x", -1, "move"))
+
+
+def test_the_models_own_symmetry_is_shown_where_nobody_has_marked_it(page: Page) -> None:
+    panel: Any = page.window.correct
+    assert panel._marks.content.startswith("the model itself: ")

@@ -114,7 +114,7 @@ def test_the_list_tells_the_judged_from_the_waiting() -> None:
         is_decided=False,
     )  # fmt: skip
     assert window_text.list_label(row, "000001", with_scene=False) == (
-        "3 flat \u00b7 doubtful \u00b7 71.0 %"
+        "3 flat \u00b7 doubtful \u00b7 fits 71.0 %"
     )
     assert window_text.list_label(row, "000001", with_scene=True).startswith("000001 \u00b7 3 flat")
 

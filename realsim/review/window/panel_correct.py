@@ -64,6 +64,7 @@ class CorrectPanel:
         """
         self._window = window
         self._now: Correction | None = None
+        self._is_busy = False
         self._copy = MovedCopy(window, self._dragged)
         self._points = PointPlacer(window, self._by_points, self._asked)
         gui = window.client.gui
@@ -138,6 +139,7 @@ class CorrectPanel:
 
     def nudge(self, axis: placing.Axis, sign: int, kind: placing.Kind) -> None:
         """Move the copy by one step."""
+        self._require_idle()
         with self._window.lock:
             now = self.begin()
             step = 1e-3 * float(self._mm.value)
@@ -154,6 +156,7 @@ class CorrectPanel:
 
     def to_table(self) -> None:
         """Lower or raise the copy until it touches the table."""
+        self._require_idle()
         plane = self._window.session.registered.plane
         if plane is None:
             raise InputError("this scene has no table; move the object by steps instead.")
@@ -180,6 +183,7 @@ class CorrectPanel:
 
     def by_points(self) -> None:
         """Take clicks: three on the model, three in the scene."""
+        self._require_idle()
         with self._window.lock:
             now = self.begin()
             self._clicks.visible = True
@@ -197,6 +201,7 @@ class CorrectPanel:
 
     def save(self) -> None:
         """Write one line: where the object really is, or what it is."""
+        self._require_idle()
         window = self._window
         with window.lock:
             now = self._now
@@ -215,6 +220,15 @@ class CorrectPanel:
             words = self._words(now)
             self.put_back()
         window.decided(entry, words)
+
+    def _require_idle(self) -> None:
+        """Refuse a change while the answer to the last one is being computed.
+
+        Raises:
+            InputError: it is.
+        """
+        if self._is_busy:
+            raise InputError("something is being computed, nothing was done; wait until it is.")
 
     def require_saved(self) -> None:
         """Refuse a decision on an object that is being moved.
@@ -235,7 +249,8 @@ class CorrectPanel:
     # --- the window's events ----------------------------------------------------------------------
 
     def enable(self, is_on: bool) -> None:
-        """Allow the buttons, or not while something takes long."""
+        """Allow the buttons and their keys, or not while something takes long."""
+        self._is_busy = not is_on
         for button in self._working:
             button.disabled = not is_on
 
@@ -256,7 +271,8 @@ class CorrectPanel:
         if window.selected is None:
             return
         mark = window.standing.state.marks().get(window.placed.obj_id)
-        self._marks.content = "nobody has marked this model"
+        own = window_text.symmetry_words(window.model_of(window.placed))
+        self._marks.content = f"the model itself: {own}"
         if mark is not None:
             said = window_text.escaped(mark.symmetry)
             self._marks.content = f"marked **{said}** by {window_text.signed(mark)}"

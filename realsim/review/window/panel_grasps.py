@@ -86,7 +86,8 @@ class GraspsPanel:
             return 0
         poses = {o.instance: o.T_world_obj for o in window.standing.scene.objects}
         count = window.nodes.draw_grasps(self._filter(sets), poses)
-        self._drawn.content = f"**{count}** of {every} grasps drawn. Click one to see how it went."
+        how = " Click one to see how it went." if count else ""
+        self._drawn.content = f"**{count}** of {every} grasps drawn.{how}"
         return count
 
     def clicked(self, instance: int, row: int) -> None:

@@ -202,7 +202,7 @@ def list_label(row: ObjectRow, scene: str, *, with_scene: bool) -> str:
         parts.insert(0, scene)
     parts.append(row.verdict + (" (moved)" if row.is_changed else ""))
     if not row.is_decided and np.isfinite(row.agree):
-        parts.append(percent(row.agree))
+        parts.append(f"fits {percent(row.agree)}")
     mark = "\u2713 " if row.is_decided else ""
     return one_line(mark + " \u00b7 ".join(parts))
 
@@ -216,3 +216,14 @@ def message_html(text: str, kind: str) -> str:
         "font-size:13px;line-height:1.35;border-radius:3px;color:#212529;overflow-wrap:anywhere"
     )
     return f'<div class="realsim-message" style="{style}">{html.escape(one_line(text))}</div>'
+
+
+def symmetry_words(model: ObjectModel) -> str:
+    """Return how a model is symmetric, in words."""
+    words: list[str] = []
+    if model.symmetry_axes:
+        n = len(model.symmetry_axes)
+        words.append("of revolution about an axis" if n == 1 else f"of revolution about {n} axes")
+    if len(model.symmetries) > 1:
+        words.append(f"looks the same in {len(model.symmetries)} positions")
+    return ", ".join(words) or "not symmetric"
