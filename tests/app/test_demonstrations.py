@@ -164,7 +164,7 @@ def test_requests_that_cannot_be_are_refused(school, written, tmp_path):
     assert "even numbers" in refused(school, *out, "--width", "65")
     assert "--view 3" in refused(school, *out, "--view", "3")
     assert "no hand-eye calibration" in refused(school, *out, "--hand-eye")
-    assert "not empty" in refused(school, "--out", written)
+    assert "finished export" in refused(school, "--out", written)
     assert "inside" in refused(school, "--out", school / "demos")
     assert "weighs" in refused(school, *out, "--mass", "cube=0.5", "--limit", "1")
 

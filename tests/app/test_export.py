@@ -270,7 +270,7 @@ def test_a_finished_export_is_known_and_not_written_again(bop, tmp_path):
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("*")}
     assert "finished already" in done(*args)
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("*")} == before
-    assert "not empty" in refused(*args, "--no-masks")
+    assert "finished export" in refused(*args, "--no-masks")
     assert str(tmp_path) not in (tmp_path / "out/.export.json").read_text()
 
 

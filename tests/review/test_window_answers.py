@@ -232,4 +232,4 @@ def test_keys_change_and_save_nothing_while_a_snap_is_computed(page: Page) -> No
 
 def test_the_models_own_symmetry_is_shown_where_nobody_has_marked_it(page: Page) -> None:
     panel: Any = page.window.correct
-    assert panel._marks.content.startswith("the model itself: ")
+    page.wait(lambda: panel._marks.content.startswith("the model itself: "))
