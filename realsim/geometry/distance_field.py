@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.interop import import_open3d
 from realsim.records import Mesh
@@ -37,7 +37,7 @@ REMEMBERED_FIELDS = 64
 _memory: "OrderedDict[str, DistanceField]" = OrderedDict()
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def sample(
     grid: NDArray[np.float32], origin: Array, cell: float, x: float, y: float, z: float
 ) -> tuple[float, float, float, float]:
@@ -73,7 +73,7 @@ def sample(
     return d, gx, gy, gz
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _sample_all(
     grid: NDArray[np.float32], origin: Array, cell: float, points: Array, T: Array
 ) -> tuple[Array, Array]:

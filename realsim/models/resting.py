@@ -10,10 +10,10 @@ facets and as many minima that mean nothing, and a cylinder of 64 facets rolls.
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry.mesh import hull_vertices, mass_properties
 from realsim.records import Mesh
@@ -219,7 +219,7 @@ def _slopes(facets: _Facets) -> Array:
     return fall / np.maximum(turn, 1e-9)
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _flood(heights: Array, edges: Ints, barriers: Array, tolerance: float) -> Ints:
     """Return the lowest facet (F,) of the basin of each facet.
 

@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass, field
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -149,7 +150,7 @@ def scores_of(
     return ((raw / len(outlines) - mean) / (1.0 - mean)).astype(np.float32)
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _sum_near(
     near: Array32, chance: Array32, outlines: Array32, middle: Array, stretches: Array,
     shifts: tuple[int, int],

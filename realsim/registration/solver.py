@@ -11,10 +11,10 @@ through) is drawn back along its normal; without it a model may grow out of what
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
 from realsim.registration.body import Body
@@ -115,7 +115,7 @@ class Fit:
         return replace(self, T_world_obj=T_world_obj)
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def accumulate_points(
     lattice: tuple[NDArray[np.float32], Array, float],
     T: Array,
@@ -178,7 +178,7 @@ def accumulate_points(
     return weight, square, kernels, used
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _accumulate_free_space(
     surface: tuple[Array, Array],
     T: Array,

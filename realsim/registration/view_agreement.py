@@ -9,10 +9,10 @@ or of a camera that stood elsewhere, are.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.registration.evidence import DepthNoise
@@ -152,7 +152,7 @@ def partners(Ts_world_cam: Array, near: int, spread: int) -> NDArray[np.int64]:
     return np.array(rows, dtype=np.int64).reshape(n, wanted)
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _fill(pixels: NDArray[np.int32], z: Array32, cell: float, low: Array32, high: Array32) -> None:
     """Enter the depths (N,) [m] into the cells of one view's maps."""
     for n in range(len(z)):
@@ -162,7 +162,7 @@ def _fill(pixels: NDArray[np.int32], z: Array32, cell: float, low: Array32, high
         high[i, j] = max(high[i, j], z[n])
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _compare(
     points_cam: Array,
     low: Array32,

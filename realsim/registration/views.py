@@ -6,10 +6,10 @@ All steps after this one work on these points: 256 images of 1280x720 pixels bec
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
@@ -58,7 +58,7 @@ class ViewPoints:
         return se3.transform(T, self.points.astype(np.float64))
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _trusted_pixels(
     depth: Array32, stride: int, reach: int, limits: tuple[float, float, float, float, float]
 ) -> tuple[NDArray[np.int32], int]:

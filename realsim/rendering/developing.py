@@ -1,8 +1,9 @@
 """From linear light to the picture: exposure, noise of the sensor, highlights, sRGB."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array32 = NDArray[np.float32]
 SHOULDER = 0.8
@@ -52,7 +53,7 @@ def developed(
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _develop(
     light: Array32,
     noise: Array32,

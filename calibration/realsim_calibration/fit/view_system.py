@@ -15,9 +15,10 @@ gives the columns of the poses. A view costs the same with 20 corners or with 2,
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array = NDArray[np.float64]
 CAMERA_TERMS = 12
@@ -32,11 +33,7 @@ BEHIND_PX = 1e4
 """Residual of a point behind the camera [px]: large, so that the step is refused."""
 
 
-def _compiled(function: Any) -> Any:
-    return numba.njit(cache=True)(function)
-
-
-@_compiled
+@njit
 def _product(A: Any, B: Any) -> Any:
     """Return the product of two rigid transforms."""
     T = np.eye(4)
@@ -47,7 +44,7 @@ def _product(A: Any, B: Any) -> Any:
     return T
 
 
-@_compiled
+@njit
 def _inverse(A: Any) -> Any:
     """Return the inverse of a rigid transform."""
     T = np.eye(4)
@@ -58,7 +55,7 @@ def _inverse(A: Any) -> Any:
     return T
 
 
-@_compiled
+@njit
 def _adjoint(T: Any) -> Any:
     """Return Ad(T) (6, 6), rotation first."""
     ad = np.zeros((6, 6))
@@ -71,7 +68,7 @@ def _adjoint(T: Any) -> Any:
     return ad
 
 
-@_compiled
+@njit
 def camera_from_board(X: Any, Z: Any, A: Any, D: Any, to_hand: bool) -> Any:
     """Return T_cam_board (4, 4)."""
     AD = _product(A, D)
@@ -80,7 +77,7 @@ def camera_from_board(X: Any, Z: Any, A: Any, D: Any, to_hand: bool) -> Any:
     return _product(_inverse(_product(AD, X)), Z)
 
 
-@_compiled
+@njit
 def _point_rows(
     M: Any, row: int, p: Any, lens: Any, measured: Any, root: float, chain: Any
 ) -> None:
@@ -129,7 +126,7 @@ def _point_rows(
         M[k, COLUMNS - 1] = root * (predicted - measured[axis])
 
 
-@_compiled
+@njit
 def _rows(
     T: Any, lens: Any, board: Any, half: float, middle: Any, xy: Any, uv: Any, root: Any
 ) -> Any:
@@ -154,7 +151,7 @@ def _rows(
     return M
 
 
-@_compiled
+@njit
 def _triangle(rows_by_columns: Any) -> Any:
     """Return the (24, 24) R of M = QR by Householder reflections; rank deficiency is no matter."""
     M = rows_by_columns.T.copy()  # a column lies in one piece
@@ -181,7 +178,7 @@ def _triangle(rows_by_columns: Any) -> Any:
     return R
 
 
-@_compiled
+@njit
 def pose_normal_equations(T: Any, lens: Any, points: Any, uv: Any) -> Any:
     """Return H (6, 6), g (6,) and the sum of squares of the residuals of a pose alone [px^2].
 
@@ -209,7 +206,7 @@ def pose_normal_equations(T: Any, lens: Any, points: Any, uv: Any) -> Any:
     return H, g, total
 
 
-@_compiled
+@njit
 def _exp(xi: Any) -> Any:
     """Return the rigid transform of a twist (6,), rotation first."""
     theta2 = xi[0] * xi[0] + xi[1] * xi[1] + xi[2] * xi[2]
@@ -232,7 +229,7 @@ def _exp(xi: Any) -> Any:
     return T
 
 
-@_compiled
+@njit
 def refined_pose(
     start: Any, lens: Any, points: Any, uv: Any, steps: int, damping: float, gain: float
 ) -> Any:
@@ -257,7 +254,7 @@ def refined_pose(
     return T, cost
 
 
-@_compiled
+@njit
 def residual_norm(  # noqa: PLR0913, PLR0917 - compiled code takes no records
     X: Any, Z: Any, A: Any, D: Any, to_hand: bool, lens: Any, board: Any,
     half: float, middle: Any, xy: Any, uv: Any, root: Any,
@@ -271,7 +268,7 @@ def residual_norm(  # noqa: PLR0913, PLR0917 - compiled code takes no records
     return np.sqrt(total)
 
 
-@_compiled
+@njit
 def view_rows(  # noqa: PLR0913, PLR0917 - compiled code takes no records
     X: Any, Z: Any, A: Any, D: Any, to_hand: bool, lens: Any, board: Any,
     half: float, middle: Any, xy: Any, uv: Any, root: Any,
@@ -281,7 +278,7 @@ def view_rows(  # noqa: PLR0913, PLR0917 - compiled code takes no records
     return _rows(T, lens, board, half, middle, xy, uv, root)
 
 
-@_compiled
+@njit
 def view_equations(  # noqa: PLR0913, PLR0917 - compiled code takes no records
     X: Any, Z: Any, A: Any, D: Any, to_hand: bool, lens: Any, board: Any,
     half: float, middle: Any, xy: Any, uv: Any, root: Any,

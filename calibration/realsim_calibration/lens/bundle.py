@@ -15,10 +15,10 @@ pulls, which the covariance and the fits without a view need.
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.camera import projection_jacobian
@@ -202,7 +202,7 @@ class _Normal:
     """(views,) robust cost; infinite where a corner is behind the camera."""
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _accumulate(
     offsets: NDArray[np.int64],
     derivatives: tuple[Array, Array],

@@ -5,8 +5,9 @@ so hold for every order and every choice.
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array = NDArray[np.float64]
 ASCENT_STEPS = 400
@@ -50,7 +51,7 @@ def held_karp_bound(least_s: Array, tour_s: float) -> float:
     return max(_ascend(np.ascontiguousarray(least_s), tour_s), two_nearest_bound(least_s))
 
 
-@njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _ascend(least: Array, upper: float) -> float:
     """Return the best bound met while raising the prices of views with too many moves."""
     n = len(least)
@@ -69,7 +70,7 @@ def _ascend(least: Array, upper: float) -> float:
     return best
 
 
-@njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _one_tree(least: Array, price: Array) -> tuple[float, Array]:
     """Return the priced length of the least 1-tree, and the moves (N + 1,) at every stop."""
     n = len(least)

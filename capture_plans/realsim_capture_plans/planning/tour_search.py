@@ -6,8 +6,9 @@ Rows number the candidates of all views one after the other; row 0 is home, clus
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -48,7 +49,7 @@ class Problem(NamedTuple):
     """Of the leading joint [rad/s^2]."""
 
 
-@njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def lower_least(least: Array, joints: Array, first: Ints, new: Ints) -> None:
     """Lower the least turns between clusters to those of candidates from rows `new` (N + 1,) on."""
     n = len(first) - 1
@@ -69,7 +70,7 @@ def lower_least(least: Array, joints: Array, first: Ints, new: Ints) -> None:
             least[j, i] = best
 
 
-@njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _seconds(a: int, b: int, p: Problem) -> float:
     """Return the time of the move between two rows, with the charge if it collides."""
     q = p.joints
@@ -91,7 +92,7 @@ def _seconds(a: int, b: int, p: Problem) -> float:
     return t
 
 
-@njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def nearest_neighbour(least: Array, p: Problem) -> Ints:
     """Return rows (N,): always the nearest candidate of any view that is left."""
     n = len(p.first) - 2
@@ -113,7 +114,7 @@ def nearest_neighbour(least: Array, p: Problem) -> Ints:
     return path
 
 
-@njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _length(path: Ints, p: Problem) -> float:
     """Return the time of a path from home, with the charges for collisions."""
     total = 0.0
@@ -124,7 +125,7 @@ def _length(path: Ints, p: Problem) -> float:
     return total
 
 
-@njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def best_candidates(path: Ints, least: Array, p: Problem) -> Ints:
     """Return rows (N,) with the same order of views and the candidates that make it shortest."""
     n = len(path)
@@ -161,7 +162,7 @@ def best_candidates(path: Ints, least: Array, p: Problem) -> Ints:
     return out
 
 
-@njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _taken_out(place: Ints, nearest: Ints, rng: np.random.Generator) -> NDArray[np.bool_]:
     """Return (N,) which places of the tour go out: strings round a view and its neighbours."""
     n = len(place)
@@ -184,7 +185,7 @@ def _taken_out(place: Ints, nearest: Ints, rng: np.random.Generator) -> NDArray[
     return out
 
 
-@njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _put_back(
     kept: Ints, size: int, view: int, least: Array, p: Problem, rng: np.random.Generator
 ) -> None:
@@ -220,7 +221,7 @@ def _put_back(
     kept[best_place] = best_row
 
 
-@njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def ruin_and_recreate(
     path: Ints, least: Array, steps: int, p: Problem, rng: np.random.Generator
 ) -> Ints:

@@ -9,8 +9,6 @@ import json
 import os
 import sys
 from importlib import import_module
-from pathlib import Path
-from types import CodeType
 from typing import Any, TextIO
 
 
@@ -58,20 +56,14 @@ def library(name: str) -> str:
 
 
 def numba_cache(_: str) -> str:
-    """Return the folder that numba keeps realsim's compiled functions in."""
-    from numba.core.caching import FunctionCache
+    """Return the folder that realsim's compiled functions are kept in, proven to be writable."""
+    import tempfile
 
-    import realsim
+    from realsim.compiled import cache_folder
 
-    # numba looks at the file of a function; one of realsim's modules, without importing it.
-    place = Path(str(realsim.__file__)).parent / "registration" / "judging" / "patches.py"
-    code: CodeType = _square.__code__.replace(co_filename=str(place))
-    _square.__code__ = code
-    return str(FunctionCache(_square).cache_path)
-
-
-def _square(x: float) -> float:
-    return x * x
+    cache_folder().mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=cache_folder()).close()
+    return str(cache_folder())
 
 
 def realsense(_: str) -> list[dict[str, str]]:

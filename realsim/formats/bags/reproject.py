@@ -9,10 +9,10 @@ image back, count for count.
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import Array
@@ -28,7 +28,7 @@ SAME_SURFACE = 0.01
 """Depths that differ by less than this share are of one surface: 80 deg of slope at 1 px."""
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _project(
     depth: Any, rays: Any, R: Any, t: Any, camera: Any, scale: Any, count_m: float, out: Any
 ) -> None:

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
 from realsim.records import SupportPlane
@@ -15,7 +15,7 @@ from realsim.registration.body import Body
 Array = NDArray[np.float64]
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def claim_points(
     points: Array,
     lattice: tuple[NDArray[np.float32], Array, float],

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
 from realsim.geometry.mesh import sample_surface
 from realsim.registration.body import Body
@@ -83,7 +83,7 @@ def make_patches(body: Body, size_m: float, samples_per_patch: float) -> Patches
     )
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def add_to_patches(
     points: tuple[Array, Array],
     lattice: tuple[NDArray[np.float32], Array, float],
@@ -150,7 +150,7 @@ def add_to_patches(
         sums[p, 3] += w * r * r
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def look_at_patches(
     surface: tuple[Array, Array],
     T_cam_obj: Array,

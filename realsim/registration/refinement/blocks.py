@@ -12,9 +12,10 @@ and hardly visible directions would be pulled by many sigma (errors in variables
 are taken where the point's ray meets the surface.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -23,7 +24,7 @@ LEAST_ALONG = 0.15
 """Least cosine between ray and normal at which the ray is followed to the surface."""
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def add_blocks(
     surface: tuple[Array, Array, Array],
     views: Ints,

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
 from realsim.registration.body import Body
@@ -54,14 +54,14 @@ def joined(views: Sequence[ViewPoints]) -> AllPoints:
     )
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _square_gap(p: Array32, q: Array) -> float:
     """Return the square of the distance of two points (3,)."""
     x, y, z = p[0] - q[0], p[1] - q[1], p[2] - q[2]
     return x * x + y * y + z * z
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _sorted_in(
     points: Array32,
     views: Ints,
@@ -124,7 +124,7 @@ def _sorted_in(
     return out, around, index, begin
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _claim(
     lattice: tuple[NDArray[np.float32], Array, float],
     world: Array32,

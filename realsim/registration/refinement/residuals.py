@@ -6,10 +6,10 @@ the surface the camera saw. What is fitted is the distance to the tangent plane 
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
 from realsim.registration.body import Body
 
@@ -23,7 +23,7 @@ GATE = 0.05
 """Least cosine between a surface and the direction to the camera that saw it."""
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def field_residuals(
     lattice: tuple[NDArray[np.float32], Array, float],
     points: Array,

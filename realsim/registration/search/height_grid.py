@@ -6,10 +6,10 @@ seen free, and nothing can stand there. Where nothing was measured the height is
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
@@ -112,7 +112,7 @@ def _bounds(p: Array, config: GridConfig) -> tuple[Array, Array]:
     return low, np.minimum(high + config.cell_m, middle + config.reach_m)
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _table_points(points: Array, T: Array, low: float, high: float) -> Array:
     """Return the points (N, 3), moved by T, whose z lies in [low, high]."""
     out = np.empty((len(points), 3))
@@ -128,7 +128,7 @@ def _table_points(points: Array, T: Array, low: float, high: float) -> Array:
     return out[:n]
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _heights(
     p: Array,
     origin: Array,
@@ -172,7 +172,7 @@ def _heights(
     return out.reshape(shape)
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _top(z: Array32, rule: tuple[float, float, float]) -> float:
     """Return the height that the ascending heights (N,) of one cell stand for."""
     n = len(z)

@@ -6,9 +6,10 @@ for 'never measured', 10 m for 'another object'. A rule is what `rule_of` makes.
 
 from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 if TYPE_CHECKING:
     from realsim.registration.search.matching import MatchConfig
@@ -40,7 +41,7 @@ def rule_of(config: "MatchConfig") -> Rule:
     return tuple(np.float32(f) for f in figures)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _agreement(h: np.float32, low: np.float32, high: np.float32, rule: Rule) -> np.float32:
     """Return from -1 to 1 how well a model's height agrees with measured ones [low, high] [m]."""
     above = h - high
@@ -50,14 +51,14 @@ def _agreement(h: np.float32, low: np.float32, high: np.float32, rule: Rule) -> 
     return value * min(ONE, max(ZERO, (high - rule[5]) * rule[6]))
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _goes_on(h: np.float32, measured: np.float32, rule: Rule) -> np.float32:
     """Return from 0 to 1 whether a surface measured outside goes on at the edge's height [m]."""
     value = min(ONE, max(ZERO, (rule[1] - abs(measured - h)) * rule[2]))
     return value * min(ONE, max(ZERO, (measured - rule[5]) * rule[6]))
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _score_at(
     flat: Array32, base: int, shifts: Ints, heights: Array32, around: int, rule: Rule
 ) -> float:
@@ -94,7 +95,7 @@ def _score_at(
     return float(total) / n - float(rule[7]) * float(beyond) / max(1, around)
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def correlated(
     maps: Array32,
     rows: Ints,
@@ -139,7 +140,7 @@ def correlated(
     return out
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def maxima(volume: Array32, least: float, slack: float) -> Ints:
     """Return the local maxima (N, 3) of a volume (Y, R, C) that is cyclic in its first axis.
 
@@ -172,7 +173,7 @@ def maxima(volume: Array32, least: float, slack: float) -> Ints:
     return found[:n].copy()
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def climbed(
     maps: Array32,
     frame: Array,
@@ -231,7 +232,7 @@ def climbed(
     return out, scores
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _score_near(
     flat: Array32,
     frame: Array,

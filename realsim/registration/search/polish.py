@@ -9,10 +9,10 @@ axis without its points noticing.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
 from realsim.registration.evidence import Cloud
 from realsim.registration.search.refine import Candidate, RefineConfig, Sought, candidate
@@ -59,7 +59,7 @@ def owners(
     return owner
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _claim(
     points: Array,
     T: Array,

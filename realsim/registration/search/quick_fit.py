@@ -4,10 +4,10 @@ The equations are `realsim.registration.solver`'s own; only the loop around them
 ends sooner. A step turns about the box centre and shifts it: T <- T C exp(omega) C^-1, then v.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.registration.body import Body
 from realsim.registration.evidence import Cloud
 from realsim.registration.solver import (
@@ -54,7 +54,7 @@ def quick_fit(
     )
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _fit(
     lattice: tuple[NDArray[np.float32], Array, float],
     T: Array,
@@ -90,7 +90,7 @@ def _fit(
     return T
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _solved(H: Array, b: Array) -> Array:
     """Return H^-1 b by Cholesky's method; only the upper half of H (6, 6) is read."""
     n = len(b)
@@ -117,7 +117,7 @@ def _solved(H: Array, b: Array) -> Array:
     return x
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _moved(T: Array, center: Array, x: Array) -> None:
     """Turn T in place about the object's centre by x[:3] and shift it by x[3:], object's axes."""
     angle = np.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
 from realsim.records import SupportPlane
@@ -142,7 +142,7 @@ def nearby(cloud: Cloud, sought: Sought, T_world_obj: Array, margin_m: float, mo
     )
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _near(
     points: Array,
     T: Array,

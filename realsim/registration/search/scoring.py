@@ -12,10 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.camera import project, ray_table
 from realsim.records import CameraIntrinsics, SupportPlane
@@ -234,7 +234,7 @@ def _boxes(canvas: Canvas, body: Body, Ts_obj_cam: Array) -> NDArray[np.int64]:
     return boxes
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _box_rays(
     boxes: NDArray[np.int64], table: Array32, Ts_obj_cam: Array, measured: Array32
 ) -> tuple[Array32, Cells]:
@@ -261,7 +261,7 @@ def _box_rays(
     return rays[:n].copy(), cells[:n].copy()
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _likelihood(m: float, z: float, tau: float, front: float) -> float:
     """Return l of one pixel; 0 if nothing is rendered there."""
     if z >= 0.1 * FAR:
@@ -270,7 +270,7 @@ def _likelihood(m: float, z: float, tau: float, front: float) -> float:
     return max(1.0 - 2.0 * d * d, -front if d < 0.0 else -1.0)
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _likelihoods(
     cells: Cells, buffer: Array32, known: tuple[Array32, Array32, Array32, Array32], front: float
 ) -> Array:
@@ -287,7 +287,7 @@ def _likelihoods(
     return out
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _gain(
     cells: Cells,
     z: Array32,

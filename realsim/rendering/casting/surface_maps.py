@@ -1,8 +1,9 @@
 """Maps of the surfaces that a view sees: where on its object a pixel lies, and how it is turned."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -10,7 +11,7 @@ Int32 = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def surface_maps(
     rays: Array32,
     hits: tuple[Array32, Int32, Int32],

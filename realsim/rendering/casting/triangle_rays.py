@@ -9,9 +9,10 @@ meshes have triangles smaller than a pixel: this is why going by triangles costs
 by rays, at twice the digits.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -36,7 +37,7 @@ GRID = 9
 """Points per side of that grid."""
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _distorted(lens: Array, x: float, y: float) -> tuple[float, float]:
     """Return the pixel of ideal coordinates; `lens` as of `project_vertices`."""
     if lens[14] == 0.0:
@@ -50,7 +51,7 @@ def _distorted(lens: Array, x: float, y: float) -> tuple[float, float]:
     return xd * lens[0] + lens[2], yd * lens[1] + lens[3]
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def project_vertices(vertices: Array, T_cam_obj: Array, lens: Array) -> tuple[Array, Array]:
     """Return vertices in the camera (V, 3) [m] and where they are seen (V, 4): u, v [px], x/z, y/z.
 
@@ -85,7 +86,7 @@ def project_vertices(vertices: Array, T_cam_obj: Array, lens: Array) -> tuple[Ar
     return points, seen
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _curved_box(low_x: float, high_x: float, low_y: float, high_y: float, lens: Array) -> Box:
     """Return u and v bounds of a box of ideal coordinates, where the lens model is one to one."""
     u0 = v0 = np.inf
@@ -105,7 +106,7 @@ def _curved_box(low_x: float, high_x: float, low_y: float, high_y: float, lens: 
     return u0 - slack, u1 + slack, v0 - slack, v1 + slack
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _lens_box(points: Array, seen: Array, i: int, j: int, k: int, lens: Array) -> Box:
     """Return what `_box` does, for a triangle that bends or has a vertex without a pixel."""
     za, zb, zc = points[i, 2], points[j, 2], points[k, 2]
@@ -121,7 +122,7 @@ def _lens_box(points: Array, seen: Array, i: int, j: int, k: int, lens: Array) -
     return _curved_box(low_x, high_x, low_y, high_y, lens)
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _box(points: Array, seen: Array, i: int, j: int, k: int, lens: Array) -> Box:
     """Return u and v bounds of a triangle's picture [px]; first > second where there is none."""
     ua, ub, uc = seen[i, 0], seen[j, 0], seen[k, 0]
@@ -145,7 +146,7 @@ def _box(points: Array, seen: Array, i: int, j: int, k: int, lens: Array) -> Box
     )
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _pixel_range(box: Box, width: int, height: int) -> PixelRange:
     """Return first and last column, first and last row of the pixel centres in a box."""
     u0, u1, v0, v1 = box
@@ -159,7 +160,7 @@ def _pixel_range(box: Box, width: int, height: int) -> PixelRange:
     )
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _edge_planes(points: Array, i: int, j: int, k: int) -> EdgePlanes:
     """Return b x c, c x a and a x b of a triangle a b c, and a . (b x c)."""
     ax, ay, az = points[i, 0], points[i, 1], points[i, 2]
@@ -174,7 +175,7 @@ def _edge_planes(points: Array, i: int, j: int, k: int) -> EdgePlanes:
     )  # fmt: skip
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _sides(seen: Array, i: int, j: int, k: int, box: Box) -> Sides:
     """Return the three sides of a triangle's picture as lines, pushed outwards by its slack.
 
@@ -199,7 +200,7 @@ def _sides(seen: Array, i: int, j: int, k: int, box: Box) -> Sides:
     )  # fmt: skip
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _narrowed(first: int, last: int, g: float, h: float, e: float, v: int) -> tuple[int, int]:
     """Return the columns of first..last in which g u + h v + e >= 0 may hold in row v."""
     if g > 0.0:
@@ -209,7 +210,7 @@ def _narrowed(first: int, last: int, g: float, h: float, e: float, v: int) -> tu
     return first, last if h * v + e >= 0.0 else first - 1
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def cast_triangles(
     mesh: Placed,
     lens: Array,
@@ -284,7 +285,7 @@ def cast_triangles(
     return count, (left, right, top, bottom), (low_u, high_u, low_v, high_v)
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def count_outside(
     mesh: Placed, lens: Array, rays: Array32, origin: tuple[int, int], size: tuple[int, int]
 ) -> int:
@@ -327,7 +328,7 @@ def count_outside(
     return count
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def solid_angle_share(points: Array, faces: Int32) -> float:
     """Return the share of the sphere about the origin that the faces fill: 1 inside, 0 outside.
 

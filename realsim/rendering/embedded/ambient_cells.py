@@ -4,10 +4,10 @@ Light that comes from all sides changes slowly along a surface. The cells' rays 
 filter that stops at edges; each pixel then takes from the cells of its own surface.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.rendering.embedded.sky_light import SkyArrays, map_at
 from realsim.rendering.embedded.surface_table import SurfacePoints
 
@@ -24,7 +24,7 @@ SEARCH_CELLS = 2
 """So far, on either side."""
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def cell_pixels(geometry: Int32, height: int, width: int) -> Rows:
     """Return the pixel (rows * columns,) that stands for each cell: its first that meets a mesh.
 
@@ -62,7 +62,7 @@ def taken(points: SurfacePoints, rows: Rows) -> SurfacePoints:
     )
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _same_surface(p: SurfacePoints, i: int, q: SurfacePoints, j: int, slope: float) -> float:
     """Return how far point j of q lies in the plane of point i of p and looks the same way [0, 1].
 
@@ -80,7 +80,7 @@ def _same_surface(p: SurfacePoints, i: int, q: SurfacePoints, j: int, slope: flo
     return max(near, 0.0) * min(5.0 * turn - 4.0, 1.0)
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def edge_filtered(
     values: Array32,
     points: SurfacePoints,
@@ -134,7 +134,7 @@ def edge_filtered(
     return source
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def divide_by_whole(values: Array32) -> None:
     """Turn luminance of the open and of the whole sky (the first two values) into their ratio."""
     for i in range(len(values)):
@@ -142,7 +142,7 @@ def divide_by_whole(values: Array32) -> None:
         values[i, 1] = 1.0
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def spread_cells(
     sky: SkyArrays,
     cells: tuple[SurfacePoints, Int32, Array32],
@@ -193,7 +193,7 @@ def spread_cells(
         out[i, 3] = found[0] / total
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _add(values: Array32, j: int, w: float, found: NDArray[np.float64]) -> None:
     """Add the values of cell j by the weight w."""
     found[0] += w * values[j, 0]
@@ -202,7 +202,7 @@ def _add(values: Array32, j: int, w: float, found: NDArray[np.float64]) -> None:
     found[3] += w * values[j, 4]
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _add_from_afar(
     cells: tuple[SurfacePoints, Int32, Array32],
     pixel: tuple[SurfacePoints, int, int],

@@ -5,10 +5,10 @@ partly spread by the cosine, partly aimed at what is bright in the sky; a filter
 gathers those of a window. Nothing here is random: the same view gives the same light.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.rendering.embedded.sky_light import (
     SkyArrays,
     coarse_at,
@@ -28,7 +28,7 @@ NEIGHBOUR_OPENNESS = 0.7
 """Share of the sky that neighbours see themselves, on average: it is not traced."""
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def shared_pair(pixel: int, width: int, k: int, n: int) -> tuple[float, float]:
     """Return two numbers in [0, 1) for ray k of n of a pixel.
 
@@ -42,7 +42,7 @@ def shared_pair(pixel: int, width: int, k: int, n: int) -> tuple[float, float]:
     return a - np.floor(a), b - np.floor(b)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _axes(x: float, y: float, z: float) -> tuple[float, float, float, float, float, float]:
     """Return two unit vectors across a unit vector (Duff et al., JCGT 2017)."""
     s = 1.0 if z >= 0 else -1.0
@@ -51,7 +51,7 @@ def _axes(x: float, y: float, z: float) -> tuple[float, float, float, float, flo
     return 1.0 + s * x * x * a, s * b, -s * x, b, s + y * y * a, -y
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def ambient_rays(
     sky: SkyArrays,
     points: SurfacePoints,
@@ -99,7 +99,7 @@ def ambient_rays(
             origins[j, 2] = points.position[i, 2] + lift * fz
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def sun_rays(
     sky: SkyArrays,
     points: SurfacePoints,
@@ -135,7 +135,7 @@ def sun_rays(
             origins[m, k] = points.position[i, k] + up
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def mirror_rays(
     points: SurfacePoints,
     rows: NDArray[np.int64],
@@ -172,7 +172,7 @@ def mirror_rays(
         origins[m, 2] = points.position[i, 2] + lift * fz
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def face_light(sky: SkyArrays, surfaces: SurfaceArrays, out: Array32) -> None:
     """Fill what each face sends on (F, 6): under the open sky, and added where the sun shines."""
     for g in range(len(surfaces.base)):
@@ -191,7 +191,7 @@ def face_light(sky: SkyArrays, surfaces: SurfaceArrays, out: Array32) -> None:
                 out[f, 3 + k] = surfaces.mean_color[g, k] * facing * sky.sun[k]
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def gather_ambient(
     sky: SkyArrays,
     face_radiance: Array32,
@@ -234,7 +234,7 @@ def gather_ambient(
         out[i, 2], out[i, 3], out[i, 4] = red / n, green / n, blue / n
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def fill_tints(
     s: SurfaceArrays,
     tex: TextureArrays,

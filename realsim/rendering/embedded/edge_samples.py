@@ -2,10 +2,10 @@
 
 from math import gcd
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.rendering.embedded.sky_light import SkyArrays, map_at
 from realsim.rendering.embedded.surface_table import SAME_DIRECTION, SurfacePoints
 
@@ -29,7 +29,7 @@ def pixel_lattice(samples: int) -> Array32:
     return ((uv + 0.5) / samples - 0.5).astype(np.float32)
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def busy_pixels(
     color: Array32,
     base: Array32,
@@ -75,7 +75,7 @@ def busy_pixels(
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def settle_by_neighbours(
     geometry: Int32, rows: NDArray[np.int64], size: tuple[int, int], values: Array32
 ) -> NDArray[np.int64]:
@@ -106,14 +106,14 @@ def settle_by_neighbours(
     return left[:count]
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _alike(p: SurfacePoints, i: int, q: SurfacePoints, j: int) -> bool:
     """Return whether point i of p and point j of q look the same way."""
     turn = p.smooth[i, 0] * q.smooth[j, 0] + p.smooth[i, 1] * q.smooth[j, 1]
     return turn + p.smooth[i, 2] * q.smooth[j, 2] > SAME_DIRECTION
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def borrow_light(
     sky: SkyArrays,
     samples: tuple[SurfacePoints, Int32, NDArray[np.int64]],

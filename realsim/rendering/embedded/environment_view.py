@@ -8,10 +8,10 @@ what is smooth. Everything but the casts is compiled, and nothing is random.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import camera
 from realsim.records import CameraIntrinsics
@@ -331,7 +331,7 @@ def _spread_rows(
     return full[0], full[1], full[2]
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _fill_background(sky: SkyArrays, level: int, rays: tuple[Int32, Array32], out: Array32) -> None:
     """Fill the radiance (N, 3) of rays that meet nothing: the panorama itself."""
     geometry, directions = rays
@@ -346,7 +346,7 @@ def _fill_background(sky: SkyArrays, level: int, rays: tuple[Int32, Array32], ou
             )
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _number_faces(first_face: Rows, geometry: Int32, face: Int32, out: Int32) -> None:
     """Fill the number of each face in the scene (N,); -1 stays where there is none."""
     for i in range(len(geometry)):
@@ -354,7 +354,7 @@ def _number_faces(first_face: Rows, geometry: Int32, face: Int32, out: Int32) ->
             out[i] = first_face[geometry[i]] + face[i]
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _find_facing(face_light: Array32, face: Int32, out: NDArray[np.bool_]) -> None:
     """Fill whether each face (N,) looks towards the sun."""
     for i in range(len(face)):
@@ -362,7 +362,7 @@ def _find_facing(face_light: Array32, face: Int32, out: NDArray[np.bool_]) -> No
         out[i] = f >= 0 and face_light[f, 3] + face_light[f, 4] + face_light[f, 5] > 0
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _arrivals(
     rays: tuple[Array, Array32],
     hits: tuple[Array32, Array32],
@@ -379,7 +379,7 @@ def _arrivals(
             out[m, k] = origins[i, k] + t[i] * directions[i, k] + lift * normal[i, k]
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _fill_mirrored(
     face_light: Array32,
     hits: tuple[Int32, NDArray[np.bool_], Array32],

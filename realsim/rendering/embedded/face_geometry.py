@@ -1,15 +1,16 @@
 """Geometry of one face under a ray: where it is met, how it is rounded, how its normal bends."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array32 = NDArray[np.float32]
 Edges = tuple[float, float, float, float, float, float]
 """The two edges of a face from its first corner [m]."""
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def edges_of(corners: Array32, f: int) -> Edges:
     """Return the two edges of face f from its first corner."""
     x, y, z = corners[f, 0, 0], corners[f, 0, 1], corners[f, 0, 2]
@@ -19,7 +20,7 @@ def edges_of(corners: Array32, f: int) -> Edges:
     )  # fmt: skip
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def plane_met(
     e: Edges,
     o: tuple[float, float, float],
@@ -45,7 +46,7 @@ def plane_met(
     return u, v, (e[3] * q[0] + e[4] * q[1] + e[5] * q[2]) / safe
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def bulge_of(e: Edges, m: Array32, weights: tuple[float, float, float]) -> float:
     """Return how high the rounded surface stands above a point of the face; 0 in hollows.
 
@@ -67,7 +68,7 @@ def bulge_of(e: Edges, m: Array32, weights: tuple[float, float, float]) -> float
     return height + w * max(-(qx * m[2, 0] + qy * m[2, 1] + qz * m[2, 2]), 0.0)
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def bent_normal(
     n: tuple[float, float, float],
     e: Edges,

@@ -6,10 +6,10 @@ and Conty 2017 as in Lagarde and de Rousiers, "Moving Frostbite to PBR", and Fil
 surface in a white room is white at any roughness.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.rendering.embedded.sky_light import SkyArrays, lobe_at
 from realsim.rendering.embedded.surface_table import SurfacePoints
 
@@ -22,7 +22,7 @@ MIRROR_UNTIL, MIRROR_FADES = 0.5, 0.2
 by the ambient rays."""
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def coat(nv: float, roughness: float) -> tuple[float, float]:
     """Return scale and offset of the reflectance of a GGX coat under even light.
 
@@ -38,13 +38,13 @@ def coat(nv: float, roughness: float) -> tuple[float, float]:
     return -1.04 * a + z, 1.04 * a + w
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def mirror_share(roughness: float) -> float:
     """Return how far a reflected ray stands for the whole lobe [0, 1]."""
     return min(max((MIRROR_UNTIL - roughness) / MIRROR_FADES, 0.0), 1.0)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def highlight(
     n: tuple[float, float, float],
     v: tuple[float, float, float],
@@ -68,7 +68,7 @@ def highlight(
     return spread * 0.5 / max(masking, 1e-9) * nl, vh
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def shade(
     sky: SkyArrays,
     points: SurfacePoints,
@@ -136,7 +136,7 @@ def shade(
             out[i, k] = color[k]
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _open_for_gloss(nv: float, open_share: float, alpha: float) -> float:
     """Return the open share of the glossy lobe (Lagarde and de Rousiers 2014, listing 26)."""
     if open_share >= 1.0:
@@ -145,7 +145,7 @@ def _open_for_gloss(nv: float, open_share: float, alpha: float) -> float:
     return min(max((nv + open_share) ** power - 1.0 + open_share, 0.0), 1.0)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _mirrored_sky(
     sky: SkyArrays,
     points: SurfacePoints,

@@ -10,10 +10,10 @@ SIGGRAPH 2013).
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.rendering.appearance import Environment
 
 Array = NDArray[np.float64]
@@ -154,7 +154,7 @@ def _lamps(coarse: Array32) -> tuple[Array, float, float]:
     return sums / max(total, 1e-30), total, share
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _fill_octahedron(stack: MapStack, out: Array32) -> None:
     """Fill the octahedral map (n, n) with the luminance of a panorama."""
     n = out.shape[0]
@@ -172,7 +172,7 @@ def _fill_octahedron(stack: MapStack, out: Array32) -> None:
             out[i, j] = 0.2126 * r + 0.7152 * g + 0.0722 * b
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def coarse_at(coarse: Array32, x: float, y: float, z: float) -> float:
     """Return the coarse luminance in a unit direction."""
     n = coarse.shape[0]
@@ -184,7 +184,7 @@ def coarse_at(coarse: Array32, x: float, y: float, z: float) -> float:
     return coarse[min(max(i, 0), n - 1), min(max(j, 0), n - 1)]
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def lamp_direction(sky: SkyArrays, u1: float, u2: float) -> tuple[float, float, float]:
     """Return a unit direction to the lamps, spread by their luminance, of two numbers in [0, 1)."""
     n = sky.coarse.shape[0]
@@ -207,7 +207,7 @@ def lamp_direction(sky: SkyArrays, u1: float, u2: float) -> tuple[float, float, 
     return x / length, y / length, z / length
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def ray_weight(sky: SkyArrays, d: tuple[float, float, float], cosine: float) -> float:
     """Return by what an ambient ray counts: the cosine's density over that of all the rays.
 
@@ -227,7 +227,7 @@ def ray_weight(sky: SkyArrays, d: tuple[float, float, float], cosine: float) -> 
     return spread / (sky.lamp_rays * aimed + (1 - sky.lamp_rays) * spread)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _angles(x: float, y: float, z: float) -> tuple[float, float]:
     """Return azimuth and polar angle of a unit direction as shares of the map, [0, 1].
 
@@ -248,7 +248,7 @@ def _angles(x: float, y: float, z: float) -> tuple[float, float]:
     return azimuth, (polar if z >= 0 else np.pi - polar) / np.pi
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _bilinear(stack: MapStack, k: int, s: float, t: float) -> tuple[float, float, float]:
     """Return the radiance of picture k at shares s of its width and t of its height."""
     first, rows = stack.layout[k, 0], stack.layout[k, 1]
@@ -267,14 +267,14 @@ def _bilinear(stack: MapStack, k: int, s: float, t: float) -> tuple[float, float
     return red, green, blue
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def map_at(stack: MapStack, k: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return the radiance of picture k of a stack in a unit direction."""
     s, t = _angles(x, y, z)
     return _bilinear(stack, k, s, t)
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def lobe_at(
     stack: MapStack, roughness: float, x: float, y: float, z: float
 ) -> tuple[float, float, float]:
@@ -290,7 +290,7 @@ def lobe_at(
     return r0 + mix * (r1 - r0), g0 + mix * (g1 - g0), b0 + mix * (b1 - b0)
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _cosine_average(panorama: Array32, out: Array32) -> None:
     """Fill `out` (H, 2H, 3) with the cosine-weighted mean of a panorama about each direction."""
     rows, columns = panorama.shape[0], panorama.shape[1]
@@ -317,7 +317,7 @@ def _cosine_average(panorama: Array32, out: Array32) -> None:
             out[i, j, 0], out[i, j, 1], out[i, j, 2] = red / total, green / total, blue / total
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _average_lobes(sources: MapStack, alpha: float, samples: int, out: Array32) -> None:
     """Fill `out` (H, 2H, 3) with the panorama averaged over the GGX lobe about each direction."""
     rows = out.shape[0]

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.rendering.appearance import LEAST_ROUGHNESS, Material
 from realsim.rendering.developing import srgb_decoded
@@ -228,7 +228,7 @@ def fill_points(
     _fill_materials(surfaces, images, hits, places, out)
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _fill_geometry(
     s: SurfaceArrays,
     rays: tuple[Array, Array, Array32, Array32, Array32],
@@ -290,7 +290,7 @@ def _fill_geometry(
         out.bulge[i] = bulge_of(e, m, (a, b, w)) if turn > 0 else 0.0
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def borrow_materials(
     pixels: tuple[SurfacePoints, Int32, Rows], geometry: Int32, out: SurfacePoints
 ) -> Int32:
@@ -322,13 +322,13 @@ def borrow_materials(
     return left
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _capped(value: float) -> float:
     """Return a change of texture coordinates of finite size."""
     return min(max(value, -WIDEST_FOOTPRINT), WIDEST_FOOTPRINT)
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def _fill_materials(
     s: SurfaceArrays,
     tex: TextureArrays,

@@ -7,10 +7,10 @@ between two halvings, with several probes along the longer side where the surfac
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.rendering.developing import srgb_decoded
 
 Array32 = NDArray[np.float32]
@@ -134,7 +134,7 @@ def _halvings(value: Array32, *, rooted: bool) -> list[UInt8]:
         value = np.asarray(cv2.resize(value, size, interpolation=cv2.INTER_AREA), np.float32)
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def _corners(
     tex: TextureArrays, i: int, k: int, u: float, v: float
 ) -> tuple[int, int, int, int, float, float]:
@@ -157,7 +157,7 @@ def _corners(
     return top + c0, top + c1, below + c0, below + c1, a, b
 
 
-@numba.njit(cache=True, inline="always", error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always", error_model="numpy")
 def footprint(
     tex: TextureArrays, i: int, du: tuple[float, float], dv: tuple[float, float], most_probes: int
 ) -> tuple[float, float, int, float]:
@@ -184,7 +184,7 @@ def footprint(
     return ax, ay, probes, min(level, tex.halvings[i] - 1.0)
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def color_at(
     tex: TextureArrays, i: int, at: tuple[float, float], spread: tuple[float, float, int, float]
 ) -> tuple[float, float, float]:
@@ -216,7 +216,7 @@ def color_at(
     return red * scale, green * scale, blue * scale
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def detail_at(
     tex: TextureArrays, i: int, at: tuple[float, float], level: float
 ) -> tuple[float, float, float, float]:

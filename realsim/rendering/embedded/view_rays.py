@@ -1,14 +1,15 @@
 """The rays of a view in world, and how they change over a pixel."""
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 
 
-@numba.njit(cache=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(error_model="numpy")
 def world_rays(
     table: Array32,
     camera: tuple[Array, float, float],

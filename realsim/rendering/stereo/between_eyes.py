@@ -5,9 +5,10 @@ its disparity. What hides a point from the projector is seen by at least one of 
 behind things that both of them see from outside: a third cast would find little more.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array32 = NDArray[np.float32]
 SAME_SURFACE_PX = np.float32(1.0)
@@ -34,7 +35,7 @@ def depth_between(left_m: Array32, right_m: Array32, fB: float, share: float) ->
     return out
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _carry(depth: Array32, fB: np.float32, share: np.float32, out: Array32) -> None:
     """Raise `out` [px] to the disparities of an eye, moved by a share of themselves.
 

@@ -8,10 +8,10 @@ projector's shadow is nearly exact (from what both eyes see).
 from dataclasses import dataclass
 from functools import lru_cache
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.light import RoomLight
 from realsim.rendering.stereo.shading import shade
@@ -115,7 +115,7 @@ def _quantiles() -> Array32:
     return np.asarray(ndtri((np.arange(1 << 16) + 0.5) / (1 << 16)), np.float32)
 
 
-@numba.njit(cache=True, fastmath=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True)
 def _to_bytes(
     light: Array32,
     noise: NDArray[np.uint16],

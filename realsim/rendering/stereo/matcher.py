@@ -6,10 +6,10 @@ finds is refined and judged on the images by `subpixel`.
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.subpixel import refined
 
@@ -60,7 +60,7 @@ def matched(left: Image8, right: Image8, exact: Array32, config: StereoConfig) -
     return _without_speckles(disparity, config.speckle_px)
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _judge(
     disparity: Array32, texture: Array32, residual: Array32, level: Image8, limits: Array32
 ) -> None:

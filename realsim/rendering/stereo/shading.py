@@ -9,10 +9,10 @@ Everything that is compiled into the pass stands in this file, because a compile
 disk is renewed when its own file changes, not when another one does.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.rendering.stereo.light import MAP_ROUGHNESS
 from realsim.rendering.stereo.pattern import HALF_HEIGHT, HALF_WIDTH, TEXEL_RAD
 from realsim.rendering.stereo.solid_noise import FINEST_CELL_M, FIRST_OCTAVE, NOISE_STEPS
@@ -49,7 +49,7 @@ COARSEST_OCTAVE = 22
 """With the one above it the coarsest: cells of 170 m."""
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _octahedral(maps: Array32, n: int, x: Scalar, y: Scalar, z: Scalar) -> Scalar:
     """Return a map's radiance in a unit direction, bilinear between texel centres."""
     side = np.float32(maps.shape[1])
@@ -71,7 +71,7 @@ def _octahedral(maps: Array32, n: int, x: Scalar, y: Scalar, z: Scalar) -> Scala
     return top + b * (bottom - top)
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _surface(run, sizes, placed, face, look, depth, scratch):  # pyright: ignore
     """Write what a run of pixels on one face sees: point, normal towards the eye, paint, texture.
 
@@ -125,7 +125,7 @@ def _surface(run, sizes, placed, face, look, depth, scratch):  # pyright: ignore
         scratch[TV + i] = v0 * a + v1 * b + v2 * c + v3
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _pixel_octave(first, last, bits, scratch):  # pyright: ignore
     """Write log2 of the edge of the patch that each pixel covers.
 
@@ -140,7 +140,7 @@ def _pixel_octave(first, last, bits, scratch):  # pyright: ignore
         scratch[LEVEL + i] = f(0.5) * (whole + m + f(0.344) * m * (f(1.0) - m))
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _grain_points(run, placed, depth, bits, scratch):  # pyright: ignore
     """Write points in the axes of the noise, the octave that a pixel resolves, and its cells."""
     f = np.float32
@@ -162,7 +162,7 @@ def _grain_points(run, placed, depth, bits, scratch):  # pyright: ignore
         bits[CELLS + i] = (127 - np.int32(octave)) << 23
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _noise(first, last, above, block, bits, scratch, value):  # pyright: ignore
     """Write the noise [counts] of the octave that is `above` the pixels' one: trilinear, repeating.
 
@@ -197,7 +197,7 @@ def _noise(first, last, above, block, bits, scratch, value):  # pyright: ignore
         scratch[value + i] = p + scratch[PART_X + i] * (r - p) - f(128.0)
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _add_grain(first, last, contrast, scratch):  # pyright: ignore
     """Multiply the paint by the micro texture, of rms `contrast`.
 
@@ -213,7 +213,7 @@ def _add_grain(first, last, contrast, scratch):  # pyright: ignore
         scratch[PAINT + i] *= max(grain, zero)
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _add_image(first, last, texels, levels, density, bits, scratch):  # pyright: ignore
     """Multiply the paint by a mesh's image, of 2^density texels per metre.
 
@@ -232,7 +232,7 @@ def _add_image(first, last, texels, levels, density, bits, scratch):  # pyright:
         i = j
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _image_run(first, last, texels, height, width, bits, scratch):  # pyright: ignore
     """Multiply the paint by one halving of an image: bilinear, repeating, v up."""
     f = np.float32
@@ -266,7 +266,7 @@ def _image_run(first, last, texels, height, width, bits, scratch):  # pyright: i
         scratch[PAINT + i] *= (a + scratch[PART_Y + i] * (c - a)) * f(1 / 65535)
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _light_matte(first, last, look, R, light, ambient, scratch):  # pyright: ignore
     """Write light, matte share and mirrored share of a run that mirrors nothing sharp."""
     f = np.float32
@@ -302,7 +302,7 @@ def _light_matte(first, last, look, R, light, ambient, scratch):  # pyright: ign
         scratch[FRESNEL + i] = fresnel
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _add_mirrored(run, sizes, look, R, light, ambient, scratch):  # pyright: ignore
     """Put what a smooth surface mirrors in the place of the even light that it was given.
 
@@ -335,14 +335,14 @@ def _add_mirrored(run, sizes, look, R, light, ambient, scratch):  # pyright: ign
         scratch[VALUE + i] += ambient * scratch[FRESNEL + i] * (seen - scratch[EVEN + i])
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _sharpness(roughness: Scalar) -> Scalar:
     """Return the exponent of a highlight."""
     alpha = max(roughness * roughness, np.float32(1e-3))
     return min(np.float32(2.0) / (alpha * alpha), np.float32(SHARPEST_LOBE))
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _find_dots(run, sizes, projector, depth, shadow, bits, scratch):  # pyright: ignore
     """Write the projector's light on a run per unit cosine; 0 in its shadow and outside its field.
 
@@ -389,7 +389,7 @@ def _find_dots(run, sizes, projector, depth, shadow, bits, scratch):  # pyright:
         scratch[DOTS + i] = light
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _add_dots(run, sizes, roughness, offset, depth, scratch):  # pyright: ignore
     """Add the projector's light on a run, and its highlight (see `_add_mirrored`).
 
@@ -417,7 +417,7 @@ def _add_dots(run, sizes, roughness, offset, depth, scratch):  # pyright: ignore
         scratch[VALUE + i] += scratch[DOTS + i] * value
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def _nothing(run, sizes, R, reflections, ambient, scratch):  # pyright: ignore
     """Write the surroundings that a run sees past everything."""
     f = np.float32
@@ -432,7 +432,7 @@ def _nothing(run, sizes, R, reflections, ambient, scratch):  # pyright: ignore
         scratch[VALUE + i] = ambient * _octahedral(reflections, 2, wx, wy, wz)
 
 
-@numba.njit(cache=True, fastmath=True, error_model="numpy")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True, error_model="numpy")
 def shade(hits, view, surfaces, images, light, projector, ambient, out):  # pyright: ignore
     """Write the light of every pixel; the arguments are those of `radiance`, unpacked."""
     depth, geometry, face = hits

@@ -6,10 +6,10 @@ Testing, ch. 14: sigma_phase ~ 1 / contrast), pixels that see two depths blend t
 the projector does not reach has none.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.rendering.depth_sensors.noise import correlated
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.shading import SHADOW_SLACK
@@ -64,7 +64,7 @@ def decoded(
     return out
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _reached(
     depth: Array32, exact: Array32, projector_depth: Array32, signal: Array32, out: Array32
 ) -> None:
@@ -83,7 +83,7 @@ def _reached(
                 out[v, u] = signal[v, u]
 
 
-@numba.njit(cache=True, fastmath=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True)
 def _phasors(
     exact: Array32, lit: Array32, per_px: float | np.float32, cosine: Array32, sine: Array32
 ) -> None:
@@ -94,7 +94,7 @@ def _phasors(
             sine[v, u] = lit[v, u] * np.sin(per_px * exact[v, u])
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _decode(
     exact: Array32,
     blurred: tuple[Array32, Array32, Array32],

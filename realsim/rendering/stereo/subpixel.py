@@ -10,9 +10,10 @@ Only pixels at nearly the same disparity share a window, so edges do not bend, a
 compared at its own smoothed disparity, so tilted surfaces are as good as facing ones.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array32 = NDArray[np.float32]
 SIMILAR_PX = np.float32(1.0)
@@ -62,7 +63,7 @@ def _central_slope(image: Array32) -> Array32:
     return out
 
 
-@numba.njit(cache=True, fastmath=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True)
 def _smooth(disparity: Array32, out: Array32) -> None:
     """Write the mean disparity of the similar neighbours, every other one of a 9x9 window."""
     height, width = disparity.shape
@@ -90,7 +91,7 @@ def _smooth(disparity: Array32, out: Array32) -> None:
             out[v, u] = total[u] / count[u] if found else center[u]
 
 
-@numba.njit(cache=True, fastmath=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True)
 def _compare(
     left: Array32,
     right: Array32,
@@ -129,7 +130,7 @@ def _compare(
             gradient[v, u] = f(0.5) * (left_slope[v, u] + slope)
 
 
-@numba.njit(cache=True, fastmath=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True)
 def _row_sums(
     disparity: Array32, error: Array32, gradient: Array32, half: int, sums: Array32
 ) -> None:
@@ -161,7 +162,7 @@ def _row_sums(
             ee[i] += we * e[i]
 
 
-@numba.njit(cache=True, fastmath=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True)
 def _add_similar(center: Array32, other: Array32, sums: Array32, total: Array32) -> None:
     """Add to a row's sums those of another row, where the disparity is similar."""
     for channel in range(6):
@@ -171,7 +172,7 @@ def _add_similar(center: Array32, other: Array32, sums: Array32, total: Array32)
             t[u] += w * s[u]
 
 
-@numba.njit(cache=True, fastmath=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(fastmath=True)
 def _solve(
     disparity: Array32,
     error: Array32,

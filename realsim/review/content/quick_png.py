@@ -12,10 +12,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.formats import images, png
 from realsim.formats.image_headers import MOST_PIXELS
 
@@ -128,7 +128,7 @@ def _image_data(data: bytes) -> tuple[bytes, bytes | memoryview]:
     return header, parts[0] if len(parts) == 1 else b"".join(parts)
 
 
-@numba.njit(cache=True, nogil=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(nogil=True)
 def _paeth(a: Any, b: Any, c: Any) -> Any:
     """Return which of left, above and their corner is nearest to left + above - corner."""
     to_a, to_b, to_c = abs(b - c), abs(a - c), abs(a + b - 2 * c)
@@ -137,7 +137,7 @@ def _paeth(a: Any, b: Any, c: Any) -> Any:
     return b if to_b <= to_c else c
 
 
-@numba.njit(cache=True, nogil=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(nogil=True)
 def _unfilter(filtered: Any, rows: Any, step: int) -> bool:
     """Undo the filters of the rows; return whether all are known.
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.distance_field import DistanceField, sample
@@ -198,7 +198,7 @@ def legend(full_m: float = FULL_M, within_m: float = 0.01) -> Legend:
     )  # fmt: skip
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _near_points(
     lattice: tuple[Array32, Array, float],
     points: Array32,

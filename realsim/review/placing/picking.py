@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, ObjectPose
@@ -149,7 +149,7 @@ def _meets_ball(o: Array, d: Array, center: Array, radius: float) -> bool:
     return along > 0 and away2 - along**2 <= radius**2
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _first_triangle(o: Array, d: Array, vertices: Array, faces: NDArray[np.int32]) -> float:
     """Return the parameter of the first triangle on a ray; inf = none.
 
@@ -184,7 +184,7 @@ def _first_triangle(o: Array, d: Array, vertices: Array, faces: NDArray[np.int32
     return first
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _in_cone(o: Array, d: Array, points: NDArray[np.float32], radius: float, tangent: float) -> int:
     """Return which of the points (N, 3) a ray means; -1 = none. See `ray_on_cloud`."""
     best, least = -1, np.inf

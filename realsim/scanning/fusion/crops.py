@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.camera import project, ray_table
 from realsim.records import CameraIntrinsics
@@ -81,7 +81,7 @@ def cropped(
     )
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def pixel_of(camera: Array, x: float, y: float, z: float) -> tuple[int, int]:
     """Return the pixel (u, v) that sees a camera point, (-1, -1) if the lens model has none."""
     a, b = x / z, y / z

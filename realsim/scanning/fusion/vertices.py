@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.scanning.fusion.crops import Crops, pixel_of
 from realsim.scanning.fusion.result import FusionConfig, FusionFrame
 
@@ -29,7 +29,7 @@ class VertexEvidence:
     """(V, 3) mean RGB of the views that measured it; grey where none did."""
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _look(
     view: tuple[NDArray[np.float32], NDArray[np.int64], Array],
     camera: Array,

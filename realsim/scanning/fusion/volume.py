@@ -12,10 +12,10 @@ of all that is around; that word counts only where too few views measured anythi
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
 from realsim.scanning.fusion.crops import Crops, pixel_of
 from realsim.scanning.fusion.result import FusionConfig
@@ -47,7 +47,7 @@ class Volume:
     """(X, Y, Z) number of views that say something about the voxel."""
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _one_view(  # noqa: PLR0911 - seven ways to see nothing, in a row
     view: tuple[Array32, NDArray[np.int64], Array],
     lens: tuple[Array, Array],
@@ -114,7 +114,7 @@ def _one_view(  # noqa: PLR0911 - seven ways to see nothing, in a row
     return min(along, truncation), weight, edge
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _fuse(
     crops: tuple[Array32, NDArray[np.int64], tuple[Array, Array]],
     Ts_cam_table: Array,

@@ -14,10 +14,10 @@ Shape: the real surface lies outside of the mesh by delta_k in patch k of the su
 surface point has r - delta_k and an outline point r + delta_k.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
 
 Array = NDArray[np.float64]
@@ -41,7 +41,7 @@ GATE = 0.05
 """Least cosine between a surface and the direction to the camera that saw it."""
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _turned(M: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return the vector turned by the rotation of M."""
     return (
@@ -51,7 +51,7 @@ def _turned(M: Array, x: float, y: float, z: float) -> tuple[float, float, float
     )
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _turned_back(M: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return the vector turned by the inverse of the rotation of M."""
     return (
@@ -61,7 +61,7 @@ def _turned_back(M: Array, x: float, y: float, z: float) -> tuple[float, float, 
     )
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _camera_terms(
     J: Array, a: tuple[float, float, float], h: tuple[float, float, float], r: float
 ) -> None:
@@ -84,7 +84,7 @@ def _camera_terms(
     J[16] = along * z * z
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _facing(
     lattice: tuple[NDArray[np.float32], Array, float],
     m: tuple[float, float, float],
@@ -122,7 +122,7 @@ def _facing(
     return r - t * facing, gx, gy, gz, facing > GATE
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def add_surface(
     lattice: tuple[NDArray[np.float32], Array, float],
     pose: tuple[float, Array, Array],
@@ -195,7 +195,7 @@ def add_surface(
                 H[k, c, d] += w * J[c] * J[d]
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def add_table(
     frame: tuple[Array, Array, Array, Array],
     cameras: Array,
@@ -242,7 +242,7 @@ def add_table(
     return total
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def add_outline(  # noqa: PLR0915 - one pass over the points, in compiled code
     pose: tuple[float, Array, Array],
     T_world_cam: Array,

@@ -8,10 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.camera import project, ray_table
 from realsim.geometry.clouds import voxel_mean
@@ -139,7 +139,7 @@ OBJECT, GROUND, TABLE = 1, 2, 4
 """Marks of a pixel: of the object; of what is not the object; of the table around it."""
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _marks(
     rays: Array32,
     depth: Array32,

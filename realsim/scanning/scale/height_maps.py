@@ -10,10 +10,10 @@ Without the last a small scale would win, without the free space a large one.
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.mesh import hull_vertices
@@ -261,7 +261,7 @@ def _ray_grid(turned: Array, rays: int) -> tuple[Array, float]:
     return grid.reshape(-1, 3), float(np.sqrt(np.prod(extent / counts)))
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def agreement(model: float, measured: float, tolerance: float, low_cost: float) -> float:
     """Return +1 where heights [m] agree, down to -1 where the space was seen free.
 
@@ -279,7 +279,7 @@ def agreement(model: float, measured: float, tolerance: float, low_cost: float) 
     return max(-low_cost, min(1.0, 1.0 + (1.0 + low_cost) * 0.5 * (1.0 + gap / tolerance)))
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def map_score(
     heights: Array, place: Array, points: Array, move: Array, rule: Array, areas: Array
 ) -> float:

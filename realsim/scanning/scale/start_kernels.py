@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.scanning.scale.height_maps import agreement, map_score
 
 Array = NDArray[np.float64]
@@ -50,7 +50,7 @@ class Rule(NamedTuple):
     """(3,)."""
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def scan(
     evidence: Evidence3, points: Array, area: float, scales: Array, turns: Array, centers: Array,
     rule: Array,
@@ -81,7 +81,7 @@ def scan(
     return out
 
 
-@numba.njit(cache=True, inline="always")  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit(inline="always")
 def _at(grid: Array32, corner: Array, x: float, y: float, z: float) -> float:
     """Return the distance at a point, a large one outside of the grid."""
     i = int(np.floor((x - corner[0]) / corner[3]))
@@ -92,7 +92,7 @@ def _at(grid: Array32, corner: Array, x: float, y: float, z: float) -> float:
     return OUTSIDE
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def judge(
     evidence: Evidence3, model: Model3, template: tuple[Array, float, Array], R: Array, at: Array,
     rule: Rule,
@@ -137,7 +137,7 @@ def judge(
     return w[0] * score + w[1] * near / len(evidence.points) + w[2] * seen / weight
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def climb(
     evidence: Evidence3, model: Model3, template: tuple[Array, float, Array],
     start: tuple[Array, Array], rule: Rule, steps: Array, limits: tuple[int, int],
@@ -175,7 +175,7 @@ def climb(
     return R, at, best
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def near_share(model: Model3, relative: Array, limit: float) -> float:
     """Return which share of the samples, moved by (3, 4) relative, lies near the surface.
 

@@ -4,10 +4,10 @@ What `label_maps` makes of `Labels.object_coordinates()` and `Labels.normals()`,
 float32 in between: those are twice as large, and allocating them costs as much as filling them.
 """
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.formats import label_maps
 from realsim.rendering.labels import Labels
 
@@ -39,7 +39,7 @@ def coordinate_counts(
     )  # fmt: skip
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _coordinates(
     rays: Array32,
     depth: Array32,
@@ -78,7 +78,7 @@ def normal_counts(labels: Labels) -> Counts:
     return _normals(s.rays, labels.geometry, labels.face, s.Ts_obj_cam, s.normals, s.starts)
 
 
-@numba.njit(cache=True)  # pyright: ignore[reportUntypedFunctionDecorator]
+@njit
 def _normals(
     rays: Array32,
     geometry: Int32,

@@ -13,10 +13,10 @@ arm's foot (link 0) against table and objects, because it is bolted to where it 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_sim_bridge.arm import panda
@@ -199,11 +199,7 @@ def _levers(links: NDArray[np.int64], centers: Array, slides: Array) -> Array:
 _NEAR_END, _FAR_START = max(NEAR_LINKS) + 1, min(FAR_LINKS)
 
 
-def _compiled(function: Any) -> Any:
-    return numba.njit(cache=True)(function)
-
-
-@_compiled
+@njit
 def _centers_into(q: Any, opening: float, body: Any, frames: Any, centers: Any) -> None:
     """Write the spheres' centres (S, 3) in the table's frame [m]."""
     frames_into(q, body.T_table_base, frames)
@@ -215,7 +211,7 @@ def _centers_into(q: Any, opening: float, body: Any, frames: Any, centers: Any) 
             centers[s, r] = T[r, 0] * x + T[r, 1] * y + T[r, 2] * z + T[r, 3]
 
 
-@_compiled
+@njit
 def _outer_gap(
     x: float, y: float, z: float, radius: float, clearance: float, obstacles: Any
 ) -> Any:
@@ -233,7 +229,7 @@ def _outer_gap(
     return min(gap, table), FREE
 
 
-@_compiled
+@njit
 def _self_step(centers: Any, body: Any, rates: Any, turns: Any, step: float) -> float:
     """Return how far along a move wrist and hand are safe of base and shoulder; -1 = too near.
 
@@ -266,7 +262,7 @@ def _self_step(centers: Any, body: Any, rates: Any, turns: Any, step: float) -> 
     return step
 
 
-@_compiled
+@njit
 def _stop_or_step(centers: Any, body: Any, obstacles: Any, rates: Any, turns: Any) -> Any:
     """Return what stops a configuration (or FREE), and how far along a move it is safe.
 
@@ -292,7 +288,7 @@ def _stop_or_step(centers: Any, body: Any, obstacles: Any, rates: Any, turns: An
     return FREE, step
 
 
-@_compiled
+@njit
 def blame_move(start: Any, end: Any, opening: float, body: Any, obstacles: Any, room: Any) -> Any:
     """Return what stops the straight move from `start` to `end` (7,), or FREE.
 
@@ -318,14 +314,14 @@ def blame_move(start: Any, end: Any, opening: float, body: Any, obstacles: Any, 
         t = min(t + step, 1.0)
 
 
-@_compiled
+@njit
 def room_for(body: Any) -> Any:
     """Return arrays for `blame_move` to work in."""
     count = len(body.links)
     return np.empty((9, 3, 4)), np.empty((count, 3)), np.empty(count), np.empty(7), np.empty(7)
 
 
-@_compiled
+@njit
 def _blame_paths(paths: Any, openings: Any, body: Any, obstacles: Any) -> Any:
     """Return what stops each path (N, W, 7) of straight moves first, or FREE."""
     codes = np.full(len(paths), FREE, dtype=np.int64)

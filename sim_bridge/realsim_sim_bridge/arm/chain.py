@@ -6,10 +6,10 @@ is its upper three rows (3, 4).
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim_sim_bridge.arm import panda
 
 Array = NDArray[np.float64]
@@ -28,11 +28,7 @@ _A, _D = panda.A_M.copy(), panda.D_M.copy()
 _T_7_GRASP = np.linalg.inv(panda.JOINT7_GRASP)
 
 
-def _compiled(function: Any) -> Any:
-    return numba.njit(cache=True)(function)
-
-
-@_compiled
+@njit
 def frames_into(q: Any, T_a_base: Any, frames: Any) -> None:
     """Write T_a_link (9, 3, 4) of joints q (7,) into `frames`: base, joints 1 to 7, grasp."""
     for r in range(3):
@@ -54,7 +50,7 @@ def frames_into(q: Any, T_a_base: Any, frames: Any) -> None:
         frames[8, r, 3] += frames[7, r, 3]
 
 
-@_compiled
+@njit
 def _jacobian_into(frames: Any, J: Any) -> None:
     """Write the Jacobian (6, 7), rotation first, at the grasp's origin."""
     for i in range(7):
@@ -66,7 +62,7 @@ def _jacobian_into(frames: Any, J: Any) -> None:
         J[3, i], J[4, i], J[5, i] = zy * z - zz * y, zz * x - zx * z, zx * y - zy * x
 
 
-@_compiled
+@njit
 def _least_motion(J: Any, twist: Any, L: Any, joints: Any) -> None:
     """Write the least joint motion (7,) that gives the twist (6,): J^T (J J^T + damping)^-1 twist.
 
@@ -96,7 +92,7 @@ def _least_motion(J: Any, twist: Any, L: Any, joints: Any) -> None:
             joints[i] += J[r, i] * y[r]
 
 
-@_compiled
+@njit
 def _gap_to(frames: Any, R: Any, x: float, y: float, z: float, gap: Any) -> float:
     """Write the twist (6,) from the grasp frame to the pose R (3, 3), (x, y, z); return its size.
 
@@ -116,7 +112,7 @@ def _gap_to(frames: Any, R: Any, x: float, y: float, z: float, gap: Any) -> floa
     return np.sqrt(total)
 
 
-@_compiled
+@njit
 def follow_lines(q: Any, Ts: Any, directions: Any, distances: Any) -> Any:
     """Follow a straight line from each configuration without changing branch.
 

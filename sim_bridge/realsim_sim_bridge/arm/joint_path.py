@@ -8,10 +8,10 @@ whatever was planned before and in which process.
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.arm_space import FREE, ArmSpace, blame_move, room_for
 
@@ -67,11 +67,7 @@ _EDGES_PER_GROWTH = 16
 """A greedy tree adds at most so many edges for one target: the joint space is shorter."""
 
 
-def _compiled(function: Any) -> Any:
-    return numba.njit(cache=True)(function)
-
-
-@_compiled
+@njit
 def _uniform(state: Any) -> float:
     """Return the next number from 0 to 1 of a xorshift generator (Marsaglia 2003)."""
     x = state[0]
@@ -82,7 +78,7 @@ def _uniform(state: Any) -> float:
     return float(x >> np.uint64(11)) * 2.0**-53
 
 
-@_compiled
+@njit
 def _distance(a: Any, b: Any) -> float:
     total = 0.0
     for k in range(7):
@@ -90,7 +86,7 @@ def _distance(a: Any, b: Any) -> float:
     return np.sqrt(total)
 
 
-@_compiled
+@njit
 def _grow(
     nodes: Any, parents: Any, count: int, target: Any, extension: float, greedy: bool, check: Any
 ) -> Any:
@@ -130,7 +126,7 @@ def _grow(
     return count, last, False
 
 
-@_compiled
+@njit
 def _branch(nodes: Any, parents: Any, node: int) -> Any:
     """Return the nodes from `node` to the root (M, 7)."""
     count, at = 0, node
@@ -143,7 +139,7 @@ def _branch(nodes: Any, parents: Any, node: int) -> Any:
     return path
 
 
-@_compiled
+@njit
 def _connect(
     start: Any, goal: Any, opening: float, body: Any, obstacles: Any, config: Any, state: Any
 ) -> Any:
@@ -176,7 +172,7 @@ def _connect(
     return None
 
 
-@_compiled
+@njit
 def _shortened(path: Any, shortcuts: int, check: Any, state: Any) -> Any:
     """Return the path with straight moves between random pairs of its points, where free."""
     opening, body, obstacles, room = check

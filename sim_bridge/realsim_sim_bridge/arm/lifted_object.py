@@ -9,10 +9,10 @@ sides, that is in each of eight directions around it.
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim_sim_bridge.grasping.candidates import Surroundings
 
 Array = NDArray[np.float64]
@@ -98,4 +98,4 @@ def _look_up_loops(
     return above, sectors, gap
 
 
-_look_up = numba.njit(cache=True)(_look_up_loops)
+_look_up = njit(_look_up_loops)

@@ -7,9 +7,10 @@ themselves are asked, which lie sorted by cell.
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array = NDArray[np.float64]
 
@@ -61,11 +62,7 @@ def obstacles_of(points: Array, instances: NDArray[np.int64], own: NDArray[np.bo
     )
 
 
-def _compiled(function: Any) -> Any:
-    return numba.njit(cache=True)(function)
-
-
-@_compiled
+@njit
 def _bounds(occupied: Any) -> Any:
     """Return the distance (X, Y, Z) [m] from each cell's box to the nearest occupied one.
 
@@ -102,7 +99,7 @@ def _bounds(occupied: Any) -> Any:
     return (np.sqrt(squared) * CELL_M).astype(np.float32)
 
 
-@_compiled
+@njit
 def least_distance(obstacles: Any, x: float, y: float, z: float) -> float:
     """Return a lower bound of the distance [m] from (x, y, z) to any point."""
     origin, bound, box = obstacles.origin, obstacles.bound_m, obstacles.box
@@ -123,7 +120,7 @@ def least_distance(obstacles: Any, x: float, y: float, z: float) -> float:
     return outside
 
 
-@_compiled
+@njit
 def nearest_within(obstacles: Any, x: float, y: float, z: float, radius: float) -> Any:
     """Return the distance [m] to the nearest point within `radius` and its row, or (inf, -1)."""
     origin, starts, points = obstacles.origin, obstacles.starts, obstacles.points

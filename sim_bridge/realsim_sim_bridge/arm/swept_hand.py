@@ -7,10 +7,10 @@ Kay & Kajiya 1986). Nothing is stepped over.
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim_sim_bridge.arm.obstacles import CELL_M, Obstacles
 
 Array = NDArray[np.float64]
@@ -47,11 +47,7 @@ def first_touched(
     )
 
 
-def _compiled(function: Any) -> Any:
-    return numba.njit(cache=True)(function)
-
-
-@_compiled
+@njit
 def _meets(box: Any, x: Any, move: Any) -> bool:
     """Return whether x - s move is inside the box (2, 3) for an s from 0 to 1."""
     first, last = 0.0, 1.0
@@ -67,7 +63,7 @@ def _meets(box: Any, x: Any, move: Any) -> bool:
     return True
 
 
-@_compiled
+@njit
 def _extent(box: Any, T: Any, move: Any, low: Any, high: Any) -> None:
     """Write the corners of the moving box's extent in the table's frame."""
     for r in range(3):
@@ -78,7 +74,7 @@ def _extent(box: Any, T: Any, move: Any, low: Any, high: Any) -> None:
             high[r] += max(a, b)
 
 
-@_compiled
+@njit
 def _touched(box: Any, T: Any, move: Any, obstacles: Any, own_too: bool, room: Any) -> int:
     """Return the instance of an object that one moving box touches, or -1."""
     low, high, x, turned = room
@@ -109,7 +105,7 @@ def _touched(box: Any, T: Any, move: Any, obstacles: Any, own_too: bool, room: A
     return -1
 
 
-@_compiled
+@njit
 def _search(boxes: Any, Ts: Any, moves: Any, obstacles: Any, own_too: bool) -> Any:
     """Return the instance that each hand (N,) touches first, or -1."""
     found = np.full(len(boxes), -1, dtype=np.int64)

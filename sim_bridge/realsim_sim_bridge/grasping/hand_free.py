@@ -5,9 +5,10 @@ Compiled, because thousands of hands meet thousands of points.
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array = NDArray[np.float64]
 STRIDE = 61
@@ -84,4 +85,4 @@ def _search_loops(boxes: Any, Ts: Any, points: Any) -> Any:
     return found
 
 
-_search = numba.njit(cache=True)(_search_loops)
+_search = njit(_search_loops)

@@ -8,10 +8,10 @@ axis theorem: no piece of a triangle that is inside a box goes unnoticed, howeve
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim_sim_bridge.grasping.hand_free import boxes_free
 
 Array = NDArray[np.float64]
@@ -156,7 +156,7 @@ def _triangle_meets_box_loops(a: Any, b: Any, c: Any, half: Any) -> Any:
     return True
 
 
-_triangle_meets_box = numba.njit(cache=True)(_triangle_meets_box_loops)
+_triangle_meets_box = njit(_triangle_meets_box_loops)
 
 
 def _leaf_hit_loops(boxes: Any, R: Any, t: Any, triangles: Any, start: Any) -> Any:
@@ -179,7 +179,7 @@ def _leaf_hit_loops(boxes: Any, R: Any, t: Any, triangles: Any, start: Any) -> A
     return -1
 
 
-_leaf_hit = numba.njit(cache=True)(_leaf_hit_loops)
+_leaf_hit = njit(_leaf_hit_loops)
 
 
 def _near_loops(boxes: Any, R: Any, t: Any, center: Any, halves: Any) -> Any:
@@ -203,7 +203,7 @@ def _near_loops(boxes: Any, R: Any, t: Any, center: Any, halves: Any) -> Any:
     return False
 
 
-_near = numba.njit(cache=True)(_near_loops)
+_near = njit(_near_loops)
 
 
 def _search_loops(
@@ -235,4 +235,4 @@ def _search_loops(
     return found
 
 
-_search = numba.njit(cache=True)(_search_loops)
+_search = njit(_search_loops)

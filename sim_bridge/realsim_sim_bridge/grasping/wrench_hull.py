@@ -15,9 +15,10 @@ point contacts (gamma = 0) have no volume in six dimensions: the quality is 0.
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.compiled import njit
 
 Array = NDArray[np.float64]
 SPANLESS = 1e-10
@@ -97,7 +98,7 @@ def _pivot_loops(rows: Any, order: Any, i: Any) -> Any:
     return True
 
 
-_pivot = numba.njit(cache=True)(_pivot_loops)
+_pivot = njit(_pivot_loops)
 
 
 def _hyperplane_loops(p: Any, rows: Any, normal: Any) -> Any:
@@ -129,7 +130,7 @@ def _hyperplane_loops(p: Any, rows: Any, normal: Any) -> Any:
     return True
 
 
-_hyperplane = numba.njit(cache=True)(_hyperplane_loops)
+_hyperplane = njit(_hyperplane_loops)
 
 
 def _facet_distance_loops(p: Any, corners: Any, rows: Any, normal: Any, scale: Any) -> Any:
@@ -154,7 +155,7 @@ def _facet_distance_loops(p: Any, corners: Any, rows: Any, normal: Any, scale: A
     return -offset if above else offset
 
 
-_facet_distance = numba.njit(cache=True)(_facet_distance_loops)
+_facet_distance = njit(_facet_distance_loops)
 
 
 def _nearest_facets_loops(wrenches: Any, triangles: Any, lines: Any, basis: Any) -> Any:
@@ -184,4 +185,4 @@ def _nearest_facets_loops(wrenches: Any, triangles: Any, lines: Any, basis: Any)
     return nearest
 
 
-_nearest_facets = numba.njit(cache=True)(_nearest_facets_loops)
+_nearest_facets = njit(_nearest_facets_loops)

@@ -7,11 +7,11 @@ other side of a mug's wall) does not.
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
 
@@ -96,4 +96,4 @@ def _extents_loops(triangles: Any, Ts: Any, finger: Any, halves: Any) -> Any:
     return extents
 
 
-_extents: Any = numba.njit(cache=True)(_extents_loops)
+_extents: Any = njit(_extents_loops)
