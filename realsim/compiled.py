@@ -2,8 +2,8 @@
 
 Numba keeps compiled code beside the source file, so that every clone compiles anew, and it does not
 notice when a function that the loop calls has changed in another file. Here compiled code lies in
-one folder of the user (`$NUMBA_CACHE_DIR`, or `realsim/numba` in `$XDG_CACHE_HOME`), under a hash of
-the loop's file, of every compiled function and constant that it uses, and of Numba's version.
+one folder of the user (`$NUMBA_CACHE_DIR`, or `realsim/numba` in `$XDG_CACHE_HOME`). Its name is a
+hash of the loop's file, of each compiled function and constant that it uses, and of the version.
 """
 
 import contextlib
