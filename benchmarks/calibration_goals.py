@@ -2,25 +2,7 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class Goal:
-    """What a figure should be."""
-
-    low: float = -np.inf
-    high: float = np.inf
-
-    def __str__(self) -> str:
-        if np.isfinite(self.low) and np.isfinite(self.high):
-            return f"{self.low:g}" if self.low == self.high else f"{self.low:g} to {self.high:g}"
-        return f">= {self.low:g}" if np.isfinite(self.low) else f"<= {self.high:g}"
-
-    def met(self, value: float) -> bool:
-        """Return whether a figure is as good as it should be."""
-        return bool(self.low <= value <= self.high)
-
+from figures import Goal
 
 COVERED = Goal(low=0.93, high=0.97)
 GOALS = {

@@ -1,21 +1,50 @@
-"""Figures of a benchmark: what they should be, what was measured, the table and the JSON.
+"""What all benchmarks have in common: the command line, parts, goals, the table and the JSON.
 
-Imported by the benchmarks. A figure that could not be measured is missing from what its part found;
-its key is null in the JSON.
+A benchmark is a docstring, its figures with their goals, and parts that measure them:
+
+    FIGURES = {"error_mm": Figure(unit="mm", goal=Goal(high=0.5))}
+    PARTS = {"exact": "labels_exact:exactness"}    # imported when it runs; or a function
+    if __name__ == "__main__":
+        run("labels", __doc__, ("numpy", "realsim"), FIGURES, PARTS)
+
+A part takes the command line (`seed`, `quick`, `parts`, and what the benchmark added) and returns
+what it found. A figure that could not be measured is missing there; its key is null in the JSON.
 """
 
 import argparse
+import json
 import os
 import platform
-from collections.abc import Mapping, Sequence
+import sys
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from calibration_goals import Goal
 
 from realsim.app.console import Console
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Goal:
+    """What a figure should be."""
+
+    low: float = -np.inf
+    high: float = np.inf
+
+    def __str__(self) -> str:
+        if np.isfinite(self.low) and np.isfinite(self.high):
+            return f"{self.low:g}" if self.low == self.high else f"{self.low:g} to {self.high:g}"
+        return f">= {self.low:g}" if np.isfinite(self.low) else f"<= {self.high:g}"
+
+    def met(self, value: float) -> bool:
+        """Return whether a figure is as good as it should be."""
+        return bool(self.low <= value <= self.high)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -128,3 +157,83 @@ def _version(name: str) -> str | None:
         return version(name)
     except PackageNotFoundError:
         return None
+
+
+def run(
+    name: str,
+    text: str,
+    packages: Sequence[str],
+    figures: Mapping[str, Figure],
+    parts: Mapping[str, "str | Callable[[argparse.Namespace], Found]"],
+    *,
+    seed: int = 0,
+    options: Callable[[argparse.ArgumentParser], object] | None = None,
+    end: Callable[[Found], object] | None = None,
+) -> None:
+    """Run a benchmark from its command line: parts, table, JSON; exit with 1 if a part failed.
+
+    Args:
+        name: of the benchmark, in the JSON.
+        text: its docstring, which is the help; the first line is the table's title.
+        packages: whose versions are written.
+        figures: what it measures; all of these keys are in the JSON of every run.
+        parts: what measures them: a function of the command line, or "module:function".
+        seed: used where the command line gives none.
+        options: adds options of its own to the command line.
+        end: adds what follows from all parts.
+    """
+    arguments = _arguments_of(text, parts, seed, options)
+    console, begin, found = Console(), time.perf_counter(), Found()
+    failures: dict[str, str] = {}
+    for part in arguments.parts:
+        start = time.perf_counter()
+        try:
+            found.take(_part(parts[part])(arguments))
+        except KeyboardInterrupt:
+            sys.exit(130)
+        except Exception as error:
+            failures[part] = f"{type(error).__name__}: {error}"
+            print(f"\n{part}:\n{traceback.format_exc()}", file=sys.stderr)
+        console.warn(f"{part}: {time.perf_counter() - start:.0f} s")
+    if end is not None:
+        end(found)
+    seconds = time.perf_counter() - begin
+    print_table(console, text.splitlines()[0].rstrip("."), figures, found)
+    for part, why in failures.items():
+        console.warn(f"the part {part} failed: {why}")
+    console.say(f"{seconds:.0f} s, load {os.getloadavg()[0]:.1f}")
+    if arguments.json:
+        document = document_of(name, packages, figures, arguments, found)
+        document |= {"wall_s": round(seconds, 1), "failures": failures}
+        arguments.json.write_text(json.dumps(document, indent=1, default=str))
+    if failures:
+        sys.exit(1)
+
+
+def _arguments_of(
+    text: str,
+    parts: Mapping[str, Any],
+    seed: int,
+    options: Callable[[argparse.ArgumentParser], object] | None,
+) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=text, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    parser.add_argument("--quick", action="store_true", help="every figure from fewer samples")
+    parser.add_argument("--seed", type=int, default=seed, help=f"of what is random ({seed})")
+    parser.add_argument(
+        "--part", action="append", dest="parts", choices=list(parts), help="run this one alone"
+    )
+    if options is not None:
+        options(parser)
+    arguments = parser.parse_args()
+    arguments.parts = arguments.parts or list(parts)
+    return arguments
+
+
+def _part(what: "str | Callable[[argparse.Namespace], Found]") -> Callable[..., Found]:
+    if callable(what):
+        return what
+    module, function = what.split(":")
+    return getattr(import_module(module), function)

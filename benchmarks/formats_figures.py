@@ -1,7 +1,6 @@
 """What the figures of `formats.py` are, should be, and have as rivals."""
 
-from calibration_goals import Goal
-from figures import Figure
+from figures import Figure, Goal
 from formats_round_trips import BOUND_MM
 
 FIGURES = {

@@ -1,7 +1,6 @@
 """What the figures of `labels.py` are, should be, and have as rivals."""
 
-from calibration_goals import Goal
-from figures import Figure
+from figures import Figure, Goal
 
 PAPER_FRAMES_PER_GPU_H = 100 * 256 / (7 * 24)
 """The paper: 100 scenes of 256 views in a week on one RTX 6000, grasps included."""

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from calibration_goals import Goal
+from figures import Goal
 
 LOST_MM = 1000.0
 """Error of an object that was not found [mm]."""

@@ -1,7 +1,6 @@
 """What the figures of `review.py` are and should be."""
 
-from calibration_goals import Goal
-from figures import Figure
+from figures import Figure, Goal
 
 FIGURES = {
     "click_ms": Figure(unit="ms", goal=Goal(high=150.0)),

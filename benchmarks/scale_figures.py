@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from calibration_goals import Goal
+from figures import Goal
 
 Kind = Literal["exact", "distorted", "cold"]
 KINDS: tuple[Kind, ...] = ("exact", "distorted", "cold")

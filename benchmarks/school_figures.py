@@ -3,8 +3,7 @@
 Imported by `school.py`.
 """
 
-from calibration_goals import Goal
-from figures import Figure
+from figures import Figure, Goal
 
 PAPER_GRASPS_PER_S = 100 * 2198 / (7 * 86400)
 """The paper: 100 scenes of 2198 candidates in a week on one RTX 6000."""
