@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim.geometry import se3
-from realsim.records import Mesh
+from realsim.geometry import camera, se3
+from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Material
 
 Array = NDArray[np.float64]
@@ -66,6 +66,16 @@ class HitBuffer:
     """(N, 2) barycentric weights of the face's second and third vertex."""
     normal: Array32
     """(N, 3) unit normal of the face in world, on the side the face's winding says."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class DepthView:
+    """What each pixel of a camera sees."""
+
+    depth_m: Array32
+    """(H, W) depth along z [m]; 0 = nothing."""
+    geometry: NDArray[np.int32]
+    """(H, W) index of the placed mesh; -1 = nothing."""
 
 
 class RayScene:
@@ -148,6 +158,18 @@ class RayScene:
             face=hits["primitive_ids"].numpy().view(np.int32),
             uv=hits["primitive_uvs"].numpy(),
             normal=hits["primitive_normals"].numpy(),
+        )
+
+    def view(
+        self, intrinsics: CameraIntrinsics, T_world_cam: ArrayLike, stride: int = 1
+    ) -> DepthView:
+        """Return what a camera at T_world_cam (4, 4) sees at every `stride`-th pixel's centre."""
+        T = np.asarray(T_world_cam, dtype=np.float64)
+        rays = np.ascontiguousarray(camera.ray_table(intrinsics)[::stride, ::stride])
+        t, geometry = self.first_hits(T[:3, 3], rotated(rays, T[:3, :3]).reshape(-1, 3))
+        return DepthView(
+            depth_m=np.where(np.isfinite(t), t, 0).reshape(rays.shape[:2]),
+            geometry=geometry.reshape(rays.shape[:2]),
         )
 
     def occluded(self, origins: Array, directions: Array32, until: float = np.inf) -> Mask:

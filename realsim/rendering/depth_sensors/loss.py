@@ -6,14 +6,13 @@ surface's reflectance (Lambert). A pixel is lost when that signal is under a thr
 from place to place: a normal distribution in the logarithm of the signal.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Material
+from realsim.rendering.developing import srgb_decoded
+from realsim.rendering.rays import PlacedMesh
 
 Array32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -23,6 +22,10 @@ sRGB 48 of 255, black plastic and rubber, which projected patterns show in patch
 SHINY_LOSS = 0.6
 """Share lost of a polished metal seen from the working distance: its highlight blinds, and its
 mirror image of the surroundings gives wrong matches."""
+TEXELS = 10_000
+"""So many texels, evenly spread, are a texture's mean."""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Of linear red, green and blue (ITU-R BT.709)."""
 
 
 def signal_loss(
@@ -103,47 +106,46 @@ def blob_mask(
     return mask > 0
 
 
-def loss_map(ids: NDArray[np.integer], shares: Mapping[int, float]) -> Array32:
-    """Return the share (H, W) of pixels lost, from each instance's.
-
-    Args:
-        ids: (H, W) instance per pixel, -1 = none (Labels.ids).
-        shares: share lost [0, 1] of an instance; -1 stands for the background. Others lose nothing.
-
-    Raises:
-        InputError: a share is outside [0, 1].
-    """
-    wrong = {i: s for i, s in shares.items() if not 0 <= s <= 1}
-    if wrong:
-        raise InputError(f"shares that are lost lie between 0 and 1; found {wrong}.")
-    lost = np.zeros(ids.shape, np.float32)
-    for instance, share in shares.items():
-        lost[ids == instance] = share
-    return lost
-
-
 def material_loss(material: Material) -> float:
     """Return the share of pixels that a surface of this material is expected to lose.
 
     Two causes, independent of each other: dark surfaces return too little light, and polished metal
     returns it in one direction. A rough guess, for materials that nobody has measured; a fit to
-    real frames of the object (`depth_loss_fit`) is better.
+    real frames of the object (`loss_fit`) is better.
     """
     from scipy.special import ndtr
 
-    r, g, b = _mean_color(material)
-    luminance = max(0.2126 * r + 0.7152 * g + 0.0722 * b, 1e-4)
+    luminance = max(float(LUMINANCE @ _mean_color(material)), 1e-4)
     dark = float(ndtr(np.log(DARK_REFLECTANCE / luminance) / DARK_SPREAD))
     shiny = SHINY_LOSS * material.metallic * (1 - material.roughness) ** 2
     return 1 - (1 - dark) * (1 - shiny)
 
 
-def _mean_color(material: Material) -> tuple[float, float, float]:
-    """Return the linear base colour, averaged over the image where there is one."""
-    r, g, b = material.base_color
-    if material.base_color_image is None:
-        return r, g, b
-    s = material.base_color_image.reshape(-1, 3)[:: max(1, material.base_color_image.size // 30000)]
-    s = s.astype(np.float64) / 255
-    linear = np.where(s <= 0.04045, s / 12.92, ((s + 0.055) / 1.055) ** 2.4).mean(0)
-    return r * float(linear[0]), g * float(linear[1]), b * float(linear[2])
+def look_of(placed: PlacedMesh) -> Material:
+    """Return a mesh's material with its mean colour as the base colour, without images.
+
+    A mesh without a material has the mean of its texture or colours, else a light grey.
+    """
+    look, mesh = placed.material, placed.mesh
+    if look is None:
+        look = Material()
+        own = mesh.colors if mesh.texture is None else mesh.texture
+        mean = np.array(look.base_color) if own is None else _mean_srgb(own)
+    else:
+        mean = _mean_color(look)
+    r, g, b = np.clip(mean, 0.0, 1.0).tolist()
+    return Material(base_color=(r, g, b), roughness=look.roughness, metallic=look.metallic)
+
+
+def _mean_color(material: Material) -> NDArray[np.float64]:
+    """Return the linear base colour (3,), averaged over the image where there is one."""
+    base = np.array(material.base_color)
+    image = material.base_color_image
+    return base if image is None else base * _mean_srgb(image)
+
+
+def _mean_srgb(values: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return the mean linear light (3,) of 8-bit sRGB values (..., 3)."""
+    flat = values.reshape(-1, 3)
+    flat = flat[:: max(1, len(flat) // TEXELS)]
+    return np.asarray(srgb_decoded(flat / 255.0), np.float64).mean(0)

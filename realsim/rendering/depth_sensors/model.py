@@ -5,12 +5,10 @@ noise of constant size in d becomes sigma_z = z^2 sigma_d / (f B), surfaces that
 have no match, matches smear over depth edges. The defaults are those of a RealSense D405.
 
 What the steps of `DepthSensorModel.measure` need stands beside this file: which surfaces only one
-eye sees (depth_shadow), what is lost (depth_loss), and noise (depth_noise).
+eye sees (shadow), what is lost (loss), and noise (noise).
 """
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,7 +30,7 @@ from realsim.rendering.depth_sensors.noise import (
     uniform,
 )
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
-from realsim.rendering.depth_sensors.sensor_file import checked_fields, read_sensor
+from realsim.rendering.depth_sensors.sensor_file import SensorRecord
 from realsim.rendering.depth_sensors.shadow import half_occluded, require_same_size, shadow_mask
 from realsim.rendering.rays import RayScene
 
@@ -48,13 +46,16 @@ ASSUMED_BY_PATTERN: dict[str, dict[str, float]] = {
     },
 }  # fmt: skip
 """What differs from the defaults with each pattern: assumptions, to be replaced by a fit."""
-FORMAT = "realsim depth sensor 1"
-"""Names the kind of JSON file that `DepthSensorModel.load` reads."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class DepthSensorModel:
+class DepthSensorModel(SensorRecord):
     """A stereo depth camera. Every fault can be switched off by its zero."""
+
+    FORMAT = "realsim depth sensor 1"
+    KEY = "model"
+    NAME = "a depth sensor model"
+    COMMAND = "realsim depth-fit FRAMES --out FILE"
 
     baseline_m: float = 0.018
     """Distance of the two eyes [m]; the D405's 18 mm."""
@@ -112,7 +113,7 @@ class DepthSensorModel:
     """Whether the band that the second eye's picture does not cover is lost, with occlusion."""
     signal_range_m: float = 0.0
     """Depth at which half of a white surface seen frontally is lost for want of light [m]; loss
-    grows with distance, obliquity and darkness from there (see depth_loss). 0 = never."""
+    grows with distance, obliquity and darkness from there (see loss). 0 = never."""
     signal_spread: float = 0.4
     """How soft that limit is [standard deviation in the natural logarithm of the signal]."""
     loss_patch_px: float = 3.0
@@ -186,33 +187,6 @@ class DepthSensorModel:
         }  # fmt: skip
         return cls.from_fields(values | overrides, f"depth profile '{p.name}'")
 
-    @classmethod
-    def from_fields(cls, values: Mapping[str, Any], source: str) -> "DepthSensorModel":
-        """Return the model of named values; fields that are not named keep their defaults.
-
-        Args:
-            values: field and value.
-            source: where they are from, for the message.
-
-        Raises:
-            InputError: a name is no field, a value has the wrong type or is out of range.
-        """
-        return cls(**checked_fields(cls, values, source, "a depth sensor model"))
-
-    @classmethod
-    def load(cls, path: Path | str) -> "DepthSensorModel":
-        """Return the model in a JSON file that `realsim depth-fit` wrote (its key "model").
-
-        Raises:
-            InputError: the file cannot be read, is of another kind, or holds a wrong value.
-        """
-        command = "realsim depth-fit FRAMES --out FILE"
-        return cls.from_fields(read_sensor(path, FORMAT, "model", command), str(path))
-
-    def document(self) -> dict[str, Any]:
-        """Return what `load` reads, ready for JSON."""
-        return {"format": FORMAT, "model": asdict(self)}
-
     def sigma_z(self, z_m: ArrayLike, intrinsics: CameraIntrinsics) -> Array:
         """Return the standard deviation of depth [m] at depths [m]: z^2 sigma_d / (f B)."""
         z = np.asarray(z_m, dtype=np.float64)
@@ -226,7 +200,7 @@ class DepthSensorModel:
         scene: RayScene,
         T_world_cam: ArrayLike,
     ) -> Mask:
-        """Return where (H, W) an eye of this camera is blocked, exactly (see depth_shadow)."""
+        """Return where (H, W) an eye of this camera is blocked, exactly (see shadow)."""
         return shadow_mask(
             scene, depth_m, intrinsics, T_world_cam,
             baseline_m=self.baseline_m, eye_offset_m=self.eye_offset_m, border=self.border,
@@ -254,7 +228,7 @@ class DepthSensorModel:
             T_world_cam: (4, 4) the camera in that scene [m].
             shadow: (H, W) where an eye is blocked, in place of `scene`. Without both the shadows
                 are found from the depth picture alone.
-            loss: (H, W) share of pixels lost because of their material (depth_loss.loss_map).
+            loss: (H, W) share of pixels lost because of their material (see loss).
             reflectance: (H, W) linear, for `signal_range_m`; None = white.
 
         Returns:

@@ -7,21 +7,20 @@ Fields that govern the NOISE of depth: `full_well`, `read_noise` (photons), `tex
 stripes `least_signal` and `least_modulation`.
 """
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 from realsim.errors import InputError
-from realsim.rendering.depth_sensors.sensor_file import checked_fields, read_sensor
-
-FORMAT = "realsim stereo sensor 1"
-"""Names the kind of JSON file that `StereoConfig.load` reads."""
+from realsim.rendering.depth_sensors.sensor_file import SensorRecord
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class StereoConfig:
+class StereoConfig(SensorRecord):
     """Scene texture, sensor, projector and matcher of a simulated stereo camera."""
+
+    FORMAT = "realsim stereo sensor 1"
+    KEY = "config"
+    NAME = "a stereo configuration"
+    COMMAND = "realsim depth-fit FRAMES --simulator stereo --out FILE"
 
     texture_contrast: float = 0.15
     """Rms of the unevenness of a rough surface's reflectance at the scale of pixels, relative:
@@ -102,29 +101,6 @@ class StereoConfig:
             raise InputError(
                 f"stereo: the window is {self.window_px} px; odd sizes from 3 to 15 are accepted."
             )
-
-    @classmethod
-    def from_fields(cls, values: Mapping[str, Any], source: str) -> "StereoConfig":
-        """Return the configuration of named values; what is not named keeps its default.
-
-        Raises:
-            InputError: a name is no field, a value has the wrong type or is out of range.
-        """
-        return cls(**checked_fields(cls, values, source, "a stereo configuration"))
-
-    @classmethod
-    def load(cls, path: Path | str) -> "StereoConfig":
-        """Return the configuration in a JSON file of `realsim depth-fit --simulator stereo`.
-
-        Raises:
-            InputError: the file cannot be read, is of another kind, or holds a wrong value.
-        """
-        command = "realsim depth-fit FRAMES --simulator stereo --out FILE"
-        return cls.from_fields(read_sensor(path, FORMAT, "config", command), str(path))
-
-    def document(self) -> dict[str, Any]:
-        """Return what `load` reads, ready for JSON."""
-        return {"format": FORMAT, "config": asdict(self)}
 
     @property
     def electron_noise(self) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from grey_planes import grey_plane
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.profiles import profile
@@ -16,7 +17,6 @@ from realsim.rendering.stereo import (
     StereoCamera,
     StereoConfig,
     fit_stereo,
-    grey_plane,
 )
 from realsim.rendering.stereo.fit_picture import stereo_fit_picture
 

@@ -6,9 +6,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from grey_planes import grey_plane, plane_noise
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.profiles import profile
-from realsim.rendering.stereo import StereoCamera, StereoConfig, grey_plane, plane_statistics
+from realsim.rendering.stereo import StereoCamera, StereoConfig
 
 CAMERA = CameraIntrinsics(width=360, height=240, fx=640, fy=640, cx=179.5, cy=119.5)
 QUIET = StereoConfig(full_well=1e8, read_noise=0.0, texture_contrast=0.25, least_texture_snr=1.0)
@@ -57,7 +58,7 @@ def test_a_tilted_plane_has_its_disparity_without_a_staircase(tilt: float, turn:
 
 def sigma_z(z: float, baseline: float) -> float:
     camera = replace(PASSIVE, baseline_m=baseline)
-    sigma, _, _ = plane_statistics(StereoConfig(), camera, CAMERA, z, np.random.default_rng(1))
+    sigma = plane_noise(StereoConfig(), camera, CAMERA, z, np.random.default_rng(1))
     return z * z * sigma / (CAMERA.fx * baseline)
 
 
@@ -73,7 +74,7 @@ def test_twice_the_baseline_halves_the_depth_noise() -> None:
 def test_noise_falls_with_light_and_window_and_texture() -> None:
     def sigma(**changes: float) -> float:
         config = replace(StereoConfig(), **changes)
-        return plane_statistics(config, PASSIVE, CAMERA, 0.4, np.random.default_rng(2))[0]
+        return plane_noise(config, PASSIVE, CAMERA, 0.4, np.random.default_rng(2))
 
     usual = sigma()
     # Four times the electrons: half the shot noise; rounding to bytes and read noise stay.

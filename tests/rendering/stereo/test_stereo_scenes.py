@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from grey_planes import disparity_noise, grey_plane
 from realsim.errors import InputError
 from realsim.geometry import camera as lens
 from realsim.records import CameraIntrinsics, Mesh
@@ -12,12 +13,7 @@ from realsim.rendering.appearance import Material
 from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import PlacedMesh
-from realsim.rendering.stereo import (
-    StereoCamera,
-    StereoConfig,
-    disparity_statistics,
-    grey_plane,
-)
+from realsim.rendering.stereo import StereoCamera, StereoConfig
 
 CAMERA = CameraIntrinsics(width=360, height=240, fx=360, fy=360, cx=179.5, cy=119.5)
 RICH = StereoConfig(texture_contrast=0.25)
@@ -87,7 +83,7 @@ def test_dots_fade_with_distance_and_the_noise_grows() -> None:
     def sigma(z: float) -> float:
         wall = StereoCamera([grey_plane(CAMERA, z)], profile("d435"), BLANK)
         d = wall.measure(CAMERA, np.eye(4), np.random.default_rng(0)).disparity_px
-        return disparity_statistics(d, 360 * 0.05 / z)[0]
+        return disparity_noise(d, 360 * 0.05 / z)
 
     assert sigma(2.0) > 2 * sigma(0.7)
 
