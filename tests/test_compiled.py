@@ -1,0 +1,72 @@
+"""Compiled loops are found again by what they say, wherever the file lies and whoever they call."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+CALLED = """
+from realsim.compiled import njit
+SHIFT = {shift}
+
+@njit
+def called(x):
+    return x + SHIFT
+"""
+LOOP = """
+from realsim.compiled import njit
+from realsim_probe_called import called
+
+@njit(inline="always")
+def loop(x):
+    return 2.0 * called(x)
+
+@njit
+def outer(x):
+    return loop(x) + 1.0
+"""
+
+
+def clone(folder: Path, shift: float) -> ModuleType:
+    """Write both files to a folder, as a clone would, and import them from there."""
+    folder.mkdir()
+    loaded: list[ModuleType] = []
+    texts = {"realsim_probe_called": CALLED.format(shift=shift), "realsim_probe_loop": LOOP}
+    for name, text in texts.items():
+        (folder / f"{name}.py").write_text(text)
+        spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
+        assert spec is not None and spec.loader is not None
+        loaded.append(importlib.util.module_from_spec(spec))
+        sys.modules[name] = loaded[-1]
+        spec.loader.exec_module(loaded[-1])
+    return loaded[-1]
+
+
+def test_a_clone_finds_what_another_compiled(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    first, second = clone(tmp_path / "a", 1.0), None
+    assert first.outer(1.0) == 5.0
+    assert sum(first.outer.stats.cache_misses.values()) == 1
+    second = clone(tmp_path / "b", 1.0)
+    assert second.outer(1.0) == 5.0
+    assert sum(second.outer.stats.cache_hits.values()) == 1
+
+
+def test_a_change_in_a_called_function_s_constant_is_noticed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    assert clone(tmp_path / "a", 1.0).outer(1.0) == 5.0
+    assert clone(tmp_path / "b", 10.0).outer(1.0) == 23.0
+
+
+def test_a_home_that_cannot_be_written_compiles_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
+    assert clone(tmp_path / "a", 1.0).outer(2.0) == 7.0
