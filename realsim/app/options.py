@@ -6,6 +6,7 @@ from typing import Any
 import click
 
 from realsim.app.command import Decorator
+from realsim.app.outputs import OutputFile
 
 FOLDER = click.Path(path_type=Path)
 """A file or folder as a pathlib.Path; whoever opens it says what is wrong with it."""
@@ -14,9 +15,10 @@ QUIET = click.option("--quiet", is_flag=True, help="No progress; only the result
 JSON = click.option("--json", "as_json", is_flag=True, help="The result as JSON on stdout.")
 
 
-def json_file(what: str) -> Decorator:
-    """Return the option that writes the JSON into a file as well."""
-    return click.option("--json-file", type=FOLDER, default=None, metavar="FILE", help=what)
+def json_file(what: str, key: str, *keys: str) -> Decorator:
+    """Return the option that writes the JSON into a file as well; `keys` tell its own files."""
+    own = OutputFile({".json": [f'"{name}"' for name in (key, *keys)]}, "document")
+    return click.option("--json-file", type=own, default=None, metavar="FILE", help=what)
 
 
 def overwrite(what: str) -> Decorator:

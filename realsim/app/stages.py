@@ -14,6 +14,7 @@ from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.records import GraspSet, HandEye, ObjectModel, ObjectPose, Scene
 from realsim.store import SessionStore
+from realsim.store.opening import require_header
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.annotation.annotate import AnnotationSummary
@@ -33,6 +34,7 @@ def open_session(folder: Path) -> SessionStore:
             f"'{folder}' is not a folder; a session folder (one that holds session.json) is "
             "expected. `realsim demo` makes one in demo/session."
         )
+    require_header(folder)
     if not (folder / "session.json").is_file():
         inner = sorted(p.parent.name for p in folder.glob("*/session.json"))
         hint = f" Did you mean {', '.join(str(folder / n) for n in inner)}?" if inner else ""

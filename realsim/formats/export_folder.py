@@ -20,7 +20,7 @@ from typing import Any
 
 from realsim.errors import InputError
 from realsim.store import atomic
-from realsim.store.json_files import read_object
+from realsim.untrusted.own_json import read_object
 
 STATE = ".export"
 FINISHED = ".export.json"

@@ -1,7 +1,7 @@
 """What a calibration found: the hand-eye, the robot's error map, the checks with their advice."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +11,7 @@ from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.records.capture import CameraIntrinsics
 from realsim.records.checked_arrays import Array, frozen, rigid
+from realsim.untrusted.own_json import Real, Tagged
 
 MAP_FEATURES = 12
 """Features of a pose in an error map: position (3) and rotation matrix (9)."""
@@ -27,15 +28,21 @@ class Check:
     """What was found, with the figures."""
     advice: str = ""
     """What to do; empty where the verdict is good."""
-    value: float = float("nan")
+    value: Real = float("nan")
     """The figure that was judged; NaN where there is none."""
     unit: str = ""
     views: tuple[int, ...] = ()
     """Views that the check names."""
 
 
+class RobotMap(Tagged):
+    """A robot's error: a RobotErrorMap or an ArmErrorMap."""
+
+    __slots__ = ()
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class RobotErrorMap:
+class RobotErrorMap(RobotMap):
     """The robot's pose error as a linear function of its pose: T_true = T Exp(B(T) W).
 
     B(T) W = W phi(T) ("ee": error in the axes of the tool) or R^T W phi(T) for both halves ("base":
@@ -43,10 +50,11 @@ class RobotErrorMap:
     beyond the poses it was fitted on it is a guess.
     """
 
+    kind: Literal["pose map"] = "pose map"
     frame: Literal["ee", "base"]
     mean: Array
     """(12,) mean of position [m] and of the rotation matrix, row by row."""
-    sd_m: float
+    sd_m: Real
     """Spread of the positions, the same for all three axes [m]."""
     weights: Array
     """(6, 12) W, rotation first [rad, m per unit feature]."""
@@ -97,9 +105,10 @@ class RobotErrorMap:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class ArmErrorMap:
+class ArmErrorMap(RobotMap):
     """The robot's error as errors of its arm's Denavit-Hartenberg numbers; needs the joints."""
 
+    kind: Literal["arm"] = "arm"
     arm: DhArm
     """The arm as it is said to be."""
     errors: Array
@@ -121,6 +130,12 @@ class ArmErrorMap:
         return np.asarray(T, dtype=np.float64) @ se3.invert(G) @ moved @ G
 
 
+if TYPE_CHECKING:
+    AnyRobotMap = RobotErrorMap | ArmErrorMap
+else:  # what a file is read as: its word tells which
+    AnyRobotMap = RobotMap
+
+
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class HandEye:
     """A hand-eye calibration: the camera in the hand, and everything that says how good it is."""
@@ -139,14 +154,14 @@ class HandEye:
     """Views used."""
     view_rms_px: Array
     """(views used,) reprojection RMS of each view through the robot pose [px]."""
-    held_out_px: float
+    held_out_px: Real
     """RMS of views predicted by a fit without them, through the robot pose [px]."""
     rejected: tuple[tuple[int, str], ...] = ()
     """(view, reason) of every view that was not used."""
     method: str = ""
-    starts: tuple[tuple[str, float], ...] = ()
+    starts: tuple[tuple[str, Real], ...] = ()
     """(closed form, its reprojection RMS [px]) of every start tried."""
-    robot_map: RobotErrorMap | ArmErrorMap | None = None
+    robot_map: AnyRobotMap | None = None
     """The robot's error map that belongs to T_ee_cam; None = the controller's poses are taken as
     they are."""
     checks: tuple[Check, ...] = ()

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.records.checked_arrays import Array, frozen
+from realsim.untrusted.own_json import Real
 
 LARGEST_SCALE_ERROR = 0.5
 """A camera that is wrong by half has another fault (its unit, its resolution) than a bias."""
@@ -28,9 +29,9 @@ class DepthBias:
     """Offset of the inverse depth [1/m]; a disparity that is too large makes it negative."""
     covariance: Array = field(default_factory=lambda: np.zeros((2, 2)))
     """(2, 2) of (scale, offset_per_m); zero = taken for exact."""
-    noise_per_m: float = float("nan")
+    noise_per_m: Real = float("nan")
     """k of one pixel's noise sigma_z = k z^2 [1/m]; NaN = not measured."""
-    range_m: tuple[float, float] = (0.0, float("inf"))
+    range_m: tuple[Real, Real] = (0.0, float("inf"))
     """Distances at which it was measured [m]; beyond them it is extrapolated."""
     separable: bool = True
     """Whether scale and offset were told apart; if not, only their sum at the middle distance is

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records.checked_arrays import Array, frozen, rigid
+from realsim.untrusted.own_json import Real
 
 Verdict = Literal["accepted", "doubtful", "rejected", "unchecked"]
 
@@ -96,7 +97,7 @@ class ObjectPose:
     """(4, 4) object in world [m]."""
     covariance: Array | None = None
     """(6, 6) of the right perturbation, rotation first [rad, m]."""
-    checks: dict[str, float] = field(default_factory=dict[str, float])
+    checks: dict[str, Real] = field(default_factory=dict[str, Real])
     """Named checks without ground truth, e.g. agree (share of pixels that agree with the depth)."""
     verdict: Verdict = "unchecked"
     reasons: tuple[str, ...] = ()
@@ -117,7 +118,7 @@ class SupportPlane:
 
     T_world_table: Array
     """(4, 4) table in world [m]."""
-    rms_m: float = 0.0
+    rms_m: Real = 0.0
     """RMS distance of the points that carry the plane [m]."""
     inliers: int = 0
     """How many points carry it."""

@@ -47,7 +47,7 @@ from realsim.registration.hint_regions import (
 from realsim.registration.search.records import Wanted
 from realsim.registration.views import SampleConfig, sample_views
 from realsim.store import SessionStore
-from realsim.store.json_files import read_object
+from realsim.untrusted.own_json import read_object
 
 __all__ = [
     "Box", "Click", "Hint", "HintConfig", "HintScene", "Marked", "RoughPose", "Where",

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from realsim.errors import InputError
+from realsim.store.opening import require_header
 
 SESSION_FILE = "session.json"
 SCENE_FILE = "registration/scene.json"
@@ -57,6 +58,7 @@ def sessions_under(folders: Sequence[Path]) -> list[Path]:
                 f"'{folder}' is not a folder; a session (a folder that holds {SESSION_FILE}) or a "
                 "folder of sessions is expected. `realsim demo` makes one in demo/session."
             )
+        require_header(folder)
         inside = _sessions_in(folder, DEEPEST)
         if not inside:
             raise InputError(

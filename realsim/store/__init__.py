@@ -1,7 +1,6 @@
 """A session on disk: atomic, checksummed, resumable."""
 
 from realsim.store.atomic import StorageError
-from realsim.store.records_json import tag_board_from_json, tag_board_to_json
 from realsim.store.results import (
     load_board,
     load_grasps,
@@ -25,6 +24,4 @@ __all__ = [
     "save_grasps",
     "save_hand_eye",
     "save_scene",
-    "tag_board_from_json",
-    "tag_board_to_json",
 ]

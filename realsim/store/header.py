@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from realsim.errors import InputError
-from realsim.records import CaptureSession
-from realsim.store import records_json
+from realsim.records import CameraIntrinsics, CaptureSession
 from realsim.untrusted import json_text
+from realsim.untrusted.own_json import from_json, to_json
+from realsim.untrusted.values import need
 
 SESSION_FILE = "session.json"
 FORMAT = "realsim session"
@@ -35,7 +36,7 @@ def new_header(session: CaptureSession, extra: dict[str, Any]) -> dict[str, Any]
         "name": session.name,
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "units": {"length": "m", "angle": "rad", "time": "s", "scene_camera.json": "mm"},
-        "camera": records_json.intrinsics_to_json(session.intrinsics),
+        "camera": to_json(session.intrinsics),
         "depth_unit_m": session.depth_unit_m,
         "T_world_cam": {},
         "versions": _versions(),
@@ -61,9 +62,9 @@ def checked_header(path: Path) -> dict[str, Any]:
             f"{path} has format version {header['format_version']}; this realsim reads up to "
             f"{FORMAT_VERSION}. Use a newer realsim."
         )
-    records_json.need(header, ("name", "camera", "depth_unit_m", "T_world_cam"), str(path))
+    need(header, ("name", "camera", "depth_unit_m", "T_world_cam"), str(path))
     try:
-        records_json.intrinsics_from_json(header["camera"])
+        from_json(header["camera"], CameraIntrinsics, f"the camera of {path}")
         float(header["depth_unit_m"])
         dict(header["T_world_cam"])
         dict(header.get("extra", {}))

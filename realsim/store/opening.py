@@ -32,6 +32,20 @@ def require_free(folder: Path) -> None:
         )
 
 
+def require_header(folder: Path) -> None:
+    """Refuse a session whose session.json is gone; any other folder is none of ours.
+
+    Raises:
+        InputError: there are views, or what the session was begun with, and no header.
+    """
+    left = [name for name in (ROBOT_FILE, BEGUN_FILE) if (folder / name).is_file()]
+    if left and not (folder / SESSION_FILE).is_file():
+        raise InputError(
+            f"{folder} holds a session ({left[0]} is there), but its {SESSION_FILE} is lost. "
+            f"{repair_command(folder)} makes it anew."
+        )
+
+
 def require_session(folder: Path) -> None:
     """Refuse a folder without a session, and views without a manifest.
 
@@ -41,12 +55,8 @@ def require_session(folder: Path) -> None:
         InputError: no session.json, or views and no manifest; no kill takes that away.
     """
     views = atomic.complete_lines(folder / ROBOT_FILE)
+    require_header(folder)
     if not (folder / SESSION_FILE).is_file():
-        if views:
-            raise InputError(
-                f"{folder} holds views, but its {SESSION_FILE} is lost. "
-                f"{repair_command(folder)} makes it anew."
-            )
         raise InputError(
             f"{folder} holds no session: {SESSION_FILE} is not there. The folder of a capture "
             "session is expected; a BOP dataset is read by realsim.formats.bop.scene."

@@ -5,6 +5,7 @@ import math
 import zipfile
 import zlib
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ import numpy as np
 from realsim.errors import InputError
 from realsim.records import STAGES, GraspSet, HandEye, Scene, TagBoard
 from realsim.records.grasps import MEASURES
-from realsim.store import atomic, records_json
-from realsim.store.records_json import number_to_json
-from realsim.store.session_store import SessionStore, read_json_file
+from realsim.store import atomic
+from realsim.store.session_store import SessionStore
+from realsim.untrusted.own_json import from_json, read_own, to_json
 
 HAND_EYE_FILE = "calibration/hand_eye.json"
 BOARD_FILE = "calibration/board.json"
@@ -28,37 +29,52 @@ GRASP_FORMAT_VERSION = 2
 """Version 1 has no measures; it is still read."""
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class GraspsHead:
+    """What is read of the readable side of a grasp set."""
+
+    obj_id: int
+    instance: int
+    parameters: dict[str, Any]
+    format_version: int = 1
+
+
 # --- one record, one file ---------------------------------------------------------------------
 
 
 def save_hand_eye(store: SessionStore, result: HandEye, name: str = HAND_EYE_FILE) -> None:
     """Write the calibration into the session."""
-    store.write_json(name, records_json.hand_eye_to_json(result))
+    store.write_json(name, hand_eye_to_json(result))
+
+
+def hand_eye_to_json(result: HandEye) -> dict[str, Any]:
+    """Return a hand-eye calibration as JSON values; sigma_deg and sigma_mm are for the reader."""
+    return to_json(result) | to_json({"sigma_deg": result.sigma_deg, "sigma_mm": result.sigma_mm})
 
 
 def load_hand_eye(store: SessionStore, name: str = HAND_EYE_FILE) -> HandEye:
     """Return the calibration of the session."""
-    return records_json.hand_eye_from_json(store.read_json(name))
+    return from_json(store.read_json(name), HandEye, "the hand-eye calibration")
 
 
 def save_board(store: SessionStore, board: TagBoard, name: str = BOARD_FILE) -> None:
     """Write the calibration board into the session."""
-    store.write_json(name, records_json.tag_board_to_json(board))
+    store.write_json(name, to_json(board))
 
 
 def load_board(store: SessionStore, name: str = BOARD_FILE) -> TagBoard:
     """Return the calibration board of the session."""
-    return records_json.tag_board_from_json(store.read_json(name))
+    return from_json(store.read_json(name), TagBoard, "the board")
 
 
 def save_scene(store: SessionStore, scene: Scene, name: str = SCENE_FILE) -> None:
     """Write the registered scene into the session."""
-    store.write_json(name, records_json.scene_to_json(scene))
+    store.write_json(name, to_json(scene))
 
 
 def load_scene(store: SessionStore, name: str = SCENE_FILE) -> Scene:
     """Return the registered scene of the session."""
-    return records_json.scene_from_json(store.read_json(name))
+    return from_json(store.read_json(name), Scene, "the scene")
 
 
 # --- grasps -----------------------------------------------------------------------------------
@@ -93,8 +109,8 @@ def grasps_to_json(grasps: GraspSet) -> dict[str, Any]:
     rows: list[dict[str, Any]] = [
         {
             "index": i,
-            "score": number_to_json(float(grasps.scores[i])),
-            "base_score": number_to_json(float(grasps.base_scores[i])),
+            "score": to_json(grasps.scores[i]),
+            "base_score": to_json(grasps.base_scores[i]),
             "reachable": bool(grasps.reachable[i]),
             "failure": grasps.failures[i],
             "slip_mm": _by_stage(1e3 * grasps.slip_m[i]),
@@ -121,13 +137,13 @@ def grasps_to_json(grasps: GraspSet) -> dict[str, Any]:
 
 def _measure_to_json(name: str, value: Any) -> Any:
     if MEASURES[name].by_stage:
-        return {s: number_to_json(float(v)) for s, v in zip(STAGES, value, strict=True)}
-    return number_to_json(float(value))
+        return {s: to_json(v) for s, v in zip(STAGES, value, strict=True)}
+    return to_json(value)
 
 
 def _by_stage(values: Any) -> dict[str, Any]:
     rounded = (float(v) if not math.isfinite(v) else round(float(v), 6) for v in values)
-    return {stage: number_to_json(v) for stage, v in zip(STAGES, rounded, strict=True)}
+    return {stage: to_json(v) for stage, v in zip(STAGES, rounded, strict=True)}
 
 
 def save_grasps(store_or_folder: SessionStore | Path | str, grasps: GraspSet) -> Path:
@@ -169,13 +185,11 @@ def load_grasps(folder: SessionStore | Path | str) -> list[GraspSet]:
 
 
 def _load_grasp_set(file: Path) -> GraspSet:
-    keys = ("obj_id", "instance", "parameters")
-    head = records_json.need(read_json_file(file.with_suffix(".json")), keys, f"{file.stem}.json")
-    found = head.get("format_version", 1)
-    if not (isinstance(found, int) and 1 <= found <= GRASP_FORMAT_VERSION):
+    head = read_own(file.with_suffix(".json"), GraspsHead)
+    if not 1 <= head.format_version <= GRASP_FORMAT_VERSION:
         raise InputError(
-            f"{file.stem}.json has the format version {found!r}; this realsim reads 1 to "
-            f"{GRASP_FORMAT_VERSION}. Read it with the version that wrote it, or a newer one."
+            f"{file.stem}.json has the format version {head.format_version}; this realsim reads 1 "
+            f"to {GRASP_FORMAT_VERSION}. Read it with the version that wrote it, or a newer one."
         )
     try:
         with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as npz:
@@ -191,12 +205,11 @@ def _load_grasp_set(file: Path) -> GraspSet:
             f"{file} is not a complete grasp file ({error}). Delete it and its .json, and run the "
             "school again for this object."
         ) from error
-    grasps = GraspSet(
-        obj_id=int(head["obj_id"]),
-        instance=int(head["instance"]),
+    return GraspSet(
+        obj_id=head.obj_id,
+        instance=head.instance,
         failures=failures,
         measures=measures,
-        parameters=head["parameters"],
+        parameters=head.parameters,
         **arrays,
     )
-    return records_json.exactly(grasps, Ts_obj_grasp=arrays["Ts_obj_grasp"])

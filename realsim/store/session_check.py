@@ -13,8 +13,8 @@ from typing import Any
 
 from realsim.errors import RealsimError
 from realsim.formats import images
-from realsim.records import CameraIntrinsics
-from realsim.store import atomic, records_json
+from realsim.records import CameraIntrinsics, View
+from realsim.store import atomic
 from realsim.store.check_report import CheckReport, Finding, Kind, Lists
 from realsim.store.header import SESSION_FILE, checked_header
 from realsim.store.manifest import NAME as MANIFEST_FILE
@@ -30,6 +30,7 @@ from realsim.store.session_notes import (
     without_checksum,
 )
 from realsim.store.session_store import CAMERA_FILE, ROBOT_FILE, depth_path, rgb_path
+from realsim.untrusted.own_json import from_json
 
 __all__ = ["CheckReport", "Finding", "check_session", "inner_sessions", "is_session", "read_lists"]
 
@@ -121,7 +122,7 @@ def read_lists(folder: Path) -> Lists:
                     _take_entry(lists.entries, entry_from(line))
                 else:
                     record = record_of(line)
-                    records_json.view_from_json(record)
+                    from_json(record, View, "a view")
                     index = int(record["index"])
                     lists.records.pop(index, None)  # the order is that of the lines that count
                     lists.records[index] = record
@@ -155,7 +156,9 @@ def _take_entry(entries: dict[str, Entry], entry: Entry) -> None:
 def _camera_of(folder: Path, findings: list[Finding]) -> CameraIntrinsics | None:
     """Return the camera of the header; a header that cannot be used is a finding."""
     try:
-        return records_json.intrinsics_from_json(checked_header(folder / SESSION_FILE)["camera"])
+        return from_json(
+            checked_header(folder / SESSION_FILE)["camera"], CameraIntrinsics, "the camera"
+        )
     except RealsimError as error:
         there = (folder / SESSION_FILE).is_file()
         found = str(error) if there else "no file"

@@ -17,7 +17,6 @@ from realsim.records import CaptureSession
 from realsim.store import atomic
 from realsim.store.begun import BEGUN_FILE, RECOVERED, read_begun
 from realsim.store.header import SESSION_FILE, checked_header, new_header
-from realsim.store.json_files import read_object
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import Manifest, entry_from, entry_of
 from realsim.store.robot_lines import CHECK, record_of
@@ -35,6 +34,7 @@ from realsim.store.session_store import (
     depth_path,
     rgb_path,
 )
+from realsim.untrusted.own_json import read_object
 
 LENS = ("camera", "depth_unit_m")
 """What a calibration changes after the beginning."""

@@ -29,11 +29,10 @@ from realsim.errors import InputError
 from realsim.formats import images
 from realsim.formats.bop import units as bop_units
 from realsim.records import CameraIntrinsics, CaptureSession, View
-from realsim.store import atomic, records_json
+from realsim.store import atomic
 from realsim.store.atomic import storing
 from realsim.store.begun import BEGUN_FILE, begun_bytes
 from realsim.store.header import SESSION_FILE, header_to_open, new_header
-from realsim.store.json_files import read_json_file
 from realsim.store.manifest import Fault, Manifest, entry_of
 from realsim.store.opening import (
     ROBOT_FILE,
@@ -44,12 +43,13 @@ from realsim.store.opening import (
 )
 from realsim.store.robot_lines import RobotLines, record_of
 from realsim.store.view_images import check_sizes, depth_path, is_whole, rgb_path
+from realsim.untrusted.own_json import from_json, read_values, to_json
 
 if TYPE_CHECKING:
     from realsim.store.session_check import CheckReport
     from realsim.store.session_repair import RepairReport
 
-__all__ = ["ROBOT_FILE", "SESSION_FILE", "SessionStore", "depth_path", "read_json_file", "rgb_path"]
+__all__ = ["ROBOT_FILE", "SESSION_FILE", "SessionStore", "depth_path", "rgb_path"]
 
 Array = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ class SessionStore:
         self._views: dict[int, View] = {}
         self._camera_lines: dict[int, str] = {}
         self._cameras_written = self._cameras_due = 0
-        self._intrinsics = records_json.intrinsics_from_json(header["camera"])
+        self._intrinsics = from_json(header["camera"], CameraIntrinsics, "the camera")
 
     # --- making and opening -------------------------------------------------------------------
 
@@ -205,14 +205,9 @@ class SessionStore:
     def _view(self, index: int) -> View:
         # Kept, because the capture of view 256 should not take longer than that of view 1.
         if index not in self._views:
-            view = records_json.view_from_json(self._robot[index])
+            view = from_json(self._robot[index], View, f"view {index}")
             T = self._header["T_world_cam"].get(str(index))
-            if T is not None:
-                view = replace(view, T_world_cam=np.asarray(T))
-                view = records_json.exactly(
-                    view, T_base_ee=self._robot[index]["T_base_ee"], T_world_cam=T
-                )
-            self._views[index] = view
+            self._views[index] = view if T is None else replace(view, T_world_cam=np.asarray(T))
         return self._views[index]
 
     # --- images -------------------------------------------------------------------------------
@@ -253,7 +248,7 @@ class SessionStore:
         if counts is not None:
             files[depth_path(view.index)] = images.png_bytes(counts)
         entries = [entry_of(path, data) for path, data in files.items()]
-        record = records_json.view_to_json(view) | {"depth": counts is not None}
+        record = to_json(view) | {"depth": counts is not None}
         with storing(self.folder, f"view {view.index}"):
             for path, data in files.items():
                 atomic.write_bytes(self.folder / path, data)
@@ -315,7 +310,7 @@ class SessionStore:
             self._require(index)
             checked = View(index=index, T_world_cam=np.asarray(T, dtype=np.float64)).T_world_cam
             poses[str(index)] = None if checked is None else checked.tolist()
-        camera = records_json.intrinsics_to_json(intrinsics)
+        camera = to_json(intrinsics)
         self._header = {**self._header, "camera": camera, "T_world_cam": poses}
         self._intrinsics = intrinsics
         self._session = None
@@ -409,7 +404,7 @@ class SessionStore:
         Raises:
             InputError: it is missing or not JSON.
         """
-        return read_json_file(self.path(relative))
+        return read_values(self.path(relative))
 
     def write_npz(self, relative: str, **arrays: ArrayLike) -> None:
         """Write arrays as npz; the same arrays give the same bytes."""

@@ -116,6 +116,23 @@ def mapping(value: Any, name: str) -> dict[str, Any]:
     return named
 
 
+def need(data: Any, keys: tuple[str, ...], what: str) -> dict[str, Any]:
+    """Return data as an object that has the keys.
+
+    Raises:
+        InputError: it is not one; the message names what is missing.
+    """
+    if not isinstance(data, dict):
+        raise InputError(f"{what}: an object is expected, found {type(data).__name__}.")
+    record = {str(k): v for k, v in cast("dict[Any, Any]", data).items()}
+    missing = [key for key in keys if key not in record]
+    if missing:
+        raise InputError(
+            f"{what} lacks {', '.join(missing)}; it has: {', '.join(record) or 'nothing'}."
+        )
+    return record
+
+
 def path_inside(folder: Path, value: Any, name: str) -> Path:
     """Return the path that a file names, if it stays inside the folder, links resolved.
 

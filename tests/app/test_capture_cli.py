@@ -15,7 +15,7 @@ from realsim.geometry import se3
 from realsim.interop import import_pyrealsense2
 from realsim.records import CaptureSession
 from realsim.store import SessionStore
-from realsim.store.session_store import read_json_file
+from realsim.untrusted.own_json import read_values
 from realsim_capture_plans.arms.kinematics import UR5, UR5E
 from realsim_capture_plans.capturing.contact_sheet import SheetConfig, contact_sheet
 from realsim_capture_plans.capturing.log import CaptureLog
@@ -303,7 +303,7 @@ def test_board_views_lie_where_the_calibration_looks_for_them(
     listed = {json.loads(line)["path"] for line in (out / "manifest.jsonl").read_text().split("\n")
               if line}  # fmt: skip
     assert "calibration/board.json" in listed
-    kind = read_json_file(out / "calibration/board.json")
+    kind = read_values(out / "calibration/board.json")
     assert (kind["rows"], kind["columns"]) == (5, 7)
     notes = [e["notes"] for e in CaptureLog(board).views().values()]
     assert notes == [[]] * 12  # the board was seen in every view

@@ -17,6 +17,7 @@ from realsim.app.command import default_of, settable, spelling, walk
 from realsim.app.config.files import find_config, line_of, read_config
 from realsim.app.config.settings import settings_of
 from realsim.app.config.template import template, toml_value
+from realsim.app.outputs import OutputFile
 from realsim.errors import InputError
 
 EVERY = walk(commands)
@@ -183,6 +184,8 @@ def another_value(option: click.Option) -> Any:
         value = 11
     elif kind is click.FLOAT:
         value = 0.125
+    elif isinstance(kind, OutputFile):
+        value = f"another{next(iter(kind.own))}"
     else:
         value = "another"
     return [value] if option.multiple else value

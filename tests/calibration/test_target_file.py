@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from realsim.errors import InputError, UnitError
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
-from realsim.store.records_json import tag_board_to_json
+from realsim.untrusted.own_json import to_json
 from realsim_calibration.targets.marker_sets import (
     dictionary_name,
     dictionary_names,
@@ -236,7 +236,7 @@ CHARUCO = {"kind": "charuco", "rows": 7, "columns": 5, "square_mm": 33, "marker_
 
 def test_a_tag_board_of_the_store_is_read_without_kind() -> None:
     board = TagBoard(rows=4, columns=6, tag_size_m=0.04, gap_m=0.01, first_id=5)
-    assert fields_of(target_from_json(tag_board_to_json(board))) == fields_of(board)
+    assert fields_of(target_from_json(to_json(board))) == fields_of(board)
 
 
 def test_optional_keys_have_the_record_s_defaults_and_names_are_canonical() -> None:

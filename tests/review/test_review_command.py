@@ -68,15 +68,14 @@ def test_the_static_page_is_of_one_scene(tmp_path: Path) -> None:
 
 
 def test_where_the_static_page_cannot_be_is_told_before_anything_is_read(tmp_path: Path) -> None:
-    from realsim.app.console import Console
-
-    request, console = ReviewRequest(folders=(tmp_path / "no session",)), Console(quiet=True)
     for path, words in (
-        (tmp_path, f"{tmp_path}\\) is a folder"),
-        (tmp_path / "no/page.html", f"{tmp_path / 'no'}\\) for the page is not there"),
+        (tmp_path, f"{tmp_path}' is a folder"),
+        (tmp_path / "no/page.html", f"{tmp_path / 'no'}) for --static is not there"),
     ):
-        with pytest.raises(InputError, match=words):
-            write_page(request, path, console)
+        done = CliRunner().invoke(
+            review_command, [str(tmp_path / "no session"), "--static", str(path)]
+        )
+        assert isinstance(done.exception, InputError) and words in str(done.exception)
 
 
 def test_a_session_that_was_moved_is_told_at_the_end_and_its_decisions_counted(

@@ -1,27 +1,38 @@
 """Records written and read are the same records, bit for bit."""
 
 import json
+import math
+import re
+from dataclasses import replace
+from typing import Annotated, Literal
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec import Meta
+from numpy.typing import NDArray
 
 from realsim import store as stores
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.dh import ARMS
 from realsim.records import (
+    ArmErrorMap,
     CameraIntrinsics,
     CaptureSession,
     GraspSet,
     HandEye,
     ObjectPose,
+    RobotErrorMap,
     Scene,
     SupportPlane,
     TagBoard,
     View,
 )
-from realsim.store import records_json as rj
+from realsim.records.calibration import RobotMap
+from realsim.records.depth_bias import DepthBias
+from realsim.untrusted.own_json import OwnFile, Real, from_json, read_own, to_json
 
 few = settings(max_examples=25, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -125,66 +136,97 @@ def views(rng):
 
 @few
 @given(seeds)
-@pytest.mark.parametrize(
-    ("make", "to_json", "from_json"),
-    [
-        (camera, rj.intrinsics_to_json, rj.intrinsics_from_json),
-        (views, rj.view_to_json, rj.view_from_json),
-        (hand_eye, rj.hand_eye_to_json, rj.hand_eye_from_json),
-        (scene, rj.scene_to_json, rj.scene_from_json),
-    ],
-)
-def test_reading_undoes_writing_bit_for_bit(make, to_json, from_json, seed):
+@pytest.mark.parametrize("make", [camera, views, hand_eye, scene])
+def test_reading_undoes_writing_bit_for_bit(make, seed):
     record = make(np.random.default_rng(seed))
     text = through_text(to_json(record))
-    back = from_json(text)
+    back = from_json(text, type(record), "the record")
     assert_same(record, back)
     assert through_text(to_json(back)) == text
 
 
-def test_boards_and_bare_records():
-    board = TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.009, first_id=3)
-    assert_same(board, rj.tag_board_from_json(through_text(rj.tag_board_to_json(board))))
-    assert_same(View(index=1), rj.view_from_json(through_text(rj.view_to_json(View(index=1)))))
-    empty = Scene(name="empty", objects=())
-    assert_same(empty, rj.scene_from_json(through_text(rj.scene_to_json(empty))))
+ARM = ArmErrorMap(arm=ARMS["UR5"], errors=np.arange(24.0), T_flange_tool=np.eye(4))
+POSES = RobotErrorMap(
+    frame="base", mean=np.zeros(12), sd_m=np.nan, weights=np.ones((6, 12)), reach=np.ones((3, 12))
+)
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        TagBoard(rows=5, columns=7, tag_size_m=0.03, gap_m=0.009, first_id=3), View(index=1),
+        Scene(name="empty", objects=()), DepthBias(),
+        replace(hand_eye(np.random.default_rng(1)), robot_map=ARM),
+        replace(hand_eye(np.random.default_rng(1)), robot_map=POSES),
+    ],
+    ids=lambda r: type(r).__name__,
+)  # fmt: skip
+def test_bare_records_and_either_error_map_come_back(record):
+    assert_same(record, from_json(through_text(to_json(record)), type(record), "it"))
 
 
 def test_numbers_that_json_lacks():
     values = np.array([[1.5, np.nan], [np.inf, -np.inf]])
-    assert rj.array_to_json(values) == [[1.5, None], ["inf", "-inf"]]
-    np.testing.assert_array_equal(
-        rj.array_from_json(through_text(rj.array_to_json(values))), values
-    )
+    assert to_json(values) == [[1.5, None], ["inf", "-inf"]]
+    back = from_json(through_text(to_json(values)), NDArray[np.float64], "an array")
+    np.testing.assert_array_equal(back, values)
 
 
 def test_a_rotation_edited_by_hand_is_made_rigid_again():
-    data = rj.view_to_json(views(np.random.default_rng(0)))
+    data = to_json(views(np.random.default_rng(0)))
     data["T_base_ee"] = np.round(data["T_base_ee"], 6).tolist()
-    R = rj.view_from_json(data).T_base_ee[:3, :3]
+    R = from_json(data, View, "the view").T_base_ee[:3, :3]
     assert np.abs(R.T @ R - np.eye(3)).max() < 1e-14
 
 
 def test_numpy_scalars_become_plain_numbers():
-    rng = np.random.default_rng(0)
-    plain, f, i = camera(rng), np.float32, np.int64
+    f, i = np.float32, np.int64
     odd = CameraIntrinsics(width=i(640), height=i(480), fx=f(600), fy=f(600), cx=f(3), cy=f(4))
-    assert rj.intrinsics_from_json(through_text(rj.intrinsics_to_json(odd))).fx == 600
-    assert_same(plain, rj.intrinsics_from_json(rj.intrinsics_to_json(plain)))
-    view = View(index=i(3), time_s=np.float32(0.5))
-    assert rj.view_from_json(through_text(rj.view_to_json(view))).index == 3
-    pose = ObjectPose(
-        obj_id=i(2), instance=i(0), T_world_obj=np.eye(4), checks={"agree": np.float32(0.5)}
-    )
-    back = rj.object_pose_from_json(through_text(rj.object_pose_to_json(pose)))
-    assert back.checks == {"agree": 0.5}
+    assert from_json(through_text(to_json(odd)), CameraIntrinsics, "it").fx == 600
+    pose = ObjectPose(obj_id=i(2), instance=i(0), T_world_obj=np.eye(4), checks={"agree": f(0.5)})
+    assert from_json(through_text(to_json(pose)), ObjectPose, "it").checks == {"agree": 0.5}
 
 
-def test_missing_keys_are_named():
-    with pytest.raises(InputError, match=r"lacks T_world_obj; it has: obj_id, instance"):
-        rj.object_pose_from_json({"obj_id": 1, "instance": 0})
-    with pytest.raises(InputError, match="found list"):
-        rj.scene_from_json([])
+class Note(OwnFile, kw_only=True):
+    format: Literal["note 1"] = "note 1"
+    unit_m: Annotated[float, Meta(gt=0, le=0.02)]
+    sigma: Real = math.nan
+    scene: Scene | None = None
+    map: RobotMap | None = None
+
+
+POSE = {"obj_id": 1, "instance": 0, "T_world_obj": np.eye(4).tolist()}
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({}, "missing required field `unit_m`; it has: nothing"),
+        ({"unit_m": 1}, "`float` <= 0.02 - at `unit_m`"),
+        ({"unit_m": 0.01, "unitt": 1}, "unknown field `unitt`"),
+        ({"unit_m": 0.01, "format": "note 2"}, "'note 2' - at `format`"),
+        ({"unit_m": 0.01, "sigma": "much"}, "at `sigma`"),
+        ({"unit_m": 0.01, "scene": {"name": "s", "objects": [POSE | {"obj_id": "one"}]}},
+         "expected `int`, got `str` - at `scene.objects[0].obj_id`"),
+        ({"unit_m": 0.01, "scene": {"name": "s", "objects": [{"obj_id": 1}]}},
+         "missing required field `instance` - at `scene.objects[0]`"),
+        ({"unit_m": 0.01, "map": {"kind": "guess"}}, "'guess' is not known; pose map, arm are"),
+        ([], "expected `object`, got `array`"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_named_with_its_place(tmp_path, values, words):
+    path = tmp_path / "note.json"
+    path.write_text(json.dumps(values))
+    with pytest.raises(InputError, match=re.escape(words)) as told:
+        read_own(path, Note)
+    assert str(told.value).startswith(str(path))
+
+
+@pytest.mark.parametrize("text", ['{"unit_m": 0.01, "unit_m": 0.02}', '{"unit_m": NaN}', "[" * 200])
+def test_what_is_no_sound_json_is_refused_as_that_of_others(tmp_path, text):
+    (tmp_path / "note.json").write_text(text)
+    with pytest.raises(InputError, match="run the step that writes it again"):
+        read_own(tmp_path / "note.json", Note)
 
 
 def new_store(folder):

@@ -5,7 +5,8 @@ from pathlib import Path
 import click
 
 from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET, overwrite
+from realsim.app.options import JSON, QUIET, overwrite
+from realsim.app.outputs import OutputFolder
 
 
 @click.command(
@@ -17,7 +18,9 @@ from realsim.app.options import FOLDER, JSON, QUIET, overwrite
     ),
 )
 @click.argument("what", metavar="TARGET")
-@click.option("--out", type=FOLDER, default=Path("boards"), show_default=True, help="Folder.")
+@click.option(
+    "--out", type=OutputFolder(), default=Path("boards"), show_default=True, help="Folder."
+)
 @click.option("--paper", default="A4", show_default=True, help="A5 to A0, letter, 300x400mm, auto.")
 @click.option("--preview", is_flag=True, help="A PNG beside the PDF.")
 @click.option("--cut-marks", is_flag=True, help="Where to cut the sheet.")

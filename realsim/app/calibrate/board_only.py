@@ -10,10 +10,9 @@ from realsim.app.stages import BOARD_VIEWS, require_sound
 from realsim.records import HandEye
 from realsim.store import SessionStore
 from realsim.store.atomic import json_bytes, write_bytes
-from realsim.store.records_json import hand_eye_to_json
-from realsim.store.results import HAND_EYE_FILE
+from realsim.store.results import HAND_EYE_FILE, hand_eye_to_json
 from realsim.store.session_check import is_session
-from realsim.store.session_store import read_json_file
+from realsim.untrusted.own_json import read_values
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -33,7 +32,7 @@ class CalibrationFolder:
         Raises:
             InputError: it is missing or not JSON.
         """
-        return read_json_file(self.folder / relative)
+        return read_values(self.folder / relative)
 
     def write_json(self, relative: str, value: Any) -> None:
         """Write plain JSON values, whole or not at all."""

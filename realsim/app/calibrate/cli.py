@@ -7,6 +7,7 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.options import FOLDER, JSON, QUIET
+from realsim.app.outputs import GOES_ON
 
 
 @click.command(
@@ -26,7 +27,13 @@ from realsim.app.options import FOLDER, JSON, QUIET
 @click.option("--camera", type=FOLDER, default=None, help="File with known intrinsics.")
 @click.option("--eye-to-hand", is_flag=True, help="The camera stands still, the target moves.")
 @click.option("--robot", default="", help="UR5 or UR5e; found out where joints are given.")
-@click.option("--out", type=FOLDER, default=Path("calibration"), show_default=True, help="Folder.")
+@click.option(
+    "--out",
+    type=GOES_ON,
+    default=Path("calibration"),
+    show_default=True,
+    help="Folder.",
+)
 @click.option("--live", is_flag=True, help="Watch SOURCE for new views and say when to stop.")
 @JSON
 @QUIET

@@ -5,6 +5,7 @@ said; where the file leaves several readings open, the images decide, or nothing
 """
 
 import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.geometry.dh import ARMS, DhArm
 from realsim.records import CameraIntrinsics, Target
-from realsim.store.atomic import write_json
+from realsim.store.atomic import write_json, write_text
 from realsim_calibration import (
     BoardView,
     Calibration,
@@ -37,6 +38,10 @@ if TYPE_CHECKING:
     from realsim_calibration.inputs import FolderInput, PoseReading, RawPoses
 
 Array = NDArray[np.float64]
+CALIBRATED = ("exports/calibration.json", "calibration_report.html")
+"""What a folder holds that somebody has calibrated into."""
+MADE_OF = "calibrated_of.json"
+"""File beside them that says what they were made of: only that is replaced."""
 MIN_POSE_POINTS = 6
 """Fewest points of a board pose that may speak for a reading."""
 MIN_DIAGNOSED = 6
@@ -71,6 +76,11 @@ class FolderRequest:
     mode: Literal["eye_in_hand", "eye_to_hand"] = "eye_in_hand"
     robot: str = ""
     """Name of the arm; empty = the one that joints and poses prove, if any."""
+
+
+def made_of(images: Path) -> str:
+    """Return the text of the file that says what a folder of results was made of."""
+    return json.dumps({"images": str(images.resolve())})
 
 
 def calibrate_folder(request: FolderRequest, console: Console) -> tuple[Calibration, list[Path]]:
@@ -112,7 +122,7 @@ def calibrate_folder(request: FolderRequest, console: Console) -> tuple[Calibrat
     arm = _arm(request.robot, views, console)
     with console.stage("calibrate", f"{len(views)} views"):
         result = calibrate(views, target, intrinsics0=camera, arm=arm, config=config)
-    return result, write_calibration(result, request.out, folder.images, console)
+    return result, write_calibration(result, request, folder.images, console)
 
 
 def target_of(text: str) -> Target:
@@ -172,8 +182,6 @@ def _detection_json(found: TargetDetection) -> dict[str, Any]:
 
 def _noted(path: Path) -> TargetDetection | None:
     """Return a detection noted earlier; a damaged note is no note."""
-    import json
-
     try:
         d = json.loads(path.read_text())
         return TargetDetection(
@@ -350,18 +358,20 @@ def _from_pose_files(
     )
     console.say(f"robot poses read as {reading}, board poses as {board_reading}")
     result = Calibration(hand_eye=report, lens=None)
-    return result, write_calibration(result, request.out, (), console)
+    return result, write_calibration(result, request, (), console)
 
 
 def write_calibration(
-    result: Calibration, out: Path, images: Sequence[Path], console: Console
+    result: Calibration, request: FolderRequest, images: Sequence[Path], console: Console
 ) -> list[Path]:
     """Write report, pictures and exports; return the paths, the page first."""
     from realsim_calibration.exports import FrameNames, write_exports
     from realsim_calibration.inputs import load_image
     from realsim_calibration.report import write_calibration_report
 
+    out = request.out
     with console.stage("report", str(out)):
+        write_text(out / MADE_OF, made_of(request.images))
         exports = write_exports(
             result.hand_eye, out / "exports", frames=FrameNames(), with_camera=bool(images)
         )

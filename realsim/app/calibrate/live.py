@@ -53,7 +53,7 @@ def run_live(request: FolderRequest, console: Console) -> bool:
         if done:
             break
     if report is not None:
-        files = write_calibration(Calibration(hand_eye=report, lens=None), request.out, (), console)
+        files = write_calibration(Calibration(hand_eye=report, lens=None), request, (), console)
         show_report(report, report.checks, console)
         console.say(f"report: {files[0]}")
         console.result(report_document(report, report.checks, files))

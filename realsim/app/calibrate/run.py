@@ -61,7 +61,7 @@ def _run_session(source: Path, console: Console) -> bool:
     """Calibrate a session, also one that has board views only; return whether no check is bad."""
     from realsim.app.calibrate.board_only import calibrate_board_only, has_board_views_only
     from realsim.app.stages import calibrate_session, open_session
-    from realsim.store.records_json import hand_eye_to_json
+    from realsim.store.results import hand_eye_to_json
 
     board_only = has_board_views_only(source)
     if board_only:
@@ -119,13 +119,15 @@ def _refuse_folder_options(options: dict[str, Any]) -> None:
 
 def _request(source: Path, options: dict[str, Any]) -> Any:
     """Return the request for a plain folder; relative pose files may lie inside it."""
-    from realsim.app.calibrate.folder import FolderRequest
+    from realsim.app.calibrate.folder import CALIBRATED, MADE_OF, FolderRequest, made_of
+    from realsim.app.outputs import require_free_folder
 
     def inside(path: Path | None) -> Path | None:
         if path is None or path.exists() or path.is_absolute():
             return path
         return source / path if (source / path).exists() else path
 
+    require_free_folder(options["out"], "--out", CALIBRATED, (MADE_OF, (made_of(source),)))
     return FolderRequest(
         images=source,
         out=options["out"],

@@ -8,7 +8,8 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.option_values import numbers_of
-from realsim.app.options import FOLDER, JSON, QUIET, PlanName, seed
+from realsim.app.options import JSON, QUIET, PlanName, seed
+from realsim.app.outputs import GOES_ON
 
 
 @click.command(
@@ -20,7 +21,7 @@ from realsim.app.options import FOLDER, JSON, QUIET, PlanName, seed
         "realsim capture mugs --plan plan.json --robot-host 192.168.1.10",
     ),
 )
-@click.argument("out", type=FOLDER)
+@click.argument("out", type=GOES_ON)
 @click.option("--plan", required=True, type=PlanName(),
               help="Plan file, or shipped:ur5_d405_hemisphere_256.")  # fmt: skip
 @click.option("--robot-host", default="", help="IP address of the UR5's controller.")

@@ -369,9 +369,9 @@ def _keep_board(out: Path, target: Target | None) -> None:
     if target is not None:
         data = target_to_json(target)
         if path.is_file():
-            from realsim.store.session_store import read_json_file
+            from realsim.untrusted.own_json import read_values
 
-            if target_to_json(target_from_json(read_json_file(path))) != data:
+            if target_to_json(target_from_json(read_values(path))) != data:
                 raise InputError(
                     f"{path} describes another target than --board. Capture into a new folder; "
                     "views of two targets cannot be calibrated as one."

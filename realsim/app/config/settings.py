@@ -115,7 +115,7 @@ def _one(option: click.Option, value: Any, where: str) -> Any:
             text = str(Path(text).expanduser())  # on the command line the shell does it
         except RuntimeError as error:
             raise InputError(f"{where} = {_shown(value)} cannot be used: {error}") from error
-    ctx = click.Context(click.Command("settings"))
+    ctx = click.Context(click.Command("settings"), resilient_parsing=True)
     try:
         option.type.convert(text, option, ctx)
     except click.BadParameter as error:

@@ -5,14 +5,21 @@ from pathlib import Path
 import click
 
 from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET, seed, workers
+from realsim.app.options import JSON, QUIET, seed, workers
+from realsim.app.outputs import GOES_ON
 
 
 @click.command(
     "demo", cls=Command,
     examples=("realsim demo", "realsim demo --out small --views 12 --objects 2 --grasps 20"),
 )  # fmt: skip
-@click.option("--out", type=FOLDER, default=Path("demo"), show_default=True, help="Folder to fill.")
+@click.option(
+    "--out",
+    type=GOES_ON,
+    default=Path("demo"),
+    show_default=True,
+    help="Folder to fill.",
+)
 @click.option("--views", default=24, show_default=True, type=click.IntRange(4, 1024),
               help="Of the scene.")  # fmt: skip
 @click.option("--objects", default=5, show_default=True, type=click.IntRange(1, 40),

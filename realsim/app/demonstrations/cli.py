@@ -7,6 +7,7 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.options import FOLDER, JSON, QUIET
+from realsim.app.outputs import GOES_ON
 
 
 @click.command(
@@ -18,7 +19,12 @@ from realsim.app.options import FOLDER, JSON, QUIET
     ),
 )
 @click.argument("source", type=FOLDER)
-@click.option("--out", type=FOLDER, required=True, help="Folder to fill; new, or to go on in.")
+@click.option(
+    "--out",
+    type=GOES_ON,
+    required=True,
+    help="Folder to fill; new, or to go on in.",
+)
 @click.option("--fps", default=20, show_default=True, type=click.IntRange(1, 240),
               help="Steps per second.")  # fmt: skip
 @click.option("--outcome", default="all", show_default=True,

@@ -7,7 +7,9 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.options import FOLDER, JSON, QUIET
+from realsim.app.outputs import OutputFile
 
+OUT = OutputFile({".json": (' sensor 1"',)}, "sensor", beside=(".png",))
 CAMERAS = ("d405", "d415", "d435", "structured_light")
 """The depth cameras by name; a test holds them equal to the profiles', which are not imported
 here."""
@@ -27,7 +29,7 @@ here."""
 @click.option("--simulator", default="disparity", show_default=True,
               type=click.Choice(["disparity", "stereo"]),
               help="The model in disparity space, or the stereo camera.")  # fmt: skip
-@click.option("--out", type=FOLDER, default=None,
+@click.option("--out", type=OUT, default=None,
               help="The JSON; a picture is written beside it.  "
                    "[depth_sensor.json, stereo_sensor.json]")  # fmt: skip
 @click.option("--views", default="", help="Only these views, such as 1-8.  [all, at most 12]")

@@ -8,6 +8,7 @@ import click
 from realsim.app.command import Command
 from realsim.app.option_values import numbers_of
 from realsim.app.options import FOLDER, JSON, QUIET
+from realsim.app.outputs import GOES_ON
 
 FORMATS = (
     "bop", "graspnet", "colmap", "nerfstudio", "urdf", "mjcf", "usd", "graspit", "grasp-group",
@@ -26,7 +27,12 @@ FORMATS = (
 @click.argument("sources", type=FOLDER, nargs=-1, required=True, metavar="SOURCE...")
 @click.option("--to", "target", required=True, type=click.Choice(FORMATS), metavar="FORMAT",
               help=f"{', '.join(FORMATS[:-1])} or {FORMATS[-1]}.")  # fmt: skip
-@click.option("--out", type=FOLDER, required=True, help="Folder to fill; new, or to go on in.")
+@click.option(
+    "--out",
+    type=GOES_ON,
+    required=True,
+    help="Folder to fill; new, or to go on in.",
+)
 @click.option("--labels", default="auto", show_default=True,
               type=click.Choice(("auto", "annotated", "imported", "none")),
               help="Of a session: realsim's own, or those it came with.")  # fmt: skip

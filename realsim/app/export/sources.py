@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from realsim.app.export.request import ExportRequest
+from realsim.app.stages import BOARD_VIEWS
 from realsim.errors import InputError
 from realsim.formats.labelled_scene import LabelledScene
 from realsim.records import Scene
 from realsim.store import SessionStore
+from realsim.store.opening import require_header
 from realsim.store.session_store import SESSION_FILE
 
 ACCEPTED = (
@@ -79,11 +81,19 @@ def _scenes_of(source: Path, request: ExportRequest) -> list[SourceScene]:
 
 
 def session_folders(source: Path) -> list[Path]:
-    """Return a folder that is a session, or the sessions up to two levels below it."""
+    """Return a folder that is a session, or the sessions up to two levels below it.
+
+    Raises:
+        InputError: one of them has lost its header; what else is there would be taken for a scene.
+    """
+    require_header(source)
     if (source / SESSION_FILE).is_file():
         return [source]
-    for pattern in (f"*/{SESSION_FILE}", f"*/*/{SESSION_FILE}"):
-        found = sorted(p.parent for p in source.glob(pattern) if not p.parent.name.startswith("."))
+    for below in ("*", "*/*"):
+        folders = sorted(p for p in source.glob(below) if not p.name.startswith("."))
+        for folder in folders:
+            require_header(folder)
+        found = [p for p in folders if (p / SESSION_FILE).is_file() and not p.match(BOARD_VIEWS)]
         if found:
             return found
     return []
@@ -114,7 +124,7 @@ def _sessions(source: Path, folders: list[Path], request: ExportRequest) -> list
 def _place_of(folder: Path) -> tuple[int, str]:
     """Return number and camera of a session: those of the data set that it was imported from."""
     from realsim.formats.imported_labels import SCENE
-    from realsim.store.json_files import read_object
+    from realsim.untrusted.own_json import read_object
 
     if (folder / SCENE).is_file():
         head = read_object(folder / SCENE)

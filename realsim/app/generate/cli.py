@@ -9,6 +9,7 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.options import FOLDER, JSON, QUIET, seed, workers
+from realsim.app.outputs import GOES_ON
 
 if TYPE_CHECKING:
     from realsim.app.generate.request import GenerateRequest
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
         "realsim generate near --scenes 1 --views 2 --objects 2 --size 320x240 --range d405",
     ),
 )
-@click.argument("out", type=FOLDER)
+@click.argument("out", type=GOES_ON)
 @click.option("--scenes", default=10, show_default=True, type=click.IntRange(1, 1_000_000),
               help="So many in all.")  # fmt: skip
 @seed("The same seed, the same scenes.")

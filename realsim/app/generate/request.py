@@ -12,7 +12,7 @@ from realsim import __version__
 from realsim.errors import InputError
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.store import atomic
-from realsim.store.json_files import read_object
+from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.table_scenes.cameras import RANGES, ViewConfig
 from realsim_sim_bridge.table_scenes.config import TableSceneConfig

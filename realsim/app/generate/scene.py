@@ -9,7 +9,7 @@ from typing import Any
 from realsim.app.generate.request import LAYOUTS, GenerateRequest
 from realsim.errors import InputError
 from realsim.store import SessionStore, atomic
-from realsim.store.json_files import read_object
+from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.synthetic.write import write_session
 from realsim_sim_bridge.table_scenes.cameras import intrinsics_of, views
 from realsim_sim_bridge.table_scenes.layout import Layout, layout_from_json, layout_to_json

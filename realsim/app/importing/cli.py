@@ -6,6 +6,7 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.options import FOLDER, JSON, QUIET, overwrite
+from realsim.app.outputs import GOES_ON
 
 
 @click.command(
@@ -18,7 +19,7 @@ from realsim.app.options import FOLDER, JSON, QUIET, overwrite
     ),
 )
 @click.argument("source", type=FOLDER)
-@click.argument("out", type=FOLDER, required=False)
+@click.argument("out", type=GOES_ON, required=False)
 @click.option(
     "--kind",
     default="auto",

@@ -19,9 +19,9 @@ from realsim.app.console import Console, Tick
 from realsim.errors import InputError, UnitError
 from realsim.formats.frame_source import FrameSource, SourceFrame
 from realsim.records import CaptureSession, View
-from realsim.store import records_json
 from realsim.store.lock import only_run_in
 from realsim.store.session_store import SESSION_FILE, SessionStore
+from realsim.untrusted.own_json import to_json
 from realsim_capture_plans.capturing.contact_sheet import (
     SheetConfig,
     Thumbnails,
@@ -129,7 +129,7 @@ def content_key(source: FrameSource) -> str:
     if content is None:
         content = {k: v for k, v in extra.items() if k not in ("path", "source")}
     values = {
-        "camera": records_json.intrinsics_to_json(source.intrinsics),
+        "camera": to_json(source.intrinsics),
         "depth_unit_m": source.depth_unit_m,
         "frames": len(source),
         "content": content,

@@ -17,6 +17,7 @@ from realsim.errors import InputError
 from realsim.formats.folders import FolderChoice
 from realsim.formats.folders.listing import ENDINGS, shown
 from realsim.formats.frame_source import FrameSource
+from realsim.store.opening import require_header
 from realsim.store.session_store import CAMERA_FILE, SESSION_FILE
 
 ROS1_MAGIC = b"#ROSBAG V"
@@ -268,6 +269,7 @@ def kind_of(request: ImportRequest, console: Console) -> str:
         if request.kind in ("bag", "realsense") and path.is_file():
             _check_bag_file(path)
         return "bag" if request.kind == "realsense" else request.kind
+    require_header(path)
     fits = kinds_of(path)
     if path.is_dir() and (path / SESSION_FILE).is_file():
         raise InputError(

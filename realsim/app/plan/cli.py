@@ -9,7 +9,9 @@ import click
 from realsim.app.command import Command
 from realsim.app.option_values import port_in_use
 from realsim.app.options import FOLDER, JSON, QUIET, PlanName, overwrite, seed
+from realsim.app.outputs import GOES_ON, OutputFile
 
+REPLAY = OutputFile({".html": ("viser",), ".viser": ("viser",)}, "replay")
 ROBOT = click.Choice(["UR5", "UR5e"], case_sensitive=False)
 
 
@@ -38,7 +40,13 @@ ROBOT = click.Choice(["UR5", "UR5e"], case_sensitive=False)
 @seed("Another seed, another plan.")
 @click.option("--board", is_flag=True, help="Views of a board, to calibrate with.")
 @click.option("--advise", is_flag=True, help="Say where the centre is best put; plan nothing.")
-@click.option("--out", type=FOLDER, default=Path("plan.json"), show_default=True, help="File.")
+@click.option(
+    "--out",
+    type=GOES_ON,
+    default=Path("plan.json"),
+    show_default=True,
+    help="File.",
+)
 @overwrite("Replace a plan of the same name.")
 @click.option("--no-pictures", is_flag=True, help="The plan file alone.")
 @JSON
@@ -69,7 +77,7 @@ def plan_command(advise: bool, as_json: bool, quiet: bool, **options: Any) -> No
 )
 @click.argument("source", metavar="PLAN", type=PlanName())
 @click.option("--replay", is_flag=True, help="Drive it on the screen, in the browser.")
-@click.option("--replay-file", type=FOLDER, default=None, help="Write the replay as a file.")
+@click.option("--replay-file", type=REPLAY, default=None, help="Write the replay as a file.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address of the replay.")
 @click.option(
     "--port", default=8080, show_default=True, type=click.IntRange(0, 65535),
@@ -116,7 +124,7 @@ def plan_show_command(
     ),
 )
 @click.argument("source", type=PlanName())
-@click.argument("dest", type=FOLDER)
+@click.argument("dest", type=GOES_ON)
 @click.option("--robot", type=ROBOT, default=None, help="Arm of a path without tool poses.")
 @click.option("--calibration", type=FOLDER, default=None, help="The arm's own calibration.")
 @click.option("--mount", type=FOLDER, default=None, help="Mount file.  [a D405 on a bracket]")

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from realsim.app.console import Console, Tick
+from realsim.app.outputs import require_free_file
 from realsim.app.plan.request import Place, PlanRequest
 from realsim.errors import InputError
 from realsim_capture_plans.arms.kinematics import CHAINS, DhChain
@@ -22,6 +23,12 @@ if TYPE_CHECKING:
 
 PICTURES = "_pictures"
 """Added to a plan's name: the folder of its pictures beside it."""
+PLAN_MARKS = {
+    ".json": ('"realsim capture plan"',),
+    ".csv": ("view,via,q1_rad",),
+    ".script": ("def realsim_plan():",),
+}
+"""What every plan file of ours holds, by its suffix."""
 ODD_ROW_M = 0.010
 """A tool pose that is farther than this from its joints' is named [m]; arms leave 1 to 3 mm."""
 ODD_ROW_TIMES = 5.0
@@ -186,6 +193,8 @@ def run_convert(
     writer = _writer(dest)
     if dest.exists() and not overwrite:
         raise InputError(f"{dest} is there already; --overwrite replaces it, or name another.")
+    if dest.exists() and dest.suffix:
+        require_free_file(dest, "DEST", PLAN_MARKS, "plan")
     plan = _source_plan(source, place, joints_unit, console)
     files = writer(plan, dest)
     free = show_colliding(plan, console) if plan.kind == "imported" else True
@@ -374,6 +383,8 @@ def _check_free_name(out: Path, overwrite: bool, pictures: bool) -> None:
             f"{there[0]} is there already, and a plan that was driven must not be lost. Name "
             "another with --out, or replace it with --overwrite."
         )
+    if out.exists():
+        require_free_file(out, "--out", PLAN_MARKS, "plan")
 
 
 def _write_pictures(

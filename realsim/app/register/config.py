@@ -10,7 +10,7 @@ from realsim.errors import InputError
 from realsim.records.depth_bias import DepthBias
 from realsim.store import SessionStore
 from realsim.store.records_json import number_from_json
-from realsim.store.session_store import read_json_file
+from realsim.untrusted.own_json import read_values
 
 if TYPE_CHECKING:
     from realsim.registration.config import Method, RegistrationConfig
@@ -104,7 +104,7 @@ def load_depth_bias(path: Path) -> DepthBias:
     Raises:
         InputError: it is no such file.
     """
-    value: Any = read_json_file(path)
+    value: Any = read_values(path)
     try:
         if not value["known"]:
             return DepthBias.none()

@@ -7,6 +7,7 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.options import FOLDER, JSON, QUIET, seed, workers
+from realsim.app.outputs import GOES_ON
 
 
 @click.command(
@@ -20,7 +21,7 @@ from realsim.app.options import FOLDER, JSON, QUIET, seed, workers
 @click.argument("session", type=FOLDER)
 @click.option("--views", default="real", show_default=True, metavar="real|N",
               help="Twins of the real frames, or N new views.")  # fmt: skip
-@click.option("--out", type=FOLDER, default=None, help="Folder.  [SESSION/synthetic/...]")
+@click.option("--out", type=GOES_ON, default=None, help="Folder.  [SESSION/synthetic/...]")
 @click.option("--renderer", default="embedded", show_default=True,
               type=click.Choice(["embedded", "photoreal"]),
               help="Rasterised here, or ray-traced by Mitsuba.")  # fmt: skip

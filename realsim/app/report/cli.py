@@ -7,6 +7,10 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.options import FOLDER, JSON, QUIET
+from realsim.app.outputs import OutputFile
+
+MARK = ('<script type="application/json" id="report">',)
+PAGE = OutputFile({".html": MARK, ".htm": MARK}, "page")
 
 
 @click.command(
@@ -20,7 +24,7 @@ from realsim.app.options import FOLDER, JSON, QUIET
 @click.argument("sessions", type=FOLDER, nargs=-1, required=True, metavar="SESSION...")
 @click.option("--truth", type=FOLDER, default=None, help="The simulated lab's truth folder.")
 @click.option(
-    "--out", type=FOLDER, default=None, metavar="FILE",
+    "--out", type=PAGE, default=None, metavar="FILE",
     help="HTML file to write.  [one session: SESSION/reports/report.html; several: none]",
 )  # fmt: skip
 @click.option(

@@ -16,7 +16,6 @@ from realsim.app.report.compare_page import (
     figure_rows,
     object_rows,
 )
-from realsim.app.report.destination import require_destination
 from realsim.app.report.limits import Limit, broken, limit_of, read_limits
 from realsim.app.report.page import Page
 from realsim.app.report.session import hidden_of, page_html, report_of, write_report_of
@@ -47,9 +46,6 @@ def run_report(request: ReportRequest) -> bool:
     """
     limits = [limit_of(text) for text in request.fail_on]
     limits += read_limits(request.limits) if request.limits is not None else []
-    if request.out is not None:
-        inputs = [p for p in (*request.sources, request.limits, request.truth) if p is not None]
-        require_destination(request.out, inputs)
     if len(request.sources) == 1:
         if request.fail_if_worse:
             raise InputError("--fail-if-worse compares: give two sessions or more.")

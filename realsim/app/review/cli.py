@@ -7,6 +7,10 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.options import FOLDER, JSON, QUIET
+from realsim.app.outputs import OutputFile
+
+MARK = ("Made with realsim", "The viewer in this file is Viser")
+PAGE = OutputFile({".html": MARK, ".htm": MARK}, "page")
 
 
 @click.command(
@@ -24,7 +28,7 @@ from realsim.app.options import FOLDER, JSON, QUIET
 @click.option("--token-file", type=FOLDER, default=None, metavar="FILE",
               help="Ask for the secret in this file, in place of one that is made.")  # fmt: skip
 @click.option("--reviewer", default="", metavar="NAME", help="Your name; decisions are signed.")
-@click.option("--static", type=FOLDER, default=None, metavar="FILE",
+@click.option("--static", type=PAGE, default=None, metavar="FILE",
               help="Write the reviewed scene as one HTML file, and end.")  # fmt: skip
 @click.option("--no-browser", is_flag=True, help="Do not open a browser.")
 @QUIET

@@ -96,9 +96,8 @@ def write_page(request: ReviewRequest, path: Path, console: Console) -> None:
     from realsim.review import journal
     from realsim.review.content.content import SceneConfig, SceneContent
     from realsim.review.journal import JOURNAL_FILE
-    from realsim.review.static.static_page import check_page_path, write_static
+    from realsim.review.static.static_page import write_static
 
-    check_page_path(path)
     folders = scene_list.sessions_under(request.folders)
     if len(folders) != 1:
         raise InputError(

@@ -8,6 +8,7 @@ import click
 
 from realsim.app.command import Command, Group
 from realsim.app.options import FOLDER, JSON, QUIET, json_file, seed, workers
+from realsim.app.outputs import GOES_ON, OutputFolder
 
 ENGINES = ("pybullet", "mujoco")
 FORMATS = ("acronym", "graspgen", "isaac", "hdf5", "parquet")
@@ -56,7 +57,12 @@ def SCHOOL() -> None:
     ),
 )
 @click.argument("source", type=FOLDER)
-@click.option("--out", type=FOLDER, default=None, help="Folder, where SOURCE is no session.")
+@click.option(
+    "--out",
+    type=GOES_ON,
+    default=None,
+    help="Folder, where SOURCE is no session.",
+)
 @click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000),
               help="Candidates to try on each object, at most.")  # fmt: skip
 @click.option("--engine", default="pybullet", show_default=True, type=click.Choice(ENGINES),
@@ -83,7 +89,7 @@ def SCHOOL() -> None:
 @click.option("--address", default="", metavar="RAY", help="HOST:PORT of a Ray cluster, or local.")
 @click.option("--restart", is_flag=True, help="Throw away results of other parameters.")
 @seed()
-@json_file("Write the counts there, too.")
+@json_file("Write the counts there, too.", "reasons", "agreement", "settings")
 @JSON
 @QUIET
 def run_command(
@@ -102,14 +108,13 @@ def run_command(
     """
     from realsim.app.console import Console
     from realsim.app.school.files import PAGE
-    from realsim.app.school.inputs import SchoolRequest, require_file_name
+    from realsim.app.school.inputs import SchoolRequest
     from realsim.app.school.run import run
     from realsim.app.school.tables import as_json as json_of
     from realsim.app.school.tables import show_school
     from realsim.store import atomic
 
     request = SchoolRequest(**options)
-    require_file_name(json_file)
     console = Console(quiet=quiet, as_json=as_json)
     outcome = run(source, out, request, console)
     show_school(outcome.sets, outcome.models, console)
@@ -140,8 +145,8 @@ def run_command(
 @click.option("--engine", default="both", show_default=True,
               type=click.Choice([*ENGINES, "both"]), help="Which physics.")  # fmt: skip
 @click.option("--quick", is_flag=True, help="Every part with fewer samples: about a minute.")
-@json_file("Write the reports there, too.")
-@click.option("--out", type=FOLDER, default=None, help="Folder for reports and pictures.")
+@json_file("Write the reports there, too.", "checks", "ratios", "cpu_s")
+@click.option("--out", type=OutputFolder(), default=None, help="Folder for reports and pictures.")
 @JSON
 @QUIET
 def validate_command(
@@ -173,8 +178,8 @@ def validate_command(
 @click.option("--density", type=float, default=None, help="Of the others [kg/m^3].")
 @click.option("--support", "supports", multiple=True, type=FOLDER, metavar="URDF",
               help="A bin or shelf, in the table's frame; repeat.")  # fmt: skip
-@click.option("--out", type=FOLDER, default=None, help="Folder for the picture.")
-@json_file("Write the table there, too.")
+@click.option("--out", type=OutputFolder(), default=None, help="Folder for the picture.")
+@json_file("Write the table there, too.", "stable", "simulated_s")
 @JSON
 @QUIET
 def settle_command(
@@ -207,7 +212,7 @@ def settle_command(
 )
 @click.argument("source", type=FOLDER)
 @click.option("--to", "target", required=True, type=click.Choice(FORMATS), help="Format.")
-@click.option("--out", type=FOLDER, required=True, help="Folder to write into.")
+@click.option("--out", type=OutputFolder(), required=True, help="Folder to write into.")
 @click.option("--least-score", default=0.0, show_default=True, type=click.FloatRange(0, 1),
               help="Leave out worse grasps (isaac).")  # fmt: skip
 @JSON
@@ -231,7 +236,7 @@ def export_command(
     examples=("realsim school summary demo/session", "realsim school summary demo/session --json"),
 )  # fmt: skip
 @click.argument("sources", type=FOLDER, nargs=-1, required=True, metavar="SESSION...")
-@json_file("Write the counts there, too.")
+@json_file("Write the counts there, too.", "with_trajectory", "closures")
 @JSON
 @QUIET
 def summary_command(

@@ -73,16 +73,6 @@ class SchoolRequest:
         )
 
 
-def require_file_name(path: Path | None) -> None:
-    """Raise if a file that a run writes in the end cannot be one: hours later is too late.
-
-    Raises:
-        InputError: a folder stands there.
-    """
-    if path is not None and path.is_dir():
-        raise InputError(f"--json-file '{path}' is a folder; the name of a file is expected.")
-
-
 def _require_positive(
     option: str, value: float | None, words: str, *, most: float, least: float = 0.0
 ) -> None:

@@ -6,6 +6,13 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.options import FOLDER, JSON, QUIET, json_file
+from realsim.app.outputs import OutputFolder
+
+KEYS = ("statistics", "landscape")
+OUT = OutputFolder(
+    ("statistics.csv", "sessions.csv", "objects.csv", "statistics.json", "statistics.html"),
+    own=("statistics.json", KEYS),
+)
 
 
 @click.command(
@@ -13,8 +20,8 @@ from realsim.app.options import FOLDER, JSON, QUIET, json_file
     examples=("realsim stats demo/session --out statistics", "realsim stats demo/session --json"),
 )  # fmt: skip
 @click.argument("sources", type=FOLDER, nargs=-1, required=True, metavar="SOURCE...")
-@click.option("--out", type=FOLDER, default=None, help="Folder for CSV, JSON and an HTML page.")
-@json_file("File for the JSON alone.")
+@click.option("--out", type=OUT, default=None, help="Folder for CSV, JSON and an HTML page.")
+@json_file("File for the JSON alone.", *KEYS)
 @JSON
 @QUIET
 def stats_command(

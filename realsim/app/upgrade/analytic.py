@@ -20,7 +20,7 @@ from realsim.app.upgrade.dataset import SceneRef
 from realsim.errors import InputError
 from realsim.records import GraspSet, ObjectModel
 from realsim.store import SessionStore, atomic
-from realsim.store.json_files import read_object
+from realsim.untrusted.own_json import read_object
 
 FOLDER = "grasps_analytic"
 LABELS = "grasp_label/{:03d}_labels.npz"

@@ -9,6 +9,7 @@ import click
 from realsim.app.command import Command
 from realsim.app.option_values import numbers_of
 from realsim.app.options import FOLDER, JSON, QUIET, workers
+from realsim.app.outputs import GOES_ON
 
 
 @click.command(
@@ -20,7 +21,12 @@ from realsim.app.options import FOLDER, JSON, QUIET, workers
     ),
 )
 @click.argument("dataset", type=FOLDER)
-@click.option("--out", type=FOLDER, required=True, help="Folder for the upgraded BOP dataset.")
+@click.option(
+    "--out",
+    type=GOES_ON,
+    required=True,
+    help="Folder for the upgraded BOP dataset.",
+)
 @click.option("--kind", default="auto", show_default=True,
               type=click.Choice(["auto", "bop", "graspnet"]), help="What DATASET is.")  # fmt: skip
 @click.option("--camera", default="", help="kinect or realsense, of GraspNet.  [both]",

@@ -18,7 +18,7 @@ from realsim.app.upgrade.config import UpgradeConfig
 from realsim.app.upgrade.dataset import SceneRef
 from realsim.errors import InputError
 from realsim.store import SessionStore, atomic
-from realsim.store.json_files import read_object
+from realsim.untrusted.own_json import read_object
 
 IMPORTED = "imported"
 NOTE = "stages/upgrade.json"

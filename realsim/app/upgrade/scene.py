@@ -25,7 +25,7 @@ from realsim.geometry import se3
 from realsim.records import CaptureSession, GraspSet, ObjectPose, Scene, View
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
-from realsim.store.session_store import read_json_file
+from realsim.untrusted.own_json import read_values
 
 Record = dict[str, Any]
 """What came of a scene, as plain JSON values."""
@@ -236,8 +236,8 @@ def _shown(source: SceneSource, store: SessionStore, pose: ObjectPose) -> Record
 
 def _visible_fractions(store: SessionStore, pose: ObjectPose) -> dict[int, float]:
     """Return how much of an object each image shows; rejected ones have no label to tell it."""
-    truth: Mapping[str, Any] = read_json_file(store.path("scene_gt.json"))
-    info: Mapping[str, Any] = read_json_file(store.path("scene_gt_info.json"))
+    truth: Mapping[str, Any] = read_values(store.path("scene_gt.json"))
+    info: Mapping[str, Any] = read_values(store.path("scene_gt_info.json"))
     out: dict[int, float] = {}
     for image, rows in truth.items():
         for row, about in zip(rows, info.get(image, ()), strict=False):

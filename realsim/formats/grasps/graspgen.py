@@ -28,8 +28,8 @@ from realsim.formats.grasps.scene_grasps import check_values, executed, held, un
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.store import atomic
-from realsim.store.json_files import read_object
 from realsim.store.records_json import array_from_json, array_to_json
+from realsim.untrusted.own_json import read_object
 
 Array = NDArray[np.float64]
 MOST_BYTES = 1 << 30

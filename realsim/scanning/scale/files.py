@@ -15,7 +15,6 @@ from realsim.scanning.scale.measured import Measurement
 from realsim.scanning.scale.measured_check import MeasuredCheck
 from realsim.scanning.scale.result import Limit, ScaleFit, Similarity, ViewAgreement
 from realsim.store import atomic
-from realsim.store.json_files import read_object
 from realsim.store.records_json import (
     array_from_json,
     array_to_json,
@@ -25,6 +24,7 @@ from realsim.store.records_json import (
     plane_from_json,
     plane_to_json,
 )
+from realsim.untrusted.own_json import read_object
 
 Json = dict[str, Any]
 FORMAT = "realsim scale"

@@ -21,8 +21,8 @@ from realsim.errors import InputError
 from realsim.scanning.sfm.config import SfmConfig
 from realsim.scanning.sfm.result import Alignment, SfmResult
 from realsim.store.atomic import write_bytes, write_json
-from realsim.store.json_files import read_object
 from realsim.store.records_json import array_to_json, intrinsics_to_json, number_to_json
+from realsim.untrusted.own_json import read_object
 
 Array = NDArray[np.float64]
 RESULT, CAMERAS, CLOUD = "sfm.json", "cameras.json", "sparse.ply"

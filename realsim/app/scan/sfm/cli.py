@@ -8,6 +8,7 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.options import FOLDER, JSON, QUIET, seed
+from realsim.app.outputs import OutputFolder
 
 
 @click.command(
@@ -19,7 +20,9 @@ from realsim.app.options import FOLDER, JSON, QUIET, seed
     ),
 )
 @click.argument("images", type=FOLDER)
-@click.option("--out", type=FOLDER, default=None, help="Folder.  [SESSION/scans/sfm, IMAGES/sfm]")
+@click.option(
+    "--out", type=OutputFolder(), default=None, help="Folder.  [SESSION/scans/sfm, IMAGES/sfm]"
+)
 @click.option(
     "--poses",
     type=click.Choice(["unknown", "known", "refined"]),

@@ -1,0 +1,166 @@
+"""Where commands may write: on a new name, or on what the same option wrote before.
+
+    @click.option("--out", type=OutputFile({".html": (DOCUMENT_SCRIPT,)}, "page"))
+
+The check is part of the option's type, so that it comes before any work, and a command that has
+such an option cannot forget it. A test holds every output option to these types.
+"""
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from realsim.errors import InputError
+
+Marks = Mapping[str, Sequence[str]]
+"""Suffix -> texts that every file of the option's own has; none = the suffix is enough."""
+SESSION_FILES = ("session.json", "session.begun.json", "robot.jsonl", "manifest.jsonl")
+SESSION_FOLDERS = (
+    "annotations", "calibration", "depth", "grasps", "imported", "labels", "mask", "mask_visib",
+    "models", "registration", "review", "rgb", "stages",
+)  # fmt: skip
+"""Folders of a session that hold data; into `reports`, `scans` and others anything may go."""
+
+
+class OutputFile(click.Path):
+    """A file that a command writes: a new one, or one that it wrote before."""
+
+    def __init__(self, own: Marks, what: str, *, beside: Sequence[str] = ()) -> None:
+        """Take what the command writes.
+
+        Args:
+            own: how its earlier files are told from other ones; its suffixes are those accepted.
+            what: the file in a word or two, such as "page".
+            beside: suffixes of files of the same name that are written with it.
+        """
+        super().__init__(path_type=Path)
+        self.own, self.what, self.beside = own, what, beside
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Return the path, if it may be written."""
+        path = Path(value)
+        if ctx is None or not ctx.resilient_parsing:
+            require_free_file(path, _spelled(param), self.own, self.what, self.beside)
+        return path
+
+
+class OutputFolder(click.Path):
+    """A folder that a command fills."""
+
+    def __init__(
+        self, files: Sequence[str] = (), own: tuple[str, Sequence[str]] = ("", ()), *,
+        goes_on: bool = False,
+    ) -> None:  # fmt: skip
+        """Take what the command writes there.
+
+        Args:
+            files: names that are the same in every run.
+            own: one of them and the texts in it, which tell an earlier run's from others' files.
+            goes_on: the command looks itself at what is there, to go on with it.
+        """
+        super().__init__(path_type=Path)
+        self.files, self.own, self.goes_on = files, own, goes_on
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Return the path, if it may be filled."""
+        path = Path(value)
+        if not (self.goes_on or (ctx is not None and ctx.resilient_parsing)):
+            require_free_folder(path, _spelled(param), self.files, self.own)
+        return path
+
+
+GOES_ON = OutputFolder(goes_on=True)
+"""A place of a command that says itself, and better, what it does with what is there."""
+
+
+def require_free_file(
+    path: Path, name: str, own: Marks, what: str, beside: Sequence[str] = ()
+) -> None:
+    """Raise unless a file can be written without loss of anything but its earlier self.
+
+    Args:
+        path: the file.
+        name: of the option, for messages.
+        own: see `OutputFile`.
+        what: the file in a word or two.
+        beside: suffixes of files that are written with it.
+
+    Raises:
+        InputError: a folder, a device, another suffix, a file that the option did not write, or in
+            a folder that is missing or cannot be written.
+    """
+    shown, suffixes = f"{name} '{path}'", " or ".join(own)
+    if path.is_dir():
+        raise InputError(f"{shown} is a folder; the name of a file ({suffixes}) is expected.")
+    if os.path.lexists(path) and not path.is_file():
+        raise InputError(
+            f"{shown} is a device, or a link to nothing; give a name for the {what}, such as "
+            f"result{next(iter(own))}. `--json` prints the figures."
+        )
+    if path.suffix.lower() not in own:
+        raise InputError(
+            f"{shown} is written as a {what}; a name that ends in {suffixes} is expected."
+        )
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise InputError(
+            f"the folder '{path.parent}' ({folder}) for {name} is not there; make it first."
+        )
+    if not os.access(folder, os.W_OK):
+        raise InputError(f"the folder '{path.parent}' for {name} may not be written by you.")
+    if path.name in SESSION_FILES:
+        raise InputError(f"{shown} is a name of a session's own files; give another name.")
+    is_own = path.is_file() and has_texts(path, own[path.suffix.lower()])
+    others = [p for p in (path.with_suffix(suffix) for suffix in beside) if os.path.lexists(p)]
+    if path.is_file() and not is_own:
+        others = [path]
+    if others and not is_own:
+        raise InputError(
+            f"{name} '{others[0]}' is there and is no {what} that this command wrote; it is not "
+            "replaced. Give another name, or delete it first."
+        )
+
+
+def require_free_folder(
+    path: Path, name: str, files: Sequence[str], own: tuple[str, Sequence[str]]
+) -> None:
+    """Raise unless a folder can be filled without loss of anything but what was written there.
+
+    Raises:
+        InputError: a file, a session, a folder of a session's data, or it holds files of the same
+            names that another program or user made.
+    """
+    if os.path.lexists(path) and not path.is_dir():
+        raise InputError(f"{name} '{path}' is a file; give a folder.")
+    real = path.resolve()
+    for session in (real, *real.parents):
+        inside = real.relative_to(session).parts[:1]
+        if (not inside or inside[0] in SESSION_FOLDERS) and any(
+            (session / file).is_file() for file in SESSION_FILES
+        ):
+            raise InputError(
+                f"{name} '{path}' is part of the session '{session}', whose own files are not "
+                "replaced; give another folder."
+            )
+    there = [path / file for file in files if os.path.lexists(path / file)]
+    if there and not (own[0] and (path / own[0]).is_file() and has_texts(path / own[0], own[1])):
+        raise InputError(
+            f"{name} '{path}': {there[0]} is there, made by something else or of something else; "
+            "it is not replaced. Give another folder, or delete it first."
+        )
+
+
+def has_texts(path: Path, texts: Iterable[str]) -> bool:
+    """Return whether a file holds all texts."""
+    data = path.read_bytes()
+    return all(text.encode() in data for text in texts)
+
+
+def _spelled(param: click.Parameter | None) -> str:
+    """Return an option as it is typed, an argument as the help names it."""
+    if param is None:
+        return "the output"
+    return param.opts[0] if isinstance(param, click.Option) else param.human_readable_name

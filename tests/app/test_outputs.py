@@ -1,0 +1,144 @@
+"""No output option replaces what its command did not write; a session without a header is told."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from realsim.app.cli import commands
+from realsim.app.command import walk
+from realsim.app.outputs import OutputFile, OutputFolder
+from realsim.errors import InputError
+from synthetic_scenes import captured_session
+
+NAMES = {"out", "dest", "static", "replay_file", "json_file"}
+"""What parameters are called that say where a result goes."""
+OUTPUTS = {
+    f"{' '.join(path)} {parameter.opts[0]}": (path, parameter)
+    for path, command in walk(commands).items()
+    for parameter in command.params
+    if parameter.name in NAMES
+}
+FILES = [name for name, (_, p) in OUTPUTS.items() if isinstance(p.type, OutputFile)]
+FOLDERS = [
+    name
+    for name, (_, p) in OUTPUTS.items()
+    if isinstance(p.type, OutputFolder) and not p.type.goes_on
+]
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return captured_session(tmp_path_factory.mktemp("outputs") / "s", count=2).folder
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def convert(name: str, path: Path) -> Path:
+    return OUTPUTS[name][1].type.convert(str(path), OUTPUTS[name][1], None)
+
+
+def test_every_output_option_has_the_guard() -> None:
+    kinds = {name: p.type for name, (_, p) in OUTPUTS.items()}
+    assert not [n for n, kind in kinds.items() if not isinstance(kind, OutputFile | OutputFolder)]
+    assert len(FILES) >= 8 and len(FOLDERS) >= 6
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_file_that_the_command_did_not_write_is_refused(
+    name: str, session: Path, tmp_path: Path
+) -> None:
+    before = contents(session)
+    suffix = next(iter(OUTPUTS[name][1].type.own))
+    foreign, pipe, link = (tmp_path / f"{n}{suffix}" for n in ("mine", "pipe", "link"))
+    foreign.write_text('{"my": "thesis"}')
+    os.mkfifo(pipe)
+    link.symlink_to(session / "session.json")
+    for path in (*before, foreign, pipe, link, tmp_path, tmp_path / "no" / f"x{suffix}"):
+        with pytest.raises(InputError):
+            convert(name, path)
+    assert contents(session) == before
+    assert convert(name, tmp_path / f"new{suffix}") == tmp_path / f"new{suffix}"
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_what_the_command_wrote_before_is_replaced(name: str, tmp_path: Path) -> None:
+    for suffix, texts in OUTPUTS[name][1].type.own.items():
+        path = tmp_path / f"earlier{suffix}"
+        path.write_text(" ".join(texts))
+        assert convert(name, path) == path
+
+
+@pytest.mark.parametrize("name", FOLDERS)
+def test_a_session_is_no_folder_for_results(name: str, session: Path, tmp_path: Path) -> None:
+    for path in (session, session / "registration", session / "rgb/more", session / "session.json"):
+        with pytest.raises(InputError, match=r"part of the session|is a file"):
+            convert(name, path)
+    assert convert(name, session / "reports/more") and convert(name, tmp_path)
+    for file in OUTPUTS[name][1].type.files:
+        (tmp_path / file).write_text("mine")
+        with pytest.raises(InputError, match="not replaced"):
+            convert(name, tmp_path)
+        (tmp_path / file).unlink()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["stats", "S", "--json-file", "S/session.json"],
+        ["review", "S", "--static", "S/session.json"],
+        ["report", "S", "--out", "S/rgb/000000.png"],
+        ["depth-fit", "S", "--out", "S/scene_camera.json"],
+        ["stats", "S", "--out", "S"],
+        ["calibrate", "P", "--board", "tag:7,size=80mm", "--out", "S/calibration"],
+    ],
+)
+def test_nothing_of_a_session_is_lost(session: Path, tmp_path: Path, words: list[str]) -> None:
+    before = contents(session)
+    typed = [w.replace("S", str(session), 1) if w[0] == "S" else w for w in words]
+    done = CliRunner().invoke(commands, [str(tmp_path) if w == "P" else w for w in typed])
+    assert isinstance(done.exception, InputError), done.output
+    assert contents(session) == before
+
+
+def test_a_calibration_of_other_images_is_not_replaced(tmp_path: Path) -> None:
+    done = tmp_path / "calibration/exports"
+    done.mkdir(parents=True)
+    (done / "calibration.json").write_text("{}")
+    call = ["calibrate", str(tmp_path), "--board", "tag:7,size=80mm", "--out", str(done.parent)]
+    assert "made by something else" in str(CliRunner().invoke(commands, call).exception)
+    note = json.dumps({"images": str(tmp_path.resolve())})
+    (done.parent / "calibrated_of.json").write_text(note)
+    assert "made by something else" not in str(CliRunner().invoke(commands, call).exception)
+
+
+def test_a_session_without_its_header_is_told_and_how_it_is_mended(
+    session: Path, tmp_path: Path
+) -> None:
+    board = session / "calibration/capture"
+    captured_session(board, count=2)
+    header = session / "session.json"
+    kept = header.read_bytes()
+    header.unlink()
+    out = tmp_path / "out"
+    for words in (
+        ["export", session, "--to", "bop", "--out", out], ["stats", session],
+        ["export", session.parent, "--to", "bop", "--out", out], ["stats", session.parent],
+        ["import", session, out], ["report", session], ["review", session, "--no-browser"],
+    ):  # fmt: skip
+        done = CliRunner().invoke(commands, [str(w) for w in words])
+        assert isinstance(done.exception, InputError), (words, done.output)
+        assert "session.json is lost" in str(done.exception), words
+        assert "--repair` makes it anew" in str(done.exception)
+    assert not out.exists()
+    header.write_bytes(kept)
+
+
+def test_board_views_alone_are_no_scene(tmp_path: Path) -> None:
+    captured_session(tmp_path / "s/calibration/capture", count=2)
+    done = CliRunner().invoke(commands, ["stats", str(tmp_path / "s")])
+    assert isinstance(done.exception, InputError) and "no session" in str(done.exception)
