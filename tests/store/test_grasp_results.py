@@ -55,7 +55,7 @@ def test_a_newer_format_is_refused_by_its_number(tmp_path, found):
     path = stores.save_grasps(tmp_path, tried_set(np.random.default_rng(1), 3))
     note = path.with_suffix(".json")
     note.write_text(json.dumps(json.loads(note.read_text()) | {"format_version": found}))
-    with pytest.raises(InputError, match="format.version"):
+    with pytest.raises(InputError, match=r"format.version"):
         stores.load_grasps(tmp_path)
 
 
