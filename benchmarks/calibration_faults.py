@@ -28,7 +28,7 @@ from realsim.geometry import se3
 from realsim.records import Chessboard
 from realsim_calibration.faults.diagnose import diagnose
 from realsim_calibration.faults.diagnosis import Diagnosis
-from realsim_calibration.faults.half_turns import turn_board
+from realsim_calibration.faults.half_turns import half_turn
 from realsim_calibration.faults.rotation_readings import (
     Convention,
     four_number_conventions,
@@ -276,7 +276,7 @@ def flipped(s: Session, rng: Rng) -> Session:
     count = int(rng.integers(1, (n - 1) // 2 + 1))
     rows = np.sort(rng.choice(n, count, replace=False))
     C = s.C.copy()
-    C[rows] = C[rows] @ turn_board(s.target.points_board.mean(0), 2)
+    C[rows] = C[rows] @ half_turn(s.target.points_board.mean(0))
     return replace(s, C=C, expected=("board_flips",), views=tuple(int(r) for r in rows))
 
 

@@ -30,10 +30,10 @@ from realsim_calibration.fit.joint_solve import (
     JointState,
     Setup,
     ViewCorners,
-    camera_vector,
 )
 from realsim_calibration.fit.linear_model import LinearModel
 from realsim_calibration.fit.robust_fit import solve
+from realsim_calibration.fit.view_system import camera_vector
 from realsim_capture_plans.arms.kinematics import UR5E
 
 Array = NDArray[np.float64]

@@ -272,7 +272,7 @@ def _closed_forms(
     tried: dict[str, tuple[Array, Array, Array]] = {}
     for name, solve_closed in CLOSED_FORMS.items():
         X, Z = solve_closed(A, C)
-        tried[name] = (X, Z, np.array([_view_px(c, X, Z, intrinsics) for c in candidates]))
+        tried[name] = (X, Z, _view_px(candidates, X, Z, intrinsics))
     return tried
 
 
@@ -281,8 +281,12 @@ def _best(tried: dict[str, tuple[Array, Array, Array]]) -> tuple[Array, Array, A
     return min(tried.values(), key=lambda entry: float(np.median(entry[2])))
 
 
-def _view_px(c: Candidate, X: Array, Z: Array, intrinsics: CameraIntrinsics) -> float:
-    """Return a view's reprojection RMS through the robot pose [px], infinite behind the camera."""
-    error = project(intrinsics, se3.transform(se3.invert(c.A @ X) @ Z, c.points)) - c.uv
-    px = float(np.sqrt(np.mean(np.sum(error**2, -1))))
-    return px if np.isfinite(px) else np.inf
+def _view_px(candidates: list[Candidate], X: Array, Z: Array, camera: CameraIntrinsics) -> Array:
+    """Return each view's RMS through the robot pose [px], infinite behind the camera."""
+    Ts = se3.invert(_stacks(candidates)[0] @ X) @ Z
+    seen = [se3.transform(T, c.points) for T, c in zip(Ts, candidates, strict=True)]
+    error = project(camera, np.concatenate(seen)) - np.concatenate([c.uv for c in candidates])
+    counts = np.array([len(c.uv) for c in candidates])
+    first = np.cumsum(counts) - counts
+    px = np.sqrt(np.add.reduceat(np.sum(error**2, -1), first) / counts)
+    return np.where(np.isfinite(px), px, np.inf)

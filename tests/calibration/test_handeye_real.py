@@ -9,7 +9,7 @@ from realsim.geometry import se3
 from realsim_calibration import CLOSED_FORMS
 from realsim_calibration.faults.gates import (
     GateConfig,
-    angle_gate,
+    frame_gate,
     rotation_mismatch_deg,
     screw_ratio,
 )
@@ -83,5 +83,5 @@ def _is_rigid(T):
 
 def test_the_rotation_outlier_is_named(data):
     A, C = data
-    _, dropped, _ = angle_gate(A, C, [None] * len(A), GateConfig())
+    _, dropped, _ = frame_gate(A, C, [None] * len(A), np.zeros(3), GateConfig())
     assert list(dropped) == [7]

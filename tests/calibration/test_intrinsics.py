@@ -10,11 +10,11 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Chessboard, CircleGrid
+from realsim_calibration.fit.view_system import camera_vector
 from realsim_calibration.lens.bundle import (
     Observations,
     State,
     _normal,  # pyright: ignore[reportPrivateUsage]
-    camera_vector,
     shaped_points,
 )
 from realsim_calibration.lens.fit import IntrinsicsConfig

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.camera import project, projection_jacobian, undistort
+from realsim.geometry.camera import project, projection_jacobian
 from realsim.records import CameraIntrinsics, Target
+from realsim_calibration.fit.board_pose import planar_poses
 from realsim_calibration.results import BoardShape
 from realsim_calibration.views import Array, TargetDetection
 
@@ -181,7 +182,7 @@ def board_poses(
     if view.T_cam_board is not None:
         found = [(_rms(view.T_cam_board, points, detection.uv, camera), view.T_cam_board)]
     else:
-        found = planar_poses(drawn, points, detection.uv, camera)
+        found = planar_poses(points, detection.uv, camera, drawn)
     if not found:
         return "no pose of the target in front of the camera fits its points"
     poses: list[PosedBoard] = []
@@ -200,30 +201,6 @@ def board_poses(
 def _rms(T: Array, points: Array, uv: Array, camera: CameraIntrinsics) -> float:
     error = project(camera, se3.transform(T, points)) - uv
     return float(np.sqrt(np.mean(np.sum(error**2, -1))))
-
-
-def planar_poses(
-    drawn: Array, points: Array, uv: Array, camera: CameraIntrinsics
-) -> list[tuple[float, Array]]:
-    """Return (RMS [px], T_cam_board) of both planar solutions, refined, the better one first."""
-    import cv2
-
-    from realsim_calibration.fit.board_pose import refine_board_pose
-
-    xy, valid = undistort(camera, uv)
-    if valid.sum() < 4:
-        return []
-    found: list[tuple[float, Array]] = []
-    _, rotations, translations, _ = cv2.solvePnPGeneric(
-        drawn[valid], xy[valid], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-    )
-    for r, t in zip(rotations, translations, strict=True):
-        start = se3.from_rt(se3.exp_so3(np.ravel(r)), np.ravel(t))
-        T, rms = refine_board_pose(start, points, uv, camera)
-        fresh = all(se3.angle(se3.invert(T) @ other) > 1e-3 for _, other in found)
-        if np.isfinite(rms) and fresh:
-            found.append((rms, T))
-    return sorted(found, key=lambda pair: pair[0])
 
 
 def pose_jacobian(T: Array, points: Array, camera: CameraIntrinsics) -> tuple[Array, Array]:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.geometry import se3
 from realsim_calibration.faults.diagnosis import DiagnosisConfig
+from realsim_calibration.faults.frame_fit import chord_angle
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ def find_copies(T: Array, C: Array, middle: Array, config: DiagnosisConfig) -> C
     same_hand = _near(T, 1e-3 * config.same_pose_mm * unit, np.radians(config.same_pose_deg))
     q = C[:, :3, :3] @ middle + C[:, :3, 3]
     distance = max(float(np.median(np.linalg.norm(q, axis=-1))), 1e-12)
-    turn = se3.angle(np.swapaxes(C[:, :3, :3], -1, -2)[:, None] @ C[None, :, :3, :3])
+    turn = chord_angle(C[:, None, :3, :3], C[None, :, :3, :3])
     slip = np.linalg.norm(q[:, None] - q[None], axis=-1) / distance
     seen = np.hypot(turn / np.radians(config.fit.unit_deg), slip / config.fit.unit_part)
     # The same image gives the same numbers; a second photograph of the same view does not.
@@ -48,7 +48,7 @@ def _length_unit(T: Array) -> float:
 
 def _near(T: Array, length: float, angle: float) -> NDArray[np.bool_]:
     far = np.linalg.norm(T[:, None, :3, 3] - T[None, :, :3, 3], axis=-1)
-    turn = se3.angle(np.swapaxes(T[:, :3, :3], -1, -2)[:, None] @ T[None, :, :3, :3])
+    turn = chord_angle(T[:, None, :3, :3], T[None, :, :3, :3])
     return (far < length) & (turn < angle)
 
 

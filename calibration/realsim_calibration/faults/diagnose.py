@@ -40,6 +40,7 @@ from realsim_calibration.faults.hypotheses import (
     size_name,
 )
 from realsim_calibration.faults.tool_offset import tool_offset
+from realsim_calibration.fit.closed_forms import motions, principal_turns
 from realsim_calibration.results import Mode
 
 Array = NDArray[np.float64]
@@ -266,11 +267,7 @@ def _best(
 
 def _untestable(p: Poses, config: DiagnosisConfig) -> tuple[str, str] | None:
     """Return why conventions cannot be tested, None where they can."""
-    i, j = np.triu_indices(len(p.T), 1)
-    second: list[float] = []
-    for S in (p.T, p.C):
-        w = se3.log_so3(np.swapaxes(S[j, :3, :3], -1, -2) @ S[i, :3, :3])
-        second.append(float(np.degrees(np.sqrt(max(np.linalg.eigvalsh(w.T @ w / len(w))[1], 0)))))
+    second = [np.degrees(principal_turns(m.turns)[0][1]) for m in motions(p.T, p.C)]
     if max(second) >= config.least_turn_deg:
         return None
     return (

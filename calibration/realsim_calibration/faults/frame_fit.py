@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.fit.closed_forms import HALF_TURN
+from realsim_calibration.fit.closed_forms import clear_of_half_turns, motions
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -126,11 +126,10 @@ def fit_frames(
     m = np.asarray(middle, dtype=np.float64)
     q = C[:, :3, :3] @ m + C[:, :3, 3]
     rng = np.random.default_rng(config.seed)
-    Ra, Rc = A[:, :3, :3], C[:, :3, :3]
-    Rx, Rz = _start_rotations(Ra, np.swapaxes(Rc, -1, -2), config, rng)
+    Rx, Rz = _start_rotations(A, C, config, rng)
     distance = max(float(np.median(np.linalg.norm(q, axis=-1))), 1e-12)
     linear = _start_translations(A, q, Rx, distance, config, rng)
-    return _refine(A, Rc, q, (Rx, Rz, linear), m, config)
+    return _refine(A, C[:, :3, :3], q, (Rx, Rz, linear), m, config)
 
 
 def mismatch(fit: FrameFit, A: ArrayLike, C: ArrayLike, config: FitConfig) -> Array:
@@ -138,7 +137,7 @@ def mismatch(fit: FrameFit, A: ArrayLike, C: ArrayLike, config: FitConfig) -> Ar
     A, C = np.asarray(A, dtype=np.float64), np.asarray(C, dtype=np.float64)
     left = A @ fit.X
     Rs = fit.Z[:3, :3] @ np.swapaxes(C[:, :3, :3], -1, -2)
-    angle = _chord_angle(left[:, None, :3, :3], Rs[None])
+    angle = chord_angle(left[:, None, :3, :3], Rs[None])
     seen = fit.length_ratio * (C[:, :3, :3] @ fit.middle + C[:, :3, 3])
     where = np.einsum("kij,lj->kli", left[:, :3, :3], seen) + left[:, None, :3, 3]
     z = fit.Z[:3, :3] @ fit.middle * fit.length_ratio + fit.Z[:3, 3]
@@ -150,7 +149,7 @@ def _units(angles: Array, slips: Array, distance: float, config: FitConfig) -> A
     return np.hypot(angles / np.radians(config.unit_deg), slips / (distance * config.unit_part))
 
 
-def _chord_angle(R: Array, S: Array) -> Array:
+def chord_angle(R: Array, S: Array) -> Array:
     """Return the angle between rotations from their chord, exact for small angles [rad]."""
     chord = np.linalg.norm(R - S, axis=(-2, -1))
     return 2 * np.arcsin(np.clip(chord / np.sqrt(8.0), 0.0, 1.0))
@@ -173,24 +172,22 @@ def _draw(n: int, size: int, samples: int, rng: np.random.Generator) -> Indices:
     return np.argsort(rng.random((samples, n)), axis=1)[:, :size]
 
 
-def _turns(Ra: Array, Rd: Array) -> tuple[Array, Array]:
+def _turns(A: Array, C: Array) -> tuple[Array, Array]:
     """Return the turns (n, n, 3) of hand and camera between views, 0 near half turns [rad]."""
-    n = len(Ra)
-    i, j = np.triu_indices(n, 1)
-    a = se3.log_so3(np.swapaxes(Ra[j], -1, -2) @ Ra[i])
-    b = se3.log_so3(np.swapaxes(Rd[j], -1, -2) @ Rd[i])
-    longest = np.maximum(np.linalg.norm(a, axis=-1), np.linalg.norm(b, axis=-1))
-    clear = (longest < HALF_TURN)[:, None]
-    turns = np.zeros((2, n, n, 3))
-    turns[0, i, j], turns[1, i, j] = a * clear, b * clear
+    hand, cam = motions(A, C)
+    clear = clear_of_half_turns(hand, cam)[:, None]
+    i, j = np.triu_indices(len(A), 1)
+    turns = np.zeros((2, len(A), len(A), 3))
+    turns[0, i, j], turns[1, i, j] = hand.turns * clear, cam.turns * clear
     return turns[0], turns[1]
 
 
 def _start_rotations(
-    Ra: Array, Rd: Array, config: FitConfig, rng: np.random.Generator
+    A: Array, C: Array, config: FitConfig, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Return R_X and R_Z that most views agree with."""
-    a, b = _turns(Ra, Rd)
+    Ra, Rd = A[:, :3, :3], np.swapaxes(C[:, :3, :3], -1, -2)
+    a, b = _turns(A, C)
     triples = np.sort(_draw(len(Ra), 3, 3 * config.samples, rng), axis=1)
     i, j, k = triples.T
     M = sum(a[p, q][:, :, None] * b[p, q][:, None, :] for p, q in ((i, j), (i, k), (j, k)))
@@ -204,11 +201,11 @@ def _start_rotations(
                               Zs[-1:].sum(1)])  # fmt: skip
     Rz = _nearest_rotations(members)
     limit = np.radians(config.unit_deg) * config.agree
-    loss = np.minimum(_chord_angle(Zs, Rz[:, None]), limit)
+    loss = np.minimum(chord_angle(Zs, Rz[:, None]), limit)
     best = int(np.argmin(np.sum(loss**2, 1)))
     X, Z = Rx[best], Rz[best]
     for _ in range(2):
-        good = _chord_angle(Ra @ X @ np.swapaxes(Rd, -1, -2), Z) < limit
+        good = chord_angle(Ra @ X @ np.swapaxes(Rd, -1, -2), Z) < limit
         if good.sum() < MIN_VIEWS:
             break
         w = good[:, None] & good[None, :]

@@ -8,8 +8,7 @@ their motion, which must be the hand's, without any hand-eye:
 
 The pairwise answers are made consistent by the leading eigenvector of the matrix of their signs
 (angular synchronisation, Singer, ACHA 30(1), 2011), which half of the views turned do not disturb.
-Square grids also look the same turned by 90 deg: then the answers are the four roots of unity. All
-views turned alike is no fault, so the fewer views are called turned.
+All views turned alike is no fault, so the fewer views are called turned.
 """
 
 from dataclasses import dataclass
@@ -21,14 +20,13 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 
 Array = NDArray[np.float64]
+Flips = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class HalfTurnConfig:
     """How the turns are decided."""
 
-    quarter_turns: bool = False
-    """Whether 90 deg are possible too: square symmetric grids only."""
     soft_deg: float = 0.5
     """Differences of angle below this say nothing [deg]: the angle error of a planar pose."""
     sweeps: int = 5
@@ -43,26 +41,22 @@ class HalfTurnConfig:
 class HalfTurns:
     """Which boards were read turned."""
 
-    flips: NDArray[np.bool_]
+    flips: Flips
     """(n,) whether the board was read turned."""
-    quarters: NDArray[np.int64]
-    """(n,) by how many quarter turns its pose must be turned to agree: 0 or 2, or 0 to 3."""
     before_deg: float
     """RMS difference of the turns of hand and camera over the pairs as given, at most 60 each."""
     after_deg: float
     """The same with the boards turned back."""
-    margins_deg: Array
-    """(n,) how much worse each view fits (median over its pairs) turned any other way [deg]."""
     decisive: bool
     """Whether turned boards are certain: they explain what the poses as given do not."""
     repaired: Array
     """(n, 4, 4) board poses turned back."""
 
 
-def turn_board(middle_m: ArrayLike, quarters: int) -> Array:
-    """Return F (4, 4): `quarters` times 90 deg about the normal through the board's middle."""
+def half_turn(middle_m: ArrayLike) -> Array:
+    """Return F (4, 4): the turn by 180 deg about the normal through the board's middle."""
+    R = np.diag([-1.0, -1.0, 1.0])
     m = np.asarray(middle_m, dtype=np.float64)
-    R = se3.exp_so3(np.array([0.0, 0.0, quarters * np.pi / 2]))
     return se3.from_rt(R, m - R @ m)
 
 
@@ -90,101 +84,59 @@ def synchronise_half_turns(
             f"half turns: {len(A)} hand poses and {len(C)} board poses; three or more views with "
             "one of each are needed."
         )
-    steps = (0, 1, 2, 3) if config.quarter_turns else (0, 2)
-    off = _differences(A, C, steps)
-    quarters = _synchronise(off, steps, np.radians(config.soft_deg))
-    quarters = _polish(off, steps, quarters, config.sweeps)
-    values, counts = np.unique(quarters, return_counts=True)
-    quarters = (quarters - values[np.argmax(counts)]) % 4
-    before, after = _rms(off, steps, 0 * quarters), _rms(off, steps, quarters)
-    repaired = np.array(
-        [T @ turn_board(middle_m, int(q)) for T, q in zip(C, quarters, strict=True)]
-    )
+    off = _differences(A, C)
+    flips = _polish(off, _synchronise(off, np.radians(config.soft_deg)), config.sweeps)
+    if 2 * flips.sum() > len(flips):
+        flips = ~flips
+    before, after = _rms(off, np.zeros_like(flips)), _rms(off, flips)
+    sure = flips.any() and after * config.decisive_ratio < before
     return HalfTurns(
-        flips=quarters != 0,
-        quarters=quarters,
-        before_deg=before,
-        after_deg=after,
-        margins_deg=_margins(off, steps, quarters),
-        decisive=bool(
-            quarters.any()
-            and after * config.decisive_ratio < before
-            and after < config.max_after_deg
-        ),
-        repaired=repaired,
+        flips=flips, before_deg=before, after_deg=after,
+        decisive=bool(sure and after < config.max_after_deg),
+        repaired=np.where(flips[:, None, None], C @ half_turn(middle_m), C),
+    )  # fmt: skip
+
+
+def _differences(A: Array, C: Array) -> Array:
+    """Return (2, n, n) |angle(A_ij) - angle(F^k C_i^-1 C_j)| [rad], k = 0, 1.
+
+    tr(R^T S) is the product of the two as vectors.
+    """
+    turned = (C @ half_turn(np.zeros(3)))[:, :3, :3].reshape(-1, 9)
+    Ra, Rc = A[:, :3, :3].reshape(-1, 9), C[:, :3, :3].reshape(-1, 9)
+    hand, same, other = (
+        np.arccos(np.clip((left @ right.T - 1) / 2, -1, 1))
+        for left, right in ((Ra, Ra), (Rc, Rc), (turned, Rc))
     )
+    return np.abs(np.stack([same, other]) - hand)
 
 
-def _differences(A: Array, C: Array, steps: tuple[int, ...]) -> Array:
-    """Return (steps, n, n) |angle(A_ij) - angle(F^step C_i^-1 C_j)| [rad]."""
-    Ra, Rc = A[:, :3, :3], C[:, :3, :3]
-    hand = se3.angle(np.swapaxes(Ra, -1, -2)[:, None] @ Ra[None])
-    cam = np.swapaxes(Rc, -1, -2)[:, None] @ Rc[None]
-    return np.array(
-        [np.abs(se3.angle(turn_board(np.zeros(3), k)[:3, :3] @ cam) - hand) for k in steps]
-    )
-
-
-def _synchronise(off: Array, steps: tuple[int, ...], soft: float) -> NDArray[np.int64]:
-    """Return the quarter turns (n,) that the pairwise answers agree on best."""
-    order = np.sort(off, axis=0)
-    weight = (order[1] - order[0]) / (order[1] + order[0] + soft)
-    answer = np.exp(0.5j * np.pi * np.array(steps)[off.argmin(0)]) * weight
+def _synchronise(off: Array, soft: float) -> Flips:
+    """Return the turns (n,) that the pairwise answers agree on best."""
+    answer = (off[1] - off[0]) / (off[1] + off[0] + soft)
     np.fill_diagonal(answer, 0)
-    # answer_ij = phase_j / phase_i, so that conj(phase) is an eigenvector.
-    hermitian = (answer + answer.conj().T) / 2
-    leading = np.linalg.eigh(hermitian)[1][:, -1].conj()
-    phase = leading / leading[np.argmax(np.abs(leading))]
-    distance = np.abs(
-        phase[:, None] - np.abs(phase)[:, None] * np.exp(0.5j * np.pi * np.array(steps))
-    )
-    return np.array(steps, dtype=np.int64)[distance.argmin(1)]
+    leading = np.linalg.eigh(answer)[1][:, -1]
+    return leading * leading[np.argmax(np.abs(leading))] < 0
 
 
-def _chosen(off: Array, steps: tuple[int, ...], quarters: NDArray[np.int64]) -> Array:
-    """Return (n, n) the differences under these turns, NaN on the diagonal."""
-    relative = (quarters[None] - quarters[:, None]) % 4
-    slot = np.searchsorted(np.array(steps), relative)
-    chosen = np.take_along_axis(off, slot[None], 0)[0].copy()
-    np.fill_diagonal(chosen, np.nan)
-    return chosen
-
-
-def _polish(
-    off: Array, steps: tuple[int, ...], quarters: NDArray[np.int64], sweeps: int
-) -> NDArray[np.int64]:
+def _polish(off: Array, flips: Flips, sweeps: int) -> Flips:
     """Return the turns after every view was turned to where it fits best, a few times."""
-    quarters = quarters.copy()
+    flips = flips.copy()
+    others = ~np.eye(len(flips), dtype=bool)
     for _ in range(sweeps):
-        old = quarters.copy()
-        for v in range(len(quarters)):
-            quarters[v] = steps[int(np.argmin(_view_costs(off, steps, quarters, v)))]
-        if np.array_equal(old, quarters):
+        old = flips.copy()
+        for v in range(len(flips)):
+            apart = flips[others[v]].astype(int)
+            row = off[:, v, others[v]]
+            as_is, turned = (np.median(np.where(apart == k, row[0], row[1])) for k in (0, 1))
+            flips[v] = turned < as_is
+        if np.array_equal(old, flips):
             break
-    return quarters
+    return flips
 
 
-def _view_costs(
-    off: Array, steps: tuple[int, ...], quarters: NDArray[np.int64], view: int
-) -> Array:
-    """Return the median difference (steps,) of a view's pairs for every way to turn it [rad]."""
-    others = np.arange(len(quarters)) != view
-    costs = np.empty(len(steps))
-    for k, step in enumerate(steps):
-        slot = np.searchsorted(np.array(steps), (step - quarters[others]) % 4)
-        costs[k] = np.median(off[slot, np.flatnonzero(others), view])
-    return costs
-
-
-def _margins(off: Array, steps: tuple[int, ...], quarters: NDArray[np.int64]) -> Array:
-    margins = np.empty(len(quarters))
-    for v in range(len(quarters)):
-        costs = np.sort(_view_costs(off, steps, quarters, v))
-        margins[v] = np.degrees(costs[1] - costs[0])
-    return margins
-
-
-def _rms(off: Array, steps: tuple[int, ...], quarters: NDArray[np.int64]) -> float:
-    """Return the RMS over the pairs, each at most 60 deg [deg]."""
-    degrees = np.degrees(_chosen(off, steps, quarters))
-    return float(np.sqrt(np.nanmean(np.minimum(degrees, 60.0) ** 2)))
+def _rms(off: Array, flips: Flips) -> float:
+    """Return the RMS over the pairs under these turns, each at most 60 deg [deg]."""
+    degrees = np.degrees(np.where(flips[None] == flips[:, None], off[0], off[1]))
+    degrees = degrees[~np.eye(len(flips), dtype=bool)]
+    return float(np.sqrt(np.mean(np.minimum(degrees, 60.0) ** 2)))

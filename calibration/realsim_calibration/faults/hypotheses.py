@@ -20,6 +20,7 @@ from realsim_calibration.faults.rotation_readings import (
     reread_degrees,
 )
 from realsim_calibration.faults.tool_offset import describe_offset
+from realsim_calibration.fit.closed_forms import motions
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -221,11 +222,7 @@ def reread_rotations(p: Poses, config: DiagnosisConfig, *, thorough: bool) -> li
                 f"They agree when what was read as {r.read_as} is read as {r.meant}.")
         for r in readings
     ]  # fmt: skip
-    i, j = np.triu_indices(len(R), 1)
-    hand, cam = (
-        float(np.sqrt(np.mean(se3.angle(np.swapaxes(S[i], -1, -2) @ S[j]) ** 2)))
-        for S in (R, p.C[:, :3, :3])
-    )
+    hand, cam = (float(np.sqrt(np.mean(np.sum(m.turns**2, -1)))) for m in motions(p.T, p.C))
     if hand < config.small_turn_part * cam:
         scale = float(np.degrees(1.0))
         readings = every_reading(R, scale) if thorough else reread(R, t, D, config.readings, scale)

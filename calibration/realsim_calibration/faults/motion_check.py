@@ -21,6 +21,7 @@ from realsim_calibration.faults.frame_fit import (
     hand_side,
     linearise,
 )
+from realsim_calibration.fit.closed_forms import principal_turns, relative
 
 Array = NDArray[np.float64]
 UNSEEN = 1e-8
@@ -105,7 +106,8 @@ def check_motion(
             "with one of each are needed."
         )
     m = np.asarray(middle, dtype=np.float64)
-    turns, axes = _turns(C)
+    rms, axes = principal_turns(relative(se3.invert(C)).turns)
+    turns, axes = np.degrees(rms), axes.T
     fit = fit_frames(hand_side(T, eye_in_hand), C, m, config.fit)
     sd_deg, sd_mm = _best_sd(hand_side(T, eye_in_hand), C, m, fit, config)
     roll = _range_deg(np.arctan2(C[:, 1, 0], C[:, 0, 0]))
@@ -119,14 +121,6 @@ def check_motion(
         turns_deg=turns, roll_deg=roll, sd_mm=sd_mm, sd_deg=sd_deg, identical=identical,
         sentences=tuple(found),
     )  # fmt: skip
-
-
-def _turns(C: Array) -> tuple[Array, Array]:
-    """Return the RMS turns [deg] about the camera's principal axes, and the axes (3, 3) in rows."""
-    i, j = np.triu_indices(len(C), 1)
-    w = se3.log_so3(C[j, :3, :3] @ np.swapaxes(C[i, :3, :3], -1, -2))
-    values, vectors = np.linalg.eigh(w.T @ w / len(w))
-    return np.degrees(np.sqrt(np.maximum(values[::-1], 0.0))), vectors.T[::-1]
 
 
 def _best_sd(
@@ -160,9 +154,9 @@ def _range_deg(angles: Array) -> float:
 
 def _identical(T: Array, config: MotionCheckConfig) -> tuple[tuple[int, int], ...]:
     i, j = np.triu_indices(len(T), 1)
-    step = se3.invert(T[i]) @ T[j]
-    near = np.linalg.norm(step[:, :3, 3], axis=-1) < 1e-3 * config.same_pose_mm
-    near &= se3.angle(step) < np.radians(config.same_pose_deg)
+    step = relative(T)
+    near = np.linalg.norm(step.Ts[:, :3, 3], axis=-1) < 1e-3 * config.same_pose_mm
+    near &= np.linalg.norm(step.turns, axis=-1) < np.radians(config.same_pose_deg)
     return tuple((int(a), int(b)) for a, b in zip(i[near], j[near], strict=True))
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.geometry.camera import undistort
 from realsim.records import CameraIntrinsics
-from realsim_calibration.fit.view_system import refined_pose
+from realsim_calibration.fit.view_system import camera_vector, refined_pose
 
 Array = NDArray[np.float64]
 REFINE_STEPS = 15
@@ -49,42 +49,49 @@ def estimate_board_pose(points: Array, uv: Array, intrinsics: CameraIntrinsics) 
         points: (n, 3) points in the board frame [m].
         uv: (n, 2) where they are in the image [px].
         intrinsics: the camera.
+    """
+    found = planar_poses(points, uv, intrinsics)
+    if not found:
+        return None
+    best, twin = found[0], found[1] if len(found) > 1 else (np.inf, None)
+    return BoardPose(T_cam_board=best[1], rms_px=best[0], twin=twin[1], twin_rms_px=twin[0])
+
+
+def planar_poses(
+    points: Array, uv: Array, intrinsics: CameraIntrinsics, drawn: Array | None = None
+) -> list[tuple[float, Array]]:
+    """Return (RMS [px], T_cam_board) of all planar solutions, refined, the best first.
 
     IPPE (Collins & Bartoli, IJCV 2014) gives both planar solutions and SQPnP one more start; all
-    are refined in pixels.
+    are refined in pixels. `drawn` (n, 3) is a flat board to start from where the points are warped.
     """
     import cv2
 
     xy, valid = undistort(intrinsics, uv)
     if valid.sum() < MIN_POINTS:
-        return None
-    starts: list[Array] = []
+        return []
+    flat, lens = points if drawn is None else drawn, camera_vector(intrinsics)
+    found: list[tuple[float, Array]] = []
     for flag in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP):
         _, rotations, translations, _ = cv2.solvePnPGeneric(
-            points[valid], xy[valid], np.eye(3), None, flags=flag
+            flat[valid], xy[valid], np.eye(3), None, flags=flag
         )
         for r, t in zip(rotations, translations, strict=True):
-            starts.append(se3.from_rt(se3.exp_so3(np.ravel(r)), np.ravel(t)))
-    found: list[tuple[float, Array]] = []
-    for T in starts:
-        refined, rms = refine_board_pose(T, points, uv, intrinsics)
-        turns = [se3.angle(se3.invert(refined) @ other) for _, other in found]
-        fresh = all(turn > SAME_POSE_RAD for turn in turns)
-        if np.isfinite(rms) and fresh:
-            found.append((rms, refined))
-    if not found:
-        return None
-    found.sort(key=lambda pair: pair[0])
-    best, twin = found[0], found[1] if len(found) > 1 else (np.inf, None)
-    return BoardPose(T_cam_board=best[1], rms_px=best[0], twin=twin[1], twin_rms_px=twin[0])
+            start = se3.from_rt(se3.exp_so3(np.ravel(r)), np.ravel(t))
+            refined, rms = refine_board_pose(start, points, uv, lens)
+            turns = [se3.angle(se3.invert(refined) @ other) for _, other in found]
+            if np.isfinite(rms) and all(turn > SAME_POSE_RAD for turn in turns):
+                found.append((rms, refined))
+    return sorted(found, key=lambda pair: pair[0])
 
 
 def refine_board_pose(
-    T_cam_board: Array, points: Array, uv: Array, intrinsics: CameraIntrinsics
+    T_cam_board: Array, points: Array, uv: Array, lens: Array
 ) -> tuple[Array, float]:
-    """Return the pose of locally least reprojection and its RMS [px] (Levenberg-Marquardt)."""
-    lens = np.concatenate([[intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy],
-                           intrinsics.distortion])  # fmt: skip
+    """Return the pose of locally least reprojection and its RMS [px] (Levenberg-Marquardt).
+
+    `lens` is (12,) fx fy cx cy and the distortion.
+    """
     T, cost = refined_pose(
         np.ascontiguousarray(T_cam_board), lens, np.ascontiguousarray(points),
         np.ascontiguousarray(uv), REFINE_STEPS, FIRST_DAMPING, RELATIVE_GAIN,

@@ -12,6 +12,7 @@ of the base frame and the choice of the board frame do not matter.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,19 +37,38 @@ class MotionConfig:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Motions:
-    """The relative motions of all pairs of views."""
+class Relative:
+    """The motions between all pairs i < j of a stack of poses."""
 
-    Ts_hand: Array
-    """(P, 4, 4) A_ij = T_eej_eei [m]."""
-    Ts_cam: Array
-    """(P, 4, 4) B_ij = T_camj_cami [m]."""
-    pairs: NDArray[np.int64]
-    """(P, 2) i < j."""
+    Ts: Array
+    """(P, 4, 4) T_j^-1 T_i [m]."""
+    turns: Array
+    """(P, 3) their rotation vectors [rad]."""
 
 
-def motions(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike) -> Motions:
-    """Return the motions between all pairs of N views.
+@lru_cache(maxsize=6)
+def _relative(poses: bytes) -> Relative:
+    # The tests of conventions, motion and turns, the gates and the closed forms all ask for the
+    # pairs of the same views: 33,000 of 256.
+    T = np.frombuffer(poses).reshape(-1, 4, 4)
+    i, j = np.triu_indices(len(T), 1)
+    Ts = se3.invert(T)[j] @ T[i]
+    found = Relative(Ts=Ts, turns=se3.log_so3(Ts[:, :3, :3]))
+    for array in (found.Ts, found.turns):
+        array.setflags(write=False)
+    return found
+
+
+def relative(Ts: ArrayLike) -> Relative:
+    """Return the motions T_j^-1 T_i between all pairs i < j of poses (N, 4, 4), computed once.
+
+    Of hand poses T_base_ee they are A_ij, of T_board_cam = C^-1 they are B_ij.
+    """
+    return _relative(np.ascontiguousarray(Ts, dtype=np.float64).tobytes())
+
+
+def motions(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike) -> tuple[Relative, Relative]:
+    """Return the motions of hand and camera between all pairs of N views.
 
     Raises:
         InputError: the two stacks do not have the same number of poses.
@@ -60,10 +80,16 @@ def motions(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike) -> Motions:
             f"hand-eye: {len(A)} hand poses and {len(C)} board poses were given; every view needs "
             "one of each."
         )
-    i, j = np.triu_indices(len(A), 1)
-    return Motions(
-        Ts_hand=se3.invert(A[j]) @ A[i], Ts_cam=C[j] @ se3.invert(C[i]), pairs=np.stack([i, j], -1)
-    )
+    return relative(A), relative(se3.invert(C))
+
+
+def principal_turns(turns: Array) -> tuple[Array, Array]:
+    """Return the RMS (3,) of turns (P, 3) about their principal axes, descending, and the axes.
+
+    The axes (3, 3) stand in columns.
+    """
+    values, axes = np.linalg.eigh(turns.T @ turns / len(turns))
+    return np.sqrt(np.maximum(values[::-1], 0.0)), axes[:, ::-1]
 
 
 def check_observable(Ts_base_ee: ArrayLike, config: MotionConfig | None = None) -> Array:
@@ -87,9 +113,7 @@ def check_observable(Ts_base_ee: ArrayLike, config: MotionConfig | None = None) 
             f"hand-eye: {len(A)} usable views; at least {config.min_views} that turn the hand "
             "about two different axes are needed, and 12 or more are advised."
         )
-    turns = se3.log_so3(motions(A, A).Ts_hand[:, :3, :3])
-    values, axes = np.linalg.eigh(turns.T @ turns / len(turns))
-    rms, axes = np.sqrt(np.maximum(values[::-1], 0.0)), axes[:, ::-1]
+    rms, axes = principal_turns(relative(A).turns)
     least = np.radians(config.min_turn_deg)
     if rms[0] < least:
         raise DegenerateError(
@@ -126,16 +150,16 @@ def park(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike) -> tuple[Array, Array]:
         DegenerateError: the motion does not determine the hand-eye.
     """
     check_observable(Ts_base_ee)
-    m = _without_half_turns(motions(Ts_base_ee, Ts_cam_board))
-    a, b = se3.log_so3(m.Ts_hand[:, :3, :3]), se3.log_so3(m.Ts_cam[:, :3, :3])
-    R = nearest_rotation(a.T @ b)
+    A, B, clear = _clear_motions(Ts_base_ee, Ts_cam_board)
+    R = nearest_rotation(A.turns[clear].T @ B.turns[clear])
+    hand, cam = A.Ts[clear], B.Ts[clear]
+    H, g = np.zeros((3, 3)), np.zeros(3)
     # Unlike the rotation, this equation of a pair differs from that of the pair reversed.
-    hand = np.concatenate([m.Ts_hand, se3.invert(m.Ts_hand)])
-    cam = np.concatenate([m.Ts_cam, se3.invert(m.Ts_cam)])
-    left = hand[:, :3, :3] - np.eye(3)
-    right = cam[:, :3, 3] @ R.T - hand[:, :3, 3]
-    t = np.linalg.lstsq(left.reshape(-1, 3), right.ravel(), rcond=None)[0]
-    X = se3.from_rt(R, t)
+    for a, b in ((hand, cam), (se3.invert(hand), se3.invert(cam))):
+        left = (a[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+        H += left.T @ left
+        g += left.T @ (b[:, :3, 3] @ R.T - a[:, :3, 3]).ravel()
+    X = se3.from_rt(R, np.linalg.solve(H, g))
     return X, mean_board(Ts_base_ee, X, Ts_cam_board)
 
 
@@ -151,16 +175,17 @@ def daniilidis(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike) -> tuple[Array, A
         DegenerateError: the motion does not determine the hand-eye.
     """
     check_observable(Ts_base_ee)
-    m = _without_half_turns(motions(Ts_base_ee, Ts_cam_board))
-    length = max(float(np.median(np.linalg.norm(m.Ts_hand[:, :3, 3], axis=-1))), 1e-9)
-    a, a_dual = _dual_quaternion(m.Ts_hand, length)
-    b, b_dual = _dual_quaternion(m.Ts_cam, length)
+    A, B, clear = _clear_motions(Ts_base_ee, Ts_cam_board)
+    length = max(float(np.median(np.linalg.norm(A.Ts[clear, :3, 3], axis=-1))), 1e-9)
+    a, a_dual = _dual_quaternion(A, clear, length)
+    b, b_dual = _dual_quaternion(B, clear, length)
     S = np.zeros((len(a), 6, 8))
     S[:, :3, 0] = S[:, 3:, 4] = (a - b)[:, 1:]
     S[:, :3, 1:4] = S[:, 3:, 5:] = se3.hat((a + b)[:, 1:])
     S[:, 3:, 0] = (a_dual - b_dual)[:, 1:]
     S[:, 3:, 1:4] = se3.hat((a_dual + b_dual)[:, 1:])
-    v1, v2 = np.linalg.svd(S.reshape(-1, 8), full_matrices=False)[2][-2:]
+    flat = S.reshape(-1, 8)
+    v2, v1 = np.linalg.eigh(flat.T @ flat)[1].T[:2]
     q, q_dual = _unit_dual_in_plane(v1, v2)
     R = se3.from_quaternion_wxyz(q)
     # t = 2 q' q^-1, its vector part
@@ -183,8 +208,8 @@ def shah(Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike) -> tuple[Array, Array]:
     A = np.asarray(Ts_base_ee, dtype=np.float64)
     B = se3.invert(Ts_cam_board)
     RA, RB = A[:, :3, :3], B[:, :3, :3]
-    K = sum(np.kron(rb.T, ra.T) for ra, rb in zip(RA, RB, strict=True))
-    U, _, Vt = np.linalg.svd(np.asarray(K))
+    K = np.einsum("nji,nlk->ikjl", RB, RA).reshape(9, 9)
+    U, _, Vt = np.linalg.svd(K)
     # vec stacks columns, numpy stacks rows
     Rx, Rz = U[:, 0].reshape(3, 3).T, Vt[0].reshape(3, 3).T
     Rx = nearest_rotation(Rx * np.sign(np.linalg.det(Rx)))
@@ -215,22 +240,34 @@ def nearest_rotation(M: Array) -> Array:
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt, dtype=np.float64)
 
 
-def _without_half_turns(m: Motions) -> Motions:
-    """Return the motions without those near 180 deg, where the axis has no sure sign."""
-    turn = np.maximum(se3.angle(m.Ts_hand), se3.angle(m.Ts_cam))
-    keep = turn < HALF_TURN
-    if not keep.any():
+def _clear_motions(
+    Ts_base_ee: ArrayLike, Ts_cam_board: ArrayLike
+) -> tuple[Relative, Relative, NDArray[np.bool_]]:
+    """Return the motions of hand and camera and which (P,) are clear of half turns.
+
+    Near 180 deg the axis has no sure sign.
+    """
+    A, B = motions(Ts_base_ee, Ts_cam_board)
+    clear = clear_of_half_turns(A, B)
+    if not clear.any():
         raise DegenerateError(
             "hand-eye: every pair of views turns the hand by about 180 deg; add views in between."
         )
-    return Motions(Ts_hand=m.Ts_hand[keep], Ts_cam=m.Ts_cam[keep], pairs=m.pairs[keep])
+    return A, B, clear
 
 
-def _dual_quaternion(T: Array, length: float) -> tuple[Array, Array]:
-    """Return real and dual part (N, 4) of rigid transforms, lengths in units of `length`."""
-    q = se3.quaternion_wxyz(T[:, :3, :3])
-    t = T[:, :3, 3] / length
-    w, v = q[:, :1], q[:, 1:]
+def clear_of_half_turns(hand: Relative, cam: Relative) -> NDArray[np.bool_]:
+    """Return which pairs (P,) turn neither hand nor camera by nearly 180 deg."""
+    turn = np.maximum(*(np.linalg.norm(m.turns, axis=-1) for m in (hand, cam)))
+    return turn < HALF_TURN
+
+
+def _dual_quaternion(m: Relative, rows: NDArray[np.bool_], length: float) -> tuple[Array, Array]:
+    """Return real and dual part (N, 4) of some motions, lengths in units of `length`."""
+    turns, t = m.turns[rows], m.Ts[rows, :3, 3] / length
+    angle = np.linalg.norm(turns, axis=-1, keepdims=True)
+    w, v = np.cos(angle / 2), turns * np.sinc(angle / (2 * np.pi)) / 2
+    q = np.concatenate([w, v], -1)
     dual = 0.5 * np.concatenate([-(t * v).sum(-1, keepdims=True), w * t + np.cross(t, v)], -1)
     return q, dual
 

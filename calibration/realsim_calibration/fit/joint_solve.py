@@ -1,16 +1,21 @@
-"""The joint fit: camera, target and its shape, lens, and the robot's errors, in one GTSAM graph.
+"""The joint fit: camera, target and its shape, lens, and the robot's errors, by Gauss-Newton.
 
     T_cam_board,i = X^-1 D_i^-1 A_i^-1 Z             (X^-1 A_i D_i Z for a camera that stands still)
     cost = sum_ij w_ij |pi_K(T_i P_j(b)) - u_ij|^2 / sigma^2
          + sum_i |S^-1/2 (log D_i - B_i w)|^2 + |w|^2 + priors of K and b
     S = sigma^2 diag(lambda_r^2 / f^2 I, lambda_t^2 d^2 / f^2 I)
 
-One custom factor per view (compressed to 24 rows, `view_system`) on X, Z, K, b, D_i, and one small
-factor per view that ties its robot error to the smooth part B_i w. lambda bounds the robot's share,
-so that corner errors that are common to a view (a warped print) are not blamed on the robot.
+A view's points are compressed to 24 rows r_i + J_i dtheta + E_i e_i (`view_system`). With the robot
+error e_i = B_i w + n_i the noise n_i of a view meets only its own rows and is eliminated,
+
+    G_i = [J_i | E_i B_i],    H = sum_i G_i^T (1 - E_i (E_i^T E_i + S^-1)^-1 E_i^T) G_i    (sigma 1)
+
+so that a step solves for X, Z, K, b and w alone, and each n_i follows from it. lambda bounds the
+robot's share, so that corner errors that are common to a view (a warped print) are not blamed on
+the robot.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,15 +26,15 @@ from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim_calibration.fit.robot_error import ErrorBasis
 from realsim_calibration.fit.view_system import (
-    CAMERA_TERMS,
-    COLUMNS,
     SHARED,
-    residual_norm,
-    view_equations,
-    view_rows,
+    all_equations,
+    all_rows,
+    camera_vector,
 )
 
 Array = NDArray[np.float64]
+MOST_DAMPING = 1e6
+"""A step that is still no gain with this much of the curvature added is none: the fit has ended."""
 HELD_SD = 1e-3
 """Prior of a term that is held: it has no derivative in any view, so this only fills the matrix."""
 FLAT = np.array([1.0, 0.0, 0.0, 0.0, 0.0])
@@ -64,7 +69,7 @@ class JointConfig:
     warp_sd: float = 0.01
     """Prior of a warp coefficient: 1 % of the half extent, 1.5 mm on an A4 sheet; 0 holds them."""
     max_iterations: int = 30
-    """Levenberg-Marquardt steps per round; seven are typical."""
+    """Gauss-Newton steps per round; three are typical."""
     step_tolerance: float = 1e-6
     """Relative decrease of the cost at which a round ends: the parameters move by 1e-3 sigma."""
 
@@ -128,12 +133,6 @@ class JointState:
         )
 
 
-def camera_vector(intrinsics: CameraIntrinsics) -> Array:
-    """Return (12,) fx fy cx cy and the eight distortion terms."""
-    i = intrinsics
-    return np.concatenate([[i.fx, i.fy, i.cx, i.cy], i.distortion])
-
-
 def camera_of(vector: Array, like: CameraIntrinsics) -> CameraIntrinsics:
     """Return the camera of a (12,) vector with the image size of another."""
     fx, fy, cx, cy = (float(v) for v in vector[:4])
@@ -143,19 +142,19 @@ def camera_of(vector: Array, like: CameraIntrinsics) -> CameraIntrinsics:
 
 
 class JointProblem:
-    """The graph of one calibration; sigma, lambda and the corner weights are fixed in one solve."""
+    """The least-squares fit of one setup; sigma, lambda and weights are arguments."""
 
     def __init__(self, setup: Setup, config: JointConfig) -> None:
-        from gtsam import symbol
-
         self.setup, self.config = setup, config
-        self.x, self.z, self.k, self.b, self.w = (symbol(c, 0) for c in "xzkbw")
-        self.d = [symbol("d", n) for n in range(len(setup.views))]
         free = [config.focal_sd > 0] * 2 + [config.center_sd > 0] * 2
         free += [sd > 0 for sd in (*config.distortion_sd, *config.board_sd())]
         self.free = np.array(free)
         """(17,) camera and board terms that are estimated."""
-        self._A = [np.ascontiguousarray(v.T_base_ee) for v in setup.views]
+        self._A = np.stack([v.T_base_ee for v in setup.views])
+        self._xy = np.concatenate([v.xy for v in setup.views])
+        self._uv = np.concatenate([v.uv for v in setup.views])
+        self.starts = np.cumsum([0, *(len(v.uv) for v in setup.views)])
+        """(views + 1,) first point of every view among all points."""
 
     def start(self, X: Array, Z: Array) -> JointState:
         """Return the state at a closed-form solution."""
@@ -164,19 +163,22 @@ class JointProblem:
             weights=np.zeros(0), errors=np.zeros((len(self.setup.views), 6)),
         )  # fmt: skip
 
-    def _arguments(self, n: int, X: Array, Z: Array, D: Array, camera: Array, board: Array,
-                   root: Array) -> tuple[Any, ...]:  # fmt: skip
-        s, v = self.setup, self.setup.views[n]
-        return (X, Z, self._A[n], D, s.to_hand, camera, board, s.half_extent, s.middle, v.xy, v.uv,
-                root)  # fmt: skip
+    def _arguments(self, state: JointState, errors: Array) -> tuple[Any, ...]:
+        s = self.setup
+        X, Z = np.ascontiguousarray(state.X), np.ascontiguousarray(state.Z)
+        return (X, Z, self._A, se3.exp(errors), s.to_hand, state.camera, state.board,
+                s.half_extent, s.middle, self._xy, self._uv, self.starts)  # fmt: skip
+
+    def poses(self, state: JointState, errors: Array) -> Array:
+        """Return T_cam_board (views, 4, 4) of every view with robot errors (views, 6)."""
+        AD = self._A @ se3.exp(errors)
+        if self.setup.to_hand:
+            return se3.invert(state.X) @ AD @ state.Z
+        return se3.invert(AD @ state.X) @ state.Z
 
     def unit_robot_sd(self, state: JointState) -> Array:
         """Return the 1-sigma (6,) of a robot error for lambda = 1 and sigma = 1 px."""
-        A = np.stack(self._A)
-        if self.setup.to_hand:
-            T = se3.invert(state.X) @ A @ state.Z
-        else:
-            T = se3.invert(A @ state.X) @ state.Z
+        T = self.poses(state, np.zeros((len(self._A), 6)))
         middle = se3.transform(T, self.setup.middle[None])[..., 0, :]
         distance = float(np.median(np.linalg.norm(middle, axis=-1)))
         return np.array([1.0] * 3 + [distance] * 3) / float(state.camera[:2].mean())
@@ -195,130 +197,54 @@ class JointProblem:
             covariance[:2, :2] = relative * np.outer(center[:2], center[:2])
         return center, covariance
 
-    def graph(
-        self, start: JointState, sigma: float, ratio: Array, roots: list[Array],
-        basis: ErrorBasis | None, *, robot: bool = True,
-    ) -> tuple[Any, Any]:  # fmt: skip
-        """Return the gtsam graph for fixed sigma, lambda (2,), corner weights, and its values."""
-        import gtsam
-
-        from realsim.interop import pose3_from_T
-
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        values.insert(self.x, pose3_from_T(start.X))
-        values.insert(self.z, pose3_from_T(start.Z))
-        values.insert(self.k, start.camera)
-        values.insert(self.b, start.board)
-        center, covariance = self.prior()
-        for key, part in ((self.k, slice(0, CAMERA_TERMS)), (self.b, slice(CAMERA_TERMS, None))):
-            noise = gtsam.noiseModel.Gaussian.Covariance(covariance[part, part])
-            graph.add(gtsam.PriorFactorVector(key, center[part], noise))
-        pixel_noise = gtsam.noiseModel.Isotropic.Sigma(COLUMNS, sigma)
-        robot_sd = np.repeat(ratio, 3) * sigma * self.unit_robot_sd(start)
-        robot_noise = gtsam.noiseModel.Diagonal.Sigmas(robot_sd)
-        if robot and basis is not None:
-            p = basis.columns.shape[-1]
-            values.insert(self.w, start.weights if len(start.weights) else np.zeros(p))
-            one = gtsam.noiseModel.Isotropic.Sigma(p, 1.0)
-            graph.add(gtsam.PriorFactorVector(self.w, np.zeros(p), one))
-        for n in range(len(self.setup.views)):
-            keys = [self.x, self.z, self.k, self.b]
-            if robot:
-                keys.append(self.d[n])
-                values.insert(self.d[n], gtsam.Pose3.Expmap(start.errors[n]))
-            graph.add(gtsam.CustomFactor(pixel_noise, keys, self._view_error(n, roots[n])))
-            if robot and basis is None:
-                graph.add(gtsam.PriorFactorPose3(self.d[n], gtsam.Pose3(), robot_noise))
-            elif robot and basis is not None:
-                error = _smooth_error(basis.columns[n])
-                graph.add(gtsam.CustomFactor(robot_noise, [self.d[n], self.w], error))
-        return graph, values
-
     def optimize(
-        self, start: JointState, sigma: float, ratio: Array, roots: list[Array],
-        basis: ErrorBasis | None, *, robot: bool = True,
+        self, start: JointState, sigma: float, ratio: Array, roots: Array,
+        basis: ErrorBasis | None,
     ) -> JointState:  # fmt: skip
-        """Return the least-squares state for fixed sigma, lambda and roots of the corner weights.
+        """Return the least-squares state for fixed sigma, lambda (2,), and roots of the weights.
+
+        lambda 0 is a robot without errors.
 
         Raises:
             DegenerateError: the views do not determine the parameters.
         """
-        import gtsam
+        noise = sigma * np.repeat(ratio, 3) * self.unit_robot_sd(start)
+        p = 0 if basis is None else basis.columns.shape[-1]
+        state = replace(start, weights=start.weights if len(start.weights) == p else np.zeros(p))
+        if not ratio.any():
+            state = replace(state, errors=np.zeros_like(state.errors))
+        normal = _Normal.at(self, state, sigma, noise, roots, basis)
+        damping = 0.0
+        for _ in range(self.config.max_iterations):
+            trial = normal.step(damping)
+            moved = _Normal.at(self, trial, sigma, noise, roots, basis)
+            if not moved.cost < normal.cost:
+                damping = max(10 * damping, 1e-4)
+                if damping > MOST_DAMPING:
+                    break
+                continue
+            gain = (normal.cost - moved.cost) / max(normal.cost, 1e-12)
+            state, normal, damping = trial, moved, damping / 10
+            if gain < self.config.step_tolerance:
+                break
+        return state
 
-        graph, values = self.graph(start, sigma, ratio, roots, basis, robot=robot)
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setMaxIterations(self.config.max_iterations)
-        parameters.setRelativeErrorTol(self.config.step_tolerance)
-        try:
-            values = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-        except RuntimeError as error:
-            raise DegenerateError(
-                "hand-eye: the joint fit is not determined by these views (the normal equations "
-                "are singular). Add views that tilt the hand about two axes, roll it about the "
-                "optical axis, and show points that are not all in one line."
-            ) from error
-        return self._state(values, robot, basis)
+    def ones(self) -> Array:
+        """Return unit corner weights of all points."""
+        return np.ones(len(self._uv))
 
-    def _view_error(self, n: int, root: Array) -> Any:
-        """Return the error function of one view's factor."""
-        held = np.concatenate([np.zeros(12, bool), ~self.free, np.zeros(7, bool)])
-        eye = np.eye(4)
-
-        def error(this: Any, values: Any, H: list[Any] | None) -> Array:
-            keys = this.keys()
-            X, Z = values.atPose3(keys[0]).matrix(), values.atPose3(keys[1]).matrix()
-            D = values.atPose3(keys[4]).matrix() if len(keys) > 4 else eye
-            camera, board = values.atVector(keys[2]), values.atVector(keys[3])
-            X, Z, D = (np.ascontiguousarray(T) for T in (X, Z, D))
-            arguments = self._arguments(n, X, Z, D, camera, board, root)
-            if H is None:
-                r = np.zeros(COLUMNS)
-                r[0] = residual_norm(*arguments)
-                return r
-            J = view_equations(*arguments)
-            J[:, held] = 0.0
-            parts = (slice(0, 6), slice(6, 12), slice(12, 24), slice(24, 29), slice(29, 35))
-            for k in range(len(keys)):
-                H[k] = np.asfortranarray(J[:, parts[k]])
-            return J[:, -1]
-
-        return error
-
-    def _state(self, values: Any, robot: bool, basis: ErrorBasis | None) -> JointState:
-        import gtsam
-
-        errors = np.zeros((len(self.d), 6))
-        if robot:
-            errors = np.array([gtsam.Pose3.Logmap(values.atPose3(k)) for k in self.d])
-        smooth = robot and basis is not None
-        return JointState(
-            X=np.array(values.atPose3(self.x).matrix()),
-            Z=np.array(values.atPose3(self.z).matrix()),
-            camera=np.array(values.atVector(self.k)),
-            board=np.array(values.atVector(self.b)),
-            weights=np.array(values.atVector(self.w)) if smooth else np.zeros(0),
-            errors=errors,
-        )
-
-    def ones(self) -> list[Array]:
-        """Return unit corner weights of every view."""
-        return [np.ones(len(v.uv)) for v in self.setup.views]
-
-    def rows(self, state: JointState, n: int, error: Array | None = None) -> Array:
-        """Return [xi | camera | board | residual] (2 points, 24) of view n, unweighted.
+    def rows(self, state: JointState, errors: Array | None = None) -> Array:
+        """Return [xi | camera | board | residual] (2 points, 24) of all views, unweighted.
 
         Args:
             state: where.
-            n: which view.
-            error: (6,) robot error instead of the state's.
+            errors: (views, 6) robot errors instead of the state's.
         """
-        D = se3.exp(state.errors[n] if error is None else error)
-        one = np.ones(len(self.setup.views[n].uv))
-        return view_rows(*self._arguments(n, state.X, state.Z, D, state.camera, state.board, one))
+        return all_rows(*self._arguments(state, state.errors if errors is None else errors))
 
-    def residuals(self, state: JointState, n: int, error: Array | None = None) -> Array:
-        """Return predicted minus measured (points, 2) [px] of view n, as `rows`."""
-        return self.rows(state, n, error)[:, -1].reshape(-1, 2)
+    def residuals(self, state: JointState, errors: Array | None = None) -> Array:
+        """Return predicted minus measured (points, 2) [px] of all views, as `rows`."""
+        return self.rows(state, errors)[:, -1].reshape(-1, 2)
 
     def shaped_points(self, board: Array, xy: Array) -> Array:
         """Return points (n, 3) [m] of places (n, 2) from the middle on a board of a shape (5,)."""
@@ -327,65 +253,103 @@ class JointProblem:
         lift = (board[2] * x * x + board[3] * x * y + board[4] * y * y) / self.setup.half_extent
         return self.setup.middle + s * np.stack([x, (1 + a) * y, lift], -1)
 
-    def equations(self, state: JointState, roots: list[Array]) -> Array:
+    def equations(self, state: JointState, roots: Array) -> Array:
         """Return every view's compressed equations (views, 24, 36) at a state [px]."""
-        held = np.concatenate([np.zeros(12, bool), ~self.free, np.zeros(7, bool)])
-        rows = np.empty((len(self.d), COLUMNS, SHARED + 7))
-        for n in range(len(self.d)):
-            D = se3.exp(state.errors[n])
-            rows[n] = view_equations(
-                *self._arguments(n, state.X, state.Z, D, state.camera, state.board, roots[n])
-            )
-        rows[:, :, held] = 0.0
+        rows = all_equations(*self._arguments(state, state.errors), roots)
+        rows[:, :, 12:SHARED][:, :, ~self.free] = 0.0
         return rows
 
     def spread(
         self, state: JointState, sigma: float, ratio: Array, basis: ErrorBasis | None
-    ) -> tuple[float, list[Array]]:
-        """Return the unit-weight sigma [px] and the roots of the Huber weights of every view.
+    ) -> tuple[float, Array]:
+        """Return the unit-weight sigma [px] and the roots (points,) of the Huber weights.
 
         sigma^2 = (sum w |r|^2 + sum e^T S0^-1 e) / (2 N - dim theta), S0 = S / sigma^2, e = the
         robot error beyond its smooth part.
         """
-        roots: list[Array] = []
-        total, count = 0.0, 0
-        for n in range(len(self.d)):
-            r = np.linalg.norm(self.residuals(state, n), axis=-1)
-            w = np.minimum(1.0, self.config.huber_sigmas * sigma / np.maximum(r, 1e-12))
-            total += float(np.sum(w * r**2))
-            count += 2 * len(r)
-            roots.append(np.sqrt(w))
-        rest = state.errors - smooth_errors(basis, state.weights, len(self.d))
-        total += float(np.sum((rest / (np.repeat(ratio, 3) * self.unit_robot_sd(state))) ** 2))
-        free = 12 + int(self.free.sum())
-        return float(np.sqrt(total / max(count - free, 1))), roots
+        r = np.linalg.norm(self.residuals(state), axis=-1)
+        w = np.minimum(1.0, self.config.huber_sigmas * sigma / np.maximum(r, 1e-12))
+        rest = state.errors - smooth_errors(basis, state.weights, len(self._A))
+        robot = rest / (np.repeat(ratio, 3) * self.unit_robot_sd(state))
+        freedom = max(2 * len(r) - 12 - int(self.free.sum()), 1)
+        return float(np.sqrt((np.sum(w * r**2) + np.sum(robot**2)) / freedom)), np.sqrt(w)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Normal:
+    """The normal equations of one state, robot noise eliminated."""
+
+    state: JointState
+    cost: float
+    """Twice the negative logarithm of the density, robot errors as they are."""
+    H: Array
+    """(29 + p, 29 + p)."""
+    g: Array
+    """(29 + p,) gradient where every view's robot noise follows the rest."""
+    noise_gain: Array
+    """(views, 6, 24) robot noise per residual."""
+    G: Array
+    """(views, 24, 29 + p) derivatives of the residuals."""
+    r: Array
+    """(views, 24) residuals without robot noise."""
+    basis: ErrorBasis | None
+
+    @classmethod
+    def at(
+        cls, problem: JointProblem, state: JointState, sigma: float, noise: Array, roots: Array,
+        basis: ErrorBasis | None,
+    ) -> "_Normal":  # fmt: skip
+        """Return the equations at a state for robot noise of 1-sigma (6,); 0 = none."""
+        rows = problem.equations(state, roots) / sigma
+        J, E, r = rows[..., :SHARED], rows[..., SHARED:-1], rows[..., -1]
+        G = J if basis is None else np.concatenate([J, E @ basis.columns], -1)
+        rest = state.errors - smooth_errors(basis, state.weights, len(E))
+        robot = rest / np.where(noise > 0, noise, np.inf)
+        Et = np.swapaxes(E, 1, 2)
+        scaled = noise[:, None] * Et
+        inner = np.eye(6) + scaled @ (E * noise)
+        gain = -noise[:, None] * np.linalg.solve(inner, scaled)
+        free = r - (E @ rest[..., None])[..., 0]
+        pulled = np.concatenate([G, free[..., None]], -1)
+        reduced = pulled + E @ (gain @ pulled)
+        p = G.shape[-1]
+        gram = pulled.reshape(-1, p + 1).T @ reduced.reshape(-1, p + 1)
+        center, covariance = problem.prior()
+        prior = np.eye(p)
+        prior[:12, :12] = 0.0
+        prior[12:SHARED, 12:SHARED] = np.linalg.inv(covariance)
+        off = np.concatenate([np.zeros(12), state.camera, state.board, state.weights])
+        off[12:SHARED] -= center
+        cost = float(np.sum(r**2) + np.sum(robot**2) + off @ prior @ off)
+        return cls(
+            state=state, cost=cost, H=gram[:-1, :-1] + prior, g=gram[:-1, -1] + prior @ off,
+            noise_gain=gain, G=G, r=free, basis=basis,
+        )  # fmt: skip
+
+    def step(self, damping: float) -> JointState:
+        """Return the state after a Gauss-Newton step, its curvature raised by a share.
+
+        Raises:
+            DegenerateError: the views do not determine the parameters.
+        """
+        from scipy.linalg import cho_factor, cho_solve
+
+        scale = np.sqrt(np.maximum(np.diag(self.H), 1e-300))
+        H = self.H / np.outer(scale, scale) + damping * np.eye(len(scale))
+        try:
+            move = -cho_solve(cho_factor(H), self.g / scale) / scale
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise DegenerateError(
+                "hand-eye: the joint fit is not determined by these views (the normal equations "
+                "are singular). Add views that tilt the hand about two axes, roll it about the "
+                "optical axis, and show points that are not all in one line."
+            ) from error
+        state = self.state.moved(move)
+        noise = (self.noise_gain @ (self.r + self.G @ move)[..., None])[..., 0]
+        smooth = smooth_errors(self.basis, state.weights, len(noise))
+        return replace(state, errors=smooth + noise)
 
 
 def smooth_errors(basis: ErrorBasis | None, weights: Array, views: int) -> Array:
     """Return B_i w (views, 6)."""
     return np.zeros((views, 6)) if basis is None else basis.columns @ weights
-
-
-def _smooth_error(columns: Array) -> Any:
-    """Return the error function log D - B w of the factor between a robot error and the map."""
-    import gtsam
-
-    minus = np.asfortranarray(-columns)
-
-    def error(this: Any, values: Any, H: list[Any] | None) -> Array:
-        keys = this.keys()
-        twist = gtsam.Pose3.Logmap(values.atPose3(keys[0]))
-        if H is not None:
-            H[0] = np.asfortranarray(_right_jacobian_inverse(twist))
-            H[1] = minus
-        return twist - columns @ values.atVector(keys[1])
-
-    return error
-
-
-def _right_jacobian_inverse(twist: Array) -> Array:
-    """Return d log(D Exp(d)) / d d (6, 6) to third order in the twist, which is milliradians."""
-    ad = np.zeros((6, 6))
-    ad[:3, :3] = ad[3:, 3:] = se3.hat(twist[:3])
-    ad[3:, :3] = se3.hat(twist[3:])
-    return np.eye(6) + ad / 2 + ad @ ad / 12

@@ -61,11 +61,11 @@ class LinearModel:
     `ratio` (2,) is lambda for rotation and for translation everywhere.
     """
 
-    def __init__(self, problem: JointProblem, state: JointState, roots: list[Array]) -> None:
+    def __init__(self, problem: JointProblem, state: JointState, roots: Array) -> None:
         self.problem, self.state = problem, state
         rows = problem.equations(state, roots)
-        self.coordinates = 2 * sum(len(r) for r in roots)
-        self.weight_sums = np.array([float(np.sum(r**2)) for r in roots])
+        self.coordinates = 2 * len(roots)
+        self.weight_sums = np.add.reduceat(roots**2, problem.starts[:-1])
         self.J, self.D = rows[:, :, :SHARED], rows[:, :, ROBOT]
         # The residual as it would be without robot errors.
         self.r = rows[:, :, -1] - (self.D @ state.errors[..., None])[..., 0]

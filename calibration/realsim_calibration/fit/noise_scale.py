@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.geometry import se3
 from realsim_calibration.fit.joint_solve import JointProblem, JointState
 from realsim_calibration.fit.linear_model import LinearModel
 from realsim_calibration.fit.robot_error import ARM_ANGLES, ErrorBasis, RobotErrorConfig
@@ -68,8 +67,8 @@ def whiteness(problem: JointProblem, state: JointState, config: NoiseConfig) -> 
     """Return how far the residuals left by a free pose per view are from independent."""
     smooth = rough = 0.0
     smooth_count = rough_count = 0
-    for n, view in enumerate(problem.setup.views):
-        rows = problem.rows(state, n)
+    per_view = np.split(problem.rows(state), 2 * problem.starts[1:-1])
+    for rows, view in zip(per_view, problem.setup.views, strict=True):
         free_pose, _ = np.linalg.qr(rows[:, :6])
         r = rows[:, -1] - free_pose @ (free_pose.T @ rows[:, -1])
         x, y = (view.xy / problem.setup.half_extent).T
@@ -203,11 +202,3 @@ def unknown_arm_columns(
     constant = np.diag(hidden_factor * np.repeat(shown, 3))
     constant = np.broadcast_to(constant, (len(linear.columns), 6, 6))
     return np.concatenate([constant, linear.columns * share[:, None]], -1)
-
-
-def pose_of(state: JointState, to_hand: bool, A: Array, error: Array) -> Array:
-    """Return T_cam_board (4, 4) of a robot pose and its error (6,)."""
-    AD = A @ se3.exp(error)
-    if to_hand:
-        return se3.invert(state.X) @ AD @ state.Z
-    return se3.invert(AD @ state.X) @ state.Z

@@ -18,7 +18,7 @@ from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim_calibration.fit.board_pose import refine_board_pose
-from realsim_calibration.fit.joint_solve import JointProblem, JointState, Setup, camera_of
+from realsim_calibration.fit.joint_solve import JointProblem, JointState, Setup, smooth_errors
 from realsim_calibration.fit.linear_model import LinearFit, LinearModel
 from realsim_calibration.fit.noise_scale import (
     Whiteness,
@@ -26,7 +26,6 @@ from realsim_calibration.fit.noise_scale import (
     estimate_ratio,
     estimate_scale,
     largest_ratio,
-    pose_of,
     unknown_arm_columns,
     whiteness,
 )
@@ -156,12 +155,12 @@ def solve(
 
 def _first_fit(
     problem: JointProblem, start: tuple[Array, Array], config: "HandEyeConfig"
-) -> tuple[JointState, float, list[Array]]:
+) -> tuple[JointState, float, Array]:
     """Return the fit at the bounded lambda, sigma, and the roots of the corner weights."""
     joint = config.joint
     ratio = np.full(2, joint.robot_ratio or config.noise.bound)
     state, roots = problem.start(*start), problem.ones()
-    state = problem.optimize(state, joint.start_sigma_px, ratio, roots, None, robot=False)
+    state = problem.optimize(state, joint.start_sigma_px, np.zeros(2), roots, None)
     sigma, roots = problem.spread(state, joint.start_sigma_px, ratio, None)
     for _ in range(joint.rounds - 1):
         state = problem.optimize(state, sigma, ratio, roots, None)
@@ -188,8 +187,8 @@ def _robot_share(
 
 
 def _final_fit(
-    problem: JointProblem, state: JointState, best: _Choice, roots: list[Array]
-) -> tuple[JointState, float, list[Array]]:
+    problem: JointProblem, state: JointState, best: _Choice, roots: Array
+) -> tuple[JointState, float, Array]:
     """Return the joint fit with the chosen robot error, from the linear solution."""
     weights = best.fit.step[29:]
     moved = replace(state.moved(best.fit.step[:29]), weights=weights)
@@ -273,37 +272,37 @@ def _offsets(best: _Choice, state: JointState, covariance: Array) -> Array | Non
 def _views(
     problem: JointProblem, state: JointState, basis: ErrorBasis | None, fit: LinearFit
 ) -> tuple[SolvedView, ...]:
-    """Return the part of every view that took part."""
-    found: list[SolvedView] = []
-    for n in range(len(problem.setup.views)):
-        smooth = np.zeros(6) if basis is None else basis.columns[n] @ state.weights
-        residuals = problem.residuals(state, n, smooth)
-        without = state.moved(fit.away[n])
-        error = np.zeros(6) if basis is None else basis.columns[n] @ without.weights
-        mm, deg = _place_error(problem, without, n, error)
-        found.append(
-            SolvedView(
-                residuals=residuals,
-                seen_px=float(np.sqrt(np.mean(np.sum(residuals**2, -1)))),
-                unseen_px=float(fit.unseen_px[n]),
-                unseen_mm=mm,
-                unseen_deg=deg,
-                robot_error=state.errors[n],
-            )
+    """Return the part of every view that took part.
+
+    The board as a view alone sees it is held against where the fit without the view expects it.
+    """
+    views, away = problem.setup.views, fit.away
+    smooth = smooth_errors(basis, state.weights, len(views))
+    residuals = np.split(problem.residuals(state, smooth), problem.starts[1:-1])
+    without = JointState(
+        X=state.X @ se3.exp(away[:, :6]), Z=state.Z @ se3.exp(away[:, 6:12]),
+        camera=state.camera + away[:, 12:24], board=state.board + away[:, 24:SHARED],
+        weights=state.weights, errors=state.errors,
+    )  # fmt: skip
+    if basis is not None:
+        smooth = smooth + (basis.columns @ away[:, SHARED:, None])[..., 0]
+    expected = problem.poses(without, smooth)
+    seen = np.empty_like(expected)
+    for n, view in enumerate(views):
+        points = problem.shaped_points(without.board[n], view.xy)
+        seen[n] = refine_board_pose(expected[n], points, view.uv, without.camera[n])[0]
+    middle = problem.setup.middle[None]
+    apart = (se3.transform(seen, middle) - se3.transform(expected, middle))[:, 0]
+    mm = 1e3 * np.linalg.norm(apart, axis=-1)
+    deg = np.degrees(se3.angle(se3.invert(expected) @ seen))
+    return tuple(
+        SolvedView(
+            residuals=r,
+            seen_px=float(np.sqrt(np.mean(np.sum(r**2, -1)))),
+            unseen_px=float(fit.unseen_px[n]),
+            unseen_mm=float(mm[n]),
+            unseen_deg=float(deg[n]),
+            robot_error=state.errors[n],
         )
-    return tuple(found)
-
-
-def _place_error(
-    problem: JointProblem, state: JointState, n: int, error: Array
-) -> tuple[float, float]:
-    """Return how far the board is from where a fit expects it: middle [mm], angle [deg]."""
-    setup, view = problem.setup, problem.setup.views[n]
-    expected = pose_of(state, setup.to_hand, view.T_base_ee, error)
-    points = problem.shaped_points(state.board, view.xy)
-    camera = camera_of(state.camera, setup.intrinsics0)
-    seen, _ = refine_board_pose(expected, points, view.uv, camera)
-    apart = se3.transform(seen, setup.middle) - se3.transform(expected, setup.middle)
-    return 1e3 * float(np.linalg.norm(apart)), float(
-        np.degrees(se3.angle(se3.invert(expected) @ seen))
+        for n, r in enumerate(residuals)
     )

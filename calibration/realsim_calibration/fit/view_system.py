@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.compiled import njit
+from realsim.records import CameraIntrinsics
 
 Array = NDArray[np.float64]
 CAMERA_TERMS = 12
@@ -31,6 +32,12 @@ COLUMNS = 6 + CAMERA_TERMS + BOARD_TERMS + 1
 """Columns before the chain rule: xi, camera, board, residual."""
 BEHIND_PX = 1e4
 """Residual of a point behind the camera [px]: large, so that the step is refused."""
+
+
+def camera_vector(intrinsics: CameraIntrinsics) -> Array:
+    """Return (12,) fx fy cx cy and the eight distortion terms."""
+    i = intrinsics
+    return np.concatenate([[i.fx, i.fy, i.cx, i.cy], i.distortion])
 
 
 @njit
@@ -255,20 +262,6 @@ def refined_pose(
 
 
 @njit
-def residual_norm(  # noqa: PLR0913, PLR0917 - compiled code takes no records
-    X: Any, Z: Any, A: Any, D: Any, to_hand: bool, lens: Any, board: Any,
-    half: float, middle: Any, xy: Any, uv: Any, root: Any,
-) -> float:  # fmt: skip
-    """Return the norm of the weighted residuals of a view [px]."""
-    T = camera_from_board(X, Z, A, D, to_hand)
-    M = _rows(T, lens, board, half, middle, xy, uv, root)
-    total = 0.0
-    for i in range(len(M)):
-        total += M[i, COLUMNS - 1] ** 2
-    return np.sqrt(total)
-
-
-@njit
 def view_rows(  # noqa: PLR0913, PLR0917 - compiled code takes no records
     X: Any, Z: Any, A: Any, D: Any, to_hand: bool, lens: Any, board: Any,
     half: float, middle: Any, xy: Any, uv: Any, root: Any,
@@ -308,4 +301,34 @@ def view_equations(  # noqa: PLR0913, PLR0917 - compiled code takes no records
         for j in range(CAMERA_TERMS + BOARD_TERMS):
             J[i, 12 + j] = R[i, 6 + j]
         J[i, SHARED + 6] = R[i, COLUMNS - 1]
+    return J
+
+
+@njit
+def all_rows(  # noqa: PLR0913, PLR0917 - compiled code takes no records
+    X: Any, Z: Any, A: Any, D: Any, to_hand: bool, lens: Any, board: Any,
+    half: float, middle: Any, xy: Any, uv: Any, starts: Any,
+) -> Any:  # fmt: skip
+    """Return the rows (2 points, 24) of views (A and D: views, 4, 4) whose points are stacked."""
+    M, root = np.empty((2 * len(uv), COLUMNS)), np.ones(len(uv))
+    for n in range(len(A)):
+        a, b = starts[n], starts[n + 1]
+        M[2 * a : 2 * b] = view_rows(
+            X, Z, A[n], D[n], to_hand, lens, board, half, middle, xy[a:b], uv[a:b], root[a:b]
+        )
+    return M
+
+
+@njit
+def all_equations(  # noqa: PLR0913, PLR0917 - compiled code takes no records
+    X: Any, Z: Any, A: Any, D: Any, to_hand: bool, lens: Any, board: Any,
+    half: float, middle: Any, xy: Any, uv: Any, starts: Any, root: Any,
+) -> Any:  # fmt: skip
+    """Return the compressed equations (views, 24, 36) of views whose points are stacked [px]."""
+    J = np.empty((len(A), COLUMNS, SHARED + 7))
+    for n in range(len(A)):
+        a, b = starts[n], starts[n + 1]
+        J[n] = view_equations(
+            X, Z, A[n], D[n], to_hand, lens, board, half, middle, xy[a:b], uv[a:b], root[a:b]
+        )
     return J

@@ -265,12 +265,6 @@ def camera_record(camera: Array, image_size: tuple[int, int]) -> CameraIntrinsic
     )
 
 
-def camera_vector(intrinsics: CameraIntrinsics) -> Array:
-    """Return (12,) fx fy cx cy and the eight distortion terms."""
-    i = intrinsics
-    return np.concatenate([[i.fx, i.fy, i.cx, i.cy], i.distortion])
-
-
 def points_in_camera(state: State, obs: Observations) -> Array:
     """Return all corners (N, 3) in camera axes [m]."""
     points = shaped_points(obs.flat, state.board, obs.half_extent_m)

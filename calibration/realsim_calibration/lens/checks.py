@@ -6,7 +6,8 @@ import numpy as np
 
 from realsim.geometry.camera import undistort
 from realsim.records import CameraIntrinsics, Check
-from realsim_calibration.lens.bundle import CAMERA_TERMS, Prior, camera_vector
+from realsim_calibration.fit.view_system import camera_vector
+from realsim_calibration.lens.bundle import CAMERA_TERMS, Prior
 from realsim_calibration.lens.covariance import border_pixels
 from realsim_calibration.lens.models import TERM_NAMES
 from realsim_calibration.lens.report import IntrinsicsReport

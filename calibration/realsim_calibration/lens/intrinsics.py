@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Target
+from realsim_calibration.fit.view_system import camera_vector
 from realsim_calibration.lens.bundle import (
     CAMERA_TERMS,
     Fit,
@@ -24,7 +25,6 @@ from realsim_calibration.lens.bundle import (
     Prior,
     adjust,
     camera_record,
-    camera_vector,
 )
 from realsim_calibration.lens.checks import intrinsics_checks
 from realsim_calibration.lens.choice import (

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
-from realsim_calibration.lens.bundle import CAMERA_TERMS, GLOBALS, Prior, camera_vector
+from realsim_calibration.fit.view_system import camera_vector
+from realsim_calibration.lens.bundle import CAMERA_TERMS, GLOBALS, Prior
 
 Array = NDArray[np.float64]
 TERM_NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
