@@ -17,7 +17,7 @@ import numpy as np
 from labels_scene import camera_720p, cameras, scene
 from numpy.typing import NDArray
 
-from realsim.formats import images
+from realsim import images
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer
 

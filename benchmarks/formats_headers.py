@@ -95,7 +95,7 @@ def _write_bop(source: LongScene, root: Path) -> Path:
     write_bop_models(source.models(), export)
     write_bop_root(export, name="headers")
     export.finish({})
-    from realsim.formats import images
+    from realsim import images
 
     for kind, visible in MASKS:
         folder = written.folder / kind

@@ -17,7 +17,7 @@ from formats_frames import Picture, real, simulated
 from formats_settings import opencv_png
 from numpy.typing import NDArray
 
-from realsim.formats import images
+from realsim import images
 from realsim.formats.bop.image_copies import colour_content, depth_content
 from realsim.formats.export_folder import Content, ExportFolder
 

@@ -31,7 +31,7 @@ def drain_source(source: Any) -> list[Any]:
 
 def drain_scene(scene: Any) -> list[Any]:
     """Return what a labelled scene says: cameras, poses, images, masks, models, grasps."""
-    from realsim.formats import images
+    from realsim import images
 
     found: list[Any] = [scene.name, scene.number, scene.split, scene.T_world_table, scene.notes]
     for index in scene.indices:
@@ -140,7 +140,7 @@ def read_session(folder: Path) -> Any:
 
 def make_graspnet(folder: Path) -> None:
     """Write a GraspNet tree of one scene from rendered images."""
-    from realsim.formats import images
+    from realsim import images
     from realsim.formats.graspnet.meta import meta_bytes
     from realsim.geometry import se3
     from realsim.geometry.mesh_files import ply_bytes
@@ -220,7 +220,7 @@ def read_graspnet_table(folder: Path) -> Any:
 def _make_colmap(folder: Path, *, text: bool) -> None:
     import pycolmap
 
-    from realsim.formats import images
+    from realsim import images
     from realsim.geometry import se3
     from realsim.interop import rigid3d_from_T
 
@@ -261,7 +261,7 @@ def make_nerfstudio(folder: Path) -> None:
     """Write a nerfstudio folder with depth that agrees between views."""
     import json
 
-    from realsim.formats import images
+    from realsim import images
     from registered_sessions import CAMERA, table_session, true_cameras
 
     store = table_session(folder / "s", 3, (0.0, 0.0))

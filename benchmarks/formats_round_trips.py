@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
 
 from labelled_scenes import labelled_scene
-from realsim.formats import images
+from realsim import images
 from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 from realsim.formats.bop.writing import write_bop_scene

@@ -19,7 +19,7 @@ from figures import Found
 from formats_frames import Picture, real, simulated
 from numpy.typing import NDArray
 
-from realsim.formats import png
+from realsim.images import png
 
 Image = NDArray[Any]
 Encoder = Callable[[Image], bytes]

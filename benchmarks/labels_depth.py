@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from registration_real import ycbv_frame
 
 from realsim.errors import InputError
-from realsim.formats.images import read_image
 from realsim.geometry.camera import ray_table
+from realsim.images import read_image
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.depth_sensors.fit import FittedDepthModel, fit_depth_model
 from realsim.rendering.depth_sensors.loss_fit import (

@@ -37,8 +37,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.console import Console
-from realsim.formats.images import png_bytes
 from realsim.geometry import se3
+from realsim.images import png_bytes
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.photo import Lighting, PhotoRenderer
 from realsim.rendering.rays import BACKGROUND, PlacedMesh

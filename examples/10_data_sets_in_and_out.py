@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from realsim import CameraIntrinsics, ObjectModel
-from realsim.formats import images
+from realsim import CameraIntrinsics, ObjectModel, images
 from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.root_files import write_bop_models
 from realsim.formats.bop.writing import write_bop_scene

@@ -4,8 +4,7 @@
 import numpy as np
 from device_checks import check_arm, check_camera
 
-from realsim import CaptureSession, InputError
-from realsim.formats import images
+from realsim import CaptureSession, InputError, images
 from realsim.geometry import se3
 from realsim.store import SessionStore
 from realsim_capture_plans import UR5, Arm, ArmState, DepthCamera, Frame, PlanConfig, capture

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.geometry import se3
 from realsim.geometry.clouds import voxel_mean

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
-from realsim.formats.bop import units
 from realsim.formats.bop.labels import mask_path
 from realsim.formats.labelled_scene import LabelledObject, LabelledScene
+from realsim.records import bop_units as units
 from realsim.records.checked_arrays import Array, rigid
 from realsim.store import SessionStore
 from realsim.store.atomic import json_bytes

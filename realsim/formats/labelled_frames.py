@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.source import file_digest
 from realsim.formats.frame_source import SourceFrame

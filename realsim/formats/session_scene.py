@@ -13,14 +13,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
-from realsim.formats.bop import units
 from realsim.formats.bop.labels import mask_path
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.imported_labels import ImportedLabels, load_imported
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
 from realsim.records import GraspSet, ObjectModel
+from realsim.records import bop_units as units
 from realsim.records.checked_arrays import Array
 from realsim.store import SessionStore, load_grasps, load_scene
 from realsim.store.session_store import depth_path, rgb_path

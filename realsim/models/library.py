@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.bop.models import INFO_FILE, info_of, model_files
 from realsim.geometry.mesh import mass_properties, ply_bytes
 from realsim.models import library_files as files

@@ -268,6 +268,6 @@ def sheet_png(
     mesh: Mesh, properties: ModelProperties, parts: ConvexParts | None, name: str
 ) -> bytes:
     """Return the sheet as the content of a PNG file."""
-    from realsim.formats.images import png_bytes
+    from realsim.images import png_bytes
 
     return png_bytes(model_sheet(mesh, replace(properties, name=name), parts))

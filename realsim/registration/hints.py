@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError, RealsimError, UnitError
-from realsim.formats.images import read_image
 from realsim.geometry import se3
+from realsim.images import read_image
 from realsim.records import CameraIntrinsics, ObjectModel, SupportPlane
 from realsim.registration.evidence import DepthFrame, EvidenceConfig, measure_noise
 from realsim.registration.find_table import TableSearchConfig, find_table

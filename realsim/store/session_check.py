@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from realsim import images
 from realsim.errors import RealsimError
-from realsim.formats import images
 from realsim.records import CameraIntrinsics, View
 from realsim.store import atomic
 from realsim.store.check_report import CheckReport, Finding, Kind, Lists

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from realsim import images
 from realsim.errors import InputError, RealsimError
-from realsim.formats import images
-from realsim.formats.bop import units as bop_units
-from realsim.records import CaptureSession
+from realsim.records import CaptureSession, bop_units
 from realsim.store import atomic
 from realsim.store.begun import BEGUN_FILE, RECOVERED, read_begun
 from realsim.store.header import SESSION_FILE, checked_header, new_header

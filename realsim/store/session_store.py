@@ -25,10 +25,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
-from realsim.formats.bop import units as bop_units
-from realsim.records import CameraIntrinsics, CaptureSession, View
+from realsim.records import CameraIntrinsics, CaptureSession, View, bop_units
 from realsim.store import atomic
 from realsim.store.atomic import storing
 from realsim.store.begun import BEGUN_FILE, begun_bytes

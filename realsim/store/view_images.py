@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError, RealsimError
-from realsim.formats import images
 
 
 def rgb_path(index: int) -> str:

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from realsim import images
 from realsim.app.annotate.cli import annotate_command
 from realsim.app.annotate.page import PAGE_FILE
 from realsim.app.annotate.run import SHEET_FILE, sheet_views
 from realsim.app.register.files import write_result
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.store import SessionStore, load_scene, save_scene
 from realsim.store.lock import only_run_in
 from registered_sessions import models_of, registered_by_hand, table_session

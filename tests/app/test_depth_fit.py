@@ -11,7 +11,7 @@ from realsim.app.cli import commands
 from realsim.app.depth_fit.cli import CAMERAS, depth_fit
 from realsim.app.depth_fit.run import DepthFitRequest, read_frames
 from realsim.errors import InputError
-from realsim.formats.images import depth_counts, png_bytes
+from realsim.images import depth_counts, png_bytes
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.profiles import PROFILES
@@ -128,7 +128,7 @@ def test_folders_that_hold_nothing_to_fit_are_named(walls: Path, tmp_path: Path)
     assert "no folder" in refusal(tmp_path / "nowhere")
     assert "holds no PNG" in refusal(tmp_path)
     assert "names none" in refusal(walls, "--views", "40-50")
-    assert "cannot be the JSON" in refusal(walls, "--out", tmp_path)
+    assert "is a folder" in refusal(walls, "--out", tmp_path)
     (tmp_path / "a.png").write_bytes(png_bytes(depth_counts(wall(0.3, 0.1), UNIT)))
     assert "--camera FILE" in refusal(tmp_path)
 

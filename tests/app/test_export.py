@@ -9,9 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 from labelled_scenes import INTRINSICS, MODELS, labelled_scene
+from realsim import images
 from realsim.app.cli import commands
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene

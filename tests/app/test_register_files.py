@@ -23,10 +23,9 @@ from realsim.app.register.results import (
     load_table_scene,
     sigmas_of,
 )
-from realsim.formats.bop import units as bop_units
 from realsim.geometry import se3
 from realsim.geometry.parts import part
-from realsim.records import CameraIntrinsics, ObjectPose
+from realsim.records import CameraIntrinsics, ObjectPose, bop_units
 from realsim.store import SessionStore, load_scene
 from registered_sessions import models_of, registered_by_hand, table_session
 

@@ -8,7 +8,7 @@ import pytest
 from realsim.app.console import Console
 from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm
 from realsim.errors import DegenerateError, InputError
-from realsim.formats.images import png_bytes
+from realsim.images import png_bytes
 
 
 def put(folder: Path, sizes: list[tuple[int, int]]) -> Path:

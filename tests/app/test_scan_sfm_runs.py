@@ -14,8 +14,8 @@ import pytest
 
 from realsim.app.console import Console
 from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm
-from realsim.formats.images import png_bytes
 from realsim.geometry import se3
+from realsim.images import png_bytes
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.scanning.sfm.files import read_cameras
 from realsim.store import SessionStore

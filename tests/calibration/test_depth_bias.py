@@ -459,7 +459,7 @@ def test_real_depth_that_is_not_aligned_is_refused() -> None:
     """Depth 1024x768 of an L515 (0.25 mm) beside 1920x1080 colour, intrinsics unknown."""
     import cv2
 
-    from realsim.formats.images import read_depth, read_grey
+    from realsim.images import read_depth, read_grey
     from realsim.records import CharucoBoard
 
     known = json.loads((REAL / "cam_params_calibrated.json").read_text())

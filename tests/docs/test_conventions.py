@@ -9,8 +9,8 @@ import trimesh
 from documents import ROOT
 from scipy.spatial.transform import Rotation
 
-from realsim import CameraIntrinsics, Mesh, ObjectModel, TagBoard
-from realsim.formats import images, label_maps
+from realsim import CameraIntrinsics, Mesh, ObjectModel, TagBoard, images
+from realsim.formats import label_maps
 from realsim.formats.bop.models import load_models, save_models
 from realsim.formats.grasps.hand_frames import grasp_poses, hand_poses
 from realsim.geometry import camera, se3

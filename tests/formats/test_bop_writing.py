@@ -21,8 +21,8 @@ from realsim.formats.bop.scene import find_scenes
 from realsim.formats.bop.targets import read_targets
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.images import read_rgb
 from realsim.geometry import se3
+from realsim.images import read_rgb
 from tests.support.bop_scenes import MODELS, bbox, edit, write_boxes
 
 DOCUMENTS = ("scene_camera", "scene_gt", "scene_gt_info")

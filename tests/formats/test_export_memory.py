@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from realsim import CameraIntrinsics
-from realsim.formats import images
+from realsim import images
 from realsim.formats.bop.root_files import write_bop_root
 from realsim.formats.bop.writing import write_bop_scene
 from realsim.formats.export_folder import ExportFolder

@@ -6,8 +6,8 @@ from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
 from labelled_scenes import MODELS, PLACES, TABLE, labelled_scene
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.bop.models import save_models
 from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene

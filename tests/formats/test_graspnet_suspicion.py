@@ -9,8 +9,8 @@ import pytest
 from scipy.io import loadmat
 
 from labelled_scenes import labelled_scene
+from realsim import images
 from realsim.errors import InputError, NotRigidError, RealsimError, UnitError
-from realsim.formats import images
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.annotations import annotation_bytes, object_fields, read_objects
 from realsim.formats.graspnet.meta import meta_bytes, read_meta

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from labelled_scenes import INTRINSICS, MODELS, PLACES, labelled_scene
-from realsim import CameraIntrinsics
+from realsim import CameraIntrinsics, images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.opening import open_scene
 from realsim.formats.graspnet.tree import open_graspnet

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.bags.pixels import kind_of, rgb_of
 from realsim.formats.bags.wire import ImageMessage
 from realsim.formats.folders.listing import image_header
-from realsim.formats.image_headers import require_decodable
+from realsim.images import require_decodable
 
 RGB = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
 ENDINGS = ("png", "jpg", "tif", "webp", "bmp", "ppm")

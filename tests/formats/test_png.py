@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from realsim.errors import InputError
-from realsim.formats.images import png_bytes, read_depth, read_image
-from realsim.formats.png import encode_png
+from realsim.images import png_bytes, read_depth, read_image
+from realsim.images.png import encode_png
 
 DATA = Path(os.environ.get("REALSIM_DATA", "../shared/data"))
 

@@ -4,9 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images, png
-from realsim.formats.png_window import encode_window
+from realsim.images import png
+from realsim.images.png import encode_window
 
 WINDOWS = [
     (0, 0, 64, 48),

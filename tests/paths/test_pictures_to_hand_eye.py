@@ -14,8 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from documented_commands import as_arguments, documented
-from realsim.formats.png import encode_png
 from realsim.geometry import camera, se3
+from realsim.images.png import encode_png
 from realsim.records import CameraIntrinsics
 
 pytestmark = pytest.mark.slow

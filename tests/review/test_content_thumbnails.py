@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from realsim import InputError
-from realsim.formats import images
+from realsim import InputError, images
 from realsim.review.content import quick_png
 from realsim.review.content.thumbnails import FOLDER, Thumbnails, thumbnail
 from realsim.store import SessionStore

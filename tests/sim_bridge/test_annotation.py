@@ -20,8 +20,8 @@ from realsim import (
     Scene,
     SupportPlane,
     View,
+    images,
 )
-from realsim.formats import images
 from realsim.formats.bop import scene as bop
 from realsim.formats.bop.labels import mask_of
 from realsim.geometry import se3

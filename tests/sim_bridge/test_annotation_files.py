@@ -20,8 +20,9 @@ from realsim import (
     Scene,
     SupportPlane,
     View,
+    images,
 )
-from realsim.formats import images, label_maps
+from realsim.formats import label_maps
 from realsim.formats.bop.labels import mask_of, rle_area_and_bbox
 from realsim.geometry import camera, se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh

@@ -12,9 +12,9 @@ from realsim.app.register.files import write_result
 from realsim.app.school.inputs import SchoolRequest
 from realsim.app.school.run import run_in_session
 from realsim.app.stages import save_starts
-from realsim.formats.images import depth_counts, png_bytes
 from realsim.geometry import se3
 from realsim.geometry.parts import part
+from realsim.images import depth_counts, png_bytes
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.review.journal import append, new_entry

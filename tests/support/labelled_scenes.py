@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from realsim import CameraIntrinsics, Mesh, ObjectModel
-from realsim.formats import images
+from realsim import CameraIntrinsics, Mesh, ObjectModel, images
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.app.check.agreement import AgreementConfig, SceneAgreement
 from realsim.app.check.tally import (
     DepthDifference,
@@ -23,7 +24,6 @@ from realsim.app.check.tally import (
 from realsim.app.upgrade.config import UpgradeConfig
 from realsim.app.upgrade.dataset import SceneRef, open_scene, scenes_of
 from realsim.errors import InputError, RealsimError
-from realsim.formats import images
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.records import ObjectModel
 from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh

@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.app.outputs import require_free_file
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
@@ -17,6 +18,8 @@ CAMERA_NAMES = ("camera.json", "intrinsics.json", "cam_K.txt", "camera.yaml", "i
 """Files beside depth images that may hold their camera."""
 MOST_FRAMES = 12
 """More frames take longer and say little more."""
+SENSOR_MARKS = {".json": (' sensor 1"',)}
+"""What every file of a sensor holds."""
 OUT = {"disparity": Path("depth_sensor.json"), "stereo": Path("stereo_sensor.json")}
 """What is written where `--out` is not given."""
 
@@ -55,10 +58,7 @@ def run_depth_fit(source: Path, request: DepthFitRequest, console: Any) -> None:
 
     simulator = request.simulator
     out = OUT[simulator] if request.out is None else request.out
-    if out.suffix.lower() == ".png" or out.is_dir():
-        raise InputError(
-            f"--out {out} cannot be the JSON; give a file name such as {OUT[simulator]}."
-        )
+    require_free_file(out, "--out", SENSOR_MARKS, "sensor", (".png",))
     kind = profile(request.profile_name)
     if request.baseline_m is not None:
         kind = replace(kind, baseline_m=request.baseline_m)
@@ -171,7 +171,7 @@ def _of_session(source: Path, views: str) -> DepthFrames:
 def _of_folder(source: Path, views: str, camera: Path | None, unit_m: float) -> DepthFrames:
     from realsim.app.importing.folder import camera_of_file
     from realsim.app.option_values import numbers_of
-    from realsim.formats.images import image_size, read_depth
+    from realsim.images import image_size, read_depth
 
     place = source / "depth" if (source / "depth").is_dir() else source
     paths = sorted(place.glob("*.png"))

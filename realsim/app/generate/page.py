@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from realsim.app.picture_pages import LayeredView, Layers, Section, Sheet, Table, picture_page
 from realsim.app.picture_pages import spread as spread_order
 from realsim.app.render.pictures import fitted, layers
-from realsim.formats.images import read_rgb
+from realsim.images import read_rgb
 from realsim.store import SessionStore
 from realsim_sim_bridge.table_scenes.layout import Layout
 from realsim_sim_bridge.table_scenes.scene import scene_name

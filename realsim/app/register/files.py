@@ -41,9 +41,8 @@ from realsim.app.register.results import (
     poses_from_json,
     sigmas_of,
 )
-from realsim.formats.bop import units as bop_units
 from realsim.geometry import se3
-from realsim.records import ObjectModel, Scene
+from realsim.records import ObjectModel, Scene, bop_units
 from realsim.store import SessionStore, atomic, records_json
 from realsim.store.records_json import array_to_json, number_to_json
 

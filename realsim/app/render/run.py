@@ -10,7 +10,7 @@ from realsim.app.render.pictures import PAGE_FILE, SHEET_FILE, layers, pairs, sh
 from realsim.app.render.request import RenderRequest, WantedViews, wanted_views
 from realsim.app.render.scene import TwinScene, require_shown, twin_scene
 from realsim.errors import InputError
-from realsim.formats.images import image_size
+from realsim.images import image_size
 from realsim.records import GraspSet, ObjectModel, Scene
 from realsim.store import SessionStore
 from realsim.store.session_store import rgb_path

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from realsim import __version__
+from realsim import __version__, images
 from realsim.app.console import Console, Tick
 from realsim.app.register.run import register_session
 from realsim.app.show import why_no_grasp
@@ -19,7 +19,6 @@ from realsim.app.upgrade.dataset import SceneRef, open_scene
 from realsim.app.upgrade.files import NOTE, keep_imported, key_of
 from realsim.app.upgrade.instances import moved_from_start, world_starts
 from realsim.app.upgrade.source import SceneSource, prepare
-from realsim.formats import images
 from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry import se3
 from realsim.records import CaptureSession, GraspSet, ObjectPose, Scene, View

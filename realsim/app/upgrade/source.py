@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.app.upgrade.config import GT, UpgradeConfig
 from realsim.app.upgrade.dataset import SceneRef
 from realsim.app.upgrade.instances import Seen, told_apart
 from realsim.errors import InputError, UnitError
-from realsim.formats import images
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats.bags.wire import ImageMessage
-from realsim.formats.image_headers import require_decodable
+from realsim.images import require_decodable
 
 Kind = Literal["colour", "grey", "depth", "other"]
 

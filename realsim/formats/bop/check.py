@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.bop.check_poses import Silhouette, pose_findings, silhouette
 from realsim.formats.bop.labels import bbox_of
 from realsim.formats.bop.layout import Document, SceneLayout

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
-from realsim.formats.bop.units import MM_PER_M
 from realsim.formats.camera_direction import (
     AGREES_MM,
     STATED,
@@ -24,6 +23,7 @@ from realsim.formats.camera_direction import (
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
+from realsim.records.bop_units import MM_PER_M
 
 Array = NDArray[np.float64]
 Thing = list[tuple[int, Array]]

@@ -9,7 +9,7 @@ import math
 
 from numpy.typing import ArrayLike
 
-from realsim.formats.bop.units import MM_PER_M
+from realsim.records.bop_units import MM_PER_M
 
 STEPS = 3
 """Neighbouring doubles looked at on each side: two roundings move a number by less."""

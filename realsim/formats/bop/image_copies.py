@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.export_folder import Content
 from realsim.formats.folders.listing import image_header
 

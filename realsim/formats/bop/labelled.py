@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
-from realsim.formats.bop import units
 from realsim.formats.bop.layout import SceneLayout
 from realsim.formats.bop.models import INFO_FILE, load_models
 from realsim.formats.bop.rows import GroundTruth, Json
@@ -25,6 +24,7 @@ from realsim.formats.folders.listing import shown
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
 from realsim.records import CameraIntrinsics, ObjectModel
+from realsim.records import bop_units as units
 from realsim.untrusted.json_text import read_json
 
 Array = NDArray[np.float64]

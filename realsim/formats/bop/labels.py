@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim.formats.bop import units as bop_units
+from realsim.records import bop_units
 from realsim.store.atomic import json_bytes
 from realsim.store.session_store import SessionStore, rgb_path
 

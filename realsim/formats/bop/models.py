@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError, UnitError
-from realsim.formats import images
-from realsim.formats.bop.units import MM_PER_M, flat
 from realsim.geometry import se3
 from realsim.geometry.mesh import diameter, load_mesh, ply_bytes
 from realsim.records import Mesh, ObjectModel
+from realsim.records.bop_units import MM_PER_M, flat
 from realsim.store import atomic
 from realsim.untrusted.json_text import read_json
 from realsim.untrusted.values import mapping, number, numbers, text

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
-from realsim.formats.bop import evidence, units
+from realsim.formats.bop import evidence
 from realsim.formats.bop.instances import stated_instances, tell_apart
 from realsim.formats.bop.labelled import BopLabelledScene, SceneContent, model_ids
 from realsim.formats.bop.rows import (
@@ -25,6 +25,7 @@ from realsim.formats.bop.source import choose_scene
 from realsim.formats.bop.targets import read_targets, targets_file
 from realsim.formats.folders.listing import image_header, shown
 from realsim.records import ObjectModel
+from realsim.records import bop_units as units
 from realsim.records.capture import CaptureSession
 from realsim.untrusted.values import number
 

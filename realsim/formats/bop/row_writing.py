@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.bop import units
 from realsim.formats.bop.exact import exact_mm, exact_mm_list
 from realsim.formats.bop.instances import INSTANCE
 from realsim.formats.bop.labels import gt_info_entry
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
 from realsim.geometry import se3
+from realsim.records import bop_units as units
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError, NotRigidError
-from realsim.formats.bop import units
 from realsim.geometry import se3
+from realsim.records import bop_units as units
 from realsim.untrusted.json_text import read_json
 from realsim.untrusted.values import whole
 

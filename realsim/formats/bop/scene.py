@@ -16,14 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
-from realsim.formats.bop import units as bop_units
 from realsim.formats.bop.keyframes import read_keyframe_poses
 from realsim.formats.bop.layout import SceneLayout, cameras_of, scene_number
 from realsim.formats.bop.models import require_meshes
 from realsim.formats.bop.rows import read_cameras, read_ground_truth
-from realsim.records import CaptureSession, View
+from realsim.records import CaptureSession, View, bop_units
 from realsim.store.session_store import CAMERA_FILE
 
 __all__ = [

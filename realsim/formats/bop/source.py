@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.bop.scene import BopScene, BopSceneRef, find_scenes, read_scene
 from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.listing import image_header, shown

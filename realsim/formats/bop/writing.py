@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.bop import coco
 from realsim.formats.bop.image_copies import ColourFormat, colour_content, depth_content
 from realsim.formats.bop.layout import ONBOARDING, SceneLayout, scene_number

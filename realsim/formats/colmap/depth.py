@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.camera_scale import poses_checked_by_depth
 from realsim.formats.folders.depth_evidence import depth_evidence, require_unit
 from realsim.formats.folders.listing import image_header, shown

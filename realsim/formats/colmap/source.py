@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.colmap.depth import checked_by_depth, find_depth
 from realsim.formats.colmap.model import ColmapImage, ColmapModel, find_model, read_model
 from realsim.formats.folders.depth_evidence import read_counts

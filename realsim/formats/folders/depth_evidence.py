@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError, UnitError
-from realsim.formats import images
 
 DepthCoding = Literal["plain", "apc"]
 Counts = NDArray[np.uint16]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from realsim.errors import InputError
-from realsim.formats.image_headers import MOST_PIXELS
+from realsim.images import MOST_PIXELS
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """Endings of image files."""

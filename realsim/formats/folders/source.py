@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.folders.depth_evidence import (
     DepthCoding,
     coding_of,

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images, png
 from realsim.formats.export_folder import Content
 from realsim.formats.graspnet.annotations import annotation_bytes, object_fields, pose_of
 from realsim.formats.graspnet.labelled import ENTRY, FACTOR_DEPTH, GraspnetLabelledScene
 from realsim.formats.graspnet.meta import meta_bytes
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, LabelledScene
 from realsim.geometry import se3
+from realsim.images import png
 
 Array = NDArray[np.float64]
 UNIT_M = 1.0 / FACTOR_DEPTH

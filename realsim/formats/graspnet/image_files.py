@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.records import CameraIntrinsics
 
 RGB, DEPTH, LABEL = "rgb", "depth", "label"

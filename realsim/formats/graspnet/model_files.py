@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from realsim.formats import images
+from realsim import images
 from realsim.geometry.mesh import ply_bytes
 from realsim.records import Mesh, ObjectModel
 

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.graspnet import evidence, image_files
 from realsim.formats.graspnet.annotations import ANNOTATIONS
 from realsim.formats.graspnet.cameras import FIRST, MATRIX, POSES, CameraFiles, read_camera_files

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.graspnet import evidence, image_files
 from realsim.formats.graspnet.image_objects import joined_objects
 from realsim.formats.graspnet.instances import Instances, number_instances

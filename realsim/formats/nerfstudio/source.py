@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.camera_scale import poses_checked_by_depth
 from realsim.formats.folders import depth_evidence as depth_units
 from realsim.formats.folders.listing import image_header, shown

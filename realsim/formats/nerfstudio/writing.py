@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.formats.coloured_points import ColouredPoints, coloured_points
 from realsim.formats.export_folder import Content, ExportFolder
 from realsim.formats.folders.depth_evidence import read_counts

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.png import encode_png
+from realsim.images.png import encode_png
 from realsim.records import Mesh
 
 Array = NDArray[np.float64]

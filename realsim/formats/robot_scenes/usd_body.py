@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.png import encode_png
 from realsim.formats.robot_scenes.convex_parts import collision_parts
 from realsim.formats.robot_scenes.mesh_obj import PLAIN_RGB, Look, look_of
 from realsim.formats.robot_scenes.pixar import Pixar
 from realsim.formats.robot_scenes.placed_scene import RigidBody, principal_inertia
 from realsim.geometry import se3
+from realsim.images.png import encode_png
 from realsim.records import Mesh
 
 Array = NDArray[np.float64]

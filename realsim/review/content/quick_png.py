@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.compiled import njit
-from realsim.formats import images, png
-from realsim.formats.image_headers import MOST_PIXELS
+from realsim.images import MOST_PIXELS, png
 
 Bytes = NDArray[np.uint8]
 CHUNK_BYTES = 12

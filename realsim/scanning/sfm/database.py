@@ -206,7 +206,7 @@ def _claim(
     for stale in folder.glob(f"{DATABASE}*"):
         stale.unlink()
     for name, mask in (masks or {}).items():
-        from realsim.formats.images import png_bytes
+        from realsim.images import png_bytes
 
         # COLMAP's rule: the mask of a.png is a.png.png, black where no feature may lie.
         image = mask.astype(np.uint8) * np.uint8(255)
@@ -220,7 +220,7 @@ def _chosen_threshold(photographs: Photographs, config: SfmConfig) -> float:
     """Return the highest contrast threshold that gives enough features in a few images."""
     import pycolmap
 
-    from realsim.formats.images import read_grey
+    from realsim.images import read_grey
 
     f, paths = config.features, photographs.paths
     picks = np.unique(np.linspace(0, len(paths) - 1, f.probe_images).round().astype(int))

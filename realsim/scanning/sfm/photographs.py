@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from realsim.errors import InputError
-from realsim.formats.images import image_size, read_grey
+from realsim.images import image_size, read_grey
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 """Files that are taken for photographs."""

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.records import GraspSet, ObjectModel, Scene, View
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.formats.bop.labels import mask_path
-from realsim.formats.png_window import encode_window
+from realsim.images.png import encode_window
 from realsim.rendering.labels import LabelRenderer, Labels
 from realsim_sim_bridge.annotation import files
 from realsim_sim_bridge.annotation.frame_grasps import (

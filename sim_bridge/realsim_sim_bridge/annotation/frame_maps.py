@@ -9,8 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats import images, label_maps
-from realsim.formats.png_window import encode_window
+from realsim import images
+from realsim.formats import label_maps
+from realsim.images.png import encode_window
 from realsim.rendering.labels import Labels
 from realsim_sim_bridge.annotation import map_counts
 from realsim_sim_bridge.annotation.object_masks import ObjectMasks, Window, union_of

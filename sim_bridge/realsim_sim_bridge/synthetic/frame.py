@@ -15,8 +15,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim import images
 from realsim.errors import InputError
-from realsim.formats import images
 from realsim.records import CameraIntrinsics
 from realsim.rendering.photo import Photo
 from realsim_sim_bridge.synthetic.config import SyntheticConfig

@@ -86,7 +86,7 @@ def result_bytes(record: ScaleRecord, box_mm: Array) -> bytes:
 
 def model_files(mesh: Mesh, scale: float) -> dict[str, bytes]:
     """Return the mesh at metric scale as PLY [mm], and its texture beside it."""
-    from realsim.formats import images
+    from realsim import images
     from realsim.geometry.mesh import ply_bytes
 
     texture = Path(MODEL_FILE).with_suffix(".png").name if mesh.texture is not None else ""

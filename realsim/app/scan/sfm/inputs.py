@@ -85,7 +85,7 @@ def sfm_inputs(request: SfmRequest) -> SfmInputs:
     intrinsics = None
     if request.camera is not None:
         from realsim.app.importing.folder import camera_of_file
-        from realsim.formats.images import image_size
+        from realsim.images import image_size
 
         intrinsics = camera_of_file(request.camera, image_size(paths[0]))
     return SfmInputs(
@@ -133,7 +133,7 @@ def _session_inputs(request: SfmRequest) -> SfmInputs:
 
 def sfm_masks(request: SfmRequest, inputs: SfmInputs) -> dict[str, NDArray[np.bool_]] | None:
     """Return the masks by the photographs' names."""
-    from realsim.formats.images import read_grey
+    from realsim.images import read_grey
 
     if request.masks is None:
         return None
