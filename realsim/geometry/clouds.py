@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
+from realsim.geometry.robust import tukey_weights
 
 Array = NDArray[np.float64]
 REFINE_STEPS = 8
@@ -127,7 +128,7 @@ def refine_plane(
     cutoff = 2.0 * tolerance_m
     for _ in range(REFINE_STEPS):
         r = p @ n - offset
-        w = np.square(np.clip(1.0 - np.square(r / cutoff), 0.0, None))
+        w = tukey_weights(np.square(r / cutoff))
         if np.count_nonzero(w) < 3:
             break
         mean = (w @ p) / w.sum()

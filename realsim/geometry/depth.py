@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError, UnitError
 from realsim.geometry.camera import ray_table
+from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.records import CameraIntrinsics
 
 Array = NDArray[np.float64]
@@ -14,8 +15,6 @@ FARTHEST_M = 20.0
 """Half of a depth image beyond this is in another unit: no hand camera sees so far."""
 UNIT_STRIDE = 16
 """Every so many rows and columns tell the unit."""
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution whose median absolute deviation is 1."""
 
 
 def check_depth(depth_m: NDArray[np.float32], intrinsics: CameraIntrinsics) -> None:

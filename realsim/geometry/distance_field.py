@@ -132,6 +132,11 @@ class DistanceField:
             _memory.popitem(last=False)
         return known
 
+    @property
+    def lattice(self) -> tuple[NDArray[np.float32], Array, float]:
+        """Grid, origin and cell: what compiled loops take (see `sample`)."""
+        return self.grid, self.origin, self.cell
+
     def distance(self, points: ArrayLike, T_obj_points: ArrayLike | None = None) -> Array:
         """Return the signed distance (N,) of points (N, 3) [m], mapped by T first if given."""
         return self._sampled(points, T_obj_points)[0]

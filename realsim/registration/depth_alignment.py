@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.geometry.depth import MAD_TO_SIGMA
+from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.records import CameraIntrinsics
 from realsim.registration.outlines import AlignmentConfig, edge_distance, outlines_of, scores_of
 

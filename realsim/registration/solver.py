@@ -17,15 +17,13 @@ from numpy.typing import NDArray
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
+from realsim.geometry.normal_equations import add_row
+from realsim.geometry.robust import tukey
+from realsim.geometry.seen_surface import GATE_COS, follow_to_camera
 from realsim.registration.body import Body
 from realsim.registration.evidence import Cloud
 
 Array = NDArray[np.float64]
-FRONT_STEPS = 6
-"""Cells by which a point behind a thin wall is followed towards the camera that saw it: walls of up
-to about 10 mm; a point deeper inside has its own surface."""
-KINK = 0.64
-"""Squared gradient below which a grid cell holds two surfaces (a distance has gradient 1)."""
 LEAST_POINTS = 6
 """Fewer points than unknowns determine nothing: the pose is left where it is."""
 
@@ -62,9 +60,6 @@ class SolverConfig:
         Stage(kernel=6.0, cap_m=0.008, steps=12, gated=True),
     )
     """From a pose that is right to some millimetres."""
-    gate_cos: float = 0.05
-    """Least cosine between the model's normal and the direction to the camera (a surface is never
-    seen from behind)."""
     damping: float = 0.04
     """Levenberg: sensitivities (root mean square cosine) below this are not moved along."""
     free_space_weight: float = 0.3
@@ -120,14 +115,14 @@ def accumulate_points(
     lattice: tuple[NDArray[np.float32], Array, float],
     T: Array,
     cloud: tuple[Array, Array, Array],
-    limits: tuple[float, float, float],
+    limits: tuple[float, float, bool],
     center: Array,
     system: tuple[Array, Array],
 ) -> tuple[float, float, float, int]:
     """Add the points' equations to H, b; return sum w, sum w r^2, sum of kernel weights, count."""
     grid, origin, cell = lattice
     points, towards, sigmas = cloud
-    kernel, cap, gate = limits
+    kernel, cap, gated = limits
     H, b = system
     weight, square, kernels, used = 0.0, 0.0, 0.0, 0
     J = np.empty(6)
@@ -143,35 +138,27 @@ def accumulate_points(
         q = r / min(kernel * s, cap)
         if q * q >= 1.0:
             continue
-        if gate > -1.0:
+        if gated:
             ta, te, tf = towards[m, 0], towards[m, 1], towards[m, 2]
             vx = T[0, 0] * ta + T[1, 0] * te + T[2, 0] * tf
             vy = T[0, 1] * ta + T[1, 1] * te + T[2, 1] * tf
             vz = T[0, 2] * ta + T[1, 2] * te + T[2, 2] * tf
-            # Behind or within a thin wall: step towards the camera to the side that was seen, and
-            # take the distance to the tangent plane there.
-            t = 0.0
-            while t < FRONT_STEPS * cell and (
-                gx * vx + gy * vy + gz * vz <= gate or gx * gx + gy * gy + gz * gz < KINK
-            ):
-                t += cell
-                r, gx, gy, gz = sample(grid, origin, cell, x + t * vx, y + t * vy, z + t * vz)
-            facing = gx * vx + gy * vy + gz * vz
-            if facing <= gate:
+            # Behind or within a thin wall: the distance to the side that the camera saw.
+            r, gx, gy, gz, t, facing = follow_to_camera(
+                lattice, (x, y, z), (vx, vy, vz), (r, gx, gy, gz)
+            )
+            if facing <= GATE_COS:
                 continue
             r -= t * facing
             q = r / min(kernel * s, cap)
             if q * q >= 1.0:
                 continue
-        kernels += (1.0 - q * q) ** 2
-        w = (1.0 - q * q) ** 2 / (s * s)
+        kernels += tukey(q * q)
+        w = tukey(q * q) / (s * s)
         x, y, z = x - center[0], y - center[1], z - center[2]
         J[0], J[1], J[2] = -(y * gz - z * gy), -(z * gx - x * gz), -(x * gy - y * gx)
         J[3], J[4], J[5] = -gx, -gy, -gz
-        for i in range(6):
-            b[i] -= w * J[i] * r
-            for j in range(i, 6):
-                H[i, j] += w * J[i] * J[j]
+        add_row(H, b, J, w, r)
         weight += w
         square += w * r * r
         used += 1
@@ -225,14 +212,11 @@ def _accumulate_free_space(
                 continue
             # Moving back along the ray by `gap` in depth moves by n.(ray gap) along the normal.
             r = -gap * (nx * x + ny * y + nz)
-            w = weight * (1.0 - (gap / cap) ** 2) ** 2
+            w = weight * tukey((gap / cap) ** 2)
             q0, q1, q2 = s0 - center[0], s1 - center[1], s2 - center[2]
             J[0], J[1], J[2] = q1 * a2 - q2 * a1, q2 * a0 - q0 * a2, q0 * a1 - q1 * a0
             J[3], J[4], J[5] = a0, a1, a2
-            for c in range(6):
-                b[c] -= w * J[c] * r
-                for d in range(c, 6):
-                    H[c, d] += w * J[c] * J[d]
+            add_row(H, b, J, w, r)
             violating += 1
     return violating
 
@@ -320,12 +304,11 @@ def _linearised(
 ) -> tuple[_Sums, Array, Array]:
     """Return the sums at pose T, and the upper normal matrix (6, 6) and right side (6,)."""
     H, b = np.zeros((6, 6)), np.zeros(6)
-    gate = config.gate_cos if stage.gated else -2.0
     weight, square, kernels, used = accumulate_points(
-        (body.field.grid, body.field.origin, body.field.cell),
+        body.field.lattice,
         T,
         cloud,
-        (stage.kernel, stage.cap_m, gate),
+        (stage.kernel, stage.cap_m, stage.gated),
         body.center_obj,
         (H, b),
     )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.depth import MAD_TO_SIGMA
+from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.records import SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.evidence import DepthNoise

@@ -8,23 +8,28 @@ import pytest
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
+from realsim.geometry.normal_equations import System, covariances, solved
 from realsim.geometry.parts import part
+from realsim.geometry.seen_surface import seen_distances
 from realsim.records import ObjectPose
 from realsim.registration.body import Body, make_body
-from realsim.registration.refinement.blocks import BLOCK, add_blocks
 from realsim.registration.refinement.equations import (
     BIAS,
+    BIAS_AT,
+    BLOCK,
     HAND_EYE,
     OBJECTS,
     TABLE,
+    TABLE_AT,
     TABLE_ROWS,
     Blocks,
-    System,
+    Offsets,
+    add_blocks,
+    add_offsets,
     assembled,
-    covariances,
-    solved,
+    object_at,
 )
-from realsim.registration.refinement.residuals import exact_residuals, field_residuals, thin_share
+from realsim.registration.refinement.residuals import exact_residuals, thin_share
 from realsim.registration.refinement.state import State, centred, moved
 
 Array = NDArray[np.float64]
@@ -83,8 +88,9 @@ class OnePoint:
         )  # fmt: skip
         assert kernels[0] == pytest.approx(1.0)
         H = H + np.swapaxes(np.triu(H, 1), 1, 2)
-        blocks = Blocks(H=H, b=b, Ms=se3.from_translation(-center) @ M)
-        system = assembled([], blocks) if self.of_table else assembled([blocks], None)
+        own, rows = (TABLE_AT, TABLE_ROWS) if self.of_table else (object_at(0), tuple(range(6)))
+        blocks = Blocks(H=H, b=b, Ms=se3.from_translation(-center) @ M, own=own, rows=rows)
+        system = assembled([blocks], OBJECTS + 6 * len(self.bodies))
         return -system.a / TINY_M, -system.d[0] / TINY_M
 
 
@@ -225,8 +231,9 @@ def test_residual_is_the_distance_along_the_normal(box: Body, exact: bool):
     if exact:
         places, distances, normals = exact_residuals(box, points_cam, views, Ms, eyes)
     else:
-        lattice = (box.field.grid, box.field.origin, box.field.cell)
-        places, distances, normals = field_residuals(lattice, points_cam, views, Ms, eyes)
+        places, distances, normals = seen_distances(
+            box.field.lattice, 1.0, points_cam, views, (Ms, eyes), False
+        )
     np.testing.assert_allclose(places, points_obj, atol=1e-12)
     np.testing.assert_allclose(distances, beyond, atol=2e-5 if not exact else 1e-6)
     np.testing.assert_allclose(normals, box.normals[seen], atol=0.02 if not exact else 1e-5)
@@ -256,8 +263,9 @@ def test_point_behind_a_thin_wall_belongs_to_the_side_that_was_seen(exact: bool)
     if exact:
         _, distances, normals = exact_residuals(mug, points_cam, views, Ms, eyes)
     else:
-        lattice = (mug.field.grid, mug.field.origin, mug.field.cell)
-        _, distances, normals = field_residuals(lattice, points_cam, views, Ms, eyes)
+        _, distances, normals = seen_distances(
+            mug.field.lattice, 1.0, points_cam, views, (Ms, eyes), False
+        )
     cosine = np.sum(normals * mug.normals[some], axis=1)
     assert np.median(cosine) > 0.98
     assert np.median(distances) == pytest.approx(-depth, abs=4e-4 if not exact else 1e-4)
@@ -299,8 +307,9 @@ def random_rows(seed: int, objects: int = 2, views: int = 4, each: int = 15) -> 
                 H[v] += np.outer(A, A)
                 b[v] -= A * r
                 rows.append((k if k < objects else -1, v, A, r))
-        parts.append(Blocks(H=H, b=b, Ms=Ms[k]))
-    system = assembled(parts[:-1], parts[-1])
+        own, used = (object_at(k), tuple(range(6))) if k < objects else (TABLE_AT, TABLE_ROWS)
+        parts.append(Blocks(H=H, b=b, Ms=Ms[k], own=own, rows=used))
+    system = assembled(parts, OBJECTS + 6 * objects)
     sigmas = {"hand": 0.7, "bias": 0.3, "view": 0.5, "weak": 10.0}
     n = OBJECTS + 6 * objects
     add = np.full(n, sigmas["weak"] ** -2)
@@ -397,6 +406,45 @@ def test_step_and_covariance_are_those_of_gtsam(seed: int):
     together = marginals.jointMarginalCovariance(both)
     cross = together.at(O(1), V(2))
     np.testing.assert_allclose(C_own.cross[2][OBJECTS + 6 : OBJECTS + 12], cross, atol=1e-8)
+
+
+@pytest.mark.parametrize("size", [0.5, 1.0, 2.5])
+def test_size_and_offsets_have_the_derivatives_of_the_residual(box: Body, size: float):
+    # r = size * phi(M p / size) - delta over the size's logarithm and a patch's offset.
+    center, T = box.center_obj, se3.look_at([0.2, 0.1, 0.4], [0, 0, 0])
+    grid, origin, cell = box.field.lattice
+    lattice = (grid, origin - center, cell)
+    top = np.array([[0.01, 0.005, box.model.mesh.bounds[1, 2] - center[2]]])
+    points = se3.transform(se3.invert(T), size * top + [0, 0, 1e-4])
+    views, cameras = np.zeros(1, np.int32), (T[None], T[None, :3, 3].copy())
+
+    def seen(of: float) -> tuple[Array, Array, Array]:
+        return seen_distances(lattice, of, points, views, cameras, False)
+
+    places, distances, normals = seen(size)
+    H, b, n = np.zeros((1, BLOCK + 1, BLOCK + 1)), np.zeros((1, BLOCK + 1)), OBJECTS + 6
+    frame = (np.zeros(3), *seen_from(T[None]))
+    kernels = np.zeros(1)
+    near = (places, distances, normals)
+    add_blocks(near, views, frame, (np.ones(1), np.full(1, 1e6)), (H, b), kernels)
+    slope = (seen(size * np.exp(STEP))[1] - seen(size * np.exp(-STEP))[1]) / (2 * STEP)
+    np.testing.assert_allclose(-b[0, 8] / distances, slope, rtol=0.01)
+    coupling, information, right = np.zeros((1, BLOCK + 1, 2)), np.zeros(2), np.zeros(2)
+    add_offsets(near, views, frame, kernels, np.array([1]), (coupling, information, right))
+    offsets = Offsets(
+        coupling=coupling, information=information, right=right, at=np.array([n + 1, n + 2])
+    )
+    H = H + np.swapaxes(np.triu(H, 1), 1, 2)
+    blocks = Blocks(
+        H=H, b=b, Ms=T[None], own=object_at(0), further=np.append(BIAS_AT, n), offsets=offsets
+    )
+    system = assembled([blocks], n + 3)
+    # One point says one number: its row [.., -1 of its patch] times itself.
+    row, view = -system.a / distances, -system.d[0] / distances
+    row[-2:] = [0.0, -1.0]
+    np.testing.assert_allclose(system.A, np.outer(row, row), atol=1e-6)
+    np.testing.assert_allclose(system.B[0], np.outer(row, view), atol=1e-6)
+    np.testing.assert_allclose(system.a[-2:], [0.0, distances[0]], atol=1e-9)
 
 
 # --- state ---------------------------------------------------------------------------------------

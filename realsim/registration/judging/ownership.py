@@ -82,7 +82,7 @@ def make_claims(
         T_table_world=None if plane is None else se3.invert(plane.T_world_table),
         objects=tuple(
             (
-                (b.field.grid, b.field.origin, b.field.cell),
+                b.field.lattice,
                 se3.invert(T),
                 b.model.mesh.bounds,
                 b.center(T),

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
 from realsim.geometry.mesh import sample_surface
+from realsim.geometry.seen_surface import GATE_COS, follow_to_camera
 from realsim.registration.body import Body
 
 Array = NDArray[np.float64]
@@ -15,12 +16,6 @@ SIDES = 6
 """Ways a patch may face: along +x -x +y -y +z -z. The two sides of a thin wall stay apart."""
 PATCH_SEED = 0
 """The patches are part of the model: always the same."""
-MARCH_CELLS = 6
-"""Cells of the field by which a point behind a thin wall is followed towards its camera."""
-KINK = 0.64
-"""Squared gradient below which a cell of the field holds two surfaces."""
-GATE_COS = 0.05
-"""Least cosine between normal and direction to the camera: a surface is not seen from behind."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -112,15 +107,9 @@ def add_to_patches(
         vx, vy, vz = eye[0] - x, eye[1] - y, eye[2] - z
         length = np.sqrt(vx * vx + vy * vy + vz * vz)
         vx, vy, vz = vx / length, vy / length, vz / length
-        r, gx, gy, gz = sample(grid, origin, cell, x, y, z)
-        t = 0.0
-        # Behind or within a thin wall: to the side that the camera saw.
-        while t < MARCH_CELLS * cell and (
-            gx * vx + gy * vy + gz * vz <= GATE_COS or gx * gx + gy * gy + gz * gz < KINK
-        ):
-            t += cell
-            r, gx, gy, gz = sample(grid, origin, cell, x + t * vx, y + t * vy, z + t * vz)
-        facing = gx * vx + gy * vy + gz * vz
+        r, gx, gy, gz, t, facing = follow_to_camera(
+            lattice, (x, y, z), (vx, vy, vz), sample(grid, origin, cell, x, y, z)
+        )
         if facing <= GATE_COS:
             continue
         # The foot on the surface, and the distance of the point itself to the plane there.

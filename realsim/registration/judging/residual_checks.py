@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.registration.judging.surface_residuals import MAD, ResidualConfig, SurfaceResiduals
+from realsim.geometry.robust import mad_sigma
+from realsim.registration.judging.surface_residuals import ResidualConfig, SurfaceResiduals
 
 Array = NDArray[np.float64]
 
@@ -23,7 +24,7 @@ def error_level_m(residuals: Sequence[SurfaceResiduals], config: ResidualConfig)
     depths: list[float] = []
     for r in residuals:
         if np.any(r.measured):
-            spread = MAD * float(np.median(np.abs(r.mean_m[r.measured])))
+            spread = mad_sigma(r.mean_m[r.measured])
             noise = float(np.median(r.sigma_m[r.measured]))
             own.append(float(np.sqrt(max(0.0, spread**2 - noise**2))))
             depths.append(r.depth_m)

@@ -31,8 +31,6 @@ from realsim.registration.judging.patches import (
 from realsim.registration.views import ViewPoints
 
 Array = NDArray[np.float64]
-MAD = 1.4826
-"""Standard deviation of a normal distribution per median absolute deviation."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,139 +1,257 @@
-"""The normal equations of all unknowns, put together from the blocks, solved view by view.
+"""The normal equations of everything that is fitted together, from points of many views.
 
-Shared unknowns: 6 of every object (right twist about its centre), 3 of the table (two tilts and the
-height), 2 of the depth's bias, 6 of the hand-eye. Every view has 6 more. No two views share an
-equation, so their unknowns are eliminated one by one (Schur's complement); what is left is as small
-for 256 views as for 3.
+What one body's points say in one view is a block: the twist xi = [omega, v] of the view's points in
+the body's frame about its centre, and further columns. A point p of the camera becomes m = M p,
+M = T_body_cam, and with g the surface's normal and r = g.(m - s) its distance,
+    m' = exp(xi) m:             dr/domega = m x g,   dr/dv = g
+    1/z' = scale/z + offset:    dr/dscale = -L,      dr/doffset = -L z,   L = g.(m - eye)
+    a body exp(lambda) as large (about the origin of its frame):    dr/dlambda = -g.m
+where z is the depth along the camera's axis, not the range, which is a third more at the border.
 
-With A the row of a block (see `blocks`): object -A, table -A[0, 1, 5], camera A Ad(M) where
-M = T_body_cam, because M exp(xi) = exp(Ad(M) xi) M.
+The noise of a point is in its residual. Were it in the derivative too, the two would be correlated
+and hardly visible directions would be pulled by many sigma (errors in variables); so derivatives
+are taken where the point's ray meets the surface.
+
+All other unknowns follow from the block by adjoints. With A the row of a block's twist: object -A,
+table -A[0, 1, 5], camera A Ad(M), because M exp(xi) = exp(Ad(M) xi) M. Shared unknowns are 6 of the
+hand-eye, 2 of the depth's bias, 3 of the table (two tilts and the height), 6 of every object (right
+twist about its centre); then whatever the caller adds: the sizes of objects, offsets of patches of
+the surface, an offset of outlines. Every view has 6 more (see `geometry.normal_equations`).
+
+To fit a size too (the body's frame at its centre, as large as the body now is):
+    places, distances, normals = seen_distances(lattice, size, points, views, cameras, edges)
+    add_blocks(..., system=(H, b))    with blocks of 9 columns instead of 8, the last is the size's
+    Blocks(..., own=object_at(0), further=np.append(BIAS_AT, place of the size's logarithm))
+    system = assembled(blocks of all bodies, number of shared unknowns); add priors to A and a
+    shared, views = solved(system); C = covariances(system)
+Alone, with all cameras held, its 7 unknowns have the sum of H over views, bias columns left out.
+Terms of another kind (outlines) fill blocks of their own; those of no view (contact) add to A, a.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.compiled import njit
 from realsim.geometry import se3
+from realsim.geometry.normal_equations import Places, System, add_row
+from realsim.geometry.robust import tukey
 
 Array = NDArray[np.float64]
-TABLE_ROWS = (0, 1, 5)
-"""Of the table's twist: turns about its x and y, shift along its z."""
+Ints = NDArray[np.int32]
 HAND_EYE, BIAS, TABLE = slice(0, 6), slice(6, 8), slice(8, 11)
 """Where shared unknowns stand; the objects follow, six each."""
 OBJECTS = 11
+TABLE_ROWS = (0, 1, 5)
+"""Of the table's twist: turns about its x and y, shift along its z."""
+BIAS_AT: Places = np.arange(BIAS.start, BIAS.stop)
+TABLE_AT: Places = np.arange(TABLE.start, TABLE.stop)
+HAND_EYE_AT: Places = np.arange(HAND_EYE.start, HAND_EYE.stop)
+BLOCK = 8
+"""Columns of a block: twist and bias. A ninth is the logarithm of the body's size."""
+LEAST_ALONG = 0.15
+"""Least cosine between ray and normal at which the ray is followed to the surface."""
+
+
+def object_at(k: int) -> Places:
+    """Return the places (6,) of an object's twist among the shared unknowns."""
+    return np.arange(OBJECTS + 6 * k, OBJECTS + 6 * k + 6)
+
+
+@njit
+def add_blocks(
+    surface: tuple[Array, Array, Array],
+    views: Ints,
+    frame: tuple[Array, Array, Array],
+    precision: tuple[Array, Array],
+    system: tuple[Array, Array],
+    kernels: Array,
+) -> float:
+    """Add a body's points to the blocks of their views; return the weighted sum of squares.
+
+    Args:
+        surface: places (N, 3) in the body's frame, distances (N,), normals (N, 3), as from
+            `seen_distances`. NaN = not used.
+        views: (N,).
+        frame: the body's centre (3,), and of the cameras in the body's frame the place (V, 3) and
+            the unit direction (V, 3) in which they look.
+        precision: weight (N,) [1/m^2], and the square (N,) of the distance at which Tukey's kernel
+            ends [m^2].
+        system: H (V, n, n) upper triangles and b (V, n), added to; n = 8, or 9 with a size.
+        kernels: (N,) filled with Tukey's weights; 0 = not used.
+    """
+    places, distances, normals = surface
+    center, eyes, axes = frame
+    weight, reach = precision
+    H, b = system
+    J = np.empty(b.shape[1])
+    total = 0.0
+    for i in range(len(places)):
+        kernels[i] = 0.0
+        r = distances[i]
+        if np.isnan(r):
+            continue
+        q = r * r / reach[i]
+        if q >= 1.0:
+            continue
+        kernels[i] = tukey(q)
+        w = kernels[i] * weight[i]
+        k = views[i]
+        fill_row(J, (places[i], r, normals[i]), (center, eyes[k], axes[k]))
+        add_row(H[k], b[k], J, w, r)
+        total += w * r * r
+    return total
+
+
+@njit(inline="always")
+def fill_row(
+    J: Array, point: tuple[Array, float, Array], frame: tuple[Array, Array, Array]
+) -> None:
+    """Fill in the derivatives J (8 or 9,) of one point's distance.
+
+    Args:
+        J: filled in.
+        point: place (3,) in the body's frame, distance, normal (3,).
+        frame: the body's centre, the camera's place in the body's frame and its direction, (3,).
+    """
+    place, r, g = point
+    center, eye, axis = frame
+    gx, gy, gz = g[0], g[1], g[2]
+    ex, ey, ez = eye[0], eye[1], eye[2]
+    x, y, z = place[0] - ex, place[1] - ey, place[2] - ez
+    far = np.sqrt(x * x + y * y + z * z)
+    along = gx * x + gy * y + gz * z
+    deep = axis[0] * x + axis[1] * y + axis[2] * z
+    f = 1.0 - r / along if abs(along) > LEAST_ALONG * far else 1.0
+    x, y, z = ex + f * x - center[0], ey + f * y - center[1], ez + f * z - center[2]
+    J[0], J[1], J[2] = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
+    J[3], J[4], J[5] = gx, gy, gz
+    J[6] = -f * along
+    J[7] = -f * along * f * deep
+    if len(J) > BLOCK:
+        J[8] = -(gx * x + gy * y + gz * z)
+
+
+@njit
+def add_offsets(
+    surface: tuple[Array, Array, Array],
+    views: Ints,
+    frame: tuple[Array, Array, Array],
+    weights: Array,
+    patches: Places,
+    system: tuple[Array, Array, Array],
+) -> None:
+    """Add what the points say of offsets of the surface: r - delta of the patch a point lies in.
+
+    Args:
+        surface: as of `add_blocks`; distances with the offsets in them.
+        views: likewise.
+        frame: likewise.
+        weights: (N,) kernel and precision of every point [1/m^2]; 0 = not used.
+        patches: (N,) the patch of every point.
+        system: coupling (V, n, K) to the columns of the blocks, information (K,) and right side
+            (K,) of the offsets, added to.
+    """
+    places, distances, normals = surface
+    center, eyes, axes = frame
+    coupling, information, right = system
+    J = np.empty(coupling.shape[1])
+    for i in range(len(places)):
+        w, r, k, n = weights[i], distances[i], views[i], patches[i]
+        if w <= 0.0:
+            continue
+        fill_row(J, (places[i], r, normals[i]), (center, eyes[k], axes[k]))
+        information[n] += w
+        right[n] += w * r
+        for c in range(len(J)):
+            coupling[k, c, n] -= w * J[c]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Offsets:
+    """How the blocks of one body hang together with offsets of its surface."""
+
+    coupling: Array
+    """(V, n, K)."""
+    information: Array
+    """(K,) diagonal: a point lies in one patch."""
+    right: Array
+    """(K,)."""
+    at: Places
+    """(K,) places among the shared unknowns."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Blocks:
-    """What the points of one body said."""
+    """What the points of one body said, and which unknowns they speak of."""
 
     H: Array
-    """(V, 8, 8), symmetric."""
+    """(V, n, n), symmetric: twist, and n - 6 further columns."""
     b: Array
-    """(V, 8)."""
+    """(V, n)."""
     Ms: Array
     """(V, 4, 4) T_body_cam, the body's frame moved to its centre."""
+    own: Places
+    """Places of the body's own unknowns among the shared ones."""
+    rows: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    """Which components of the twist these are."""
+    further: Places = field(default_factory=BIAS_AT.copy)
+    """(n - 6,) places of the further columns."""
+    offsets: Offsets | None = None
+    """None = the surface is as the model says."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class System:
-    """Normal equations: shared unknowns s, and of every view v."""
-
-    A: Array
-    """(S, S) of s."""
-    a: Array
-    """(S,) right side."""
-    B: Array
-    """(V, S, 6) coupling."""
-    D: Array
-    """(V, 6, 6) of the views."""
-    d: Array
-    """(V, 6) right side."""
-
-
-def assembled(objects: list[Blocks], table: Blocks | None) -> System:
-    """Return the normal equations without any prior."""
-    first = objects[0] if objects else table
-    assert first is not None, "there is something to fit"
-    V, S = len(first.H), OBJECTS + 6 * len(objects)
+def assembled(bodies: Sequence[Blocks], unknowns: int) -> System:
+    """Return the normal equations of so many shared unknowns without any prior."""
+    V, S = len(bodies[0].H), unknowns
     system = System(
         A=np.zeros((S, S)), a=np.zeros(S), B=np.zeros((V, S, 6)), D=np.zeros((V, 6, 6)),
         d=np.zeros((V, 6)),
     )  # fmt: skip
-    for k, blocks in enumerate(objects):
-        at = OBJECTS + 6 * k
-        _add(system, blocks, np.arange(at, at + 6), np.arange(6))
-    if table is not None:
-        _add(system, table, np.arange(TABLE.start, TABLE.stop), np.array(TABLE_ROWS))
+    for blocks in bodies:
+        _add(system, blocks)
     return system
 
 
-def _add(system: System, blocks: Blocks, own: NDArray[np.int64], rows: NDArray[np.int64]) -> None:
-    """Add the blocks of one body, whose unknowns are `own` and use `rows` of the twist."""
+def _add(system: System, blocks: Blocks) -> None:
+    """Add the blocks of one body."""
+    own, rows, more, hand = blocks.own, np.array(blocks.rows), blocks.further, HAND_EYE_AT
     Ad = se3.adjoint(blocks.Ms)
+    back = np.swapaxes(Ad, 1, 2)
     H, b = blocks.H[:, :6, :6], blocks.b[:, :6]
-    bias = np.arange(BIAS.start, BIAS.stop)
-    hand = np.arange(HAND_EYE.start, HAND_EYE.stop)
     Hc = H @ Ad
-    cc = np.swapaxes(Ad, 1, 2) @ Hc
-    cb = np.swapaxes(Ad, 1, 2) @ blocks.H[:, :6, 6:]
+    cc = back @ Hc
+    cb = back @ blocks.H[:, :6, 6:]
     cd = np.einsum("vji,vj->vi", Ad, b)
     A, B = system.A, system.B
     A[np.ix_(own, own)] += H.sum(0)[np.ix_(rows, rows)]
-    A[np.ix_(bias, bias)] += blocks.H[:, 6:, 6:].sum(0)
+    A[np.ix_(more, more)] += blocks.H[:, 6:, 6:].sum(0)
     A[np.ix_(hand, hand)] += cc.sum(0)
-    for left, right, value in (
-        (own, bias, -blocks.H[:, :6, 6:].sum(0)[rows]),
-        (own, hand, -Hc.sum(0)[rows]),
-        (hand, bias, cb.sum(0)),
-    ):
-        A[np.ix_(left, right)] += value
-        A[np.ix_(right, left)] += value.T
+    _couple(A, own, more, -blocks.H[:, :6, 6:].sum(0)[rows])
+    _couple(A, own, hand, -Hc.sum(0)[rows])
+    _couple(A, hand, more, cb.sum(0))
     system.a[own] -= b.sum(0)[rows]
-    system.a[bias] += blocks.b[:, 6:].sum(0)
+    system.a[more] += blocks.b[:, 6:].sum(0)
     system.a[hand] += cd.sum(0)
     B[:, own] -= Hc[:, rows]
-    B[:, bias] += np.swapaxes(cb, 1, 2)
+    B[:, more] += np.swapaxes(cb, 1, 2)
     B[:, hand] += cc
     system.D[:] += cc
     system.d[:] += cd
+    if (offsets := blocks.offsets) is not None:
+        at, total = offsets.at, offsets.coupling.sum(0)
+        ck = back @ offsets.coupling[:, :6]
+        A[at, at] += offsets.information
+        system.a[at] += offsets.right
+        _couple(A, own, at, -total[rows])
+        _couple(A, more, at, total[6:])
+        _couple(A, hand, at, ck.sum(0))
+        B[:, at] += np.swapaxes(ck, 1, 2)
 
 
-def solved(system: System) -> tuple[Array, Array]:
-    """Return the step of the shared unknowns (S,) and of the views (V, 6)."""
-    inverse = np.linalg.inv(system.D)
-    BD = system.B @ inverse
-    A = system.A - np.einsum("vij,vkj->ik", BD, system.B)
-    a = system.a - np.einsum("vij,vj->i", BD, system.d)
-    s = _inverse(A) @ a
-    views = np.einsum("vij,vj->vi", inverse, system.d - np.einsum("vij,i->vj", system.B, s))
-    return s, views
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Covariances:
-    """The inverse of the normal matrix, in pieces."""
-
-    shared: Array
-    """(S, S)."""
-    cross: Array
-    """(V, S, 6) of shared unknowns and a view's."""
-    views: Array
-    """(V, 6, 6)."""
-
-
-def covariances(system: System) -> Covariances:
-    """Return the covariance of all unknowns that are asked for."""
-    inverse = np.linalg.inv(system.D)
-    BD = system.B @ inverse
-    shared = _inverse(system.A - np.einsum("vij,vkj->ik", BD, system.B))
-    cross = -shared @ BD
-    views = inverse - np.swapaxes(BD, 1, 2) @ cross
-    return Covariances(shared=shared, cross=cross, views=views)
-
-
-def _inverse(A: Array) -> Array:
-    """Return the inverse of a normal matrix whose unknowns have very different units."""
-    scale = np.sqrt(np.maximum(np.diag(A), 1e-12))
-    return np.linalg.inv(A / np.outer(scale, scale)) / np.outer(scale, scale)
+def _couple(A: Array, left: Places, right: Places, value: Array) -> None:
+    """Add a piece of a symmetric matrix on both sides of its diagonal."""
+    A[np.ix_(left, right)] += value
+    A[np.ix_(right, left)] += value.T

@@ -17,33 +17,39 @@ from numpy.typing import NDArray
 
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
+from realsim.geometry.normal_equations import (
+    Covariances,
+    System,
+    add_prior,
+    covariances,
+    solved,
+    symmetric,
+)
+from realsim.geometry.robust import mad_sigma
+from realsim.geometry.seen_surface import seen_distances
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.refinement.blocks import BLOCK, LEAST_ALONG, add_blocks
 from realsim.registration.refinement.config import NoiseConfig, RefineConfig
 from realsim.registration.refinement.equations import (
     BIAS,
+    BLOCK,
     HAND_EYE,
+    LEAST_ALONG,
     OBJECTS,
+    TABLE_AT,
+    TABLE_ROWS,
     Blocks,
-    Covariances,
-    System,
+    add_blocks,
     assembled,
-    covariances,
-    solved,
+    object_at,
 )
 from realsim.registration.refinement.points import Owned, assigned, joined
-from realsim.registration.refinement.residuals import (
-    exact_residuals,
-    field_residuals,
-    thin_share,
-)
+from realsim.registration.refinement.residuals import exact_residuals, thin_share
 from realsim.registration.refinement.state import State, moved
 from realsim.registration.views import ViewPoints
 
 Array = NDArray[np.float64]
-MAD_TO_SIGMA = 1.4826
 LEAST_SIGMA = (np.radians(1e-3), 1e-5)
 """Least prior 1-sigma of a turn [rad] and a shift [m]: nothing is perfect."""
 FIXED = 1e-9
@@ -200,16 +206,14 @@ def _linearised(
         if exact and task.thin[k]:
             surface = exact_residuals(body, p, mine.views, Ms, eyes)
         else:
-            f = body.field
-            surface = field_residuals((f.grid, f.origin, f.cell), p, mine.views, Ms, eyes)
+            surface = seen_distances(body.field.lattice, 1.0, p, mine.views, (Ms, eyes), False)
         center = body.center_obj
         Ms_centred = se3.from_translation(-center) @ Ms
         few = len(p) < task.config.points.least_points
-        block, seen[k], used[k] = _blocks(
+        (H, b), seen[k], used[k] = _block_sums(
             task, (surface, mine, p), (center, eyes), Ms_centred, (float(misfits[k]), 0.0), few
         )
-        blocks.append(block)
-    flat = None
+        blocks.append(Blocks(H=H, b=b, Ms=Ms_centred, own=object_at(k)))
     if state.T_world_table is not None and len(table.points):
         Ms = se3.invert(state.T_world_table) @ cameras
         eyes = np.ascontiguousarray(Ms[:, :3, 3])
@@ -217,28 +221,29 @@ def _linearised(
         M = Ms[table.views]
         places = np.einsum("nij,nj->ni", M[:, :3, :3], p) + M[:, :3, 3]
         up = np.tile(np.array([0.0, 0.0, 1.0]), (len(p), 1))
-        flat, seen[-1], used[-1] = _blocks(
+        (H, b), seen[-1], used[-1] = _block_sums(
             task, ((places, places[:, 2].copy(), up), table, p), (np.zeros(3), eyes), Ms,
             (float(misfits[-1]), task.config.noise.table_flat_m), False,
         )  # fmt: skip
-    return assembled(blocks, flat), seen, used
+        blocks.append(Blocks(H=H, b=b, Ms=Ms, own=TABLE_AT, rows=TABLE_ROWS))
+    return assembled(blocks, OBJECTS + 6 * len(own)), seen, used
 
 
-def _blocks(
+def _block_sums(
     task: _Task,
     data: tuple[tuple[Array, Array, Array], Owned, Array],
     frame: tuple[Array, Array],
     Ms: Array,
     misfit: tuple[float, float],
     few: bool,
-) -> tuple[Blocks, float, int]:
-    """Return the blocks of one body, its misfit as seen, and how many points were used."""
+) -> tuple[tuple[Array, Array], float, int]:
+    """Return the views' blocks H, b of one body, its misfit as seen, and how many points it had."""
     (places, distances, normals), mine, p = data
     noise = task.config.noise
     n = len(Ms)
     H, b = np.zeros((n, BLOCK, BLOCK)), np.zeros((n, BLOCK))
     if few:
-        return Blocks(H=H, b=b, Ms=Ms), misfit[0], 0
+        return (H, b), misfit[0], 0
     rays = places - frame[1][mine.views]
     along = np.sum(normals * rays, axis=1)
     cosine = np.abs(along) / np.linalg.norm(rays, axis=1)
@@ -255,9 +260,8 @@ def _blocks(
     add_blocks(
         (places, distances, normals), mine.views, (*frame, axes), (weight, reach), (H, b), kernels
     )
-    H = H + np.swapaxes(np.triu(H, 1), 1, 2)
     seen = _misfit(distances, variance, noise)
-    return Blocks(H=H, b=b, Ms=Ms), min(seen, noise.widest_m), int(np.count_nonzero(kernels))
+    return (symmetric(H), b), min(seen, noise.widest_m), int(np.count_nonzero(kernels))
 
 
 def _misfit(distances: Array, variance: Array, noise: NoiseConfig) -> float:
@@ -265,7 +269,7 @@ def _misfit(distances: Array, variance: Array, noise: NoiseConfig) -> float:
     known = np.isfinite(distances)
     if np.count_nonzero(known) < 2:
         return noise.widest_m
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(distances[known])))
+    spread = mad_sigma(distances[known])
     beyond = spread**2 - float(np.median(variance[known]))
     return max(noise.least_misfit_m, float(np.sqrt(max(beyond, 0.0))))
 
@@ -275,7 +279,7 @@ def _add_priors(system: System, task: _Task, state: State, view_sigmas: Array) -
     config = task.config
     p = config.prior
     hand = np.repeat([np.radians(p.hand_eye_deg), p.hand_eye_mm / 1e3], 3)
-    _add_prior(system, HAND_EYE, state.hand_eye, np.diag(1.0 / np.square(hand)))
+    add_prior(system, HAND_EYE, state.hand_eye, np.diag(1.0 / np.square(hand)))
     own = np.diag(1.0 / np.square(np.repeat(np.maximum(view_sigmas, LEAST_SIGMA), 3)))
     system.D[:] += own
     system.d[:] -= state.views @ own
@@ -284,22 +288,14 @@ def _add_priors(system: System, task: _Task, state: State, view_sigmas: Array) -
         C = np.diag([config.unmeasured_scale**2, config.unmeasured_offset_per_m**2])
     W: Array = np.asarray(np.linalg.inv(C), np.float64) if config.fit_bias else np.eye(2) / FIXED**2
     said = np.array([config.bias.scale, config.bias.offset_per_m])
-    _add_prior(system, BIAS, state.bias - said, W)
+    add_prior(system, BIAS, state.bias - said, W)
     free = 1.0 / np.radians(config.free_turn_deg) ** 2
     for k in range(len(task.bodies)):
-        at = np.arange(OBJECTS + 6 * k, OBJECTS + 6 * k + 3)
-        system.A[at, at] += free
+        turn, shift = np.split(object_at(k), 2)
+        system.A[turn, turn] += free
         # An object without points stays where it is.
-        shift = at + 3
         system.A[shift, shift] += 1.0
-    table = np.arange(8, 11)
-    system.A[table, table] += 1.0
-
-
-def _add_prior(system: System, at: slice, value: Array, W: Array) -> None:
-    """Add that `value` of the unknowns at a place is zero with the precision W."""
-    system.A[at, at] += W
-    system.a[at] -= W @ value
+    system.A[TABLE_AT, TABLE_AT] += 1.0
 
 
 def _learned(system: System, state: State, config: RefineConfig, sigmas: Array) -> Array:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.registration.body import Body
-from realsim.registration.refinement.equations import BIAS, HAND_EYE, OBJECTS, TABLE, TABLE_ROWS
+from realsim.registration.refinement.equations import BIAS, HAND_EYE, TABLE, TABLE_ROWS, object_at
 
 Array = NDArray[np.float64]
 
@@ -52,7 +52,7 @@ def moved(state: State, bodies: list[Body], shared: Array, views: Array) -> Stat
         views: (V, 6).
     """
     poses = [
-        centred(b, T) @ se3.exp(shared[OBJECTS + 6 * k : OBJECTS + 6 * k + 6])
+        centred(b, T) @ se3.exp(shared[object_at(k)])
         @ se3.from_translation(-b.center_obj)
         for k, (b, T) in enumerate(zip(bodies, state.poses, strict=True))
     ]  # fmt: skip

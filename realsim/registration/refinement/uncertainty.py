@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.registration.body import Body
-from realsim.registration.refinement.equations import HAND_EYE, OBJECTS
+from realsim.registration.refinement.equations import HAND_EYE_AT, object_at
 from realsim.registration.refinement.refine import Refined
 from realsim.registration.refinement.state import centred
 
@@ -37,10 +37,10 @@ class SeenPose:
 
 def object_covariance(refined: Refined, body: Body, k: int) -> Array:
     """Return the covariance (6, 6) of T_world_obj: right perturbation, rotation first [rad, m]."""
-    at = slice(OBJECTS + 6 * k, OBJECTS + 6 * k + 6)
+    at = object_at(k)
     # T exp(xi) with xi about the object's origin: T c exp(eta) c^-1, xi = Ad(c) eta.
     Ad = se3.adjoint(se3.from_translation(body.center_obj))
-    return _symmetric(Ad @ refined.covariance.shared[at, at] @ Ad.T)
+    return _symmetric(Ad @ refined.covariance.shared[np.ix_(at, at)] @ Ad.T)
 
 
 def seen_poses(
@@ -53,9 +53,7 @@ def seen_poses(
 def _seen(refined: Refined, body: Body, k: int, intrinsics: CameraIntrinsics) -> list[SeenPose]:
     """Return one object's pose in every view."""
     C = refined.covariance
-    at = np.arange(OBJECTS + 6 * k, OBJECTS + 6 * k + 6)
-    hand = np.arange(HAND_EYE.start, HAND_EYE.stop)
-    picked = np.concatenate([at, hand])
+    picked = np.concatenate([object_at(k), HAND_EYE_AT])
     T_centre = centred(body, refined.poses[k])
     Ms = se3.invert(T_centre) @ refined.cameras
     Ad = se3.adjoint(Ms)

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.robust import mad_sigma, tukey_weights
 from realsim.records import CameraIntrinsics
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.refinement.config import CameraPrior, NoiseConfig
 from realsim.registration.views import ViewPoints
 
 Array = NDArray[np.float64]
-MAD_TO_SIGMA = 1.4826
 GAPS = 3.0
 """A partner may be so many spacings of its surface's points away."""
 
@@ -269,7 +269,7 @@ def _misfit(match: _Match, noise: NoiseConfig) -> float:
     Of every pair on its own: a depth camera's distortions are alike in views from nearby, so these
     agree better than views from far apart, and say more.
     """
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(match.residuals)))
+    spread = mad_sigma(match.residuals)
     beyond = np.sqrt(max(spread**2 - float(np.median(match.variances)), 0.0))
     return float(np.clip(beyond, noise.least_misfit_m, noise.widest_m))
 
@@ -296,9 +296,8 @@ def _add(A: Array, b: Array, match: _Match, misfit: float, noise: NoiseConfig) -
     """Add what the partners of two views say."""
     r, (J_i, J_j) = match.residuals, match.jacobians
     q = np.square(r) / (noise.cut_sigmas**2 * (match.variances + misfit**2))
-    tukey = np.square(np.clip(1.0 - q, 0.0, None))
     # A misfit of the surfaces is common to all points of a patch, as the noise is.
-    w = (tukey / ((match.variances + misfit**2) * match.crowding))[:, None]
+    w = (tukey_weights(q) / ((match.variances + misfit**2) * match.crowding))[:, None]
     i, j = slice(6 * match.i, 6 * match.i + 6), slice(6 * match.j, 6 * match.j + 6)
     A[i, i] += J_i.T @ (w * J_i)
     A[j, j] += J_j.T @ (w * J_j)

@@ -20,6 +20,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.distance_field import DistanceField, raycasting_scene
 from realsim.geometry.mesh import sample_surface, symmetry_transforms
+from realsim.geometry.robust import tukey_weights
 from realsim.interop import import_open3d
 from realsim.records import ObjectModel
 from realsim.registration.search.templates import content_key, is_ball
@@ -266,7 +267,7 @@ def _fitted(shape: _Shape, Ts: Array, config: NearSymmetryConfig, *, shift_only:
         J = np.concatenate([np.cross(lever, g) / shape.size, g], axis=2)
         if shift_only:
             J[:, :, :3] = 0.0
-        w = np.square(np.maximum(0.0, 1.0 - np.square(d / (scale * shape.size))))
+        w = tukey_weights(np.square(d / (scale * shape.size)))
         Jw = J * w[:, :, None]
         H = np.swapaxes(Jw, 1, 2) @ J
         H += np.eye(6) * (DAMPING + DAMPING * np.trace(H, axis1=1, axis2=2)[:, None, None])

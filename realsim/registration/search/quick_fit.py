@@ -18,8 +18,6 @@ from realsim.registration.solver import (
 )
 
 Array = NDArray[np.float64]
-UNGATED = -2.0
-"""A cosine that every normal exceeds."""
 
 
 def quick_fit(
@@ -40,12 +38,10 @@ def quick_fit(
         config: of the solver.
         converged_m: a step that moves no point of the object further ends a stage [m].
     """
-    rules = np.array(
-        [[s.kernel, s.cap_m, config.gate_cos if s.gated else UNGATED, s.steps] for s in stages]
-    )
+    rules = np.array([[s.kernel, s.cap_m, s.gated, s.steps] for s in stages], np.float64)
     sigmas = np.sqrt(np.square(cloud.sigmas) + config.sigma_floor_m**2)
     return _fit(
-        (body.field.grid, body.field.origin, body.field.cell),
+        body.field.lattice,
         np.array(T_world_obj, dtype=np.float64),
         (cloud.points, cloud.towards, sigmas),
         rules,
@@ -63,7 +59,7 @@ def _fit(
     shape: tuple[Array, float],
     limits: tuple[float, float],
 ) -> Array:
-    """Return T after all stages; rules (K, 4) are kernel, cap [m], gate and steps."""
+    """Return T after all stages; rules (K, 4) are kernel, cap [m], whether gated, and steps."""
     center, radius = shape
     damping, converged = limits
     scale = np.array([radius, radius, radius, 1.0, 1.0, 1.0])
@@ -71,7 +67,7 @@ def _fit(
         for _ in range(int(rules[k, 3])):
             H, b = np.zeros((6, 6)), np.zeros(6)
             weight, _square, _kernels, used = accumulate_points(
-                lattice, T, cloud, (rules[k, 0], rules[k, 1], rules[k, 2]), center, (H, b)
+                lattice, T, cloud, (rules[k, 0], rules[k, 1], rules[k, 2] > 0.0), center, (H, b)
             )
             if used < LEAST_POINTS:
                 break

@@ -133,7 +133,7 @@ def nearby(cloud: Cloud, sought: Sought, T_world_obj: Array, margin_m: float, mo
     """Return the points within `margin_m` of a body's surface, evenly thinned to about `most`."""
     body = sought.body
     limit = (sought.reach_m + margin_m, margin_m)
-    lattice = (body.field.grid, body.field.origin, body.field.cell)
+    lattice = body.field.lattice
     where = _near(cloud.points, T_world_obj, body.center(T_world_obj), limit, lattice)
     if len(where) > most:
         where = where[np.linspace(0, len(where) - 1, most).astype(np.int64)]

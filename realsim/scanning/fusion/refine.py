@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.geometry.depth import MAD_TO_SIGMA
+from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.scanning.fusion.patches import Observations
 from realsim.scanning.fusion.result import FusionConfig
 

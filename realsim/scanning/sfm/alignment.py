@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
-from realsim.geometry.depth import MAD_TO_SIGMA
+from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.scanning.sfm.bundle import hand_eye_sigmas, prior_sigmas
 from realsim.scanning.sfm.config import AlignmentConfig
 from realsim.scanning.sfm.result import Alignment, ViewResidual

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.geometry.camera import project, projection_jacobian
-from realsim.geometry.depth import MAD_TO_SIGMA
+from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.scanning.sfm.config import MappingConfig, RobotNoise
 from realsim.scanning.sfm.independence import variance_inflation
 from realsim.scanning.sfm.result import Geometry

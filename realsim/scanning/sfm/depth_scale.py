@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim.geometry.depth import MAD_TO_SIGMA, edge_mask
+from realsim.geometry.depth import edge_mask
+from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.scanning.sfm.config import TrustConfig
 from realsim.scanning.sfm.result import DepthScale, Geometry
 
