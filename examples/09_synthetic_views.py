@@ -10,8 +10,7 @@ from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.rendering.overlay import contact_sheet, depth_picture, save_png
 from realsim.rendering.photo import PhotoRenderer
-from realsim.rendering.procedural.choose import random_material
-from realsim.rendering.procedural.environments import random_environment
+from realsim.rendering.procedural.choose import random_environment, random_material
 from realsim.rendering.rays import RayScene
 
 rng = np.random.default_rng(3)

@@ -1,6 +1,6 @@
 """Projection of points into a distorted image, and the exact way back.
 
-Distortion is OpenCV's: Brown (k1 k2 p1 p2 k3) or rational (k1..k6). Going back is a Newton solve
+Distortion is OpenCV's (`lens`). Going back is a Newton solve
 with the analytic 2x2 Jacobian, because OpenCV's fixed-point iteration is tens of pixels off on
 strong distortion; pixels outside the model's invertible region are reported, never guessed.
 """
@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.geometry import lens
 from realsim.records import CameraIntrinsics
 
 Array = NDArray[np.float64]
@@ -24,36 +25,19 @@ def distort(coefficients: ArrayLike, xy: ArrayLike) -> Array:
         coefficients: (8,) k1 k2 p1 p2 k3 k4 k5 k6.
         xy: (..., 2) x/z, y/z.
     """
-    k1, k2, p1, p2, k3, k4, k5, k6 = np.asarray(coefficients, dtype=np.float64)
     xy = np.asarray(xy, dtype=np.float64)
-    x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        -1,
-    )
+    terms = np.asarray(coefficients, dtype=np.float64)
+    return np.stack(lens.bent(xy[..., 0], xy[..., 1], terms), -1)
 
 
 def distort_jacobian(coefficients: ArrayLike, xy: ArrayLike) -> Array:
     """Return d distort / d xy (..., 2, 2) at ideal normalised coordinates (..., 2)."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = np.asarray(coefficients, dtype=np.float64)
     xy = np.asarray(xy, dtype=np.float64)
-    x, y = xy[..., 0], xy[..., 1]
-    r2 = x * x + y * y
-    num = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    den = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    radial = num / den
-    # d radial / d r2
-    slope = ((k1 + r2 * (2 * k2 + 3 * r2 * k3)) - radial * (k4 + r2 * (2 * k5 + 3 * r2 * k6))) / den
+    terms = np.asarray(coefficients, dtype=np.float64)
+    xx, across, yy, _, _ = lens.bent_slopes(xy[..., 0], xy[..., 1], terms)
     J = np.empty((*xy.shape[:-1], 2, 2))
-    J[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    J[..., 0, 1] = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    J[..., 1, 0] = J[..., 0, 1]
-    J[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    J[..., 0, 0], J[..., 1, 1] = xx, yy
+    J[..., 0, 1] = J[..., 1, 0] = across
     return J
 
 
@@ -155,8 +139,7 @@ def projection_jacobian(
     d_point = f[:, None] * (distort_jacobian(d, xy) @ d_xy)
 
     r2 = x * x + y * y
-    den = 1 + r2 * (d[5] + r2 * (d[6] + r2 * d[7]))
-    radial = (1 + r2 * (d[0] + r2 * (d[1] + r2 * d[4]))) / den
+    *_, radial, den = lens.bent_slopes(x, y, d)
     powers = r2[:, None] ** np.array([1, 2, 3])
     d_cam = np.zeros((len(p), 2, 12))
     d_cam[:, 0, 0], d_cam[:, 1, 1] = dxy[:, 0], dxy[:, 1]

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
+from realsim.geometry.lens_loops import pixel
 from realsim.geometry.normal_equations import add_row
 from realsim.geometry.robust import tukey
 from realsim.geometry.seen_surface import GATE_COS, follow_to_camera
@@ -179,8 +180,6 @@ def _accumulate_free_space(
     depths, Ts, camera = images
     weight, tolerance, cap, k, floor = limits
     H, b = system
-    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
-    k1, k2, p1, p2, k3, k4, k5, k6 = camera[4:12]
     height, width = depths.shape[1], depths.shape[2]
     J = np.empty(6)
     violating = 0
@@ -198,10 +197,7 @@ def _accumulate_free_space(
             if pz <= 0.0 or nx * px + ny * py + nz * pz >= 0.0:
                 continue
             x, y = px / pz, py / pz
-            r2 = x * x + y * y
-            radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-            u = fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + cx
-            v = fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + cy
+            u, v = pixel(camera, x, y)
             i, j = int(np.floor(v + 0.5)), int(np.floor(u + 0.5))
             if i < 0 or j < 0 or i >= height or j >= width or depths[f, i, j] <= 0.0:
                 continue

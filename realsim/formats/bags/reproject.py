@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from realsim.compiled import njit
 from realsim.geometry.camera import ray_table
+from realsim.geometry.lens_loops import pixel
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import Array
 
@@ -39,9 +40,6 @@ def _project(
     """
     height, width = out.shape
     off = np.full((height, width), np.inf, dtype=np.float32)
-    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
-    k1, k2, p1, p2 = camera[4], camera[5], camera[6], camera[7]
-    k3, k4, k5, k6 = camera[8], camera[9], camera[10], camera[11]
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             count = depth[v, u]
@@ -54,11 +52,7 @@ def _project(
             Z = z * (R[2, 0] * rx + R[2, 1] * ry + R[2, 2]) + t[2]
             if Z <= 0:
                 continue
-            x, y = X / Z, Y / Z
-            r2 = x * x + y * y
-            radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-            px = fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + cx
-            py = fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + cy
+            px, py = pixel(camera, X / Z, Y / Z)
             hx = min(0.5 * scale[0] * z / Z, MAX_FOOTPRINT_PX)
             hy = min(0.5 * scale[1] * z / Z, MAX_FOOTPRINT_PX)
             # A pixel is covered where its centre is in [p - h, p + h).
@@ -98,8 +92,8 @@ def depth_in_colour(
     camera = np.concatenate([[c.fx, c.fy, c.cx, c.cy], c.distortion])
     T = np.asarray(T_colour_depth, dtype=np.float64)
     # The box around the turned pixel, so that a rolled camera leaves no holes.
-    pixel = np.array([1 / depth_camera.fx, 1 / depth_camera.fy])
-    scale = OVERLAP * np.array([c.fx, c.fy]) * (np.abs(T[:2, :2]) @ pixel)
+    pitch = np.array([1 / depth_camera.fx, 1 / depth_camera.fy])
+    scale = OVERLAP * np.array([c.fx, c.fy]) * (np.abs(T[:2, :2]) @ pitch)
     # The table is float32, which is 1e-4 px; the footprint's edge is at half pixels, never near it.
     rays = ray_table(depth_camera)
     R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])

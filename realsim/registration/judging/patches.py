@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
+from realsim.geometry.lens_loops import pixel
 from realsim.geometry.mesh import sample_surface
 from realsim.geometry.seen_surface import GATE_COS, follow_to_camera
 from realsim.registration.body import Body
@@ -162,8 +163,6 @@ def look_at_patches(
     centers, normals = surface
     depth, stride = image
     gate, tolerance, sigmas, bias, per_m, floor = limits
-    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
-    k1, k2, p1, p2, k3, k4, k5, k6 = camera[4:12]
     M = T_cam_obj
     for m in range(len(centers)):
         s0, s1, s2 = centers[m, 0], centers[m, 1], centers[m, 2]
@@ -178,10 +177,7 @@ def look_at_patches(
         if pz <= 0.0 or -(nx * px + ny * py + nz * pz) < gate * away:
             continue
         x, y = px / pz, py / pz
-        r2 = x * x + y * y
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        u = fx * (x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)) + cx
-        v = fy * (y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y) + cy
+        u, v = pixel(camera, x, y)
         i, j = int(np.floor(v / stride + 0.5)), int(np.floor(u / stride + 0.5))
         if i < 0 or j < 0 or i >= depth.shape[0] or j >= depth.shape[1] or depth[i, j] <= 0.0:
             continue

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.compiled import njit
+from realsim.geometry.lens_loops import pixel
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -38,17 +39,11 @@ GRID = 9
 
 
 @njit(inline="always")
-def _distorted(lens: Array, x: float, y: float) -> tuple[float, float]:
+def _pixel(lens: Array, x: float, y: float) -> tuple[float, float]:
     """Return the pixel of ideal coordinates; `lens` as of `project_vertices`."""
     if lens[14] == 0.0:
         return x * lens[0] + lens[2], y * lens[1] + lens[3]
-    r2 = x * x + y * y
-    radial = (1.0 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))) / (
-        1.0 + r2 * (lens[9] + r2 * (lens[10] + r2 * lens[11]))
-    )
-    xd = x * radial + 2.0 * lens[6] * x * y + lens[7] * (r2 + 2.0 * x * x)
-    yd = y * radial + lens[6] * (r2 + 2.0 * y * y) + 2.0 * lens[7] * x * y
-    return xd * lens[0] + lens[2], yd * lens[1] + lens[3]
+    return pixel(lens, x, y)
 
 
 @njit
@@ -79,7 +74,7 @@ def project_vertices(vertices: Array, T_cam_obj: Array, lens: Array) -> tuple[Ar
             x, y = points[i, 0] / z, points[i, 1] / z
             seen[i, 2], seen[i, 3] = x, y
             if x * x + y * y < reach2:
-                seen[i, 0], seen[i, 1] = _distorted(lens, x, y)
+                seen[i, 0], seen[i, 1] = _pixel(lens, x, y)
                 continue
         seen[i, 0] = np.nan
         seen[i, 1] = np.nan
@@ -98,7 +93,7 @@ def _curved_box(low_x: float, high_x: float, low_y: float, high_y: float, lens: 
             r = np.sqrt(x * x + y * y)
             if r > lens[12]:
                 x, y = x * lens[12] / r, y * lens[12] / r
-            u, v = _distorted(lens, x, y)
+            u, v = _pixel(lens, x, y)
             u0, u1, v0, v1 = min(u0, u), max(u1, u), min(v0, v), max(v1, v)
     slack = ROUNDING_PX + lens[16] * (step_x * step_x + step_y * step_y)
     if lens[12] < np.inf:  # a clamped grid misses the rim between its points

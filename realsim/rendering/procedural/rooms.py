@@ -167,7 +167,7 @@ def _lamp_points(panel: Panel, low: Array, high: Array) -> tuple[Array, float]:
 
 def _on_face(face: int, points: Array, low: Array, high: Array, panels: list[Panel]) -> Array:
     """Return the light (N, 3) that lamps throw on points (N, 2) of a face: irradiance / pi."""
-    import cv2
+    from scipy.ndimage import map_coordinates
 
     normal, a, b = face_axes(face)
     grid = np.empty((GRID, GRID, 3))
@@ -184,24 +184,11 @@ def _on_face(face: int, points: Array, low: Array, high: Array, panels: list[Pan
         square = np.maximum(np.sum(gap**2, -1), 0.02)
         facing = np.abs(gap[..., normal]) * np.abs(gap[..., p.face // 2]) / square**2
         total += (facing.sum(0) * area / np.pi)[..., None] * p.radiance
-    where = (points - np.array([low[a], low[b]])) / np.array([(high - low)[a], (high - low)[b]])
-    where = (where * (GRID - 1)).astype(np.float32)
-    out = cv2.remap(
-        total.astype(np.float32), where[:, :1], where[:, 1:], cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    ) if len(points) < 32767 else _remapped(total.astype(np.float32), where)  # fmt: skip
-    return np.asarray(out, np.float64).reshape(-1, 3)
-
-
-def _remapped(table: NDArray[np.float32], where: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Look up in pieces, because OpenCV's images end at 32767 rows."""
-    import cv2
-
-    parts = [
-        cv2.remap(table, w[:, :1], w[:, 1:], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for w in np.array_split(where, 1 + len(where) // 32000)
-    ]
-    return np.asarray(np.concatenate(parts), np.float32)
+    along = [b, a]
+    at = ((points[:, ::-1] - low[along]) / (high - low)[along] * (GRID - 1)).T
+    return np.stack(
+        [map_coordinates(total[..., k], at, order=1, mode="nearest") for k in range(3)], -1
+    )
 
 
 def _thrown_back(low: Array, high: Array, paints: Array, panels: list[Panel]) -> Array:

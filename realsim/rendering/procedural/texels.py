@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from realsim.rendering.appearance import Color
+from realsim.rendering.appearance import Material
 from realsim.rendering.procedural.noise import Field, Values
 
 Image = NDArray[np.uint8]
@@ -42,9 +42,37 @@ def normals8(height_m: Values, period_m: float) -> Image:
     return np.round(128.0 + 127.0 * normal).astype(np.uint8)
 
 
-def grey8(share: Values) -> Image:
-    """Return values in [0, 1] as bytes, for a roughness image."""
-    return image8(255.0 * share)
+def finished(
+    name: str,
+    period_m: float,
+    color: Values,
+    roughness: float,
+    *,
+    gloss: Values | None = None,
+    height_m: Values | None = None,
+    metallic: float = 0.0,
+) -> Material:
+    """Return the material of a tile.
+
+    Args:
+        name: for people.
+        period_m: edge of the tile [m].
+        color: (n, n, 3) sRGB [0, 255].
+        roughness: [0.04, 1], multiplied by `gloss`.
+        gloss: (n, n) share of the roughness [0, 1]; None = even.
+        height_m: (n, n) relief [m]; None = flat.
+        metallic: 0 or 1.
+    """
+    return Material(
+        base_color=(1.0, 1.0, 1.0),
+        base_color_image=image8(color),
+        roughness=float(roughness),
+        roughness_image=None if gloss is None else image8(255.0 * gloss),
+        metallic=metallic,
+        normal_image=None if height_m is None else normals8(height_m.astype(np.float32), period_m),
+        period_m=period_m,
+        name=name,
+    )
 
 
 def srgb_to_linear(values: ArrayLike) -> NDArray[np.float64]:
@@ -56,12 +84,6 @@ def srgb_to_linear(values: ArrayLike) -> NDArray[np.float64]:
 def luminance(linear: ArrayLike) -> NDArray[np.float64]:
     """Return the luminance (...) of linear sRGB colours (..., 3) (ITU-R BT.709)."""
     return np.asarray(linear, np.float64) @ np.array([0.2126, 0.7152, 0.0722])
-
-
-def linear_color(tint: Tint) -> Color:
-    """Return an sRGB colour [0, 255] as linear light [0, 1]."""
-    r, g, b = srgb_to_linear(tint).tolist()
-    return r, g, b
 
 
 def hsv_tint(hue: float, saturation: float, value: float) -> tuple[float, float, float]:

@@ -4,23 +4,17 @@ A board is a flat cut near the axis of a trunk, so its growth rings are hyperbol
 ("cathedrals") in the middle and straight lines at the sides. The grain runs along u.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from realsim.rendering.appearance import Material
 from realsim.rendering.procedural.noise import Field, blurred, fine, fractal, grid, smooth, step
-from realsim.rendering.procedural.texels import (
-    Tint,
-    grey8,
-    image8,
-    linear_color,
-    mixed,
-    normals8,
-    random_tint,
-    shaded,
-)
+from realsim.rendering.procedural.texels import Tint, finished, mixed, random_tint, shaded
 
+Boards = NDArray[np.int64]
 WOOD_PX = 1024
 """Side of wooden tiles [px]: 0.6 mm a texel, about a pixel of a view from a metre."""
 LAMINATE_PX = 512
@@ -45,38 +39,24 @@ class Timber:
     """Length of a pore along the grain [m]."""
 
 
-OAK = Timber(name="oak", early=(205, 167, 118), late=(148, 106, 64), rings_per_m=210,
-             contrast=0.62, pores=0.30, pore_m=0.016)  # fmt: skip
-WALNUT = Timber(name="walnut", early=(126, 90, 62), late=(66, 43, 29), rings_per_m=150,
-                contrast=0.75, pores=0.18, pore_m=0.012)  # fmt: skip
-BIRCH = Timber(name="birch", early=(231, 205, 165), late=(204, 168, 120), rings_per_m=130,
-               contrast=0.55, pores=0.05, pore_m=0.006)  # fmt: skip
-PINE = Timber(name="pine", early=(232, 197, 138), late=(188, 124, 62), rings_per_m=170,
-              contrast=0.8, pores=0.0, pore_m=0.006)  # fmt: skip
+TIMBERS = {t.name: t for t in (
+    Timber(name="oak", early=(205, 167, 118), late=(148, 106, 64), rings_per_m=210,
+           contrast=0.62, pores=0.30, pore_m=0.016),
+    Timber(name="walnut", early=(126, 90, 62), late=(66, 43, 29), rings_per_m=150,
+           contrast=0.75, pores=0.18, pore_m=0.012),
+    Timber(name="birch", early=(231, 205, 165), late=(204, 168, 120), rings_per_m=130,
+           contrast=0.55, pores=0.05, pore_m=0.006),
+    Timber(name="pine", early=(232, 197, 138), late=(188, 124, 62), rings_per_m=170,
+           contrast=0.8, pores=0.0, pore_m=0.006),
+)}  # fmt: skip
 
 
-def oak(rng: np.random.Generator) -> Material:
-    """Return oak boards: strong rings and long open pores."""
-    return _boards(rng, OAK)
-
-
-def walnut(rng: np.random.Generator) -> Material:
-    """Return dark walnut boards."""
-    return _boards(rng, WALNUT)
-
-
-def birch(rng: np.random.Generator) -> Material:
-    """Return pale birch boards with a quiet grain."""
-    return _boards(rng, BIRCH)
-
-
-def pine(rng: np.random.Generator) -> Material:
-    """Return pine boards: yellow, with hard orange rings."""
-    return _boards(rng, PINE)
+def boards(name: str) -> Callable[[np.random.Generator], Material]:
+    """Return the maker of boards of a timber, each from its own trunk, glued side by side."""
+    return lambda rng: _boards(rng, TIMBERS[name])
 
 
 def _boards(rng: np.random.Generator, timber: Timber) -> Material:
-    """Return boards glued side by side, each from its own trunk."""
     n = WOOD_PX
     period_m = float(rng.uniform(0.45, 0.75))
     count = int(rng.integers(3, 7))
@@ -99,26 +79,20 @@ def _boards(rng: np.random.Generator, timber: Timber) -> Material:
         color = mixed(color, 0.62 * np.asarray(timber.late), 0.8 * pore)
     tint = 1.0 + 0.075 * rng.standard_normal((count, 1)) + 0.02 * rng.standard_normal((count, 3))
     color *= tint[board[:, 0]][:, None, :].astype(np.float32)
-    joint = _joints(board)
+    line_between = (board != np.roll(board, 1, 0)).astype(np.float32)
+    joint = np.maximum(line_between, 0.5 * np.roll(line_between, -1, 0))
     color *= (1.0 - 0.55 * joint)[..., None]
 
-    base = float(rng.uniform(0.28, 0.6))
-    rough = np.clip(0.80 + 0.05 * fibre + 0.2 * pore + 0.2 * joint, 0.0, 1.0)
+    roughness = float(rng.uniform(0.28, 0.6)) / 0.8
     height = -6e-5 * pore - 1.2e-4 * joint - 1.5e-5 * line + 4e-6 * fibre
-    return Material(
-        base_color=(1.0, 1.0, 1.0),
-        base_color_image=image8(color),
-        roughness=base / 0.8,
-        roughness_image=grey8(rough),
-        normal_image=normals8(blurred(height.astype(np.float32), 0.8), period_m),
-        period_m=period_m,
-        name=timber.name,
-    )
+    return finished(
+        timber.name, period_m, color, roughness,
+        gloss=0.80 + 0.05 * fibre + 0.2 * pore + 0.2 * joint,
+        height_m=blurred(height.astype(np.float32), 0.8),
+    )  # fmt: skip
 
 
-def _board_of(
-    rng: np.random.Generator, v: Field, count: int
-) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.int64]], Field]:
+def _board_of(rng: np.random.Generator, v: Field, count: int) -> tuple[Boards, Field]:
     """Return the board (n, 1) of every row and the place (n, 1) across it, -0.5 to 0.5."""
     width = rng.uniform(0.8, 1.2, count)
     edges = np.concatenate([[0.0], np.cumsum(width / width.sum())])
@@ -128,12 +102,7 @@ def _board_of(
 
 
 def _rings(
-    rng: np.random.Generator,
-    u: Field,
-    across: Field,
-    board: np.ndarray[tuple[int, ...], np.dtype[np.int64]],
-    count: int,
-    per_tile: float,
+    rng: np.random.Generator, u: Field, across: Field, board: Boards, count: int, per_tile: float
 ) -> Field:
     """Return the age (n, n) in years at every texel, by the distance to the trunk's axis."""
     n = u.shape[1]
@@ -152,13 +121,6 @@ def _rings(
     return (radius * (per_tile / count) + start).astype(np.float32)
 
 
-def _joints(board: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Field:
-    """Return 1 on the lines (n, n) between boards, 0 elsewhere."""
-    n = len(board)
-    line = (board != np.roll(board, 1, 0)).astype(np.float32)
-    return np.repeat(np.maximum(line, 0.5 * np.roll(line, -1, 0)), n, axis=1)
-
-
 LAMINATES: tuple[tuple[str, Tint], ...] = (
     ("white", (236, 236, 232)), ("light grey", (200, 203, 205)), ("grey", (146, 150, 153)),
     ("anthracite", (62, 65, 69)), ("black", (34, 34, 36)), ("beige", (216, 203, 180)),
@@ -168,20 +130,13 @@ LAMINATES: tuple[tuple[str, Tint], ...] = (
 
 def laminate(rng: np.random.Generator) -> Material:
     """Return a laminated board: one colour, hardly any pattern, the fine grain of the press."""
-    n, period_m = LAMINATE_PX, 0.25
+    n = LAMINATE_PX
     name, tint = LAMINATES[int(rng.integers(len(LAMINATES)))]
     speckle = fine(rng, n, 60.0)
     cloud = fractal(rng, n, 1.6)
     color = shaded(rng, tint, 4.0) + (1.4 * speckle + 1.8 * cloud)[..., None]
     height = 6e-6 * fine(rng, n, 130.0) + 6e-6 * smooth(rng, n, 40.0)
-    return Material(
-        base_color=(1.0, 1.0, 1.0),
-        base_color_image=image8(color),
-        roughness=float(rng.uniform(0.22, 0.55)),
-        normal_image=normals8(height.astype(np.float32), period_m),
-        period_m=period_m,
-        name=f"{name} laminate",
-    )
+    return finished(f"{name} laminate", 0.25, color, rng.uniform(0.22, 0.55), height_m=height)
 
 
 def painted_wood(rng: np.random.Generator) -> Material:
@@ -189,18 +144,10 @@ def painted_wood(rng: np.random.Generator) -> Material:
     n, period_m = LAMINATE_PX, float(rng.uniform(0.3, 0.5))
     grain = smooth(rng, n, 4.0, 110.0)
     stroke = smooth(rng, n, 3.0, 60.0)
-    tint = random_tint(rng, (0.1, 0.55), (0.45, 0.95))
-    color = (
-        np.asarray(tint, np.float32) + (1.2 * stroke - 3.5 * np.maximum(grain - 0.8, 0))[..., None]
-    )
-    height = (-3.0e-5 * np.maximum(grain - 0.3, 0) + 1.0e-5 * stroke).astype(np.float32)
-    r, g, b = linear_color((255, 255, 255))
-    return Material(
-        base_color=(r, g, b),
-        base_color_image=image8(color),
-        roughness=float(rng.uniform(0.3, 0.6)),
-        roughness_image=grey8(np.clip(0.9 + 0.05 * grain, 0, 1)),
-        normal_image=normals8(height, period_m),
-        period_m=period_m,
-        name="painted wood",
-    )
+    tint = np.asarray(random_tint(rng, (0.1, 0.55), (0.45, 0.95)), np.float32)
+    color = tint + (1.2 * stroke - 3.5 * np.maximum(grain - 0.8, 0))[..., None]
+    height = -3.0e-5 * np.maximum(grain - 0.3, 0) + 1.0e-5 * stroke
+    return finished(
+        "painted wood", period_m, color, rng.uniform(0.3, 0.6),
+        gloss=0.9 + 0.05 * grain, height_m=height,
+    )  # fmt: skip

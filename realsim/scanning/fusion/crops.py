@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.camera import project, ray_table
+from realsim.geometry.lens_loops import pixel
 from realsim.records import CameraIntrinsics
 from realsim.registration.evidence import DepthNoise
 from realsim.scanning.fusion.evidence import trusted_depth
@@ -85,15 +86,7 @@ def cropped(
 def pixel_of(camera: Array, x: float, y: float, z: float) -> tuple[int, int]:
     """Return the pixel (u, v) that sees a camera point, (-1, -1) if the lens model has none."""
     a, b = x / z, y / z
-    r2 = a * a + b * b
-    if r2 > camera[12]:
+    if a * a + b * b > camera[12]:
         return -1, -1
-    radial = (1.0 + r2 * (camera[4] + r2 * (camera[5] + r2 * camera[8]))) / (
-        1.0 + r2 * (camera[9] + r2 * (camera[10] + r2 * camera[11]))
-    )
-    p1, p2 = camera[6], camera[7]
-    xd = a * radial + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a)
-    yd = b * radial + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b
-    return int(np.floor(xd * camera[0] + camera[2] + 0.5)), int(
-        np.floor(yd * camera[1] + camera[3] + 0.5)
-    )
+    u, v = pixel(camera, a, b)
+    return int(np.floor(u + 0.5)), int(np.floor(v + 0.5))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
+from realsim.geometry.lens_loops import pixel
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -273,8 +274,7 @@ def add_outline(  # noqa: PLR0915 - one pass over the points, in compiled code
     widest, cut, shape, one_sided = limits
     patch, outer = patches
     H, b, Hd, D_patch, e_patch = system
-    fx, fy, cx, cy = camera[0], camera[1], camera[2], camera[3]
-    k1, k2, t1, t2, k3, k4, k5, k6 = camera[4:12]
+    fx, fy = camera[0], camera[1]
     C = T_world_cam
     f = 0.5 * (fx + fy)
     height, width = distance.shape
@@ -286,10 +286,8 @@ def add_outline(  # noqa: PLR0915 - one pass over the points, in compiled code
         if a2 <= 0.02:
             continue
         x, y = a0 / a2, a1 / a2
-        r2 = x * x + y * y
-        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        u = fx * (x * radial + 2 * t1 * x * y + t2 * (r2 + 2 * x * x)) + cx - left
-        v = fy * (y * radial + t1 * (r2 + 2 * y * y) + 2 * t2 * x * y) + cy - top
+        u, v = pixel(camera, x, y)
+        u, v = u - left, v - top
         j, i0 = int(np.floor(u)), int(np.floor(v))
         if j < 1 or i0 < 1 or j >= width - 2 or i0 >= height - 2:
             continue

@@ -73,7 +73,7 @@ def draw_environment(rng: np.random.Generator, own: OwnLooks) -> Environment:
         from realsim.rendering.procedural.hdri import read_environment
 
         return read_environment(own.hdris[int(rng.integers(len(own.hdris)))])
-    from realsim.rendering.procedural.environments import random_environment
+    from realsim.rendering.procedural.choose import random_environment
 
     return random_environment(rng)
 

@@ -7,7 +7,7 @@ import pytest
 
 from realsim.rendering.appearance import Environment
 from realsim.rendering.procedural import light, rooms, skies
-from realsim.rendering.procedural.environments import random_environment
+from realsim.rendering.procedural.choose import random_environment
 from realsim.rendering.procedural.texels import luminance
 
 SEEDS = range(16)
