@@ -17,6 +17,7 @@ from realsim.geometry import se3
 from realsim.geometry.mesh_files import check_unit, load_mesh, ply_bytes, save_ply
 from realsim.geometry.mesh_shape import (
     MassProperties,
+    decimated,
     diameter,
     face_normals,
     hull_vertices,
@@ -30,6 +31,7 @@ from realsim.records import Mesh, ObjectModel
 __all__ = [
     "MassProperties",
     "check_unit",
+    "decimated",
     "diameter",
     "face_normals",
     "hull_vertices",

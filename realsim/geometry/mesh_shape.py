@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
+from realsim.interop import import_open3d
 from realsim.records import Mesh
 
 Array = NDArray[np.float64]
@@ -46,6 +47,26 @@ def welded_mesh(mesh: Mesh) -> Mesh:
     """Return the bare surface with equal positions merged; colours and textures are lost."""
     vertices, faces = welded(mesh)
     return Mesh(vertices=vertices, faces=faces.astype(np.int32))
+
+
+def decimated(mesh: Mesh, faces: int) -> Mesh:
+    """Return the bare surface with about so many faces, or as it is if it has no more.
+
+    Edges collapse where the quadric error is least (Garland & Heckbert 1997, "Surface
+    simplification using quadric error metrics"; Open3D's). Closed surfaces may tear;
+    `models.simplify` keeps them closed.
+    """
+    if len(mesh.faces) <= faces:
+        return mesh
+    o3d = import_open3d()
+    full: Any = o3d.geometry.TriangleMesh(  # it refuses read-only arrays
+        o3d.utility.Vector3dVector(mesh.vertices.copy()),
+        o3d.utility.Vector3iVector(mesh.faces.copy()),
+    )
+    small = full.simplify_quadric_decimation(faces)
+    small.remove_unreferenced_vertices()
+    vertices: Array = np.asarray(small.vertices, dtype=np.float64)
+    return Mesh(vertices=vertices, faces=np.asarray(small.triangles, dtype=np.int32))
 
 
 class _Content:

@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.geometry.mesh import hull_vertices, mass_properties, welded_mesh
-from realsim.interop import import_open3d
+from realsim.geometry.mesh import decimated, hull_vertices, mass_properties, welded_mesh
 from realsim.models.convex_config import ConvexConfig
 from realsim.models.convex_hulls import hull_volume
 from realsim.models.convex_obj import collision_obj, parts_from_collision_obj
@@ -86,7 +85,8 @@ def _hull(
 def _decomposed(mesh: Mesh, closed: bool, volume_m3: float, config: ConvexConfig) -> ConvexParts:
     """Return CoACD's parts, or the hull where it has none to offer in time."""
     notes: list[str] = []
-    thin = thinned(mesh, config.max_faces)
+    thin = decimated(mesh, config.max_faces)
+    thin = thin if len(thin.faces) else mesh
     volume = mass_properties(thin, density=1.0)
     if closed and not (
         volume.is_watertight and abs(volume.volume_m3 / volume_m3 - 1) < SAME_VOLUME
@@ -150,21 +150,6 @@ def _outward(mesh: Mesh, closed: bool) -> NDArray[np.int32]:
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0), 1, 0)
     inward = closed and float(np.einsum("ij,ij->", a, np.cross(b, c))) < 0
     return mesh.faces[:, ::-1] if inward else mesh.faces
-
-
-def thinned(mesh: Mesh, faces: int) -> Mesh:
-    """Return the bare mesh with at most about so many faces (quadric edge collapse)."""
-    if len(mesh.faces) <= faces:
-        return mesh
-    o3d = import_open3d()
-    full = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh.vertices.copy()),
-        o3d.utility.Vector3iVector(mesh.faces.copy()),
-    )
-    small = full.simplify_quadric_decimation(target_number_of_triangles=faces)
-    corners: Array = np.asarray(small.vertices, dtype=np.float64)
-    triangles: NDArray[np.int32] = np.asarray(small.triangles, dtype=np.int32)
-    return mesh if len(triangles) == 0 else Mesh(vertices=corners, faces=triangles)
 
 
 # --- the process ------------------------------------------------------------------------------

@@ -1,13 +1,12 @@
 """Fewer faces: quadric decimation that keeps a closed surface closed, and how far it is off."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import DegenerateError, InputError
-from realsim.geometry.mesh import sample_surface, tensor_mesh
+from realsim.geometry.mesh import decimated, sample_surface, tensor_mesh
 from realsim.interop import import_open3d
 from realsim.models.mesh_clustering import clustered
 from realsim.models.mesh_topology import Topology, topology
@@ -29,11 +28,10 @@ DEVIATION_SAMPLES = 20_000
 def simplified(mesh: Mesh, faces: int) -> Mesh:
     """Return the mesh with about so many faces, or as it is if it has no more.
 
-    Quadric decimation (Garland & Heckbert 1997, "Surface simplification using quadric error
-    metrics"; Open3D's) on welded positions, after vertex clustering where the mesh has millions
-    of faces. A closed surface stays closed: where the decimation
-    tears it, it is tried again with more faces, and in the end the mesh is returned with its
-    welded positions and all its faces. A texture becomes colours of the vertices, each taken from
+    Quadric decimation (`geometry.mesh.decimated`) on welded positions, after vertex clustering
+    where the mesh has millions of faces. A closed surface stays closed: where the decimation tears
+    it, it is tried again with more faces, and in the end the mesh is returned with its welded
+    positions and all its faces. A texture becomes colours of the vertices, each taken from
     the closest point of the given surface, since collapsed edges leave its charts meaningless;
     colours per vertex are carried over likewise.
 
@@ -55,32 +53,27 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
     bare = Mesh(vertices=topo.positions, faces=topo.faces[topo.proper])
     if len(bare.faces) > max(CLUSTERED_FROM, CLUSTERED_TO * faces):
         bare = clustered(topo, round(CLUSTERED_TO * faces)) or bare
-    result = _decimated(bare, topo, faces)
+    result = _still_closed(bare, topo, faces)
     if mesh.colors is None and mesh.texture is None:
         return result
     return replace(result, colors=colors_at(mesh, result.vertices))
 
 
-def _decimated(bare: Mesh, topo: Topology, faces: int) -> Mesh:
-    o3d = import_open3d()
+def _still_closed(bare: Mesh, topo: Topology, faces: int) -> Mesh:
+    """Return the mesh decimated, with more faces where it tears."""
     # About the middle and of size 1, so that the result does not depend on the unit.
     center, size = topo.positions.mean(axis=0), topo.size
-    legacy: Any = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector((bare.vertices - center) / size),
-        o3d.utility.Vector3iVector(bare.faces.copy()),  # it refuses read-only arrays
-    )
+    unit = Mesh(vertices=(bare.vertices - center) / size, faces=bare.faces)
     for more in SECOND_CHANCES:
         wanted = round(faces * more)
         if wanted >= len(bare.faces):
             break
-        small = legacy.simplify_quadric_decimation(wanted)
-        small.remove_unreferenced_vertices()
-        triangles = np.asarray(small.triangles)
-        if len(triangles) < LEAST_FACES:
+        small = decimated(unit, wanted)
+        if len(small.faces) < LEAST_FACES:
             raise DegenerateError(
                 f"with {wanted} faces nothing is left of a mesh of {len(bare.faces)}; ask for more."
             )
-        result = Mesh(vertices=np.asarray(small.vertices) * size + center, faces=triangles)
+        result = replace(small, vertices=small.vertices * size + center)
         if not topo.is_watertight or topology(result).is_watertight:
             return result
     return bare

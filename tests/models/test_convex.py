@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.geometry.mesh import hull_vertices
+from realsim.geometry.mesh import decimated, hull_vertices
 from realsim.geometry.parts import part
 from realsim.models.convex import (
     ConvexConfig,
     collision_obj,
     convex_parts,
     parts_from_collision_obj,
-    thinned,
 )
 from realsim.models.convex_hulls import fewest, hull_triangles, hull_volume, outermost
 from realsim.records import Mesh
@@ -202,10 +201,10 @@ def test_a_frozen_program_cuts_in_its_own_process(monkeypatch):
 
 def test_a_thinned_mesh_is_closed_and_as_large():
     mug = part("mug").mesh
-    thin = thinned(mug, 3000)
+    thin = decimated(mug, 3000)
     assert len(thin.faces) <= 3000
     assert solid_volume(thin) == pytest.approx(solid_volume(mug), rel=0.02)
-    assert thinned(thin, 10**6) is thin
+    assert decimated(thin, 10**6) is thin
 
 
 def test_a_round_part_keeps_its_volume_with_more_corners():

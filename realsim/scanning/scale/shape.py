@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import DegenerateError
 from realsim.geometry.distance_field import DistanceField, raycasting_scene
-from realsim.geometry.mesh import face_normals, hull_vertices, sample_surface
+from realsim.geometry.mesh import decimated, face_normals, hull_vertices, sample_surface
 from realsim.records import Mesh
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.shape_error import SurfacePatches, make_patches
@@ -90,7 +90,7 @@ def make_shape(mesh: Mesh, config: ScaleConfig) -> ScanShape:
     unit = INNER_EXTENT / largest
     center = mesh.bounds.mean(0)
     inner = _welded(mesh, center, unit)
-    inner = _lighter(inner, config.fit_faces)
+    inner = decimated(inner, config.fit_faces)
     samples, normals = sample_surface(inner, SURFACE_SAMPLES, np.random.default_rng(0))
     edges, edge_normals = _two_faced_edges(inner)
     return ScanShape(
@@ -134,24 +134,6 @@ def mirrored(shape: ScanShape) -> ScanShape:
         normals=shape.normals * flip,
         edge_normals=shape.edge_normals * flip,
         hull=shape.hull * flip,
-    )
-
-
-def _lighter(mesh: Mesh, faces: int) -> Mesh:
-    """Return the mesh with at most about so many faces (quadric decimation)."""
-    if len(mesh.faces) <= faces:
-        return mesh
-    from realsim.interop import import_open3d
-
-    o3d = import_open3d()
-    heavy = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(np.array(mesh.vertices)),
-        o3d.utility.Vector3iVector(np.array(mesh.faces)),
-    )
-    light = heavy.simplify_quadric_decimation(faces)
-    return Mesh(
-        vertices=np.asarray(light.vertices, dtype=np.float64),
-        faces=np.asarray(light.triangles, dtype=np.int32),
     )
 
 
