@@ -20,7 +20,6 @@ Parts and the figures they give (keys of the JSON's "figures"):
                                 the way through a session; graspnet_meta_diff: in meta files
            bop_graspnet_mm, bop_graspnet_deg    BOP -> GraspNet -> BOP by four decimals, the worst
            FORMAT_mm, FORMAT_deg    grasps written and read: acronym, graspgen, isaac, graspgroup
-  settings no figure: tables of encoders, filters and levels (docs/decisions/0027); only if named
 
 Real frames are measured too where REALSIM_DATA is.
 """
@@ -51,10 +50,8 @@ PARTS: dict[str, tuple[str, str]] = {
     "export": ("formats_export", "export_memory"),
     "trips": ("formats_round_trips", "round_trips"),
     "damage": ("formats_damage", "damage"),
-    "settings": ("formats_settings", "settings_table"),
 }
 """Part -> module and function: imported when it runs."""
-ONLY_IF_NAMED = ("settings",)
 
 
 def part_of(name: str) -> Callable[[int, bool], Found]:
@@ -76,7 +73,7 @@ def arguments_of() -> argparse.Namespace:
         "--part", action="append", dest="parts", choices=list(PARTS), help="run this one alone"
     )
     arguments = parser.parse_args()
-    arguments.parts = arguments.parts or [p for p in PARTS if p not in ONLY_IF_NAMED]
+    arguments.parts = arguments.parts or list(PARTS)
     return arguments
 
 

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from figures import Found
 from formats_frames import Picture, real, simulated
-from formats_settings import opencv_png
 from numpy.typing import NDArray
 
 from realsim import images
@@ -158,3 +157,13 @@ def _over(by_kind: Mapping[str, float]) -> str:
 
 def _rival(slowest: Mapping[str, float], ways: Sequence[str]) -> str:
     return ", ".join(f"{way} {slowest[way]:.1f}" for way in ways)
+
+
+def opencv_png(image: Image, flags: tuple[int, ...]) -> bytes:
+    """Return OpenCV's PNG; the channels of RGB are exchanged first, as its callers have to."""
+    import cv2
+
+    given = cv2.cvtColor(image, cv2.COLOR_RGB2BGR) if image.ndim == 3 else image
+    done, data = cv2.imencode(".png", given, list(flags))
+    assert done
+    return data.tobytes()

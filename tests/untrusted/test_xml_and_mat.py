@@ -150,7 +150,7 @@ def test_mat_files_that_unfold_or_lie_are_refused(tmp_path: Path) -> None:
     body = flags + shape + name + struct.pack("<II", 9, 2**32 - 8)
     packed = zlib.compress(struct.pack("<II", 14, len(body)) + body)
     path.write_bytes(head + struct.pack("<II", 15, len(packed)) + packed)
-    with pytest.raises(InputError, match="cut off"):
+    with pytest.raises(InputError, match="could not read bytes"):
         read_mat(path, ["a"])
     path.write_bytes(b"\x89HDF" + bytes(200))
     with pytest.raises(InputError, match=r"7\.3"):
