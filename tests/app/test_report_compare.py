@@ -17,7 +17,7 @@ from realsim.app.report.compare import (
     object_differences,
     pose_difference,
 )
-from realsim.app.report.compare_page import as_json, comparison_html, comparison_of
+from realsim.app.report.compare_page import as_json, comparison_of, comparison_page
 from realsim.app.report.figures import Figure, count
 from realsim.app.report.session import write_report
 from realsim.app.report.sources import Source, sources_of
@@ -165,7 +165,7 @@ def test_sessions_of_another_content_say_what_cannot_be_compared(folders: dict[s
     assert by["registration.objects"].outcome is None
     assert by["capture.views"].outcome == "same"
     assert all(o.note == "only in A" for o in c.objects[0])
-    text = comparison_html(c)
+    text = comparison_page(c).encode().decode()
     assert "only in A (registration" in text and "https://" not in text
     assert str(folders["a"].parent) not in text
 
@@ -175,12 +175,12 @@ def test_the_page_of_three_holds_its_document_and_escapes_names(
 ) -> None:
     hostile = replace(both[1], label="C <script>alert(1)</script>")
     c = comparison_of([*both, hostile])
-    text = comparison_html(c)
+    text = comparison_page(c).encode().decode()
     assert "<script>alert" not in text
     data = text.partition('id="report">')[2].partition("</script>")[0]
     assert json.loads(data) == json.loads(json.dumps(as_json(c)))
     assert len(json.loads(data)["differences"]) == 2
-    assert comparison_html(c) == text
+    assert comparison_page(c).encode().decode() == text
 
 
 def test_a_stored_report_stands_for_its_session(folders: dict[str, Path]) -> None:
@@ -221,4 +221,6 @@ def test_exit_codes_and_json_of_a_comparison(folders: dict[str, Path], tmp_path:
 def test_an_empty_scene_can_be_compared(both: list[Source]) -> None:
     empty = replace(both[0], objects=[], figures={})
     assert {o.note for o in object_differences(both[0], empty)} == {"only in A"}
-    assert comparison_html(comparison_of([empty, empty])).count("Neither has objects") == 1
+    assert (
+        comparison_page(comparison_of([empty, empty])).encode().count(b"Neither has objects") == 1
+    )

@@ -16,7 +16,6 @@ from realsim.app.report.figures import (
     shown,
 )
 from realsim.app.report.limits import broken, limit_of, read_limits
-from realsim.app.report.page import Cell, Page
 from realsim.app.report.uncertainty import held, sigmas
 from realsim.errors import InputError
 from realsim.records import Mesh, ObjectModel
@@ -133,35 +132,6 @@ def test_a_file_of_limits_that_says_something_else_is_refused(
 def test_a_rule_that_cannot_be_read_is_refused(rule: str) -> None:
     with pytest.raises(InputError):
         limit_of(rule)
-
-
-# --- the page ---------------------------------------------------------------------------------
-
-
-def test_nothing_on_a_page_is_markup_or_a_path_of_this_machine() -> None:
-    page = Page(hidden={"/data/lab 7/run": "SESSION"})
-    hostile = '<script>alert("1")</script>'
-    page.section(hostile, hostile, key="a")
-    page.heading(hostile)
-    page.table([hostile], [[hostile], [Cell(text=hostile, kind="bad", hover=hostile, note="1")]])
-    page.folded(hostile, ["x"], [["/data/lab 7/run/rgb/1.png and /home/someone/models/cup.ply"]])
-    page.image(b"\x89PNG", hostile)
-    text = "".join(page.parts)
-    assert "<script" not in text and text.count("&lt;script") >= 6
-    assert "SESSION/rgb/1.png and cup.ply" in text and "/home" not in text
-
-
-def test_words_with_slashes_are_no_paths() -> None:
-    for text in ("1.2 mm / 0.3 deg", "0.0013 1/m", "RGB/depth", "and/or", "reports/report.html"):
-        assert Page().plain(text) == text
-
-
-def test_a_picture_stands_on_a_page_once() -> None:
-    page = Page()
-    page.image(b"\xff\xd8 one", "first")
-    page.image(b"\xff\xd8 one", "again")
-    page.image(b"\x89PNG two", "another")
-    assert "".join(page.parts).count("<img") == 2
 
 
 # --- uncertainty ------------------------------------------------------------------------------

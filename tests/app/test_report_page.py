@@ -11,7 +11,7 @@ import pytest
 from realsim.app.annotate.run import run_annotate
 from realsim.app.console import Console
 from realsim.app.register.files import write_result
-from realsim.app.report.compare_page import comparison_html, comparison_of
+from realsim.app.report.compare_page import comparison_of, comparison_page
 from realsim.app.report.session import write_report
 from realsim.app.report.sources import sources_of
 from realsim.store import SessionStore
@@ -29,7 +29,7 @@ def pages(tmp_path: Path) -> dict[str, Path]:
     run_annotate(store.folder, Console(quiet=True), maps="all", workers=1, check_depth=True)
     comparison = tmp_path / "comparison.html"
     sources = sources_of([store.folder, store.folder])
-    comparison.write_text(comparison_html(comparison_of(sources)), "utf-8")
+    comparison.write_bytes(comparison_page(comparison_of(sources)).encode())
     return {
         "report": write_report(store, None),
         "comparison": comparison,

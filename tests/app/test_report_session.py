@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from realsim import CaptureSession
 from realsim.app.register.files import write_result
 from realsim.app.report.cli import report_command
-from realsim.app.report.session import report_of, write_report
+from realsim.app.report.session import page_of, report_of, write_report
 from realsim.app.report.summary import Report
 from realsim.errors import RealsimError
 from realsim.review import journal
@@ -161,7 +161,7 @@ def test_accepted_beside_a_low_probability_is_explained(store: SessionStore) -> 
     store.write_json("registration/scene.json", scene)
     report = report_of(store)
     assert any("probability below 0.9" in f.text for f in report.findings)
-    text = "".join(p for s in report.sections for p in s.page.parts)
+    text = page_of(store, report).encode().decode()
     assert "31.0<sup>1</sup>" in text and "registered in a single photograph" in text
 
 
@@ -176,7 +176,7 @@ def test_what_reviewers_decided_is_told(store: SessionStore) -> None:
     assert (figures["review.decided"].value, figures["review.open"].value) == (1, 0)
     assert figures["review.excluded_views"].value == 1
     assert figures["registration.accepted"].value == 2
-    text = "".join(p for s in report.sections for p in s.page.parts)
+    text = page_of(store, report).encode().decode()
     assert "<script>alert" not in text and "looked at it" in text and "blurred" in text
 
 

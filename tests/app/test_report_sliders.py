@@ -54,12 +54,14 @@ def test_the_outline_moves_from_the_start_onto_the_object(store: SessionStore) -
     assert "1 of 1 objects at the rough pose" in before and "cameras" not in before
     assert [p.caption for p in pairs] == ["view 0", "view 2", "view 3"]
     for p in pairs:
-        assert isinstance(p.before, np.ndarray) and isinstance(p.after, np.ndarray)
+        assert isinstance(p.pictures["before"], np.ndarray) and isinstance(
+            p.pictures["registered"], np.ndarray
+        )
         photo = store.rgb(int(p.caption.split()[1]))
         on_object = photo[..., 0] == 200
         # After, the outline lies within the object; before, it does not.
-        assert np.mean(on_object[coloured(p.after)]) > 0.99
-        assert np.mean(on_object[coloured(p.before)]) < 0.9
+        assert np.mean(on_object[coloured(p.pictures["registered"])]) > 0.99
+        assert np.mean(on_object[coloured(p.pictures["before"])]) < 0.9
 
 
 def test_without_a_before_there_are_no_sliders(store: SessionStore) -> None:

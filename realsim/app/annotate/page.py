@@ -9,19 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.annotate.table import HEADER, object_row
-from realsim.app.picture_pages import (
-    LayeredView,
-    Layers,
-    Pair,
-    Picture,
-    Section,
-    Sliders,
-    Table,
-    picture_page,
-)
 from realsim.app.report.sliders import registration_pairs
+from realsim.pages import Page, Picture, View
 from realsim.rendering.overlay import VERDICT_RGB
 from realsim.store import SessionStore
+from realsim.store.atomic import write_bytes
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.annotation.annotate import AnnotationSummary
@@ -61,23 +53,23 @@ def write_page(
         Where it is.
     """
     flagged = set(summary.flagged_views)
-    pairs = [
-        Pair(
-            before=partial(store.rgb, view), after=picture, before_label="photo",
-            after_label="labels", caption=_caption(view, flagged) + _unseen(store, view),
-        )
-        for view, picture in zip(views, overlays, strict=True)
-    ]  # fmt: skip
+    page = Page(title=f"Annotation of {store.session.name}", about=str(summary))
+    for note in _notes(summary):
+        page.text(note, "note")
+    page.section("Photographs and labels", _which(summary, views) + LEGEND)
+    page.sliders(
+        [
+            View(
+                _caption(view, flagged) + _unseen(store, view),
+                {"photo": partial(store.rgb, view), "labels": picture},
+            )
+            for view, picture in zip(views, overlays, strict=True)
+        ]
+    )
+    _add_sections(page, store, summary, views)
     path = store.path(PAGE_FILE)
     path.parent.mkdir(exist_ok=True)
-    photographs = Sliders(
-        title="Photographs and labels", pairs=pairs, text=_which(summary, views) + LEGEND
-    )
-    picture_page(
-        path, f"Annotation of {store.session.name}",
-        [photographs, *_sections(store, summary, views)],
-        about=str(summary), notes=_notes(summary),
-    )  # fmt: skip
+    write_bytes(path, page.encode())
     return path
 
 
@@ -111,32 +103,29 @@ def _notes(summary: "AnnotationSummary") -> list[str]:
     return notes
 
 
-def _sections(
-    store: SessionStore, summary: "AnnotationSummary", views: Sequence[int]
-) -> list[Section]:
-    """Return what stands below the sliders: the objects, the maps, and what registration did."""
-    sections: list[Section] = []
+def _add_sections(
+    page: Page, store: SessionStore, summary: "AnnotationSummary", views: Sequence[int]
+) -> None:
+    """Add what stands below the sliders: the objects, the maps, and what registration did."""
     if summary.by_object:
-        sections.append(
-            Table(
-                title="Objects", header=HEADER, rows=[object_row(o) for o in summary.by_object],
-                colors=[VERDICT_RGB[o.verdict] for o in summary.by_object],
-            )
+        page.section("Objects")
+        page.table(
+            HEADER, [object_row(o) for o in summary.by_object],
+            colors=[VERDICT_RGB[o.verdict] for o in summary.by_object],
         )  # fmt: skip
     layered = [_map_view(store, view, set(summary.flagged_views)) for view in views[:MAP_VIEWS]]
-    layered = [view for view in layered if len(view.layers) > 1]
+    layered = [view for view in layered if len(view.pictures) > 1]
     if layered:
-        sections.append(Layers(title="Maps", views=layered))
+        page.section("Maps")
+        page.layers(layered)
     if summary.objects:
         registered, before = registration_pairs(store)
         if registered:
-            sections.append(
-                Sliders(title="Before and after registration", pairs=registered, text=before)
-            )
-    return sections
+            page.section("Before and after registration", before)
+            page.sliders(registered)
 
 
-def _map_view(store: SessionStore, view: int, flagged: set[int]) -> LayeredView:
+def _map_view(store: SessionStore, view: int, flagged: set[int]) -> View:
     """Return the maps of a view that have been written, under its photograph."""
     from realsim_sim_bridge.annotation.frame_maps import map_path
 
@@ -144,7 +133,7 @@ def _map_view(store: SessionStore, view: int, flagged: set[int]) -> LayeredView:
     for name, title in MAP_TITLES.items():
         if store.has(map_path(name, view)):
             layers[title] = partial(_map_picture, store, name, view)
-    return LayeredView(layers=layers, caption=_caption(view, flagged))
+    return View(_caption(view, flagged), layers)
 
 
 def _map_picture(store: SessionStore, name: str, view: int) -> Image:

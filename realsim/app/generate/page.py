@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.app.picture_pages import LayeredView, Layers, Section, Sheet, Table, picture_page
-from realsim.app.picture_pages import spread as spread_order
+from realsim.app.generate.tables import FiguresTable
 from realsim.app.render.pictures import fitted, layers
 from realsim.images import read_rgb
+from realsim.pages import Page, View
+from realsim.pages import spread as spread_order
 from realsim.store import SessionStore
+from realsim.store.atomic import write_bytes
 from realsim_sim_bridge.table_scenes.layout import Layout
 from realsim_sim_bridge.table_scenes.scene import scene_name
 
@@ -65,7 +67,7 @@ def write_page(
     out: Path,
     layouts: Sequence[Layout],
     views: int,
-    tables: Sequence[Table],
+    tables: Sequence[FiguresTable],
     about: str,
     notes: Sequence[str] = (),
 ) -> Path | None:
@@ -86,24 +88,29 @@ def write_page(
         return None
     chosen = _spread(layouts, PAGE_SCENES)
     each = max(1, min(views, PAGE_VIEWS // len(chosen), 4))
-    shown: list[LayeredView] = []
+    shown: list[View] = []
     for layout in chosen:
         store = SessionStore.open(out / scene_name(layout.number))
         name = f"{scene_name(layout.number)}, {layout.table}, view"
         shown += layers(store, sheet_views(views, each), name)
     thumbnails = [
-        (f"{scene_name(layout.number)}, {layout.table}, {len(layout.objects)} objects",
-         _picture(out, layout, sheet_views(views, 1)[0]))
+        View(f"{scene_name(layout.number)}, {layout.table}, {len(layout.objects)} objects",
+             {"": _picture(out, layout, sheet_views(views, 1)[0])})
         for layout in layouts
     ]  # fmt: skip
-    sections: list[Section] = [
-        Layers(title="Views", views=shown,
-               text="Picture, labels, the simulated sensor's depth, exact depth and label maps."),
-        Sheet(title="Scenes", pictures=thumbnails),
-        *tables,
-    ]  # fmt: skip
-    picture_page(out / PAGE_FILE, f"Generated scenes: {out.name}", sections, about=about,
-                 notes=notes)  # fmt: skip
+    page = Page(title=f"Generated scenes: {out.name}", about=about)
+    for note in notes:
+        page.text(note, "note")
+    page.section(
+        "Views", "Picture, labels, the simulated sensor's depth, exact depth and label maps."
+    )
+    page.layers(shown)
+    page.section("Scenes")
+    page.sheet(thumbnails)
+    for table in tables:
+        page.section(table.title, table.text)
+        page.table(table.header, table.rows)
+    write_bytes(out / PAGE_FILE, page.encode())
     return out / PAGE_FILE
 
 

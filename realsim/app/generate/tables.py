@@ -3,7 +3,7 @@
 from collections import Counter
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from realsim.app.console import Console
 from realsim.app.generate.request import GenerateRequest
 from realsim.app.generate.run import GenerateOutcome
 from realsim.app.generate.scene import is_finished, load_layout, stored_costs
-from realsim.app.picture_pages import Table
 from realsim.store import atomic
 from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.table_scenes.layout import Layout
@@ -122,6 +121,15 @@ def _spread(values: list[float]) -> dict[str, float]:
 # --- for people -------------------------------------------------------------------------------
 
 
+class FiguresTable(NamedTuple):
+    """Figures of a data set as rows."""
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
+    text: str = ""
+
+
 LOST = "lost: fell off / hung over the rim / never rested. Times are CPU seconds."
 SCENES_HEADER = ["scene", "table", "objects", "lost", "moves [mm]", "sunk [mm]", "visible",
                  "physics [s]", "views [s]"]  # fmt: skip
@@ -177,14 +185,14 @@ def cost_rows(out: Path, dataset: dict[str, Any]) -> list[list[str]]:
     ]
 
 
-def tables_of(out: Path, dataset: dict[str, Any]) -> list[Table]:
+def tables_of(out: Path, dataset: dict[str, Any]) -> list[FiguresTable]:
     """Return every table of a data set; empty ones are left out."""
     tables = [
-        Table(title="Generated scenes", header=SCENES_HEADER, rows=scene_rows(out, dataset),
+        FiguresTable(title="Generated scenes", header=SCENES_HEADER, rows=scene_rows(out, dataset),
               text=LOST),
-        Table(title="Visibility of objects in views", header=["visible", "labels", "share"],
+        FiguresTable(title="Visibility of objects in views", header=["visible", "labels", "share"],
               rows=visibility_rows(dataset)),
-        Table(title="CPU time of a frame", header=["part", "s", "share"],
+        FiguresTable(title="CPU time of a frame", header=["part", "s", "share"],
               rows=cost_rows(out, dataset)),
     ]  # fmt: skip
     return [t for t in tables if t.rows]

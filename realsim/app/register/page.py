@@ -1,12 +1,7 @@
 """The page of one registration: tables and pictures in one file that prints well."""
 
-import base64
-import html
 from collections.abc import Mapping
-from importlib.resources import files
-from string import Template
 
-from realsim import __version__
 from realsim.app.register.pictures import GAIN, MAP, OVERLAY, RESIDUALS
 from realsim.app.register.results import Registered
 from realsim.app.register.tables import (
@@ -23,21 +18,10 @@ from realsim.app.register.tables import (
     table_line,
     view_rows,
 )
-from realsim.app.report.session import Page
+from realsim.pages import VERDICT_KIND, Cell, Page
 from realsim.records import ObjectModel
-from realsim.scanning.scale.pictures import VERDICT_COLORS
 from realsim.store import SessionStore
 
-STYLE = """<style>
-.tag { color: white; padding: .05em .5em; border-radius: 3px; font-size: 12px; }
-td:last-child { max-width: 34em; }
-@media print {
-  body { max-width: none; margin: 0; font-size: 11px; }
-  figure, table { break-inside: avoid; }
-  h2 { break-after: avoid; margin-top: 1.2em; }
-  .tag { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
-}
-</style>"""
 CAPTIONS: dict[str, tuple[str, str]] = {
     OVERLAY: (
         "In the photographs",
@@ -73,10 +57,18 @@ def page_bytes(
         models: obj_id -> model.
         pictures: file name -> JPEG or PNG; those that are missing are left out.
     """
-    page = Page(parts=[STYLE])
+    n, taken = len(store.session.views), len(result.cameras.refined)
+    page = Page(
+        title=f"Registration of {result.scene.name}",
+        about=f"{taken} of {n} views, method {_method(result)}",
+    )
     page.section("Objects", f"{summary_line(result)}. {table_line(result)}")
     if result.scene.objects:
-        page.parts.append(_verdict_table(OBJECT_HEADER, object_rows(result, models)))
+        rows: list[list[object]] = [
+            [name, Cell(verdict, kind=VERDICT_KIND[verdict]), *rest]
+            for name, verdict, *rest in object_rows(result, models)
+        ]
+        page.table(OBJECT_HEADER, rows)
     if result.not_placed:
         page.section("Not placed")
         page.table(MISSING_HEADER, missing_rows(result, models))
@@ -88,47 +80,15 @@ def page_bytes(
     for file, (title, caption) in CAPTIONS.items():
         if file in pictures:
             page.section(title)
-            page.parts.append(_figure(file, pictures[file], caption))
+            page.picture(pictures[file], caption)
     page.section("Checks without ground truth")
     page.table(*_checks(result, models))
-    template = Template((files("realsim.app") / "report_page.html").read_text())
-    n, taken = len(store.session.views), len(result.cameras.refined)
-    text = template.substitute(
-        title=html.escape(f"Registration of {result.scene.name}"),
-        about=html.escape(f"{taken} of {n} views, method {_method(result)}"),
-        body="\n".join(page.parts),
-        version=__version__,
-    )
-    return text.encode("utf-8")
+    return page.encode()
 
 
 def _method(result: Registered) -> str:
     """Return the method by name."""
     return str(result.report.get("asked", {}).get("method", "joint"))
-
-
-def _verdict_table(header: list[str], rows: Rows) -> str:
-    """Return a table whose second column is a verdict in its colour."""
-    head = "".join(f"<th>{html.escape(h)}</th>" for h in header)
-    body = ""
-    for row in rows:
-        cells = [html.escape(c) for c in row]
-        cells[1] = (
-            f'<span class="tag" style="background:{VERDICT_COLORS[row[1]]}">{cells[1]}</span>'
-        )
-        body += "<tr>" + "".join(f"<td>{c}</td>" for c in cells) + "</tr>"
-    return f"<table><tr>{head}</tr>{body}</table>"
-
-
-def _figure(file: str, data: bytes, caption: str) -> str:
-    """Return a picture inside the page itself."""
-    kind = "jpeg" if file.endswith(".jpg") else "png"
-    text = html.escape(caption)
-    code = base64.b64encode(data).decode()
-    return (
-        f'<figure><img src="data:image/{kind};base64,{code}" alt="{text}">'
-        f"<figcaption>{text}</figcaption></figure>"
-    )
 
 
 def _checks(result: Registered, models: Mapping[int, ObjectModel]) -> tuple[list[str], Rows]:

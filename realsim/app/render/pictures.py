@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.app.picture_pages import LayeredView, Pair
 from realsim.app.render.compare import label_ids
+from realsim.pages import View
 from realsim.rendering import overlay
 from realsim.store import SessionStore
 
@@ -81,21 +81,23 @@ def fitted(rgb: Rgb, width_px: int = CELL_WIDTH_PX) -> Rgb:
 # --- for the page -----------------------------------------------------------------------------
 
 
-def pairs(store: SessionStore, twin: SessionStore, real: Sequence[int]) -> list[Pair]:
+def pairs(store: SessionStore, twin: SessionStore, real: Sequence[int]) -> list[View]:
     """Return real and synthetic pictures of the views that are shown, for sliders."""
     return [
-        Pair(
-            before=fitted(store.rgb(real[k]), PAGE_WIDTH_PX),
-            after=fitted(twin.rgb(k), PAGE_WIDTH_PX),
-            caption=f"view {real[k]}", before_label="real", after_label="synthetic",
+        View(
+            f"view {real[k]}",
+            {
+                "real": fitted(store.rgb(real[k]), PAGE_WIDTH_PX),
+                "synthetic": fitted(twin.rgb(k), PAGE_WIDTH_PX),
+            },
         )
         for k in shown_views(len(real))
-    ]  # fmt: skip
+    ]
 
 
 def layers(
     twin: SessionStore, views: Sequence[int] | None = None, name: str = "synthetic view"
-) -> list[LayeredView]:
+) -> list[View]:
     """Return views as layers: picture, labels, both depths, and the label maps that there are.
 
     Args:
@@ -105,10 +107,7 @@ def layers(
     """
     chosen = shown_views(len(twin.session.views)) if views is None else views
     return [
-        LayeredView(
-            layers={n: fitted(p, PAGE_WIDTH_PX) for n, p in _layers_of(twin, k).items()},
-            caption=f"{name} {k}",
-        )
+        View(f"{name} {k}", {n: fitted(p, PAGE_WIDTH_PX) for n, p in _layers_of(twin, k).items()})
         for k in chosen
     ]
 

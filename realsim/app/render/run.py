@@ -191,26 +191,25 @@ def _figures_title(figures: TwinFigures) -> str:
 
 def write_page(outcome: RenderOutcome) -> None:
     """Write the page: real against synthetic under sliders, the layers, the figures."""
-    from realsim.app.picture_pages import Layers, Section, Sliders, Table, picture_page
+    from realsim.pages import Page
+    from realsim.store.atomic import write_bytes
 
-    sections: list[Section] = []
+    page = Page(
+        title=f"Synthetic views of {outcome.store.session.name}", about=str(outcome.summary)
+    )
+    for note in notes_of(outcome):
+        page.text(note, "note")
     if outcome.real is not None:
-        sections.append(
-            Sliders(
-                title="Real and synthetic", pairs=pairs(outcome.store, outcome.twin, outcome.real)
-            )
-        )
-    sections.append(Layers(title="Synthetic views", views=layers(outcome.twin)))
+        page.section("Real and synthetic")
+        page.sliders(pairs(outcome.store, outcome.twin, outcome.real))
+    page.section("Synthetic views")
+    page.layers(layers(outcome.twin))
     if outcome.figures is not None:
-        sections.append(
-            Table(title=_figures_title(outcome.figures), header=FIGURES_HEADER,
-                  rows=outcome.figures.rows())
-        )  # fmt: skip
-    sections.append(Table(title="The run", header=["what", "value"], rows=summary_rows(outcome)))
-    picture_page(
-        outcome.page, f"Synthetic views of {outcome.store.session.name}", sections,
-        about=str(outcome.summary), notes=notes_of(outcome),
-    )  # fmt: skip
+        page.section(_figures_title(outcome.figures))
+        page.table(FIGURES_HEADER, outcome.figures.rows())
+    page.section("The run")
+    page.table(["what", "value"], summary_rows(outcome))
+    write_bytes(outcome.page, page.encode())
 
 
 def notes_of(outcome: RenderOutcome) -> list[str]:

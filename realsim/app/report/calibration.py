@@ -8,10 +8,9 @@ import numpy as np
 
 from realsim.app.report import plots_capture
 from realsim.app.report.figures import Figure, count, shown
-from realsim.app.report.page import Cell
-from realsim.app.report.plots import WIDTH_PX
 from realsim.app.report.section import Section, attempted, counted, drawn
 from realsim.app.stages import BOARD_VIEWS
+from realsim.pages import Cell
 from realsim.records import Check, HandEye
 from realsim.store import SessionStore
 from realsim.store.records_json import check_from_json
@@ -158,7 +157,7 @@ def _plots(section: Section, store: SessionStore, hand_eye: HandEye) -> None:
         if any(change) and any(sd):
             picture = plots_capture.intrinsics_change(LENS[:4], change, sd)
             plots.append((picture, "What the calibration changed of the camera's own figures."))
-    section.page.plots(plots, WIDTH_PX)
+    section.page.plots(plots)
 
 
 def _checks(section: Section, title: str, checks: Sequence[Check]) -> None:

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from realsim.app.report import plots_capture
 from realsim.app.report.figures import Figure, count
-from realsim.app.report.page import jpeg_bytes
-from realsim.app.report.plots import WIDTH_PX
 from realsim.app.report.section import READING, Section, attempted, counted, drawn
 from realsim.store import SessionStore
 from realsim.store.atomic import complete_lines
@@ -51,7 +49,7 @@ def plan_section(section: Section, store: SessionStore) -> None:
     drawn(section, "the coverage", lambda: _coverage(section, store, told))
     rest = [[name, f"{value:.4g}"] for name, value in sorted(metrics.items())]
     if rest:
-        section.page.folded("All figures of the plan", ["figure", "value"], rest)
+        section.page.table(["figure", "value"], rest, folded="All figures of the plan")
 
 
 def _coverage(section: Section, store: SessionStore, told: Any) -> None:
@@ -59,7 +57,7 @@ def _coverage(section: Section, store: SessionStore, told: Any) -> None:
     center = np.asarray(told["content"]["center_world"], dtype=np.float64)
     there = {v.index for v in store.session.views}
     picture = plots_capture.coverage(poses, center, [k in there for k in range(len(poses))])
-    section.page.plots([(picture, "Planned views around the middle of the scene.")], WIDTH_PX)
+    section.page.plots([(picture, "Planned views around the middle of the scene.")])
 
 
 def capture_section(section: Section, store: SessionStore) -> None:
@@ -138,7 +136,7 @@ def _log(section: Section, store: SessionStore) -> None:
             section.add(Figure(name=name, value=float(pick(seen))))
     if is_drawn and any(measured.values()):
         plots.append((plots_capture.photographs(measured), "Measured when they were taken."))
-    section.page.plots(plots, WIDTH_PX)
+    section.page.plots(plots)
     told = [[k, "; ".join([*map(str, e.get("retaken", ())), *map(str, e.get("notes", ()))])]
             for k, e in sorted(stored.items()) if e.get("retaken") or e.get("notes")]  # fmt: skip
     skipped = [e for e in events if e.get("event") == "skipped" and e.get("view") not in stored]
@@ -163,7 +161,7 @@ def _sheet(section: Section, store: SessionStore) -> None:
     sheet = contact_sheet(small, columns=4, captions=[f"view {k}" for k in shown])
     if section.pictures == "kept":
         save_png(store.folder / "reports/views.png", sheet)
-    section.page.image(jpeg_bytes(sheet), f"{len(shown)} of {len(indices)} captured views")
+    section.page.picture(sheet, f"{len(shown)} of {len(indices)} captured views")
 
 
 def _thumbnail(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -15,11 +15,9 @@ from realsim.app.report.compare import (
     object_differences,
 )
 from realsim.app.report.figures import figures_to_json
-from realsim.app.report.page import Cell, Page
-from realsim.app.report.plots import WIDTH_PX
-from realsim.app.report.session import filled
 from realsim.app.report.sources import Source
 from realsim.app.report.summary import SCHEMA_VERSION, VERDICTS
+from realsim.pages import Cell, Page
 
 SCHEMA = "realsim report comparison"
 KINDS = {"better": "good", "worse": "bad", "same": "", "other": "", "unknown": "off"}
@@ -179,9 +177,10 @@ def as_json(c: Comparison) -> dict[str, Any]:
     }
 
 
-def comparison_html(c: Comparison) -> str:
-    """Return the comparison as one self-contained page."""
-    page = Page()
+def comparison_page(c: Comparison) -> Page:
+    """Return the comparison as a page."""
+    names = " and ".join(s.label for s in c.sources[:2]) + " ..." * (len(c.sources) > 2)
+    page = Page(title=f"Comparison: {names}", document=as_json(c))
     _summary(page, c)
     plots = plots_compare.overlaid([(s.label, s.series) for s in c.sources])
     for other, found in zip(c.sources[1:], c.objects, strict=True):
@@ -191,26 +190,18 @@ def comparison_html(c: Comparison) -> str:
             page.table(OBJECT_HEADER, object_rows(found))
             picture = plots_compare.moves(found, labels)
             if picture is not None:
-                page.plots(
-                    [
-                        (
-                            picture,
-                            "Bars: shift. Marks: 2 sigma: a bar beyond is more than noise.",
-                        )
-                    ],
-                    WIDTH_PX,
-                )
+                said = "Bars: shift. Marks: 2 sigma: a bar beyond is more than noise."
+                page.plots([(picture, said)])
         else:
             page.text("Neither has objects.")
     page.section("Plots")
     if plots:
-        page.plots(plots, WIDTH_PX)
+        page.plots(plots)
     else:
         page.text("There is nothing that two of them have measured.")
     page.section("All figures", EXPLAINED)
     page.table(figure_header(c), figure_rows(c))
-    names = " and ".join(s.label for s in c.sources[:2]) + " ..." * (len(c.sources) > 2)
-    return filled(page, title=f"Comparison: {names}", about="", document=as_json(c))
+    return page
 
 
 def _summary(page: Page, c: Comparison) -> None:
@@ -219,11 +210,11 @@ def _summary(page: Page, c: Comparison) -> None:
         worse = [d for d in found if d.outcome == "worse"]
         better = [d for d in found if d.outcome == "better"]
         kind = "bad" if worse else "good" if better else "off"
-        page.parts.append(
-            f'<div class="verdict {kind}"><b>{page.escaped(other.label)}</b> against '
-            f"{page.escaped(c.sources[0].label)}: {len(worse)} figures worse, "
-            f"{len(better)} better, by more than noise.</div>"
-        )
+        page.verdict(
+            kind, other.label,
+            f"against {c.sources[0].label}: {len(worse)} figures worse, {len(better)} better, by "
+            "more than noise.",
+        )  # fmt: skip
         rows: list[list[object]] = []
         for d in [*worse, *better]:
             sign = Cell(text=SIGNS[d.outcome or "same"], kind=KINDS[d.outcome or "same"])
@@ -237,7 +228,7 @@ def _summary(page: Page, c: Comparison) -> None:
         if only:
             page.text(_uncompared(only, c.sources[0], other))
     rows = [
-        [Cell(text=s.label), Cell(text=VERDICTS[s.verdict][0], kind=VERDICTS[s.verdict][1]),
+        [s.label, Cell(text=VERDICTS[s.verdict][0], kind=VERDICTS[s.verdict][1]),
          len(s.objects), len(s.figures)]
         for s in c.sources
     ]  # fmt: skip

@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from realsim.app.report import plots_objects
 from realsim.app.report.figures import Figure, count
-from realsim.app.report.page import Cell, jpeg_bytes
-from realsim.app.report.plots import WIDTH_PX
 from realsim.app.report.section import Section, drawn
+from realsim.pages import Cell, Picture
 from realsim.store import SessionStore
 
 Array = NDArray[np.float64]
@@ -63,7 +62,7 @@ def labels_section(section: Section, store: SessionStore) -> None:
 
 def _plot(section: Section, shares: Array) -> None:
     picture = plots_objects.visibility(shares)
-    section.page.plots([(picture, "1 = no other object in front of it.")], WIDTH_PX)
+    section.page.plots([(picture, "1 = no other object in front of it.")])
 
 
 def _figures(section: Section, frames: Mapping[int, Any], rows: list[tuple[int, Any]]) -> None:
@@ -174,10 +173,10 @@ def _photographs(section: Section, store: SessionStore) -> None:
     for path in folder.glob("overlay_*.png") if is_kept else ():
         path.unlink()  # of an earlier report, perhaps of views that took no part since
     section.page.heading("The annotated scene")
-    section.page.parts.append('<div class="pictures">')
+    pictures: list[tuple[Picture, str]] = []
     for index in (told[k] for k in pick):
         picture = overlay_picture(store, index, scene, models, grasps, GRASPS)
         if is_kept:
             save_png(folder / f"overlay_{index:06d}.png", picture)
-        section.page.image(jpeg_bytes(picture), f"view {index}")
-    section.page.parts.append("</div>")
+        pictures.append((picture, f"view {index}"))
+    section.page.pictures(pictures)

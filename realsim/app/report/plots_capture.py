@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.app.report.plots import (
+from realsim.geometry import se3
+from realsim.pages.plots import (
     BAD,
     GOOD,
     INK,
@@ -17,7 +18,6 @@ from realsim.app.report.plots import (
     titled,
     whole_numbers,
 )
-from realsim.geometry import se3
 from realsim.records import HandEye
 
 Array = NDArray[np.float64]

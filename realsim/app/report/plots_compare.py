@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from realsim.app.report.compare import ObjectDifference
-from realsim.app.report.plots import (
+from realsim.pages.plots import (
     INK,
     MARKERS,
     MUTED,

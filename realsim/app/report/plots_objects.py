@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.app.report.plots import (
+from realsim.pages.plots import (
     BAD,
     GOOD,
     INK,

@@ -22,10 +22,9 @@ from realsim.app.register.tables import (
 )
 from realsim.app.report import plots_capture, plots_objects
 from realsim.app.report.figures import Figure, count
-from realsim.app.report.page import Cell
-from realsim.app.report.plots import WIDTH_PX
 from realsim.app.report.section import Section, counted, drawn
 from realsim.app.report.uncertainty import sigmas
+from realsim.pages import Cell
 from realsim.records import ObjectModel, ObjectPose
 from realsim.registration.judging.verdict import VerdictConfig
 from realsim.review.corrections import decision_on
@@ -289,7 +288,7 @@ def _plots(section: Section, result: Registered) -> None:
     if any(not is_same_pose(claimed[k], T) for k, T in refined.items() if k in claimed):
         picture = plots_capture.camera_moves(claimed, refined)
         plots.append((picture, "From where robot and calibration claim them to be."))
-    section.page.plots(plots, WIDTH_PX)
+    section.page.plots(plots)
 
 
 def _views(section: Section, store: SessionStore, result: Registered, state: ReviewState) -> None:
@@ -321,20 +320,18 @@ def _views(section: Section, store: SessionStore, result: Registered, state: Rev
 
 def _pictures(section: Section, store: SessionStore) -> None:
     """Add sliders of before and after where there is a before, and registration's own pictures."""
-    from realsim.app.picture_pages import pair_markup
     from realsim.app.report.sliders import registration_pairs
 
     pairs, before = registration_pairs(store)
     if pairs:
         section.page.heading("Before and after registration")
         section.page.text(before)
-        pictures = [pair_markup(p) for p in pairs]
-        section.page.parts += ['<div class="pictures">', *pictures, "</div>"]
+        section.page.sliders(pairs)
     folder: Path = store.folder / "registration/pictures"
     for name, caption in PICTURES:
         # The sliders show the outlines already.
         if (folder / name).is_file() and not (pairs and name == "overlay.jpg"):
-            section.page.picture(folder / name, caption)
+            section.page.picture((folder / name).read_bytes(), caption)
 
 
 def _check_table(
@@ -348,4 +345,4 @@ def _check_table(
             [name, *[f"{o.checks[name]:.3g}" if name in o.checks else "-" for o in objects]]
             for name in checks
         ]
-        section.page.folded("All checks of all objects", header, rows)
+        section.page.table(header, rows, folded="All checks of all objects")

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from realsim.app.report.figures import count
-from realsim.app.report.page import Cell
 from realsim.app.report.section import READING, Section
 from realsim.app.reviewed import review_of
+from realsim.pages import Cell
 from realsim.review.journal import JOURNAL_FILE, Entry, ReviewState, read, replay
 from realsim.store import SessionStore
 

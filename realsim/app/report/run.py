@@ -1,5 +1,6 @@
 """`realsim report`: one session's report, or several compared; checked against limits."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,18 +11,18 @@ from realsim.app.report.compare_page import (
     OBJECT_HEADER,
     Comparison,
     as_json,
-    comparison_html,
     comparison_of,
+    comparison_page,
     figure_header,
     figure_rows,
     object_rows,
 )
 from realsim.app.report.limits import Limit, broken, limit_of, read_limits
-from realsim.app.report.page import Page
-from realsim.app.report.session import hidden_of, page_html, report_of, write_report_of
+from realsim.app.report.session import hidden_of, page_of, report_of, write_report_of
 from realsim.app.report.sources import sources_of
 from realsim.app.report.summary import VERDICTS
 from realsim.errors import InputError
+from realsim.pages import Page
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -70,7 +71,7 @@ def _one(request: ReportRequest, limits: Sequence[Limit]) -> bool:
         path = write_report_of(store, report)
     else:
         report = report_of(store, errors, "shown")
-        path = _written(request.out, page_html(store, report))
+        path = _written(request.out, page_of(store, report))
     page = Page(hidden=hidden_of(store))
     failed = [f"bad: {page.plain(f.text)}" for f in report.findings if f.severity == "bad"]
     failed += [f"limit: {text}" for text in broken(limits, report.figures)]
@@ -118,7 +119,7 @@ def _several(request: ReportRequest, limits: Sequence[Limit]) -> bool:
             unit = f" {d.first.meaning.unit}".rstrip() if d.first is not None else ""
             failed.append(f"worse: {other.label}: {d.name} by {d.shown}{unit}")
     if request.out is not None:
-        _written(request.out, comparison_html(comparison))
+        _written(request.out, comparison_page(comparison))
     console.result(as_json(comparison) | {"failed": failed})
     if not (request.as_json or request.quiet):
         _say_several(console, comparison)
@@ -143,10 +144,10 @@ def _say_several(console: Console, c: Comparison) -> None:
             console.table(title, OBJECT_HEADER, object_rows(found))
 
 
-def _written(path: Path, text: str) -> Path:
+def _written(path: Path, page: Page) -> Path:
     from realsim.store import atomic
 
-    atomic.write_bytes(path, text.encode("utf-8"))
+    atomic.write_bytes(path, page.encode(math.inf))
     return path
 
 

@@ -6,7 +6,6 @@ import numpy as np
 
 from realsim.app.report import plots_objects
 from realsim.app.report.figures import Figure, count, share
-from realsim.app.report.plots import WIDTH_PX
 from realsim.app.report.section import Section, drawn
 from realsim.app.show import GRASP_HEADER, grasp_rows, why_no_grasp
 from realsim.records import GraspSet
@@ -119,11 +118,13 @@ def _plots(section: Section, sets: list[GraspSet]) -> None:
         plots.append((plots_objects.slips(mm, deg), "Linear below 0.1, logarithmic above."))
     if failed:
         plots.append((plots_objects.failures(failed), "The first thing that stopped each grasp."))
-    section.page.plots(plots, WIDTH_PX)
+    section.page.plots(plots)
 
 
 def _pictures(section: Section, store: SessionStore) -> None:
     if store.has(SHEET):
         section.page.text(f"The grasps of every object, drawn: {SHEET}.")
     if store.path(SETTLED).is_file():
-        section.page.picture(store.path(SETTLED), "How the objects settled in the simulation.")
+        section.page.picture(
+            store.path(SETTLED).read_bytes(), "How the objects settled in the simulation."
+        )

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from realsim.app.report.figures import Figure
-from realsim.app.report.page import Page
 from realsim.errors import RealsimError
+from realsim.pages import Page
 
 Severity = Literal["bad", "warn", "note"]
 State = Literal["done", "missing", "damaged"]

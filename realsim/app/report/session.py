@@ -3,20 +3,14 @@
 Beside it report.json holds the same figures for programs. The same session gives the same bytes.
 """
 
-import html
-import json
+import math
 from collections.abc import Callable, Sequence
-from importlib.resources import files
 from pathlib import Path
-from string import Template
-from typing import Any
 
-from realsim import __version__
 from realsim.app.console import StageTime
 from realsim.app.report.calibration import calibration_section
 from realsim.app.report.capturing import capture_section, plan_section
 from realsim.app.report.labelling import labels_section
-from realsim.app.report.page import Page
 from realsim.app.report.registering import registration_section
 from realsim.app.report.reviewing import review_section, review_state
 from realsim.app.report.schooling import school_section
@@ -24,13 +18,10 @@ from realsim.app.report.section import Pictures, Section, built, counted
 from realsim.app.report.storage import files_section, settings_section
 from realsim.app.report.summary import Report, truth_section, write_summary
 from realsim.app.truth import LoopErrors
+from realsim.pages import Page
 from realsim.store import SessionStore
 
-__all__ = ["Page", "page_html", "report_of", "write_report", "write_report_of"]
-
 PAGE, DOCUMENT = "reports/report.html", "reports/report.json"
-DOCUMENT_SCRIPT = '<script type="application/json" id="report">'
-"""In every page: what holds its figures, and what tells it from other pages."""
 Build = Callable[[Section], None]
 
 
@@ -63,10 +54,10 @@ def write_report_of(
     times: Sequence[StageTime] = (),
 ) -> Path:
     """Write a report that has been made; see `write_report`."""
-    text = page_html(store, report, notes=notes, times=times)
-    document = report.document(Page(hidden=hidden_of(store)))
-    store.write_json(DOCUMENT, document)
-    store.write_bytes(PAGE, text.encode("utf-8"))
+    page = page_of(store, report, notes=notes, times=times)
+    data = page.encode(math.inf)
+    store.write_json(DOCUMENT, page.document)
+    store.write_bytes(PAGE, data)
     return store.folder / PAGE
 
 
@@ -89,11 +80,10 @@ def report_of(
     if pictures == "kept":
         (store.folder / "reports").mkdir(exist_ok=True)
     hidden = hidden_of(store)
-    seen: set[str] = set()
     sections: list[Section] = []
 
     def add(key: str, title: str, command: str, build: Build) -> Section:
-        page = Page(hidden=hidden, seen=seen)
+        page = Page(hidden=hidden)
         run = f"realsim {command} SESSION" if command else ""
         section = built(
             Section(key=key, title=title, page=page, command=run, pictures=pictures), build
@@ -125,17 +115,16 @@ def report_of(
     return Report(name=store.session.name, about=_about(store), sections=tuple(sections))
 
 
-def page_html(
+def page_of(
     store: SessionStore,
     report: Report,
     *,
     notes: Sequence[str] = (),
     times: Sequence[StageTime] = (),
-) -> str:
+) -> Page:
     """Return the page of a report; see `write_report`."""
-    from realsim.app.picture_pages import slider_style
-
-    page = Page(hidden=hidden_of(store))
+    page = Page(title=report.name, about=report.about, hidden=hidden_of(store))
+    page.document = report.document(page)
     write_summary(page, report, notes)
     for section in report.sections:
         page.parts += section.page.parts
@@ -143,33 +132,7 @@ def page_html(
         page.section("Cost of the run")
         rows = [[t.name, f"{t.cpu_s:.1f}", f"{t.wall_s:.1f}"] for t in times]
         page.table(["stage", "CPU [s]", "clock [s]"], rows)
-    return filled(
-        page, title=report.name, about=report.about, document=report.document(page),
-        style=slider_style(),
-    )  # fmt: skip
-
-
-def filled(page: Page, *, title: str, about: str, document: Any, style: str = "") -> str:
-    """Return a page in its frame, with its figures for programs inside.
-
-    Args:
-        page: the body.
-        title: of the page.
-        about: one line under the title.
-        document: plain JSON values.
-        style: further CSS.
-    """
-    template = Template((files("realsim.app") / "report_page.html").read_text("utf-8"))
-    # "</" would end the script, "<!--" would begin a comment in it.
-    data = json.dumps(document, allow_nan=False, ensure_ascii=True).replace("<", "\\u003c")
-    markup = f"<style>{style}</style>" if style else ""
-    script = f"{DOCUMENT_SCRIPT}{data}</script>"
-    return template.substitute(
-        title=html.escape(page.plain(title)),
-        about=html.escape(page.plain(about)),
-        body="\n".join([markup, *page.parts, script]),
-        version=__version__,
-    )
+    return page
 
 
 def _about(store: SessionStore) -> str:

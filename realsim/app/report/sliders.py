@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.app.picture_pages import Pair
 from realsim.app.register.inputs import STARTS_FILE
 from realsim.app.register.results import claimed_cameras, is_same_pose
 from realsim.app.stages import registered_views, session_models
 from realsim.geometry import se3
+from realsim.pages import View
 from realsim.records import ObjectModel, ObjectPose
 from realsim.store import SessionStore
 
@@ -24,7 +24,7 @@ VIEWS = 3
 """Sliders in a report, spread over the session."""
 
 
-def registration_pairs(store: SessionStore, views: int = VIEWS) -> tuple[list[Pair], str]:
+def registration_pairs(store: SessionStore, views: int = VIEWS) -> tuple[list[View], str]:
     """Return before/after pairs of registered views, and in words what 'before' is.
 
     Both are empty where nothing tells what was before: no rough poses, no camera refined.
@@ -63,15 +63,16 @@ def registration_pairs(store: SessionStore, views: int = VIEWS) -> tuple[list[Pa
     ]
     kept: list[tuple[ObjectPose, Array]] = [(o, o.T_world_obj) for o in after]
     pick = np.unique(np.linspace(0, len(seen) - 1, views).round().astype(int))
-    pairs: list[Pair] = []
+    pairs: list[View] = []
     for view in (seen[k] for k in pick):
         assert view.T_world_cam is not None
         pairs.append(
-            Pair(
-                before=_outlined(store, view.index, claimed[view.index], before, models),
-                after=_outlined(store, view.index, view.T_world_cam, kept, models),
-                caption=f"view {view.index}",
-                after_label="registered",
+            View(
+                f"view {view.index}",
+                {
+                    "before": _outlined(store, view.index, claimed[view.index], before, models),
+                    "registered": _outlined(store, view.index, view.T_world_cam, kept, models),
+                },
             )
         )
     return pairs, f"Before: {', and '.join(what)}."

@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from realsim.app.report.figures import Figure
-from realsim.app.report.page import Page
 from realsim.app.report.section import READING
 from realsim.app.report.session import DOCUMENT, hidden_of, report_of
 from realsim.app.report.stored import read_stored
 from realsim.app.stages import open_session, session_models
 from realsim.errors import InputError
+from realsim.pages import Page
 from realsim.records import ObjectModel
 
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"

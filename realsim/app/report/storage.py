@@ -6,8 +6,8 @@ from typing import Any
 
 from realsim import __version__
 from realsim.app.report.figures import Figure, count
-from realsim.app.report.page import Cell
 from realsim.app.report.section import Section, attempted
+from realsim.pages import Cell
 from realsim.store import SessionStore
 from realsim.store.check_report import CheckReport
 from realsim.store.session_check import check_session, read_lists
@@ -94,7 +94,7 @@ def _settings(section: Section, store: SessionStore) -> None:
     for title, values in found:
         rows = [[name, _short(v)] for name, v in _flat(values)]
         if rows:
-            section.page.folded(title, ["setting", "value"], rows)
+            section.page.table(["setting", "value"], rows, folded=title)
 
 
 def _flat(values: Any, before: str = "") -> Iterator[tuple[str, Any]]:

@@ -1,13 +1,13 @@
 """The first screen: can this session be trusted, what speaks against it, what is missing."""
 
-import html
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from realsim.app.report.figures import Figure, count, figures_to_json
-from realsim.app.report.page import Cell, Page
 from realsim.app.report.section import SEVERITIES, Finding, Section
+from realsim.pages import Cell, Page
 
 SCHEMA, SCHEMA_VERSION = "realsim report", 1
 SHOWN = 6
@@ -107,22 +107,15 @@ def write_summary(page: Page, report: Report, notes: Sequence[str] = ()) -> None
     """
     found = [f for f in report.findings if f.severity != "note"]
     title, kind = VERDICTS[report.verdict]
-    page.parts.append(
-        f'<div class="verdict {kind}"><b>{html.escape(title)}.</b> {page.escaped(_why(report))}'
-        "</div>"
-    )
-    if found:
-        page.parts.append('<ul class="findings">')
-        for f in found[:SHOWN]:
-            text = f.text if len(f.text) <= LONGEST else f"{f.text[: LONGEST - 1]}…"
-            page.parts.append(
-                f'<li><span class="tag {f.severity}">{f.severity}</span> {page.escaped(text)} '
-                f'<a href="#{html.escape(f.section)}">more</a></li>'
-            )
-        page.parts.append("</ul>")
-        if len(found) > SHOWN:
-            page.text(f"... and {len(found) - SHOWN} more, in the sections below.")
-    rows: list[list[object]] = []
+    rows: list[list[object]] = [
+        [Cell(f.severity, kind=f.severity), textwrap.shorten(f.text, LONGEST, placeholder="…"),
+         Cell("more", href=f.section)]
+        for f in found[:SHOWN]
+    ]  # fmt: skip
+    page.verdict(kind, f"{title}.", _why(report), rows)
+    if len(found) > SHOWN:
+        page.text(f"... and {len(found) - SHOWN} more, in the sections below.")
+    rows = []
     for s in report.sections:
         run = f"run {s.command}" if s in report.missing else ""
         state = _state(s)
@@ -137,7 +130,7 @@ def _notes(page: Page, notes: Sequence[str]) -> None:
         page.text(note, "note")
     if len(notes) > NOTES_SHOWN:
         rest = [[note] for note in notes[NOTES_SHOWN:]]
-        page.folded(f"{len(rest)} more notes of the run", ["note"], rest)
+        page.table(["note"], rest, folded=f"{len(rest)} more notes of the run")
 
 
 def _state(section: Section) -> Cell:

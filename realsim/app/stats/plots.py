@@ -1,19 +1,27 @@
 """The pictures of the statistics: what became of grasps, how visible and certain objects are."""
 
-import io
 from collections import Counter
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from realsim.app.report.plots import BAD, GOOD, INK, MUTED, VERDICT_COLORS, WARN
 from realsim.app.stats.statistics import VERDICTS, Statistics
 from realsim.formats.grasps.scene_grasps import executed
+from realsim.pages.plots import (
+    BAD,
+    GOOD,
+    INK,
+    MUTED,
+    VERDICT_COLORS,
+    WARN,
+    columns,
+    legend,
+    png,
+    titled,
+    whole_numbers,
+)
 from realsim_sim_bridge.school.summary import GOOD as GOOD_OUTCOMES
 from realsim_sim_bridge.school.summary_rows import OUTCOME_NAMES, PAPER_CANDIDATES, PAPER_OUTCOMES
 
-Image = NDArray[np.uint8]
 BINS = 20
 LEAST_BINS = 5
 """Numbers that an axis of counts spans at least: one bar alone would be as wide as the plot."""
@@ -23,9 +31,9 @@ VIOLIN_LEAST = 3
 """Fewer scores make no distribution: they are drawn as points."""
 
 
-def figures(stats: Statistics) -> list[tuple[str, Image]]:
+def figures(stats: Statistics) -> list[tuple[str, bytes]]:
     """Return (caption, picture) of everything that there are figures for."""
-    drawn: list[tuple[str, Image]] = []
+    drawn: list[tuple[str, bytes]] = []
     if stats.school.judged:
         drawn.append(("What became of the candidates, beside the paper's", _outcomes(stats)))
         drawn.append(("Score, and force closure against it", _scores(stats)))
@@ -36,41 +44,8 @@ def figures(stats: Statistics) -> list[tuple[str, Image]]:
     return drawn
 
 
-def _axes(columns: int) -> tuple[Any, list[Any]]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 3.4), dpi=110, layout="constrained")
-    axes = [figure.add_subplot(1, columns, k + 1) for k in range(columns)]
-    for ax in axes:
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.tick_params(colors=INK, labelsize=8)
-    return figure, axes
-
-
-def _counted(*axes: Any) -> None:
-    """Number the axes of counts by whole numbers."""
-    from matplotlib.ticker import MaxNLocator
-
-    for axis in axes:
-        axis.set_major_locator(MaxNLocator(integer=True))
-
-
-def _titled(ax: Any, title: str, x: str = "", y: str = "") -> None:
-    ax.set_title(title, fontsize=9, loc="left", color=INK)
-    ax.set_xlabel(x, fontsize=8, color=INK)
-    ax.set_ylabel(y, fontsize=8, color=INK)
-
-
-def _picture(figure: Any) -> Image:
-    from PIL import Image as Picture
-
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", facecolor="white")
-    return np.asarray(Picture.open(buffer).convert("RGB"))
-
-
-def _outcomes(stats: Statistics) -> Image:
-    figure, (ax,) = _axes(1)
+def _outcomes(stats: Statistics) -> bytes:
+    figure, (ax,) = columns(1)
     names = [n for n in OUTCOME_NAMES if stats.school.outcomes[n] or n in PAPER_OUTCOMES]
     rows = np.arange(len(names))
     here = [100 * stats.school.share(stats.school.outcomes[n]) for n in names]
@@ -85,12 +60,12 @@ def _outcomes(stats: Statistics) -> Image:
                     color=MUTED)  # fmt: skip
     ax.set_yticks(rows, [OUTCOME_NAMES[n] for n in names])
     ax.invert_yaxis()
-    _titled(ax, f"{stats.school.judged:,} candidates with a score", "share [%]")
-    return _picture(figure)
+    titled(ax, f"{stats.school.judged:,} candidates with a score", "share [%]", "")
+    return png(figure)
 
 
-def _scores(stats: Statistics) -> Image:
-    figure, (left, right) = _axes(2)
+def _scores(stats: Statistics) -> bytes:
+    figure, (left, right) = columns(2)
     sets = [s for session in stats.sessions for s in session.sets]
     scores = np.concatenate([np.zeros(0), *(s.scores for s in sets)])
     scores = scores[np.isfinite(scores)]
@@ -98,7 +73,7 @@ def _scores(stats: Statistics) -> Image:
     counts, _ = np.histogram(scores, edges)
     middle = 0.5 * (edges[1:] + edges[:-1])
     left.bar(middle, counts, 0.9 / BINS, color=[GOOD if m >= 0.5 else BAD for m in middle])
-    _titled(left, "Scores", "score", "grasps")
+    titled(left, "Scores", "score", "grasps")
     groups: dict[float, list[float]] = {}
     for s in sets:
         friction = s.measures.get("closure_friction")
@@ -117,18 +92,18 @@ def _scores(stats: Statistics) -> Image:
         right.text(k, 1.04, f"{len(values)}", ha="center", fontsize=7, color=MUTED)
     right.set_xticks(range(len(levels)), ["none" if np.isinf(v) else f"{v:g}" for v in levels])
     right.set_ylim(-0.02, 1.12)
-    _titled(right, "Score by the friction from which it closes (dot: mean, above: grasps)",
+    titled(right, "Score by the friction from which it closes (dot: mean, above: grasps)",
             "least friction that closes", "score")  # fmt: skip
     if not levels:
         right.text(0.5, 0.5, "force closure was not computed", ha="center", color=MUTED, fontsize=9)
-    return _picture(figure)
+    return png(figure)
 
 
-def _trust(stats: Statistics) -> Image:
-    figure, (left, middle, right) = _axes(3)
+def _trust(stats: Statistics) -> bytes:
+    figure, (left, middle, right) = columns(3)
     seen = stats.visibility
     left.hist(seen, np.linspace(0, 1, BINS + 1).tolist(), color=GOOD, rwidth=0.9)
-    _titled(left, f"Visible share, {len(seen):,} objects in frames", "visible share", "number")
+    titled(left, f"Visible share, {len(seen):,} objects in frames", "visible share", "number")
     for ax, name, unit in ((middle, "sigma_mm", "mm"), (right, "sigma_deg", "deg")):
         values = np.array([getattr(o, name) for o in stats.objects], dtype=np.float64)
         known = np.isfinite(values)
@@ -139,22 +114,22 @@ def _trust(stats: Statistics) -> Image:
             ]
             ax.hist(parts, edges.tolist(), stacked=True, rwidth=0.9, label=list(VERDICTS),
                     color=[VERDICT_COLORS[v] for v in VERDICTS])  # fmt: skip
-            ax.legend(fontsize=7, frameon=False)
+            legend(ax)
         else:
             ax.text(0.5, 0.5, "not known", ha="center", transform=ax.transAxes, color=MUTED)
-        _titled(ax, "Uncertainty of the poses, 1 sigma", f"[{unit}]", "objects")
-        _counted(ax.yaxis)
-    return _picture(figure)
+        titled(ax, "Uncertainty of the poses, 1 sigma", f"[{unit}]", "objects")
+        whole_numbers(ax.yaxis)
+    return png(figure)
 
 
-def _scenes(stats: Statistics) -> Image:
-    figure, (left, middle, right) = _axes(3)
+def _scenes(stats: Statistics) -> bytes:
+    figure, (left, middle, right) = columns(3)
     counts = np.array([len(s.objects) for s in stats.sessions])
     edges = np.arange(counts.min(), counts.max() + 2) - 0.5
     left.hist(counts, edges.tolist(), color=GOOD, rwidth=0.9)
     spare = max(0.0, 0.5 * (LEAST_BINS - (edges[-1] - edges[0])))
     left.set_xlim(edges[0] - spare - 0.1, edges[-1] + spare + 0.1)
-    _titled(left, "Objects per scene", "objects", "scenes")
+    titled(left, "Objects per scene", "objects", "scenes")
     kinds = Counter({s.kind: 0 for s in stats.sessions})
     annotated = Counter(kinds)
     for s in stats.sessions:
@@ -166,11 +141,11 @@ def _scenes(stats: Statistics) -> Image:
     middle.set_xticks(list(places), list(kinds))
     middle.set_xlim(-0.5 - WIDE, len(kinds) - 0.5 + WIDE)
     middle.set_ylim(0, 1.25 * max(1, *kinds.values()))  # the legend stands above the bars
-    middle.legend(fontsize=7, frameon=False, loc="upper right", ncols=2)
-    _titled(middle, "Frames", "", "frames")
+    legend(middle, loc="upper right", ncols=2)
+    titled(middle, "Frames", "", "frames")
     verdicts = Counter(o.verdict for o in stats.objects)
     right.bar(VERDICTS, [verdicts.get(v, 0) for v in VERDICTS],
               color=[VERDICT_COLORS[v] for v in VERDICTS])  # fmt: skip
-    _titled(right, "Verdicts", "", "objects")
-    _counted(left.xaxis, left.yaxis, middle.yaxis, right.yaxis)
-    return _picture(figure)
+    titled(right, "Verdicts", "", "objects")
+    whole_numbers(left.xaxis, left.yaxis, middle.yaxis, right.yaxis)
+    return png(figure)

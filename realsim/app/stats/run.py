@@ -9,7 +9,6 @@ from typing import Any
 
 from realsim.app.console import Console
 from realsim.app.export.sources import session_folders
-from realsim.app.picture_pages import LayeredView, Layers, Section, Table, picture_page
 from realsim.app.stats import landscape
 from realsim.app.stats.collect import SessionFacts, session_facts
 from realsim.app.stats.statistics import (
@@ -25,6 +24,7 @@ from realsim.app.stats.statistics import (
     statistics_of,
 )
 from realsim.errors import InputError, RealsimError
+from realsim.pages import Page
 from realsim.store import atomic
 
 HEADER = ("property", "here", "in the paper")
@@ -160,30 +160,27 @@ def _write_all(
 def _write_page(path: Path, stats: Statistics, notes: list[str]) -> None:
     from realsim.app.stats.plots import figures
 
-    sections: list[Section] = [
-        Layers(title=caption, views=[LayeredView(layers={"": picture}, caption="")])
-        for caption, picture in figures(stats)
-    ]
-    sections += [
-        Table(title="Statistics, row by row as in the paper", header=HEADER, rows=all_rows(stats)),
-        Table(
-            title="Beside other data sets",
-            header=landscape.LANDSCAPE_HEADER,
-            rows=[*landscape.LANDSCAPE, landscape.landscape_row(stats)],
-            text=landscape.LANDSCAPE_TEXT,
-        ),
-        Table(
-            title="Grasps beside those of other data sets",
-            header=landscape.GRASPS_HEADER,
-            rows=[*landscape.GRASPS, landscape.grasps_row(stats)],
-            text=landscape.GRASPS_TEXT,
-        ),
-        Table(title="Sessions", header=SESSION_HEADER, rows=_shown(session_table(stats))),
-        Table(title="Objects", header=OBJECT_HEADER, rows=_shown(object_table(stats))),
-    ]
     frames = sum(s.frames for s in stats.sessions)
-    about = f"{_sessions(stats)}, {frames:,} frames, {stats.school.candidates:,} grasps"
-    picture_page(path, "Statistics", sections, about=about, notes=notes)
+    page = Page(
+        title="Statistics",
+        about=f"{_sessions(stats)}, {frames:,} frames, {stats.school.candidates:,} grasps",
+    )
+    for note in notes:
+        page.text(note, "note")
+    for title, picture in figures(stats):
+        page.section(title)
+        page.picture(picture, "")
+    page.section("Statistics, row by row as in the paper")
+    page.table(HEADER, all_rows(stats))
+    page.section("Beside other data sets", landscape.LANDSCAPE_TEXT)
+    page.table(landscape.LANDSCAPE_HEADER, [*landscape.LANDSCAPE, landscape.landscape_row(stats)])
+    page.section("Grasps beside those of other data sets", landscape.GRASPS_TEXT)
+    page.table(landscape.GRASPS_HEADER, [*landscape.GRASPS, landscape.grasps_row(stats)])
+    page.section("Sessions")
+    page.table(SESSION_HEADER, _shown(session_table(stats)))
+    page.section("Objects")
+    page.table(OBJECT_HEADER, _shown(object_table(stats)))
+    atomic.write_bytes(path, page.encode())
 
 
 def _shown(rows: Sequence[Sequence[Cell]]) -> list[list[str]]:

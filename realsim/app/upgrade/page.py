@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.first_surfaces import FirstSurfaces
-from realsim.app.picture_pages import PageSummary, Pair, Section, Sliders, Table, picture_page
 from realsim.app.upgrade.analytic import LEVEL_HEADER, correlation_line, level_rows
 from realsim.app.upgrade.scene import Record
 from realsim.app.upgrade.tables import (
@@ -20,13 +19,14 @@ from realsim.app.upgrade.tables import (
     summary_of,
     worst_first,
 )
+from realsim.pages import Image, Page, View
 from realsim.records import ObjectModel
 from realsim.rendering.overlay import VERDICT_RGB, draw_outlines
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore
+from realsim.store.atomic import write_bytes
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 PAGE = "upgrade.html"
 PAIRS = 60
 """Objects with pictures, the worst; a page of more is not looked at."""
@@ -49,51 +49,43 @@ def write_page(
     records: Sequence[Record],
     failed: Mapping[str, str],
     analytic: Record | None,
-) -> PageSummary:
+) -> None:
     """Write OUT/upgrade.html."""
     summary = summary_of(records)
     ranked = worst_first(objects_of(records))
     pictured = [(r, o) for r, o in ranked if o["shown"] is not None]
-    sections: list[Section] = []
+    notes = [(place, f"was left out: {why}") for place, why in failed.items()]
+    notes += [(str(r["place"]), str(note)) for r in records for note in r["notes"]]
+    page = Page(title="Upgraded data set", about=summary_line(summary))
+    for line in notes_line(notes, len(failed)):
+        page.text(line, "note")
     pairs = [_pair(out, r, o) for r, o in pictured[:PAIRS]]
     if pairs:
         more = "" if len(pairs) == len(pictured) else f" The worst {PAIRS} of {len(pictured)}."
-        sections.append(
-            Sliders(
-                title="Before and after", pairs=pairs,
-                text="Magenta and thin, on both sides of the handle: the pose as the data set has "
-                "it. Right of the handle also the refined one, in the colour of its verdict. "
-                f"Whole outlines, as if nothing stood in front. Worst first.{more}",
-            )
-        )  # fmt: skip
-    sections.append(
-        Table(
-            title="Objects", header=HEADER, rows=[row_of(r, o) for r, o in ranked[:ROWS]],
-            colors=[VERDICT_RGB.get(o["verdict"], (150, 150, 150)) for _, o in ranked[:ROWS]],
-            text="Worst first." if len(ranked) <= ROWS else
-            f"The worst {ROWS} of {len(ranked)}; upgrade.csv has all.",
+        page.section(
+            "Before and after",
+            "Magenta and thin, on both sides of the handle: the pose as the data set has it. Right "
+            "of the handle also the refined one, in the colour of its verdict. Whole outlines, as "
+            f"if nothing stood in front. Worst first.{more}",
         )
+        page.sliders(pairs)
+    shown = ranked[:ROWS]
+    worst = f"The worst {ROWS} of {len(ranked)}; upgrade.csv has all."
+    page.section("Objects", "Worst first." if len(ranked) <= ROWS else worst)
+    page.table(
+        HEADER, [row_of(r, o) for r, o in shown],
+        colors=[VERDICT_RGB.get(o["verdict"], (150, 150, 150)) for _, o in shown],
     )  # fmt: skip
     if analytic is not None:
-        rows = level_rows(analytic)
-        text = f"By the label's friction; {correlation_line(analytic)}."
-        sections.append(
-            Table(title="Analytic grasps, tried", header=LEVEL_HEADER, rows=rows, text=text)
+        page.section(
+            "Analytic grasps, tried", f"By the label's friction; {correlation_line(analytic)}."
         )
-    notes = [(place, f"was left out: {why}") for place, why in failed.items()]
-    notes += [(str(r["place"]), str(note)) for r in records for note in r["notes"]]
+        page.table(LEVEL_HEADER, level_rows(analytic))
     if notes:
-        sections.append(
-            Table(
-                title="Notes", header=["scene", "note"], rows=notes[:ROWS],
-                text="" if len(notes) <= ROWS else
-                f"The first {ROWS} of {len(notes)}; upgrade.json has all.",
-            )
-        )  # fmt: skip
-    return picture_page(
-        out / PAGE, "Upgraded data set", sections, about=summary_line(summary),
-        notes=notes_line(notes, len(failed)),
-    )  # fmt: skip
+        first = f"The first {ROWS} of {len(notes)}; upgrade.json has all."
+        page.section("Notes", "" if len(notes) <= ROWS else first)
+        page.table(["scene", "note"], notes[:ROWS])
+    write_bytes(out / PAGE, page.encode())
 
 
 def notes_line(notes: Sequence[tuple[str, str]], left_out: int) -> list[str]:
@@ -109,15 +101,15 @@ def _counted(n: int, word: str) -> str:
     return f"{n} {word}" if n == 1 else f"{n} {word}s"
 
 
-def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> Pair:
+def _pair(out: Path, record: Record, o: Mapping[str, Any]) -> View:
     """Return the two pictures of an object, drawn when the page asks for them."""
     before, after = _pictures(out, str(record["place"]), o)
-    return Pair(
-        before=before, after=after, before_label="as given", after_label="refined",
-        caption=f"{record['place']} image {o['shown']['image']}, {o['name']}: {o['verdict']}, "
+    return View(
+        f"{record['place']} image {o['shown']['image']}, {o['name']}: {o['verdict']}, "
         f"moved by {o['moved_mm']:.1f} mm and {o['moved_deg']:.1f} deg"
         + (f"; {'; '.join(o['reasons'])}" if o["reasons"] else ""),
-    )  # fmt: skip
+        {"as given": before, "refined": after},
+    )
 
 
 def _pictures(
