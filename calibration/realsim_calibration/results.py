@@ -1,16 +1,26 @@
 """What a hand-eye calibration says of itself: the estimate, every view, every check."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check, HandEye, RobotErrorMap, Target
+from realsim.records.checked_arrays import frozen
+from realsim.untrusted.own_json import Real
 
 Array = NDArray[np.float64]
 Mode = Literal["eye_in_hand", "eye_to_hand"]
+
+
+def _freeze(record: Any, **shapes: tuple[int | None, ...]) -> None:
+    """Check and freeze the arrays of a record that are there."""
+    for name, shape in shapes.items():
+        value = getattr(record, name)
+        if value is not None:
+            object.__setattr__(record, name, frozen(value, np.float64, shape, name))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -64,17 +74,24 @@ class ViewReport:
     """(n, 2) detected points [px]."""
     residuals: Array
     """(n, 2) predicted through the robot's pose minus detected [px]; (0, 2) where not used."""
-    seen_px: float
+    seen_px: Real
     """RMS of the residuals [px]; NaN where not used."""
-    unseen_px: float
+    unseen_px: Real
     """The same, predicted by the fit without this view [px]; NaN where not used."""
-    unseen_mm: float
+    unseen_mm: Real
     """Distance of the board's middle, as the camera alone sees it, from where the fit without this
     view expects it [mm]; NaN where not used."""
-    unseen_deg: float
+    unseen_deg: Real
     """Angle between the two board poses [deg]; NaN where not used."""
     robot_error: Array
     """(6,) estimated robot error right of T_base_ee, map and rest together [rad, m]."""
+
+    def __post_init__(self) -> None:
+        """Check that all points are there; freeze the arrays."""
+        for name in ("uv", "residuals"):
+            object.__setattr__(self, name, np.reshape(getattr(self, name), (-1, 2)))
+        _freeze(self, T_base_ee=(4, 4), joints=(None,), uv=(len(self.point_ids), 2),
+                robot_error=(6,))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -141,6 +158,12 @@ class HandEyeReport:
     """(29, 29) information about X (6), Z (6), the camera (12) and the board's shape (5: scale,
     aspect, warp) with the robot's map held: for the next best view. What X_covariance has beyond
     its inverse no further view lowers at once: errors of the arm that look like another X."""
+
+    def __post_init__(self) -> None:
+        """Check the arrays' shapes and freeze them."""
+        _freeze(self, X=(4, 4), Z=(4, 4), X_alone=(4, 4), Z_alone=(4, 4), X_covariance=(6, 6),
+                X_alone_covariance=(6, 6), intrinsics_covariance=(12, 12), joint_offsets=(6, 2),
+                information=(None, None))  # fmt: skip
 
     @property
     def floor_px(self) -> float:

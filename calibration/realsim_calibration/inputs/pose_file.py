@@ -10,7 +10,7 @@ import numpy as np
 
 from realsim.errors import InputError
 from realsim_calibration.inputs.columns import LABEL_NAMES, PoseTable, raw_from_table
-from realsim_calibration.inputs.natural_order import natural_key
+from realsim_calibration.inputs.pairing import natural_key
 from realsim_calibration.inputs.pose_arrays import table_from_npy, table_from_npz
 from realsim_calibration.inputs.pose_text import decoded, table_from_text
 from realsim_calibration.inputs.pose_tree import table_from_tree
@@ -77,7 +77,7 @@ def _text(path: Path) -> str:
 def _tree(path: Path) -> Any:
     """Return the tree of a JSON or YAML file."""
     text = _text(path)
-    return (loaded_json if path.suffix.lower() == ".json" else loaded_yaml)(path, text)
+    return (loaded_json if path.suffix.lower() == ".json" else loaded_yaml)(text, str(path))
 
 
 def _table(path: Path, key: str | None, tree: Any = None) -> PoseTable:
@@ -94,7 +94,7 @@ def _table(path: Path, key: str | None, tree: Any = None) -> PoseTable:
     text = _text(path)
     if re.match(r"\s*(\{|\[\s*[\[{])", text):
         try:
-            return table_from_tree(path, loaded_json(path, text), key)
+            return table_from_tree(path, loaded_json(text, str(path)), key)
         except InputError:
             if text.lstrip().startswith("{"):
                 raise

@@ -10,7 +10,7 @@ import numpy as np
 
 from realsim.errors import InputError
 from realsim_calibration.inputs.columns import ACCEPTED, LABEL_NAMES, PoseTable, role_of
-from realsim_calibration.inputs.natural_order import natural_key
+from realsim_calibration.inputs.pairing import natural_key
 from realsim_calibration.inputs.pose_text import IMAGE_ENDING, number_of
 
 _SHAPES = frozenset({(6,), (7,), (12,), (16,), (3, 4), (4, 4)})

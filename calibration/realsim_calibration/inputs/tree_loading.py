@@ -1,119 +1,82 @@
-"""Loading JSON and YAML as trees of dicts, lists and numbers; nothing of a file is executed."""
+"""JSON, YAML and OpenCV's XML as trees of dicts, lists and numbers, through the checked readers."""
 
-import json
 import re
-from pathlib import Path
 from typing import Any
 
 from realsim.errors import InputError
+from realsim.untrusted.json_text import parsed_json
+from realsim.untrusted.xml_tree import parsed_xml
+from realsim.untrusted.yaml_text import parsed_yaml
 from realsim_calibration.inputs.pose_text import number_of
 
-MAX_NUMBERS = 2_000_000
-"""Values in one file; a YAML file of a few lines can otherwise unfold to billions."""
-MAX_DEPTH = 40
-"""Levels of nesting in one file."""
+_NOT_FINITE = re.compile(
+    r"(?<=[\[,:\s])([-+]?)\.?(nan|inf(?:inity)?)(?=[\s,\]}]|\Z)", re.IGNORECASE
+)
+"""Numbers that were not measured: they become texts, which say the same and are no surprise."""
 
 
-def loaded_json(path: Path, text: str) -> Any:
-    """Return the tree of a JSON file.
-
-    Raises:
-        InputError: malformed, nested too deeply, or a key twice; the line is named.
-    """
-
-    def once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        node = dict(pairs)
-        if len(node) != len(pairs):
-            keys = [k for k, _ in pairs]
-            twice = next(k for k in keys if keys.count(k) > 1)
-            raise InputError(
-                f"{path}: the key '{twice}' stands twice in one object; one of its two values "
-                "would be lost. Give every pose a name of its own."
-            )
-        return node
-
-    try:
-        tree = json.loads(text, object_pairs_hook=once)
-    except json.JSONDecodeError as error:
-        raise InputError(
-            f"{path}, line {error.lineno}, column {error.colno}: not JSON ({error.msg}). Is the "
-            "file cut off?"
-        ) from error
-    except RecursionError as error:
-        raise InputError(f"{path} is nested too deeply to be a list of poses.") from error
-    _check_size(path, tree)
-    return _plain(path, tree)
-
-
-def loaded_yaml(path: Path, text: str) -> Any:
-    """Return the tree of a YAML file (several documents become a list), OpenCV's matrices too.
+def loaded_json(text: str, where: str) -> Any:
+    """Return the tree of a JSON text; `where` names it in messages.
 
     Raises:
-        InputError: malformed, an unknown tag, nested too deeply; the line is named.
+        InputError: malformed, nested too deeply, or a key twice.
     """
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    loader: Any = YAML(typ="safe", pure=True)
-
-    def opencv(constructor: Any, node: Any) -> Any:
-        return dict(constructor.construct_mapping(node, deep=True), type_id="opencv-matrix")
-
-    constructor: Any = type("FileStorageConstructor", (loader.Constructor,), {})
-    constructor.add_constructor("tag:yaml.org,2002:opencv-matrix", opencv)
-    loader.Constructor = constructor
-    # OpenCV writes "%YAML:1.0", which is no directive of YAML
-    text = re.sub(r"\A%YAML[^\n]*", "", text)
-    try:
-        documents = [d for d in loader.load_all(text) if d is not None]
-    except YAMLError as error:
-        mark: Any = getattr(error, "problem_mark", None)
-        at = f", line {mark.line + 1}" if mark is not None else ""
-        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-        raise InputError(f"{path}{at}: not YAML that can be read ({problem}).") from error
-    except (RecursionError, ValueError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: not YAML that can be read ({error}).") from error
-    tree = documents[0] if len(documents) == 1 else documents
-    _check_size(path, tree)
-    return _plain(path, tree)
+    return _plain(parsed_json(_NOT_FINITE.sub(r'"\1\2"', text), where), where)
 
 
-def _check_size(path: Path, tree: Any) -> None:
-    """Raise if a tree is too large or too deep; nodes that are shared count every time."""
-    count = 0
-    stack: list[tuple[Any, int]] = [(tree, 0)]
-    while stack:
-        node, depth = stack.pop()
-        count += 1
-        if depth > MAX_DEPTH or count > MAX_NUMBERS:
-            raise InputError(
-                f"{path} holds more than {MAX_NUMBERS} values or {MAX_DEPTH} levels: this is no "
-                "list of poses."
-            )
-        if isinstance(node, dict):
-            stack += [(v, depth + 1) for v in node.values()]
-        elif isinstance(node, list):
-            stack += [(v, depth + 1) for v in node]
+def loaded_yaml(text: str, where: str) -> Any:
+    """Return the tree of a YAML text (several documents become a list), OpenCV's dialect too.
+
+    Raises:
+        InputError: malformed, an unknown tag, nested too deeply.
+    """
+    # OpenCV writes "%YAML:1.0", which is no directive of YAML, and tags its matrices.
+    text = re.sub(r"\A%YAML[^\n]*", "", text).replace("!!opencv-matrix", "")
+    parts = re.split(r"(?m)^---(?=\s|$)", _NOT_FINITE.sub(r'"\1\2"', text))
+    found = (parsed_yaml(part, where) for part in parts if part.strip())
+    documents = [d for d in found if d is not None]
+    return _plain(documents[0] if len(documents) == 1 else documents, where)
 
 
-def _plain(path: Path, node: Any) -> Any:
-    """Return the tree with OpenCV's matrices as nested lists."""
+def loaded_xml(text: str, where: str) -> Any:
+    """Return the tree of OpenCV's XML.
+
+    Raises:
+        InputError: malformed, or XML of another kind.
+    """
+    root = parsed_xml(text.encode(), where)
+    if root.tag != "opencv_storage":
+        raise InputError(f"{where} is XML of the kind <{root.tag}>; OpenCV's is read.")
+    return _plain({node.tag: _of_xml(node) for node in root}, where)
+
+
+def _of_xml(node: Any) -> Any:
+    if len(node):
+        return {child.tag: _of_xml(child) for child in node}
+    words = (node.text or "").split()
+    numbers = [number_of(word) for word in words]
+    if None in numbers:
+        return (node.text or "").strip()
+    return numbers[0] if len(numbers) == 1 and node.tag != "data" else numbers
+
+
+def _plain(node: Any, where: str) -> Any:
+    """Return the tree with matrices, written as rows, cols and data, as nested lists."""
     if isinstance(node, list):
-        return [_plain(path, n) for n in node]
+        return [_plain(n, where) for n in node]
     if not isinstance(node, dict):
         return node
-    if node.get("type_id") != "opencv-matrix" and not {"rows", "cols", "dt", "data"} <= set(node):
-        return {str(k): _plain(path, v) for k, v in node.items()}
+    if not {"rows", "cols", "data"} <= set(node):
+        return {str(k): _plain(v, where) for k, v in node.items()}
     try:
-        channels = int(re.sub(r"\D", "", str(node["dt"])) or 1)
+        channels = int(re.sub(r"\D", "", str(node.get("dt", ""))) or 1)
         shape = (int(node["rows"]), int(node["cols"]) * channels)
         data = [number_of(str(v)) for v in node["data"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: an OpenCV matrix lacks rows, cols, dt or data.") from error
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{where}: rows, cols, dt or data of a matrix are no numbers.") from error
     if len(data) != shape[0] * shape[1] or None in data:
         raise InputError(
-            f"{path}: an OpenCV matrix of {shape[0]} rows and {shape[1]} columns holds "
-            f"{len(data)} values{', not all of them numbers' if None in data else ''}. Is the "
-            "file cut off?"
+            f"{where}: a matrix of {shape[0]} rows and {shape[1]} columns holds {len(data)} "
+            f"values{', not all of them numbers' if None in data else ''}. Is the file cut off?"
         )
     return [data[r * shape[1] : (r + 1) * shape[1]] for r in range(shape[0])]

@@ -1,13 +1,11 @@
-"""Text, JSON, YAML and OpenCV's XML as plain named values: safe loaders and size limits only."""
+"""The named values of a camera file, whatever text it is."""
 
-import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from realsim.errors import InputError
+from realsim.untrusted.files import checked_bytes
+from realsim_calibration.inputs.tree_loading import loaded_json, loaded_xml, loaded_yaml
 
 Fields = dict[str, Any]
 LARGEST_BYTES = 4_000_000
@@ -37,31 +35,17 @@ def read_text(path: Path) -> str:
     Raises:
         InputError: it is missing, too large, or no text.
     """
-    if not path.is_file():
-        raise InputError(f"the camera file {path} does not exist.")
-    size = path.stat().st_size
-    if size > LARGEST_BYTES:
-        raise InputError(
-            f"the camera file {path} has {size / 1e6:.1f} MB; {LARGEST_BYTES / 1e6:.0f} MB are "
-            "accepted. Is it a picture or a bag?"
-        )
-    if what := _binary_kind(path):
+    data = checked_bytes(path, LARGEST_BYTES)
+    known = next((what for magic, what in BINARY_KINDS if data.startswith(magic)), "")
+    if what := known or ("a binary file" if b"\0" in data[:HEAD_BYTES] else ""):
         raise InputError(f"{path} is {what}, no camera file. {ACCEPTED}")
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (UnicodeDecodeError, OSError) as error:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
         raise InputError(f"the camera file {path} cannot be read as text: {error}.") from error
     if not text.strip():
         raise InputError(f"the camera file {path} is empty.")
     return text
-
-
-def _binary_kind(path: Path) -> str:
-    """Return what a file is that is no text, an empty text where it may be one."""
-    with path.open("rb") as file:
-        head = file.read(HEAD_BYTES)
-    known = next((what for magic, what in BINARY_KINDS if head.startswith(magic)), "")
-    return known or ("a binary file" if b"\0" in head else "")
 
 
 def named_values(text: str, path: Path, camera_keys: tuple[str, ...]) -> Fields:
@@ -75,21 +59,10 @@ def named_values(text: str, path: Path, camera_keys: tuple[str, ...]) -> Fields:
     Raises:
         InputError: it is damaged, or is no mapping.
     """
-    start = text.lstrip()[:1]
-    try:
-        if start == "{":
-            data: Any = json.loads(text)
-        elif start == "<":
-            data = _xml(text, path)
-        elif start == "[":
-            raise InputError(f"{path} holds a list; a camera file holds named values.")
-        else:
-            data = _yaml(text, path)
-        if not isinstance(data, Mapping):
-            raise InputError(f"{path} holds no named values, so no camera.")
-        fields = _plain({str(key): value for key, value in data.items()})
-    except (ValueError, TypeError, OverflowError, RecursionError) as error:
-        raise InputError(f"the camera file {path} is damaged: {first_line(error)}") from error
+    read = {"{": loaded_json, "[": loaded_json, "<": loaded_xml}.get(text.lstrip()[:1], loaded_yaml)
+    fields = read(text, f"the camera file {path}")
+    if not isinstance(fields, dict):
+        raise InputError(f"{path} holds no named values, so no camera.")
     inner = [k for k, v in fields.items() if _has(v, camera_keys)]
     if _has(fields, camera_keys) or not inner:
         return fields
@@ -107,73 +80,3 @@ def first_line(error: Exception) -> str:
 
 def _has(value: Any, keys: tuple[str, ...]) -> bool:
     return isinstance(value, dict) and any(key in value for key in keys)
-
-
-def _plain(fields: Fields) -> Fields:
-    """Return fields with matrices written as {rows, cols, data} made arrays."""
-    plain: Fields = {}
-    for key, value in fields.items():
-        if isinstance(value, Mapping) and "data" in value:
-            data = np.array(value["data"], dtype=np.float64).ravel()
-            rows, cols = int(value.get("rows", 1)), int(value.get("cols", data.size))
-            if rows * cols != data.size:
-                raise ValueError(f"{key} claims {rows}x{cols} numbers and holds {data.size}")
-            plain[key] = data.reshape(rows, cols)
-        elif isinstance(value, Mapping):
-            plain[key] = {str(k): v for k, v in value.items()}
-            plain[key] = _plain(plain[key])
-        else:
-            plain[key] = value
-    return plain
-
-
-def _yaml(text: str, path: Path) -> Any:
-    """Return a YAML file's value; OpenCV's dialect starts with %YAML:1.0 and tags its matrices."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    lines = text.splitlines()
-    if lines[0].startswith("%YAML"):
-        lines = lines[1:]
-    lines = [line for line in lines if not line.lstrip().startswith("#")]
-    cleaned = "\n".join(lines).replace("!!opencv-matrix", "")
-    if "&" in cleaned and "*" in cleaned:
-        raise InputError(f"{path} uses YAML references, which no camera file needs.")
-    try:
-        # The safe loader makes plain values only: no tag in the file can run anything.
-        return YAML(typ="safe", pure=True).load(cleaned)
-    except YAMLError as error:
-        raise ValueError(first_line(error)) from error
-
-
-def _xml(text: str, path: Path) -> Fields:
-    """Return the matrices and numbers of OpenCV's XML."""
-    from xml.etree import ElementTree
-
-    if "<!" in text.replace("<!--", ""):
-        raise InputError(f"{path} declares XML entities, which no camera file needs.")
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ValueError(str(error)) from error
-    if root.tag != "opencv_storage":
-        raise InputError(f"{path} is XML of the kind <{root.tag}>; OpenCV's is read.")
-    return {node.tag: _xml_value(node) for node in root}
-
-
-def _xml_value(node: Any) -> Any:
-    data = node.find("data")
-    if data is not None:
-        return {
-            "rows": int(node.findtext("rows", "1")),
-            "cols": int(node.findtext("cols", "1")),
-            "data": [float(x) for x in (data.text or "").split()],
-        }
-    if len(node):
-        return {child.tag: _xml_value(child) for child in node}
-    words = (node.text or "").split()
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        return (node.text or "").strip()
-    return numbers[0] if len(numbers) == 1 else numbers

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.interop import opencv_from_colmap_px
 from realsim.records import CameraIntrinsics
-from realsim.store.records_json import intrinsics_from_json, intrinsics_to_json
+from realsim.untrusted.own_json import from_json, to_json
 from realsim_calibration.lens.camera_file_syntax import Fields, first_line, named_values, read_text
 
 Array = NDArray[np.float64]
@@ -100,6 +100,7 @@ def _first(fields: Fields, keys: tuple[str, ...]) -> Any:
 
 
 def _numbers(value: Any, name: str, path: Path) -> Array:
+    value = value.get("data") if isinstance(value, Mapping) else value
     try:
         numbers = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -220,8 +221,9 @@ def _camera(fields: Fields, path: Path, size: tuple[int, int] | None = None) -> 
     """
     if "fisheye" in fields and fields["fisheye"] not in (False, 0, "false"):
         raise InputError(f"{path} describes a fisheye lens, which the record has no place for.")
-    if {"fx", "fy", "cx", "cy", "distortion", "width", "height"} <= set(fields):
-        return intrinsics_from_json(fields)
+    own = ("width", "height", "fx", "fy", "cx", "cy", "distortion")
+    if set(own) <= set(fields):
+        return from_json({k: fields[k] for k in own}, CameraIntrinsics, f"the camera file {path}")
     if {"fx", "fy"} <= set(fields):
         center = [_first(fields, keys) for keys in (("cx", "ppx"), ("cy", "ppy"))]
         if None in center:
@@ -237,7 +239,7 @@ def _camera(fields: Fields, path: Path, size: tuple[int, int] | None = None) -> 
                 f"{path} holds no camera: neither a camera matrix ({', '.join(MATRIX_KEYS[:3])}, "
                 f"...) nor fx and fy. It holds: {', '.join(list(fields)[:12]) or 'nothing'}."
             )
-        if isinstance(value, Mapping):
+        if isinstance(value, Mapping) and "data" not in value:
             # fx fy cx cy by name; what stands beside them (size, distortion) belongs to them.
             beside = {k: v for k, v in fields.items() if k not in MATRIX_KEYS}
             named = {str(k): v for k, v in value.items()}
@@ -331,7 +333,7 @@ def write_camera(
     from realsim.store import atomic
 
     if format == "realsim":
-        atomic.write_json(path, intrinsics_to_json(intrinsics))
+        atomic.write_json(path, to_json(intrinsics))
     elif format == "ros":
         if not name.replace("_", "").replace("-", "").isalnum():
             raise InputError(f"the camera's name '{name}' may have letters, digits, _ and - only.")

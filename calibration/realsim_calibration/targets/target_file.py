@@ -7,7 +7,6 @@ optional key would silently mean its default. Files are data only, nothing in th
 """
 
 import dataclasses
-import json
 import math
 from collections.abc import Mapping
 from decimal import Decimal
@@ -23,6 +22,8 @@ from realsim.records import (
     TagBoard,
     Target,
 )
+from realsim.untrusted.json_text import read_json
+from realsim.untrusted.yaml_text import read_yaml
 from realsim_calibration.targets.marker_sets import check_markers, dictionary_name
 
 LARGEST_BYTES = 65536
@@ -296,71 +297,14 @@ def read_target(path: Path | str) -> Target:
         InputError: the file is not there, too large, not JSON or YAML, or not a target.
     """
     path = Path(path)
-    readers = {".json": _json_values, ".yaml": _yaml_values, ".yml": _yaml_values}
+    readers = {".json": read_json, ".yaml": read_yaml, ".yml": read_yaml}
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise InputError(
             f"{path}: a target file ends in {', '.join(readers)}; this one ends in '{path.suffix}'."
         )
-    text = _read_text(path)
+    values = reader(path, most_bytes=LARGEST_BYTES)
     try:
-        return target_from_json(reader(text))
-    except RecursionError:
-        raise InputError(f"{path}: the file is nested too deeply for a target.") from None
+        return target_from_json(values)
     except InputError as error:
         raise type(error)(f"{path}: {error}") from None
-
-
-def _read_text(path: Path) -> str:
-    """Return the text of a file that is small enough to be a target."""
-    try:
-        if not path.is_file():
-            raise InputError(f"{path}: there is no such file.")
-        with path.open("rb") as file:
-            data = file.read(LARGEST_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}).") from None
-    if len(data) > LARGEST_BYTES:
-        raise InputError(
-            f"{path}: a target file has at most {LARGEST_BYTES // 1024} KiB; this is another file."
-        )
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not UTF-8 text (byte {error.start}).") from None
-
-
-def _json_values(text: str) -> Any:
-    """Return the values of JSON text; NaN and a key that occurs twice are refused."""
-
-    def once(pairs: list[tuple[str, Any]]) -> Json:
-        values: Json = {}
-        for key, value in pairs:
-            if key in values:
-                raise InputError(f"the key '{key[:80]}' occurs twice.")
-            values[key] = value
-        return values
-
-    def refuse(name: str) -> Any:
-        raise InputError(f"{name} is not a number that JSON has.")
-
-    try:
-        return json.loads(text, object_pairs_hook=once, parse_constant=refuse)
-    except ValueError as error:
-        raise InputError(f"not JSON: {str(error)[:200]}") from None
-
-
-def _yaml_values(text: str) -> Any:
-    """Return the values of YAML text, by a loader that makes plain values only."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    try:
-        return YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
-        problem = getattr(error, "problem", None) or "not YAML"
-        mark = getattr(error, "problem_mark", None)
-        place = "" if mark is None else f" in line {mark.line + 1}"
-        raise InputError(f"not YAML{place}: {str(problem)[:200]}.") from None
-    except ValueError as error:
-        raise InputError(f"not YAML: {str(error)[:200]}") from None
