@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry.mesh import decimated, hull_vertices, mass_properties, welded_mesh
 from realsim.models.convex_config import ConvexConfig
-from realsim.models.convex_hulls import hull_volume
-from realsim.models.convex_obj import collision_obj, parts_from_collision_obj
+from realsim.models.convex_hulls import collision_obj, hull_volume, parts_from_collision_obj
 from realsim.models.convex_worker import decompose, light, passes, step_path
 from realsim.models.model_records import ConvexParts
 from realsim.records import Mesh

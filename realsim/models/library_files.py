@@ -19,14 +19,9 @@ from typing import Any
 
 from realsim.errors import InputError
 from realsim.formats.bop.models import INFO_FILE, model_file
-from realsim.models.library_records import (
-    PROPERTIES_FORMAT,
-    ModelProperties,
-    from_json,
-    to_json,
-)
+from realsim.models.library_records import PROPERTIES_FORMAT, ModelProperties
 from realsim.store import atomic
-from realsim.untrusted.own_json import read_object
+from realsim.untrusted.own_json import from_json, read_object, to_json
 
 NAME = re.compile(r"(?!\d+$)[A-Za-z0-9_][A-Za-z0-9_.+-]{0,79}")
 """Names become file names, and a number alone would be taken for an id."""
@@ -94,7 +89,11 @@ def read_properties(path: Path) -> ModelProperties:
             f"{path} has the format {found}; {PROPERTIES_FORMAT} is known. Was it written by a "
             "newer realsim? Otherwise restore it, or import the model again with --overwrite."
         )
-    return from_json(ModelProperties, values, str(path))
+    try:
+        return from_json(values, ModelProperties, str(path))
+    except InputError as error:
+        remedy = "Restore the file, or import the model again with --overwrite."
+        raise InputError(f"{error} {remedy}") from error
 
 
 def read_info(folder: Path) -> dict[int, dict[str, Any]]:

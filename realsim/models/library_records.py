@@ -1,15 +1,7 @@
-"""What the model library keeps of a model, and how it stands in JSON.
+"""What the model library keeps of a model; in JSON by `realsim.untrusted.own_json`."""
 
-Records become JSON objects with the names of their fields and come back by the types of their
-fields, so that a file that does not fit is named with the field that is wrong.
-"""
-
-import dataclasses
-import types
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cache
-from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +17,6 @@ from realsim.models.model_records import (
 from realsim.records import Mesh, ObjectModel, Verdict
 
 Array = NDArray[np.float64]
-T = TypeVar("T")
 PROPERTIES_FORMAT = 1
 """Of the properties files; a newer one is refused, not guessed at."""
 
@@ -152,101 +143,3 @@ class UnscaledModel:
     mesh: Mesh
     """In the file's own units, z up."""
     properties: ModelProperties
-
-
-def to_json(value: Any) -> Any:
-    """Return a record as plain JSON values."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: to_json(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, np.ndarray):
-        return cast(Any, value).tolist()
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, Mapping):
-        items = cast("Mapping[Any, Any]", value)
-        return {str(k): to_json(v) for k, v in items.items()}
-    if isinstance(value, tuple | list):
-        return [to_json(v) for v in cast("tuple[Any, ...]", value)]
-    return value
-
-
-def from_json(kind: type[T], value: Any, where: str) -> T:
-    """Return the record of this kind from the values of `to_json`.
-
-    Raises:
-        InputError: a field is missing or does not fit; `where` and the field are named.
-    """
-    return cast(T, _value(kind, value, where))
-
-
-@cache
-def _hints(kind: type[Any]) -> dict[str, Any]:
-    return get_type_hints(kind)
-
-
-def _value(kind: Any, value: Any, where: str) -> Any:  # noqa: PLR0911 - one line per kind of type
-    """Return a plain value as the type that is written at its field."""
-    origin, args = get_origin(kind), get_args(kind)
-    if kind is Any:
-        return value
-    if origin in (Union, types.UnionType):
-        return None if value is None else _value(args[0], value, where)
-    if origin is Literal:
-        return _one_of(args, value, where)
-    if origin is np.ndarray:
-        return _numbers(value, where)
-    if origin is tuple:
-        return _tuple(args, value, where)
-    if origin is dict:
-        _require(isinstance(value, dict), value, where, "an object")
-        return {k: _value(args[1], v, f"{where}.{k}") for k, v in value.items()}
-    if dataclasses.is_dataclass(kind):
-        return _record(cast("type[Any]", kind), value, where)
-    if kind is float:
-        _require(isinstance(value, int | float) and not isinstance(value, bool), value, where, kind)
-        return float(value)
-    _require(isinstance(value, kind), value, where, kind)
-    return value
-
-
-def _one_of(choices: tuple[Any, ...], value: Any, where: str) -> Any:
-    _require(value in choices, value, where, f"one of {', '.join(map(str, choices))}")
-    return value
-
-
-def _numbers(value: Any, where: str) -> Array:
-    try:
-        return np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise _misfit(value, where, "numbers") from None
-
-
-def _tuple(args: tuple[Any, ...], value: Any, where: str) -> tuple[Any, ...]:
-    _require(isinstance(value, list), value, where, "a list")
-    kinds = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
-    _require(len(kinds) == len(value), value, where, f"{len(kinds)} entries")
-    return tuple(_value(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value)))  # noqa: B905
-
-
-def _record(kind: type[Any], value: Any, where: str) -> Any:
-    _require(isinstance(value, dict), value, where, "an object")
-    given: dict[str, Any] = {}
-    for f in dataclasses.fields(kind):
-        if f.name in value:
-            given[f.name] = _value(_hints(kind)[f.name], value[f.name], f"{where}.{f.name}")
-        elif f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
-            raise InputError(f"{where} has no '{f.name}'. {_WHAT_TO_DO}")
-    return kind(**given)
-
-
-_WHAT_TO_DO = "Restore the file, or import the model again with --overwrite."
-
-
-def _require(fits: bool, value: Any, where: str, expected: Any) -> None:
-    if not fits:
-        raise _misfit(value, where, expected)
-
-
-def _misfit(value: Any, where: str, expected: Any) -> InputError:
-    name = expected if isinstance(expected, str) else f"a {expected.__name__}"
-    return InputError(f"{where} is {str(value)[:60]!r}; {name} is expected. {_WHAT_TO_DO}")

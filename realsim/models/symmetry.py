@@ -30,19 +30,22 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.models.model_records import Symmetries
 from realsim.models.symmetry_config import SymmetryConfig
-from realsim.models.symmetry_groups import POLYHEDRA, frame_about, frame_on, group, turn
 from realsim.models.symmetry_search import (
     COARSE_SCALES,
     FINE_SCALES,
+    POLYHEDRA,
     Axis,
     Fit,
     best_mirror,
     fits_of,
     found_axes,
+    frame_about,
+    frame_on,
+    group,
     moved_about,
+    turn,
 )
-from realsim.models.symmetry_surface import Surface, refinement, surface_of
-from realsim.models.symmetry_texture import texture_breaks
+from realsim.models.symmetry_surface import Surface, refinement, surface_of, texture_breaks
 from realsim.records import Mesh
 
 Array = NDArray[np.float64]

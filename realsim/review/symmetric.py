@@ -38,7 +38,7 @@ def symmetry_of(text: str, mesh: Mesh) -> tuple[Array, Axes]:
     Raises:
         InputError: the text is not understood, or the turns it names make no finite group.
     """
-    from realsim.models.symmetry_groups import closed, turn
+    from realsim.models.symmetry_search import closed, turn
 
     middle = mesh.bounds.mean(0)
     words = text.split()

@@ -11,9 +11,10 @@ from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.parts import part
 from realsim.models.library import ModelLibrary
 from realsim.models.library_prepare import PrepareConfig, prepare_mesh, prepare_unscaled
-from realsim.models.library_records import ScaleNote, to_json
+from realsim.models.library_records import ScaleNote
 from realsim.models.library_session import copy_models, known_solids
 from realsim.records import Mesh
+from realsim.untrusted.own_json import to_json
 
 BARE = PrepareConfig(with_parts=False)
 

@@ -14,7 +14,7 @@ from realsim.geometry.mesh import diameter, symmetry_transforms, transformed
 from realsim.geometry.parts import object_model, part, part_names
 from realsim.models.reading import read_scan
 from realsim.models.symmetry import SymmetryConfig, find_symmetries
-from realsim.models.symmetry_groups import closed, group, turn
+from realsim.models.symmetry_search import closed, group, turn
 from realsim.records import Mesh, ObjectModel
 from realsim.scanning.simulated import distorted
 
