@@ -1,23 +1,21 @@
-"""The stages of the loop as they run on a session: read what is there, compute, write, show.
+"""What every command knows of a session: opening it, what is current in it, its models and scene.
 
-Each stage takes its input from the session's folder and leaves its result there, so that the
-stages can be run one by one, by the demo, or again after an interruption.
+A stage takes its input from the session's folder and leaves its result there, so that the stages
+can be run one by one, by the demo, or again after an interruption. Commands import this file; it
+imports none of them.
 """
 
 import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from realsim.app.console import Console
 from realsim.errors import InputError
-from realsim.records import GraspSet, HandEye, ObjectModel, ObjectPose, Scene
+from realsim.records import ObjectModel, ObjectPose, Scene
 from realsim.store import SessionStore
 from realsim.store.opening import require_header
-
-if TYPE_CHECKING:
-    from realsim_sim_bridge.annotation.annotate import AnnotationSummary
 
 BOARD_VIEWS = "calibration/capture"
 """Where in a session the views of the tag board lie: a session of their own."""
@@ -90,59 +88,6 @@ def is_current(store: SessionStore, stage: str, key: str) -> bool:
 def mark_current(store: SessionStore, stage: str, key: str) -> None:
     """Note that this stage has been done with these inputs."""
     store.write_json(f"stages/{stage}.json", {"key": key})
-
-
-def calibrate_session(store: SessionStore, console: Console) -> HandEye:
-    """Calibrate the hand-eye from the board views and place every camera of the session.
-
-    Raises:
-        InputError: there are no board views, or no calibration/board.json.
-        DegenerateError: the views do not determine the hand-eye.
-    """
-    from realsim.app.calibrate.board_views import read_board_views, write_results
-    from realsim.store import load_hand_eye, save_hand_eye
-    from realsim_calibration import calibrate_hand_eye_report
-
-    folder = store.folder / BOARD_VIEWS
-    if not (folder / "session.json").is_file():
-        raise InputError(
-            f"session '{store.folder}' has no board views: {folder} is missing. Capture the tag "
-            "board first, or place the cameras by importing a calibration."
-        )
-    views_store = SessionStore.open(folder)
-    require_sound(views_store)
-    views = views_store.session.views
-    key = content_key(
-        folder / "robot.jsonl", store.folder / "calibration/board.json", folder / "session.json"
-    )
-    with console.stage("calibrate", f"{len(views)} board views") as tick:
-        if is_current(store, "calibrate", key):
-            hand_eye = load_hand_eye(store)
-        else:
-            seen, target, arm = read_board_views(store, views_store, tick)
-            camera = views_store.session.intrinsics
-            report = calibrate_hand_eye_report(seen, target, camera, arm=arm)
-            hand_eye = report.hand_eye
-            write_results(report, seen, store, views_store)
-            save_hand_eye(store, hand_eye)
-        place_cameras(store, hand_eye)
-        mark_current(store, "calibrate", key)
-    return hand_eye
-
-
-def place_cameras(store: SessionStore, hand_eye: HandEye) -> None:
-    """Write T_world_cam for every view that has a robot pose, robot errors corrected.
-
-    Cameras that a registration has refined stay refined where the calibration says the same again.
-    """
-    from realsim.app.register.results import keep_refined
-
-    cameras = {
-        v.index: hand_eye.camera_poses(v.T_base_ee, v.joints)
-        for v in store.session.views
-        if v.T_base_ee is not None
-    }
-    store.set_cameras(hand_eye.intrinsics, keep_refined(store, cameras))
 
 
 def save_starts(store: SessionStore, starts: Sequence[ObjectPose], source: str) -> None:
@@ -233,81 +178,3 @@ def registered_views(store: SessionStore) -> list[int] | None:
     if not excluded:
         return None
     return [v.index for v in store.session.views if v.index not in excluded]
-
-
-def school_session(
-    store: SessionStore,
-    console: Console,
-    *,
-    grasps_per_object: int,
-    seed: int = 0,
-    workers: int = 2,
-) -> list[GraspSet]:
-    """Try grasps on every registered object in the Robot School and keep them in the session.
-
-    Models that came from a library bring their convex parts, mass, centre of mass and inertia; they
-    are taken as long as the session's mesh is the one they were computed of. Of other models the
-    School makes the parts itself, and takes the mass from the mesh and its density.
-
-    Raises:
-        InputError: the session has not been registered, or has no supporting plane, or holds
-            unfinished results of other parameters.
-    """
-    from realsim.app.school.inputs import SchoolRequest
-    from realsim.app.school.run import run_in_session
-
-    request = SchoolRequest(
-        grasps=grasps_per_object, seed=seed, workers=workers, restart="finished"
-    )
-    return run_in_session(store, request, console).sets
-
-
-def annotate_session(
-    store: SessionStore,
-    console: Console,
-    *,
-    maps: str = "",
-    workers: int = 1,
-    check_depth: bool = True,
-) -> "AnnotationSummary":
-    """Write masks, poses, visibility and grasps of every frame that the objects are registered in.
-
-    Args:
-        store: the session.
-        console: where progress is shown.
-        maps: 'all', 'none' or a list of maps; '' = instances and exact depth.
-        workers: processes that compute frames.
-        check_depth: whether what the measured depth shows in front of an object leaves its mask.
-
-    Raises:
-        InputError: the session has not been registered, or there is no such map.
-    """
-    from realsim.app.annotate.current import grasps_of_scene
-    from realsim.store import load_grasps
-    from realsim_sim_bridge.annotation.annotate import annotate
-    from realsim_sim_bridge.annotation.config import (
-        DEFAULT_MAPS,
-        AnnotationConfig,
-        OccluderConfig,
-        maps_of,
-    )
-    from realsim_sim_bridge.synthetic.labelling import exact_annotation
-    from realsim_sim_bridge.synthetic.surroundings import load_surroundings
-
-    chosen = maps_of(maps) if maps else DEFAULT_MAPS
-    config = AnnotationConfig(maps=chosen, occluder=OccluderConfig(is_on=check_depth))
-    surroundings = load_surroundings(store)
-    if surroundings is not None:  # a synthetic session: everything is known
-        config = exact_annotation(chosen)
-    damaged = require_sound(store)
-    scene = judged_scene(store)
-    models = session_models(store, console)
-    sets = load_grasps(store.folder / "grasps")
-    grasps = grasps_of_scene(store, scene, sets, console)
-    only = registered_views(store)
-    n = len(store.session.views) if only is None else len(only)
-    with console.stage("annotate", f"{n} frames") as tick:
-        return annotate(
-            store, scene, models, grasps, config,
-            only=only, progress=tick, workers=workers, surroundings=surroundings, damaged=damaged,
-        )  # fmt: skip

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from realsim.app import cli, stages
+from realsim.app import cli
+from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
 from realsim.app.register.run import register_session
+from realsim.app.school.run import school_session
 from realsim.errors import RealsimError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
@@ -212,10 +214,10 @@ def _reviewed_session_follows_the_reviewer(store: SessionStore) -> None:
     console = Console(quiet=True)
     reviewed = ReviewedSession(store)
     reviewed.decide("reject", reviewed.standing.scene.object(0), "anna", comment="wrong side up")
-    sets = stages.school_session(store, console, grasps_per_object=4, workers=1)
+    sets = school_session(store, console, grasps_per_object=4, workers=1)
     assert [s.instance for s in sets] == [1]
     assert [p.name for p in (store.folder / "grasps").glob("*.npz")] == ["000001_obj000008.npz"]
-    stages.annotate_session(store, console)
+    annotate_session(store, console)
     assert [row["obj_id"] for row in store.read_json("scene_gt.json")["3"]] == [8]
     assert len(list((store.folder / "mask").glob("*.png"))) == 1
     assert store.verify() == []

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from realsim.app import stages
+from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
 from realsim.app.register.run import register_session
 from realsim.errors import InputError, UnitError
@@ -62,7 +63,7 @@ def test_a_changed_capture_is_refused_even_after_it_was_registered(
     else:
         store.path("rgb/000003.png").unlink()
     again = SessionStore.open(store.folder)
-    for stage in (register_session, stages.annotate_session):
+    for stage in (register_session, annotate_session):
         with pytest.raises(InputError, match="not as it was captured"):
             stage(again, QUIET)
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from realsim.app.annotate.current import annotate_session
 from realsim.app.cli import commands
 from realsim.app.console import Console
-from realsim.app.stages import annotate_session
 from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_group import read_grasp_group
 from realsim.formats.grasps.acronym import read_acronym

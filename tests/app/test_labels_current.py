@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim.app import stages
-from realsim.app.annotate.current import refresh_labels, what_is_stale
+from realsim.app.annotate.current import annotate_session, refresh_labels, what_is_stale
 from realsim.app.console import Console
 from realsim.app.export.request import ExportRequest
 from realsim.app.export.run import run_export
@@ -29,7 +28,7 @@ def labelled(tmp_path_factory: pytest.TempPathFactory) -> Path:
         store,
         Scene(name="s", objects=tuple(true_poses()), plane=SupportPlane(T_world_table=np.eye(4))),
     )
-    stages.annotate_session(store, QUIET, maps="instance")
+    annotate_session(store, QUIET, maps="instance")
     return store.folder
 
 

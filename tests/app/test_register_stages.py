@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
 from realsim.app.register.colour import colour_remark
 from realsim.app.register.files import documents, remark_of, write_result
 from realsim.app.register.results import NEXT_FILE, SCENE_FILE, cameras_now
 from realsim.app.register.tables import as_json, odometry_line
 from realsim.app.report.session import write_report
-from realsim.app.stages import annotate_session, judged_scene, registered_views
+from realsim.app.stages import judged_scene, registered_views
 from realsim.app.upgrade.scene import registration_notes  # pyright: ignore[reportPrivateUsage]
 from realsim.records import CaptureSession, Mesh, View
 from realsim.registration.odometry.cross_check import Fault, KinematicsCheck, ViewDifference

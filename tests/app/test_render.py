@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from realsim import CameraIntrinsics, InputError, Mesh
+from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
 from realsim.app.render.cli import render_command
 from realsim.app.render.compare import label_ids, rim_distances_px
@@ -15,7 +16,6 @@ from realsim.app.render.light import linear_of, matched_look, neutral_environmen
 from realsim.app.render.request import RenderRequest, camera_of, radius_of, resized, size_of
 from realsim.app.render.run import notes_of, run_render
 from realsim.app.render.scene import table_top_m, twin_scene
-from realsim.app.stages import annotate_session
 from realsim.geometry import camera, se3
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from realsim.app.annotate.current import annotate_session
 from realsim.app.cli import commands
 from realsim.app.console import Console
-from realsim.app.stages import annotate_session, open_session
+from realsim.app.stages import open_session
 from realsim.app.stats.collect import session_facts
 from realsim.app.stats.landscape import LANDSCAPE_HEADER
 from realsim.app.stats.run import document_of

@@ -1,19 +1,72 @@
-"""Whether a session's labels are those of its scene as it is reviewed, and new ones if not."""
+"""The labels of a session, whether they are those of its scene as reviewed, and new ones if not."""
 
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from realsim.app.console import Console
-from realsim.app.stages import annotate_session, judged_scene, registered_views
+from realsim.app.stages import judged_scene, registered_views, require_sound, session_models
 from realsim.records import GraspSet, ObjectPose, Scene
 from realsim.store import SessionStore
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.annotation.annotate import AnnotationSummary
 
 OBJECTS_FILE = "annotations/objects.json"
 SAME = 1e-9
 """Greatest difference of the numbers of two poses that are one."""
+
+
+def annotate_session(
+    store: SessionStore,
+    console: Console,
+    *,
+    maps: str = "",
+    workers: int = 1,
+    check_depth: bool = True,
+) -> "AnnotationSummary":
+    """Write masks, poses, visibility and grasps of every frame that the objects are registered in.
+
+    Args:
+        store: the session.
+        console: where progress is shown.
+        maps: 'all', 'none' or a list of maps; '' = instances and exact depth.
+        workers: processes that compute frames.
+        check_depth: whether what the measured depth shows in front of an object leaves its mask.
+
+    Raises:
+        InputError: the session has not been registered, or there is no such map.
+    """
+    from realsim.store import load_grasps
+    from realsim_sim_bridge.annotation.annotate import annotate
+    from realsim_sim_bridge.annotation.config import (
+        DEFAULT_MAPS,
+        AnnotationConfig,
+        OccluderConfig,
+        maps_of,
+    )
+    from realsim_sim_bridge.synthetic.labelling import exact_annotation
+    from realsim_sim_bridge.synthetic.surroundings import load_surroundings
+
+    chosen = maps_of(maps) if maps else DEFAULT_MAPS
+    config = AnnotationConfig(maps=chosen, occluder=OccluderConfig(is_on=check_depth))
+    surroundings = load_surroundings(store)
+    if surroundings is not None:  # a synthetic session: everything is known
+        config = exact_annotation(chosen)
+    damaged = require_sound(store)
+    scene = judged_scene(store)
+    models = session_models(store, console)
+    sets = load_grasps(store.folder / "grasps")
+    grasps = grasps_of_scene(store, scene, sets, console)
+    only = registered_views(store)
+    n = len(store.session.views) if only is None else len(only)
+    with console.stage("annotate", f"{n} frames") as tick:
+        return annotate(
+            store, scene, models, grasps, config,
+            only=only, progress=tick, workers=workers, surroundings=surroundings, damaged=damaged,
+        )  # fmt: skip
 
 
 def is_annotated(store: SessionStore) -> bool:

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.app.annotate.current import annotate_session
 from realsim.app.annotate.page import write_page
 from realsim.app.annotate.table import HEADER, object_row
 from realsim.app.console import Console
 from realsim.app.stages import (
-    annotate_session,
     judged_scene,
     open_session,
     registered_views,

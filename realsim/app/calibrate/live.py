@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from realsim.app.calibrate.folder import FolderRequest, target_of, write_calibration
-from realsim.app.calibrate.run import report_document, show_report
+from realsim.app.calibrate.show import report_document, show_report
 from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim_calibration import (

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from realsim.app.calibrate.run import show_hand_eye
+from realsim.app.annotate.current import annotate_session
+from realsim.app.calibrate.session import calibrate_session
+from realsim.app.calibrate.show import show_hand_eye
 from realsim.app.console import Console, StageTime
 from realsim.app.register.run import register_session
+from realsim.app.school.run import school_session
 from realsim.app.show import show_grasps, show_scene
 from realsim.app.stages import (
     BOARD_VIEWS,
-    annotate_session,
-    calibrate_session,
     save_starts,
-    school_session,
 )
 from realsim.errors import InputError
 from realsim.records import CaptureSession, GraspSet, HandEye, Scene

@@ -4,30 +4,28 @@ import contextlib
 import shutil
 import tempfile
 from collections.abc import Generator
-from dataclasses import replace
 from pathlib import Path
 
 from realsim.app.console import Console
-from realsim.app.importing.source import ImportRequest
 
 ARCHIVES = (".zip", ".tar", ".tar.gz", ".tgz")
 
 
 @contextlib.contextmanager
-def unpacked(request: ImportRequest, out: Path, console: Console) -> Generator[ImportRequest]:
-    """Yield the request; of an archive, with what was in it for the time being."""
+def unpacked(source: Path, out: Path, console: Console) -> Generator[Path]:
+    """Yield what is imported; of an archive, what was in it for the time being."""
     from realsim.untrusted.archives import extract
 
-    if not is_archive(request.source):
-        yield request
+    if not is_archive(source):
+        yield source
         return
     out.parent.mkdir(parents=True, exist_ok=True)
     room = shutil.disk_usage(out.parent).free / 2
     # Beside the session: there is room for the images, a system's /tmp may be small.
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as place:
-        console.say(f"{request.source} is an archive: unpacking it beside {out}.")
-        extract(request.source, Path(place) / "content", most_bytes=room)
-        yield replace(request, source=content_of(Path(place) / "content"))
+        console.say(f"{source} is an archive: unpacking it beside {out}.")
+        extract(source, Path(place) / "content", most_bytes=room)
+        yield content_of(Path(place) / "content")
 
 
 def is_archive(path: Path) -> bool:

@@ -154,7 +154,8 @@ def run_import(
 
     if out.resolve() == request.source.resolve():
         raise InputError(f"{out} is the source itself: give another folder for the session.")
-    with unpacked(request, out, console) as given:
+    with unpacked(request.source, out, console) as place:
+        given = replace(request, source=place)
         source = open_source(given, console)
         labels = None if request.no_labels else labels_of(given, source)
         summary = import_session(source, out, console, overwrite=overwrite)

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.first_surfaces import FirstSurfaces
-from realsim.app.register.pictures import placed_objects
 from realsim.app.register.results import Registered
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel
 from realsim.rendering.overlay import contact_sheet, draw_outlines
+from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore
 
 Array = NDArray[np.float64]
@@ -28,6 +28,13 @@ class GainConfig:
     """Side of the part of a photograph that shows what cameras gained [px]."""
     zoom: int = 16
     """By which it is enlarged: one pixel is then as wide as a hand-drawn line."""
+
+
+def placed_objects(result: Registered, models: Mapping[int, ObjectModel]) -> list[PlacedMesh]:
+    """Return the objects as they stand in world."""
+    return [
+        PlacedMesh(o.instance, models[o.obj_id].mesh, o.T_world_obj) for o in result.scene.objects
+    ]
 
 
 def camera_shifts_px(

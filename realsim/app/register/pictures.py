@@ -82,7 +82,7 @@ def draw_pictures(
         models: obj_id -> model.
         config: how they are drawn.
     """
-    from realsim.app.register.gain import gain_picture
+    from realsim.app.register.gain import gain_picture, placed_objects
     from realsim.app.register.map import map_png
 
     config = config or PictureConfig()
@@ -109,13 +109,6 @@ def spread_views(result: Registered, n: int) -> list[int]:
     views = sorted(result.cameras.refined)
     pick = np.unique(np.linspace(0, len(views) - 1, min(n, len(views))).round().astype(int))
     return [views[k] for k in pick]
-
-
-def placed_objects(result: Registered, models: Mapping[int, ObjectModel]) -> list[PlacedMesh]:
-    """Return the objects as they stand in world."""
-    return [
-        PlacedMesh(o.instance, models[o.obj_id].mesh, o.T_world_obj) for o in result.scene.objects
-    ]
 
 
 def window_of(ids: Ids, config: PictureConfig) -> Window:

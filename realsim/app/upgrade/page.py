@@ -13,6 +13,7 @@ from realsim.app.upgrade.analytic import LEVEL_HEADER, correlation_line, level_r
 from realsim.app.upgrade.scene import Record
 from realsim.app.upgrade.tables import (
     HEADER,
+    PAGE,
     objects_of,
     row_of,
     summary_line,
@@ -27,7 +28,6 @@ from realsim.store import SessionStore
 from realsim.store.atomic import write_bytes
 
 Array = NDArray[np.float64]
-PAGE = "upgrade.html"
 PAIRS = 60
 """Objects with pictures, the worst; a page of more is not looked at."""
 ROWS = 400

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from realsim import __version__, images
+from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console, Tick
 from realsim.app.register.run import register_session
+from realsim.app.school.run import school_session
 from realsim.app.show import why_no_grasp
-from realsim.app.stages import annotate_session, save_starts, school_session
+from realsim.app.stages import save_starts
 from realsim.app.upgrade.analytic import AnalyticJob, agreement_of, try_analytic
 from realsim.app.upgrade.config import UpgradeConfig
 from realsim.app.upgrade.dataset import SceneRef, open_scene

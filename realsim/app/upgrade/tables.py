@@ -24,6 +24,7 @@ COLUMNS = (
     "scene", "instance", "obj_id", "name", "verdict", "agree", "probability", "moved_mm",
     "moved_deg", "candidates", "tried", "good", "reasons",
 )  # fmt: skip
+PAGE = "upgrade.html"
 HEADER = ["scene, object", "verdict", "agrees", "moved [mm]", "turned [deg]", "good grasps"]
 MOST_ROWS = 60
 """Objects in the console's table, worst first where there are more; upgrade.csv has all."""
@@ -118,8 +119,6 @@ def write_tables(
 
 def show_upgrade(result: "UpgradeResult", console: Console) -> None:
     """Print one table over all scenes, the notes, and where pictures and tables are."""
-    from realsim.app.upgrade.page import PAGE
-
     objects = objects_of(result.scenes)
     shown = objects if len(objects) <= MOST_ROWS else worst_first(objects)[:MOST_ROWS]
     console.table("Upgraded scenes", HEADER, [row_of(r, o) for r, o in shown])

@@ -109,7 +109,7 @@ def test_the_session_is_sound_and_the_school_opens_it(written):
 
 
 def test_the_label_transfer_of_real_sessions_opens_it(written, tmp_path):
-    from realsim.app.stages import annotate_session
+    from realsim.app.annotate.current import annotate_session
 
     write(tmp_path / "s", 1)
     store = SessionStore.open(tmp_path / "s")

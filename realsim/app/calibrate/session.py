@@ -1,4 +1,4 @@
-"""The hand-eye of a session that has board views only: known before the board is taken away."""
+"""The hand-eye of a session, also of one with board views only: before the board is taken away."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,13 +6,66 @@ from typing import Any
 
 from realsim.app.calibrate.board_views import read_board_views, write_results
 from realsim.app.console import Console
-from realsim.app.stages import BOARD_VIEWS, require_sound
+from realsim.app.stages import BOARD_VIEWS, content_key, is_current, mark_current, require_sound
+from realsim.errors import InputError
 from realsim.records import HandEye
 from realsim.store import SessionStore
 from realsim.store.atomic import json_bytes, write_bytes
 from realsim.store.results import HAND_EYE_FILE, hand_eye_to_json
 from realsim.store.session_check import is_session
 from realsim.untrusted.own_json import read_values
+
+
+def calibrate_session(store: SessionStore, console: Console) -> HandEye:
+    """Calibrate the hand-eye from the board views and place every camera of the session.
+
+    Raises:
+        InputError: there are no board views, or no calibration/board.json.
+        DegenerateError: the views do not determine the hand-eye.
+    """
+    from realsim.store import load_hand_eye, save_hand_eye
+    from realsim_calibration import calibrate_hand_eye_report
+
+    folder = store.folder / BOARD_VIEWS
+    if not (folder / "session.json").is_file():
+        raise InputError(
+            f"session '{store.folder}' has no board views: {folder} is missing. Capture the tag "
+            "board first, or place the cameras by importing a calibration."
+        )
+    views_store = SessionStore.open(folder)
+    require_sound(views_store)
+    views = views_store.session.views
+    key = content_key(
+        folder / "robot.jsonl", store.folder / "calibration/board.json", folder / "session.json"
+    )
+    with console.stage("calibrate", f"{len(views)} board views") as tick:
+        if is_current(store, "calibrate", key):
+            hand_eye = load_hand_eye(store)
+        else:
+            seen, target, arm = read_board_views(store, views_store, tick)
+            camera = views_store.session.intrinsics
+            report = calibrate_hand_eye_report(seen, target, camera, arm=arm)
+            hand_eye = report.hand_eye
+            write_results(report, seen, store, views_store)
+            save_hand_eye(store, hand_eye)
+        place_cameras(store, hand_eye)
+        mark_current(store, "calibrate", key)
+    return hand_eye
+
+
+def place_cameras(store: SessionStore, hand_eye: HandEye) -> None:
+    """Write T_world_cam for every view that has a robot pose, robot errors corrected.
+
+    Cameras that a registration has refined stay refined where the calibration says the same again.
+    """
+    from realsim.app.register.results import keep_refined
+
+    cameras = {
+        v.index: hand_eye.camera_poses(v.T_base_ee, v.joints)
+        for v in store.session.views
+        if v.T_base_ee is not None
+    }
+    store.set_cameras(hand_eye.intrinsics, keep_refined(store, cameras))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -1,0 +1,98 @@
+"""A calibration told: as tables on the console, and as values for `--json`."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from realsim.app.console import Console
+from realsim.errors import RealsimError
+from realsim.geometry import se3
+from realsim.records import Check, HandEye
+from realsim_calibration import HandEyeReport
+
+NEXT_VIEWS = 3
+"""Further views that are proposed."""
+ORDER = ("bad", "warn", "unknown", "good")
+
+
+def report_document(
+    report: HandEyeReport, checks: Sequence[Check], files: Sequence[Path]
+) -> dict[str, object]:
+    """Return what a program wants to know of a calibrated folder, for `--json`."""
+    from realsim.store.records_json import check_to_json, intrinsics_to_json
+
+    in_hand = report.mode == "eye_in_hand"
+    return {
+        "passed": not any(c.verdict == "bad" for c in checks),
+        "mode": report.mode,
+        "T_ee_cam" if in_hand else "T_base_cam": report.X,
+        "T_base_board" if in_hand else "T_ee_board": report.Z,
+        "sigma_mm": report.sigma_mm,
+        "sigma_deg": report.sigma_deg,
+        "covariance": report.X_covariance,
+        "held_out_px": report.held_out_px,
+        "held_out_mm": report.held_out_mm,
+        "held_out_deg": report.held_out_deg,
+        "intrinsics": intrinsics_to_json(report.intrinsics),
+        "view_indices": [v.index for v in report.used],
+        "rejected": report.rejected,
+        "checks": [check_to_json(c) for c in checks],
+        "files": files,
+    }
+
+
+def show_hand_eye(hand_eye: HandEye, console: Console) -> None:
+    """Print the hand-eye of a session and what speaks for it."""
+    t, w = hand_eye.T_ee_cam[:3, 3] * 1e3, np.degrees(se3.log_so3(hand_eye.T_ee_cam[:3, :3]))
+    rows = [
+        ["camera in tool, translation [mm]", " ".join(f"{v:.2f}" for v in t)],
+        ["camera in tool, rotation vector [deg]", " ".join(f"{v:.3f}" for v in w)],
+        ["1 sigma (worst axis)", f"{hand_eye.sigma_mm:.3f} mm / {hand_eye.sigma_deg:.4f} deg"],
+        ["reprojection of held-out views", f"{hand_eye.held_out_px:.3f} px"],
+        ["views used / rejected", f"{len(hand_eye.view_indices)} / {len(hand_eye.rejected)}"],
+    ]
+    console.table("Hand-eye calibration", ["", "value"], rows)
+    for index, reason in hand_eye.rejected:
+        console.warn(f"board view {index} was not used: {reason}")
+    show_checks([c for c in hand_eye.checks if c.verdict != "good"], console)
+
+
+def show_report(report: HandEyeReport, checks: Sequence[Check], console: Console) -> None:
+    """Print a calibration: figures, every check, every dropped view."""
+    from realsim_calibration.report import summary_rows
+
+    console.table("Calibration", ["", "value"], [list(row) for row in summary_rows(report)])
+    show_checks(checks, console)
+    for view in report.views:
+        if not view.used:
+            console.warn(f"{view.label} was not used: {view.reason}")
+
+
+def show_next_views(report: HandEyeReport, console: Console) -> None:
+    """Print the views that would lower the uncertainty most."""
+    from realsim_calibration import choose_next_views
+    from realsim_calibration.planning.view_proposals import propose_views
+
+    try:
+        views = choose_next_views(report, propose_views(report), NEXT_VIEWS)
+    except RealsimError:
+        return  # a calibration that is this poor has said so in its checks
+    rows = [
+        [
+            f"{k + 1}", f"{100 * v.distance_m:.0f} cm", f"{v.tilt_deg:.0f} deg",
+            f"{v.roll_deg:+.0f} deg", f"{v.sigma_mm:.2f} mm / {v.sigma_deg:.3f} deg",
+        ]
+        for k, v in enumerate(views)
+    ]  # fmt: skip
+    header = ["view", "distance", "tilt", "roll in the image", "sigma expected then"]
+    console.table("Further views that would help most, in this order", header, rows)
+
+
+def show_checks(checks: Sequence[Check], console: Console) -> None:
+    """Print checks, the worst first."""
+    if not checks:
+        return
+    ordered = sorted(checks, key=lambda c: ORDER.index(c.verdict))
+    rows = [[c.name, c.verdict, f"{c.sentence} {c.advice}".strip()] for c in ordered]
+    console.table("Checks", ["check", "verdict", "what was found"], rows)
