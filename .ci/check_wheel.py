@@ -21,7 +21,7 @@ from importlib.resources import files
 assert (files("realsim.app") / "report_page.html").is_file()
 from realsim.interop import import_open3d, import_pyrealsense2
 import_open3d(); import_pyrealsense2()
-from realsim_capture_plans.plan_files.shipped_plans import shipped_plan
+from realsim_capture_plans.plan_files.plan_json import shipped_plan
 assert len(shipped_plan("ur5_d405_hemisphere_256")) == 256
 print("isolated install works")
 """

@@ -35,7 +35,7 @@ from realsim_capture_plans.capturing.contact_sheet import Thumbnails
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import Frame
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
-from realsim_capture_plans.lab.arm import HOME
+from realsim_capture_plans.lab.devices import HOME
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 PACKAGES = ("realsim", "numpy", "opencv-python-headless")

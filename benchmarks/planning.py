@@ -107,7 +107,7 @@ def greedy_ring_seconds(plan: CapturePlan, *, free_radius: bool) -> float:
         if len(near) == 0:  # none of these rolls is free: what the plan found
             near = plan.joints[view][None]
         gaps = np.abs(near - here).max(-1)
-        total += float(move_seconds(gaps.min(), plan.config))
+        total += float(move_seconds(gaps.min(), plan.config.speed, plan.config.acceleration))
         here = near[int(np.argmin(gaps))]
     return total
 

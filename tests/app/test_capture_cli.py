@@ -21,7 +21,7 @@ from realsim_capture_plans.capturing.contact_sheet import SheetConfig, contact_s
 from realsim_capture_plans.capturing.log import CaptureLog
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
-from realsim_capture_plans.lab.arm import HOME
+from realsim_capture_plans.lab.devices import HOME
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from typed_commands import realsim

@@ -15,7 +15,7 @@ from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
 from realsim_capture_plans.arms.kinematics import UR5, UR5E
 from realsim_capture_plans.collision.mount import d405_mount
-from realsim_capture_plans.plan_files.graspnet import table_frame
+from realsim_capture_plans.plan_files.exported import table_frame
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 

@@ -32,10 +32,10 @@ from realsim_capture_plans.capturing.capture import (
     dry_run,
 )
 from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
-from realsim_capture_plans.capturing.settle import SettleConfig
+from realsim_capture_plans.capturing.look import SettleConfig
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, DeviceError, Frame
-from realsim_capture_plans.lab.arm import HOME
+from realsim_capture_plans.lab.devices import HOME
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 

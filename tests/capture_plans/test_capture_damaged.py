@@ -12,10 +12,10 @@ from realsim.store import SessionStore
 from realsim.store.begun import BEGUN_FILE
 from realsim.store.session_repair import repair_session
 from realsim_capture_plans.capturing.capture import CaptureConfig, CaptureJob, capture
+from realsim_capture_plans.capturing.look import SettleConfig
 from realsim_capture_plans.capturing.run import CaptureSummary
-from realsim_capture_plans.capturing.settle import SettleConfig
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
-from realsim_capture_plans.plan_files.shipped_plans import resolve_plan
+from realsim_capture_plans.plan_files.plan_json import resolve_plan
 from realsim_capture_plans.planning.record import CapturePlan
 
 QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))

@@ -12,9 +12,9 @@ from realsim_capture_plans.capturing.checks import (
     check_sharpness,
     sharpness,
 )
-from realsim_capture_plans.capturing.settle import SettleConfig, until_still
+from realsim_capture_plans.capturing.look import SettleConfig, until_still
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError
-from realsim_capture_plans.lab.arm import HOME, SimulatedArm
+from realsim_capture_plans.lab.devices import HOME, SimulatedArm
 
 
 class RingingArm(SimulatedArm):

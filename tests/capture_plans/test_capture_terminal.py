@@ -25,10 +25,10 @@ from realsim.store import SessionStore
 from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.capturing.capture import CaptureJob, capture
 from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
-from realsim_capture_plans.capturing.terminal import TerminalOperator
+from realsim_capture_plans.capturing.operator import TerminalOperator
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import DeviceError, Frame
-from realsim_capture_plans.lab.arm import HOME, SimulatedArm
+from realsim_capture_plans.lab.devices import HOME, SimulatedArm
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 VIEWS = 40

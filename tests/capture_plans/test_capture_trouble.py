@@ -28,13 +28,12 @@ from realsim_capture_plans.capturing.capture import (
 )
 from realsim_capture_plans.capturing.contact_sheet import SHEET_FILE, write_contact_sheet
 from realsim_capture_plans.capturing.log import CaptureLog
+from realsim_capture_plans.capturing.look import SettleConfig
 from realsim_capture_plans.capturing.operator import CaptureStatus, Command, NoOperator
-from realsim_capture_plans.capturing.settle import SettleConfig
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError, Frame, Stop
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
-from realsim_capture_plans.lab.arm import HOME, SimulatedArm
-from realsim_capture_plans.lab.camera import SimulatedDepthCamera
+from realsim_capture_plans.lab.devices import HOME, SimulatedArm, SimulatedDepthCamera
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 Array = NDArray[np.float64]

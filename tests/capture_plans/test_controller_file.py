@@ -212,11 +212,11 @@ def test_damaged_files_are_named(text: str, says: str, tmp_path: Path) -> None:
 
 
 def test_files_that_are_none(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no file at"):
+    with pytest.raises(InputError, match="does not exist"):
         read_controller_calibration(tmp_path / "nowhere.conf", UR5)
     (tmp_path / "packed").write_bytes(b"\x1f\x8b\xff\xfe" * 100)
-    with pytest.raises(InputError, match="not a text file"):
+    with pytest.raises(InputError, match="not UTF-8"):
         read_controller_calibration(tmp_path / "packed", UR5)
     (tmp_path / "large").write_bytes(b" " * 1_000_001)
-    with pytest.raises(InputError, match="bytes"):
+    with pytest.raises(InputError, match="MB"):
         read_controller_calibration(tmp_path / "large", UR5)

@@ -117,7 +117,7 @@ def test_a_missing_broken_or_foreign_truth_is_refused(tmp_path):
     with pytest.raises(InputError, match="there is no truth"):
         load_truth(tmp_path)
     (tmp_path / "truth.json").write_text("{")
-    with pytest.raises(InputError, match="not JSON"):
+    with pytest.raises(InputError, match="not valid JSON"):
         load_truth(tmp_path)
     (tmp_path / "truth.json").write_text(json.dumps({"version": 99}))
     with pytest.raises(InputError, match="version"):

@@ -11,16 +11,14 @@ from hypothesis import strategies as st
 from realsim.errors import InputError, RealsimError, UnitError
 from realsim.geometry import se3
 from realsim_capture_plans.arms.kinematics import UR5
-from realsim_capture_plans.collision.model import CollisionModel
-from realsim_capture_plans.collision.mount import (
-    CAMERA_BODIES,
-    d405_mount,
-    plain_bracket,
+from realsim_capture_plans.collision.cell_files import (
     read_mount,
+    read_work_cell_obstacles,
     write_mount,
 )
+from realsim_capture_plans.collision.model import CollisionModel
+from realsim_capture_plans.collision.mount import CAMERA_BODIES, d405_mount, plain_bracket
 from realsim_capture_plans.collision.shapes import Box, Mount, Shape, WorkCell
-from realsim_capture_plans.collision.work_cell_file import read_work_cell_obstacles
 
 CELL = WorkCell(
     table=Box(lower=(-0.6, -0.8, -np.inf), upper=(1.0, 0.8, 0.0)),
@@ -195,8 +193,8 @@ def test_the_plain_bracket_joins_flange_and_camera(at: list[float], camera: str)
     """It touches the flange's face and the camera, in one piece, without entering the wrist."""
     import coal
 
-    from realsim_capture_plans.collision.camera_bodies import camera_shape
     from realsim_capture_plans.collision.coal_geometry import coal_shape
+    from realsim_capture_plans.collision.mount import camera_shape
 
     T = se3.from_translation(at)
     mount = Mount(name="m", camera=camera, T_ee_cam=T, bracket=plain_bracket(T, camera))

@@ -5,11 +5,12 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 
-from realsim_capture_plans.planning.bounds import held_karp_bound, two_nearest_bound
 from realsim_capture_plans.planning.ordering import Clusters, move_seconds, tour, tour_seconds
 from realsim_capture_plans.planning.record import PlanConfig
+from realsim_capture_plans.planning.tour_search import held_karp_bound, two_nearest_bound
 
 CONFIG = PlanConfig()
+PACE = CONFIG.speed, CONFIG.acceleration
 HOME = np.zeros(6)
 
 
@@ -100,12 +101,12 @@ def test_further_candidates_change_least_times_as_if_they_had_been_there() -> No
     assert np.array_equal(grown.joints, whole.joints) and np.array_equal(grown.first, whole.first)
     assert np.allclose(grown.least_s, whole.least_s)
     gaps = np.abs(both[1][:, None] - both[4][None]).max(-1)
-    assert whole.least_s[2, 5] == pytest.approx(float(move_seconds(gaps.min(), CONFIG)))
+    assert whole.least_s[2, 5] == pytest.approx(float(move_seconds(gaps.min(), *PACE)))
 
 
 def test_move_times_are_continuous_and_trapezoidal() -> None:
     knee = CONFIG.speed**2 / CONFIG.acceleration
-    just_below = float(move_seconds(knee * (1 - 1e-9), CONFIG))
-    assert move_seconds(knee, CONFIG) == pytest.approx(just_below)
-    assert move_seconds(2.0, CONFIG) == pytest.approx(2.0 / 1.05 + 1.05 / 1.4)
-    assert move_seconds(0.0, CONFIG) == 0.0
+    just_below = float(move_seconds(knee * (1 - 1e-9), *PACE))
+    assert move_seconds(knee, *PACE) == pytest.approx(just_below)
+    assert move_seconds(2.0, *PACE) == pytest.approx(2.0 / 1.05 + 1.05 / 1.4)
+    assert move_seconds(0.0, *PACE) == 0.0

@@ -48,7 +48,7 @@ def plan(request: pytest.FixtureRequest) -> CapturePlan:
 def test_exactly_n_poses_that_follow_from_the_joints(plan: CapturePlan) -> None:
     assert len(plan) == N
     assert np.abs(UR5.forward(plan.joints) - plan.Ts_base_ee).max() < 1e-9
-    assert np.abs(plan.Ts_base_ee @ plan.T_ee_cam_nominal - plan.Ts_base_cam).max() < 1e-12
+    assert np.abs(plan.Ts_base_ee @ plan.mount.T_ee_cam - plan.Ts_base_cam).max() < 1e-12
     assert np.all(UR5.limits.contains(plan.joints))
     assert np.all(UR5.sigma_min(plan.joints) >= plan.config.sigma_min)
 
@@ -70,7 +70,9 @@ def test_moves_join_up_and_metrics_are_theirs(plan: CapturePlan) -> None:
         assert np.array_equal(before[-1], after[0])
     legs = np.concatenate([np.abs(np.diff(c, axis=0)) for c in corners])
     assert plan.metrics["travel_total_rad"] == pytest.approx(legs.sum())
-    assert plan.metrics["seconds"] == pytest.approx(move_seconds(legs.max(1), plan.config).sum())
+    assert plan.metrics["seconds"] == pytest.approx(
+        move_seconds(legs.max(1), plan.config.speed, plan.config.acceleration).sum()
+    )
     assert plan.metrics["colliding_legs"] == 0
 
 
@@ -115,7 +117,9 @@ def test_every_view_sees_most_of_the_scene(scene_plan: CapturePlan) -> None:
 def test_tour_is_far_shorter_than_the_spiral_order(scene_plan: CapturePlan) -> None:
     # The order in which a golden spiral numbers its points: from the top down.
     naive = scene_plan.joints[np.argsort(-scene_plan.directions()[:, 2])]
-    spiral = move_seconds(np.abs(np.diff(naive, axis=0)).max(1), scene_plan.config).sum()
+    c = scene_plan.config
+    legs = np.abs(np.diff(naive, axis=0)).max(1)
+    spiral = move_seconds(legs, c.speed, c.acceleration).sum()
     assert scene_plan.metrics["seconds"] < 0.8 * spiral
 
 

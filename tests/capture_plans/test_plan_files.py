@@ -14,11 +14,10 @@ from realsim.geometry import se3
 from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.collision.shapes import Box
-from realsim_capture_plans.plan_files import plan_json, shipped_plans
+from realsim_capture_plans.plan_files import plan_json
 from realsim_capture_plans.plan_files.plan_json import load_plan, plan_to_json, save_plan
-from realsim_capture_plans.planning.content import hash_of
 from realsim_capture_plans.planning.ordering import move_seconds
-from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.planning.record import CapturePlan, PlanConfig, hash_of
 
 HOME = np.array([0.1, -1.6, 1.7, -1.7, -1.5, 0.3])
 CENTER = np.array([0.37, 0.02, 0.05])
@@ -99,12 +98,8 @@ def test_another_program_drives_the_plan_from_the_segments_alone(tmp_path: Path)
         assert np.array_equal(corners, plan.move(k))
         assert segment["settle_s"] == 0.4
         leading = np.abs(np.diff(corners, axis=0)).max(-1)
-        v = replace(
-            plan.config,
-            speed=segment["speed_rad_s"],
-            acceleration=segment["acceleration_rad_s2"],
-        )
-        assert segment["seconds"] == pytest.approx(move_seconds(leading, v).sum(), abs=1e-6)
+        pace = segment["speed_rad_s"], segment["acceleration_rad_s2"]
+        assert segment["seconds"] == pytest.approx(move_seconds(leading, *pace).sum(), abs=1e-6)
         at = corners[-1]
     assert np.array_equal(at, plan.joints[-1])
 
@@ -252,19 +247,19 @@ def test_a_huge_file_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 
 def test_a_shipped_plan_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nowhere"):
-        shipped_plans.resolve_plan("shipped:nowhere")
+        plan_json.resolve_plan("shipped:nowhere")
     with pytest.raises(InputError, match="no plan at"):
-        shipped_plans.resolve_plan(tmp_path / "p.json")
+        plan_json.resolve_plan(tmp_path / "p.json")
     save_plan(a_plan(), tmp_path / "p.json")
-    back = shipped_plans.resolve_plan(str(tmp_path / "p.json"))
+    back = plan_json.resolve_plan(str(tmp_path / "p.json"))
     assert back.content_hash == a_plan().content_hash
 
 
 def test_the_shipped_plan_keeps_its_promises() -> None:
     name = "ur5_d405_hemisphere_256"
-    if name not in shipped_plans.shipped_plans():
+    if name not in plan_json.shipped_plans():
         pytest.skip(f"{name} is not shipped")
-    plan = shipped_plans.resolve_plan(f"shipped:{name}")
+    plan = plan_json.resolve_plan(f"shipped:{name}")
     assert len(plan) == 256 and plan.robot == "UR5" and plan.mount.camera == "D405"
     assert np.all(plan.chain.limits.contains(plan.joints))
     model = plan.collision_model()

@@ -14,8 +14,12 @@ from realsim.geometry import se3
 from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.collision.shapes import Box
-from realsim_capture_plans.plan_files.exported import export_csv, export_urscript
-from realsim_capture_plans.plan_files.graspnet import export_graspnet, table_frame
+from realsim_capture_plans.plan_files.exported import (
+    export_csv,
+    export_graspnet,
+    export_urscript,
+    table_frame,
+)
 from realsim_capture_plans.plan_files.imported import (
     axes_meeting_point,
     colliding_legs,

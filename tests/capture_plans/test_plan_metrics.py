@@ -16,8 +16,12 @@ from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.planning import view_quality
 from realsim_capture_plans.planning.make import calibration_plan
-from realsim_capture_plans.planning.metric_meanings import OF_FULL_PLANS, goal_of
-from realsim_capture_plans.planning.metrics import METRIC_MEANINGS, plan_metrics
+from realsim_capture_plans.planning.metrics import (
+    METRIC_MEANINGS,
+    OF_FULL_PLANS,
+    goal_of,
+    plan_metrics,
+)
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from realsim_capture_plans.planning.tour_time import TourTime
 from realsim_capture_plans.planning.view_quality import D405, SENSORS, hole_deg

@@ -20,11 +20,10 @@ from realsim_capture_plans.pictures.arm_looks import (
     shape_mesh,
     ur5_looks,
 )
-from realsim_capture_plans.pictures.coverage_chart import coverage_chart
-from realsim_capture_plans.pictures.curves import PlanCurves
+from realsim_capture_plans.pictures.drawing import PlanCurves
 from realsim_capture_plans.pictures.motion_charts import clearance_chart, joints_chart
 from realsim_capture_plans.pictures.plan_pictures import plan_picture, plan_pictures
-from realsim_capture_plans.pictures.quality_charts import board_chart, quality_chart
+from realsim_capture_plans.pictures.view_charts import board_chart, coverage_chart, quality_chart
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 CENTER = np.array([0.40, 0.05, 0.05])

@@ -22,8 +22,13 @@ from realsim.geometry import se3
 from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.collision.shapes import Box
-from realsim_capture_plans.pictures.replay import PlanReplay, near_parts, serve_replay, write_replay
-from realsim_capture_plans.pictures.replay_scene import NEAR_RGB
+from realsim_capture_plans.pictures.replay import (
+    NEAR_RGB,
+    PlanReplay,
+    near_parts,
+    serve_replay,
+    write_replay,
+)
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 CENTER = np.array([0.40, 0.05, 0.05])

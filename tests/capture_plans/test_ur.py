@@ -20,7 +20,7 @@ from realsim.geometry import se3
 from realsim.interop import T_from_rotation_vector_pose
 from realsim_capture_plans.arms.kinematics import CHAINS, UR5, UR5E
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError
-from realsim_capture_plans.devices.ur import UrArm, controller_gap_m, gap_advice
+from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_connection import UrConfig
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
 
@@ -124,10 +124,7 @@ def test_a_calibrated_controller_is_told_from_the_nominal_arm() -> None:
         with UrArm(controller.host) as arm:
             q = arm.state().joints
             expected = np.linalg.norm((calibrated.forward(q) - UR5E.forward(q))[:3, 3])
-            assert controller_gap_m(arm, UR5E) == pytest.approx(expected, abs=1e-9)
             assert arm.description["controller_gap_mm"] == pytest.approx(1e3 * expected, abs=1e-3)
-            assert "calibration.conf" in gap_advice(controller_gap_m(arm, UR5E))
-            assert gap_advice(controller_gap_m(arm, calibrated)) == ""
         with UrArm(controller.host, chain=calibrated) as arm:
             assert arm.description["controller_gap_mm"] == 0.0
 

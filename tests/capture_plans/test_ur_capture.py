@@ -16,7 +16,7 @@ from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmStoppedError
 from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
-from realsim_capture_plans.lab.camera import SimulatedDepthCamera
+from realsim_capture_plans.lab.devices import SimulatedDepthCamera
 from realsim_capture_plans.lab.lab import LabConfig, SimulatedLab
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 

@@ -15,7 +15,7 @@ from realsim.interop import T_from_rotation_vector_pose
 from realsim_capture_plans.arms.kinematics import UR5E
 from realsim_capture_plans.devices.interfaces import DeviceError
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
-from realsim_capture_plans.devices.ur_loopback.motion import Motion
+from realsim_capture_plans.devices.ur_loopback.robot import Motion
 from realsim_capture_plans.devices.ur_messages import detected_model, trouble
 
 HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.dh import JOINTS, UR5_ARM, UR5E_ARM, DhArm
+from realsim.untrusted.files import checked_text
 from realsim_capture_plans.arms.kinematics import DhChain
 
 Array = NDArray[np.float64]
@@ -87,7 +88,7 @@ def read_controller_calibration(path: Path | str, chain: DhChain) -> DhChain:
             `calibration.conf` cannot tell a UR5 from a UR5e (their arms' lengths are the same).
     """
     path = Path(path)
-    text = _text(path)
+    text = checked_text(path, LARGEST_BYTES)
     if re.search(r"^\s*delta_(theta|a|d|alpha)\s*=", text, re.MULTILINE):
         lists = _controller_lists(path, text)
         return _checked(path, chain, lambda arm: _with_deltas(arm, lists))
@@ -193,7 +194,7 @@ def _with_links(path: Path, arm: DhArm, links: Array) -> DhArm:
 
 def _checked(path: Path, chain: DhChain, calibrate: Callable[[DhArm], DhArm]) -> DhChain:
     """Return the calibrated chain, if its flange is where this model's is."""
-    nominal = replace(chain, **{f"delta_{name}": np.zeros(JOINTS) for name in LISTS})
+    nominal = chain.nominal()
     calibrated = calibrate(nominal)
     gap = flange_gap_m(calibrated, nominal)
     if gap <= MODEL_GAP_M:
@@ -217,21 +218,6 @@ def _checked(path: Path, chain: DhChain, calibrate: Callable[[DhArm], DhArm]) ->
         f"{path} moves the flange of a {chain.name} by {1e3 * gap:.0f} mm; a calibration moves it "
         f"by 1 to 5 mm. {remedy}"
     )
-
-
-def _text(path: Path) -> str:
-    """Return a small text file."""
-    if not path.is_file():
-        raise InputError(
-            f"there is no file at {path}; the controller's calibration.conf or the YAML of ROS's "
-            "ur_calibration is needed."
-        )
-    if path.stat().st_size > LARGEST_BYTES:
-        raise InputError(f"{path} has {path.stat().st_size} bytes; a calibration has about 2000.")
-    try:
-        return path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file; is it packed? ({error.reason})") from error
 
 
 def _controller_lists(path: Path, text: str) -> dict[str, Array]:

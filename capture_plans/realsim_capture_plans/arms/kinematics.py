@@ -11,7 +11,7 @@ after which the analytic inverse does not hold any more: it then only seeds a Ne
 chain as it is, so that the inverse is exact for every chain.
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import product
 from typing import Any
@@ -82,6 +82,11 @@ class DhChain(DhArm):
         """Return the chain of an arm."""
         numbers = {f.name: getattr(arm, f.name) for f in fields(DhArm)}
         return cls(**numbers, limits=limits)
+
+    def nominal(self) -> "DhChain":
+        """Return the chain without its calibration."""
+        zero = np.zeros(JOINTS)
+        return replace(self, delta_a=zero, delta_d=zero, delta_alpha=zero, delta_theta=zero)
 
     def sigma_min(self, joints: ArrayLike) -> Array:
         """Return the least singular value (...) of the Jacobian (rad and m taken as they are)."""

@@ -133,23 +133,6 @@ def _block(block: Block) -> Shape:
     )
 
 
-def nominal_chain(chain: DhChain) -> DhChain:
-    """Return the chain without its calibration."""
-    zero = np.zeros(JOINTS)
-    return DhChain(
-        name=chain.name,
-        a=chain.a,
-        d=chain.d,
-        alpha=chain.alpha,
-        theta=chain.theta,
-        delta_a=zero,
-        delta_d=zero,
-        delta_alpha=zero,
-        delta_theta=zero,
-        limits=chain.limits,
-    )
-
-
 def link_placements(chain: DhChain) -> Array:
     """Return (7, 4, 4): where link i's nominal frame is in the calibrated DH frame i [m].
 
@@ -161,7 +144,7 @@ def link_placements(chain: DhChain) -> Array:
         InputError: the arm's numbers are not those that its shapes were drawn for, or the
             calibration moves a link farther than any calibration does.
     """
-    nominal = nominal_chain(chain)
+    nominal = chain.nominal()
     drawn = CHAINS.get(chain.name)
     for name in ("a", "d", "alpha", "theta"):
         if drawn is not None and not np.allclose(getattr(drawn, name), getattr(nominal, name)):

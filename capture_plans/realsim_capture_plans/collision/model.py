@@ -17,10 +17,9 @@ from realsim_capture_plans.collision.arm_shapes import (
     arm_shapes,
     finite_box,
     link_placements,
-    nominal_chain,
 )
-from realsim_capture_plans.collision.camera_bodies import camera_shape
 from realsim_capture_plans.collision.coal_geometry import Body, Geometry
+from realsim_capture_plans.collision.mount import camera_shape
 from realsim_capture_plans.collision.pairs import choose_pairs
 from realsim_capture_plans.collision.shapes import Mount, WorkCell
 
@@ -62,7 +61,7 @@ class CollisionModel:
         geometry = Geometry(chain, placements, self._bodies)
         # Which pairs the design keeps apart is seen on the nominal arm: the calibration's
         # millimetres would make constant distances look as if they changed.
-        drawn = Geometry(nominal_chain(chain), np.tile(np.eye(4), (JOINTS + 1, 1, 1)), self._bodies)
+        drawn = Geometry(chain.nominal(), np.tile(np.eye(4), (JOINTS + 1, 1, 1)), self._bodies)
         chosen = choose_pairs(self._bodies, drawn, self.clearance_m)
         order = sorted(
             range(len(chosen.pairs)), key=lambda k: (LEAST_FIRST.index(chosen.groups[k]), k)

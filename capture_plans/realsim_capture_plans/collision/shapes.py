@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.geometry import se3
+from realsim.records.checked_arrays import frozen, rigid
 
 Array = NDArray[np.float64]
 Kind = Literal["box", "capsule", "cylinder", "sphere", "convex"]
@@ -45,18 +45,14 @@ class Shape:
                 f"{SIZES[self.kind]} positive lengths [m] are needed."
             )
         object.__setattr__(self, "size_m", size)
-        T = np.array(se3.check_rigid(self.T_frame_shape, f"the pose of shape '{self.part}'"))
-        T.setflags(write=False)
+        T = rigid(self.T_frame_shape, f"the pose of shape '{self.part}'")
         object.__setattr__(self, "T_frame_shape", T)
         if (self.kind == "convex") != (self.points is not None):
             raise InputError(f"shape '{self.part}': corners belong to 'convex' shapes, only there.")
         if self.points is not None:
-            points = np.array(self.points, dtype=np.float64)
-            if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4:
-                raise InputError(
-                    f"shape '{self.part}' has corners {points.shape}; (P >= 4, 3) are needed."
-                )
-            points.setflags(write=False)
+            points = frozen(self.points, np.float64, (None, 3), f"corners of shape '{self.part}'")
+            if len(points) < 4:
+                raise InputError(f"shape '{self.part}' has {len(points)} corners; 4 are needed.")
             object.__setattr__(self, "points", points)
 
 
@@ -103,8 +99,7 @@ class Mount:
 
     def __post_init__(self) -> None:
         """Check the pose and that the bracket moves with the flange."""
-        T = np.array(se3.check_rigid(self.T_ee_cam, f"mount '{self.name}': T_ee_cam"))
-        T.setflags(write=False)
+        T = rigid(self.T_ee_cam, f"mount '{self.name}': T_ee_cam")
         object.__setattr__(self, "T_ee_cam", T)
         if wrong := [s.part for s in self.bracket if s.frame != 6]:
             raise InputError(f"mount '{self.name}': {wrong} are not fixed in the flange (frame 6).")

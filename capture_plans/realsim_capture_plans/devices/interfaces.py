@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError, RealsimError
-from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
+from realsim.records.checked_arrays import rigid
 from realsim_capture_plans.arms.kinematics import JOINTS, JointLimits
 
 Array = NDArray[np.float64]
@@ -58,11 +58,10 @@ class ArmState:
         joints = np.array(self.joints, dtype=np.float64)
         if joints.shape != (JOINTS,) or not np.all(np.isfinite(joints)):
             raise InputError(f"the arm's joints are {joints.tolist()}; 6 finite angles are needed.")
-        T = se3.check_rigid(self.T_base_ee, "the arm's T_base_ee")
-        T_ee_tcp = se3.check_rigid(self.T_ee_tcp, "the arm's T_ee_tcp")
-        for name, value in (("joints", joints), ("T_base_ee", T), ("T_ee_tcp", T_ee_tcp)):
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
+        joints.setflags(write=False)
+        object.__setattr__(self, "joints", joints)
+        for name in ("T_base_ee", "T_ee_tcp"):
+            object.__setattr__(self, name, rigid(getattr(self, name), f"the arm's {name}"))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -90,6 +89,31 @@ class Frame:
         for name, value in (("rgb", rgb), ("depth_m", depth)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
+
+
+def checked_goal(joints: ArrayLike, limits: JointLimits) -> Array:
+    """Return the goal (6,) of a move [rad].
+
+    Raises:
+        InputError: it is not 6 finite angles within the limits.
+    """
+    goal = np.array(joints, dtype=np.float64)
+    if goal.shape != (JOINTS,) or not np.all(np.isfinite(goal)):
+        raise InputError(f"the goal is {goal.tolist()}; {JOINTS} finite angles are needed.")
+    bad = np.flatnonzero((goal < limits.lower) | (goal > limits.upper))
+    if len(bad):
+        degrees = (
+            " Are these degrees? Radians are needed: np.radians(goal)."
+            if np.abs(goal).max() > 2 * np.pi
+            else ""
+        )
+        raise InputError(
+            f"the goal's joints {bad.tolist()} (counted from 0) are at "
+            f"{goal[bad].round(4).tolist()} rad, outside the limits "
+            f"{limits.lower[bad].round(4).tolist()} to {limits.upper[bad].round(4).tolist()} rad; "
+            f"the arm stays.{degrees}"
+        )
+    return goal
 
 
 class Arm(Protocol):

@@ -20,9 +20,8 @@ from realsim.interop import import_pyrealsense2
 from realsim.records import CameraIntrinsics
 from realsim_capture_plans.devices import realsense_facts as facts
 from realsim_capture_plans.devices.interfaces import DeviceError, Frame
-from realsim_capture_plans.devices.realsense_align import Alignment
 from realsim_capture_plans.devices.realsense_facts import intrinsics_of
-from realsim_capture_plans.devices.realsense_pairs import COLOR, DEPTH, Pair, PairBuffer
+from realsim_capture_plans.devices.realsense_pairs import COLOR, DEPTH, Alignment, Pair, PairBuffer
 
 __all__ = ["EndOfRecordingError", "RealSenseCamera", "RealSenseConfig", "intrinsics_of"]
 

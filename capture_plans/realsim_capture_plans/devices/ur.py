@@ -20,13 +20,10 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.interop import T_from_rotation_vector_pose
 from realsim_capture_plans.arms.kinematics import CHAINS, JOINTS, DhChain, JointLimits
-from realsim_capture_plans.devices.interfaces import Arm, ArmState, ArmStoppedError
+from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, checked_goal
 from realsim_capture_plans.devices.ur_connection import Identity, UrConfig, UrConnection
 
 Array = NDArray[np.float64]
-FULL_CIRCLE = 2 * np.pi
-CALIBRATION_GAP_M = 5e-4
-"""From here on a chain without the factory calibration matters: half a pixel of a D405 at 0.4 m."""
 
 
 class UrArm:
@@ -223,22 +220,7 @@ class UrArm:
         Raises:
             InputError: it, the speed or the acceleration cannot be used.
         """
-        goal = np.array(joints, dtype=np.float64)
-        if goal.shape != (JOINTS,) or not np.all(np.isfinite(goal)):
-            raise InputError(f"the goal is {goal.tolist()}; {JOINTS} finite angles are needed.")
-        bad = np.flatnonzero((goal < self.limits.lower) | (goal > self.limits.upper))
-        if len(bad):
-            degrees = (
-                " Are these degrees? Radians are needed: np.radians(goal)."
-                if np.abs(goal).max() > FULL_CIRCLE
-                else ""
-            )
-            raise InputError(
-                f"the goal's joints {bad.tolist()} (counted from 0) are at "
-                f"{goal[bad].round(4).tolist()} rad, outside the limits "
-                f"{self.limits.lower[bad].round(4).tolist()} to "
-                f"{self.limits.upper[bad].round(4).tolist()} rad; the arm stays.{degrees}"
-            )
+        goal = checked_goal(joints, self.limits)
         for what, value, most, unit in (
             ("speed", speed, self._config.speed_max_rad_s, "rad/s"),
             ("acceleration", acceleration, self._config.acceleration_max_rad_s2, "rad/s^2"),
@@ -294,25 +276,6 @@ class UrArm:
             "see that nothing holds it, that the speed slider is up, and that the load set at the "
             "pendant is right",
         )
-
-
-def controller_gap_m(arm: Arm, chain: DhChain) -> float:
-    """Return how far the controller's own flange is from the chain's, at the present joints [m].
-
-    The controller knows its factory calibration. A few millimetres mean that the chain does not:
-    give the controller's calibration.conf.
-    """
-    return _gap_m(arm.state(), chain)
-
-
-def gap_advice(gap_m: float) -> str:
-    """Return what a gap between controller and chain [m] asks for; empty where it does not."""
-    if gap_m < CALIBRATION_GAP_M:
-        return ""
-    return (
-        f"The controller's flange is {1e3 * gap_m:.1f} mm from the arm's kinematics as they are "
-        "known here: give the controller's calibration.conf, so that plans meet the real arm."
-    )
 
 
 def _gap_m(state: ArmState, chain: DhChain) -> float:

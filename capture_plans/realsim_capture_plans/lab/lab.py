@@ -17,8 +17,7 @@ from realsim.geometry import se3
 from realsim.geometry.parts import object_model, part_names
 from realsim.records import Mesh, ObjectModel, ObjectPose, TagBoard
 from realsim_capture_plans.lab import truth as lab_truth
-from realsim_capture_plans.lab.arm import SimulatedArm
-from realsim_capture_plans.lab.camera import SimulatedDepthCamera
+from realsim_capture_plans.lab.devices import SimulatedArm, SimulatedDepthCamera
 from realsim_capture_plans.lab.placement import CrowdedError, PlacementConfig, place_objects
 from realsim_capture_plans.lab.truth import LabConfig, LabTruth
 

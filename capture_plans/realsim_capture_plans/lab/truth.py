@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose
+from realsim.untrusted.json_text import read_json
 from realsim_capture_plans.arms.kinematics import UR5, DhChain
 
 Array = NDArray[np.float64]
@@ -270,15 +271,10 @@ def load_truth(folder: Path | str) -> LabTruth:
     Raises:
         InputError: there is no such file, or it is not a truth of this version.
     """
-    import json
-
     path = Path(folder) / TRUTH_FILE
     if not path.is_file():
         raise InputError(f"there is no {TRUTH_FILE} in {folder}; only a simulated lab writes one.")
-    try:
-        r = json.loads(path.read_text(encoding="utf-8"))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path} is not JSON ({error}); write it anew from the lab.") from error
+    r = read_json(path)
     if not isinstance(r, dict) or r.get("version") != TRUTH_VERSION:
         raise InputError(
             f"{path} is not a lab truth of version {TRUTH_VERSION}; write it anew from the lab."

@@ -9,13 +9,13 @@ from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim_capture_plans.collision.shapes import Box
 from realsim_capture_plans.pictures.arm_looks import arm_parts, part_frames
-from realsim_capture_plans.pictures.curves import PlanCurves
 from realsim_capture_plans.pictures.drawing import (
     BLUE,
     GREEN,
     ORANGE,
     PURPLE,
     RED,
+    PlanCurves,
     new_figure,
     plain,
 )
@@ -58,6 +58,7 @@ def arm_chart(curves: PlanCurves) -> Any:
 def draw_arm(axes: Any, curves: PlanCurves) -> None:
     """Draw the scene in space on a 3-D axes."""
     from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+    from trimesh.remesh import subdivide_to_size
 
     plan = curves.plan
     # The order is given: matplotlib would guess it, and draw the table over the arm.
@@ -72,7 +73,9 @@ def draw_arm(axes: Any, curves: PlanCurves) -> None:
     colors: list[Array] = []
     for k, color in zip(_shown(curves), ARM_COLORS, strict=False):
         for vertices, faces in _posed(curves, k):
-            corner = _split(vertices[faces])
+            # Triangles are sorted by their middles; long ones would be drawn over what is before.
+            fine, index = subdivide_to_size(vertices, faces, LONGEST_EDGE_M)
+            corner: Array = fine[index]
             triangles.append(corner)
             colors.append(_shaded(corner, color))
             everything.append(vertices)
@@ -141,26 +144,6 @@ def _posed(curves: PlanCurves, view: int) -> list[tuple[Array, NDArray[np.int64]
     """Return vertices (V, 3) in base [m] and triangles of every body of the arm at a view."""
     frames = part_frames(curves.plan, curves.plan.joints[view])
     return [(se3.transform(frames[p.frame], p.vertices), p.faces) for p in arm_parts(curves.plan)]
-
-
-def _split(triangles: Array) -> Array:
-    """Return triangles (F, 3, 3) halved at their longest edge until all edges are short.
-
-    Triangles are sorted by their middles; long ones would be drawn over what is before them.
-    """
-    done: list[Array] = []
-    while len(triangles):
-        edge = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=-1)
-        short = edge.max(axis=1) <= LONGEST_EDGE_M
-        done.append(triangles[short])
-        triangles, first = triangles[~short], edge[~short].argmax(axis=1)
-        # The longest edge goes from corner 0 to corner 1.
-        order = (first[:, None] + np.arange(3)) % 3
-        a, b, c = np.moveaxis(np.take_along_axis(triangles, order[..., None], axis=1), 1, 0)
-        middle = (a + b) / 2
-        halves = [np.stack([a, middle, c], 1), np.stack([middle, b, c], 1)]
-        triangles = np.concatenate(halves)
-    return np.concatenate(done)
 
 
 def _shaded(triangles: Array, color: str) -> Array:

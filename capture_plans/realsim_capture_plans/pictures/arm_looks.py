@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from realsim.errors import MissingLibraryError
 from realsim.geometry import se3
+from realsim.models.convex_hulls import hull_triangles
 from realsim_capture_plans.arms.kinematics import JOINTS
 from realsim_capture_plans.collision.arm_shapes import (
     LINK_NAMES,
     arm_shapes,
     link_placements,
-    nominal_chain,
 )
-from realsim_capture_plans.collision.camera_bodies import camera_shape
+from realsim_capture_plans.collision.mount import camera_shape
 from realsim_capture_plans.collision.shapes import Shape
 from realsim_capture_plans.collision.ur5_meshes import BASE_LINK_FROM_BASE, URDF, robots_folder
 from realsim_capture_plans.planning.record import CapturePlan
@@ -52,16 +52,12 @@ def arm_parts(plan: CapturePlan) -> list[Part]:
     Raises:
         InputError: there are no shapes for this arm.
     """
-    return [_part(shape) for shape in _shapes(plan)]
+    return [*map(_part, arm_shapes(plan.chain)), *camera_parts(plan)]
 
 
 def camera_parts(plan: CapturePlan) -> list[Part]:
     """Return what is fixed to the flange: camera and bracket."""
     return [_part(shape) for shape in (camera_shape(plan.mount), *plan.mount.bracket)]
-
-
-def _shapes(plan: CapturePlan) -> tuple[Shape, ...]:
-    return (*arm_shapes(plan.chain), camera_shape(plan.mount), *plan.mount.bracket)
 
 
 def _part(shape: Shape) -> Part:
@@ -87,7 +83,7 @@ def shape_mesh(shape: Shape) -> tuple[Array, NDArray[np.int64]]:
         points = np.asarray(shape.points)
     else:
         points = _round_points(shape)
-    return convex_mesh(points)
+    return hull_triangles(points)
 
 
 def _round_points(shape: Shape) -> Array:
@@ -102,22 +98,6 @@ def _round_points(shape: Shape) -> Array:
     tilt = np.linspace(0.0, np.pi / 2, ROUND_RINGS)[:, None, None]
     cap = (radius * (np.cos(tilt) * circle + np.sin(tilt) * up) + half * up).reshape(-1, 3)
     return np.concatenate([cap, cap * [1.0, 1.0, -1.0]])
-
-
-def convex_mesh(points: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the vertices (V, 3) and outward triangles (F, 3) of the hull of points (P, 3)."""
-    from scipy.spatial import ConvexHull
-
-    hull = ConvexHull(points)
-    number = np.full(len(points), -1, dtype=np.int64)
-    number[hull.vertices] = np.arange(len(hull.vertices))
-    faces = number[hull.simplices]
-    vertices = points[hull.vertices]
-    corner = vertices[faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    inward = np.sum(normal * hull.equations[:, :3], axis=-1) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return vertices, faces
 
 
 def ur5_looks(plan: CapturePlan) -> list[Part] | None:
@@ -143,7 +123,7 @@ def ur5_looks(plan: CapturePlan) -> list[Part] | None:
     data = model.createData()
     pin.forwardKinematics(model, data, np.zeros(JOINTS))
     # The nominal links are where the drawn links of a calibrated arm are, too.
-    T_link_base = se3.invert(nominal_chain(plan.chain).link_frames(np.zeros(JOINTS)))
+    T_link_base = se3.invert(plan.chain.nominal().link_frames(np.zeros(JOINTS)))
     parts: list[Part] = []
     for one in visual.geometryObjects:
         frame = int(one.parentJoint)

@@ -5,13 +5,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim_capture_plans.pictures.curves import PlanCurves
 from realsim_capture_plans.pictures.drawing import (
     BLACK,
     GREY,
     GROUP_COLORS,
     JOINT_COLORS,
     RED,
+    PlanCurves,
     new_figure,
     plain,
 )

@@ -4,15 +4,19 @@ from pathlib import Path
 from typing import Any
 
 from realsim_capture_plans.pictures.arm_chart import arm_chart, draw_arm
-from realsim_capture_plans.pictures.coverage_chart import coverage_chart, draw_coverage
-from realsim_capture_plans.pictures.curves import PlanCurves
-from realsim_capture_plans.pictures.drawing import new_figure, save_png
+from realsim_capture_plans.pictures.drawing import PlanCurves, new_figure, save_png
 from realsim_capture_plans.pictures.motion_charts import (
     clearance_chart,
     draw_clearance,
     joints_chart,
 )
-from realsim_capture_plans.pictures.quality_charts import board_chart, draw_rolls, quality_chart
+from realsim_capture_plans.pictures.view_charts import (
+    board_chart,
+    coverage_chart,
+    draw_coverage,
+    draw_rolls,
+    quality_chart,
+)
 from realsim_capture_plans.planning.record import CapturePlan
 
 

@@ -17,7 +17,7 @@ from realsim_capture_plans.collision.model import interpolate
 from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.plan_files.evidence import FITS_M, MILLIMETRES_FROM_M, JointUnit
 from realsim_capture_plans.plan_files.joint_paths import JointPath, read_path
-from realsim_capture_plans.planning.metric_meanings import JOINT_NAMES, Meaning
+from realsim_capture_plans.planning.metrics import JOINT_NAMES, Meaning
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 Array = NDArray[np.float64]

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
+from realsim.untrusted.files import checked_text
+from realsim.untrusted.json_text import read_json
 from realsim_capture_plans.arms.kinematics import JOINTS, DhChain
 from realsim_capture_plans.plan_files.evidence import (
     JointUnit,
@@ -23,7 +25,7 @@ from realsim_capture_plans.plan_files.evidence import (
     check_joint_unit,
     proven_reading,
 )
-from realsim_capture_plans.plan_files.plan_json import LARGEST_BYTES, read_json
+from realsim_capture_plans.plan_files.plan_json import LARGEST_BYTES
 
 Array = NDArray[np.float64]
 YES = ("1", "true", "yes")
@@ -86,7 +88,7 @@ def read_path(
 
 def _json_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> JointPath:
     """Return a path of lists `joints`, `cart_pose` (x y z, rotation vector a b c), `via_points`."""
-    data = read_json(path, "a joint path")
+    data = read_json(path, most_bytes=LARGEST_BYTES)
     if not isinstance(data, dict) or "joints" not in data:
         keys = sorted(data)[:6] if isinstance(data, dict) else type(data).__name__
         raise InputError(
@@ -149,13 +151,9 @@ def _csv_path(path: Path, unit: JointUnit | None) -> JointPath:
         seen = np.array([bool(v) for v in table[CAMERA_COLUMNS[0]]])
         kept = [n for n, s in zip(lines, seen, strict=True) if s]
         Ts = np.full((len(q), 4, 4), np.nan)
-        numbers = np.stack(
-            [
-                _numbers(path, [v for v, s in zip(table[c], seen, strict=True) if s], c, kept)
-                for c in CAMERA_COLUMNS
-            ],
-            axis=-1,
-        )
+        columns = (np.array(table[c])[seen].tolist() for c in CAMERA_COLUMNS)
+        read = (_numbers(path, c, n, kept) for c, n in zip(columns, CAMERA_COLUMNS, strict=True))
+        numbers = np.stack(list(read), axis=-1)
         if len(numbers):
             R = se3.from_quaternion_wxyz(numbers[:, 3:])
             Ts[seen] = se3.from_rt(R, numbers[:, :3])
@@ -166,15 +164,9 @@ def _csv_path(path: Path, unit: JointUnit | None) -> JointPath:
 
 def _csv_table(path: Path) -> tuple[dict[str, list[str]], list[int]]:
     """Return the columns of a CSV file by their names, and the line number of every row."""
-    if path.stat().st_size > LARGEST_BYTES:
-        raise InputError(f"{path} is larger than {LARGEST_BYTES / 1e6:.0f} MB: this is no path.")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not UTF-8 text ({error.reason}); export it as CSV.") from error
     filled = [
         (n, line)
-        for n, line in enumerate(text.splitlines(), 1)
+        for n, line in enumerate(checked_text(path, LARGEST_BYTES).splitlines(), 1)
         if line.strip() and not line.lstrip().startswith("#")
     ]
     if not filled:

@@ -7,6 +7,7 @@ chain, so that a plan of another robot or in other units is found before anythin
 """
 
 import json
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError, RealsimError, UnitError
+from realsim.untrusted.json_text import read_json
 from realsim_capture_plans.arms.kinematics import CHAINS
 from realsim_capture_plans.plan_files.evidence import (
     MILLIMETRES_FROM_M,
     check_joint_unit,
     why_poses_disagree,
 )
-from realsim_capture_plans.planning.content import (
+from realsim_capture_plans.planning.record import (
+    CapturePlan,
     expected_poses,
     hash_of,
     plan_content,
     plan_of,
     segments,
 )
-from realsim_capture_plans.planning.record import CapturePlan
 
 Array = NDArray[np.float64]
 SCHEMA = "realsim capture plan"
@@ -117,30 +119,7 @@ def load_plan(path: Path | str) -> CapturePlan:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"there is no plan at {path}; make one with `realsim plan`.")
-    return plan_from_json(read_json(path, "a saved capture plan"), str(path))
-
-
-def read_json(path: Path, what: str) -> Any:
-    """Return the values of a JSON file of a reasonable size.
-
-    Raises:
-        InputError: too large, not JSON, not text, nested too deeply, or NaN in it.
-    """
-    if (size := path.stat().st_size) > LARGEST_BYTES:
-        raise InputError(
-            f"{path} has {size / 1e6:.0f} MB; {what} has less than {LARGEST_BYTES / 1e6:.0f} MB. "
-            "Is it the right file?"
-        )
-
-    def refuse(constant: str) -> float:
-        raise ValueError(f"it holds {constant}, which is no number")
-
-    try:
-        return json.loads(path.read_text(encoding="utf-8-sig"), parse_constant=refuse)
-    except RecursionError as error:
-        raise InputError(f"{path} is nested too deeply; {what} is needed.") from error
-    except ValueError as error:
-        raise InputError(f"{path} is not JSON ({error}); {what} is needed.") from error
+    return plan_from_json(read_json(path, most_bytes=LARGEST_BYTES), str(path))
 
 
 def readable_json(value: Any) -> str:
@@ -251,3 +230,41 @@ def _check_segments(plan: CapturePlan, written: list[dict[str, Any]], source: st
                 f"{source}: the segment of view {mine['view']} is not the move of the content: it "
                 "was changed after the plan was checked and may collide. Make the plan anew."
             )
+
+
+PREFIX = "shipped:"
+_FOLDER = "realsim_capture_plans.plan_files.shipped"
+
+
+def shipped_plans() -> list[str]:
+    """Return the names of the plans that come with realsim."""
+    names = [f.name for f in files(_FOLDER).iterdir() if f.name.endswith(".json")]
+    return sorted(name.removesuffix(".json") for name in names)
+
+
+def shipped_plan(name: str) -> CapturePlan:
+    """Return a plan that comes with realsim.
+
+    Raises:
+        InputError: there is none of this name.
+    """
+    import json
+
+    if name not in shipped_plans():
+        there = ", ".join(shipped_plans()) or "none in this installation"
+        raise InputError(f"no plan '{name}' comes with realsim; there is: {there}.")
+    text = (files(_FOLDER) / f"{name}.json").read_text(encoding="utf-8")
+    return plan_from_json(json.loads(text), PREFIX + name)
+
+
+def resolve_plan(text: str | Path) -> CapturePlan:
+    """Return the plan of a file, or of `shipped:NAME`.
+
+    Raises:
+        InputError: no such file or name, or not an unchanged plan of this version.
+    """
+    if str(text).startswith(PREFIX):
+        return shipped_plan(str(text).removeprefix(PREFIX))
+    if not Path(text).is_file() and str(text) in shipped_plans():
+        raise InputError(f"there is no file {text}; did you mean {PREFIX}{text}?")
+    return load_plan(text)

@@ -153,7 +153,8 @@ def detour(
     def consider(via: Array) -> None:
         nonlocal best
         corners = np.concatenate([q_from[None], via, q_to[None]])
-        seconds = float(move_seconds(np.abs(np.diff(corners, axis=0)).max(-1), config).sum())
+        legs = np.abs(np.diff(corners, axis=0)).max(-1)
+        seconds = float(move_seconds(legs, config.speed, config.acceleration).sum())
         if best is not None and seconds >= best[0]:
             return
         if np.all(model.edges_free(corners[:-1], corners[1:], config.edge_step_rad)):

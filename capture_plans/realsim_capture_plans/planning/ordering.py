@@ -34,13 +34,12 @@ Stop = tuple[int, int]
 """(view, candidate of it); (HOME, 0) is home."""
 
 
-def move_seconds(distance_rad: ArrayLike, config: PlanConfig) -> Array:
+def move_seconds(distance_rad: ArrayLike, speed: float, acceleration: float) -> Array:
     """Return the time (...) [s] of a stop-to-stop move whose leading joint turns by distance (...).
 
     T(d) = d / v + v / a, or 2 sqrt(d / a) where the speed v is never reached (d < v^2 / a).
     """
-    d = np.asarray(distance_rad, dtype=np.float64)
-    v, a = config.speed, config.acceleration
+    d, v, a = np.asarray(distance_rad, dtype=np.float64), speed, acceleration
     return np.where(d >= v * v / a, d / v + v / a, 2.0 * np.sqrt(d / a))
 
 
@@ -139,7 +138,10 @@ def tour_seconds(
     rows = [0, *path.tolist()]
     hits = sum(move in colliding for move in pairwise(rows))
     legs = np.abs(np.diff(clusters.joints[rows], axis=0)).max(-1)
-    return float(move_seconds(legs, config).sum()) + COLLISION_SECONDS * hits
+    return (
+        float(move_seconds(legs, config.speed, config.acceleration).sum())
+        + COLLISION_SECONDS * hits
+    )
 
 
 def _rows(clusters: list[Array]) -> tuple[Array, Ints]:
@@ -150,6 +152,7 @@ def _rows(clusters: list[Array]) -> tuple[Array, Ints]:
 
 def _timed(least_rad: Array, config: PlanConfig) -> Array:
     """Return the times [s] of least turns between clusters; none from a cluster to itself."""
-    least = move_seconds(np.where(np.isfinite(least_rad), least_rad, 0.0), config)
+    finite = np.where(np.isfinite(least_rad), least_rad, 0.0)
+    least = move_seconds(finite, config.speed, config.acceleration)
     np.fill_diagonal(least, 0.0)
     return least

@@ -1,15 +1,23 @@
-"""What a capture plan is, and the numbers it is made with."""
+"""What a capture plan is, the numbers it is made with, and its content as JSON under a hash.
 
-from dataclasses import dataclass, field
-from typing import Literal
+The content is what a plan is made of. What follows from it (flange and camera poses, corners and
+times of the moves) is written beside it for other programs, and compared with the chain when the
+file is read: it is no part of the hash, whose last bits it would make depend on the machine.
+"""
+
+import hashlib
+import json
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim_capture_plans.arms.kinematics import JOINTS, DhChain
+from realsim.records.checked_arrays import frozen
+from realsim_capture_plans.arms.kinematics import JOINTS, DhChain, JointLimits
 from realsim_capture_plans.collision.model import CollisionModel
-from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
+from realsim_capture_plans.collision.shapes import Box, Mount, Shape, WorkCell
 
 Array = NDArray[np.float64]
 
@@ -162,20 +170,17 @@ class CapturePlan:
         n = len(self.joints)
         shapes = {"home": (JOINTS,), "joints": (n, JOINTS), "center_world": (3,)}
         for name, shape in shapes.items():
-            array = np.array(getattr(self, name), dtype=np.float64)
-            if array.shape != shape or not np.all(np.isfinite(array)):
-                raise InputError(f"plan: {name} has shape {array.shape}; {shape} is needed.")
-            array.setflags(write=False)
+            array = frozen(getattr(self, name), np.float64, shape, f"the plan's {name}")
+            if not np.all(np.isfinite(array)):
+                raise InputError(f"the plan's {name} holds NaN or infinite numbers.")
             object.__setattr__(self, name, array)
         if n == 0 or not 0 <= self.reference_view < n:
             raise InputError(f"reference view {self.reference_view} is not one of {n} views.")
         vias: list[tuple[int, Array]] = []
         for k, via in self.vias:
-            q = np.array(via, dtype=np.float64)
-            if not 0 <= k < n or q.ndim != 2 or q.shape[1] != JOINTS:
-                raise InputError(f"via points of move {k} have shape {q.shape}; (K, 6) is needed.")
-            q.setflags(write=False)
-            vias.append((k, q))
+            if not 0 <= k < n:
+                raise InputError(f"via points of move {k}: the plan has the moves 0 to {n - 1}.")
+            vias.append((k, frozen(via, np.float64, (None, JOINTS), f"via points of move {k}")))
         object.__setattr__(self, "vias", tuple(vias))
         Ts_base_ee = self.chain.forward(self.joints)
         for name, Ts in (
@@ -191,16 +196,9 @@ class CapturePlan:
         return self.chain.name
 
     @property
-    def T_ee_cam_nominal(self) -> Array:
-        """The (4, 4) mount that the plan was made for [m]."""
-        return self.mount.T_ee_cam
-
-    @property
     def content_hash(self) -> str:
-        """The sha256 of the plan's content, see `content.plan_content`."""
-        from realsim_capture_plans.planning.content import content_hash
-
-        return content_hash(self)
+        """The sha256 of the plan's content, see `plan_content`."""
+        return hash_of(plan_content(self))
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -220,3 +218,104 @@ class CapturePlan:
         """Return the unit vectors (N, 3) from the centre to the cameras."""
         d = self.Ts_base_cam[:, :3, 3] - self.center_world
         return np.asarray(d / np.linalg.norm(d, axis=-1, keepdims=True), dtype=np.float64)
+
+
+def plan_content(plan: CapturePlan) -> dict[str, Any]:
+    """Return what the plan is made of as plain JSON values; an infinite bound of a box is null.
+
+    A change of these keys, or of the fields of `PlanConfig`, changes every hash: it needs a new
+    schema version of the file.
+    """
+    dh = _plain(plan.chain)
+    names = (
+        "mount", "cell", "home", "center_world", "reference_view", "joints", "vias", "config",
+        "metrics",
+    )  # fmt: skip
+    return {
+        "kind": plan.kind,
+        "robot": dh.pop("name"),
+        "limits": dh.pop("limits"),
+        "dh": dh,
+        **{name: _plain(getattr(plan, name)) for name in names},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """Return records, arrays and tuples as mappings and lists."""
+    if is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, np.ndarray):
+        return cast("Array", value).tolist()
+    if isinstance(value, tuple):
+        return [_plain(v) for v in cast("tuple[Any, ...]", value)]
+    return None if isinstance(value, float) and np.isinf(value) else value
+
+
+def expected_poses(plan: CapturePlan) -> dict[str, Any]:
+    """Return the (N, 4, 4) poses of flange and nominal camera in base [m] as JSON values."""
+    return {"Ts_base_ee": plan.Ts_base_ee.tolist(), "Ts_base_cam": plan.Ts_base_cam.tolist()}
+
+
+def segments(plan: CapturePlan) -> list[dict[str, Any]]:
+    """Return all that a controller needs for each move, so that it needs nothing else.
+
+    `corners` are the joints [rad] from the move's start over its via points to the view; the arm
+    goes straight from one to the next in joint space and stops at each. `seconds` is the time of
+    the motion, the settling that follows not included.
+    """
+    from realsim_capture_plans.planning.ordering import move_seconds
+
+    c = plan.config
+    rows: list[dict[str, Any]] = []
+    for k in range(len(plan)):
+        corners = plan.move(k)
+        leading = np.abs(np.diff(corners, axis=0)).max(-1)
+        rows.append(
+            {
+                "view": k,
+                "seconds": round(float(np.sum(move_seconds(leading, c.speed, c.acceleration))), 6),
+                "speed_rad_s": c.speed,
+                "acceleration_rad_s2": c.acceleration,
+                "settle_s": c.settle_s,
+                "corners": corners.tolist(),
+            }
+        )
+    return rows
+
+
+def hash_of(content: dict[str, Any]) -> str:
+    """Return the sha256 of a content."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _box_of(data: dict[str, Any]) -> Box:
+    lower = [-np.inf if v is None else float(v) for v in data["lower"]]
+    upper = [np.inf if v is None else float(v) for v in data["upper"]]
+    return Box(lower=(lower[0], lower[1], lower[2]), upper=(upper[0], upper[1], upper[2]))
+
+
+def plan_of(content: dict[str, Any]) -> CapturePlan:
+    """Return the record of a plan's content."""
+    config: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in content["config"].items()
+    }
+    mount, cell = content["mount"], content["cell"]
+    return CapturePlan(
+        kind=content["kind"],
+        chain=DhChain(
+            name=content["robot"], **content["dh"], limits=JointLimits(**content["limits"])
+        ),
+        mount=Mount(**{**mount, "bracket": tuple(Shape(**s) for s in mount["bracket"])}),
+        cell=WorkCell(
+            table=_box_of(cell["table"]),
+            keep_out=_box_of(cell["keep_out"]),
+            obstacles=tuple((str(name), _box_of(box)) for name, box in cell["obstacles"]),
+        ),
+        vias=tuple((int(k), np.array(q)) for k, q in content["vias"]),
+        config=PlanConfig(**config),
+        **{
+            name: content[name]
+            for name in ("home", "joints", "center_world", "reference_view", "metrics")
+        },
+    )

@@ -56,13 +56,12 @@ class TourTime:
         start = np.concatenate([c[:-1] for c in corners])
         goal = np.concatenate([c[1:] for c in corners])
         move = np.repeat(np.arange(len(plan)), [len(c) - 1 for c in corners])
-        seconds = move_seconds(np.abs(goal - start).max(-1), plan.config)
+        c = plan.config
+        seconds = move_seconds(np.abs(goal - start).max(-1), c.speed, c.acceleration)
         last = np.append(np.diff(move) > 0, True)
-        pause = np.where(last, plan.config.settle_s, 0.0)
+        pause = np.where(last, c.settle_s, 0.0)
         end = np.cumsum(seconds + pause) - pause
-        return cls(
-            config=plan.config, start=start, goal=goal, move=move, begin_s=end - seconds, end_s=end
-        )
+        return cls(config=c, start=start, goal=goal, move=move, begin_s=end - seconds, end_s=end)
 
     @property
     def leading_rad(self) -> Array:

@@ -15,7 +15,7 @@ from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
 from realsim_capture_plans.collision.shapes import Box
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
-from realsim_capture_plans.planning.viewpoints import golden_cap
+from realsim_capture_plans.planning.viewpoints import board_roll, golden_cap, plane_axes
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -56,34 +56,26 @@ class Sensor:
         return z**2 * self.disparity_noise_px / (self.depth_focal_px * self.baseline_m)
 
 
-def _pinhole_720p(focal_px: float) -> CameraIntrinsics:
-    return CameraIntrinsics(width=1280, height=720, fx=focal_px, fy=focal_px, cx=639.5, cy=359.5)
+def _sensor(
+    name: str, color_px: float, depth_px: float, baseline_m: float, nearest_m: float
+) -> Sensor:
+    return Sensor(
+        name=name,
+        intrinsics=CameraIntrinsics(
+            width=1280, height=720, fx=color_px, fy=color_px, cx=639.5, cy=359.5
+        ),
+        depth_focal_px=depth_px,
+        baseline_m=baseline_m,
+        nearest_m=nearest_m,
+    )
 
 
-D405 = Sensor(
-    name="D405",
-    intrinsics=_pinhole_720p(646.0),
-    depth_focal_px=646.0,
-    baseline_m=0.018,
-    nearest_m=0.10,
-)
+D405 = _sensor("D405", 646.0, 646.0, 0.018, 0.10)
 """D405 at 1280x720: colour comes from the depth imagers (datasheet: 87 deg, 18 mm, 100 mm)."""
-_D435 = Sensor(
-    name="D435",
-    intrinsics=_pinhole_720p(931.0),
-    depth_focal_px=674.0,
-    baseline_m=0.050,
-    nearest_m=0.28,
-)
+_D435 = _sensor("D435", 931.0, 674.0, 0.050, 0.28)
 SENSORS = {
     "D405": D405,
-    "D415": Sensor(
-        name="D415",
-        intrinsics=_pinhole_720p(931.0),
-        depth_focal_px=1005.0,
-        baseline_m=0.055,
-        nearest_m=0.45,
-    ),
+    "D415": _sensor("D415", 931.0, 1005.0, 0.055, 0.45),
     "D435": _D435,
     "D435i": _D435,
 }
@@ -274,15 +266,12 @@ def board_views(plan: CapturePlan, normal: ArrayLike = (0.0, 0.0, 1.0)) -> Board
     if n.shape != (3,) or not np.linalg.norm(n) > 0:
         raise InputError(f"the board's normal is {n.tolist()}; a direction (3,) is needed.")
     n = n / np.linalg.norm(n)
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(n)))], n)
-    x = x / np.linalg.norm(x)
-    x_cam = np.swapaxes(plan.Ts_base_cam[:, :3, :3], -1, -2) @ x
     cosine = np.clip(-plan.Ts_base_cam[:, :3, 2] @ n, -1.0, 1.0)
     height = (plan.Ts_base_cam[:, :3, 3] - plan.center_world) @ n
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = height / cosine
     return BoardViews(
-        roll_deg=np.degrees(np.arctan2(x_cam[:, 1], x_cam[:, 0])),
+        roll_deg=np.degrees(board_roll(plan.Ts_base_cam, plane_axes(n))),
         tilt_deg=np.degrees(np.arccos(cosine)),
         distance_m=distance,
     )

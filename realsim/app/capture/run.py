@@ -92,7 +92,7 @@ def run_capture(request: CaptureRequest, console: Console) -> bool:
     """
     from threadpoolctl import threadpool_limits
 
-    from realsim_capture_plans.plan_files.shipped_plans import resolve_plan
+    from realsim_capture_plans.plan_files.plan_json import resolve_plan
 
     plan = resolve_plan(request.plan)
     target = _target(request, plan)
@@ -241,7 +241,7 @@ def _ends_on_request() -> Generator[None]:
 @contextmanager
 def _operator(request: CaptureRequest, title: str, console: Console) -> Generator[Operator]:
     """Open the terminal view where a person sits at it, else write lines."""
-    from realsim_capture_plans.capturing.terminal import TerminalOperator, is_terminal
+    from realsim_capture_plans.capturing.operator import TerminalOperator, is_terminal
 
     if not request.no_input and not console.quiet and is_terminal():
         with TerminalOperator(title) as operator:

@@ -35,7 +35,7 @@ class Place:
     keep_out: str = ""
     """'x,y,z' size of the box that only the objects may fill [m]."""
     obstacles: Path | None = None
-    """File of named boxes, see `collision.work_cell_file`."""
+    """File of named boxes, see `collision.cell_files`."""
 
     def chain(self) -> DhChain | None:
         """Return the arm, calibrated if a file was given; None where none was named."""
@@ -61,7 +61,7 @@ class Place:
 
     def boxes(self) -> tuple[tuple[str, Box], ...]:
         """Return the named obstacles."""
-        from realsim_capture_plans.collision.work_cell_file import read_work_cell_obstacles
+        from realsim_capture_plans.collision.cell_files import read_work_cell_obstacles
 
         return () if self.obstacles is None else read_work_cell_obstacles(self.obstacles)
 

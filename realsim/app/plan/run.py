@@ -145,7 +145,7 @@ def run_show(
     Raises:
         InputError: no such plan.
     """
-    from realsim_capture_plans.plan_files.shipped_plans import PREFIX, resolve_plan
+    from realsim_capture_plans.plan_files.plan_json import PREFIX, resolve_plan
 
     plan = resolve_plan(text)
     metrics = plan.metrics | _metrics(plan)
@@ -210,8 +210,7 @@ def _source_plan(
     """Return the plan that a file holds, or the one that a joint path makes."""
     from realsim_capture_plans.plan_files.imported import plan_of_path
     from realsim_capture_plans.plan_files.joint_paths import read_path
-    from realsim_capture_plans.plan_files.plan_json import SCHEMA, read_json
-    from realsim_capture_plans.plan_files.shipped_plans import PREFIX, resolve_plan
+    from realsim_capture_plans.plan_files.plan_json import PREFIX, SCHEMA, read_json, resolve_plan
 
     path = Path(source)
     is_plan = source.startswith(PREFIX)
@@ -256,8 +255,11 @@ def _source_plan(
 
 def _writer(dest: Path) -> Callable[[CapturePlan, Path], list[Path]]:
     """Return what writes a file of this suffix."""
-    from realsim_capture_plans.plan_files.exported import export_csv, export_urscript
-    from realsim_capture_plans.plan_files.graspnet import export_graspnet
+    from realsim_capture_plans.plan_files.exported import (
+        export_csv,
+        export_graspnet,
+        export_urscript,
+    )
     from realsim_capture_plans.plan_files.plan_json import save_plan
 
     writers: dict[str, Callable[[CapturePlan, Path], None]] = {
@@ -306,8 +308,7 @@ def _metrics(plan: CapturePlan) -> dict[str, float]:
 def show_plan(plan: CapturePlan, metrics: dict[str, float], console: Console) -> None:
     """Print what the plan is for, and its metrics beside what is good."""
     from realsim_capture_plans.plan_files.imported import IMPORT_MEANINGS
-    from realsim_capture_plans.planning.metric_meanings import goal_of
-    from realsim_capture_plans.planning.metrics import METRIC_MEANINGS
+    from realsim_capture_plans.planning.metrics import METRIC_MEANINGS, goal_of
 
     meanings = METRIC_MEANINGS | IMPORT_MEANINGS
     x, y, z = plan.center_world.tolist()

@@ -1,4 +1,4 @@
-"""The simulated D405 in the arm's hand: photographs and noisy depth of what is on the table.
+"""The simulated arm and the D405 in its hand, as the devices that a capture asks.
 
 Colour and depth share one pixel grid, as on the D405 whose colour comes from its stereo module.
 The images are made by the true, distorted lens; the intrinsics it reports are the factory's.
@@ -9,17 +9,75 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from realsim.records import CameraIntrinsics
-from realsim_capture_plans.devices.interfaces import Arm, Frame
+from realsim_capture_plans.arms.kinematics import UR5, DhChain, JointLimits
+from realsim_capture_plans.devices.interfaces import Arm, ArmState, Frame, checked_goal
 from realsim_capture_plans.lab.truth import NOISE, LabConfig, LabTruth, factory_intrinsics, stream
+from realsim_capture_plans.planning.ordering import move_seconds
 
 if TYPE_CHECKING:
     from realsim.rendering.photo import PhotoRenderer
     from realsim.rendering.rays import PlacedMesh
 
 Array = NDArray[np.float64]
+
+HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
+"""(6,) where the arm stands when it is switched on: folded, the tool looking down [rad]."""
+
+
+class SimulatedArm:
+    """A UR5 without errors of its own knowledge: the errors are in where it really stands.
+
+    The reported pose is the nominal forward kinematics of the commanded joints. The true flange,
+    which only the lab's truth knows, is elsewhere by the errors of the chain and the repeatability.
+    Time is simulated: a move lasts as long as moveJ's trapezoid of its leading joint.
+    """
+
+    def __init__(self, chain: DhChain = UR5) -> None:
+        """Switch the arm on at its home position."""
+        self._chain = chain
+        self._joints = HOME.copy()
+        self._time_s = 0.0
+
+    @property
+    def name(self) -> str:
+        """Model name, a key of `kinematics.CHAINS`."""
+        return self._chain.name
+
+    @property
+    def limits(self) -> JointLimits:
+        """Limits of the joints."""
+        return self._chain.limits
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """What is kept with the session."""
+        return {"model": self.name, "simulated": True}
+
+    def recover(self) -> None:
+        """Do nothing: this arm never stops by itself."""
+
+    def move(self, joints: ArrayLike, speed: float = 1.05, acceleration: float = 1.4) -> None:
+        """Go to joints (6,) [rad] at the speed [rad/s] and acceleration [rad/s^2] of moveJ.
+
+        Raises:
+            InputError: the goal is not 6 finite angles within the limits; the arm has not moved.
+        """
+        goal = checked_goal(joints, self.limits)
+        way = np.abs(goal - self._joints).max()
+        self._time_s += float(move_seconds(way, speed, acceleration))
+        self._joints = goal
+
+    def state(self) -> ArmState:
+        """Return where the arm believes it is."""
+        return ArmState(
+            joints=self._joints,
+            T_base_ee=self._chain.forward(self._joints),
+            time_s=self._time_s,
+        )
+
 
 DEPTH_UNIT_M = 1e-4
 """Metres per count of the D405's depth (its driver's default)."""

@@ -1,4 +1,6 @@
-"""The mount file: a few lines of TOML that say where the camera sits and what holds it.
+"""Hand-written TOML: the mount file and the work cell file.
+
+A mount file says where the camera sits and what holds it:
 
 name = "printed bracket, left"
 camera = "D405"
@@ -16,8 +18,18 @@ rotation_vector_rad = [0.0, 0.0, 0.0]
 kind = "convex"                               # the convex hull of a mesh
 file = "bracket.stl"
 unit = "mm"
+
+A work cell file says what the arm keeps away from:
+
+[[obstacles]]
+name = "back wall"
+lower_m = [-2.0, 0.70, -1.0]      # in the controller's base; inf and -inf are accepted
+upper_m = [2.0, 0.75, 2.0]
 """
 
+import math
+import tomllib
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,9 +38,96 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
-from realsim_capture_plans.collision.camera_bodies import FLANGE, camera_body
-from realsim_capture_plans.collision.shapes import SIZES, Kind, Mount, Shape
-from realsim_capture_plans.collision.toml_fields import Fields, read_toml
+from realsim_capture_plans.collision.mount import FLANGE, camera_body, plain_bracket
+from realsim_capture_plans.collision.shapes import SIZES, Box, Kind, Mount, Shape
+
+
+class Fields:
+    """One table of a TOML file; remembers which file and where, for messages."""
+
+    def __init__(self, values: dict[str, Any], where: str, known: tuple[str, ...]) -> None:
+        """Check the keys.
+
+        Raises:
+            InputError: a key that is not known; it is named with the nearest known one.
+        """
+        self.values, self.where = values, where
+        if unknown := [key for key in values if key not in known]:
+            key = unknown[0]
+            near = get_close_matches(key, known, n=1, cutoff=0.5)
+            meant = f" Was '{near[0]}' meant?" if near else ""
+            raise InputError(f"{where}: '{key}' is not known.{meant} There are {', '.join(known)}.")
+
+    def text(self, key: str) -> str:
+        """Return a text that must be there."""
+        value = self.values.get(key)
+        if not isinstance(value, str) or not value.strip():
+            raise InputError(f"{self.where}: {key} is {_shown(value)}; a text is needed.")
+        return value
+
+    def number(self, key: str, default: float) -> float:
+        """Return a finite number, or the default."""
+        value = self.values.get(key, default)
+        if not _is_number(value):
+            raise InputError(f"{self.where}: {key} is {_shown(value)}; a number is needed.")
+        return float(value)
+
+    def row(self, key: str, count: int, default: tuple[float, ...] | None = None) -> list[float]:
+        """Return a list of `count` numbers, finite or not."""
+        value = self.values.get(key, default)
+        if (
+            not isinstance(value, list | tuple)
+            or len(value) != count
+            or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+        ):
+            raise InputError(
+                f"{self.where}: {key} is {_shown(value)}; a list of {count} numbers is needed."
+            )
+        return [float(v) for v in value]
+
+    def finite_row(
+        self, key: str, count: int, default: tuple[float, ...] | None = None
+    ) -> list[float]:
+        """Return a list of `count` finite numbers."""
+        row = self.row(key, count, default)
+        if not all(math.isfinite(v) for v in row):
+            raise InputError(f"{self.where}: {key} is {row}; finite numbers are needed.")
+        return row
+
+    def tables(self, key: str) -> list[dict[str, Any]]:
+        """Return the [[key]] tables, none if there are none."""
+        value = self.values.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(v, dict) for v in value):
+            raise InputError(f"{self.where}: {key} must be written as [[{key}]] tables.")
+        return value
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return a TOML file's values.
+
+    Raises:
+        InputError: no such file, or not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist. Give the path of a TOML file.") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read: {error}.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(
+            f"{path} is not TOML: {error}. Numbers are written 0.035 (with a point), texts in "
+            "quotes, lists in brackets."
+        ) from None
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _shown(value: Any) -> str:
+    return "missing" if value is None else repr(value)
+
 
 Array = NDArray[np.float64]
 ROTATIONS = ("rotation_vector_rad", "quaternion_xyzw", "matrix")
@@ -54,8 +153,6 @@ def read_mount(path: Path | str) -> Mount:
             cannot be read.
         UnitError: lengths that can only be millimetres.
     """
-    from realsim_capture_plans.collision.mount import plain_bracket
-
     path = Path(path)
     fields = Fields(read_toml(path), str(path), MOUNT_KEYS)
     camera = fields.text("camera")
@@ -252,3 +349,47 @@ def _quoted(text: str) -> str:
 
 def _numbers(row: Array) -> str:
     return "[" + ", ".join(repr(float(v)) for v in row) + "]"
+
+
+FAR_M = 20.0
+"""No work cell is larger; larger finite numbers are millimetres."""
+
+
+def read_work_cell_obstacles(path: Path | str) -> tuple[tuple[str, Box], ...]:
+    """Return the named boxes in base of a file (see the module's text for the format) [m].
+
+    Raises:
+        InputError: no such file, unknown keys, a name twice, a box without volume.
+        UnitError: coordinates that can only be millimetres.
+    """
+    path = Path(path)
+    top = Fields(read_toml(path), str(path), ("obstacles",))
+    tables = top.tables("obstacles")
+    if not tables:
+        raise InputError(f"{path} holds no [[obstacles]] tables (name, lower_m, upper_m).")
+    found: dict[str, Box] = {}
+    for k, table in enumerate(tables, 1):
+        fields = Fields(table, f"{path}, obstacle {k}", ("name", "lower_m", "upper_m"))
+        name = fields.text("name")
+        if name in found:
+            raise InputError(f"{path}: two obstacles are called '{name}'; give each its own name.")
+        found[name] = _box(fields, name)
+    return tuple(found.items())
+
+
+def _box(fields: Fields, name: str) -> Box:
+    lower, upper = fields.row("lower_m", 3), fields.row("upper_m", 3)
+    for value in (*lower, *upper):
+        if math.isnan(value):
+            raise InputError(f"{fields.where} ('{name}'): a coordinate is NaN.")
+        if math.isfinite(value) and abs(value) > FAR_M:
+            raise UnitError(
+                f"{fields.where} ('{name}'): a coordinate of {value} m is beyond {FAR_M:.0f} m. "
+                "Were millimetres given? Boxes are in metres in the controller's base."
+            )
+    try:
+        return Box(lower=(lower[0], lower[1], lower[2]), upper=(upper[0], upper[1], upper[2]))
+    except InputError as error:
+        raise InputError(
+            f"{fields.where} ('{name}'): {error} Every number of lower_m must be below upper_m's."
+        ) from None
