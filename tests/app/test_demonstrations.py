@@ -13,7 +13,7 @@ from realsim.app.demonstrations import run as demonstrations
 from realsim.app.demonstrations.cli import demonstrations_command
 from realsim.app.demonstrations.run import DemonstrationRequest, open_source
 from realsim.errors import InputError
-from realsim.formats.lerobot import layout
+from realsim.formats.lerobot import episodes as layout
 from realsim_sim_bridge.demonstrations import lerobot_episodes
 from realsim_sim_bridge.demonstrations.lerobot_episodes import episode_columns
 from school_sessions import registered, run

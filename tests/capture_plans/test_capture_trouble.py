@@ -394,14 +394,6 @@ def test_a_doubt_that_stays_is_stored_with_a_note_and_three_in_a_row_are_asked_a
     assert summary.complete and [k for k, _ in summary.noted] == [5, 6, 7, 8]
 
 
-def test_what_earlier_runs_saw_is_what_later_ones_are_judged_by(tmp_path: Path) -> None:
-    b = bench(tmp_path / "s", {7: blurred})
-    b.capture(views=tuple(range(6)))
-    b.store = SessionStore.open(b.store.folder)
-    summary = b.capture()
-    assert [k for k, _ in summary.rejected] == [6] and "blurred" in summary.rejected[0][1]
-
-
 def test_skip_redo_and_stop(tmp_path: Path, reference: SessionStore) -> None:
     b = bench(tmp_path / "s")
     person = Person(keys={2: ["skip"], 5: ["redo"], 7: ["stop"]})

@@ -252,26 +252,9 @@ def test_a_cell_in_millimetres_and_an_unknown_arm_are_named() -> None:
         CollisionModel(UR5, d405_mount(), CELL, -0.01)
 
 
-@pytest.mark.parametrize("chain", CHAINS, ids=lambda c: c.name)
-def test_the_usual_poses_are_free(chain: DhChain) -> None:
-    """Straight up, and looking down on the table in front."""
-    up = np.radians([0.0, -90.0, 0.0, -90.0, 0.0, 0.0])
-    assert model(chain).free(np.stack([HOME, up])).all()
-
-
 def test_folded_onto_itself_is_not_free() -> None:
     folded = np.radians([0.0, -90.0, 175.0, 0.0, 0.0, 0.0])
     asked = model()
     assert not asked.free(folded[None])[0]
     group, first, second, distance = asked.nearest(folded)
     assert group in ("self", "tool") and distance < 0.01, (first, second)
-
-
-def test_interpolated_moves_keep_their_ends_and_the_step() -> None:
-    start, end = joints(20, 1), joints(20, 2)
-    q, owner = interpolate(start, end, 0.04)
-    for e in range(20):
-        part = q[owner == e]
-        assert np.array_equal(part[0], start[e])
-        assert np.abs(part[-1] - end[e]).max() < 1e-12
-        assert np.abs(np.diff(part, axis=0)).max() <= 0.04

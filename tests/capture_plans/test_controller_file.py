@@ -126,20 +126,6 @@ def test_the_ros_file_gives_its_own_forward_kinematics(name: str, tmp_path: Path
     assert np.abs(chain.delta_d).max() > 10.0  # the parallel axes' common normals lie far away
 
 
-@pytest.mark.parametrize("name", ["UR5", "UR5e"])
-def test_exactly_parallel_axes_give_the_nominal_arm_back(name: str) -> None:
-    arm = NOMINAL[name]
-    a, d = arm.a, arm.d
-    half = np.pi / 2
-    rows = [
-        [0, 0, d[0], 0, 0, 0], [0, 0, 0, half, 0, 0], [a[1], 0, 0, 0, 0, 0],
-        [a[2], 0, d[3], 0, 0, 0], [0, -d[4], 0, half, 0, 0], [0, d[5], 0, -half, 0, 0],
-    ]  # fmt: skip
-    numbers = dh_of_links(link_transforms(rows), arm)
-    for key in LISTS:
-        assert np.abs(numbers[key] - getattr(arm, key)).max() < 1e-12, key
-
-
 def test_any_arm_of_six_axes_comes_back_from_its_dh_numbers() -> None:
     """The law behind the ROS file: links of random DH numbers give the same arm again."""
     rng = np.random.default_rng(3)

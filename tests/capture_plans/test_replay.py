@@ -98,13 +98,6 @@ def test_a_foreign_page_cannot_connect(replay: PlanReplay) -> None:
         pass
 
 
-def test_nobody_can_ask_for_a_public_tunnel(replay: PlanReplay) -> None:
-    from viser import _messages
-
-    handlers: Any = replay.server._websock_server._incoming_handlers  # type: ignore[reportPrivateUsage]
-    assert _messages.ShareUrlRequest not in handlers or not handlers[_messages.ShareUrlRequest]
-
-
 # --- what it draws ----------------------------------------------------------------------------
 
 
@@ -154,16 +147,6 @@ def test_steps_go_from_view_to_view(replay: PlanReplay) -> None:
     replay.show_view(0)
     step(-1)
     assert replay.time_s == pytest.approx(replay.tour.view_s[0])
-
-
-def test_playing_moves_on_and_begins_again(replay: PlanReplay) -> None:
-    replay.show(replay.tour.total_s)
-    replay._playing.value = True  # type: ignore[reportPrivateUsage]
-    end = time.monotonic() + 20
-    while not 0.05 < replay.time_s < replay.tour.total_s and time.monotonic() < end:
-        time.sleep(0.02)
-    replay._playing.value = False  # type: ignore[reportPrivateUsage]
-    assert 0.05 < replay.time_s < replay.tour.total_s
 
 
 def test_the_scene_has_arm_camera_table_boxes_and_views(replay: PlanReplay) -> None:
@@ -269,11 +252,3 @@ def test_in_chromium_the_file_draws_the_scene_without_a_server(tmp_path: Path) -
     image = photographed(path.as_uri(), tmp_path / "profile")
     assert orange(image) >= 20  # the keep-out box
     assert image[150:550, 200:800].std() > 8  # and more than that
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_in_chromium_the_running_replay_is_drawn(replay: PlanReplay, tmp_path: Path) -> None:
-    replay.show_view(2)
-    image = photographed(replay.url, tmp_path / "profile")
-    assert orange(image) >= 20

@@ -8,7 +8,7 @@ import pytest
 
 from realsim.errors import RealsimError
 from realsim.formats.bags import BagChoice, BagSource, open_bag
-from realsim.formats.bags import stored as stored_module
+from realsim.formats.bags import scan as stored_module
 from realsim.formats.bags.tf_tree import T_BASE_BASELINK
 from realsim.formats.frame_source import FrameSource
 from realsim.geometry import se3

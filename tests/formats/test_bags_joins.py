@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from realsim.errors import InputError, UnitError
-from realsim.formats.bags import clocks, depth_unit, wire
+from realsim.formats.bags import clocks, pixels, wire
 from realsim.formats.bags.joints import UR_JOINTS, JointTrack, prefixes
 from realsim.formats.bags.reproject import depth_in_colour
 from realsim.formats.bags.tf_tree import T_BASE_BASELINK, TfTree, arm_frames
@@ -55,19 +55,19 @@ def test_clocks_apart_are_named_with_both_ranges() -> None:
 
 def test_depth_units() -> None:
     depth = [np.full((4, 4), 400, np.uint16)]
-    assert depth_unit.unit_of(depth, "t", "16UC1", None, None)[0] == 1e-3
-    assert depth_unit.unit_of(depth, "t", "mono16", None, 2e-4)[0] == 2e-4
-    assert depth_unit.unit_of(depth, "t", "mono16", 5e-4, 2e-4)[0] == 5e-4
+    assert pixels.unit_of(depth, "t", "16UC1", None, None)[0] == 1e-3
+    assert pixels.unit_of(depth, "t", "mono16", None, 2e-4)[0] == 2e-4
+    assert pixels.unit_of(depth, "t", "mono16", 5e-4, 2e-4)[0] == 5e-4
     with pytest.raises(UnitError, match="has no unit"):
-        depth_unit.unit_of(depth, "t", "mono16", None, None)
+        pixels.unit_of(depth, "t", "mono16", None, None)
     for counts in (30, 50000):
         with pytest.raises(UnitError, match="depth_unit_m="):
-            depth_unit.unit_of([np.full((4, 4), counts, np.uint16)], "t", "16UC1", None, None)
+            pixels.unit_of([np.full((4, 4), counts, np.uint16)], "t", "16UC1", None, None)
     near, far = (np.full((4, 4), z, np.float32) for z in (0.5, 6.0))
-    assert depth_unit.unit_of([near], "t", "32FC1", None, None)[0] == 1e-4
-    assert depth_unit.unit_of([far], "t", "32FC1", None, None)[0] == 1e-3
+    assert pixels.unit_of([near], "t", "32FC1", None, None)[0] == 1e-4
+    assert pixels.unit_of([far], "t", "32FC1", None, None)[0] == 1e-3
     with pytest.raises(UnitError):
-        depth_unit.unit_of([near * 1000], "t", "32FC1", None, None)
+        pixels.unit_of([near * 1000], "t", "32FC1", None, None)
 
 
 # --- joints ---------------------------------------------------------------------------------------

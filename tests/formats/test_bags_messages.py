@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from realsim.errors import InputError
-from realsim.formats.bags import camera_info, depth_unit, pixels, wire
+from realsim.formats.bags import camera_info, pixels, wire
 from realsim.geometry.camera import project
 
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
@@ -175,8 +175,8 @@ def test_depth_encodings() -> None:
         assert np.array_equal(pixels.depth_of(message, False, "x"), counts)
     metres = np.array([[0.5, np.nan, np.inf], [0.0, -1.0, 7.0]], np.float32)
     found = pixels.depth_of(raw_image(metres, "32FC1"), False, "x")
-    assert depth_unit.counts_of(found, 1e-4).tolist() == [[5000, 0, 0], [0, 0, 0]]
-    assert depth_unit.counts_of(found, 1e-3).tolist() == [[500, 0, 0], [0, 0, 7000]]
+    assert pixels.counts_of(found, 1e-4).tolist() == [[5000, 0, 0], [0, 0, 0]]
+    assert pixels.counts_of(found, 1e-3).tolist() == [[500, 0, 0], [0, 0, 7000]]
 
 
 def compressed(data: bytes, encoding: str) -> wire.ImageMessage:

@@ -8,10 +8,16 @@ import pycolmap
 import pytest
 
 from realsim.errors import InputError
-from realsim.formats.colmap.encoding import binary_files, camera_row, image_row, text_files
 from realsim.formats.colmap.model import read_model
 from realsim.formats.colmap.source import open_colmap
-from realsim.formats.colmap.writing import ColmapWriteConfig, write_colmap
+from realsim.formats.colmap.writing import (
+    ColmapWriteConfig,
+    binary_files,
+    camera_row,
+    image_row,
+    text_files,
+    write_colmap,
+)
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.session_scene import open_session_scene
 from realsim.geometry import se3

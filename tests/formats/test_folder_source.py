@@ -18,7 +18,7 @@ from realsim.formats.folders import (
     read_cam_info,
 )
 from realsim.formats.folders.depth_evidence import coding_of, decoded, depth_evidence, read_counts
-from realsim.formats.folders.joining import frame_key, join_names, join_states
+from realsim.formats.folders.listing import frame_key, join_names, join_states
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 

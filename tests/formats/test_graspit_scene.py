@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError, NotRigidError
-from realsim.formats.graspit.contacts import contact_distances
+from realsim.formats.graspit.grasps import contact_distances
 from realsim.formats.graspit.scene import (
     is_graspit_scene,
     read_graspit_grasps,

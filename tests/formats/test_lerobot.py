@@ -11,7 +11,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.lerobot import layout
+from realsim.formats.lerobot import episodes as layout
 from realsim.formats.lerobot.episodes import LeRobotEpisode, LeRobotFeature
 from realsim.formats.lerobot.writer import LeRobotConfig, write_lerobot
 

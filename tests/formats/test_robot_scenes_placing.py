@@ -16,7 +16,7 @@ from realsim.formats.robot_scenes.placed_scene import (
     unique_names,
 )
 from realsim.formats.robot_scenes.placing import PlacingConfig, place_scene
-from realsim.formats.robot_scenes.urdf_angles import R_from_rpy, rpy_from_R
+from realsim.formats.robot_scenes.urdf import R_from_rpy, rpy_from_R
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 

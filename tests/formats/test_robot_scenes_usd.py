@@ -11,7 +11,7 @@ from pxr import Gf, Usd, UsdGeom, UsdPhysics, UsdSemantics, UsdShade
 import placed_scenes
 from realsim.errors import MissingLibraryError
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.robot_scenes.convex_parts import collision_parts
+from realsim.formats.robot_scenes.mesh_reading import collision_parts
 from realsim.formats.robot_scenes.usd_scene import UsdConfig, write_usd_scene
 from realsim.models.reading import read_scan
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from realsim import __version__
 from realsim.formats.export_folder import Content
-from realsim.formats.lerobot import layout
-from realsim.formats.lerobot.video import read_video
+from realsim.formats.lerobot import episodes as layout
+from realsim.formats.lerobot.spool import read_video
 
 Rgb = NDArray[np.uint8]
 SHOWN = 4

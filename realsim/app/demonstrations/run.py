@@ -246,7 +246,7 @@ def export_demonstrations(
     from realsim.app.demonstrations.card import demonstrations_card
     from realsim.app.demonstrations.page import page_file
     from realsim.app.export.card import CARD_FILE
-    from realsim.formats.lerobot.video import import_av
+    from realsim.formats.lerobot.spool import import_av
     from realsim.formats.lerobot.writer import LeRobotConfig, write_lerobot
     from realsim.store.lock import only_run_in
     from realsim_sim_bridge.demonstrations.lerobot_episodes import LeRobotDemonstrations

@@ -4,7 +4,7 @@
 bounded memory, one frame at a time.
 """
 
-from realsim.formats.bags.choice import BagChoice
 from realsim.formats.bags.source import BagSource, open_bag
+from realsim.formats.bags.topics import BagChoice
 
 __all__ = ["BagChoice", "BagSource", "open_bag"]

@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.bags.choice import BagChoice
 from realsim.formats.bags.clocks import Times, check_overlap
 from realsim.formats.bags.scan import Scan
 from realsim.formats.bags.tf_tree import arm_frames
-from realsim.formats.bags.topics import Topics
+from realsim.formats.bags.topics import BagChoice, Topics
 from realsim.records.checked_arrays import Array
 
 

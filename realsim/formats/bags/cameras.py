@@ -7,10 +7,9 @@ import numpy as np
 from realsim.errors import InputError
 from realsim.formats.bags import camera_info as ci
 from realsim.formats.bags import realsense as rs
-from realsim.formats.bags.choice import BagChoice
 from realsim.formats.bags.recording import Recording
 from realsim.formats.bags.tf_tree import TfTree
-from realsim.formats.bags.topics import CAMERA_INFO, ImageTopic, Topics
+from realsim.formats.bags.topics import CAMERA_INFO, BagChoice, ImageTopic, Topics
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import Array
 

@@ -14,12 +14,10 @@ from realsim.errors import InputError
 from realsim.formats.bags import cameras, clocks, pixels
 from realsim.formats.bags import realsense as rs
 from realsim.formats.bags.arm import ArmAtFrames, arm_at
-from realsim.formats.bags.choice import BagChoice
-from realsim.formats.bags.depth_unit import counts_of, unit_of
+from realsim.formats.bags.pixels import counts_of, unit_of
 from realsim.formats.bags.recording import Recording
-from realsim.formats.bags.scan import ImageTimes, Scan, scan
-from realsim.formats.bags.stored import Messages, StoredImages
-from realsim.formats.bags.topics import Topics, choose
+from realsim.formats.bags.scan import ImageTimes, Messages, Scan, StoredImages, scan
+from realsim.formats.bags.topics import BagChoice, Topics, choose
 from realsim.formats.bags.wire import NS_PER_S, ImageMessage, MessageError
 from realsim.formats.frame_source import SourceFrame
 from realsim.records import CameraIntrinsics

@@ -1,98 +1,59 @@
-"""The registered images of a COLMAP model as a frame source."""
+"""Images that a COLMAP model places, with depth beside them: joined by name."""
 
-import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from realsim import images
 from realsim.errors import InputError
-from realsim.formats.colmap.depth import checked_by_depth, find_depth
 from realsim.formats.colmap.model import ColmapImage, ColmapModel, find_model, read_model
-from realsim.formats.folders.depth_evidence import read_counts
-from realsim.formats.folders.joining import natural_key
-from realsim.formats.folders.listing import image_header, shown
-from realsim.formats.folders.source import file_digest, require_one_size
-from realsim.formats.frame_source import SourceFrame
+from realsim.formats.folders.listing import image_header, natural_key, shown
+from realsim.formats.folders.posed_images import (
+    PosedImage,
+    PosedImages,
+    checked_by_depth,
+    require_scale,
+    same_camera,
+)
+from realsim.formats.folders.source import require_one_size
 from realsim.records import CameraIntrinsics
+
+FOLDER = "depth"
+"""Where `realsim export` puts depth in a COLMAP project."""
+REMEDY = "COLMAP's poses are world to camera, with OpenCV's axes; export the model again."
+
+
+def find_depth(
+    root: Path, given: Path | str | None, names: Sequence[str], notes: list[str]
+) -> dict[str, Path]:
+    """Return the depth image of each image name that has one: the same name, as PNG.
+
+    Args:
+        root: the project.
+        given: folder of the depth images; None = depth/ in the project.
+        names: of the images.
+        notes: what is left out is added.
+
+    Raises:
+        InputError: a folder was given and no image has depth there.
+    """
+    places = [root / FOLDER] if given is None else [Path(given), root / given]
+    for place in places:
+        found = {n: place / Path(n).with_suffix(".png") for n in names}
+        found = {n: p for n, p in found.items() if p.is_file()}
+        if found:
+            absent = [n for n in names if n not in found]
+            if absent:
+                notes.append(f"{len(absent)} images have no depth, left out: {shown(absent)}.")
+            return found
+    if given is not None:
+        raise InputError(
+            f"{given} holds no depth image of the name of an image, such as "
+            f"{Path(names[0]).with_suffix('.png') if names else '000000.png'}."
+        )
+    return {}
+
 
 IMAGE_FOLDERS = ("images", "image", "rgb", "input", "")
 """Where in a project's folder its images may be."""
-SAME_CAMERA = 1e-9
-"""Cameras whose parameters differ by less are one camera, listed once for every image."""
-
-
-class ColmapSource:
-    """Images of one camera of a COLMAP model; made by `open_colmap`."""
-
-    def __init__(
-        self, name: str, model: ColmapModel, camera: CameraIntrinsics,
-        files: Sequence[tuple[ColmapImage, Path]], notes: Sequence[str], scale: float | None,
-        depth: Mapping[str, Path], unit_m: float | None,
-    ) -> None:  # fmt: skip
-        """Take over what was checked; see `open_colmap`."""
-        self._depth, self._unit_m = dict(depth), unit_m
-        self._name, self._model, self._camera = name, model, camera
-        self._files, self._notes, self._scale = tuple(files), tuple(notes), scale
-
-    @property
-    def name(self) -> str:
-        """The project's folder name."""
-        return self._name
-
-    @property
-    def intrinsics(self) -> CameraIntrinsics:
-        """The camera of all images."""
-        return self._camera
-
-    @property
-    def depth_unit_m(self) -> float | None:
-        """Metres per count; None without depth images, which COLMAP itself has not."""
-        return self._unit_m
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was left out, and what is not known of the scale."""
-        return self._notes
-
-    @property
-    def extra(self) -> dict[str, Any]:
-        """Where it came from: model, images, scale, content key."""
-        digest = hashlib.sha256()
-        for image, path in self._files:
-            digest.update(file_digest(path, image.name))
-            if image.name in self._depth:
-                digest.update(file_digest(self._depth[image.name], image.name))
-            digest.update(image.T_world_cam.tobytes())
-        return {
-            "kind": "colmap",
-            "path": str(self._model.folder.resolve()),
-            "metres_per_unit": self._scale,
-            "frames": [image.name for image, _ in self._files],
-            "content_key": digest.hexdigest(),
-        }
-
-    def __len__(self) -> int:
-        """Return the number of images."""
-        return len(self._files)
-
-    def frames(self, start: int = 0) -> Iterator[SourceFrame]:
-        """Yield the images from place `start` on, in natural order of their names.
-
-        Raises:
-            InputError: an image cannot be read; the message names it.
-        """
-        for k in range(start, len(self._files)):
-            image, path = self._files[k]
-            deep = self._depth.get(image.name)
-            yield SourceFrame(
-                name=image.name, time_s=float(k), rgb=images.read_rgb(path),
-                depth_counts=None if deep is None else read_counts(deep),
-                T_world_cam=_metric(image, self._scale),
-            )  # fmt: skip
 
 
 def open_colmap(
@@ -104,7 +65,7 @@ def open_colmap(
     depth_folder: Path | str | None = None,
     depth_unit_m: float | None = None,
     use_depth: bool = True,
-) -> ColmapSource:
+) -> PosedImages:
     """Return a COLMAP model with its images as a frame source.
 
     Args:
@@ -127,8 +88,7 @@ def open_colmap(
             f"{root} holds no COLMAP model: cameras and images (.bin or .txt) were looked for "
             "there and in sparse/0, sparse, model, colmap and dense/sparse."
         )
-    if metres_per_unit is not None and not (np.isfinite(metres_per_unit) and metres_per_unit > 0):
-        raise InputError(f"the scale {metres_per_unit} is not a positive number of metres.")
+    require_scale(metres_per_unit)
     model = read_model(folder)
     chosen, camera, notes = _of_one_camera(model, camera_id)
     place = _images_place(root, folder, images_folder, chosen)
@@ -153,12 +113,20 @@ def open_colmap(
     unit_m: float | None = None
     if use_depth and (depth_folder is not None or depth_unit_m is not None):
         depth = find_depth(root, depth_folder, [i.name for i, _ in there], notes)
+    posed = [
+        PosedImage(
+            name=i.name,
+            colour=p,
+            depth=depth.get(i.name),
+            intrinsics=camera,
+            T_world_cam=i.T_world_cam,
+        )
+        for i, p in there
+        if not depth or i.name in depth
+    ]
     if depth:
-        there = [pair for pair in there if pair[0].name in depth]
-        Ts = np.stack([_metric(i, metres_per_unit) for i, _ in there])
-        paths = [depth[i.name] for i, _ in there]
-        unit_m, said = checked_by_depth(
-            paths, Ts, camera, depth_unit_m, str(folder), metres_per_unit
+        unit_m, _, said = checked_by_depth(
+            posed, camera, depth_unit_m, str(folder), metres_per_unit, REMEDY
         )
         notes += said
     elif metres_per_unit is None:
@@ -167,15 +135,16 @@ def open_colmap(
             "taken as if its unit were the metre. Give --scale (metres per unit) once it is known, "
             "such as a measured distance over the same distance in the model."
         )
-    name = root.resolve().name if folder != root else folder.resolve().parent.name
-    return ColmapSource(name, model, camera, there, notes, metres_per_unit, depth, unit_m)
-
-
-def _metric(image: ColmapImage, scale: float | None) -> NDArray[np.float64]:
-    """Return T_world_cam of an image with its translation in metres, as far as they are known."""
-    T = image.T_world_cam.copy()
-    T[:3, 3] *= 1.0 if scale is None else scale
-    return T
+    return PosedImages(
+        kind="colmap",
+        path=model.folder,
+        name=root.resolve().name if folder != root else folder.resolve().parent.name,
+        intrinsics=camera,
+        images=tuple(posed),
+        depth_unit_m=unit_m,
+        metres_per_unit=metres_per_unit,
+        notes=tuple(notes),
+    )
 
 
 def _of_one_camera(
@@ -190,7 +159,7 @@ def _of_one_camera(
         raise InputError(f"the COLMAP model {model.folder} has no registered image.")
     groups: dict[int, list[int]] = {}
     for k, camera in sorted(model.cameras.items()):
-        first = next((g for g in groups if _same(camera, model.cameras[g])), k)
+        first = next((g for g in groups if same_camera(camera, model.cameras[g])), k)
         groups.setdefault(first, []).append(k)
     counts = {g: sum(i.camera_id in members for i in model.images) for g, members in groups.items()}
     listed = "; ".join(
@@ -216,11 +185,6 @@ def _of_one_camera(
         notes += [f"{left} images of other cameras were left out."] if left else []
     chosen = [i for i in model.images if i.camera_id in groups[group]]
     return chosen, model.cameras[group], notes
-
-
-def _same(a: CameraIntrinsics, b: CameraIntrinsics) -> bool:
-    values = [np.array([c.width, c.height, c.fx, c.fy, c.cx, c.cy, *c.distortion]) for c in (a, b)]
-    return bool(np.allclose(values[0], values[1], rtol=0, atol=SAME_CAMERA))
 
 
 def _images_place(

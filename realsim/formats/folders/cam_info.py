@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
-from realsim.formats.folders.joining import FrameState
+from realsim.formats.folders.listing import FrameState
 from realsim.geometry import se3
 from realsim.untrusted.files import checked_bytes
 

@@ -18,16 +18,19 @@ from realsim.formats.folders.depth_evidence import (
     read_counts,
     require_unit,
 )
-from realsim.formats.folders.joining import (
+from realsim.formats.folders.listing import (
     FrameState,
+    ImageFile,
+    ImageFolder,
     Join,
     join_names,
     join_states,
+    list_folder,
     natural_key,
     plain_values,
     require_unique,
+    shown,
 )
-from realsim.formats.folders.listing import ImageFile, ImageFolder, list_folder, shown
 from realsim.formats.frame_source import SourceFrame
 from realsim.records import CameraIntrinsics
 
@@ -61,56 +64,44 @@ class _Row:
     states: tuple[FrameState, ...]
 
 
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class FolderSource:
     """A folder of images, opened and checked; made by `open_folder`."""
 
-    def __init__(
-        self, root: Path, camera: CameraIntrinsics, rows: Sequence[_Row], *,
-        unit_m: float | None, coding: DepthCoding, notes: Sequence[str],
-    ) -> None:  # fmt: skip
-        """Take over what was checked; see `open_folder`."""
-        self._root, self._camera, self._rows = root, camera, tuple(rows)
-        self._unit_m, self._notes = unit_m, tuple(notes)
-        self._coding: DepthCoding = coding
+    root: Path
+    intrinsics: CameraIntrinsics
+    """The camera that was given."""
+    rows: tuple[_Row, ...]
+    """The complete frames, in natural order of the colour names."""
+    depth_unit_m: float | None
+    """Metres per count; None without depth."""
+    coding: DepthCoding
+    notes: tuple[str, ...]
+    """How frames were joined, and what was left out."""
 
     @property
     def name(self) -> str:
         """The folder's name."""
-        return self._root.resolve().name
-
-    @property
-    def intrinsics(self) -> CameraIntrinsics:
-        """The camera that was given."""
-        return self._camera
-
-    @property
-    def depth_unit_m(self) -> float | None:
-        """Metres per count; None without depth."""
-        return self._unit_m
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """How frames were joined, and what was left out."""
-        return self._notes
+        return self.root.resolve().name
 
     @property
     def extra(self) -> dict[str, Any]:
         """Where it came from: kind, files of every frame, depth coding, content key."""
-        files = [[self._relative(r.colour), self._relative(r.depth)] for r in self._rows]
+        files = [[self._relative(r.colour), self._relative(r.depth)] for r in self.rows]
         return {
             "kind": "folder",
-            "path": str(self._root.resolve()),
-            "depth_coding": self._coding if self._unit_m else None,
+            "path": str(self.root.resolve()),
+            "depth_coding": self.coding if self.depth_unit_m else None,
             "frames": files,
             "content_key": self._content_key(),
         }
 
     def _relative(self, image: ImageFile | None) -> str | None:
-        return None if image is None else image.path.relative_to(self._root).as_posix()
+        return None if image is None else image.path.relative_to(self.root).as_posix()
 
     def _content_key(self) -> str:
         digest = hashlib.sha256()
-        for row in self._rows:
+        for row in self.rows:
             for image in (row.colour, row.depth):
                 if image is not None:
                     digest.update(file_digest(image.path, str(self._relative(image))))
@@ -119,7 +110,7 @@ class FolderSource:
 
     def __len__(self) -> int:
         """Return the number of complete frames."""
-        return len(self._rows)
+        return len(self.rows)
 
     def frames(self, start: int = 0) -> Iterator[SourceFrame]:
         """Yield the frames from number `start` on, in natural order of the colour names.
@@ -127,11 +118,11 @@ class FolderSource:
         Raises:
             InputError: an image cannot be read; the message names it.
         """
-        for k in range(start, len(self._rows)):
-            row = self._rows[k]
+        for k in range(start, len(self.rows)):
+            row = self.rows[k]
             counts = None
             if row.depth is not None:
-                counts = decoded(read_counts(row.depth.path), self._coding)
+                counts = decoded(read_counts(row.depth.path), self.coding)
             known = {
                 name: next(
                     (v for v in (getattr(s, name) for s in row.states) if v is not None), None
@@ -196,7 +187,14 @@ def open_folder(
             f"depth: {100 * evidence.filled:.0f} % of the pixels, median "
             f"{evidence.median(coding) * unit_m:.3g} m with {unit_m:g} m per count."
         )
-    return FolderSource(listing.root, camera, rows, unit_m=unit_m, coding=coding, notes=notes)
+    return FolderSource(
+        root=listing.root,
+        intrinsics=camera,
+        rows=tuple(rows),
+        depth_unit_m=unit_m,
+        coding=coding,
+        notes=tuple(notes),
+    )
 
 
 def _checked_camera(listing: ImageFolder, camera: CameraIntrinsics | None) -> CameraIntrinsics:

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.graspit.contacts import midway_error
 from realsim.formats.graspit.grasps import (
     GRASP_FILE,
     SAMPLED_GRASPS,
     WorldGrasps,
+    midway_error,
     object_grasps,
     read_grasp_file,
 )

@@ -161,8 +161,7 @@ def _write_mesh(
     body = scene.bodies[obj_id]
     files = {f"{piece}.stl": stl_bytes(body.model.mesh)}
     if config.with_usd:
-        from realsim.formats.robot_scenes.pixar import Pixar
-        from realsim.formats.robot_scenes.usd_body import body_stage, texture_png
+        from realsim.formats.robot_scenes.usd_body import Pixar, body_stage, texture_png
         from realsim.formats.robot_scenes.usd_scene import layer_bytes
 
         stage = body_stage(Pixar(), body, name, f"./{name}.png")

@@ -16,12 +16,25 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.formats.export_folder import Content, ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
-from realsim.formats.lerobot import layout
+from realsim.formats.lerobot import episodes as layout
 from realsim.formats.lerobot.episodes import LeRobotSource, check_source
-from realsim.formats.lerobot.spool import SPOOL, SpooledEpisode, forget, spool, spooled
-from realsim.formats.lerobot.statistics import Stats, column_stats, together
-from realsim.formats.lerobot.tables import data_bytes, episodes_bytes, tasks_bytes
-from realsim.formats.lerobot.video import import_av, join
+from realsim.formats.lerobot.spool import (
+    SPOOL,
+    SpooledEpisode,
+    forget,
+    import_av,
+    join,
+    spool,
+    spooled,
+)
+from realsim.formats.lerobot.tables import (
+    Stats,
+    column_stats,
+    data_bytes,
+    episodes_bytes,
+    tasks_bytes,
+    together,
+)
 from realsim.store import atomic
 
 GROUPS = "meta/groups"

@@ -23,8 +23,13 @@ from realsim.formats.export_folder import Content, ExportFolder
 from realsim.formats.folders.depth_evidence import read_counts
 from realsim.formats.folders.listing import shown
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene, WrittenScene
-from realsim.formats.nerfstudio.cameras import camera_entry, transform_matrix
-from realsim.formats.nerfstudio.transforms import DEFAULT_DEPTH_UNIT_M, FILE, UNIT
+from realsim.formats.nerfstudio.transforms import (
+    DEFAULT_DEPTH_UNIT_M,
+    FILE,
+    UNIT,
+    camera_entry,
+    transform_matrix,
+)
 from realsim.records import CameraIntrinsics
 
 POINTS_FILE = "sparse_pc.ply"

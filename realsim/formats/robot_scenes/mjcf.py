@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from realsim import interop
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
-from realsim.formats.robot_scenes.convex_parts import collision_parts
 from realsim.formats.robot_scenes.mesh_obj import (
     PLAIN_RGB,
     TABLE_RGB,
@@ -26,14 +25,15 @@ from realsim.formats.robot_scenes.mesh_obj import (
     part_file,
     visual_files,
 )
+from realsim.formats.robot_scenes.mesh_reading import collision_parts
 from realsim.formats.robot_scenes.placed_scene import (
     TABLE_NAME,
     PlacedObject,
     PlacedScene,
     RigidBody,
     SceneCamera,
+    spaced,
 )
-from realsim.formats.robot_scenes.xml_numbers import spaced
 from realsim.geometry import se3
 
 Array = NDArray[np.float64]

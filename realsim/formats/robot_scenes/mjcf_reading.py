@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError, MissingLibraryError, UnitError
-from realsim.formats.robot_scenes.convex_parts import convex_part
+from realsim.formats.robot_scenes.mesh_reading import convex_part
 from realsim.formats.robot_scenes.mjcf_worker import FAILED, FOUND, MOST_CPU_S, SHAPES
 from realsim.formats.robot_scenes.placed_scene import (
     TABLE_NAME,

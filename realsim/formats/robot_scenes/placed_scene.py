@@ -6,6 +6,7 @@ kilograms and seconds. One body may stand in several places.
 
 import math
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -245,3 +246,8 @@ def _require_inertia(inertia: Array, name: str) -> None:
             "of which two exceed the third are what a body can have. Is it about the centre of "
             "mass, and in kg m^2?"
         )
+
+
+def spaced(values: Iterable[float]) -> str:
+    """Return numbers as XML's formats have them; they are read back bit for bit."""
+    return " ".join(repr(float(v)) for v in values)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.robot_scenes.convex_parts import convex_part
+from realsim.formats.robot_scenes.mesh_reading import convex_part
 from realsim.formats.robot_scenes.placed_scene import (
     GRAVITY,
     PlacedObject,

@@ -1,15 +1,4 @@
-"""A scene as a folder of URDFs: one per body, one of the table, and where they stand.
-
-    scene.json              the poses, gravity; what load_pybullet.py reads
-    load_pybullet.py        loads the scene: `python load_pybullet.py --gui`
-    world.urdf              all in one file with floating joints, for programs that know them
-    table.urdf
-    objects/NAME.urdf       a body: visual mesh, convex parts, mass
-    objects/meshes/NAME/    visual.obj, visual.mtl, texture.png, part_000.obj ...
-
-URDF has no free bodies, so that a scene is a list of loaded files: a body may stand in several
-places. Meshes are in metres; the scale of 1 is written out.
-"""
+"""Roll, pitch and yaw as URDF means them: fixed axes, R = Rz(yaw) Ry(pitch) Rx(roll)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,13 +7,13 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from realsim import interop
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
-from realsim.formats.robot_scenes.convex_parts import collision_parts
 from realsim.formats.robot_scenes.mesh_obj import TABLE_RGB, VISUAL, part_file, visual_files
+from realsim.formats.robot_scenes.mesh_reading import collision_parts
 from realsim.formats.robot_scenes.placed_scene import (
     TABLE_NAME,
     WORLD_NAME,
@@ -33,13 +22,38 @@ from realsim.formats.robot_scenes.placed_scene import (
     RigidBody,
     SceneCamera,
     TableBox,
+    spaced,
 )
-from realsim.formats.robot_scenes.urdf_angles import rpy_from_R
-from realsim.formats.robot_scenes.xml_numbers import spaced
 from realsim.geometry import se3
 from realsim.store import atomic
 
 Array = NDArray[np.float64]
+
+
+def rpy_from_R(R: ArrayLike) -> Array:
+    """Return roll, pitch, yaw (3,) [rad] of a rotation (3, 3).
+
+    Straight up and down (pitch of a right angle) roll and yaw are one turn: yaw takes what it can
+    read, roll the rest, so that the rotation comes back in any case.
+    """
+    R = np.asarray(R, dtype=np.float64)
+    yaw = np.arctan2(R[1, 0], R[0, 0])
+    s, c = np.sin(yaw), np.cos(yaw)
+    pitch = np.arctan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = np.arctan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return np.array([roll, pitch, yaw])
+
+
+def R_from_rpy(rpy: ArrayLike) -> Array:
+    """Return the rotation (3, 3) of roll, pitch, yaw (3,) [rad]."""
+    roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)
+    x, y, z = (
+        se3.exp_so3(angle * axis) for angle, axis in zip((roll, pitch, yaw), np.eye(3), strict=True)
+    )
+    product: Array = z @ y @ x
+    return product
+
+
 SCENE_FILE, SCRIPT, WORLD_FILE = "scene.json", "load_pybullet.py", "world.urdf"
 FORMAT, VERSION = "realsim URDF scene", 1
 ABOUT = (

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats.robot_scenes.mesh_reading import colliding, scene_mesh
-from realsim.formats.robot_scenes.urdf_angles import R_from_rpy
+from realsim.formats.robot_scenes.urdf import R_from_rpy
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties, merged, transformed
 from realsim.records import Mesh

@@ -1,22 +1,48 @@
-"""A body as a USD file of its own: what is seen, what collides, of what it is.
+"""Pixar's library, which comes with an extra."""
 
-/NAME is an Xform with rigid body, mass and label; below it are `visual`, a mesh with texture
-coordinates and UsdPreviewSurface, `collision`, of purpose guide, with the convex hulls part_000 ...
-that rub by the body's friction, and `Looks`, the materials.
-"""
-
+import importlib
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.robot_scenes.convex_parts import collision_parts
+from realsim.errors import MissingLibraryError
 from realsim.formats.robot_scenes.mesh_obj import PLAIN_RGB, Look, look_of
-from realsim.formats.robot_scenes.pixar import Pixar
+from realsim.formats.robot_scenes.mesh_reading import collision_parts
 from realsim.formats.robot_scenes.placed_scene import RigidBody, principal_inertia
 from realsim.geometry import se3
 from realsim.images.png import encode_png
 from realsim.records import Mesh
+
+MODULES = ("Gf", "Sdf", "Usd", "UsdGeom", "UsdPhysics", "UsdSemantics", "UsdShade", "Vt")
+
+
+class Pixar:
+    """Pixar's modules, imported when a scene is written."""
+
+    def __init__(self) -> None:
+        """Import them.
+
+        Raises:
+            MissingLibraryError: the extra is not installed.
+        """
+        try:
+            found = {name: importlib.import_module(f"pxr.{name}") for name in MODULES}
+        except ImportError as error:
+            raise MissingLibraryError(
+                f"writing USD needs Pixar's library, which cannot be imported ({error}). Install "
+                "the extra: `pip install 'realsim[usd]'` (or `uv sync --extra usd`), or write URDF "
+                "or MJCF."
+            ) from error
+        self.Gf: Any = found["Gf"]
+        self.Sdf: Any = found["Sdf"]
+        self.Usd: Any = found["Usd"]
+        self.UsdGeom: Any = found["UsdGeom"]
+        self.UsdPhysics: Any = found["UsdPhysics"]
+        self.UsdSemantics: Any = found["UsdSemantics"]
+        self.UsdShade: Any = found["UsdShade"]
+        self.Vt: Any = found["Vt"]
+
 
 Array = NDArray[np.float64]
 LABEL = "class"

@@ -21,7 +21,6 @@ from realsim import interop
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.robot_scenes.mesh_obj import TABLE_RGB
-from realsim.formats.robot_scenes.pixar import Pixar
 from realsim.formats.robot_scenes.placed_scene import (
     PlacedObject,
     PlacedScene,
@@ -29,6 +28,7 @@ from realsim.formats.robot_scenes.placed_scene import (
     TableBox,
 )
 from realsim.formats.robot_scenes.usd_body import (
+    Pixar,
     bind_friction,
     body_stage,
     friction_material,
