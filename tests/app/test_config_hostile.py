@@ -9,9 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 from realsim.app.cli import commands
-from realsim.app.config.toml_text import MOST_BYTES, parsed_toml, read_toml
 from realsim.app.report.limits import read_limits
 from realsim.errors import InputError
+from realsim.untrusted.toml_text import MOST_BYTES, parsed_toml, read_toml
 
 HOSTILE = {
     "deep": ("a = " + "[" * 5000, "nested deeper"),

@@ -28,7 +28,6 @@ upper_m = [2.0, 0.75, 2.0]
 """
 
 import math
-import tomllib
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, cast
@@ -38,6 +37,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
+from realsim.untrusted.toml_text import read_toml
 from realsim_capture_plans.collision.mount import FLANGE, camera_body, plain_bracket
 from realsim_capture_plans.collision.shapes import SIZES, Box, Kind, Mount, Shape
 
@@ -102,25 +102,6 @@ class Fields:
         return value
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """Return a TOML file's values.
-
-    Raises:
-        InputError: no such file, or not TOML.
-    """
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist. Give the path of a TOML file.") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read: {error}.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(
-            f"{path} is not TOML: {error}. Numbers are written 0.035 (with a point), texts in "
-            "quotes, lists in brackets."
-        ) from None
-
-
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
@@ -154,7 +135,7 @@ def read_mount(path: Path | str) -> Mount:
         UnitError: lengths that can only be millimetres.
     """
     path = Path(path)
-    fields = Fields(read_toml(path), str(path), MOUNT_KEYS)
+    fields = Fields(read_toml(path)[1], str(path), MOUNT_KEYS)
     camera = fields.text("camera")
     try:
         camera_body(camera)
@@ -363,7 +344,7 @@ def read_work_cell_obstacles(path: Path | str) -> tuple[tuple[str, Box], ...]:
         UnitError: coordinates that can only be millimetres.
     """
     path = Path(path)
-    top = Fields(read_toml(path), str(path), ("obstacles",))
+    top = Fields(read_toml(path)[1], str(path), ("obstacles",))
     tables = top.tables("obstacles")
     if not tables:
         raise InputError(f"{path} holds no [[obstacles]] tables (name, lower_m, upper_m).")

@@ -18,6 +18,7 @@ from realsim_capture_plans.lab.truth import NOISE, LabConfig, LabTruth, factory_
 from realsim_capture_plans.planning.ordering import move_seconds
 
 if TYPE_CHECKING:
+    from realsim.rendering.depth_camera import DepthCamera
     from realsim.rendering.photo import PhotoRenderer
     from realsim.rendering.rays import PlacedMesh
 
@@ -109,6 +110,7 @@ class SimulatedDepthCamera:
         self._arm = arm
         self._table = table
         self._factory = factory_intrinsics(config)
+        self._depth = _depth_camera(config)
         self._seen: Sequence[PlacedMesh] | None = None
         self._renderer: PhotoRenderer | None = None
         self._frames = 0
@@ -149,7 +151,7 @@ class SimulatedDepthCamera:
         self._frames += 1
         return Frame(
             rgb=photo.rgb,
-            depth_m=self._measured(photo.depth_m, rng),
+            depth_m=self._depth.measure(self._truth.intrinsics, T_world_cam, rng, photo),
             time_s=state.time_s + self._frames * FRAME_S,
         )
 
@@ -165,13 +167,12 @@ class SimulatedDepthCamera:
             self._renderer, self._seen = PhotoRenderer(placed), placed
         return self._renderer
 
-    def _measured(
-        self, depth_m: NDArray[np.float32], rng: np.random.Generator
-    ) -> NDArray[np.float32]:
-        """Return the depth (H, W) [m] as the sensor measures it, in whole counts."""
-        from realsim.rendering.depth_sensors.model import DepthSensorModel
 
-        sensor = DepthSensorModel() if self._config.depth_noise else DepthSensorModel.noiseless()
-        sensor = replace(sensor, bias_px=self._config.disparity_bias_px)
-        counts = np.round(sensor.measure(depth_m, self._truth.intrinsics, rng) / DEPTH_UNIT_M)
-        return (counts * DEPTH_UNIT_M).astype(np.float32)
+def _depth_camera(config: LabConfig) -> "DepthCamera":
+    """Return what measures the depth of the exact photographs, in whole counts."""
+    from realsim.rendering.depth_camera import DepthCamera
+    from realsim.rendering.depth_sensors.model import DepthSensorModel
+
+    sensor = DepthSensorModel() if config.depth_noise else DepthSensorModel.noiseless()
+    sensor = replace(sensor, bias_px=config.disparity_bias_px)
+    return DepthCamera(sensor=sensor, unit_m=DEPTH_UNIT_M)

@@ -6,9 +6,9 @@ a capture that was killed and resumed sees the very images it would have seen in
 """
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,13 +16,12 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose
-from realsim.untrusted.json_text import read_json
+from realsim.untrusted.own_json import OwnFile, read_own, to_json
 from realsim_capture_plans.arms.kinematics import UR5, DhChain
 
 Array = NDArray[np.float64]
 
 TRUTH_FILE = "truth.json"
-TRUTH_VERSION = 1
 T_EE_CAM_NOMINAL = se3.from_translation([0.0, -0.065, 0.035])
 """(4, 4) the mount as drawn [m]: the optical axis along the tool's z, 65 mm beside it."""
 FACTORY_WIDTH_PX = 1280
@@ -229,40 +228,37 @@ def with_views(truth: LabTruth, views: Mapping[int, ArrayLike]) -> LabTruth:
     return replace(truth, views=tuple(rows))
 
 
+class _TruthFile(OwnFile, kw_only=True):
+    """truth.json: of the chain its errors alone; T_a_b maps b to a."""
+
+    format: Literal["realsim-lab-truth"] = "realsim-lab-truth"
+    version: Literal[1] = 1
+    units: str = "m, rad, px; T_a_b maps b to a"
+    seed: int
+    T_ee_cam: Array
+    intrinsics: CameraIntrinsics
+    chain: dict[str, Array]
+    repeat_m: float
+    repeat_rad: float
+    objects: tuple[ObjectPose, ...]
+    T_world_board: Array
+    table_height_m: float
+    views: tuple[TrueView, ...]
+
+
+_DELTAS = ("delta_a", "delta_d", "delta_alpha", "delta_theta")
+_AS_THEY_ARE = tuple(f.name for f in fields(LabTruth) if f.name != "chain")
+
+
 def write_truth(folder: Path | str, truth: LabTruth) -> Path:
     """Write the truth to FOLDER/truth.json, whole or not at all, and return the file."""
     from realsim.store.atomic import write_json
 
-    camera = asdict(truth.intrinsics)
-    camera["distortion"] = truth.intrinsics.distortion.tolist()
-    deltas = {name: getattr(truth.chain, name).tolist() for name in _DELTAS}
-    record: dict[str, Any] = {
-        "format": "realsim-lab-truth",
-        "version": TRUTH_VERSION,
-        "units": "m, rad, px; T_a_b maps b to a",
-        "seed": truth.seed,
-        "T_ee_cam": truth.T_ee_cam.tolist(),
-        "intrinsics": camera,
-        "chain": deltas,
-        "repeat_m": truth.repeat_m,
-        "repeat_rad": truth.repeat_rad,
-        "objects": [
-            {"obj_id": o.obj_id, "instance": o.instance, "T_world_obj": o.T_world_obj.tolist()}
-            for o in truth.objects
-        ],
-        "T_world_board": truth.T_world_board.tolist(),
-        "table_height_m": truth.table_height_m,
-        "views": [
-            {"index": v.index, "joints": v.joints.tolist(), "T_world_cam": v.T_world_cam.tolist()}
-            for v in truth.views
-        ],
-    }
     path = Path(folder) / TRUTH_FILE
-    write_json(path, record)
+    deltas = {name: getattr(truth.chain, name) for name in _DELTAS}
+    same = {name: getattr(truth, name) for name in _AS_THEY_ARE}
+    write_json(path, to_json(_TruthFile(chain=deltas, **same)))
     return path
-
-
-_DELTAS = ("delta_a", "delta_d", "delta_alpha", "delta_theta")
 
 
 def load_truth(folder: Path | str) -> LabTruth:
@@ -274,32 +270,6 @@ def load_truth(folder: Path | str) -> LabTruth:
     path = Path(folder) / TRUTH_FILE
     if not path.is_file():
         raise InputError(f"there is no {TRUTH_FILE} in {folder}; only a simulated lab writes one.")
-    r = read_json(path)
-    if not isinstance(r, dict) or r.get("version") != TRUTH_VERSION:
-        raise InputError(
-            f"{path} is not a lab truth of version {TRUTH_VERSION}; write it anew from the lab."
-        )
-    return LabTruth(
-        seed=int(r["seed"]),
-        T_ee_cam=np.array(r["T_ee_cam"]),
-        intrinsics=CameraIntrinsics(**r["intrinsics"]),
-        chain=replace(UR5, **{name: np.array(r["chain"][name]) for name in _DELTAS}),
-        repeat_m=float(r["repeat_m"]),
-        repeat_rad=float(r["repeat_rad"]),
-        objects=tuple(
-            ObjectPose(
-                obj_id=o["obj_id"], instance=o["instance"], T_world_obj=np.array(o["T_world_obj"])
-            )
-            for o in r["objects"]
-        ),
-        T_world_board=np.array(r["T_world_board"]),
-        table_height_m=float(r["table_height_m"]),
-        views=tuple(
-            TrueView(
-                index=v["index"],
-                joints=np.array(v["joints"]),
-                T_world_cam=np.array(v["T_world_cam"]),
-            )
-            for v in r["views"]
-        ),
-    )
+    found = read_own(path, _TruthFile)
+    same = {name: getattr(found, name) for name in _AS_THEY_ARE}
+    return LabTruth(chain=replace(UR5, **found.chain), **same)

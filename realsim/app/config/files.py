@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from realsim.app.config.toml_text import read_toml
 from realsim.errors import InputError
+from realsim.untrusted.toml_text import read_toml
 
 VARIABLE = "REALSIM_CONFIG"
 """Names the file; empty: none is read."""

@@ -55,9 +55,10 @@ class Place:
 
     def camera_mount(self) -> Mount:
         """Return the mount of the file, or the usual one."""
-        from realsim_capture_plans.collision import mount
+        from realsim_capture_plans.collision.cell_files import read_mount
+        from realsim_capture_plans.collision.mount import d405_mount
 
-        return mount.d405_mount() if self.mount is None else mount.read_mount(self.mount)
+        return d405_mount() if self.mount is None else read_mount(self.mount)
 
     def boxes(self) -> tuple[tuple[str, Box], ...]:
         """Return the named obstacles."""

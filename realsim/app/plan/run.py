@@ -13,9 +13,11 @@ from realsim.app.console import Console, Tick
 from realsim.app.outputs import require_free_file
 from realsim.app.plan.request import Place, PlanRequest
 from realsim.errors import InputError
+from realsim.untrusted.json_text import read_json
 from realsim_capture_plans.arms.kinematics import CHAINS, DhChain
 from realsim_capture_plans.collision.shapes import Mount
 from realsim_capture_plans.plan_files.evidence import JointUnit
+from realsim_capture_plans.planning.metrics import METRIC_MEANINGS, goal_of, plan_metrics
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 if TYPE_CHECKING:
@@ -58,7 +60,7 @@ def run_plan(request: PlanRequest, console: Console, *, advise: bool) -> bool:
     out, pictures = request.out, not request.no_pictures
     _check_free_name(out, request.overwrite, pictures)
     plan = make_plan(request, chain, mount, config, console)
-    plan = replace(plan, metrics=plan.metrics | _metrics(plan))
+    plan = replace(plan, metrics=plan.metrics | plan_metrics(plan))
     from realsim_capture_plans.plan_files.plan_json import save_plan
 
     save_plan(plan, out)
@@ -148,7 +150,7 @@ def run_show(
     from realsim_capture_plans.plan_files.plan_json import PREFIX, resolve_plan
 
     plan = resolve_plan(text)
-    metrics = plan.metrics | _metrics(plan)
+    metrics = plan.metrics | plan_metrics(plan)
     show_plan(plan, metrics, console)
     free = show_colliding(plan, console)
     files: list[Path] = []
@@ -210,12 +212,17 @@ def _source_plan(
     """Return the plan that a file holds, or the one that a joint path makes."""
     from realsim_capture_plans.plan_files.imported import plan_of_path
     from realsim_capture_plans.plan_files.joint_paths import read_path
-    from realsim_capture_plans.plan_files.plan_json import PREFIX, SCHEMA, read_json, resolve_plan
+    from realsim_capture_plans.plan_files.plan_json import (
+        LARGEST_BYTES,
+        PREFIX,
+        SCHEMA,
+        resolve_plan,
+    )
 
     path = Path(source)
     is_plan = source.startswith(PREFIX)
     if path.suffix.lower() == ".json" and path.is_file():
-        data = read_json(path, "a plan or a joint path")
+        data = read_json(path, most_bytes=LARGEST_BYTES)
         is_plan = isinstance(data, dict) and data.get("schema") == SCHEMA
     if is_plan or not path.exists():
         if is_plan and (place != Place() or joints_unit):
@@ -250,7 +257,7 @@ def _source_plan(
         center=place.given_center() if place.center else None,
         obstacles=place.boxes(),
     )
-    return replace(plan, metrics=_metrics(plan) | plan.metrics)
+    return replace(plan, metrics=plan_metrics(plan) | plan.metrics)
 
 
 def _writer(dest: Path) -> Callable[[CapturePlan, Path], list[Path]]:
@@ -299,16 +306,9 @@ def _document(plan: CapturePlan, metrics: dict[str, float]) -> dict[str, object]
     }
 
 
-def _metrics(plan: CapturePlan) -> dict[str, float]:
-    from realsim_capture_plans.planning.metrics import plan_metrics
-
-    return plan_metrics(plan)
-
-
 def show_plan(plan: CapturePlan, metrics: dict[str, float], console: Console) -> None:
     """Print what the plan is for, and its metrics beside what is good."""
     from realsim_capture_plans.plan_files.imported import IMPORT_MEANINGS
-    from realsim_capture_plans.planning.metrics import METRIC_MEANINGS, goal_of
 
     meanings = METRIC_MEANINGS | IMPORT_MEANINGS
     x, y, z = plan.center_world.tolist()

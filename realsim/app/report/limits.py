@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from realsim.app.config.toml_text import read_toml
 from realsim.app.report.figures import Figure, require_known, shown
 from realsim.errors import InputError
+from realsim.untrusted.toml_text import read_toml
 
 FAIL_ON = re.compile(r"\s*([\w.]+)\s*([<>])\s*(\S+)\s*")
 """NAME<VALUE or NAME>VALUE."""
