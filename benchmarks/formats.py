@@ -30,87 +30,102 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 import argparse
-import json
-import sys
-import time
-import traceback
+from collections import Counter
 from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
 
-from figures import Found, document_of, print_table
-from formats_figures import FIGURES
-
-from realsim.app.console import Console, cpu_seconds
+from figures import Figure, Found, Goal, run
+from formats_round_trips import BOUND_MM
 
 PACKAGES = ("realsim", "numpy", "isal", "opencv-python-headless", "pillow", "h5py")
-PARTS: dict[str, tuple[str, str]] = {
-    "images": ("formats_images", "write_speed"),
-    "headers": ("formats_headers", "header_cost"),
-    "export": ("formats_export", "export_memory"),
-    "trips": ("formats_round_trips", "round_trips"),
-    "damage": ("formats_damage", "damage"),
+FIGURES = {
+    "write_frames_per_s": Figure(unit="1/s", goal=Goal(low=15.0)),
+    "jpeg_frames_per_s": Figure(unit="1/s", goal=Goal(low=40.0)),
+    "copy_frames_per_s": Figure(unit="1/s"),
+    "bytes_over_cv2": Figure(unit="x"),
+    "bop_headers_s": Figure(unit="s", goal=Goal(high=2.0)),
+    "bop_list_s": Figure(unit="s"),
+    "graspnet_headers_s": Figure(unit="s"),
+    "mutated_files": Figure(unit=""),
+    "mutated_tracebacks": Figure(unit="", goal=Goal(high=0.0)),
+    "mutated_nan": Figure(unit="", goal=Goal(high=0.0)),
+    "mutated_hangs": Figure(unit="", goal=Goal(high=0.0)),
+    "mutated_memory": Figure(unit="", goal=Goal(high=0.0)),
+    "mutated_crashes": Figure(unit="", goal=Goal(high=0.0)),
+    "export_peak_mb": Figure(unit="MB", goal=Goal(high=1000.0)),
+    "resume_s": Figure(unit="s"),
+    "graspnet_export_peak_mb": Figure(unit="MB", goal=Goal(high=1000.0)),
+    "graspnet_resume_s": Figure(unit="s"),
+    "bop_round_trip_diff": Figure(unit="", goal=Goal(high=0.0)),
+    "graspnet_round_trip_diff": Figure(unit="", goal=Goal(high=0.0)),
+    "graspnet_meta_diff": Figure(unit=""),
+    "bop_graspnet_mm": Figure(
+        unit="mm", goal=Goal(high=round(BOUND_MM, 4)), rival=f"bound {BOUND_MM:.3f}"
+    ),
+    "bop_graspnet_deg": Figure(unit="deg"),
+    "acronym_mm": Figure(unit="mm"),
+    "acronym_deg": Figure(unit="deg"),
+    "graspgen_mm": Figure(unit="mm"),
+    "graspgen_deg": Figure(unit="deg"),
+    "isaac_mm": Figure(unit="mm"),
+    "isaac_deg": Figure(unit="deg"),
+    "graspgroup_mm": Figure(unit="mm"),
+    "graspgroup_deg": Figure(unit="deg"),
 }
-"""Part -> module and function: imported when it runs."""
+"""All keys, in the table's order. In every run they are in the JSON."""
+COUNT, QUICK_COUNT = 10_000, 300
+WORKERS = 2
+CLASSES = {
+    "mutated_tracebacks": "traceback", "mutated_nan": "nan", "mutated_hangs": "hang",
+    "mutated_memory": "memory", "mutated_crashes": "crash",
+}  # fmt: skip
 
 
-def part_of(name: str) -> Callable[[int, bool], Found]:
-    """Return the function that measures a part."""
-    module, function = PARTS[name]
-    return getattr(import_module(module), function)
+def damage(seed: int, quick: bool) -> Found:
+    """Return how many mutated files there were, and how many ended otherwise than they may."""
+    from formats_mutations import run_mutations
 
-
-def arguments_of() -> argparse.Namespace:
-    """Return the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--quick", action="store_true", help="fewer frames, fewer mutations")
-    parser.add_argument("--seed", type=int, default=0, help="of noise, grasps and mutations")
-    parser.add_argument("--frames", type=int, default=0, help="of the larger BOP export")
-    parser.add_argument(
-        "--part", action="append", dest="parts", choices=list(PARTS), help="run this one alone"
-    )
-    arguments = parser.parse_args()
-    arguments.parts = arguments.parts or list(PARTS)
-    return arguments
-
-
-def main() -> None:
-    """Run the parts, print the table, write the JSON."""
-    arguments = arguments_of()
-    console = Console()
-    begin = time.perf_counter()
+    result = run_mutations(QUICK_COUNT if quick else COUNT, seed, WORKERS)
     found = Found()
-    failures: dict[str, str] = {}
-    if arguments.frames:
-        import formats_export
+    sums = Counter[str]()
+    for row in result.counts.values():
+        sums.update(row)
+    found.add(
+        "mutated_files", result.total(),
+        f"{len(result.counts)} formats; {sums['read']} read, {sums['refused']} refused",
+    )  # fmt: skip
+    for key, name in CLASSES.items():
+        found.add(key, sums[name])
+    found.cases["mutations"] = result.counts
+    found.cases["offenders"] = [o._asdict() for o in result.offenders]
+    found.notes += [f"{o.kind}: --replay '{o.name}:{o.seed}'" for o in result.offenders]
+    return found
 
-        formats_export.FRAMES = arguments.frames
-    for name in arguments.parts:
-        start, cpu = time.perf_counter(), cpu_seconds()
-        try:
-            found.take(part_of(name)(arguments.seed, arguments.quick))
-        except KeyboardInterrupt:
-            sys.exit(130)
-        except Exception as error:
-            failures[name] = f"{type(error).__name__}: {error}"
-            print(f"\n{name}:\n{traceback.format_exc()}", file=sys.stderr)
-        console.warn(f"{name}: {time.perf_counter() - start:.0f} s, {cpu_seconds() - cpu:.0f} CPU")
-    seconds = time.perf_counter() - begin
-    print_table(console, "Formats", FIGURES, found)
-    for name, why in failures.items():
-        console.warn(f"the part {name} failed: {why}")
-    console.say(f"{seconds:.0f} s, CPU {cpu_seconds():.0f} s, load {os.getloadavg()[0]:.1f}")
-    if arguments.json:
-        document = document_of("formats", PACKAGES, FIGURES, arguments, found)
-        document |= {"wall_s": round(seconds, 1), "cpu_s": round(cpu_seconds(), 1),
-                     "failures": failures}  # fmt: skip
-        arguments.json.write_text(json.dumps(document, indent=1, default=str))
-    if failures:
-        sys.exit(1)
 
+def part(module: str, function: str) -> Callable[[argparse.Namespace], Found]:
+    """Return what imports and runs a part when its turn comes."""
+
+    def call(arguments: argparse.Namespace) -> Found:
+        loaded = import_module(module)
+        if arguments.frames and hasattr(loaded, "FRAMES"):
+            loaded.FRAMES = arguments.frames
+        return getattr(loaded, function)(arguments.seed, arguments.quick)
+
+    return call
+
+
+def frames_option(parser: argparse.ArgumentParser) -> None:
+    """Add how large the export is."""
+    parser.add_argument("--frames", type=int, default=0, help="of the larger BOP export")
+
+
+PARTS = {
+    "images": part("formats_images", "write_speed"),
+    "headers": part("formats_headers", "header_cost"),
+    "export": part("formats_export", "export_memory"),
+    "trips": part("formats_round_trips", "round_trips"),
+    "damage": lambda given: damage(given.seed, given.quick),
+}
 
 if __name__ == "__main__":
-    main()
+    run("formats", __doc__ or "", PACKAGES, FIGURES, PARTS, options=frames_option)
