@@ -6,6 +6,7 @@ from typing import Literal
 from realsim.errors import InputError
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.profiles import profile
+from realsim.rendering.stereo.config import StereoConfig
 from realsim_sim_bridge.annotation.config import MAPS, checked_maps
 
 Renderer = Literal["embedded", "photoreal"]
@@ -32,9 +33,6 @@ class SyntheticConfig:
     depth_model: DepthSensorModel | None = None
     """Figures of the noise model, as `realsim depth-fit` finds them for a camera at hand; None =
     the profile's. For `disparity` only."""
-    material_loss: bool = True
-    """Disparity: whether dark and mirroring surfaces lose pixels, as they do before a real camera;
-    off, only geometry and chance make holes."""
     depth_unit_m: float | None = None
     """Metres per count of the depth images; None = the fitted model's, or the profile's own."""
     samples: int = 8
@@ -78,3 +76,9 @@ class SyntheticConfig:
             return self.depth_unit_m
         fitted = 0.0 if self.depth_model is None else self.depth_model.depth_unit_m
         return fitted if fitted >= LEAST_UNIT_M else profile(self.profile).depth_unit_m
+
+    def depth_sensor(self) -> DepthSensorModel | StereoConfig | None:
+        """Return where the depth camera's errors come from; None = it has none."""
+        if self.depth == "disparity":
+            return self.depth_model or DepthSensorModel.from_profile(self.profile)
+        return StereoConfig() if self.depth == "stereo" else None

@@ -18,9 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from realsim import images
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
+from realsim.rendering.depth_camera import DepthCamera
+from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.photo import Photo
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
-from realsim_sim_bridge.synthetic.depth_camera import depth_source
 from realsim_sim_bridge.synthetic.scene import SyntheticScene
 
 PHOTO, DEPTH = 0, 1
@@ -77,7 +78,7 @@ class FrameRenderer:
         """
         self.job = job
         self._pictures = picture_source(job.synthetic, job.config)
-        self._depth = depth_source(job.synthetic, job.config)
+        self._depth = depth_camera(job.synthetic, job.config)
 
     def render(self, index: int, T_world_cam: ArrayLike) -> SyntheticFrame:
         """Return frame `index`, seen from a pose (4, 4) [m]."""
@@ -86,7 +87,7 @@ class FrameRenderer:
         photo = self._pictures.render(job.intrinsics, T_world_cam, self._chance(index, PHOTO))
         between = time.process_time()
         chance = self._chance(index, DEPTH)
-        depth_m = self._depth.measure(photo, job.intrinsics, T_world_cam, chance)
+        depth_m = self._depth.measure(job.intrinsics, T_world_cam, chance, photo)
         return SyntheticFrame(
             rgb=photo.rgb,
             depth_counts=images.depth_counts(depth_m, job.config.unit_m),
@@ -125,6 +126,22 @@ def picture_source(synthetic: SyntheticScene, config: SyntheticConfig) -> Pictur
     from realsim.rendering.photo import PhotoRenderer
 
     return PhotoRenderer(placed, environment=synthetic.environment)
+
+
+def depth_camera(synthetic: SyntheticScene, config: SyntheticConfig) -> DepthCamera:
+    """Return the depth camera that the config names, before the scene.
+
+    The noise model is told what only the scene knows: which surfaces the second eye cannot see, by
+    rays to it, and which materials return too little light or mirror it away.
+    """
+    return DepthCamera(
+        synthetic.placed(),
+        config.depth_sensor(),
+        profile=profile(config.profile),
+        environment=synthetic.environment,
+        exact_shadows=True,
+        material_loss=True,
+    )
 
 
 # --- in another process -----------------------------------------------------------------------

@@ -28,6 +28,8 @@ from realsim.records import CameraIntrinsics, GraspSet, View
 from realsim.rendering.casting.triangle_rays import solid_angle_share
 from realsim.store import SessionStore, save_scene
 from realsim.store.lock import only_run_in
+from realsim_sim_bridge.annotation.annotate import annotate
+from realsim_sim_bridge.annotation.config import AnnotationConfig, OccluderConfig
 from realsim_sim_bridge.annotation.summary import AnnotationSummary
 from realsim_sim_bridge.school.workers import Workers, local_workers
 from realsim_sim_bridge.synthetic.claim import claimed_session, with_stored_models
@@ -40,9 +42,7 @@ from realsim_sim_bridge.synthetic.frame import (
     keep_job,
     require_renderer,
 )
-from realsim_sim_bridge.synthetic.labelling import label_session
-from realsim_sim_bridge.synthetic.scene import SyntheticScene
-from realsim_sim_bridge.synthetic.surroundings import save_surroundings
+from realsim_sim_bridge.synthetic.scene import SyntheticScene, save_surroundings
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -81,6 +81,11 @@ class SyntheticSummary:
             f"{len(self.empty_views)} without any object, {len(self.left_out)} objects left out; "
             f"CPU s per frame: {cost or 'none'}"
         )
+
+
+def exact_annotation(maps: tuple[str, ...]) -> AnnotationConfig:
+    """Return the settings for a scene without error: no clearance, and nothing that is unknown."""
+    return AnnotationConfig(plane_clearance_m=0.0, maps=maps, occluder=OccluderConfig(is_on=False))
 
 
 def write_session(  # noqa: PLR0913, PLR0917 - the inputs of a session, all of them needed
@@ -128,8 +133,11 @@ def write_session(  # noqa: PLR0913, PLR0917 - the inputs of a session, all of t
         job = FrameJob(synthetic=stored, intrinsics=intrinsics, config=config, seed=seed)
         spent = _write_frames(store, job, Ts, workers, lambda k: _tell(progress, k, total))
         began = _cpu_s()
-        labels = label_session(
-            store, stored, list(grasp_sets), maps=config.maps, workers=workers,
+        exact = stored.exact()
+        shown = {o.instance for o in exact.objects}
+        labels = annotate(
+            store, exact, stored.models, [g for g in grasp_sets if g.instance in shown],
+            exact_annotation(config.maps), workers=workers, surroundings=stored.surroundings,
             progress=lambda done, n: _tell(progress, len(Ts) + done, total),
         )  # fmt: skip
         if labels.views > labels.skipped:

@@ -13,7 +13,7 @@ from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer
 from realsim.store import SessionStore, load_scene
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
-from realsim_sim_bridge.synthetic.surroundings import load_surroundings
+from realsim_sim_bridge.synthetic.scene import load_surroundings
 from realsim_sim_bridge.synthetic.write import cameras_inside, write_session
 from synthetic_scenes import (
     INTRINSICS,
