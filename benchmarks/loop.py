@@ -25,7 +25,7 @@ import numpy as np
 from realsim.app.console import Console
 from realsim.app.demo.run import DemoConfig, DemoResult, run_demo
 from realsim.app.truth import GOALS
-from realsim_sim_bridge.slip.bullet_settings import BulletSettings
+from realsim_sim_bridge.slip.engines import BulletSettings
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.world import Replay, SlipPhysics

@@ -23,8 +23,8 @@ from realsim.models.convex import ConvexConfig, convex_parts
 from realsim.models.properties import physical_properties
 from realsim.records import Mesh
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.slip_test import SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.validation.specimens import ready_trial
 
 Mask = NDArray[np.bool_]

@@ -22,13 +22,13 @@ from realsim.models.library_records import KnownSolid
 from realsim.models.properties import physical_properties
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.registration.simulated import TableLabConfig, scatter_objects
-from realsim_sim_bridge.grasping.candidate_config import CandidateConfig
+from realsim_sim_bridge.grasping.antipodal import CandidateConfig
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.object_slips import trial_of
 from realsim_sim_bridge.school.object_task import ObjectTask, prepare
 from realsim_sim_bridge.school.school import object_tasks
-from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.slip_test import SlipTrial
+from realsim_sim_bridge.slip.world import SlipBody
 
 Array = NDArray[np.float64]
 CONVEX = ConvexConfig(thresholds=(0.05, 0.02), max_parts=32)

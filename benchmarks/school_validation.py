@@ -11,8 +11,7 @@ import numpy as np
 from figures import Found
 from school_processes import in_processes
 
-from realsim_sim_bridge.slip.bullet_settings import BulletSettings
-from realsim_sim_bridge.slip.engines import settings_of
+from realsim_sim_bridge.slip.engines import BulletSettings, settings_of
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.slip.world import Replay, SlipPhysics
 from realsim_sim_bridge.validation.config import CHECKS, LabelConfig, ValidationConfig

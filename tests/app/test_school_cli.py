@@ -21,8 +21,7 @@ from realsim.geometry.parts import part
 from realsim.records import ObjectPose, Scene
 from realsim.store import SessionStore, load_grasps, save_scene
 from realsim_sim_bridge.school.sweep import SweepConfig
-from realsim_sim_bridge.slip.bullet_settings import BulletSettings
-from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings
 from school_sessions import GRASPS, QUICK, T_WORLD_TABLE, refused, registered, run, scene
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[3] / "shared/data"))

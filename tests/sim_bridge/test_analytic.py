@@ -9,8 +9,12 @@ from realsim.formats.graspnet import gripper_frame as frame
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels, write_grasp_labels
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim_sim_bridge.grasping.analytic import analytic_labels, gripper_boxes, spread_points
-from realsim_sim_bridge.grasping.analytic_config import AnalyticConfig
+from realsim_sim_bridge.grasping.analytic import (
+    AnalyticConfig,
+    analytic_labels,
+    gripper_boxes,
+    spread_points,
+)
 from realsim_sim_bridge.grasping.analytic_given import given_candidates, standing_labels
 from realsim_sim_bridge.grasping.analytic_select import select_analytic, select_rows
 from realsim_sim_bridge.grasping.candidates import (

@@ -8,7 +8,7 @@ from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim_sim_bridge.annotation import map_counts
+from realsim_sim_bridge.annotation import frame_maps
 
 CAMERA = CameraIntrinsics(
     width=160, height=120, fx=150, fy=150, cx=79.5, cy=59.5,
@@ -37,7 +37,7 @@ def test_counts_equal_those_of_the_float_maps(seed: int) -> None:
     window = (slice(10, 110), slice(20, 150))
     seen = (labels.ids[window] >= 0) & (rng.random((100, 130)) < 0.9)
     boxes = np.stack([p.mesh.bounds for p in placed])
-    got = map_counts.coordinate_counts(labels, window, seen, boxes)
+    got = frame_maps.coordinate_counts(labels, window, seen, boxes)
     points = labels.object_coordinates()[window]
     for k in range(3):
         mask = seen & (labels.ids[window] == k)
@@ -46,7 +46,7 @@ def test_counts_equal_those_of_the_float_maps(seed: int) -> None:
         # Float32 products may fall on either side of a half.
         assert np.max(np.abs(got[mask].astype(int) - wanted)) <= 1
     assert not got[~seen].any()
-    normals = map_counts.normal_counts(labels).astype(int)
+    normals = frame_maps.normal_counts(labels).astype(int)
     assert np.max(np.abs(normals - label_maps.normal_counts(labels.normals()))) <= 1
     assert np.array_equal(normals.any(axis=-1), labels.geometry >= 0)
 
@@ -58,5 +58,5 @@ def test_a_flat_model_and_the_corner_of_the_box_are_marked_as_seen() -> None:
     placed = [PlacedMesh(0, flat, np.eye(4))]
     labels = LabelRenderer(placed).render(CAMERA, se3.look_at([0.03, 0.03, 0.3], [0.03, 0.03, 0]))
     window = (slice(0, 120), slice(0, 160))
-    counts = map_counts.coordinate_counts(labels, window, labels.ids >= 0, flat.bounds[None])
+    counts = frame_maps.coordinate_counts(labels, window, labels.ids >= 0, flat.bounds[None])
     assert np.array_equal(counts.any(axis=-1), labels.ids >= 0) and (labels.ids >= 0).any()

@@ -22,7 +22,7 @@ from realsim_sim_bridge.annotation.frame_labels import (
     label_object,
     unknown_occluder,
 )
-from realsim_sim_bridge.annotation.object_masks import object_masks
+from realsim_sim_bridge.annotation.unmodelled import object_masks
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 SIDE = 0.05

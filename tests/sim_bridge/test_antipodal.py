@@ -8,8 +8,7 @@ import trimesh
 
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim_sim_bridge.grasping.antipodal import RaySurface, antipodal_pairs
-from realsim_sim_bridge.grasping.candidate_config import CandidateConfig
+from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface, antipodal_pairs
 
 CONFIG = CandidateConfig(surface_points=500)
 

@@ -7,7 +7,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_sim_bridge.arm import hermite, panda
+from realsim_sim_bridge.arm import panda, stage_motion
 from realsim_sim_bridge.arm.arm_space import FREE, ArmSpace, ArmSpaceConfig
 from realsim_sim_bridge.arm.joint_path import PlannerConfig, connect
 from realsim_sim_bridge.arm.obstacles import obstacles_of
@@ -192,11 +192,11 @@ def test_hermite_paths_are_exact_for_cubics_and_bound_their_slopes():
     def slope(s):
         return sum(k * c[k] * np.asarray(s)[:, None] ** (k - 1) for k in range(1, 4))
 
-    v, m = hermite.basis(at, nodes)
+    v, m = stage_motion.basis(at, nodes)
     assert np.allclose(v @ value(nodes) + m @ slope(nodes), value(at), atol=1e-12)
-    v, m = hermite.basis_slope(at, nodes)
+    v, m = stage_motion.basis_slope(at, nodes)
     assert np.allclose(v @ value(nodes) + m @ slope(nodes), slope(at), atol=1e-10)
-    first, second = hermite.greatest_slopes(value(nodes), slope(nodes), nodes)
+    first, second = stage_motion.greatest_slopes(value(nodes), slope(nodes), nodes)
     bend = 2 * c[2] + 6 * c[3] * at[:, None]
     assert np.all(np.abs(slope(at)) <= first + 1e-9)
     assert np.allclose(np.abs(bend).max(axis=0), second, rtol=1e-6)

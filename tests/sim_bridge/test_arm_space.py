@@ -10,7 +10,6 @@ from scipy.spatial import KDTree
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.arm.arm_shape import FINGER_SIDE, arm_spheres, hand_spheres
 from realsim_sim_bridge.arm.arm_space import (
     FREE,
     IN_ITSELF,
@@ -18,7 +17,14 @@ from realsim_sim_bridge.arm.arm_space import (
     ArmSpace,
     ArmSpaceConfig,
 )
-from realsim_sim_bridge.arm.obstacles import least_distance, nearest_within, obstacles_of
+from realsim_sim_bridge.arm.obstacles import (
+    FINGER_SIDE,
+    arm_spheres,
+    hand_spheres,
+    least_distance,
+    nearest_within,
+    obstacles_of,
+)
 from realsim_sim_bridge.grasping.hand import HandGeometry
 
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])

@@ -13,8 +13,7 @@ from realsim_sim_bridge.grasping.candidates import (
     sample_candidates,
     standing_object,
 )
-from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.grasping.hand_free import boxes_free, lowest_corner
+from realsim_sim_bridge.grasping.hand import HandGeometry, boxes_free, lowest_corner
 
 HAND = HandGeometry()
 

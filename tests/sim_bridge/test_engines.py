@@ -9,13 +9,16 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.body import SlipBody
-from realsim_sim_bridge.slip.bullet_settings import BulletSettings
 from realsim_sim_bridge.slip.bullet_world import BulletEngine
-from realsim_sim_bridge.slip.engines import ENGINES, make_engine, settings_of
-from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.engines import (
+    ENGINES,
+    BulletSettings,
+    MujocoSettings,
+    make_engine,
+    settings_of,
+)
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
-from realsim_sim_bridge.slip.world import Closing, Grips, Replay, SlipPhysics
+from realsim_sim_bridge.slip.world import Closing, Grips, Replay, SlipBody, SlipPhysics
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 

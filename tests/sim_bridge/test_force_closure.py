@@ -11,10 +11,14 @@ from realsim.geometry import se3
 from realsim.records import MEASURES, Mesh
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.candidates import CandidateConfig, Surroundings, sample_candidates
-from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
+from realsim_sim_bridge.grasping.force_closure import (
+    ClosureConfig,
+    finger_wrenches,
+    force_closure,
+    largest_balls,
+)
 from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.grasping.pad_contacts import pad_contacts
-from realsim_sim_bridge.grasping.wrench_hull import finger_wrenches, largest_balls
 
 HAND = HandGeometry()
 

@@ -9,13 +9,17 @@ import trimesh
 
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim_sim_bridge.grasping.antipodal import RaySurface
-from realsim_sim_bridge.grasping.candidate_config import CandidateConfig
-from realsim_sim_bridge.grasping.candidates import Surroundings, sample_candidates, standing_object
-from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.grasping.hand_free import boxes_free
-from realsim_sim_bridge.grasping.hand_poses import IN_OBJECT, HandPoses, Stand
-from realsim_sim_bridge.grasping.surface_tree import (
+from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface
+from realsim_sim_bridge.grasping.candidates import (
+    IN_OBJECT,
+    HandPoses,
+    Stand,
+    Surroundings,
+    sample_candidates,
+    standing_object,
+)
+from realsim_sim_bridge.grasping.hand import HandGeometry, boxes_free
+from realsim_sim_bridge.grasping.surroundings import (
     first_triangle_inside,
     hands_free,
     surface_tree,

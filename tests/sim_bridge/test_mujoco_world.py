@@ -9,11 +9,10 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.motion import SlipMotion, lift_acceleration, oscillation_acceleration
-from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
 from realsim_sim_bridge.slip.mujoco_world import MODELS_KEPT, MujocoEngine
-from realsim_sim_bridge.slip.world import Closing, Grips, SlipPhysics
+from realsim_sim_bridge.slip.world import Closing, Grips, SlipBody, SlipPhysics
 
 pytest.importorskip("mujoco")
 

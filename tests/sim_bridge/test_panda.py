@@ -8,10 +8,10 @@ import pytest
 from realsim.geometry import se3
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.chain import follow_lines, frames_into
-from realsim_sim_bridge.arm.panda_urdf import panda_urdf
+from realsim_sim_bridge.arm.panda import panda_urdf
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.hand_urdf import hand_urdf
-from realsim_sim_bridge.slip.pads import PadModel
+from realsim_sim_bridge.slip.bullet_shapes import hand_urdf
+from realsim_sim_bridge.slip.world import PadModel
 
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
 

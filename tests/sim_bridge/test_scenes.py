@@ -19,9 +19,8 @@ from realsim_sim_bridge.scenes.stable_state import (
     stand_rows,
 )
 from realsim_sim_bridge.scenes.stand_picture import outline, stand_picture
-from realsim_sim_bridge.scenes.table_world import TableWorld
-from realsim_sim_bridge.scenes.world_config import WorldConfig
-from realsim_sim_bridge.slip.hull_margin import drawn_in
+from realsim_sim_bridge.scenes.table_world import TableWorld, WorldConfig
+from realsim_sim_bridge.slip.bullet_shapes import drawn_in
 
 SIDE = 0.05
 ONE_SECOND = StandConfig(shortest_s=1.0, longest_s=1.0, rest_s=0.25)

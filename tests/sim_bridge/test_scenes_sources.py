@@ -12,9 +12,8 @@ from realsim.geometry import se3
 from realsim.models.convex import ConvexConfig
 from realsim.records import Mesh, ObjectModel
 from realsim.store.atomic import write_json
-from realsim_sim_bridge.scenes.importers import from_bop
+from realsim_sim_bridge.scenes.importers import from_bop, load_scene_source
 from realsim_sim_bridge.scenes.school_scene import Matter
-from realsim_sim_bridge.scenes.source import load_scene_source
 from realsim_sim_bridge.scenes.stable_state import stable_state
 from realsim_sim_bridge.scenes.table_world import TableWorld
 

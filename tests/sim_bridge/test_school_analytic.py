@@ -9,11 +9,10 @@ from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_labels import write_grasp_labels
 from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry.parts import part
-from realsim_sim_bridge.grasping.analytic import analytic_labels
-from realsim_sim_bridge.grasping.analytic_config import AnalyticConfig
+from realsim_sim_bridge.grasping.analytic import AnalyticConfig, analytic_labels
 from realsim_sim_bridge.school import SchoolConfig
 from realsim_sim_bridge.school.school import run_school
-from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.engines import MujocoSettings
 from school_sessions import NAMES, scene
 
 LABELS = AnalyticConfig(points=60, view_step=2)

@@ -14,7 +14,7 @@ from scipy.stats import spearmanr
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import GraspSet
-from realsim_sim_bridge.school import summary_rows as paper
+from realsim_sim_bridge.school import summary as paper
 from realsim_sim_bridge.school.measure_statistics import LEAST_GRASPS, spearman
 from realsim_sim_bridge.school.summary import GOOD, OUTCOMES, outcomes_of, summarise
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages

@@ -8,9 +8,8 @@ import pytest
 
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.body import SlipBody
-from realsim_sim_bridge.slip.bullet_settings import BulletSettings
 from realsim_sim_bridge.slip.bullet_world import BulletEngine
+from realsim_sim_bridge.slip.engines import BulletSettings
 from realsim_sim_bridge.slip.motion import (
     SlipMotion,
     lift_acceleration,
@@ -20,7 +19,7 @@ from realsim_sim_bridge.slip.motion import (
 )
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, batches, run_slip_test
-from realsim_sim_bridge.slip.world import Closing, Replay, SlipPhysics
+from realsim_sim_bridge.slip.world import Closing, Replay, SlipBody, SlipPhysics
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 SIDE = 0.05

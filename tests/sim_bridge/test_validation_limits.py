@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from realsim_sim_bridge.slip.pads import PadModel
-from realsim_sim_bridge.validation.limit_surface import FrictionPatch, hand_patch
+from realsim_sim_bridge.slip.world import PadModel
+from realsim_sim_bridge.validation.loads import FrictionPatch, hand_patch
 from realsim_sim_bridge.validation.slip_limits import bracket, pulls, turns
 
 PADS = PadModel().centers_xz()

@@ -10,10 +10,9 @@ from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip.motion import SlipMotion
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.validation.config import LabelConfig
-from realsim_sim_bridge.validation.full_arm import carry_cube
+from realsim_sim_bridge.validation.full_arm import carry_cube, stage_joints
 from realsim_sim_bridge.validation.known_outcomes import peak_load
 from realsim_sim_bridge.validation.loads import with_hand
-from realsim_sim_bridge.validation.moving_arm import stage_joints
 from realsim_sim_bridge.validation.specimens import READY, cube, edge_trial, specimen
 
 SHAPES = LabelConfig().shapes

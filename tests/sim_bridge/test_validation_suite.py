@@ -10,9 +10,7 @@ import pytest
 from PIL import Image
 
 from realsim.errors import InputError
-from realsim_sim_bridge.slip.bullet_settings import BulletSettings
-from realsim_sim_bridge.slip.engines import make_engine, settings_of
-from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine, settings_of
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.slip.world import SlipPhysics
 from realsim_sim_bridge.validation.config import (
@@ -23,8 +21,7 @@ from realsim_sim_bridge.validation.config import (
     ValidationConfig,
 )
 from realsim_sim_bridge.validation.labels import refined
-from realsim_sim_bridge.validation.picture import picture
-from realsim_sim_bridge.validation.report import CheckResult, LimitRatio, ValidationReport
+from realsim_sim_bridge.validation.report import CheckResult, LimitRatio, ValidationReport, picture
 from realsim_sim_bridge.validation.suite import validate
 
 SMALL = ValidationConfig(

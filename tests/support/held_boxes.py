@@ -5,8 +5,8 @@ from itertools import product
 import numpy as np
 
 from realsim.geometry import se3
-from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.slip_test import SlipTrial
+from realsim_sim_bridge.slip.world import SlipBody
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 SIDE = 0.05

@@ -6,7 +6,7 @@ import numpy as np
 
 from realsim.geometry import se3
 from realsim.records import Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
-from realsim_sim_bridge.grasping.candidate_config import CandidateConfig
+from realsim_sim_bridge.grasping.antipodal import CandidateConfig
 from realsim_sim_bridge.school import SchoolConfig
 
 CONFIG = SchoolConfig(max_candidates=6, candidates=CandidateConfig(surface_points=200))

@@ -47,8 +47,8 @@ def annotate_session(
         OccluderConfig,
         maps_of,
     )
-    from realsim_sim_bridge.synthetic.write import exact_annotation
     from realsim_sim_bridge.synthetic.scene import load_surroundings
+    from realsim_sim_bridge.synthetic.write import exact_annotation
 
     chosen = maps_of(maps) if maps else DEFAULT_MAPS
     config = AnnotationConfig(maps=chosen, occluder=OccluderConfig(is_on=check_depth))

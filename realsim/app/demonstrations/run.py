@@ -142,13 +142,13 @@ def _cameras(
     Raises:
         InputError: a view or a calibration is asked for that there is not.
     """
-    from realsim_sim_bridge.demonstrations.cameras import (
+    from realsim_sim_bridge.demonstrations.front_view import (
         FRONT,
+        FrontView,
         sees_fingertips,
         view_camera,
         wrist_camera,
     )
-    from realsim_sim_bridge.demonstrations.front_view import FrontView
 
     size = request.width, request.height
     if (request.view is not None or request.hand_eye) and not is_session(source):

@@ -130,8 +130,8 @@ def _request(**options: Any) -> "GenerateRequest":
     from realsim_sim_bridge.synthetic.config import SyntheticConfig
     from realsim_sim_bridge.table_scenes.cameras import ViewConfig
     from realsim_sim_bridge.table_scenes.config import PoolConfig, TableSceneConfig
-    from realsim_sim_bridge.table_scenes.looks import own_looks
     from realsim_sim_bridge.table_scenes.pool import open_pool
+    from realsim_sim_bridge.table_scenes.scene import own_looks
 
     near = options["distance"] == "d405" and options["radius"] is None
     rendering = SyntheticConfig(

@@ -14,7 +14,7 @@ from realsim.pages import Page, View
 from realsim.pages import spread as spread_order
 from realsim.store import SessionStore
 from realsim.store.atomic import write_bytes
-from realsim_sim_bridge.table_scenes.layout import Layout
+from realsim_sim_bridge.table_scenes.sample import Layout
 from realsim_sim_bridge.table_scenes.scene import scene_name
 
 Rgb = NDArray[np.uint8]

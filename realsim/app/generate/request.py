@@ -16,8 +16,8 @@ from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.table_scenes.cameras import RANGES, ViewConfig
 from realsim_sim_bridge.table_scenes.config import TableSceneConfig
-from realsim_sim_bridge.table_scenes.looks import OwnLooks
 from realsim_sim_bridge.table_scenes.pool import ObjectPool
+from realsim_sim_bridge.table_scenes.scene import OwnLooks
 
 REQUEST_FILE = "generate.json"
 LAYOUTS = "layouts"

@@ -12,8 +12,13 @@ from realsim.store import SessionStore, atomic
 from realsim.untrusted.own_json import read_object
 from realsim_sim_bridge.synthetic.write import write_session
 from realsim_sim_bridge.table_scenes.cameras import intrinsics_of, views
-from realsim_sim_bridge.table_scenes.layout import Layout, layout_from_json, layout_to_json
-from realsim_sim_bridge.table_scenes.sample import generator, sample_layout
+from realsim_sim_bridge.table_scenes.sample import (
+    Layout,
+    generator,
+    layout_from_json,
+    layout_to_json,
+    sample_layout,
+)
 from realsim_sim_bridge.table_scenes.scene import build_scene, scene_name, write_models
 
 CACHE = "cache"

@@ -14,7 +14,7 @@ from realsim.app.generate.run import GenerateOutcome
 from realsim.app.generate.scene import is_finished, load_layout, stored_costs
 from realsim.store import atomic
 from realsim.untrusted.own_json import read_object
-from realsim_sim_bridge.table_scenes.layout import Layout
+from realsim_sim_bridge.table_scenes.sample import Layout
 from realsim_sim_bridge.table_scenes.scene import scene_name
 
 DATASET_FILE = "dataset.json"

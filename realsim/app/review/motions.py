@@ -25,8 +25,7 @@ from realsim.records.trajectories import PHASES, GraspTrajectories
 from realsim.review.replay.grasp_replay import GraspMotion, HandApproach, hand_approach
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.reach_config import base_on_table
-from realsim_sim_bridge.demonstrations.panda_looks import panda_meshes
-from realsim_sim_bridge.demonstrations.pictures import drawn_mesh
+from realsim_sim_bridge.demonstrations.pictures import drawn_mesh, panda_meshes
 from realsim_sim_bridge.demonstrations.records import DemonstrationConfig
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource

@@ -171,8 +171,8 @@ def session_inputs(store: SessionStore, request: SchoolRequest, console: Console
 
 def _of_source(source: Path, out: Path, request: SchoolRequest, console: Console) -> SchoolInputs:
     """Return the scene of another program's files."""
+    from realsim_sim_bridge.scenes.importers import load_scene_source
     from realsim_sim_bridge.scenes.school_scene import Matter
-    from realsim_sim_bridge.scenes.source import load_scene_source
 
     if request.models is not None and not request.models.is_dir():
         raise InputError(f"--models '{request.models}' is no folder.")

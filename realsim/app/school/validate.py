@@ -67,7 +67,7 @@ def show_report(report: "ValidationReport", console: Console) -> None:
 
 def _write(report: "ValidationReport", name: str, out: Path, console: Console) -> None:
     """Write the report of one engine and its picture."""
-    from realsim_sim_bridge.validation.picture import picture
+    from realsim_sim_bridge.validation.report import picture
 
     atomic.write_json(out / f"validation_{name}.json", report.to_json())
     atomic.write_bytes(out / f"validation_{name}.png", picture(report))

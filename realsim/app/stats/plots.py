@@ -20,7 +20,7 @@ from realsim.pages.plots import (
     whole_numbers,
 )
 from realsim_sim_bridge.school.summary import GOOD as GOOD_OUTCOMES
-from realsim_sim_bridge.school.summary_rows import OUTCOME_NAMES, PAPER_CANDIDATES, PAPER_OUTCOMES
+from realsim_sim_bridge.school.summary import OUTCOME_NAMES, PAPER_CANDIDATES, PAPER_OUTCOMES
 
 BINS = 20
 LEAST_BINS = 5

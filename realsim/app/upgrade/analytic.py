@@ -60,7 +60,7 @@ def try_analytic(store: SessionStore, job: AnalyticJob, console: Console) -> lis
     """
     from realsim.models.library_session import known_solids
     from realsim.store import load_grasps
-    from realsim_sim_bridge.grasping.analytic_config import AnalyticConfig
+    from realsim_sim_bridge.grasping.analytic import AnalyticConfig
     from realsim_sim_bridge.school.config import SchoolConfig
     from realsim_sim_bridge.school.school import object_tasks, run_school_results
 

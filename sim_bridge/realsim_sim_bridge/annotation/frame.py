@@ -30,8 +30,13 @@ from realsim_sim_bridge.annotation.frame_labels import (
 )
 from realsim_sim_bridge.annotation.frame_maps import map_files
 from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView
-from realsim_sim_bridge.annotation.object_masks import ObjectMasks, object_masks, union_of
-from realsim_sim_bridge.annotation.unmodelled import UnmodelledRegion, unmodelled_region
+from realsim_sim_bridge.annotation.unmodelled import (
+    ObjectMasks,
+    UnmodelledRegion,
+    object_masks,
+    union_of,
+    unmodelled_region,
+)
 
 Depth = NDArray[np.float32]
 

@@ -15,7 +15,7 @@ from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh, ObjectPose
 from realsim.rendering.labels import Labels
 from realsim_sim_bridge.annotation.config import OccluderConfig
-from realsim_sim_bridge.annotation.object_masks import ObjectMasks
+from realsim_sim_bridge.annotation.unmodelled import ObjectMasks
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

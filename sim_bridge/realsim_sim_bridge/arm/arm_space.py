@@ -20,9 +20,15 @@ from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.arm.arm_shape import FINGER_SIDE, arm_spheres, hand_spheres
 from realsim_sim_bridge.arm.chain import frames_into
-from realsim_sim_bridge.arm.obstacles import Obstacles, least_distance, nearest_within
+from realsim_sim_bridge.arm.obstacles import (
+    FINGER_SIDE,
+    Obstacles,
+    arm_spheres,
+    hand_spheres,
+    least_distance,
+    nearest_within,
+)
 from realsim_sim_bridge.grasping.hand import HandGeometry
 
 Array = NDArray[np.float64]

@@ -31,8 +31,7 @@ from realsim_sim_bridge.arm.stage_motion import (
 from realsim_sim_bridge.arm.swept_hand import first_touched
 from realsim_sim_bridge.arm.timing import timed_path
 from realsim_sim_bridge.grasping.candidates import Surroundings
-from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.grasping.hand_free import lowest_corner
+from realsim_sim_bridge.grasping.hand import HandGeometry, lowest_corner
 from realsim_sim_bridge.slip.motion import SlipMotion
 
 __all__ = ["Reach", "ReachConfig", "ReachTask", "base_on_table", "check_reach", "home_joints"]

@@ -25,7 +25,7 @@ from realsim.records.trajectories import PHASES, GraspTrajectories
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.demonstrations.falling import FallConfig, fall
 from realsim_sim_bridge.demonstrations.slip_replay import HeldStage, SlipReplay
-from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.world import SlipBody
 
 Array = NDArray[np.float64]
 CLOSE = PHASES.index("close")

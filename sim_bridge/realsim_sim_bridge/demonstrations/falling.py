@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from realsim import interop
 from realsim.geometry import se3
 from realsim.models.convex import collision_obj
-from realsim_sim_bridge.slip.body import SlipBody
-from realsim_sim_bridge.slip.hull_margin import drawn_in
+from realsim_sim_bridge.slip.bullet_shapes import drawn_in
+from realsim_sim_bridge.slip.world import SlipBody
 
 Array = NDArray[np.float64]
 

@@ -24,11 +24,14 @@ from realsim.records import Mesh, ObjectModel
 from realsim.records.trajectories import PHASES
 from realsim_sim_bridge.arm.reach_config import base_on_table
 from realsim_sim_bridge.demonstrations.attempt_motion import Attempt, AttemptMotion, attempt_motion
-from realsim_sim_bridge.demonstrations.cameras import wrist_camera
 from realsim_sim_bridge.demonstrations.falling import FallConfig
-from realsim_sim_bridge.demonstrations.front_view import FrontView, happening, placed_front
+from realsim_sim_bridge.demonstrations.front_view import (
+    FrontView,
+    happening,
+    placed_front,
+    wrist_camera,
+)
 from realsim_sim_bridge.demonstrations.pictures import StepPictures, drawn_mesh
-from realsim_sim_bridge.demonstrations.recorded_worlds import RecordedEngine
 from realsim_sim_bridge.demonstrations.records import (
     AttemptOutcome,
     DemonstrationCamera,
@@ -37,11 +40,10 @@ from realsim_sim_bridge.demonstrations.records import (
     GraspGoal,
     RobotAction,
 )
-from realsim_sim_bridge.demonstrations.school_settings import school_config_of
-from realsim_sim_bridge.demonstrations.slip_replay import replay_grasp
-from realsim_sim_bridge.demonstrations.tried_bodies import tried_body
-from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
+from realsim_sim_bridge.demonstrations.slip_replay import RecordedEngine, replay_grasp
 from realsim_sim_bridge.slip.engines import make_engine
+from realsim_sim_bridge.slip.world import SlipBody
 
 Array = NDArray[np.float64]
 STAGES_IN_ALL = 4

@@ -8,6 +8,9 @@ what the fingers need to pass the contacts, the collision whether GraspNet's gri
 reaches into the object. Nothing else is asked: tipping, weight and the table are the School's.
 """
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,10 +30,54 @@ from realsim.formats.graspnet.gripper_frame import (
 )
 from realsim.geometry.mesh import sample_surface
 from realsim.records import Mesh
-from realsim_sim_bridge.grasping.analytic_config import AnalyticConfig
-from realsim_sim_bridge.grasping.analytic_spread import farthest_rows
+from realsim_sim_bridge.grasping.analytic_select import farthest_rows
 from realsim_sim_bridge.grasping.antipodal import RaySurface
-from realsim_sim_bridge.grasping.surface_tree import hands_free, surface_tree
+from realsim_sim_bridge.grasping.surroundings import hands_free, surface_tree
+
+# --- How GraspNet-style labels of an object are computed -----------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class AnalyticConfig:
+    """Which candidates are looked at, and when one closes."""
+
+    points: int = 200
+    """Surface points at most, spread over the object; GraspNet has some 500 an object."""
+    voxel_m: float = 0.005
+    """Least distance of the points [m]: GraspNet's; a small object has fewer points."""
+    view_step: int = 1
+    """Every so many of the 300 views is looked from: 1 = all, 4 = a quarter of the time."""
+    levels: tuple[float, ...] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+    """Frictions of the labels (Fang et al. 2020, section 3.3: from 1 down to 0.1 by 0.1). The
+    evaluation of graspnetAPI has others, 0.2 to 1.2, those of `ClosureConfig`."""
+    max_opening_m: float = 0.08
+    """How far the gripper opens [m]: the Panda's; GraspNet's gripper opens 0.1 m."""
+    clearance_m: float = 0.002
+    """Gap on the tighter side between finger and object before closing [m]."""
+    least_width_m: float = 0.001
+    """Closer contacts are the thickness of a scan's double surface [m]."""
+
+    def __post_init__(self) -> None:
+        """Name a value that cannot be.
+
+        Raises:
+            InputError: a count below 1, a length or a friction that is not positive.
+        """
+        for name in ("points", "view_step"):
+            if getattr(self, name) < 1:
+                raise InputError(f"analytic grasps: {name} is {getattr(self, name)}; 1 or more.")
+        for name in ("voxel_m", "max_opening_m", "clearance_m", "least_width_m"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0):
+                raise InputError(
+                    f"analytic grasps: {name} is {value} m; a length above 0 is needed."
+                )
+        if not self.levels or not all(math.isfinite(f) and 0 < f <= 2 for f in self.levels):
+            raise InputError(
+                f"analytic grasps: the friction levels are {self.levels}; numbers above 0, at most "
+                "2, are needed."
+            )
+
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

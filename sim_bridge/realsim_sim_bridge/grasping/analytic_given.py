@@ -13,18 +13,17 @@ from numpy.typing import NDArray
 from realsim.formats.graspnet.grasp_labels import GraspLabels
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim_sim_bridge.grasping.antipodal import RaySurface
-from realsim_sim_bridge.grasping.candidate_config import CandidateConfig
-from realsim_sim_bridge.grasping.candidates import Candidates
-from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.grasping.hand_poses import (
+from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface
+from realsim_sim_bridge.grasping.candidates import (
     FREE,
     IN_NEIGHBOUR,
     IN_OBJECT,
     IN_TABLE,
+    Candidates,
     HandPoses,
     Stand,
 )
+from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.grasping.pad_contacts import pad_contacts
 from realsim_sim_bridge.grasping.surroundings import Surroundings
 

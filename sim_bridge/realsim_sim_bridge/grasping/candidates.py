@@ -12,18 +12,170 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim_sim_bridge.grasping.antipodal import RaySurface, antipodal_pairs
-from realsim_sim_bridge.grasping.candidate_config import CandidateConfig
-from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.grasping.hand_poses import (
-    FREE,
-    IN_NEIGHBOUR,
-    IN_OBJECT,
-    IN_TABLE,
-    Stand,
-    turned_poses,
+from realsim_sim_bridge.grasping.antipodal import (
+    AntipodalPairs,
+    CandidateConfig,
+    RaySurface,
+    antipodal_pairs,
+    perpendicular,
 )
-from realsim_sim_bridge.grasping.surroundings import Surroundings, standing_object, together
+from realsim_sim_bridge.grasping.hand import HandGeometry, lowest_corner
+from realsim_sim_bridge.grasping.surroundings import (
+    SurfaceTree,
+    Surroundings,
+    hands_free,
+    standing_object,
+    surface_tree,
+    together,
+)
+
+# --- Where the open hand can stand around antipodal pairs: free of object, neighbours and table --
+# Every pair gives grasps turned about its closing axis. Of each, several stands are tried in order
+# of preference: with the contacts in the middle of the pads or nearer to their tips (so that the
+# fingers clear the table), and with several openings. The first free stand is the grasp.
+
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+IN_TABLE, IN_OBJECT, IN_NEIGHBOUR, FREE = range(4)
+"""How far a stand got, in the order of the checks."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class HandPoses:
+    """Grasps about one object."""
+
+    Ts_obj_grasp: Array
+    """(N, 4, 4) [m]."""
+    widths_m: Array
+    """(N,) distance of the contacts [m]."""
+    openings_m: Array
+    """(N,) distance of the finger faces before closing [m]."""
+    contact_depths_m: Array
+    """(N,) z of the contacts in the grasp frame [m]: 0 = middle of the pads, + = to their tips."""
+
+    def __len__(self) -> int:
+        """Return the number of grasps."""
+        return len(self.Ts_obj_grasp)
+
+    def rows(self, rows: Mask | NDArray[np.int64]) -> "HandPoses":
+        """Return some of them."""
+        return HandPoses(
+            Ts_obj_grasp=self.Ts_obj_grasp[rows],
+            widths_m=self.widths_m[rows],
+            openings_m=self.openings_m[rows],
+            contact_depths_m=self.contact_depths_m[rows],
+        )
+
+
+def turned_poses(
+    pairs: AntipodalPairs, config: CandidateConfig, geometry: HandGeometry, rng: np.random.Generator
+) -> HandPoses:
+    """Return k fully open grasps per pair, evenly turned about its closing axis.
+
+    The contacts are in the middle of the pads.
+    """
+    k, widths = config.rotations, pairs.widths_m
+    closing = (pairs.points[:, 1] - pairs.points[:, 0]) / widths[:, None]
+    u, v = perpendicular(closing)
+    first = rng.uniform(0.0, 2 * np.pi, (len(closing), 1))
+    turn = (first + 2 * np.pi / k * np.arange(k))[..., None]
+    approach = np.cos(turn) * u[:, None] + np.sin(turn) * v[:, None]
+    y = np.broadcast_to(closing[:, None], approach.shape)
+    R = np.stack([np.cross(y, approach), y, approach], axis=-1)
+    Ts = se3.from_rt(R, pairs.points.mean(axis=1)[:, None]).reshape(-1, 4, 4)
+    return HandPoses(
+        Ts_obj_grasp=Ts,
+        widths_m=np.repeat(widths, k),
+        openings_m=np.full(len(Ts), geometry.max_opening_m),
+        contact_depths_m=np.zeros(len(Ts)),
+    )
+
+
+class Stand:
+    """One object where it stands, with what is around it."""
+
+    def __init__(
+        self,
+        surface: RaySurface,
+        T_table_obj: Array,
+        neighbours: SurfaceTree | None,
+        config: CandidateConfig,
+        geometry: HandGeometry,
+    ) -> None:
+        self._surface, self._T_table_obj, self._neighbours = surface, T_table_obj, neighbours
+        self._config, self._geometry = config, geometry
+        mesh = surface.mesh
+        self._tree = surface_tree(mesh.vertices[mesh.faces])
+
+    def placed(self, poses: HandPoses) -> tuple[HandPoses, NDArray[np.int64]]:
+        """Return the poses in their first free stand, and how far the best stand of each got (N,).
+
+        Rows that are not FREE are as they came.
+        """
+        n = len(poses)
+        Ts, openings = poses.Ts_obj_grasp.copy(), poses.openings_m.copy()
+        depths = poses.contact_depths_m.copy()
+        reached = np.full(n, IN_TABLE, dtype=np.int64)
+        for depth in self._config.contact_depths_m:
+            for margin in self._config.opening_margins_m:
+                rest = np.nonzero(reached != FREE)[0]
+                tried = self._stands(poses.rows(rest), depth, margin)
+                outcome = self._outcome(tried)
+                reached[rest] = np.maximum(reached[rest], outcome)
+                free = outcome == FREE
+                Ts[rest[free]] = tried.Ts_obj_grasp[free]
+                openings[rest[free]] = tried.openings_m[free]
+                depths[rest[free]] = depth
+        placed = HandPoses(
+            Ts_obj_grasp=Ts, widths_m=poses.widths_m, openings_m=openings, contact_depths_m=depths
+        )
+        return placed, reached
+
+    def _stands(self, poses: HandPoses, depth_m: float, margin_m: float) -> HandPoses:
+        """Return the poses, moved back so that the contacts are at z = depth, with an opening."""
+        Ts = poses.Ts_obj_grasp.copy()
+        Ts[:, :3, 3] -= depth_m * Ts[:, :3, 2]
+        openings = np.minimum(poses.widths_m + 2 * margin_m, self._geometry.max_opening_m)
+        return HandPoses(
+            Ts_obj_grasp=Ts,
+            widths_m=poses.widths_m,
+            openings_m=openings,
+            contact_depths_m=np.full(len(Ts), depth_m),
+        )
+
+    def _outcome(self, poses: HandPoses) -> NDArray[np.int64]:
+        """Return what stops each hand (N,): the first of table, object, neighbours, or FREE."""
+        config, outcome = self._config, np.full(len(poses), IN_TABLE, dtype=np.int64)
+        lowest = lowest_corner(
+            self._geometry.boxes(poses.openings_m), self._T_table_obj @ poses.Ts_obj_grasp
+        )
+        rows = np.nonzero(lowest > config.table_clearance_m)[0]
+        outcome[rows] = IN_OBJECT
+        rows = rows[self._free_of_object(poses.rows(rows))]
+        outcome[rows] = IN_NEIGHBOUR
+        near = poses.rows(rows)
+        swept = self._geometry.swept_boxes(near.widths_m, near.openings_m)
+        Ts_table_grasp = self._T_table_obj @ near.Ts_obj_grasp
+        free = hands_free(swept, Ts_table_grasp, self._neighbours, config.neighbour_clearance_m)
+        outcome[rows[free]] = FREE
+        return outcome
+
+    def _free_of_object(self, poses: HandPoses) -> Mask:
+        """Return whether the open hand is free of the object (N,).
+
+        A hand whose boxes cross no triangle is wholly outside or, if the object is greater than
+        the palm, wholly inside: its boxes hang together.
+        """
+        boxes = self._geometry.boxes(poses.openings_m)
+        free = hands_free(boxes, poses.Ts_obj_grasp, self._tree, self._config.clearance_m)
+        if self._surface.size_m > self._geometry.palm_width_m:
+            middle = boxes[free, 0].mean(axis=1)
+            palm = se3.transform(poses.Ts_obj_grasp[free], middle[:, None])[:, 0]
+            free[free] = ~self._surface.contains(palm)
+        return free
+
 
 __all__ = [
     "CandidateConfig",
@@ -33,8 +185,6 @@ __all__ = [
     "standing_object",
     "together",
 ]
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

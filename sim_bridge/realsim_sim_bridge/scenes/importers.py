@@ -8,11 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.graspit.scene import GraspitScene, QuaternionOrder, read_graspit_scene
-from realsim.formats.graspnet.scene import GraspnetScene, read_graspnet_scene
+from realsim.formats.graspit.scene import (
+    SCENE_FILE,
+    GraspitScene,
+    QuaternionOrder,
+    is_graspit_scene,
+    read_graspit_scene,
+)
+from realsim.formats.graspnet.cameras import POSES
+from realsim.formats.graspnet.scene import GraspnetScene, cameras_of, read_graspnet_scene
 from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim.store.session_store import CAMERA_FILE
 from realsim_sim_bridge.scenes.school_scene import Matter, SchoolScene, Support, known_solids
 
 Array = NDArray[np.float64]
@@ -212,3 +220,57 @@ def _sunk(
         "table: the depth reads short, or the poses are off as a whole. `realsim upgrade` fits the "
         "poses to the depth."
     ]
+
+
+# --- Which of the known kinds of scene a path holds ----------------------------------------------
+
+
+def load_scene_source(
+    path: Path | str,
+    matter: Matter | None = None,
+    *,
+    models: Path | None = None,
+    scene_id: int | None = None,
+    supports: Sequence[Support] = (),
+    order: QuaternionOrder | None = None,
+) -> SchoolScene:
+    """Read a scene of any known kind, told apart by what the folder holds.
+
+    Args:
+        path: a scene.yaml or its folder, a GraspNet scene, or a BOP dataset, split or scene.
+        matter: weighed masses, convex parts.
+        models: folder of the models (meshes), where it is not at its usual place.
+        scene_id: number of the scene in a BOP dataset of several.
+        supports: bodies besides the table that stand still.
+        order: of a scene.yaml's quaternions, where its content does not tell it.
+
+    Raises:
+        InputError: nothing there is known; what was found and what is read is named.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"'{path}' does not exist; a scene's file or folder is expected.")
+    if is_graspit_scene(path):
+        return from_graspit_yaml(path, matter, supports=supports, order=order, meshes=models)
+    if path.is_dir():
+        if cameras_of(path) or ((path / POSES).is_file() and cameras_of(path.parent)):
+            return from_graspnet(path, matter, models=models, supports=supports)
+        if any(next(path.glob(f"{p}{CAMERA_FILE}"), None) for p in ("", "*/", "*/*/")):
+            return from_bop(path, scene_id, matter, models=models, supports=supports)
+    raise InputError(
+        f"'{path}' holds no scene that is known: {_contents(path)}. Read are a {SCENE_FILE} of "
+        "GraspIT (object1: {file_path, name, orientation, position}), a scene of GraspNet-1Billion "
+        f"(realsense/{POSES} or kinect/{POSES}), and a BOP dataset, split or scene "
+        f"({CAMERA_FILE})."
+    )
+
+
+def _contents(path: Path) -> str:
+    if path.is_file():
+        return (
+            f"it is a file of the kind '{path.suffix or 'no suffix'}' without the keys of a scene"
+        )
+    names = sorted(p.name for p in path.iterdir())
+    return (
+        f"the folder has {', '.join(names[:12]) or 'nothing'}{', ...' if len(names) > 12 else ''}"
+    )

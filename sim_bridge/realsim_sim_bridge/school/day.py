@@ -10,8 +10,13 @@ from typing import Any
 import numpy as np
 
 from realsim.errors import RealsimError
-from realsim_sim_bridge.school.kept_prepared import read_prepared, write_prepared
-from realsim_sim_bridge.school.kept_sets import SchoolResult, read_result, write_result
+from realsim_sim_bridge.school.kept_sets import (
+    SchoolResult,
+    read_prepared,
+    read_result,
+    write_prepared,
+    write_result,
+)
 from realsim_sim_bridge.school.object_slips import Rows, in_words, result_of, trial_of
 from realsim_sim_bridge.school.object_task import ObjectTask, Prepared, not_prepared, prepare
 from realsim_sim_bridge.school.shards import (

@@ -18,7 +18,7 @@ from realsim.store import atomic
 from realsim.store.lock import only_run_in
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.object_task import ObjectTask
-from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.engines import MujocoSettings
 
 RUN_FILE = "run.json"
 RESULTS = "instance_*.npz"

@@ -26,11 +26,9 @@ from realsim import interop
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.body import SlipBody
-from realsim_sim_bridge.slip.bullet_settings import BulletSettings
-from realsim_sim_bridge.slip.hand_urdf import hand_urdf
-from realsim_sim_bridge.slip.hull_margin import drawn_in
-from realsim_sim_bridge.slip.world import SlipPhysics
+from realsim_sim_bridge.slip.bullet_shapes import drawn_in, hand_urdf
+from realsim_sim_bridge.slip.engines import BulletSettings
+from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
 
 Array = NDArray[np.float64]
 FINGERS = (0, 1)

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.bullet_pair import BulletPair
-from realsim_sim_bridge.slip.bullet_settings import BulletSettings
-from realsim_sim_bridge.slip.world import Closing, Grips, Motion, PairStates, SlipPhysics
+from realsim_sim_bridge.slip.engines import BulletSettings
+from realsim_sim_bridge.slip.world import Closing, Grips, Motion, PairStates, SlipBody, SlipPhysics
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

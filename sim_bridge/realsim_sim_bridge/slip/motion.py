@@ -12,9 +12,12 @@ are chosen here because the paper gives none: docs/decisions/0005-slip-test-para
 """
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+from realsim.records import STAGES
 
 Array = NDArray[np.float64]
 
@@ -133,3 +136,46 @@ def field_wrenches(acceleration: Array, mass: float, gravity: float, count: int)
     wrench = np.zeros((len(acceleration), 6))
     wrench[:, 3:] = mass * (np.array([0.0, 0.0, -gravity]) - acceleration)
     return np.broadcast_to(wrench, (count, *wrench.shape))
+
+
+# --- What the objects feel in each stage of the slip test ----------------------------------------
+
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.slip.slip_test import SlipTrial
+
+
+def stage_wrenches(
+    stage: int, trial: "SlipTrial", Ts_world_body: Array, motion: SlipMotion, dt: float
+) -> Array:
+    """Return the true wrenches (K, T, 6) of a stage, one every `dt` of the hand's motion.
+
+    Args:
+        stage: number in STAGES, not 0.
+        trial: the K grasps.
+        Ts_world_body: (K, 4, 4) where the objects are when the stage starts.
+        motion: amplitudes and durations.
+        dt: [s]; an engine that steps k times finer than this plays k times too slowly.
+    """
+    mass = trial.body.mass_kg
+    name = STAGES[stage]
+    if name == "lift":
+        lift = lift_acceleration(motion, dt)
+        return field_wrenches(lift, mass, motion.gravity, len(trial))
+    if name == "oscillate":
+        shake = oscillation_acceleration(motion, dt)
+        return field_wrenches(shake, mass, motion.gravity, len(trial))
+    sweep = np.radians(motion.pendulum_deg)
+    low, high = np.clip(trial.joint5_ranges, -sweep, sweep).T
+    angles = np.stack(
+        [pendulum_angle(motion, dt, a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
+    )
+    R = trial.Ts_table_grasp[:, :3, :3]
+    axes = np.einsum("kij,kj->ki", R, trial.joint5_axes)
+    points = np.einsum("kij,kj->ki", R, trial.joint5_points)
+    moments = trial.body.principal_frame()[1]
+    turned = Ts_world_body[:, :3, :3]
+    inertias = np.einsum("kij,j,klj->kil", turned, moments, turned)
+    return pendulum_wrenches(
+        angles, axes, Ts_world_body[:, :3, 3] - points, inertias, mass, motion.gravity
+    )

@@ -22,11 +22,9 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.mujoco_approach import surface_triangles
-from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
-from realsim_sim_bridge.slip.pads import PadModel
-from realsim_sim_bridge.slip.world import SlipPhysics
+from realsim_sim_bridge.slip.world import PadModel, SlipBody, SlipPhysics
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip import mujoco_state
-from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.mujoco_approach import advanced_fingers
 from realsim_sim_bridge.slip.mujoco_model import (
     OBJECT,
@@ -27,8 +27,7 @@ from realsim_sim_bridge.slip.mujoco_model import (
     read_settings,
     set_drag,
 )
-from realsim_sim_bridge.slip.mujoco_samples import Samples
-from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.mujoco_state import Samples
 from realsim_sim_bridge.slip.world import (
     Closing,
     Grips,
@@ -37,6 +36,7 @@ from realsim_sim_bridge.slip.world import (
     Motion,
     PairStates,
     Replay,
+    SlipBody,
     SlipPhysics,
 )
 

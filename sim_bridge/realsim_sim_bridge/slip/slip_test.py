@@ -16,13 +16,9 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.records import STAGES
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.body import SlipBody
-from realsim_sim_bridge.slip.bullet_settings import BulletSettings
-from realsim_sim_bridge.slip.engines import make_engine
-from realsim_sim_bridge.slip.motion import SlipMotion
-from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
+from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
 from realsim_sim_bridge.slip.score import ScoreLimits
-from realsim_sim_bridge.slip.stage_loads import stage_wrenches
 from realsim_sim_bridge.slip.world import (
     Closing,
     Engine,
@@ -31,6 +27,7 @@ from realsim_sim_bridge.slip.world import (
     Motion,
     PairStates,
     Replay,
+    SlipBody,
     SlipPhysics,
 )
 

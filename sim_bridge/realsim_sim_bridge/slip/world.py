@@ -17,11 +17,68 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.body import SlipBody
-from realsim_sim_bridge.slip.pads import PadModel
+
+# --- An object as the physics engines need it ----------------------------------------------------
+
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SlipBody:
+    """Convex parts and matter of an object."""
+
+    parts: tuple[Array, ...]
+    """Vertices (V, 3) of each convex part, object frame [m]."""
+    mass_kg: float
+    center_of_mass: Array
+    """(3,) object frame [m]."""
+    inertia: Array
+    """(3, 3) about the centre of mass, object axes [kg m^2]."""
+
+    def principal_frame(self) -> tuple[Array, Array]:
+        """Return T_obj_body (4, 4), at the centre of mass along the principal axes, and moments."""
+        moments, axes = np.linalg.eigh(self.inertia)
+        if np.linalg.det(axes) < 0:
+            axes[:, 0] = -axes[:, 0]
+        return se3.from_rt(axes, self.center_of_mass), moments
+
+    def reach(self) -> float:
+        """Return the greatest distance of a vertex from the centre of mass [m]."""
+        corners = np.concatenate(self.parts) - self.center_of_mass
+        return float(np.linalg.norm(corners, axis=1).max())
+
+
+# --- How the fingers touch: sphere pads, the same in every engine --------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PadModel:
+    """Spheres in front of a finger's box.
+
+    Flat pads carry their load on one corner in Bullet's solver, so that they turn like a point, and
+    a mesh finger touches at two or three points in MuJoCo; six spheres share the load evenly. Their
+    mean distance from the centre, 7.66 mm, is that of an evenly loaded patch of 20 x 20 mm.
+    """
+
+    sphere_radius_m: float = 0.004
+    """Radius of a pad's spheres [m]."""
+    protrusion_m: float = 0.0015
+    """How far the spheres stand out of the finger's box [m]; at 0.3 mm the box touches too."""
+    x_m: tuple[float, ...] = (-0.006, 0.006)
+    """x of the spheres' centres [m]."""
+    z_m: tuple[float, ...] = (-0.006, 0.0, 0.006)
+    """z of the spheres' centres [m]."""
+    finger_mass_kg: float = 0.1
+    """Mass of a finger [kg]."""
+
+    def centers_xz(self) -> NDArray[np.float64]:
+        """Return x and z (S, 2) of the spheres' centres [m], grasp frame."""
+        return np.array([[x, z] for x in self.x_m for z in self.z_m])
+
+
 Mask = NDArray[np.bool_]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.table_scenes.config import DropConfig
 from realsim_sim_bridge.table_scenes.drop_world import DropWorld
 from realsim_sim_bridge.table_scenes.tables import TableModel

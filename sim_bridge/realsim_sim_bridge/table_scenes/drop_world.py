@@ -18,8 +18,8 @@ from realsim import interop
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.models.convex import collision_obj
-from realsim_sim_bridge.slip.body import SlipBody
-from realsim_sim_bridge.slip.hull_margin import drawn_in
+from realsim_sim_bridge.slip.bullet_shapes import drawn_in
+from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.table_scenes.config import DropConfig
 from realsim_sim_bridge.table_scenes.tables import TableModel
 

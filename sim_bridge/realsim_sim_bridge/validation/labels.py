@@ -7,8 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim_sim_bridge.slip.bullet_settings import BulletSettings
-from realsim_sim_bridge.slip.mujoco_settings import MujocoSettings
+from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
 from realsim_sim_bridge.validation.config import ValidationConfig

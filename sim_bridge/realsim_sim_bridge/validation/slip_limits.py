@@ -5,13 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim_sim_bridge.slip.body import SlipBody
-from realsim_sim_bridge.slip.pads import PadModel
 from realsim_sim_bridge.slip.slip_test import SlipConfig
-from realsim_sim_bridge.slip.world import Engine
+from realsim_sim_bridge.slip.world import Engine, PadModel, SlipBody
 from realsim_sim_bridge.validation.config import ValidationConfig
-from realsim_sim_bridge.validation.limit_surface import hand_patch
-from realsim_sim_bridge.validation.loads import Held, hold, with_hand
+from realsim_sim_bridge.validation.loads import Held, hand_patch, hold, with_hand
 from realsim_sim_bridge.validation.report import CheckResult, LimitRatio
 from realsim_sim_bridge.validation.specimens import cube, specimen
 

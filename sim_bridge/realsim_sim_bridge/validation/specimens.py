@@ -11,8 +11,8 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import Mesh, mass_properties
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.slip_test import SlipTrial
+from realsim_sim_bridge.slip.world import SlipBody
 
 Array = NDArray[np.float64]
 

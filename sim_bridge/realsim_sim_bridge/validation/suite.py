@@ -3,14 +3,21 @@
 import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim_sim_bridge.slip.engines import make_engine
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
+from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, run_slip_test
+from realsim_sim_bridge.slip.world import Engine
 from realsim_sim_bridge.validation.config import CHECKS, ValidationConfig
 from realsim_sim_bridge.validation.full_arm import arm_checks
 from realsim_sim_bridge.validation.known_outcomes import box_checks, capacity_checks
-from realsim_sim_bridge.validation.labels import LabelChecks, MakeEngine, Settings
-from realsim_sim_bridge.validation.repeat import repeat_checks, settings_check
+from realsim_sim_bridge.validation.labels import LabelChecks, MakeEngine, Settings, edge_config
+from realsim_sim_bridge.validation.loads import with_hand
 from realsim_sim_bridge.validation.report import CheckResult, LimitRatio, ValidationReport
 from realsim_sim_bridge.validation.slip_limits import (
     coulomb_checks,
@@ -19,6 +26,127 @@ from realsim_sim_bridge.validation.slip_limits import (
     force_check,
     torque_checks,
 )
+from realsim_sim_bridge.validation.specimens import DOWN, cube_trial, edge_trial
+
+# --- What the engine says its settings are, whether it repeats itself, and whether pairs are alone
+
+
+Array = NDArray[np.float64]
+
+MASSES_KG = (0.013, 0.5)
+"""On both sides of the mass floor."""
+COMPANY = 4
+"""Grasps in a world."""
+
+
+def settings_check(
+    engine: Engine, config: ValidationConfig, settings: BulletSettings | MujocoSettings
+) -> CheckResult:
+    """Return the greatest relative difference between what was asked and what the engine says."""
+    worst, where = 0.0, ""
+    for force_n, friction in config.limits.cases:
+        slip = with_hand(config.slip, force_n, friction)
+        for mass in MASSES_KG:
+            asked = _asked(slip, mass, settings)
+            found = _found(engine, slip, mass)
+            for name, value in asked.items():
+                error = abs(found.get(name, float("nan")) - value) / (abs(value) or 1.0)
+                if not error <= worst:
+                    worst, where = error, f"{name} is {found.get(name)}, asked was {value}"
+    names = ", ".join(_asked(config.slip, MASSES_KG[0], settings))
+    return CheckResult(
+        group="settings", name="settings read back",
+        what="relative difference of a setting, read back from the engine",
+        measured=worst, unit="", limit=config.stages.settings_tolerance, detail=where or names,
+    )  # fmt: skip
+
+
+def repeat_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
+    """Return whether the same call gives the same bits, and what company does to a grasp."""
+    labels = config.labels
+    mass = labels.masses_kg[len(labels.masses_kg) // 2]
+    slip = edge_config(config, mass)
+    differing = held = same = tried = alone = 0
+    apart_m = 0.0
+    for shape in labels.shapes:
+        trial = edge_trial(shape, mass, COMPANY, labels.seed)
+        together = run_slip_test(trial, slip, engine=engine)
+        again = run_slip_test(trial, slip, engine=engine)
+        differing += sum(not a for a in _equal_bits(together, again))
+        held, tried = held + int(together.passed.sum()), tried + len(trial)
+        for k in (0, COMPANY - 1):
+            one = run_slip_test(trial.part(slice(k, k + 1)), slip, engine=engine)
+            alone += 1
+            same += bool(together.passed[k] == one.passed[0])
+            if together.passed[k] and one.passed[0]:
+                apart_m = max(apart_m, float(np.abs(together.slip_m[k] - one.slip_m[0]).max()))
+    company = f"{alone} grasps alone and among {COMPANY}"
+    return [
+        CheckResult(
+            group="repeat", name="bit-equal repeat",
+            what="grasps whose slips differ in any bit when the same call is made twice",
+            measured=float(differing), unit="", limit=0.0, detail=f"{tried} grasps, {held} held",
+        ),
+        CheckResult(
+            group="repeat", name="batch independence, labels",
+            what="share of grasps with the same label alone and among others",
+            measured=same / alone, unit="", limit=1.0, at_least=True, detail=company,
+        ),
+        CheckResult(
+            group="repeat", name="batch independence, slip",
+            what="difference of a held grasp's slip, alone and among others",
+            measured=1e3 * apart_m, unit="mm", limit=1e3 * config.stages.pair_slip_m,
+            detail=company,
+        ),
+    ]  # fmt: skip
+
+
+def _asked(
+    slip: SlipConfig, mass_kg: float, settings: BulletSettings | MujocoSettings
+) -> dict[str, float]:
+    """Return what the engine should say."""
+    physics = slip.physics
+    asked = {
+        "friction": physics.friction,
+        "object_mass_kg": max(mass_kg, physics.mass_floor_kg),
+        "force_n": physics.force_n,
+    }
+    if isinstance(settings, BulletSettings):
+        asked["dt_s"] = 1.0 / settings.rate_hz
+        asked |= {"iterations": float(settings.iterations), "substeps": 0.0}
+        if physics.pads:
+            asked |= {"contact_stiffness": settings.stiffness, "contact_damping": settings.damping}
+    else:
+        asked["dt_s"] = settings.step_s
+    return asked
+
+
+def _found(engine: Engine, slip: SlipConfig, mass_kg: float) -> dict[str, float]:
+    """Return what the engine says of a closed world, with the friction that its rule makes."""
+    trial = cube_trial(mass_kg, DOWN[None])
+    with engine.world(
+        trial.body, trial.grips(slip.headroom_m), slip.physics, HandGeometry()
+    ) as world:
+        world.close(slip.closing)
+        found: dict[str, Any] = world.settings()
+    pair = found["finger_friction"], found["object_friction"]
+    # Bullet multiplies the two surfaces' coefficients; MuJoCo takes the greater one.
+    found["friction"] = pair[0] * pair[1] if engine.name == "pybullet" else max(pair)
+    return found
+
+
+def _equal_bits(a: Slips, b: Slips) -> list[bool]:
+    """Return for every grasp whether all its figures are the same to the bit."""
+    fields = asdict(a), asdict(b)
+    return [
+        all(
+            np.asarray(fields[0][name][k]).tobytes() == np.asarray(fields[1][name][k]).tobytes()
+            for name in ("slip_m", "slip_rad", "force_n", "duration_s")
+        )
+        and a.failures[k] == b.failures[k]
+        for k in range(len(a.failures))
+    ]
+
 
 Progress = Callable[[str, int, int], None]
 

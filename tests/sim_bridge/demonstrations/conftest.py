@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from realsim.app.school.files import stored_grasps
-from realsim_sim_bridge.demonstrations.cameras import wrist_camera
-from realsim_sim_bridge.demonstrations.front_view import FrontView
+from realsim_sim_bridge.demonstrations.front_view import FrontView, wrist_camera
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource
 from school_sessions import registered, run
 

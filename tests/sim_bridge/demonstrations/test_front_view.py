@@ -7,7 +7,6 @@ import pytest
 
 from realsim.geometry import se3
 from realsim.records.trajectories import PHASES
-from realsim_sim_bridge.demonstrations.cameras import view_intrinsics
 from realsim_sim_bridge.demonstrations.front_view import (
     BORDER,
     FINGERS_M,
@@ -16,6 +15,7 @@ from realsim_sim_bridge.demonstrations.front_view import (
     hidden,
     nearest_camera,
     placed_front,
+    view_intrinsics,
 )
 
 CAMERA = view_intrinsics(40.0)

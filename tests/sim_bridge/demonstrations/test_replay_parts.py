@@ -11,14 +11,16 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 from realsim.records import GraspSet
 from realsim_sim_bridge.demonstrations.falling import FallConfig, fall
-from realsim_sim_bridge.demonstrations.recorded_worlds import RecordedEngine
-from realsim_sim_bridge.demonstrations.school_settings import school_config_of
-from realsim_sim_bridge.demonstrations.slip_replay import _disagreement, replay_grasp
-from realsim_sim_bridge.demonstrations.tried_bodies import tried_body
+from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
+from realsim_sim_bridge.demonstrations.slip_replay import (
+    RecordedEngine,
+    _disagreement,
+    replay_grasp,
+)
 from realsim_sim_bridge.school import run_school_results
 from realsim_sim_bridge.school.sweep import SweepConfig
-from realsim_sim_bridge.slip.body import SlipBody
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
+from realsim_sim_bridge.slip.world import SlipBody
 from school_scenes import CONFIG, at, model, scene, small_worlds
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.025

@@ -11,8 +11,7 @@ from realsim.geometry.mesh import save_ply
 from realsim.geometry.parts import part
 from realsim.models.convex_hulls import hull_volume
 from realsim_sim_bridge.table_scenes.config import PoolConfig
-from realsim_sim_bridge.table_scenes.pool import open_pool
-from realsim_sim_bridge.table_scenes.pool_objects import read_object
+from realsim_sim_bridge.table_scenes.pool import open_pool, read_object
 
 HULLS = PoolConfig(hull_only=True)
 

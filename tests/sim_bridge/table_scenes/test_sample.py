@@ -11,16 +11,22 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import save_ply
 from realsim.geometry.parts import part
-from realsim_sim_bridge.slip.body import SlipBody
+from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.table_scenes.config import (
     DropConfig,
     PoolConfig,
     TableSceneConfig,
 )
 from realsim_sim_bridge.table_scenes.drop import settle
-from realsim_sim_bridge.table_scenes.layout import Layout, layout_from_json, layout_to_json
 from realsim_sim_bridge.table_scenes.pool import ObjectPool, open_pool
-from realsim_sim_bridge.table_scenes.sample import generator, sample_layout, scene_table
+from realsim_sim_bridge.table_scenes.sample import (
+    Layout,
+    generator,
+    layout_from_json,
+    layout_to_json,
+    sample_layout,
+    scene_table,
+)
 from realsim_sim_bridge.table_scenes.scene import BuiltScene, build_scene
 
 CONFIG = TableSceneConfig(objects=(4, 6))

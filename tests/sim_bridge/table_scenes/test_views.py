@@ -17,10 +17,15 @@ from realsim_sim_bridge.scenes.stable_state import stable_state
 from realsim_sim_bridge.scenes.table_world import TableWorld
 from realsim_sim_bridge.table_scenes.cameras import ViewConfig, intrinsics_of, views
 from realsim_sim_bridge.table_scenes.config import TableSceneConfig
-from realsim_sim_bridge.table_scenes.looks import OwnLooks, own_looks
 from realsim_sim_bridge.table_scenes.pool import open_pool
 from realsim_sim_bridge.table_scenes.sample import sample_layout
-from realsim_sim_bridge.table_scenes.scene import BuiltScene, build_scene, write_models
+from realsim_sim_bridge.table_scenes.scene import (
+    BuiltScene,
+    OwnLooks,
+    build_scene,
+    own_looks,
+    write_models,
+)
 from realsim_sim_bridge.table_scenes.tables import corners
 
 CUBE = [corners((-0.05, -0.05, 0.0), (0.05, 0.05, 0.1))]

@@ -1,0 +1,134 @@
+"""The hand and convex parts as PyBullet takes them."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim_sim_bridge.slip.world import PadModel
+
+# --- The Franka Hand as a URDF for PyBullet: a fixed palm and two fingers that slide along y -----
+
+
+Array = NDArray[np.float64]
+
+
+def hand_urdf(geometry: HandGeometry, pads: PadModel | None) -> str:
+    """Return the URDF of the hand: a fixed palm and two fingers that slide along y.
+
+    The joint positions are the distances [m] of the finger faces from the middle.
+
+    Args:
+        geometry: sizes of the hand.
+        pads: the sphere pads, or None for bare boxes.
+    """
+    palm, _, finger = geometry.boxes(0.0)[0]
+    mass = pads.finger_mass_kg if pads else PadModel().finger_mass_kg
+    fingers = ""
+    for name, side in (("left", 1.0), ("right", -1.0)):
+        low, high = finger.copy()
+        if pads:
+            low[1] += pads.protrusion_m
+        parts = _box(low, high, side)
+        if pads:
+            parts += "".join(
+                f'<collision><origin xyz="{x} {side * pads.sphere_radius_m} {z}"/>'
+                f'<geometry><sphere radius="{pads.sphere_radius_m}"/></geometry></collision>'
+                for x, z in pads.centers_xz().tolist()
+            )
+        fingers += (
+            f'<link name="{name}"><inertial><mass value="{mass}"/>{_FINGER_INERTIA}</inertial>'
+            f"{parts}</link>"
+            f'<joint name="{name}_slide" type="prismatic"><parent link="palm"/>'
+            f'<child link="{name}"/><axis xyz="0 {side:g} 0"/>'
+            f'<limit lower="0" upper="{geometry.max_opening_m / 2}" effort="1000" velocity="1"/>'
+            "</joint>"
+        )
+    return (
+        '<robot name="hand"><link name="palm"><inertial><mass value="0.7"/>'
+        f"{_PALM_INERTIA}</inertial>{_box(palm[0], palm[1], 1.0)}</link>{fingers}</robot>"
+    )
+
+
+_FINGER_INERTIA = '<inertia ixx="3e-5" iyy="3e-5" izz="3e-5" ixy="0" ixz="0" iyz="0"/>'
+_PALM_INERTIA = '<inertia ixx="2e-3" iyy="1e-3" izz="2e-3" ixy="0" ixz="0" iyz="0"/>'
+
+
+def _box(low: Array, high: Array, side: float) -> str:
+    """Return the collision element of the box from `low` to `high`, mirrored in y if side < 0."""
+    center, size = (low + high) / 2.0, high - low
+    return (
+        f'<collision><origin xyz="{center[0]} {side * center[1]} {center[2]}"/><geometry>'
+        f'<box size="{size[0]} {size[1]} {size[2]}"/></geometry></collision>'
+    )
+
+
+# --- Convex parts drawn in by Bullet's collision margin, which is laid around them again ---------
+# Bullet finds contact normals reliably only between hulls that do not overlap: their margins do.
+# With a margin of 0, faces that lie on each other get normals that are off by tens of degrees (a
+# flat box of mu 0.3 then sticks to a slope of 22 degrees); with the margin around the true hull,
+# everything stands 1 mm off the table. So the planes of each hull are moved inwards by the margin
+# first.
+
+
+LEAST_CORE = 0.5
+"""A part is drawn in by at most this share of its inner radius: a core has to be left."""
+LEAST_MARGIN_M = 1e-4
+"""The margin is not made smaller for thin parts [m], which are up to so much too fat then: at
+0.1 mm normals are still right."""
+
+
+def drawn_in(parts: list[Array], margin_m: float) -> tuple[list[Array], float]:
+    """Return the parts' cores and the margin that makes them the parts again.
+
+    Corners and edges become round by the margin.
+
+    Args:
+        parts: vertices (V, 3) of each convex part [m].
+        margin_m: wished for [m]; less is used where a part is too thin for it.
+    """
+    hulls = [_planes(part) for part in parts]
+    inner = [_inner_ball(planes) for planes in hulls]
+    thinnest = min(LEAST_CORE * radius for _, radius in inner)
+    margin = min(margin_m, max(LEAST_MARGIN_M, thinnest))
+    cores = [
+        _core(part, planes, middle, min(margin, LEAST_CORE * radius))
+        for part, planes, (middle, radius) in zip(parts, hulls, inner, strict=True)
+    ]
+    return cores, margin
+
+
+def _planes(part: Array) -> Array:
+    """Return the hull's planes (F, 4): n . x + d <= 0 inside, |n| = 1; each once."""
+    from scipy.spatial import ConvexHull
+
+    hull: Any = ConvexHull(part)
+    return np.unique(np.round(hull.equations, 12), axis=0)
+
+
+def _inner_ball(planes: Array) -> tuple[Array, float]:
+    """Return centre (3,) and radius [m] of the largest ball inside (a linear program)."""
+    from scipy.optimize import linprog
+
+    A = np.hstack([planes[:, :3], np.ones((len(planes), 1))])
+    found: Any = linprog(
+        [0.0, 0.0, 0.0, -1.0], A_ub=A, b_ub=-planes[:, 3], bounds=[(None, None)] * 3 + [(0, None)]
+    )
+    return np.asarray(found.x[:3], dtype=np.float64), float(found.x[3])
+
+
+def _core(part: Array, planes: Array, inside: Array, margin_m: float) -> Array:
+    """Return the corners of the hull whose planes lie deeper by the margin."""
+    from scipy.spatial import HalfspaceIntersection, QhullError
+
+    if margin_m <= 0.0:
+        return part
+    deeper = planes + np.array([0.0, 0.0, 0.0, margin_m])
+    try:
+        found: Any = HalfspaceIntersection(deeper, inside)
+    except QhullError:  # numerically flat: left as it is, larger by the margin
+        return part
+    corners = np.asarray(found.intersections, dtype=np.float64)
+    corners = corners[np.all(np.isfinite(corners), axis=1)]
+    return np.unique(np.round(corners, 9), axis=0)
