@@ -12,7 +12,7 @@ from realsim.store.header import SESSION_FILE, repair_command
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import Entry, Fault, Manifest, entry_of, size_fault_of
 
-ROBOT_FILE = "robot.jsonl"
+CAMERA_FILE, ROBOT_FILE = "scene_camera.json", "robot.jsonl"
 
 
 def require_free(folder: Path) -> None:

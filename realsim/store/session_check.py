@@ -19,6 +19,7 @@ from realsim.store.check_report import CheckReport, Finding, Kind, Lists
 from realsim.store.header import SESSION_FILE, checked_header
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import REMOVED, Entry, entry_from, entry_of, fault_of
+from realsim.store.opening import CAMERA_FILE, ROBOT_FILE
 from realsim.store.robot_lines import record_of
 from realsim.store.session_notes import (
     PLAN_FILE,
@@ -29,7 +30,7 @@ from realsim.store.session_notes import (
     note_unproven,
     without_checksum,
 )
-from realsim.store.session_store import CAMERA_FILE, ROBOT_FILE, depth_path, rgb_path
+from realsim.store.view_images import depth_path, rgb_path
 from realsim.untrusted.own_json import from_json
 
 __all__ = ["CheckReport", "Finding", "check_session", "inner_sessions", "is_session", "read_lists"]

@@ -18,6 +18,7 @@ from realsim.store.begun import BEGUN_FILE, RECOVERED, read_begun
 from realsim.store.header import SESSION_FILE, checked_header, new_header
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import Manifest, entry_from, entry_of
+from realsim.store.opening import CAMERA_FILE, ROBOT_FILE
 from realsim.store.robot_lines import CHECK, record_of
 from realsim.store.session_check import (
     DAMAGED,
@@ -26,13 +27,8 @@ from realsim.store.session_check import (
     read_lists,
 )
 from realsim.store.session_notes import PLAN_FILE, is_image, is_own, log_entries
-from realsim.store.session_store import (
-    CAMERA_FILE,
-    ROBOT_FILE,
-    SessionStore,
-    depth_path,
-    rgb_path,
-)
+from realsim.store.session_store import SessionStore
+from realsim.store.view_images import depth_path, rgb_path
 from realsim.untrusted.own_json import read_object
 
 LENS = ("camera", "depth_unit_m")

@@ -34,6 +34,7 @@ from realsim.store.begun import BEGUN_FILE, begun_bytes
 from realsim.store.header import SESSION_FILE, header_to_open, new_header
 from realsim.store.manifest import Fault, Manifest, entry_of
 from realsim.store.opening import (
+    CAMERA_FILE,
     ROBOT_FILE,
     keep_beginning,
     require_free,
@@ -46,13 +47,11 @@ from realsim.untrusted.own_json import from_json, read_values, to_json
 
 if TYPE_CHECKING:
     from realsim.store.session_check import CheckReport
-    from realsim.store.session_repair import RepairReport
 
 __all__ = ["ROBOT_FILE", "SESSION_FILE", "SessionStore", "depth_path", "rgb_path"]
 
 Array = NDArray[np.float64]
 
-CAMERA_FILE = "scene_camera.json"
 EAGER_VIEWS = 256
 """Up to so many views scene_camera.json is written anew with each; beyond, ..."""
 LAZY_GROWTH = 1.1
@@ -434,15 +433,3 @@ class SessionStore:
         from realsim.store.session_check import check_session
 
         return check_session(self.folder)
-
-    def repair(self) -> "RepairReport":
-        """Take out what is damaged, and only that; damaged files move to `damaged/`.
-
-        A view with a damaged image counts as not captured from here on.
-        """
-        from realsim.store.session_repair import repair_session
-
-        report = repair_session(self.folder)
-        fresh = SessionStore.open(self.folder)
-        self.__dict__.update(fresh.__dict__)
-        return report

@@ -21,6 +21,7 @@ from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer
 from realsim.store import SessionStore, save_scene
 from realsim.store.lock import only_run_in
+from realsim.store.session_repair import repair_session
 from synthetic_scenes import (
     INTRINSICS,
     MODELS,
@@ -111,7 +112,7 @@ def test_new_views_see_the_objects_at_the_asked_size(real, tmp_path):
 def test_new_views_of_a_session_that_lost_its_photographs_have_a_neutral_light(tmp_path):
     store = captured_session(tmp_path / "s", 1)
     store.path("rgb/000000.png").unlink()
-    assert store.repair() is not None
+    repair_session(store.folder)
     store = SessionStore.open(store.folder)
     assert not store.session.views
     look = twin_scene(store, two_boxes(), MODELS, RenderRequest(views="1"))

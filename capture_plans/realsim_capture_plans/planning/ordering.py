@@ -11,12 +11,12 @@ a move is its time. Moves that were found to collide are charged extra.
 from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim_capture_plans.planning.record import PlanConfig
 from realsim_capture_plans.planning.tour_search import (
     COLLISION_SECONDS,
     Problem,
@@ -25,6 +25,9 @@ from realsim_capture_plans.planning.tour_search import (
     nearest_neighbour,
     ruin_and_recreate,
 )
+
+if TYPE_CHECKING:
+    from realsim_capture_plans.planning.record import PlanConfig
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -57,7 +60,7 @@ class Clusters:
     """(N + 1, N + 1) the same as turns of the leading joint [rad]."""
 
     @classmethod
-    def of(cls, candidates: list[Array], home: Array, config: PlanConfig) -> "Clusters":
+    def of(cls, candidates: list[Array], home: Array, config: "PlanConfig") -> "Clusters":
         """Return the clusters of views with candidates (Ki, 6) and of home (6,).
 
         Raises:
@@ -70,7 +73,7 @@ class Clusters:
         lower_least(least, joints, first, first[:-1])
         return cls(joints=joints, first=first, least_s=_timed(least, config), _least_rad=least)
 
-    def with_more(self, further: list[Array], config: PlanConfig) -> "Clusters":
+    def with_more(self, further: list[Array], config: "PlanConfig") -> "Clusters":
         """Return the clusters with further candidates (Ki, 6) behind those of every view."""
         own = [self.joints[a:b] for a, b in zip(self.first[:-1], self.first[1:], strict=True)]
         none = np.zeros((0, self.joints.shape[1]))
@@ -97,7 +100,7 @@ class Clusters:
 
 def tour(
     clusters: Clusters,
-    config: PlanConfig,
+    config: "PlanConfig",
     rng: np.random.Generator,
     *,
     steps: int,
@@ -132,7 +135,10 @@ def tour(
 
 
 def tour_seconds(
-    clusters: Clusters, path: Ints, config: PlanConfig, colliding: Collection[tuple[int, int]] = ()
+    clusters: Clusters,
+    path: Ints,
+    config: "PlanConfig",
+    colliding: Collection[tuple[int, int]] = (),
 ) -> float:
     """Return the time of a path of rows (N,) from home [s], with the charge for collisions."""
     rows = [0, *path.tolist()]
@@ -150,7 +156,7 @@ def _rows(clusters: list[Array]) -> tuple[Array, Ints]:
     return np.ascontiguousarray(np.concatenate(clusters), dtype=np.float64), first
 
 
-def _timed(least_rad: Array, config: PlanConfig) -> Array:
+def _timed(least_rad: Array, config: "PlanConfig") -> Array:
     """Return the times [s] of least turns between clusters; none from a cluster to itself."""
     finite = np.where(np.isfinite(least_rad), least_rad, 0.0)
     least = move_seconds(finite, config.speed, config.acceleration)

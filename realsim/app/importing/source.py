@@ -17,8 +17,8 @@ from realsim.errors import InputError
 from realsim.formats.folders import FolderChoice
 from realsim.formats.folders.listing import ENDINGS, shown
 from realsim.formats.frame_source import FrameSource
-from realsim.store.opening import require_header
-from realsim.store.session_store import CAMERA_FILE, SESSION_FILE
+from realsim.store.header import SESSION_FILE
+from realsim.store.opening import CAMERA_FILE, require_header
 
 ROS1_MAGIC = b"#ROSBAG V"
 MCAP_MAGIC = b"\x89MCAP0\r\n"

@@ -17,7 +17,7 @@ millimetres. One pair, built once and reset for every grasp, costs no more.
 import tempfile
 import weakref
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,10 @@ from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip.bullet_shapes import drawn_in, hand_urdf
-from realsim_sim_bridge.slip.engines import BulletSettings
 from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.slip.engines import BulletSettings
 
 Array = NDArray[np.float64]
 FINGERS = (0, 1)
@@ -41,7 +43,11 @@ class BulletPair:
     """A hand fixed at the origin, in the grasp frame's axes, and an object."""
 
     def __init__(
-        self, body: SlipBody, physics: SlipPhysics, geometry: HandGeometry, settings: BulletSettings
+        self,
+        body: SlipBody,
+        physics: SlipPhysics,
+        geometry: HandGeometry,
+        settings: "BulletSettings",
     ) -> None:
         """Build the pair.
 

@@ -1,6 +1,7 @@
 """PyBullet as an engine of the slip test: K grasps, one after the other in one pair."""
 
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,8 +9,10 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip.bullet_pair import BulletPair
-from realsim_sim_bridge.slip.engines import BulletSettings
 from realsim_sim_bridge.slip.world import Closing, Grips, Motion, PairStates, SlipBody, SlipPhysics
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.slip.engines import BulletSettings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -20,7 +23,7 @@ class BulletEngine:
 
     name = "pybullet"
 
-    def __init__(self, settings: BulletSettings) -> None:
+    def __init__(self, settings: "BulletSettings") -> None:
         """Keep the settings."""
         self.settings = settings
         self.pairs_per_world = settings.pairs_per_world

@@ -14,7 +14,7 @@ What makes its friction right (each was measured to be wrong without it):
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
-from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.mujoco_approach import surface_triangles
 from realsim_sim_bridge.slip.world import PadModel, SlipBody, SlipPhysics
+
+if TYPE_CHECKING:
+    from realsim_sim_bridge.slip.engines import MujocoSettings
 
 Array = NDArray[np.float64]
 
@@ -69,7 +71,7 @@ def load_mujoco() -> Any:
 
 
 def compile_pair(
-    body: SlipBody, physics: SlipPhysics, geometry: HandGeometry, settings: MujocoSettings
+    body: SlipBody, physics: SlipPhysics, geometry: HandGeometry, settings: "MujocoSettings"
 ) -> PairModel:
     """Compile the model.
 
@@ -142,7 +144,7 @@ def read_settings(model: Any) -> dict[str, float]:
     }
 
 
-def _set_options(spec: Any, physics: SlipPhysics, settings: MujocoSettings) -> None:
+def _set_options(spec: Any, physics: SlipPhysics, settings: "MujocoSettings") -> None:
     """Set integrator, solver and cone."""
     mujoco = load_mujoco()
 
@@ -168,7 +170,7 @@ def _add_finger(
     finger: int,
     geometry: HandGeometry,
     physics: SlipPhysics,
-    settings: MujocoSettings,
+    settings: "MujocoSettings",
 ) -> None:
     """Add a finger that slides along y; its joint's position is its face's distance from y = 0."""
     mujoco = load_mujoco()
@@ -209,7 +211,7 @@ def _add_finger(
     )
 
 
-def _add_drive(spec: Any, physics: SlipPhysics, settings: MujocoSettings) -> None:
+def _add_drive(spec: Any, physics: SlipPhysics, settings: "MujocoSettings") -> None:
     """Add the carriage that takes the fingers along until they resist with more than their force.
 
     Each finger is held to the carriage by dry friction of the hand's force; the carriage is too
@@ -232,7 +234,7 @@ def _add_drive(spec: Any, physics: SlipPhysics, settings: MujocoSettings) -> Non
         clutch.wrap_joint(CARRIAGE, -1.0)
 
 
-def _couple_fingers(spec: Any, settings: MujocoSettings) -> None:
+def _couple_fingers(spec: Any, settings: "MujocoSettings") -> None:
     """Keep both fingers at the same distance from the middle, as the real hand's drive does."""
     mujoco = load_mujoco()
 
@@ -253,7 +255,7 @@ def _add_object(
     mass_kg: float,
     moments: Array,
     physics: SlipPhysics,
-    settings: MujocoSettings,
+    settings: "MujocoSettings",
 ) -> None:
     """Add the object; its body frame is the principal one, its parts are in that frame."""
     mujoco = load_mujoco()
@@ -283,7 +285,7 @@ def _add_box(body: Any, low: Array, high: Array, side: float) -> Any:
     )
 
 
-def _set_contact(geom: Any, side: int, physics: SlipPhysics, settings: MujocoSettings) -> None:
+def _set_contact(geom: Any, side: int, physics: SlipPhysics, settings: "MujocoSettings") -> None:
     """Set friction, stiffness and what the geom meets."""
     geom.contype, geom.conaffinity = side, HAND_SIDE + OBJECT_SIDE - side
     geom.condim = 3

@@ -8,7 +8,7 @@ import copy
 import hashlib
 from collections import OrderedDict
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip import mujoco_state
-from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.mujoco_approach import advanced_fingers
 from realsim_sim_bridge.slip.mujoco_model import (
     OBJECT,
@@ -40,6 +39,9 @@ from realsim_sim_bridge.slip.world import (
     SlipPhysics,
 )
 
+if TYPE_CHECKING:
+    from realsim_sim_bridge.slip.engines import MujocoSettings
+
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
@@ -59,7 +61,7 @@ class MujocoEngine:
 
     name = "mujoco"
 
-    def __init__(self, settings: MujocoSettings) -> None:
+    def __init__(self, settings: "MujocoSettings") -> None:
         """Take the settings; nothing is compiled yet."""
         self.settings = settings
         self._models: OrderedDict[str, PairModel] = OrderedDict()
@@ -103,7 +105,7 @@ class MujocoWorld(HandWorld):
     """K pairs, each a row of state; see `mujoco_state`."""
 
     def __init__(
-        self, pair: PairModel, grips: Grips, physics: SlipPhysics, settings: MujocoSettings
+        self, pair: PairModel, grips: Grips, physics: SlipPhysics, settings: "MujocoSettings"
     ) -> None:
         """Place the hands open and the objects where the grips say."""
         mujoco = load_mujoco()

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 
 from realsim.errors import InputError
-from realsim_sim_bridge.table_scenes.tables import table_names
+from realsim_sim_bridge.table_scenes.table_shapes import table_names
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

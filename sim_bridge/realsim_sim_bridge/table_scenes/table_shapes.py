@@ -1,7 +1,10 @@
 """The ten table models, each with sizes drawn within what is built [m]."""
 
+from collections.abc import Callable
+
 import numpy as np
 
+from realsim.errors import InputError
 from realsim.geometry import parts_solids as solids
 from realsim_sim_bridge.table_scenes.tables import (
     Array,
@@ -318,3 +321,23 @@ SHAPES = {
     "bar_table": bar_table,
 }
 """Name -> how such a table is made."""
+
+
+# --- by name ----------------------------------------------------------------------------------
+
+
+def table_names() -> tuple[str, ...]:
+    """Return the names of the table models."""
+    return tuple(SHAPES)
+
+
+def table(name: str, rng: np.random.Generator) -> TableModel:
+    """Return a table of a kind, its sizes drawn.
+
+    Raises:
+        InputError: there is no such kind.
+    """
+    if name not in SHAPES:
+        raise InputError(f"there is no table '{name}'; the tables are: {', '.join(SHAPES)}.")
+    make: Callable[[np.random.Generator], TableModel] = SHAPES[name]
+    return make(rng)

@@ -4,14 +4,13 @@ The frame is `table`: the top surface is z = 0, the floor z = -height. Outlines 
 what collides is the outline as a thick plate and the rims that rise above it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from realsim.errors import InputError
 from realsim.geometry import parts_solids as solids
 from realsim.records import Mesh
 
@@ -152,27 +151,3 @@ def walls(height_m: float, farthest_m: float, rng: np.random.Generator) -> Table
         c, s = round(np.cos(turn)), round(np.sin(turn))
         pieces.append(piece @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T)
     return part("wall", "wall", pieces)
-
-
-# --- by name ----------------------------------------------------------------------------------
-
-
-def table_names() -> tuple[str, ...]:
-    """Return the names of the table models."""
-    from realsim_sim_bridge.table_scenes.table_shapes import SHAPES
-
-    return tuple(SHAPES)
-
-
-def table(name: str, rng: np.random.Generator) -> TableModel:
-    """Return a table of a kind, its sizes drawn.
-
-    Raises:
-        InputError: there is no such kind.
-    """
-    from realsim_sim_bridge.table_scenes.table_shapes import SHAPES
-
-    if name not in SHAPES:
-        raise InputError(f"there is no table '{name}'; the tables are: {', '.join(SHAPES)}.")
-    make: Callable[[np.random.Generator], TableModel] = SHAPES[name]
-    return make(rng)

@@ -5,7 +5,8 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry.mesh import mass_properties
-from realsim_sim_bridge.table_scenes.tables import floor, table, table_names, walls
+from realsim_sim_bridge.table_scenes.table_shapes import table, table_names
+from realsim_sim_bridge.table_scenes.tables import floor, walls
 
 FOOT_M = 0.005
 """The ends of slanted legs are cut square to the leg, so a corner dips below the floor [m]."""
