@@ -21,7 +21,8 @@ from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.table_scenes.config import TableSceneConfig
 from realsim_sim_bridge.table_scenes.drop import Resting, drop
 from realsim_sim_bridge.table_scenes.pool import ObjectPool, PoolObject, read_object
-from realsim_sim_bridge.table_scenes.tables import TableModel, table, table_names
+from realsim_sim_bridge.table_scenes.table_shapes import table, table_names
+from realsim_sim_bridge.table_scenes.tables import TableModel
 
 # --- What a scene is made of: table, objects, sizes and poses, as it is kept in the scene's folder
 
