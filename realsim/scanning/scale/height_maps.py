@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 
 from realsim.compiled import njit
 from realsim.errors import DegenerateError
-from realsim.geometry import se3
-from realsim.geometry.mesh import hull_vertices
-from realsim.records import Mesh
+from realsim.scanning.scale.shape import ScanShape
 
 Array = NDArray[np.float64]
 FILL_NEIGHBOURS = 5
@@ -25,6 +23,8 @@ FILL_NEIGHBOURS = 5
 NEIGHBOURS = ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1))
 RAY_MARGIN = 1.5
 """Rays start so many radii from the centre of the mesh: outside of it."""
+RAYS = 1200
+"""Rays of each template, over its box."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -72,7 +72,7 @@ class HeightMap:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Template:
-    """The top surface of a mesh of radius 1 about the origin, seen against one direction."""
+    """The top surface of the inner mesh, seen against one direction."""
 
     R: Array
     """(3, 3) turns the direction down to -z."""
@@ -115,54 +115,40 @@ def height_map(points: Array, config: HeightMapConfig) -> HeightMap:
     return _described(heights, origin, cell, config)
 
 
-def templates(
-    mesh: Mesh, rotations: Array, priors: Array, names: list[str], rays: int, seed: int
+def make_templates(
+    shape: ScanShape, rotations: Array, priors: Array, names: list[str]
 ) -> list[Template]:
-    """Return the top surfaces of a mesh of radius 1 about the origin, seen against each -z.
+    """Return the top surfaces of the inner mesh, seen against each -z.
 
     Args:
-        mesh: centred, of radius 1.
+        shape: the mesh.
         rotations: (D, 3, 3); each turns a direction down to -z.
         priors: (D,) see `Template.prior`.
         names: of the directions.
-        rays: per direction.
-        seed: of the order of the points.
     """
-    from realsim.rendering.rays import PlacedMesh, RayScene
-
-    scene = RayScene([PlacedMesh(0, mesh, np.eye(4))])
-    corners = hull_vertices(mesh.vertices)
-    grids = [_ray_grid(corners @ R.T, rays) for R in rotations]
+    still = (1.0, np.eye(3), np.zeros(3))
+    grids = [_ray_grid(shape.hull @ R.T, RAY_MARGIN * shape.radius) for R in rotations]
     origins = np.concatenate([g @ R for (g, _), R in zip(grids, rotations, strict=True)])
     counts = [len(g) for g, _ in grids]
     directions = np.repeat(-rotations[:, 2], counts, axis=0).astype(np.float32)
-    t, _ = scene.first_hits(origins, directions)
-    rng = np.random.default_rng(seed)
+    hit_t = np.split(shape.cast(origins, directions, *still), np.cumsum(counts)[:-1])
+    rng = np.random.default_rng(0)
     found: list[Template] = []
-    start = 0
-    for k, (grid, cell) in enumerate(grids):
-        hit_t = t[start : start + counts[k]]
-        start += counts[k]
-        hits = grid[np.isfinite(hit_t)]
-        hits[:, 2] -= hit_t[np.isfinite(hit_t)]
+    for R, (grid, cell), t, prior, name in zip(rotations, grids, hit_t, priors, names, strict=True):
+        hits = grid[np.isfinite(t)]
+        hits[:, 2] -= t[np.isfinite(t)]
         if len(hits) < 3:
             continue
         hits = hits[rng.permutation(len(hits))]
         center, spread = _center_and_spread(hits[:, :2])
-        z = corners @ rotations[k, 2]
         found.append(
             Template(
-                R=rotations[k], points=hits @ rotations[k], area=len(hits) * cell**2,
-                height=float(np.ptp(z)), center=center, spread=spread,
-                prior=float(priors[k]), name=names[k],
+                R=R, points=hits @ R, area=len(hits) * cell**2,
+                height=float(np.ptp(shape.hull @ R[2])), center=center, spread=spread,
+                prior=float(prior), name=name,
             )
         )  # fmt: skip
     return found
-
-
-def table_points(points: Array, T_world_table: Array) -> Array:
-    """Return points (N, 3) of world in the table's frame [m]."""
-    return se3.transform(se3.invert(T_world_table), points)
 
 
 def _of_the_object(above: Array, config: HeightMapConfig) -> NDArray[np.bool_]:
@@ -250,19 +236,19 @@ def _center_and_spread(xy: Array) -> tuple[Array, Array]:
     return center, np.sqrt(np.clip(values[::-1], 0, None))
 
 
-def _ray_grid(turned: Array, rays: int) -> tuple[Array, float]:
+def _ray_grid(turned: Array, height: float) -> tuple[Array, float]:
     """Return where rays start (N, 3) over the box of turned vertices, and the edge of a cell."""
     low, high = turned[:, :2].min(0), turned[:, :2].max(0)
-    extent = np.maximum(high - low, 1e-3)
-    cell = float(np.sqrt(np.prod(extent) / rays))
+    extent = np.maximum(high - low, 1e-3 * height)
+    cell = float(np.sqrt(np.prod(extent) / RAYS))
     counts = np.maximum(1, np.round(extent / cell)).astype(int)
     x, y = (low[k] + (np.arange(counts[k]) + 0.5) * extent[k] / counts[k] for k in (0, 1))
-    grid = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full(tuple(counts), RAY_MARGIN)], -1)
+    grid = np.stack([*np.meshgrid(x, y, indexing="ij"), np.full(tuple(counts), height)], -1)
     return grid.reshape(-1, 3), float(np.sqrt(np.prod(extent / counts)))
 
 
 @njit(inline="always")
-def agreement(model: float, measured: float, tolerance: float, low_cost: float) -> float:
+def _agreement(model: float, measured: float, tolerance: float, low_cost: float) -> float:
     """Return +1 where heights [m] agree, down to -1 where the space was seen free.
 
     Args:
@@ -279,34 +265,52 @@ def agreement(model: float, measured: float, tolerance: float, low_cost: float) 
     return max(-low_cost, min(1.0, 1.0 + (1.0 + low_cost) * 0.5 * (1.0 + gap / tolerance)))
 
 
-@njit
-def map_score(
-    heights: Array, place: Array, points: Array, move: Array, rule: Array, areas: Array
-) -> float:
-    """Return the agreement of one placed template with the map, in [-2, 1].
+def scan_map(
+    measured: HeightMap, points: Array, area: float, scales: Array, turns: Array, centers: Array,
+    rule: tuple[float, float, float],
+) -> Array:  # fmt: skip
+    """Return the agreement (S, Y, H), in [-2, 1], of a template with the map.
 
     (sum of a f - cost * uncovered area) / the greater of both areas, a = area of one cell.
 
     Args:
-        heights: (X, Y) of the map.
-        place: (3,) corner of cell (0, 0) and the edge of a cell.
-        points: (K, 3) of the template.
-        move: (3, 4) of p_table = scale R p + t.
-        rule: (3,) tolerance [m], cost of a low model, cost of uncovered area.
-        areas: (2,) of the measured footprint and of the placed template [m^2].
+        measured: the map.
+        points: (K, 3) of the template, turned, its foot's centre at the origin.
+        area: of its footprint.
+        scales: (S,).
+        turns: (Y, 2) cosine and sine of the yaws.
+        centers: (H, 2) places of the foot's centre [m].
+        rule: tolerance [m], cost of a low model, cost of uncovered area.
     """
-    total, covered = 0.0, 0
-    for k in range(len(points)):
-        a, b, c = points[k, 0], points[k, 1], points[k, 2]
-        x = move[0, 0] * a + move[0, 1] * b + move[0, 2] * c + move[0, 3]
-        y = move[1, 0] * a + move[1, 1] * b + move[1, 2] * c + move[1, 3]
-        z = move[2, 0] * a + move[2, 1] * b + move[2, 2] * c + move[2, 3]
-        i, j = int(np.floor((x - place[0]) / place[2])), int(np.floor((y - place[1]) / place[2]))
-        measured = 0.0
-        if 0 <= i < heights.shape[0] and 0 <= j < heights.shape[1]:
-            measured = heights[i, j]
-        covered += measured > 0.0
-        total += agreement(z, measured, rule[0], rule[1])
-    share = areas[1] / len(points)
-    uncovered = max(0.0, areas[0] - share * covered)
-    return (share * total - rule[2] * uncovered) / max(areas[0], areas[1])
+    place = (*measured.origin, measured.cell)
+    footprint = (float(measured.area), float(area))
+    return _scan(measured.heights, place, footprint, points, scales, turns, centers, rule)
+
+
+@njit
+def _scan(
+    heights: Array, place: tuple[float, float, float], areas: tuple[float, float], points: Array,
+    scales: Array, turns: Array, centers: Array, rule: tuple[float, float, float],
+) -> Array:  # fmt: skip
+    """Return what `scan_map` does."""
+    out = np.empty((len(scales), len(turns), len(centers)))
+    n = len(points)
+    for s in range(len(scales)):
+        share = areas[1] * scales[s] * scales[s] / n
+        for y in range(len(turns)):
+            c, d = scales[s] * turns[y, 0], scales[s] * turns[y, 1]
+            for h in range(len(centers)):
+                total, covered = 0.0, 0
+                for k in range(n):
+                    x = c * points[k, 0] - d * points[k, 1] + centers[h, 0]
+                    v = d * points[k, 0] + c * points[k, 1] + centers[h, 1]
+                    i = int(np.floor((x - place[0]) / place[2]))
+                    j = int(np.floor((v - place[1]) / place[2]))
+                    measured = 0.0
+                    if 0 <= i < heights.shape[0] and 0 <= j < heights.shape[1]:
+                        measured = heights[i, j]
+                    covered += measured > 0.0
+                    total += _agreement(scales[s] * points[k, 2], measured, rule[0], rule[1])
+                uncovered = max(0.0, areas[0] - share * covered)
+                out[s, y, h] = (share * total - rule[2] * uncovered) / max(areas[0], share * n)
+    return out

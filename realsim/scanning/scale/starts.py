@@ -1,4 +1,8 @@
-"""Starts for the fit of scale and pose, from nothing but the mesh and the measured points."""
+"""Starts for the fit of scale and pose, from nothing but the mesh and the measured points.
+
+Every direction down, scale, yaw and place of the mesh is laid over the map of heights; the best
+that differ are starts. `starts_near` gives the alternatives of a start that somebody typed.
+"""
 
 from dataclasses import dataclass, field, replace
 
@@ -7,43 +11,78 @@ from numpy.typing import NDArray
 
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
-from realsim.records import Mesh, SupportPlane
+from realsim.models.resting import RestingConfig, resting_orientations, turned_down
+from realsim.records import SupportPlane
 from realsim.registration.evidence import Cloud
-from realsim.scanning.scale.height_maps import HeightMapConfig, height_map, table_points
-from realsim.scanning.scale.result import Similarity
-from realsim.scanning.scale.start_search import (
-    Placement,
-    SearchConfig,
-    climbed,
-    distinct,
-    evidence_of,
-    place_of,
-    rule_of,
-    scanned,
+from realsim.scanning.scale.height_maps import (
+    HeightMap,
+    HeightMapConfig,
+    Template,
+    height_map,
+    make_templates,
+    scan_map,
 )
-from realsim.scanning.scale.start_shape import Shape, ShapeConfig, point_grid, shape_of
+from realsim.scanning.scale.result import Similarity
+from realsim.scanning.scale.shape import INNER_EXTENT, ScanShape
 
 Array = NDArray[np.float64]
+GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+COMPARED_POINTS = 150
+"""Points of the surface by which two starts are told apart."""
+NEARLY_ALL = 0.95
+"""Share of two surfaces that must be near each other to be one: the rest may be a handle's edge."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class StartsConfig:
     """How starts are found, and how many are given."""
 
-    most: int = 24
+    most: int = 32
     """Starts given at most."""
-    same_share: float = 0.03
+    same_share: float = 0.06
     """Two starts are one if 95 % of the surface of each lies within this share of the size of the
     other's: a fit brings both to the same end. Surfaces are compared, not poses, so that the turns
     of a symmetric body count once."""
-    cloud_points: int = 500
-    """Points of the cloud that are compared with the mesh."""
-    shape: ShapeConfig = field(default_factory=ShapeConfig)
-    """How the mesh is prepared (once)."""
+    directions: int = 200
+    """Directions down besides the resting ones: 16 deg apart, so that none is farther than about 9
+    deg from a pose that no resting pose explains (a leaning object, a hull that is wrong)."""
+    general_penalty: float = 0.06
+    """What a direction that is no resting pose loses of its score, which is at most 1."""
+    rare_penalty: float = 0.02
+    """What a resting pose of probability 1 % loses; one of 10 % loses half of it."""
+    resting: RestingConfig = field(default_factory=RestingConfig)
+    """How the mesh may stand."""
     height_map: HeightMapConfig = field(default_factory=HeightMapConfig)
     """How the cloud is mapped."""
-    search: SearchConfig = field(default_factory=SearchConfig)
-    """How placements are tried."""
+    shape_error: float = 0.025
+    """Error of the mesh's outline as a share of its size, 1-sigma: generated meshes have 2 % RMS.
+    It says how well height, area and widths must agree on one scale."""
+    map_error_m: float = 0.0015
+    """Error of a measured height or width [m], 1-sigma: half a cell and the depth noise."""
+    directions_kept: int = 90
+    """Directions whose height, area and widths agree best on one scale; the other two thirds are
+    not scanned, which halves the time."""
+    scale_steps: tuple[float, ...] = (-0.14, -0.07, 0.0, 0.07, 0.14)
+    """Logarithms of scale tried about the value that height, area and widths agree on."""
+    yaws: int = 36
+    """Yaws tried: 10 deg apart, within the reach of the fit."""
+    shift_share: float = 0.04
+    """Shifts tried along the table's axes, as a share of the size: centroids are about so good."""
+    points: int = 110
+    """Points of a template that are compared."""
+    tolerance_share: float = 0.03
+    """Heights agree within this share of the size: 2 % of shape error, some tilt."""
+    tolerance_m: float = 0.003
+    """But never within less [m]: two cells of a slope."""
+    low_cost: float = 0.5
+    """What a model that is lower than the measurement costs; one that is higher costs 1. Lower may
+    be a hole of the mesh that the cameras could not look into."""
+    uncovered_cost: float = 0.7
+    """What measured area costs that the model leaves uncovered."""
+    peaks: int = 4
+    """Yaws of each direction that are looked at on."""
+    looked_at: int = 160
+    """Best places among which different ones are sought."""
     near_scales: tuple[float, ...] = (0.87, 1.15)
     """`starts_near`: other scales, as factors; a fit reaches about half of it."""
     near_turn_deg: float = 20.0
@@ -52,91 +91,148 @@ class StartsConfig:
 
 
 def find_starts(
-    mesh: Mesh, cloud: Cloud, plane: SupportPlane, config: StartsConfig, rng: np.random.Generator
+    shape: ScanShape, cloud: Cloud, plane: SupportPlane, config: StartsConfig
 ) -> list[Similarity]:
-    """Return distinct starts for the fit of scale and pose, the most promising first.
+    """Return distinct starts of the inner mesh for the fit, the most promising first.
 
     Args:
-        mesh: the object in any unit and attitude.
+        shape: the object in any attitude.
         cloud: measured points of this one object above the table, in world [m].
         plane: the table it stands on.
         config: see there.
-        rng: which points of the cloud are compared.
 
     Raises:
-        InputError: the mesh is flat.
         DegenerateError: the points are too few, or do not lie above the plane.
     """
-    shape = shape_of(mesh, config.shape)
-    points = table_points(cloud.points, plane.T_world_table)
+    points = se3.transform(se3.invert(plane.T_world_table), cloud.points)
     measured = height_map(points, config.height_map)
-    low = measured.origin - measured.cell
-    high = measured.origin + measured.cell * (np.array(measured.heights.shape) + 1)
-    inside = np.all((points[:, :2] > low) & (points[:, :2] < high), axis=1) & (points[:, 2] > 0)
-    points = points[inside & (points[:, 2] < measured.top + 4 * measured.cell)]
-    few = points[rng.permutation(len(points))[: config.cloud_points]]
-    cell = max(measured.cell, 0.02 * measured.size)
-    margin = int(np.ceil(1.5 * config.search.near_share * measured.size / cell))
-    evidence = evidence_of(measured, few, point_grid(points, cell, margin))
-    over_map = rule_of(measured, config.search, (1.0, 0.0, 0.0))
-    full = rule_of(measured, config.search, config.search.weights)
-    found = scanned(measured, evidence, shape, config.search)[: config.search.climbers]
-    found = climbed(found, evidence, shape, over_map, config.search)
-    found = distinct(found, shape, config.same_share, config.search.finalists)
-    found = climbed(found, evidence, shape, full, config.search)
-    found = distinct(found, shape, config.same_share, config.most)
+    found = _scanned(measured, _templates(shape, config), shape, config)
     if not found:
         raise DegenerateError("no placement of the mesh on the table resembles the points.")
-    return [_similarity(p, shape, plane) for p in found]
+    kept: list[Similarity] = []
+    for s in found[: config.looked_at]:
+        if not any(_same(s, other, shape, config.same_share) for other in kept):
+            kept.append(s)
+        if len(kept) == config.most:
+            break
+    return [replace(s, T_world_obj=plane.T_world_table @ s.T_world_obj) for s in kept]
 
 
 def starts_near(
-    given: Similarity, mesh: Mesh, config: StartsConfig, rng: np.random.Generator
+    given: Similarity, config: StartsConfig, rng: np.random.Generator
 ) -> list[Similarity]:
-    """Return a given start, then its alternatives: other scales, small turns, half turns.
+    """Return a given start of the inner mesh, then its alternatives: scales, turns, half turns.
 
     Scales and turns keep the middle of the mesh's box where it is; a start of another scale on a
     table is off by at most half its height times the change of scale, which a fit makes up for.
 
     Args:
         given: an operator's or another program's start.
-        mesh: the object.
         config: see there.
         rng: direction of the small turns about the box axes, so that no attitude is preferred.
     """
-    center = mesh.bounds.mean(0)
-    found = [given]
-    for factor in config.near_scales:
-        found.append(_about(given, center, np.eye(3), factor, f"{given.source}, x{factor:g}"))
-    angle = np.radians(config.near_turn_deg)
-    frame = se3.random_rotation(rng)
-    for k, axis in enumerate(frame.T):
-        for sign in (1.0, -1.0):
-            R = se3.exp_so3(sign * angle * axis)
-            name = f"{given.source}, turned {sign * config.near_turn_deg:+.0f} deg ({k + 1})"
-            found.append(_about(given, center, R, 1.0, name))
-    for k, letter in enumerate("xyz"):
-        R = se3.exp_so3(np.pi * np.eye(3)[k])
-        found.append(_about(given, center, R, 1.0, f"{given.source}, half turn about {letter}"))
-    return found
+
+    def other(source: str, R: Array, factor: float = 1.0) -> Similarity:
+        T = given.T_world_obj @ se3.from_rt(R, np.zeros(3))
+        return Similarity(
+            scale=given.scale * factor, T_world_obj=T, source=f"{given.source}, {source}"
+        )
+
+    degrees = config.near_turn_deg
+    turns = [(k, axis, sign) for k, axis in enumerate(se3.random_rotation(rng).T) for sign in (1, -1)]
+    return [
+        given,
+        *(other(f"x{factor:g}", np.eye(3), factor) for factor in config.near_scales),
+        *(
+            other(f"turned {sign * degrees:+.0f} deg ({k + 1})",
+                  se3.exp_so3(sign * np.radians(degrees) * axis))
+            for k, axis, sign in turns
+        ),
+        *(other(f"half turn about {'xyz'[k]}", se3.exp_so3(np.pi * np.eye(3)[k])) for k in range(3)),
+    ]  # fmt: skip
 
 
-def _about(given: Similarity, center: Array, R: Array, factor: float, source: str) -> Similarity:
-    """Return the start turned by R (object's axes) and scaled about a point of the mesh."""
-    middle = se3.transform(given.T_world_obj, given.scale * center[None])[0]
-    rotation = given.T_world_obj[:3, :3] @ R
-    scale = given.scale * factor
-    T = se3.from_rt(rotation, middle - rotation @ (scale * center))
-    return replace(given, scale=scale, T_world_obj=T, score=float("nan"), source=source)
+def _templates(shape: ScanShape, config: StartsConfig) -> list[Template]:
+    """Return the templates of the resting poses, most probable first, and of all directions."""
+    resting = resting_orientations(shape.mesh, config.resting)
+    general = [turned_down(d) for d in _spread_directions(config.directions)]
+    basin = np.array([r.basin for r in resting])
+    # A body that rolls is as likely to lie as all its representatives together.
+    together = np.bincount(basin, [r.probability for r in resting])[basin]
+    rare = 0.5 * config.rare_penalty * np.log10(np.clip(together, 1e-3, 1.0))
+    priors = np.concatenate([rare, np.full(len(general), -config.general_penalty)])
+    names = [f"resting pose {k + 1}" for k in range(len(resting))]
+    names += [f"direction {k + 1}" for k in range(len(general))]
+    return make_templates(shape, np.stack([*(r.R for r in resting), *general]), priors, names)
 
 
-def _similarity(p: Placement, shape: Shape, plane: SupportPlane) -> Similarity:
-    """Return a placement as the scale and pose of the mesh itself."""
-    scale = p.scale / shape.radius
-    T_table_obj = se3.from_rt(p.R, place_of(p, shape) - p.R @ (scale * shape.center))
-    return Similarity(
-        scale=scale,
-        T_world_obj=plane.T_world_table @ T_table_obj,
-        score=p.score,
-        source=shape.templates[p.template].name,
-    )
+def _spread_directions(n: int) -> Array:
+    """Return n unit vectors (n, 3) spread evenly over the sphere (Fibonacci's lattice)."""
+    k = np.arange(n) + 0.5
+    z = 1 - 2 * k / n
+    out = np.sqrt(1 - z * z)
+    return np.stack([out * np.cos(GOLDEN_ANGLE * k), out * np.sin(GOLDEN_ANGLE * k), z], -1)
+
+
+def _common_scale(
+    measured: HeightMap, template: Template, config: StartsConfig
+) -> tuple[float, float]:
+    """Return the log scale on which height, area and widths agree best, and their disagreement.
+
+    Each gives a scale of its own, with an error of a fixed length: of a flat object the height says
+    little, of a thin one the width. The disagreement is chi-square per figure.
+    """
+    lengths = np.array([measured.top, np.sqrt(measured.area), *(3.5 * measured.spread)])
+    units = np.array([template.height, np.sqrt(template.area), *(3.5 * template.spread)])
+    logs = np.log(np.maximum(lengths, 1e-6) / np.maximum(units, 1e-9))
+    error = np.hypot(config.shape_error * measured.size, config.map_error_m)
+    relative = np.hypot(error / lengths, config.shape_error)
+    weights = 1 / np.square(relative)
+    middle = float(weights @ logs / weights.sum())
+    return middle, float(np.mean(np.square((logs - middle) / relative)))
+
+
+def _scanned(
+    measured: HeightMap, templates: list[Template], shape: ScanShape, config: StartsConfig
+) -> list[Similarity]:
+    """Return the best places over all directions, scales, yaws and shifts, in the table's frame."""
+    agreed = [_common_scale(measured, t, config) for t in templates]
+    order = np.argsort([chi for _, chi in agreed], kind="stable")[: config.directions_kept]
+    angles = 2 * np.pi * np.arange(config.yaws) / config.yaws
+    turns = np.stack([np.cos(angles), np.sin(angles)], -1)
+    step = config.shift_share * measured.size
+    shifts = step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=np.float64)
+    tolerance = max(config.tolerance_m, config.tolerance_share * measured.size)
+    rule = (tolerance, config.low_cost, config.uncovered_cost)
+    found: list[Similarity] = []
+    for k in order:
+        t = templates[k]
+        lowest = float((shape.hull @ t.R[2]).min())
+        points = t.points[: config.points] @ t.R.T - [*t.center, lowest]
+        scales = np.exp(agreed[k][0] + np.array(config.scale_steps))
+        table = scan_map(measured, points, t.area, scales, turns, measured.center + shifts, rule)
+        best = table.max(axis=(0, 2))
+        peak = (best >= np.roll(best, 1)) & (best > np.roll(best, -1))
+        for y in sorted(np.flatnonzero(peak), key=lambda y: -best[y])[: config.peaks]:
+            s, h = np.unravel_index(int(np.argmax(table[:, y])), table[:, y].shape)
+            yaw = se3.exp_so3([0.0, 0.0, angles[y]])
+            foot = np.array([*(measured.center + shifts[h]), 0.0])
+            place = foot - scales[s] * yaw @ [*t.center, lowest]
+            found.append(
+                Similarity(
+                    scale=float(scales[s]), T_world_obj=se3.from_rt(yaw @ t.R, place),
+                    score=float(best[y]) + t.prior, source=t.name,
+                )
+            )  # fmt: skip
+    return sorted(found, key=lambda p: -p.score)
+
+
+def _same(a: Similarity, b: Similarity, shape: ScanShape, share: float) -> bool:
+    """Return whether 95 % of each placed surface lie near the other."""
+    some = shape.samples[:: max(1, len(shape.samples) // COMPARED_POINTS)]
+    for p, q in ((a, b), (b, a)):
+        T = se3.invert(q.T_world_obj) @ p.T_world_obj
+        points = se3.transform(T, p.scale * some) / q.scale
+        if np.mean(np.abs(shape.field.distance(points)) < share * INNER_EXTENT) < NEARLY_ALL:
+            return False
+    return True
