@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from realsim.geometry import se3
-from realsim.scanning.scale.agreement import explain, tolerance
-from realsim.scanning.scale.state import State
+from realsim.scanning.scale.state import ScaleState
+from realsim.scanning.scale.verdict import explain
 from scanned_objects import evidence_of, scanned, shape_of, true_state
 
 NAMES = [
@@ -22,10 +22,14 @@ def truth(name: str, lab: str = "exact"):
     return shape, evidence, true_state(scanned(name, lab), shape, evidence)
 
 
-def scaled_about_foot(state: State, factor: float) -> State:
+def scaled_about_foot(state: ScaleState, factor: float) -> ScaleState:
     """Return the object at another scale, standing where it stood."""
     foot = np.array([state.t[0], state.t[1], 0.0])
-    return replace(state, s=state.s * factor, t=foot + factor * (state.t - foot))
+    return shifted(replace(state, s=state.s * factor), (factor - 1) * (state.t - foot))
+
+
+def shifted(state: ScaleState, step: np.ndarray) -> ScaleState:
+    return replace(state, poses=se3.from_translation(step) @ state.poses)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -49,23 +53,12 @@ def test_too_small_and_too_large_explain_less(name: str, factor: float):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_gain_falls_on_both_sides_the_farther_the_more(name: str):
-    shape, evidence, state = truth(name)
-    gains = [
-        explain(shape, evidence, replace(state, s=f * state.s)).gain
-        for f in (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15)
-    ]
-    assert np.argmax(gains) == 3
-    assert np.all(np.diff(gains[:4]) > 0) and np.all(np.diff(gains[3:]) < 0)
-
-
-@pytest.mark.parametrize("name", NAMES)
 def test_a_mesh_elsewhere_explains_less_than_nothing(name: str):
     """Next to the object, in the views' sight: the cameras looked through there."""
     shape, evidence, state = truth(name)
     step = 1.1 * (np.ptp(evidence.footprint.box, axis=0)[:2].max())
     for angle in (0.5, 2.6, 4.7):
-        away = replace(state, t=state.t + step * np.array([np.cos(angle), np.sin(angle), 0]))
+        away = shifted(state, step * np.array([np.cos(angle), np.sin(angle), 0]))
         seen = explain(shape, evidence, away)
         assert seen.gain < 0.0
         assert seen.cover < 0.25
@@ -75,7 +68,8 @@ def test_a_turned_mesh_explains_less():
     shape, evidence, state = truth("scalene")
     right = explain(shape, evidence, state).gain
     for axis in np.eye(3):
-        turned = replace(state, R=state.R @ se3.exp_so3(np.radians(15) * axis))
+        turn = se3.from_rt(se3.exp_so3(np.radians(15) * axis), np.zeros(3))
+        turned = replace(state, poses=state.poses @ turn)
         assert explain(shape, evidence, turned).gain < right - 0.1
 
 
@@ -88,15 +82,6 @@ def test_agreement_does_not_depend_on_how_densely_it_is_looked_at():
     assert some.iou == pytest.approx(full.iou, abs=0.04)
     assert few.gain == pytest.approx(full.gain, abs=0.08)
     assert len(few.view_iou) == 6 and len(full.view_iou) == 10
-
-
-def test_more_noise_and_a_larger_object_are_allowed_more():
-    evidence = evidence_of("bunny", "lab")
-    z = np.array([0.2, 0.4, 0.8])
-    allowed = tolerance(evidence, z)
-    assert np.all(np.diff(allowed) >= 0) and allowed[-1] > allowed[0]
-    larger = tolerance(replace(evidence, size_m=3 * evidence.size_m), z)
-    assert np.all(larger > allowed)
 
 
 @pytest.mark.parametrize("name", ["mug", "bowl"])

@@ -11,7 +11,7 @@ from realsim.geometry.camera import project
 from realsim.geometry.distance_field import DistanceField
 from realsim.scanning.scale.config import SampleConfig, ScaleConfig
 from realsim.scanning.scale.evidence import ScanView
-from realsim.scanning.scale.shape import outline
+from realsim.scanning.scale.outlines import outline
 from realsim.scanning.scale.state import metre_per_px
 from scanned_objects import (
     LAB,
@@ -35,7 +35,7 @@ def outline_px(name: str, lab: str) -> list[tuple[ScanView, Array, Array]]:
     state = true_state(known, shape, evidence)
     rows = []
     for view, T in zip(evidence.views, known.views.Ts_world_cam, strict=True):
-        points = outline(shape, state.pose, T, evidence.intrinsics.fx, 400).points
+        points = outline(shape, state, T, evidence.intrinsics.fx, 400).points
         world = state.s * points @ state.R.T + state.t
         uv = project(evidence.intrinsics, se3.transform(se3.invert(T), world))
         rows.append((view, uv, world[:, 2]))
@@ -50,7 +50,7 @@ def looked_up(image: Array, view: ScanView, uv: Array) -> Array:
     return map_coordinates(image, at, order=1, mode="nearest")
 
 
-@pytest.mark.parametrize("name", ["bunny", "mug", "block"])
+@pytest.mark.parametrize("name", ["bunny", "block"])
 def test_the_signed_distance_is_zero_at_the_true_outline_within_a_pixel(name: str):
     off: list[Array] = []
     for view, uv, height in outline_px(name, "exact"):
@@ -61,13 +61,6 @@ def test_the_signed_distance_is_zero_at_the_true_outline_within_a_pixel(name: st
     assert len(d) > 500
     assert abs(np.median(d)) < 0.5
     assert np.mean(np.abs(d) < 1.0) > 0.9
-
-
-def test_with_noise_the_outline_is_still_within_two_pixels():
-    d = np.concatenate([
-        looked_up(v.rim.distance_px, v, uv[h > 0.02]) for v, uv, h in outline_px("bunny", "lab")
-    ])  # fmt: skip
-    assert np.mean(np.abs(d) < 2.0) > 0.9
 
 
 def test_the_distance_is_negative_inside_and_grows_by_one_per_pixel():
@@ -96,35 +89,9 @@ def test_without_noise_points_lie_on_the_object_and_on_the_table():
         assert len(view.table) > 100
 
 
-def test_no_point_of_a_noisy_view_floats_between_object_and_table():
-    known = scanned("bunny")
-    field = DistanceField.from_mesh(known.real, 96)
-    off: list[Array] = []
-    for view, T in zip(evidence_of("bunny").views, known.views.Ts_world_cam, strict=True):
-        world = se3.transform(T, view.points)
-        off.append(field.distance(se3.transform(se3.invert(known.T_world_obj), world)))
-    d = np.concatenate(off)
-    assert np.mean(np.abs(d) < 0.006) > 0.99
-    assert abs(np.median(d)) < 0.0004
-
-
-def test_rays_carry_the_measured_depth_and_who_was_met():
-    known = scanned("block", "exact")
-    field = DistanceField.from_mesh(known.real, 96)
-    for view in evidence_of("block", "exact").views:
-        assert view.rays.shape == (len(view.depth), 3)
-        np.testing.assert_allclose(view.rays[:, 2], 1.0)
-        on = view.is_object
-        assert 50 < np.count_nonzero(on) < len(on)
-        assert np.all(view.depth[on] > 0)
-        world = se3.transform(view.T_world_cam, view.rays[on] * view.depth[on, None])
-        d = field.distance(se3.transform(se3.invert(known.T_world_obj), world))
-        assert np.abs(d).max() < 0.0015
-
-
 def test_sampling_keeps_about_as_many_as_wanted_and_says_what_each_stands_for():
     known = scanned("block")
-    for wanted in (60, 250, 900):
+    for wanted in (60, 900):
         samples = SampleConfig(object_points=wanted, table_points=wanted, rays=wanted)
         evidence = gathered(known, ScaleConfig(samples=samples))
         for view in evidence.views:
@@ -146,13 +113,12 @@ def test_a_view_that_does_not_see_the_object_is_named():
     assert [v.index for v in evidence.views] == [0, 1, 2, 4, 6, 7, 8, 9]
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -0.3])
-def test_invalid_depth_is_no_depth(value: float):
+def test_invalid_depth_is_no_depth():
     known = scanned("block")
     spoiled = []
     for f in known.frames:
         z = f.depth_m.copy()
-        z[::17, ::13] = value
+        z[::17, ::13], z[1::17, ::13], z[2::17, ::13] = np.nan, np.inf, -0.3
         spoiled.append(replace(f, depth_m=z))
     views = replace(known.views, frames=tuple(spoiled))
     evidence = gathered(Scanned(known.real, known.scan, views))
@@ -179,19 +145,6 @@ def test_the_cloud_lies_on_the_object_and_looks_at_the_cameras():
     np.testing.assert_allclose(np.linalg.norm(evidence.cloud.towards, axis=1), 1.0, atol=1e-9)
     assert np.all(evidence.cloud.sigmas > 0)
     assert np.mean(evidence.cloud.towards[:, 2] > 0) > 0.99
-
-
-def test_progress_counts_the_views():
-    from realsim.registration.evidence import measure_noise
-    from realsim.scanning.scale.evidence import gather_scan
-
-    known, before, config = scanned("block"), evidence_of("block"), ScaleConfig()
-    ticks: list[tuple[int, int]] = []
-    gather_scan(
-        known.views.intrinsics, known.frames, (before.plane, before.footprint),
-        measure_noise(known.frames, config.noise), config, lambda a, b: ticks.append((a, b)),
-    )  # fmt: skip
-    assert ticks == [(k + 1, 10) for k in range(10)]
 
 
 def test_an_object_cut_by_the_image_border_keeps_what_is_seen():

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.registration.evidence import DepthFrame
+from realsim.registration.refinement.equations import BIAS, HAND_EYE_AT
 from realsim.scanning.scale.config import SampleConfig, ScaleConfig
 from realsim.scanning.scale.joint import joint_fit
 from realsim.scanning.scale.result import ScaleFit, Similarity
-from realsim.scanning.scale.state import BIAS, HAND_EYE, VIEWS
+from realsim.scanning.scale.state import SIZE
 from scanned_objects import (
     LAB,
     UNIT_M,
@@ -56,7 +57,7 @@ def placed_vertices(fit: ScaleFit, mesh: Mesh) -> Array:
     return se3.transform(fit.T_world_obj, fit.scale * mesh.vertices)
 
 
-@pytest.mark.parametrize("name", ["bunny", "mug", "scalene"])
+@pytest.mark.parametrize("name", ["mug", pytest.param("bunny", marks=pytest.mark.slow)])
 def test_without_errors_the_scale_is_right_to_a_tenth_of_a_per_cent(name: str):
     fit = fitted(name, "exact")
     assert fit.scale == pytest.approx(UNIT_M, rel=1e-3)
@@ -65,7 +66,7 @@ def test_without_errors_the_scale_is_right_to_a_tenth_of_a_per_cent(name: str):
     assert abs(z_of(fit)) < 1.0
 
 
-@pytest.mark.parametrize("name", ["bunny", "mug", "scalene"])
+@pytest.mark.parametrize("name", ["bunny", "mug"])
 def test_with_a_labs_errors_scale_and_pose_are_as_good_as_the_result_says(name: str):
     fit, known = fitted(name), scanned(name)
     assert fit.scale == pytest.approx(UNIT_M, rel=0.005)
@@ -113,13 +114,16 @@ def test_the_result_does_not_depend_on_the_meshs_unit_and_axes(cold: bool):
     assert 1e3 * np.linalg.norm(gap, axis=1).max() < 0.3
 
 
-def test_the_order_of_the_frames_does_not_matter():
+def test_order_and_numbers_of_the_frames_do_not_matter_and_progress_goes_to_the_end():
     known, plain = scanned("bunny"), fitted("bunny")
     order = np.random.default_rng(0).permutation(len(known.frames))
-    fit = fit_of(known, frames=tuple(known.frames[k] for k in order))
+    frames = tuple(replace(known.frames[k], index=3 * known.frames[k].index + 2) for k in order)
+    ticks: list[tuple[int, int]] = []
+    fit = fit_of(known, frames=frames, progress=lambda done, total: ticks.append((done, total)))
     assert fit.scale == plain.scale
     np.testing.assert_array_equal(fit.T_world_obj, plain.T_world_obj)
-    assert [v.index for v in fit.views] == [v.index for v in plain.views]
+    assert [v.index for v in fit.views] == [3 * k + 2 for k in range(10)]
+    assert ticks == [(k + 1, 14) for k in range(14)]
 
 
 def test_the_same_input_gives_the_same_bytes():
@@ -136,20 +140,6 @@ def test_a_start_and_none_lead_to_the_same(name: str):
     assert abs(given.scale - found.scale) < 0.2 * given.sigma
     assert surface_gap_mm(found, scanned(name)) < 1.2
     assert found.verdict == "accepted"
-
-
-@pytest.mark.slow
-def test_two_starts_lead_to_the_same():
-    known = scanned("scalene")
-    fits = [fit_of(known, start=rough_start(known, seed)) for seed in (1, 2)]
-    assert abs(fits[0].scale - fits[1].scale) < 0.2 * fits[0].sigma
-
-
-@pytest.mark.slow
-def test_errors_are_of_the_size_that_sigma_says():
-    z = np.array([z_of(fitted(n, "lab", s)) for n in ("block", "bunny") for s in (0, 1)])
-    assert np.all(np.abs(z) < 3.5), z.round(2)
-    assert np.sqrt(np.mean(np.square(z))) < 1.7, z.round(2)
 
 
 @pytest.mark.slow
@@ -175,7 +165,7 @@ def test_noise_of_the_depth_leaves_bias_and_hand_eye_alone(name: str):
     state = true_state(scanned(name, "exact"), shape, evidence)
     config = ScaleConfig(samples=SampleConfig(noise_area_px=1.0))
     z: list[Array] = []
-    for seed in range(4):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
 
         def noisy(points: Array, rng: np.random.Generator = rng) -> Array:
@@ -188,8 +178,8 @@ def test_noise_of_the_depth_leaves_bias_and_hand_eye_alone(name: str):
         )
         seen = replace(evidence, views=views, noise=replace(evidence.noise, per_m=0.0069))
         found, look = joint_fit(shape, seen, state, config)
-        off = np.array([*found.hand_eye, found.bias, np.log(found.s / state.s)])
-        at = [*range(HAND_EYE, VIEWS), BIAS, 6]
+        off = np.array([*found.hand_eye, found.bias[1], np.log(found.s / state.s)])
+        at = [*HAND_EYE_AT, BIAS.start + 1, SIZE]
         z.append(off / np.sqrt(np.diag(look.covariance)[at]))
     mean = np.mean(z, axis=0)
     # The priors hold what the points do not say: steps are smaller than the covariance, never
@@ -198,52 +188,38 @@ def test_noise_of_the_depth_leaves_bias_and_hand_eye_alone(name: str):
     assert np.sqrt(np.mean(np.square(z))) < 1.5
 
 
-@pytest.mark.parametrize("name", ["bunny", pytest.param("scalene", marks=pytest.mark.slow)])
-def test_a_slipped_view_is_left_out_and_named(name: str):
-    known = scanned(name)
+def test_a_slipped_view_is_left_out_and_a_blind_one_named():
+    known = scanned("bunny")
     slip = se3.from_rt(se3.exp_so3([np.radians(2.0), 0, 0]), [0, 0.006, 0])
     frames = list(known.frames)
     frames[4] = replace(frames[4], T_world_cam=frames[4].T_world_cam @ slip)
+    frames[6] = replace(frames[6], depth_m=np.zeros_like(frames[6].depth_m))
     fit = fit_of(known, frames=tuple(frames))
-    assert [v.index for v in fit.views if not v.used] == [4]
+    assert [v.index for v in fit.views] == list(range(10))
+    assert [v.index for v in fit.views if not v.used] == [4, 6]
     assert any("view 4" in n and "left out" in n for n in fit.notes)
-    assert abs(fit.scale - fitted(name).scale) < 1.0 * fit.sigma
+    assert any("view 6 does not see the object" in n for n in fit.notes)
+    assert abs(fit.scale - fitted("bunny").scale) < 1.5 * fit.sigma
     assert fit.scale == pytest.approx(UNIT_M, rel=0.005)
+    for v in fit.views:
+        if v.used:
+            assert v.points > 50 and 0.9 < v.agree <= 1.0 and 0.85 < v.iou <= 1.0
+            # The lab's errors are half a millimetre; a tenth of a degree turns about the hand.
+            assert 0 < v.rms_mm < 5 and v.shift_mm < 2.0 and v.turn_deg < 0.4
+        else:
+            assert v.points == 0 and np.isnan(v.agree)
 
 
-@pytest.mark.parametrize("name", ["mug", pytest.param("bowl", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mug", "bowl"])
 def test_no_right_view_is_left_out(name: str):
     fit = fitted(name, "true cameras")
     assert all(v.used for v in fit.views), fit.notes
     assert fit.notes == ()
 
 
-def test_views_are_in_order_with_what_was_used_of_them():
-    known = scanned("bunny")
-    blind = replace(known.frames[6], depth_m=np.zeros_like(known.frames[6].depth_m))
-    fit = fit_of(known, frames=(*known.frames[:6], blind, *known.frames[7:]))
-    assert [v.index for v in fit.views] == list(range(10))
-    assert [v.index for v in fit.views if not v.used] == [6]
-    assert any("view 6 does not see the object" in n for n in fit.notes)
-    for v in fit.views:
-        if v.used:
-            assert v.points > 50 and 0.9 < v.agree <= 1.0 and 0.85 < v.iou <= 1.0
-            assert 0 < v.rms_mm < 5
-            # The lab's errors are half a millimetre; a tenth of a degree turns about the hand.
-            assert v.shift_mm < 2.0 and v.turn_deg < 0.4
-        else:
-            assert v.points == 0 and np.isnan(v.agree)
-
-
-def test_view_numbers_are_those_of_the_session():
-    known = scanned("bunny")
-    frames = tuple(replace(f, index=3 * f.index + 2) for f in known.frames)
-    fit = fit_of(known, frames=frames)
-    assert [v.index for v in fit.views] == [3 * k + 2 for k in range(10)]
-    assert fit.scale == fitted("bunny").scale
-
-
-@pytest.mark.parametrize("height_mm", [2.0, pytest.param(-2.0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("height_mm", [2.0, -2.0])
 def test_the_residual_map_shows_a_bump_with_sign_and_size(height_mm: float):
     """The real block carries a plate on its top that the mesh does not know, or the other way."""
     # The knob tells top from bottom: with the plate hidden below, the depth would fit as well.
@@ -269,25 +245,6 @@ def test_the_residual_map_shows_a_bump_with_sign_and_size(height_mm: float):
 
 
 @pytest.mark.slow
-def test_sigma_grows_with_the_distortion():
-    known = scanned("bunny")
-    sigmas = [
-        fit_of(known, scaled(wrong(known.real, a, seed=1), 1 / UNIT_M)).sigma_percent
-        for a in (0.0025, 0.03)
-    ]
-    assert np.all(np.diff(sigmas) > 0), sigmas
-    assert sigmas[-1] > 2 * sigmas[0]
-
-
-@pytest.mark.slow
-def test_more_views_know_the_scale_better():
-    few, many = fitted("bunny", "lab", 0, 5), fitted("bunny", "lab", 0, 20)
-    assert many.sigma < few.sigma
-    for fit in (few, many):
-        assert fit.scale == pytest.approx(UNIT_M, rel=0.008)
-
-
-@pytest.mark.slow
 def test_views_from_one_side_only_know_the_scale_less_well():
     known = scanned("bunny", "lab", 0, 20)
     eyes = np.stack([f.T_world_cam[:3, 3] for f in known.frames]) - known.T_world_obj[:3, 3]
@@ -298,15 +255,6 @@ def test_views_from_one_side_only_know_the_scale_less_well():
     around = fitted("bunny", "lab", 0, 20)
     assert side.sigma > 1.5 * around.sigma or side.verdict != "accepted"
     assert abs(z_of(side)) < 3.5
-
-
-def test_progress_goes_up_to_the_end():
-    ticks: list[tuple[int, int]] = []
-    fit_of(scanned("block"), progress=lambda done, total: ticks.append((done, total)))
-    done = [t[0] for t in ticks]
-    assert done == sorted(done) and done[0] == 1
-    assert ticks[-1] == (14, 14) and len({t[1] for t in ticks}) == 1
-    assert len(ticks) == 14
 
 
 @pytest.mark.slow
@@ -325,15 +273,15 @@ def test_a_point_picks_the_object():
 
 
 def test_a_given_plane_is_used():
-    known, found = scanned("block"), fitted("block").plane
+    known, found = scanned("bunny"), fitted("bunny").plane
     given = replace(found, T_world_table=found.T_world_table @ se3.from_translation([0, 0, 1e-4]))
     fit = fit_of(known, plane=given)
-    assert abs(fit.scale - fitted("block").scale) < 0.5 * fit.sigma
+    assert abs(fit.scale - fitted("bunny").scale) < 0.5 * fit.sigma
     assert fit.plane.inliers == found.inliers
 
 
 def test_limits_name_what_limits_worst_first():
-    for name in ("bunny", "block"):
+    for name in ("bunny", "mug"):
         fit = fitted(name)
         # The last one is not in the sigma.
         assert fit.limits[-1].name == "surface offset"
@@ -345,20 +293,6 @@ def test_limits_name_what_limits_worst_first():
             assert limit.percent >= 0 and limit.text
             if limit.name != "surface offset":
                 assert limit.percent <= 1.01 * fit.sigma_percent
-    distorted = fit_of(scanned("bunny"), scaled(wrong(scanned("bunny").real, 0.02, 2), 1 / UNIT_M))
-    assert distorted.limits[0].name == "shape"
-
-
-@pytest.mark.slow
-def test_known_cameras_say_more_than_unknown_ones():
-    known = scanned("block", "true cameras")
-    sharp = ScaleConfig(
-        hand_eye_sigma_mm=0.01, hand_eye_sigma_deg=0.001, arm_sigma_mm=0.01, arm_sigma_deg=0.001
-    )
-    fit = fit_of(known, config=sharp)
-    assert fit.sigma < fitted("block", "true cameras").sigma
-    assert all(v.shift_mm < 0.1 for v in fit.views)
-    assert abs(z_of(fit)) < 3.5
 
 
 def test_the_covariance_is_one_and_holds_sigma():

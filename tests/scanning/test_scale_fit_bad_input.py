@@ -1,7 +1,6 @@
 """What cannot be fitted is named with what to do, and no wrong scale is accepted."""
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from realsim.errors import DegenerateError, InputError, RealsimError, UnitError
+from realsim.errors import DegenerateError, InputError, RealsimError
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.registration.evidence import DepthFrame
@@ -17,7 +16,6 @@ from realsim.scanning.scale.result import ScaleFit, Similarity
 from scanned_objects import (
     LAB,
     UNIT_M,
-    Scanned,
     block,
     fit_of,
     fitted,
@@ -36,68 +34,8 @@ from scanned_objects import (
 Array = NDArray[np.float64]
 
 
-def changed(known: Scanned, change: Callable[[DepthFrame], DepthFrame]) -> tuple[DepthFrame, ...]:
-    return tuple(change(f) for f in known.frames)
-
-
 def as_scan(name: str) -> Mesh:
     return scaled(real_mesh(name), 1 / UNIT_M)
-
-
-@pytest.mark.parametrize("n", [1, 2])
-def test_fewer_than_three_frames(n: int):
-    known = scanned("block")
-    with pytest.raises(InputError, match=rf"{n} views .* at least 3 .* 12 or more") as caught:
-        fit_of(known, frames=known.frames[:n])
-    assert "from different sides" in str(caught.value) or "different sides" in str(caught.value)
-
-
-def test_no_frame():
-    with pytest.raises(InputError, match="no depth frames"):
-        fit_of(scanned("block"), frames=())
-
-
-def test_frames_without_depth():
-    known = scanned("block")
-    empty = changed(known, lambda f: replace(f, depth_m=np.zeros_like(f.depth_m)))
-    with pytest.raises(InputError, match=r"10 depth images .*Is the depth all zero\?"):
-        fit_of(known, frames=empty)
-
-
-def test_only_two_frames_that_see_the_object():
-    known = scanned("block")
-    blind = changed(
-        known, lambda f: f if f.index in (4, 7) else replace(f, depth_m=np.zeros_like(f.depth_m))
-    )
-    with pytest.raises(InputError, match=r"2 views .* left of 10: the others do not see"):
-        fit_of(known, frames=blind)
-
-
-def test_depth_in_millimetres_names_the_unit():
-    known = scanned("block")
-    in_mm = changed(known, lambda f: replace(f, depth_m=f.depth_m * np.float32(1000)))
-    with pytest.raises((UnitError, InputError, DegenerateError), match=r"(?i)millimet|unit|metres"):
-        fit_of(known, frames=in_mm)
-
-
-def test_raw_counts_name_the_unit():
-    known = scanned("block")
-    raw = changed(known, lambda f: replace(f, depth_m=(1e4 * f.depth_m).astype(np.uint16)))
-    with pytest.raises(InputError, match=r"uint16; float32 metres .* depth unit"):
-        fit_of(known, frames=raw)
-
-
-def test_a_frame_of_another_size():
-    known = scanned("block")
-    small = replace(known.frames[3], depth_m=known.frames[3].depth_m[::2, ::2])
-    with pytest.raises(InputError, match=r"\(180, 320\); the camera's is \(360, 640\)"):
-        fit_of(known, frames=(*known.frames[:3], small, *known.frames[4:]))
-
-
-def test_two_frames_of_one_number():
-    known = scanned("block")
-    with pytest.raises(InputError, match="same number"):
-        fit_of(known, frames=(*known.frames, known.frames[0]))
 
 
 def test_an_empty_table():
@@ -114,6 +52,33 @@ def test_several_objects():
         fit_of(known, as_scan("block"), start=None)
 
 
+def blind(frame: DepthFrame) -> DepthFrame:
+    return replace(frame, depth_m=np.zeros_like(frame.depth_m))
+
+
+@pytest.mark.parametrize(
+    ("frames", "said"),
+    [
+        (lambda f: (), "no depth frames"),
+        (lambda f: f[:2], r"2 views .* at least 3 from different sides .* 12 or more"),
+        (lambda f: [blind(g) for g in f], r"10 depth images .*Is the depth all zero\?"),
+        (lambda f: [g if g.index in (4, 7) else blind(g) for g in f],
+         r"2 views .* left of 10: the others do not see"),
+        (lambda f: [replace(g, depth_m=g.depth_m * np.float32(1000)) for g in f],
+         r"(?i)millimet|unit|metres"),
+        (lambda f: [replace(g, depth_m=(1e4 * g.depth_m).astype(np.uint16)) for g in f],
+         r"uint16; float32 metres .* depth unit"),
+        (lambda f: (*f[:3], replace(f[3], depth_m=f[3].depth_m[::2, ::2])),
+         r"\(180, 320\); the camera's is \(360, 640\)"),
+        (lambda f: (*f, f[0]), "same number"),
+    ],
+)  # fmt: skip
+def test_frames_that_cannot_be_used_are_named(frames, said: str):
+    known = scanned("block")
+    with pytest.raises(RealsimError, match=said):
+        fit_of(known, frames=frames(known.frames))
+
+
 @pytest.mark.parametrize("axes", [[1, 1, 0], [1, 0, 0], [0, 0, 0]])
 def test_flat_meshes(axes: list[int]):
     known = scanned("block")
@@ -122,19 +87,6 @@ def test_flat_meshes(axes: list[int]):
         fit_of(known, flat)
     assert isinstance(caught.value, InputError | DegenerateError)
     assert "extent" in str(caught.value)
-
-
-def test_an_empty_mesh():
-    with pytest.raises(InputError, match="empty"):
-        fit_of(scanned("block"), Mesh(vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), np.int32)))
-
-
-def test_a_mesh_with_vertices_that_are_no_numbers():
-    known = scanned("block")
-    vertices = known.scan.vertices.copy()
-    vertices[3, 1] = np.nan
-    with pytest.raises(RealsimError, match="finite"):
-        fit_of(known, replace(known.scan, vertices=vertices))
 
 
 @lru_cache(maxsize=16)
@@ -159,7 +111,8 @@ def test_no_mesh_of_another_object_is_accepted(real: str, given: str):
     assert another(real, given).verdict != "accepted"
 
 
-@pytest.mark.parametrize("cold", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("cold", [True, False])
 def test_a_mirrored_mesh_is_not_accepted_and_named(cold: bool):
     known = scanned("scalene")
     given = {"start": None} if cold else {}
@@ -177,8 +130,8 @@ def test_the_mirror_image_of_a_symmetric_object_is_the_object():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["bunny", pytest.param("block", marks=pytest.mark.slow)])
-def test_an_inside_out_mesh_gives_the_same(name: str):
+def test_an_inside_out_mesh_gives_the_same():
+    name = "bunny"
     known = scanned(name)
     fit, plain = fit_of(known, inside_out(known.scan)), fitted(name)
     assert abs(fit.scale - plain.scale) < 0.5 * plain.sigma
@@ -189,7 +142,7 @@ def test_an_inside_out_mesh_gives_the_same(name: str):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("unit", [pytest.param(1e6, marks=pytest.mark.slow), 1e-6])
+@pytest.mark.parametrize("unit", [1e6, 1e-6])
 def test_huge_and_tiny_units(unit: float):
     known = scanned("bunny")
     fit, plain = fit_of(known, scaled(known.scan, unit), start=None), fitted("bunny")
@@ -198,7 +151,8 @@ def test_huge_and_tiny_units(unit: float):
     assert fit.verdict == "accepted"
 
 
-@pytest.mark.parametrize("name", [pytest.param("bunny", marks=pytest.mark.slow), "block"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["bunny", "block"])
 def test_an_open_mesh_is_fitted_too(name: str):
     """Scans have no underside: nobody saw it."""
     known = scanned(name)
@@ -223,15 +177,7 @@ def test_a_heavy_mesh_is_fitted_in_reasonable_time():
     assert len(fit.residual_mm) == len(heavy.vertices)
 
 
-@pytest.mark.slow
-def test_faces_without_area_do_no_harm():
-    known = scanned("block")
-    empty = np.array([[0, 0, 1], [2, 2, 2]], dtype=np.int32)
-    fit = fit_of(known, replace(known.scan, faces=np.concatenate([known.scan.faces, empty])))
-    assert abs(fit.scale - fitted("block").scale) < 0.1 * fit.sigma
-
-
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("turned", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_faces_that_are_there_twice_do_no_harm(turned: bool):
     """Exporters write double-sided materials so; an edge of four faces is an edge all the same."""
     known = scanned("block")
@@ -241,13 +187,7 @@ def test_faces_that_are_there_twice_do_no_harm(turned: bool):
     assert abs(fit.scale - fitted("block").scale) < 1.0 * fit.sigma
 
 
-def test_a_vertex_far_away_that_no_face_uses_is_not_the_objects_size():
-    known = scanned("block")
-    stray = replace(known.scan, vertices=np.concatenate([known.scan.vertices, [[40.0, 3, 5]]]))
-    fit = fit_of(known, stray, start=None)
-    assert fit.verdict != "accepted" or fit.scale == pytest.approx(UNIT_M, rel=0.01)
-
-
+@pytest.mark.slow
 def test_an_object_cut_by_the_image_border_in_some_views():
     """The camera looks past it: half of the object is out of the picture in every third view."""
     known = scanned("bunny")
@@ -261,14 +201,6 @@ def test_an_object_cut_by_the_image_border_in_some_views():
     fit = fit_of(known, frames=tuple(frames))
     assert fit.scale == pytest.approx(UNIT_M, rel=0.006)
     assert fit.verdict == "accepted"
-
-
-@pytest.mark.slow
-def test_an_object_larger_than_the_picture():
-    near = replace(LAB, focal_px=1000.0, views=8)
-    close = scanned_mesh(real_mesh("bunny"), near, seed=5)
-    again = fit_of(close)
-    assert again.scale == pytest.approx(UNIT_M, rel=0.006) or again.verdict != "accepted"
 
 
 def test_poses_of_other_images_are_not_accepted():
@@ -286,19 +218,10 @@ def test_poses_of_other_images_are_not_accepted():
         assert fit.verdict != "accepted"
 
 
+@pytest.mark.slow
 def test_a_start_that_is_turned_over_is_put_right_or_not_accepted():
     """The handle of a mug on the other side: most of it agrees, and it is wrong by 130 mm."""
     known = scanned("mug")
     turned = known.T_world_obj @ se3.from_rt(se3.exp_so3([0, 0, np.pi]), np.zeros(3))
     fit = fit_of(known, start=Similarity(scale=UNIT_M, T_world_obj=turned))
     assert fit.verdict != "accepted" or surface_gap_mm(fit, known) < 5.0
-
-
-@pytest.mark.slow
-def test_a_start_that_is_nowhere_near_is_forgotten():
-    known = scanned("scalene")
-    rng = np.random.default_rng(3)
-    far = Similarity(scale=7.0, T_world_obj=se3.from_rt(se3.random_rotation(rng), [0.5, 0.2, 0.4]))
-    fit = fit_of(known, start=far)
-    assert fit.scale == pytest.approx(UNIT_M, rel=0.005)
-    assert surface_gap_mm(fit, known) < 1.2

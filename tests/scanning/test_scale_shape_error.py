@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 
 from realsim.scanning.scale.config import ShapeConfig
-from realsim.scanning.scale.shape import INNER_EXTENT
-from realsim.scanning.scale.shape_error import (
+from realsim.scanning.scale.shape import (
+    INNER_EXTENT,
     SurfacePatches,
     covariance_of,
     make_patches,
@@ -18,15 +18,7 @@ from scanned_objects import shape_of
 
 Array = NDArray[np.float64]
 CONFIG = ShapeConfig()
-NAMES = ["block", "mug", "bunny", "elbow"]
-
-
-def sphere(n: int = 4000, radius: float = 0.05) -> tuple[Array, Array]:
-    """Return points spread evenly over a sphere, and their normals."""
-    k = np.arange(n) + 0.5
-    z, turn = 1 - 2 * k / n, k * np.pi * (3 - np.sqrt(5))
-    n_out = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], -1)
-    return radius * n_out, n_out
+NAMES = ["block", "mug"]
 
 
 def patches_of(name: str) -> SurfacePatches:
@@ -36,24 +28,6 @@ def patches_of(name: str) -> SurfacePatches:
 def unconditioned(patches: SurfacePatches, length: float) -> Array:
     r = np.sqrt(3) * np.linalg.norm(patches.middles[:, None] - patches.middles, axis=2) / length
     return (1 + r) * np.exp(-r) * (patches.normals @ patches.normals.T)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_patches_cover_all_samples_and_their_areas_are_shares(name: str):
-    shape = shape_of(name)
-    patches = shape.patches
-    ids = patches.of(shape.samples, shape.normals)
-    assert patches.areas.sum() == pytest.approx(1.0, abs=1e-12)
-    assert np.all(patches.areas > 0)
-    assert len(patches.areas) <= CONFIG.patches
-    assert ids.min() >= 0 and ids.max() < len(patches.areas)
-    assert len(np.unique(ids)) == len(patches.areas)
-    # What is asked later gives about the shares that were counted when they were made.
-    counted = np.bincount(ids, minlength=len(patches.areas)) / len(ids)
-    assert np.abs(counted - patches.areas).sum() < 0.5
-    assert np.all(np.linalg.norm(patches.normals, axis=1) <= 1 + 1e-12)
-    assert np.linalg.norm(shape.samples - patches.middles[ids], axis=1).max() < 0.5 * INNER_EXTENT
-    assert len(patches.of(np.zeros((0, 3)), np.zeros((0, 3)))) == 0
 
 
 def test_the_two_sides_of_a_thin_wall_are_two_patches():
@@ -75,43 +49,11 @@ def test_the_two_sides_of_a_thin_wall_are_two_patches():
     assert C[k, near] < -0.8
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("length", [0.005, 0.02, 0.1])
-def test_covariances_are_positive_and_conditioning_takes_variance_away(name: str, length: float):
-    patches = patches_of(name)
-    S = covariance_of(patches, length)
-    np.testing.assert_array_equal(S, S.T)
-    assert np.linalg.eigvalsh(S).min() > -1e-9
-    gone = unconditioned(patches, length) - S
-    assert np.linalg.eigvalsh(gone).min() > -1e-9
-    assert np.linalg.matrix_rank(gone, tol=1e-9) <= 7
-    assert np.all(np.diag(S) <= 1 + 1e-9)
-
-
 def modes_of(middles: Array, areas: Array) -> Array:
     """Return shift, turn and growth (7, K, 3) about the surface's middle, by hand."""
     q = middles - areas @ middles
     turns = [np.cross(e, q) for e in np.eye(3)]
     return np.stack([*(np.tile(e, (len(q), 1)) for e in np.eye(3)), *turns, q])
-
-
-def test_on_a_sphere_no_offsets_are_left_that_shift_or_grow_it():
-    """There the normal part of the field holds these sums alone: they must vanish.
-
-    A turn has no normal part on a sphere.
-    """
-    patches = make_patches(*sphere(), 60, CONFIG.normal_share * INNER_EXTENT)
-    for length in (0.01, 0.03, 0.1):
-        S = covariance_of(patches, length)
-        before = unconditioned(patches, length)
-        modes = modes_of(patches.middles, patches.areas)
-        normal = np.einsum("mkc,kc->mk", modes, patches.normals) * patches.areas
-        for m in (0, 1, 2, 6):
-            u = normal[m] / np.linalg.norm(normal[m])
-            # A vector field's tangential part may compensate: most is gone, not all.
-            assert u @ S @ u < 0.75 * (u @ before @ u)
-        for m in (3, 4, 5):
-            assert np.linalg.norm(normal[m]) < 0.02 * np.linalg.norm(normal[6] / 0.05)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -217,9 +159,3 @@ def test_the_posterior_is_between_the_measurement_and_nothing():
     d, C = posterior(np.zeros_like(S), np.zeros(len(S)), S)
     np.testing.assert_allclose(C, S, rtol=1e-9)
     assert not d.any()
-
-
-def test_a_field_longer_than_a_patch_hardly_varies_inside_it():
-    patches = patches_of("bunny")
-    assert within_share(patches, patches.radius / 3) == 1.0
-    assert within_share(patches, 10 * patches.radius) == pytest.approx(0.1)

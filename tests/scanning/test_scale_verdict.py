@@ -6,11 +6,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from realsim.scanning.scale.agreement import Explained, explain
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.joint import Outlook, joint_fit
-from realsim.scanning.scale.state import State
-from realsim.scanning.scale.verdict import Judged, judge
+from realsim.scanning.scale.state import ScaleState
+from realsim.scanning.scale.verdict import Explained, Judged, explain, judge
 from scanned_objects import evidence_of, scanned, shape_of, true_state
 
 CONFIG = ScaleConfig()
@@ -18,7 +17,7 @@ V = CONFIG.verdict
 
 
 @lru_cache(maxsize=1)
-def right() -> tuple[State, Outlook, Explained]:
+def right() -> tuple[ScaleState, Outlook, Explained]:
     shape, evidence = shape_of("bunny"), evidence_of("bunny", "exact")
     state = true_state(scanned("bunny", "exact"), shape, evidence)
     state, look = joint_fit(shape, evidence, state, CONFIG)

@@ -6,11 +6,17 @@ import pytest
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
-from realsim.scanning.sfm.bundle import adjust, point_covariances, reprojection_errors
+from realsim.scanning.sfm.bundle import (
+    adjust,
+    halves,
+    point_covariances,
+    reliability,
+    reprojection_errors,
+    variance_inflation,
+)
 from realsim.scanning.sfm.config import FeatureConfig, MappingConfig, RobotNoise, TrustConfig
-from realsim.scanning.sfm.depth_scale import depth_scale
-from realsim.scanning.sfm.independence import halves, reliability, variance_inflation
-from realsim.scanning.sfm.pairs import pairs_to_match
+from realsim.scanning.sfm.database import pairs_to_match
+from realsim.scanning.sfm.judging import depth_scale
 from realsim.scanning.sfm.result import Geometry
 
 CAMERA = CameraIntrinsics(

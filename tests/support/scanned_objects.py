@@ -20,7 +20,7 @@ from realsim.scanning.scale.evidence import ScanEvidence, gather_scan
 from realsim.scanning.scale.fit import fit_scale
 from realsim.scanning.scale.result import ScaleFit, Similarity
 from realsim.scanning.scale.shape import ScanShape, make_shape
-from realsim.scanning.scale.state import State, first_state
+from realsim.scanning.scale.state import ScaleState, first_state
 from realsim.scanning.scale.table import find_object, find_table
 from realsim.scanning.simulated import (
     ScanLabConfig,
@@ -129,11 +129,11 @@ def shape_of(name: str) -> ScanShape:
     return make_shape(scaled(real_mesh(name), 1 / UNIT_M), ScaleConfig())
 
 
-def true_state(known: Scanned, shape: ScanShape, evidence: ScanEvidence) -> State:
+def true_state(known: Scanned, shape: ScanShape, evidence: ScanEvidence) -> ScaleState:
     """Return the state at which scale and pose are true."""
     T = known.T_world_obj
     s = UNIT_M / shape.unit
-    return first_state(evidence, s, T[:3, :3], T[:3, 3] + T[:3, :3] @ (UNIT_M * shape.center))
+    return first_state(evidence, s, T @ se3.from_translation(UNIT_M * shape.center))
 
 
 def scaled(mesh: Mesh, factor: float) -> Mesh:

@@ -11,8 +11,7 @@ from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.evidence import DepthNoise
-from realsim.scanning.fusion.crops import cropped
-from realsim.scanning.fusion.evidence import LEAST_FRAMES
+from realsim.scanning.fusion.evidence import LEAST_FRAMES, cropped
 from realsim.scanning.fusion.patches import observed_object, observed_table, view_points
 from realsim.scanning.fusion.refine import PoseState, refined_twists, start_state
 from realsim.scanning.fusion.region import Region

@@ -15,8 +15,13 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import vertex_normals
 from realsim.records import CameraIntrinsics, Mesh, SupportPlane, Verdict
 from realsim.scanning.fusion.align import Alignment, aligned, cut_height, volume_box
-from realsim.scanning.fusion.crops import Crops, cropped
-from realsim.scanning.fusion.evidence import checked_frames, fitted_to_noise, measured_noise
+from realsim.scanning.fusion.evidence import (
+    Crops,
+    checked_frames,
+    cropped,
+    fitted_to_noise,
+    measured_noise,
+)
 from realsim.scanning.fusion.region import find_region
 from realsim.scanning.fusion.result import (
     Coverage,
@@ -25,8 +30,14 @@ from realsim.scanning.fusion.result import (
     FusionFrame,
     ViewCorrection,
 )
-from realsim.scanning.fusion.surface import Surface, closed_surface, in_world, patch_widths
-from realsim.scanning.fusion.vertices import VertexEvidence, vertex_evidence
+from realsim.scanning.fusion.surface import (
+    Surface,
+    VertexEvidence,
+    closed_surface,
+    in_world,
+    patch_widths,
+    vertex_evidence,
+)
 from realsim.scanning.fusion.volume import fused_volume, least_views
 
 __all__ = [

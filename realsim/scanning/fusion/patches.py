@@ -14,7 +14,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.geometry.distance_field import DistanceField
 from realsim.records import CameraIntrinsics
-from realsim.scanning.fusion.crops import Crops
+from realsim.scanning.fusion.evidence import Crops
 from realsim.scanning.fusion.result import FusionConfig
 from realsim.scanning.fusion.volume import Volume, smoothed
 

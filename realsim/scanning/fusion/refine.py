@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.geometry.robust import MAD_TO_SIGMA
+from realsim.geometry.robust import mad_sigma, tukey_weights
 from realsim.scanning.fusion.patches import Observations
 from realsim.scanning.fusion.result import FusionConfig
 
@@ -236,15 +236,15 @@ def _weights(
     z, z_table = np.abs(left) / (seen.sigma * free), np.abs(table_left) / table.sigma
     scale, table_scale = _scale(z[several]), _scale(z_table)
 
-    def tukey(z: Array, scale: float) -> Array:
-        return np.square(np.clip(1 - np.square(z / (KERNEL * scale)), 0, None))
-
-    return (np.where(several, tukey(z, scale), 1.0), tukey(z_table, table_scale)), scale
+    return (
+        np.where(several, tukey_weights(np.square(z / (KERNEL * scale))), 1.0),
+        tukey_weights(np.square(z_table / (KERNEL * table_scale))),
+    ), scale
 
 
 def _scale(z: Array) -> float:
     """Return the robust standard deviation of residuals in sigmas, not below LEAST_SCALE."""
-    return float(max(LEAST_SCALE, MAD_TO_SIGMA * np.median(z))) if len(z) else 1.0
+    return max(LEAST_SCALE, mad_sigma(z)) if len(z) else 1.0
 
 
 def _surface_sigma(seen: Observations, weights: Array, covariance: Array) -> float:

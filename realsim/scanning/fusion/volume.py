@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
-from realsim.scanning.fusion.crops import Crops, pixel_of
+from realsim.scanning.fusion.evidence import Crops, pixel_of
 from realsim.scanning.fusion.result import FusionConfig
 
 Array = NDArray[np.float64]

@@ -86,6 +86,12 @@ class ScanEvidence:
     unseen: tuple[int, ...]
     """Numbers of the views that do not see the object."""
 
+    @property
+    def camera_numbers(self) -> Array:
+        """(12,) fx fy cx cy and the eight distortion terms."""
+        i = self.intrinsics
+        return np.array([i.fx, i.fy, i.cx, i.cy, *i.distortion])
+
 
 def gather_scan(
     intrinsics: CameraIntrinsics,

@@ -18,18 +18,15 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, Mesh, SupportPlane, Verdict
 from realsim.registration.evidence import DepthFrame, check_frames, measure_noise
-from realsim.scanning.scale.agreement import Explained, explain
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.evidence import ScanEvidence, gather_scan
-from realsim.scanning.scale.joint import Outlook, joint_fit
-from realsim.scanning.scale.limits import limits_of, sigma_log
-from realsim.scanning.scale.residuals import residual_per_vertex
+from realsim.scanning.scale.joint import Outlook, joint_fit, residual_per_vertex
 from realsim.scanning.scale.result import ScaleFit, Similarity, ViewAgreement
 from realsim.scanning.scale.search import Hypothesis, hypotheses, mirror_gain, to_given
 from realsim.scanning.scale.shape import ScanShape, make_shape
-from realsim.scanning.scale.state import State, priors_of
+from realsim.scanning.scale.state import SIMILARITY, ScaleState, priors_of
 from realsim.scanning.scale.table import find_object, find_table
-from realsim.scanning.scale.verdict import Judged, judge
+from realsim.scanning.scale.verdict import Explained, Judged, explain, judge, limits_of, sigma_log
 
 __all__ = ["DepthFrame", "ScaleConfig", "ScaleFit", "Similarity", "fit_scale"]
 
@@ -74,8 +71,8 @@ def fit_scale(  # noqa: PLR0913 - keywords, each with a meaning of its own
     ordered = check_frames(frames, intrinsics)
     _require_views(len(ordered), "given")
     ticks = _Ticks(progress, len(ordered) + 4)
-    evidence = _evidence(intrinsics, ordered, config, (plane, at), ticks)
     shape = make_shape(mesh, config)
+    evidence = _evidence(intrinsics, ordered, config, (plane, at), ticks)
     ticks.step()
     found = hypotheses(shape, evidence, start, config, size_m)
     ticks.step()
@@ -113,7 +110,7 @@ class _Fitted:
     """A hypothesis fitted to the end."""
 
     found: Hypothesis
-    state: State
+    state: ScaleState
     look: Outlook
     explained: Explained
 
@@ -163,8 +160,8 @@ def _evidence(
 
 
 def _joint(
-    shape: ScanShape, evidence: ScanEvidence, start: State, config: ScaleConfig
-) -> tuple[State, Outlook, ScanEvidence, tuple[int, ...]]:
+    shape: ScanShape, evidence: ScanEvidence, start: ScaleState, config: ScaleConfig
+) -> tuple[ScaleState, Outlook, ScanEvidence, tuple[int, ...]]:
     """Return the joint fit, the evidence it used, and the numbers of the views left out."""
     state, look = joint_fit(shape, evidence, start, config)
     bad = _against_all(shape, evidence, state, config)
@@ -181,7 +178,7 @@ def _joint(
 
 
 def _against_all(
-    shape: ScanShape, evidence: ScanEvidence, state: State, config: ScaleConfig
+    shape: ScanShape, evidence: ScanEvidence, state: ScaleState, config: ScaleConfig
 ) -> NDArray[np.bool_]:
     """Return which views (V,) are out of line: their camera, or what they see of the object."""
     v = config.verdict
@@ -215,7 +212,7 @@ def _ranked(
 def _if_mirrored(
     shape: ScanShape,
     evidence: ScanEvidence,
-    fit: tuple[State, float],
+    fit: tuple[ScaleState, float],
     judged: Judged,
     config: ScaleConfig,
 ) -> Judged:
@@ -246,13 +243,13 @@ def _if_mirrored(
 
 def _covariance(look: Outlook, sigma: float) -> Array:
     """Return the covariance (7, 7) of pose and log scale; all of it grows as the scale's part."""
-    C = look.covariance[:7, :7]
+    C = look.covariance[np.ix_(SIMILARITY, SIMILARITY)]
     return np.asarray(C * (sigma**2 / C[6, 6]), dtype=np.float64)
 
 
 def _views(
     evidence: ScanEvidence,
-    fit: tuple[State, Outlook, Explained],
+    fit: tuple[ScaleState, Outlook, Explained],
     dropped: Sequence[int],
 ) -> tuple[ViewAgreement, ...]:
     """Return how every view agrees, in the order of their numbers."""

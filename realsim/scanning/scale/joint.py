@@ -1,49 +1,47 @@
 """Everything fitted together: object, table, cameras, depth bias, outlines and shape error.
 
-The joint fit minimises, over object (7), table (3), depth bias, outline offset, hand-eye (6), one
-twist per view (6 each) and an offset delta_k of the real surface per patch of the mesh,
-    sum of surface points   (r - delta_k)^2 / var   (data to model, at the side the camera saw)
-  + sum of outline points   (r + delta_k)^2 / var   (model to data: keeps the model from growing)
-  + sum of table points     r^2 / var
-  + contact of the lowest point with the table
-  + priors of hand-eye, arm, bias, outline offset and of the shape's error (see `shape_error`).
+The joint fit is registration's (see `registration.refinement`), with three kinds of unknowns more:
+the size, the outlines' offset, and an offset delta_k of the real surface per patch of the mesh,
+whose prior is that of the shape's error (see `shape_error`); `equations` says what is minimised.
 The table makes the cameras' height and tilt visible, which would otherwise pass for a change of
 size. The inverse of the normal matrix is the covariance of the result.
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.geometry.normal_equations import System, inverse, view_steps
+from realsim.records import Mesh
+from realsim.registration.refinement.equations import BIAS_AT, HAND_EYE_AT, TABLE_AT
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.equations import (
-    Rims,
-    Surface,
-    System,
-    coarser,
+    Reduced,
+    Round,
     linearised,
-    local_points,
-    outlines_of,
-    pivot_of,
-    surface_of,
+    new_round,
+    object_distances,
+    reduced,
 )
 from realsim.scanning.scale.evidence import ScanEvidence
-from realsim.scanning.scale.shape import ScanShape
-from realsim.scanning.scale.shape_error import (
+from realsim.scanning.scale.shape import (
+    INNER_EXTENT,
+    ScanShape,
     ShapeModel,
     posterior,
     shape_models,
     within_share,
 )
 from realsim.scanning.scale.state import (
-    BIAS,
-    HAND_EYE,
+    PATCHES,
     RIM,
-    TABLE,
-    VIEWS,
-    State,
-    moved_all,
+    SIMILARITY,
+    SIZE,
+    ScaleState,
+    claimed_cameras,
+    moved_state,
 )
 
 Array = NDArray[np.float64]
@@ -55,6 +53,12 @@ FIRST_SHAPE = 0.015
 """The shape's 1-sigma before it has been measured, as a share of the size."""
 LEAST_PROBABILITY = 1e-3
 """Assumptions about the shape less probable than this are left out of the mean."""
+REACH = 0.03
+"""Points within this share of the size speak for a vertex of the residual map."""
+NEIGHBOURS = 12
+"""At most so many of them."""
+FEWEST = 3
+"""Fewer do not make a median."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -62,7 +66,7 @@ class Outlook:
     """What the last step of the joint fit saw."""
 
     covariance: Array
-    """(18, 18) of object, table, biases and hand-eye; all assumptions about the shape averaged."""
+    """(19, 19) of the shared unknowns (see `state`); all assumptions about the shape averaged."""
     without: dict[str, float]
     """Variance of the log scale if one source of error were gone: 'shape', 'hand-eye', 'arm',
     'bias', 'noise'."""
@@ -70,7 +74,7 @@ class Outlook:
     """(N,) of the surface points [m]; NaN = the camera cannot have seen that surface."""
     kernels: Array
     """(N,) Tukey's weights; 0 = not used."""
-    view_of: NDArray[np.int64]
+    view_of: NDArray[np.int32]
     """(N,) which view (its place in the list) a surface point belongs to."""
     local: Array
     """(N, 3) the surface points in the inner mesh's axes."""
@@ -84,103 +88,137 @@ class Outlook:
 
 
 def joint_fit(
-    shape: ScanShape, evidence: ScanEvidence, start: State, config: ScaleConfig
-) -> tuple[State, Outlook]:
+    shape: ScanShape, evidence: ScanEvidence, start: ScaleState, config: ScaleConfig
+) -> tuple[ScaleState, Outlook]:
     """Return everything fitted together from a start that is right to some millimetres."""
     state, size = start, evidence.size_m
     offsets = np.zeros(len(shape.patches.areas))
     width = FIRST_SHAPE * size
     models: list[ShapeModel] = []
-    seen: tuple[Array, Array] = (np.zeros(0), np.zeros(0))
     history: list[dict[str, float]] = []
-    surface, rims = surface_of(shape, evidence, state, config), Rims([], [], [])
+    held: Round | None = None
     for cut in CUTS:
-        surface = surface_of(shape, evidence, state, config)
-        rims = outlines_of(shape, evidence, state, config)
         within = 0.0
         if models:
             inner = within_share(shape.patches, models[0].length_m / state.s)
             within = models[0].sigma_m * inner
-        surface = coarser(surface, within, config)
+        held = new_round(shape, evidence, state, within, config)
         for step in range(STEPS):
-            system, seen = linearised(
-                shape, evidence, state, (surface, rims), (offsets, cut, width), config
-            )
-            information, offered = system.of_offsets()
+            system, *_ = linearised(shape, evidence, state, held, (offsets, cut, width), config)
+            shared = reduced(system)
+            information, offered = shared.of_offsets()
             if step == 0 or not models:
                 models = shape_models(
                     shape.patches, information, offered, (state.s, size), config.shape
                 )
             offsets, _ = posterior(information, offered, models[0].covariance)
-            pivot = pivot_of(evidence, state)
-            state = moved_all(state, system.rest(offsets), pivot)
+            state = _moved(state, system, shared.rest(offsets), offsets)
         width = max(models[0].sigma_m, config.shape.floor_m)
         history.append({
             "scale": state.s * shape.unit, "shape_mm": 1e3 * models[0].sigma_m,
-            "length_mm": 1e3 * models[0].length_m, "rim_px": state.rim, "bias_per_m": state.bias,
-            "outline_points": float(sum(len(r) for r in rims.points)),
+            "length_mm": 1e3 * models[0].length_m, "rim_px": state.rim,
+            "bias_per_m": state.bias_per_m,
+            "outline_points": float(sum(len(r) for r in held.rims.points)),
         })  # fmt: skip
-    system, seen = linearised(
-        shape, evidence, state, (surface, rims), (offsets, CUTS[-1], width), config
+    assert held is not None, "there is at least one round"
+    system, residuals, kernels = linearised(
+        shape, evidence, state, held, (offsets, CUTS[-1], width), config
     )
-    look = _outlook(shape, evidence, state, (surface, system, seen), config)
+    look, (mean, offsets) = _outlook(shape, evidence, state, (system, residuals, kernels), config)
     # The mean over all assumptions about the shape, of which the last step took the best.
-    state = moved_all(state, look[1], pivot_of(evidence, state))
-    return state, replace(look[0], history=tuple(history), local=local_points(state, evidence))
+    state = _moved(state, system, mean, offsets)
+    cameras = state.cameras(claimed_cameras(evidence.views))
+    (places, *_), _ = object_distances(shape, state, cameras, held.points, held.views)
+    local = places / state.s
+    return state, replace(look, history=tuple(history), local=local, view_of=held.views)
+
+
+def _moved(state: ScaleState, system: System, rest: Array, offsets: Array) -> ScaleState:
+    """Return the state after the step of everything but the offsets, which are as given."""
+    shared = np.concatenate([rest, offsets])
+    return moved_state(state, shared, view_steps(system, shared))
 
 
 def _outlook(
     shape: ScanShape,
     evidence: ScanEvidence,
-    state: State,
-    last: tuple[Surface, System, tuple[Array, Array]],
+    state: ScaleState,
+    last: tuple[System, Array, Array],
     config: ScaleConfig,
-) -> tuple[Outlook, Array]:
-    """Return what was seen, and the step to the mean over all assumptions about the shape."""
-    surface, system, (residuals, kernels) = last
-    information, offered = system.of_offsets()
+) -> tuple[Outlook, tuple[Array, Array]]:
+    """Return what was seen, and step and offsets in the mean over all assumptions."""
+    system, residuals, kernels = last
+    shared = reduced(system)
+    information, offered = shared.of_offsets()
     models = shape_models(
         shape.patches, information, offered, (state.s, evidence.size_m), config.shape
     )
     likely = [m for m in models if m.probability > LEAST_PROBABILITY]
     total = sum(m.probability for m in likely)
-    n = len(system.g)
-    mean, second, within = np.zeros(n), np.zeros((n, n)), np.zeros((n, n))
+    mean, second, within = np.zeros(PATCHES), np.zeros((PATCHES,) * 2), np.zeros((PATCHES,) * 2)
     offsets, spread = np.zeros(len(offered)), np.zeros(len(offered))
     for m in likely:
         p = m.probability / total
         d, C = posterior(information, offered, m.covariance)
-        x = system.rest(d)
+        x = shared.rest(d)
         mean += p * x
         second += p * np.outer(x, x)
-        within += p * system.covariance(C)
+        within += p * shared.covariance(C)
         offsets += p * d
         spread += p * np.diag(C)
-    covariance = within + second - np.outer(mean, mean)
-    best = posterior(information, offered, models[0].covariance)[1]
     look = Outlook(
-        covariance=covariance[:VIEWS, :VIEWS],
-        without=_without(system, best),
-        residuals=residuals, kernels=kernels, view_of=surface.view_of, local=np.zeros((0, 3)),
-        offsets=offsets, offset_sigmas=np.sqrt(spread), shape=models[0],
+        covariance=within + second - np.outer(mean, mean),
+        without=_without(system, models[0].covariance),
+        residuals=residuals, kernels=kernels, view_of=np.zeros(0, np.int32),
+        local=np.zeros((0, 3)), offsets=offsets, offset_sigmas=np.sqrt(spread), shape=models[0],
     )  # fmt: skip
-    return look, mean
+    return look, (mean, offsets)
 
 
-def _without(system: System, offset_covariance: Array) -> dict[str, float]:
+def _without(system: System, shape_covariance: Array) -> dict[str, float]:
     """Return the variance of the log scale if each source of error were known exactly."""
-    # Noise alone: nothing but the object unknown.
+
+    def covariance(shared: Reduced) -> Array:
+        return shared.covariance(posterior(*shared.of_offsets(), shape_covariance)[1])
+
+    shared, held = reduced(system), Reduced(system.A, system.a)
+    alone = system.A[np.ix_(SIMILARITY, SIMILARITY)]
     out = {
-        "shape": float(np.linalg.inv(system.G)[6, 6]),
-        "all": float(np.linalg.inv(system.G[:7, :7])[6, 6]),
+        "shape": float(inverse(shared.A[:PATCHES, :PATCHES])[SIZE, SIZE]),
+        # Noise alone: nothing but the object unknown.
+        "all": float(inverse(alone)[-1, -1]),
+        "arm": float(covariance(held)[SIZE, SIZE]),
     }
-    full = np.linalg.inv(system.covariance(offset_covariance))
-    n = len(system.g)
-    sources = {
-        "bias": [BIAS], "outline": [RIM], "hand-eye": list(range(HAND_EYE, VIEWS)),
-        "arm": list(range(VIEWS, n)), "table": list(range(TABLE, TABLE + 3)),
-    }  # fmt: skip
+    full = inverse(covariance(shared))
+    sources = {"bias": BIAS_AT, "outline": [RIM], "hand-eye": HAND_EYE_AT, "table": TABLE_AT}
     for name, known in sources.items():
-        free = np.setdiff1d(np.arange(n), known)
-        out[name] = float(np.linalg.inv(full[np.ix_(free, free)])[6, 6])
+        free = np.setdiff1d(np.arange(PATCHES), known)
+        place = int(np.searchsorted(free, SIZE))
+        out[name] = float(inverse(full[np.ix_(free, free)])[place, place])
+    return out
+
+
+def residual_per_vertex(mesh: Mesh, shape: ScanShape, look: Outlook) -> Array:
+    """Return the signed distance (V,) of the real surface at each vertex of the given mesh [mm].
+
+    The median of the measured points around the vertex, positive outside; NaN where fewer than
+    three were measured.
+    """
+    from scipy.spatial import KDTree
+
+    vertices = (mesh.vertices - shape.center) * shape.unit
+    # Points far off are not fitted to, but they are there to be seen.
+    known = np.isfinite(look.residuals)
+    out = np.full(len(vertices), np.nan)
+    if np.count_nonzero(known) < FEWEST:
+        return out
+    distance, gradient = shape.field.distance_gradient(look.local[known])
+    # A point speaks for the place of the surface that it is nearest to.
+    tree: Any = KDTree(look.local[known] - distance[:, None] * gradient)
+    residuals = np.append(look.residuals[known], np.nan)
+    distance, index = tree.query(vertices, k=NEIGHBOURS, distance_upper_bound=REACH * INNER_EXTENT)
+    near = np.isfinite(distance)
+    enough = near.sum(axis=1) >= FEWEST
+    values = np.where(near, residuals[np.minimum(index, len(residuals) - 1)], np.nan)
+    out[enough] = 1e3 * np.nanmedian(values[enough], axis=1)
     return out

@@ -1,4 +1,10 @@
-"""From no start, or a rough one, to the few scales and poses that explain the measurements best."""
+"""From no start, or a rough one, to the few scales and poses that explain the measurements best.
+
+Every start is fitted by Gauss-Newton of scale and pose alone: points of all views are drawn to the
+model's surface (data to model), and samples of the model that lie outside of the measured outline
+are drawn back into it: the camera looked through there. The first alone lets a model grow, for a
+huge one has a surface near every point.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,42 +12,72 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.scanning.scale.agreement import explain
-from realsim.scanning.scale.coarse import coarse_fit
+from realsim.geometry import se3
+from realsim.geometry.normal_equations import symmetric
+from realsim.registration.refinement.equations import BLOCK, add_blocks
 from realsim.scanning.scale.config import ScaleConfig
+from realsim.scanning.scale.equations import frame_of, object_distances
 from realsim.scanning.scale.evidence import ScanEvidence
+from realsim.scanning.scale.outlines import COLUMNS, add_outside
 from realsim.scanning.scale.result import Similarity
 from realsim.scanning.scale.shape import INNER_EXTENT, ScanShape, mirrored
 from realsim.scanning.scale.starts import StartsConfig, find_starts, starts_near
-from realsim.scanning.scale.state import State, first_state
+from realsim.scanning.scale.state import (
+    PATCHES,
+    SIMILARITY,
+    ScaleState,
+    claimed_cameras,
+    first_state,
+    moved_state,
+    stacked,
+)
+from realsim.scanning.scale.verdict import explain
 
 Array = NDArray[np.float64]
+WIDTHS = (0.25, 0.12, 0.06)
+"""Tukey's cut-offs as shares of the object's size: 25, 12 and 6 mm of 10 cm."""
+STEPS = 8
+"""Steps with each."""
+POINTS = 5_000
+"""Measured points used: 100 ns each and step."""
+OUTLINE_VIEWS = 12
+"""Views whose outlines are used."""
+SAMPLE_STEP = 3
+"""Every third sample of the surface is looked at."""
+OUTSIDE_WEIGHT = 0.3
+"""Weight of one sample outside an outline relative to one measured point."""
+OUTSIDE_PX = 3.0
+"""A sample must lie so far outside [px]: the foot of an object is not measured."""
+DAMPING = 1e-3
+"""Levenberg: directions seen with less than this share of the best are moved along little."""
+SURFACE, OUTLINE = np.array([*range(6), BLOCK]), np.arange(7)
+"""Columns of twist and size in blocks of points and of outlines."""
+AGAINST = np.array([-1.0] * 6 + [1.0])
+SETTLED = 2e-5
+"""A step that moves no point by more than this share of the size ends a width."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Hypothesis:
     """A scale and pose after the coarse fit, and how well it explains the measurements."""
 
-    state: State
+    state: ScaleState
     gain: float
     source: str
 
 
 def from_given(shape: ScanShape, start: Similarity) -> Similarity:
     """Return a similarity of the given mesh as one of the inner mesh."""
-    T = start.T_world_obj.copy()
-    T[:3, 3] += T[:3, :3] @ (start.scale * shape.center)
+    T = start.T_world_obj @ se3.from_translation(start.scale * shape.center)
     return Similarity(
         scale=start.scale / shape.unit, T_world_obj=T, score=start.score, source=start.source
     )
 
 
-def to_given(shape: ScanShape, state: State, score: float, source: str) -> Similarity:
+def to_given(shape: ScanShape, state: ScaleState, score: float, source: str) -> Similarity:
     """Return a state as a similarity of the given mesh."""
     scale = state.s * shape.unit
-    T = np.eye(4)
-    T[:3, :3] = state.R
-    T[:3, 3] = state.t - state.R @ (scale * shape.center)
+    T = state.poses[0] @ se3.from_translation(-scale * shape.center)
     return Similarity(scale=scale, T_world_obj=T, score=score, source=source)
 
 
@@ -88,7 +124,7 @@ def hypotheses(
 
 
 def mirror_gain(
-    shape: ScanShape, evidence: ScanEvidence, state: State, config: ScaleConfig
+    shape: ScanShape, evidence: ScanEvidence, state: ScaleState, config: ScaleConfig
 ) -> float:
     """Return how much the mirror image of the mesh explains, placed as the mesh is.
 
@@ -101,7 +137,7 @@ def mirror_gain(
     best = -np.inf
     for axis in np.eye(3):
         R = state.R @ (np.eye(3) - 2.0 * np.outer(axis, axis)) @ D
-        start = first_state(evidence, state.s, R, state.t)
+        start = first_state(evidence, state.s, se3.from_rt(R, state.t))
         placed = coarse_fit(other, evidence, start)
         seen = explain(other, evidence, placed, views=c.rough_views, every=c.rough_every)
         if seen.gain > best - 0.05:
@@ -120,8 +156,7 @@ def _fitted(
     c = config.search
     rough: list[Hypothesis] = []
     for start in starts:
-        T = start.T_world_obj
-        first = first_state(evidence, start.scale, T[:3, :3], T[:3, 3])
+        first = first_state(evidence, start.scale, start.T_world_obj)
         state = coarse_fit(shape, evidence, first)
         gain = explain(shape, evidence, state, views=c.rough_views, every=c.rough_every).gain
         rough.append(Hypothesis(state=state, gain=gain, source=start.source))
@@ -150,3 +185,51 @@ def _distinct(
             kept.append(h)
             placed.append(points)
     return kept
+
+
+def coarse_fit(shape: ScanShape, evidence: ScanEvidence, start: ScaleState) -> ScaleState:
+    """Return scale and pose from a start that is right to a tenth of the size, cameras as said."""
+    cameras = start.cameras(claimed_cameras(evidence.views))
+    points, views = stacked([v.points for v in evidence.views])
+    every = max(1, len(points) // POINTS)
+    points, views = np.ascontiguousarray(points[::every]), np.ascontiguousarray(views[::every])
+    samples = np.ascontiguousarray(shape.samples[::SAMPLE_STEP])
+    some = range(0, len(cameras), max(1, len(cameras) // OUTLINE_VIEWS))
+    no_view, shared = np.zeros((len(cameras), 6)), np.zeros(PATCHES)
+    state = start
+    for width in WIDTHS:
+        cut = width * evidence.size_m
+        for _ in range(STEPS):
+            seen, Ms = object_distances(shape, state, cameras, points, views)
+            # The shape is taken as it is: one patch without offset.
+            H, b = (
+                np.zeros((len(cameras), BLOCK + 1, BLOCK + 1)),
+                np.zeros((len(cameras), BLOCK + 1)),
+            )
+            precision = (np.ones(len(points)), np.full(len(points), cut * cut))
+            add_blocks(seen, views, frame_of(Ms), precision, (H, b), np.empty(len(points)))
+            outside = np.zeros((COLUMNS, COLUMNS)), np.zeros(COLUMNS)
+            for v in some:
+                rule = (OUTSIDE_WEIGHT, OUTSIDE_PX, 2.0 * cut)
+                add_outside(evidence, state, cameras[v], v, samples, rule, outside)
+            A, a = np.zeros((7, 7)), np.zeros(7)
+            for (M, right), columns in (((H.sum(0), b.sum(0)), SURFACE), (outside, OUTLINE)):
+                # The object moves against the points: the sign of its twist is the other one.
+                A += symmetric(M)[np.ix_(columns, columns)] * np.outer(AGAINST, AGAINST)
+                a += right[columns] * AGAINST
+            x = _step(shape, state, A, a)
+            shared[SIMILARITY] = x
+            state = moved_state(state, shared, no_view)
+            reach = state.s * shape.radius
+            if np.abs(x[:3]).max() + np.abs(x[3:6]).max() / reach + abs(x[6]) < SETTLED:
+                break
+    return state
+
+
+def _step(shape: ScanShape, state: ScaleState, H: Array, b: Array) -> Array:
+    """Return the damped step (7,): in scaled units every unknown moves the surface alike."""
+    reach = state.s * shape.radius
+    unit = np.array([reach, reach, reach, 1.0, 1.0, 1.0, reach])
+    A = H / np.outer(unit, unit)
+    A += DAMPING * max(float(np.trace(A)) / 7, 1e-9) * np.eye(7)
+    return np.asarray(np.linalg.solve(A, b / unit) / unit)

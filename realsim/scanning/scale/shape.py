@@ -1,4 +1,22 @@
-"""The mesh as the scale fit sees it: distance field, rays, patches of surface and outlines."""
+"""The mesh as the scale fit sees it: distance field, rays, patches of surface and outlines.
+
+The error of the mesh's own shape: a random field on its surface, estimated with the scale.
+
+The true surface is the mesh displaced by a random vector field d, independent in every axis and
+correlated over a length l. Of it a depth camera sees the normal part, delta_k = n_k . d_k in patch
+k of the surface, so
+    cov(delta_i, delta_j) = s^2 rho(|x_i - x_j|) n_i . n_j,
+    rho(r) = (1 + a) exp(-a), a = sqrt(3) r / l    (Matern 3/2):
+the two sides of a thin wall move together. What of the field is a shift, a turn or a change of
+size is no error of the shape but the pose and the scale themselves: the covariance is conditioned
+on the area-weighted sums of d . u over the whole surface being zero for the seven such u. With this
+the scale of a wrong shape is defined: that of the mesh that fits the real thing best everywhere,
+its underside included.
+
+s and l are those under which the measurements are most probable with everything else integrated
+out (restricted maximum likelihood, Patterson & Thompson 1971), and their own uncertainty enters the
+result: the estimates of all (s, l) are averaged by their probability.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,12 +28,169 @@ from realsim.errors import DegenerateError
 from realsim.geometry.distance_field import DistanceField, raycasting_scene
 from realsim.geometry.mesh import decimated, face_normals, hull_vertices, sample_surface
 from realsim.records import Mesh
-from realsim.scanning.scale.config import ScaleConfig
-from realsim.scanning.scale.shape_error import SurfacePatches, make_patches
+from realsim.scanning.scale.config import ScaleConfig, ShapeConfig
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+JITTER = 1e-12
+"""Share of the variance that keeps conditioned covariances positive."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class SurfacePatches:
+    """Patches of the mesh's surface."""
+
+    middles: Array
+    """(K, 3) in the inner mesh's axes."""
+    normals: Array
+    """(K, 3) mean outward normals, at most of unit length: a patch over an edge has less."""
+    areas: Array
+    """(K,) shares of the surface."""
+    normal_weight: float
+    """Length that a unit normal counts as in the distance to a patch [inner unit]."""
+    radius: float
+    """Typical distance of a patch's points from its middle [inner unit]."""
+
+    def of(self, points: Array, normals: Array) -> NDArray[np.int64]:
+        """Return the patch (N,) of points (N, 3) with the normals (N, 3) of their surface."""
+        from scipy.spatial import KDTree
+
+        if len(points) == 0:
+            return np.zeros(0, dtype=np.int64)
+        tree: Any = KDTree(
+            np.concatenate([self.middles, self.normal_weight * self.normals], axis=1)
+        )
+        both = np.concatenate([points, self.normal_weight * normals], axis=1)
+        return np.asarray(tree.query(both)[1], dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class ShapeModel:
+    """One assumption about the shape's error, and how probable it is."""
+
+    sigma_m: float
+    """1-sigma of the displacement along each axis [m]."""
+    length_m: float
+    """Correlation length l [m]."""
+    covariance: Array
+    """(K, K) of the patches' offsets [m^2]."""
+    probability: float
+    """Relative to the others' of one grid."""
+
+
+def make_patches(samples: Array, normals: Array, k: int, normal_weight: float) -> SurfacePatches:
+    """Return k patches of a surface from evenly spread samples (S, 3) and their normals.
+
+    Middles are chosen each as far as possible from those before, in place and direction: the two
+    sides of a wall are two patches.
+    """
+    both = np.concatenate([samples, normal_weight * normals], axis=1)
+    chosen = [int(np.argmax(np.linalg.norm(samples - samples.mean(0), axis=1)))]
+    nearest = np.linalg.norm(both - both[chosen[0]], axis=1)
+    label = np.zeros(len(both), dtype=np.int64)
+    while len(chosen) < min(k, len(both)):
+        chosen.append(int(np.argmax(nearest)))
+        distance = np.linalg.norm(both - both[chosen[-1]], axis=1)
+        closer = distance < nearest
+        label[closer], nearest[closer] = len(chosen) - 1, distance[closer]
+    count = np.bincount(label, minlength=len(chosen)).astype(np.float64)
+
+    def mean(values: Array) -> Array:
+        sums = [np.bincount(label, values[:, c], len(chosen)) for c in range(3)]
+        return np.stack(sums, -1) / count[:, None]
+
+    middles = mean(samples)
+    spread = samples - middles[label]
+    return SurfacePatches(
+        middles=middles, normals=mean(normals), areas=count / count.sum(),
+        normal_weight=normal_weight,
+        radius=float(np.sqrt(np.mean(np.sum(np.square(spread), axis=1)))),
+    )  # fmt: skip
+
+
+def covariance_of(patches: SurfacePatches, length: float) -> Array:
+    """Return the covariance (K, K) of the patches' offsets for a field of unit variance.
+
+    Args:
+        patches: the surface.
+        length: correlation length, in the patches' unit.
+    """
+    x, n, a = patches.middles, patches.normals, patches.areas
+    squares = np.sum(np.square(x[:, None] - x[None]), axis=2)
+    r = np.sqrt(3.0 * squares) / length
+    rho = (1.0 + r) * np.exp(-r)
+    S = rho * (n @ n.T)
+    q = x - a @ x
+    q = q / np.sqrt(a @ np.sum(np.square(q), axis=1))
+    modes = [np.tile(e, (len(x), 1)) for e in np.eye(3)]
+    modes += [np.cross(e, q) for e in np.eye(3)] + [q]
+    U = np.stack(modes)  # (7, K, 3)
+    weighted = np.einsum("kl,l,mlc->mkc", rho, a, U)
+    C = np.einsum("kc,mkc->km", n, weighted)
+    M = np.einsum("k,mkc,nkc->mn", a, U, weighted)
+    S = S - C @ np.linalg.solve(M + JITTER * np.eye(7), C.T)
+    return 0.5 * (S + S.T)
+
+
+def shape_models(
+    patches: SurfacePatches,
+    information: Array,
+    offered: Array,
+    scale: tuple[float, float],
+    config: ShapeConfig,
+) -> list[ShapeModel]:
+    """Return the assumptions about the shape's error with their probabilities, best first.
+
+    log p = -1/2 log |I + S Lambda| + 1/2 eta^T (S^-1 + Lambda)^-1 eta.
+
+    Args:
+        patches: the surface, in the inner mesh's unit.
+        information: (K, K) Lambda of the offsets, all else integrated out [1/m^2].
+        offered: (K,) eta, likewise [1/m].
+        scale: metres per unit of the inner mesh, and the object's size [m].
+        config: see there.
+    """
+    s, size = scale
+    k = len(offered)
+    rows: list[tuple[float, float, float, Array]] = []
+    for share in config.lengths:
+        unit = covariance_of(patches, share * size / s)
+        within = within_share(patches, share * size / s)
+        unit += config.nugget * within**2 * np.eye(k)
+        for amplitude in config.amplitudes:
+            sigma = max(amplitude * size, config.floor_m)
+            S = sigma**2 * unit
+            A = np.eye(k) + S @ information
+            _, log_det = np.linalg.slogdet(A)
+            quadratic = float(offered @ np.linalg.solve(A, S @ offered))
+            rows.append((-0.5 * float(log_det) + 0.5 * quadratic, sigma, share * size, S))
+    best = max(r[0] for r in rows)
+    weights = np.exp(np.array([r[0] for r in rows]) - best)
+    weights /= weights.sum()
+    models = [
+        ShapeModel(sigma_m=sigma, length_m=length, covariance=S, probability=float(w))
+        for w, (_, sigma, length, S) in zip(weights, rows, strict=True)
+    ]
+    return sorted(models, key=lambda m: -m.probability)
+
+
+def within_share(patches: SurfacePatches, length: float) -> float:
+    """Return how much the field varies inside a patch, as a share of its 1-sigma: r / l."""
+    return min(1.0, patches.radius / length)
+
+
+def posterior(information: Array, offered: Array, S: Array) -> tuple[Array, Array]:
+    """Return the offsets (K,) and their covariance (K, K) under one assumption."""
+    A = np.eye(len(S)) + S @ information
+    C = np.linalg.solve(A, S)
+    C = 0.5 * (C + C.T)
+    return C @ offered, C
+
+
+# --- the mesh ------------------------------------------------------------------------------------
+
+
 INNER_EXTENT = 0.1
 """Greatest side of the mesh inside of the fit [m]: numbers near those of real objects, so that a
 mesh in inches or in units of its own is solved alike."""
@@ -151,76 +326,3 @@ def _two_faced_edges(mesh: Mesh) -> tuple[NDArray[np.int64], Array]:
     normals = face_normals(mesh)
     two = np.stack([normals[owner[pairs]], normals[owner[pairs + 1]]], axis=1)
     return edges[order][pairs], two
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Outline:
-    """Points on the model's outline as one camera would see it."""
-
-    points: Array
-    """(N, 3) in the inner mesh's axes."""
-    normals: Array
-    """(N, 3) of the surface there, outward, unit."""
-
-
-def outline(
-    shape: ScanShape,
-    pose: tuple[float, Array, Array],
-    T_world_cam: Array,
-    focal_px: float,
-    wanted: int,
-) -> Outline:
-    """Return points of the model's outline against the background in one view.
-
-    Edges between a face that looks at the camera and one that does not, evenly by their length;
-    of these the ones that a ray just inside meets, and a ray just outside misses.
-
-    Args:
-        shape: the mesh.
-        pose: scale, R (3, 3) and t (3,) of the inner mesh in world.
-        T_world_cam: (4, 4).
-        focal_px: [px], for the width of "just".
-        wanted: points before the test; about half of them stay.
-    """
-    s, R, t = pose
-    eye = (T_world_cam[:3, 3] - t) @ R / s
-    a = shape.vertices[shape.edges[:, 0]]
-    to_eye = eye - a
-    facing = np.einsum("ekc,ec->ek", shape.edge_normals, to_eye) > 0
-    border = np.flatnonzero(facing[:, 0] != facing[:, 1])
-    if len(border) == 0:
-        return Outline(np.zeros((0, 3)), np.zeros((0, 3)))
-    a = a[border]
-    b = shape.vertices[shape.edges[border, 1]]
-    length = np.linalg.norm(b - a, axis=1)
-    total = np.cumsum(length)
-    at = (np.arange(wanted) + 0.5) / wanted * total[-1]
-    e = np.searchsorted(total, at)
-    part = ((total[e] - at) / np.maximum(length[e], 1e-12))[:, None]
-    points = part * a[e] + (1 - part) * b[e]
-    normal = shape.edge_normals[border[e]].sum(1)
-    R_cam = T_world_cam[:3, :3]
-    points_cam = (points * s @ R.T + t - T_world_cam[:3, 3]) @ R_cam
-    out_cam = normal @ R.T @ R_cam
-    z = points_cam[:, 2]
-    # The direction out of the outline in the image is that of the normal, less its share along
-    # the viewing ray.
-    ray = points_cam / z[:, None]
-    flat = out_cam[:, :2] - ray[:, :2] * out_cam[:, 2:]
-    size = np.linalg.norm(flat, axis=1)
-    ok = (size > 1e-9) & (z > 0.02)
-    points, normal, ray = points[ok], normal[ok], ray[ok]
-    flat = flat[ok] / size[ok, None]
-    step = 1.5 / focal_px
-    z = z[ok]
-    outer, inner = ray.copy(), ray.copy()
-    outer[:, :2] += step * flat
-    inner[:, :2] -= step * flat
-    both = np.concatenate([outer, inner]).astype(np.float32) @ R_cam.T.astype(np.float32)
-    hit = shape.cast(T_world_cam[:3, 3], both, s, R, t)
-    n = len(points)
-    # What the inner ray meets may lie a little behind the edge on a round body, not far behind.
-    seen = np.isfinite(hit[n:]) & (np.abs(hit[n:] - z) < 0.25 * s * INNER_EXTENT)
-    keep = ~np.isfinite(hit[:n]) & seen
-    normal = normal[keep] / np.linalg.norm(normal[keep], axis=1, keepdims=True)
-    return Outline(points[keep], normal)

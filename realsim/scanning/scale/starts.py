@@ -139,7 +139,9 @@ def starts_near(
         )
 
     degrees = config.near_turn_deg
-    turns = [(k, axis, sign) for k, axis in enumerate(se3.random_rotation(rng).T) for sign in (1, -1)]
+    turns = [
+        (k, axis, sign) for k, axis in enumerate(se3.random_rotation(rng).T) for sign in (1, -1)
+    ]
     return [
         given,
         *(other(f"x{factor:g}", np.eye(3), factor) for factor in config.near_scales),
@@ -148,7 +150,10 @@ def starts_near(
                   se3.exp_so3(sign * np.radians(degrees) * axis))
             for k, axis, sign in turns
         ),
-        *(other(f"half turn about {'xyz'[k]}", se3.exp_so3(np.pi * np.eye(3)[k])) for k in range(3)),
+        *(
+            other(f"half turn about {letter}", se3.exp_so3(np.pi * axis))
+            for letter, axis in zip("xyz", np.eye(3), strict=True)
+        ),
     ]  # fmt: skip
 
 

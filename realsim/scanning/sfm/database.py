@@ -2,12 +2,15 @@
 
 The database belongs to the images, the camera, the masks and the settings that made it; a note
 beside it holds their hash. When the hash differs, it is begun anew.
+
+Which images to match: all pairs, or those that may see the same where poses are known.
 """
 
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +20,7 @@ from numpy.typing import NDArray
 from realsim.errors import DegenerateError
 from realsim.interop import colmap_from_opencv_px, quiet_output
 from realsim.records import CameraIntrinsics
-from realsim.scanning.sfm.config import SfmConfig
+from realsim.scanning.sfm.config import FeatureConfig, SfmConfig
 from realsim.scanning.sfm.photographs import Photographs, images_digest
 from realsim.scanning.sfm.result import Matching
 from realsim.store.atomic import write_bytes, write_json, write_text
@@ -260,3 +263,45 @@ def _require_texture(database: MatchDatabase, masked: bool) -> None:
             "are the least and 1000 are good. Put newspaper or the tag board under the object, "
             "check exposure and focus, and take the photographs again."
         )
+
+
+# --- which images to match -----------------------------------------------------------------------
+
+
+Array = NDArray[np.float64]
+
+
+def pairs_to_match(
+    count: int, Ts_world_cam: Array | None, config: FeatureConfig
+) -> list[tuple[int, int]]:
+    """Return pairs of image numbers (i < j), in order.
+
+    Without poses all pairs; with poses those whose optical axes differ by at most
+    `max_angle_deg`, and, where there are many views, of each view the `neighbours` nearest by the
+    angle plus the distance of the centres over the spread of all. Each view keeps its nearest two
+    whatever the angle, so that none is left out by a wrong pose.
+
+    Args:
+        count: images.
+        Ts_world_cam: (count, 4, 4) camera poses [m], rough ones do; None where not known.
+        config: angles and numbers.
+    """
+    every = list(combinations(range(count), 2))
+    if Ts_world_cam is None:
+        return every
+    axes, centres = Ts_world_cam[:, :3, 2], Ts_world_cam[:, :3, 3]
+    angle = np.degrees(np.arccos(np.clip(axes @ axes.T, -1.0, 1.0)))
+    distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    spread = max(float(np.median(distance)), 1e-9)
+    # One spread of the centres counts as much as 30 deg: on a hemisphere they go together.
+    cost = angle + 30.0 * distance / spread
+    np.fill_diagonal(cost, np.inf)
+    order = np.argsort(cost, axis=1, kind="stable")
+    near = np.zeros((count, count), dtype=bool)
+    most = count if count <= config.exhaustive_up_to else config.neighbours
+    for i in range(count):
+        chosen = [j for j in order[i, :most] if angle[i, j] <= config.max_angle_deg and j != i]
+        near[i, chosen] = True
+        near[i, order[i, : min(2, count - 1)]] = True
+    near |= near.T
+    return [(i, j) for i, j in every if near[i, j]]

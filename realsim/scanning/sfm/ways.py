@@ -12,10 +12,9 @@ from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.scanning.sfm.alignment import align_to_robot
-from realsim.scanning.sfm.bundle import Bundle, adjust, prior_sigmas
+from realsim.scanning.sfm.bundle import Bundle, adjust, halves, prior_sigmas, reliability
 from realsim.scanning.sfm.config import SfmConfig
 from realsim.scanning.sfm.database import MatchDatabase
-from realsim.scanning.sfm.independence import halves, reliability
 from realsim.scanning.sfm.mapping import (
     geometry_of,
     map_freely,

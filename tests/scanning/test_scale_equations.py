@@ -1,0 +1,159 @@
+"""What a scale fit adds to registration's equations: derivatives are the residuals' differences."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.geometry.normal_equations import System, symmetric
+from realsim.registration.refinement.equations import OBJECTS, Blocks, Offsets, assembled
+from realsim.scanning.scale.config import ScaleConfig
+from realsim.scanning.scale.equations import add_contact
+from realsim.scanning.scale.outlines import COLUMNS, add_outline
+from realsim.scanning.scale.state import (
+    OBJECT,
+    PATCHES,
+    RIM,
+    SIZE,
+    ScaleState,
+    moved_state,
+)
+from scanned_objects import shape_of
+
+Array = NDArray[np.float64]
+STEP = 1e-6
+SHARED = PATCHES + 1
+"""Unknowns of one patch: registration's, size, outlines' offset, the patch's offset."""
+
+
+def posed(rng: np.random.Generator) -> ScaleState:
+    """Return an object of about 90 mm anywhere, seen by one camera."""
+    T = se3.from_rt(se3.random_rotation(rng), rng.uniform(-0.3, 0.3, 3))
+    return ScaleState(
+        s=0.9, poses=T[None], hand_eye=np.zeros(6), views=np.zeros((1, 6)),
+        bias=np.array([1.0, 0.0]), rim=0.0,
+        T_world_table=T @ se3.from_rt(se3.exp_so3(0.3 * rng.standard_normal(3)), [0, 0, -0.05]),
+    )  # fmt: skip
+
+
+def camera_looking_at(point: Array, rng: np.random.Generator) -> Array:
+    eye = point + rng.uniform(0.25, 0.45) * (d := rng.standard_normal(3)) / np.linalg.norm(d)
+    return se3.look_at(eye, point) @ se3.from_translation(rng.uniform(-0.04, 0.04, 3))
+
+
+def differences(residual, state: ScaleState) -> Array:
+    """Return the central differences (SHARED + 6,) of residual(state), of a view's twist last."""
+    out = np.zeros(SHARED + 6)
+    for k in range(SHARED + 6):
+        step = np.zeros(SHARED + 6)
+        step[k] = STEP
+        plus, minus = (
+            residual(moved_state(state, sign * step[:SHARED], sign * step[None, SHARED:]))
+            for sign in (1.0, -1.0)
+        )
+        out[k] = (plus - minus) / (2 * STEP)
+    return out
+
+
+def row_of(system: System) -> tuple[float, Array]:
+    """Return residual and derivatives of a system that one measurement made."""
+    joint = np.block([[system.A, system.B[0]], [system.B[0].T, system.D[0]]])
+    right = np.concatenate([system.a, system.d[0]])
+    J = joint[PATCHES]  # the patch's own derivative is one
+    np.testing.assert_allclose(joint, np.outer(J, J), rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(right, J * right[PATCHES], rtol=1e-6, atol=1e-9)
+    return -float(right[PATCHES]), J
+
+
+def outline_row(
+    state: ScaleState, T: Array, point: Array, image: tuple[Array, float], distortion: Array
+) -> tuple[float, Array]:
+    """Return the row of one point of the outline against a plane of signed distances."""
+    normal, c = image
+    H, b, Hd = np.zeros((1, COLUMNS, COLUMNS)), np.zeros((1, COLUMNS)), np.zeros((1, COLUMNS, 1))
+    information, right = np.zeros(1), np.zeros(1)
+    left, top, size = 120.0, 20.0, (330, 400)
+    v, u = np.mgrid[: size[0], : size[1]]
+    distance = (normal[0] * (u + left) + normal[1] * (v + top) - c).astype(np.float32)
+    Ms = se3.invert(state.poses[0]) @ state.cameras(T[None])
+    add_outline(
+        state.s * point[None], Ms[0], np.concatenate([[324.0, 324.0, 319.5, 179.5], distortion]),
+        (distance, np.ones(size, np.float32), left, top), (np.ones(1), state.rim, 1.0),
+        (5.0, 1e6, 0.0, False), (np.zeros(1, np.int64), np.zeros(1)),
+        (H[0], b[0], Hd[0], information, right),
+    )  # fmt: skip
+    w = information[0]
+    offsets = Offsets(
+        coupling=Hd / w, information=information / w, right=right / w, at=np.array([PATCHES])
+    )
+    blocks = Blocks(
+        H=symmetric(H) / w, b=b / w, Ms=Ms, own=OBJECT, further=np.array([SIZE, RIM]),
+        offsets=offsets,
+    )  # fmt: skip
+    return row_of(assembled([blocks], SHARED))
+
+
+@pytest.mark.parametrize("lens", [0.0, 1.0])
+def test_outline_derivatives_are_the_differences_of_the_distance(lens: float):
+    distortion = lens * np.array([-0.055, 0.06, 2e-4, -1e-4, -0.02, 0, 0, 0])
+    # The lens is taken for straight in the derivative: a few per cent of it.
+    share = 1e-5 if lens == 0 else 0.05
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        state = posed(rng)
+        T = camera_looking_at(state.t, rng)
+        point = rng.uniform(-0.05, 0.05, 3)
+        normal = rng.standard_normal(2)
+        normal /= np.linalg.norm(normal)
+        # The image is so shifted that the point lies on the outline but for a rounding.
+        far, _ = outline_row(state, T, point, (normal, 0.0), distortion)
+        z = se3.transform(se3.invert(T), state.s * state.R @ point + state.t)[0, 2]
+        image = (normal, far / (z / 324.0))
+        r, J = outline_row(state, T, point, image, distortion)
+        assert abs(r) < 1e-7
+        numeric = differences(
+            lambda s, T=T, p=point, i=image: outline_row(s, T, p, i, distortion)[0], state
+        )
+        numeric[PATCHES] = 1.0  # where the real surface lies outside, so does the outline
+        np.testing.assert_allclose(J, numeric, atol=1e-4 + share * np.abs(J).max())
+        assert not J[6:OBJECTS].any()
+
+
+def test_an_outline_point_counts_only_outside_where_told_so():
+    rng = np.random.default_rng(3)
+    state = posed(rng)
+    M = se3.invert(state.poses[0]) @ camera_looking_at(state.t, rng)
+    for distance, counts in ((-4.0, False), (2.9, False), (3.1, True), (30.0, True)):
+        information = np.zeros(1)
+        rim = (np.full((360, 640), distance, np.float32), np.full((360, 640), 99, np.float32))
+        add_outline(
+            np.zeros((1, 3)), M, np.array([324.0, 324, 319.5, 179.5, *np.zeros(8)]),
+            (*rim, 0.0, 0.0), (np.ones(1), 3.0, 1.0), (0.0, 1e6, 0.0, True),
+            (np.zeros(1, np.int64), np.zeros(1)),
+            (np.zeros((8, 8)), np.zeros(8), np.zeros((8, 1)), information, np.zeros(1)),
+        )  # fmt: skip
+        assert (information[0] > 0) == counts
+
+
+def test_contact_derivatives_are_the_differences_of_the_lowest_points_height():
+    shape, config = shape_of("scalene"), ScaleConfig()
+    state = posed(np.random.default_rng(1))
+    offsets = np.zeros(len(shape.patches.areas))
+
+    def row(state: ScaleState) -> tuple[float, Array]:
+        n = PATCHES + len(offsets)
+        system = System(A=np.zeros((n, n)), a=np.zeros(n), B=np.zeros((1, n, 6)),
+                        D=np.zeros((1, 6, 6)), d=np.zeros((1, 6)))  # fmt: skip
+        add_contact(shape, state, offsets, (0.0, config), system)
+        J = np.sqrt(np.diag(system.A)) * np.sign(system.A[SIZE]) * np.sign(system.A[SIZE, SIZE])
+        w = 1.0 / config.prior.contact_m**2
+        T = se3.invert(state.T_world_table) @ state.poses[0]
+        height = float(se3.transform(T, state.s * shape.hull)[:, 2].min())
+        sign = np.sign(shape.hull[np.argmin(shape.hull @ T[2, :3])] @ T[2, :3])
+        np.testing.assert_allclose(system.a, -sign * J * np.sqrt(w) * height, rtol=1e-6)
+        return height, sign * J / np.sqrt(w)
+
+    _, J = row(state)
+    numeric = differences(lambda s: row(s)[0], state)
+    np.testing.assert_allclose(J[:PATCHES], numeric[:PATCHES], atol=1e-6)
+    assert np.count_nonzero(J[PATCHES:]) == 1 and J[PATCHES:].sum() == pytest.approx(-1.0)
