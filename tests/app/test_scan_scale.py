@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from realsim.app.console import Console
-from realsim.app.scan.scale.box import box_mm_of, smallest_box
 from realsim.app.scan.scale.cli import point_of, request_of, scale
 from realsim.app.scan.scale.files import Place, model_files, write_result
 from realsim.app.scan.scale.inputs import (
@@ -32,7 +31,7 @@ from realsim.models.library_prepare import PrepareConfig, prepare_unscaled
 from realsim.models.library_records import ScaleNote
 from realsim.records import CaptureSession, View
 from realsim.scanning.scale.files import ScaleRecord, installed_versions, load_record
-from realsim.scanning.scale.measured import length_of, parse_measurement
+from realsim.scanning.scale.measured import length_of, parse_measurement, smallest_box
 from realsim.scanning.scale.result import Limit
 from realsim.store import SessionStore
 from scale_fits import UNIT_M, fit_of, known_scan
@@ -226,7 +225,7 @@ def test_the_smallest_box_does_not_depend_on_the_axes():
         T = se3.from_rt(se3.random_rotation(rng), rng.normal(size=3))
         turned = replace(real, vertices=se3.transform(T, real.vertices) / UNIT_M)
         np.testing.assert_allclose(UNIT_M * smallest_box(turned), sides, rtol=1e-4)
-        np.testing.assert_allclose(box_mm_of(turned, UNIT_M), 1e3 * sides, rtol=1e-4)
+        np.testing.assert_allclose(1e3 * UNIT_M * smallest_box(turned), 1e3 * sides, rtol=1e-4)
 
 
 def test_the_smallest_box_is_what_longest_measures(known):
@@ -468,7 +467,9 @@ def test_a_second_run_finds_the_first(known, fit, session, mesh_file, capsys):
     assert "library   none: --library models" in said and "--unit mm --name mug" in said
     assert "--measured longest=...mm" in said.splitlines()[-1]
     stored = json.loads((session.folder / "scans/mug/scale.json").read_text())["fit"]
-    np.testing.assert_allclose(stored["smallest_box_mm"], box_mm_of(named.mesh, fit.scale))
+    np.testing.assert_allclose(
+        stored["smallest_box_mm"], 1e3 * fit.scale * smallest_box(named.mesh)
+    )
     assert list(stored).index("smallest_box_mm") == list(stored).index("extent_mm") + 1
 
 

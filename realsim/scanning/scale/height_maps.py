@@ -258,7 +258,7 @@ def _agreement(model: float, measured: float, tolerance: float, low_cost: float)
         low_cost: cost of a model that is lower than the measurement.
     """
     if measured <= 0.0:
-        return -min(1.0, max(0.0, model) / tolerance)
+        return -min(1.0, model / tolerance)
     gap = model - measured
     if gap >= 0.0:
         return max(-1.0, min(1.0, 2.0 - gap / tolerance))
@@ -267,7 +267,7 @@ def _agreement(model: float, measured: float, tolerance: float, low_cost: float)
 
 def scan_map(
     measured: HeightMap, points: Array, area: float, scales: Array, turns: Array, centers: Array,
-    rule: tuple[float, float, float],
+    rule: tuple[float, float, float, float],
 ) -> Array:  # fmt: skip
     """Return the agreement (S, Y, H), in [-2, 1], of a template with the map.
 
@@ -280,7 +280,8 @@ def scan_map(
         scales: (S,).
         turns: (Y, 2) cosine and sine of the yaws.
         centers: (H, 2) places of the foot's centre [m].
-        rule: tolerance [m], cost of a low model, cost of uncovered area.
+        rule: tolerance [m], cost of a low model, cost of uncovered area, height below which a
+            model is not told from the table [m]: the floor of an open vessel.
     """
     place = (*measured.origin, measured.cell)
     footprint = (float(measured.area), float(area))
@@ -290,7 +291,7 @@ def scan_map(
 @njit
 def _scan(
     heights: Array, place: tuple[float, float, float], areas: tuple[float, float], points: Array,
-    scales: Array, turns: Array, centers: Array, rule: tuple[float, float, float],
+    scales: Array, turns: Array, centers: Array, rule: tuple[float, float, float, float],
 ) -> Array:  # fmt: skip
     """Return what `scan_map` does."""
     out = np.empty((len(scales), len(turns), len(centers)))
@@ -300,7 +301,7 @@ def _scan(
         for y in range(len(turns)):
             c, d = scales[s] * turns[y, 0], scales[s] * turns[y, 1]
             for h in range(len(centers)):
-                total, covered = 0.0, 0
+                total, covered, counted = 0.0, 0, 0
                 for k in range(n):
                     x = c * points[k, 0] - d * points[k, 1] + centers[h, 0]
                     v = d * points[k, 0] + c * points[k, 1] + centers[h, 1]
@@ -309,8 +310,13 @@ def _scan(
                     measured = 0.0
                     if 0 <= i < heights.shape[0] and 0 <= j < heights.shape[1]:
                         measured = heights[i, j]
-                    covered += measured > 0.0
-                    total += _agreement(scales[s] * points[k, 2], measured, rule[0], rule[1])
+                    z = scales[s] * points[k, 2]
+                    if measured > 0.0 or z > rule[3]:
+                        covered += measured > 0.0
+                        counted += 1
+                        total += _agreement(z, measured, rule[0], rule[1])
                 uncovered = max(0.0, areas[0] - share * covered)
-                out[s, y, h] = (share * total - rule[2] * uncovered) / max(areas[0], share * n)
+                out[s, y, h] = (share * total - rule[2] * uncovered) / max(
+                    areas[0], share * counted
+                )
     return out

@@ -204,7 +204,7 @@ def length_of(mesh: Mesh, measurement: Measurement, R_up: Array | None = None) -
 
     v, kind = mesh.vertices, measurement.kind
     if kind == "longest":
-        length = _longest(v)
+        length = float(smallest_box(mesh)[0])
     elif kind == "diameter":
         length = diameter(mesh)
     elif kind == "height":
@@ -224,26 +224,28 @@ def length_of(mesh: Mesh, measurement: Measurement, R_up: Array | None = None) -
     return length
 
 
-def _longest(vertices: Array) -> float:
-    """Return the longest side of the smallest box around points (V, 3), turned as it likes."""
+def smallest_box(mesh: Mesh) -> Array:
+    """Return the sides (3,) of the smallest box around a mesh, longest first [its units].
+
+    The box is turned as it likes, so that its sides do not depend on the mesh's axes.
+    """
     import trimesh
 
     from realsim.geometry.mesh import hull_vertices
 
-    corners = hull_vertices(vertices)
-    low = corners.min(0)
+    corners = hull_vertices(mesh.vertices)
     # The box of a micrometre-sized or a kilometre-sized scan must not fall under an absolute
     # tolerance of the library: it is found at unit size.
     size = float(np.ptp(corners, axis=0).max())
     if not size > 0:
-        return 0.0
+        return np.zeros(3)
     try:
-        _, extents = trimesh.bounds.oriented_bounds((corners - low) / size)
+        _, sides = trimesh.bounds.oriented_bounds((corners - corners.min(0)) / size)
     except Exception:  # a flat mesh has no hull; its box along the axes of most spread is the same
         centred = corners - corners.mean(0)
         axes = np.linalg.svd(centred, full_matrices=False)[2]
-        return float(np.ptp(centred @ axes.T, axis=0).max())
-    return size * float(np.max(extents))
+        return np.sort(np.ptp(centred @ axes.T, axis=0))[::-1].copy()
+    return size * np.sort(np.asarray(sides, dtype=np.float64))[::-1]
 
 
 def scale_of(

@@ -79,6 +79,8 @@ class StartsConfig:
     be a hole of the mesh that the cameras could not look into."""
     uncovered_cost: float = 0.7
     """What measured area costs that the model leaves uncovered."""
+    hidden_m: float = 0.006
+    """What lies so low over the table is not told from it [m]: the floor of an open vessel."""
     peaks: int = 4
     """Yaws of each direction that are looked at on."""
     looked_at: int = 160
@@ -188,7 +190,10 @@ def _common_scale(
     little, of a thin one the width. The disagreement is chi-square per figure.
     """
     lengths = np.array([measured.top, np.sqrt(measured.area), *(3.5 * measured.spread)])
-    units = np.array([template.height, np.sqrt(template.area), *(3.5 * template.spread)])
+    z = template.points @ template.R[2]
+    hidden = config.hidden_m * template.height / measured.top
+    area = template.area * np.mean(z > z.min() + hidden)
+    units = np.array([template.height, np.sqrt(area), *(3.5 * template.spread)])
     logs = np.log(np.maximum(lengths, 1e-6) / np.maximum(units, 1e-9))
     error = np.hypot(config.shape_error * measured.size, config.map_error_m)
     relative = np.hypot(error / lengths, config.shape_error)
@@ -208,7 +213,7 @@ def _scanned(
     step = config.shift_share * measured.size
     shifts = step * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]], dtype=np.float64)
     tolerance = max(config.tolerance_m, config.tolerance_share * measured.size)
-    rule = (tolerance, config.low_cost, config.uncovered_cost)
+    rule = (tolerance, config.low_cost, config.uncovered_cost, config.hidden_m)
     found: list[Similarity] = []
     for k in order:
         t = templates[k]

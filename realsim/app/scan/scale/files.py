@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.app.scan.scale.box import box_mm_of
 from realsim.app.scan.scale.inputs import NamedMesh
 from realsim.errors import InputError
 from realsim.records import Mesh
 from realsim.scanning.scale.files import ScaleRecord, json_lines, load_record, record_to_json
+from realsim.scanning.scale.measured import smallest_box
 from realsim.scanning.scale.result import ScaleFit
 from realsim.store import SessionStore, atomic
 from realsim.store.records_json import array_to_json
@@ -61,7 +61,7 @@ def write_result(place: Place, record: ScaleRecord, named: NamedMesh, store: Ses
     """Write the scaled model, the pictures, the page and, last, scale.json."""
     from realsim.app.scan.scale.page import page_bytes
 
-    box_mm = box_mm_of(named.mesh, record.fit.scale)
+    box_mm = 1e3 * record.fit.scale * smallest_box(named.mesh)
     for name, data in model_files(named.mesh, record.fit.scale).items():
         place.write(name, data)
     # The titles name one size: that of the object, which a caliper finds, not of the mesh's axes.

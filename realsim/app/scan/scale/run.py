@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from realsim.app.console import Console
-from realsim.app.scan.scale.box import box_mm_of
 from realsim.app.scan.scale.files import (
     FILE,
     MODEL_FILE,
@@ -40,6 +39,7 @@ from realsim.scanning.scale.files import (
     installed_versions,
     json_lines,
 )
+from realsim.scanning.scale.measured import smallest_box
 from realsim.scanning.scale.result import ScaleFit
 from realsim.store import SessionStore
 
@@ -71,7 +71,7 @@ def run_scale(request: ScaleRequest, console: Console) -> bool:
     record = known or _fitted(request, named, store, views, inputs, console)
     if known is None:
         write_result(place, record, named, store)
-    fit, box_mm = record.fit, box_mm_of(named.mesh, record.fit.scale)
+    fit, box_mm = record.fit, 1e3 * record.fit.scale * smallest_box(named.mesh)
     show_fit(named.name, fit, record.measured, box_mm, console)
     for note in named.notes:
         console.say(f"note: {note}")
@@ -206,7 +206,7 @@ def _by_measurement(request: ScaleRequest, console: Console) -> bool:
     named = read_mesh(request)
     scale, sigma, each = scale_from(named.mesh, request.measured)
     size_mm = [1e3 * scale * float(e) for e in named.mesh.extent]
-    box_mm = [float(side) for side in box_mm_of(named.mesh, scale)]
+    box_mm = [float(side) for side in 1e3 * scale * smallest_box(named.mesh)]
     show_measured(named.name, (scale, sigma), each, (box_mm, size_mm), console)
     for note in named.notes:
         console.say(f"note: {note}")
