@@ -20,13 +20,6 @@ from realsim.scanning.scale.picture_overlays import (
     rendered_depth,
     worst_views,
 )
-from realsim.scanning.scale.picture_shading import (
-    UNSEEN,
-    ShadingConfig,
-    diverging,
-    half_width,
-    shaded_view,
-)
 from realsim.scanning.scale.pictures import (
     ROUND_MM,
     candidates_png,
@@ -35,9 +28,17 @@ from realsim.scanning.scale.pictures import (
     residuals_png,
     views_png,
 )
+from realsim.scanning.shading import (
+    UNSEEN,
+    ShadingConfig,
+    diverging,
+    shaded_views,
+    value_paint,
+)
 from scale_fits import fit_of, known_scan
 
 SMALL = ShadingConfig(size_px=120)
+ONE = replace(SMALL, sides_deg=((30.0, 22.0),))
 
 
 @pytest.fixture(scope="module")
@@ -74,12 +75,15 @@ def test_red_is_outside_blue_is_inside_grey_is_unseen():
     np.testing.assert_array_equal(*diverging(np.array([7.0, 1.0]), 1.0))
 
 
+def painted(mesh: Mesh, values: np.ndarray) -> np.ndarray:
+    (picture,) = shaded_views(mesh, value_paint(values, 1.0), ONE)
+    return picture
+
+
 @pytest.mark.parametrize(("value", "count"), [(1.0, reddish), (-1.0, bluish)])
 def test_a_mesh_has_the_colour_of_its_residual(known, value, count):
     mesh = known.real
-    picture = shaded_view(
-        mesh, np.full(len(mesh.vertices), value), 1.0, 30.0, half_width(mesh, SMALL), SMALL
-    )
+    picture = painted(mesh, np.full(len(mesh.vertices), value))
     drawn = np.any(picture != 255, axis=-1)
     assert 0.1 < drawn.mean() < 0.9
     assert count(picture.astype(int)) > 0.9 * drawn.sum()
@@ -87,22 +91,18 @@ def test_a_mesh_has_the_colour_of_its_residual(known, value, count):
 
 def test_what_was_not_measured_is_grey(known):
     mesh = known.real
-    half_m = half_width(mesh, SMALL)
-    unseen = shaded_view(mesh, np.full(len(mesh.vertices), np.nan), 1.0, 30.0, half_m, SMALL)
+    unseen = painted(mesh, np.full(len(mesh.vertices), np.nan))
     pixels = unseen[np.any(unseen != 255, axis=-1)].astype(int)
     assert np.all(np.ptp(pixels, axis=-1) < 15)
     half = np.where(mesh.vertices[:, 2] > mesh.bounds.mean(0)[2], 1.0, np.nan)
-    picture = shaded_view(mesh, half, 1.0, 30.0, half_m, SMALL).astype(int)
+    picture = painted(mesh, half).astype(int)
     upper, lower = reddish(picture[:50]), reddish(picture[70:])
     assert upper > 100 and lower < 0.1 * upper
 
 
 def test_the_whole_mesh_is_in_the_picture_from_every_side(known):
     mesh = known.real
-    for azimuth in SMALL.azimuths_deg:
-        picture = shaded_view(
-            mesh, np.zeros(len(mesh.vertices)), 1.0, azimuth, half_width(mesh, SMALL), SMALL
-        )
+    for picture in shaded_views(mesh, value_paint(np.zeros(len(mesh.vertices)), 1.0), SMALL):
         rim = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
         assert np.all(rim == 255)
 

@@ -16,7 +16,7 @@ from realsim.records.depth_bias import DepthBias
 from realsim.rendering.overlay import INK, PAPER, VERDICT_RGB, contact_sheet, draw_outlines
 from realsim.rendering.overlay_words import write_names
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim.scanning.scale.picture_shading import diverging
+from realsim.scanning.shading import diverging
 from realsim.store import SessionStore
 
 Array = NDArray[np.float64]

@@ -12,9 +12,9 @@ from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.overlay import draw_outlines
 from realsim.rendering.rays import PlacedMesh, RayScene, rotated
-from realsim.scanning.scale.picture_shading import diverging
 from realsim.scanning.scale.pictures import INK, MUTED, diverging_map, new_figure, png_of
 from realsim.scanning.scale.result import ScaleFit, ViewAgreement
+from realsim.scanning.shading import diverging
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import Mesh
-from realsim.scanning.scale.picture_shading import (
+from realsim.scanning.scale.result import ScaleFit
+from realsim.scanning.shading import (
     DIVERGING,
     UNSEEN,
     ShadingConfig,
-    half_width,
-    shaded_view,
-    standing_mesh,
+    shaded_views,
+    value_paint,
 )
-from realsim.scanning.scale.result import ScaleFit
 
 Array = NDArray[np.float64]
 INK, MUTED, GOOD, WARN, BAD = "#22303c", "#8a99a8", "#1f8a7d", "#b26a00", "#c03f26"
@@ -99,14 +98,16 @@ def residuals_png(mesh: Mesh, fit: ScaleFit, config: ShadingConfig | None = None
             f"{len(mesh.vertices)} vertices: they are not of each other."
         )
     T_table_obj = se3.invert(fit.plane.T_world_table) @ fit.T_world_obj
-    standing = standing_mesh(mesh, fit.scale, T_table_obj)
-    limit, half_m = residual_range_mm(fit), half_width(standing, config)
+    standing = Mesh(
+        vertices=se3.transform(T_table_obj, fit.scale * mesh.vertices), faces=mesh.faces
+    )
+    limit = residual_range_mm(fit)
+    pictures = shaded_views(standing, value_paint(fit.residual_mm, limit), config)
     figure = new_figure(11.0, 3.7, fit)
-    axes = figure.subplots(1, len(config.azimuths_deg))
-    for ax, azimuth in zip(np.atleast_1d(axes), config.azimuths_deg, strict=True):
-        picture = shaded_view(standing, fit.residual_mm, limit, azimuth, half_m, config)
+    axes = figure.subplots(1, len(pictures))
+    for ax, picture, side in zip(np.atleast_1d(axes), pictures, config.sides_deg, strict=True):
         ax.imshow(picture, interpolation="antialiased")
-        ax.set_title(f"from {azimuth:.0f}°", fontsize=8, color=MUTED)
+        ax.set_title(f"from {side[0]:.0f}°", fontsize=8, color=MUTED)
         ax.axis("off")
     _residual_bar(figure, axes, limit)
     seen = fit.residual_mm[np.isfinite(fit.residual_mm)]
@@ -263,7 +264,7 @@ def _percent_ticks(ax: Any, percent: Array) -> None:
 
     span = max(float(np.abs(np.log(np.append(percent, 100) / 100)).max()), np.log(1.05))
     ax.set_xlim(100 * np.exp(-1.15 * span), 100 * np.exp(1.15 * span))
-    choices = [
+    choices = (
         10,
         20,
         33,
@@ -283,7 +284,7 @@ def _percent_ticks(ax: Any, percent: Array) -> None:
         300,
         500,
         1000,
-    ]
+    )
     inside = [c for c in choices if abs(np.log(c / 100)) <= 1.15 * span]
     if span > np.log(1.4):
         inside = [c for c in inside if c not in (95, 98, 102, 105)]
