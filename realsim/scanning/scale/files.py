@@ -1,7 +1,7 @@
 """A scale fit as one JSON file: everything that was found, from what, with which settings."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -13,27 +13,22 @@ from realsim.errors import InputError, NotRigidError
 from realsim.geometry import se3
 from realsim.scanning.scale.measured import Measurement
 from realsim.scanning.scale.measured_check import MeasuredCheck
-from realsim.scanning.scale.result import Limit, ScaleFit, Similarity, ViewAgreement
+from realsim.scanning.scale.result import ScaleFit, Similarity
 from realsim.store import atomic
-from realsim.store.records_json import (
-    array_from_json,
-    array_to_json,
-    need,
-    number_from_json,
-    number_to_json,
-    plane_from_json,
-    plane_to_json,
-)
-from realsim.untrusted.own_json import read_object
+from realsim.untrusted.own_json import from_json, read_object, to_json
+from realsim.untrusted.values import need
 
 Json = dict[str, Any]
 FORMAT = "realsim scale"
 FORMAT_VERSION = 1
 VERSIONS_OF = ("realsim", "numpy", "scipy", "open3d", "trimesh")
-VERDICTS = ("accepted", "doubtful", "rejected", "unchecked")
+SHAPES = {"T_world_obj": (4, 4), "covariance": (7, 7), "extent_mm": (3,)}
+"""Of a fit's arrays."""
+FIRST = ("verdict", "reasons", "scale", "sigma")
+"""What a person looks for stands first."""
+TOLD = ("derived", "smallest_box_mm")
+"""What is told for other programs, and follows from the rest."""
 UNITS = {"scale": "metres per unit of the mesh", "T": "m", "residual_mm": "mm, null = unseen"}
-FIT_FLOATS = ("scale", "sigma", "cpu_s")
-VIEW_FLOATS = ("agree", "iou", "rms_mm", "shift_mm", "turn_deg")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -64,17 +59,6 @@ def installed_versions() -> dict[str, str]:
     return found
 
 
-# --- the fit ----------------------------------------------------------------------------------
-
-
-def similarity_to_json(s: Similarity) -> Json:
-    """Return a similarity as JSON values."""
-    return {
-        "scale": s.scale, "T_world_obj": array_to_json(s.T_world_obj),
-        "score": number_to_json(s.score), "source": s.source,
-    }  # fmt: skip
-
-
 def similarity_from_json(data: Any, what: str = "similarity") -> Similarity:
     """Return the similarity of JSON values.
 
@@ -83,61 +67,29 @@ def similarity_from_json(data: Any, what: str = "similarity") -> Similarity:
         NotRigidError: T_world_obj is not rigid.
     """
     d = need(data, ("scale", "T_world_obj"), what)
-    scale = d["scale"]
-    if isinstance(scale, bool) or not isinstance(scale, int | float) or not 0 < scale < np.inf:
-        raise InputError(f"{what} has the scale {scale!r}; metres per unit of the mesh, a positive "
-                         "number, is expected.")  # fmt: skip
-    T = _matrix(d["T_world_obj"], (4, 4), f"T_world_obj of {what}")
+    if (
+        isinstance(d["scale"], bool)
+        or not isinstance(d["scale"], int | float)
+        or not d["scale"] > 0
+    ):
+        raise InputError(f"{what} has the scale {d['scale']!r}; metres per unit of the mesh, a "
+                         "positive number, is expected.")  # fmt: skip
+    found = from_json({k: d[k] for k in ("scale", "T_world_obj")}, Similarity, what)
+    _require_shape(found.T_world_obj, (4, 4), f"T_world_obj of {what}")
     try:
-        se3.check_rigid(T, f"T_world_obj of {what}")
+        se3.check_rigid(found.T_world_obj, f"T_world_obj of {what}")
     except NotRigidError as error:
         raise NotRigidError(
             f"{error} The scale of the mesh stands beside it, as 'scale', never inside it."
         ) from error
-    return Similarity(
-        scale=float(scale), T_world_obj=T, score=number_from_json(d.get("score")),
-        source=str(d.get("source", "")),
-    )  # fmt: skip
+    return found
 
 
 def fit_to_json(fit: ScaleFit) -> Json:
     """Return a fit as JSON values; NaN becomes null."""
-    views = [
-        {"index": v.index, "points": v.points, "used": v.used}
-        | {name: number_to_json(getattr(v, name)) for name in VIEW_FLOATS}
-        for v in fit.views
-    ]
-    limits = [{"name": k.name, "percent": number_to_json(k.percent), "text": k.text}
-              for k in fit.limits]  # fmt: skip
-    low, high = fit.interval
-    return {
-        "verdict": fit.verdict,
-        "reasons": list(fit.reasons),
-        "scale": number_to_json(fit.scale),
-        "sigma": number_to_json(fit.sigma),
-        "derived": {
-            "sigma_percent": number_to_json(fit.sigma_percent),
-            "interval_95": [number_to_json(low), number_to_json(high)],
-        },
-        "extent_mm": array_to_json(fit.extent_mm),
-        "T_world_obj": array_to_json(fit.T_world_obj),
-        "covariance": array_to_json(fit.covariance),
-        "checks": {name: number_to_json(float(x)) for name, x in fit.checks.items()},
-        "limits": limits,
-        "views": views,
-        "plane": plane_to_json(fit.plane),
-        "candidates": [similarity_to_json(s) for s in fit.candidates],
-        "history": _plain(fit.history),
-        "cpu_s": number_to_json(fit.cpu_s),
-        "notes": list(fit.notes),
-        "residual_mm": array_to_json(fit.residual_mm),
-    }
-
-
-FIT_KEYS = (
-    "verdict", "reasons", "scale", "sigma", "extent_mm", "T_world_obj", "covariance", "checks",
-    "limits", "views", "plane", "candidates", "history", "cpu_s", "notes", "residual_mm",
-)  # fmt: skip
+    values = to_json(fit)
+    derived = {"sigma_percent": fit.sigma_percent, "interval_95": list(fit.interval)}
+    return {k: values[k] for k in FIRST} | {"derived": to_json(derived)} | values
 
 
 def fit_from_json(data: Any) -> ScaleFit:
@@ -146,101 +98,36 @@ def fit_from_json(data: Any) -> ScaleFit:
     Raises:
         InputError: something is missing or is not what it should be.
     """
-    d = need(data, FIT_KEYS, "a scale fit")
-    if d["verdict"] not in VERDICTS:
-        raise InputError(f"a scale fit has the verdict {d['verdict']!r}; {', '.join(VERDICTS)} "
-                         "are known.")  # fmt: skip
+    values = {k: v for k, v in need(data, (), "a scale fit").items() if k not in TOLD}
     try:
-        numbers: dict[str, float] = {name: number_from_json(d[name]) for name in FIT_FLOATS}
-        return ScaleFit(
-            **numbers,
-            verdict=d["verdict"],
-            reasons=tuple(str(r) for r in d["reasons"]),
-            extent_mm=_matrix(d["extent_mm"], (3,), "extent_mm"),
-            T_world_obj=_matrix(d["T_world_obj"], (4, 4), "T_world_obj"),
-            covariance=_matrix(d["covariance"], (7, 7), "covariance"),
-            checks={str(k): number_from_json(x) for k, x in d["checks"].items()},
-            limits=tuple(
-                Limit(name=str(k["name"]), percent=number_from_json(k["percent"]), text=k["text"])
-                for k in d["limits"]
-            ),
-            views=tuple(_view(v) for v in d["views"]),
-            plane=plane_from_json(d["plane"]),
-            candidates=tuple(similarity_from_json(s, "a candidate") for s in d["candidates"]),
-            history=tuple(d["history"]),
-            notes=tuple(str(n) for n in d["notes"]),
-            residual_mm=np.array([number_from_json(x) for x in d["residual_mm"]], dtype=np.float64),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        fit = from_json(values, ScaleFit, "a scale fit")
+        for name, shape in SHAPES.items():
+            _require_shape(getattr(fit, name), shape, name)
+    except InputError as error:
         raise InputError(
-            f"a scale fit is damaged ({type(error).__name__}: {error}). Restore the file, or make "
-            "it anew with `realsim scan scale --overwrite`."
+            f"{error} Restore the file, or make it anew with `realsim scan scale --overwrite`."
         ) from error
+    return fit
 
 
-def _view(data: Any) -> ViewAgreement:
-    """Return the agreement of one view."""
-    d = need(data, ("index", "points", "used", *VIEW_FLOATS), "a view of a scale fit")
-    floats: dict[str, float] = {name: number_from_json(d[name]) for name in VIEW_FLOATS}
-    return ViewAgreement(
-        index=int(d["index"]), points=int(d["points"]), used=bool(d["used"]), **floats
-    )
-
-
-def _matrix(values: Any, shape: tuple[int, ...], what: str) -> Any:
-    """Return an array of JSON numbers of this shape."""
-    try:
-        array = array_from_json(values)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{what} is no array of numbers ({error}).") from error
-    if array.shape != shape:
-        raise InputError(f"{what} has the shape {array.shape}; {shape} is expected.")
-    return array
-
-
-def _plain(value: Any) -> Any:
-    """Return plain JSON values: numpy's numbers and arrays become lists, NaN becomes null."""
-    if isinstance(value, Mapping):
-        items: Any = value.items()  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
-        return {str(k): _plain(v) for k, v in items}
-    if isinstance(value, np.ndarray | np.generic):
-        return _plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]  # pyright: ignore[reportUnknownVariableType]
-    if isinstance(value, float):
-        return number_to_json(value)
-    return str(value) if isinstance(value, Path) else value
-
-
-# --- the record -------------------------------------------------------------------------------
+def _require_shape(array: Any, shape: tuple[int, ...], what: str) -> None:
+    if np.shape(array) != shape:
+        raise InputError(f"{what} has the shape {np.shape(array)}; {shape} is expected.")
 
 
 def check_to_json(check: MeasuredCheck) -> Json:
-    """Return a measured length against the fit as JSON values."""
-    m = check.measurement
-    return {
-        "kind": m.kind, "value_m": m.value_m, "sigma_m": m.sigma_m,
-        "points": None if m.points is None else [list(p) for p in m.points],
-        "length": check.length, "scale": check.scale, "sigma": check.sigma,
-        "fitted_mm": check.fitted_mm, "difference_percent": check.difference_percent,
-        "z": check.z, "agrees": check.agrees, "text": check.text,
-    }  # fmt: skip
-
-
-CHECK_FLOATS = ("length", "scale", "sigma", "fitted_mm", "difference_percent", "z")
+    """Return a measured length against the fit as JSON values, all on one level."""
+    values = to_json(check)
+    return values.pop("measurement") | values
 
 
 def check_from_json(data: Any) -> MeasuredCheck:
     """Return the measured length of `check_to_json`."""
-    keys = ("kind", "value_m", "sigma_m", "points", *CHECK_FLOATS, "agrees", "text")
-    d = need(data, keys, "a measured length")
-    ends = d["points"]
-    m = Measurement(
-        kind=d["kind"], value_m=d["value_m"], sigma_m=d["sigma_m"],
-        points=None if ends is None else (tuple(ends[0]), tuple(ends[1])),
-    )  # fmt: skip
-    floats: dict[str, float] = {name: d[name] for name in CHECK_FLOATS}
-    return MeasuredCheck(measurement=m, agrees=d["agrees"], text=d["text"], **floats)
+    d = need(data, (), "a measured length")
+    own = Measurement.__dataclass_fields__
+    nested = {"measurement": {k: v for k, v in d.items() if k in own}}
+    rest = {k: v for k, v in d.items() if k not in own}
+    return from_json(nested | rest, MeasuredCheck, "a measured length")
 
 
 def record_to_json(record: ScaleRecord) -> Json:
@@ -249,11 +136,11 @@ def record_to_json(record: ScaleRecord) -> Json:
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "units": UNITS,
-        "inputs": _plain(record.inputs),
-        "config": _plain(record.config),
+        "inputs": to_json(record.inputs),
+        "config": to_json(record.config),
         "versions": dict(record.versions),
         "measured": [check_to_json(c) for c in record.measured],
-        "poses": _plain(record.poses),
+        "poses": to_json(record.poses),
         "fit": fit_to_json(record.fit),
     }
 

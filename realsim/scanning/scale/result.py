@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.records import Mesh, SupportPlane, Verdict
+from realsim.untrusted.own_json import Real
 
 Array = NDArray[np.float64]
 
@@ -20,7 +21,7 @@ class Similarity:
     """Metres per unit of the mesh."""
     T_world_obj: Array
     """(4, 4) of the scaled mesh in world [m]."""
-    score: float = float("nan")
+    score: Real = float("nan")
     """Of the step that made it; greater is better. Comparable within one list only."""
     source: str = ""
     """Where it comes from, for the report: 'given', 'stable pose 2, yaw 90 deg', ..."""
@@ -36,7 +37,7 @@ class Limit:
 
     name: str
     """'shape', 'depth noise', 'hand-eye', 'arm', 'mask', 'surface offset'."""
-    percent: float
+    percent: Real
     """What it alone contributes to the scale's 1-sigma [% of the scale]."""
     text: str
     """One sentence for a person, with numbers."""
@@ -50,15 +51,15 @@ class ViewAgreement:
     """Number of the view in its session."""
     points: int
     """Measured points of the object that were used."""
-    agree: float
+    agree: Real
     """Share of the rendered object's measured pixels whose depth agrees."""
-    iou: float
+    iou: Real
     """Overlap of the rendered and the measured mask: intersection over union."""
-    rms_mm: float
+    rms_mm: Real
     """RMS distance of its points to the model's surface [mm]."""
-    shift_mm: float
+    shift_mm: Real
     """By how much this view's camera was moved to agree with the others [mm]."""
-    turn_deg: float
+    turn_deg: Real
     """By how much it was turned [deg]."""
     used: bool = True
     """False: the view speaks against the others and was left out."""
@@ -68,9 +69,9 @@ class ViewAgreement:
 class ScaleFit:
     """The metric scale of a mesh, with everything needed to trust it or not."""
 
-    scale: float
+    scale: Real
     """Metres per unit of the mesh."""
-    sigma: float
+    sigma: Real
     """1-sigma of the scale, in metres per unit too; see `sigma_percent`."""
     T_world_obj: Array
     """(4, 4) pose of the scaled mesh in world [m]."""
@@ -80,7 +81,7 @@ class ScaleFit:
     verdict: Verdict
     reasons: tuple[str, ...]
     """Why the verdict is not 'accepted'."""
-    checks: dict[str, float]
+    checks: dict[str, Real]
     """Named checks without ground truth: agree, cover, iou, gain, contrast, shape_mm, noise, ..."""
     limits: tuple[Limit, ...]
     """What limits the scale, worst first."""
@@ -96,7 +97,7 @@ class ScaleFit:
     """Other scales and poses that were looked at, best first."""
     history: tuple[dict[str, Any], ...] = ()
     """Steps of the fit, plain JSON values."""
-    cpu_s: float = float("nan")
+    cpu_s: Real = float("nan")
     """CPU time of the fit [s]."""
     notes: tuple[str, ...] = field(default=())
     """What a user should know besides: a repaired mesh, a mirrored one, views left out."""
