@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_origin
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.untrusted import json_text
@@ -74,6 +75,17 @@ def from_json(data: Any, kind: type[Declared], what: str) -> Declared:
         if "missing" in told and isinstance(data, dict):
             told += f"; it has: {', '.join(map(str, data)) or 'nothing'}"
         raise InputError(f"{what}: {told[:1].lower()}{told[1:500]}.") from error
+
+
+def number_from_json(value: Any) -> float:
+    """Return the number that `to_json` made JSON of."""
+    return math.nan if value is None else float(value)
+
+
+def array_from_json(values: Any, shape: tuple[int, ...] | None = None) -> NDArray[np.float64]:
+    """Return the array that `to_json` made JSON of, in a shape if one is given."""
+    array = np.array(values, dtype=np.float64)
+    return array if shape is None else array.reshape(shape)
 
 
 def read_own(path: Path | str, kind: type[Declared]) -> Declared:
@@ -132,7 +144,7 @@ def _finite(value: Any) -> Any:
 
 def _built(kind: Any, value: Any) -> Any:
     if kind is Real:
-        return math.nan if value is None else float(value)
+        return number_from_json(value)
     if get_origin(kind) is np.ndarray:
         return np.array(value, dtype=kind.__args__[1].__args__[0])
     if isinstance(kind, type) and issubclass(kind, Tagged):

@@ -11,7 +11,7 @@ from realsim.errors import InputError, RealsimError
 from realsim.geometry.dh import ARMS, DhArm
 from realsim.records import Target
 from realsim.store import SessionStore
-from realsim.store.records_json import check_to_json, number_to_json
+from realsim.untrusted.own_json import to_json
 from realsim_calibration import (
     BoardView,
     DepthBoardView,
@@ -135,8 +135,8 @@ def depth_bias_to_json(found: DepthBiasReport) -> dict[str, Any]:
         "scale": bias.scale,
         "offset_per_m": bias.offset_per_m,
         "covariance": bias.covariance.tolist(),
-        "noise_per_m": number_to_json(bias.noise_per_m),
-        "range_m": [number_to_json(v) for v in bias.range_m],
+        "noise_per_m": to_json(bias.noise_per_m),
+        "range_m": [to_json(v) for v in bias.range_m],
         "separable": bias.separable,
-        "checks": [check_to_json(check) for check in found.checks],
+        "checks": [to_json(check) for check in found.checks],
     }

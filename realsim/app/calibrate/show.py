@@ -20,7 +20,7 @@ def report_document(
     report: HandEyeReport, checks: Sequence[Check], files: Sequence[Path]
 ) -> dict[str, object]:
     """Return what a program wants to know of a calibrated folder, for `--json`."""
-    from realsim.store.records_json import check_to_json, intrinsics_to_json
+    from realsim.untrusted.own_json import to_json
 
     in_hand = report.mode == "eye_in_hand"
     return {
@@ -34,10 +34,10 @@ def report_document(
         "held_out_px": report.held_out_px,
         "held_out_mm": report.held_out_mm,
         "held_out_deg": report.held_out_deg,
-        "intrinsics": intrinsics_to_json(report.intrinsics),
+        "intrinsics": to_json(report.intrinsics),
         "view_indices": [v.index for v in report.used],
         "rejected": report.rejected,
-        "checks": [check_to_json(c) for c in checks],
+        "checks": [to_json(c) for c in checks],
         "files": files,
     }
 

@@ -9,8 +9,7 @@ import numpy as np
 from realsim.errors import InputError
 from realsim.records.depth_bias import DepthBias
 from realsim.store import SessionStore
-from realsim.store.records_json import number_from_json
-from realsim.untrusted.own_json import read_values
+from realsim.untrusted.own_json import number_from_json, read_values
 
 if TYPE_CHECKING:
     from realsim.registration.config import Method, RegistrationConfig

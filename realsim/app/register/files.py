@@ -43,8 +43,8 @@ from realsim.app.register.results import (
 )
 from realsim.geometry import se3
 from realsim.records import ObjectModel, Scene, bop_units
-from realsim.store import SessionStore, atomic, records_json
-from realsim.store.records_json import array_to_json, number_to_json
+from realsim.store import SessionStore, atomic
+from realsim.untrusted.own_json import to_json
 
 # --- to JSON ----------------------------------------------------------------------------------
 
@@ -80,9 +80,9 @@ def documents(
         TABLE_FILE: _table_to_json(result.scene, models),
         f"{FOLDER}/scene_gt.json": _bop_objects(result),
         f"{FOLDER}/scene_camera.json": _bop_cameras(result, store),
-        SINGLE_FILE: records_json.scene_to_json(result.single_view),
+        SINGLE_FILE: to_json(result.single_view),
         REPORT_FILE: plain(report),
-        SCENE_FILE: records_json.scene_to_json(result.scene),
+        SCENE_FILE: to_json(result.scene),
     }
 
 
@@ -97,7 +97,7 @@ def _cameras_to_json(cameras: CameraChange) -> Json:
 
 def _poses_to_json(poses: Mapping[int, Array]) -> Json:
     """Return poses by view."""
-    return {str(k): array_to_json(poses[k]) for k in sorted(poses)}
+    return {str(k): to_json(poses[k]) for k in sorted(poses)}
 
 
 def _seen_to_json(result: Registered, models: Mapping[int, ObjectModel]) -> Json:
@@ -109,11 +109,11 @@ def _seen_to_json(result: Registered, models: Mapping[int, ObjectModel]) -> Json
         for instance, pose in sorted(seen[index].items()):
             mm, deg = sigmas_of(pose.covariance, models.get(scene.object(instance).obj_id))
             rows[str(instance)] = {
-                "sigma_px": number_to_json(pose.sigma_px),
-                "sigma_mm": number_to_json(mm),
-                "sigma_deg": number_to_json(deg),
-                "T_cam_obj": array_to_json(pose.T_cam_obj),
-                "covariance": array_to_json(pose.covariance),
+                "sigma_px": to_json(pose.sigma_px),
+                "sigma_mm": to_json(mm),
+                "sigma_deg": to_json(deg),
+                "T_cam_obj": to_json(pose.T_cam_obj),
+                "covariance": to_json(pose.covariance),
             }
         views[str(index)] = rows
     return {
@@ -132,17 +132,17 @@ def _table_to_json(scene: Scene, models: Mapping[int, ObjectModel]) -> Json:
     T_world_table = np.eye(4) if plane is None else plane.T_world_table
     rows: list[Json] = []
     for o in scene.objects:
-        row = records_json.object_pose_to_json(o)
+        row = to_json(o)
         T_world_obj = row.pop("T_world_obj")
         T = se3.invert(T_world_table) @ np.asarray(T_world_obj)
         name = models[o.obj_id].name if o.obj_id in models else ""
-        rows.append({"name": name} | row | {"T_table_obj": array_to_json(T)})
+        rows.append({"name": name} | row | {"T_table_obj": to_json(T)})
     return {
         "format_version": FORMAT_VERSION,
         "name": scene.name,
         "frame": "world" if plane is None else "table",
-        "T_world_table": array_to_json(T_world_table),
-        "rms_m": None if plane is None else number_to_json(plane.rms_m),
+        "T_world_table": to_json(T_world_table),
+        "rms_m": None if plane is None else to_json(plane.rms_m),
         "inliers": None if plane is None else int(plane.inliers),
         "objects": rows,
     }

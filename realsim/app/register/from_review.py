@@ -19,7 +19,7 @@ from realsim.registration.search.records import Region, Wanted
 from realsim.review.corrections import DECIDED, corrected_scene, decision_on, pending
 from realsim.review.journal import Entry, ReviewState
 from realsim.store import SessionStore, load_scene
-from realsim.store.records_json import array_to_json
+from realsim.untrusted.own_json import to_json
 
 SCENE_FILE = "registration/scene.json"
 REVIEW_FILE = "registration/review.json"
@@ -122,7 +122,7 @@ def _row(placed: ObjectPose, is_moved: bool) -> Row:
     return {
         "obj_id": placed.obj_id,
         "instance": placed.instance,
-        "T_world_obj": array_to_json(placed.T_world_obj),
+        "T_world_obj": to_json(placed.T_world_obj),
         "radius_m": MOVED_RADIUS_M if is_moved else HELD_RADIUS_M,
         "turn_deg": MOVED_TURN_DEG if is_moved else HELD_TURN_DEG,
     }

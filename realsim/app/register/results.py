@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.records import ObjectModel, Scene, SupportPlane, View
+from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane, View
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.search.records import NotPlaced
-from realsim.store import SessionStore, load_scene, records_json
-from realsim.store.records_json import number_from_json
+from realsim.store import SessionStore, load_scene
+from realsim.untrusted.own_json import array_from_json, from_json, number_from_json
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -143,8 +143,8 @@ def load_seen(store: SessionStore) -> dict[int, dict[int, SeenPose]]:
     return {
         int(index): {
             int(instance): SeenPose(
-                T_cam_obj=records_json.array_from_json(row["T_cam_obj"]),
-                covariance=records_json.array_from_json(row["covariance"], (6, 6)),
+                T_cam_obj=array_from_json(row["T_cam_obj"]),
+                covariance=array_from_json(row["covariance"], (6, 6)),
                 sigma_px=number_from_json(row["sigma_px"]),
             )
             for instance, row in rows.items()
@@ -163,7 +163,7 @@ def load_table_scene(store: SessionStore) -> Scene:
             T_world_table=np.eye(4), rms_m=number_from_json(value["rms_m"]),
             inliers=int(value["inliers"]),
         )  # fmt: skip
-    objects = tuple(records_json.object_pose_from_json(row) for row in rows)
+    objects = tuple(from_json(row, ObjectPose, "an object's pose") for row in rows)
     return Scene(name=str(value["name"]), objects=objects, plane=plane)
 
 

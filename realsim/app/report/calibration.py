@@ -13,7 +13,7 @@ from realsim.app.stages import BOARD_VIEWS
 from realsim.pages import Cell
 from realsim.records import Check, HandEye
 from realsim.store import SessionStore
-from realsim.store.records_json import check_from_json
+from realsim.untrusted.own_json import from_json
 
 HAND_EYE, DEPTH, EXPORT = (
     "calibration/hand_eye.json",
@@ -239,7 +239,7 @@ def _depth(section: Section, store: SessionStore) -> None:
             ["measured over", f"{low:.2f} to {high:.2f} m"],
         ],
     )
-    checks = [check_from_json(c) for c in told.get("checks", ())]
+    checks = [from_json(c, Check, "a check") for c in told.get("checks", ())]
     # A bias that is known is taken out by registration: it is no reason to look first.
     ordered = sorted(checks, key=lambda c: ORDER.index(c.verdict))
     section.page.table(CHECK_HEADER, _rows(ordered))

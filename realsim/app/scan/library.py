@@ -63,7 +63,7 @@ def list_library(folder: Path, console: Console) -> None:
 
 def _entry_document(e: "LibraryEntry") -> dict[str, object]:
     """Return what a program wants to know of a model in the list."""
-    from realsim.models.library_records import to_json
+    from realsim.untrusted.own_json import to_json
 
     known = None if e.properties is None else to_json(e.properties)
     return {"name": e.name, "obj_id": e.obj_id, "info": e.info, "properties": known}
@@ -129,9 +129,9 @@ def show_model(folder: Path, name: str, console: Console) -> None:
     """
     from realsim.models import library_files as files
     from realsim.models.library_reading import LibraryReader
-    from realsim.models.library_records import to_json
     from realsim.models.pictures import sheet_png
     from realsim.store import atomic
+    from realsim.untrusted.own_json import to_json
 
     library = LibraryReader.open(folder)
     unscaled = (folder / files.UNSCALED / name / files.UNSCALED_REPORT).is_file()

@@ -28,8 +28,7 @@ from realsim.formats.grasps.scene_grasps import check_values, executed, held, un
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.store import atomic
-from realsim.store.records_json import array_from_json, array_to_json
-from realsim.untrusted.own_json import read_object
+from realsim.untrusted.own_json import array_from_json, read_object, to_json
 
 Array = NDArray[np.float64]
 MOST_BYTES = 1 << 30
@@ -93,8 +92,8 @@ def write_graspgen(
             "version": version("realsim"),
             "frame": known_frame(frame),
             "rows": rows.tolist(),
-            "scores": array_to_json(grasps.scores[rows]),
-            "widths_m": array_to_json(grasps.widths_m[rows]),
+            "scores": to_json(grasps.scores[rows]),
+            "widths_m": to_json(grasps.widths_m[rows]),
             "left_out": len(grasps) - len(rows),
         },
     }

@@ -21,8 +21,7 @@ from realsim.errors import InputError
 from realsim.scanning.sfm.config import SfmConfig
 from realsim.scanning.sfm.result import Alignment, SfmResult
 from realsim.store.atomic import write_bytes, write_json
-from realsim.store.records_json import array_to_json, intrinsics_to_json, number_to_json
-from realsim.untrusted.own_json import read_object
+from realsim.untrusted.own_json import read_object, to_json
 
 Array = NDArray[np.float64]
 RESULT, CAMERAS, CLOUD = "sfm.json", "cameras.json", "sparse.ply"
@@ -70,12 +69,12 @@ def cameras_json(result: SfmResult) -> dict[str, Any]:
         "format": "realsim-sfm-cameras",
         "version": VERSION,
         "units": ("m" if result.is_metric else "arbitrary") + "; T_world_cam maps camera to world",
-        "camera": intrinsics_to_json(g.intrinsics),
+        "camera": to_json(g.intrinsics),
         "views": [
             {
                 "name": name,
-                "T_world_cam": array_to_json(T),
-                "reprojection_px": number_to_json(error),
+                "T_world_cam": to_json(T),
+                "reprojection_px": to_json(error),
                 **sigma,
             }
             for name, T, error, sigma in zip(
@@ -114,9 +113,9 @@ def result_json(result: SfmResult, config: SfmConfig) -> dict[str, Any]:
         "notes": list(result.notes),
         "poses": result.poses,
         "is_metric": result.is_metric,
-        "scale_m_per_unit": number_to_json(result.scale),
-        "scale_sigma_percent": number_to_json(result.sigma_percent),
-        "refinement_reliability": number_to_json(result.reliability),
+        "scale_m_per_unit": to_json(result.scale),
+        "scale_sigma_percent": to_json(result.sigma_percent),
+        "refinement_reliability": to_json(result.reliability),
         "alignment": None if result.alignment is None else _alignment_json(result.alignment),
         "depth": None if d is None else {
             "ratio": d.ratio, "sigma": d.sigma, "pairs": d.pairs, "views": d.views,
@@ -128,11 +127,11 @@ def result_json(result: SfmResult, config: SfmConfig) -> dict[str, Any]:
         },
         "points": {
             "count": len(g.points),
-            "mean_track": number_to_json(float(result.track_lengths.mean())),
-            "median_sigma_mm": number_to_json(float(np.median(result.point_sigma_mm))),
-            "reprojection_px": number_to_json(result.reprojection_px),
+            "mean_track": to_json(float(result.track_lengths.mean())),
+            "median_sigma_mm": to_json(float(np.median(result.point_sigma_mm))),
+            "reprojection_px": to_json(result.reprojection_px),
         },
-        "camera": intrinsics_to_json(g.intrinsics),
+        "camera": to_json(g.intrinsics),
         "features": dict(zip(result.matching.names, result.matching.features, strict=True)),
         "peak_threshold": result.matching.peak_threshold,
         "pairs_verified": sum(1 for p in result.matching.pairs if p[3] > 0),
@@ -146,12 +145,12 @@ def _alignment_json(a: Alignment) -> dict[str, Any]:
     return {
         "scale": a.scale,
         "sigma_percent": a.sigma_percent,
-        "sigma_parts_percent": {k: number_to_json(v) for k, v in a.parts_percent.items()},
-        "R": array_to_json(a.R),
-        "t_m": array_to_json(a.t),
+        "sigma_parts_percent": {k: to_json(v) for k, v in a.parts_percent.items()},
+        "R": to_json(a.R),
+        "t_m": to_json(a.t),
         "hand_eye_correction_deg": np.degrees(a.hand_eye_twist[:3]).tolist(),
         "hand_eye_correction_mm": (1e3 * a.hand_eye_twist[3:]).tolist(),
-        "covariance": array_to_json(a.covariance),
+        "covariance": to_json(a.covariance),
         "views": [asdict(v) for v in a.views],
     }
 

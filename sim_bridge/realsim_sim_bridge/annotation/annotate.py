@@ -24,8 +24,8 @@ from realsim.records import GraspSet, Mesh, ObjectModel, Scene, View
 from realsim.rendering.rays import PlacedMesh
 from realsim.store import SessionStore
 from realsim.store.atomic import npz_bytes
-from realsim.store.records_json import object_pose_to_json
 from realsim.store.session_store import depth_path
+from realsim.untrusted.own_json import to_json
 from realsim_sim_bridge.annotation import files
 from realsim_sim_bridge.annotation.config import AnnotationConfig
 from realsim_sim_bridge.annotation.files import OBJECTS_FILE, surface_path
@@ -73,7 +73,7 @@ def _object_entries(scene: Scene, models: Mapping[int, ObjectModel]) -> list[dic
     """Return one entry per object of the scene, rejected ones included."""
     entries: list[dict[str, Any]] = []
     for placed in scene.objects:
-        entry = object_pose_to_json(placed)
+        entry = to_json(placed)
         if placed.obj_id in models:
             model = models[placed.obj_id]
             low, high = model.mesh.bounds

@@ -24,7 +24,7 @@ from realsim.errors import InputError
 from realsim.formats.bop import labels as bop_labels
 from realsim.rendering.labels import Labels
 from realsim.store import SessionStore
-from realsim.store.records_json import intrinsics_to_json, number_to_json
+from realsim.untrusted.own_json import to_json
 from realsim_sim_bridge.annotation.config import MAPS
 from realsim_sim_bridge.annotation.frame_grasps import GraspsInView
 from realsim_sim_bridge.annotation.frame_labels import FrameLabel
@@ -118,7 +118,7 @@ def part_of_view(
         "format_version": FORMAT_VERSION,
         "view": view.index,
         "inputs": view.digest,
-        "camera": intrinsics_to_json(inputs.intrinsics),
+        "camera": to_json(inputs.intrinsics),
         "T_world_cam": view.T_world_cam.tolist(),
         "maps": list(inputs.config.maps),
         "is_empty": not any(label.info["px_count_visib"] for label in frame),
@@ -131,7 +131,7 @@ def part_of_view(
 def _json(record: Any) -> dict[str, Any]:
     """Return a record's fields as JSON values."""
     return {
-        name: number_to_json(value) if isinstance(value, float) else value
+        name: to_json(value) if isinstance(value, float) else value
         for name, value in asdict(record).items()
     }
 

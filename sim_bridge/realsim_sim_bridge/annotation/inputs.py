@@ -22,8 +22,8 @@ from realsim.records import (
 )
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.store import SessionStore
-from realsim.store.records_json import object_pose_to_json
 from realsim.store.session_store import depth_path, rgb_path
+from realsim.untrusted.own_json import to_json
 from realsim_sim_bridge.annotation.config import AnnotationConfig
 
 FORMAT_VERSION = 2
@@ -144,7 +144,7 @@ def _scene_digest(
     numbers = [i.width, i.height, i.fx, i.fy, i.cx, i.cy, store.session.depth_unit_m]
     digest.update(np.array([*numbers, *i.distortion]).tobytes())
     for o in chosen:
-        digest.update(json.dumps(object_pose_to_json(o), sort_keys=True).encode())
+        digest.update(json.dumps(to_json(o), sort_keys=True).encode())
     for obj_id in sorted({o.obj_id for o in chosen}):
         model = models[obj_id]
         digest.update(f"{obj_id} {model.name} ".encode())

@@ -15,7 +15,7 @@ from realsim.scanning.scale.files import ScaleRecord, json_lines, load_record, r
 from realsim.scanning.scale.measured import smallest_box
 from realsim.scanning.scale.result import ScaleFit
 from realsim.store import SessionStore, atomic
-from realsim.store.records_json import array_to_json
+from realsim.untrusted.own_json import to_json
 
 Array = NDArray[np.float64]
 FILE = "scale.json"
@@ -80,7 +80,7 @@ def result_bytes(record: ScaleRecord, box_mm: Array) -> bytes:
     for key, value in values["fit"].items():
         fit[key] = value
         if key == "extent_mm":
-            fit["smallest_box_mm"] = array_to_json(box_mm)
+            fit["smallest_box_mm"] = to_json(box_mm)
     return json_lines(values | {"fit": fit}).encode("utf-8")
 
 
