@@ -1,51 +1,59 @@
-"""Benchmark of capture: speed, kills and full disks, import; the three scripts one after the other.
+"""Benchmark of capture: speed, kills and full disks, import.
 
-    uv run python benchmarks/capture.py [--quick] [--json FILE]
+    uv run python benchmarks/capture.py [--quick] [--json FILE] [--part NAME]
 
-Figures (keys of the JSON's "figures"), goals in brackets:
-  capture_ms_per_view  CPU of a 1280x720 view beyond rendering, checks and files included (<= 40)
-  kills, kills_with_loss   SIGKILLs at random moments, and those that lost a sealed view (60, 0)
-  import_mb_per_s      of a 500 MB bag per CPU second, PNG writing included (>= 100)
-  import_peak_mb       greatest memory of the importing process (< 500)
-and what `capture_speed.py`, `capture_kills.py` and `capture_import.py` print besides.
+Figures (keys of the JSON's "figures"):
+  speed   capture_ms_per_view   CPU of a 1280x720 view beyond rendering, checks and files included;
+          of which capture_checks_ms_per_view is all but storing; capture_wall_ms_per_view,
+          capture_mb_per_view and what else `capture_speed` says
+  kills   kills, kills_with_loss   SIGKILLs at random moments, and those that lost a sealed view;
+          enospc_runs, enospc_with_loss   the same on a full disk (root)
+  import  import_mb_per_s   of a 500 MB bag per CPU second, PNG writing included
+          import_peak_mb    greatest memory of the importing process; both the worst container's,
+          and KIND_cpu_s ... of each
 """
 
-import argparse
-import json
-import subprocess
-import sys
-import tempfile
-from pathlib import Path
-from typing import Any
+import os
 
-PARTS = ("capture_speed", "capture_kills", "capture_import")
-KEYS = (
-    "capture_ms_per_view", "kills", "kills_with_loss", "import_mb_per_s", "import_peak_mb",
-)  # fmt: skip
+for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
 
+from figures import Figure, Goal, run
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="fewer views, kills and bytes")
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
-    figures: dict[str, Any] = {}
-    parts: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as folder:
-        for part in PARTS:
-            file = Path(folder) / f"{part}.json"
-            script = Path(__file__).with_name(f"{part}.py")
-            command = [sys.executable, str(script), "--json", str(file)]
-            subprocess.run([*command, *(["--quick"] if args.quick else [])], check=True)
-            parts[part] = json.loads(file.read_text())
-            figures |= parts[part]["figures"]
-    print()
-    for key in KEYS:
-        print(f"{key:<22} {figures[key]:.4g}")
-    if args.json:
-        document = {"benchmark": "capture", "figures": figures, "parts": parts}
-        args.json.write_text(json.dumps(document, indent=2))
-
+KINDS = ("ros1", "sqlite3", "mcap")
+"""Containers of a recording."""
+ROW = {
+    "cpu_s": "s", "open_cpu_s": "s", "wall_s": "s", "peak_mb": "MB", "frames": "",
+    "with_joints": "", "bag_mb": "MB", "mb_per_s": "MB/s",
+}  # fmt: skip
+"""What is measured of the import of each container."""
+NONE = Goal(low=0, high=0)
+FIGURES = {
+    "capture_ms_per_view": Figure(unit="ms", goal=Goal(high=40)),
+    **{
+        f"capture_{key}": Figure(unit=unit)
+        for key, unit in {
+            "checks_ms_per_view": "ms", "render_ms_per_view": "ms", "wall_ms_per_view": "ms",
+            "mb_per_view": "MB", "frames_retaken": "", "views_noted": "",
+        }.items()
+    },
+    "kills": Figure(unit=""),
+    "kills_with_loss": Figure(unit="", goal=NONE),
+    "views_in_flight_lost_max": Figure(unit="", goal=Goal(high=1)),
+    "sessions_completed": Figure(unit=""),
+    "capture_s": Figure(unit="s"),
+    "enospc_runs": Figure(unit=""),
+    "enospc_with_loss": Figure(unit="", goal=NONE),
+    "import_mb_per_s": Figure(unit="MB/s", goal=Goal(low=100)),
+    "import_peak_mb": Figure(unit="MB", goal=Goal(high=500)),
+    **{f"{kind}_{key}": Figure(unit=unit) for kind in KINDS for key, unit in ROW.items()},
+}  # fmt: skip
+PARTS = {
+    "speed": "capture_speed:speed",
+    "kills": "capture_kills:kills",
+    "import": "capture_import:imports",
+}
 
 if __name__ == "__main__":
-    main()
+    packages = ("realsim", "numpy", "opencv-python-headless", "rosbags", "isal")
+    run("capture", __doc__, packages, FIGURES, PARTS)

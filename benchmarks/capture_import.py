@@ -1,32 +1,23 @@
-"""Benchmark of importing a recording: megabytes of bag per CPU second, and peak memory.
-
-    uv run python benchmarks/capture_import.py [--mb 500] [--quick] [--json FILE] [--kind KIND ...]
+"""Importing a recording: megabytes of bag per CPU second, and peak memory.
 
 A bag of the simulated lab's photographs (rgb8 1280x720, 16UC1 millimetres, camera_info, 125 Hz
-joint states) is written as ROS1, sqlite3 and MCAP, and each is imported into a session by a fresh
-process. Figures: import_mb_per_s (bag size / CPU seconds of opening and importing, PNG files
-included) and import_peak_mb (peak resident memory of the whole process), the worst kind's of each.
+joint states) is written in each container and imported into a session by a fresh process.
 """
-
-import os
-
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
 
 import argparse
 import json
-import platform
 import resource
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from capture import KINDS
+from figures import Found
 from numpy.typing import NDArray
 
 WIDTH, HEIGHT = 1280, 720
@@ -34,9 +25,6 @@ FRAME_HZ, JOINT_HZ = 5, 125
 RENDERED = 4
 """Different photographs; the others are these, shifted sideways and with new noise."""
 SHIFT_PX = 37
-GOALS = {"import_mb_per_s": 100.0, "import_peak_mb": 500.0}
-PACKAGES = ("realsim", "numpy", "opencv-python-headless", "rosbags", "isal")
-KINDS = ("ros1", "sqlite3", "mcap")
 JOINTS = ("elbow_joint", "shoulder_lift_joint", "shoulder_pan_joint", "wrist_1_joint",
           "wrist_2_joint", "wrist_3_joint")  # fmt: skip
 """In the alphabetic order in which the UR driver sends them."""
@@ -196,7 +184,7 @@ def measured(kind: str, camera: Any, images: Images, mb: float) -> dict[str, flo
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / ("recording.bag" if kind == "ros1" else "recording")
         size = write_bag(bag, kind, camera, images, mb)
-        command = [sys.executable, __file__, "--child", str(bag), str(Path(folder) / "session")]
+        command = [sys.executable, __file__, str(bag), str(Path(folder) / "session")]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise SystemExit(f"the import of a {kind} bag failed:\n{done.stdout}{done.stderr}")
@@ -204,44 +192,17 @@ def measured(kind: str, camera: Any, images: Images, mb: float) -> dict[str, flo
     return row | {"bag_mb": size / 1e6, "mb_per_s": size / 1e6 / row["cpu_s"]}
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--mb", type=float, default=500.0, help="size of the bag")
-    parser.add_argument("--quick", action="store_true", help="100 MB, ROS1 only")
-    parser.add_argument("--json", type=Path, help="where the figures go")
-    parser.add_argument("--kind", nargs="+", choices=KINDS, default=list(KINDS))
-    parser.add_argument("--child", nargs=2, type=Path, help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.child:
-        child(*args.child)
-        return
-    kinds = ["ros1"] if args.quick else args.kind
-    mb = min(args.mb, 100.0) if args.quick else args.mb
+def imports(arguments: argparse.Namespace) -> Found:
+    """Return what the import of each container takes; of one, and a fifth of it, if quick."""
+    kinds, mb = (KINDS[:1], 100.0) if arguments.quick else (KINDS, 500.0)
     camera, images = photographs()
     rows = {kind: measured(kind, camera, images, mb) for kind in kinds}
     figures = {
         "import_mb_per_s": min(r["mb_per_s"] for r in rows.values()),
         "import_peak_mb": max(r["peak_mb"] for r in rows.values()),
     }
-    for kind, r in rows.items():
-        print(
-            f"{kind:8s} {r['bag_mb']:6.0f} MB {r['frames']:4.0f} frames  {r['mb_per_s']:6.1f} MB/s "
-            f"CPU ({r['cpu_s']:.2f} s, {r['open_cpu_s']:.2f} of it opening)  peak "
-            f"{r['peak_mb']:.0f} MB"
-        )
-    fast = figures["import_mb_per_s"] >= GOALS["import_mb_per_s"]
-    small = figures["import_peak_mb"] < GOALS["import_peak_mb"]
-    print(f"import_mb_per_s {figures['import_mb_per_s']:.1f} (>= 100: {'yes' if fast else 'NO'})")
-    print(f"import_peak_mb {figures['import_peak_mb']:.0f} (< 500: {'yes' if small else 'NO'})")
-    if args.json:
-        report = {
-            "figures": figures | {f"{k}_{n}": v for k, r in rows.items() for n, v in r.items()},
-            "python": platform.python_version(),
-            "machine": platform.machine(),
-            "versions": {p: version(p) for p in PACKAGES},
-        }
-        args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    return Found(figures=figures | {f"{k}_{n}": v for k, r in rows.items() for n, v in r.items()})
 
 
 if __name__ == "__main__":
-    main()
+    child(Path(sys.argv[1]), Path(sys.argv[2]))

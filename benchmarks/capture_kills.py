@@ -1,26 +1,15 @@
 """Captures killed at random moments, and on a full disk: is anything that was sealed ever lost?
 
-    uv run python benchmarks/capture_kills.py [--quick] [--json FILE] [--kills N] [--enospc N]
-
 A child process captures a small session in the simulated lab (the real pipeline, 320x180) and is
 killed with SIGKILL at a moment drawn evenly over its running time, start included; then the same
 command runs again. What the parent saw sealed (a whole line in robot.jsonl) must be there for ever
-after, bit for bit. With --enospc the child writes to a small file system of its own that fills up
-at random places (root, Linux); room is made, and it goes on.
-
-Figures (keys of the JSON's "figures"): kills, kills_with_loss, views_in_flight_lost_max,
-sessions_completed; enospc_runs, enospc_with_loss.
+after, bit for bit. Another child writes to a small file system of its own that fills up at random
+places (root, Linux); room is made, and it goes on.
 """
-
-import os
-
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
 
 import argparse
 import hashlib
 import json
-import platform
 import shutil
 import signal
 import subprocess
@@ -28,14 +17,13 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
+from figures import Found
 
 VIEWS, WIDTH, HEIGHT = 24, 320, 180
 SEED = 4
-PACKAGES = ("realsim", "numpy", "isal")
 FULL_EXIT = 3
 """What the child ends with when it was told that the disk is full."""
 DISK_MB = 8
@@ -52,7 +40,7 @@ def child(folder: Path) -> None:
 
     plan = load_plan(folder.parent / "plan.json")
     lab = SimulatedLab(LabConfig(seed=SEED, width=WIDTH, height=HEIGHT))
-    lab.place_board()
+    lab.place_objects()
     try:
         if (folder / "session.json").is_file():
             store = SessionStore.open(folder)
@@ -70,15 +58,12 @@ def child(folder: Path) -> None:
 
 
 def make_plan(folder: Path) -> None:
-    """Plan the views once; every run drives the same."""
-    from realsim_capture_plans.collision.mount import d405_mount
-    from realsim_capture_plans.plan_files.plan_json import save_plan
-    from realsim_capture_plans.planning.make import calibration_plan
-    from realsim_capture_plans.planning.record import PlanConfig
+    """Write the beginning of the shipped plan; every run drives the same."""
+    from capture_speed import first_views
 
-    rng = np.random.default_rng(SEED)
-    plan = calibration_plan(VIEWS, [0.375, 0.0, 0.0], d405_mount(), PlanConfig(), rng)
-    save_plan(plan, folder / "plan.json")
+    from realsim_capture_plans.plan_files.plan_json import save_plan
+
+    save_plan(first_views(VIEWS), folder / "plan.json")
 
 
 @dataclass(kw_only=True)
@@ -123,9 +108,7 @@ def _digest(file: Path) -> str:
 
 
 def start(folder: Path) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        [sys.executable, __file__, "--child", str(folder)], stderr=subprocess.PIPE
-    )
+    return subprocess.Popen([sys.executable, __file__, str(folder)], stderr=subprocess.PIPE)
 
 
 def finish(folder: Path) -> float:
@@ -182,7 +165,7 @@ def run_enospc(root: Path, runs: int, rng: np.random.Generator) -> dict[str, flo
     disk.mkdir()
     mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK_MB}m", "tmpfs", str(disk)]
     if subprocess.run(mount, check=False, capture_output=True).returncode != 0:
-        print("a small file system cannot be mounted here; --enospc needs root", file=sys.stderr)
+        print("a small file system cannot be mounted here: that needs root", file=sys.stderr)
         return {}
     try:
         shutil.copy(root / "plan.json", disk / "plan.json")
@@ -208,44 +191,15 @@ def run_enospc(root: Path, runs: int, rng: np.random.Generator) -> dict[str, flo
         subprocess.run(["umount", str(disk)], check=False)
 
 
-def main() -> None:
-    """Kill, fill, compare, print, write the JSON."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--quick", action="store_true", help="2 kills, 1 full disk")
-    parser.add_argument("--kills", type=int, default=60)
-    parser.add_argument("--enospc", type=int, default=10, help="full disks (needs root)")
-    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.child:
-        child(args.child)
-        return
-    kills, full = (2, 1) if args.quick else (args.kills, args.enospc)
+def kills(arguments: argparse.Namespace) -> Found:
+    """Kill, fill, compare."""
+    count, full = (2, 1) if arguments.quick else (60, 10)
     rng = np.random.default_rng(SEED)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         make_plan(root)
-        figures = run_kills(root, kills, rng)
-        if full:
-            figures |= run_enospc(root, full, rng)
-    from realsim.app.console import Console
-
-    goals = {"kills_with_loss": "0", "views_in_flight_lost_max": "1", "enospc_with_loss": "0"}
-    table = [[key, f"{value:.4g}", goals.get(key, "")] for key, value in figures.items()]
-    Console().table("Captures killed at random moments", ["figure", "value", "goal"], table)
-    if args.json:
-        document = {
-            "benchmark": "capture_kills",
-            "machine": {"cpu": platform.machine(), "cores": os.cpu_count()},
-            "versions": {name: version(name) for name in PACKAGES},
-            "seed": SEED,
-            "quick": args.quick,
-            "figures": figures,
-        }
-        args.json.write_text(json.dumps(document, indent=1))
+        return Found(figures=run_kills(root, count, rng) | run_enospc(root, full, rng))
 
 
 if __name__ == "__main__":
-    main()
+    child(Path(sys.argv[1]))

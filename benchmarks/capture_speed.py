@@ -1,50 +1,29 @@
-"""Benchmark of the capture in the simulated lab: CPU per view beyond rendering.
+"""CPU of a view of 1280x720 in the simulated lab, colour and depth stored, rendering taken off.
 
-    uv run python benchmarks/capture_speed.py [--views 256] [--quick] [--json FILE]
-
-Figures (keys of the JSON's "figures"): capture_ms_per_view, CPU of process and threads per view of
-1280x720 with colour and depth stored, the camera's own CPU taken off; of which
-capture_checks_ms_per_view is everything but `SessionStore.add_view`; capture_wall_ms_per_view,
-which includes the wait for a standing arm and the disk; capture_mb_per_view. The arm and the
-frames are those of the lab; planning is not part of it: the views are an arc round the objects.
+The frames are those of the lab; planning is not part of it: the views are the shipped plan's.
 """
 
-import os
-
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-
 import argparse
-import json
-import platform
 import tempfile
 import time
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from figures import Found
 
-from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, CaptureSession
+from realsim.records import CaptureSession
 from realsim.store import SessionStore
-from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.capturing.capture import CaptureConfig, CaptureJob, capture
 from realsim_capture_plans.capturing.contact_sheet import Thumbnails
-from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import Frame
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
-from realsim_capture_plans.lab.devices import HOME
-from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.plan_files.plan_json import resolve_plan
+from realsim_capture_plans.planning.record import CapturePlan
 
-PACKAGES = ("realsim", "numpy", "opencv-python-headless")
+VIEWS = 256
 RENDERED = 32
 """Frames that are rendered, each a CPU-second; then they come again in turn."""
-RADIUS_M = 0.36
-"""Camera to the objects [m], the middle of a D405's sweet spot."""
-PART_OF_ARC = np.pi
-"""Half a turn round the objects, on the arm's side."""
 
 
 class TimedCamera:
@@ -52,31 +31,14 @@ class TimedCamera:
 
     def __init__(self, lab: SimulatedLab, rendered: int) -> None:
         """Take over the camera of a lab."""
-        self._camera = lab.camera
-        self._rendered = rendered
+        self._camera, self._rendered = lab.camera, rendered
         self._frames: list[Frame] = []
         self._count = 0
         self.cpu_s = 0.0
 
-    @property
-    def name(self) -> str:
-        """The lab camera's."""
-        return self._camera.name
-
-    @property
-    def intrinsics(self) -> CameraIntrinsics:
-        """The lab camera's."""
-        return self._camera.intrinsics
-
-    @property
-    def depth_unit_m(self) -> float:
-        """The lab camera's."""
-        return self._camera.depth_unit_m
-
-    @property
-    def description(self) -> dict[str, Any]:
-        """The lab camera's."""
-        return self._camera.description
+    def __getattr__(self, name: str) -> Any:
+        """Return what the lab's camera says of itself."""
+        return getattr(self._camera, name)
 
     def grab(self) -> Frame:
         """Return a frame with a new time stamp, its cost noted."""
@@ -87,9 +49,6 @@ class TimedCamera:
         self._count += 1
         self.cpu_s += time.process_time() - began
         return frame
-
-    def recover(self) -> None:
-        """Do nothing: it never stops."""
 
 
 class TimedStore(SessionStore):
@@ -104,31 +63,18 @@ class TimedStore(SessionStore):
         TimedStore.cpu_s += time.process_time() - began
 
 
-def arc_plan(views: int, center: np.ndarray[Any, Any]) -> CapturePlan:
-    """Return a plan of views on an arc round the objects, all of one arm branch."""
-    config, joints = PlanConfig(), list[np.ndarray[Any, Any]]()
-    home = HOME + np.pi * np.eye(6)[0]
-    for turn in np.linspace(0.0, PART_OF_ARC, views):
-        eye = center + RADIUS_M * np.array([-0.3 * np.sin(turn), 0.3 * np.cos(turn), 0.95])
-        z = (center - eye) / np.linalg.norm(center - eye)
-        y = UR5.forward(home)[:3, 1]
-        x = np.cross(y, z) / np.linalg.norm(np.cross(y, z))
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
-        q = UR5.inverse(T @ se3.invert(d405_mount().T_ee_cam))
-        joints.append(q[np.argmin(np.abs(q - (joints[-1] if joints else home)).max(-1))])
-    return CapturePlan(
-        kind="hemisphere", chain=UR5, mount=d405_mount(),
-        cell=config.work_cell(center, "hemisphere"), home=home, joints=np.stack(joints),
-        center_world=center, vias=(), reference_view=views // 2, config=config,
-    )  # fmt: skip
+def first_views(views: int) -> CapturePlan:
+    """Return the beginning of the shipped plan."""
+    plan = resolve_plan("shipped:ur5_d405_hemisphere_256")
+    vias = tuple((k, via) for k, via in plan.vias if k < views)
+    return replace(plan, joints=plan.joints[:views], vias=vias, reference_view=0)
 
 
-def run(views: int, rendered: int, folder: Path) -> dict[str, float]:
+def captured(views: int, rendered: int, folder: Path) -> dict[str, float]:
     """Capture once and return the figures."""
     lab = SimulatedLab(LabConfig(seed=0))
     lab.place_objects()
-    plan = arc_plan(views, lab.scene_center)
+    plan = first_views(views)
     camera = TimedCamera(lab, rendered)
     session = CaptureSession(
         name="benchmark", intrinsics=camera.intrinsics, views=(), depth_unit_m=camera.depth_unit_m
@@ -155,27 +101,8 @@ def run(views: int, rendered: int, folder: Path) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    """Run, print, write JSON."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--views", type=int, default=256)
-    parser.add_argument("--quick", action="store_true", help="24 views, 6 rendered")
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
-    views, rendered = (24, 6) if args.quick else (args.views, RENDERED)
+def speed(arguments: argparse.Namespace) -> Found:
+    """Return the figures of one capture."""
+    views, rendered = (24, 6) if arguments.quick else (VIEWS, RENDERED)
     with tempfile.TemporaryDirectory() as folder:
-        figures = run(views, rendered, Path(folder) / "session")
-    for key, value in figures.items():
-        print(f"{key:32} {value:10.3f}")
-    if args.json:
-        result = {
-            "figures": figures,
-            "views": views,
-            "machine": platform.platform(),
-            "versions": {p: version(p) for p in PACKAGES},
-        }
-        args.json.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+        return Found(figures=captured(views, rendered, Path(folder) / "session"))

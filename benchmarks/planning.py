@@ -1,6 +1,6 @@
 """Benchmark of capture plans: 256 views with a UR5 and a D405, from nothing.
 
-    uv run python benchmarks/planning.py [--quick] [--json FILE] [--seeds N]
+    uv run python benchmarks/planning.py [--quick] [--json FILE] [--seed N]
 
 Figures (keys of the JSON's "figures"), the worst of the seeds:
   views_valid         views that are reached to 1e-6, inside the limits, free, not singular, of 256
@@ -23,20 +23,17 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 import argparse
-import json
-import platform
 import time
-from importlib.metadata import version
-from pathlib import Path
 
 import numpy as np
+from figures import Figure, Found, Goal, run
 from numpy.typing import NDArray
 
 from realsim.errors import MissingLibraryError
 from realsim_capture_plans import PlanConfig, d405_mount
 from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.collision.model import interpolate
-from realsim_capture_plans.planning.advise import advise
+from realsim_capture_plans.planning.advise import DISTANCES_M, advise
 from realsim_capture_plans.planning.make import hemisphere_plan
 from realsim_capture_plans.planning.ordering import move_seconds
 from realsim_capture_plans.planning.record import CapturePlan
@@ -48,7 +45,7 @@ from realsim_capture_plans.planning.viewpoints import (
 )
 
 Array = NDArray[np.float64]
-VIEWS = 256
+VIEWS, QUICK_VIEWS, SEEDS = 256, 48, 3
 AIM_HEIGHT_M = 0.05
 RING_DEG = 10.0
 """Width of the rings of the greedy order: its best of 5, 7.5, 10 and 15 degrees."""
@@ -127,17 +124,11 @@ def mesh_figures(plan: CapturePlan, configurations: int) -> dict[str, float]:
     return {"colliding_edges": float(len(hits))} | shares
 
 
-def best_center(config: PlanConfig) -> tuple[float, float, float]:
-    """Return the placement that `realsim plan --advise` puts first, at the table's height."""
-    places = advise(UR5, d405_mount(), config, VIEWS, AIM_HEIGHT_M, lifts_m=(0.0,))
-    return places[0].center
-
-
-def run(seed: int, center: tuple[float, float, float], quick: bool) -> dict[str, float]:
+def planned(seed: int, center: tuple[float, float, float], quick: bool) -> dict[str, float]:
     """Make one plan and return its figures."""
-    config = PlanConfig()
+    config, views = PlanConfig(), QUICK_VIEWS if quick else VIEWS
     began = time.process_time()
-    plan = hemisphere_plan(VIEWS, center, d405_mount(), config, np.random.default_rng(seed))
+    plan = hemisphere_plan(views, center, d405_mount(), config, np.random.default_rng(seed))
     cpu_s = time.process_time() - began
     seconds = plan.metrics["seconds"]
     return {
@@ -150,37 +141,44 @@ def run(seed: int, center: tuple[float, float, float], quick: bool) -> dict[str,
         "tour_over_greedy": seconds / greedy_ring_seconds(plan, free_radius=False),
         "tour_over_greedy_free": seconds / greedy_ring_seconds(plan, free_radius=True),
         "plan_cpu_s": cpu_s,
-        **mesh_figures(plan, 2000 if quick else 20000),
+        **mesh_figures(plan, 1000 if quick else 20000),
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="one seed, fewer configurations")
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--json", type=Path)
-    args = parser.parse_args()
+def plans(arguments: argparse.Namespace) -> Found:
+    """Return the worst of some plans at the best placement."""
     # Compiles what numba compiles.
     hemisphere_plan(8, (0.35, 0.0, 0.05), d405_mount(), PlanConfig(), np.random.default_rng(0))
     began = time.process_time()
-    center = best_center(PlanConfig())
-    advice_cpu_s = time.process_time() - began
-    runs = [run(seed, center, args.quick) for seed in range(1 if args.quick else args.seeds)]
-    figures = {key: (min if key == "views_valid" else max)(r[key] for r in runs) for key in runs[0]}
-    figures["advice_cpu_s"] = advice_cpu_s
-    figures["center_x_m"] = center[0]
-    for key, value in figures.items():
-        print(f"{key:<22} {value:.4g}")
-    if args.json:
-        document = {
-            "benchmark": "planning",
-            "figures": figures,
-            "runs": runs,
-            "python": platform.python_version(),
-            "versions": {name: version(name) for name in ("numpy", "eaik", "coal", "pin", "ompl")},
-        }
-        args.json.write_text(json.dumps(document, indent=2))
+    distances = (0.35, 0.40) if arguments.quick else DISTANCES_M
+    center = advise(
+        UR5, d405_mount(), PlanConfig(), VIEWS, AIM_HEIGHT_M, distances_m=distances, lifts_m=(0.0,)
+    )[0].center
+    advice = {"advice_cpu_s": time.process_time() - began, "center_x_m": center[0]}
+    seeds = range(arguments.seed, arguments.seed + (1 if arguments.quick else SEEDS))
+    runs = [planned(seed, center, arguments.quick) for seed in seeds]
+    worst = {key: (min if key == "views_valid" else max)(r[key] for r in runs) for key in runs[0]}
+    return Found(figures=worst | advice, cases={"runs": runs})
 
+
+FIGURES = {
+    "views_valid": Figure(unit="", goal=Goal(low=VIEWS)),
+    "hole_reachable_deg": Figure(unit="deg", goal=Goal(high=6)),
+    "hole_cap_deg": Figure(unit="deg", goal=Goal(high=8)),
+    "tour_s": Figure(unit="s"),
+    "tour_over_bound": Figure(unit=""),
+    "tour_over_held_karp": Figure(unit="", goal=Goal(high=1.22)),
+    "tour_over_greedy": Figure(unit=""),
+    "tour_over_greedy_free": Figure(unit=""),
+    "plan_cpu_s": Figure(unit="s"),
+    "colliding_edges": Figure(unit="", goal=Goal(low=0, high=0)),
+    "unsafe_share": Figure(unit="", goal=Goal(low=0, high=0)),
+    "overcautious_share": Figure(unit=""),
+    "mesh_colliding_share": Figure(unit=""),
+    "advice_cpu_s": Figure(unit="s"),
+    "center_x_m": Figure(unit="m"),
+}
 
 if __name__ == "__main__":
-    main()
+    packages = ("numpy", "eaik", "coal", "pin", "ompl")
+    run("planning", __doc__, packages, FIGURES, {"plans": plans})

@@ -59,7 +59,7 @@ def factory_arm(seed: int, tilt_rad: float = 2e-4, shift_m: float = 3e-4) -> DhC
     return chain_through(axes)
 
 
-ARMS = [factory_arm(seed) for seed in range(8)]
+ARMS = [factory_arm(seed) for seed in range(3)]
 
 
 def test_these_are_calibrations_like_the_controllers() -> None:
@@ -86,7 +86,7 @@ def test_links_stay_within_millimetres_of_the_nominal_ones(arm: DhChain) -> None
         assert np.linalg.norm((arm.link_frames(q) - nominal)[:, 2, :3, 3], axis=-1).min() > 0.9
 
 
-@pytest.mark.parametrize("arm", ARMS[:4], ids=[f"arm {k}" for k in range(4)])
+@pytest.mark.parametrize("arm", ARMS[:1], ids=["arm 0"])
 def test_clearances_change_by_millimetres_only(arm: DhChain) -> None:
     q = np.random.default_rng(3).uniform(-np.pi, np.pi, (200, 6))
     mount = d405_mount()

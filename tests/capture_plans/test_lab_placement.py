@@ -64,7 +64,7 @@ def test_what_rolls_for_ever_is_refused():
         stable_rests(Mesh(vertices=square, faces=faces), 4e-4)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_layouts_touch_the_table_stay_in_the_disc_and_keep_their_distance(seed):
     models, Ts = scene(seed)
     outlines = []

@@ -252,8 +252,9 @@ def test_tables_that_cannot_be_right_are_named(
     assert "p.csv" in str(caught.value)
 
 
-@pytest.mark.parametrize("mark", [",", ";", "\t"])
-@pytest.mark.parametrize("form", ["q{j}_deg", "Q{j} [deg]", "q{j}(degrees)"])
+@pytest.mark.parametrize(
+    ("mark", "form"), [(",", "q{j}_deg"), (";", "Q{j} [deg]"), ("\t", "q{j}(degrees)")]
+)
 def test_tables_of_other_programs_are_read(mark: str, form: str, tmp_path: Path) -> None:
     header = mark.join(["name", *(form.format(j=j) for j in range(1, 7)), "via"])
     rows = [mark.join(["a", *row.split(","), str(k % 2)]) for k, row in enumerate(ROWS_DEG)]

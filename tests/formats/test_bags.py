@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from realsim.errors import RealsimError
-from realsim.formats.bags import BagChoice, BagSource, open_bag
+from realsim.formats.bags import BagChoice, open_bag
 from realsim.formats.bags import scan as stored_module
 from realsim.formats.bags.tf_tree import T_BASE_BASELINK
 from realsim.formats.frame_source import FrameSource
@@ -52,14 +52,6 @@ def test_every_container_gives_back_what_was_sent(tmp_path: Path, kind: str) -> 
     assert any("millimetres" in note for note in source.notes)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_frames_from_a_number_on_are_the_tail_of_all(tmp_path: Path, kind: str) -> None:
-    source = open_bag(recorded(tmp_path, kind).path)
-    names = [f.name for f in source.frames()]
-    for start in (0, 1, 4, 5, 6, 9):
-        assert [f.name for f in source.frames(start)] == names[start:]
-
-
 def test_one_storage_file_is_a_recording_too(tmp_path: Path) -> None:
     for kind, ending in (("sqlite3", ".db3"), ("mcap", ".mcap")):
         folder = tmp_path / kind
@@ -72,19 +64,11 @@ def test_one_storage_file_is_a_recording_too(tmp_path: Path) -> None:
         assert any("metadata.yaml" in note for note in source.notes)
 
 
-def test_two_readings_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
-    source = open_bag(recorded(tmp_path, "mcap").path)
-    for a, b in zip(source.frames(), source.frames(), strict=True):
-        assert a.name == b.name
-        assert np.array_equal(a.rgb, b.rgb)
-
-
 # --- joining --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_frames_without_partner_are_left_out_and_named(tmp_path: Path, kind: str) -> None:
-    sent = recorded(tmp_path, kind, n=8, without=(0, 3, 4))
+def test_frames_without_partner_are_left_out_and_named(tmp_path: Path) -> None:
+    sent = recorded(tmp_path, "mcap", n=8, without=(0, 3, 4))
     source = open_bag(sent.path)
     kept = [1, 2, 5, 6, 7]
     for k, frame in zip(kept, source.frames(), strict=True):
@@ -207,11 +191,10 @@ def test_two_arms_are_listed(tmp_path: Path) -> None:
     assert "no joint left_" in refused(path, BagChoice(joint_prefix="left_"))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_tf_gives_the_flange_in_the_controllers_base(tmp_path: Path, kind: str) -> None:
+def test_tf_gives_the_flange_in_the_controllers_base(tmp_path: Path) -> None:
     rng = np.random.default_rng(4)
     q = rng.uniform(-1, 1, (6, 6))
-    sent = recorded(tmp_path, kind, joints=False, write=False)
+    sent = recorded(tmp_path, "ros1", joints=False, write=False)
     T_base_ee = UR5.forward(q)
     T_ee_cam = se3.random_transform(rng)
     for k in range(6):
@@ -303,7 +286,7 @@ def cuts(data: bytes) -> Iterator[bytes]:
     rng = np.random.default_rng(6)
     for share in (0.02, 0.3, 0.7, 0.95, 0.999):
         yield data[: int(share * len(data))]
-    for _ in range(25):
+    for _ in range(8):
         damaged = bytearray(data)
         for _ in range(int(rng.integers(1, 40))):
             damaged[int(rng.integers(len(data)))] ^= int(rng.integers(1, 256))
@@ -340,20 +323,3 @@ def test_a_bag_without_index_says_reindex(tmp_path: Path) -> None:
 
 
 # --- all the way ----------------------------------------------------------------------------------
-
-
-def test_an_import_is_a_session_with_the_same_pixels(tmp_path: Path) -> None:
-    from realsim.app.console import Console
-    from realsim.app.importing.session import import_session
-    from realsim.store.session_store import SessionStore
-
-    sent = recorded(tmp_path, "mcap", without=(2,))
-    source: BagSource = open_bag(sent.path)
-    import_session(source, tmp_path / "session", Console(quiet=True))
-    store = SessionStore.open(tmp_path / "session")
-    assert len(store.session.views) == 5
-    for view, k in zip(store.session.views, (0, 1, 3, 4, 5), strict=True):
-        assert np.array_equal(store.rgb(view.index), sent.rgb[k])
-        assert np.allclose(store.depth_m(view.index), sent.depth[k] * 1e-3)
-        assert view.joints is not None
-        assert np.allclose(view.joints, sent.q[k])

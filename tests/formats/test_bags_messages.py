@@ -115,11 +115,6 @@ def test_a_message_cut_anywhere_is_an_error_of_its_own(form: str) -> None:
                 read(whole[:length], is_ros2)
 
 
-def test_other_encapsulations_are_refused() -> None:
-    with pytest.raises(InputError, match="plain CDR"):
-        wire.header_of(b"\x00\x07\x00\x00" + bytes(40), True)
-
-
 # --- pixels ---------------------------------------------------------------------------------------
 
 

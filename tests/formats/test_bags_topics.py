@@ -5,7 +5,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from realsim.errors import UnitError
 from realsim.formats.bags import BagChoice, open_bag
 from realsim.records import CameraIntrinsics
 from written_bags import COLOUR, DEPTH, HEIGHT, WIDTH, Bag, pictures, recorded, refused, stamp
@@ -101,14 +100,3 @@ def test_bad_cameras_are_refused(tmp_path: Path) -> None:
     bag.info("/camera/color/camera_info", model="equidistant", d=(0.1, 0.1, 0.0, 0.0))
     bag.image(COLOUR, pictures(0)[0], "rgb8", stamp(0))
     assert "fisheye" in refused(bag.write())
-
-
-def test_an_unknown_depth_unit_is_asked_for(tmp_path: Path) -> None:
-    bag = Bag(tmp_path)
-    bag.info("/camera/color/camera_info")
-    bag.info("/camera/aligned_depth_to_color/camera_info")
-    bag.image(COLOUR, pictures(0)[0], "rgb8", stamp(0))
-    bag.image(DEPTH, pictures(0)[1], "mono16", stamp(0))
-    path = bag.write()
-    assert "depth_unit_m=0.001" in refused(path, kind=UnitError)
-    assert open_bag(path, BagChoice(depth_unit_m=1e-4 * 5)).depth_unit_m == 5e-4

@@ -21,7 +21,6 @@ from realsim.formats.colmap.writing import (
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.session_scene import open_session_scene
 from realsim.geometry import se3
-from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
 from tests.support.synthetic_scenes import DEPTH_UNIT_M, captured_session
 
@@ -94,17 +93,6 @@ def test_the_binary_files_are_those_that_colmap_writes(tmp_path):
         assert (tmp_path / "theirs" / name).read_bytes() == data, name
 
 
-@pytest.mark.parametrize("lens", sorted(LENSES))
-def test_their_camera_projects_as_ours(lens):
-    row, ours = camera_row(1, camera(lens)), camera(lens)
-    theirs = pycolmap.Camera(
-        camera_id=1, model=row.model, width=641, height=481, params=list(row.params)
-    )
-    points = np.random.default_rng(0).uniform([-0.3, -0.3, 0.9], [0.3, 0.3, 1.5], (50, 3))
-    expected = np.array([theirs.img_from_cam(p) for p in points])
-    np.testing.assert_allclose(project(ours, points) + 0.5, expected, atol=1e-9)
-
-
 @pytest.mark.parametrize("encoding", ["binary", "text"])
 def test_a_session_comes_back(store, tmp_path, encoding):
     said = written(store, tmp_path / "out", encoding=encoding, depth=True)
@@ -172,14 +160,6 @@ def test_an_interrupted_export_is_finished_as_if_it_had_not_been(store, tmp_path
     ):
         other = tmp_path / "cut" / path.relative_to(tmp_path / "whole")
         assert other.read_bytes() == path.read_bytes()
-
-
-def test_referenced_images_stay_where_they_are(store, tmp_path):
-    said = written(store, tmp_path / "out", images="referenced", points=0)
-    assert not (tmp_path / "out/images").exists()
-    assert any(str((store.folder / "rgb").resolve()) in n for n in said.notes)
-    source = open_colmap(tmp_path / "out", images_folder=store.folder / "rgb")
-    assert len(source) == 3
 
 
 def test_what_cannot_be_written_is_said(store, tmp_path):

@@ -1,6 +1,5 @@
 """LeRobot v3.0 data sets: what is written is what was given, wherever it was interrupted."""
 
-import itertools
 import json
 import sys
 from collections.abc import Iterator
@@ -169,19 +168,6 @@ def test_a_frame_at_its_episodes_time_is_its_picture(folder):
                 assert psnr > 35, (k, s, camera, psnr)
 
 
-def test_every_second_frame_can_be_jumped_to(folder):
-    import av
-
-    path = folder / layout.VIDEO_PATH.format(
-        video_key="observation.images.a", chunk_index=0, file_index=0
-    )
-    with av.open(str(path)) as file:
-        keys = [f.key_frame for f in file.decode(video=0)]
-    edges = np.cumsum([0, *LENGTHS[:2]])
-    for first, end in itertools.pairwise(edges):
-        assert all(keys[first:end:2])
-
-
 def test_statistics_are_those_of_all_steps_and_pictures(folder):
     stats = json.loads((folder / layout.STATS).read_text())
     for key in ("observation.state", "action"):
@@ -226,12 +212,7 @@ def test_tasks_are_a_pandas_frame_indexed_by_their_words(folder):
     assert json.loads(table.schema.metadata[b"pandas"])["index_columns"] == ["task"]
 
 
-def test_the_same_episodes_give_the_same_bytes(folder, tmp_path):
-    write(tmp_path / "again")
-    assert files_of(tmp_path / "again") == files_of(folder)
-
-
-@pytest.mark.parametrize("dies_at", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("dies_at", [0, 3])
 def test_a_killed_export_goes_on_at_the_next_episode(folder, tmp_path, dies_at):
     first = Source(dies_at=dies_at)
     with pytest.raises(KeyboardInterrupt):
