@@ -1,6 +1,7 @@
 """Clicks: what each keeps the server busy for, and how soon the first bytes of its answer come."""
 
 import time
+from argparse import Namespace
 from collections.abc import Callable
 
 import numpy as np
@@ -20,10 +21,10 @@ ROUNDS, QUICK_ROUNDS = 5, 2
 Click = tuple[str, Callable[[], None]]
 
 
-def clicks(seed: int, quick: bool) -> Found:
+def clicks(arguments: Namespace) -> Found:
     """Click everything a reviewer clicks, with 100,000 points and 256 frustums in the page."""
     found = Found()
-    with serving(scene_of(seed), USUAL) as server:
+    with serving(scene_of(arguments), USUAL) as server:
         browser = Browser.open(server.url)
         browser.until_scene(QUIET_S)
         _idle_share(server)
@@ -31,7 +32,7 @@ def clicks(seed: int, quick: bool) -> Found:
         first = [_measured(server, browser, click, 0.0)[1] for _, click in _kinds(browser)]
         idle = _idle_share(server)
         rows: dict[str, list[tuple[float, float]]] = {}
-        for _ in range(QUICK_ROUNDS if quick else ROUNDS):
+        for _ in range(QUICK_ROUNDS if arguments.quick else ROUNDS):
             for name, click in _kinds(browser):
                 rows.setdefault(name, []).append(_measured(server, browser, click, idle))
         browser.close()

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from argparse import Namespace
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from figures import Found
 from review_client import Browser
 from review_session import GRASPS, make_session
 
-VIEWS = 256
+VIEWS, QUICK_VIEWS = 256, 96
 SERVER = Path(__file__).with_name("review_server.py")
 USUAL = ("0.002", "400000", "100000")
 """Voxel [m], points kept and points shown of the settings as they are delivered."""
@@ -88,24 +89,21 @@ def clean_up() -> None:
         shutil.rmtree(_scratch(), ignore_errors=True)
 
 
-@lru_cache(maxsize=1)
-def scene_of(seed: int) -> Path:
-    """Return the session that all parts look at, and see that the byte code is there."""
+def scene_of(arguments: Namespace) -> Path:
+    """Return the session that all parts look at."""
     given = os.environ.get("REVIEW_SESSION")
     if given:
         return Path(given)
     folder = _scratch() / "session"
-    make_session(folder, VIEWS, seed)
+    if not folder.exists():
+        make_session(folder, QUICK_VIEWS if arguments.quick else VIEWS, arguments.seed)
     return folder
 
 
 def _environment() -> dict[str, str]:
     # As installed: byte code is kept. Where the caller forbids it every start would compile.
     kept = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-    return kept | {
-        "PYTHONPYCACHEPREFIX": str(_scratch() / "bytecode"),
-        "NUMBA_CACHE_DIR": str(_scratch() / "compiled"),
-    }
+    return kept | {"PYTHONPYCACHEPREFIX": str(_scratch() / "bytecode")}
 
 
 @lru_cache(maxsize=1)
@@ -165,29 +163,28 @@ def _opened(
     return cost, browser
 
 
-def opening(seed: int, quick: bool) -> Found:
+def opening(arguments: Namespace) -> Found:
     """Open the scene of 256 views as delivered, cold and warm."""
     found = Found()
-    folder = scene_of(seed)
+    folder = scene_of(arguments)
     limit = _decoding_s(folder)
     _forget(folder)
     cold, browser = _opened(folder, USUAL)
     frustums = len(browser.of_type("CameraFrustumMessage"))
     found.add("open_cpu_s", cold.cpu_s, f"{frustums} frustums with photographs, nothing kept")
     found.add("open_over_decoding", cold.cpu_s / limit,
-              f"all {VIEWS} photographs decoded once by OpenCV: {limit:.1f} CPU s")  # fmt: skip
+              f"all photographs decoded once by OpenCV: {limit:.1f} CPU s")  # fmt: skip
     found.add("open_mb", cold.peak_mb, "greatest resident size of the server's process")
     found.add("open_sent_mb", browser.received_bytes / 1e6)
-    if not quick:
-        warm, _ = _opened(folder, USUAL)
-        found.add("open_warm_cpu_s", warm.cpu_s, "photographs kept by an earlier opening")
+    warm, _ = _opened(folder, USUAL)
+    found.add("open_warm_cpu_s", warm.cpu_s, "photographs kept by an earlier opening")
     return found
 
 
-def big_scene(seed: int, quick: bool) -> Found:
+def big_scene(arguments: Namespace) -> Found:
     """Open 2 million points, 256 frustums and 5,000 grasps, photographs kept or not as they are."""
     found = Found()
-    folder = scene_of(seed)
+    folder = scene_of(arguments)
 
     def all_grasps(browser: Browser) -> None:
         of = browser.control("Of", "GuiDropdownMessage")

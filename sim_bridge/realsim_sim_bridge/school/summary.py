@@ -217,8 +217,6 @@ class SchoolSummary:
 
     def to_rows(self) -> list[tuple[str, str, str]]:
         """Return (property, here, in the paper) as texts, in the paper's order."""
-        from realsim_sim_bridge.school.summary import rows_of
-
         return rows_of(self)
 
     def to_json(self) -> dict[str, Any]:
