@@ -1,6 +1,6 @@
 """How often does the convention test name the fault that was put into the data?
 
-    uv run python benchmarks/calibration_faults.py [--trials N] [--seed S] [--json FILE]
+Imported by `calibration.py` (`--part faults`).
 
 Every trial draws a session (a hemisphere of 12 to 40 views with roll over a chessboard, camera in
 the hand or fixed; robot 0.5 mm and 0.5 mrad, board poses 0.3 mm and 0.1 deg per axis), puts one
@@ -9,17 +9,9 @@ and where rotations were misread when the repaired rotations are the true ones. 
 hold few views, small motions and a bad robot too: anything but "none" is a false alarm.
 """
 
-import os
-
-for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
-
-import argparse
-import json
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -391,26 +383,3 @@ def faults_named_share(
         table.append((name, hits, trials - hits, dict(said)))
     total = sum(hits + misses for _, hits, misses, _ in table)
     return sum(hits for _, hits, _, _ in table) / total, table
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--trials", type=int, default=10, help="sessions per fault")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path, help="write the figures here as well")
-    arguments = parser.parse_args()
-    share, table = faults_named_share(arguments.trials, arguments.seed)
-    print(f"{'fault':32s} named missed  said")
-    for name, hits, misses, said in table:
-        text = ", ".join(f"{k} {v}" for k, v in said.items())
-        print(f"{name:32s} {hits:5d} {misses:6d}  {text}")
-    print(f"named: {100 * share:.1f} %")
-    if arguments.json:
-        rows = [dict(zip(("fault", "named", "missed", "said"), r, strict=True)) for r in table]
-        figures = {"faults_named_share": share}
-        arguments.json.write_text(json.dumps({"figures": figures, "table": rows}, indent=1))
-
-
-if __name__ == "__main__":
-    main()

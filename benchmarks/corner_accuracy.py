@@ -30,16 +30,15 @@ from numpy.typing import NDArray
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics
 from realsim.records.targets import (
-    TAG_CELLS,
     CharucoBoard,
     Chessboard,
     CircleGrid,
     TagBoard,
     Target,
 )
-from realsim_calibration.detect.charuco import charuco_markers, white_parity
 from realsim_calibration.detect.find import find_target
 from realsim_calibration.detect.markers import FAMILY_DICTIONARY, predefined_dictionary
+from realsim_calibration.sheets import target_image
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -63,8 +62,6 @@ LENS = CameraIntrinsics(
     width=1280, height=720, fx=900.0, fy=900.0, cx=639.5, cy=359.5,
     distortion=np.array([-0.25, 0.08, 0.001, -0.001]),
 )  # fmt: skip
-DOT_SHARE = 0.25
-"""Radius of a dot in distances to its nearest neighbour; a large origin dot has 1.6 times it."""
 KINDS: dict[str, Target] = {
     "tags 36h11": TagBoard(rows=4, columns=6, tag_size_m=0.04, gap_m=0.01),
     "tags 36h10": TagBoard(rows=4, columns=6, tag_size_m=0.04, gap_m=0.01, family="tag36h10"),
@@ -85,87 +82,12 @@ KINDS: dict[str, Target] = {
 """What is measured."""
 
 
-def _ink_squares(target: Target) -> Array:
-    """Return the black squares (n, 3): x, y of the corner and the edge [m]."""
-    if isinstance(target, TagBoard) and target.corner_squares:
-        g, pitch = target.gap_m, target.tag_size_m + target.gap_m
-        r, c = np.divmod(np.arange((target.rows + 1) * (target.columns + 1)), target.columns + 1)
-        return np.stack([c * pitch - g, r * pitch - g, np.full(len(r), g)], -1)
-    if isinstance(target, Chessboard):
-        rows, columns, start = target.rows + 1, target.columns + 1, -target.square_m
-        parity = 1
-    elif isinstance(target, CharucoBoard):
-        rows, columns, start, parity = target.rows, target.columns, 0.0, white_parity(target)
-    else:
-        return np.zeros((0, 3))
-    r, c = np.divmod(np.arange(rows * columns), columns)
-    black = (r + c) % 2 != parity
-    x, y = c[black] * target.square_m + start, r[black] * target.square_m + start
-    return np.stack([x, y, np.full(len(x), target.square_m)], -1)
-
-
-def _ink_markers(target: Target) -> list[tuple[Array, NDArray[np.bool_]]]:
-    """Return (top left corner [m] and edge [m] (3,), ink (cells, cells)) of every marker."""
-    if isinstance(target, TagBoard):
-        name, cells = FAMILY_DICTIONARY[target.family], TAG_CELLS[target.family]
-        ids, corners, edge = target.ids, target.corners_board[:, 0, :2], target.tag_size_m
-    elif isinstance(target, CharucoBoard):
-        corners, edge = charuco_markers(target)[:, 0], target.marker_m
-        name, ids = target.dictionary, np.arange(len(corners))
-        cells = int(predefined_dictionary(name).markerSize) + 2
-    else:
-        return []
-    from cv2 import aruco
-
-    dictionary = predefined_dictionary(name)
-    return [
-        (np.array([*p, edge]), aruco.generateImageMarker(dictionary, int(i), cells) == 0)
-        for p, i in zip(corners, ids, strict=True)
-    ]
-
-
-def _ink_dots(target: Target) -> Array:
-    """Return the dots (n, 3): middle and radius [m]."""
-    if not isinstance(target, CircleGrid):
-        return np.zeros((0, 3))
-    near = target.pitch_m * (np.sqrt(2.0) if target.asymmetric else 1.0)
-    radius = np.full(target.rows * target.columns, DOT_SHARE * near)
-    if target.large_origin:
-        radius[0] *= 1.6
-    return np.concatenate([target.points_board[:, :2], radius[:, None]], -1)
-
-
 def draw_target(target: Target) -> tuple[Image, Array]:
     """Return the printed page and the map (3, 3) from board metres to its pixels."""
-    points = target.points_board[:, :2]
-    edge = getattr(target, "square_m", 0.0) + MARGIN_M
-    low, high = points.min(0) - edge, points.max(0) + edge
-    width, height = np.ceil((high - low) / TEXTURE_M).astype(int)
-    page = np.full((height, width), PAPER, np.uint8)
-    # Page pixel k covers low + [k, k + 1] * TEXTURE_M.
-    x = low[0] + (np.arange(width) + 0.5) * TEXTURE_M
-    y = low[1] + (np.arange(height) + 0.5) * TEXTURE_M
-    for left, top, size in _ink_squares(target):
-        page[_span(y, top, size), _span(x, left, size)] = INK
-    for (left, top, size), ink in _ink_markers(target):
-        rows, columns = _span(y, top, size), _span(x, left, size)
-        r = np.clip((y[rows] - top) / size * len(ink), 0, len(ink) - 1).astype(int)
-        c = np.clip((x[columns] - left) / size * len(ink), 0, len(ink) - 1).astype(int)
-        page[rows, columns] = np.where(ink[np.ix_(r, c)], INK, PAPER)
-    for u, v, radius in _ink_dots(target):
-        rows, columns = _span(y, v - radius, 2 * radius), _span(x, u - radius, 2 * radius)
-        inside = (x[columns] - u) ** 2 + (y[rows, None] - v) ** 2 < radius**2
-        page[rows, columns] = np.where(inside, INK, page[rows, columns])
     per_m = 1.0 / TEXTURE_M
-    return page, np.array(
-        [[per_m, 0, -low[0] * per_m - 0.5], [0, per_m, -low[1] * per_m - 0.5], [0, 0, 1]]
-    )
-
-
-def _span(centres: Array, start: float, size: float) -> slice:
-    """Return the pixels whose middles lie in [start, start + size)."""
-    a, b = np.searchsorted(centres, [start, start + size])
-    return slice(int(a), int(b))
+    white, (u, v) = target_image(target, per_m, MARGIN_M)
+    page = np.rint(INK + (PAPER - INK) * (white / 255.0)).astype(np.uint8)
+    return page, np.array([[per_m, 0, u], [0, per_m, v], [0, 0, 1]])
 
 
 def photograph(

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, HandEye, Target
 from realsim_calibration.checks import given_camera_check, hand_eye_checks
-from realsim_calibration.fit.joint_solve import Setup, ViewCorners, camera_of
+from realsim_calibration.fit.joint_solve import Setup, ViewCorners
 from realsim_calibration.fit.robust_fit import Solution, solve
-from realsim_calibration.fit.view_system import SHARED
+from realsim_calibration.fit.view_system import SHARED, camera_record
 from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
 from realsim_calibration.screening import (
     Candidate,
@@ -109,7 +109,7 @@ def _report(
     lens = solution.covariance[12:24, 12:24].copy()
     held = ~problem.free[:12]
     lens[held], lens[:, held] = 0.0, 0.0
-    used = solution.views
+    used, size = solution.views, (intrinsics0.width, intrinsics0.height)
     report = HandEyeReport(
         mode=config.mode,
         target=target,
@@ -119,8 +119,8 @@ def _report(
         X_alone=solution.alone.X,
         X_alone_covariance=solution.alone_covariance[:6, :6],
         Z_alone=solution.alone.Z,
-        intrinsics_alone=camera_of(solution.alone.camera, intrinsics0),
-        intrinsics=camera_of(state.camera, intrinsics0),
+        intrinsics_alone=camera_record(solution.alone.camera, size),
+        intrinsics=camera_record(state.camera, size),
         intrinsics_covariance=lens,
         board=shape,
         robot_map=solution.robot_map,

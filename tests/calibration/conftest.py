@@ -20,34 +20,13 @@ from realsim.records import (
 )
 from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
 from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
+from realsim_calibration.sheets import target_image
 from realsim_calibration.views import BoardView, TargetDetection
 
 Array = NDArray[np.float64]
 MODULES = 8  # of a 36h11 tag with its black border
 TEXTURE = 12  # texture pixels per module
 SUPER = 8  # supersampling of the renderer
-
-
-def board_texture(board: TagBoard, margin_m: float) -> tuple[NDArray[np.uint8], float, float]:
-    """Return the printed board, texture pixels per metre, and the margin [texture px]."""
-    from cv2 import aruco
-
-    tag_px = MODULES * TEXTURE
-    per_m = tag_px / board.tag_size_m
-    pitch = (board.tag_size_m + board.gap_m) * per_m
-    assert abs(pitch - round(pitch)) < 1e-6, "choose a gap that is a whole number of texture px"
-    margin = round(margin_m * per_m)
-    w, h = (round(v * per_m) + 2 * margin for v in board.size_m)
-    texture = np.full((h, w), 255, np.uint8)
-    dictionary = aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11)
-    for k, tag in enumerate(board.ids):
-        r, c = divmod(k, board.columns)
-        y, x = margin + r * round(pitch), margin + c * round(pitch)
-        marker = aruco.generateImageMarker(dictionary, int(tag), MODULES)
-        texture[y : y + tag_px, x : x + tag_px] = np.kron(
-            marker, np.ones((TEXTURE, TEXTURE), np.uint8)
-        )
-    return texture, per_m, margin
 
 
 def render_homography(
@@ -61,13 +40,13 @@ def render_homography(
     """Return a photograph (no distortion): 8x supersampled, box filter, blur, noise."""
     import cv2
 
-    texture, per_m, margin = board_texture(board, 0.02)
-    # texture pixel k covers [k - 0.5, k + 0.5]; the board's origin is the tag's outer corner.
-    to_texture = np.array([[per_m, 0, margin - 0.5], [0, per_m, margin - 0.5], [0, 0, 1]])
+    per_m = MODULES * TEXTURE / board.tag_size_m
+    texture, (u, v) = target_image(board, per_m, 0.02)
+    to_texture = np.array([[per_m, 0, u], [0, per_m, v], [0, 0, 1]])
     H = intrinsics.K @ T_cam_board[:3, [0, 1, 3]] @ np.linalg.inv(to_texture)
     half = (SUPER - 1) / 2
     big = np.array([[SUPER, 0, half], [0, SUPER, half], [0, 0, 1.0]]) @ H
-    paper = np.where(texture > 0, 215, 30).astype(np.uint8)
+    paper = np.where(texture > 127, 215, 30).astype(np.uint8)
     size = (intrinsics.width * SUPER, intrinsics.height * SUPER)
     fine = cv2.warpPerspective(paper, big, size, flags=cv2.INTER_NEAREST, borderValue=120.0)
     image = cv2.resize(

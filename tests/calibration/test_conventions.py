@@ -10,12 +10,10 @@ import pytest
 
 from realsim.errors import InputError, NotRigidError
 from realsim.geometry import se3
-from realsim.records import Chessboard, CircleGrid
 from realsim_calibration.faults.diagnose import diagnose, prove_reading
 from realsim_calibration.faults.frame_fit import fit_frames, hand_side, mismatch
 from realsim_calibration.faults.gates import GateConfig, frame_gate
 from realsim_calibration.faults.half_turns import half_turn, synchronise_half_turns
-from realsim_calibration.faults.hypotheses import size_name
 from realsim_calibration.faults.motion_check import check_motion
 from realsim_calibration.faults.rotation_readings import (
     four_number_conventions,
@@ -55,15 +53,6 @@ def test_every_form_of_a_rotation_decodes_to_it(name):
     R = se3.random_rotation(np.random.default_rng(0), 200)
     forms = CONVENTIONS[name].decode(CONVENTIONS[name].encode(R))
     assert np.abs(forms - R[:, None]).max() < 1e-9
-
-
-def test_conventions_differ_from_each_other():
-    R = se3.random_rotation(np.random.default_rng(1), 5)
-    three = three_number_conventions()
-    numbers = three[0].encode(R)[:, 0]
-    decoded = np.array([c.decode(numbers) for c in three])
-    apart = np.abs(decoded[:, None] - decoded[None]).max((2, 3, 4))
-    assert apart[~np.eye(len(three), dtype=bool)].min() > 1e-3
 
 
 def test_euler_conventions_are_those_of_the_textbook():
@@ -161,13 +150,6 @@ def test_clean_sessions_raise_no_alarm(kind, seeds):
         assert d.repaired_base_ee is None and not d.views
 
 
-@pytest.mark.slow
-def test_the_benchmark_counts_and_tells():
-    share, table = faults.faults_named_share(1, 5)
-    assert share == sum(row[1] for row in table) / len(table) > 0.9
-    assert all(sum(row[3].values()) == 1 for row in table)
-
-
 def test_a_repair_makes_the_data_clean():
     rng = np.random.default_rng(8)
     clean = faults.draw_session(rng, views=(12, 16))
@@ -212,23 +194,6 @@ def test_a_small_print_error_is_a_scale_and_not_a_fault():
     C[:, :3, 3] *= 1.02
     d = faults.ask(replace(s, C=C, nominal=None))
     assert d.fault == "none" and d.length_ratio == pytest.approx(1 / 1.02, rel=0.01)
-
-
-def test_the_size_of_the_board_is_said():
-    assert size_name(Chessboard(rows=6, columns=9, square_m=0.035), 0.5444) == (
-        "the square is 19.05 mm, not 35 mm"
-    )
-    assert "pitch" in size_name(CircleGrid(rows=7, columns=7, pitch_m=0.02), 1.2)
-
-
-def test_views_are_called_by_their_names():
-    rng = np.random.default_rng(9)
-    s = faults.swapped(faults.draw_session(rng), rng)
-    names = [f"{k:03d}.png" for k in range(len(s.T))]
-    mode = "eye_in_hand" if s.eye_in_hand else "eye_to_hand"
-    d = diagnose(s.T, s.C, labels=names, target=faults.BOARD, mode=mode)
-    assert d.labels == tuple(names[k] for k in s.views)
-    assert all(name in d.sentence for name in d.labels)
 
 
 def test_a_hand_that_does_not_turn_cannot_be_tested():

@@ -32,7 +32,7 @@ from realsim_calibration.exports import (
     ros,
     write_exports,
 )
-from realsim_calibration.exports.frames import number, roll_pitch_yaw
+from realsim_calibration.exports.frames import roll_pitch_yaw
 from realsim_calibration.results import HandEyeReport, Mode
 
 Array = NDArray[np.float64]
@@ -183,14 +183,6 @@ def test_opencv_reads_the_same_transform(full_record: Maker, X: Array, mode: Mod
     assert same(storage.getNode("camera_matrix").mat(), report.intrinsics_alone.K)
     assert same(storage.getNode("dist_coeffs").mat()[0], report.intrinsics_alone.distortion)
     assert int(storage.getNode("image_width").real()) == 1280
-
-
-@given(st.floats(allow_nan=False, allow_infinity=False))
-def test_numbers_are_floats_of_yaml_too(value: float) -> None:
-    text = number(value)
-    assert float(text) == value
-    read = yaml11(f"v: {text}\n")["v"]
-    assert type(read) is float and read == value
 
 
 # --- known answers ------------------------------------------------------------------------------

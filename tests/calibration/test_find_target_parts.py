@@ -9,7 +9,7 @@ from realsim_calibration.detect.homography import (
     fit_homography,
     seen_from_front,
 )
-from realsim_calibration.detect.lattice import grow_lattice, grow_lattices, lay_pattern
+from realsim_calibration.detect.lattice import grow_lattices, lay_pattern
 from realsim_calibration.detect.saddles import grid_arms, refine_saddles
 
 K = np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]])
@@ -80,7 +80,7 @@ def test_a_lattice_grows_among_specks_and_takes_the_pattern_in_any_basis():
     nodes = pattern @ np.array([[21.0, 9.0], [-4.0, 12.0]]) + [200, 150]
     specks = rng.uniform(0, 130, size=(60, 2))
     points = np.concatenate([specks, nodes])[rng.permutation(102)]
-    lattice = grow_lattice(points)
+    lattice = grow_lattices(points)[0]
     assert len(lattice) == 42
     laid = lay_pattern(lattice, pattern, [])
     ways = {tuple(np.rint(points[one.points[0]]).astype(int)) for one in laid}

@@ -67,19 +67,6 @@ def test_more_robot_noise_claims_more(simulate):
     assert loud.held_out_px > 4 * quiet.held_out_px
 
 
-def test_a_known_board_and_camera_leave_less_doubt(simulate):
-    sim = simulate(2)
-    held = JointConfig(scale_sd=0.0, distortion_sd=(0.0,) * 8)
-    free = calibrate(sim)
-    fixed = calibrate_hand_eye(
-        sim.views, sim.board, sim.intrinsics, HandEyeConfig(joint=replace(held, focal_sd=1e-5))
-    )
-    assert fixed.sigma_mm < free.sigma_mm
-    assert np.array_equal(fixed.intrinsics.distortion, sim.intrinsics.distortion)
-    assert not fixed.intrinsics_sd[4:].any() and free.intrinsics_sd[4] > 0
-    assert not free.intrinsics_sd[9:].any()
-
-
 def test_order_of_views_does_not_matter(simulate):
     sim = simulate(3, views=12)
     order = np.random.default_rng(0).permutation(12)
@@ -149,15 +136,6 @@ def test_inverted_poses_are_told(simulate):
     sim = simulate(9)
     views = [replace(v, T_base_ee=se3.invert(v.T_base_ee)) for v in sim.views]
     with pytest.raises(InputError, match=r"hand poses are inverted.*as given: \d+\.\d+ deg"):
-        calibrate(sim, views)
-
-
-def test_a_shifted_pairing_is_told(simulate):
-    sim = simulate(9)
-    views = [
-        replace(v, T_base_ee=sim.views[(k + 1) % 24].T_base_ee) for k, v in enumerate(sim.views)
-    ]
-    with pytest.raises(InputError, match="images 0 to 23 fit the pose 1 earlier"):
         calibrate(sim, views)
 
 

@@ -9,7 +9,6 @@ from realsim.geometry import se3
 from realsim_calibration import CLOSED_FORMS
 from realsim_calibration.faults.gates import (
     GateConfig,
-    frame_gate,
     rotation_mismatch_deg,
     screw_ratio,
 )
@@ -79,9 +78,3 @@ def test_closed_forms_are_more_consistent_than_the_stored_result(data):
 
 def _is_rigid(T):
     return np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() < 1e-5
-
-
-def test_the_rotation_outlier_is_named(data):
-    A, C = data
-    _, dropped, _ = frame_gate(A, C, [None] * len(A), np.zeros(3), GateConfig())
-    assert list(dropped) == [7]

@@ -20,7 +20,6 @@ from realsim_calibration.fit.robot_error import (
     arm_basis,
     map_basis,
     map_record,
-    pose_features,
 )
 from realsim_calibration.fit.view_system import (
     camera_from_board,
@@ -177,21 +176,6 @@ def test_the_linear_model_has_the_marginals_and_the_optimum_of_all_unknowns(simu
         assert np.allclose(fit.step[29:], state.weights, atol=0.02)
 
 
-def test_leaving_a_view_out_by_woodbury_is_a_solve_without_it(simulate):
-    sim = simulate(6, views=9)
-    problem, state, _ = fitted(sim)
-    model = LinearModel(problem, state, problem.ones())
-    fit = model.fit(None, RATIO, 0.3, rounds=0)
-    for n in (0, 4):
-        U = fit.view_rows[n]
-        rest = fit.information - U.T @ U
-        whole = fit.information @ fit.step
-        robot = model._robot_rows(None, RATIO)[n] / 0.3
-        r = np.concatenate([robot[:, -1], model.rest[n, :, -1] / 0.3])
-        alone = np.linalg.solve(rest, whole + U.T @ r)
-        assert np.allclose(alone, fit.step + fit.away[n], rtol=1e-6, atol=1e-9)
-
-
 def test_the_likelihood_finds_the_robots_share(simulate):
     from realsim_calibration.fit.noise_scale import estimate_ratio
 
@@ -258,9 +242,3 @@ def test_records_of_maps_give_the_basis_errors():
     assert isinstance(record, ArmErrorMap)
     exact = se3.log(se3.invert(held) @ record.corrected(held, joints))
     assert np.allclose(exact, basis.columns @ w, atol=3e-6)  # the basis is linear, the arm is not
-
-
-def test_features_are_centred_and_of_unit_spread():
-    phi, _, spread = pose_features(se3.random_transform(np.random.default_rng(0), 30, 0.3))
-    assert np.abs(phi.mean(0)).max() < 1e-12
-    assert np.isclose(np.mean(phi[:, :3] ** 2), 1.0) and spread > 0.01

@@ -13,8 +13,6 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics, Check, Chessboard, TagBoard, Target
-from realsim_calibration.fit.joint_solve import JointConfig
-from realsim_calibration.hand_eye import calibrate_hand_eye_report
 from realsim_calibration.planning.live_calibration import (
     LiveCalibration,
     LiveConfig,
@@ -25,17 +23,13 @@ from realsim_calibration.planning.next_view import (
     NextViewConfig,
     board_geometry,
     choose_next_views,
-    covariance_floor,
     displacement_metric,
-    estimated_terms,
     predicted_boards,
     rank_next_views,
-    view_information,
 )
 from realsim_calibration.planning.view_needs import roll_range_deg, second_turn_deg
 from realsim_calibration.planning.view_proposals import ViewLimits, describe_move, propose_views
 from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
-from realsim_calibration.screening import HandEyeConfig
 from realsim_calibration.views import BoardView, TargetDetection
 
 Array = NDArray[np.float64]
@@ -201,24 +195,6 @@ def few() -> HandEyeReport:
 # ---- laws
 
 
-@pytest.mark.parametrize("mode", ["eye_in_hand", "eye_to_hand"])
-def test_information_is_that_of_numerical_least_squares(mode: str) -> None:
-    """Analytic Jacobians and the eliminated robot error against differences and full weights."""
-    rng = np.random.default_rng(1)
-    boards = [board_at(rng.uniform(5, 40), rng.uniform(0, 360), rng.uniform(0, 360), DISTANCE)
-              for _ in range(5)]  # fmt: skip
-    hands = np.stack([hand_at(T, mode) for T in boards])
-    report = report_of(hands, mode=mode)
-    np.testing.assert_allclose(predicted_boards(report, hands), boards, atol=1e-6)
-    added = view_information(report, hands)
-    for A, H in zip(hands, added, strict=True):
-        _, _, expected = linear(A.tobytes(), mode)
-        unit = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-        np.testing.assert_allclose(H[np.ix_(FREE, FREE)] / unit, expected / unit, atol=2e-4)
-        held = np.setdiff1d(np.arange(29), FREE)
-        assert not H[held].any() and not H[:, held].any()
-
-
 def test_the_prediction_is_what_the_added_view_really_brings(few: HandEyeReport) -> None:
     rng = np.random.default_rng(2)
     hands = np.stack([v.T_base_ee for v in few.views])
@@ -281,79 +257,6 @@ def test_a_pose_that_sees_nothing_leaves_what_the_report_says(
     assert not row.visible and row.gain == pytest.approx(0.0, abs=1e-12)
     assert row.sigma_mm == pytest.approx(report.sigma_mm, rel=1e-9)
     assert row.sigma_deg == pytest.approx(report.sigma_deg, rel=1e-9)
-
-
-@pytest.mark.parametrize("case", CASES)
-def test_no_views_lower_the_covariance_below_the_floor(
-    case: str, reports: dict[str, HandEyeReport]
-) -> None:
-    """Views that are nearly free of noise: what is left is the floor."""
-    report, rng = reports[case], np.random.default_rng(4)
-    F, M = covariance_floor(report), displacement_metric(report, NextViewConfig())
-    np.testing.assert_allclose(F, F.T, atol=1e-9 * np.abs(F).max())
-    assert np.linalg.eigvalsh(F)[0] >= -1e-12 * np.trace(F)
-    # the floor is a part of what the report says: no more than it in any direction
-    unit = 1 / np.sqrt(np.diag(report.X_covariance))
-    rest = (report.X_covariance - F) * np.outer(unit, unit)
-    assert np.linalg.eigvalsh(rest)[0] > -1e-9
-    least = 1e3 * np.sqrt(np.trace(M @ F))
-    least_mm = 1e3 * np.sqrt(np.linalg.eigvalsh(F[3:, 3:])[-1])
-    plan = plan_of(report, rng, 12)
-    for v in choose_next_views(report, plan, 6):
-        assert v.rms_mm >= least and v.sigma_mm >= least_mm
-    sharp = choose_next_views(replace(report, sigma_px=1e-4 * report.sigma_px), plan, 6)[-1]
-    now = 1e3 * np.sqrt(np.trace(M @ report.X_covariance))
-    assert least <= sharp.rms_mm <= least + 0.02 * now
-
-
-def test_the_floor_is_what_the_covariance_has_beyond_the_information(
-    reports: dict[str, HandEyeReport],
-) -> None:
-    few, rng = reports["as informed"], np.random.default_rng(5)
-    N = few.X_covariance  # this file's least squares: the inverse information
-    scale = np.sqrt(np.outer(np.diag(N), np.diag(N)))
-    np.testing.assert_allclose(covariance_floor(few) / scale, 0.0, atol=1e-9)
-    np.testing.assert_allclose(covariance_floor(reports["better"]) / scale, 0.0, atol=1e-9)
-    half = rng.normal(size=(6, 2)) * np.sqrt(np.diag(N))[:, None]
-    hidden = half @ half.T  # an error of the arm along two directions
-    more = replace(few, X_covariance=N + hidden)
-    np.testing.assert_allclose(covariance_floor(more) / scale, hidden / scale, atol=1e-9)
-    # and is added to what the view makes of the rest
-    (A,) = random_hands(rng, 1)[None]
-    after = report_of(np.concatenate([np.stack([v.T_base_ee for v in few.views]), A]))
-    M = displacement_metric(few, NextViewConfig())
-    (row,) = rank_next_views(more, A)
-    expected = 1e3 * np.sqrt(np.trace(M @ (after.X_covariance + hidden)))
-    assert row.rms_mm == pytest.approx(expected, rel=0.01)
-
-
-def test_an_arm_that_hides_errors_is_promised_no_more_than_it_can_give(
-    reports: dict[str, HandEyeReport],
-) -> None:
-    """The fit knows the arm's own errors as parameters: most of sigma is theirs."""
-    report = reports["arm with joints"]
-    M = displacement_metric(report, NextViewConfig())
-    floor, now = (np.trace(M @ C) for C in (covariance_floor(report), report.X_covariance))
-    assert 0.5 * now < floor < now
-    assert rank_next_views(report, propose_views(report))[0].gain < 0.1
-
-
-@pytest.mark.parametrize("ratio", [0.05, 1.0, 3.0])
-def test_information_is_that_of_the_solver(ratio: float, simulate: Any) -> None:
-    """The views' information, summed over the captured poses, is the joint fit's own."""
-    s = simulate(0, views=12, robot=(0.0, 0.0))
-    views = [v for v in s.views if len(v.detection) == len(s.board.points_board)]
-    config = HandEyeConfig(robot_map=False, joint=JointConfig(robot_ratio=ratio))
-    report = calibrate_hand_eye_report(views, s.board, s.intrinsics0, config)
-    hands = np.stack([v.T_base_ee for v in report.used])
-    total = view_information(report, hands, NextViewConfig(border_px=0.0)).sum(0)
-    free = estimated_terms(report)
-    np.testing.assert_array_equal(np.flatnonzero(~free), [21, 22, 23])  # k4 k5 k6 are held
-    assert not total[~free].any() and not total[:, ~free].any()
-    # X and Z have no prior; camera and board have one in their own block
-    unit = np.sqrt(np.outer(np.diag(total), np.diag(total)))[:12, free]
-    expected = report.information[:12, free] / unit
-    np.testing.assert_allclose(total[:12, free] / unit, expected, atol=0.01)
 
 
 def test_ranking_does_not_depend_on_the_base_frame(few: HandEyeReport) -> None:
@@ -621,18 +524,6 @@ def test_live_does_not_end_while_roll_or_the_second_tilt_lack(lacking: str) -> N
     assert f"Before the end: {told}" in almost.sentence
     assert twice.stop and f"Still missing: {told}" in twice.sentence
     assert told in almost.needs[0]
-
-
-def test_live_ends_without_a_word_where_nothing_lacks() -> None:
-    easy = LiveConfig(sigma_mm=100.0, sigma_deg=10.0, min_views_to_stop=6, limits=FEW_PROPOSALS)
-    live = running(easy)
-    rng, states = np.random.default_rng(18), list[str]()
-    for k in range(14):
-        T = board_at(rng.uniform(20, 40), 100.0 * k, 70.0 * k, 0.25 + 0.02 * k)
-        shift = se3.from_translation([0.07 * (k % 3 - 1), 0.04 * (k // 3 % 3 - 1), 0.0])
-        status = live.add(live_view(k, hand_at(shift @ T)))
-        states.append(status.state)
-    assert status.stop and not status.needs and "issing" not in status.sentence
 
 
 def test_live_does_not_stop_while_the_error_on_unseen_views_moves() -> None:

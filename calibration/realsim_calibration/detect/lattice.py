@@ -52,12 +52,6 @@ def grow_lattices(points: Array, sizes: Array | None = None) -> list[dict[Node, 
     return sorted(found, key=len, reverse=True)
 
 
-def grow_lattice(points: Array) -> dict[Node, int]:
-    """Return the largest lattice in points (n, 2), empty where there is none."""
-    lattices = grow_lattices(points)
-    return lattices[0] if lattices else {}
-
-
 def _basis(points: Array, seed: int) -> tuple[Array, Array] | None:
     """Return the two shortest steps that lead from the seed to a point on either side."""
     offset = points - points[seed]

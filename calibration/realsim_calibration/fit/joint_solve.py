@@ -133,14 +133,6 @@ class JointState:
         )
 
 
-def camera_of(vector: Array, like: CameraIntrinsics) -> CameraIntrinsics:
-    """Return the camera of a (12,) vector with the image size of another."""
-    fx, fy, cx, cy = (float(v) for v in vector[:4])
-    return CameraIntrinsics(
-        width=like.width, height=like.height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=vector[4:]
-    )
-
-
 class JointProblem:
     """The least-squares fit of one setup; sigma, lambda and weights are arguments."""
 

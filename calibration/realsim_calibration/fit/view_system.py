@@ -40,6 +40,15 @@ def camera_vector(intrinsics: CameraIntrinsics) -> Array:
     return np.concatenate([[i.fx, i.fy, i.cx, i.cy], i.distortion])
 
 
+def camera_record(camera: Array, image_size: tuple[int, int]) -> CameraIntrinsics:
+    """Return the camera of a (12,) vector for images of (width, height) [px]."""
+    fx, fy, cx, cy = (float(v) for v in camera[:4])
+    width, height = image_size
+    return CameraIntrinsics(
+        width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=camera[4:]
+    )
+
+
 @njit
 def _product(A: Any, B: Any) -> Any:
     """Return the product of two rigid transforms."""

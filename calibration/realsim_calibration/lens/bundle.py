@@ -22,7 +22,7 @@ from realsim.compiled import njit
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.camera import projection_jacobian
-from realsim.records import CameraIntrinsics
+from realsim_calibration.fit.view_system import camera_record
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -254,15 +254,6 @@ def shaped_points(flat: Array, board: Array, half_extent_m: float) -> Array:
     u, v = flat[:, 0] / half_extent_m, flat[:, 1] / half_extent_m
     lift = half_extent_m * (board[1] * u * u + board[2] * u * v + board[3] * v * v)
     return np.stack([flat[:, 0], flat[:, 1] * (1 + board[0]), lift], -1)
-
-
-def camera_record(camera: Array, image_size: tuple[int, int]) -> CameraIntrinsics:
-    """Return the record of a camera vector (12,)."""
-    fx, fy, cx, cy = (float(v) for v in camera[:4])
-    width, height = image_size
-    return CameraIntrinsics(
-        width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy, distortion=camera[4:]
-    )
 
 
 def points_in_camera(state: State, obs: Observations) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import DegenerateError
+from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.lens.bundle import (
     GLOBALS,
     Fit,
@@ -18,7 +19,6 @@ from realsim_calibration.lens.bundle import (
     SolverConfig,
     State,
     adjust,
-    camera_record,
     points_in_camera,
     refine_poses,
 )

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.lens.bundle import (
     CAMERA_TERMS,
     Fit,
@@ -14,7 +15,6 @@ from realsim_calibration.lens.bundle import (
     SolverConfig,
     State,
     adjust,
-    camera_record,
 )
 from realsim_calibration.lens.checks import CheckLimits
 from realsim_calibration.lens.covariance import GlobalCovariance, border_effect, global_covariance

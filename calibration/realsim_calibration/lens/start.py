@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.geometry.camera import undistort
+from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.lens.bundle import (
     BOARD_TERMS,
     CAMERA_TERMS,
@@ -24,7 +25,6 @@ from realsim_calibration.lens.bundle import (
     Observations,
     SolverConfig,
     State,
-    camera_record,
     points_in_camera,
     refine_poses,
 )

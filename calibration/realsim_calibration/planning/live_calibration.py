@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from realsim.errors import DegenerateError, InputError, RealsimError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Target
-from realsim_calibration.depth.board import planar_poses
+from realsim_calibration.fit.board_pose import planar_poses
 from realsim_calibration.planning.next_view import (
     NextView,
     NextViewConfig,
@@ -181,7 +181,7 @@ class LiveCalibration:
         if found < self.config.min_points:
             return f"view {view.label} is of no use: {found} points of the target were found"
         drawn = view.detection.points(self.target)
-        poses = planar_poses(drawn, drawn, view.detection.uv, self.intrinsics0)
+        poses = planar_poses(drawn, view.detection.uv, self.intrinsics0)
         if not poses:
             return f"view {view.label} is of no use: no pose of the target fits its points"
         for other in self._seen:

@@ -188,30 +188,11 @@ def choose_next_views(
     return tuple(chosen)
 
 
-def view_information(
-    report: HandEyeReport, Ts_planned: ArrayLike, config: NextViewConfig | None = None
-) -> Array:
-    """Return what each planned view would add to `report.information` (n, 29, 29).
-
-    Held terms have zero rows; a pose that does not see the target adds nothing.
-    """
-    return _Planned(report, Ts_planned, config or NextViewConfig()).informations
-
-
 def estimated_terms(report: HandEyeReport) -> Mask:
     """Return which of the 29 terms (29,) are estimated; the information of held ones is filling."""
     camera = np.diag(report.intrinsics_covariance) > 0
     known = np.concatenate([np.ones(12, bool), camera, report.board.sd > 0])
     return np.asarray(known & (np.diag(report.information) > 0), np.bool_)
-
-
-def covariance_floor(report: HandEyeReport) -> Array:
-    """Return F (6, 6), the part of X's covariance that no further view lowers [rad, m].
-
-    Raises:
-        DegenerateError: the calibration so far does not determine X.
-    """
-    return _Knowledge(report, np.eye(6)).floor
 
 
 def displacement_metric(report: HandEyeReport, config: NextViewConfig) -> Array:

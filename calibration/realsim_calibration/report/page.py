@@ -1,35 +1,27 @@
 """The calibration's page: verdict, checks, figures and pictures in one self-contained HTML file."""
 
-import base64
-import html
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim import __version__
+from realsim.pages import Cell, Page, plots
 from realsim.records import ArmErrorMap, CameraIntrinsics, Check
 from realsim.store import atomic
 from realsim_calibration.depth.bias import DepthBiasReport
 from realsim_calibration.lens.models import TERM_NAMES
 from realsim_calibration.lens.report import IntrinsicsReport, LensView
 from realsim_calibration.report import (
-    coverage_plots,
-    lens_plots,
     model_plots,
-    residual_plots,
     scene_3d,
     style,
+    view_plots,
 )
-from realsim_calibration.report.residual_plots import Images
 from realsim_calibration.report.summary import (
     NOT_KNOWN,
-    Judgement,
     accuracy_rows,
     amount,
     carrier,
@@ -39,55 +31,31 @@ from realsim_calibration.report.summary import (
     viewpoint,
     worst_first,
 )
+from realsim_calibration.report.view_plots import Images
 from realsim_calibration.results import HandEyeReport, ViewReport
 
 PAGE_NAME = "calibration_report.html"
-WIDE_COLUMNS = 4
-"""Columns from which a table takes the whole width of the page."""
+VERDICT_KIND = {"good": "good", "warn": "warn", "bad": "bad", "unknown": "off"}
 
 
 @dataclass(eq=False, kw_only=True, slots=True)
-class _Page:
-    """The body while it is being written, and the files that lie beside it."""
+class _Page(Page):
+    """The page while it is being written, and the pictures that lie beside it."""
 
     folder: Path
-    parts: list[str] = field(default_factory=list[str])
     written: list[Path] = field(default_factory=list[Path])
 
-    def section(self, title: str, text: str = "") -> None:
-        """Begin a section."""
-        self.parts.append(f"<h2>{html.escape(title)}</h2>")
-        if text:
-            self.parts.append(f"<p>{html.escape(text)}</p>")
-
-    def table(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-        """Add a table; the four verdicts become coloured words."""
-        self.parts.append(table_html(header, rows))
-
-    def picture(self, name: str, draw: Callable[[], Any], caption: str) -> None:
+    def plot(self, name: str, draw: Callable[[], Any], caption: str) -> None:
         """Draw a picture, write it beside the page and put it into the page itself."""
         with style.paper_style():
-            data = style.png_bytes(draw())
+            data = plots.png(draw())
         atomic.write_bytes(self.folder / name, data)
         self.written.append(self.folder / name)
-        text = html.escape(caption)
-        self.parts.append(
-            f'<figure><img src="data:image/png;base64,{base64.b64encode(data).decode()}" '
-            f'alt="{text}"><figcaption>{text}</figcaption></figure>'
-        )
+        self.picture(data, caption)
 
-
-def table_html(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table, every cell escaped; a first cell that is a verdict is coloured."""
-    head = "".join(f"<th>{html.escape(h)}</th>" for h in header)
-    lines: list[str] = []
-    for row in rows:
-        cells = [html.escape(str(c)) for c in row]
-        if row and row[0] in style.VERDICT_COLORS:
-            cells[0] = f'<span class="pill {row[0]}">{row[0]}</span>'
-        lines.append("<tr>" + "".join(f"<td>{c}</td>" for c in cells) + "</tr>")
-    wide = ' class="wide"' if len(header) >= WIDE_COLUMNS else ""
-    return f"<table{wide}><tr>{head}</tr>{''.join(lines)}</table>"
+    def checks(self, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+        """Add a table whose first column is a verdict."""
+        self.table(header, [[Cell(r[0], kind=VERDICT_KIND[r[0]]), *r[1:]] for r in rows])
 
 
 def write_calibration_report(
@@ -109,7 +77,7 @@ def write_calibration_report(
         depth_report: the depth camera's bias.
         title: heading of the page.
     """
-    page = _Page(folder=Path(folder))
+    page = _Page(folder=Path(folder), title=title, about=_about(report))
     _verdict_section(page, report)
     _place_section(page, report)
     _residual_section(page, report, images)
@@ -119,14 +87,7 @@ def write_calibration_report(
     if depth_report is not None:
         _depth_section(page, depth_report)
     _appendix(page, report)
-    template = Template((files("realsim_calibration.report") / "page_template.html").read_text())
-    text = template.substitute(
-        title=html.escape(title),
-        about=html.escape(_about(report)),
-        body="\n".join(page.parts),
-        version=__version__,
-    )
-    atomic.write_text(page.folder / PAGE_NAME, text)
+    atomic.write_bytes(page.folder / PAGE_NAME, page.encode())
     return [page.folder / PAGE_NAME, *page.written]
 
 
@@ -140,36 +101,21 @@ def _about(report: HandEyeReport) -> str:
     )
 
 
-def _banner(judgement: Judgement) -> str:
-    """Return the verdict as a coloured box."""
-    return (
-        f'<div class="verdict {judgement.verdict}"><strong>{html.escape(judgement.headline)}'
-        f"</strong>{html.escape(judgement.sentence)}</div>"
-    )
-
-
 def _verdict_section(page: _Page, report: HandEyeReport) -> None:
     """Say in one sentence what to do, then show figures and checks."""
-    page.parts.append(_banner(verdict(report)))
-    cards = [
+    judged = verdict(report)
+    page.verdict(VERDICT_KIND[judged.verdict], judged.headline, judged.sentence)
+    page.cards([
         (amount(report.held_out_px, 2, "px"), "error of unseen views"),
         (amount(report.held_out_mm, 2, "mm"), "the same, as a distance"),
         (amount(report.held_out_deg, 3, "deg"), "the same, as an angle"),
         (f"± {amount(report.sigma_mm, 2, 'mm')}", "camera's place, 1 sigma"),
         (f"± {amount(report.sigma_deg, 3, 'deg')}", "camera's rotation, 1 sigma"),
         (f"{len(report.used)} / {len(report.views)}", "views used / given"),
-    ]
-    page.parts.append(
-        '<div class="cards">'
-        + "".join(
-            f'<div class="card"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>'
-            for value, what in cards
-        )
-        + "</div>"
-    )
+    ])  # fmt: skip
     page.section("Checks", "" if report.checks else "Nothing was checked.")
     if report.checks:
-        page.table(["", "check", "value", "what was found", "what to do"], check_rows(report))
+        page.checks(["", "check", "value", "what was found", "what to do"], check_rows(report))
 
 
 def _place_section(page: _Page, report: HandEyeReport) -> None:
@@ -177,14 +123,14 @@ def _place_section(page: _Page, report: HandEyeReport) -> None:
     what = carrier(report)
     page.section("Where the camera is")
     hang = ", which hangs with its z axis down" if report.mode == "eye_in_hand" else ""
-    page.picture(
+    page.plot(
         "camera_place.png", lambda: scene_3d.plot_camera_in_hand(report),
         f"Camera and {what} frame{hang}. Axes: x red, y green, z blue. Grey: a flange of 63 mm for "
         "scale. Yellow: the field of view. If this is not how the camera is mounted, a convention "
         "is wrong.",
     )  # fmt: skip
     page.table(["figure", "value"], [*pose_rows(report), *accuracy_rows(report)])
-    page.picture(
+    page.plot(
         "scene.png", lambda: scene_3d.plot_scene(report),
         "Robot base, target and cameras, coloured by the error of the unseen view; dotted red: "
         "dropped views. The dot is the target's first point.",
@@ -198,20 +144,20 @@ def _residual_section(page: _Page, report: HandEyeReport, images: Images | None)
         "All errors are measured through the robot's own pose. An unseen view was predicted by a "
         "calibration that did not know it.",
     )
-    page.picture(
-        "views.png", lambda: residual_plots.plot_views(report),
+    page.plot(
+        "views.png", lambda: view_plots.plot_views(report),
         "If unseen errors are much larger than seen ones, there are too few views. One long bar is "
         "a view to look at; many alike are the robot's accuracy.",
     )  # fmt: skip
-    page.picture(
-        "residuals.png", lambda: residual_plots.plot_residuals(report),
+    page.plot(
+        "residuals.png", lambda: view_plots.plot_residuals(report),
         "Predicted minus detected. Arrows of neighbours that agree on the right mean that the lens "
         "or the target's shape is not described well; the robot's errors average out there.",
     )  # fmt: skip
-    worst = residual_plots.worst_views(report)
+    worst = view_plots.worst_views(report)
     if worst:
-        page.picture(
-            "worst_views.png", lambda: residual_plots.plot_worst_views(report, worst, images),
+        page.plot(
+            "worst_views.png", lambda: view_plots.plot_worst_views(report, worst, images),
             "The views that the others predict worst. Arrows that all agree: the robot's pose. "
             "Arrows in disorder: blur, a wrong detection, or a bent target.",
         )  # fmt: skip
@@ -220,8 +166,8 @@ def _residual_section(page: _Page, report: HandEyeReport, images: Images | None)
 def _coverage_section(page: _Page, report: HandEyeReport) -> None:
     """Show what the calibration has seen."""
     page.section("What the calibration has seen")
-    page.picture(
-        "coverage.png", lambda: coverage_plots.plot_coverage(report),
+    page.plot(
+        "coverage.png", lambda: view_plots.plot_coverage(report),
         "Left: hatched parts of the image never held a point; the lens is a guess there. Middle: "
         "from where the target was seen, its normal in the centre. Right: how the camera was "
         "rolled about its optical axis; a full circle is best.",
@@ -231,13 +177,13 @@ def _coverage_section(page: _Page, report: HandEyeReport) -> None:
 def _model_section(page: _Page, report: HandEyeReport) -> None:
     """Show the estimates beside X: covariance, target, robot, choices."""
     page.section("How sure it is")
-    page.picture(
+    page.plot(
         "uncertainty.png", lambda: model_plots.plot_uncertainty(report),
         "Covariance of the camera's place along the camera's own axes. A long ellipse names the "
         "direction that further views should fix.",
     )  # fmt: skip
     page.section("The target's shape")
-    page.picture(
+    page.plot(
         "board.png", lambda: model_plots.plot_board(report),
         "Left: how far the print lies out of its plane. Right: its size against the drawing. Both "
         "are measured against the robot's own metre.",
@@ -253,7 +199,7 @@ def _model_section(page: _Page, report: HandEyeReport) -> None:
             if isinstance(report.robot_map, ArmErrorMap)
             else "The map is an interpolator: outside of the calibrated region it is a guess."
         )
-        page.picture("robot.png", lambda: model_plots.plot_robot(report), text)
+        page.plot("robot.png", lambda: model_plots.plot_robot(report), text)
     if report.joint_offsets is not None:
         rows = [
             [f"joint {k + 1}", f"{v:+.3f} ± {amount(sd, 3)}" if np.isfinite(v) else NOT_KNOWN]
@@ -261,7 +207,7 @@ def _model_section(page: _Page, report: HandEyeReport) -> None:
         ]
         page.table(["zero offset", "[deg]"], rows)
     if report.map_scores or report.starts:
-        page.picture(
+        page.plot(
             "choices.png", lambda: model_plots.plot_choices(report),
             "Left: how well every error map predicts unseen views; dark: the chosen one, which "
             "must be better by more than its noise. "
@@ -280,9 +226,9 @@ def _lens_section(
         "outline of all points, beyond it the lens is a guess; hatched: pixels that no ray reaches "
         "with these numbers. Cross: the principal point."
     )
-    page.picture(
+    page.plot(
         "lens.png",
-        lambda: lens_plots.plot_lens(
+        lambda: model_plots.plot_lens(
             report.intrinsics, report.intrinsics_covariance, _points(report.used)
         ),
         f"As calibrated together with the hand-eye. {caption}",
@@ -293,9 +239,9 @@ def _lens_section(
         r = intrinsics_report
         header.append("lens alone")
         columns.append(_lens_column(r.intrinsics, r.covariance))
-        page.picture(
+        page.plot(
             "lens_alone.png",
-            lambda: lens_plots.plot_lens(r.intrinsics, r.open_covariance, _points(r.used)),
+            lambda: model_plots.plot_lens(r.intrinsics, r.open_covariance, _points(r.used)),
             f"The lens alone, {r.model}. {caption}",
         )
     page.table(header, [[name, *[c[k] for c in columns]] for k, name in enumerate(TERM_NAMES)])
@@ -303,12 +249,7 @@ def _lens_section(
         page.table(
             ["lens model", "unseen [px]", "seen [px]", ""],
             [
-                [
-                    m.model,
-                    amount(m.held_out_px, 3),
-                    amount(m.seen_px, 3),
-                    "chosen" if m.chosen else "",
-                ]
+                [m.model, amount(m.held_out_px, 3), amount(m.seen_px, 3), "chosen" * m.chosen]
                 for m in intrinsics_report.held_out
             ],
         )
@@ -335,7 +276,7 @@ def _checks_of(page: _Page, checks: Sequence[Check], title: str) -> None:
     if not checks:
         return
     page.section(title)
-    page.table(
+    page.checks(
         ["", "check", "what was found", "what to do"],
         [[c.verdict, c.name, c.sentence, c.advice] for c in worst_first(checks)],
     )
@@ -344,8 +285,8 @@ def _checks_of(page: _Page, checks: Sequence[Check], title: str) -> None:
 def _depth_section(page: _Page, report: DepthBiasReport) -> None:
     """Show the depth camera's bias."""
     page.section("The depth camera's bias")
-    page.picture(
-        "depth_bias.png", lambda: lens_plots.plot_depth_bias(report),
+    page.plot(
+        "depth_bias.png", lambda: model_plots.plot_depth_bias(report),
         "Left: measured minus true depth of every view and the fitted curve. Right: what is left "
         "where each view is corrected by the others.",
     )  # fmt: skip
@@ -353,35 +294,25 @@ def _depth_section(page: _Page, report: DepthBiasReport) -> None:
 
 
 def _appendix(page: _Page, report: HandEyeReport) -> None:
-    """Add every view and the matrices, folded away."""
+    """Add every view and the matrices."""
     rows: list[list[str]] = []
     for v in report.views:
         p = viewpoint(report, v)
-        figures = [
-            amount(v.seen_px, 3),
-            amount(v.unseen_px, 3),
-            amount(v.unseen_mm, 3),
-            amount(v.unseen_deg, 4),
-        ]
-        rows.append(
-            [
-                v.label,
-                str(v.index),
-                str(len(v.uv)),
-                *(figures if v.used else ["-"] * 4),
-                amount(1e3 * p.distance_m, 0),
-                amount(p.tilt_deg, 0),
-                amount(p.roll_deg, 0),
-                "" if v.used else f"dropped: {v.reason}",
-            ]
-        )
+        errors = [(v.seen_px, 3), (v.unseen_px, 3), (v.unseen_mm, 3), (v.unseen_deg, 4)]
+        place = [(1e3 * p.distance_m, 0), (p.tilt_deg, 0), (p.roll_deg, 0)]
+        rows.append([
+            v.label, str(v.index), str(len(v.uv)),
+            *(amount(*e) if v.used else "-" for e in errors),
+            *(amount(*e) for e in place),
+            "" if v.used else f"dropped: {v.reason}",
+        ])  # fmt: skip
     header = [
         "view", "index", "points", "seen [px]", "unseen [px]", "unseen [mm]", "unseen [deg]",
         "distance [mm]", "tilt [deg]", "roll [deg]", "",
     ]  # fmt: skip
-    page.parts.append("<details open><summary>Every view</summary>")
+    page.section("Every view")
     page.table(header, rows)
-    page.parts.append("</details><details open><summary>The numbers, to copy</summary>")
+    page.section("The numbers, to copy")
     what, other = ("ee", "base") if report.mode == "eye_in_hand" else ("base", "ee")
     suffix = ", only together with the robot's error map" if report.robot_map is not None else ""
     for name, T in (
@@ -391,5 +322,4 @@ def _appendix(page: _Page, report: HandEyeReport) -> None:
         (f"T_{other}_board that belongs to the camera without a map [m]", report.Z_alone),
     ):
         text = np.array2string(np.asarray(T), precision=9, suppress_small=True, separator=", ")
-        page.parts.append(f"<pre>{html.escape(name)}\n{html.escape(text)}</pre>")
-    page.parts.append("</details>")
+        page.code(f"{name}\n{text}")

@@ -1,6 +1,5 @@
 """How the pictures of a calibration look: one paper, one ink, colours that the colour-blind see."""
 
-import io
 import unicodedata
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
@@ -10,13 +9,12 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.pages.plots import AXIS_COLORS, BAD, FAINT, GOOD, INK, MUTED, WARN
+
+__all__ = ["AXIS_COLORS", "BAD", "FAINT", "GOOD", "INK", "MUTED", "WARN"]
+
 Array = NDArray[np.float64]
-INK, MUTED, FAINT = "#22303c", "#8a99a8", "#dfe5ea"
-GOOD, WARN, BAD = "#2a9d8f", "#e9a13b", "#c8553d"
 BLUE, PALE = "#2b6ca3", "#a9c7e0"
-AXIS_COLORS = ("#c8553d", "#4c9a3f", "#2b6ca3")
-"""x, y, z of a frame."""
-VERDICT_COLORS = {"good": GOOD, "warn": WARN, "bad": BAD, "unknown": MUTED}
 ERROR_MAP = "viridis"
 """Colour map of errors: dark is small, bright is large."""
 DPI = 140
@@ -70,13 +68,6 @@ def new_figure(height_in: float, width_in: float = PAGE_WIDTH_IN) -> Any:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), dpi=DPI, layout="constrained")
-
-
-def png_bytes(figure: Any) -> bytes:
-    """Return a figure as PNG."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()
 
 
 @cache

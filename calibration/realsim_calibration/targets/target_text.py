@@ -15,7 +15,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Any, cast
+from typing import cast
 
 from realsim.errors import InputError, UnitError
 from realsim.records import (
@@ -380,9 +380,3 @@ def describe(target: Target) -> str:
         f"AprilGrid, {counts} tags of {_mm(target.tag_size_m)}, gaps of {_mm(target.gap_m)}, "
         f"{target.family}, ids {target.first_id} to {last} from the {target.ids_from}{squares}"
     )
-
-
-def lengths_of(target: Target) -> dict[str, Any]:
-    """Return the target's printed lengths by their field's name [m]."""
-    names = ("tag_size_m", "gap_m", "square_m", "marker_m", "pitch_m")
-    return {name: float(getattr(target, name)) for name in names if hasattr(target, name)}
