@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.formats.bop.exact import exact_mm
 from realsim.formats.bop.models import load_models
 from realsim.formats.bop.opening import open_labelled_bop, open_labelled_scene
 from realsim.formats.bop.root_files import write_bop_models, write_bop_root
+from realsim.formats.bop.row_writing import exact_mm
 from realsim.formats.bop.run_lengths import decoded
 from realsim.formats.bop.scene import find_scenes
 from realsim.formats.bop.targets import read_targets

@@ -6,17 +6,15 @@ view to view, or what was measured at an object is not where the object is said 
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
-from realsim.formats.camera_direction import (
+from realsim.formats.evidence import (
     AGREES_MM,
     STATED,
-    WORSE_BY,
-    WORSE_MM,
+    limit_mm,
     objects_evidence,
     require_direction,
 )
@@ -38,10 +36,6 @@ UNIT_FACTOR = 3.0
 """Measured depth within an object's visible part is at most this many times its distance, or less:
 what lies in front of an object's origin, or behind it where the label is rough, changes it by
 tenths; units differ by ten and more."""
-LEAST_MEASURED = 20
-"""Pixels with depth in an object's visible part from which their median is one."""
-WINDOW_PX = 2
-"""Without masks depth is looked at around the origin's pixel, this far on each side."""
 LEAST_BOXES = 8
 """Objects whose box is compared with the projected one, at least."""
 BOX_VOTES = 0.8
@@ -78,7 +72,7 @@ def check_camera_poses(Ts_world_cam: Array, things: Sequence[Thing], where: str)
     }
     best = min(others, key=lambda name: others[name])
     least = others[best]
-    is_worse = stated > max(WORSE_BY * least, least + WORSE_MM) and least <= AGREES_MM
+    is_worse = stated > limit_mm(least) and least <= AGREES_MM
     if evidence.compared and is_worse and all(least <= s.mm for s in evidence.spreads.values()):
         kind = InputError if best == COLUMNS_FIRST else UnitError
         remedy = {
@@ -163,39 +157,6 @@ def require_depth_unit(ratios: Sequence[float], unit_m: float, where: str) -> st
         f"checked: depth fits the labels, surfaces of {len(ratios)} objects are measured at "
         f"{ratio:.3g} of the distance of their origins."
     )
-
-
-def depth_ratio(
-    depth_m: NDArray[Any],
-    mask: NDArray[np.bool_] | None,
-    intrinsics: CameraIntrinsics,
-    T_cam_obj: Array,
-) -> float | None:
-    """Return median depth where an object is seen / distance of its origin; None = not measured.
-
-    Args:
-        depth_m: (H, W) [m], 0 = none.
-        mask: (H, W) its visible part; None = look around the pixel of its origin.
-        intrinsics: the image's camera.
-        T_cam_obj: (4, 4) [m].
-    """
-    z = float(T_cam_obj[2, 3])
-    if z <= 0:
-        return None
-    if mask is not None:
-        values = depth_m[mask]
-        least = LEAST_MEASURED
-    else:
-        with np.errstate(invalid="ignore", over="ignore"):
-            at = project(intrinsics, T_cam_obj[:3, 3])
-        if not (0 <= at[0] < intrinsics.width and 0 <= at[1] < intrinsics.height):
-            return None
-        u, v = (int(x) for x in at)
-        values = depth_m[max(v - WINDOW_PX, 0) : v + WINDOW_PX + 1,
-                         max(u - WINDOW_PX, 0) : u + WINDOW_PX + 1].ravel()  # fmt: skip
-        least = 1
-    values = values[values > 0]
-    return float(np.median(values)) / z if len(values) >= least else None
 
 
 # --- boxes --------------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from realsim.formats.bop.run_lengths import read_coco_masks
 from realsim.formats.bop.scene import GT_FILE, BopSceneRef, ground_truth_file
 from realsim.formats.bop.source import choose_scene
 from realsim.formats.bop.targets import read_targets, targets_file
+from realsim.formats.evidence import depth_ratio
 from realsim.formats.folders.listing import image_header, shown
 from realsim.records import ObjectModel
 from realsim.records import bop_units as units
@@ -333,7 +334,7 @@ def _check_depth(scene: BopLabelledScene, where: str) -> None:
         depth_m = images.read_depth(file, unit)
         for k, o in enumerate(scene.frame(i).objects):
             mask = scene.mask(i, k, visible=True)
-            ratio = evidence.depth_ratio(depth_m, mask, scene.intrinsics(i), o.T_cam_obj)
+            ratio = depth_ratio(depth_m, mask, scene.intrinsics(i), o.T_cam_obj)
             ratios += [] if ratio is None else [ratio]
     said = evidence.require_depth_unit(ratios, unit_m, where)
     scene.notes_found.append(said.removeprefix(f"{where}: "))

@@ -4,14 +4,14 @@ A row that came from a BOP file is repeated, its unknown keys with it; a number 
 written anew where it no longer says what the frame says.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim.formats.bop.exact import exact_mm, exact_mm_list
 from realsim.formats.bop.instances import INSTANCE
 from realsim.formats.bop.labels import gt_info_entry
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject, Mask
@@ -23,6 +23,8 @@ Json = dict[str, Any]
 SAME = 1e-12
 """Rotations (their entries) and positions [m] that differ by less are the row's own: reading makes
 them orthonormal and may round the last digit."""
+STEPS = 3
+"""Neighbouring doubles looked at on each side: two roundings move a number by less."""
 NO_DEPTH_SCALE = 1.0
 """depth_scale of images without depth: nothing is scaled, and tools ask for the key."""
 
@@ -138,3 +140,27 @@ def info_rows(
         else:
             return None
     return rows
+
+
+def exact_mm(metres: float) -> float:
+    """Return the shortest decimal [mm] that divides to these metres.
+
+    x = d / 1000 is rounded, and so is x * 1000: 0.1 mm would come back as 0.09999999999999999.
+    Decimals of up to 15 digits lie farther apart than the doubles that divide to the same metres,
+    so whatever had at most 15 digits comes back. Not every double is a thousandth of one; then the
+    product is returned, one bit off at most.
+    """
+    middle = metres * units.MM_PER_M
+    candidates = [middle]
+    for direction in (-math.inf, math.inf):
+        x = middle
+        for _ in range(STEPS):
+            x = math.nextafter(x, direction)
+            candidates.append(x)
+    same = [x for x in candidates if x / units.MM_PER_M == metres]
+    return min(same, key=lambda x: len(repr(x))) if same else middle
+
+
+def exact_mm_list(metres: ArrayLike) -> list[float]:
+    """Return a vector (N,) [m] as shortest decimals [mm]."""
+    return [exact_mm(float(x)) for x in np.asarray(metres, dtype=np.float64).ravel()]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from realsim import images
 from realsim.errors import InputError
-from realsim.formats.camera_scale import poses_checked_by_depth
+from realsim.formats.evidence import poses_checked_by_depth
 from realsim.formats.folders.depth_evidence import depth_evidence, read_counts, require_unit
 from realsim.formats.folders.listing import image_header
 from realsim.formats.folders.source import file_digest, require_one_size

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
+from realsim.formats.evidence import depth_ratio
 from realsim.formats.graspnet.image_objects import ImageObject
 from realsim.geometry import se3
 from realsim.geometry.camera import project
@@ -213,29 +214,14 @@ def _depth_ratios(image: SeenImage) -> list[float]:
     """Return measured depth / annotated distance of the objects of an image."""
     if image.depth_m is None:
         return []
-    ratios: list[float] = []
-    for o in single_objects(image.objects):
-        if image.label is not None:
-            measured = image.depth_m[image.label == o.number + 1]
-        else:
-            measured = _about_origin(image, o)
-        measured = measured[measured > 0]
-        if len(measured) >= FEWEST_PX and o.T_cam_obj[2, 3] > 0:
-            ratios.append(float(np.median(measured)) / float(o.T_cam_obj[2, 3]))
-    return ratios
-
-
-def _about_origin(image: SeenImage, o: ImageObject) -> NDArray[np.float32]:
-    """Return the depth (n,) [m] in a small window about an object's origin."""
-    assert image.depth_m is not None
-    uv = project(image.intrinsics, o.T_cam_obj[:3, 3])
-    if not np.all(np.isfinite(uv)):
-        return np.zeros(0, np.float32)
-    height, width = image.depth_m.shape
-    if not (0 <= uv[0] < width and 0 <= uv[1] < height):
-        return np.zeros(0, np.float32)
-    x, y = (int(v) for v in uv)
-    return image.depth_m[max(0, y - 5) : y + 6, max(0, x - 5) : x + 6].ravel()
+    found = [
+        depth_ratio(
+            image.depth_m, None if image.label is None else image.label == o.number + 1,
+            image.intrinsics, o.T_cam_obj, window_px=5, least=(FEWEST_PX, FEWEST_PX),
+        )
+        for o in single_objects(image.objects)
+    ]  # fmt: skip
+    return [ratio for ratio in found if ratio is not None]
 
 
 def check_labels(images: Sequence[SeenImage], where: str) -> list[str]:

@@ -1,11 +1,22 @@
-"""The models folder of GraspNet-1Billion: one folder an object, named by its number, in metres."""
+"""The models folder of GraspNet-1Billion: one folder an object, named by its number, in metres.
+
+Each holds nontextured.ply, textured.obj, mtl and png. An OBJ's texture coordinates have v up, as
+realsim's meshes do.
+"""
 
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
-from realsim.geometry.mesh import load_mesh
-from realsim.records import ObjectModel
+import numpy as np
 
+from realsim import images
+from realsim.geometry.mesh import load_mesh, ply_bytes
+from realsim.records import Mesh, ObjectModel
+
+PLAIN, TEXTURED, MATERIAL, TEXTURE = (
+    "nontextured.ply", "textured.obj", "textured.mtl", "texture_map.png",
+)  # fmt: skip
 MESH_FILES = ("nontextured.ply", "textured.ply", "textured.obj", "nontextured_simplified.ply")
 """Looked for in a model's folder, in this order."""
 
@@ -35,3 +46,38 @@ def load_models(models: Path, numbers: Collection[int], notes: list[str]) -> dic
             mesh = load_mesh(file, "m", notes)
             found[number + 1] = ObjectModel(obj_id=number + 1, name=f"{number:03d}", mesh=mesh)
     return found
+
+
+def model_files(model: ObjectModel) -> dict[str, bytes]:
+    """Return the files of a model's folder, by name."""
+    mesh = model.mesh
+    files = {PLAIN: ply_bytes(replace(mesh, uv=None, texture=None), "m")}
+    textured = mesh.texture is not None and mesh.uv is not None
+    if textured and mesh.texture is not None:
+        files[TEXTURE] = images.png_bytes(mesh.texture)
+    files[MATERIAL] = _material(textured).encode("ascii")
+    files[TEXTURED] = _obj(mesh, textured)
+    return files
+
+
+def _material(textured: bool) -> str:
+    lines = ["newmtl surface", "Ka 0.2 0.2 0.2", "Kd 1.0 1.0 1.0", "Ks 0.0 0.0 0.0", "d 1.0"]
+    return "\n".join([*lines, *([f"map_Kd {TEXTURE}"] if textured else []), ""])
+
+
+def _obj(mesh: Mesh, textured: bool) -> bytes:
+    """Return an OBJ; colours of the vertices stand behind their places, as many programs do it."""
+    parts = [f"mtllib {MATERIAL}\n"]
+    rows = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in mesh.vertices.tolist()]
+    if mesh.colors is not None and not textured:
+        shades = (mesh.colors / np.float64(255)).tolist()
+        rows = [f"{v} {r:.6g} {g:.6g} {b:.6g}" for v, (r, g, b) in zip(rows, shades, strict=True)]
+    parts.append("\n".join(rows) + "\n")
+    corner = "{0}"
+    if textured and mesh.uv is not None:
+        parts.append("\n".join(f"vt {u:.9g} {v:.9g}" for u, v in mesh.uv.tolist()) + "\n")
+        corner = "{0}/{0}"
+    parts.append("usemtl surface\n")
+    for a, b, c in (mesh.faces + 1).tolist():
+        parts.append(f"f {corner.format(a)} {corner.format(b)} {corner.format(c)}\n")
+    return "".join(parts).encode("ascii")

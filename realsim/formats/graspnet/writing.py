@@ -19,7 +19,7 @@ from realsim.formats.graspnet.frame_files import Loss, frame_files
 from realsim.formats.graspnet.instances import OBJECT_LIST
 from realsim.formats.graspnet.label_copies import keeps_numbers, label_files, rect_file
 from realsim.formats.graspnet.labelled import GraspnetLabelledScene
-from realsim.formats.graspnet.model_files import model_files
+from realsim.formats.graspnet.models import model_files
 from realsim.formats.graspnet.write_plan import GraspnetWriteConfig, WritePlan, plan_scene
 from realsim.formats.labelled_scene import LabelledFrame, LabelledScene, WrittenScene
 from realsim.records import ObjectModel

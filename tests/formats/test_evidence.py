@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
-from realsim.formats.camera_direction import (
+from realsim.formats.evidence import (
     depth_evidence,
     objects_evidence,
     readings,
     require_direction,
+    require_scale,
+    scale_evidence,
     things_of,
 )
-from realsim.formats.camera_scale import require_scale, scale_evidence
 from realsim.formats.labelled_scene import LabelledFrame, LabelledObject
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table

@@ -1,4 +1,4 @@
-"""Camera to world or world to camera, OpenCV's axes or OpenGL's: decided by agreement of views.
+"""Which convention camera poses have: direction, axes and unit, decided by agreement of views.
 
 A file of camera poses does not prove its convention, but a static scene does: only with the right
 one do different views put the same things in the same place. Four readings are compared, each up
@@ -12,11 +12,15 @@ to a turn of the world, which no agreement can tell:
 What is compared is either the poses of labelled objects (`objects_evidence`) or measured depth
 (`depth_evidence`). Where the camera hardly moves, or only along x, readings agree equally well;
 then nothing is decided, and that is said.
+
+Depth that is in metres also tells the metres per unit of the poses (`scale_evidence`): it fixes how
+far a surface moves in the image when the camera moves by so many units. A pair of views needs
+translation for that, and scenes of any scale are tried.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +29,9 @@ from realsim.errors import InputError
 from realsim.formats.depth_agreement import DepthOf, disagreement_mm, near_pairs, sampled_views
 from realsim.formats.labelled_scene import LabelledFrame
 from realsim.geometry import se3
+from realsim.geometry.camera import project
 from realsim.interop import T_CAM_GL
+from realsim.records import CameraIntrinsics
 
 Array = NDArray[np.float64]
 Direction = Literal["as stated", "inverted", "other axes", "inverted, other axes"]
@@ -42,6 +48,20 @@ MOST_VIEWS = 200
 SPREAD_PERCENTILE = 75.0
 """Of the distances from the middle: a camera that stands still in half of the views hides nothing,
 and a quarter of wrong labels does not spoil it."""
+DECADES = 4
+"""Scales from 1e-4 to 1e4 metres per unit are tried: millimetres, kilometres, and NeRF's boxes."""
+STEP = 1.12
+"""Between the scales that are tried: with the motion of a pair, a quarter of the distance, one step
+off moves points by 3 % of their distance, which is still seen as agreeing."""
+FINE = 15
+"""Steps of the finer search between two of them: to 1.5 %."""
+TELLING = 1.5
+"""Factor by which a wrong scale must show, or the camera moves too little to tell."""
+
+
+def limit_mm(least_mm: float) -> float:
+    """Return the spread [mm] up to which a reading is as good as the one with the least."""
+    return max(WORSE_BY * least_mm, least_mm + WORSE_MM)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -77,8 +97,7 @@ class DirectionEvidence:
         least = self.spreads[known[0]].mm if known else float("inf")
         if least > AGREES_MM:
             return ()
-        limit = max(WORSE_BY * least, least + WORSE_MM)
-        return tuple(name for name in known if self.spreads[name].mm <= limit)
+        return tuple(name for name in known if self.spreads[name].mm <= limit_mm(least))
 
     @property
     def decisive(self) -> bool:
@@ -255,3 +274,157 @@ def _meaning(direction: Direction) -> str:
         if word in direction
     ]
     return "; and ".join(parts)
+
+
+# --- unit ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class ScaleEvidence:
+    """What depth says of the unit of camera poses."""
+
+    stated_mm: float
+    """Disagreement of the views if the poses are in metres as stated [mm]; NaN = no pairs."""
+    best: float
+    """Metres per stated metre at which they agree best."""
+    best_mm: float
+    """Disagreement there [mm]."""
+    beside_mm: float
+    """The smaller disagreement at scales TELLING times larger and smaller than the best one."""
+
+    @property
+    def decisive(self) -> bool:
+        """Whether the views agree at the best scale and not beside it."""
+        return self.best_mm <= AGREES_MM and self.beside_mm > limit_mm(self.best_mm)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether another scale than the stated one is right."""
+        return self.decisive and self.stated_mm > limit_mm(self.best_mm)
+
+
+def scale_evidence(Ts_world_cam: ArrayLike, depth_of: DepthOf) -> ScaleEvidence:
+    """Return at which scale of the translations the depth images agree.
+
+    Args:
+        Ts_world_cam: (N, 4, 4) camera poses as stated [m].
+        depth_of: of a place in `Ts_world_cam`: the depth (H, W) [m], 0 = none, and its camera.
+    """
+    Ts = np.asarray(Ts_world_cam, dtype=np.float64).reshape(-1, 4, 4)
+    views = sampled_views(Ts, depth_of)
+    if len(views) < 2:
+        nan = float("nan")
+        return ScaleEvidence(stated_mm=nan, best=1.0, best_mm=nan, beside_mm=nan)
+
+    def at(scale: float) -> float:
+        scaled = Ts.copy()
+        scaled[:, :3, 3] *= scale
+        # Which views are near depends on the scale: each is judged where it says they are.
+        return disagreement_mm(scaled, views, near_pairs(scaled, views))
+
+    steps = round(DECADES * np.log(10) / np.log(STEP))
+    coarse = STEP ** np.arange(-steps, steps + 1.0)
+    best = _least(coarse, at)
+    best = _least(best * np.geomspace(1 / STEP, STEP, FINE), at)
+    best_mm, stated_mm = at(best), at(1.0)
+    if stated_mm <= best_mm:
+        best, best_mm = 1.0, stated_mm
+    return ScaleEvidence(
+        stated_mm=stated_mm, best=best, best_mm=best_mm,
+        beside_mm=min(at(best * TELLING), at(best / TELLING)),
+    )  # fmt: skip
+
+
+def _least(scales: Array, at: Callable[[float], float]) -> float:
+    """Return the scale of least disagreement; of equal ones the nearest to 1."""
+    ordered = sorted((float(s) for s in scales), key=lambda s: abs(np.log(s)))
+    return min(ordered, key=at)
+
+
+def require_scale(evidence: ScaleEvidence, where: str, *, stated: float = 1.0) -> str:
+    """Return a note on the scale if depth does not contradict it.
+
+    Args:
+        evidence: of the poses, stated scale applied.
+        where: for messages.
+        stated: metres per unit of the file that were applied.
+
+    Raises:
+        InputError: the depth agrees at another scale only.
+    """
+    if evidence.contradicts:
+        raise InputError(
+            f"{where}: with {stated:g} metres per unit of the camera poses, the depth of near "
+            f"views disagrees by {evidence.stated_mm:.1f} mm; with {stated * evidence.best:.4g} it "
+            f"agrees ({evidence.best_mm:.1f} mm). If the depth unit is right, give --scale "
+            f"{stated * evidence.best:.4g}; if the poses are in metres, the depth unit is wrong."
+        )
+    if evidence.decisive:
+        return (
+            f"scale checked: with {stated:g} metres per unit the depth of near views agrees to "
+            f"{evidence.stated_mm:.1f} mm."
+        )
+    return (
+        f"the scale of the camera poses ({stated:g} metres per unit) could not be checked by "
+        f"depth: near views disagree by {evidence.stated_mm:.1f} mm, at the best scale "
+        f"{stated * evidence.best:.4g} by {evidence.best_mm:.1f} mm, and "
+        f"{TELLING:g} times beside it by {evidence.beside_mm:.1f} mm."
+    )
+
+
+def poses_checked_by_depth(
+    Ts_world_cam: Array,
+    depth_of: DepthOf,
+    where: str,
+    metres_per_unit: float | None,
+    remedy: str,
+) -> list[str]:
+    """Return notes on what depth says of camera poses: their direction, axes and unit.
+
+    Raises:
+        InputError: it contradicts them.
+    """
+    direction = depth_evidence(Ts_world_cam, depth_of)
+    note = require_direction(direction, where, remedy=remedy)
+    # A wrong unit makes every reading disagree, so it is looked for in any case.
+    scale = scale_evidence(Ts_world_cam, depth_of)
+    return [note, require_scale(scale, where, stated=metres_per_unit or 1.0)]
+
+
+# --- depth at labelled objects ------------------------------------------------------------------
+
+
+def depth_ratio(
+    depth_m: NDArray[Any],
+    mask: NDArray[np.bool_] | None,
+    intrinsics: CameraIntrinsics,
+    T_cam_obj: Array,
+    *,
+    window_px: int = 2,
+    least: tuple[int, int] = (20, 1),
+) -> float | None:
+    """Return median depth where an object is seen / distance of its origin; None = not measured.
+
+    Args:
+        depth_m: (H, W) [m], 0 = none.
+        mask: (H, W) its visible part; None = look around the pixel of its origin.
+        intrinsics: the image's camera.
+        T_cam_obj: (4, 4) [m].
+        window_px: without a mask depth is looked at this far on each side of the origin's pixel.
+        least: measured pixels with and without a mask from which their median is one.
+    """
+    z = float(T_cam_obj[2, 3])
+    if z <= 0:
+        return None
+    if mask is not None:
+        values = depth_m[mask]
+    else:
+        with np.errstate(invalid="ignore", over="ignore"):
+            at = project(intrinsics, T_cam_obj[:3, 3])
+        if not (0 <= at[0] < intrinsics.width and 0 <= at[1] < intrinsics.height):
+            return None
+        u, v = (int(x) for x in at)
+        values = depth_m[max(v - window_px, 0) : v + window_px + 1,
+                         max(u - window_px, 0) : u + window_px + 1].ravel()  # fmt: skip
+    values = values[values > 0]
+    return float(np.median(values)) / z if len(values) >= least[mask is None] else None
