@@ -27,7 +27,7 @@ from realsim.registration.evidence import (
     held,
     without_table,
 )
-from realsim.registration.hypotheses import Found, search
+from realsim.registration.hypotheses import BestHypothesis, search
 from realsim.registration.intake import Intake
 from realsim.registration.joint import joint_fit
 from realsim.registration.plane import find_support_plane
@@ -37,7 +37,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Work:
+class FewViewsTask:
     """What every step needs."""
 
     intake: Intake
@@ -74,7 +74,7 @@ class FewViews:
     kept: list[Kept]
     clouds: list[Cloud]
     """Each object's own points."""
-    found: list[Found]
+    found: list[BestHypothesis]
     history: list[dict[str, Any]]
     plane: SupportPlane | None
     no_plane: str
@@ -83,7 +83,7 @@ class FewViews:
 
 def begin(
     intake: Intake, bodies: Sequence[Body], config: RegistrationConfig, up: Array | None
-) -> Work:
+) -> FewViewsTask:
     """Return the points near the bodies' starts, and the plane under them."""
     evidence = gather(intake.intrinsics, intake.frames, bodies, config.evidence)
     centers = np.stack([b.center(b.T_start) for b in bodies])
@@ -91,10 +91,10 @@ def begin(
     distance = float(np.median(np.linalg.norm(cameras - centers.mean(0), axis=1)))
     sigma = float(evidence.noise.sigma(np.array([distance]))[0])
     plane, why = find_support_plane(evidence.support, centers, cameras, config.plane, sigma, up)
-    return Work(intake, plane, why, evidence, config)
+    return FewViewsTask(intake, plane, why, evidence, config)
 
 
-def search_near(work: Work, bodies: Sequence[Body], tick: Callable[[], None]) -> list[Found]:
+def search_near(work: FewViewsTask, bodies: Sequence[Body], tick: Callable[[], None]) -> list[BestHypothesis]:
     """Return of every body the pose near its start that explains the images best."""
     return [
         _search_one(work, body, near, tick)
@@ -127,7 +127,7 @@ def register_few(
     )  # fmt: skip
 
 
-def _search_one(work: Work, body: Body, near: Cloud, tick: Callable[[], None]) -> Found:
+def _search_one(work: FewViewsTask, body: Body, near: Cloud, tick: Callable[[], None]) -> BestHypothesis:
     """Return the best hypothesis of one object, its neighbours not yet considered."""
     config = work.config
     center = body.center(body.T_start)
@@ -142,7 +142,7 @@ def _search_one(work: Work, body: Body, near: Cloud, tick: Callable[[], None]) -
 
 
 def _joint(
-    work: Work, bodies: Sequence[Body], found: Sequence[Found]
+    work: FewViewsTask, bodies: Sequence[Body], found: Sequence[BestHypothesis]
 ) -> tuple[list[Kept], list[Cloud], list[dict[str, Any]]]:
     """Return the fits of all objects together, the points of each, and the sweeps' history.
 

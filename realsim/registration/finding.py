@@ -14,7 +14,7 @@ from realsim.registration.body import Body, make_body
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.few_views import begin, search_near
 from realsim.registration.intake import Intake
-from realsim.registration.judging.scene_checks import Finding
+from realsim.registration.judging.scene_checks import SceneFinding
 from realsim.registration.judging.unit_checks import unit_errors
 from realsim.registration.odometry.cross_check import KinematicsCheck
 from realsim.registration.reports import search_report
@@ -46,7 +46,7 @@ class Ticker:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Work:
+class RegistrationTask:
     """What every step of one registration needs."""
 
     name: str
@@ -59,7 +59,7 @@ class Work:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Found:
+class FoundObjects:
     """What the search found."""
 
     bodies: list[Body]
@@ -72,7 +72,7 @@ class Found:
     reports: list[dict[str, Any]]
     not_placed: tuple[NotPlaced, ...]
     report: dict[str, Any]
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[SceneFinding, ...] = ()
     """What is wrong with what was claimed."""
 
 
@@ -164,13 +164,13 @@ def _middle_pose(intake: Intake) -> Array:
     return se3.from_translation(np.median(view.world(), axis=0))
 
 
-def found_objects(work: Work, asked: list[Wanted] | None) -> Found:
+def found_objects(work: RegistrationTask, asked: list[Wanted] | None) -> FoundObjects:
     """Return the objects near their final poses, whatever was known of them before."""
     intake, config = work.intake, work.config
     near_only = asked is not None and all(w.T_start is not None for w in asked)
     few = len(intake.frames) < config.refine_from
     if asked is not None and not asked:
-        return Found(
+        return FoundObjects(
             bodies=[], claimed=[], contrasts=[], rivals=[], reports=[], not_placed=(), report={}
         )
     if config.method == "top-down" and asked is None:
@@ -211,11 +211,11 @@ def found_objects(work: Work, asked: list[Wanted] | None) -> Found:
     return replace(_as_found(work, result, claims), findings=tuple(findings))
 
 
-def _as_found(work: Work, result: SearchResult, asked: Sequence[Wanted]) -> Found:
+def _as_found(work: RegistrationTask, result: SearchResult, asked: Sequence[Wanted]) -> FoundObjects:
     """Return what a search placed as bodies, with what was rightly claimed of them."""
     claims = {w.instance: w.T_start for w in asked}
     placed: list[Placed] = sorted(result.placed, key=lambda p: p.instance)
-    return Found(
+    return FoundObjects(
         bodies=[_body(work, p.obj_id, p.instance, p.T_world_obj) for p in placed],
         claimed=[claims.get(p.instance) for p in placed],
         contrasts=[p.contrast for p in placed],
@@ -225,7 +225,7 @@ def _as_found(work: Work, result: SearchResult, asked: Sequence[Wanted]) -> Foun
     )  # fmt: skip
 
 
-def _found_near(work: Work, asked: list[Wanted]) -> Found:
+def _found_near(work: RegistrationTask, asked: list[Wanted]) -> FoundObjects:
     """Return the objects at their claimed starts; where there are few views the fit searches."""
     T_starts = [w.T_start for w in asked if w.T_start is not None]
     missing = [
@@ -246,20 +246,20 @@ def _found_near(work: Work, asked: list[Wanted]) -> Found:
             replace(b, start=replace(b.start, T_world_obj=f.fit.T_world_obj))
             for b, f in zip(bodies, found, strict=True)
         ]
-    return Found(
+    return FoundObjects(
         bodies=bodies, claimed=list(T_starts), contrasts=[None] * len(bodies),
         rivals=[None] * len(bodies), reports=reports, not_placed=tuple(missing), report={},
     )  # fmt: skip
 
 
-def _body(work: Work, obj_id: int, instance: int, T: Array) -> Body:
+def _body(work: RegistrationTask, obj_id: int, instance: int, T: Array) -> Body:
     """Return the body of an instance at a pose."""
     c = work.config
     start = ObjectPose(obj_id=obj_id, instance=instance, T_world_obj=T)
     return make_body(start, work.models[obj_id], c.field_cells, c.samples, c.field_folder)
 
 
-def claimed_bodies(found: Found) -> list[Body]:
+def claimed_bodies(found: FoundObjects) -> list[Body]:
     """Return the bodies with the starts that somebody claimed, where somebody did."""
     return [
         b if T is None else replace(b, start=replace(b.start, T_world_obj=T))

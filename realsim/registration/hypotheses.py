@@ -37,7 +37,7 @@ class SearchConfig:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Found:
+class BestHypothesis:
     """The best hypothesis of one object."""
 
     fit: Fit
@@ -88,7 +88,7 @@ def search(
     comparer: Comparer,
     free_space: FreeSpace | None,
     configs: tuple[SearchConfig, SolverConfig],
-) -> Found:
+) -> BestHypothesis:
     """Return the pose near the start that explains the images best.
 
     Args:
@@ -129,7 +129,7 @@ def search(
         "steps": sum(f.steps for f in fits) + sum(f.steps for f in refined),
     }
     gain_px, per_pixel = final[best]
-    return Found(fit=refined[best], gain_px=gain_px, gain_per_pixel=per_pixel, report=report)
+    return BestHypothesis(fit=refined[best], gain_px=gain_px, gain_per_pixel=per_pixel, report=report)
 
 
 def _preference(body: Body, fit: Fit, gain_px: float, config: SearchConfig) -> float:

@@ -16,7 +16,7 @@ from realsim.registration.intake import Intake, scene_cloud
 from realsim.registration.judging.held_out import half_fit, held_out, owned_points
 from realsim.registration.judging.probability import probability_right
 from realsim.registration.judging.residual_checks import error_level_m, residual_checks
-from realsim.registration.judging.scene_checks import Finding as SceneFinding
+from realsim.registration.judging.scene_checks import SceneFinding
 from realsim.registration.judging.scene_checks import scene_findings
 from realsim.registration.judging.support import support_checks
 from realsim.registration.judging.surface_residuals import surface_residuals

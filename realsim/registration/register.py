@@ -26,10 +26,10 @@ from realsim.registration.covariance import uncertainty
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.few_views import register_few
 from realsim.registration.finding import (
-    Found,
+    FoundObjects,
     Progress,
     Ticker,
-    Work,
+    RegistrationTask,
     claimed_bodies,
     found_objects,
     in_units,
@@ -102,7 +102,7 @@ def register_scene(
         kinematics, why_not = check_odometry(intake, config)
         if why_not is not None:
             intake = replace(intake, findings=(*intake.findings, why_not))
-    work = Work(name, intake, models, config, up, tick, kinematics)
+    work = RegistrationTask(name, intake, models, config, up, tick, kinematics)
     found = found_objects(work, asked)
     missing = (*refused, *found.not_placed)
     if not found.bodies:
@@ -112,7 +112,7 @@ def register_scene(
     return _with_few(work, found, missing)
 
 
-def _with_many(work: Work, found: Found, missing: tuple[NotPlaced, ...]) -> Registration:
+def _with_many(work: RegistrationTask, found: FoundObjects, missing: tuple[NotPlaced, ...]) -> Registration:
     """Return the registration with everything refined together."""
     intake, config = work.intake, work.config
     claimed = claimed_bodies(found)
@@ -203,7 +203,7 @@ def _is_lost(fought: Duel | None) -> bool:
     return contrast is not None and contrast < -CONTRAST_DECIDED
 
 
-def _fought(found: Found, many: ManyViews, config: RegistrationConfig) -> list[Duel | None]:
+def _fought(found: FoundObjects, many: ManyViews, config: RegistrationConfig) -> list[Duel | None]:
     """Return how every pose compares with its near-symmetric rival, cameras refined."""
     rivals = [
         None if R is None else T @ se3.invert(b.T_start) @ R
@@ -213,7 +213,7 @@ def _fought(found: Found, many: ManyViews, config: RegistrationConfig) -> list[D
     return duels(found.bodies, poses, rivals, many.clouds, misfits, config.rivals)
 
 
-def _with_few(work: Work, found: Found, missing: tuple[NotPlaced, ...]) -> Registration:
+def _with_few(work: RegistrationTask, found: FoundObjects, missing: tuple[NotPlaced, ...]) -> Registration:
     """Return the registration with the cameras at their word."""
     intake, config = work.intake, work.config
     few = register_few(intake, found.bodies, config, work.up, work.tick)
@@ -247,7 +247,7 @@ def _with_few(work: Work, found: Found, missing: tuple[NotPlaced, ...]) -> Regis
     )
 
 
-def _nothing(work: Work, found: Found, missing: tuple[NotPlaced, ...]) -> Registration:
+def _nothing(work: RegistrationTask, found: FoundObjects, missing: tuple[NotPlaced, ...]) -> Registration:
     """Return the registration of a scene in which nothing was found."""
     scene = Scene(name=work.name, objects=(), plane=work.intake.plane)
     return Registration(
@@ -261,8 +261,8 @@ def _nothing(work: Work, found: Found, missing: tuple[NotPlaced, ...]) -> Regist
 
 
 def _registration(
-    work: Work,
-    search: tuple[Found, tuple[NotPlaced, ...]],
+    work: RegistrationTask,
+    search: tuple[FoundObjects, tuple[NotPlaced, ...]],
     results: tuple[Poses, Judged, Comparer],
     views: tuple[dict[int, Array], dict[int, dict[int, SeenPose]]],
     reports: tuple[dict[str, Any], list[dict[str, Any]]],
@@ -319,7 +319,7 @@ def _not_seen(
 
 
 def _single_view(
-    work: Work, given: Poses, comparer: Comparer
+    work: RegistrationTask, given: Poses, comparer: Comparer
 ) -> tuple[list[ObjectPose], dict[str, Any]]:
     """Return the baseline's poses and which frame it used; objects it cannot see are left out."""
     config, intake = work.config, work.intake

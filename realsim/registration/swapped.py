@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.records import ObjectModel
-from realsim.registration.judging.scene_checks import Finding
+from realsim.registration.judging.scene_checks import SceneFinding
 from realsim.registration.search.records import Placed, SearchResult, Wanted
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ def with_swaps(
     models: dict[int, ObjectModel],
     search: Callable[[Sequence[Wanted]], SearchResult],
     config: SwappedConfig,
-) -> tuple[SearchResult, list[Finding]]:
+) -> tuple[SearchResult, list[SceneFinding]]:
     """Return the search's result with objects that stand in each other's places, and who they are.
 
     Args:
@@ -58,7 +58,7 @@ def with_swaps(
     freed = [replace(w, region=None, T_start=None) if w.instance in lost else w for w in asked]
     second = {p.instance: p for p in search(freed).placed}
     moved: dict[int, Placed] = {}
-    findings: list[Finding] = []
+    findings: list[SceneFinding] = []
     for w in failed:
         there = second.get(w.instance)
         if there is None or there.gain_per_pixel < config.found_gain:
@@ -95,10 +95,10 @@ def _center(T: Array, model: ObjectModel) -> Array:
     return T[:3, :3] @ model.mesh.bounds.mean(0) + T[:3, 3]
 
 
-def _finding(w: Wanted, other: Wanted, models: dict[int, ObjectModel]) -> Finding:
+def _finding(w: Wanted, other: Wanted, models: dict[int, ObjectModel]) -> SceneFinding:
     """Return the finding of one object in another's place."""
     mine, theirs = models[w.obj_id].name, models[other.obj_id].name
-    return Finding(
+    return SceneFinding(
         kind="swapped ids",
         words=f"{mine} (id {w.obj_id}, instance {w.instance}) was not found at its given pose but "
         f"where {theirs} (id {other.obj_id}, instance {other.instance}) was said to be: their ids "

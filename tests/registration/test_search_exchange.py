@@ -10,7 +10,7 @@ from realsim.registration.evidence import DepthNoise
 from realsim.registration.search.bench import FindConfig, fitted_candidates, make_bench
 from realsim.registration.search.exchange import exchanged
 from realsim.registration.search.records import Wanted
-from realsim.registration.search.refine import RefineConfig, candidate
+from realsim.registration.search.refine import CandidateConfig, candidate
 from realsim.registration.search.scoring import ScoreConfig
 from realsim.registration.search.selection import Selection, buffer_of
 from realsim.registration.search.state import Search
@@ -25,7 +25,7 @@ CONFIG = FindConfig(
     field_cells=48,
     templates=TemplateConfig(rays=1500),
     score=ScoreConfig(columns=80, frames=8),
-    refine=RefineConfig(refined=3),
+    refine=CandidateConfig(refined=3),
 )
 
 

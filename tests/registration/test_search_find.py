@@ -12,7 +12,7 @@ from realsim.registration.evidence import DepthNoise
 from realsim.registration.find_table import TableSearchConfig, find_table
 from realsim.registration.search.find import FindConfig, find_objects
 from realsim.registration.search.records import Region, SearchResult, Wanted
-from realsim.registration.search.refine import RefineConfig
+from realsim.registration.search.refine import CandidateConfig
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import ScoreConfig
 from realsim.registration.search.templates import TemplateConfig
@@ -26,7 +26,7 @@ CONFIG = FindConfig(
     field_cells=48,
     templates=TemplateConfig(rays=1500),
     score=ScoreConfig(columns=80, frames=8),
-    refine=RefineConfig(refined=3),
+    refine=CandidateConfig(refined=3),
 )
 
 

@@ -29,7 +29,7 @@ FindingKind = Literal["common shift", "common sinking", "swapped ids", "not in t
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Finding:
+class SceneFinding:
     """One thing that is wrong with a scene."""
 
     kind: FindingKind
@@ -89,7 +89,7 @@ def scene_findings(
     config: SceneCheckConfig,
     with_starts: bool = True,
     usable: Sequence[bool] | None = None,
-) -> list[Finding]:
+) -> list[SceneFinding]:
     """Return what is wrong with the scene.
 
     Args:
@@ -103,7 +103,7 @@ def scene_findings(
         usable: which objects count for what all have in common; None = those of `config.good`.
     """
     use = [p >= config.good for p in probabilities] if usable is None else list(usable)
-    findings: list[Finding] = []
+    findings: list[SceneFinding] = []
     if with_starts:
         findings += shift_findings(bodies, poses, use, config.offset)
     findings += sinking_findings(bodies, poses, use, comparer.plane, config.sinking)
@@ -116,7 +116,7 @@ def scene_findings(
         absent = gain < config.absent_gain and p < config.absent_probability
         if absent and body.start.instance not in swapped:
             findings.append(
-                Finding(
+                SceneFinding(
                     kind="not in the scene",
                     words=f"{_named(body)} seems not to be in the scene: its best pose explains "
                     f"the depth by {gain:.2f} per pixel better than the bare table does (0.6 or "
@@ -131,7 +131,7 @@ def scene_findings(
 
 def shift_findings(
     bodies: Sequence[Body], poses: Sequence[Array], use: Sequence[bool], config: OffsetConfig
-) -> list[Finding]:
+) -> list[SceneFinding]:
     """Return the finding that all objects stand off their starts by one vector, if they do."""
     found = common_offset(bodies, poses, use, config)
     if not found["consistent"]:
@@ -144,7 +144,7 @@ def shift_findings(
         "frame's or another calibration's. Check which camera pose they were made with."
     )
     instances = tuple(b.start.instance for b, u in zip(bodies, use, strict=True) if u)
-    return [Finding(kind="common shift", words=words, instances=instances, numbers=found)]
+    return [SceneFinding(kind="common shift", words=words, instances=instances, numbers=found)]
 
 
 def sinking_findings(
@@ -153,7 +153,7 @@ def sinking_findings(
     use: Sequence[bool],
     plane: SupportPlane | None,
     config: SinkingConfig,
-) -> list[Finding]:
+) -> list[SceneFinding]:
     """Return the finding that all objects sink or float by one share of their height, if so."""
     found = common_sinking(bodies, poses, use, plane, config)
     if not found["consistent"]:
@@ -168,7 +168,7 @@ def sinking_findings(
         "one model against a ruler."
     )
     instances = tuple(b.start.instance for b, u in zip(bodies, use, strict=True) if u)
-    return [Finding(kind="common sinking", words=words, instances=instances, numbers=found)]
+    return [SceneFinding(kind="common sinking", words=words, instances=instances, numbers=found)]
 
 
 def swap_findings(
@@ -178,7 +178,7 @@ def swap_findings(
     cloud: Cloud,
     comparer: Comparer,
     config: SwapConfig,
-) -> list[Finding]:
+) -> list[SceneFinding]:
     """Return the pairs of objects that explain each other's place better than their own.
 
     Args:
@@ -205,7 +205,7 @@ def swap_findings(
             more = min(there - gains[j][0], here - gains[i][0])
             if more >= config.better * max(there, here, 1.0):
                 pairs.append((more, i, j, here, there))
-    findings: list[Finding] = []
+    findings: list[SceneFinding] = []
     taken: set[int] = set()
     for _, i, j, here, there in sorted(pairs, reverse=True):
         if {i, j} & taken:
@@ -218,7 +218,7 @@ def swap_findings(
             f"{gains[i][0]:.0f} and {gains[j][0]:.0f}. Swap the two ids."
         )
         findings.append(
-            Finding(
+            SceneFinding(
                 kind="swapped ids",
                 words=words,
                 instances=(a.start.instance, b.start.instance),

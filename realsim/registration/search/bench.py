@@ -25,7 +25,7 @@ from realsim.registration.search.records import Region, Wanted
 from realsim.registration.search.refine import (
     Candidate,
     Fused,
-    RefineConfig,
+    CandidateConfig,
     Sought,
     candidates,
     fuse,
@@ -85,7 +85,7 @@ class FindConfig:
     """Turns after which a model looks nearly the same."""
     start: SearchConfig = field(default_factory=SearchConfig)
     """Neighbours of a claimed pose."""
-    refine: RefineConfig = field(default_factory=RefineConfig)
+    refine: CandidateConfig = field(default_factory=CandidateConfig)
     """Fits to the points."""
     score: ScoreConfig = field(default_factory=ScoreConfig)
     """Render and compare."""

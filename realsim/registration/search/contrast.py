@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.registration.evidence import Cloud
-from realsim.registration.search.refine import RefineConfig, Sought, nearby
+from realsim.registration.search.refine import CandidateConfig, Sought, nearby
 from realsim.registration.search.sameness import distinct
 from realsim.registration.search.scoring import (
     Array32,
@@ -81,7 +81,7 @@ def decided(
     others: Array32,
     evidence: tuple[Canvas, Cloud, Array],
     config: ContrastConfig,
-    refine: RefineConfig,
+    refine: CandidateConfig,
 ) -> Decision:
     """Return the best of a pose and its near-symmetric rivals.
 
@@ -128,7 +128,7 @@ def _rivals(
     cloud: Cloud,
     near: Array,
     config: ContrastConfig,
-    refine: RefineConfig,
+    refine: CandidateConfig,
 ) -> list[Array]:
     """Return the near-symmetric poses (4, 4), each fitted to the points."""
     rivals: list[Array] = []

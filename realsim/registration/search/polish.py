@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from realsim.compiled import njit
 from realsim.geometry.distance_field import sample
 from realsim.registration.evidence import Cloud
-from realsim.registration.search.refine import Candidate, RefineConfig, Sought, candidate
+from realsim.registration.search.refine import Candidate, CandidateConfig, Sought, candidate
 from realsim.registration.search.scoring import Canvas, compose, score
 
 Array = NDArray[np.float64]
@@ -91,7 +91,7 @@ def polished(
     cloud: Cloud,
     placed: Sequence[tuple[Sought, Candidate]],
     config: PolishConfig,
-    refine: RefineConfig,
+    refine: CandidateConfig,
 ) -> list[Candidate]:
     """Return the placed objects fitted to their own points.
 

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class RefineConfig:
+class CandidateConfig:
     """How hypotheses are fitted."""
 
     coarse_voxel_m: float = 0.003
@@ -115,7 +115,7 @@ class Candidate:
 
 
 def fuse(
-    views: Sequence[ViewPoints], noise: DepthNoise, plane: SupportPlane, config: RefineConfig
+    views: Sequence[ViewPoints], noise: DepthNoise, plane: SupportPlane, config: CandidateConfig
 ) -> Fused:
     """Return the views' points above the table, averaged on voxels of the table's frame."""
     above = [without_table(world_cloud([v], noise), plane, config.above_table_m) for v in views]
@@ -170,7 +170,7 @@ def _near(
 
 
 def fitted(
-    sought: Sought, cloud: Cloud, T_world_obj: Array, fine: bool, config: RefineConfig
+    sought: Sought, cloud: Cloud, T_world_obj: Array, fine: bool, config: CandidateConfig
 ) -> Array:
     """Return the pose (4, 4) after a coarse or a fine fit to the points near it."""
     margin = config.fine_margin_m if fine else config.coarse_margin_m
@@ -205,7 +205,7 @@ def candidates(
     fused: Fused,
     canvas: Canvas,
     starts: Sequence[tuple[Array, str]],
-    config: RefineConfig,
+    config: CandidateConfig,
     buffer: Array32 | None = None,
 ) -> list[Candidate]:
     """Return the distinct poses that the starts lead to, the best first.
@@ -235,7 +235,7 @@ def refined(
     fused: Fused,
     canvas: Canvas,
     start: Candidate,
-    config: RefineConfig,
+    config: CandidateConfig,
     buffer: Array32 | None = None,
 ) -> Candidate:
     """Return a candidate refined on the fine points, or as it was if that explains less."""
