@@ -50,9 +50,12 @@ from realsim.registration.judging.held_out import (
     owned_points,
 )
 from realsim.registration.judging.ownership import make_claims, owners
-from realsim.registration.judging.residual_checks import error_level_m, residual_checks
-from realsim.registration.judging.support import support_checks
-from realsim.registration.judging.surface_residuals import ResidualConfig, surface_residuals
+from realsim.registration.judging.surface_residuals import (
+    ResidualConfig,
+    error_level_m,
+    residual_checks,
+    surface_residuals,
+)
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.simulated import (
     TableLabConfig,
@@ -62,6 +65,7 @@ from realsim.registration.simulated import (
     with_found_symmetries,
 )
 from realsim.registration.solver import SolverConfig, Stage, solve_pose
+from realsim.registration.table_planes import support_checks
 from realsim.registration.verify import VerifyConfig, verify_objects
 from realsim.registration.views import SampleConfig, ViewPoints, sample_views, world_cloud
 from realsim.scanning.simulated import distorted
@@ -310,7 +314,7 @@ def kept_checks(seed: int, rounds: int, models: dict[int, ObjectModel], folder: 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--keep", type=Path, required=True, help="images and checks between runs")
     parser.add_argument("--out", type=Path, help="folder of the picture")
     parser.add_argument("--rounds", type=int, default=12, help="of each table")

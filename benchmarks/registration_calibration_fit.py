@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.registration.judging import probability
-from realsim.registration.judging.probability import NAMES, Coefficients, Kind, terms_of
-from realsim.registration.judging.verdict import VerdictConfig
+from realsim.registration.judging import verdict
+from realsim.registration.judging.verdict import NAMES, Coefficients, Kind, VerdictConfig, terms_of
 
 Array = NDArray[np.float64]
 RIDGE = 0.003
@@ -71,7 +70,7 @@ def _fitted(samples: Sequence[Any], kind: Kind, right_m: float) -> Coefficients:
 
 
 def printed(sets: Mapping[Kind, Coefficients]) -> str:
-    """Return the sets as the lines of `probability.py`."""
+    """Return the sets as the lines of `verdict.py`."""
     lines = ["COEFFICIENTS: dict[Kind, Coefficients] = {"]
     for kind, c in sets.items():
         lines += [f'    "{kind}": Coefficients(', f"        bias={c.bias:.3f},"]
@@ -85,18 +84,18 @@ def printed(sets: Mapping[Kind, Coefficients]) -> str:
 
 def told(sets: Mapping[Kind, Coefficients], samples: Sequence[Any], drop: str) -> Array:
     """Return the probability of every sample, the checks whose name begins with `drop` left out."""
-    before = dict(probability.COEFFICIENTS)
-    probability.COEFFICIENTS.update(sets)
+    before = dict(verdict.COEFFICIENTS)
+    verdict.COEFFICIENTS.update(sets)
     try:
         return np.array([
-            probability.probability_right({
+            verdict.probability_right({
                 n: v for n, v in s["checks"].items() if not (drop and n.startswith(drop))
             })
             for s in samples
         ])  # fmt: skip
     finally:
-        probability.COEFFICIENTS.clear()
-        probability.COEFFICIENTS.update(before)
+        verdict.COEFFICIENTS.clear()
+        verdict.COEFFICIENTS.update(before)
 
 
 def figures(name: str, p: Array, right: NDArray[np.bool_]) -> str:

@@ -21,7 +21,7 @@ from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose
 from realsim.registration.body import make_body
 from realsim.registration.intake import take_in
-from realsim.registration.judge import Poses, judged
+from realsim.registration.judge import Poses, judge_objects
 from realsim.registration.many_views import comparer_on, register_many
 from realsim.registration.search.records import Region, Wanted
 
@@ -131,6 +131,6 @@ def _judged(g: Given, claims: Sequence[Array]) -> list[ObjectPose]:
     given = Poses(
         bodies=bodies, poses=many.poses, clouds=many.clouds, covariances=list(many.covariances),
         blind=[0] * len(bodies), contrasts=[None] * len(bodies), cameras=many.refined.cameras,
-        plane=many.plane, with_starts=False,
+        plane=many.plane, known=(), with_starts=False,
     )  # fmt: skip
-    return judged(intake, given, comparer, c).objects
+    return judge_objects(intake, given, comparer, c).objects

@@ -1,6 +1,6 @@
 """One object instance as the fit sees it: distance field, surface samples, ray-casting scene."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from dataclasses import field as derived
 from pathlib import Path
 from typing import Any
@@ -52,6 +52,11 @@ class Body:
     def center(self, T_world_obj: Array) -> Array:
         """Return the centre of the bounding box (3,) in world [m]."""
         return T_world_obj[:3, :3] @ self.center_obj + T_world_obj[:3, 3]
+
+
+def moved_body(body: Body, T_world_obj: Array) -> Body:
+    """Return the body with another start (4, 4)."""
+    return replace(body, start=replace(body.start, T_world_obj=T_world_obj))
 
 
 def make_body(

@@ -12,7 +12,7 @@ from realsim.geometry.depth import edge_mask
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body, footprint, pixel_box
 from realsim.registration.evidence import DepthFrame, DepthNoise
-from realsim.registration.plane import table_depth
+from realsim.registration.table_planes import table_depth
 
 Array = NDArray[np.float64]
 

@@ -5,28 +5,25 @@ from pathlib import Path
 from typing import Literal
 
 from realsim.records.depth_bias import DepthBias
-from realsim.registration.blind import BlindConfig
+from realsim.registration.blind import BlindConfig, CovarianceConfig
 from realsim.registration.compare import CompareConfig
-from realsim.registration.covariance import CovarianceConfig
 from realsim.registration.evidence import EvidenceConfig
 from realsim.registration.find_table import TableSearchConfig
-from realsim.registration.hypotheses import SearchConfig
-from realsim.registration.joint import JointConfig
 from realsim.registration.judging.held_out import HeldOutConfig
-from realsim.registration.judging.scene_checks import SceneCheckConfig
+from realsim.registration.judging.scene_checks import SceneCheckConfig, SwappedConfig
 from realsim.registration.judging.surface_residuals import ResidualConfig
 from realsim.registration.judging.unit_checks import UnitConfig
 from realsim.registration.judging.verdict import VerdictConfig
 from realsim.registration.near_rivals import RivalConfig
+from realsim.registration.near_start import JointConfig, SearchConfig
 from realsim.registration.odometry.cross_check import CheckConfig
-from realsim.registration.plane import PlaneConfig
 from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.search.find import FindConfig
 from realsim.registration.single_view import SingleViewConfig
 from realsim.registration.solver import SolverConfig
-from realsim.registration.swapped import SwappedConfig
+from realsim.registration.table_planes import PlaneConfig
 from realsim.registration.verify import OffsetConfig, SinkingConfig, VerifyConfig
-from realsim.registration.view_findings import ViewCheckConfig
+from realsim.registration.view_agreement import ViewCheckConfig
 from realsim.registration.views import SampleConfig
 
 Method = Literal["joint", "top-down"]

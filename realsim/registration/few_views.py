@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.blind import Kept, keep_start
-from realsim.registration.body import Body
+from realsim.registration.body import Body, moved_body
 from realsim.registration.compare import Comparer, make_comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import (
@@ -27,17 +27,16 @@ from realsim.registration.evidence import (
     held,
     without_table,
 )
-from realsim.registration.hypotheses import BestHypothesis, search
 from realsim.registration.intake import Intake
-from realsim.registration.joint import joint_fit
-from realsim.registration.plane import find_support_plane
+from realsim.registration.near_start import BestStart, joint_fit, search
 from realsim.registration.solver import FreeSpace
+from realsim.registration.table_planes import find_support_plane
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class FewViewsTask:
+class NearTask:
     """What every step needs."""
 
     intake: Intake
@@ -74,7 +73,7 @@ class FewViews:
     kept: list[Kept]
     clouds: list[Cloud]
     """Each object's own points."""
-    found: list[BestHypothesis]
+    found: list[BestStart]
     history: list[dict[str, Any]]
     plane: SupportPlane | None
     no_plane: str
@@ -83,7 +82,7 @@ class FewViews:
 
 def begin(
     intake: Intake, bodies: Sequence[Body], config: RegistrationConfig, up: Array | None
-) -> FewViewsTask:
+) -> NearTask:
     """Return the points near the bodies' starts, and the plane under them."""
     evidence = gather(intake.intrinsics, intake.frames, bodies, config.evidence)
     centers = np.stack([b.center(b.T_start) for b in bodies])
@@ -91,10 +90,12 @@ def begin(
     distance = float(np.median(np.linalg.norm(cameras - centers.mean(0), axis=1)))
     sigma = float(evidence.noise.sigma(np.array([distance]))[0])
     plane, why = find_support_plane(evidence.support, centers, cameras, config.plane, sigma, up)
-    return FewViewsTask(intake, plane, why, evidence, config)
+    return NearTask(intake, plane, why, evidence, config)
 
 
-def search_near(work: FewViewsTask, bodies: Sequence[Body], tick: Callable[[], None]) -> list[BestHypothesis]:
+def search_near(
+    work: NearTask, bodies: Sequence[Body], tick: Callable[[], None]
+) -> list[BestStart]:
     """Return of every body the pose near its start that explains the images best."""
     return [
         _search_one(work, body, near, tick)
@@ -127,7 +128,7 @@ def register_few(
     )  # fmt: skip
 
 
-def _search_one(work: FewViewsTask, body: Body, near: Cloud, tick: Callable[[], None]) -> BestHypothesis:
+def _search_one(work: NearTask, body: Body, near: Cloud, tick: Callable[[], None]) -> BestStart:
     """Return the best hypothesis of one object, its neighbours not yet considered."""
     config = work.config
     center = body.center(body.T_start)
@@ -142,7 +143,7 @@ def _search_one(work: FewViewsTask, body: Body, near: Cloud, tick: Callable[[], 
 
 
 def _joint(
-    work: FewViewsTask, bodies: Sequence[Body], found: Sequence[BestHypothesis]
+    work: NearTask, bodies: Sequence[Body], found: Sequence[BestStart]
 ) -> tuple[list[Kept], list[Cloud], list[dict[str, Any]]]:
     """Return the fits of all objects together, the points of each, and the sweeps' history.
 
@@ -156,10 +157,7 @@ def _joint(
     ]
     near = work.evidence.near
     if max(moved) > config.regather_m:
-        there = [
-            replace(b, start=replace(b.start, T_world_obj=T))
-            for b, T in zip(bodies, poses, strict=True)
-        ]
+        there = [moved_body(b, T) for b, T in zip(bodies, poses, strict=True)]
         near = gather(work.intake.intrinsics, work.intake.frames, there, config.evidence).near
     clouds = [
         averaged(

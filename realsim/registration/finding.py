@@ -10,17 +10,16 @@ from numpy.typing import NDArray
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, names_of
-from realsim.registration.body import Body, make_body
+from realsim.registration.body import Body, make_body, moved_body
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.few_views import begin, search_near
 from realsim.registration.intake import Intake
-from realsim.registration.judging.scene_checks import SceneFinding
+from realsim.registration.judging.scene_checks import SceneFinding, with_swaps
 from realsim.registration.judging.unit_checks import unit_errors
 from realsim.registration.odometry.cross_check import KinematicsCheck
 from realsim.registration.reports import search_report
 from realsim.registration.search.find import find_objects
 from realsim.registration.search.records import NotPlaced, Placed, Region, SearchResult, Wanted
-from realsim.registration.swapped import with_swaps
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -46,7 +45,7 @@ class Ticker:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class RegistrationTask:
+class SceneTask:
     """What every step of one registration needs."""
 
     name: str
@@ -164,22 +163,20 @@ def _middle_pose(intake: Intake) -> Array:
     return se3.from_translation(np.median(view.world(), axis=0))
 
 
-def found_objects(work: RegistrationTask, asked: list[Wanted] | None) -> FoundObjects:
+def seek_objects(task: SceneTask, asked: list[Wanted] | None) -> FoundObjects:
     """Return the objects near their final poses, whatever was known of them before."""
-    intake, config = work.intake, work.config
+    intake, config = task.intake, task.config
     near_only = asked is not None and all(w.T_start is not None for w in asked)
     few = len(intake.frames) < config.refine_from
     if asked is not None and not asked:
-        return FoundObjects(
-            bodies=[], claimed=[], contrasts=[], rivals=[], reports=[], not_placed=(), report={}
-        )
+        return _objects_near(task, [])
     if config.method == "top-down" and asked is None:
         raise InputError(
             "method 'top-down' fits objects from rough poses and none were given; give one per "
             "object, or use method 'joint'."
         )
     if config.method == "top-down" or (near_only and (few or intake.plane is None)):
-        return _found_near(work, asked or [])
+        return _objects_near(task, asked or [])
     if intake.plane is None:
         lost = [w for w in asked or () if w.T_start is None]
         reason = (
@@ -193,30 +190,30 @@ def found_objects(work: RegistrationTask, asked: list[Wanted] | None) -> FoundOb
                 f"no table was found: {intake.no_plane} Without one, objects can only be "
                 "registered from rough poses; name them with their poses."
             )
-        found = _found_near(work, near)
+        found = _objects_near(task, near)
         return replace(found, not_placed=(*found.not_placed, *missing))
     plane = intake.plane
 
     def search(these: Sequence[Wanted] | None) -> SearchResult:
         return find_objects(
-            intake.intrinsics, intake.frames, intake.views, plane, intake.noise, work.models,
-            these, config.find, field_folder=config.field_folder, progress=work.tick.each,
+            intake.intrinsics, intake.frames, intake.views, plane, intake.noise, task.models,
+            these, config.find, field_folder=config.field_folder, progress=task.tick.each,
         )  # fmt: skip
 
     result, findings = search(asked), []
     if asked is not None:
-        result, findings = with_swaps(result, asked, dict(work.models), search, config.swapped)
+        result, findings = with_swaps(result, asked, dict(task.models), search, config.swapped)
     wrong = {i for f in findings for i in f.instances}
     claims = [w for w in asked or () if w.instance not in wrong]
-    return replace(_as_found(work, result, claims), findings=tuple(findings))
+    return replace(_found_objects(task, result, claims), findings=tuple(findings))
 
 
-def _as_found(work: RegistrationTask, result: SearchResult, asked: Sequence[Wanted]) -> FoundObjects:
+def _found_objects(task: SceneTask, result: SearchResult, asked: Sequence[Wanted]) -> FoundObjects:
     """Return what a search placed as bodies, with what was rightly claimed of them."""
     claims = {w.instance: w.T_start for w in asked}
     placed: list[Placed] = sorted(result.placed, key=lambda p: p.instance)
     return FoundObjects(
-        bodies=[_body(work, p.obj_id, p.instance, p.T_world_obj) for p in placed],
+        bodies=[_body(task, p.obj_id, p.instance, p.T_world_obj) for p in placed],
         claimed=[claims.get(p.instance) for p in placed],
         contrasts=[p.contrast for p in placed],
         rivals=[p.T_rival for p in placed],
@@ -225,43 +222,40 @@ def _as_found(work: RegistrationTask, result: SearchResult, asked: Sequence[Want
     )  # fmt: skip
 
 
-def _found_near(work: RegistrationTask, asked: list[Wanted]) -> FoundObjects:
+def _objects_near(task: SceneTask, asked: list[Wanted]) -> FoundObjects:
     """Return the objects at their claimed starts; where there are few views the fit searches."""
     T_starts = [w.T_start for w in asked if w.T_start is not None]
     missing = [
         NotPlaced(
             obj_id=w.obj_id, instance=w.instance,
-            reason=f"method '{work.config.method}' fits from rough poses only, and it has none.",
+            reason=f"method '{task.config.method}' fits from rough poses only, and it has none.",
         )
         for w in asked if w.T_start is None
     ]  # fmt: skip
-    bodies = [_body(work, w.obj_id, w.instance, w.T_start) for w in asked if w.T_start is not None]
+    bodies = [_body(task, w.obj_id, w.instance, w.T_start) for w in asked if w.T_start is not None]
     reports: list[dict[str, Any]] = [{} for _ in bodies]
-    many = len(work.intake.frames) >= work.config.refine_from and work.config.refine_cameras
-    if many and bodies and work.config.method == "joint":
-        started = begin(work.intake, bodies, work.config, work.up)
-        found = search_near(started, bodies, work.tick)
+    many = len(task.intake.frames) >= task.config.refine_from and task.config.refine_cameras
+    if many and bodies and task.config.method == "joint":
+        started = begin(task.intake, bodies, task.config, task.up)
+        found = search_near(started, bodies, task.tick)
         reports = [f.report for f in found]
-        bodies = [
-            replace(b, start=replace(b.start, T_world_obj=f.fit.T_world_obj))
-            for b, f in zip(bodies, found, strict=True)
-        ]
+        bodies = [moved_body(b, f.fit.T_world_obj) for b, f in zip(bodies, found, strict=True)]
     return FoundObjects(
         bodies=bodies, claimed=list(T_starts), contrasts=[None] * len(bodies),
         rivals=[None] * len(bodies), reports=reports, not_placed=tuple(missing), report={},
     )  # fmt: skip
 
 
-def _body(work: RegistrationTask, obj_id: int, instance: int, T: Array) -> Body:
+def _body(task: SceneTask, obj_id: int, instance: int, T: Array) -> Body:
     """Return the body of an instance at a pose."""
-    c = work.config
+    c = task.config
     start = ObjectPose(obj_id=obj_id, instance=instance, T_world_obj=T)
-    return make_body(start, work.models[obj_id], c.field_cells, c.samples, c.field_folder)
+    return make_body(start, task.models[obj_id], c.field_cells, c.samples, c.field_folder)
 
 
 def claimed_bodies(found: FoundObjects) -> list[Body]:
     """Return the bodies with the starts that somebody claimed, where somebody did."""
     return [
-        b if T is None else replace(b, start=replace(b.start, T_world_obj=T))
+        b if T is None else moved_body(b, T)
         for b, T in zip(found.bodies, found.claimed, strict=True)
     ]

@@ -13,12 +13,13 @@ from realsim.registration.find_table import region_of_interest
 from realsim.registration.view_agreement import (
     NO_COUNTS,
     Counts,
+    ViewCheckConfig,
+    ViewFinding,
     ViewMaps,
     compare,
     make_maps,
     partners,
 )
-from realsim.registration.view_findings import ViewCheckConfig, ViewFinding
 from realsim.registration.views import ViewPoints
 
 Array = NDArray[np.float64]

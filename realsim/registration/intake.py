@@ -22,8 +22,8 @@ from realsim.registration.evidence import (
 )
 from realsim.registration.find_table import find_table, looked_at
 from realsim.registration.odometry.cross_check import KinematicsCheck, check_kinematics
+from realsim.registration.view_agreement import ViewFinding
 from realsim.registration.view_checks import check_views
-from realsim.registration.view_findings import ViewFinding
 from realsim.registration.views import (
     SampleConfig,
     ViewPoints,

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,14 @@ from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import Cloud
 from realsim.registration.intake import Intake, scene_cloud
 from realsim.registration.judging.held_out import half_fit, held_out, owned_points
-from realsim.registration.judging.probability import probability_right
-from realsim.registration.judging.residual_checks import error_level_m, residual_checks
-from realsim.registration.judging.scene_checks import SceneFinding
-from realsim.registration.judging.scene_checks import scene_findings
-from realsim.registration.judging.support import support_checks
-from realsim.registration.judging.surface_residuals import surface_residuals
-from realsim.registration.judging.verdict import verdict_of
-from realsim.registration.result import Finding
+from realsim.registration.judging.scene_checks import SceneFinding, scene_findings
+from realsim.registration.judging.surface_residuals import (
+    error_level_m,
+    residual_checks,
+    surface_residuals,
+)
+from realsim.registration.judging.verdict import probability_right, verdict_of
+from realsim.registration.table_planes import support_checks
 from realsim.registration.verify import Checked, verify_objects
 
 Array = NDArray[np.float64]
@@ -31,6 +31,20 @@ COMMON = ("common shift", "common sinking")
 """Findings on the scene's starts, depth or models that speak against no single pose."""
 WORST = ("accepted", "doubtful", "rejected")
 """Verdicts, better first."""
+
+
+class Finding(Protocol):
+    """Something that is wrong with a view, or with the scene as a whole."""
+
+    @property
+    def kind(self) -> str:
+        """What it is, in a word or two."""
+        ...
+
+    @property
+    def words(self) -> str:
+        """One or two sentences for a person."""
+        ...
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -55,14 +69,16 @@ class Poses:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Judged:
+class Judgement:
     """The judged objects and what is wrong with the scene."""
 
     objects: list[ObjectPose]
     findings: Sequence[Finding]
 
 
-def judged(intake: Intake, given: Poses, comparer: Comparer, config: RegistrationConfig) -> Judged:
+def judge_objects(
+    intake: Intake, given: Poses, comparer: Comparer, config: RegistrationConfig
+) -> Judgement:
     """Return the objects with checks, probability, verdict and reasons."""
     checked = verify_objects(given.bodies, given.poses, given.clouds, comparer, config.verify)
     features = _features(intake, given, checked, config)
@@ -79,7 +95,7 @@ def judged(intake: Intake, given: Poses, comparer: Comparer, config: Registratio
         _object(given, k, checked[k], features[k], probabilities[k], findings, config)
         for k in range(len(given.bodies))
     ]
-    return Judged(objects=objects, findings=findings)
+    return Judgement(objects=objects, findings=findings)
 
 
 def _features(

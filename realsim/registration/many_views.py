@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.records.depth_bias import DepthBias
-from realsim.registration.blind import Kept, keep_start, nearest_to_start
+from realsim.registration.blind import Kept, blind_motions, keep_start, nearest_to_start
 from realsim.registration.body import Body
 from realsim.registration.compare import Comparer, make_comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.covariance import blind_motions
 from realsim.registration.evidence import (
     Cloud,
     DepthFrame,
@@ -23,10 +22,10 @@ from realsim.registration.evidence import (
     without_table,
 )
 from realsim.registration.intake import Intake
-from realsim.registration.joint import assigned
+from realsim.registration.near_start import assigned
 from realsim.registration.refinement.config import RefineConfig
+from realsim.registration.refinement.equations import State
 from realsim.registration.refinement.refine import Refined, refine
-from realsim.registration.refinement.state import State
 from realsim.registration.refinement.uncertainty import SeenPose, object_covariance, seen_poses
 from realsim.registration.solver import Fit, solve_pose
 from realsim.registration.views import ViewPoints

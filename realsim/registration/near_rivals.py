@@ -16,7 +16,7 @@ from realsim.geometry import se3
 from realsim.geometry.metrics import mssd_symmetric
 from realsim.registration.body import Body
 from realsim.registration.evidence import Cloud
-from realsim.registration.judging.probability import CONTRAST_DECIDED
+from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.registration.solver import SolverConfig, solve_pose
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,27 +18,26 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, Scene
-from realsim.registration.blind import Kept
-from realsim.registration.body import Body
+from realsim.registration.blind import Kept, Uncertainty, uncertainty
+from realsim.registration.body import Body, moved_body
 from realsim.registration.compare import Comparer
 from realsim.registration.config import METHODS, RegistrationConfig
-from realsim.registration.covariance import uncertainty
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.few_views import register_few
 from realsim.registration.finding import (
     FoundObjects,
     Progress,
+    SceneTask,
     Ticker,
-    RegistrationTask,
     claimed_bodies,
-    found_objects,
     in_units,
     models_in_units,
+    seek_objects,
     wanted_objects,
 )
 from realsim.registration.intake import Intake, check_odometry, take_in
-from realsim.registration.judge import Judged, Poses, judged
-from realsim.registration.judging.probability import CONTRAST_DECIDED
+from realsim.registration.judge import Finding, Poses, judge_objects
+from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.registration.many_views import ManyViews, comparer_on, register_many
 from realsim.registration.near_rivals import Duel, duels
 from realsim.registration.refinement.uncertainty import SeenPose
@@ -48,7 +47,6 @@ from realsim.registration.reports import (
     object_report,
     plane_report,
 )
-from realsim.registration.result import Finding, Registration
 from realsim.registration.search.records import NotPlaced, Wanted
 from realsim.registration.single_view import fit_single_view, reference_frame
 from realsim.registration.verify import verify_objects
@@ -57,6 +55,28 @@ from realsim.registration.view_checks import check_views
 __all__ = ["DepthFrame", "Registration", "RegistrationConfig", "register_scene"]
 
 Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Registration:
+    """A registered scene, its baseline, and how it came about."""
+
+    scene: Scene
+    """Poses with covariance, checks, verdict, reasons; and the support plane."""
+    single_view: Scene
+    """The baseline: robust ICP in one reference frame, checked in the same way."""
+    cameras: dict[int, Array]
+    """View number -> (4, 4) T_world_cam; refined if the views allow it. Views that were left out
+    are not in it."""
+    seen: dict[int, dict[int, SeenPose]]
+    """View number -> instance -> its pose in that view, with covariance and pixel uncertainty.
+    Empty if cameras were not refined."""
+    not_placed: tuple[NotPlaced, ...]
+    """Objects that were wanted and not found, and why."""
+    findings: tuple[Finding, ...]
+    """What is wrong with views or with the scene."""
+    report: Mapping[str, Any]
+    """Plain JSON values: per object the search, the residuals, what was rejected; the cameras."""
 
 
 def register_scene(
@@ -102,71 +122,71 @@ def register_scene(
         kinematics, why_not = check_odometry(intake, config)
         if why_not is not None:
             intake = replace(intake, findings=(*intake.findings, why_not))
-    work = RegistrationTask(name, intake, models, config, up, tick, kinematics)
-    found = found_objects(work, asked)
+    task = SceneTask(name, intake, models, config, up, tick, kinematics)
+    found = seek_objects(task, asked)
     missing = (*refused, *found.not_placed)
     if not found.bodies:
-        return _nothing(work, found, missing)
-    if len(intake.frames) >= config.refine_from and config.refine_cameras:
-        return _with_many(work, found, missing)
-    return _with_few(work, found, missing)
+        return _nothing(task, found, missing)
+    many = len(intake.frames) >= config.refine_from and config.refine_cameras
+    fit = _fit_many(task, found) if many else _fit_few(task, found)
+    return _registration(task, found, missing, fit)
 
 
-def _with_many(work: RegistrationTask, found: FoundObjects, missing: tuple[NotPlaced, ...]) -> Registration:
-    """Return the registration with everything refined together."""
-    intake, config = work.intake, work.config
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class _Fit:
+    """Objects at their final poses, not yet judged."""
+
+    poses: Poses
+    frames: Sequence[DepthFrame]
+    """With the cameras and the depth as they are now known."""
+    kept: list[Kept]
+    uncertain: list[Uncertainty]
+    searches: list[dict[str, Any]]
+    """Per object how it was found, as JSON values."""
+    seen: dict[int, dict[int, SeenPose]]
+    """See `Registration`."""
+    findings: list[Finding]
+    """What does not fit the objects."""
+    report: dict[str, Any]
+    """Of what all objects have in common, as JSON values."""
+
+
+def _fit_many(task: SceneTask, found: FoundObjects) -> _Fit:
+    """Return everything refined together."""
+    intake, config = task.intake, task.config
     claimed = claimed_bodies(found)
     starts = [b if T is not None else None for b, T in zip(claimed, found.claimed, strict=True)]
-    many = register_many(intake, found.bodies, starts, intake.plane, config, work.tick.each)
-    fought = _fought(found, many, config)
-    lost = [_is_lost(d) for d in fought]
-    if any(lost):
-        bodies = [
-            b if d is None or not gone
-            else replace(b, start=replace(b.start, T_world_obj=d.T_rival))
-            for b, d, gone in zip(found.bodies, fought, lost, strict=True)
-        ]  # fmt: skip
-        rivals = [
-            b.T_start if gone else R
-            for b, R, gone in zip(found.bodies, found.rivals, lost, strict=True)
-        ]
-        found = replace(found, bodies=bodies, rivals=rivals)
-        many = register_many(intake, bodies, starts, intake.plane, config)
-        fought = _fought(found, many, config)
-    contrasts = [
-        _contrast(c, d, k) for c, d, k in zip(found.contrasts, fought, many.kept, strict=True)
-    ]
-    comparer = comparer_on(intake, many.frames, many.plane, claimed, many.poses, config)
+    many = register_many(intake, found.bodies, starts, intake.plane, config, task.tick.each)
+    fought = _duels(found, many, config)
+    if any(_is_lost(d) for d in fought):
+        found = _with_rivals(found, fought)
+        many = register_many(intake, found.bodies, starts, intake.plane, config)
+        fought = _duels(found, many, config)
     uncertain = [
         uncertainty(b, k.fit, 1, config.covariance) for b, k in zip(claimed, many.kept, strict=True)
     ]
-    given = Poses(
+    poses = Poses(
         bodies=claimed, poses=many.poses, clouds=many.clouds, covariances=list(many.covariances),
-        blind=[len(u.unobservable) for u in uncertain], contrasts=contrasts,
+        blind=[len(u.unobservable) for u in uncertain],
+        contrasts=[
+            _contrast(c, d, k) for c, d, k in zip(found.contrasts, fought, many.kept, strict=True)
+        ],
         cameras=many.refined.cameras, plane=many.plane,
         known=found.findings, with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
-    result = judged(intake, given, comparer, config)
-    off = _views_off(intake, many, claimed, config)
-    result = replace(result, findings=[*off, *result.findings])
-    work.tick()
     numbers = [f.index for f in intake.frames]
-    instances = [b.start.instance for b in claimed]
-    seen = {
-        number: {i: of[v] for i, of in zip(instances, many.seen, strict=True)}
-        for v, number in enumerate(numbers)
-    }
-    extra = {"refinement": camera_report(many, numbers)}
-    reports = [
-        object_report(b, o, k, r, u)
-        for b, o, k, r, u in zip(
-            claimed, result.objects, many.kept, found.reports, uncertain, strict=True
-        )
-    ]
-    cameras = dict(zip(numbers, many.refined.cameras, strict=True))
-    return _registration(
-        work, (found, missing), (given, result, comparer), (cameras, seen), (extra, reports)
-    )
+    return _Fit(
+        poses=poses, frames=many.frames, kept=many.kept, uncertain=uncertain,
+        searches=found.reports,
+        seen={
+            number: {
+                b.start.instance: of[v] for b, of in zip(claimed, many.seen, strict=True)
+            }
+            for v, number in enumerate(numbers)
+        },
+        findings=_views_off(intake, many, claimed, config),
+        report={"refinement": camera_report(many, numbers)},
+    )  # fmt: skip
 
 
 def _views_off(
@@ -203,7 +223,7 @@ def _is_lost(fought: Duel | None) -> bool:
     return contrast is not None and contrast < -CONTRAST_DECIDED
 
 
-def _fought(found: FoundObjects, many: ManyViews, config: RegistrationConfig) -> list[Duel | None]:
+def _duels(found: FoundObjects, many: ManyViews, config: RegistrationConfig) -> list[Duel | None]:
     """Return how every pose compares with its near-symmetric rival, cameras refined."""
     rivals = [
         None if R is None else T @ se3.invert(b.T_start) @ R
@@ -213,76 +233,74 @@ def _fought(found: FoundObjects, many: ManyViews, config: RegistrationConfig) ->
     return duels(found.bodies, poses, rivals, many.clouds, misfits, config.rivals)
 
 
-def _with_few(work: RegistrationTask, found: FoundObjects, missing: tuple[NotPlaced, ...]) -> Registration:
-    """Return the registration with the cameras at their word."""
-    intake, config = work.intake, work.config
-    few = register_few(intake, found.bodies, config, work.up, work.tick)
+def _with_rivals(found: FoundObjects, fought: Sequence[Duel | None]) -> FoundObjects:
+    """Return the objects with poses and rivals exchanged where the rival is the better one."""
+    bodies, rivals = list(found.bodies), list(found.rivals)
+    for n, d in enumerate(fought):
+        if d is not None and _is_lost(d):
+            rivals[n] = bodies[n].T_start
+            bodies[n] = moved_body(bodies[n], d.T_rival)
+    return replace(found, bodies=bodies, rivals=rivals)
+
+
+def _fit_few(task: SceneTask, found: FoundObjects) -> _Fit:
+    """Return the objects fitted with the cameras at their word."""
+    intake, config = task.intake, task.config
+    few = register_few(intake, found.bodies, config, task.up, task.tick)
     claimed = claimed_bodies(found)
-    plane = few.plane if few.plane is not None else intake.plane
-    poses = [k.fit.T_world_obj for k in few.kept]
-    comparer = comparer_on(intake, intake.frames, plane, claimed, poses, config)
     uncertain = [
         uncertainty(b, k.fit, few.stride, config.covariance)
         for b, k in zip(claimed, few.kept, strict=True)
     ]
-    given = Poses(
-        bodies=claimed, poses=poses, clouds=few.clouds,
+    poses = Poses(
+        bodies=claimed, poses=[k.fit.T_world_obj for k in few.kept], clouds=few.clouds,
         covariances=[u.covariance for u in uncertain],
         blind=[len(u.unobservable) for u in uncertain], contrasts=found.contrasts,
-        cameras=intake.cameras, plane=plane,
+        cameras=intake.cameras, plane=few.plane if few.plane is not None else intake.plane,
         known=found.findings, with_starts=all(T is not None for T in found.claimed),
     )  # fmt: skip
-    result = judged(intake, given, comparer, config)
-    work.tick()
-    reports = [
-        object_report(b, o, k, {**r, **f.report}, u)
-        for b, o, k, r, f, u in zip(
-            claimed, result.objects, few.kept, found.reports, few.found, uncertain, strict=True
-        )
-    ]
-    cameras = {f.index: f.T_world_cam for f in intake.frames}
-    extra: dict[str, Any] = {"joint": few.history}
-    return _registration(
-        work, (found, missing), (given, result, comparer), (cameras, {}), (extra, reports)
-    )
+    return _Fit(
+        poses=poses, frames=intake.frames, kept=few.kept, uncertain=uncertain,
+        searches=[{**r, **f.report} for r, f in zip(found.reports, few.found, strict=True)],
+        seen={}, findings=[], report={"joint": few.history},
+    )  # fmt: skip
 
 
-def _nothing(work: RegistrationTask, found: FoundObjects, missing: tuple[NotPlaced, ...]) -> Registration:
+def _nothing(task: SceneTask, found: FoundObjects, missing: tuple[NotPlaced, ...]) -> Registration:
     """Return the registration of a scene in which nothing was found."""
-    scene = Scene(name=work.name, objects=(), plane=work.intake.plane)
+    scene = Scene(name=task.name, objects=(), plane=task.intake.plane)
     return Registration(
         scene=scene, single_view=scene,
-        cameras={f.index: f.T_world_cam for f in work.intake.frames}, seen={},
-        not_placed=missing, findings=work.intake.findings,
-        report={"frames": [f.index for f in work.intake.frames], "objects": [],
-                "plane": plane_report(work.intake.plane, work.intake.no_plane),
+        cameras={f.index: f.T_world_cam for f in task.intake.frames}, seen={},
+        not_placed=missing, findings=task.intake.findings,
+        report={"frames": [f.index for f in task.intake.frames], "objects": [],
+                "plane": plane_report(task.intake.plane, task.intake.no_plane),
                 "search": found.report},
     )  # fmt: skip
 
 
 def _registration(
-    work: RegistrationTask,
-    search: tuple[FoundObjects, tuple[NotPlaced, ...]],
-    results: tuple[Poses, Judged, Comparer],
-    views: tuple[dict[int, Array], dict[int, dict[int, SeenPose]]],
-    reports: tuple[dict[str, Any], list[dict[str, Any]]],
+    task: SceneTask, found: FoundObjects, missing: tuple[NotPlaced, ...], fit: _Fit
 ) -> Registration:
-    """Return all parts together, with the paper's way beside them."""
-    (found, missing), (given, result, comparer) = search, results
-    intake, config = work.intake, work.config
-    single, single_report = _single_view(work, given, comparer)
-    work.tick()
-    objects = tuple(result.objects)
-    baseline = Scene(name=f"{work.name} (single view)", objects=tuple(single), plane=given.plane)
+    """Return the objects judged, with the paper's way beside them."""
+    given, intake, config = fit.poses, task.intake, task.config
+    comparer = comparer_on(intake, fit.frames, given.plane, given.bodies, given.poses, config)
+    judgement = judge_objects(intake, given, comparer, config)
+    task.tick()
+    single, single_report = _single_view(task, given, comparer)
+    task.tick()
+    objects = tuple(judgement.objects)
+    scene = Scene(name=task.name, objects=objects, plane=given.plane)
+    baseline = Scene(name=f"{task.name} (single view)", objects=tuple(single), plane=given.plane)
+    cameras = {f.index: T for f, T in zip(intake.frames, given.cameras, strict=True)}
+    seen = fit.seen
     if config.method == "top-down":
-        scene = replace(baseline, name=work.name)
+        scene = replace(baseline, name=task.name)
         # The paper carries its poses to the other views by the cameras as they are claimed.
-        views = {f.index: f.T_world_cam for f in intake.frames}, {}
+        cameras, seen = {f.index: f.T_world_cam for f in intake.frames}, {}
         missing = (*missing, *_not_seen(given, single, single_report))
-    else:
-        scene = Scene(name=work.name, objects=objects, plane=given.plane)
-    gross = () if work.kinematics is None else work.kinematics.faults
-    findings = (*intake.findings, *gross, *result.findings)
+    gross = () if task.kinematics is None else task.kinematics.faults
+    findings = (*intake.findings, *gross, *fit.findings, *judgement.findings)
     report = {
         "method": config.method,
         "frames": [f.index for f in intake.frames],
@@ -296,12 +314,17 @@ def _registration(
             {"obj_id": n.obj_id, "instance": n.instance, "reason": n.reason} for n in missing
         ],
         "findings": [{"kind": f.kind, "words": f.words} for f in findings],
-        "kinematics": None if work.kinematics is None else work.kinematics.as_json(),
-        **reports[0],
-        "objects": reports[1],
+        "kinematics": None if task.kinematics is None else task.kinematics.as_json(),
+        **fit.report,
+        "objects": [
+            object_report(*one)
+            for one in zip(
+                given.bodies, objects, fit.kept, fit.searches, fit.uncertain, strict=True
+            )
+        ],
     }
     return Registration(
-        scene=scene, single_view=baseline, cameras=views[0], seen=views[1], not_placed=missing,
+        scene=scene, single_view=baseline, cameras=cameras, seen=seen, not_placed=missing,
         findings=findings, report=report,
     )  # fmt: skip
 
@@ -319,10 +342,10 @@ def _not_seen(
 
 
 def _single_view(
-    work: RegistrationTask, given: Poses, comparer: Comparer
+    task: SceneTask, given: Poses, comparer: Comparer
 ) -> tuple[list[ObjectPose], dict[str, Any]]:
     """Return the baseline's poses and which frame it used; objects it cannot see are left out."""
-    config, intake = work.config, work.intake
+    config, intake = task.config, task.intake
     if not (config.with_single_view or config.method == "top-down"):
         return [], {"frame": None, "not_fitted": []}
     center = np.mean([b.center(b.T_start) for b in given.bodies], axis=0)

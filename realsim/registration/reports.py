@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.records import ObjectPose, SupportPlane
-from realsim.registration.blind import Kept
+from realsim.registration.blind import Kept, Uncertainty
 from realsim.registration.body import Body
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.covariance import Uncertainty
 from realsim.registration.judge import Poses
 from realsim.registration.many_views import ManyViews
 from realsim.registration.refinement.equations import BIAS, HAND_EYE

@@ -12,8 +12,7 @@ from realsim.records import SupportPlane, Verdict
 from realsim.registration.body import Body, footprint
 from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud, DepthFrame
-from realsim.registration.judging.support import support_checks
-from realsim.registration.plane import lowest_height
+from realsim.registration.table_planes import lowest_height, support_checks
 
 Array = NDArray[np.float64]
 

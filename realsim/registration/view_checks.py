@@ -27,7 +27,7 @@ from realsim.registration.held_views import (
     sheet_contradicted,
     support,
 )
-from realsim.registration.view_findings import Kind, ViewCheckConfig, ViewFinding
+from realsim.registration.view_agreement import Kind, ViewCheckConfig, ViewFinding
 from realsim.registration.views import ViewPoints
 
 __all__ = ["ViewCheckConfig", "ViewFinding", "check_views"]

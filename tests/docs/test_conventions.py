@@ -18,7 +18,7 @@ from realsim.geometry.parts import part
 from realsim.interop import T_world_cam_from_gl, colmap_from_opencv_px
 from realsim.records import MEASURES, STAGES, Verdict
 from realsim.records.depth_bias import DepthBias
-from realsim.registration.judging.probability import CONTRAST_DECIDED
+from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim_sim_bridge.annotation.config import SightConfig
 from realsim_sim_bridge.slip.score import ScoreLimits, recompute_scores

@@ -3,18 +3,19 @@
 import numpy as np
 import pytest
 
-from realsim.registration.judging.probability import (
+from realsim.registration.judging.verdict import (
     COEFFICIENTS,
     CONTRAST_DECIDED,
     HELD_OUT,
     NAMES,
     SURFACE,
     TERMS,
+    VerdictConfig,
     kind_of,
     probability_right,
     terms_of,
+    verdict_of,
 )
-from realsim.registration.judging.verdict import VerdictConfig, verdict_of
 
 GOOD = {
     "agree": 0.995,

@@ -10,12 +10,13 @@ from realsim.registration.body import make_body
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.judging.ownership import make_claims, owners
 from realsim.registration.judging.patches import make_patches
-from realsim.registration.judging.residual_checks import (
+from realsim.registration.judging.surface_residuals import (
+    ResidualConfig,
     error_level_m,
     residual_checks,
+    surface_residuals,
     wrong_bound_m,
 )
-from realsim.registration.judging.surface_residuals import ResidualConfig, surface_residuals
 from realsim.registration.views import SampleConfig, sample_views
 from table_scenes import named_scene
 

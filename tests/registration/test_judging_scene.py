@@ -12,8 +12,8 @@ from realsim.registration.body import make_body
 from realsim.registration.compare import CompareConfig, make_comparer
 from realsim.registration.evidence import DepthNoise, averaged
 from realsim.registration.judging.scene_checks import SceneCheckConfig, scene_findings
-from realsim.registration.judging.support import support_checks
 from realsim.registration.judging.unit_checks import unit_errors
+from realsim.registration.table_planes import support_checks
 from realsim.registration.views import SampleConfig, sample_views, world_cloud
 from table_scenes import named_scene
 

@@ -11,10 +11,9 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.odometry.above_table import on_plane, without_plane
 from realsim.registration.odometry.cross_check import CheckConfig, check_kinematics
 from realsim.registration.odometry.kiss import OdometryConfig, odometry, thinned
-from realsim.registration.odometry.pairs import PairConfig, neighbour_pairs
+from realsim.registration.odometry.pairs import PairConfig, neighbour_pairs, on_plane, without_plane
 from realsim.registration.views import SampleConfig, ViewPoints, sample_views
 from table_scenes import small_scene
 

@@ -24,13 +24,15 @@ from realsim.registration.refinement.equations import (
     TABLE_ROWS,
     Blocks,
     Offsets,
+    State,
     add_blocks,
     add_offsets,
     assembled,
+    centred,
+    moved,
     object_at,
 )
-from realsim.registration.refinement.residuals import exact_residuals, thin_share
-from realsim.registration.refinement.state import State, centred, moved
+from realsim.registration.refinement.points import exact_residuals, thin_share
 
 Array = NDArray[np.float64]
 TINY_M = 1e-9

@@ -9,7 +9,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.metrics import mssd
 from realsim.records import ObjectPose
-from realsim.registration.covariance import CovarianceConfig
+from realsim.registration.blind import CovarianceConfig
 from realsim.registration.register import DepthFrame, RegistrationConfig, register_scene
 
 CONFIG = RegistrationConfig(

@@ -14,8 +14,7 @@ from realsim.geometry.metrics import mssd_symmetric
 from realsim.geometry.parts import part
 from realsim.records import Mesh, ObjectModel, ObjectPose
 from realsim.registration.evidence import DepthFrame
-from realsim.registration.register import RegistrationConfig, register_scene
-from realsim.registration.result import Registration
+from realsim.registration.register import Registration, RegistrationConfig, register_scene
 from realsim.registration.search.records import Region, Wanted
 from realsim.registration.simulated import TableScene
 from realsim.registration.simulated_faults import (

@@ -12,8 +12,8 @@ from realsim.geometry.parts import part
 from realsim.records import Mesh, ObjectModel, ObjectPose, SupportPlane
 from realsim.registration.body import make_body
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.search.contrast import ContrastConfig, Decision, decided
-from realsim.registration.search.refine import CandidateConfig, Sought, fuse
+from realsim.registration.search.candidates import CandidateConfig, Sought, fuse
+from realsim.registration.search.polish import ContrastConfig, Decision, decided
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import ScoreConfig, make_canvas
 from realsim.registration.simulated import TableScene, resized, table_scene

@@ -8,12 +8,11 @@ from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.search.bench import FindConfig, fitted_candidates, make_bench
-from realsim.registration.search.exchange import exchanged
+from realsim.registration.search.candidates import CandidateConfig, candidate
 from realsim.registration.search.records import Wanted
-from realsim.registration.search.refine import CandidateConfig, candidate
 from realsim.registration.search.scoring import ScoreConfig
 from realsim.registration.search.selection import Selection, buffer_of
-from realsim.registration.search.state import Search
+from realsim.registration.search.state import Search, exchanged
 from realsim.registration.search.templates import TemplateConfig
 from realsim.registration.views import SampleConfig, sample_views
 from table_scenes import named_scene

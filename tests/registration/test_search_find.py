@@ -10,9 +10,9 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.find_table import TableSearchConfig, find_table
+from realsim.registration.search.candidates import CandidateConfig
 from realsim.registration.search.find import FindConfig, find_objects
 from realsim.registration.search.records import Region, SearchResult, Wanted
-from realsim.registration.search.refine import CandidateConfig
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import ScoreConfig
 from realsim.registration.search.templates import TemplateConfig

@@ -11,6 +11,7 @@ from realsim.geometry.parts import part
 from realsim.records import ObjectPose
 from realsim.registration.body import make_body
 from realsim.registration.evidence import Cloud
+from realsim.registration.search.candidates import Candidate, Sought
 from realsim.registration.search.peel import (
     PeelConfig,
     clusters,
@@ -18,7 +19,6 @@ from realsim.registration.search.peel import (
     residual_starts,
     suspects,
 )
-from realsim.registration.search.refine import Candidate, Sought
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Render, Score
 

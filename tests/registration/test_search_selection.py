@@ -9,7 +9,7 @@ from realsim.geometry import se3
 from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.body import make_body
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.search.refine import Candidate, Sought, candidate
+from realsim.registration.search.candidates import Candidate, Sought, candidate
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import Canvas, ScoreConfig, compose, make_canvas, score
 from realsim.registration.search.selection import (

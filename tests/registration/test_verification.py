@@ -5,12 +5,12 @@ import pytest
 
 from realsim.geometry import se3
 from realsim.records import ObjectPose, SupportPlane
+from realsim.registration.blind import CovarianceConfig, uncertainty
 from realsim.registration.body import make_body
 from realsim.registration.compare import CompareConfig, make_comparer, spread_frames
-from realsim.registration.covariance import CovarianceConfig, uncertainty
 from realsim.registration.evidence import EvidenceConfig, averaged, gather, without_table
-from realsim.registration.plane import PlaneConfig, find_support_plane
 from realsim.registration.solver import SolverConfig, solve_pose
+from realsim.registration.table_planes import PlaneConfig, find_support_plane
 from realsim.registration.verify import (
     SinkingConfig,
     VerifyConfig,

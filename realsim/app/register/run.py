@@ -36,7 +36,7 @@ from realsim.app.stages import is_current, mark_current, require_sound, take_mod
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, ObjectModel, Scene
 from realsim.registration.refinement.uncertainty import SeenPose
-from realsim.registration.result import Registration
+from realsim.registration.register import Registration
 from realsim.store import SessionStore
 
 Array = NDArray[np.float64]

@@ -1,12 +1,254 @@
 """Accepted, doubtful or rejected, and why, in words with numbers."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from realsim.records import Verdict
-from realsim.registration.judging.probability import CONTRAST_DECIDED
+
+Array = NDArray[np.float64]
+Kind = Literal["views", "no_held_out", "single_view"]
+LEAST_ODDS = 0.003
+"""Added to both sides of a share before its odds are taken: 3 of 1000 pixels are always off."""
+HIDDEN_FREE = 0.3
+"""To be hidden up to this share by what is no model speaks against no pose."""
+LOWEST, HIGHEST = 0.0005, 0.9995
+"""No check can be surer than what it was calibrated on: some thousand poses."""
+CONTRAST_DECIDED = 0.1
+"""From this contrast to its rival on, a near-symmetric pose is decided (facts of simulated tables:
+right ones have 0.14 to 0.4)."""
+CONTRAST_WEIGHT = 3.0
+"""What a contrast of 0 takes from the log-odds. Set, not fitted: at a contrast of 0 two poses are
+as good as each other, whatever else is right; 20 : 1 becomes 1 : 1."""
+
+
+def _odds(name: str) -> Callable[[Mapping[str, float]], float]:
+    """Return the transform of a share of which more is better."""
+
+    def term(f: Mapping[str, float]) -> float:
+        p = float(np.clip(f[name], 0.0, 1.0))
+        return float(np.log((p + LEAST_ODDS) / (1.0 - p + LEAST_ODDS)))
+
+    return term
+
+
+def _root(name: str) -> Callable[[Mapping[str, float]], float]:
+    """Return the transform of a share of which less is better: the root spreads small ones."""
+    return lambda f: -float(np.sqrt(np.clip(f[name], 0.0, 1.0)))
+
+
+def _length(name: str, unit: float, most: float) -> Callable[[Mapping[str, float]], float]:
+    """Return the transform of a length of which less is better, in `unit`, cut at `most` of it."""
+    return lambda f: -float(np.log1p(np.clip(f[name] / unit, 0.0, most)))
+
+
+def _relative(name: str, unit: float, most: float) -> Callable[[Mapping[str, float]], float]:
+    """Return the same of a length that errors common to the session lengthen too.
+
+    Its unit grows with `residual_bound_mm` [mm], which is 1 on the tables of the calibration and up
+    to 5 with a camera at 1 m and hand-made meshes.
+    """
+
+    def term(f: Mapping[str, float]) -> float:
+        bound = f.get("residual_bound_mm", 1.0)
+        scale = max(1.0, bound) if np.isfinite(bound) else 1.0
+        return -float(np.log1p(np.clip(f[name] / (unit * scale), 0.0, most)))
+
+    return term
+
+
+TERMS: dict[str, Callable[[Mapping[str, float]], float]] = {
+    "agree": _odds("agree"),
+    "gain": lambda f: float(np.clip(f["gain"], -1.0, 1.0)),
+    "cover": _odds("cover"),
+    "free_space_violation": _root("free_space_violation"),
+    "hidden": lambda f: -float(np.clip(f["hidden"] - HIDDEN_FREE, 0.0, 1.0)),
+    "n_pixels": lambda f: float(np.clip(np.log(max(f["n_pixels"], 1.0) / 1e4), -4.0, 0.0)),
+    "residual_median_mm": _relative("residual_median_mm", 0.5, 20.0),
+    "penetration_mm": _relative("penetration_mm", 2.0, 20.0),
+    "sunk_mm": _relative("sunk_mm", 1.0, 50.0),
+    "floating_mm": _relative("floating_mm", 2.0, 50.0),
+    "wrong_surface": _root("wrong_surface"),
+    "patch_rms": lambda f: -float(np.clip(f["patch_rms"], 0.0, 4.0)),
+    "wrong_patch_mm2": _length("wrong_patch_mm2", 30.0, 200.0),
+    "looked_through": _root("looked_through"),
+    "held_out_shift_mm": _length("held_out_shift_mm", 0.5, 100.0),
+    "held_out_agree": _odds("held_out_agree"),
+}
+"""From checks by name to terms; all grow with the evidence for the pose."""
+IMAGES = (
+    "agree", "gain", "cover", "free_space_violation", "hidden", "n_pixels", "residual_median_mm",
+    "penetration_mm", "sunk_mm", "floating_mm",
+)  # fmt: skip
+SURFACE = ("wrong_surface", "patch_rms", "wrong_patch_mm2", "looked_through")
+HELD_OUT = ("held_out_shift_mm", "held_out_agree")
+NAMES: dict[Kind, tuple[str, ...]] = {
+    "views": (*IMAGES, *SURFACE, *HELD_OUT),
+    "no_held_out": (*IMAGES, *SURFACE),
+    "single_view": IMAGES,
+}
+"""The checks that each set of coefficients needs."""
+NEEDED = ("agree", "gain", "cover", "free_space_violation")
+"""Without these nothing can be said; others that are missing are taken as unremarkable."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Coefficients:
+    """Of one set."""
+
+    bias: float
+    """b."""
+    weights: Mapping[str, float]
+    """c_i >= 0 by name; a name that is missing has 0."""
+    usual: Mapping[str, float]
+    """Term of a check that is missing (no table: neither sunk nor floating): the median of right
+    poses."""
+
+
+# COEFFICIENTS-BEGIN
+COEFFICIENTS: dict[Kind, Coefficients] = {
+    "views": Coefficients(
+        bias=0.152,
+        weights={
+            "agree": 0.476,
+            "gain": 0.691,
+            "cover": 0.432,
+            "free_space_violation": 2.511,
+            "hidden": 11.473,
+            "residual_median_mm": 0.006,
+            "penetration_mm": 0.249,
+            "sunk_mm": 0.559,
+            "floating_mm": 2.227,
+            "wrong_surface": 3.027,
+            "patch_rms": 0.442,
+            "wrong_patch_mm2": 0.519,
+            "looked_through": 2.252,
+            "held_out_shift_mm": 0.892,
+            "held_out_agree": 0.143,
+        },
+        usual={
+            "agree": 5.023,
+            "gain": 0.929,
+            "cover": 5.274,
+            "free_space_violation": -0.050,
+            "hidden": 0.000,
+            "n_pixels": 0.000,
+            "residual_median_mm": -0.533,
+            "penetration_mm": 0.000,
+            "sunk_mm": -0.062,
+            "floating_mm": 0.000,
+            "wrong_surface": 0.000,
+            "patch_rms": 0.000,
+            "wrong_patch_mm2": 0.000,
+            "looked_through": 0.000,
+            "held_out_shift_mm": -0.707,
+            "held_out_agree": 5.789,
+        },
+    ),
+    "no_held_out": Coefficients(
+        bias=-0.738,
+        weights={
+            "agree": 0.533,
+            "gain": 0.753,
+            "cover": 0.513,
+            "free_space_violation": 2.751,
+            "hidden": 10.118,
+            "residual_median_mm": 0.123,
+            "penetration_mm": 0.156,
+            "sunk_mm": 0.644,
+            "floating_mm": 2.118,
+            "wrong_surface": 3.370,
+            "patch_rms": 0.488,
+            "wrong_patch_mm2": 0.536,
+            "looked_through": 2.033,
+        },
+        usual={
+            "agree": 5.023,
+            "gain": 0.929,
+            "cover": 5.274,
+            "free_space_violation": -0.050,
+            "hidden": 0.000,
+            "n_pixels": 0.000,
+            "residual_median_mm": -0.533,
+            "penetration_mm": 0.000,
+            "sunk_mm": -0.062,
+            "floating_mm": 0.000,
+            "wrong_surface": 0.000,
+            "patch_rms": 0.000,
+            "wrong_patch_mm2": 0.000,
+            "looked_through": 0.000,
+        },
+    ),
+    "single_view": Coefficients(
+        bias=-2.156,
+        weights={
+            "agree": 0.994,
+            "gain": 1.172,
+            "cover": 0.381,
+            "free_space_violation": 6.870,
+            "hidden": 5.828,
+            "residual_median_mm": 1.160,
+            "penetration_mm": 0.564,
+            "sunk_mm": 0.931,
+            "floating_mm": 4.897,
+        },
+        usual={
+            "agree": 4.957,
+            "gain": 0.918,
+            "cover": 5.074,
+            "free_space_violation": -0.052,
+            "hidden": 0.000,
+            "n_pixels": 0.000,
+            "residual_median_mm": -0.563,
+            "penetration_mm": 0.000,
+            "sunk_mm": -0.077,
+            "floating_mm": 0.000,
+        },
+    ),
+}
+# COEFFICIENTS-END
+
+
+def kind_of(features: Mapping[str, float]) -> Kind:
+    """Return which set of coefficients the checks at hand allow."""
+
+    def has(names: tuple[str, ...]) -> bool:
+        return all(np.isfinite(features.get(n, np.nan)) for n in names)
+
+    if not has(SURFACE):
+        return "single_view"
+    return "views" if has(HELD_OUT) else "no_held_out"
+
+
+def terms_of(features: Mapping[str, float], kind: Kind) -> dict[str, float]:
+    """Return the terms of one set; those whose check is missing or not finite are left out."""
+    return {n: TERMS[n](features) for n in NAMES[kind] if np.isfinite(features.get(n, np.nan))}
+
+
+def probability_right(features: Mapping[str, float | None]) -> float:
+    """Return the probability that a pose is right within 3 mm.
+
+    Args:
+        features: checks by name, as `verify_objects`, `residual_checks`, `HeldOut.checks` and
+            `support_checks` return them; also `contrast` to a near-symmetric rival (None = it has
+            none). 0 where agree, gain, cover or free_space_violation are missing or not finite:
+            what was not seen is not right.
+    """
+    known = {k: float(v) for k, v in features.items() if v is not None}
+    if not all(np.isfinite(known.get(n, np.nan)) for n in NEEDED) or known.get("n_pixels") == 0:
+        return 0.0
+    kind = kind_of(known)
+    c, terms = COEFFICIENTS[kind], terms_of(known, kind)
+    score = c.bias
+    for name, weight in c.weights.items():
+        score += weight * terms.get(name, c.usual.get(name, 0.0))
+    contrast = known.get("contrast", CONTRAST_DECIDED)
+    score -= CONTRAST_WEIGHT * float(np.clip(1.0 - contrast / CONTRAST_DECIDED, 0.0, 2.0))
+    p = 1.0 / (1.0 + np.exp(-np.clip(score, -40.0, 40.0)))
+    return float(np.clip(p, LOWEST, HIGHEST))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

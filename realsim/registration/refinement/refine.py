@@ -40,13 +40,19 @@ from realsim.registration.refinement.equations import (
     TABLE_AT,
     TABLE_ROWS,
     Blocks,
+    State,
     add_blocks,
     assembled,
+    moved,
     object_at,
 )
-from realsim.registration.refinement.points import Owned, assigned, joined
-from realsim.registration.refinement.residuals import exact_residuals, thin_share
-from realsim.registration.refinement.state import State, moved
+from realsim.registration.refinement.points import (
+    Owned,
+    assigned,
+    exact_residuals,
+    joined,
+    thin_share,
+)
 from realsim.registration.views import ViewPoints
 
 Array = NDArray[np.float64]

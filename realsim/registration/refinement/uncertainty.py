@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.registration.body import Body
-from realsim.registration.refinement.equations import HAND_EYE_AT, object_at
+from realsim.registration.refinement.equations import HAND_EYE_AT, centred, object_at
 from realsim.registration.refinement.refine import Refined
-from realsim.registration.refinement.state import centred
 
 Array = NDArray[np.float64]
 PIXEL_SAMPLES = 40

@@ -14,22 +14,21 @@ from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, SupportPl
 from realsim.registration.body import make_body
 from realsim.registration.evidence import DepthFrame, DepthNoise
 from realsim.registration.find_table import TableSearchConfig, region_of_interest
-from realsim.registration.hypotheses import SearchConfig, perturbed_starts
-from realsim.registration.search.contrast import ContrastConfig
-from realsim.registration.search.height_grid import GridConfig, HeightGrid, height_grid
-from realsim.registration.search.matching import MatchConfig, matched
-from realsim.registration.search.near_symmetry import NearSymmetryConfig, near_symmetries
-from realsim.registration.search.peel import ExchangeConfig, PeelConfig
-from realsim.registration.search.polish import PolishConfig
-from realsim.registration.search.records import Region, Wanted
-from realsim.registration.search.refine import (
+from realsim.registration.near_start import SearchConfig, perturbed_starts
+from realsim.registration.search.candidates import (
     Candidate,
-    Fused,
     CandidateConfig,
+    Fused,
     Sought,
     candidates,
     fuse,
 )
+from realsim.registration.search.height_grid import GridConfig, HeightGrid, height_grid
+from realsim.registration.search.matching import MatchConfig, matched
+from realsim.registration.search.near_symmetry import NearSymmetryConfig, near_symmetries
+from realsim.registration.search.peel import ExchangeConfig, PeelConfig
+from realsim.registration.search.polish import ContrastConfig, PolishConfig
+from realsim.registration.search.records import Region, Wanted
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import (
     Array32,

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, ObjectModel, SupportPlane
 from realsim.registration.evidence import DepthFrame, DepthNoise
-from realsim.registration.search.again import peeled
 from realsim.registration.search.bench import (
     FindConfig,
     claimed_starts,
@@ -28,14 +27,12 @@ from realsim.registration.search.bench import (
     resting_starts,
     within,
 )
-from realsim.registration.search.contrast import Decision, decided
-from realsim.registration.search.exchange import exchanged
-from realsim.registration.search.polish import polished
+from realsim.registration.search.candidates import Candidate, candidate
+from realsim.registration.search.polish import Decision, decided, polished
 from realsim.registration.search.records import NotPlaced, Placed, SearchResult, Wanted
-from realsim.registration.search.refine import Candidate, candidate
 from realsim.registration.search.scoring import compose, render, score
 from realsim.registration.search.selection import Selection
-from realsim.registration.search.state import Search
+from realsim.registration.search.state import Search, exchanged, peeled
 from realsim.registration.views import ViewPoints
 
 __all__ = ["FindConfig", "find_objects"]

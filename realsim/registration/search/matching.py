@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
-from realsim.registration.search.height_grid import HeightGrid
+from realsim.registration.search.height_grid import HeightGrid, Maps, maps_of, near_enough
 from realsim.registration.search.matching_kernels import climbed, correlated, maxima, rule_of
-from realsim.registration.search.matching_maps import Maps, maps_of, near_enough
 from realsim.registration.search.records import Hypothesis, Region
 from realsim.registration.search.templates import ModelTemplates, turned
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.registration.evidence import Cloud
+from realsim.registration.search.candidates import Candidate, Sought
 from realsim.registration.search.height_grid import HeightGrid
 from realsim.registration.search.polish import NOBODY, owners
-from realsim.registration.search.refine import Candidate, Sought
 from realsim.registration.search.scoring import Score
 
 Array = NDArray[np.float64]

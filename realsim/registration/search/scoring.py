@@ -22,7 +22,7 @@ from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.compare import CompareConfig
 from realsim.registration.evidence import DepthFrame, DepthNoise
-from realsim.registration.plane import table_depth
+from realsim.registration.table_planes import table_depth
 from realsim.registration.views import SampleConfig, sample_view
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from realsim.registration.search.refine import Candidate
+from realsim.registration.search.candidates import Candidate
 from realsim.registration.search.scoring import Array32, Canvas, Score, compose, score
 
 Clash = Callable[[int, int], bool]

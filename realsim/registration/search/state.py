@@ -1,14 +1,19 @@
 """The state of a search: the poses found so far, and which wanted object may have which."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from realsim.registration.search.bench import Bench
+from realsim.geometry import se3
+from realsim.registration.search import peel
+from realsim.registration.search.bench import Bench, fitted_candidates, resting_starts
+from realsim.registration.search.candidates import Candidate, Fused, Sought, inside_share
+from realsim.registration.search.polish import owners
 from realsim.registration.search.records import Region, Wanted
-from realsim.registration.search.refine import Candidate, inside_share
-from realsim.registration.search.selection import Selection, Slot, select, select_any
+from realsim.registration.search.scoring import Array32, compose
+from realsim.registration.search.selection import Selection, Slot, select, select_any, select_pair
 
 
 @dataclass(eq=False, kw_only=True)
@@ -74,3 +79,196 @@ class Search:
             else:
                 free.setdefault(w.obj_id, []).append(n)
         return out + [(obj_id, None, ns) for obj_id, ns in free.items()]
+
+
+Array = NDArray[np.float64]
+
+
+def peeled(search: Search, selection: Selection) -> Selection:
+    """Return the choice after what is unsure was sought again where the sure ones are not."""
+    config = search.bench.config.peel
+    rng = np.random.default_rng(search.bench.config.seed)
+    for round_ in range(1 + config.rounds):
+        unsure = [n for n, s in enumerate(selection.scores) if not peel.is_sure(s, config)]
+        if (search.wanted is not None and not unsure) or not _sought(
+            search, selection, unsure, None if round_ == 0 else rng
+        ):
+            break
+        selection = search.choose(selection.chosen)
+    if search.wanted is None:
+        return selection
+    unsure = _suspects(search, selection)
+    if unsure and _sought(search, selection, unsure, rng):
+        selection = search.choose(selection.chosen)
+    return selection
+
+
+def _sought(
+    search: Search, selection: Selection, unsure: Sequence[int], rng: np.random.Generator | None
+) -> bool:
+    """Put poses of unsure objects into the pool; return whether there was anything left to explain.
+
+    Args:
+        search: the pool grows.
+        selection: what is chosen.
+        unsure: the places of those that are sought.
+        rng: of the turns at clusters; None = at rest on the table.
+    """
+    bench, config = search.bench, search.bench.config.peel
+    T_table_world = se3.invert(bench.plane.T_world_table)
+    sure = _placed(search, selection, unsure)
+    known = peel.explained_points(bench.fused.coarse, sure, config)
+    rest = bench.fused.coarse.select(~known)
+    groups = peel.clusters(rest.points, T_table_world, config)
+    if not groups:
+        return False
+    fine = peel.explained_points(bench.fused.fine, sure, config)
+    left = Fused(coarse=rest, fine=bench.fused.fine.select(~fine))
+    buffer = compose(bench.canvas.table, [c.rendered for _, c in sure])
+    taken = peel.taken_cells(bench.grid, T_table_world, bench.fused.coarse, known)
+    bench.watch.lap("peel")
+    for obj_id, region, places in search.groups(unsure):
+        starts = (
+            resting_starts(bench, obj_id, region, taken)
+            if rng is None
+            else peel.residual_starts(
+                bench.sought[obj_id], groups, bench.plane.T_world_table[:3, 2], rng, config
+            )
+        )
+        search.add(fitted_candidates(bench, obj_id, starts, region, (left, buffer)), places)
+    return True
+
+
+def _placed(
+    search: Search, selection: Selection, but: Sequence[int] = ()
+) -> list[tuple[Sought, Candidate]]:
+    """Return the chosen objects but some."""
+    kept = [c for n, c in enumerate(selection.chosen) if c is not None and n not in but]
+    chosen = [search.pool[c] for c in kept]
+    return [(search.bench.sought[c.obj_id], c) for c in chosen]
+
+
+def _suspects(search: Search, selection: Selection) -> list[int]:
+    """Return the places of the objects about which much is left over."""
+    bench, config = search.bench, search.bench.config.peel
+    at = [n for n, c in enumerate(selection.chosen) if c is not None]
+    placed = _placed(search, selection)
+    cloud = bench.fused.coarse
+    rest = cloud.points[~peel.explained_points(cloud, placed, config)]
+    left = peel.clusters(rest, se3.invert(bench.plane.T_world_table), config)
+    found = [at[n] for n in peel.suspects(cloud, left, placed, config)]
+    bench.watch.lap("peel")
+    return found
+
+
+def exchanged(search: Search, selection: Selection) -> Selection:
+    """Return the choice after unsure objects were tried in the places of others.
+
+    Where it is not known which objects are there, every place is open to all of them anyway.
+    """
+    if search.wanted is None:
+        return selection
+    config = search.bench.config.exchange
+    rng = np.random.default_rng(config.seed)
+    pairs = _pairs(search, selection)[: config.most_pairs]
+    for u, v in pairs:
+        if selection.chosen[v] is None or peel.is_sure(selection.scores[u], _peel(search)):
+            continue
+        rest = [c for n, c in enumerate(selection.chosen) if c is not None and n not in (u, v)]
+        buffer = compose(search.bench.canvas.table, [search.pool[c].rendered for c in rest])
+        _seek(search, (u, v), selection, buffer, rng)
+        slots = (Slot(choices=frozenset(search.choices[u] - set(rest))),
+                 Slot(choices=frozenset(search.choices[v] - set(rest))))  # fmt: skip
+        now = (selection.chosen[u], selection.chosen[v])
+        better = select_pair(
+            search.bench.canvas, search.pool, slots, now, buffer, search.bench.config.selection
+        )
+        search.bench.watch.lap("exchange")
+        if better is None:
+            continue
+        chosen = list(selection.chosen)
+        chosen[u], chosen[v] = better
+        selection = search.choose(chosen)
+    return selection
+
+
+def _peel(search: Search) -> peel.PeelConfig:
+    """Return when an object is sure."""
+    return search.bench.config.peel
+
+
+def _pairs(search: Search, selection: Selection) -> list[tuple[int, int]]:
+    """Return an unsure object and a placed one of similar size, of another model, each.
+
+    Those come first of which both agree least with the images.
+    """
+    assert search.wanted is not None
+    bench, wanted, config = search.bench, search.wanted, search.bench.config.exchange
+    radius = [bench.sought[w.obj_id].body.radius_m for w in wanted]
+    agree = [-1.0 if s is None else s.agree for s in selection.scores]
+    least = bench.config.peel.sure_agree
+    found: list[tuple[float, int, int]] = []
+    for u in (n for n in range(len(wanted)) if agree[n] < least):
+        lost = selection.chosen[u] is None
+        mine: list[tuple[float, int, int]] = []
+        for v, c in enumerate(selection.chosen):
+            twice = agree[v] < least and v < u and not lost
+            if c is None or v == u or twice or wanted[u].obj_id == wanted[v].obj_id:
+                continue
+            ratio = abs(float(np.log(radius[u] / radius[v])))
+            certain = agree[v] > config.certain_agree and not lost
+            if ratio <= np.log(config.size_ratio) and not certain:
+                mine.append((agree[u] + agree[v] + ratio, u, v))
+        found += sorted(mine)[: config.most_per_object]
+    return [(u, v) for _, u, v in sorted(found)]
+
+
+def _seek(
+    search: Search,
+    pair: tuple[int, int],
+    selection: Selection,
+    buffer: Array32,
+    rng: np.random.Generator,
+) -> None:
+    """Put poses of each of two objects in the other's place into the pool."""
+    assert search.wanted is not None
+    bench, wanted = search.bench, search.wanted
+    at = [selection.chosen[n] for n in pair]
+    placed = [
+        (bench.sought[search.pool[c].obj_id], search.pool[c])
+        for n, c in enumerate(selection.chosen) if c is not None and n not in pair
+    ]  # fmt: skip
+    peeling = bench.config.peel
+    left = Fused(
+        coarse=bench.fused.coarse.select(
+            ~peel.explained_points(bench.fused.coarse, placed, peeling)
+        ),
+        fine=bench.fused.fine.select(~peel.explained_points(bench.fused.fine, placed, peeling)),
+    )
+    for n, there in zip(pair, reversed(at), strict=True):
+        if there is None:
+            continue
+        starts = _starts(search, wanted[n].obj_id, there, left, rng)
+        found = fitted_candidates(bench, wanted[n].obj_id, starts, wanted[n].region, (left, buffer))
+        search.add(found, [n])
+
+
+def _starts(
+    search: Search, obj_id: int, there: int, left: Fused, rng: np.random.Generator
+) -> Sequence[tuple[Array, str]]:
+    """Return poses (4, 4) of a model in the place of another object, and their names."""
+    bench, config = search.bench, search.bench.config.exchange
+    other = search.pool[there]
+    sought = bench.sought[other.obj_id]
+    T = other.T_world_obj
+    own = owners(left.coarse, [sought], [T], bench.config.peel.explained_m) == 0
+    middle = sought.body.center(T)
+    beside = Region(center_world=middle, radius_m=config.beside_m)
+    starts = [(S, f"exchange, {name}") for S, name in resting_starts(bench, obj_id, beside)]
+    if np.count_nonzero(own) >= bench.config.peel.least_points:
+        turns = replace(bench.config.peel, rotations=config.turns, most_starts=config.turns)
+        up = bench.plane.T_world_table[:3, 2]
+        groups = [left.coarse.points[own]]
+        random = peel.residual_starts(bench.sought[obj_id], groups, up, rng, turns)
+        starts += [(S, name.replace("residual 0", "exchange")) for S, name in random]
+    return starts

@@ -17,14 +17,12 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.records.depth_bias import DepthBias
-from realsim.registration.blind import keep_start, nearest_to_start
+from realsim.registration.blind import keep_start, nearest_to_start, uncertainty
 from realsim.registration.body import Body, make_body
 from realsim.registration.compare import Comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.covariance import uncertainty
 from realsim.registration.evidence import Cloud, averaged, without_table
-from realsim.registration.hypotheses import search
-from realsim.registration.joint import assigned
+from realsim.registration.near_start import assigned, search
 from realsim.registration.refinement.config import CameraPrior, RefineConfig
 from realsim.registration.refinement.refine import refine
 from realsim.registration.solver import FreeSpace, solve_pose

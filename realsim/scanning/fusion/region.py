@@ -11,7 +11,7 @@ from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, SupportPlane
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.plane import PlaneConfig, find_support_plane
+from realsim.registration.table_planes import PlaneConfig, find_support_plane
 from realsim.scanning.fusion.evidence import cloud_stride, sparse_cloud
 from realsim.scanning.fusion.result import FusionConfig, FusionFrame
 
