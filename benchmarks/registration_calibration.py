@@ -39,7 +39,7 @@ from realsim.registration.evidence import (
     DepthFrame,
     DepthNoise,
     EvidenceConfig,
-    averaged,
+    average_cloud,
     measure_noise,
     without_table,
 )
@@ -148,7 +148,7 @@ def round_of(
     noise = measure_noise(frames, EvidenceConfig())
     points = sample_views(scene.intrinsics, frames, noise, SampleConfig(stride=2))
     plane = SupportPlane(T_world_table=np.eye(4))
-    cloud = averaged(without_table(world_cloud(points, noise), plane, 0.002), np.eye(4), 0.003)
+    cloud = average_cloud(without_table(world_cloud(points, noise), plane, 0.002), np.eye(4), 0.003)
     Ts = np.stack([f.T_world_cam for f in frames])
     return Round(scene, bodies, frames, points, Ts, noise, plane, cloud)
 

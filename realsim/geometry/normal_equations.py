@@ -65,7 +65,7 @@ def view_steps(system: System, shared: Array) -> Array:
     return np.einsum("vij,vj->vi", np.linalg.inv(system.D), left)
 
 
-def solved(system: System) -> tuple[Array, Array]:
+def solve(system: System) -> tuple[Array, Array]:
     """Return the step of the shared unknowns (S,) and of the views (V, 6)."""
     A, a = without_views(system)
     s = inverse(A) @ a

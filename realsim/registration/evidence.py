@@ -63,14 +63,14 @@ class LazyFrame(DepthFrame):
         return read()
 
 
-def corrected_frame(frame: DepthFrame, T_world_cam: Array, bias: DepthBias) -> DepthFrame:
+def correct_frame(frame: DepthFrame, T_world_cam: Array, bias: DepthBias) -> DepthFrame:
     """Return the frame with another camera pose and the depth's bias taken out; read when asked."""
     return LazyFrame(
         frame.index, T_world_cam, lambda: bias.corrected(frame.depth_m).astype(np.float32)
     )
 
 
-def held(frame: DepthFrame) -> DepthFrame:
+def read_frame(frame: DepthFrame) -> DepthFrame:
     """Return the frame with its image in memory."""
     return DepthFrame(index=frame.index, depth_m=frame.depth_m, T_world_cam=frame.T_world_cam)
 
@@ -204,13 +204,13 @@ def gather(
             progress(n + 1, len(frames))
     return Evidence(
         noise=noise,
-        near=tuple(_joined(clouds) for clouds in near),
+        near=tuple(join_clouds(clouds) for clouds in near),
         support=np.concatenate(support),
         stride=stride,
     )
 
 
-def averaged(cloud: Cloud, T_world_obj: Array, size: float) -> Cloud:
+def average_cloud(cloud: Cloud, T_world_obj: Array, size: float) -> Cloud:
     """Return the cloud averaged on voxels of the object's frame (inverse-variance weights).
 
     The grid lies in the object's frame, so the result moves with the world; points seen from
@@ -279,7 +279,7 @@ def _stride(
     return int(np.clip(np.sqrt(fewest / config.points_per_object), 1, config.stride))
 
 
-def _joined(clouds: Sequence[Cloud]) -> Cloud:
+def join_clouds(clouds: Sequence[Cloud]) -> Cloud:
     """Return the clouds one after the other."""
     return Cloud(
         points=np.concatenate([c.points for c in clouds]),

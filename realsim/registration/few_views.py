@@ -22,9 +22,9 @@ from realsim.registration.evidence import (
     Cloud,
     DepthFrame,
     Evidence,
-    averaged,
+    average_cloud,
     gather,
-    held,
+    read_frame,
     without_table,
 )
 from realsim.registration.intake import Intake
@@ -47,7 +47,7 @@ class NearTask:
 
     def comparer(self, center: Array, n: int, rays: int) -> Comparer:
         """Return a comparer on n frames spread around `center`."""
-        chosen = [held(f) for f in spread_frames(self.intake.frames, center, n)]
+        chosen = [read_frame(f) for f in spread_frames(self.intake.frames, center, n)]
         config = replace(self.config.compare, rays=rays)
         return make_comparer(
             self.intake.intrinsics, chosen, self.evidence.noise, self.plane, config
@@ -135,8 +135,8 @@ def _search_one(work: NearTask, body: Body, near: Cloud, tick: Callable[[], None
     comparer = work.comparer(center, config.compare.frames, config.compare.rays)
     free_space = work.free_space(comparer.frames)
     above = without_table(near, work.plane, config.joint.drop_height(body, work.plane))
-    coarse = averaged(above, body.T_start, config.joint.coarse_voxel(body))
-    fine = averaged(above, body.T_start, config.joint.fine_voxel(body))
+    coarse = average_cloud(above, body.T_start, config.joint.coarse_voxel(body))
+    fine = average_cloud(above, body.T_start, config.joint.fine_voxel(body))
     found = search(body, coarse, fine, comparer, free_space, (config.search, config.solver))
     tick()
     return found
@@ -160,7 +160,7 @@ def _joint(
         there = [moved_body(b, T) for b, T in zip(bodies, poses, strict=True)]
         near = gather(work.intake.intrinsics, work.intake.frames, there, config.evidence).near
     clouds = [
-        averaged(
+        average_cloud(
             without_table(cloud, work.plane, config.joint.drop_height(body, work.plane)),
             body.T_start,
             config.joint.fine_voxel(body),

@@ -75,7 +75,7 @@ def hold_views(
     )
 
 
-def contradicted(
+def contradiction(
     held: HeldViews,
     k: int,
     others: Sequence[int] | NDArray[np.int64],
@@ -91,7 +91,7 @@ def contradicted(
         config: see there.
         T_world_cam: (4, 4) where it is supposed to be; None = where it is said to be.
     """
-    maps = held.maps if T_world_cam is None else _moved(held.maps, k, T_world_cam)
+    maps = held.maps if T_world_cam is None else _move_camera(held.maps, k, T_world_cam)
     Ts = maps.Ts_world_cam
     mine = se3.transform(Ts[k], held.above[k])
     counts: list[Counts] = []
@@ -120,7 +120,7 @@ def support(
     return total.support
 
 
-def sheet_contradicted(held: HeldViews, k: int, margin_m: float, config: ViewCheckConfig) -> float:
+def sheet_contradiction(held: HeldViews, k: int, margin_m: float, config: ViewCheckConfig) -> float:
     """Return the share of all points by which view k and its partners contradict each other."""
     Ts = held.maps.Ts_world_cam
     total = NO_COUNTS
@@ -202,7 +202,7 @@ def _scene_support(held: HeldViews, Ts: Array, scale: float, config: ViewCheckCo
     return total.support
 
 
-def _moved(maps: ViewMaps, k: int, T_world_cam: Array) -> ViewMaps:
+def _move_camera(maps: ViewMaps, k: int, T_world_cam: Array) -> ViewMaps:
     """Return the maps with camera k elsewhere."""
     Ts = maps.Ts_world_cam.copy()
     Ts[k] = T_world_cam

@@ -14,10 +14,10 @@ from realsim.registration.evidence import (
     Cloud,
     DepthFrame,
     DepthNoise,
-    averaged,
-    corrected_frame,
-    held,
+    average_cloud,
+    correct_frame,
     measure_noise,
+    read_frame,
     without_table,
 )
 from realsim.registration.find_table import find_table, looked_at
@@ -94,13 +94,13 @@ def take_in(
     if len({f.index for f in ordered}) != len(ordered):
         raise InputError("two depth frames have the same number; view numbers must be unique.")
     if not config.bias.is_none:
-        ordered = [corrected_frame(f, f.T_world_cam, config.bias) for f in ordered]
+        ordered = [correct_frame(f, f.T_world_cam, config.bias) for f in ordered]
     check_depth(ordered[0].depth_m, intrinsics)
     noise = _noise(ordered, config)
     sample = sampling(intrinsics, len(ordered), config)
     views: list[ViewPoints] = []
     for frame in ordered:
-        image = held(frame)
+        image = read_frame(frame)
         check_depth(image.depth_m, intrinsics)
         views.append(sample_view(intrinsics, image, noise, sample))
         if progress is not None:
@@ -187,4 +187,4 @@ def scene_cloud(intake: Intake, cameras: Array, plane: SupportPlane | None) -> C
     ]
     cloud = without_table(world_cloud(moved, intake.noise), plane, ABOVE_M)
     T = np.eye(4) if plane is None else plane.T_world_table
-    return averaged(cloud, T, SCENE_VOXEL_M)
+    return average_cloud(cloud, T, SCENE_VOXEL_M)

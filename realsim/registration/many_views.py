@@ -16,13 +16,13 @@ from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import (
     Cloud,
     DepthFrame,
-    averaged,
-    corrected_frame,
-    held,
+    average_cloud,
+    correct_frame,
+    read_frame,
     without_table,
 )
 from realsim.registration.intake import Intake
-from realsim.registration.near_start import assigned
+from realsim.registration.near_start import assign_points
 from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.refinement.equations import State
 from realsim.registration.refinement.refine import Refined, refine
@@ -106,7 +106,7 @@ def register_many(
     """
     rough = [b.T_start for b in bodies]
     constants = refine_config(config)
-    refined, frames, clouds, kept = _refined(
+    refined, frames, clouds, kept = _refine_once(
         intake, bodies, (rough, claimed), plane, constants, config, progress
     )
     turned = [_turn_deg(T, k.fit.T_world_obj) for T, k in zip(refined.poses, kept, strict=True)]
@@ -115,7 +115,7 @@ def register_many(
         # An axis that was fitted is a little off, and so is what is turned far about it.
         rough = [k.fit.T_world_obj for k in kept]
         constants = replace(constants, rounds=AGAIN_ROUNDS)
-        refined, frames, clouds, kept = _refined(
+        refined, frames, clouds, kept = _refine_once(
             intake, bodies, (rough, claimed), plane, constants, config, None
         )
     back = [se3.invert(T) @ k.fit.T_world_obj for T, k in zip(refined.poses, kept, strict=True)]
@@ -124,12 +124,16 @@ def register_many(
         for k, b in enumerate(bodies)
     ]
     covariances = [
-        _turned(object_covariance(refined, b, k), S) + more
+        _turn_covariance(object_covariance(refined, b, k), S) + more
         for k, (b, S, more) in enumerate(zip(bodies, back, beyond, strict=True))
     ]
     seen = [
         [
-            replace(p, T_cam_obj=p.T_cam_obj @ S, covariance=_turned(p.covariance, S) + more)
+            replace(
+                p,
+                T_cam_obj=p.T_cam_obj @ S,
+                covariance=_turn_covariance(p.covariance, S) + more,
+            )
             for p in of
         ]
         for of, S, more in zip(
@@ -142,7 +146,7 @@ def register_many(
     )  # fmt: skip
 
 
-def _refined(
+def _refine_once(
     intake: Intake,
     bodies: Sequence[Body],
     poses: tuple[Sequence[Array], Sequence[Body | None]],
@@ -158,18 +162,18 @@ def _refined(
     )
     bias = DepthBias(scale=float(refined.state.bias[0]), offset_per_m=float(refined.state.bias[1]))
     frames = tuple(
-        corrected_frame(f, T, bias) for f, T in zip(intake.frames, refined.cameras, strict=True)
+        correct_frame(f, T, bias) for f, T in zip(intake.frames, refined.cameras, strict=True)
     )
     clouds = _clouds(intake, bodies, refined, config)
     comparer = comparer_on(intake, frames, refined.plane, bodies, refined.poses, config)
     kept = [
-        _kept(body, start, T, (cloud, comparer), config)
+        _keep_blind(body, start, T, (cloud, comparer), config)
         for body, start, T, cloud in zip(bodies, claimed, refined.poses, clouds, strict=True)
     ]
     return refined, frames, clouds, kept
 
 
-def _kept(
+def _keep_blind(
     body: Body,
     claimed: Body | None,
     T: Array,
@@ -194,7 +198,7 @@ def _turn_deg(T_a: Array, T_b: Array) -> float:
     return float(np.degrees(se3.angle(T_a[:3, :3].T @ T_b[:3, :3])))
 
 
-def _turned(C: Array, S: Array) -> Array:
+def _turn_covariance(C: Array, S: Array) -> Array:
     """Return the covariance (6, 6) of T S from that of T: right perturbations."""
     Ad = se3.adjoint(se3.invert(S))
     return Ad @ C @ Ad.T
@@ -213,7 +217,7 @@ def comparer_on(
         center = np.mean([b.center(T) for b, T in zip(bodies, poses, strict=True)], axis=0)
     else:
         center = np.zeros(3) if plane is None else plane.T_world_table[:3, 3]
-    chosen = [held(f) for f in spread_frames(frames, center, config.verify.frames)]
+    chosen = [read_frame(f) for f in spread_frames(frames, center, config.verify.frames)]
     compare = replace(config.compare, rays=config.verify.rays)
     return make_comparer(intake.intrinsics, chosen, intake.noise, plane, compare)
 
@@ -252,10 +256,10 @@ def _clouds(
     ]
     near: list[Cloud] = []
     for k, (body, T) in enumerate(zip(bodies, refined.poses, strict=True)):
-        cloud = _joined([p[k] for p in parts], intake)
+        cloud = _join_parts([p[k] for p in parts], intake)
         above = without_table(cloud, refined.plane, config.joint.drop_height(body, refined.plane))
-        near.append(averaged(above, T, config.joint.fine_voxel(body)))
-    return assigned(bodies, list(refined.poses), near, config.joint)
+        near.append(average_cloud(above, T, config.joint.fine_voxel(body)))
+    return assign_points(bodies, list(refined.poses), near, config.joint)
 
 
 def _points_near(
@@ -279,7 +283,7 @@ def _points_near(
     return out
 
 
-def _joined(parts: Sequence[tuple[Array, Array, Array]], intake: Intake) -> Cloud:
+def _join_parts(parts: Sequence[tuple[Array, Array, Array]], intake: Intake) -> Cloud:
     """Return the points of all views as one cloud."""
     points, towards, z = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Cloud(points=points, towards=towards, sigmas=intake.noise.sigma(z))

@@ -234,7 +234,7 @@ def joint_fit(
     fits: list[Fit] = []
     history: list[dict[str, Any]] = []
     for sweep in range(config.sweeps):
-        own = assigned(bodies, current, clouds, config)
+        own = assign_points(bodies, current, clouds, config)
         fits = [
             solve_pose(b, c, T, solver.fine, solver, s)
             for b, c, T, s in zip(bodies, own, current, spaces, strict=True)
@@ -245,7 +245,7 @@ def joint_fit(
         ]
         history.append({"sweep": sweep, "moved_mm": moved})
         current = [f.T_world_obj for f in fits]
-    own = assigned(bodies, current, clouds, config)
+    own = assign_points(bodies, current, clouds, config)
     for i, body in enumerate(bodies):
         stride = comparers[i].stride_of(body, before[i])
         old = comparers[i].gain(body, before[i], stride)[0]
@@ -259,7 +259,7 @@ def joint_fit(
     return fits, own, history
 
 
-def assigned(
+def assign_points(
     bodies: Sequence[Body], poses: Sequence[Array], clouds: Sequence[Cloud], config: JointConfig
 ) -> list[Cloud]:
     """Return of each object's nearby points those that are nearest to it and not too far."""

@@ -1,8 +1,7 @@
 """Depth views of a table full of known objects, with the errors of a real lab and a known truth.
 
 What registration can be worth is found out here: the same views with the same errors serve the
-tests, the benchmark, and whoever asks which accuracy a scene allows. `simulated_layout` puts the
-objects down, `simulated_faults` spoils what came out.
+tests, the benchmark, and whoever asks which accuracy a scene allows.
 """
 
 import hashlib
@@ -21,6 +20,7 @@ from realsim.records import CameraIntrinsics, ObjectModel, ObjectPose, names_of
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.simulated_lab import (
     T_EE_CAM,
+    Scattered,
     TableLabConfig,
     arm_error,
     camera_of,
@@ -28,12 +28,9 @@ from realsim.registration.simulated_lab import (
     hemisphere,
     offset,
     resized,
+    scatter_objects,
     sensor_of,
     table_square,
-)
-from realsim.registration.simulated_layout import (
-    Scattered,
-    scatter_objects,
     with_found_symmetries,
 )
 from realsim.rendering.depth_sensors.model import DepthSensorModel

@@ -114,7 +114,7 @@ def verify_objects(
             floats = supports[i].get("floating_mm", 0.0)
             checks["plane_gap_mm"] = floats if height > 0 else 1e3 * height
         checks["penetration_mm"] = _penetration_mm(i, bodies, poses)
-        results.append(_judged(checks, stride, slack, config))
+        results.append(_verdict_on(checks, stride, slack, config))
     return _without_doubles(results, bodies, poses)
 
 
@@ -225,7 +225,7 @@ def _penetration_mm(i: int, bodies: Sequence[Body], poses: Sequence[Array]) -> f
     return 1e3 * deepest
 
 
-def _judged(
+def _verdict_on(
     checks: dict[str, float], stride: int, slack_mm: float, config: VerifyConfig
 ) -> Checked:
     """Return the checks with a verdict and the reasons for it.

@@ -22,9 +22,9 @@ from realsim.registration.find_table import ViewTable, view_table
 from realsim.registration.held_views import (
     HeldViews,
     check_all_poses,
-    contradicted,
+    contradiction,
     hold_views,
-    sheet_contradicted,
+    sheet_contradiction,
     support,
 )
 from realsim.registration.view_agreement import Kind, ViewCheckConfig, ViewFinding
@@ -151,7 +151,7 @@ def _odd_views(held: HeldViews, offs: dict[int, str], config: ViewCheckConfig) -
     shares = np.zeros(n)
     for round_ in range(config.rounds):
         shares = np.array([
-            contradicted(held, k, _sound_partners(held, k, bad, config), config) for k in range(n)
+            contradiction(held, k, _sound_partners(held, k, bad, config), config) for k in range(n)
         ])  # fmt: skip
         usual, spread = _middle(shares.tolist())
         limit = max(config.partly_share, usual + config.spreads * spread)
@@ -202,7 +202,7 @@ def _tables_off(
         if abs(up) <= most_height and t.tilt_deg <= most_tilt:
             continue
         shift = max(abs(up), LEVER_M * float(np.tan(np.radians(t.tilt_deg))))
-        if sheet_contradicted(held, k, 0.5 * shift, config) > config.partly_share:
+        if sheet_contradiction(held, k, 0.5 * shift, config) > config.partly_share:
             off[k] = (
                 f"it sees the table {1e3 * abs(up):.0f} mm {'above' if up > 0 else 'below'} and "
                 f"{t.tilt_deg:.1f} deg tilted against where the others see it"
@@ -274,7 +274,7 @@ def _pose_of(
         gain = support(held, odd.k, near, config, Ts[u])
         if gain <= best_support:
             continue
-        rest = contradicted(held, odd.k, near, config, Ts[u])
+        rest = contradiction(held, odd.k, near, config, Ts[u])
         moved = view_table(
             replace(held.views[odd.k], T_world_cam=Ts[u]), table[0], table[1], config.table
         )

@@ -23,7 +23,6 @@ from realsim.registration.hints import (
     read_starts,
     region_of,
     save_hints,
-    wanted_objects,
 )
 from realsim.registration.simulated import seen_instances
 from realsim.store import SessionStore
@@ -138,24 +137,6 @@ def test_regions_move_with_the_world():
     a, b = (region_of(hint, model, s, CONFIG) for s in (scene, there))
     assert a is not None and b is not None and a.radius_m == pytest.approx(b.radius_m)
     assert np.allclose(se3.transform(T, a.center_world), b.center_world, atol=1e-6)
-
-
-def test_a_rough_pose_keeps_its_accuracy():
-    scene, hints, _ = setting(1)
-    pose = scene.truth[0]
-    model = scene.models[pose.obj_id]
-    where = RoughPose(T_world_obj=pose.T_world_obj, radius_m=0.02, turn_deg=15)
-    wanted = wanted_objects(
-        [Hint(obj_id=pose.obj_id, instance=4, where=where), Hint(obj_id=pose.obj_id, instance=5)],
-        scene.models, hints, CONFIG,
-    )  # fmt: skip
-    region = wanted[0].region
-    assert region is not None and wanted[1].region is None and wanted[1].T_start is None
-    assert (region.radius_m, region.turn_deg) == (0.02, 15)
-    assert np.allclose(region.center_world, middle_of(pose, model))
-    assert region.R_world_obj is not None
-    assert np.array_equal(region.R_world_obj, pose.T_world_obj[:3, :3])
-    assert wanted[0].T_start is not None and wanted[0].instance == 4
 
 
 @pytest.mark.parametrize(
@@ -275,15 +256,6 @@ def test_typed_places_become_regions_in_a_session(store):
     assert np.linalg.norm(region.center_world - middle_of(pose, model)) <= region.radius_m
     with pytest.raises(InputError, match="view 77"):
         parse_objects(["5@view77:1,2"], part_models(), store)
-
-
-def test_files_of_rough_poses_are_read_as_ever(tmp_path):
-    T = se3.from_translation([0.4, 0.1, 0.05])
-    rows = [{"obj_id": 5, "instance": 3, "T_world_obj": T.tolist()}]
-    (tmp_path / "starts.json").write_text(json.dumps({"source": "cosypose", "starts": rows}))
-    (hint,) = read_hints(tmp_path / "starts.json", part_models())
-    assert isinstance(hint.where, RoughPose) and hint.where.radius_m is None
-    assert (hint.obj_id, hint.instance) == (5, 3) and np.array_equal(hint.where.T_world_obj, T)
 
 
 EYE = np.eye(4).tolist()

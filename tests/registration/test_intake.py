@@ -11,11 +11,10 @@ from realsim.geometry import se3
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.body import make_body
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.evidence import DepthFrame, LazyFrame, corrected_frame, held
-from realsim.registration.intake import sampling, scene_cloud, take_in
+from realsim.registration.evidence import DepthFrame, LazyFrame, correct_frame, read_frame
+from realsim.registration.intake import scene_cloud, take_in
 from realsim.registration.simulated import TableScene
-from realsim.registration.simulated_faults import foreign, shifted_view, without_any_depth
-from realsim.registration.simulated_lab import camera_of
+from table_faults import foreign, shifted_view, without_any_depth
 from table_scenes import SMALL_LAB, small_scene
 
 CONFIG = RegistrationConfig()
@@ -51,7 +50,7 @@ def test_a_lazy_frame_reads_when_asked_and_keeps_nothing():
     assert frame.index == 7 and frame.T_world_cam is T and reader.times == 0
     assert frame.depth_m is reader.image and frame.depth_m is reader.image
     assert reader.times == 2
-    kept = held(frame)
+    kept = read_frame(frame)
     assert reader.times == 3
     assert kept.depth_m is reader.image and kept.depth_m is reader.image
     assert reader.times == 3 and isinstance(frame, DepthFrame)
@@ -64,48 +63,16 @@ def test_a_corrected_frame_has_its_bias_taken_out_and_its_camera_moved():
     z = np.array([[0.0, 0.2, 0.4]], np.float32)
     reader = Reader(bias.measured(z).astype(np.float32))
     T = se3.from_translation([1, 2, 3])
-    frame = corrected_frame(LazyFrame(3, np.eye(4), reader), T, bias)
+    frame = correct_frame(LazyFrame(3, np.eye(4), reader), T, bias)
     assert reader.times == 0
     np.testing.assert_allclose(frame.depth_m, z, atol=1e-7)
     assert frame.depth_m.dtype == np.float32 and frame.index == 3
     np.testing.assert_array_equal(frame.T_world_cam, T)
-    twice = corrected_frame(frame, np.eye(4), DepthBias(scale=2.0 / 1.5))
+    twice = correct_frame(frame, np.eye(4), DepthBias(scale=2.0 / 1.5))
     np.testing.assert_allclose(twice.depth_m, 0.75 * z, atol=1e-7)
 
 
-def test_a_lazy_frame_may_be_given_in_place_of_an_image():
-    readers = [Reader(f.depth_m) for f in scene().frames]
-    lazy = [
-        LazyFrame(f.index, f.T_world_cam, r) for f, r in zip(scene().frames, readers, strict=True)
-    ]
-    here, there = taken(scene().frames), taken(lazy)
-    for a, b in zip(here.views, there.views, strict=True):
-        assert a.points.tobytes() == b.points.tobytes()
-    # Once for the points, and once more for the noise of some.
-    assert max(r.times for r in readers) <= 3
-
-
-def test_a_lazy_frame_can_be_replaced_like_any_other():
-    reader = Reader(np.ones((2, 2), np.float32))
-    frame = LazyFrame(1, np.eye(4), reader)
-    assert replace(frame, depth_m=2 * reader.image).depth_m[0, 0] == 2
-    with pytest.raises(InputError, match="view 1 has neither"):
-        LazyFrame(1, np.eye(4))
-    moved = replace(frame, T_world_cam=se3.from_translation([0, 0, 1]))
-    assert moved.index == 1 and moved.depth_m.shape == (2, 2) and moved.T_world_cam[2, 3] == 1
-
-
 # --- thinning out --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "width, frames, stride, reach",
-    [(1280, 32, 4, 3), (1280, 256, 8, 3), (640, 32, 2, 2), (320, 32, 1, 1), (2560, 32, 4, 3)],
-)
-def test_images_are_thinned_out_by_size_and_number(width, frames, stride, reach):
-    camera = camera_of(replace(SMALL_LAB, width=width, height=width * 9 // 16))
-    found = sampling(camera, frames, CONFIG)
-    assert (found.stride, found.edge_reach_px) == (stride, reach)
 
 
 # --- what is taken in ----------------------------------------------------------------------------
@@ -122,14 +89,6 @@ def test_table_noise_and_points_are_those_of_the_scene():
     np.testing.assert_array_equal(intake.cameras, scene().Ts_world_cam_claimed)
 
 
-def test_frames_come_in_the_order_of_their_numbers():
-    here, there = taken(scene().frames), taken(scene().frames[::-1])
-    assert [f.index for f in there.frames] == list(range(SMALL_LAB.views))
-    assert [v.index for v in there.views] == [f.index for f in there.frames]
-    assert here.plane is not None and there.plane is not None
-    np.testing.assert_array_equal(here.plane.T_world_table, there.plane.T_world_table)
-
-
 def test_a_known_bias_is_taken_out():
     bias = DepthBias(scale=1.003, offset_per_m=-0.01)
     spoilt = [
@@ -144,12 +103,6 @@ def test_a_known_bias_is_taken_out():
     # What is only unsure leaves the images as they are.
     unsure = taken(scene().frames, RegistrationConfig(bias=DepthBias.unmeasured()))
     assert unsure.frames[0].depth_m is scene().frames[0].depth_m
-
-
-def test_progress_is_told_for_every_frame():
-    seen: list[int] = []
-    take_in(scene().intrinsics, scene().frames, CONFIG, progress=lambda: seen.append(1))
-    assert len(seen) == SMALL_LAB.views
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan])
@@ -199,11 +152,6 @@ def test_nothing_to_use_is_refused_by_name():
     small = replace(scene().frames[1], depth_m=np.ones((9, 16), np.float32))
     with pytest.raises(InputError, match="shape"):
         taken([scene().frames[0], small])
-
-
-def test_one_view_is_enough():
-    intake = taken(scene().frames[:1])
-    assert len(intake.views) == 1 and intake.plane is not None
 
 
 def test_scene_cloud_is_what_stands_on_the_table():

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.body import make_body
@@ -12,7 +11,6 @@ from realsim.registration.judging.held_out import (
     HeldOutConfig,
     box_shift_m,
     half_fit,
-    halves,
     held_out,
     owned_points,
 )
@@ -61,19 +59,3 @@ def test_what_no_view_saw_has_no_figures(halved):
     h = judge([poses[0], gone, poses[2]])[1]
     assert np.isnan(h.shift_mm)
     assert np.isnan(h.agree)
-
-
-def test_halves_share_no_view_and_miss_none():
-    a, b = halves(7)
-    assert sorted([*a, *b]) == list(range(7))
-    with pytest.raises(InputError, match="1 views"):
-        halves(1)
-
-
-def test_box_shift_is_that_of_a_translation_and_grows_with_a_turn(halved):
-    body, T = halved[0][0], halved[1][0]
-    assert box_shift_m(body, T, se3.from_translation([0, 0.003, 0.004]) @ T) == pytest.approx(0.005)
-    center = se3.from_translation(body.center(T))
-    turn = center @ se3.from_rt(se3.exp_so3([0, 0, 0.01]), np.zeros(3)) @ se3.invert(center)
-    shift = box_shift_m(body, T, turn @ T)
-    assert 0.002 * body.radius_m < shift <= 0.01 * body.radius_m * 1.0001

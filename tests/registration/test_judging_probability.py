@@ -11,9 +11,7 @@ from realsim.registration.judging.verdict import (
     SURFACE,
     TERMS,
     VerdictConfig,
-    kind_of,
     probability_right,
-    terms_of,
     verdict_of,
 )
 
@@ -88,13 +86,6 @@ def test_every_term_grows_with_the_evidence_and_no_coefficient_is_negative():
         assert set(c.weights) <= set(NAMES[kind])
         assert all(w >= 0 for w in c.weights.values())
         assert set(c.usual) == set(NAMES[kind])
-
-
-def test_the_set_follows_from_what_is_known():
-    assert kind_of(GOOD) == "views"
-    assert kind_of({**GOOD, "held_out_shift_mm": float("nan")}) == "no_held_out"
-    assert kind_of({**GOOD, "wrong_surface": float("nan")}) == "single_view"
-    assert "wrong_surface" not in terms_of(GOOD, "single_view")
 
 
 def test_what_was_not_seen_is_not_right_and_no_table_is_no_reproach():

@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.body import make_body
 from realsim.registration.evidence import DepthNoise
-from realsim.registration.judging.ownership import make_claims, owners
-from realsim.registration.judging.patches import make_patches
 from realsim.registration.judging.surface_residuals import (
     ResidualConfig,
     error_level_m,
@@ -112,30 +109,3 @@ def test_errors_that_all_objects_share_raise_the_bound_but_not_without_end(watch
     assert max(shares) < 0.1 < min(without)
     # A single object cannot excuse itself.
     assert error_level_m(results[:1], CONFIG) < level
-
-
-def test_patches_hold_the_whole_surface(watched):
-    _, bodies, _, _ = watched
-    box = bodies[1]
-    a, b, c = box.model.mesh.extent
-    patches = make_patches(box, 0.004, 8.0)
-    assert patches.areas_mm2.sum() == pytest.approx(2e6 * (a * b + b * c + c * a), rel=0.06)
-    assert np.abs(box.field.distance(patches.centers)).max() < 0.002
-    numbers = patches.index[patches.index >= 0]
-    assert sorted(numbers) == list(range(len(patches.centers)))
-
-
-def test_points_belong_to_what_is_nearest(watched):
-    _, bodies, poses, _ = watched
-    on = [se3.transform(T, b.samples[::7]) for b, T in zip(bodies, poses, strict=True)]
-    claims = make_claims(bodies, poses, PLANE, 0.008)
-    for k, points in enumerate(on):
-        high = points[points[:, 2] > 0.003]
-        assert np.mean(owners(claims, high) == k) > 0.98
-    assert np.all(owners(claims, np.array([[0.0, 0.0, 0.5], [0.3, 0.3, 0.0005]])) == -1)
-
-
-def test_cameras_must_be_as_many_as_views(watched):
-    scene, _, poses, residuals = watched
-    with pytest.raises(InputError, match="16 views"):
-        residuals(poses, scene.Ts_world_cam[:3])

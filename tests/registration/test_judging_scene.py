@@ -10,7 +10,7 @@ from realsim.geometry import se3
 from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.body import make_body
 from realsim.registration.compare import CompareConfig, make_comparer
-from realsim.registration.evidence import DepthNoise, averaged
+from realsim.registration.evidence import DepthNoise, average_cloud
 from realsim.registration.judging.scene_checks import SceneCheckConfig, scene_findings
 from realsim.registration.judging.unit_checks import unit_errors
 from realsim.registration.table_planes import support_checks
@@ -33,7 +33,7 @@ def table():
     bodies = [make_body(p, scene.models[p.obj_id], 48, 300) for p in scene.truth]
     comparer = make_comparer(scene.intrinsics, frames, NOISE, PLANE, CompareConfig())
     views = sample_views(scene.intrinsics, frames, NOISE, SampleConfig(stride=2))
-    cloud = averaged(world_cloud(views, NOISE), np.eye(4), 0.003)
+    cloud = average_cloud(world_cloud(views, NOISE), np.eye(4), 0.003)
     return scene, bodies, comparer, cloud.select(cloud.points[:, 2] > 0.003)
 
 

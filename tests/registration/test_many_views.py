@@ -12,13 +12,11 @@ from realsim.geometry.metrics import mssd_symmetric
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.body import Body, make_body
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.evidence import LazyFrame
 from realsim.registration.intake import Intake, take_in
 from realsim.registration.many_views import (
     LEAST_SIGMA_DEG,
     LEAST_SIGMA_MM,
     ManyViews,
-    comparer_on,
     refine_config,
     register_many,
 )
@@ -92,18 +90,6 @@ def test_a_turn_that_nothing_shows_stays_as_it_was_claimed():
     assert c.many.kept[1].report == {} and c.many.kept[2].report == {}
 
 
-def test_all_parts_of_the_result_speak_of_the_same_poses():
-    c = case()
-    for k, T in enumerate(c.many.poses):
-        np.testing.assert_array_equal(T, c.many.kept[k].fit.T_world_obj)
-        for v, camera in enumerate(c.many.refined.cameras):
-            np.testing.assert_allclose(camera @ c.many.seen[k][v].T_cam_obj, T, atol=1e-9)
-        body = c.bodies[k]
-        distance = body.field.distance(c.many.clouds[k].points, se3.invert(T))
-        assert np.median(np.abs(distance)) < 5e-4 and len(distance) > 100
-    assert len(c.many.poses) == len(c.many.covariances) == len(c.many.seen) == 3
-
-
 def test_covariances_hold_and_turn_with_the_pose():
     c = case()
     for k, (p, C) in enumerate(zip(c.scene.truth, c.many.covariances, strict=True)):
@@ -122,32 +108,6 @@ def test_covariances_hold_and_turn_with_the_pose():
     assert np.degrees(np.sqrt(np.linalg.eigvalsh(c.many.covariances[1][:3, :3])[2])) < 0.5
 
 
-def test_frames_have_the_refined_cameras_and_are_read_when_asked():
-    c = case()
-    scale, offset = c.many.refined.state.bias
-    for f, g, T in zip(c.many.frames, c.intake.frames, c.many.refined.cameras, strict=True):
-        assert isinstance(f, LazyFrame) and f.index == g.index
-        np.testing.assert_array_equal(f.T_world_cam, T)
-    z = c.intake.frames[2].depth_m.astype(np.float64)
-    expected = np.where(z > 0, z / (scale + offset * z), 0)
-    np.testing.assert_allclose(c.many.frames[2].depth_m, expected, atol=1e-6)
-
-
-def test_comparer_looks_from_directions_far_apart():
-    c = case()
-    few = replace(CONFIG, verify=replace(CONFIG.verify, frames=3))
-    poses = c.many.poses
-    comparer = comparer_on(c.intake, c.many.frames, c.many.plane, c.bodies, poses, few)
-    assert len(comparer.frames) == 3
-    assert not any(isinstance(f, LazyFrame) for f in comparer.frames)
-    center = np.mean([b.center(T) for b, T in zip(c.bodies, poses, strict=True)], axis=0)
-    rays = np.stack([f.T_world_cam[:3, 3] - center for f in comparer.frames])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    cosines = (rays @ rays.T)[np.triu_indices(3, 1)]
-    assert np.degrees(np.arccos(cosines.max())) > 35
-    assert len(comparer_on(c.intake, c.many.frames, None, [], [], few).frames) == 3
-
-
 def test_what_calibrations_say_becomes_the_prior():
     said = RegistrationConfig(
         hand_eye_sigma_mm=0.3, hand_eye_sigma_deg=1e-5, arm_sigma_mm=1e-6,
@@ -162,17 +122,6 @@ def test_what_calibrations_say_becomes_the_prior():
     assert (found.bias.scale, found.bias.offset_per_m) == (1.0, 0.0)
     np.testing.assert_array_equal(found.bias.covariance, said.bias.covariance)
     assert refine_config(RegistrationConfig()).prior == RegistrationConfig().refine.prior
-
-
-def test_progress_is_told_by_rounds():
-    c = case()
-    seen: list[tuple[int, int]] = []
-    config = replace(CONFIG, refine=replace(CONFIG.refine, rounds=2))
-    register_many(
-        c.intake, c.bodies[1:], [None, None], c.intake.plane, config,
-        lambda done, of: seen.append((done, of)),
-    )  # fmt: skip
-    assert seen == [(1, 2), (2, 2)]
 
 
 @pytest.mark.slow

@@ -12,8 +12,8 @@ from realsim.geometry import se3
 from realsim.records import SupportPlane
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.odometry.cross_check import CheckConfig, check_kinematics
-from realsim.registration.odometry.kiss import OdometryConfig, odometry, thinned
-from realsim.registration.odometry.pairs import PairConfig, neighbour_pairs, on_plane, without_plane
+from realsim.registration.odometry.kiss import OdometryConfig, odometry
+from realsim.registration.odometry.pairs import on_plane
 from realsim.registration.views import SampleConfig, ViewPoints, sample_views
 from table_scenes import small_scene
 
@@ -79,14 +79,6 @@ def test_odometry_is_repeatable_and_names_small_clouds():
         odometry(clouds, OdometryConfig(), guesses=[np.eye(4)])
 
 
-def test_without_plane_keeps_what_is_above():
-    rng = np.random.default_rng(3)
-    T = se3.look_at([0.1, 0.2, 0.4], [0, 0, 0])
-    world = rng.uniform([-0.2, -0.2, 0], [0.2, 0.2, 0.1], (500, 3))
-    kept = without_plane(se3.transform(se3.invert(T), world), T, PLANE, 0.02)
-    assert se3.transform(T, kept) == pytest.approx(world[world[:, 2] > 0.02])
-
-
 def test_on_plane_brings_one_plane_onto_the_other():
     rng = np.random.default_rng(4)
     a, b = (se3.look_at(p, [0, 0, 0]) for p in ([0.1, 0.2, 0.4], [0.2, 0.1, 0.35]))
@@ -98,21 +90,6 @@ def test_on_plane_brings_one_plane_onto_the_other():
     assert mended[:3, :3] @ planes[1][0] == pytest.approx(planes[0][0], abs=1e-9)
     on_b = planes[1][0] * planes[1][1]
     assert planes[0][0] @ se3.transform(mended, on_b[None])[0] == pytest.approx(planes[0][1])
-
-
-def test_pairs_join_all_views():
-    rng = np.random.default_rng(5)
-    u = rng.normal(size=(40, 3))
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    angles = np.degrees(np.arccos(np.clip(u @ u.T, -1, 1)))
-    pairs = neighbour_pairs(angles, PairConfig())
-    group = np.arange(40)
-    for _ in range(40):
-        for i, j in pairs:
-            group[[i, j]] = min(group[i], group[j])
-    assert set(group.tolist()) == {0}
-    assert len(pairs) == len(set(pairs)) and all(i < j for i, j in pairs)
-    assert thinned(np.zeros((5, 3)), 0.004).shape == (1, 3)
 
 
 def test_a_clean_capture_raises_no_alarm():

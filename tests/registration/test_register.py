@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.metrics import mssd
 from realsim.records import ObjectPose
@@ -59,15 +58,6 @@ def test_rough_start_ends_at_the_truth_and_beats_one_view(clutter, result):
     json.dumps(result.report)
 
 
-def test_support_plane_is_the_table(result):
-    plane = result.scene.plane
-    assert plane is not None
-    T = plane.T_world_table
-    assert np.degrees(np.arccos(T[2, 2])) < 0.1
-    assert abs(T[2, 3]) < 2e-4
-    assert plane.rms_m < 0.003
-
-
 def test_the_answer_moves_with_the_world(clutter, starts, result):
     T = se3.random_transform(np.random.default_rng(3))
     frames = [
@@ -91,24 +81,6 @@ def test_order_of_frames_and_objects_does_not_matter(clutter, starts, result):
         np.testing.assert_allclose(a.T_world_obj, b.T_world_obj, atol=1e-6)
 
 
-def test_covariance_is_of_the_size_of_the_errors(clutter, result):
-    ratios = []
-    for t, o in zip(clutter.truth, result.scene.objects, strict=True):
-        xi = se3.log(se3.invert(t.T_world_obj) @ o.T_world_obj)
-        assert o.covariance is not None
-        assert np.all(np.linalg.eigvalsh(o.covariance) > 0)
-        ratios.append(float(xi @ np.linalg.solve(o.covariance, xi)) / 6)
-    # Six degrees of freedom: 1 on average; the floor and the 0.6 mm make it careful, not careless.
-    assert np.mean(ratios) < 3.0
-    assert np.max(ratios) > 0.005
-
-
-def test_single_frame_is_the_same_code(clutter, starts):
-    one = run(clutter, starts, clutter.frames[:1])
-    assert one.report["frames"] == [0]
-    assert np.median(errors_mm(clutter, one.scene.objects)) < 4.0
-
-
 def test_a_common_move_of_all_starts_is_reported(clutter):
     shift = se3.from_translation([0.010, -0.006, 0.0])
     moved = [
@@ -119,16 +91,3 @@ def test_a_common_move_of_all_starts_is_reported(clutter):
     assert report["consistent"]
     np.testing.assert_allclose(report["offset_mm"], [-10, 6, 0], atol=0.5)
     assert report["spread_mm"] < 0.5
-
-
-def test_wrong_inputs_are_named(clutter, starts):
-    with pytest.raises(InputError, match="at least one"):
-        run(clutter, starts, [])
-    unknown = ObjectPose(obj_id=99, instance=7, T_world_obj=np.eye(4))
-    with pytest.raises(InputError, match="99"):
-        run(clutter, [unknown])
-    with pytest.raises(InputError, match="same instance"):
-        run(clutter, [starts[0], starts[0]])
-    small = DepthFrame(index=0, depth_m=np.zeros((5, 5), np.float32), T_world_cam=np.eye(4))
-    with pytest.raises(InputError, match="shape"):
-        run(clutter, starts, [small])

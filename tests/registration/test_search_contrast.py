@@ -13,7 +13,7 @@ from realsim.records import Mesh, ObjectModel, ObjectPose, SupportPlane
 from realsim.registration.body import make_body
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.search.candidates import CandidateConfig, Sought, fuse
-from realsim.registration.search.polish import ContrastConfig, Decision, decided
+from realsim.registration.search.polish import ContrastConfig, Decision, decide_rivals
 from realsim.registration.search.sameness import make_sameness
 from realsim.registration.search.scoring import ScoreConfig, make_canvas
 from realsim.registration.simulated import TableScene, resized, table_scene
@@ -56,7 +56,7 @@ def decide(knob_m: float, start: np.ndarray, near: np.ndarray) -> Decision:
     cloud = fuse(views, NOISE, PLANE, CandidateConfig()).fine
     canvas = make_canvas(made.intrinsics, made.frames, NOISE, PLANE, CONFIG.lattice)
     T = made.truth[0].T_world_obj @ start
-    return decided(sought, T, canvas.table, (canvas, cloud, near), CONFIG, CandidateConfig())
+    return decide_rivals(sought, T, canvas.table, (canvas, cloud, near), CONFIG, CandidateConfig())
 
 
 @pytest.mark.parametrize("knob_m", [0.012, 0.008])

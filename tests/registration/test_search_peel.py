@@ -89,10 +89,3 @@ def test_one_of_the_starts_in_a_cluster_is_near_the_truth(name: str):
     shifts = [np.linalg.norm(s.body.center(S) - s.body.center(T)) for S, _ in starts]
     assert min(turns) < 60  # missed by all of 80 random turns once in 100 times
     assert max(shifts) < 1.5 * s.body.radius_m
-
-
-def test_low_and_small_groups_are_left_out():
-    rng = np.random.default_rng(3)
-    flat = np.c_[rng.uniform(-0.1, 0.1, (500, 2)), np.full(500, 0.003)]
-    few = np.tile([0.0, 0.0, 0.05], (20, 1))
-    assert clusters(np.concatenate([flat, few]), np.eye(4), CONFIG) == []

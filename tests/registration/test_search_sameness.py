@@ -47,14 +47,6 @@ def test_it_is_the_sampled_distance_with_the_sampling_gone(name: str):
     assert 0.9 * sampled - 3e-4 < got < 1.35 * sampled
 
 
-def test_distance_does_not_depend_on_the_world():
-    same = make_sameness(part("gear"))
-    rng = np.random.default_rng(5)
-    A, B, W = (se3.random_transform(rng) for _ in range(3))
-    assert same.distance(W @ A, W @ B) == pytest.approx(same.distance(A, B), rel=1e-9)
-    assert same.distance(A, A) < 1e-12
-
-
 def test_of_a_ball_only_the_middle_counts():
     same = make_sameness(BALL)
     rng = np.random.default_rng(1)

@@ -11,7 +11,6 @@ from realsim.registration.body import Body, footprint, make_body
 from realsim.registration.compare import CompareConfig, make_comparer
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.search.scoring import (
-    FAR,
     Canvas,
     ScoreConfig,
     compose,
@@ -74,20 +73,6 @@ def test_gains_of_a_whole_scene_do_not_depend_on_the_order():
         assert total == pytest.approx(full - empty, abs=1e-6 * abs(full))
 
 
-def test_a_pose_that_is_there_already_gains_nothing():
-    first = render(canvas(), *bodies()[0])
-    s = score(canvas(), first, compose(canvas().table, [first]))
-    assert (s.gain, s.cells) == (0.0, 0)
-
-
-def test_composing_keeps_the_nearest():
-    a, b = (render(canvas(), *bodies()[n]) for n in (0, 1))
-    both = compose(canvas().table, [a, b])
-    np.testing.assert_array_equal(both, compose(canvas().table, [b, a]))
-    assert np.all(both <= canvas().table)
-    assert np.all(both[a.cells] <= a.z)
-
-
 @pytest.mark.parametrize("n", range(5))
 def test_the_truth_gains_more_than_anything_beside_it(n: int):
     body, T = bodies()[n]
@@ -114,14 +99,3 @@ def test_likelihood_is_the_comparers():
             one.measured[cells].astype(np.float64), z[cells].astype(np.float64)
         )
         np.testing.assert_allclose(likelihoods(one, z, cells), expected, atol=2e-3)
-
-
-def test_nothing_rendered_is_neutral():
-    cells = np.arange(50, dtype=np.int32)
-    empty = np.full_like(canvas().table, FAR)
-    assert np.all(likelihoods(canvas(), empty, cells) == 0)
-
-
-def test_an_object_behind_the_camera_is_not_seen():
-    body, _ = bodies()[0]
-    assert len(render(canvas(), body, se3.from_translation([0, 0, 3.0])).cells) == 0

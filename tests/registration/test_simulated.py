@@ -9,7 +9,6 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.camera import ray_table
 from realsim.geometry.depth import points_from_depth
 from realsim.geometry.distance_field import raycasting_scene
 from realsim.geometry.mesh import to_trimesh
@@ -18,27 +17,20 @@ from realsim.geometry.parts import part, part_names
 from realsim.interop import import_open3d
 from realsim.records import Mesh, ObjectPose
 from realsim.registration.simulated import (
-    DEPTH_UNIT_M,
     Scattered,
     TableLabConfig,
     TableScene,
-    full_size,
     resized,
     scatter_objects,
     seen_instances,
     table_scene,
 )
-from realsim.registration.simulated_faults import (
-    foreign,
-    shifted_depth,
-    shifted_view,
-    swapped,
-    without_any_depth,
-    without_depth_on,
-)
 from realsim.registration.simulated_lab import camera_of, sensor_of
 from realsim.rendering.depth_sensors.model import DepthSensorModel
-from table_scenes import named_scene, part_models, small_scene, with_found_symmetries
+from table_faults import (
+    without_depth_on,
+)
+from table_scenes import part_models, small_scene, with_found_symmetries
 
 NO_ERRORS = {"hand_eye_mm": 0.0, "hand_eye_deg": 0.0, "arm_mm": 0.0, "arm_deg": 0.0}
 TINY = resized(TableLabConfig(sensor=DepthSensorModel.noiseless()), 64)
@@ -142,13 +134,6 @@ def test_a_seed_gives_a_layout_and_what_finds_no_room_is_named():
 # --- cameras -------------------------------------------------------------------------------------
 
 
-def test_without_errors_the_claimed_cameras_are_true():
-    scene = mug_alone(replace(TINY, **NO_ERRORS), 1)
-    claimed = np.stack([f.T_world_cam for f in scene.frames])
-    np.testing.assert_allclose(claimed, scene.Ts_world_cam, atol=1e-12)
-    np.testing.assert_allclose(scene.T_ee_cam, scene.T_ee_cam_true, atol=1e-15)
-
-
 def test_the_errors_are_those_asked_for_and_stored_consistently():
     scene = mug_alone(replace(TINY, views=600), 3)
     np.testing.assert_allclose(
@@ -165,23 +150,6 @@ def test_the_errors_are_those_asked_for_and_stored_consistently():
     assert np.degrees(xi[:, :3].std()) == pytest.approx(0.03, rel=spread)
     assert 1e3 * xi[:, 3:].std() == pytest.approx(0.2, rel=spread)
     assert np.abs(np.corrcoef(xi.T) - np.eye(6)).max() < 4.5 / np.sqrt(600)
-
-
-def test_views_are_where_they_are_said_to_be_and_keep_clear_of_objects():
-    scene = small_scene(0)
-    top = scene.Ts_world_cam[0]
-    assert top[2, 2] < -0.999
-    assert top[2, 3] == pytest.approx(0.45 + 0.03, abs=0.011)
-    surfaces = [
-        (raycasting_scene(scene.models[p.obj_id].mesh), se3.invert(p.T_world_obj))
-        for p in scene.truth
-    ]
-    for T in scene.Ts_world_cam:
-        for surface, T_obj_world in surfaces:
-            eye = se3.transform(T_obj_world, T[:3, 3][None])
-            assert (
-                distances(surface, eye)[0] > 0.10 - 0.01
-            )  # points are sampled: a centimetre apart
 
 
 # --- depth ---------------------------------------------------------------------------------------
@@ -208,12 +176,6 @@ def test_exact_depth_lies_on_the_true_surfaces():
         assert np.abs(world[which < 0, 2]).max() < 1e-4
 
 
-def test_depth_is_in_tenths_of_a_millimetre_as_stored():
-    depth = small_scene(0).frames[0].depth_m.astype(np.float64)
-    np.testing.assert_allclose(depth / DEPTH_UNIT_M, np.round(depth / DEPTH_UNIT_M), atol=1e-3)
-    assert 0.9 < np.mean(depth > 0) < 1
-
-
 @pytest.mark.parametrize("width", [320, 640, 1280])
 def test_every_image_size_has_the_same_noise_and_the_same_information(width: int):
     """Depth of a plane: sigma_z is the D405's, and so is that of the mean over a patch."""
@@ -233,21 +195,6 @@ def test_every_image_size_has_the_same_noise_and_the_same_information(width: int
     # A tile of a Gaussian-correlated field has pixels / (4 pi correlation^2) independent values.
     independent = 40**2 / (4 * np.pi * 2.0**2)
     assert means.std() == pytest.approx(sigma / np.sqrt(independent), rel=0.15)
-
-
-def test_full_size_is_the_d405_and_a_bias_is_the_same_error_of_depth():
-    full = full_size(TableLabConfig(bias_px=0.02))
-    assert (full.width, full.height, full.focal_px) == (1280, 720, 648.0)
-    assert sensor_of(full).disparity_noise_px == pytest.approx(0.08)
-    half = replace(TableLabConfig(), bias_px=0.02)
-    assert sensor_of(half).disparity_noise_px == pytest.approx(0.04)
-    for config in (full, half):
-        noiseless = replace(config, sensor=DepthSensorModel.noiseless())
-        camera = camera_of(noiseless)
-        flat = np.full((camera.height, camera.width), 0.4, np.float32)
-        z = sensor_of(noiseless).measure(flat, camera, np.random.default_rng(0))
-        expected = 1 / (1 / 0.4 + 0.02 / (648 * 0.018))
-        assert float(np.median(z)) == pytest.approx(expected, abs=1e-7)
 
 
 def test_a_seed_gives_the_same_bytes_whether_images_are_kept_or_made(tmp_path: Path):
@@ -309,56 +256,7 @@ def test_a_black_object_has_no_depth_and_nothing_else_changes():
         without_depth_on(scene, 99)
 
 
-def test_through_a_transparent_object_the_table_is_seen():
-    scene = small_scene(0)
-    one = scene.truth[1].instance
-    for k, frame in enumerate(without_depth_on(scene, one, "transparent")):
-        on = (seen_instances(scene, [k])[0] == one) & (frame.depth_m > 0)
-        rays = ray_table(scene.intrinsics)[on].astype(np.float64)
-        world = se3.transform(scene.Ts_world_cam[k], rays * frame.depth_m[on, None])
-        assert np.abs(world[:, 2]).max() < 1e-5
-
-
-def test_faults_of_single_views_do_what_they_say():
-    scene, other = small_scene(0), small_scene(1)
-    f = scene.frames[3]
-    xi = np.array([0.01, 0, 0.02, 0.003, 0, 0.001])
-    moved = shifted_view(f, xi)
-    np.testing.assert_allclose(
-        se3.log(se3.invert(f.T_world_cam) @ moved.T_world_cam), xi, atol=1e-12
-    )
-    assert moved.depth_m is f.depth_m
-    spoilt = swapped(scene.frames, 2, 5)
-    assert spoilt[2].depth_m is scene.frames[5].depth_m
-    assert spoilt[5].depth_m is scene.frames[2].depth_m
-    assert [s.index for s in spoilt] == [s.index for s in scene.frames]
-    assert spoilt[2].T_world_cam is scene.frames[2].T_world_cam
-    again = swapped(spoilt, 2, 5)
-    assert all(a.depth_m is b.depth_m for a, b in zip(again, scene.frames, strict=True))
-    assert foreign(f, other.frames[0]).depth_m is other.frames[0].depth_m
-    assert not without_any_depth(f).depth_m.any()
-    with pytest.raises(InputError, match="no view 77"):
-        swapped(scene.frames, 2, 77)
-
-
-@pytest.mark.parametrize("right, down", [(12, 0), (-7, 3), (0, -9), (500, 0)])
-def test_shifted_depth_moves_the_image(right: int, down: int):
-    f = small_scene(0).frames[3]
-    moved = shifted_depth(f, (right, down)).depth_m
-    height, width = f.depth_m.shape
-    for y, x in np.random.default_rng(0).integers((0, 0), (height, width), (200, 2)):
-        inside = 0 <= y - down < height and 0 <= x - right < width
-        assert moved[y, x] == (f.depth_m[y - down, x - right] if inside else 0)
-
-
 # --- scenes for tests ----------------------------------------------------------------------------
-
-
-def test_scenes_for_tests_are_made_once_and_differ_by_seed():
-    assert small_scene(0) is small_scene(0)
-    assert {p.obj_id for p in small_scene(0).truth} != {p.obj_id for p in small_scene(1).truth}
-    twice = named_scene(0, ("mug", "mug"), 2)
-    assert [(p.obj_id, p.instance) for p in twice.truth] == [(10, 0), (10, 1)]
 
 
 @pytest.mark.slow

@@ -113,31 +113,6 @@ def test_slopes_are_kept_and_steps_are_not():
     assert columns == set(range(160)) - set(range(80 - reach, 80 + reach))
 
 
-@pytest.mark.parametrize("value", [0.0, np.nan, np.inf, -1.0])
-def test_an_empty_image_has_no_points(value: float):
-    view = sample_view(CAMERA, frame(np.full((90, 160), value)), NOISE, EVERY)
-    assert view.points.shape == (0, 3) and view.pixels.shape == (0, 2)
-    assert view.measured_share == 0 and view.world().shape == (0, 3)
-
-
-def test_the_image_is_left_as_it_was():
-    depth = np.full((90, 160), 0.4, np.float32)
-    depth.setflags(write=False)
-    image = frame(depth)
-    sample_view(CAMERA, image, NOISE, EVERY)
-    assert image.depth_m is depth and np.all(depth == np.float32(0.4))
-
-
-def test_views_come_in_the_order_of_the_frames_and_each_is_counted():
-    T = se3.look_at([0, 0, 0.4], [0, 0, 0])
-    frames = [frame(np.full((90, 160), 0.3 + 0.1 * k), T, index=9 - k) for k in range(3)]
-    seen: list[tuple[int, int]] = []
-    views = sample_views(CAMERA, frames, NOISE, EVERY, lambda done, of: seen.append((done, of)))
-    assert [v.index for v in views] == [9, 8, 7]
-    assert seen == [(1, 3), (2, 3), (3, 3)]
-    np.testing.assert_allclose([v.points[0, 2] for v in views], [0.3, 0.4, 0.5], rtol=1e-6)
-
-
 def test_cloud_looks_back_at_the_cameras_with_their_noise():
     Ts = [se3.look_at([0.2, 0, 0.4], [0, 0, 0]), se3.look_at([0, -0.3, 0.9], [0, 0, 0])]
     views = sample_views(

@@ -84,22 +84,6 @@ def test_it_does_not_matter_where_the_world_is(scene):
     np.testing.assert_allclose(moved @ a.cameras, b.cameras, atol=2e-6)
 
 
-def test_views_that_see_nothing_keep_the_robots_word(scene):
-    views, noise = points_of(scene)
-    empty = DepthFrame(
-        index=99, depth_m=np.zeros_like(scene.frames[0].depth_m),
-        T_world_cam=scene.frames[0].T_world_cam,
-    )  # fmt: skip
-    blind = sample_views(scene.intrinsics, [empty], noise, SampleConfig(stride=1))
-    refined = refine_views(scene.intrinsics, [*views[:4], *blind], noise, QUICK)
-    assert refined.overlaps[-1] == 0
-    twist = se3.log(se3.invert(empty.T_world_cam) @ refined.cameras[-1])
-    np.testing.assert_allclose(twist, refined.hand_eye, atol=1e-6)
-    # What is not seen is less sure than what is.
-    sigma = np.sqrt(np.einsum("vii->v", refined.covariances[:, 3:, 3:]))
-    assert sigma[-1] > sigma[:-1].max()
-
-
 def test_one_view_cannot_be_aligned(scene):
     views, _ = points_of(scene)
     with pytest.raises(InputError, match="two that overlap"):

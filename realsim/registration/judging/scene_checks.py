@@ -119,7 +119,7 @@ def scene_findings(
             findings.append(
                 SceneFinding(
                     kind="not in the scene",
-                    words=f"{_named(body)} seems not to be in the scene: its best pose explains "
+                    words=f"{_name_of(body)} seems not to be in the scene: its best pose explains "
                     f"the depth by {gain:.2f} per pixel better than the bare table does (0.6 or "
                     "more is usual). Remove it from the list, or check that its model is the "
                     "object's.",
@@ -214,8 +214,8 @@ def swap_findings(
         taken |= {i, j}
         a, b = bodies[i], bodies[j]
         words = (
-            f"{_named(a)} and {_named(b)} seem to be swapped: at each other's place they explain "
-            f"{there:.0f} and {here:.0f} pixels better than the bare table does, at their own "
+            f"{_name_of(a)} and {_name_of(b)} seem to be swapped: at each other's place they "
+            f"explain {there:.0f} and {here:.0f} pixels better than the bare table does, at their own "
             f"{gains[i][0]:.0f} and {gains[j][0]:.0f}. Swap the two ids."
         )
         findings.append(
@@ -229,7 +229,7 @@ def swap_findings(
     return findings
 
 
-def _named(body: Body) -> str:
+def _name_of(body: Body) -> str:
     """Return how a finding calls an object."""
     return f"{body.model.name} (id {body.start.obj_id}, instance {body.start.instance})"
 

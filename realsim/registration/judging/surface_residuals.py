@@ -146,7 +146,7 @@ def surface_residuals(
         if v % every == 0:
             _look(poses, pieces, intrinsics, view, T, noise, looks, config)
     return [
-        _finished(p, s, seen, depth, len(views), config)
+        _means_of(p, s, seen, depth, len(views), config)
         for p, s, seen, depth in zip(pieces, sums, looks, depths, strict=True)
     ]
 
@@ -238,7 +238,7 @@ def _look(
         )
 
 
-def _finished(
+def _means_of(
     patches: Patches,
     sums: Array,
     looks: NDArray[np.int32],

@@ -27,8 +27,8 @@ from realsim.registration.odometry.faults import (
 from realsim.registration.odometry.mismatch import (
     Mismatch,
     MismatchConfig,
-    failed,
     find_mismatches,
+    has_failed,
 )
 from realsim.registration.odometry.pairs import (
     AboveTableConfig,
@@ -225,7 +225,7 @@ def check_kinematics(
         )
     empty = set(range(len(views))) - set(use)
     claimed = np.stack([views[k].T_world_cam for k in use])
-    found = _examined([clouds[k] for k in use], claimed, config)
+    found = _examine([clouds[k] for k in use], claimed, config)
     numbers = [views[k].index for k in use]
     faults = [
         Fault(kind=m.kind, view=numbers[m.place],
@@ -247,7 +247,7 @@ def check_kinematics(
     unknown = ViewDifference(index=-1, mm=np.nan, deg=np.nan, pairs=0, overlap=0.0)
     return KinematicsCheck(
         views=tuple(
-            _numbered(by_place.get(k, unknown), view.index) for k, view in enumerate(views)
+            _number(by_place.get(k, unknown), view.index) for k, view in enumerate(views)
         ),
         faults=tuple(faults),
         noise_mm=found.noise_mm,
@@ -275,20 +275,20 @@ class _Found:
     pairs: int
 
 
-def _examined(clouds: Sequence[ViewCloud], claimed: Array, config: CheckConfig) -> _Found:
+def _examine(clouds: Sequence[ViewCloud], claimed: Array, config: CheckConfig) -> _Found:
     """Return mismatches first, then the faults of the poses that the images do belong to."""
     meter = PairMeter(clouds, config.pairs)
     aim = _middle(clouds, claimed)
     angles = view_angles(claimed, aim, config.pairs.zoom_deg)
     everyone = list(range(len(claimed)))
-    edges = _measured(meter, claimed, angles, everyone, config)
+    edges = _measure_pairs(meter, claimed, angles, everyone, config)
     mismatches, poses = find_mismatches(meter, claimed, edges, angles, config.mismatch)
     Ts = claimed[np.maximum(poses, 0)]
     kept = [k for k in everyone if poses[k] >= 0]
     if mismatches:
         angles = view_angles(Ts, aim, config.pairs.zoom_deg)
-        edges = _measured(meter, Ts, angles, kept, config)
-    trusted = [e for e in edges if not failed(e, config.mismatch)]
+        edges = _measure_pairs(meter, Ts, angles, kept, config)
+    trusted = [e for e in edges if not has_failed(e, config.mismatch)]
     faults, mended = find_faults(Ts, trusted, aim, config.faults)
     noise = noise_of(differences(mended, trusted), config.faults)
     paired = {k for e in trusted for k in (e.first, e.second)}
@@ -312,7 +312,7 @@ def _examined(clouds: Sequence[ViewCloud], claimed: Array, config: CheckConfig) 
     )
 
 
-def _measured(
+def _measure_pairs(
     meter: PairMeter, Ts: Array, angles: Array, kept: Sequence[int], config: CheckConfig
 ) -> list[Edge]:
     """Return the pairs of neighbours, and more of those that a pair makes suspect."""
@@ -323,7 +323,7 @@ def _measured(
     large = (1e3 * np.linalg.norm(r[:, 3:], axis=1) > config.faults.least_mm) | (
         np.degrees(np.linalg.norm(r[:, :3], axis=1)) > config.faults.least_deg
     )
-    odd = [e for e, big in zip(edges, large, strict=True) if big or failed(e, config.mismatch)]
+    odd = [e for e, big in zip(edges, large, strict=True) if big or has_failed(e, config.mismatch)]
     doubted = sorted({k for e in odd for k in (e.first, e.second)})
     if len(doubted) > config.further_share * len(kept):
         return edges
@@ -363,7 +363,7 @@ def _difference(k: int, Ts: Array, mended: Array, edges: Sequence[Edge]) -> View
     )
 
 
-def _numbered(difference: ViewDifference, index: int) -> ViewDifference:
+def _number(difference: ViewDifference, index: int) -> ViewDifference:
     """Return the difference with the view's number."""
     from dataclasses import replace
 

@@ -143,7 +143,7 @@ def find_faults(
         fault = _gravest(Ts, edges, aim, _screening(before, config), refuted, config)
         if fault is None:
             break
-        mended = _corrected(Ts, fault)
+        mended = _correct_poses(Ts, fault)
         # What is left without the fault says what the noise is.
         noise = noise_of(differences(mended, edges), config)
         if not _explains(fault, Ts, mended, edges, noise, config):
@@ -204,11 +204,11 @@ def _gravest(
                 continue
             if np.median(cost[which]) < config.cauchy or (_group(kind), k) in refuted:
                 continue
-            found = _fitted(kind, k, Ts, edges, r, which, noise, config)
+            found = _fit_fault(kind, k, Ts, edges, r, which, noise, config)
             if found is None:
                 continue
             gain, twist = found
-            fault = _measured(kind, k, Ts, twist, aim)
+            fault = _size_of(kind, k, Ts, twist, aim)
             if (best is None or gain > best[0]) and _size(fault, noise, config) > config.nuisance:
                 best = gain, fault
     if best is None:
@@ -218,7 +218,7 @@ def _gravest(
     )  # fmt: skip
 
 
-def _fitted(
+def _fit_fault(
     kind: str, k: int, Ts: Array, edges: Sequence[Edge], r: Array,
     which: NDArray[np.intp], noise: Noise, config: FaultConfig,
 ) -> tuple[float, Array] | None:  # fmt: skip
@@ -277,10 +277,10 @@ def _mount_or_world(
     costs: dict[str, tuple[float, PoseFault]] = {}
     kinds: tuple[Kind, ...] = ("mount", "world")
     for kind in kinds:
-        found = _fitted(kind, fault.place, Ts, edges, r, later, noise, _lenient(config))
+        found = _fit_fault(kind, fault.place, Ts, edges, r, later, noise, _lenient(config))
         if found is not None:
             gain, twist = found
-            costs[kind] = (gain, _measured(kind, fault.place, Ts, twist, aim))
+            costs[kind] = (gain, _size_of(kind, fault.place, Ts, twist, aim))
     if not costs:
         return fault
     ordered = sorted(costs.values(), key=lambda c: -c[0])
@@ -299,7 +299,7 @@ def _lenient(config: FaultConfig) -> FaultConfig:
     return replace(config, least_gain=-np.inf, explained_share=0.0)
 
 
-def _measured(kind: Kind | str, k: int, Ts: Array, twist: Array, aim: Array) -> PoseFault:
+def _size_of(kind: Kind | str, k: int, Ts: Array, twist: Array, aim: Array) -> PoseFault:
     """Return a fault with its size [mm, deg]."""
     T = se3.exp(twist)
     deg = float(np.degrees(se3.angle(T)))
@@ -318,7 +318,7 @@ def _size(fault: PoseFault, noise: Noise, config: FaultConfig) -> float:
     return max(fault.mm / mm, fault.deg / deg)
 
 
-def _corrected(Ts: Array, fault: PoseFault) -> Array:
+def _correct_poses(Ts: Array, fault: PoseFault) -> Array:
     """Return the poses (F, 4, 4) without a fault."""
     out = Ts.copy()
     T, k = se3.exp(fault.twist), fault.place

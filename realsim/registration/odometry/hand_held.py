@@ -77,7 +77,7 @@ class Graph:
     """(E, 6) what is left of each pair's twist [rad, m]."""
 
 
-def optimised(
+def optimise_poses(
     Ts_world_cam: Array, edges: Sequence[Edge], levelled: Sequence[bool], angles: Array,
     config: GraphConfig,
 ) -> Graph:  # fmt: skip
@@ -230,9 +230,9 @@ def hand_held_poses(
     )
     levelled = tuple(c.normal is not None for c in clouds)
     angles = view_angles(Ts, aim, config.pairs.zoom_deg)
-    Ts = optimised(Ts, path.edges, levelled, angles, config.graph).Ts_world_cam
+    Ts = optimise_poses(Ts, path.edges, levelled, angles, config.graph).Ts_world_cam
     loops = _loops(path, Ts, view_angles(Ts, aim, config.pairs.zoom_deg))
-    graph = optimised(Ts, [*path.edges, *loops], levelled, angles, config.graph)
+    graph = optimise_poses(Ts, [*path.edges, *loops], levelled, angles, config.graph)
     r = graph.residuals if len(graph.residuals) else np.zeros((1, 6))
     return HandHeld(
         Ts_world_cam=graph.Ts_world_cam,

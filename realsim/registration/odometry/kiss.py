@@ -171,7 +171,7 @@ def odometry(
     )
 
 
-def thinned(points: Array, spacing_m: float) -> Array:
+def thin_points(points: Array, spacing_m: float) -> Array:
     """Return the points (M, 3) averaged in voxels of this edge: less noise than picking one."""
     return voxel_mean(points, spacing_m).points
 
@@ -199,7 +199,7 @@ def _distances(map_points: Array, points: Array, config: OdometryConfig) -> Arra
     """Return each point's distance (N,) to the map's points [m]."""
     from scipy.spatial import KDTree
 
-    tree: Any = KDTree(thinned(map_points, config.voxel_m / 2))
+    tree: Any = KDTree(thin_points(map_points, config.voxel_m / 2))
     return np.asarray(tree.query(points)[0], dtype=np.float64)
 
 

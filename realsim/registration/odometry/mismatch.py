@@ -60,7 +60,7 @@ class Mismatch:
     """The view whose pose it fits; of a shift, how many poses ahead."""
 
 
-def failed(edge: Edge, config: MismatchConfig) -> bool:
+def has_failed(edge: Edge, config: MismatchConfig) -> bool:
     """Return whether a pair could not be aligned."""
     return edge.overlap < config.least_overlap
 
@@ -75,7 +75,7 @@ def suspects(Ts_world_cam: Array, edges: Sequence[Edge], config: MismatchConfig)
         )
         for k in (e.first, e.second):
             total[k] += 1
-            bad[k] += failed(e, config) or gross
+            bad[k] += has_failed(e, config) or gross
     return np.flatnonzero((total > 0) & (bad >= config.suspect_share * total)).tolist()
 
 
@@ -95,7 +95,7 @@ def find_mismatches(
     n = len(Ts_world_cam)
     own = np.arange(n)
     doubted = suspects(Ts_world_cam, edges, config)
-    aligned = [e.distance_m for e in edges if not failed(e, config)]
+    aligned = [e.distance_m for e in edges if not has_failed(e, config)]
     if not doubted or not aligned:
         return (), own
     fits = config.fits_factor * float(np.median(aligned))

@@ -10,7 +10,7 @@ from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.clouds import fit_plane_ransac, refine_plane
 from realsim.records import SupportPlane
-from realsim.registration.odometry.kiss import FitConfig, LocalMap, thinned
+from realsim.registration.odometry.kiss import FitConfig, LocalMap, thin_points
 from realsim.registration.views import ViewPoints
 
 Array = NDArray[np.float64]
@@ -89,7 +89,7 @@ def view_cloud(
     found = None
     if plane is not None:
         T_table_cam = se3.invert(plane.T_world_table) @ view.T_world_cam
-        found = _refined(p, T_table_cam[2, :3], -float(T_table_cam[2, 3]), config)
+        found = _refine_table(p, T_table_cam[2, :3], -float(T_table_cam[2, 3]), config)
     if found is None:
         found = _largest(p, config, rng)
     if found is None:
@@ -101,17 +101,17 @@ def view_cloud(
         normal, offset = found
         height = p @ normal - offset
         things = p[(height > config.height_m) & (height < config.top_m)]
-    target = thinned(things, config.map_spacing_m)
+    target = thin_points(things, config.map_spacing_m)
     return ViewCloud(
         index=view.index,
         normal=normal,
         offset=offset,
         target=target,
-        source=thinned(target, config.source_spacing_m),
+        source=thin_points(target, config.source_spacing_m),
     )
 
 
-def snapped(T_a_b: Array, a: ViewCloud, b: ViewCloud) -> Array:
+def snap_tables(T_a_b: Array, a: ViewCloud, b: ViewCloud) -> Array:
     """Return the relative pose of two views, turned and lifted so that their tables coincide.
 
     b's things are turned about their centroid, so that what an alignment said of them holds.
@@ -144,7 +144,7 @@ def on_plane(
     return se3.from_rt(R, center - R @ about)
 
 
-def _refined(
+def _refine_table(
     p: Array, normal: Array, offset: float, config: AboveTableConfig
 ) -> tuple[Array, float] | None:
     """Return the plane (normal, offset) near a given one, or None if the view has none there."""
@@ -171,7 +171,9 @@ def _largest(
         return None
     if np.mean(inliers) < config.least_share:
         return None
-    return _refined(p, n, float(d), config) if d < 0 else _refined(p, -n, -float(d), config)
+    return (
+        _refine_table(p, n, float(d), config) if d < 0 else _refine_table(p, -n, -float(d), config)
+    )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -223,8 +225,8 @@ class PairMeter:
         The table gives three of the six numbers, KISS-ICP the other three.
         """
         a, b = self.clouds[first], self.clouds[second]
-        guess = snapped(T_guess, a, b)
-        T = snapped(self._map(first).align(b.source, guess, self.config.fit), a, b)
+        guess = snap_tables(T_guess, a, b)
+        T = snap_tables(self._map(first).align(b.source, guess, self.config.fit), a, b)
         overlap, distance = self.agreement(first, second, T)
         return Edge(
             first=first, second=second, T_first_second=T, overlap=overlap, distance_m=distance

@@ -204,7 +204,7 @@ class Blocks:
     """None = the surface is as the model says."""
 
 
-def assembled(bodies: Sequence[Blocks], unknowns: int) -> System:
+def assemble(bodies: Sequence[Blocks], unknowns: int) -> System:
     """Return the normal equations of so many shared unknowns without any prior."""
     V, S = len(bodies[0].H), unknowns
     system = System(
@@ -283,12 +283,12 @@ class State:
         return points / (scale + offset * points[:, 2:])
 
 
-def centred(body: Body, T_world_obj: Array) -> Array:
+def centre_pose(body: Body, T_world_obj: Array) -> Array:
     """Return the pose (4, 4) of the body's frame moved to the centre of its box."""
     return T_world_obj @ se3.from_translation(body.center_obj)
 
 
-def moved(state: State, bodies: list[Body], shared: Array, views: Array) -> State:
+def step_state(state: State, bodies: list[Body], shared: Array, views: Array) -> State:
     """Return the state after one step.
 
     Args:
@@ -298,7 +298,7 @@ def moved(state: State, bodies: list[Body], shared: Array, views: Array) -> Stat
         views: (V, 6).
     """
     poses = [
-        centred(b, T) @ se3.exp(shared[object_at(k)])
+        centre_pose(b, T) @ se3.exp(shared[object_at(k)])
         @ se3.from_translation(-b.center_obj)
         for k, (b, T) in enumerate(zip(bodies, state.poses, strict=True))
     ]  # fmt: skip

@@ -47,7 +47,7 @@ class Owned:
     """(N,) pixels that each stands for, those left out for it included."""
 
 
-def joined(views: Sequence[ViewPoints]) -> AllPoints:
+def join_views(views: Sequence[ViewPoints]) -> AllPoints:
     """Return the points of all views in one piece."""
     return AllPoints(
         points=np.concatenate([v.points for v in views]),
@@ -160,7 +160,7 @@ def _claim(
             distance[i], owner[i] = abs(d), number
 
 
-def assigned(
+def assign_views(
     points: AllPoints,
     noise: DepthNoise,
     bodies: Sequence[Body],

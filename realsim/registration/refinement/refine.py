@@ -22,7 +22,7 @@ from realsim.geometry.normal_equations import (
     System,
     add_prior,
     covariances,
-    solved,
+    solve,
     symmetric,
 )
 from realsim.geometry.robust import mad_sigma
@@ -42,15 +42,15 @@ from realsim.registration.refinement.equations import (
     Blocks,
     State,
     add_blocks,
-    assembled,
-    moved,
+    assemble,
     object_at,
+    step_state,
 )
 from realsim.registration.refinement.points import (
     Owned,
-    assigned,
+    assign_views,
     exact_residuals,
-    joined,
+    join_views,
     thin_share,
 )
 from realsim.registration.views import ViewPoints
@@ -140,14 +140,14 @@ def refine(
         hand_eye=np.zeros(6), views=np.zeros((len(views), 6)),
         bias=np.array([config.bias.scale, config.bias.offset_per_m]),
     )  # fmt: skip
-    everything = joined(views)
+    everything = join_views(views)
     misfits = np.full(len(bodies) + 1, config.noise.widest_m)
     sigmas = np.array([np.radians(config.prior.view_deg), config.prior.view_mm / 1e3])
     history: list[dict[str, float]] = []
     system, used = None, np.zeros(len(bodies) + 1)
     for round_ in range(config.rounds):
         last = round_ == config.rounds - 1
-        own, table = assigned(
+        own, table = assign_views(
             everything, noise, bodies, state, state.cameras(task.claimed), config.points,
             1.0 if last else config.early_share,
         )  # fmt: skip
@@ -159,10 +159,10 @@ def refine(
             )
         exact = round_ >= config.rounds - config.exact_rounds
         for _ in range(config.steps):
-            system, misfits, used = _linearised(task, state, (own, table), misfits, exact)
+            system, misfits, used = _linearise(task, state, (own, table), misfits, exact)
             _add_priors(system, task, state, sigmas)
-            state = moved(state, task.bodies, *solved(system))
-            sigmas = _learned(system, state, config, sigmas)
+            state = step_state(state, task.bodies, *solve(system))
+            sigmas = _learn_sigmas(system, state, config, sigmas)
         history.append(_row(state, misfits, sigmas))
         if progress is not None:
             progress(round_ + 1, config.rounds)
@@ -196,7 +196,7 @@ def _row(state: State, misfits: Array, sigmas: Array) -> dict[str, float]:
     }
 
 
-def _linearised(
+def _linearise(
     task: _Task, state: State, points: tuple[list[Owned], Owned], misfits: Array, exact: bool
 ) -> tuple[System, Array, Array]:
     """Return the equations at a state without priors, the bodies' misfits, and points used."""
@@ -232,7 +232,7 @@ def _linearised(
             (float(misfits[-1]), task.config.noise.table_flat_m), False,
         )  # fmt: skip
         blocks.append(Blocks(H=H, b=b, Ms=Ms, own=TABLE_AT, rows=TABLE_ROWS))
-    return assembled(blocks, OBJECTS + 6 * len(own)), seen, used
+    return assemble(blocks, OBJECTS + 6 * len(own)), seen, used
 
 
 def _block_sums(
@@ -304,7 +304,7 @@ def _add_priors(system: System, task: _Task, state: State, view_sigmas: Array) -
     system.A[TABLE_AT, TABLE_AT] += 1.0
 
 
-def _learned(system: System, state: State, config: RefineConfig, sigmas: Array) -> Array:
+def _learn_sigmas(system: System, state: State, config: RefineConfig, sigmas: Array) -> Array:
     """Return the 1-sigma of the views' turns and shifts [rad, m]: one step of EM."""
     p = config.prior
     if not p.learn_views or len(state.views) < p.learn_from:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 from realsim.registration.body import Body
-from realsim.registration.refinement.equations import HAND_EYE_AT, centred, object_at
+from realsim.registration.refinement.equations import HAND_EYE_AT, centre_pose, object_at
 from realsim.registration.refinement.refine import Refined
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ def _seen(refined: Refined, body: Body, k: int, intrinsics: CameraIntrinsics) ->
     """Return one object's pose in every view."""
     C = refined.covariance
     picked = np.concatenate([object_at(k), HAND_EYE_AT])
-    T_centre = centred(body, refined.poses[k])
+    T_centre = centre_pose(body, refined.poses[k])
     Ms = se3.invert(T_centre) @ refined.cameras
     Ad = se3.adjoint(Ms)
     # Columns: object, hand-eye, view. The twist of T_cam_obj is xi_o - Ad(M) (hand-eye + view).

@@ -169,7 +169,7 @@ def refine_views(
         hand = hand + step[n:]
         covariances = np.stack([inverse[k : k + 6, k : k + 6] for k in range(0, n, 6)])
         if p.learn_views and len(views) >= p.learn_from:
-            sigmas = _learned(twists - hand, inverse[n:, n:], covariances, p)
+            sigmas = _learn_sigmas(twists - hand, inverse[n:, n:], covariances, p)
         median = float(np.median(misfits)) if misfits else config.noise.widest_m
         history.append(_row(matches, step, median, sigmas))
         if progress is not None:
@@ -308,7 +308,7 @@ def _add(A: Array, b: Array, match: _Match, misfit: float, noise: NoiseConfig) -
     b[j] -= J_j.T @ (w[:, 0] * r)
 
 
-def _learned(own: Array, common: Array, covariances: Array, prior: CameraPrior) -> Array:
+def _learn_sigmas(own: Array, common: Array, covariances: Array, prior: CameraPrior) -> Array:
     """Return the 1-sigma of the views' own turns and shifts [rad, m]: one step of EM.
 
     A view's own twist is at least as uncertain as the difference of the two covariances.

@@ -24,7 +24,7 @@ from realsim.registration.search.candidates import (
     fuse,
 )
 from realsim.registration.search.height_grid import GridConfig, HeightGrid, height_grid
-from realsim.registration.search.matching import MatchConfig, matched
+from realsim.registration.search.matching import MatchConfig, match_templates
 from realsim.registration.search.near_symmetry import NearSymmetryConfig, near_symmetries
 from realsim.registration.search.peel import ExchangeConfig, PeelConfig
 from realsim.registration.search.polish import ContrastConfig, PolishConfig
@@ -249,7 +249,7 @@ def resting_starts(
     bench: Bench, obj_id: int, region: Region | None, taken: NDArray[np.bool_] | None = None
 ) -> list[tuple[Array, str]]:
     """Return where a model may rest on the table: poses (4, 4) and their names."""
-    found = matched(
+    found = match_templates(
         bench.grid, bench.templates[obj_id], bench.config.match,
         region=region, plane=bench.plane, taken=taken,
     )  # fmt: skip

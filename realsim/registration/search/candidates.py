@@ -16,7 +16,7 @@ from realsim.geometry import se3
 from realsim.geometry.distance_field import sample
 from realsim.records import SupportPlane
 from realsim.registration.body import Body
-from realsim.registration.evidence import Cloud, DepthNoise, averaged, without_table
+from realsim.registration.evidence import Cloud, DepthNoise, average_cloud, without_table
 from realsim.registration.search.sameness import Sameness, distinct
 from realsim.registration.search.scoring import Array32, Canvas, Render, Score, render, score
 from realsim.registration.solver import (
@@ -249,8 +249,8 @@ def fuse(
         sigmas=np.concatenate([c.sigmas for c in above]),
     )
     T = plane.T_world_table
-    fine = averaged(cloud, T, config.fine_voxel_m)
-    return Fused(coarse=averaged(fine, T, config.coarse_voxel_m), fine=fine)
+    fine = average_cloud(cloud, T, config.fine_voxel_m)
+    return Fused(coarse=average_cloud(fine, T, config.coarse_voxel_m), fine=fine)
 
 
 def nearby(cloud: Cloud, sought: Sought, T_world_obj: Array, margin_m: float, most: int) -> Cloud:
@@ -293,7 +293,7 @@ def _near(
     return out[:n].copy()
 
 
-def fitted(
+def fit_start(
     sought: Sought, cloud: Cloud, T_world_obj: Array, fine: bool, config: CandidateConfig
 ) -> Array:
     """Return the pose (4, 4) after a coarse or a fine fit to the points near it."""
@@ -342,19 +342,21 @@ def candidates(
         config: see there.
         buffer: what is there already; None = the bare table.
     """
-    Ts = [fitted(sought, fused.coarse, T, False, config) for T, _ in starts]
+    Ts = [fit_start(sought, fused.coarse, T, False, config) for T, _ in starts]
     made = [
         candidate(sought, canvas, Ts[n], starts[n][1], False, buffer)
         for n in distinct(sought.sameness, Ts, config.same_m)
     ]
     made.sort(key=lambda c: -c.alone.gain)
-    best = [refined(sought, fused, canvas, c, config, buffer) for c in made[: config.refined]]
+    best = [
+        refine_candidate(sought, fused, canvas, c, config, buffer) for c in made[: config.refined]
+    ]
     made = sorted([*best, *made[config.refined :]], key=lambda c: -c.alone.gain)
     kept = distinct(sought.sameness, [c.T_world_obj for c in made], config.same_m)
     return [made[n] for n in kept]
 
 
-def refined(
+def refine_candidate(
     sought: Sought,
     fused: Fused,
     canvas: Canvas,
@@ -363,7 +365,7 @@ def refined(
     buffer: Array32 | None = None,
 ) -> Candidate:
     """Return a candidate refined on the fine points, or as it was if that explains less."""
-    T = fitted(sought, fused.fine, start.T_world_obj, True, config)
+    T = fit_start(sought, fused.fine, start.T_world_obj, True, config)
     finer = candidate(sought, canvas, T, start.source, True, buffer)
     return finer if finer.alone.gain >= start.alone.gain else start
 

@@ -28,11 +28,11 @@ from realsim.registration.search.bench import (
     within,
 )
 from realsim.registration.search.candidates import Candidate, candidate
-from realsim.registration.search.polish import Decision, decided, polished
+from realsim.registration.search.polish import Decision, decide_rivals, polish_poses
 from realsim.registration.search.records import NotPlaced, Placed, SearchResult, Wanted
 from realsim.registration.search.scoring import compose, render, score
 from realsim.registration.search.selection import Selection
-from realsim.registration.search.state import Search, exchanged, peeled
+from realsim.registration.search.state import Search, exchange_places, seek_unsure
 from realsim.registration.views import ViewPoints
 
 __all__ = ["FindConfig", "find_objects"]
@@ -71,7 +71,7 @@ def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
     Raises:
         InputError: no frames, no views, no models, or two wanted objects of one instance number.
     """
-    sensible, missing = _checked(models, wanted)
+    sensible, missing = _check_wanted(models, wanted)
     used = {w.obj_id for w in sensible} if sensible is not None else set(models)
     bench = make_bench(
         intrinsics, frames, views, (plane, noise), {i: models[i] for i in used}, config,
@@ -88,11 +88,11 @@ def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
             progress(n + 1, len(groups))
     selection = search.choose()
     first = len(search.pool)
-    before = peeled(search, selection)
-    selection = exchanged(search, before)
+    before = seek_unsure(search, selection)
+    selection = exchange_places(search, before)
     if selection.chosen != before.chosen:
-        selection = peeled(search, selection)
-    final, decisions = _finished(search, selection)
+        selection = seek_unsure(search, selection)
+    final, decisions = _finish(search, selection)
     report = {
         "cpu_s": {k: round(v, 3) for k, v in bench.watch.seconds.items()},
         "poses_first": first,
@@ -105,7 +105,7 @@ def find_objects(  # noqa: PLR0913 - the stage's inputs, all of them needed
     )
 
 
-def _checked(
+def _check_wanted(
     models: Mapping[int, ObjectModel], wanted: Sequence[Wanted] | None
 ) -> tuple[tuple[Wanted, ...] | None, list[NotPlaced]]:
     """Return the wanted objects that have a model, and those that have none."""
@@ -127,7 +127,7 @@ def _checked(
     return tuple(w for w in wanted if w.obj_id in models), missing
 
 
-def _finished(
+def _finish(
     search: Search, selection: Selection
 ) -> tuple[list[Candidate | None], list[Decision | None]]:
     """Return the chosen poses, polished and set against their near-symmetric rivals."""
@@ -139,7 +139,7 @@ def _finished(
 
     def polish() -> list[Candidate]:
         pairs = list(zip(soughts, chosen, strict=True))
-        out = polished(bench.canvas, bench.fused.fine, pairs, bench.config.polish, refine)
+        out = polish_poses(bench.canvas, bench.fused.fine, pairs, bench.config.polish, refine)
         bench.watch.lap("polish")
         return out
 
@@ -151,7 +151,9 @@ def _finished(
     for n, sought in enumerate(soughts):
         others = compose(bench.close.table, [r for k, r in enumerate(renders) if k != n])
         evidence = (bench.close, bench.fused.fine, _near(search, at[n], chosen[n]))
-        d = decided(sought, chosen[n].T_world_obj, others, evidence, bench.config.contrast, refine)
+        d = decide_rivals(
+            sought, chosen[n].T_world_obj, others, evidence, bench.config.contrast, refine
+        )
         if d.changed:
             chosen[n] = candidate(sought, bench.canvas, d.T_world_obj, chosen[n].source, True)
             renders[n] = render(bench.close, sought.body, d.T_world_obj)

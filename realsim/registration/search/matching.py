@@ -126,7 +126,7 @@ class _Candidates:
         return _Candidates(pose=self.pose[index], place=self.place[index], score=self.score[index])
 
 
-def matched(
+def match_templates(
     grid: HeightGrid,
     templates: ModelTemplates,
     config: MatchConfig,

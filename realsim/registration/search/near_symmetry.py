@@ -144,7 +144,7 @@ def near_symmetries(model: ObjectModel, config: NearSymmetryConfig, folder: Path
     if is_ball(model):
         return np.zeros((0, 4, 4))
     path = None if folder is None else folder / f"near_{content_key(model, config)}.npz"
-    known = None if path is None else _loaded(path)
+    known = None if path is None else _load_motions(path)
     if known is None:
         known = _computed(model, config)
         if path is not None:
@@ -156,9 +156,9 @@ def _computed(model: ObjectModel, config: NearSymmetryConfig) -> Array:
     """Return the near symmetries of an object, those that fit best first."""
     shape = _shape_of(model, config)
     about, anywhere = _turns(shape, model, config)
-    shifted = _fitted(shape, _ranked(shape, about, config), config, shift_only=True)
+    shifted = _fit_motions(shape, _ranked(shape, about, config), config, shift_only=True)
     across = _ranked(shape, anywhere, config)
-    moved = _fitted(shape, np.concatenate([shifted, across]), config, shift_only=False)
+    moved = _fit_motions(shape, np.concatenate([shifted, across]), config, shift_only=False)
     moved = moved[shape.gaps(moved) > config.drift_share * shape.size]
     near = max(config.near_m, config.near_share_of_size * shape.size)
     both = np.concatenate([shifted, moved])
@@ -252,7 +252,9 @@ def _ranked(shape: _Shape, rotations: Array, config: NearSymmetryConfig) -> Arra
     return _distinct(shape, Ts, config)[: config.screened]
 
 
-def _fitted(shape: _Shape, Ts: Array, config: NearSymmetryConfig, *, shift_only: bool) -> Array:
+def _fit_motions(
+    shape: _Shape, Ts: Array, config: NearSymmetryConfig, *, shift_only: bool
+) -> Array:
     """Return motions (K, 4, 4) moved to where most of the surface agrees.
 
     Gauss-Newton with Tukey's weights on the distance d of q = T p; a twist (w, v) of the left
@@ -298,7 +300,7 @@ def _exact(model: ObjectModel, points: Array, Ts: Array) -> Array:
     return np.asarray(found, dtype=np.float64).reshape(len(Ts), -1)
 
 
-def _loaded(path: Path) -> Array | None:
+def _load_motions(path: Path) -> Array | None:
     """Return the motions of a file, or None if there is none or it is damaged."""
     if not path.is_file():
         return None

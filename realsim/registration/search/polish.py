@@ -104,7 +104,7 @@ def _claim(
             owner[m] = number
 
 
-def polished(
+def polish_poses(
     canvas: Canvas,
     cloud: Cloud,
     placed: Sequence[tuple[Sought, Candidate]],
@@ -186,7 +186,7 @@ class Decision:
     """Whether the best is not the pose that was there before."""
 
 
-def decided(
+def decide_rivals(
     sought: Sought,
     T_world_obj: Array,
     others: Array32,

@@ -84,7 +84,7 @@ class Search:
 Array = NDArray[np.float64]
 
 
-def peeled(search: Search, selection: Selection) -> Selection:
+def seek_unsure(search: Search, selection: Selection) -> Selection:
     """Return the choice after what is unsure was sought again where the sure ones are not."""
     config = search.bench.config.peel
     rng = np.random.default_rng(search.bench.config.seed)
@@ -161,7 +161,7 @@ def _suspects(search: Search, selection: Selection) -> list[int]:
     return found
 
 
-def exchanged(search: Search, selection: Selection) -> Selection:
+def exchange_places(search: Search, selection: Selection) -> Selection:
     """Return the choice after unsure objects were tried in the places of others.
 
     Where it is not known which objects are there, every place is open to all of them anyway.

@@ -16,7 +16,7 @@ from realsim.records import Scene
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.compare import Comparer, make_comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.evidence import Cloud, DepthFrame, LazyFrame, held, measure_noise
+from realsim.registration.evidence import Cloud, DepthFrame, LazyFrame, measure_noise, read_frame
 from realsim.registration.intake import sampling
 from realsim.registration.views import ViewPoints, sample_view
 from realsim.store import SessionStore
@@ -110,7 +110,7 @@ def measured_views(
     """
     bias = depth_bias_of(store)
     lazy = [_frame(store, k, bias) for k in numbers]
-    frames = [held(f) for f in spread_frames(lazy, _middle(scene, lazy), MOST_VIEWS)]
+    frames = [read_frame(f) for f in spread_frames(lazy, _middle(scene, lazy), MOST_VIEWS)]
     noise = measure_noise(frames, config.evidence)
     intrinsics = store.session.intrinsics
     sample = sampling(intrinsics, len(frames), config)

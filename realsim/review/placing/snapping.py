@@ -21,8 +21,8 @@ from realsim.registration.blind import keep_start, nearest_to_start, uncertainty
 from realsim.registration.body import Body, make_body
 from realsim.registration.compare import Comparer, spread_frames
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.evidence import Cloud, averaged, without_table
-from realsim.registration.near_start import assigned, search
+from realsim.registration.evidence import Cloud, average_cloud, without_table
+from realsim.registration.near_start import assign_points, search
 from realsim.registration.refinement.config import CameraPrior, RefineConfig
 from realsim.registration.refinement.refine import refine
 from realsim.registration.solver import FreeSpace, solve_pose
@@ -191,12 +191,12 @@ class _Task:
         bodies = [self.body, *self.close]
         poses = [T_world_obj, *(o.T_start for o in self.close)]
         clouds = [cloud, *(_no_points(cloud) for _ in self.close)]
-        return assigned(bodies, poses, clouds, self.config.joint)[0]
+        return assign_points(bodies, poses, clouds, self.config.joint)[0]
 
     def checks(self, T_world_obj: Array) -> dict[str, float]:
         """Return the registration's checks of the object at a pose, neighbours in place."""
         config = self.config
-        cloud = averaged(self.near, self.body.T_start, config.joint.fine_voxel(self.body))
+        cloud = average_cloud(self.near, self.body.T_start, config.joint.fine_voxel(self.body))
         own = self.own(cloud, T_world_obj)
         comparer = self.spread(config.verify.frames)
         bodies = [self.body, *self.hiding]
@@ -272,11 +272,11 @@ def _snapped(task: _Task, tick: Callable[[], None]) -> Snapped:
     """Return the result of all stages."""
     body, config, T_start = task.body, task.config, task.body.T_start
     free = _without_neighbours(task.near, task.close)
-    coarse = averaged(free, T_start, config.joint.coarse_voxel(body))
+    coarse = average_cloud(free, T_start, config.joint.coarse_voxel(body))
     if len(coarse.points) < LEAST_POINTS:
         taken = len(task.near.points) - len(free.points)
         return _nothing(body, task.checks(T_start), len(coarse.points), taken)
-    fine = averaged(free, T_start, config.joint.fine_voxel(body))
+    fine = average_cloud(free, T_start, config.joint.fine_voxel(body))
     few = task.spread(config.compare.frames)
     space = _free_space(few) if len(task.views.views) < config.refine_from else None
     found = search(body, coarse, fine, few, space, (config.search, config.solver))

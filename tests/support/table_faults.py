@@ -3,7 +3,6 @@
 Each fault is a pure function: it returns spoilt frames and leaves those it was given alone.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -16,10 +15,6 @@ from realsim.geometry.camera import ray_table
 from realsim.registration.evidence import DepthFrame
 from realsim.registration.simulated import TableScene, seen_instances
 from realsim.rendering.rays import rotated
-
-__all__ = [
-    "foreign", "shifted_depth", "shifted_view", "swapped", "without_any_depth", "without_depth_on",
-]  # fmt: skip
 
 Surface = Literal["black", "transparent"]
 MARGIN_PX = 1
@@ -74,23 +69,6 @@ def shifted_view(frame: DepthFrame, xi: ArrayLike) -> DepthFrame:
     return replace(frame, T_world_cam=frame.T_world_cam @ se3.exp(np.asarray(xi, np.float64)))
 
 
-def swapped(frames: Sequence[DepthFrame], first: int, second: int) -> tuple[DepthFrame, ...]:
-    """Return the frames with the images of two views exchanged; numbers and poses stay.
-
-    Raises:
-        InputError: there is no view of one of these numbers.
-    """
-    by = {frame.index: frame for frame in frames}
-    missing = [k for k in (first, second) if k not in by]
-    if missing:
-        raise InputError(f"there is no view {missing[0]}; there are {sorted(by)}.")
-    images = {first: by[second].depth_m, second: by[first].depth_m}
-    return tuple(
-        replace(frame, depth_m=images[frame.index]) if frame.index in images else frame
-        for frame in frames
-    )
-
-
 def foreign(frame: DepthFrame, other: DepthFrame) -> DepthFrame:
     """Return the view with the image of a view of another scene: a file of another session.
 
@@ -103,29 +81,6 @@ def foreign(frame: DepthFrame, other: DepthFrame) -> DepthFrame:
             "simulate both with the same lab."
         )
     return replace(frame, depth_m=other.depth_m)
-
-
-def shifted_depth(frame: DepthFrame, pixels: tuple[int, int]) -> DepthFrame:
-    """Return the view with its depth image moved right and down: not aligned to the camera.
-
-    Args:
-        frame: the view.
-        pixels: columns and rows; what comes in at the border has no depth.
-    """
-    right, down = pixels
-    height, width = frame.depth_m.shape
-    moved = np.zeros_like(frame.depth_m)
-    if abs(right) < width and abs(down) < height:
-        to = (
-            slice(max(down, 0), height + min(down, 0)),
-            slice(max(right, 0), width + min(right, 0)),
-        )
-        of = (
-            slice(max(-down, 0), height - max(down, 0)),
-            slice(max(-right, 0), width - max(right, 0)),
-        )
-        moved[to] = frame.depth_m[of]
-    return _with_depth(frame, moved)
 
 
 def _with_depth(frame: DepthFrame, depth_m: NDArray[np.float32]) -> DepthFrame:
