@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import System, symmetric
-from realsim.registration.refinement.equations import OBJECTS, Blocks, Offsets, assembled
+from realsim.registration.refinement.equations import OBJECTS, Blocks, Offsets, assemble
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.equations import add_contact
 from realsim.scanning.scale.outlines import COLUMNS, add_outline
@@ -90,7 +90,7 @@ def outline_row(
         H=symmetric(H) / w, b=b / w, Ms=Ms, own=OBJECT, further=np.array([SIZE, RIM]),
         offsets=offsets,
     )  # fmt: skip
-    return row_of(assembled([blocks], SHARED))
+    return row_of(assemble([blocks], SHARED))
 
 
 @pytest.mark.parametrize("lens", [0.0, 1.0])

@@ -215,8 +215,8 @@ def swap_findings(
         a, b = bodies[i], bodies[j]
         words = (
             f"{_name_of(a)} and {_name_of(b)} seem to be swapped: at each other's place they "
-            f"explain {there:.0f} and {here:.0f} pixels better than the bare table does, at their own "
-            f"{gains[i][0]:.0f} and {gains[j][0]:.0f}. Swap the two ids."
+            f"explain {there:.0f} and {here:.0f} pixels better than the bare table does, at their "
+            f"own {gains[i][0]:.0f} and {gains[j][0]:.0f}. Swap the two ids."
         )
         findings.append(
             SceneFinding(

@@ -29,7 +29,7 @@ from realsim.registration.refinement.equations import (
     Offsets,
     add_blocks,
     add_offsets,
-    assembled,
+    assemble,
 )
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.evidence import ScanEvidence
@@ -170,7 +170,7 @@ def linearised(
         _table_blocks(evidence, state, cameras, config),
         outline_blocks(evidence, state, cameras, held.rims, offsets, (cut, width)),
     ]
-    system = assembled(bodies, PATCHES + len(offsets))
+    system = assemble(bodies, PATCHES + len(offsets))
     add_contact(shape, state, offsets, (width, config), system)
     _add_priors(state, config, system)
     # Residuals hold what is believed of the offsets; the unknowns are to be the whole of them.

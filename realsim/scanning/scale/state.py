@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim.registration.refinement.equations import OBJECTS, object_at
-from realsim.registration.refinement.state import State, moved
+from realsim.registration.refinement.equations import OBJECTS, State, object_at, step_state
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.evidence import ScanEvidence, ScanView
 
@@ -98,7 +97,7 @@ def moved_state(state: ScaleState, shared: Array, views: Array) -> ScaleState:
     x[SIMILARITY] *= min(
         1.0, LARGEST_SCALE_STEP / max(growth, 1e-12), LARGEST_TURN_RAD / max(turn, 1e-12)
     )
-    cameras = moved(replace(state, poses=state.poses[:0]), [], x, views)
+    cameras = step_state(replace(state, poses=state.poses[:0]), [], x, views)
     assert isinstance(cameras, ScaleState)
     return replace(
         cameras, poses=state.poses @ se3.exp(x[OBJECT]), s=state.s * float(np.exp(x[SIZE])),

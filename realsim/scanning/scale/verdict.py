@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.records import SupportPlane, Verdict
-from realsim.registration.plane import table_depth
+from realsim.registration.table_planes import table_depth
 from realsim.rendering.rays import rotated
 from realsim.scanning.scale.config import ScaleConfig
 from realsim.scanning.scale.evidence import LEAST_HEIGHT_M, ScanEvidence, ScanView
