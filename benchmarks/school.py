@@ -2,7 +2,7 @@
 
     uv run python benchmarks/school.py [--quick] [--json FILE] [--seed N] [--part NAME]
 
-Scenes of ten generated objects of 16 to 32 convex parts (six with --quick); seeds from 100 on are
+Scenes of ten generated objects of 16 to 32 convex parts (three with --quick); seeds from 100 on are
 those of the published figures, use lower ones while developing. Parts and the figures they give
 (keys of the JSON's "figures"):
   speed       bullet_grasps_per_s, mujoco_grasps_per_s
@@ -35,113 +35,76 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 import argparse
-import json
-import sys
-import time
-import traceback
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from importlib import import_module
 from pathlib import Path
 
-from figures import Found, document_of, print_table
-from school_acronym import acronym
-from school_agreement import agreement
-from school_cases import KEEP, cut_shapes, library
-from school_figures import FIGURES
-from school_margins import margins
-from school_scaling import extrapolation, scaling
-from school_speed import speed
-from school_steps import first_steps
-from school_validation import validation
+from figures import Figure, Found, Goal, run
+from school_cases import KEEP, PAPER_GRASPS_PER_S, cut_shapes
 
-from realsim.app.console import Console
-
-PACKAGES = ("realsim", "numpy", "scipy", "numba", "pybullet", "mujoco", "coacd", "ray")
-PARTS: dict[str, Callable[[int, Path, bool], Found]] = {
-    "speed": speed,
-    "steps": first_steps,
-    "validation": validation,
-    "agreement": agreement,
-    "margins": margins,
-    "acronym": acronym,
-    "scaling": scaling,
+RATE = f"paper {PAPER_GRASPS_PER_S:.2f}, a GPU"
+FIGURES = {
+    "bullet_grasps_per_s": Figure(unit="1/s", goal=Goal(low=6.0), rival=RATE),
+    "mujoco_grasps_per_s": Figure(unit="1/s", goal=Goal(low=40.0), rival=RATE),
+    "mujoco_marginal_grasps_per_s": Figure(unit="1/s", goal=Goal(low=25.0)),
+    "plans_per_s": Figure(unit="1/s core", goal=Goal(low=400.0)),
+    "candidates_per_s": Figure(unit="1/s core", goal=Goal(low=5000.0)),
+    "candidates_above_table_per_s": Figure(unit="1/s core", goal=Goal(low=5000.0)),
+    "coulomb_worst_pct": Figure(unit="%", goal=Goal(high=3.0)),
+    "torque_worst_pct": Figure(unit="%", goal=Goal(high=10.0)),
+    "box_score": Figure(unit="", goal=Goal(low=1.0)),
+    "box_slip_mm": Figure(unit="mm", goal=Goal(high=0.2)),
+    "box_slip_deg": Figure(unit="deg", goal=Goal(high=0.5)),
+    "light_convergence_share": Figure(unit="", goal=Goal(low=0.97)),
+    "suite_checks_failed": Figure(unit="", goal=Goal(high=0.0)),
+    "fast_agree_share": Figure(unit="", goal=Goal(low=0.96)),
+    "engines_agree_share": Figure(unit="", goal=Goal(low=0.95)),
+    "engines_agree_marginal_share": Figure(unit="", goal=Goal(low=0.87)),
+    "marginal_dropped_share": Figure(unit="", goal=Goal(low=0.20, high=0.45)),
+    "marginal_speed_dropped_share": Figure(unit="", goal=Goal(low=0.20, high=0.45)),
+    "acronym_balacc": Figure(unit=""),
+    "rank_margin_score": Figure(unit=""),
+    "rank_margin_closure": Figure(unit=""),
+    "rank_score_closure": Figure(unit=""),
+    "workers_scaling": Figure(unit="x"),
+    "ray_nodes_scaling": Figure(unit="x"),
 }
-SEED = 100
 
 
-def say_objects(console: Console, keep: Path, quick: bool) -> None:
-    """Cut the objects, once for all runs, and print into how many convex parts."""
-    start = time.perf_counter()
-    cut_shapes(keep, quick)
-    solids = {m.name: s.parts for m, s in library(keep, quick).values()}
-    words = [f"{n} {len(p.parts)} ({p.volume_ratio:.2f})" for n, p in solids.items()]
-    console.say(
-        f"convex parts (volume over the mesh's): {', '.join(words)}; "
-        f"{time.perf_counter() - start:.0f} s"
-    )
+def part(where: str) -> Callable[[argparse.Namespace], Found]:
+    """Return a part, "module:function", that finds its objects cut into convex parts."""
+
+    def measure(given: argparse.Namespace) -> Found:
+        cut_shapes(given.keep, given.quick)
+        module, function = where.split(":")
+        return getattr(import_module(module), function)(given.seed, given.keep, given.quick)
+
+    return measure
 
 
-def arguments_of() -> argparse.Namespace:
-    """Return the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--quick", action="store_true", help="every figure from fewer samples")
-    parser.add_argument("--seed", type=int, default=SEED, help=f"of scenes and grasps ({SEED})")
-    parser.add_argument(
-        "--part", action="append", dest="parts", choices=list(PARTS), help="run this one alone"
-    )
+PARTS = {
+    "speed": part("school_speed:speed"),
+    "steps": part("school_speed:first_steps"),
+    "validation": part("school_validation:validation"),
+    "agreement": part("school_agreement:agreement"),
+    "margins": part("school_agreement:margins"),
+    "acronym": part("school_acronym:acronym"),
+    "scaling": part("school_scaling:scaling"),
+}
+
+
+def keep_option(parser: argparse.ArgumentParser) -> None:
+    """Add where convex parts are kept."""
     parser.add_argument("--keep", type=Path, default=KEEP, help="folder of convex parts")
-    arguments = parser.parse_args()
-    arguments.parts = arguments.parts or list(PARTS)
-    return arguments
 
 
-def main() -> None:
-    """Run the parts, print the table, write the JSON."""
-    arguments = arguments_of()
-    console = Console()
-    begin = time.perf_counter()
-    found = Found()
-    failures: dict[str, str] = {}
-    arguments.keep.mkdir(parents=True, exist_ok=True)
-    say_objects(console, arguments.keep, arguments.quick)
-    # Scaling counts its own CPU seconds and waits for Ray much of the time: in the short run it
-    # goes on beside the parts that measure no speed.
-    beside = arguments.quick and len(arguments.parts) > 1
-    later: dict[str, Future[Found]] = {}
-    with ThreadPoolExecutor(1) as thread:
-        for name in arguments.parts:
-            start = time.perf_counter()
-            if beside and name == "validation" and "scaling" in arguments.parts:
-                later["scaling"] = thread.submit(
-                    scaling, arguments.seed, arguments.keep, arguments.quick
-                )
-            try:
-                if name in later:
-                    found.take(later[name].result())
-                else:
-                    found.take(PARTS[name](arguments.seed, arguments.keep, arguments.quick))
-            except KeyboardInterrupt:
-                sys.exit(130)
-            except Exception as error:
-                failures[name] = f"{type(error).__name__}: {error}"
-                print(f"\n{name}:\n{traceback.format_exc()}", file=sys.stderr)
-            console.warn(f"{name}: {time.perf_counter() - start:.0f} s")
+def extrapolate(found: Found) -> None:
+    """Note how long the paper's data set would take."""
+    from school_scaling import extrapolation
+
     found.notes += extrapolation(found.figures)
-    seconds = time.perf_counter() - begin
-    print_table(console, "Robot School", FIGURES, found)
-    for name, why in failures.items():
-        console.warn(f"the part {name} failed: {why}")
-    console.say(f"{seconds:.0f} s, load {os.getloadavg()[0]:.1f}")
-    if arguments.json:
-        document = document_of("school", PACKAGES, FIGURES, arguments, found)
-        document |= {"wall_s": round(seconds, 1), "failures": failures}
-        arguments.json.write_text(json.dumps(document, indent=1, default=str))
-    if failures:
-        sys.exit(1)
 
 
 if __name__ == "__main__":
-    main()
+    packages = ("realsim", "numpy", "scipy", "numba", "pybullet", "mujoco", "coacd", "ray")
+    run("school", __doc__, packages, FIGURES, PARTS, seed=100, options=keep_option, end=extrapolate)

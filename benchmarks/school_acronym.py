@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from figures import Found
 from numpy.typing import NDArray
-from school_conditions import PATIENT, slip_config
-from school_processes import in_processes
+from school_cases import PATIENT, in_processes, slip_config
 
 from realsim.formats.grasps.acronym import read_acronym
 from realsim.geometry import se3

@@ -21,10 +21,15 @@ from pathlib import Path
 from typing import Any
 
 from figures import Found
-from school_cases import SchoolCase, candidate_config, school_case, tasks_of
-from school_conditions import slip_config
-from school_figures import PAPER_GRASPS_PER_S
-from school_processes import in_fresh_process
+from school_cases import (
+    PAPER_GRASPS_PER_S,
+    SchoolCase,
+    candidate_config,
+    in_fresh_process,
+    school_case,
+    slip_config,
+    tasks_of,
+)
 
 from realsim_sim_bridge.school.cluster import ClusterConfig, ray_workers
 from realsim_sim_bridge.school.config import SchoolConfig

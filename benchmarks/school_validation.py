@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from figures import Found
-from school_processes import in_processes
+from school_cases import in_processes
 
 from realsim_sim_bridge.slip.engines import BulletSettings, settings_of
 from realsim_sim_bridge.slip.slip_test import SlipConfig

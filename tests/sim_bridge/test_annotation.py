@@ -14,7 +14,6 @@ from realsim import (
     CaptureSession,
     GraspSet,
     InputError,
-    Mesh,
     ObjectModel,
     ObjectPose,
     Scene,
@@ -23,26 +22,16 @@ from realsim import (
     images,
 )
 from realsim.formats.bop import scene as bop
-from realsim.formats.bop.labels import mask_of
 from realsim.geometry import se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore
 from realsim_sim_bridge.annotation.annotate import AnnotationConfig, annotate
 from realsim_sim_bridge.annotation.inputs import table_slab
 from realsim_sim_bridge.annotation.pictures import best_and_worst, overlay_picture
+from synthetic_scenes import box
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 TABLE = se3.from_translation([0.5, 0.0, 0.1])
-CONFIG = AnnotationConfig()
-
-
-def box(size: tuple[float, float, float]) -> Mesh:
-    s = (
-        np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        * np.array(size)
-        / 2
-    )
-    return Mesh(vertices=s, faces=table_slab(CONFIG).faces)
 
 
 MODELS = {
@@ -85,15 +74,12 @@ def grasp_set(instance: int, obj_id: int, n: int = 6) -> GraspSet:
 GRASPS = [grasp_set(0, 1), grasp_set(3, 7)]
 
 
-def make_session(folder: Path, unmodelled: bool = False) -> SessionStore:
-    """Return a session of three views; with `unmodelled`, a hand hides the flat box from above."""
+def make_session(folder: Path) -> SessionStore:
+    """Return a session of three views."""
     session = CaptureSession(name="boxes", intrinsics=INTRINSICS, views=(), depth_unit_m=1e-4)
     store = SessionStore.create(folder, session)
     placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in SCENE.objects]
     placed.append(PlacedMesh(-1, table_slab(AnnotationConfig(plane_clearance_m=0.0)), TABLE))
-    if unmodelled:
-        hand = se3.from_translation([0.53, 0.02, 0.35])
-        placed.append(PlacedMesh(-1, box((0.05, 0.05, 0.01)), hand))
     renderer = LabelRenderer(placed)
     for index, T in CAMERAS.items():
         labels = renderer.render(INTRINSICS, T)
@@ -151,45 +137,6 @@ def test_the_bop_reader_gives_back_the_poses(annotated: SessionStore) -> None:
             np.testing.assert_allclose(T_world_cam @ a.T_cam_obj, placed.T_world_obj, atol=1e-9)
 
 
-def test_masks_nest_and_counts_agree_with_them(annotated: SessionStore) -> None:
-    info = annotated.read_json("scene_gt_info.json")
-    hidden_somewhere = False
-    for index in CAMERAS:
-        together = np.zeros((120, 160), int)
-        for k, entry in enumerate(info[str(index)]):
-            whole = mask(annotated, "mask", index, k)
-            visible = mask(annotated, "mask_visib", index, k)
-            together += visible
-            assert not np.any(visible & ~whole)
-            assert entry["px_count_visib"] == np.count_nonzero(visible)
-            assert entry["px_count_all"] == np.count_nonzero(whole)  # nothing leaves the image
-            assert entry["px_count_valid"] <= entry["px_count_all"]
-            assert entry["visib_fract"] == pytest.approx(visible.sum() / whole.sum())
-            hidden_somewhere |= entry["visib_fract"] < 0.9
-        assert together.max() == 1  # a pixel sees one object
-    assert hidden_somewhere
-
-
-def test_the_photograph_shows_what_the_visible_masks_say(annotated: SessionStore) -> None:
-    for index in CAMERAS:
-        grey = annotated.rgb(index)[..., 0]
-        for k, placed in enumerate(SCENE.objects):
-            seen = grey == 90 + 30 * placed.instance
-            visible = mask(annotated, "mask_visib", index, k)
-            # The table that hides things lies 2 mm lower than the one in the photograph.
-            assert np.mean(seen[visible]) > 0.97 and np.mean(visible[seen]) == 1.0
-
-
-def test_coco_holds_the_visible_masks(annotated: SessionStore) -> None:
-    coco = annotated.read_json("scene_gt_coco.json")
-    assert [c["name"] for c in coco["categories"]] == ["tall", "flat"]
-    k_of = {1: 0, 7: 1}
-    for a in coco["annotations"]:
-        saved = mask(annotated, "mask_visib", a["image_id"], k_of[a["category_id"]])
-        np.testing.assert_array_equal(mask_of(a["segmentation"]), saved)
-    assert len(coco["annotations"]) == 6
-
-
 def test_grasps_of_a_view_are_the_objects_grasps_in_its_camera(annotated: SessionStore) -> None:
     seen: list[int] = []
     for index, T_world_cam in CAMERAS.items():
@@ -218,15 +165,6 @@ def test_the_sidecar_flags_doubt_and_describes_the_objects(annotated: SessionSto
     np.testing.assert_allclose(tall["physical"]["centroid_obj_m"], np.zeros(3), atol=1e-12)
     assert tall["physical"]["volume_m3"] == pytest.approx(0.04 * 0.04 * 0.12)
     assert tall["physical"]["convex_hull_volume_fraction"] == pytest.approx(1.0)
-
-
-def test_an_unmodelled_occluder_is_noticed(tmp_path: Path) -> None:
-    store = make_session(tmp_path / "s", unmodelled=True)
-    annotate(store, SCENE, MODELS, GRASPS)
-    flat_from_above = parts(store)[2]["objects"][1]["depth"]
-    assert flat_from_above["nearer"] > 0.2
-    assert flat_from_above["agree"] == pytest.approx(1 - flat_from_above["nearer"], abs=0.02)
-    assert parts(store)[2]["objects"][0]["depth"]["nearer"] < 0.2
 
 
 def test_again_is_skipped_and_from_scratch_is_the_same(

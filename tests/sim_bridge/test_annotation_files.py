@@ -149,15 +149,6 @@ def test_object_coordinates_project_to_their_own_pixels(done: SessionStore, view
     assert not counts[nothing].any()
 
 
-def test_normals_are_unit_and_face_the_camera(done: SessionStore) -> None:
-    rays = camera.ray_table(CAMERA)
-    normals = label_maps.normals_of(deep_rgb(done, "normals", 0))
-    seen = done.read_image("labels/depth/000000.png") > 0
-    np.testing.assert_allclose(np.linalg.norm(normals[seen], axis=-1), 1, atol=1e-4)
-    assert np.all(np.sum(normals[seen] * rays[seen], axis=-1) < 1e-4)
-    assert len(np.unique(np.round(normals[seen], 2), axis=0)) >= 3
-
-
 def test_px_count_all_is_that_of_a_canvas_of_three_images(done: SessionStore) -> None:
     plain = replace(CAMERA, distortion=np.zeros(8))
     wide = replace(plain, width=480, height=360, cx=plain.cx + 160, cy=plain.cy + 120)
@@ -219,6 +210,7 @@ def test_camera_corners_and_surface_are_told(done: SessionStore) -> None:
         assert on_face.any(axis=1).all()
 
 
+@pytest.mark.slow
 def test_two_processes_write_the_same_bytes_as_one(done: SessionStore, tmp_path: Path) -> None:
     store = make_session(tmp_path / "s")
     ticks: list[tuple[int, int]] = []

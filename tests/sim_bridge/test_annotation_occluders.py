@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from realsim import CameraIntrinsics, GraspSet, Mesh, ObjectModel, ObjectPose, Scene, SupportPlane
+from realsim import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.geometry import se3
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.labels import LabelRenderer, Labels, PlacedMesh
@@ -12,15 +12,10 @@ from realsim.rendering.rays import BACKGROUND
 from realsim_sim_bridge.annotation.config import AnnotationConfig, OccluderConfig
 from realsim_sim_bridge.annotation.frame import frame_files
 from realsim_sim_bridge.annotation.inputs import FrameInputs, FrameView, table_slab
+from synthetic_scenes import box
 
 CAMERA = CameraIntrinsics(width=320, height=240, fx=300.0, fy=300.0, cx=159.5, cy=119.5)
-CONFIG = AnnotationConfig(plane_clearance_m=0.0, maps=("instance",))
 Depth = NDArray[np.float32]
-
-
-def box(size: tuple[float, float, float]) -> Mesh:
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-    return Mesh(vertices=corners * np.array(size) / 2, faces=table_slab(CONFIG).faces)
 
 
 MODELS = {
@@ -97,7 +92,7 @@ def hand(T: NDArray[np.float64], over: list[float], size: tuple[float, float], b
     return PlacedMesh(-1, box((size[0], size[1], 0.02)), T @ thing)
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 1.0, 2.5, 4.0, 5.5])
+@pytest.mark.parametrize("azimuth", [0.0, 2.5])
 @pytest.mark.parametrize("up", [0.15, 0.6, 3.0])
 def test_of_exact_depth_nothing_is_removed(azimuth: float, up: float) -> None:
     T = camera_at(0.5, azimuth, up)
@@ -108,10 +103,9 @@ def test_of_exact_depth_nothing_is_removed(azimuth: float, up: float) -> None:
         np.testing.assert_array_equal(masks[e["name"]], labels.ids == e["instance"])
 
 
-@pytest.mark.parametrize(
-    "over", [[-0.07, 0.0, 0.1], [0.0, 0.0, 0.05], [0.09, 0.02, 0.03], [0.15, -0.02, 0.02]]
-)
-@pytest.mark.parametrize("before", [0.1, 0.2])
+@pytest.mark.parametrize(("over", "before"), [
+    ([-0.07, 0.0, 0.1], 0.1), ([0.0, 0.0, 0.05], 0.2), ([0.15, -0.02, 0.02], 0.1),
+])  # fmt: skip
 def test_a_hand_takes_exactly_its_pixels(over: list[float], before: float) -> None:
     T = camera_at(0.5)
     alone, held = rendered(T), rendered(T, hand(T, over, (0.05, 0.03), before))
@@ -132,7 +126,7 @@ def test_a_hand_takes_exactly_its_pixels(over: list[float], before: float) -> No
 @pytest.mark.parametrize("distance", [0.5, 1.0])
 def test_noise_is_not_taken_for_a_thing(distance: float) -> None:
     removed = seen = 0
-    for seed, azimuth in enumerate([0.0, 1.0, 2.5, 4.0]):
+    for seed, azimuth in enumerate([0.0, 2.5]):
         T = camera_at(distance, azimuth)
         labels = rendered(T)
         sensor = DepthSensorModel()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from realsim import CameraIntrinsics, GraspSet, Mesh, ObjectPose
+from realsim import CameraIntrinsics, GraspSet, ObjectPose
 from realsim.formats.bop.labels import bbox_of
 from realsim.geometry import camera, se3
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
@@ -23,23 +23,10 @@ from realsim_sim_bridge.annotation.frame_labels import (
     unknown_occluder,
 )
 from realsim_sim_bridge.annotation.unmodelled import object_masks
+from synthetic_scenes import box
 
 INTRINSICS = CameraIntrinsics(width=160, height=120, fx=150.0, fy=150.0, cx=79.5, cy=59.5)
 SIDE = 0.05
-
-
-def box(size: tuple[float, float, float]) -> Mesh:
-    """Return a box about the origin with outward faces."""
-    s = (
-        np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-        * np.array(size)
-        / 2
-    )
-    faces = [
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
-        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ]  # fmt: skip
-    return Mesh(vertices=s, faces=np.array(faces, np.int32))
 
 
 def grasp_set(Ts: NDArray[np.float64], width: float = SIDE) -> GraspSet:
@@ -92,15 +79,6 @@ def test_from_the_side_of_one_finger_only_that_contact_is_seen() -> None:
 def test_behind_a_wall_nothing_is_seen() -> None:
     wall = PlacedMesh(-1, box((0.3, 0.3, 0.01)), se3.from_translation([0, 0, 0.2]))
     assert seen_from([0.0, 0.0, 0.5], wall).visibility[0] == GraspVisibility.HIDDEN
-
-
-def test_out_of_the_image_nothing_is_seen() -> None:
-    renderer = LabelRenderer([PlacedMesh(0, box((SIDE,) * 3), np.eye(4))])
-    away = se3.look_at([0.0, 0.0, 0.5], [0.6, 0.0, 0.0])
-    (view,) = grasps_in_view(
-        renderer, INTRINSICS, away, [(np.eye(4), grasp_set(TOP_GRASP[None]))], SightConfig()
-    )
-    assert view.visibility[0] == GraspVisibility.HIDDEN
 
 
 def test_grasps_move_with_the_world() -> None:

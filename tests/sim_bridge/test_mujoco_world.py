@@ -166,8 +166,9 @@ def test_each_finger_presses_with_the_hand_s_force_and_carries_the_load_across(f
 # --- Coulomb --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("force_n", "friction"), [(2.0, 0.25), (20.0, 0.25), (70.0, 1.0)])
-@pytest.mark.parametrize("direction", [(0, 0, -1), (1, 0, 0), (0.7071, 0, -0.7071)])
+@pytest.mark.parametrize(("force_n", "friction", "direction"), [
+    (2.0, 0.25, (0, 0, -1)), (20.0, 0.25, (0.7071, 0, -0.7071)), (70.0, 1.0, (1, 0, 0)),
+])  # fmt: skip
 def test_coulomb_s_limit_is_met_within_three_percent(force_n, friction, direction):
     capacity = 2 * friction * force_n
     with world(cube(0.3), physics=SlipPhysics(force_n=force_n, friction=friction)) as hands:
@@ -195,8 +196,9 @@ def test_no_more_than_4_um_a_second_creep_in_five_seconds_at_nine_tenths_of_the_
     assert slip[-1] - slip[1] < 0.02
 
 
-@pytest.mark.parametrize("mass", [0.125, 0.013])
-@pytest.mark.parametrize("settings", [MujocoSettings(), MujocoSettings.reference()])
+@pytest.mark.parametrize(("mass", "settings"), [
+    (0.013, MujocoSettings()), (0.125, MujocoSettings.reference()),
+])  # fmt: skip
 def test_a_box_sticks_through_lift_and_oscillation(mass, settings):
     motion, engine = SlipMotion(), MujocoEngine(settings)
     with world(cube(mass), engine=engine) as hands:

@@ -18,7 +18,7 @@ from realsim_sim_bridge.synthetic.write import write_session
 
 if __name__ == "__main__":
     write_session(
-        sys.argv[1], synthetic_scene(), INTRINSICS, cameras(6), workers=int(sys.argv[2]),
+        sys.argv[1], synthetic_scene(), INTRINSICS, cameras(3), workers=int(sys.argv[2]),
         progress=lambda done, of: print(done, of, flush=True),
     )
 """
@@ -26,7 +26,7 @@ if __name__ == "__main__":
 
 def write(folder, workers):
     return write_session(
-        folder, synthetic_scene(), INTRINSICS, cameras(6), SyntheticConfig(), workers=workers
+        folder, synthetic_scene(), INTRINSICS, cameras(3), SyntheticConfig(), workers=workers
     )
 
 
@@ -40,7 +40,7 @@ def whole(tmp_path_factory):
 @pytest.mark.slow
 def test_two_workers_write_the_bytes_of_one(tmp_path, whole):
     summary = write(tmp_path / "s", 2)
-    assert summary.rendered == 6
+    assert summary.rendered == 3
     assert content(tmp_path / "s") == whole
 
 
@@ -49,7 +49,7 @@ def test_two_workers_write_the_bytes_of_one(tmp_path, whole):
 def test_a_killed_run_ends_with_the_bytes_of_one_that_was_not(tmp_path, whole, workers):
     (tmp_path / "script.py").write_text(SCRIPT)
     support = Path(__file__).parents[2] / "support"
-    for steps in (2, 5):
+    for steps in (2, 4):
         process = subprocess.Popen(
             [sys.executable, tmp_path / "script.py", tmp_path / "s", str(workers)],
             env=os.environ | {"PYTHONPATH": str(support)}, stdout=subprocess.PIPE, text=True,
