@@ -17,11 +17,11 @@ from school_cases import PATIENT, in_processes, slip_config
 
 from realsim.formats.grasps.acronym import read_acronym
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.geometry.mesh import mass_properties
 from realsim.models.convex import ConvexConfig, convex_parts
 from realsim.models.properties import physical_properties
 from realsim.records import Mesh
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip.slip_test import SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.validation.specimens import ready_trial

@@ -16,7 +16,7 @@ from matplotlib.patheffects import withStroke
 
 from realsim.formats.graspnet.gripper_frame import BASE_M, graspnet_poses
 from realsim.formats.grasps.hand_frames import FINGERTIP_Z_M, TCP_Z_M, hand_poses
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 
 AXES = ("#c8553d", "#2a9d8f", "#3a6ea5")
 INK, PALE, PAPER = "#22303c", "#8d9aa7", "#ffffff"

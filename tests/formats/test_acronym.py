@@ -15,7 +15,6 @@ from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_ac
 from realsim.formats.grasps.hand_frames import (
     FINGERTIP_Z_M,
     T_GRASP_HAND,
-    TCP_Z_M,
     grasp_poses,
     hand_poses,
 )
@@ -23,7 +22,6 @@ from realsim.formats.grasps.scene_grasps import executed, held
 from realsim.geometry import se3
 from realsim.geometry.mesh import sample_surface
 from realsim.records import GraspSet
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from tried_grasps import assert_same, tried_set
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
@@ -75,12 +73,6 @@ def test_the_axes_of_acronyms_hand_are_known():
     T_acronym_panda = se3.invert(T) @ hand_poses(np.eye(4), "panda_hand")
     np.testing.assert_allclose(se3.log_so3(T_acronym_panda[:3, :3]), [0, 0, -np.pi / 2])
     np.testing.assert_allclose(T_acronym_panda[:3, 3], 0, atol=1e-15)  # one origin
-
-
-def test_the_frames_are_those_of_the_hand_that_is_simulated():
-    hand = HandGeometry()
-    assert hand.mount_z_m == -TCP_Z_M
-    assert hand.tip_beyond_tcp_m == pytest.approx(FINGERTIP_Z_M - TCP_Z_M, abs=1e-9)
 
 
 # --- files ------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import viser
 
 from realsim import InputError, Mesh
 from realsim.geometry import se3
+from realsim.geometry.hand import HAND
 from realsim.records import STAGES
 from realsim.records.trajectories import PHASES
 from realsim.review.replay.grasp_replay import (
@@ -29,7 +30,7 @@ from realsim.review.replay.grasp_words import (
     slip_table,
     slip_words,
 )
-from realsim.review.replay.replay_nodes import BOX_FACES, HandShape
+from realsim.review.replay.replay_nodes import BOX_FACES
 from tried_grasps import tried_set
 
 WIDTH_M = 0.03
@@ -119,11 +120,10 @@ def test_motions_that_are_none_are_refused() -> None:
 
 
 def test_the_plain_hand_is_open_by_its_opening() -> None:
-    hand = HandShape()
-    (left_low, left_high), (right_low, right_high) = hand.finger(1), hand.finger(-1)
-    assert left_low[1] == 0.0 == right_high[1], "closed, the faces touch"
-    assert left_high[1] == -right_low[1] == hand.finger_m[1]
-    assert hand.palm()[1][2] <= left_low[2] + 0.01, "the fingers begin at the palm"
+    palm, right, left = HAND.boxes(0.0)[0]
+    assert left[0, 1] == 0.0 == right[1, 1], "closed, the faces touch"
+    assert left[1, 1] == -right[0, 1] == HAND.finger_thickness_m
+    assert palm[1, 2] <= left[0, 2] + 0.01, "the fingers begin at the palm"
     assert len(np.unique(BOX_FACES)) == 8 and BOX_FACES.shape == (12, 3)
 
 

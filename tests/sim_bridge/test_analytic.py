@@ -8,6 +8,7 @@ from realsim.errors import InputError
 from realsim.formats.graspnet import gripper_frame as frame
 from realsim.formats.graspnet.grasp_labels import read_grasp_labels, write_grasp_labels
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.records import Mesh
 from realsim_sim_bridge.grasping.analytic import (
     AnalyticConfig,
@@ -24,7 +25,6 @@ from realsim_sim_bridge.grasping.candidates import (
     standing_object,
 )
 from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from tried_grasps import assert_same
 
 HAND = HandGeometry()

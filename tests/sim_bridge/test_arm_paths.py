@@ -7,6 +7,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.arm import panda, stage_motion
 from realsim_sim_bridge.arm.arm_space import FREE, ArmSpace, ArmSpaceConfig
 from realsim_sim_bridge.arm.joint_path import PlannerConfig, connect
@@ -18,7 +19,6 @@ from realsim_sim_bridge.arm.timing import (
     trapezoid,
     trapezoid_share,
 )
-from realsim_sim_bridge.grasping.hand import HandGeometry
 
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
 SIDE, LOW = np.eye(7)[0], np.eye(7)[1]

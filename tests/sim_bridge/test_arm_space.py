@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.arm_space import (
     FREE,
@@ -25,7 +26,6 @@ from realsim_sim_bridge.arm.obstacles import (
     nearest_within,
     obstacles_of,
 )
-from realsim_sim_bridge.grasping.hand import HandGeometry
 
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
 HAND = HandGeometry()

@@ -5,6 +5,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.geometry.parts import part
 from realsim.records import Mesh
 from realsim_sim_bridge.grasping.candidates import (
@@ -13,7 +14,7 @@ from realsim_sim_bridge.grasping.candidates import (
     sample_candidates,
     standing_object,
 )
-from realsim_sim_bridge.grasping.hand import HandGeometry, boxes_free, lowest_corner
+from realsim_sim_bridge.grasping.hand_free import boxes_free, lowest_corner
 
 HAND = HandGeometry()
 

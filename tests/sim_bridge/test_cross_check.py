@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from held_boxes import held_box, held_from_above
+from realsim.geometry.hand import HandGeometry
 from realsim.records import MEASURES, GraspSet
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.school.cross_check import (
     agreement,
     agreement_of,

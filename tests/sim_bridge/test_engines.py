@@ -8,7 +8,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.bullet_world import BulletEngine
 from realsim_sim_bridge.slip.engines import (
     ENGINES,

@@ -8,6 +8,7 @@ import trimesh
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.records import MEASURES, Mesh
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.candidates import CandidateConfig, Surroundings, sample_candidates
@@ -17,7 +18,6 @@ from realsim_sim_bridge.grasping.force_closure import (
     force_closure,
     largest_balls,
 )
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.grasping.pad_contacts import pad_contacts
 
 HAND = HandGeometry()

@@ -11,6 +11,7 @@ import pytest
 import trimesh
 
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.geometry.parts import part
 from realsim.records import Mesh
 from realsim_sim_bridge.grasping.candidates import (
@@ -20,7 +21,6 @@ from realsim_sim_bridge.grasping.candidates import (
     together,
 )
 from realsim_sim_bridge.grasping.force_closure import force_closure
-from realsim_sim_bridge.grasping.hand import HandGeometry
 
 NAMES = "flange wedge bowl gear mug box tube elbow cone knob".split()
 HAND = HandGeometry()

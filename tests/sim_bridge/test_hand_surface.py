@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.records import Mesh
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface
 from realsim_sim_bridge.grasping.candidates import (
@@ -18,7 +19,7 @@ from realsim_sim_bridge.grasping.candidates import (
     sample_candidates,
     standing_object,
 )
-from realsim_sim_bridge.grasping.hand import HandGeometry, boxes_free
+from realsim_sim_bridge.grasping.hand_free import boxes_free
 from realsim_sim_bridge.grasping.surroundings import (
     first_triangle_inside,
     hands_free,

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.mujoco_approach import (
     CLEARANCE_M,
     advanced_fingers,

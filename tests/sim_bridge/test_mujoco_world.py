@@ -8,7 +8,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.motion import SlipMotion, lift_acceleration, oscillation_acceleration
 from realsim_sim_bridge.slip.mujoco_world import MODELS_KEPT, MujocoEngine

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.chain import follow_lines, frames_into
 from realsim_sim_bridge.arm.panda import panda_urdf
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip.bullet_shapes import hand_urdf
 from realsim_sim_bridge.slip.world import PadModel
 

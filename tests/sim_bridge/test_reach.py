@@ -7,6 +7,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.records.trajectories import PHASES
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.lifted_object import touched_when_lifted
@@ -21,7 +22,7 @@ from realsim_sim_bridge.arm.reach import (
 from realsim_sim_bridge.arm.swept_hand import first_touched
 from realsim_sim_bridge.arm.timing import TimingConfig
 from realsim_sim_bridge.grasping.candidates import Surroundings
-from realsim_sim_bridge.grasping.hand import HandGeometry, first_point_inside
+from realsim_sim_bridge.grasping.hand_free import first_point_inside
 from realsim_sim_bridge.slip.motion import SlipMotion, min_jerk, pendulum_angle
 
 DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.bullet_world import BulletEngine
 from realsim_sim_bridge.slip.engines import BulletSettings
 from realsim_sim_bridge.slip.motion import (

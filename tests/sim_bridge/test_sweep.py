@@ -5,7 +5,7 @@ import pytest
 
 from held_boxes import held_box, held_from_above
 from realsim.errors import InputError
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.school.sweep import SweepConfig, find_levels, run_sweep, sweep_margins
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from realsim_sim_bridge.slip.score import ScoreLimits

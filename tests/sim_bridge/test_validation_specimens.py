@@ -5,8 +5,8 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip.motion import SlipMotion
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.validation.config import LabelConfig

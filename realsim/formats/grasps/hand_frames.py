@@ -17,15 +17,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HAND
 
 Array = NDArray[np.float64]
 HandFrame = Literal["grasp", "panda_hand", "acronym"]
 
-TCP_Z_M = 0.1034
+TCP_Z_M = -HAND.mount_z_m
 """z of the tool centre point in panda_hand [m]: Franka's own setting of the hand."""
-FINGERTIP_Z_M = 0.1122
+FINGERTIP_Z_M = round(TCP_Z_M + HAND.tip_beyond_tcp_m, 6)
 """z of the fingertips in panda_hand [m] (franka_description; ACRONYM's gripper marker)."""
-FINGER_OPEN_M = 0.04
+FINGER_OPEN_M = HAND.max_opening_m / 2.0
 """Position of each finger's joint when the hand is fully open [m]."""
 
 _QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

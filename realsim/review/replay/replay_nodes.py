@@ -1,19 +1,21 @@
 """The nodes of a replay in viser: links, a plain hand of boxes, and the object that is carried."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import viser
 
 from realsim.geometry import mesh as mesh_tools
+from realsim.geometry.hand import HandGeometry
 from realsim.interop import viser_wxyz_position
 from realsim.records import Mesh
 from realsim.records.checked_arrays import Array
 
 PLAIN_RGB = (176, 182, 190)
 """Colour of what has none of its own."""
+HAND_RGB = (222, 226, 232)
+"""Colour of the plain hand: light lacquer, which stands out from the grasps' colours."""
 BOX_FACES = np.array(
     [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
      [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]], dtype=np.int32,
@@ -21,45 +23,16 @@ BOX_FACES = np.array(
 """(12, 3) of the corners in the order z fastest, outward."""
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class HandShape:
-    """A two-finger hand of boxes, in its grasp frame; sizes of Franka's."""
-
-    palm_m: tuple[float, float, float] = (0.063, 0.204, 0.0658)
-    """Extent of the palm: across, along the closing axis, along the approach [m]."""
-    palm_face_z_m: float = -0.0376
-    """z of the palm's outer face [m]."""
-    finger_m: tuple[float, float, float] = (0.020, 0.015, 0.050)
-    """Extent of a finger, likewise [m]."""
-    tip_z_m: float = 0.0088
-    """z of the fingers' tips [m]."""
-    color: tuple[int, int, int] = (222, 226, 232)
-    """RGB: light lacquer, which stands out from the grasps' colours."""
-
-    def palm(self) -> tuple[Array, Array]:
-        """Return least and greatest corner (3,) of the palm [m]."""
-        half = np.array(self.palm_m[:2]) / 2.0
-        low = self.palm_face_z_m - self.palm_m[2]
-        return np.array([*-half, low]), np.array([*half, self.palm_face_z_m])
-
-    def finger(self, side: int) -> tuple[Array, Array]:
-        """Return the corners of the closed hand's finger at y > 0 (side 1) or y < 0 (-1) [m]."""
-        x, thick, long = self.finger_m
-        y = sorted((0.0, side * thick))
-        low = self.tip_z_m - long
-        return np.array([-x / 2, y[0], low]), np.array([x / 2, y[1], self.tip_z_m])
-
-
 class ReplayNodes:
     """What is drawn of a motion; only positions and orientations change while it plays."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, hand: HandShape) -> None:
+    def __init__(self, scene: viser.SceneApi, name: str, hand: HandGeometry) -> None:
         """Start with nothing drawn.
 
         Args:
             scene: of a server or of one client.
             name: of the node under which everything is.
-            hand: the plain hand.
+            hand: sizes of the plain hand.
         """
         self._scene, self._name, self._hand = scene, name, hand
         self._links: list[Any] = []
@@ -81,8 +54,8 @@ class ReplayNodes:
         for k, mesh in enumerate(link_meshes):
             self._links.append(self._add(f"link_{k}", mesh))
         if not link_meshes:
-            corners = (self._hand.palm(), self._hand.finger(1), self._hand.finger(-1))
-            for part, box in zip(("palm", "finger_left", "finger_right"), corners, strict=True):
+            palm, right, left = self._hand.boxes(0.0)[0]
+            for part, box in (("palm", palm), ("finger_left", left), ("finger_right", right)):
                 self._boxes.append(self._add_box(part, *box))
         if obj_mesh is not None:
             self._object = self._add("object", obj_mesh)
@@ -141,7 +114,7 @@ class ReplayNodes:
             f"{self._name}/{part}",
             corners.reshape(-1, 3).astype(np.float32),
             BOX_FACES,
-            color=self._hand.color,
+            color=HAND_RGB,
             flat_shading=True,
             side="double",
             cast_shadow=False,

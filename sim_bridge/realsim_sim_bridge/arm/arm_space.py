@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.chain import frames_into
 from realsim_sim_bridge.arm.obstacles import (
@@ -29,7 +30,6 @@ from realsim_sim_bridge.arm.obstacles import (
     least_distance,
     nearest_within,
 )
-from realsim_sim_bridge.grasping.hand import HandGeometry
 
 Array = NDArray[np.float64]
 Codes = NDArray[np.int64]

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.compiled import njit
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.grasping.hand import HandGeometry
 
 Array = NDArray[np.float64]
 

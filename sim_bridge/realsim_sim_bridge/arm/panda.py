@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HAND, HandGeometry
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ ALPHA = np.array([0.0, -np.pi / 2, np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, 
 D_M = np.array([0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0])
 FLANGE_M = 0.107
 """Distance of the flange from joint 7's frame [m]."""
-TCP_M = 0.1034
+TCP_M = -HAND.mount_z_m
 """Distance of the tool centre point from the flange [m]."""
 HAND_TURN = -np.pi / 4
 """The hand is mounted turned by this about the flange's axis [rad]."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.records.trajectories import GraspTrajectories
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.arm_space import AT_LIMITS, FREE, IN_TABLE, ArmSpace, Codes, in_words
@@ -31,7 +32,7 @@ from realsim_sim_bridge.arm.stage_motion import (
 from realsim_sim_bridge.arm.swept_hand import first_touched
 from realsim_sim_bridge.arm.timing import timed_path
 from realsim_sim_bridge.grasping.candidates import Surroundings
-from realsim_sim_bridge.grasping.hand import HandGeometry, lowest_corner
+from realsim_sim_bridge.grasping.hand_free import lowest_corner
 from realsim_sim_bridge.slip.motion import SlipMotion
 
 __all__ = ["Reach", "ReachConfig", "ReachTask", "base_on_table", "check_reach", "home_joints"]

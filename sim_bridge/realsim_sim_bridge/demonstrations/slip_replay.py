@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.records import STAGES, GraspSet
 from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.slip.score import score_stages
 from realsim_sim_bridge.slip.slip_test import SlipTrial, run_slip_test

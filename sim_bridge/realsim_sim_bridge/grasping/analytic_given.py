@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from realsim.formats.graspnet.grasp_labels import GraspLabels
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.records import Mesh
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface
 from realsim_sim_bridge.grasping.candidates import (
@@ -23,7 +24,6 @@ from realsim_sim_bridge.grasping.candidates import (
     HandPoses,
     Stand,
 )
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.grasping.pad_contacts import pad_contacts
 from realsim_sim_bridge.grasping.surroundings import Surroundings
 

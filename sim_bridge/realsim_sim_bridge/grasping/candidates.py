@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.records import Mesh
 from realsim_sim_bridge.grasping.antipodal import (
     AntipodalPairs,
@@ -19,7 +20,7 @@ from realsim_sim_bridge.grasping.antipodal import (
     antipodal_pairs,
     perpendicular,
 )
-from realsim_sim_bridge.grasping.hand import HandGeometry, lowest_corner
+from realsim_sim_bridge.grasping.hand_free import lowest_corner
 from realsim_sim_bridge.grasping.surroundings import (
     SurfaceTree,
     Surroundings,

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.geometry.mesh import hull_vertices, mass_properties
 from realsim.records import Mesh
 from realsim_sim_bridge.grasping.antipodal import RaySurface
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.grasping.pad_contacts import PadContacts, pad_contacts
 
 # --- The Ferrari-Canny quality of two soft fingers: exact, and quick enough for every grasp ------

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.grasping.antipodal import RaySurface
-from realsim_sim_bridge.grasping.hand import HandGeometry
 
 Array = NDArray[np.float64]
 SQUARE_LEVER = 0.3826

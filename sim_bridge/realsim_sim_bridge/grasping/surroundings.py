@@ -11,7 +11,7 @@ from realsim.compiled import njit
 from realsim.geometry import se3
 from realsim.geometry.mesh import sample_surface
 from realsim.records import Mesh
-from realsim_sim_bridge.grasping.hand import boxes_free
+from realsim_sim_bridge.grasping.hand_free import boxes_free
 
 # --- Which hands meet a surface: the hand's boxes against all triangles of a mesh, exactly -------
 # The triangles hang in a tree of bounding boxes. A hand goes down only those branches whose boxes

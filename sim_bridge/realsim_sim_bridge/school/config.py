@@ -2,11 +2,11 @@
 
 from dataclasses import dataclass, field
 
+from realsim.geometry.hand import HandGeometry
 from realsim.models.convex import ConvexConfig
 from realsim_sim_bridge.arm.reach import ReachConfig
 from realsim_sim_bridge.grasping.analytic import AnalyticConfig
 from realsim_sim_bridge.grasping.candidates import CandidateConfig
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.school.sweep import SweepConfig
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings
 from realsim_sim_bridge.slip.score import ScoreLimits

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from realsim import interop
 from realsim.errors import RealsimError
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.bullet_shapes import drawn_in, hand_urdf
 from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.world import PadModel
 
 # --- The Franka Hand as a URDF for PyBullet: a fixed palm and two fingers that slide along y -----

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.bullet_pair import BulletPair
 from realsim_sim_bridge.slip.world import Closing, Grips, Motion, PairStates, SlipBody, SlipPhysics
 

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 from realsim.compiled import njit
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 
 Array = NDArray[np.float64]
 

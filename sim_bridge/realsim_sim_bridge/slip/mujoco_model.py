@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.mujoco_approach import surface_triangles
 from realsim_sim_bridge.slip.world import PadModel, SlipBody, SlipPhysics
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip import mujoco_state
 from realsim_sim_bridge.slip.mujoco_approach import advanced_fingers
 from realsim_sim_bridge.slip.mujoco_model import (

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.records import STAGES
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
 from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
 from realsim_sim_bridge.slip.score import ScoreLimits

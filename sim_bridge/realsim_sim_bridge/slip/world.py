@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 
 # --- An object as the physics engines need it ----------------------------------------------------
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from realsim import interop
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.records import STAGES
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.panda import panda_urdf
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip.bullet_shapes import hand_urdf
 from realsim_sim_bridge.slip.motion import SlipMotion, min_jerk, pendulum_angle
 from realsim_sim_bridge.slip.score import ScoreLimits

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.geometry import se3
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.motion import min_jerk
 from realsim_sim_bridge.slip.slip_test import SlipConfig, batches
 from realsim_sim_bridge.slip.world import Engine, Grips, SlipBody

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.hand import HandGeometry
 from realsim.geometry.mesh import Mesh, mass_properties
 from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.grasping.hand import HandGeometry
 from realsim_sim_bridge.slip.slip_test import SlipTrial
 from realsim_sim_bridge.slip.world import SlipBody
 

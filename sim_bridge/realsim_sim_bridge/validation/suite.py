@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim_sim_bridge.grasping.hand import HandGeometry
+from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
 from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
