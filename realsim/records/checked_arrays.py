@@ -1,6 +1,7 @@
 """How a record takes its arrays: a private copy, its shape checked, made read-only."""
 
-from typing import Any
+from dataclasses import fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,6 +10,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 
 Array = NDArray[np.float64]
+Record = TypeVar("Record")
 
 
 def frozen(value: ArrayLike, dtype: Any, shape: tuple[int | None, ...], name: str) -> NDArray[Any]:
@@ -27,3 +29,10 @@ def rigid(value: ArrayLike, name: str) -> Array:
     """Return a read-only rigid (4, 4) copy of `value`."""
     T = se3.check_rigid(value, name)
     return frozen(T, np.float64, (4, 4), name)
+
+
+def rows_of(record: Record, rows: NDArray[Any] | slice) -> Record:
+    """Return a record of some rows (n,) of each of its arrays (N, ...); its other fields stay."""
+    values = {f.name: getattr(record, f.name) for f in fields(record)}  # pyright: ignore[reportArgumentType]
+    arrays = {name: v[rows] for name, v in values.items() if isinstance(v, np.ndarray)}
+    return replace(record, **arrays)  # pyright: ignore[reportArgumentType, reportCallIssue, reportUnknownVariableType]

@@ -155,9 +155,4 @@ def tried_body(
             "Give what the school was given, or run it again."
         )
     parts = solid.parts if solid else convex_parts(mesh, config.convex, cache)
-    return SlipBody(
-        parts=parts.parts,
-        mass_kg=matter.mass_kg,
-        center_of_mass=np.asarray(matter.center_of_mass),
-        inertia=np.asarray(matter.inertia),
-    )
+    return SlipBody.of(parts, matter)

@@ -27,7 +27,6 @@ from realsim_sim_bridge.slip.world import (
     HandWorld,
     Motion,
     PairStates,
-    Replay,
     SlipBody,
     SlipPhysics,
 )
@@ -54,34 +53,15 @@ class StageRecord:
     """How many times as fast as they were the loads were played."""
 
 
-class RecordedEngine:
+class RecordedEngine(Engine):
     """An `Engine` for one grasp at a time."""
 
     def __init__(self, engine: Engine) -> None:
         """Stand in front of an engine."""
-        self._engine = engine
+        self._engine, self.name, self.settings = engine, engine.name, engine.settings
         self.stages: list[StageRecord] = []
         """What was played of the last grasp, stage by stage."""
         self._worlds = 0
-
-    @property
-    def name(self) -> str:
-        """The engine's name."""
-        return self._engine.name
-
-    @property
-    def pairs_per_world(self) -> int:
-        """The engine's own."""
-        return self._engine.pairs_per_world
-
-    @property
-    def replay(self) -> Replay:
-        """The engine's own."""
-        return self._engine.replay
-
-    def version(self) -> str:
-        """Return the engine's version."""
-        return self._engine.version()
 
     def begin(self) -> None:
         """Forget the grasp before."""

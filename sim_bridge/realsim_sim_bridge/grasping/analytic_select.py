@@ -84,7 +84,7 @@ def select_rows(labels: GraspLabels, count: int, rng: np.random.Generator) -> Ro
         few = len(level) <= MOST_COMPARED
         rows = level if few else np.sort(rng.choice(level, MOST_COMPARED, replace=False))
         if share > 0:
-            features = _features(labels.rows(rows).Ts_obj_grasp())
+            features = grasp_features(labels.rows(rows).Ts_obj_grasp(), SPREAD_M)
             chosen.append(rows[farthest_rows(features, share, int(rng.integers(len(rows))))])
     return np.sort(np.concatenate(chosen))
 
@@ -103,11 +103,15 @@ def _shares(available: list[int], count: int) -> list[int]:
     return shares
 
 
-def _features(Ts: Array) -> Array:
+def grasp_features(Ts: Array, spread_m: float) -> Array:
     """Return numbers (N, 15) whose distances say how different grasps (N, 4, 4) are.
 
     A grasp and its half turn about the approach are one: the closing axis enters as y y'.
+
+    Args:
+        Ts: grasps.
+        spread_m: distance that counts as much as opposite approach directions [m].
     """
     y = Ts[:, :3, 1]
     axis = (y[:, :, None] * y[:, None, :]).reshape(-1, 9)
-    return np.concatenate([2.0 / SPREAD_M * Ts[:, :3, 3], Ts[:, :3, 2], axis], axis=1)
+    return np.concatenate([2.0 / spread_m * Ts[:, :3, 3], Ts[:, :3, 2], axis], axis=1)

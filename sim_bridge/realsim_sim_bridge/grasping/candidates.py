@@ -5,7 +5,7 @@ object, its neighbours and the table, and where the closing fingers are free of 
 each filter took is counted.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.geometry.hand import HandGeometry
 from realsim.records import Mesh
+from realsim.records.checked_arrays import rows_of
+from realsim_sim_bridge.grasping.analytic_select import farthest_rows, grasp_features
 from realsim_sim_bridge.grasping.antipodal import (
     AntipodalPairs,
     CandidateConfig,
@@ -62,12 +64,7 @@ class HandPoses:
 
     def rows(self, rows: Mask | NDArray[np.int64]) -> "HandPoses":
         """Return some of them."""
-        return HandPoses(
-            Ts_obj_grasp=self.Ts_obj_grasp[rows],
-            widths_m=self.widths_m[rows],
-            openings_m=self.openings_m[rows],
-            contact_depths_m=self.contact_depths_m[rows],
-        )
+        return rows_of(self, rows)
 
 
 def turned_poses(
@@ -189,17 +186,9 @@ __all__ = [
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Candidates:
+class Candidates(HandPoses):
     """Grasps that are antipodal and whose open hand is free."""
 
-    Ts_obj_grasp: Array
-    """(N, 4, 4) [m]."""
-    widths_m: Array
-    """(N,) distance of the contacts [m]."""
-    openings_m: Array
-    """(N,) distance of the finger faces before closing [m]."""
-    contact_depths_m: Array
-    """(N,) z of both contacts in the grasp frame [m]: 0 = middle of the pads, + = to the tips."""
     counts: dict[str, int]
     """How many there were after each step, and what each filter took:
 
@@ -258,13 +247,7 @@ def sample_candidates(
     chosen = free.rows(_spread_out(free.Ts_obj_grasp, config, limit, rng))
     counts["kept"] = len(chosen)
     counts["not_chosen"] = counts["free"] - counts["kept"]
-    return Candidates(
-        Ts_obj_grasp=chosen.Ts_obj_grasp,
-        widths_m=chosen.widths_m,
-        openings_m=chosen.openings_m,
-        contact_depths_m=chosen.contact_depths_m,
-        counts=counts,
-    )
+    return Candidates(**{f.name: getattr(chosen, f.name) for f in fields(chosen)}, counts=counts)
 
 
 def _reach_of_hands(mesh: Mesh, T_table_obj: Array, geometry: HandGeometry) -> tuple[Array, float]:
@@ -280,19 +263,8 @@ def _reach_of_hands(mesh: Mesh, T_table_obj: Array, geometry: HandGeometry) -> t
 def _spread_out(
     Ts: Array, config: CandidateConfig, limit: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Return the numbers of at most `limit` grasps, each the farthest from those before.
-
-    A grasp and its half turn about the approach are one: the closing axis enters as y y'.
-    """
+    """Return the numbers of at most `limit` grasps, each the farthest from those before."""
     if len(Ts) <= limit:
         return np.arange(len(Ts))
-    y = Ts[:, :3, 1]
-    axis = (y[:, :, None] * y[:, None, :]).reshape(-1, 9)
-    features = np.concatenate([2.0 / config.spread_m * Ts[:, :3, 3], Ts[:, :3, 2], axis], axis=1)
-    chosen = [int(rng.integers(len(Ts)))]
-    nearest = np.full(len(Ts), np.inf)
-    while len(chosen) < limit:
-        step = np.sum((features - features[chosen[-1]]) ** 2, axis=1)
-        nearest = np.minimum(nearest, step)
-        chosen.append(int(np.argmax(nearest)))
-    return np.sort(np.array(chosen))
+    first = int(rng.integers(len(Ts)))
+    return np.sort(farthest_rows(grasp_features(Ts, config.spread_m), limit, first))

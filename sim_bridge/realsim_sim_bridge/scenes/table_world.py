@@ -212,12 +212,7 @@ class TableWorld:
         self.names[body] = name
 
     def _add_object(self, o: ObjectPose, solid: KnownSolid, name: str, folder: Path) -> None:
-        slip_body = SlipBody(
-            parts=solid.parts.parts,
-            mass_kg=solid.matter.mass_kg,
-            center_of_mass=solid.matter.center_of_mass,
-            inertia=solid.matter.inertia,
-        )
+        slip_body = SlipBody.of(solid.parts, solid.matter)
         T_obj_body, moments = slip_body.principal_frame()
         T_body_obj = se3.invert(T_obj_body)
         parts = [se3.transform(T_body_obj, part) for part in slip_body.parts]

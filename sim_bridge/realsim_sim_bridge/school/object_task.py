@@ -345,10 +345,4 @@ def _body(task: ObjectTask, notes: dict[str, Any]) -> tuple[SlipBody | None, str
         "method": convex.method,
         "from": "library" if known else "mesh",
     }
-    body = SlipBody(
-        parts=convex.parts,
-        mass_kg=mass.mass_kg,
-        center_of_mass=mass.center_of_mass,
-        inertia=mass.inertia,
-    )
-    return body, ""
+    return SlipBody.of(convex, mass), ""

@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.bullet_pair import BulletPair
-from realsim_sim_bridge.slip.world import Closing, Grips, Motion, PairStates, SlipBody, SlipPhysics
+from realsim_sim_bridge.slip.world import (
+    Closing,
+    Engine,
+    Grips,
+    HandWorld,
+    Motion,
+    PairStates,
+    SlipBody,
+    SlipPhysics,
+)
 
 if TYPE_CHECKING:
     from realsim_sim_bridge.slip.engines import BulletSettings
@@ -18,7 +27,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-class BulletEngine:
+class BulletEngine(Engine):
     """PyBullet with its settings; keeps the pair of the last body."""
 
     name = "pybullet"
@@ -26,15 +35,7 @@ class BulletEngine:
     def __init__(self, settings: "BulletSettings") -> None:
         """Keep the settings."""
         self.settings = settings
-        self.pairs_per_world = settings.pairs_per_world
-        self.replay = settings.replay
         self._kept: tuple[SlipBody, SlipPhysics, HandGeometry, BulletPair] | None = None
-
-    def version(self) -> str:
-        """Return PyBullet's version."""
-        from importlib.metadata import version
-
-        return version("pybullet")
 
     def world(
         self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: HandGeometry
@@ -53,7 +54,7 @@ class BulletEngine:
         return pair
 
 
-class BulletWorld:
+class BulletWorld(HandWorld):
     """K pairs of hand and object; a `HandWorld`. Other worlds may be played in the same pair."""
 
     def __init__(
@@ -69,10 +70,6 @@ class BulletWorld:
         self._fingers = np.repeat(grips.openings_m[:, None] / 2.0, 2, axis=1)
         self._speeds = np.zeros((n, 2))
         self.alive: Mask = np.ones(n, dtype=np.bool_)
-
-    def __enter__(self) -> "BulletWorld":
-        """Return the world."""
-        return self
 
     def __exit__(
         self,
@@ -181,10 +178,6 @@ class BulletWorld:
             states.fingers_m[there],
             states.finger_speeds[there],
         )
-
-    def remove(self, rows: Mask) -> None:
-        """Take pairs out; see `HandWorld`."""
-        self.alive &= ~rows
 
     def settings(self) -> dict[str, float]:
         """Return the engine's own settings; see `HandWorld`."""

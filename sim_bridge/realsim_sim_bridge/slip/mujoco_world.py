@@ -29,12 +29,11 @@ from realsim_sim_bridge.slip.mujoco_model import (
 from realsim_sim_bridge.slip.mujoco_state import Samples
 from realsim_sim_bridge.slip.world import (
     Closing,
+    Engine,
     Grips,
     HandWorld,
-    Mask,
     Motion,
     PairStates,
-    Replay,
     SlipBody,
     SlipPhysics,
 )
@@ -56,7 +55,7 @@ PRESSING_SPEED = 0.1
 """Speed of the drive while loads are played [m/s]; fingers that press do not follow it."""
 
 
-class MujocoEngine:
+class MujocoEngine(Engine):
     """MuJoCo; keeps the compiled models of the last objects."""
 
     name = "mujoco"
@@ -65,20 +64,6 @@ class MujocoEngine:
         """Take the settings; nothing is compiled yet."""
         self.settings = settings
         self._models: OrderedDict[str, PairModel] = OrderedDict()
-
-    @property
-    def pairs_per_world(self) -> int:
-        """How many pairs a world should hold."""
-        return self.settings.pairs_per_world
-
-    @property
-    def replay(self) -> Replay:
-        """How stages are played."""
-        return self.settings.replay
-
-    def version(self) -> str:
-        """Return MuJoCo's version."""
-        return str(load_mujoco().__version__)
 
     def world(
         self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: HandGeometry
@@ -128,10 +113,6 @@ class MujocoWorld(HandWorld):
         self._rows = mujoco_state.rows_at(Ts_grasp_body, grips.openings_m / 2.0)
         self._open = self.alive.copy()
         """Hands that have not been closed or put anywhere yet."""
-
-    def __enter__(self) -> "MujocoWorld":
-        """Return the world."""
-        return self
 
     def __exit__(
         self,
@@ -232,10 +213,6 @@ class MujocoWorld(HandWorld):
         rows = mujoco_state.rows_of(states.rows(given), self._Rs_world_hand[given])
         self._rows[given] = rows
         self._open[given] = False
-
-    def remove(self, rows: Mask) -> None:
-        """Take pairs (K,) out of the world."""
-        self.alive &= ~rows
 
     def settings(self) -> dict[str, float]:
         """Return what the compiled model says its settings are."""

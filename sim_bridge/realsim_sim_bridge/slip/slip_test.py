@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.geometry.hand import HandGeometry
 from realsim.records import STAGES
+from realsim.records.checked_arrays import rows_of
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
 from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
 from realsim_sim_bridge.slip.score import ScoreLimits
@@ -78,15 +79,7 @@ class SlipTrial:
 
     def part(self, rows: slice | Rows | Mask) -> "SlipTrial":
         """Return the trial of some of the grasps."""
-        return SlipTrial(
-            body=self.body,
-            Ts_obj_grasp=self.Ts_obj_grasp[rows],
-            Ts_table_grasp=self.Ts_table_grasp[rows],
-            openings_m=self.openings_m[rows],
-            joint5_axes=self.joint5_axes[rows],
-            joint5_points=self.joint5_points[rows],
-            joint5_ranges=self.joint5_ranges[rows],
-        )
+        return rows_of(self, rows)
 
     def grips(self, headroom_m: float) -> Grips:
         """Return where the hands are, fingers no farther outside the object than `headroom_m`."""
@@ -215,7 +208,9 @@ class _SlipTest:
         for rows, world in worlds:
             self._judge(stage, rows)
             world.remove(~self._going[rows])
-            _put_back(world, rows, played_again)
+            if played_again is not None:
+                # What was not played again is NaN there, and stays as it is.
+                world.put(played_again.rows(rows))
 
     def _play(self, stage: int, rows: Rows, world: HandWorld, speed: int) -> None:
         """Play a stage in one world, `speed` times as fast as it is."""
@@ -237,22 +232,23 @@ class _SlipTest:
         loose = self._force_n[rows, stage] < self._config.physics.contact_n
         return far | turned | loose
 
-    def _at_true_speed(
-        self, stage: int, again: list[tuple[Rows, PairStates]]
-    ) -> dict[int, PairStates]:
-        """Play rows again at true speed from where they began, and return where each ended."""
-        ended: dict[int, PairStates] = {}
+    def _at_true_speed(self, stage: int, again: list[tuple[Rows, PairStates]]) -> PairStates | None:
+        """Play rows again at true speed from where they began.
+
+        Returns:
+            where they ended, of all N grasps: NaN = not played again; None = none was.
+        """
         rows = np.concatenate([np.zeros(0, dtype=np.int64), *(r for r, _ in again)])
         if len(rows) == 0:
-            return ended
-        states = _together([s for _, s in again])
+            return None
+        began, ended = PairStates.unknown(len(self._trial)), PairStates.unknown(len(self._trial))
+        for mine, states in again:
+            began.set_rows(mine, states)
         for part in batches(len(rows), self._engine.pairs_per_world):
             with self._world(rows[part]) as world:
-                world.put(states.rows(np.arange(part.start, part.stop)))
+                world.put(began.rows(rows[part]))
                 self._play(stage, rows[part], world, 1)
-                after = world.states()
-            for i, row in enumerate(rows[part].tolist()):
-                ended[row] = after.rows(np.array([i]))
+                ended.set_rows(rows[part], world.states())
         return ended
 
     def _world(self, rows: Rows) -> HandWorld:
@@ -312,33 +308,3 @@ class _SlipTest:
                 continue
             self._failures[row] = f"{STAGES[stage]}: {why}"
             self._going[row] = False
-
-
-def _together(states: list[PairStates]) -> PairStates:
-    """Return the pairs of all."""
-    return PairStates(
-        Ts_world_body=np.concatenate([s.Ts_world_body for s in states]),
-        twists=np.concatenate([s.twists for s in states]),
-        fingers_m=np.concatenate([s.fingers_m for s in states]),
-        finger_speeds=np.concatenate([s.finger_speeds for s in states]),
-    )
-
-
-def _put_back(world: HandWorld, rows: Rows, ended: dict[int, PairStates]) -> None:
-    """Put the pairs that were played again where they ended; the others stay as they are."""
-    mine = [
-        (k, ended[row]) for k, row in enumerate(rows.tolist()) if row in ended and world.alive[k]
-    ]
-    if not mine:
-        return
-    n = len(rows)
-    nothing = PairStates(
-        Ts_world_body=np.full((n, 4, 4), np.nan),
-        twists=np.full((n, 6), np.nan),
-        fingers_m=np.full((n, 2), np.nan),
-        finger_speeds=np.full((n, 2), np.nan),
-    )
-    for k, state in mine:
-        nothing.Ts_world_body[k], nothing.twists[k] = state.Ts_world_body[0], state.twists[0]
-        nothing.fingers_m[k], nothing.finger_speeds[k] = state.fingers_m[0], state.finger_speeds[0]
-    world.put(nothing)

@@ -10,15 +10,20 @@ in world axes. Wrenches are true ones: where an engine simulates a greater mass 
 (`SlipPhysics.mass_floor_kg`), the heavier body feels the same newtons.
 """
 
+from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, field, fields
+from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.geometry.hand import HandGeometry
+from realsim.geometry.mesh_shape import MassProperties
+from realsim.models.model_records import ConvexParts, PhysicalProperties
+from realsim.records.checked_arrays import rows_of
 
 # --- An object as the physics engines need it ----------------------------------------------------
 
@@ -37,6 +42,16 @@ class SlipBody:
     """(3,) object frame [m]."""
     inertia: Array
     """(3, 3) about the centre of mass, object axes [kg m^2]."""
+
+    @classmethod
+    def of(cls, parts: ConvexParts, matter: PhysicalProperties | MassProperties) -> "SlipBody":
+        """Return the body of convex parts and the matter of the object."""
+        return cls(
+            parts=parts.parts,
+            mass_kg=matter.mass_kg,
+            center_of_mass=np.asarray(matter.center_of_mass),
+            inertia=np.asarray(matter.inertia),
+        )
 
     def principal_frame(self) -> tuple[Array, Array]:
         """Return T_obj_body (4, 4), at the centre of mass along the principal axes, and moments."""
@@ -139,11 +154,7 @@ class Grips:
 
     def rows(self, rows: NDArray[np.int64] | Mask | slice) -> "Grips":
         """Return some of them."""
-        return Grips(
-            Ts_table_grasp=self.Ts_table_grasp[rows],
-            Ts_obj_grasp=self.Ts_obj_grasp[rows],
-            openings_m=self.openings_m[rows],
-        )
+        return rows_of(self, rows)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -161,12 +172,18 @@ class PairStates:
 
     def rows(self, rows: NDArray[np.int64] | Mask) -> "PairStates":
         """Return some of them."""
-        return PairStates(
-            Ts_world_body=self.Ts_world_body[rows],
-            twists=self.twists[rows],
-            fingers_m=self.fingers_m[rows],
-            finger_speeds=self.finger_speeds[rows],
-        )
+        return rows_of(self, rows)
+
+    @classmethod
+    def unknown(cls, count: int) -> "PairStates":
+        """Return states of which nothing is known: NaN."""
+        shapes = {"Ts_world_body": (4, 4), "twists": (6,), "fingers_m": (2,), "finger_speeds": (2,)}
+        return cls(**{name: np.full((count, *shape), np.nan) for name, shape in shapes.items()})
+
+    def set_rows(self, rows: NDArray[np.int64], states: "PairStates") -> None:
+        """Put the states of some pairs in the place of these rows."""
+        for f in fields(self):
+            getattr(self, f.name)[rows] = getattr(states, f.name)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -181,7 +198,7 @@ class Motion:
     """(S,) simulated time of each sample since the start of the play [s]; the last is its end."""
 
 
-class HandWorld(AbstractContextManager["HandWorld"], Protocol):
+class HandWorld(AbstractContextManager["HandWorld"]):
     """K pairs of hand and object in an engine. Leaving the context frees the engine's memory."""
 
     dt: float
@@ -189,68 +206,68 @@ class HandWorld(AbstractContextManager["HandWorld"], Protocol):
     alive: Mask
     """(K,) pairs that have not been removed."""
 
+    @abstractmethod
     def close(self, closing: Closing) -> Motion:
         """Close all hands on their weightless objects and press with the hand's force from then.
 
         Before the first `close` or `put` the objects are where the grips say and fingers are open.
         """
-        ...
 
+    @abstractmethod
     def play(self, wrenches: Array, sample: int, lost_m: float) -> Motion:
         """Apply wrenches (K, T, 6), one a time step, and return what is seen every `sample` steps.
 
         The fingers press with the hand's force. A pair whose object moved more than `lost_m` [m]
         need not be simulated further: its later samples may be NaN.
         """
-        ...
 
+    @abstractmethod
     def states(self) -> PairStates:
         """Return where everything is now."""
-        ...
 
+    @abstractmethod
     def put(self, states: PairStates) -> None:
         """Put pairs there, with fingers that press with the hand's force; rows of NaN stay."""
-        ...
 
     def remove(self, rows: Mask) -> None:
         """Take pairs (K,) out of the world."""
-        ...
+        self.alive &= ~rows
 
+    @abstractmethod
     def settings(self) -> dict[str, float]:
         """Return what the engine says its settings are: read back from it, not what was asked for.
 
         At least: 'finger_friction', 'object_friction', 'dt_s', 'object_mass_kg', 'force_n'.
         """
-        ...
 
 
-class Engine(Protocol):
+class Engine(ABC):
     """A physics engine with its settings; cheap to make, may keep compiled models of bodies."""
 
-    @property
-    def name(self) -> str:
-        """'pybullet' or 'mujoco'."""
-        ...
+    name: str
+    """'pybullet' or 'mujoco': of its package, too."""
+    settings: Any
+    """`BulletSettings` or `MujocoSettings`."""
 
     @property
     def pairs_per_world(self) -> int:
         """How many pairs its worlds should hold."""
-        ...
+        return self.settings.pairs_per_world
 
     @property
     def replay(self) -> "Replay":
         """How much faster than they were its loads are played."""
-        ...
+        return self.settings.replay
 
     def version(self) -> str:
         """Return the engine's version."""
-        ...
+        return version(self.name)
 
+    @abstractmethod
     def world(
         self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: HandGeometry
     ) -> HandWorld:
         """Return a world with these pairs."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -4,7 +4,7 @@ Scene k of a seed depends on the seed, on k, on the pool and on the settings: no
 scenes are made, by how many processes, or in which order. Each purpose has a generator of its own.
 """
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
-from realsim.models.model_records import ConvexParts
 from realsim.models.properties import physical_properties
-from realsim.records import Mesh, ObjectModel
+from realsim.records import ObjectModel
 from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.table_scenes.config import TableSceneConfig
 from realsim_sim_bridge.table_scenes.drop import Resting, drop
@@ -127,12 +126,7 @@ class SizedObject:
     @property
     def body(self) -> SlipBody:
         """What the engine needs of it."""
-        return SlipBody(
-            parts=self.solid.parts.parts,
-            mass_kg=self.solid.matter.mass_kg,
-            center_of_mass=self.solid.matter.center_of_mass,
-            inertia=self.solid.matter.inertia,
-        )
+        return SlipBody.of(self.solid.parts, self.solid.matter)
 
 
 def generator(seed: int, scene: int, purpose: Purpose) -> np.random.Generator:
@@ -167,17 +161,9 @@ def sized(
     """
     origin = found.middle if centred else np.zeros(3)
     old = found.mesh
-    mesh = Mesh(
-        vertices=scale * (old.vertices - origin), faces=old.faces, colors=old.colors, uv=old.uv,
-        texture=old.texture,
-    )  # fmt: skip
-    parts = ConvexParts(
-        parts=tuple(scale * (part - origin) for part in found.parts.parts),
-        volume_ratio=found.parts.volume_ratio,
-        method=found.parts.method,
-        seconds=found.parts.seconds,
-        notes=found.parts.notes,
-    )
+    mesh = replace(old, vertices=scale * (old.vertices - origin))
+    moved = tuple(scale * (part - origin) for part in found.parts.parts)
+    parts = replace(found.parts, parts=moved)
     symmetries = found.symmetries.copy()
     for S in symmetries:
         S[:3, 3] = scale * (S[:3, 3] - origin + S[:3, :3] @ origin)

@@ -225,7 +225,7 @@ def build_scene(
         density = found.density if keep and found.density else config.density
         obj_id = instance + 1
         model, solid = sized(found, laid.scale, obj_id, density, centred=not keep)
-        models[obj_id] = _named(model, names[instance])
+        models[obj_id] = replace(model, name=names[instance])
         solids[obj_id] = solid
         material = object_look(looks, own)
         if not found.has_look:
@@ -259,12 +259,6 @@ def _unique(names: list[str]) -> list[str]:
         seen[name] = seen.get(name, 0) + 1
         out.append(name if seen[name] == 1 else f"{name}-no{seen[name]}")
     return out
-
-
-def _named(model: ObjectModel, name: str) -> ObjectModel:
-    from dataclasses import replace
-
-    return replace(model, name=name)
 
 
 def _provenance(layout: Layout, pool: ObjectPool) -> dict[str, Any]:
