@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.annotate.current import annotate_session
-from realsim.app.annotate.page import write_page
-from realsim.app.annotate.table import HEADER, object_row
+from realsim.app.annotate.page import HEADER, object_row, write_page
 from realsim.app.console import Console
 from realsim.app.stages import (
     judged_scene,

@@ -1,19 +1,21 @@
 """A page to look at demonstrations: some attempts as rows of pictures, out of the videos."""
 
-import html
 import json
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
-from string import Template
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim import __version__
+from realsim.app.export.card import DatasetCard, SceneFacts, card_bytes
 from realsim.formats.export_folder import Content
+from realsim.formats.labelled_scene import WrittenScene
 from realsim.formats.lerobot import episodes as layout
 from realsim.formats.lerobot.spool import read_video
+from realsim.pages import Page
+from realsim.pages.pictures import Picture
 
 Rgb = NDArray[np.uint8]
 SHOWN = 4
@@ -24,15 +26,6 @@ PICTURE_PX = 200
 """Width of a picture."""
 POSTER_PX = 240
 """Width of what a video shows before it is played: its middle, as large as the player."""
-_PAGE = Template("""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>Demonstrations</title><style>
-body { font: 15px/1.5 system-ui, sans-serif; margin: 2em auto; max-width: 1700px; padding: 0 1em }
-img { width: 100%; display: block } video { height: 180px; margin: 0 6px 0 0 }
-h2 { margin: 1.6em 0 .2em; font-size: 1.1em } p { margin: .2em 0 .5em; color: #444 }
-table { border-collapse: collapse } td, th { padding: .1em .8em .1em 0; text-align: left }
-</style></head><body><h1>Demonstrations</h1>
-<p>$summary</p>$sections<p>realsim $version</p></body></html>
-""")
 
 
 def page_file(folder: Path, fps: int, name: str) -> Mapping[str, Content]:
@@ -52,16 +45,15 @@ def page_file(folder: Path, fps: int, name: str) -> Mapping[str, Content]:
         row for file in files for row in pq.read_table(file, columns=columns).to_pylist()
     ]
     cameras = [c.split("/")[1] for c in columns if c.endswith("/from_timestamp")]
-    sections = "".join(
-        _section(folder, rows[k], notes[k], cameras, fps) for k in shown_episodes(notes)
-    )
     succeeded = sum(bool(n["success"]) for n in notes)
     summary = (
         f"{len(notes)} attempts, {succeeded} successful, at {fps} steps per second. Each row shows "
         "one attempt from its beginning to its end; the videos are those of the data set."
     )
-    page = _PAGE.substitute(summary=html.escape(summary), sections=sections, version=__version__)
-    return {name: page.encode("utf-8")}
+    page = Page(title="Demonstrations", about=summary)
+    for k in shown_episodes(notes):
+        _add_attempt(page, folder, rows[k], notes[k], cameras, fps)
+    return {name: page.encode()}
 
 
 def shown_episodes(notes: Sequence[Mapping[str, Any]]) -> list[int]:
@@ -80,40 +72,33 @@ def _earlier(notes: Sequence[Mapping[str, Any]], k: int) -> int:
     return sum(not n["success"] and str(n["failure"]).partition(":")[0] == stage for n in notes[:k])
 
 
-def _section(
+def _add_attempt(
+    page: Page,
     folder: Path,
     row: Mapping[str, Any],
     note: Mapping[str, Any],
     cameras: Sequence[str],
     fps: int,
-) -> str:
-    """Return one attempt: its pictures and its videos."""
+) -> None:
+    """Add one attempt: its pictures and its videos."""
     outcome = "passed all stages" if note["success"] else note["failure"]
+    said = [f"{outcome}; score {note['score']:.2f}; {row['length']} steps.", *note["notes"]]
     title = f"Episode {row['episode_index']}: {row['tasks'][0]} (grasp {note['grasp']})"
-    said = f"{outcome}; score {note['score']:.2f}; {row['length']} steps."
-    if note["notes"]:
-        said += " " + " ".join(note["notes"])
-    times = np.linspace(0, row["length"] - 1, COLUMNS).round().astype(int)
+    page.section(title, " ".join(said))
+    times = np.linspace(0, row["length"] - 1, COLUMNS).round().astype(int).tolist()
     strips: list[Rgb] = []
-    videos: list[str] = []
+    videos: list[tuple[str, Picture]] = []
     for camera in cameras:
         place = {n: row[f"videos/{camera}/{n}"] for n in ("chunk_index", "file_index")}
         path = layout.VIDEO_PATH.format(video_key=camera, **place)
-        begin = row[f"videos/{camera}/from_timestamp"]
+        begin, end = (row[f"videos/{camera}/{at}_timestamp"] for at in ("from", "to"))
         middle = int(row["length"]) // 2
-        seen = _pictures(folder / path, round(begin * fps), {*times.tolist(), middle})
-        strips.append(
-            np.concatenate([_scaled(seen[k], PICTURE_PX) for k in times.tolist()], axis=1)
-        )
-        span = f"#t={begin:g},{row[f'videos/{camera}/to_timestamp']:g}"
-        videos.append(
-            f'<video controls muted preload="none" src="{html.escape(path + span)}" '
-            f'poster="{_inline(_scaled(seen[middle], POSTER_PX))}"></video>'
-        )
-    picture = f'<img alt="steps" src="{_inline(np.concatenate(strips))}">' if strips else ""
-    return (
-        f"<h2>{html.escape(title)}</h2><p>{html.escape(said)}</p>{picture}<p>{''.join(videos)}</p>"
-    )
+        seen = _pictures(folder / path, round(begin * fps), {*times, middle})
+        strips.append(np.concatenate([_scaled(seen[k], PICTURE_PX) for k in times], axis=1))
+        videos.append((f"{path}#t={begin:g},{end:g}", _scaled(seen[middle], POSTER_PX)))
+    if strips:
+        page.picture(np.concatenate(strips), "steps")
+    page.videos(videos)
 
 
 def _pictures(path: Path, first: int, steps: Collection[int]) -> dict[int, Rgb]:
@@ -141,12 +126,68 @@ def _scaled(rgb: Rgb, width_px: int) -> Rgb:
     return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _inline(rgb: Rgb) -> str:
-    """Return a picture as an address that holds it."""
-    import base64
+# --- The card of a data set of demonstrations ----------------------------------------------------
 
-    import cv2
 
-    quality = [cv2.IMWRITE_JPEG_QUALITY, 85]
-    data = cv2.imencode(".jpg", np.ascontiguousarray(rgb[..., ::-1]), quality)[1].tobytes()
-    return f"data:image/jpeg;base64,{base64.b64encode(data).decode()}"
+if TYPE_CHECKING:
+    from realsim.app.demonstrations.run import DemonstrationRequest
+
+LOADING = """
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+dataset = LeRobotDataset("local/demonstrations", root="FOLDER")
+step = dataset[0]  # observation.state, observation.images.front, action, task, ...
+"""
+STATED = ("name", "licence", "models_licence", "attribution")
+"""Options that the card tells elsewhere."""
+
+
+def demonstrations_card(
+    request: "DemonstrationRequest",
+    written: WrittenScene,
+    names: dict[int, str],
+    successes: int,
+    out: Path,
+) -> bytes:
+    """Return the card as Markdown.
+
+    Args:
+        request: what was asked for.
+        written: what came of it.
+        names: of the objects, by id.
+        successes: attempts that passed all stages.
+        out: the data set's folder.
+    """
+    from realsim_sim_bridge.demonstrations.lerobot_episodes import CONVENTIONS
+
+    facts = SceneFacts(
+        written=replace(
+            written, folder=Path(), counts={**written.counts, "successful episodes": successes}
+        ),
+        labels="replayed in simulation by realsim: physics of the hand, rendered pictures",
+        instances=len(names),
+        grasps_tried=written.counts["episodes"],
+        grasps_good=successes,
+    )
+    plain = type(request)()
+    options = [
+        (name.replace("_", "-"), str(value))
+        for name, value in asdict(request).items()
+        if value != getattr(plain, name) and name not in STATED
+    ]
+    return card_bytes(
+        DatasetCard(
+            name=request.name or out.resolve().name,
+            format="LeRobot",
+            conventions=[("version", "LeRobot v3.0"), ("steps per second", str(request.fps)),
+                         *CONVENTIONS],
+            scenes=[facts],
+            objects=names,
+            loading=LOADING,
+            command=[("command", "realsim demonstrations"), *options],
+            sources=[written.name],
+            licence=request.licence,
+            models_licence=request.models_licence,
+            attribution=request.attribution,
+        )
+    )  # fmt: skip

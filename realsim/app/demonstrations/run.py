@@ -243,8 +243,7 @@ def export_demonstrations(
     Raises:
         InputError: something given cannot be used, PyAV is missing, or `out` holds something else.
     """
-    from realsim.app.demonstrations.card import demonstrations_card
-    from realsim.app.demonstrations.page import page_file
+    from realsim.app.demonstrations.page import demonstrations_card, page_file
     from realsim.app.export.card import CARD_FILE
     from realsim.formats.lerobot.spool import import_av
     from realsim.formats.lerobot.writer import LeRobotConfig, write_lerobot

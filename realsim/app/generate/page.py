@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.app.generate.tables import FiguresTable
-from realsim.app.render.pictures import fitted, layers
+from realsim.app.render.compare import fitted, layers
 from realsim.images import read_rgb
 from realsim.pages import Page, View
 from realsim.pages import spread as spread_order

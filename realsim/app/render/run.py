@@ -5,8 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from realsim.app.console import Console, Tick
-from realsim.app.render.compare import TwinFigures, compare_twins
-from realsim.app.render.pictures import PAGE_FILE, SHEET_FILE, layers, pairs, sheet
+from realsim.app.render.compare import (
+    PAGE_FILE,
+    SHEET_FILE,
+    TwinFigures,
+    compare_twins,
+    layers,
+    pairs,
+    sheet,
+)
 from realsim.app.render.request import RenderRequest, WantedViews, wanted_views
 from realsim.app.render.scene import TwinScene, require_shown, twin_scene
 from realsim.errors import InputError

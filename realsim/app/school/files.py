@@ -45,8 +45,7 @@ class SchoolOutcome:
 
 def write_outcome(outcome: SchoolOutcome) -> None:
     """Write sets, tables, page and pictures; sets of objects that are gone are taken away."""
-    from realsim.app.school.page import page_bytes
-    from realsim.app.school.pictures import MARGINS, SHEET, margins_png, sheet_png
+    from realsim.app.school.page import MARGINS, SHEET, margins_png, page_bytes, sheet_png
     from realsim.app.school.tables import as_json
     from realsim.formats.bop.models import save_models
     from realsim.store import save_grasps

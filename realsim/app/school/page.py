@@ -1,10 +1,11 @@
 """The page of one school: counts, reasons, margins and pictures in one file that prints well."""
 
 from collections.abc import Mapping, Sequence
+from io import BytesIO
 
-from realsim.app.school.pictures import MARGINS, SHEET
 from realsim.app.school.tables import (
     FILTER_HEADER,
+    LEVELS,
     REASON_HEADER,
     SCHOOL_HEADER,
     SUMMARY_HEADER,
@@ -13,13 +14,76 @@ from realsim.app.school.tables import (
     doubts,
     filter_rows,
     level_tables,
+    named,
     not_tried,
     reason_rows,
     school_rows,
     setting_lines,
+    survivors,
 )
+from realsim.geometry import se3
 from realsim.pages import Page
-from realsim.records import GraspSet
+from realsim.records import STAGES, GraspSet, Scene
+
+SHEET, MARGINS = "school_sheet.png", "school_margins.png"
+
+
+def sheet_png(sets: Sequence[GraspSet], models: Names, scene: Scene) -> bytes:
+    """Return all objects as they stand, with their grasps by score; b'' without any.
+
+    Of a scene of more objects than a sheet takes, the first are shown.
+    """
+    from realsim_sim_bridge.school.sheet import MOST_OBJECTS, school_sheet
+
+    shown = [s for s in sets if s.obj_id in models][:MOST_OBJECTS]
+    if not shown:
+        return b""
+    # An object upside down on its table is drawn so: grasps from below are told from those above.
+    T_up_world = se3.invert(scene.plane.T_world_table) if scene.plane else None
+    poses = {} if T_up_world is None else {
+        o.instance: T_up_world @ o.T_world_obj for o in scene.objects
+    }  # fmt: skip
+    title = f"Robot School: {scene.name}"
+    return school_sheet(shown, models, title=title, Ts_up_obj=poses)
+
+
+def margins_png(sets: Sequence[GraspSet], models: Names) -> bytes:
+    """Return the share of each object's tested grasps that pass, by friction and by force.
+
+    What a run's score says is one point of each curve; b'' where nothing was swept.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9.0, 3.6), dpi=110, layout="constrained")
+    axes = [figure.add_subplot(1, len(LEVELS), k + 1) for k in range(len(LEVELS))]
+    drawn = 0
+    for ax, (measure, levels_of, what) in zip(axes, LEVELS, strict=True):
+        every: list[float] = []
+        for s in sets:
+            levels, share = survivors(s, measure, levels_of)
+            if len(levels):
+                ax.plot(levels, share, "o-", label=named(s, models), linewidth=1.2, markersize=3)
+                every += levels.tolist()
+                drawn += 1
+        ax.set_xscale("log")
+        ticks = sorted(set(every))[::-1][::2]  # every second level: all do not fit side by side
+        ax.set_xticks(ticks, [f"{v:g}" for v in ticks])
+        ax.set_xticks([], minor=True)
+        ax.set_ylim(-2, 102)
+        ax.spines[["top", "right"]].set_visible(False)
+        ax.tick_params(labelsize=8)
+        ax.set_xlabel(what, fontsize=8)
+        ax.set_title(f"Grasps [%] that pass all {len(STAGES)} stages", fontsize=9, loc="left")
+    if not drawn:
+        return b""
+    axes[0].legend(fontsize=7, frameon=False)
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
+
+
+# --- The page of one school: counts, reasons, margins and pictures in one file that prints well --
+
 
 MEANING = (
     "A label says what a simulated hand does at one force, one friction and one mass, not what a "
