@@ -87,6 +87,7 @@ def test_what_is_squeezed_at_a_curved_place_does_not_crawl():
     assert crawl_mm(replace(BulletSettings(), friction_anchor=False)) > max(0.1, 10 * anchored)
 
 
+@pytest.mark.slow
 def test_both_engines_see_the_same_closing_and_hold_the_same_grasps():
     trial = askew(4)
     seen = [run_slip_test(trial, SlipConfig(engine=settings_of(name))) for name in ENGINES]

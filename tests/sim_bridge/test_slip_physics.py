@@ -128,6 +128,7 @@ def test_results_are_repeatable_to_the_bit():
     assert np.array_equal(a.slip_m, b.slip_m) and np.array_equal(a.slip_rad, b.slip_rad)
 
 
+@pytest.mark.slow
 def test_no_grasp_depends_on_the_others_it_is_tried_with():
     together = run_slip_test(turned_trial(4))
     backwards = run_slip_test(turned_trial(4).part(np.array([3, 2, 1, 0])))

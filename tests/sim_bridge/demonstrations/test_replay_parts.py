@@ -112,6 +112,7 @@ def test_a_thrown_box_flies_on_and_lands_on_what_stands_there():
     assert Ts[1, 2, 3] == pytest.approx(0.075, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_replay_in_bullet_ends_as_the_school_did():
     config = small_worlds(dataclasses.replace(CONFIG, max_candidates=4))
     physics = dataclasses.replace(config.slip.physics, friction=0.3, force_n=6.0)

@@ -15,6 +15,7 @@ from realsim.store import SessionStore, load_scene
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
 from realsim_sim_bridge.synthetic.scene import load_surroundings
 from realsim_sim_bridge.synthetic.write import cameras_inside, write_session
+from shared_sessions import copy_of
 from synthetic_scenes import (
     INTRINSICS,
     MODELS,
@@ -111,8 +112,7 @@ def test_the_session_is_sound_and_the_school_opens_it(written):
 def test_the_label_transfer_of_real_sessions_opens_it(written, tmp_path):
     from realsim.app.annotate.current import annotate_session
 
-    write(tmp_path / "s", 1)
-    store = SessionStore.open(tmp_path / "s")
+    store = SessionStore.open(copy_of(written[1].folder, tmp_path / "s"))
     before = store.read_image("mask_visib/000000_000000.png")
     annotate_session(store, Console(quiet=True))
     assert np.array_equal(store.read_image("mask_visib/000000_000000.png"), before)
@@ -140,22 +140,22 @@ def test_an_interrupted_run_ends_with_the_bytes_of_an_uninterrupted_one(tmp_path
     assert content(tmp_path / "cut") == content(written[1].folder)
 
 
-def test_more_views_are_added_without_touching_the_first(tmp_path):
-    write(tmp_path / "s", Ts=cameras(3)[:1])
+def test_more_views_are_added_without_touching_the_first(tmp_path, written):
+    more = np.concatenate([cameras(3), cameras(1, seed=7)])
+    copy_of(written[1].folder, tmp_path / "s")
     first = content(tmp_path / "s")
-    assert write(tmp_path / "s", Ts=cameras(3)).rendered == 2
+    assert write(tmp_path / "s", Ts=more).rendered == 1
     after = content(tmp_path / "s")
     for name in ("rgb/000000.png", "depth/000000.png", "annotations/000000.json"):
         assert after[name] == first[name]
-    with pytest.raises(InputError, match="has view 1 already"):
-        write(tmp_path / "s", Ts=cameras(3)[:1])
+    with pytest.raises(InputError, match="has view 3 already"):
+        write(tmp_path / "s", Ts=cameras(3))
 
 
-def test_the_seed_is_of_the_noise_and_not_of_the_labels(tmp_path):
-    write(tmp_path / "a", 1, seed=0)
+def test_the_seed_is_of_the_noise_and_not_of_the_labels(tmp_path, written):
     write(tmp_path / "b", 1, seed=1)
     write(tmp_path / "c", 1, SyntheticConfig(maps=("instance",), depth="clean"), seed=1)
-    a, b, c = (content(tmp_path / n) for n in "abc")
+    a, b, c = (content(f) for f in (written[1].folder, tmp_path / "b", tmp_path / "c"))
     for noisy in ("rgb/000000.png", "depth/000000.png"):
         assert a[noisy] != b[noisy]
     for exact in ("mask_visib/000000_000000.png", "labels/depth/000000.png"):
@@ -207,18 +207,25 @@ def test_a_rejected_object_is_left_out_and_named(tmp_path):
     assert set(np.unique(store.read_image("labels/instance/000000.png"))) == {0, 1}
 
 
-def test_a_camera_at_an_objects_origin_is_written_too(tmp_path):
+def test_cameras_inside_an_object_or_without_one_in_sight_are_named_and_written(tmp_path):
     origin = two_boxes().objects[0].T_world_obj[:3, 3]
-    for k, off in enumerate((0.0, 0.0005)):
-        at = origin + np.array([0.0, 0.0, off])
-        T = se3.look_at(at, at + np.array([0.1, 0.02, 0.01]))
-        summary = write(tmp_path / f"{k}", Ts=np.stack([cameras(1)[0], T]))
-        assert summary.camera_inside == {1: (0,)}
-        rows = json.loads((tmp_path / f"{k}/scene_gt.json").read_text())["1"]
-        away = [np.linalg.norm(row["cam_t_m2c"]) for row in rows if row["obj_id"] == 1]
-        assert away == pytest.approx([1e3 * off], abs=1e-6)
-        part = json.loads((tmp_path / f"{k}/annotations/000001.json").read_text())
+    offs = (0.0, 0.0005, 0.02)
+    inside = [
+        se3.look_at(at, np.add(at, [0.1, 0.02, 0.01])) for at in origin + np.outer(offs, [0, 0, 1])
+    ]
+    away = se3.look_at([0.5, 0, 0.6], [1.5, 0, 0.9])
+    summary = write(tmp_path / "s", Ts=np.stack([*cameras(1), *inside, away]))
+    assert summary.camera_inside == {1: (0,), 2: (0,), 3: (0,)} and summary.empty_views == (4,)
+    assert "1 without any object" in str(summary)
+    about = json.loads((tmp_path / "s/synthetic/scene.json").read_text())
+    assert about["camera_inside"] == {str(k): [0] for k in (1, 2, 3)}
+    rows = json.loads((tmp_path / "s/scene_gt.json").read_text())
+    for view, off in enumerate(offs, start=1):
+        (row,) = [row for row in rows[str(view)] if row["obj_id"] == 1]
+        assert np.linalg.norm(row["cam_t_m2c"]) == pytest.approx(1e3 * off, abs=1e-6)
+        part = json.loads((tmp_path / f"s/annotations/{view:06d}.json").read_text())
         assert part["camera_inside"] == [0]
+    assert len(SessionStore.open(tmp_path / "s").session.views) == 5
 
 
 def test_a_camera_in_the_box_around_an_object_but_outside_it_is_not_inside():
@@ -234,13 +241,6 @@ def test_a_camera_in_the_box_around_an_object_but_outside_it_is_not_inside():
 
     assert inside(0.02, 0.02, 0.02) == {0: (0,)}
     assert inside(0.08, 0.08, 0.08) == inside(0.05, 0.05, 0.01) == inside(0.2, 0, 0) == {}
-
-
-def test_views_without_any_object_are_counted(tmp_path):
-    away = se3.look_at([0.5, 0, 0.6], [1.5, 0, 0.9])
-    summary = write(tmp_path / "s", Ts=np.stack([away, cameras(1)[0]]))
-    assert summary.empty_views == (0,)
-    assert "1 without any object" in str(summary)
 
 
 def test_the_surroundings_are_kept(written, tmp_path):
