@@ -10,24 +10,22 @@ import pytest
 
 from realsim.app.annotate.run import run_annotate
 from realsim.app.console import Console
-from realsim.app.register.files import write_result
 from realsim.app.report.compare_page import comparison_of, comparison_page
 from realsim.app.report.session import write_report
 from realsim.app.report.sources import sources_of
 from realsim.store import SessionStore
-from registered_sessions import models_of, registered_by_hand, table_session
+from shared_sessions import copy_of
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
-@pytest.fixture
-def pages(tmp_path: Path) -> dict[str, Path]:
+@pytest.fixture(scope="module")
+def pages(registered_session: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """The report and the annotation's page of a registered session."""
-    store = table_session(tmp_path / "s", views=2)
-    write_result(store, registered_by_hand(store), models_of(), {})
-    store = SessionStore.open(store.folder)
+    folder = tmp_path_factory.mktemp("pages")
+    store = SessionStore.open(copy_of(registered_session, folder / "s"))
     run_annotate(store.folder, Console(quiet=True), maps="all", workers=1, check_depth=True)
-    comparison = tmp_path / "comparison.html"
+    comparison = folder / "comparison.html"
     sources = sources_of([store.folder, store.folder])
     comparison.write_bytes(comparison_page(comparison_of(sources)).encode())
     return {

@@ -78,13 +78,6 @@ def drawn_in(rgb: NDArray[np.uint8], verdict: str) -> NDArray[np.bool_]:
     return np.all(np.abs(rgb.astype(int) - VERDICT_RGB[verdict]) < 30, axis=-1)
 
 
-def test_the_lens_is_a_strong_one() -> None:
-    corner = np.array([[0.0, 0.0]])
-    xy, _ = camera.undistort(LENS, corner)
-    ideal = xy * [LENS.fx, LENS.fy] + [LENS.cx, LENS.cy]
-    assert np.linalg.norm(ideal - corner) > 50
-
-
 @pytest.mark.parametrize("aspect", [0.7, 4 / 3, 2.4])
 def test_outlines_lie_where_the_lens_and_its_straightening_put_them(
     views: CameraViews, aspect: float
@@ -156,13 +149,6 @@ def test_objects_and_camera_moved_together_leave_the_picture(views: CameraViews)
     assert np.mean(np.any(a != b, axis=-1)) < 1e-3
 
 
-def test_a_move_there_and_back_leaves_the_picture(views: CameraViews) -> None:
-    there = replace(TALL, T_world_obj=se3.from_translation([0.02, 0, 0]) @ TALL.T_world_obj)
-    first = views.picture(4, [TALL, FLAT], aspect=1.5).rgb
-    assert np.any(views.picture(4, [there, FLAT], aspect=1.5).rgb != first)
-    np.testing.assert_array_equal(views.picture(4, [TALL, FLAT], aspect=1.5).rgb, first)
-
-
 def test_what_another_object_hides_is_dashed_and_the_highlighted_one_is_bold(
     views: CameraViews,
 ) -> None:
@@ -185,6 +171,7 @@ def test_an_object_behind_the_camera_or_without_a_model_is_not_drawn(views: Came
     np.testing.assert_array_equal(views.picture(4, [away, unknown], aspect=1.5).rgb, bare)
 
 
+@pytest.mark.slow
 def test_one_of_15_objects_is_redrawn_in_120_ms(views: CameraViews) -> None:
     many = [
         replace(

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim import CameraIntrinsics, InputError, Mesh, View
+from realsim import CameraIntrinsics, InputError, View
 from realsim.geometry import camera, depth, se3
 from realsim.rendering import overlay
 from realsim.review.content import clouds, content
@@ -16,7 +16,7 @@ from realsim.review.content.content import SceneContent
 from realsim.review.drawing import grasp_drawing
 from realsim.review.drawing.grasp_drawing import GraspFilter, passing
 from realsim.store import SessionStore
-from tests.support.reviewed_boxes import CAMERAS, MODELS, SCENE, boxes_session, grasp_set
+from tests.support.reviewed_boxes import CAMERAS, SCENE, boxes_session, grasp_set
 
 CONFIG = SceneConfig(voxel_m=0.004, coarse_points=200, piece_points=700, thumbnail_px=40)
 
@@ -58,20 +58,6 @@ def test_every_point_of_every_level_is_within_half_a_voxel_of_a_measured_one(
     distances = nearest_m(cloud.points.astype(np.float64), measured(store, shown.region))
     assert distances.max() <= CONFIG.voxel_m / 2 + 1e-6
     assert shown.region.holds(cloud.points.astype(np.float64) * (1 - 1e-7)).mean() > 0.999
-
-
-def test_positions_agree_with_the_session_to_a_micrometre(
-    store: SessionStore, shown: SceneContent
-) -> None:
-    # Voxels so small that each holds one sample: the cloud is the samples themselves.
-    fine = clouds.fused_cloud(
-        store, shown.views, shown.region, voxel_m=2e-5, most=1_000_000, coarse=100
-    )
-    points = measured(store, shown.region)
-    assert len(fine) > 0.95 * len(points)
-    # Where two samples fell into a voxel of 20 um the mean is between them.
-    distances = nearest_m(fine.points.astype(np.float64), points)
-    assert np.quantile(distances, 0.98) < 1e-6 and distances.max() < 1e-5
 
 
 def test_levels_nest_and_grow(shown: SceneContent) -> None:
@@ -148,15 +134,6 @@ def test_a_missing_model_is_named(tmp_path: Path) -> None:
     (store.folder / "models/obj_000007.ply").unlink()
     with pytest.raises(InputError, match=r"objects 7.*it has 1, 9"):
         SceneContent.load(store, CONFIG)
-
-
-def test_models_that_nobody_asked_for_are_not_read(tmp_path: Path) -> None:
-    store = boxes_session(tmp_path / "boxes")
-    (store.folder / "models/obj_000009.ply").write_bytes(b"spoiled")
-    shown = SceneContent.load(store, CONFIG)
-    assert list(shown.models) == [1, 7, 9] and 9 in shown.models and 8 not in shown.models
-    with pytest.raises(InputError):
-        _ = shown.models[9]
 
 
 def test_an_unknown_view_or_model_is_named(shown: SceneContent) -> None:
@@ -292,10 +269,3 @@ def test_score_colours_are_those_of_the_pictures() -> None:
 def test_linear_light_of_known_colours() -> None:
     rgb = np.array([[0, 128, 255]], np.uint8)
     np.testing.assert_array_equal(grasp_drawing.linear_rgb(rgb), [[0, 55, 255]])
-
-
-def test_a_mesh_within_the_budget_is_sent_as_it_is(shown: SceneContent) -> None:
-    sent = shown.meshes[7]
-    np.testing.assert_allclose(sent.vertices, MODELS[7].mesh.vertices, atol=1e-7)
-    assert isinstance(MODELS[7].mesh, Mesh) and sent.triangles_given == 12
-    assert shown.meshes[7] is sent

@@ -127,6 +127,7 @@ def test_a_click_is_invariant_under_motions_of_the_world() -> None:
         np.testing.assert_allclose(b, se3.transform(W, a[None])[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_two_million_points_are_clicked_in_60_ms() -> None:
     cloud = np.random.default_rng(3).normal(scale=0.2, size=(2_000_000, 3)).astype(np.float32)
     ray_on_cloud([0, 0, 1], [0, 0, -1], cloud[:10])

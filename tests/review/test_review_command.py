@@ -99,12 +99,3 @@ def test_other_machines_need_a_token_that_is_not_readable_by_others(tmp_path: Pa
     request = ReviewRequest(folders=(tmp_path,), host="0.0.0.0", token_file=path)
     with pytest.raises(InputError, match="chmod 600"):
         run_review(request, Console(quiet=True))
-
-
-def test_the_help_ends_with_examples() -> None:
-    text = CliRunner().invoke(review_command, ["--help"]).output
-    assert text.rstrip().splitlines()[-3:] == [
-        "Examples:",
-        "  realsim review demo/session",
-        "  realsim review demo/session --static scene.html",
-    ]

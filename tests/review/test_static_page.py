@@ -19,8 +19,6 @@ from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.static.page_nodes import (
     SCORE_EDGES,
-    StaticSize,
-    box_edges,
     drawn_grasps,
     score_class,
 )
@@ -185,19 +183,6 @@ def test_the_drawn_grasps_keep_good_and_bad_in_proportion() -> None:
     assert np.nanmedian(grasps.scores[rows]) == pytest.approx(0.5, abs=0.1)
 
 
-def test_a_smaller_size_is_smaller_in_everything() -> None:
-    a = StaticSize()
-    b = a.smaller()
-    assert all(getattr(b, n) < getattr(a, n) for n in StaticSize.__slots__)
-
-
-def test_a_box_has_twelve_edges_around_the_thing() -> None:
-    edges = box_edges(np.zeros(3), np.array([1.0, 2.0, 3.0]))
-    assert edges.shape == (12, 2, 3)
-    assert edges.min() < 0 and np.all(edges.max((0, 1)) > [1, 2, 3])
-    assert np.all(np.count_nonzero(edges[:, 0] != edges[:, 1], axis=1) == 1)
-
-
 # --- in a browser -------------------------------------------------------------------------------
 
 
@@ -245,6 +230,7 @@ def becomes(page: Any, name: str, drawn: bool) -> bool:
     return False
 
 
+@pytest.mark.slow
 def test_the_page_asks_nobody_and_complains_of_nothing(page: Any) -> None:
     assert [u for u in page.asked if not u.startswith(("data:", "blob:", "about:"))] == [page.url]
     assert page.url.startswith("file:///")
@@ -265,6 +251,7 @@ PIXELS = """async () => {
 }"""
 
 
+@pytest.mark.slow
 def test_the_scene_is_drawn(page: Any) -> None:
     end = time.monotonic() + WAIT_S
     share, kinds = 0.0, 0
@@ -276,6 +263,7 @@ def test_the_scene_is_drawn(page: Any) -> None:
     assert kinds > 5, "more than one plain colour"
 
 
+@pytest.mark.slow
 def test_a_click_in_the_list_chooses_an_object(page: Any) -> None:
     items = page.locator(".object")
     assert items.count() == 2 and "rejected" in items.nth(0).inner_text()
@@ -292,6 +280,7 @@ def test_a_click_in_the_list_chooses_an_object(page: Any) -> None:
     assert becomes(page, "/boxes/1", False) and becomes(page, "/grasps/0/3", True)
 
 
+@pytest.mark.slow
 def test_the_switches_show_and_hide(page: Any) -> None:
     for what, node in (("cloud", "/cloud"), ("objects", "/objects/1"), ("table", "/table"),
                        ("cameras", "/cameras/2")):  # fmt: skip
@@ -300,6 +289,7 @@ def test_the_switches_show_and_hide(page: Any) -> None:
             assert becomes(page, node, drawn), what
 
 
+@pytest.mark.slow
 def test_the_slider_leaves_out_worse_grasps(page: Any) -> None:
     def put(value: int) -> None:
         page.evaluate(
@@ -316,6 +306,7 @@ def test_the_slider_leaves_out_worse_grasps(page: Any) -> None:
     assert "0.75" in page.inner_text("#least-word")
 
 
+@pytest.mark.slow
 def test_a_photograph_brings_one_to_its_camera(page: Any, content: SceneContent) -> None:
     page.evaluate("document.querySelector('[data-view=\"2\"]').click()")
     where = (
@@ -334,6 +325,7 @@ def test_a_photograph_brings_one_to_its_camera(page: Any, content: SceneContent)
     pytest.fail("the camera did not get there")
 
 
+@pytest.mark.slow
 def test_a_click_in_the_scene_chooses_an_object(page: Any) -> None:
     # As the viewer reports a click on a node.
     inside(page, "__viserMutable.sendMessage({type:'SceneNodeClickMessage', name:'/objects/1'})")

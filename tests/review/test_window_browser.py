@@ -23,7 +23,7 @@ from tests.support.reviewed_boxes import boxes_session
 
 TABLE_RGB, BOX_RGB = (100, 100, 100), (210, 210, 210)
 """Of the photographs; noise of 10 on them."""
-pytestmark = [needs_chromium]
+pytestmark = [needs_chromium, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +138,6 @@ def test_keys_move_a_copy_and_saving_writes_one_line(
     np.testing.assert_allclose(step, [0.015, 0, 0], atol=1e-9)
 
 
-@pytest.mark.slow
 def test_two_reviewers_see_each_other_and_the_slower_mover_is_told(
     browser: ReviewBrowser, server: ReviewServer
 ) -> None:
@@ -175,7 +174,6 @@ def test_two_reviewers_see_each_other_and_the_slower_mover_is_told(
         bob.wait_for("2 of 2 objects judged")
 
 
-@pytest.mark.slow
 def test_the_name_is_kept_by_the_browser_and_asked_for(
     browser: ReviewBrowser, original: Path, tmp_path: Path
 ) -> None:
@@ -234,7 +232,6 @@ def _share(page: ReviewPage, rgb: tuple[int, int, int]) -> float:
     return share_of(page.screenshot()[:, 300:590], rgb)
 
 
-@pytest.mark.slow
 def test_filters_legends_and_marks(browser: ReviewBrowser, server: ReviewServer) -> None:
     with browser.page(server.url) as page:
         loaded(page)
@@ -261,7 +258,6 @@ def test_filters_legends_and_marks(browser: ReviewBrowser, server: ReviewServer)
     assert [e.action for e in lines(server)] == ["symmetric", "swap"]
 
 
-@pytest.mark.slow
 def test_snapping_brings_a_moved_object_back(browser: ReviewBrowser, server: ReviewServer) -> None:
     with browser.page(server.url) as page:
         loaded(page)
