@@ -6,15 +6,126 @@ border around each. A texture that repeats is laid out as often as its faces nee
 
 import math
 from collections.abc import Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from realsim.geometry.colors import light_of_bytes, srgb_encoded
 from realsim.geometry.mesh import GREY
-from realsim.models.mesh_pieces import Image, Piece
 from realsim.models.mesh_topology import equal_rows
+from realsim.models.model_records import ScanUnit, UpAxis
 from realsim.records import Mesh
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class Piece:
+    """A part of a mesh file that has one material, in the file's units and axes."""
+
+    name: str
+    """What the file calls it."""
+    vertices: Array
+    """(V, 3)."""
+    faces: NDArray[np.int32]
+    """(F, 3), outside counter-clockwise as far as the file says."""
+    colors: Image | None = None
+    """(V, 3) RGB per vertex."""
+    uv: Array | None = None
+    """(V, 2) texture coordinates, v up, any range: textures repeat."""
+    image: Image | None = None
+    """(H, W, 3) RGB, first row at v = 1; needs `uv`."""
+    image_key: Hashable = None
+    """Equal for pieces that share an image."""
+    color: tuple[int, int, int] | None = None
+    """RGB of the whole piece where it has neither colours nor an image; None: the file says
+    nothing."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class FileContent:
+    """What a mesh file holds and what it says about itself."""
+
+    pieces: tuple[Piece, ...]
+    declared: dict[str, str] = field(default_factory=dict[str, str])
+    """What the file states in its own words: format, generator, ..."""
+    notes: tuple[str, ...] = ()
+    up: UpAxis | None = None
+    """The axis that points up, where the file or its format says so."""
+    unit: ScanUnit | None = None
+    """The unit that the file itself states."""
+    format_unit: ScanUnit | None = None
+    """The unit that the format prescribes, whether the program that wrote it knew or not."""
+
+
+def placed(piece: Piece, matrix: ArrayLike) -> tuple[Piece, bool]:
+    """Return the piece moved by an affine matrix (4, 4), and whether that mirrors it.
+
+    A mirror turns the inside out: the winding is turned back, so that what was outside stays
+    outside. glTF and USD prescribe it so.
+    """
+    m = np.asarray(matrix, dtype=np.float64)
+    is_mirrored = bool(np.linalg.det(m[:3, :3]) < 0)
+    faces = piece.faces[:, ::-1] if is_mirrored else piece.faces
+    vertices = piece.vertices
+    if not np.array_equal(m, np.eye(4)):
+        vertices = vertices @ m[:3, :3].T + m[:3, 3]
+    return replace(piece, vertices=vertices, faces=faces), is_mirrored
+
+
+def srgb8(linear: ArrayLike) -> Image:
+    """Return the sRGB bytes of linear light, clipped to [0, 1]."""
+    light = np.clip(np.asarray(linear, dtype=np.float64), 0.0, 1.0)
+    return np.rint(255.0 * srgb_encoded(light)).astype(np.uint8)
+
+
+def rgb8(linear: ArrayLike) -> tuple[int, int, int]:
+    """Return the RGB bytes of a linear colour (3,) in [0, 1], as glTF and USD state them."""
+    r, g, b = srgb8(np.asarray(linear)[:3]).tolist()
+    return r, g, b
+
+
+def tinted(image: Image, factor: ArrayLike) -> Image:
+    """Return the image with its linear values multiplied by a factor (3,) in [0, 1]."""
+    scale = np.asarray(factor, dtype=np.float64)[:3]
+    if np.allclose(scale, 1.0, atol=0.5 / 255.0):
+        return image
+    table = light_of_bytes(np.arange(256))
+    out = [srgb8(table * s) for s in scale]
+    return np.stack([out[k][image[..., k]] for k in range(3)], axis=-1)
+
+
+def transformed_uv(
+    uv: Array, offset: ArrayLike, rotation: float, scale: ArrayLike, *, v_down: bool
+) -> Array:
+    """Return texture coordinates (N, 2), v up, scaled, then turned by [rad], then shifted.
+
+    Args:
+        uv: the coordinates.
+        offset: (2,) in texture widths and heights.
+        rotation: counter-clockwise in the axes in which the transform is stated [rad].
+        scale: (2,).
+        v_down: whether the transform is stated for v pointing down (glTF's KHR_texture_transform)
+            or up (USD's UsdTransform2d).
+    """
+    p = np.array(uv)
+    if v_down:
+        p[:, 1] = 1.0 - p[:, 1]
+    # With v down, glTF's matrix [[c, s], [-s, c]] turns counter-clockwise as one sees it.
+    c, s = np.cos(rotation), np.sin(rotation) * (-1.0 if v_down else 1.0)
+    p = (p * np.asarray(scale)) @ np.array([[c, -s], [s, c]]).T + np.asarray(offset)
+    if v_down:
+        p[:, 1] = 1.0 - p[:, 1]
+    return p
+
+
+def image_array(image: Any) -> Image:
+    """Return the RGB array (H, W, 3) of a PIL image; transparency is left out."""
+    return np.asarray(image.convert("RGB"), dtype=np.uint8)
+
 
 BORDER_PX = 4
 """Texels repeated around every texture of an atlas, so that interpolation does not mix two."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from realsim.errors import InputError
 from realsim.geometry.mesh_files import MOST_TEXELS
-from realsim.models.mesh_pieces import (
+from realsim.models.mesh_atlas import (
     FileContent,
     Piece,
     image_array,

@@ -13,23 +13,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.models.library_records import ModelProperties
-from realsim.models.model_picture_lines import (
-    Layer,
-    box_layer,
-    mass_layer,
-    rim_layer,
-    scale_bar,
-    symmetry_layers,
-)
 from realsim.models.model_picture_views import (
     INK,
     MUTED,
     PAPER,
     PART_COLORS,
+    Layer,
+    box_layer,
     draw_layer,
     drawn_size,
+    mass_layer,
     parts_mesh,
     rendered,
+    rim_layer,
+    scale_bar,
+    symmetry_layers,
     view_of,
 )
 from realsim.models.model_records import ConvexParts

@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
-from realsim.models.mesh_atlas import one_mesh
+from realsim.models.mesh_atlas import FileContent, Piece, one_mesh
 from realsim.models.mesh_loading import TRIMESH_FORMATS, load_pieces
-from realsim.models.mesh_pieces import FileContent, Piece
 from realsim.models.mesh_topology import equal_rows
 from realsim.models.model_records import ReadScan, ScanUnit, UpAxis
 from realsim.models.usd_reading import USD_FORMATS, load_usd

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError, MissingLibraryError
 from realsim.interop import quiet_output
+from realsim.models.mesh_atlas import FileContent, Piece, placed
 from realsim.models.mesh_loading import escape_error
-from realsim.models.mesh_pieces import FileContent, Piece, placed
-from realsim.models.mesh_usd_materials import Materials
-from realsim.models.mesh_usd_primvars import (
+from realsim.models.mesh_usd_materials import (
+    Materials,
     corner_values,
     joined_corners,
     triangles_of,

@@ -23,9 +23,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.geometry.colors import luminance
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment, Material
-from realsim.rendering.depth_sensors.loss import LUMINANCE, look_of, material_loss
+from realsim.rendering.depth_sensors.loss import look_of, material_loss
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.profiles import PROFILES, DepthProfile
 from realsim.rendering.rays import PlacedMesh, RayScene
@@ -148,7 +149,7 @@ class DepthCamera:
         """Share lost and reflectance (G + 1,) of each mesh; the last entry answers -1, nothing."""
         looks = [look_of(p) for p in self.placed]
         shares = np.array([*map(self._share, looks), 0.0], np.float32)
-        albedo = [float(LUMINANCE @ np.array(look.base_color)) for look in looks]
+        albedo = [float(luminance(look.base_color)) for look in looks]
         return shares, np.array([*albedo, 1.0], np.float32)
 
     def _share(self, look: Material) -> float:

@@ -4,21 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.compiled import njit
+from realsim.geometry.colors import srgb_encoded
 
 Array32 = NDArray[np.float32]
 SHOULDER = 0.8
 """Above this share of white the picture approaches white instead of clipping, so that highlights
 keep their shape; below it, it is linear light in sRGB. A value of 1 becomes 247 of 255."""
-
-
-def srgb_encoded(value: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return sRGB [0, 1] of linear light [0, 1] (IEC 61966-2-1)."""
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * np.power(value, 1 / 2.4) - 0.055)
-
-
-def srgb_decoded(value: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return linear light [0, 1] of sRGB [0, 1] (IEC 61966-2-1)."""
-    return np.where(value <= 0.04045, value / 12.92, np.power((value + 0.055) / 1.055, 2.4))
 
 
 def _encoding() -> Array32:

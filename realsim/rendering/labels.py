@@ -13,8 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import camera, mesh_shape, se3
 from realsim.records import CameraIntrinsics
-from realsim.rendering.casting.canvas_rays import canvas_rays
-from realsim.rendering.casting.pixel_caster import PixelCaster, empty_buffers, enter, finished
+from realsim.rendering.casting.pixel_caster import (
+    PixelCaster,
+    canvas_rays,
+    empty_buffers,
+    enter,
+    finished,
+)
 from realsim.rendering.casting.surface_maps import surface_maps
 from realsim.rendering.rays import BACKGROUND, HitBuffer, PlacedMesh, RayScene
 

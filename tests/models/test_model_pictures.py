@@ -9,8 +9,14 @@ from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.models.library_prepare import PrepareConfig, prepare_unscaled
 from realsim.models.library_records import ModelProperties
-from realsim.models.model_picture_lines import rim_layer, rotation_axes
-from realsim.models.model_picture_views import drawn_size, parts_mesh, rendered, view_of
+from realsim.models.model_picture_views import (
+    drawn_size,
+    parts_mesh,
+    rendered,
+    rim_layer,
+    rotation_axes,
+    view_of,
+)
 from realsim.models.model_records import ConvexParts
 from realsim.models.pictures import PANEL, figure_lines, model_sheet
 from realsim.records import Mesh

@@ -11,8 +11,7 @@ from realsim.errors import InputError, UnitError
 from realsim.geometry.mesh import mass_properties, ply_bytes, sample_surface, save_ply
 from realsim.geometry.parts import part
 from realsim.models.inspect import inspect_mesh
-from realsim.models.mesh_atlas import one_mesh
-from realsim.models.mesh_pieces import Piece, transformed_uv
+from realsim.models.mesh_atlas import Piece, one_mesh, transformed_uv
 from realsim.models.reading import METRES, ROTATIONS, read_scan
 from realsim.models.simplify import colors_at, deviation
 from realsim.records import Mesh

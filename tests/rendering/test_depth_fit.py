@@ -11,7 +11,7 @@ import pytest
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.fit import FittedDepthModel, fit_depth_model
-from realsim.rendering.depth_sensors.fit_picture import fit_picture
+from realsim.rendering.depth_sensors.fit_pictures import fit_picture
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.plane import find_plane
 from realsim.rendering.depth_sensors.statistics import disparity_step, hole_share, local_noise

@@ -5,9 +5,10 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
+from realsim.geometry.colors import srgb_decoded, srgb_encoded
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
-from realsim.rendering.developing import developed, srgb_decoded, srgb_encoded
+from realsim.rendering.developing import developed
 from realsim.rendering.embedded.materials import box_uv
 from realsim.rendering.photo import Lighting, PhotoRenderer, PlacedMesh
 

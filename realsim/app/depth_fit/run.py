@@ -83,7 +83,7 @@ def _fitted_disparity(
 ) -> tuple[dict[str, Any], bytes]:
     """Fit the disparity-space model; return its JSON and its picture."""
     from realsim.rendering.depth_sensors.fit import fit_depth_model
-    from realsim.rendering.depth_sensors.fit_picture import fit_picture
+    from realsim.rendering.depth_sensors.fit_pictures import fit_picture
 
     with console.stage(f"fitting {len(frames.names)} frames") as tick:
         fit = fit_depth_model(
@@ -107,8 +107,8 @@ def _fitted_stereo(
     frames: DepthFrames, kind: DepthProfile, console: Any
 ) -> tuple[dict[str, Any], bytes]:
     """Fit the stereo simulator; return its JSON and its picture."""
+    from realsim.rendering.depth_sensors.fit_pictures import stereo_fit_picture
     from realsim.rendering.stereo.fit import SEARCHED, fit_stereo
-    from realsim.rendering.stereo.fit_picture import stereo_fit_picture
 
     with console.stage(f"fitting {len(frames.names)} frames") as tick:
         fit = fit_stereo(

@@ -23,18 +23,25 @@ from realsim.rendering.depth_sensors.autocovariance import (
     steady_sums,
     without_trend,
 )
-from realsim.rendering.depth_sensors.estimate import Estimate
 from realsim.rendering.depth_sensors.fit_resimulated import (
     resampling_pitch,
     scaled,
     typical_ratio,
 )
-from realsim.rendering.depth_sensors.holes import HoleCount, blobs_of, count_holes, grazing_of
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.plane import PlaneConfig, PlaneView, find_plane
+from realsim.rendering.depth_sensors.plane_faults import (
+    Estimate,
+    HoleCount,
+    bands_of,
+    blobs_of,
+    count_holes,
+    grazing_of,
+    warp_of,
+    without_bands,
+)
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
 from realsim.rendering.depth_sensors.statistics import Step, disparity_step
-from realsim.rendering.depth_sensors.stripes import bands_of, warp_of, without_bands
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

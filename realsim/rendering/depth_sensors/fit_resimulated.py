@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.records import CameraIntrinsics
-from realsim.rendering.depth_sensors.estimate import Estimate
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.depth_sensors.plane import PlaneView
+from realsim.rendering.depth_sensors.plane_faults import Estimate
 from realsim.rendering.depth_sensors.statistics import local_noise
 
 Mask = NDArray[np.bool_]

@@ -9,9 +9,9 @@ from place to place: a normal distribution in the logarithm of the signal.
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.geometry.colors import light_of_bytes, luminance
 from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Material
-from realsim.rendering.developing import srgb_decoded
 from realsim.rendering.rays import PlacedMesh
 
 Array32 = NDArray[np.float32]
@@ -24,8 +24,6 @@ SHINY_LOSS = 0.6
 mirror image of the surroundings gives wrong matches."""
 TEXELS = 10_000
 """So many texels, evenly spread, are a texture's mean."""
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Of linear red, green and blue (ITU-R BT.709)."""
 
 
 def signal_loss(
@@ -115,8 +113,8 @@ def material_loss(material: Material) -> float:
     """
     from scipy.special import ndtr
 
-    luminance = max(float(LUMINANCE @ _mean_color(material)), 1e-4)
-    dark = float(ndtr(np.log(DARK_REFLECTANCE / luminance) / DARK_SPREAD))
+    bright = max(float(luminance(_mean_color(material))), 1e-4)
+    dark = float(ndtr(np.log(DARK_REFLECTANCE / bright) / DARK_SPREAD))
     shiny = SHINY_LOSS * material.metallic * (1 - material.roughness) ** 2
     return 1 - (1 - dark) * (1 - shiny)
 
@@ -148,4 +146,4 @@ def _mean_srgb(values: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return the mean linear light (3,) of 8-bit sRGB values (..., 3)."""
     flat = values.reshape(-1, 3)
     flat = flat[:: max(1, len(flat) // TEXELS)]
-    return np.asarray(srgb_decoded(flat / 255.0), np.float64).mean(0)
+    return light_of_bytes(flat).mean(0)

@@ -29,8 +29,7 @@ from realsim.rendering.depth_sensors.noise import (
     slow,
     uniform,
 )
-from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
-from realsim.rendering.depth_sensors.sensor_file import SensorRecord
+from realsim.rendering.depth_sensors.profiles import DepthProfile, SensorRecord, profile
 from realsim.rendering.depth_sensors.shadow import half_occluded, require_same_size, shadow_mask
 from realsim.rendering.rays import RayScene
 

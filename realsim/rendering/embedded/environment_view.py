@@ -31,6 +31,7 @@ from realsim.rendering.embedded.edge_samples import (
     busy_pixels,
     pixel_lattice,
     settle_by_neighbours,
+    world_rays,
 )
 from realsim.rendering.embedded.shading import MIRROR_UNTIL, shade
 from realsim.rendering.embedded.sky_light import SkyArrays, background_level, map_at, sky_arrays
@@ -40,7 +41,6 @@ from realsim.rendering.embedded.surface_table import (
     fill_points,
     surface_arrays,
 )
-from realsim.rendering.embedded.view_rays import world_rays
 from realsim.rendering.rays import HitBuffer, PlacedMesh, RayScene
 
 Array = NDArray[np.float64]

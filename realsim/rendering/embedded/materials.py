@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.geometry.colors import srgb_decoded, srgb_encoded
 from realsim.records import Mesh
-from realsim.rendering.developing import srgb_encoded
+from realsim.rendering.appearance import Material
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 
 Array32 = NDArray[np.float32]
@@ -25,6 +26,14 @@ PLAIN_COLORS = (
     (206, 130, 96), (84, 148, 152), (182, 186, 172), (142, 112, 84), (168, 64, 92),
 )  # fmt: skip
 """sRGB-like paints of objects that have neither texture nor colours, by instance."""
+
+
+WOOD_PERIOD_M = 0.5
+SPECKLE_PERIOD_M = 0.12
+OBJECT_ROUGHNESS = 0.42
+"""Of meshes without a material: satin plastic and printed cardboard."""
+TABLE_ROUGHNESS = 0.62
+"""Of background without a material: oiled wood, printed paper."""
 
 
 class MipTexture:
@@ -156,9 +165,6 @@ def speckle_texture(size: int = 512, seed: int = 11) -> NDArray[np.uint8]:
 class Surface:
     """The look of one placed mesh: normals in world and reflectance at any point of any face."""
 
-    WOOD_PERIOD_M = 0.5
-    SPECKLE_PERIOD_M = 0.12
-
     def __init__(self, placed: PlacedMesh, gamma: float) -> None:
         """Choose the look: the material's colours, texture, vertex colours, wood or paint.
 
@@ -194,12 +200,12 @@ class Surface:
             return
         elif placed.instance == BACKGROUND:
             self._texture = _shared_texture("wood", gamma)
-            self._uv = box_uv(mesh, self.WOOD_PERIOD_M)
+            self._uv = box_uv(mesh, WOOD_PERIOD_M)
         else:
             paint = np.array(PLAIN_COLORS[placed.instance % len(PLAIN_COLORS)])
             self._tint = ((paint / 255.0) ** gamma).astype(np.float32)
             self._texture = _shared_texture("speckle", gamma)
-            self._uv = box_uv(mesh, self.SPECKLE_PERIOD_M)
+            self._uv = box_uv(mesh, SPECKLE_PERIOD_M)
         self._texels_per_m = _texel_density(corners, self._uv, self._texture.levels[0].shape)
 
     def normal(self, face: Int32, weights: Array32) -> Array32:
@@ -225,6 +231,48 @@ def check_projection(number: int, placed: PlacedMesh) -> None:
             f"its material '{material.name}' has the projection 'uv'. Give the mesh uv (V, 2), or "
             "the material projection='box', which needs none."
         )
+
+
+def look_of(number: int, placed: PlacedMesh) -> tuple[Material, NDArray[np.uint8] | None]:
+    """Return the material of a placed mesh and its vertex colours (V, 3), None = they are unused.
+
+    Its own material; else the mesh's texture, its vertex colours, wood for the background, or
+    paint by its instance.
+
+    Args:
+        number: of the mesh in the scene, for messages.
+        placed: the mesh.
+
+    Raises:
+        InputError: the material needs texture coordinates and the mesh has none.
+    """
+    mesh, material = placed.mesh, placed.material
+    if material is not None:
+        check_projection(number, placed)
+        return material, None
+    rough = TABLE_ROUGHNESS if placed.instance == BACKGROUND else OBJECT_ROUGHNESS
+    white = (1.0, 1.0, 1.0)
+    if mesh.texture is not None and mesh.uv is not None:
+        own = Material(
+            base_color=white, base_color_image=mesh.texture, roughness=rough, projection="uv",
+            name="the mesh's own texture",
+        )  # fmt: skip
+        return own, None
+    if mesh.colors is not None:
+        return Material(base_color=white, roughness=rough, name="vertex colours"), mesh.colors
+    if placed.instance == BACKGROUND:
+        wood = Material(
+            base_color=white, base_color_image=wood_texture(), roughness=rough,
+            period_m=WOOD_PERIOD_M, name="light wood",
+        )  # fmt: skip
+        return wood, None
+    paint = srgb_decoded(np.array(PLAIN_COLORS[placed.instance % len(PLAIN_COLORS)]) / 255.0)
+    painted = Material(
+        base_color=(float(paint[0]), float(paint[1]), float(paint[2])),
+        base_color_image=speckle_texture(), roughness=rough,
+        period_m=SPECKLE_PERIOD_M, name="paint",
+    )  # fmt: skip
+    return painted, None
 
 
 @lru_cache(maxsize=8)

@@ -8,17 +8,14 @@ from numpy.typing import NDArray
 
 from realsim.compiled import njit
 from realsim.geometry import se3
-from realsim.rendering.appearance import LEAST_ROUGHNESS, Material
-from realsim.rendering.developing import srgb_decoded
+from realsim.geometry.colors import srgb_decoded
+from realsim.rendering.appearance import LEAST_ROUGHNESS
 from realsim.rendering.embedded.face_geometry import bent_normal, bulge_of, edges_of, plane_met
 from realsim.rendering.embedded.materials import (
-    PLAIN_COLORS,
     box_uv,
-    check_projection,
     corner_normals,
+    look_of,
     repeats,
-    speckle_texture,
-    wood_texture,
 )
 from realsim.rendering.embedded.texture_atlas import (
     MOST_PROBES,
@@ -28,16 +25,12 @@ from realsim.rendering.embedded.texture_atlas import (
     detail_at,
     footprint,
 )
-from realsim.rendering.rays import BACKGROUND, PlacedMesh
+from realsim.rendering.rays import PlacedMesh
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Int32 = NDArray[np.int32]
 Rows = NDArray[np.int64]
-OBJECT_ROUGHNESS = 0.42
-"""Of meshes without a material: satin plastic and printed cardboard."""
-TABLE_ROUGHNESS = 0.62
-"""Of background without a material: oiled wood, printed paper."""
 SAME_DIRECTION = 0.98
 """Cosine of normals (11 deg) within which a part of a pixel is what its centre is."""
 WIDEST_FOOTPRINT = 4.0
@@ -140,21 +133,25 @@ def _one_surface(
     number: int, placed: PlacedMesh, center: Array, atlas: TextureAtlas
 ) -> dict[str, Any]:
     """Return the rows of one mesh by the names of `SurfaceArrays`."""
-    mesh, material = placed.mesh, placed.material
+    mesh = placed.mesh
     world = se3.transform(placed.T_world_obj, mesh.vertices) - center
     R = placed.T_world_obj[:3, :3].astype(np.float32)
-    material, image, uv, wraps = _look(number, placed)
+    material, painted = look_of(number, placed)
+    uv, wraps = np.zeros((len(mesh.faces), 3, 2), np.float32), painted is None
+    if material.projection == "uv":
+        assert mesh.uv is not None
+        uv, wraps = mesh.uv[mesh.faces].astype(np.float32), repeats(mesh.uv)
+    elif painted is None:
+        uv = box_uv(mesh, material.period_m)
     normal, rough = atlas.add_detail(material.normal_image, material.roughness_image, wrap=wraps)
-    images = (atlas.add_color(image, wrap=wraps), rough, normal)
+    images = (atlas.add_color(material.base_color_image, wrap=wraps), rough, normal)
     base = np.array(material.base_color, np.float32)
     colors: Array32 | None = None
     mean = base * (atlas.mean_color(images[0]) if images[0] >= 0 else 1.0)
-    if placed.material is None and image is None and mesh.colors is not None:
-        linear = srgb_decoded(np.arange(256) / 255.0).astype(np.float32)[mesh.colors]
+    if painted is not None:
+        linear = srgb_decoded(np.arange(256) / 255.0).astype(np.float32)[painted]
         colors = linear[mesh.faces]
         mean = linear.mean(0)
-    if uv is None:
-        uv = np.zeros((len(mesh.faces), 3, 2), np.float32)
     return {
         "corners": world[mesh.faces].astype(np.float32),
         "normals": corner_normals(mesh) @ R.T,
@@ -166,38 +163,6 @@ def _one_surface(
         "images": images,
         "mean_color": mean,
     }
-
-
-def _look(
-    number: int, placed: PlacedMesh
-) -> tuple[Material, NDArray[np.uint8] | None, Array32 | None, bool]:
-    """Return material, base colour image, texture coordinates (F, 3, 2), whether images repeat.
-
-    A mesh without a material is satin: with its own texture or colours, as wood (background) or
-    in a paint by its instance.
-    """
-    mesh, material = placed.mesh, placed.material
-    if material is not None:
-        check_projection(number, placed)
-        if material.projection == "uv":
-            assert mesh.uv is not None
-            uv = mesh.uv[mesh.faces].astype(np.float32)
-            return material, material.base_color_image, uv, repeats(mesh.uv)
-        uv = box_uv(mesh, material.period_m)
-        return material, material.base_color_image, uv, True
-    table = placed.instance == BACKGROUND
-    rough = TABLE_ROUGHNESS if table else OBJECT_ROUGHNESS
-    white = Material(base_color=(1.0, 1.0, 1.0), roughness=rough)
-    if mesh.texture is not None and mesh.uv is not None:
-        uv = mesh.uv[mesh.faces].astype(np.float32)
-        return white, mesh.texture, uv, repeats(mesh.uv)
-    if mesh.colors is not None:
-        return white, None, None, False
-    if table:
-        return white, wood_texture(), box_uv(mesh, 0.5), True
-    r, g, b = srgb_decoded(np.array(PLAIN_COLORS[placed.instance % len(PLAIN_COLORS)]) / 255.0)
-    paint = Material(base_color=(float(r), float(g), float(b)), roughness=rough)
-    return paint, speckle_texture(), box_uv(mesh, 0.12), True
 
 
 def fill_points(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.compiled import njit
-from realsim.rendering.developing import srgb_decoded
+from realsim.geometry.colors import srgb_decoded
 
 Array32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]

@@ -7,10 +7,168 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.rendering.appearance import Environment
-from realsim.rendering.photoreal.looks import BsdfOptions, bsdf_of, look_of
-from realsim.rendering.photoreal.mesh_parts import MeshPart, mesh_parts, scene_center
-from realsim.rendering.rays import PlacedMesh
+from realsim.geometry import se3
+from realsim.geometry.colors import srgb_decoded
+from realsim.rendering.appearance import LEAST_ROUGHNESS, Environment, Material
+from realsim.rendering.embedded.materials import (
+    box_uv,
+    corner_normals,
+    look_of,
+    repeats,
+)
+from realsim.rendering.rays import GRID_M, PlacedMesh, rotated
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
+class MeshPart:
+    """Faces of one placed mesh that share a BSDF; 3 F vertices, one per corner."""
+
+    positions: Array32
+    """(3 F, 3) in world, relative to the scene's centre [m]."""
+    normals: Array32
+    """(3 F, 3) unit, world."""
+    uv: Array32 | None
+    """(3 F, 2) texture coordinates, v down; None = no image lies on it."""
+    colors: Array32 | None
+    """(3 F, 3) linear vertex colours."""
+    faces_of_mesh: NDArray[np.intp]
+    """(F,) which faces of the placed mesh these are."""
+    is_mirrored: bool
+    """Whether (u, v up, normal) is left-handed on these faces."""
+    repeats: bool
+    """Whether the images repeat beyond [0, 1]; else their border continues."""
+
+
+def scene_center(placed: tuple[PlacedMesh, ...]) -> Array:
+    """Return where the float32 coordinates have their origin (3,), the same as of `RayScene`."""
+    if not placed:
+        return np.zeros(3)
+    world = [se3.transform(p.T_world_obj, p.mesh.vertices) for p in placed]
+    low = np.min([v.min(0) for v in world], axis=0)
+    high = np.max([v.max(0) for v in world], axis=0)
+    return GRID_M * np.round((low + high) / (2 * GRID_M))
+
+
+def mesh_parts(
+    placed: PlacedMesh, material: Material, colors: NDArray[np.uint8] | None, center: Array
+) -> list[MeshPart]:
+    """Return a placed mesh as one part, or as two where a normal map meets mirrored coordinates.
+
+    Args:
+        placed: the mesh and its pose.
+        material: its look.
+        colors: (V, 3) sRGB vertex colours that are its look; None = they are not.
+        center: (3,) origin of the coordinates in world [m].
+    """
+    mesh = placed.mesh
+    world = se3.transform(placed.T_world_obj, mesh.vertices) - center
+    corners = world.astype(np.float32)[mesh.faces]
+    normals = rotated(corner_normals(mesh), placed.T_world_obj[:3, :3])
+    has_image = any(
+        image is not None
+        for image in (material.base_color_image, material.roughness_image, material.normal_image)
+    )
+    uv: Array32 | None = None
+    mirrored = np.zeros(len(mesh.faces), bool)
+    wraps = True
+    if has_image:
+        if material.projection == "uv" and mesh.uv is not None:
+            uv = mesh.uv[mesh.faces].astype(np.float32)
+            wraps = repeats(mesh.uv)
+        else:
+            uv = box_uv(mesh, material.period_m)
+        if material.normal_image is not None:
+            mirrored = _signed_area(uv) < 0
+    linear = None
+    if colors is not None:
+        decode = srgb_decoded(np.arange(256) / 255.0).astype(np.float32)
+        linear = decode[colors][mesh.faces]
+
+    parts: list[MeshPart] = []
+    for side in (False, True):
+        rows = np.flatnonzero(mirrored == side)
+        if len(rows) == 0:
+            continue
+        parts.append(
+            MeshPart(
+                positions=corners[rows].reshape(-1, 3),
+                normals=normals[rows].reshape(-1, 3),
+                uv=None if uv is None else (uv[rows] * [1, -1] + [0, 1]).reshape(-1, 2),
+                colors=None if linear is None else linear[rows].reshape(-1, 3),
+                faces_of_mesh=rows,
+                is_mirrored=side,
+                repeats=wraps,
+            )
+        )
+    return parts
+
+
+def _signed_area(uv: Array32) -> Array32:
+    """Return twice the area (F,) of the faces in the image; negative = wound clockwise."""
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], np.float32)
+
+
+UInt8 = NDArray[np.uint8]
+Bsdf = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class BsdfOptions:
+    """How a material's images lie on the part of a mesh that carries them."""
+
+    has_vertex_colors: bool = False
+    """Whether the colour comes from the mesh's attribute `vertex_color`."""
+    repeats: bool = True
+    """Whether the images repeat; else their border continues."""
+    is_mirrored: bool = False
+    """Whether v turns the other way round the normal: the normal map's v is turned too."""
+
+
+def bsdf_of(mi: Any, material: Material, options: BsdfOptions) -> Bsdf:
+    """Return a material as a Mitsuba BSDF: `principled` is the metallic-roughness model.
+
+    Args:
+        mi: the module mitsuba, set to a variant.
+        material: the look.
+        options: how its images lie.
+    """
+    wrap = "repeat" if options.repeats else "clamp"
+
+    def bitmap(values: NDArray[np.floating]) -> Bsdf:
+        return {
+            "type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(values, np.float32)),
+            "raw": True, "wrap_mode": wrap, "format": "fp16",
+        }  # fmt: skip
+
+    tint = np.array(material.base_color, np.float32)
+    if options.has_vertex_colors:
+        color: Any = {"type": "mesh_attribute", "name": "vertex_color"}
+    elif material.base_color_image is not None:
+        decode = srgb_decoded(np.arange(256) / 255.0).astype(np.float32)
+        color = bitmap(decode[material.base_color_image] * tint)
+    else:
+        color = {"type": "rgb", "value": tint.tolist()}
+    rough: Any = material.roughness
+    if material.roughness_image is not None:
+        values = material.roughness_image.astype(np.float32) * (material.roughness / 255.0)
+        rough = bitmap(np.maximum(values, LEAST_ROUGHNESS)[..., None])
+    surface: Bsdf = {
+        "type": "principled", "base_color": color, "roughness": rough,
+        "metallic": material.metallic,
+    }  # fmt: skip
+    if material.normal_image is not None:
+        # 8-bit images say 128 for "not bent", half a step off the middle.
+        normals = np.maximum((material.normal_image.astype(np.float32) - 128) / 127, -1)
+        if options.is_mirrored:
+            normals[..., 1] *= -1
+        normals = 0.5 * normals + 0.5
+        surface = {"type": "normalmap", "normalmap": bitmap(normals), "of": surface}
+    return {"type": "twosided", "of": surface}
+
 
 Array = NDArray[np.float64]
 SUN_FAR = 1000.0

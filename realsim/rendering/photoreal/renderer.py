@@ -16,10 +16,14 @@ from realsim.records import CameraIntrinsics
 from realsim.rendering.appearance import Environment
 from realsim.rendering.developing import developed
 from realsim.rendering.photo import Photo
-from realsim.rendering.photoreal.denoise import denoised, has_denoiser
 from realsim.rendering.photoreal.mitsuba_scene import mitsuba_scene
-from realsim.rendering.photoreal.pixel_samples import in_world, view_rays
-from realsim.rendering.photoreal.tracing import PathTracer
+from realsim.rendering.photoreal.tracing import (
+    PathTracer,
+    denoised,
+    has_denoiser,
+    in_world,
+    view_rays,
+)
 from realsim.rendering.photoreal.variant import Wanted, load_mitsuba
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 

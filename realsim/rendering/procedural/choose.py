@@ -8,9 +8,8 @@ import numpy as np
 from realsim.errors import InputError
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.procedural import fabrics, minerals, woods
-from realsim.rendering.procedural.light import balanced, exposed
 from realsim.rendering.procedural.rooms import room
-from realsim.rendering.procedural.skies import overcast_sky, sunny_sky
+from realsim.rendering.procedural.skies import balanced, exposed, overcast_sky, sunny_sky
 
 MAKERS: dict[str, Callable[[np.random.Generator], Material]] = {
     "oak": woods.boards("oak"),

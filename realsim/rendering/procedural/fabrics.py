@@ -5,22 +5,20 @@ import numpy as np
 from realsim.rendering.appearance import Material
 from realsim.rendering.procedural.noise import (
     Field,
+    Tint,
     blurred,
     cells,
     fine,
+    finished,
     fractal,
     grid,
-    smooth,
-    step,
-    warped,
-)
-from realsim.rendering.procedural.texels import (
-    Tint,
-    finished,
     hsv_tint,
     mixed,
     random_tint,
     shaded,
+    smooth,
+    step,
+    warped,
 )
 
 CLOTH_PX = 768

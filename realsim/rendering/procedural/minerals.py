@@ -9,15 +9,19 @@ import numpy as np
 from realsim.rendering.appearance import Material
 from realsim.rendering.procedural.noise import (
     Field,
+    Tint,
     cells,
     fine,
+    finished,
     fractal,
     grid,
+    mixed,
+    random_tint,
+    shaded,
     smooth,
     step,
     warped,
 )
-from realsim.rendering.procedural.texels import Tint, finished, mixed, random_tint, shaded
 
 LARGE_PX = 768
 PX = 512

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.geometry.colors import light_of_bytes
 from realsim.rendering.appearance import Environment
-from realsim.rendering.procedural.light import directions, planck
-from realsim.rendering.procedural.texels import srgb_to_linear
+from realsim.rendering.procedural.skies import directions, planck
 
 Array = NDArray[np.float64]
 HEIGHT = 256
@@ -57,9 +57,9 @@ def room(rng: np.random.Generator) -> Environment:
     low = np.array([-half[0], -half[1], -EYE_M]) - eye
     high = np.array([half[0], half[1], rng.uniform(2.5, 3.4) - EYE_M]) - eye
     paints = np.array(
-        [*(srgb_to_linear(WALLS[k]) for k in rng.integers(len(WALLS), size=4)),
-         srgb_to_linear(FLOORS[int(rng.integers(len(FLOORS)))]),
-         srgb_to_linear((240, 240, 238))]
+        [*(light_of_bytes(WALLS[k]) for k in rng.integers(len(WALLS), size=4)),
+         light_of_bytes(FLOORS[int(rng.integers(len(FLOORS)))]),
+         light_of_bytes((240, 240, 238))]
     )  # fmt: skip
     if rng.random() < 0.7:
         paints[:4] = paints[0]
@@ -118,7 +118,7 @@ def _furniture(rng: np.random.Generator, low: Array, high: Array) -> list[Panel]
             hangs = rng.random() < 0.35
             bottom = rng.uniform(0.0, 0.5) if hangs else low[2]
             top = bottom + rng.uniform(0.4, 0.8) if hangs else rng.uniform(-0.3, 1.0)
-            paint = srgb_to_linear(FURNITURE[int(rng.integers(len(FURNITURE)))])
+            paint = light_of_bytes(FURNITURE[int(rng.integers(len(FURNITURE)))])
             corner = np.array([start + wide, min(top, high[2])])
             out.append(Panel(face=face, low=np.array([start, bottom]), high=corner, paint=paint))
     return out

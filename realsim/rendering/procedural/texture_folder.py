@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.geometry.colors import light_of_bytes, srgb_encoded
 from realsim.rendering.appearance import LEAST_ROUGHNESS, Material
-from realsim.rendering.procedural.picture_files import HDR, PICTURES, read_picture
-from realsim.rendering.procedural.texels import srgb_to_linear
+from realsim.rendering.procedural.hdri import HDR, PICTURES, read_picture
 
 Image = NDArray[np.uint8]
 LARGEST_PX = 2048
@@ -235,7 +235,7 @@ def _rgb8(image: NDArray[Any], linear: bool = False) -> Image:
     if image.dtype.kind == "f":
         value = np.clip(np.nan_to_num(image.astype(np.float64)), 0, 1)
         if not linear:
-            value = np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+            value = srgb_encoded(value)
         return np.round(255 * value).astype(np.uint8)
     return np.round(image.astype(np.float64) * (255.0 / np.iinfo(image.dtype).max)).astype(np.uint8)
 
@@ -267,5 +267,5 @@ def linear_mean(material: Material) -> NDArray[np.float64]:
     if material.base_color_image is None:
         return factor
     values = np.arange(256)
-    decode = srgb_to_linear(values)
+    decode = light_of_bytes(values)
     return factor * decode[material.base_color_image].mean(axis=(0, 1))

@@ -11,8 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.rendering.appearance import Material
-from realsim.rendering.procedural.noise import Field, blurred, fine, fractal, grid, smooth, step
-from realsim.rendering.procedural.texels import Tint, finished, mixed, random_tint, shaded
+from realsim.rendering.procedural.noise import (
+    Field,
+    Tint,
+    blurred,
+    fine,
+    finished,
+    fractal,
+    grid,
+    mixed,
+    random_tint,
+    shaded,
+    smooth,
+    step,
+)
 
 Boards = NDArray[np.int64]
 WOOD_PX = 1024

@@ -18,12 +18,11 @@ from realsim.rendering.casting.pixel_caster import FirstHits, PixelCaster
 from realsim.rendering.depth_sensors.noise import correlated
 from realsim.rendering.depth_sensors.profiles import DepthProfile
 from realsim.rendering.rays import PlacedMesh
-from realsim.rendering.stereo.between_eyes import depth_between
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.eyes import Projector, exposed, no_projector, radiance
 from realsim.rendering.stereo.light import room_light
 from realsim.rendering.stereo.matcher import matched
-from realsim.rendering.stereo.pattern import dot_pattern, even_field
+from realsim.rendering.stereo.projector import depth_between, dot_pattern, even_field
 from realsim.rendering.stereo.rectified import on_raw_grid, rectified_pinhole
 from realsim.rendering.stereo.stripes import decoded
 from realsim.rendering.stereo.surfaces import packed_surfaces

@@ -10,7 +10,7 @@ stripes `least_signal` and `least_modulation`.
 from dataclasses import dataclass
 
 from realsim.errors import InputError
-from realsim.rendering.depth_sensors.sensor_file import SensorRecord
+from realsim.rendering.depth_sensors.profiles import SensorRecord
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -15,8 +15,7 @@ from realsim.compiled import njit
 from realsim.rendering.stereo.config import StereoConfig
 from realsim.rendering.stereo.light import RoomLight
 from realsim.rendering.stereo.shading import shade
-from realsim.rendering.stereo.solid_noise import block_axes, packed_noise
-from realsim.rendering.stereo.surfaces import SurfaceTables
+from realsim.rendering.stereo.surfaces import SurfaceTables, block_axes, packed_noise
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]

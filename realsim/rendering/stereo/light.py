@@ -11,12 +11,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.geometry.colors import LUMINANCE
 from realsim.rendering.appearance import Environment
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Rec. 709 brightness of linear RGB."""
 MAP_SIDE = 64
 """Edge of the octahedral maps [texels]: 3 deg each, finer than what a roughness of 0.1 keeps."""
 ROUGH_ROWS = 32

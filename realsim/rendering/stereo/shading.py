@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from realsim.compiled import njit
 from realsim.rendering.stereo.light import MAP_ROUGHNESS
-from realsim.rendering.stereo.pattern import HALF_HEIGHT, HALF_WIDTH, TEXEL_RAD
-from realsim.rendering.stereo.solid_noise import FINEST_CELL_M, FIRST_OCTAVE, NOISE_STEPS
-from realsim.rendering.stereo.surfaces import LEVELS
+from realsim.rendering.stereo.projector import HALF_HEIGHT, HALF_WIDTH, TEXEL_RAD
+from realsim.rendering.stereo.surfaces import FINEST_CELL_M, FIRST_OCTAVE, LEVELS, NOISE_STEPS
 
 Array32 = NDArray[np.float32]
 Scalar = float | np.float32

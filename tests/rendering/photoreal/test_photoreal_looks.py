@@ -5,9 +5,9 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.colors import srgb_decoded
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
-from realsim.rendering.developing import srgb_decoded
 from realsim.rendering.embedded.materials import PLAIN_COLORS
 from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer, find_llvm
 from realsim.rendering.rays import PlacedMesh

@@ -14,7 +14,7 @@ from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment
 from realsim.rendering.photoreal import PhotorealConfig, PhotorealRenderer, find_llvm, llvm_probe
-from realsim.rendering.photoreal.denoise import denoised
+from realsim.rendering.photoreal.tracing import denoised
 from realsim.rendering.rays import PlacedMesh
 
 SEARCH = find_llvm()

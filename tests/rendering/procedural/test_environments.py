@@ -5,10 +5,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from realsim.geometry.colors import luminance
 from realsim.rendering.appearance import Environment
-from realsim.rendering.procedural import light, rooms, skies
+from realsim.rendering.procedural import rooms, skies
 from realsim.rendering.procedural.choose import random_environment
-from realsim.rendering.procedural.texels import luminance
 
 SEEDS = range(16)
 
@@ -21,7 +21,7 @@ def drawn() -> list[Environment]:
 def test_a_grey_card_lying_flat_comes_out_mid_grey(drawn: list[Environment]) -> None:
     for e in drawn:
         # Counted here by brute force, over all texels.
-        view, size = light.directions(e.panorama.shape[0]), light.solid_angles(e.panorama.shape[0])
+        view, size = skies.directions(e.panorama.shape[0]), skies.solid_angles(e.panorama.shape[0])
         up = np.maximum(view[..., 2], 0) * size[:, None]
         sky = np.einsum("hw,hwc->c", up, e.panorama.astype(float)) / np.pi
         toward = np.array(e.sun_direction) / np.linalg.norm(e.sun_direction)
@@ -60,15 +60,15 @@ def test_there_are_skies_with_suns_and_rooms(drawn: list[Environment]) -> None:
 
 
 def test_solid_angles_make_the_sphere_and_a_white_sky_lights_a_card_white() -> None:
-    assert 2 * 64 * light.solid_angles(64).sum() == pytest.approx(4 * np.pi)
+    assert 2 * 64 * skies.solid_angles(64).sum() == pytest.approx(4 * np.pi)
     white = np.ones((64, 128, 3))
-    np.testing.assert_allclose(light.card_light(white, (0, 0, 0), (0, 0, 1)), 1.0, rtol=1e-12)
-    half = light.card_light(np.zeros((4, 8, 3)), (2.0, 2.0, 2.0), (1.0, 0.0, 1.0))
+    np.testing.assert_allclose(skies.card_light(white, (0, 0, 0), (0, 0, 1)), 1.0, rtol=1e-12)
+    half = skies.card_light(np.zeros((4, 8, 3)), (2.0, 2.0, 2.0), (1.0, 0.0, 1.0))
     np.testing.assert_allclose(half, np.sqrt(2.0))
 
 
 def test_directions_are_those_of_the_record() -> None:
-    view = light.directions(180)
+    view = skies.directions(180)
     np.testing.assert_allclose(np.linalg.norm(view, axis=-1), 1.0)
     np.testing.assert_allclose(view[0, :, 2], 1.0, atol=1e-3)
     np.testing.assert_allclose(view[90, 0], [1, 0, 0], atol=0.02)
@@ -115,10 +115,10 @@ def test_an_overcast_sky_is_three_times_brighter_overhead() -> None:
 
 
 def test_black_bodies_go_from_orange_to_blue() -> None:
-    ratio = [light.planck(k)[0] / light.planck(k)[2] for k in (2000, 2700, 4000, 6500, 10000)]
+    ratio = [skies.planck(k)[0] / skies.planck(k)[2] for k in (2000, 2700, 4000, 6500, 10000)]
     assert all(a > b for a, b in pairwise(ratio))
-    np.testing.assert_allclose(light.planck(6504), 1.0, atol=0.06)  # near D65, which is white
-    assert float(luminance(light.planck(2700))) == pytest.approx(1.0)
+    np.testing.assert_allclose(skies.planck(6504), 1.0, atol=0.06)  # near D65, which is white
+    assert float(luminance(skies.planck(2700))) == pytest.approx(1.0)
 
 
 def test_lamps_light_a_card_as_much_as_their_form_factor_says() -> None:

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
+from realsim.geometry.colors import luminance
 from realsim.rendering.procedural.hdri import read_environment, split_sun
-from realsim.rendering.procedural.light import card_light, directions, solid_angles
-from realsim.rendering.procedural.skies import sunny_sky
-from realsim.rendering.procedural.texels import luminance
+from realsim.rendering.procedural.skies import card_light, directions, solid_angles, sunny_sky
 
 
 def write_hdr(path: Path, rgb: np.ndarray) -> Path:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from realsim.errors import InputError
+from realsim.geometry.colors import light_of_bytes, luminance
 from realsim.rendering.appearance import Material
 from realsim.rendering.procedural import noise
 from realsim.rendering.procedural.choose import (
@@ -20,7 +21,7 @@ from realsim.rendering.procedural.choose import (
     random_material,
     table_material,
 )
-from realsim.rendering.procedural.texels import luminance, normals8, srgb_to_linear
+from realsim.rendering.procedural.noise import normals8
 
 
 @lru_cache(maxsize=128)
@@ -82,7 +83,7 @@ def test_reflectances_are_those_of_real_things(kind: str) -> None:
         side = m.base_color_image.shape[0]
         assert m.base_color_image.shape == (side, side, 3)
         assert 256 <= side <= 1024
-        mean = float(luminance(srgb_to_linear(m.base_color_image)).mean())
+        mean = float(luminance(light_of_bytes(m.base_color_image)).mean())
         # Between charcoal and fresh snow.
         assert 0.008 < mean < 0.9
         assert 0.01 <= m.period_m <= 1.0

@@ -11,6 +11,7 @@ import pytest
 from grey_planes import grey_plane
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
+from realsim.rendering.depth_sensors.fit_pictures import stereo_fit_picture
 from realsim.rendering.depth_sensors.profiles import profile
 from realsim.rendering.stereo import (
     FittedStereo,
@@ -18,7 +19,6 @@ from realsim.rendering.stereo import (
     StereoConfig,
     fit_stereo,
 )
-from realsim.rendering.stereo.fit_picture import stereo_fit_picture
 
 CAMERA = CameraIntrinsics(width=420, height=280, fx=640, fy=640, cx=209.5, cy=139.5)
 
