@@ -1,18 +1,31 @@
-"""What must hold before a session's folder is gone on with."""
+"""What must hold before a session's folder is gone on with, and what it was begun with.
+
+`session.begun.json`: arm, camera, lab and plan of a session stand in session.json, which is written
+anew with every calibration. This copy is written once, has a checksum of its own, and is what a
+repair takes them from where session.json is damaged.
+"""
 
 import contextlib
+import hashlib
+import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from realsim.errors import InputError
 from realsim.store import atomic
-from realsim.store.begun import BEGUN_FILE, RECOVERED, begun_bytes
 from realsim.store.header import SESSION_FILE, repair_command
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import Entry, Fault, Manifest, entry_of, size_fault_of
 
 CAMERA_FILE, ROBOT_FILE = "scene_camera.json", "robot.jsonl"
+BEGUN_FILE = "session.begun.json"
+CHECK = "sha256"
+"""Key of the checksum: of the file's JSON without this key."""
+RECOVERED = "recovered"
+"""Key of `extra` in a header that was made anew without knowing all that it was begun with."""
+CHANGING = ("T_world_cam",)
+"""Keys of a header that do not belong to its beginning."""
 
 
 def require_free(folder: Path) -> None:
@@ -67,6 +80,26 @@ def require_session(folder: Path) -> None:
             f"which of them are sound is not known. {repair_command(folder)} looks at every "
             "image, takes out what is broken, and lists the rest anew."
         )
+
+
+def begun_bytes(header: dict[str, Any]) -> bytes:
+    """Return the file for the header of a session."""
+    begun = {key: value for key, value in header.items() if key not in CHANGING}
+    return atomic.json_bytes(begun | {CHECK: _check_of(begun)})
+
+
+def read_begun(folder: Path) -> dict[str, Any] | None:
+    """Return the header that the session was begun with; None if it is lost or damaged."""
+    try:
+        begun: dict[str, Any] = json.loads((folder / BEGUN_FILE).read_text(encoding="utf-8"))
+        check = begun.pop(CHECK)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return begun if check == _check_of(begun) else None
+
+
+def _check_of(begun: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(begun, sort_keys=True).encode()).hexdigest()
 
 
 def keep_beginning(folder: Path, header: dict[str, Any], manifest: Manifest) -> None:

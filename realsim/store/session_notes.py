@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from realsim.store import atomic
-from realsim.store.begun import BEGUN_FILE
 from realsim.store.check_report import Finding, Lists
 from realsim.store.header import SESSION_FILE
 from realsim.store.manifest import NAME as MANIFEST_FILE
-from realsim.store.opening import CAMERA_FILE, ROBOT_FILE
+from realsim.store.opening import BEGUN_FILE, CAMERA_FILE, ROBOT_FILE
 
 PLAN_FILE = "plan.json"
 LOG_FILE = "capture_log.jsonl"

@@ -14,11 +14,10 @@ from realsim import images
 from realsim.errors import InputError, RealsimError
 from realsim.records import CaptureSession, bop_units
 from realsim.store import atomic
-from realsim.store.begun import BEGUN_FILE, RECOVERED, read_begun
 from realsim.store.header import SESSION_FILE, checked_header, new_header
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import Manifest, entry_from, entry_of
-from realsim.store.opening import CAMERA_FILE, ROBOT_FILE
+from realsim.store.opening import BEGUN_FILE, CAMERA_FILE, RECOVERED, ROBOT_FILE, read_begun
 from realsim.store.robot_lines import CHECK, record_of
 from realsim.store.session_check import (
     DAMAGED,

@@ -30,12 +30,13 @@ from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, CaptureSession, View, bop_units
 from realsim.store import atomic
 from realsim.store.atomic import storing
-from realsim.store.begun import BEGUN_FILE, begun_bytes
 from realsim.store.header import SESSION_FILE, header_to_open, new_header
 from realsim.store.manifest import Fault, Manifest, entry_of
 from realsim.store.opening import (
+    BEGUN_FILE,
     CAMERA_FILE,
     ROBOT_FILE,
+    begun_bytes,
     keep_beginning,
     require_free,
     require_session,

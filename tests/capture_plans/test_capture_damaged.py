@@ -9,7 +9,7 @@ import pytest
 from realsim.errors import InputError
 from realsim.records import CaptureSession
 from realsim.store import SessionStore
-from realsim.store.begun import BEGUN_FILE
+from realsim.store.opening import BEGUN_FILE
 from realsim.store.session_repair import repair_session
 from realsim_capture_plans.capturing.capture import CaptureConfig, CaptureJob, capture
 from realsim_capture_plans.capturing.look import SettleConfig

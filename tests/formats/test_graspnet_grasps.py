@@ -360,24 +360,3 @@ def test_a_header_that_claims_more_than_there_is_is_refused(tmp_path):
             new.writestr(name, header.getvalue() if name == "points.npy" else old.read(name))
     with pytest.raises(InputError, match="claims the shape"):
         read_grasp_labels(tmp_path / "n.npz")
-
-
-@given(st.data())
-@settings(max_examples=120, deadline=None)
-def test_damaged_files_are_refused_or_read(tmp_path_factory, data):
-    folder = tmp_path_factory.getbasetemp()
-    whole = folder / "whole.npz"
-    if not whole.exists():
-        write_grasp_labels(whole, some_labels(points=2, n=40))
-    content = bytearray(whole.read_bytes())
-    if data.draw(st.booleans()):
-        content = content[: data.draw(st.integers(0, len(content) - 1))]
-    for _ in range(data.draw(st.integers(1, 4))):
-        if content:
-            where = data.draw(st.integers(0, len(content) - 1))
-            content[where] = data.draw(st.integers(0, 255))
-    (folder / "damaged.npz").write_bytes(bytes(content))
-    try:
-        read_grasp_labels(folder / "damaged.npz", with_collision=True)
-    except InputError:
-        pass

@@ -141,8 +141,8 @@ def _check_stored(store: "SessionStore") -> None:
         InputError: an image is gone or of another size, or session.json was made anew without
             knowing arm, camera and lab.
     """
-    from realsim.store.begun import RECOVERED
     from realsim.store.header import SESSION_FILE, repair_command
+    from realsim.store.opening import RECOVERED
 
     if faults := store.stored_faults():
         named = "; ".join(f"{f.path}: {f.found}" for f in faults[:SHOWN])
