@@ -1,6 +1,11 @@
 """Camera and hand-eye calibration: targets, lens, hand-eye, robot errors, depth bias, reports."""
 
-from realsim_calibration.calibrate import Calibration, CalibrationConfig, calibrate
+from realsim_calibration.calibrate import (
+    Calibration,
+    CalibrationConfig,
+    calibrate,
+    calibrate_from_poses,
+)
 from realsim_calibration.depth.bias import estimate_depth_bias
 from realsim_calibration.depth.board import DepthBoardView
 from realsim_calibration.detect.find import FindConfig, find_target
@@ -16,7 +21,6 @@ from realsim_calibration.fit.closed_forms import (
     shah,
 )
 from realsim_calibration.fit.joint_solve import JointConfig
-from realsim_calibration.from_poses import calibrate_from_poses
 from realsim_calibration.hand_eye import (
     HandEyeConfig,
     calibrate_hand_eye,

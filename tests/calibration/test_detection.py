@@ -4,7 +4,7 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, TagBoard
-from realsim_calibration.detect.edges import EdgeConfig, bilinear, fit_lines
+from realsim_calibration.detect.edges import bilinear
 from realsim_calibration.detect.tags import DetectionConfig, TagDetections, detect_tags
 
 BOARD = TagBoard(rows=2, columns=3, tag_size_m=0.032, gap_m=0.008)
@@ -93,16 +93,3 @@ def test_sampling_is_exact_on_a_ramp_at_integer_pixel_centres():
     y, x = np.mgrid[0:20, 0:30].astype(float)
     where = np.random.default_rng(0).uniform(0, 18, size=(50, 2))
     assert np.allclose(bilinear(3 * x - 2 * y, where), 3 * where[:, 0] - 2 * where[:, 1])
-
-
-def test_line_fit_ignores_outliers_and_does_not_care_for_direction():
-    rng = np.random.default_rng(0)
-    s = np.linspace(0, 50, 28)
-    for angle in np.linspace(0, np.pi, 7):
-        u = np.array([np.cos(angle), np.sin(angle)])
-        n = np.array([-u[1], u[0]])
-        p = s[:, None] * u + rng.normal(scale=0.03, size=28)[:, None] * n
-        p[[3, 9, 20]] += 1.5 * n
-        center, normal, weight, rms = fit_lines(p, np.ones(28, bool), EdgeConfig())
-        assert abs(center @ n) < 0.03 and abs(normal @ u) < 2e-3
-        assert weight[[3, 9, 20]].sum() == 0 and rms < 0.05

@@ -9,8 +9,7 @@ from realsim_calibration.detect.homography import (
     fit_homography,
     seen_from_front,
 )
-from realsim_calibration.detect.lattice import grow_lattices, lay_pattern
-from realsim_calibration.detect.saddles import grid_arms, refine_saddles
+from realsim_calibration.detect.saddles import refine_saddles
 
 K = np.array([[600.0, 0, 319.5], [0, 600.0, 239.5], [0, 0, 1]])
 MIDDLE = np.array([0.07, 0.05, 0.0])
@@ -56,12 +55,6 @@ def test_a_saddle_is_exact_without_noise_and_needs_the_right_colours():
     )
 
 
-def test_arms_of_a_grid_point_to_its_neighbours():
-    grid = np.stack(np.meshgrid(np.arange(4.0), np.arange(3.0)), -1)
-    arms = grid_arms(grid)
-    assert np.allclose(arms, [[1, 0], [0, 1], [-1, 0], [0, -1]])
-
-
 def test_homography_round_trip_and_handedness():
     rng = np.random.default_rng(0)
     board = 0.02 * np.stack(np.meshgrid(np.arange(7.0), np.arange(6.0)), -1).reshape(-1, 2)
@@ -71,38 +64,3 @@ def test_homography_round_trip_and_handedness():
         assert np.allclose(H / H[2, 2], expected / expected[2, 2], atol=1e-6)
         assert seen_from_front(H, board)
         assert not seen_from_front(np.diag([-1.0, 1.0, 1.0]) @ H, board)
-
-
-def test_a_lattice_grows_among_specks_and_takes_the_pattern_in_any_basis():
-    rng = np.random.default_rng(3)
-    r, c = np.divmod(np.arange(42), 7)
-    pattern = np.stack([c, r], -1)
-    nodes = pattern @ np.array([[21.0, 9.0], [-4.0, 12.0]]) + [200, 150]
-    specks = rng.uniform(0, 130, size=(60, 2))
-    points = np.concatenate([specks, nodes])[rng.permutation(102)]
-    lattice = grow_lattices(points)[0]
-    assert len(lattice) == 42
-    laid = lay_pattern(lattice, pattern, [])
-    ways = {tuple(np.rint(points[one.points[0]]).astype(int)) for one in laid}
-    assert laid[0].seen == 42 and len(laid) == 2  # a rectangle looks the same turned by 180 deg
-    assert ways == {tuple(np.rint(nodes[k]).astype(int)) for k in (0, 41)}
-    for one in laid:
-        a, b = (
-            points[one.points[1]] - points[one.points[0]],
-            points[one.points[7]] - points[one.points[0]],
-        )
-        assert a[0] * b[1] - a[1] * b[0] > 0
-    assert lay_pattern(lattice, np.stack([c, r + c % 2], -1), [])[0].seen < 42
-
-
-def test_a_lattice_of_large_points_is_found_beside_a_larger_one_of_letters():
-    """A printed sheet: lines of letters at nearly even places below the dots."""
-    rng = np.random.default_rng(4)
-    r, c = np.divmod(np.arange(44), 4)
-    dots = np.stack([2 * c + r % 2, r], -1) * 25.0 + [40, 40]
-    line, place = np.divmod(np.arange(200), 50)
-    letters = np.stack([6.0 * place, 360 + 14.0 * line], -1) + rng.uniform(-1.5, 1.5, (200, 2))
-    points, sizes = np.concatenate([dots, letters]), np.repeat([100.0, 9.0], [44, 200])
-    lattices = grow_lattices(points, sizes)
-    assert len(lattices[0]) > 44 and min(lattices[0].values()) >= 44
-    assert any(sorted(one.values()) == list(range(44)) for one in lattices)

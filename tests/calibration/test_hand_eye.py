@@ -36,6 +36,7 @@ def test_perfect_data_gives_the_truth(simulate):
     assert h.held_out_px < 0.01
 
 
+@pytest.mark.slow
 def test_truth_lies_within_the_claimed_sigma(simulate):
     nees, errors, outside = [], [], 0
     for seed in range(10):
@@ -59,12 +60,6 @@ def test_a_measured_board_and_a_trusted_camera_halve_the_error(simulate):
     config = HandEyeConfig(joint=JointConfig(scale_sd=0.0, robot_ratio=3.0))
     errors = [error_of(calibrate(sim, config=config), sim) for sim in map(simulate, range(5))]
     assert np.sqrt(np.mean(np.sum(np.square(errors)[:, 3:], -1))) < 0.35e-3
-
-
-def test_more_robot_noise_claims_more(simulate):
-    quiet, loud = (calibrate(simulate(1, robot=(r, r))) for r in (0.1e-3, 1e-3))
-    assert 4 < loud.sigma_mm / quiet.sigma_mm < 25
-    assert loud.held_out_px > 4 * quiet.held_out_px
 
 
 def test_order_of_views_does_not_matter(simulate):
@@ -216,6 +211,7 @@ def test_board_pose_keeps_the_twin_apart(simulate):
         assert 0.03 < pose.rms_px < 0.12 and pose.twin_rms_px > pose.rms_px
 
 
+@pytest.mark.slow
 def test_from_rendered_images_to_the_hand_eye(simulate, render):
     sim = simulate(11, views=10)
     sim.intrinsics = replace(

@@ -27,8 +27,13 @@ from realsim_calibration.planning.next_view import (
     predicted_boards,
     rank_next_views,
 )
-from realsim_calibration.planning.view_needs import roll_range_deg, second_turn_deg
-from realsim_calibration.planning.view_proposals import ViewLimits, describe_move, propose_views
+from realsim_calibration.planning.view_proposals import (
+    ViewLimits,
+    describe_move,
+    propose_views,
+    roll_range_deg,
+    second_turn_deg,
+)
 from realsim_calibration.results import BoardShape, HandEyeReport, ViewReport
 from realsim_calibration.views import BoardView, TargetDetection
 
@@ -348,6 +353,7 @@ def test_second_turn_sees_a_single_axis() -> None:
 # ---- statistics
 
 
+@pytest.mark.slow
 def test_greedy_beats_random_in_expected_and_actual_error() -> None:
     """Four captured views without roll, four more out of 24: greedy against random subsets."""
     rng = np.random.default_rng(7)

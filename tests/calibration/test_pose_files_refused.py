@@ -38,14 +38,12 @@ ROW = "0.5 -0.1 0.4 1.1 2.8 -0.1\n"
     ("name", "content", "says"),
     [
         ("a.txt", "", "is empty"),
-        ("a.txt", "# nothing\n", "no line of numbers"),
         ("a.txt", ROW + "0.5 -0.1 0.4 1.1 2.8\n" + ROW, "line 2: 5 fields.*line 1 has 6"),
         ("a.txt", ROW + ROW + "0.5 -0.1 oops 1.1 2.8 -0.1\n", "line 3: field 3 is 'oops'"),
         ("a.txt", "0.5 -0.1 0.4\n" * 3, "3 numbers a pose"),
         ("a.txt", "0.5 -0.1 0.4 1.1 2.8 -0.1 9\n" * 3, "no pose format fits its 7 numbers"),
         ("a.txt", "nan nan nan nan nan nan\n" * 3, "all 3 poses hold NaN"),
         ("a.csv", "0.5,-0.1,,1.1,2.8,-0.1\n", "line 1: field 3 is empty"),
-        ("a.csv", "x,y,z,rx,ry,rz\n1,2,3,4,5\n", "line 2: 5 fields.*the header has 6"),
         ("a.csv", "x,y,z,foo,bar\n1,2,3,4,5\n", "complete rotation is missing"),
         ("a.csv", "x,x,y,z,qx,qy,qz,qw\n1,1,2,3,0,0,0,1\n", "two columns mean x"),
         ("a.csv", "x_mm,y_m,z_mm,rx,ry,rz\n1,2,3,4,5,6\n", "state the units"),
@@ -54,11 +52,8 @@ ROW = "0.5 -0.1 0.4 1.1 2.8 -0.1\n"
         ("a.json", "[[1, 2, 3", "line 1 column"),
         ("a.json", '{"a.png": [1,2,3,4,5,6],\n "a.png": [1,2,3,4,5,6]}', "'a.png' is there twice"),
         ("a.json", "[[1,2,3,4,5,6],[1,2,3]]", r"entry 1: an array of shape \(3,\)"),
-        ("a.json", '[{"x":1,"y":2,"z":3}]', "entry 0: no pose under the keys x, y, z"),
         ("a.json", '{"a":[[1,2,3,4,5,6]],"b":[[1,2,3,4,5,6]]}', r"2 lists of poses \(a, b\)"),
         ("a.json", '{"poses":[[1,2,3,4,5,6]],"images":["a","b"]}', "'images' holds 2 entries"),
-        ("a.json", "[true, 1, 2, 3, 4, 5]", "entry 0: 'True' is no pose"),
-        ("a.json", "3", "no poses"),
         ("a.yaml", "poses: [1, 2\n  b: }", "not valid YAML.*line 2"),
         ("a.yaml", "a: !!python/object/apply:os.system ['true']\n", "has the tag"),
         (
@@ -68,7 +63,6 @@ ROW = "0.5 -0.1 0.4 1.1 2.8 -0.1\n"
         ),
         ("a.xml", "<a/>", "not .xml"),
         ("a.npy", "no array", "not a readable npy"),
-        ("a.npz", "no archive", "not a readable npz"),
     ],
 )
 def test_malformed_files_are_refused_by_place(tmp_path, name, content, says):

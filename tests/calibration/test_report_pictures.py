@@ -170,6 +170,7 @@ def test_lens_field_undoes_the_lens() -> None:
     assert np.abs(none).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_labels_do_not_overlap(report: HandEyeReport) -> None:
     """Texts of the drawings that people read first keep clear of one another."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -262,22 +262,6 @@ def test_charuco_pictures_are_opencvs_own(line: str) -> None:
     assert np.array_equal(picture, reference)
 
 
-@pytest.mark.parametrize("line", SHEETS)
-def test_the_picture_and_the_outlines_have_the_same_area(line: str) -> None:
-    target = parse_target(line)
-    picture, _ = target_image(target, 3000.0, 0.003)
-    artwork = artwork_of(target)
-    area = float(np.pi * np.sum(artwork.dots[:, 2] ** 2))
-    for loop in outlines(artwork):
-        x, y = loop.T
-        area += 0.5 * float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y))
-        # Corners only: every second side is along x, every other along y.
-        sides = np.roll(loop, -1, axis=0) - loop
-        assert np.all(np.count_nonzero(np.abs(sides) > 1e-12, axis=1) == 1)
-        assert np.all((np.abs(sides[:, 0]) > 1e-12) != (np.abs(np.roll(sides[:, 0], 1)) > 1e-12))
-    assert np.sum(1 - picture / 255.0) / 3000.0**2 == pytest.approx(area, rel=2e-4)
-
-
 @given(
     cells=st.integers(1, 6).flatmap(
         lambda w: st.lists(st.lists(st.booleans(), min_size=w, max_size=w), min_size=1, max_size=6)
@@ -338,17 +322,6 @@ def test_a_dot_has_its_centre_and_its_area() -> None:
         assert mean == pytest.approx(centre, abs=2e-3)
         width = first if k == 0 else usual
         assert own.sum() == pytest.approx(np.pi / 4 * (width * per_m) ** 2, rel=1e-3)
-
-
-def test_whole_pixels_make_black_and_white_only() -> None:
-    board = TagBoard(rows=2, columns=3, tag_size_m=0.04, gap_m=0.01, first_id=11)
-    picture, origin = target_image(board, 8 * 10 / 0.04, 0.01)
-    assert set(np.unique(picture)) == {0, 255}
-    assert origin == pytest.approx((19.5, 19.5))
-    tag = aruco.generateImageMarker(
-        aruco.getPredefinedDictionary(aruco.DICT_APRILTAG_36h11), 15, 80
-    )
-    assert np.array_equal(picture[120:200, 120:200], tag)
 
 
 @pytest.mark.parametrize(("per_m", "margin"), [(0.0, 0.0), (-1.0, 0.1), (1000.0, -0.1),

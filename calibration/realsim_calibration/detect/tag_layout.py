@@ -1,17 +1,33 @@
-"""Do decoded tags lie where the board has them? One map of the plane must explain them all."""
+"""Tags against the board: which of them lie where it has them, and what it says of missed ones."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.records import TagBoard
-from realsim_calibration.detect.homography import fit_trimmed, seen_from_front
+from realsim_calibration.detect.edges import bilinear
+from realsim_calibration.detect.homography import (
+    apply_homography,
+    fit_homography,
+    fit_trimmed,
+    seen_from_front,
+)
+from realsim_calibration.detect.markers import FAMILY_DICTIONARY, predefined_dictionary
 
 Array = NDArray[np.float64]
 MIN_SHARE = 0.7
 """Least share of the tags that must agree: fewer, and the board file does not fit the picture. With
 rows counted from the wrong end a skewed map can explain half of them."""
+NEAR_TAGS = 4
+"""Known tags that tell where a neighbour is; few, so that the lens does not bend the map."""
+WRONG_SHARE = 0.1
+"""Share of a code's cells, border included, that may read wrong: 6 of 64."""
+WRONG_BORDER = 1
+"""Cells of the outermost ring that may read white: more, and a side is covered."""
+MIN_STEP = 20.0
+"""Least difference between the white and the black cells [gray levels of 255]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -81,3 +97,73 @@ def _remedy(
             if good.sum() >= least:
                 return f"; {how} they would"
     return ". Are rows, columns, first id, tag size and gap right?"
+
+
+# --- tags that the general search missed ---------------------------------------------------------
+#
+# Strong blur, and black squares that touch the corners, keep the search from closing an outline.
+# Once two tags are known the others' places follow; their codes are read there and compared.
+
+
+def read_missing_tags(
+    gray: NDArray[np.uint8],
+    board: TagBoard,
+    seen: tuple[NDArray[np.int64], Array],
+    missing: NDArray[np.int64],
+    code: tuple[int, int],
+) -> tuple[NDArray[np.int64], Array]:
+    """Return ids (n,) and rough corners (n, 4, 2) of tags that are where the board has them.
+
+    Args:
+        gray: (H, W) image.
+        board: the board.
+        seen: ids (m,) of two or more tags and their corners (m, 4, 2) in the board's order [px].
+        missing: ids to look for.
+        code: width of the black border in modules, and quarter turns of the codes on the page.
+    """
+    (ids, corners), (border, roll) = seen, code
+    row_of = {int(tag): row for row, tag in enumerate(board.ids)}
+    known = board.corners_board[[row_of[int(i)] for i in ids]][..., :2]
+    limit = np.array([gray.shape[1] - 1, gray.shape[0] - 1])
+    image = gray.astype(np.float64)
+    new_ids: list[int] = []
+    new: list[Array] = []
+    for tag in missing:
+        square = board.corners_board[row_of[int(tag)]][:, :2]
+        apart = np.linalg.norm(known.mean(1) - square.mean(0), axis=-1)
+        near = np.argsort(apart)[:NEAR_TAGS]
+        H = fit_homography(known[near].reshape(-1, 2), corners[near].reshape(-1, 2))
+        quad = apply_homography(H, square)
+        if not (np.all(quad > 0) and np.all(quad < limit)):
+            continue
+        # One code for the page: rolled corners put its own top left first.
+        if _reads(image, np.roll(quad, -roll, axis=0), _code(board.family, int(tag), border)):
+            new_ids.append(int(tag))
+            new.append(quad)
+    return np.array(new_ids, np.int64), np.array(new).reshape(-1, 4, 2)
+
+
+@lru_cache(maxsize=1024)
+def _code(family: str, tag: int, border: int) -> NDArray[np.bool_]:
+    """Return the white cells (cells, cells) of a tag, its black border included."""
+    from cv2 import aruco
+
+    dictionary = predefined_dictionary(FAMILY_DICTIONARY[family])
+    cells = int(dictionary.markerSize) + 2 * border
+    drawn = aruco.generateImageMarker(dictionary, tag, cells, borderBits=border)
+    return np.asarray(drawn) > 127
+
+
+def _reads(image: Array, corners: Array, white: NDArray[np.bool_]) -> bool:
+    """Return whether the cells within corners (4, 2) read as they should."""
+    n = len(white)
+    unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float64)
+    middle = (np.arange(n) + 0.5) / n
+    at = np.stack(np.meshgrid(middle, middle), -1)
+    level = bilinear(image, apply_homography(fit_homography(unit, corners), at))
+    low, high = np.median(level[~white]), np.median(level[white])
+    if high - low < MIN_STEP:
+        return False
+    wrong = (level > (low + high) / 2) != white
+    ring = wrong.sum() - wrong[1:-1, 1:-1].sum()
+    return bool(wrong.mean() <= WRONG_SHARE and ring <= WRONG_BORDER)

@@ -15,7 +15,6 @@ from realsim.errors import InputError
 from realsim.records import CameraIntrinsics, TagBoard
 from realsim.records.targets import TAG_CELLS
 from realsim_calibration.detect.edges import EdgeConfig, RefinedQuads, refine_quads
-from realsim_calibration.detect.guided_tags import read_missing_tags
 from realsim_calibration.detect.images import gray_image
 from realsim_calibration.detect.markers import (
     FAMILY_DICTIONARY,
@@ -23,7 +22,7 @@ from realsim_calibration.detect.markers import (
     decode_markers,
     several_boards,
 )
-from realsim_calibration.detect.tag_layout import check_layout
+from realsim_calibration.detect.tag_layout import check_layout, read_missing_tags
 
 Array = NDArray[np.float64]
 WEAK_FAMILIES = ("tag16h5",)

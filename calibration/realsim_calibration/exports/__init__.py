@@ -6,7 +6,6 @@ from realsim_calibration.exports.calibration_file import (
     write_calibration,
 )
 from realsim_calibration.exports.frames import FrameNames, note_lines, published_transform
-from realsim_calibration.exports.opencv import opencv_text
 from realsim_calibration.exports.ros import (
     camera_info_text,
     easy_handeye2_text,
@@ -18,7 +17,7 @@ from realsim_calibration.exports.ros import (
     ros2_script,
     urdf_text,
 )
-from realsim_calibration.exports.write import npz_arrays, write_exports
+from realsim_calibration.exports.write import npz_arrays, opencv_text, write_exports
 
 __all__ = [
     "FrameNames",

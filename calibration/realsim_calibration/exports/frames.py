@@ -96,15 +96,6 @@ def published_transform(report: HandEyeReport, frames: FrameNames) -> tuple[Arra
     return report.X_alone @ se3.invert(frames.T_link_optical), parent, frames.camera_link
 
 
-def number(value: float) -> str:
-    """Return a number that reads back bit for bit, also where YAML 1.1 wants a point in it.
-
-    Python's shortest text of 1e-17 has no point, and PyYAML reads such a number as a string.
-    """
-    text = repr(float(value))
-    return text.replace("e", ".0e") if "e" in text and "." not in text else text
-
-
 def quaternion_xyzw(T: Array) -> list[float]:
     """Return the unit quaternion x y z w, the order of ROS, w >= 0, of T (4, 4)."""
     w, x, y, z = (float(v) for v in se3.quaternion_wxyz(T[:3, :3]))

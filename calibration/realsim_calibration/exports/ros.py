@@ -12,11 +12,11 @@ from realsim_calibration.exports.frames import (
     comments,
     fit_line,
     note_lines,
-    number,
     published_transform,
     quaternion_xyzw,
     roll_pitch_yaw,
 )
+from realsim_calibration.lens.camera_files import number, ros_yaml
 from realsim_calibration.results import HandEyeReport
 
 Array = NDArray[np.float64]
@@ -187,28 +187,11 @@ def camera_info_text(report: HandEyeReport, frames: FrameNames) -> str:
 
     It is intrinsics_alone: the published transform is X_alone, and the two were fitted together.
     """
-    i = report.intrinsics_alone
-    rational = bool(np.any(i.distortion[5:] != 0))
-    d = i.distortion if rational else i.distortion[:5]
-    P = np.concatenate([i.K, np.zeros((3, 1))], -1)
-
-    def matrix(name: str, M: Array) -> str:
-        values = ", ".join(number(v) for v in M.ravel())
-        return f"{name}:\n  rows: {M.shape[0]}\n  cols: {M.shape[1]}\n  data: [{values}]\n"
-
-    return (
-        comments(
-            (
-                f"Camera of a hand-eye calibration by realsim {__version__}. Pixels; integer "
-                "pixels are pixel centres.",
-                f"The image's frame is {frames.camera_optical}.",
-                fit_line(report),
-            )
+    return comments(
+        (
+            f"Camera of a hand-eye calibration by realsim {__version__}. Pixels; integer "
+            "pixels are pixel centres.",
+            f"The image's frame is {frames.camera_optical}.",
+            fit_line(report),
         )
-        + f'image_width: {i.width}\nimage_height: {i.height}\ncamera_name: "{frames.name}"\n'
-        + matrix("camera_matrix", i.K)
-        + f"distortion_model: {'rational_polynomial' if rational else 'plumb_bob'}\n"
-        + matrix("distortion_coefficients", d[None])
-        + matrix("rectification_matrix", np.eye(3))
-        + matrix("projection_matrix", P)
-    )
+    ) + ros_yaml(report.intrinsics_alone, frames.name)

@@ -337,40 +337,53 @@ def write_camera(
     elif format == "ros":
         if not name.replace("_", "").replace("-", "").isalnum():
             raise InputError(f"the camera's name '{name}' may have letters, digits, _ and - only.")
-        atomic.write_text(path, _ros_yaml(intrinsics, name))
+        atomic.write_text(path, ros_yaml(intrinsics, name))
     elif format == "opencv":
-        atomic.write_text(path, _opencv_yaml(intrinsics))
+        atomic.write_text(path, opencv_yaml(intrinsics))
     else:
         raise InputError(f"the camera format '{format}' is not known; realsim, ros, opencv are.")
 
 
-def _listed(values: Array) -> str:
-    return "[" + ", ".join(repr(float(v)) for v in values.ravel()) + "]"
+def number(value: float) -> str:
+    """Return a number that reads back bit for bit, also where YAML 1.1 wants a point in it.
+
+    Python's shortest text of 1e-17 has no point, and PyYAML reads such a number as a string.
+    """
+    text = repr(float(value))
+    return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
 
-def _coefficients(intrinsics: CameraIntrinsics) -> Array:
-    rational = bool(np.any(intrinsics.distortion[5:] != 0))
-    return intrinsics.distortion if rational else intrinsics.distortion[:5]
+def yaml_matrix(name: str, M: Array, *, opencv: bool = False) -> str:
+    """Return a matrix as ROS's camera files have it, or as OpenCV's FileStorage does."""
+    values = ", ".join(number(v) for v in M.ravel())
+    tag, kind = (" !!opencv-matrix", "  dt: d\n") if opencv else ("", "")
+    rows, columns = M.shape
+    return f"{name}:{tag}\n  rows: {rows}\n  cols: {columns}\n{kind}  data: [{values}]\n"
 
 
-def _ros_yaml(intrinsics: CameraIntrinsics, name: str) -> str:
-    i, d = intrinsics, _coefficients(intrinsics)
-    model = "plumb_bob" if len(d) == 5 else "rational_polynomial"
+def _coefficients(i: CameraIntrinsics) -> Array:
+    """Return the five coefficients of the usual lens, or all eight of a rational one."""
+    return i.distortion if np.any(i.distortion[5:] != 0) else i.distortion[:5]
+
+
+def ros_yaml(i: CameraIntrinsics, name: str) -> str:
+    """Return a camera as ROS's camera_info_manager reads it (raw image, rectification = 1)."""
+    d = _coefficients(i)
     P = np.concatenate([i.K, np.zeros((3, 1))], axis=1)
-    parts = [("camera_matrix", i.K), ("rectification_matrix", np.eye(3)), ("projection_matrix", P)]
-    lines = [f"image_width: {i.width}", f"image_height: {i.height}", f"camera_name: {name}"]
-    lines.append(f"distortion_model: {model}")
-    parts.insert(1, ("distortion_coefficients", d.reshape(1, -1)))
-    for key, M in parts:
-        lines += [f"{key}:", f"  rows: {M.shape[0]}", f"  cols: {M.shape[1]}"]
-        lines.append(f"  data: {_listed(M)}")
-    return "\n".join(lines) + "\n"
+    return (
+        f'image_width: {i.width}\nimage_height: {i.height}\ncamera_name: "{name}"\n'
+        + yaml_matrix("camera_matrix", i.K)
+        + f"distortion_model: {'rational_polynomial' if len(d) > 5 else 'plumb_bob'}\n"
+        + yaml_matrix("distortion_coefficients", d[None])
+        + yaml_matrix("rectification_matrix", np.eye(3))
+        + yaml_matrix("projection_matrix", P)
+    )
 
 
-def _opencv_yaml(intrinsics: CameraIntrinsics) -> str:
-    i, d = intrinsics, _coefficients(intrinsics)
-    lines = ["%YAML:1.0", "---", f"image_width: {i.width}", f"image_height: {i.height}"]
-    for key, M in (("camera_matrix", i.K), ("distortion_coefficients", d.reshape(1, -1))):
-        lines += [f"{key}: !!opencv-matrix", f"   rows: {M.shape[0]}", f"   cols: {M.shape[1]}"]
-        lines += ["   dt: d", f"   data: {_listed(M)}"]
-    return "\n".join(lines) + "\n"
+def opencv_yaml(i: CameraIntrinsics) -> str:
+    """Return a camera for cv2.FileStorage."""
+    return (
+        f"%YAML:1.0\n---\nimage_width: {i.width}\nimage_height: {i.height}\n"
+        + yaml_matrix("camera_matrix", i.K, opencv=True)
+        + yaml_matrix("distortion_coefficients", _coefficients(i)[None], opencv=True)
+    )

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.geometry.camera import undistort
+from realsim_calibration.detect.homography import fit_homography
 from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.lens.bundle import (
     BOARD_TERMS,
@@ -40,36 +41,12 @@ FLATNESS = 1e-4
 """Points whose spread across is less than this of their spread along lie on a line."""
 
 
-def _normaliser(points: Array) -> Array:
-    """Return the similarity (3, 3) that moves points (n, 2) to mean 0 and RMS radius sqrt 2."""
-    middle = points.mean(0)
-    scale = np.sqrt(2.0) / max(float(np.sqrt(np.mean(np.sum((points - middle) ** 2, -1)))), 1e-300)
-    return np.array([[scale, 0, -scale * middle[0]], [0, scale, -scale * middle[1]], [0, 0, 1.0]])
-
-
 def is_line(points: Array) -> bool:
     """Return whether points (n, 2) lie on a line, as far as a homography is concerned."""
     if len(points) < 2:
         return True
     values = np.linalg.svd(points - points.mean(0), compute_uv=False)
     return bool(values[1] <= FLATNESS * values[0])
-
-
-def homography(flat: Array, image: Array) -> Array:
-    """Return H (3, 3) with image ~ H flat, both (n, 2) (normalised DLT, Hartley 1997)."""
-    A, B = _normaliser(flat), _normaliser(image)
-    p = np.concatenate([flat, np.ones((len(flat), 1))], -1) @ A.T
-    q = image * B[0, 0] + B[:2, 2]
-    zero = np.zeros_like(p)
-    rows = np.concatenate(
-        [
-            np.concatenate([p, zero, -q[:, :1] * p], -1),
-            np.concatenate([zero, p, -q[:, 1:] * p], -1),
-        ]
-    )
-    _, vectors = np.linalg.eigh(rows.T @ rows)
-    H = np.linalg.solve(B, vectors[:, 0].reshape(3, 3) @ A)
-    return np.asarray(H, dtype=np.float64)
 
 
 def zhang_focal(homographies: Array, image_size: tuple[int, int]) -> float:
@@ -103,7 +80,7 @@ def pose_of_homography(H: Array) -> Array:
 
 def _homographies(obs: Observations, image: Array) -> Array:
     cuts = list(zip(obs.offsets[:-1], obs.offsets[1:], strict=True))
-    return np.stack([homography(obs.flat[a:b], image[a:b]) for a, b in cuts])
+    return np.stack([fit_homography(obs.flat[a:b], image[a:b]) for a, b in cuts])
 
 
 def view_errors(state: State, obs: Observations) -> Array:

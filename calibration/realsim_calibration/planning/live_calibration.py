@@ -19,8 +19,15 @@ from realsim_calibration.planning.next_view import (
     predicted_boards,
     rank_next_views,
 )
-from realsim_calibration.planning.view_needs import Need, NeedsConfig, SeenBoard, missing
-from realsim_calibration.planning.view_proposals import ViewLimits, describe_move, propose_views
+from realsim_calibration.planning.view_proposals import (
+    Need,
+    NeedsConfig,
+    SeenBoard,
+    ViewLimits,
+    describe_move,
+    missing,
+    propose_views,
+)
 from realsim_calibration.results import HandEyeReport
 from realsim_calibration.views import Array, BoardView
 
