@@ -18,7 +18,7 @@ is in unknown units (factor 0.3 to 3) and other axes. Figures (keys of the JSON'
                       Open3D's ICP with scaling, exact mesh, same start and images
   sfm_scale_pct, tsdf_median_mm
                       of `scale_sfm.py` and `scale_fusion.py`
-Shares are 0 to 1. What crashes counts as an error of 1000 % and is named.
+Shares are 0 to 1. What raises counts as an error of 1000 % and is named.
 """
 
 import os
@@ -27,135 +27,128 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 import argparse
-import json
-import platform
+import multiprocessing
 import sys
 import time
-from collections.abc import Callable, Sequence
-from importlib.metadata import version
-from pathlib import Path
-from typing import Any
+import traceback
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import cache
 
-import numpy as np
-from scale_cases import FULL_WIDTH
-from scale_figures import GOALS, KINDS, Row, figures_of, per_object
-from scale_jobs import OTHERS, Job, results
+from figures import Found, run
+from scale_cases import FULL_WIDTH, Case, make_case
+from scale_figures import FIGURES, KINDS, Kind, Row, figures_of, told
+from scale_rivals import rival_errors
 from scale_shapes import SHAPES
-
-from realsim.app.console import Console
 
 PACKAGES = ("numpy", "scipy", "numba", "open3d-cpu", "opencv-python-headless", "pycolmap")
 QUICK_NAMES = ("bunny", "disc")
 QUICK_WIDTH = 640
 """Images of a quick run [px]: a quarter of the pixels, twice the depth noise."""
+WARM_UP_WIDTH = 320
+"""Images of the fit that only makes numba compile [px]."""
 
 
-def print_tables(
-    console: Console, rows: Sequence[Row], figures: dict[str, float], over: dict[str, str]
-) -> None:
-    """Print the objects, the failures, and every figure beside its goal."""
-    names = [n for n in SHAPES if any(r.name == n for r in rows)]
-    header = ["object", *KINDS, "Open3D fused", "Open3D top", "CPU-s"]
-    title = "Scale error [%] ± 1-sigma of every seed; ! = not accepted"
-    console.table(title, header, per_object(rows, names))
-    for row in rows:
-        if row.failure:
-            console.warn(f"{row.name}, seed {row.seed}, {row.kind} failed: {row.failure}")
-    order = [k for k in GOALS if k in figures] + [k for k in figures if k not in GOALS]
-    table: list[list[str]] = []
-    for key in order:
-        goal = GOALS.get(key)
-        verdict = "" if goal is None else "ok" if goal.met(figures[key]) else "FELL SHORT"
-        if not np.isfinite(figures[key]):
-            verdict = "not run"
-        table.append([key, f"{figures[key]:.4g}", str(goal or ""), verdict, over.get(key, "")])
-    console.table("Metric scale", ["figure", "value", "goal", "", "over"], table)
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Job:
+    """One object, one seed."""
+
+    name: str
+    seed: int
+    width: int
 
 
-def document_of(
-    arguments: argparse.Namespace, rows: Sequence[Row], figures: dict[str, float], seconds: float
-) -> dict[str, Any]:
-    """Return what is written; a figure that is not finite is null."""
-    return {
-        "benchmark": "scale",
-        "machine": {"cpu": platform.machine(), "cores": os.cpu_count()},
-        "versions": {name: version(name) for name in PACKAGES},
-        "seed": arguments.seeds,
-        "quick": arguments.quick,
-        "width_px": arguments.width,
-        "wall_s": round(seconds, 1),
-        "figures": {k: v if np.isfinite(v) else None for k, v in figures.items()},
-        "goals": {k: str(goal) for k, goal in GOALS.items()},
-        "cases": [r.plain() for r in rows],
-    }
+def fit_row(case: Case, kind: Kind) -> Row:
+    """Return one fit."""
+    from realsim.scanning.scale.fit import fit_scale
+
+    mesh = case.given_exact if kind == "exact" else case.given_distorted
+    start = {"exact": case.start_exact, "distorted": case.start_distorted, "cold": None}[kind]
+    began = time.process_time()
+    fit = fit_scale(mesh, case.views.intrinsics, case.views.frames, start=start)
+    return Row(
+        name=case.name, seed=case.seed, kind=kind,
+        error_pct=100 * (fit.scale / case.true_scale - 1), sigma_pct=fit.sigma_percent,
+        verdict=fit.verdict, cpu_s=time.process_time() - began,
+        said={"reasons": list(fit.reasons), "notes": list(fit.notes),
+              "limits": {limit.name: limit.percent for limit in fit.limits}},
+    )  # fmt: skip
 
 
-def arguments_of() -> argparse.Namespace:
-    """Return the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+def rival_rows(case: Case) -> list[Row]:
+    """Return the rival's results on a case."""
+    began = time.process_time()
+    errors = rival_errors(case)
+    each = (time.process_time() - began) / len(errors)
+    return [
+        Row(name=case.name, seed=case.seed, kind=f"open3d {key}", error_pct=error, cpu_s=each,
+            verdict="none")
+        for key, error in errors.items()
+    ]  # fmt: skip
+
+
+def _tried(job: Job, kinds: list[str], work: Callable[[], list[Row]]) -> list[Row]:
+    """Return what the work gives; the failure of all these kinds, named, if it raises."""
+    try:
+        return work()
+    except Exception as error:
+        print(f"\n{job.name} {job.seed} {kinds}:\n{traceback.format_exc()}", file=sys.stderr)
+        text = f"{type(error).__name__}: {error}"
+        return [Row(name=job.name, seed=job.seed, kind=kind, failure=text) for kind in kinds]
+
+
+@cache
+def warm_up() -> None:
+    """Load what numba compiles, so that no object pays for it."""
+    case = make_case("cube", 0, WARM_UP_WIDTH)
+    for kind in ("exact", "cold"):
+        fit_row(case, kind)
+
+
+def run_job(job: Job) -> list[Row]:
+    """Do a job in a process of its own."""
+    warm_up()
+    rivals = [f"open3d {v}_{k}" for v in ("fused", "topdown") for k in KINDS[:2]]
+    made: list[Case] = []
+
+    def case() -> Case:
+        if not made:
+            made.append(make_case(job.name, job.seed, job.width))
+        return made[0]
+
+    rows: list[Row] = []
+    for kind in KINDS:
+        rows += _tried(job, [kind], lambda kind=kind: [fit_row(case(), kind)])
+    return rows + _tried(job, rivals, lambda: rival_rows(case()))
+
+
+def fits(arguments: argparse.Namespace) -> Found:
+    """Return the figures of all objects; fresh processes: OpenCV's threads survive no fork."""
+    names = arguments.only or list(QUICK_NAMES if arguments.quick else SHAPES)
+    seeds = arguments.seeds or ([0] if arguments.quick else [0, 1, 2])
+    width = arguments.width or (QUICK_WIDTH if arguments.quick else FULL_WIDTH)
+    jobs = [Job(name=n, seed=s, width=width) for s in seeds for n in names]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(arguments.jobs, mp_context=context) as pool:
+        rows = [row for rows in pool.map(run_job, jobs) for row in rows]
+    figures, over = figures_of(rows)
+    return Found(
+        figures=figures, over=over, notes=told(rows), cases={"rows": [r.plain() for r in rows]}
     )
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    names = ", ".join(SHAPES)
     numbers: Callable[[str], list[int]] = lambda text: [int(v) for v in text.split(",")]  # noqa: E731
-    words: Callable[[str], list[str]] = lambda text: text.split(",")  # noqa: E731
-    parts = ",".join([*KINDS, "rival", *OTHERS])
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--quick", action="store_true", help="few objects, one seed, small images")
     parser.add_argument("--seeds", type=numbers, help="0,1,2 (quick: 0)")
-    parser.add_argument("--only", type=words, help=f"objects: {', '.join(SHAPES)}")
-    parser.add_argument("--parts", type=words, default=words(parts), help=f"of {parts}")
+    parser.add_argument("--only", type=lambda text: text.split(","), help=f"objects: {names}")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--width", type=int, help=f"of the images [px] ({FULL_WIDTH})")
-    parser.add_argument("--keep", type=Path, help="folder where rendered images are kept and found")
-    arguments = parser.parse_args()
-    arguments.seeds = arguments.seeds or ([0] if arguments.quick else [0, 1, 2])
-    arguments.width = arguments.width or (QUICK_WIDTH if arguments.quick else FULL_WIDTH)
-    arguments.only = arguments.only or list(QUICK_NAMES if arguments.quick else SHAPES)
-    for given, known in ((arguments.only, list(SHAPES)), (arguments.parts, parts.split(","))):
-        unknown = [n for n in given if n not in known]
-        if unknown:
-            parser.error(f"there is no {', '.join(unknown)}; there are: {', '.join(known)}")
-    return arguments
 
 
-def jobs_of(arguments: argparse.Namespace) -> list[Job]:
-    """Return what is to be done, the longest first."""
-    parts = tuple(p for p in arguments.parts if p not in OTHERS)
-    others = [p for p in OTHERS if p in arguments.parts]
-    settings: dict[str, Any] = {
-        "width": arguments.width, "keep": arguments.keep, "quick": arguments.quick
-    }  # fmt: skip
-    cases = [Job(name=n, seed=s, parts=parts, **settings)
-             for s in arguments.seeds for n in arguments.only]  # fmt: skip
-    return [Job(name=n, seed=0, parts=(), **settings) for n in others] + (cases if parts else [])
-
-
-def main() -> None:
-    """Run the jobs, print the tables, write the JSON."""
-    arguments = arguments_of()
-    console = Console()
-    begin = time.perf_counter()
-    rows: list[Row] = []
-    others: dict[str, float] = {}
-    jobs = jobs_of(arguments)
-    try:
-        with console.stage("objects", f"{len(jobs)} jobs") as tick:
-            for count, done in enumerate(results(jobs, arguments.jobs), 1):
-                rows += done.rows
-                others |= dict(done.figures)
-                tick(count, len(jobs))
-    except KeyboardInterrupt:
-        sys.exit(130)
-    order = list(SHAPES)
-    rows.sort(key=lambda r: (order.index(r.name) if r.name in order else -1, r.seed))
-    figures, over = figures_of(rows)
-    figures |= others
-    seconds = time.perf_counter() - begin
-    print_tables(console, rows, figures, over)
-    console.say(f"{seconds:.0f} s")
-    if arguments.json:
-        text = json.dumps(document_of(arguments, rows, figures, seconds), indent=1, default=str)
-        arguments.json.write_text(text)
-
+PARTS = {"fits": fits, "tsdf": "scale_fusion:measured", "sfm": "scale_sfm:measured"}
 
 if __name__ == "__main__":
-    main()
+    run("scale", __doc__, PACKAGES, FIGURES, PARTS, options=options)

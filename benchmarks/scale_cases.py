@@ -5,17 +5,14 @@ and divided by a factor of 0.3 to 3; the start is the truth moved by 10 mm, turn
 off by x0.87 or x1.15. Depth is what a D405 stores: 16 bit, 0.1 mm. All methods see these images.
 """
 
-import os
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scale_shapes import SHAPES, resting_rotation
 
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics, Mesh
+from realsim.records import Mesh
 from realsim.registration.evidence import DepthFrame
 from realsim.scanning.scale.result import Similarity
 from realsim.scanning.simulated import ScanLabConfig, ScanViews, distorted, scan_views, standing
@@ -69,25 +66,18 @@ def lab(width: int) -> ScanLabConfig:
     )
 
 
-def make_case(name: str, seed: int, width: int = FULL_WIDTH, keep: Path | None = None) -> Case:
-    """Return a case, rendered or, if it is there, read from the folder `keep`.
+def make_case(name: str, seed: int, width: int = FULL_WIDTH) -> Case:
+    """Return a case.
 
     Args:
         name: one of `SHAPES`.
         seed: of everything that is drawn.
         width: of the depth images [px].
-        keep: folder of rendered images; None = nothing is kept.
     """
     mesh = SHAPES[name]()
     rng = stream(name, seed, "lab")
     T_world_obj = standing(mesh, resting_rotation(mesh, rng), rng)
-    file = None if keep is None else keep / f"{name}-{seed}-{width}.npz"
-    views = None if file is None else _read(file, T_world_obj)
-    if views is None:
-        views = _quantised(scan_views(mesh, T_world_obj, lab(width), rng))
-        if file is not None:
-            _write(file, views)
-
+    views = _quantised(scan_views(mesh, T_world_obj, lab(width), rng))
     bent = distorted(mesh, DISTORTION, stream(name, seed, "shape"))
     rng = stream(name, seed, "given")
     R_given = se3.random_rotation(rng)
@@ -133,55 +123,10 @@ def _start(mesh: Mesh, scale: float, T: Array, rng: np.random.Generator) -> Simi
 
 def _quantised(views: ScanViews) -> ScanViews:
     """Return the views as a session stores them: 16 bit of 0.1 mm."""
-    return replace(views, frames=tuple(_framed(f, _units(f)) for f in views.frames))
+    return replace(views, frames=tuple(_stored(f) for f in views.frames))
 
 
-def _units(frame: DepthFrame) -> NDArray[np.uint16]:
-    """Return a depth image (H, W) in the sensor's unit."""
-    return np.round(frame.depth_m / DEPTH_UNIT_M).astype(np.uint16)
-
-
-def _framed(frame: DepthFrame, units: NDArray[np.uint16]) -> DepthFrame:
-    """Return a frame whose depth is that of an image (H, W) in the sensor's unit."""
+def _stored(frame: DepthFrame) -> DepthFrame:
+    """Return a frame whose depth is a whole number of the sensor's units."""
+    units = np.round(frame.depth_m / DEPTH_UNIT_M).astype(np.uint16)
     return replace(frame, depth_m=units.astype(np.float32) * np.float32(DEPTH_UNIT_M))
-
-
-def _write(file: Path, views: ScanViews) -> None:
-    """Keep the views in a file; whole or not at all."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    camera = views.intrinsics
-    part = file.with_name(f".{os.getpid()}-{file.name}")
-    np.savez_compressed(
-        part,
-        camera=np.array([camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy]),
-        depth=np.stack([_units(f) for f in views.frames]),
-        Ts_world_cam=views.Ts_world_cam,
-        reported=np.stack([f.T_world_cam for f in views.frames]),
-        T_world_obj=views.T_world_obj,
-        lab=np.array(repr(lab(camera.width))),
-    )
-    part.replace(file)
-
-
-def _read(file: Path, T_world_obj: Array) -> ScanViews | None:
-    """Return kept views; None if there are none, or of another lab or pose."""
-    if not file.is_file():
-        return None
-    with np.load(file) as kept:
-        arrays: dict[str, Any] = {name: kept[name] for name in kept.files}
-    width, height, fx, fy, cx, cy = (float(v) for v in arrays["camera"])
-    same_lab = "lab" in arrays and str(arrays["lab"]) == repr(lab(int(width)))
-    if not same_lab or not np.allclose(arrays["T_world_obj"], T_world_obj, atol=1e-12):
-        return None  # of an older version of this benchmark
-    frames = [
-        _framed(DepthFrame(index=i, depth_m=np.zeros((1, 1), np.float32), T_world_cam=pose), units)
-        for i, (units, pose) in enumerate(zip(arrays["depth"], arrays["reported"], strict=True))
-    ]
-    return ScanViews(
-        intrinsics=CameraIntrinsics(
-            width=int(width), height=int(height), fx=fx, fy=fy, cx=cx, cy=cy
-        ),
-        frames=tuple(frames),
-        Ts_world_cam=arrays["Ts_world_cam"],
-        T_world_obj=arrays["T_world_obj"],
-    )

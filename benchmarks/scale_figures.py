@@ -4,12 +4,12 @@ Imported by `scale.py`. A case that failed counts as an error of 1000 %, is not 
 interval, and is not 'accepted'.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
-from figures import Goal
+from figures import Figure, Goal
 
 Kind = Literal["exact", "distorted", "cold"]
 KINDS: tuple[Kind, ...] = ("exact", "distorted", "cold")
@@ -20,22 +20,22 @@ WRONG_PCT = 5.0
 """A cold result with a greater error should be flagged, one below it should not [%]."""
 COVERING = 1.96
 
-GOALS = {
-    "scale_median_pct_exact": Goal(high=0.25),
-    "within1pct_exact": Goal(low=0.95),
-    "within2pct_exact": Goal(low=1.0),
-    "worst_pct_exact": Goal(high=2.0),
-    "scale_median_pct_distorted": Goal(high=0.7),
-    "within2pct_distorted": Goal(low=0.90),
-    "worst_pct": Goal(high=4.0),
-    "cold_median_pct": Goal(high=0.8),
-    "cold_within2pct": Goal(low=0.88),
-    "cold_flagged_share": Goal(low=1.0),
-    "false_alarm_share": Goal(high=0.05),
-    "cpu_s_per_object": Goal(high=3.0),
-    "interval_coverage": Goal(low=0.90, high=0.98),
-    "sfm_scale_pct": Goal(high=0.5),
-    "tsdf_median_mm": Goal(high=0.8),
+FIGURES = {
+    "scale_median_pct_exact": Figure(unit="%", goal=Goal(high=0.25)),
+    "within1pct_exact": Figure(unit="", goal=Goal(low=0.95)),
+    "within2pct_exact": Figure(unit="", goal=Goal(low=1.0)),
+    "worst_pct_exact": Figure(unit="%", goal=Goal(high=2.0)),
+    "scale_median_pct_distorted": Figure(unit="%", goal=Goal(high=0.7)),
+    "within2pct_distorted": Figure(unit="", goal=Goal(low=0.90)),
+    "worst_pct": Figure(unit="%", goal=Goal(high=4.0)),
+    "cold_median_pct": Figure(unit="%", goal=Goal(high=0.8)),
+    "cold_within2pct": Figure(unit="", goal=Goal(low=0.88)),
+    "cold_flagged_share": Figure(unit="", goal=Goal(low=1.0)),
+    "false_alarm_share": Figure(unit="", goal=Goal(high=0.05)),
+    "cpu_s_per_object": Figure(unit="s", goal=Goal(high=3.0)),
+    "interval_coverage": Figure(unit="", goal=Goal(low=0.90, high=0.98)),
+    "sfm_scale_pct": Figure(unit="%", goal=Goal(high=0.5)),
+    "tsdf_median_mm": Figure(unit="mm", goal=Goal(high=0.8)),
 }
 
 
@@ -139,27 +139,15 @@ def figures_of(rows: Sequence[Row]) -> tuple[dict[str, float], dict[str, str]]:
     return figures, over
 
 
-def per_object(rows: Sequence[Row], names: Sequence[str]) -> list[list[str]]:
-    """Return a table: for every object the worst error of its seeds, and what the fit said."""
-    table: list[list[str]] = []
-    for name in names:
-        line = [name]
-        for kind in (*KINDS, "open3d fused_exact", "open3d topdown_exact"):
-            part = [r for r in rows if r.name == name and r.kind == kind]
-            line.append(_cell(part, with_sigma=kind in KINDS))
-        fits = [r.cpu_s for r in rows if r.name == name and r.kind in ("exact", "distorted")]
-        line.append(f"{np.nanmean(fits):.2f}" if np.isfinite(fits).any() else "-")
-        table.append(line)
-    return table
-
-
-def _cell(rows: Sequence[Row], *, with_sigma: bool) -> str:
-    """Return the errors of all seeds, each with its sigma; '!' = not accepted."""
-    if not with_sigma:
-        return " ".join(_percent(r) for r in rows)
-    mark: Callable[[Row], str] = lambda r: "" if r.verdict == "accepted" else "!"  # noqa: E731
-    return "  ".join(f"{_percent(r)}±{r.sigma_pct:.2f}{mark(r)}" for r in rows)
-
-
-def _percent(row: Row) -> str:
-    return "FAILED" if row.failure else f"{row.error_pct:+.2f}"
+def told(rows: Sequence[Row]) -> list[str]:
+    """Return a line an object with the errors of all seeds, and what failed; '!' = not accepted."""
+    lines: list[str] = []
+    for name in dict.fromkeys(r.name for r in rows):
+        cells = [
+            f"{r.kind} {r.error_pct:+.2f}" + ("" if r.verdict in ("accepted", "none") else "!")
+            for r in rows
+            if r.name == name
+        ]
+        lines.append(f"{name} [%]: {', '.join(cells)}")
+    return lines + [f"{r.name}, seed {r.seed}, {r.kind} failed: {r.failure}"
+                    for r in rows if r.failure]  # fmt: skip

@@ -20,17 +20,14 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 import argparse
-import json
-import platform
 import resource
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import Figure, Found, Goal, run
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
@@ -211,8 +208,9 @@ def _one(
     return figures
 
 
-def run(quick: bool) -> dict[str, float]:
+def measured(arguments: argparse.Namespace) -> Found:
     """Return the figures over all objects (one from half as many views of 640x360 if quick)."""
+    quick = arguments.quick
     objects = [o for o in OBJECTS if not quick or o[0] == QUICK]
     if not quick:
         # Compiled code is loaded before anything is timed.
@@ -246,30 +244,9 @@ def run(quick: bool) -> dict[str, float]:
             f"{rival}_complete_share": table[f"{rival}_complete"].mean(),
             f"{rival}_cpu_s": np.median(table[f"{rival}_cpu_s"]),
         }
-    return {key: float(value) for key, value in out.items()}
-
-
-def main() -> None:
-    """Run, print the figures, write the JSON."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--quick", action="store_true", help="one object, 640x360")
-    args = parser.parse_args()
-    figures = run(args.quick)
-    for key, value in figures.items():
-        print(f"{key:24s} {value:.4g}")
-    if args.json:
-        document = {
-            "benchmark": "scale_fusion",
-            "machine": {"cpu": platform.machine(), "cores": os.cpu_count()},
-            "versions": {name: version(name) for name in PACKAGES},
-            "quick": args.quick,
-            "figures": figures,
-        }
-        args.json.write_text(json.dumps(document, indent=1))
+    return Found(figures={key: float(value) for key, value in out.items()})
 
 
 if __name__ == "__main__":
-    main()
+    figure = Figure(unit="mm", goal=Goal(high=0.8))
+    run("scale_fusion", __doc__, PACKAGES, {"tsdf_median_mm": figure}, {"tsdf": measured})

@@ -25,18 +25,15 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
 import argparse
-import json
-import platform
 import tempfile
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from figures import Figure, Found, Goal, run
 from numpy.typing import NDArray
 
-from realsim.app.console import Console
 from realsim.geometry import se3
 from realsim.images import png_bytes
 from realsim.records import CameraIntrinsics, Mesh
@@ -50,7 +47,6 @@ from realsim_capture_plans.lab import LabConfig, SimulatedLab
 
 Array = NDArray[np.float64]
 PACKAGES = ("realsim", "numpy", "pycolmap")
-GOAL_PCT = 0.5
 HAND_EYE_MM, HAND_EYE_DEG = 0.5, 0.1
 SHEET_M, SHEET_PX = (0.6, 0.45), 1800
 """A sheet of newspaper under the objects, and the pixels of its picture along the longer side."""
@@ -205,17 +201,17 @@ def measure(scene: Scene, folder: Path) -> dict[str, float]:
     }
 
 
-def run(quick: bool) -> dict[str, float]:
+def measured(arguments: argparse.Namespace) -> Found:
     """Return the figures over all scenes."""
     rows: list[dict[str, float]] = []
-    for scene in QUICK if quick else SCENES:
+    for scene in QUICK if arguments.quick else SCENES:
         with tempfile.TemporaryDirectory() as folder:
             rows.append(measure(scene, Path(folder)))
 
     def over(key: str, how: str) -> float:
         return float(getattr(np, how)([r[key] for r in rows]))
 
-    return {
+    return Found(figures={
         "sfm_scale_pct": over("scale_pct", "max"),
         "sfm_interval_hits": over("hit", "mean"),
         "sfm_sigma_pct": over("sigma_pct", "median"),
@@ -228,34 +224,9 @@ def run(quick: bool) -> dict[str, float]:
         "sfm_refined_reliability": over("reliability", "median"),
         "sfm_table_mm": over("table_mm", "median"),
         "sfm_cpu_s": over("cpu_s", "median"),
-    }
-
-
-def main() -> None:
-    """Run the scenes, print the table, write the JSON."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--quick", action="store_true", help="one small scene, under 12 CPU-s")
-    args = parser.parse_args()
-    figures = run(args.quick)
-    rows = [
-        [k, f"{v:.4g}", f"<= {GOAL_PCT}" if k == "sfm_scale_pct" else ""]
-        for k, v in figures.items()
-    ]
-    Console().table("Metric scale by structure from motion", ["figure", "value", "goal"], rows)
-    if args.json:
-        document = {
-            "benchmark": "scale_sfm",
-            "machine": {"cpu": platform.machine(), "cores": os.cpu_count()},
-            "versions": {name: version(name) for name in PACKAGES},
-            "seed": [s.seed for s in (QUICK if args.quick else SCENES)],
-            "quick": args.quick,
-            "figures": figures,
-        }
-        args.json.write_text(json.dumps(document, indent=1))
+    })  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    figure = Figure(unit="%", goal=Goal(high=0.5))
+    run("scale_sfm", __doc__, PACKAGES, {"sfm_scale_pct": figure}, {"sfm": measured})

@@ -14,14 +14,10 @@ from realsim.scanning.scale.evidence import ScanView
 from realsim.scanning.scale.outlines import outline
 from realsim.scanning.scale.state import metre_per_px
 from scanned_objects import (
-    LAB,
-    TRUE,
     Scanned,
-    block,
     evidence_of,
     gathered,
     scanned,
-    scanned_mesh,
     shape_of,
     true_state,
 )
@@ -135,31 +131,3 @@ def test_the_size_is_the_objects_and_a_pixel_has_the_right_one():
     for view in evidence.views:
         z = np.median(view.points[:, 2])
         assert metre_per_px(evidence, view.T_world_cam) == pytest.approx(z / 324.0, rel=0.15)
-
-
-def test_the_cloud_lies_on_the_object_and_looks_at_the_cameras():
-    known, evidence = scanned("bunny", "exact"), evidence_of("bunny", "exact")
-    field = DistanceField.from_mesh(known.real, 96)
-    d = field.distance(se3.transform(se3.invert(known.T_world_obj), evidence.cloud.points))
-    assert np.median(np.abs(d)) < 3e-4
-    np.testing.assert_allclose(np.linalg.norm(evidence.cloud.towards, axis=1), 1.0, atol=1e-9)
-    assert np.all(evidence.cloud.sigmas > 0)
-    assert np.mean(evidence.cloud.towards[:, 2] > 0) > 0.99
-
-
-def test_an_object_cut_by_the_image_border_keeps_what_is_seen():
-    """The border is no outline: nothing beyond it is known to be empty."""
-    near = replace(LAB, **TRUE, focal_px=900.0, views=6)
-    known = scanned_mesh(block((0.16, 0.05, 0.06)), near, seed=2)
-    evidence = gathered(known)
-    cut = 0
-    for view in evidence.views:
-        uv = project(evidence.intrinsics, view.points)
-        assert np.all((uv > -1) & (uv < [640, 360]))
-        D = view.rim.distance_px
-        left = view.rim.left == 0 and (D[:, 0] < 0).any()
-        right = view.rim.left + D.shape[1] == 640 and (D[:, -1] < 0).any()
-        top = view.rim.top == 0 and (D[0] < 0).any()
-        low = view.rim.top + D.shape[0] == 360 and (D[-1] < 0).any()
-        cut += left or right or top or low
-    assert cut >= 2

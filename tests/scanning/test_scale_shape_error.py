@@ -9,7 +9,6 @@ from realsim.scanning.scale.shape import (
     INNER_EXTENT,
     SurfacePatches,
     covariance_of,
-    make_patches,
     posterior,
     shape_models,
     within_share,
@@ -28,25 +27,6 @@ def patches_of(name: str) -> SurfacePatches:
 def unconditioned(patches: SurfacePatches, length: float) -> Array:
     r = np.sqrt(3) * np.linalg.norm(patches.middles[:, None] - patches.middles, axis=2) / length
     return (1 + r) * np.exp(-r) * (patches.normals @ patches.normals.T)
-
-
-def test_the_two_sides_of_a_thin_wall_are_two_patches():
-    rng = np.random.default_rng(0)
-    flat = np.concatenate([rng.uniform(-0.05, 0.05, (3000, 2)), np.zeros((3000, 1))], axis=1)
-    side = np.where(np.arange(3000) < 1500, 1.0, -1.0)
-    normals = np.zeros((3000, 3))
-    normals[:, 2] = side
-    points = flat + 0.0005 * normals
-    patches = make_patches(points, normals, 40, CONFIG.normal_share * INNER_EXTENT)
-    ids = patches.of(points, normals)
-    np.testing.assert_array_equal(np.sign(patches.normals[ids, 2]), side)
-    np.testing.assert_allclose(np.abs(patches.normals[:, 2]), 1.0, atol=1e-9)
-    # ... which move together, one outward and one inward.
-    C = unconditioned(patches, 0.05)
-    k = int(np.argmax(patches.normals[:, 2]))
-    back = np.flatnonzero(patches.normals[:, 2] < 0)
-    near = back[np.argmin(np.linalg.norm(patches.middles[back] - patches.middles[k], axis=1))]
-    assert C[k, near] < -0.8
 
 
 def modes_of(middles: Array, areas: Array) -> Array:
@@ -75,24 +55,6 @@ def test_area_weighted_sums_of_the_seven_modes_are_zero(name: str):
     np.testing.assert_allclose(covariance_of(patches, length), N @ conditioned @ N.T, atol=1e-8)
 
 
-def test_covariances_do_not_depend_on_the_attitude_nor_on_the_unit():
-    from realsim.geometry import se3
-
-    patches = patches_of("bunny")
-    R = se3.random_rotation(np.random.default_rng(1))
-    turned = SurfacePatches(
-        middles=patches.middles @ R.T + [0.3, -1, 2], normals=patches.normals @ R.T,
-        areas=patches.areas, normal_weight=patches.normal_weight, radius=patches.radius,
-    )  # fmt: skip
-    larger = SurfacePatches(
-        middles=25.4 * patches.middles, normals=patches.normals, areas=patches.areas,
-        normal_weight=25.4 * patches.normal_weight, radius=25.4 * patches.radius,
-    )  # fmt: skip
-    S = covariance_of(patches, 0.02)
-    np.testing.assert_allclose(covariance_of(turned, 0.02), S, atol=1e-8)
-    np.testing.assert_allclose(covariance_of(larger, 25.4 * 0.02), S, atol=1e-8)
-
-
 def drawn(name: str, sigma: float, noise: float, seed: int) -> tuple[Array, Array]:
     """Return information and right side of offsets drawn with 1-sigma, seen with noise [m]."""
     patches = patches_of(name)
@@ -104,20 +66,6 @@ def drawn(name: str, sigma: float, noise: float, seed: int) -> tuple[Array, Arra
     offsets = sigma * V @ (np.sqrt(np.clip(w, 0, None)) * rng.standard_normal(len(w)))
     seen = offsets + noise * rng.standard_normal(len(w))
     return np.eye(len(w)) / noise**2, seen / noise**2
-
-
-@pytest.mark.parametrize("name", ["mug", "bunny"])
-def test_probabilities_sum_to_one_and_the_best_comes_first(name: str):
-    models = shape_models(
-        patches_of(name), *drawn(name, 1e-3, 1e-4, 0), (1.0, INNER_EXTENT), CONFIG
-    )
-    p = np.array([m.probability for m in models])
-    assert p.sum() == pytest.approx(1.0, abs=1e-12)
-    assert np.all(np.diff(p) <= 0)
-    assert len(models) == len(CONFIG.amplitudes) * len(CONFIG.lengths)
-    for m in models:
-        assert np.linalg.eigvalsh(m.covariance).min() > 0
-        assert m.sigma_m >= CONFIG.floor_m
 
 
 def test_a_larger_distortion_gives_a_larger_sigma_of_the_right_size():
