@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from realsim.app.report import plots_compare
+from realsim.app.report import compare_page
 from realsim.app.report.cli import report_command
 from realsim.app.report.session import write_report
-from realsim.app.report.stored import SERIES_BY_VIEW, SERIES_OF_SHARES, read_stored
+from realsim.app.report.sources import SERIES_BY_VIEW, SERIES_OF_SHARES, read_stored
 from realsim.errors import InputError
 from registered_sessions import models_of, registered_by_hand, table_session
 
@@ -41,8 +41,8 @@ def test_what_a_report_says_is_read_as_it_was_written(
 
 
 def test_the_plots_know_the_series_that_are_checked() -> None:
-    assert tuple(row[0] for row in plots_compare.BY_VIEW) == SERIES_BY_VIEW
-    assert tuple(row[0] for row in plots_compare.SHARES) == SERIES_OF_SHARES
+    assert tuple(row[0] for row in compare_page.BY_VIEW) == SERIES_BY_VIEW
+    assert tuple(row[0] for row in compare_page.SHARES) == SERIES_OF_SHARES
 
 
 FIGURE = "registration.accepted"

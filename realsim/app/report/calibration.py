@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from realsim.app.report import plots_capture
+from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count, shown
 from realsim.app.report.section import Section, attempted, counted, drawn
 from realsim.app.stages import BOARD_VIEWS
@@ -144,18 +144,18 @@ def _plots(section: Section, store: SessionStore, hand_eye: HandEye) -> None:
     """Add residuals, diversity and what became of the lens."""
     if not hand_eye.view_indices:
         return
-    plots = [(plots_capture.board_residuals(hand_eye), "Every board view, through the robot pose.")]
+    plots = [(drawing.board_residuals(hand_eye), "Every board view, through the robot pose.")]
     if (store.folder / BOARD_VIEWS / "session.json").is_file():
         board = SessionStore.open(store.folder / BOARD_VIEWS)
         views = [v for v in board.session.views if v.index in hand_eye.view_indices]
         poses = [v.T_base_ee for v in views if v.T_base_ee is not None]
         if poses:
-            plots.append((plots_capture.board_directions(hand_eye, poses), "How the arm turned."))
+            plots.append((drawing.board_directions(hand_eye, poses), "How the arm turned."))
         given, i = board.session.intrinsics, hand_eye.intrinsics
         change = [i.fx - given.fx, i.fy - given.fy, i.cx - given.cx, i.cy - given.cy]
         sd = [float(s) for s in hand_eye.intrinsics_sd[:4]]
         if any(change) and any(sd):
-            picture = plots_capture.intrinsics_change(LENS[:4], change, sd)
+            picture = drawing.intrinsics_change(LENS[:4], change, sd)
             plots.append((picture, "What the calibration changed of the camera's own figures."))
     section.page.plots(plots)
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.app.report import plots_capture
+from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
 from realsim.app.report.section import READING, Section, attempted, counted, drawn
 from realsim.store import SessionStore
@@ -56,7 +56,7 @@ def _coverage(section: Section, store: SessionStore, told: Any) -> None:
     poses = np.asarray(told["expected"]["Ts_base_cam"], dtype=np.float64).reshape(-1, 4, 4)
     center = np.asarray(told["content"]["center_world"], dtype=np.float64)
     there = {v.index for v in store.session.views}
-    picture = plots_capture.coverage(poses, center, [k in there for k in range(len(poses))])
+    picture = drawing.coverage(poses, center, [k in there for k in range(len(poses))])
     section.page.plots([(picture, "Planned views around the middle of the scene.")])
 
 
@@ -123,7 +123,7 @@ def _log(section: Section, store: SessionStore) -> None:
         values = np.array(list(settle.values()))
         section.add(Figure(name="capture.settle_s", value=float(np.median(values))))
         if is_drawn:
-            picture = plots_capture.settling(settle)
+            picture = drawing.settling(settle)
             plots.append((picture, "Measured between the stop and the photograph."))
     for name, key, pick in (
         ("capture.sharpness", "sharpness", np.median),
@@ -135,7 +135,7 @@ def _log(section: Section, store: SessionStore) -> None:
         if len(seen):
             section.add(Figure(name=name, value=float(pick(seen))))
     if is_drawn and any(measured.values()):
-        plots.append((plots_capture.photographs(measured), "Measured when they were taken."))
+        plots.append((drawing.photographs(measured), "Measured when they were taken."))
     section.page.plots(plots)
     told = [[k, "; ".join([*map(str, e.get("retaken", ())), *map(str, e.get("notes", ()))])]
             for k, e in sorted(stored.items()) if e.get("retaken") or e.get("notes")]  # fmt: skip

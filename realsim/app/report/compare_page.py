@@ -1,10 +1,11 @@
 """The comparison of reports: a table for the console, a document for programs, a page."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from realsim.app.report import plots_compare
+import numpy as np
+
 from realsim.app.report.catalogue import CATALOGUE
 from realsim.app.report.compare import (
     OUTCOMES,
@@ -18,6 +19,19 @@ from realsim.app.report.figures import figures_to_json
 from realsim.app.report.sources import Source
 from realsim.app.report.summary import SCHEMA_VERSION, VERDICTS
 from realsim.pages import Cell, Page
+from realsim.pages.plots import (
+    BAR_PX,
+    INK,
+    MARKERS,
+    MUTED,
+    SERIES,
+    STYLES,
+    axes,
+    legend,
+    png,
+    titled,
+    whole_numbers,
+)
 
 SCHEMA = "realsim report comparison"
 KINDS = {"better": "good", "worse": "bad", "same": "", "other": "", "unknown": "off"}
@@ -182,13 +196,13 @@ def comparison_page(c: Comparison) -> Page:
     names = " and ".join(s.label for s in c.sources[:2]) + " ..." * (len(c.sources) > 2)
     page = Page(title=f"Comparison: {names}", document=as_json(c))
     _summary(page, c)
-    plots = plots_compare.overlaid([(s.label, s.series) for s in c.sources])
+    plots = overlaid([(s.label, s.series) for s in c.sources])
     for other, found in zip(c.sources[1:], c.objects, strict=True):
         labels = f"{c.sources[0].letter} and {other.letter}"
         page.section(f"Objects, {labels}", WORLD_NOTE)
         if found:
             page.table(OBJECT_HEADER, object_rows(found))
-            picture = plots_compare.moves(found, labels)
+            picture = moves(found, labels)
             if picture is not None:
                 said = "Bars: shift. Marks: 2 sigma: a bar beyond is more than noise."
                 page.plots([(picture, said)])
@@ -244,3 +258,82 @@ def _uncompared(only: Sequence[Difference], first: Source, other: Source) -> str
             told.append(f"{len([d for d in only if getattr(d, missing) is None])} figures are only "
                         f"in {letter} ({', '.join(names)})")  # fmt: skip
     return f"Not compared: {'; '.join(told)}."
+
+
+# --- plots of several sessions over one another ---
+
+Series = Sequence[tuple[str, Mapping[str, Any]]]
+"""Label of every session with its series."""
+BY_VIEW = (
+    ("calibration.view_rms_px", "Residuals of the board views", "board view",
+     "RMS reprojection [px]"),
+    ("registration.view_sigma_px", "Where the labels lie in every view, 1 sigma", "view",
+     "median object [px]"),
+)  # fmt: skip
+"""Series with a value a view."""
+SHARES = (
+    ("school.scores", "Scores of the grasps", "score", "share of the grasps [%]"),
+    ("labels.visibility", "Visible share of the objects", "visible share",
+     "share of objects in frames [%]"),
+)  # fmt: skip
+"""Series of values between 0 and 1."""
+
+
+def overlaid(sessions: Series) -> list[tuple[bytes, str]]:
+    """Return every plot that two sessions at least have something for."""
+    drawn: list[tuple[bytes, str]] = []
+    for name, title, x, y in BY_VIEW:
+        mine = [(label, s[name], k) for k, (label, s) in enumerate(sessions) if _views(s, name)]
+        if len(mine) > 1:
+            figure, ax = axes()
+            for label, values, k in mine:
+                style = {"color": SERIES[k % 6], "marker": MARKERS[k % 6], "ls": STYLES[k % 6]}
+                # The first ones larger: equal values would hide them.
+                size = max(3, 7 - 2 * k)
+                ax.plot(values["view"], values["value"], ms=size, lw=1, label=label, **style)
+            ax.set_ylim(0, 1.3 * max(ax.get_ylim()[1], 1e-9))
+            whole_numbers(ax.xaxis)
+            legend(ax, loc="upper left", ncols=2)
+            titled(ax, title, x, y)
+            drawn.append((png(figure), f"{title}: {_labels(mine)}."))
+    for name, title, x, y in SHARES:
+        mine = [(label, s[name], k) for k, (label, s) in enumerate(sessions) if s.get(name)]
+        if len(mine) > 1:
+            figure, ax = axes()
+            edges = np.linspace(0, 1, 21)
+            for label, values, k in mine:
+                counts, _ = np.histogram(values, edges)
+                share = 100 * counts / len(values)
+                ax.stairs(share, edges, color=SERIES[k % 6], ls=STYLES[k % 6], lw=2, label=label)
+            ax.set_ylim(0, 1.25 * max(ax.get_ylim()[1], 1e-9))
+            legend(ax, loc="upper left", ncols=2)
+            titled(ax, title, x, y)
+            drawn.append((png(figure), f"{title}: {_labels(mine)}."))
+    return drawn
+
+
+def _views(series: Mapping[str, Any], name: str) -> bool:
+    return bool(series.get(name, {}).get("view"))
+
+
+def _labels(mine: Sequence[tuple[str, Any, int]]) -> str:
+    return ", ".join(label for label, _, _ in mine)
+
+
+def moves(objects: Sequence[ObjectDifference], labels: str) -> bytes | None:
+    """Plot how far the objects stand from one another, beside the noise; None where none do."""
+    rows = [o for o in objects if o.shift_mm is not None]
+    if not rows:
+        return None
+    figure, ax = axes(height_px=100 + BAR_PX * max(3, len(rows)))
+    places = np.arange(len(rows))
+    ax.barh(places, [o.shift_mm or 0.0 for o in rows], 0.6, color=SERIES[0])
+    noise = [2 * o.sigma_mm if o.sigma_mm is not None else np.nan for o in rows]
+    ax.plot(noise, places, "|", ms=16, mew=2, color=INK)
+    ax.set_yticks(places, [o.name for o in rows])
+    ax.invert_yaxis()
+    ax.margins(x=0.1)
+    ax.tick_params(axis="y", colors=INK)
+    ax.axvline(0, color=MUTED, lw=1)
+    titled(ax, f"How far the objects stand apart, {labels}", "distance of the middle [mm]", "")
+    return png(figure)

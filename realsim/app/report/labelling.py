@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.app.report import plots_objects
+from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
 from realsim.app.report.section import Section, drawn
 from realsim.pages import Cell, Picture
@@ -61,7 +61,7 @@ def labels_section(section: Section, store: SessionStore) -> None:
 
 
 def _plot(section: Section, shares: Array) -> None:
-    picture = plots_objects.visibility(shares)
+    picture = drawing.visibility(shares)
     section.page.plots([(picture, "1 = no other object in front of it.")])
 
 

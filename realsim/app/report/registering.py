@@ -20,7 +20,7 @@ from realsim.app.register.tables import (
     view_rows,
     worst_first,
 )
-from realsim.app.report import plots_capture, plots_objects
+from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
 from realsim.app.report.section import Section, counted, drawn
 from realsim.app.report.uncertainty import sigmas
@@ -274,19 +274,19 @@ def _plots(section: Section, result: Registered) -> None:
     verdicts = [r["verdict"] for r in rows]
     if any(r["probability"] is not None for r in rows):
         values = [r["probability"] or 0.0 for r in rows]
-        picture = plots_objects.probabilities(names, values, verdicts, VerdictConfig().accept)
+        picture = drawing.probabilities(names, values, verdicts, VerdictConfig().accept)
         plots.append((picture, "Bars in the colour of the verdict."))
     if any(r["sigma_mm"] is not None for r in rows):
         mm = [r["sigma_mm"] if r["sigma_mm"] is not None else float("nan") for r in rows]
-        plots.append((plots_objects.sigmas(names, mm, verdicts), "From the fit's own residuals."))
+        plots.append((drawing.sigmas(names, mm, verdicts), "From the fit's own residuals."))
     per_view = _view_sigmas(result)
     left = sorted(set(result.cameras.claimed) - set(result.cameras.refined))
     if len(per_view) > 1:
-        picture = plots_objects.view_uncertainty(per_view, left if result.cameras.refined else [])
+        picture = drawing.view_uncertainty(per_view, left if result.cameras.refined else [])
         plots.append((picture, "Objects and camera together."))
     claimed, refined = result.cameras.claimed, result.cameras.refined
     if any(not is_same_pose(claimed[k], T) for k, T in refined.items() if k in claimed):
-        picture = plots_capture.camera_moves(claimed, refined)
+        picture = drawing.camera_moves(claimed, refined)
         plots.append((picture, "From where robot and calibration claim them to be."))
     section.page.plots(plots)
 

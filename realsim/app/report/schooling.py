@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 
-from realsim.app.report import plots_objects
+from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count, share
 from realsim.app.report.section import Section, drawn
 from realsim.app.show import GRASP_HEADER, grasp_rows, why_no_grasp
@@ -108,16 +108,16 @@ def _plots(section: Section, sets: list[GraspSet]) -> None:
     if not tried.any():
         return
     failed = Counter(f.partition(":")[0] for s in sets for f in s.failures if f)
-    picture = plots_objects.stages(int(tried.sum()), int(reach[tried].sum()), base[tried])
+    picture = drawing.stages(int(tried.sum()), int(reach[tried].sum()), base[tried])
     plots = [
         (picture, "A grasp is tried even where the arm does not reach it."),
-        (plots_objects.scores(scores[tried]), "Red: score below 0.5."),
+        (drawing.scores(scores[tried]), "Red: score below 0.5."),
     ]
     mm, deg = _kept(sets)
     if len(mm):
-        plots.append((plots_objects.slips(mm, deg), "Linear below 0.1, logarithmic above."))
+        plots.append((drawing.slips(mm, deg), "Linear below 0.1, logarithmic above."))
     if failed:
-        plots.append((plots_objects.failures(failed), "The first thing that stopped each grasp."))
+        plots.append((drawing.failures(failed), "The first thing that stopped each grasp."))
     section.page.plots(plots)
 
 

@@ -1,0 +1,270 @@
+"""The plots of one report: capture, calibration, registration, Robot School and labels."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from realsim.geometry import se3
+from realsim.pages.plots import (
+    BAD,
+    BAR_PX,
+    GOOD,
+    INK,
+    MUTED,
+    VERDICT_COLORS,
+    WARN,
+    axes,
+    bars,
+    legend,
+    png,
+    titled,
+    whole_numbers,
+)
+from realsim.records import STAGES, HandEye
+
+Array = NDArray[np.float64]
+OUTLIER = 2.5
+"""Board views beyond so many medians are drawn in another colour."""
+
+
+def board_residuals(hand_eye: HandEye) -> bytes:
+    """Plot how well every board view is predicted through the robot pose."""
+    figure, ax = axes()
+    views, rms = list(hand_eye.view_indices), np.asarray(hand_eye.view_rms_px)
+    far = rms > OUTLIER * np.median(rms)
+    ax.bar(views, rms, 0.8, color=np.where(far, WARN, GOOD).tolist())
+    unseen = float(np.nan_to_num(hand_eye.held_out_px))
+    if unseen:
+        told = f"views that the fit has not seen: {unseen:.2f} px"
+        ax.axhline(unseen, color=BAD, lw=1.5, ls="--", label=told)
+        legend(ax, loc="upper left")
+    ax.set_ylim(0, 1.25 * max(float(rms.max()), unseen))
+    whole_numbers(ax.xaxis)
+    titled(ax, "Residuals of the board views", "board view", "RMS reprojection [px]")
+    return png(figure)
+
+
+def board_directions(hand_eye: HandEye, Ts_base_ee: Sequence[Array]) -> bytes:
+    """Plot how the arm turned the camera: tilt from straight down, and roll."""
+    figure, ax = axes()
+    T = np.stack(Ts_base_ee) @ hand_eye.T_ee_cam
+    tilt = np.degrees(np.arccos(np.clip(-T[:, 2, 2], -1, 1)))
+    roll = np.degrees(np.arctan2(T[:, 1, 0], T[:, 0, 0]))
+    ax.scatter(roll, tilt, s=22, color=INK)
+    ax.set_xlim(-185, 185)
+    ax.set_xticks([-180, -90, 0, 90, 180])
+    ax.set_ylim(bottom=0)
+    titled(
+        ax, "Diversity of the board views: spread is good", "direction of the image's x axis [deg]",
+        "tilt from straight down [deg]",
+    )  # fmt: skip
+    return png(figure)
+
+
+def intrinsics_change(names: Sequence[str], values: Sequence[float], sd: Sequence[float]) -> bytes:
+    """Plot the calibrated lens against the camera that was given, in pixels."""
+    figure, ax = axes()
+    ax.axhline(0, color=MUTED, lw=1)
+    ax.errorbar(range(len(names)), values, yerr=2 * np.asarray(sd), fmt="o", color=INK, capsize=4)
+    ax.set_xticks(range(len(names)), names)
+    ax.margins(x=0.2)
+    titled(ax, "Lens as calibrated less the given camera (bars: 2 sigma)", "", "difference [px]")
+    return png(figure)
+
+
+def coverage(Ts_base_cam: Array, center: Array, captured: Sequence[bool]) -> bytes:
+    """Plot from which directions the planned views look at the scene's middle, as from above."""
+    figure, ax = axes()
+    away = Ts_base_cam[:, :3, 3] - center
+    distance = np.linalg.norm(away, axis=1)
+    azimuth = np.degrees(np.arctan2(away[:, 1], away[:, 0]))
+    elevation = np.degrees(np.arcsin(np.clip(away[:, 2] / distance, -1, 1)))
+    done = np.asarray(captured, dtype=bool)
+    for mine, marker, color, label in (
+        (done, "o", GOOD, "captured"), (~done, "x", BAD, "planned, not captured"),
+    ):  # fmt: skip
+        if mine.any():
+            ax.scatter(
+                azimuth[mine], elevation[mine], s=28, marker=marker, color=color, label=label
+            )
+    ax.set_xlim(-185, 185)
+    ax.set_xticks([-180, -90, 0, 90, 180])
+    ax.set_ylim(0, 95)
+    if not done.all():
+        legend(ax, loc="upper right")
+    titled(
+        ax, "Directions from which the views look at the scene", "azimuth [deg]", "elevation [deg]"
+    )
+    return png(figure)
+
+
+def settling(settle_s: Mapping[int, float]) -> bytes:
+    """Plot how long the arm took to stand still before every view."""
+    figure, ax = axes()
+    ax.bar(list(settle_s), [1e3 * v for v in settle_s.values()], 0.8, color=GOOD)
+    whole_numbers(ax.xaxis)
+    titled(ax, "Time until the arm stood still", "view", "settling [ms]")
+    return png(figure)
+
+
+def photographs(measured: Mapping[int, Mapping[str, float]]) -> bytes:
+    """Plot the sharpness and the depth of every photograph."""
+    figure, ax = axes()
+    views = list(measured)
+    for name, label, marker, color in (
+        ("depth_fill", "pixels with depth", "o", GOOD),
+        ("sharpness", "sharpness", "s", INK),
+    ):
+        values = [measured[v].get(name, np.nan) for v in views]
+        if np.isfinite(values).any():
+            ax.plot(views, values, marker=marker, ms=4, lw=1, color=color, label=label)
+    ax.set_ylim(0, 1.25)
+    legend(ax, loc="upper left", ncols=2)
+    whole_numbers(ax.xaxis)
+    titled(ax, "Checks of the photographs", "view", "share")
+    return png(figure)
+
+
+def camera_moves(before: Mapping[int, Array], after: Mapping[int, Array]) -> bytes:
+    """Plot how far registration moved every camera."""
+    figure, ax = axes()
+    views = [k for k in sorted(after) if k in before]
+    deltas = np.stack([se3.invert(before[k]) @ after[k] for k in views])
+    mm = 1e3 * np.linalg.norm(deltas[:, :3, 3], axis=1)
+    far = mm > OUTLIER * max(1e-12, float(np.median(mm)))
+    ax.bar(views, mm, 0.8, color=np.where(far, WARN, GOOD).tolist())
+    whole_numbers(ax.xaxis)
+    titled(ax, "Cameras before and after registration", "view", "moved by [mm]")
+    return png(figure)
+
+
+MOST_BARS = 12
+"""Reasons in one plot; further ones are summed up."""
+LONGEST_LABEL = 44
+
+
+def probabilities(
+    names: Sequence[str], values: Sequence[float], verdicts: Sequence[str], accept: float
+) -> bytes:
+    """Plot the probability that every object is right, in the colour of its verdict."""
+    figure, ax = bars(
+        names, values, [VERDICT_COLORS[v] for v in verdicts],
+        f"Probability that an object is right (dashed: {accept:g})",
+        "probability of less than 3 mm",
+    )  # fmt: skip
+    for k, (value, verdict) in enumerate(zip(values, verdicts, strict=True)):
+        inside = value > 0.3
+        ax.text(
+            value - 0.01 if inside else value + 0.01, k, verdict, va="center", fontsize=8,
+            ha="right" if inside else "left", color="white" if inside else INK,
+        )  # fmt: skip
+    ax.axvline(accept, color=INK, lw=1, ls="--")
+    ax.set_xlim(0, 1)
+    return png(figure)
+
+
+def view_uncertainty(sigma_px: Mapping[int, Sequence[float]], left_out: Sequence[int]) -> bytes:
+    """Plot how certain the objects are in every view: median, least and greatest."""
+    figure, ax = axes()
+    views = sorted(sigma_px)
+    rows = [np.asarray(sigma_px[k], dtype=np.float64) for k in views]
+    middle = np.array([np.median(r) for r in rows])
+    low, high = (np.array([f(r) for r in rows]) for f in (np.min, np.max))
+    ax.vlines(views, low, high, color=MUTED, lw=2, label="least to greatest object")
+    ax.plot(views, middle, "o", ms=4, color=INK, label="median object")
+    if left_out:
+        ax.plot(list(left_out), [0] * len(left_out), "x", ms=7, color=BAD, label="took no part",
+                clip_on=False)  # fmt: skip
+    ax.set_ylim(0, 1.35 * float(high.max()))
+    whole_numbers(ax.xaxis)
+    legend(ax, loc="upper left", ncols=3)
+    titled(ax, "Where the labels lie in every view, 1 sigma", "view", "1 sigma [px]")
+    return png(figure)
+
+
+def sigmas(names: Sequence[str], mm: Sequence[float], verdicts: Sequence[str]) -> bytes:
+    """Plot 1 sigma of the objects' positions."""
+    figure, _ = bars(
+        names, np.nan_to_num(mm).tolist(), [VERDICT_COLORS[v] for v in verdicts],
+        "How certain the objects' places are", "1 sigma along the worst axis [mm]",
+    )  # fmt: skip
+    return png(figure)
+
+
+def stages(tried: int, reachable: int, base_scores: Array) -> bytes:
+    """Plot how many grasps passed each stage."""
+    names = ["tried", "reached by the arm", *[f"passed: {s}" for s in STAGES]]
+    passed = [int(np.sum(base_scores >= 0.25 * (k + 1))) for k in range(len(STAGES))]
+    counts = [tried, reachable, *passed]
+    figure, ax = axes(height_px=90 + BAR_PX * len(names))
+    bars = ax.barh(names, counts, 0.7, color=[MUTED, MUTED, *[GOOD] * len(STAGES)])
+    labels = [f"{n} ({100 * n / max(1, tried):.0f} %)" for n in counts]
+    ax.bar_label(bars, labels, fontsize=8, padding=3, color=INK)
+    ax.set_xlim(0, 1.2 * max(1, *counts))
+    ax.invert_yaxis()
+    whole_numbers(ax.xaxis)
+    titled(ax, "Grasps through the four stages", "grasps", "")
+    return png(figure)
+
+
+def scores(values: Array, good_from: float = 0.5) -> bytes:
+    """Plot how the scores are distributed."""
+    figure, ax = axes()
+    edges = np.linspace(0, 1, 21)
+    counts, _ = np.histogram(values, edges)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    ax.bar(middle, counts, 0.045, color=[GOOD if m >= good_from else BAD for m in middle])
+    ax.axvline(good_from, color=INK, lw=1, ls="--")
+    ax.text(good_from + 0.01, 0.97, "good from here", fontsize=8, color=INK, va="top",
+            transform=ax.get_xaxis_transform())  # fmt: skip
+    whole_numbers(ax.yaxis)
+    titled(ax, f"Scores of {len(values)} grasps", "score", "grasps")
+    return png(figure)
+
+
+def slips(slip_mm: Array, slip_deg: Array) -> bytes:
+    """Plot how far objects slipped in grasps that kept them, and how far they turned."""
+    figure, ax = axes()
+    ax.scatter(slip_mm, slip_deg, s=14, color=INK, alpha=0.6, linewidths=0)
+    ax.set_xscale("symlog", linthresh=0.1)
+    ax.set_yscale("symlog", linthresh=0.1)
+    ax.set_xlim(left=0)
+    ax.set_ylim(bottom=0)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_formatter("{x:g}")
+    titled(ax, f"Largest slip of {len(slip_mm)} grasps that kept their object",
+           "slip in the hand [mm]", "turn in the hand [deg]")  # fmt: skip
+    return png(figure)
+
+
+def failures(counts: Mapping[str, int]) -> bytes:
+    """Plot why grasps failed, the most frequent reasons first."""
+    ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    shown, rest = ordered[:MOST_BARS], ordered[MOST_BARS:]
+    if rest:
+        shown.append((f"{len(rest)} other reasons", sum(n for _, n in rest)))
+    names = [_shortened(name) for name, _ in shown]
+    figure, ax = axes(height_px=90 + BAR_PX * len(shown))
+    bars = ax.barh(range(len(shown)), [n for _, n in shown], 0.7, color=WARN)
+    ax.set_yticks(range(len(shown)), names, fontsize=8)
+    ax.bar_label(bars, fontsize=8, padding=3, color=INK)
+    ax.margins(x=0.15)
+    ax.invert_yaxis()
+    whole_numbers(ax.xaxis)
+    titled(ax, "Where grasps failed", "grasps", "")
+    return png(figure)
+
+
+def _shortened(name: str) -> str:
+    name = f"lost while: {name}" if name in STAGES else name
+    return name if len(name) <= LONGEST_LABEL else name[: LONGEST_LABEL - 1] + "…"
+
+
+def visibility(shares: Array) -> bytes:
+    """Plot how visible the objects are in the frames."""
+    figure, ax = axes()
+    ax.hist(shares, np.linspace(0, 1, 21).tolist(), color=GOOD, rwidth=0.9)
+    whole_numbers(ax.yaxis)
+    titled(ax, f"Visible share of {len(shares)} objects in frames", "visible share", "number")
+    return png(figure)
