@@ -7,16 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from realsim.app.first_surfaces import FirstSurfaces
 from realsim.app.register.gain import camera_shifts_px, gain_picture, zoomed_camera
-from realsim.app.register.map import footprint_mm, place_covariance_mm2
+from realsim.app.register.map import place_covariance_mm2
 from realsim.app.register.page import page_bytes
 from realsim.app.register.pictures import (
-    PictureConfig,
     bias_of,
     draw_pictures,
-    placed_objects,
-    window_of,
 )
 from realsim.app.register.results import CameraChange, Registered
 from realsim.app.register.run import pixel_sigma, without_free_turns
@@ -25,7 +21,6 @@ from realsim.geometry import camera, se3
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, ObjectPose
 from realsim.records.depth_bias import DepthBias
-from realsim.rendering.labels import LabelRenderer
 from realsim.store import SessionStore
 from registered_sessions import CAMERA, models_of, registered_by_hand, table_session
 
@@ -110,27 +105,6 @@ def test_a_zoomed_camera_sees_the_same_points_enlarged() -> None:
     assert (zoomed.width, zoomed.height) == (640, 640)
 
 
-def test_first_surfaces_are_those_of_the_labels(result: Registered) -> None:
-    placed = placed_objects(result, MODELS)
-    T = result.cameras.refined[1]
-    ids, depth = FirstSurfaces(placed).look(CAMERA, T)
-    labels = LabelRenderer(placed).render(CAMERA, T)
-    assert np.array_equal(ids, labels.ids) and set(np.unique(ids)) == {-1, 0, 1}
-    assert np.array_equal(np.nan_to_num(depth), labels.depth_m)
-
-
-def test_the_window_shows_all_objects_in_the_picture_s_proportions() -> None:
-    ids = np.full((240, 320), -1, np.int32)
-    ids[100:120, 250:310] = 3
-    rows, columns = window_of(ids, PictureConfig())
-    assert rows.start <= 100 and rows.stop >= 120
-    assert columns.start <= 250 and columns.stop >= 310 and columns.stop <= 320
-    assert (columns.stop - columns.start) / (rows.stop - rows.start) == pytest.approx(4 / 3, 0.02)
-    assert window_of(np.full((240, 320), -1, np.int32), PictureConfig()) == (
-        slice(0, 240), slice(0, 320),
-    )  # fmt: skip
-
-
 def test_two_biases_one_after_the_other_are_one(result: Registered) -> None:
     first, then = (
         DepthBias(scale=1.004, offset_per_m=-0.003),
@@ -188,25 +162,8 @@ def test_the_ellipse_is_where_random_poses_put_the_middle() -> None:
     np.testing.assert_allclose(C, np.cov(np.array(places).T), atol=0.08 * np.trace(C))
 
 
-def test_a_footprint_holds_every_vertex() -> None:
-    model = part("wedge")
-    T = se3.exp(np.array([0.2, 0.5, -0.4, 0.1, 0.2, 0.0]))
-    outline = footprint_mm(model, T)
-    points = 1e3 * se3.transform(T, model.mesh.vertices)[:, :2]
-    following = np.roll(outline, -1, axis=0)
-    for a, b in zip(outline, following, strict=True):
-        side = (b - a)[0] * (points - a)[:, 1] - (b - a)[1] * (points - a)[:, 0]
-        assert side.min() > -1e-6  # the outline runs counter-clockwise
-
-
 def test_objects_are_listed_worst_first(result: Registered) -> None:
     assert [o.verdict for o in worst_first(result)] == ["doubtful", "accepted"]
     rows = object_rows(result, MODELS)
     assert rows[0][0] == "1 wedge" and rows[0][-1] == "half of it is hidden."
     assert rows[1][2:7] == ["97.0", "0.990", "0.30", "0.17", "0.25"]
-
-
-def test_pictures_of_a_single_view(store: SessionStore, result: Registered) -> None:
-    alone = {0: result.cameras.refined[0]}
-    one = replace(result, cameras=CameraChange(claimed=dict(alone), refined=alone))
-    assert set(draw_pictures(store, one, MODELS)) == {"overlay.jpg", "residuals.jpg", "map.png"}

@@ -57,14 +57,6 @@ def test_views_that_were_left_out_get_no_labels_and_are_named(store: SessionStor
     assert shown == {f"overlay_{k:06d}.png" for k in (0, 1, 3)}
 
 
-def test_a_session_without_a_record_of_cameras_is_labelled_whole(store: SessionStore) -> None:
-    result = registered_by_hand(store)
-    store.set_cameras(CAMERA, result.cameras.refined)
-    store.write_json(SCENE_FILE, documents(result, store, MODELS)[SCENE_FILE])
-    assert registered_views(store) is None
-    assert annotate_session(store, QUIET).views == 4
-
-
 def test_an_interrupted_registration_is_finished_by_whoever_comes_next(
     store: SessionStore,
 ) -> None:

@@ -86,6 +86,7 @@ def test_a_handle_is_seen_and_its_turn_corrected(case):
     assert abs(turn_deg(scene.truth[MUG].T_world_obj, T)) < 0.5
 
 
+@pytest.mark.slow
 def test_blind_turns_move_with_the_world(case):
     scene, starts, _ = case
     T = se3.random_transform(np.random.default_rng(5))

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records.depth_bias import DepthBias
-from realsim.registration.body import make_body
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import DepthFrame, LazyFrame, correct_frame, read_frame
-from realsim.registration.intake import scene_cloud, take_in
+from realsim.registration.intake import take_in
 from realsim.registration.simulated import TableScene
 from table_faults import foreign, shifted_view, without_any_depth
 from table_scenes import SMALL_LAB, small_scene
@@ -129,15 +128,6 @@ def test_a_view_of_another_scene_and_a_slipped_view_are_named():
     assert intake.plane is not None and abs(intake.plane.T_world_table[2, 3]) < 1e-3
 
 
-def test_noise_is_measured_although_every_other_view_is_empty():
-    frames = [f if f.index % 2 else without_any_depth(f) for f in scene().frames]
-    frames += [replace(f, index=20 + f.index) for f in frames]  # every third is looked at
-    frames = [without_any_depth(f) if k % 3 == 0 else f for k, f in enumerate(frames)]
-    intake = taken(frames)
-    assert intake.noise.per_m == pytest.approx(taken(scene().frames).noise.per_m, rel=0.05)
-    assert len(intake.frames) == sum(bool(np.any(f.depth_m)) for f in frames)
-
-
 def test_nothing_to_use_is_refused_by_name():
     with pytest.raises(InputError, match="at least one"):
         taken([])
@@ -152,25 +142,3 @@ def test_nothing_to_use_is_refused_by_name():
     small = replace(scene().frames[1], depth_m=np.ones((9, 16), np.float32))
     with pytest.raises(InputError, match="shape"):
         taken([scene().frames[0], small])
-
-
-def test_scene_cloud_is_what_stands_on_the_table():
-    intake = taken(scene().frames)
-    whole = scene_cloud(intake, scene().Ts_world_cam, intake.plane)
-    # Far away the table's own noise is higher than what stands on it.
-    cloud = whole.select(np.linalg.norm(whole.points[:, :2], axis=1) < 0.17)
-    distance = np.min(
-        [
-            np.abs(
-                make_body(p, scene().models[p.obj_id], 48, 50).field.distance(
-                    cloud.points, se3.invert(p.T_world_obj)
-                )
-            )
-            for p in scene().truth
-        ],
-        axis=0,
-    )
-    assert np.mean(distance < 2e-3) > 0.95
-    everything = scene_cloud(intake, scene().Ts_world_cam, None)
-    assert len(everything.points) > 2 * len(whole.points)
-    assert whole.points[:, 2].min() > 0.002

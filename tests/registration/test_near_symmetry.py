@@ -103,13 +103,3 @@ def test_they_move_with_the_mesh():
     halves = [about_z(30), T @ about_z(30) @ se3.invert(T)]
     assert gap(knob, halves[0], first) < 0.006
     assert gap(moved, halves[1], second) < 0.006
-
-
-def test_kept_ones_are_the_same_and_a_damaged_file_is_computed_again(tmp_path):
-    model = part("u_channel")
-    first = near_symmetries(model, CONFIG, tmp_path)
-    (path,) = tmp_path.iterdir()
-    assert np.array_equal(first, near_symmetries(model, CONFIG, tmp_path))
-    path.write_bytes(b"no npz file")
-    assert np.array_equal(first, near_symmetries(model, CONFIG, tmp_path))
-    assert path.stat().st_size > 20

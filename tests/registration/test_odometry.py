@@ -13,7 +13,6 @@ from realsim.records import SupportPlane
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.odometry.cross_check import CheckConfig, check_kinematics
 from realsim.registration.odometry.kiss import OdometryConfig, odometry
-from realsim.registration.odometry.pairs import on_plane
 from realsim.registration.views import SampleConfig, ViewPoints, sample_views
 from table_scenes import small_scene
 
@@ -79,19 +78,6 @@ def test_odometry_is_repeatable_and_names_small_clouds():
         odometry(clouds, OdometryConfig(), guesses=[np.eye(4)])
 
 
-def test_on_plane_brings_one_plane_onto_the_other():
-    rng = np.random.default_rng(4)
-    a, b = (se3.look_at(p, [0, 0, 0]) for p in ([0.1, 0.2, 0.4], [0.2, 0.1, 0.35]))
-    planes = [(T[2, :3], -T[2, 3]) for T in (a, b)]
-    true = se3.invert(a) @ b
-    about = rng.normal(size=3)
-    assert on_plane(true, *planes, about) == pytest.approx(true, abs=1e-12)
-    mended = on_plane(true @ se3.exp(0.02 * rng.normal(size=6)), *planes, about)
-    assert mended[:3, :3] @ planes[1][0] == pytest.approx(planes[0][0], abs=1e-9)
-    on_b = planes[1][0] * planes[1][1]
-    assert planes[0][0] @ se3.transform(mended, on_b[None])[0] == pytest.approx(planes[0][1])
-
-
 def test_a_clean_capture_raises_no_alarm():
     check = check_kinematics(views_of(1), PLANE, CheckConfig())
     assert check.good, check.words()
@@ -120,6 +106,7 @@ def test_a_slipped_mount_is_named():
     assert check.faults[0].mm == pytest.approx(5, abs=2)
 
 
+@pytest.mark.slow
 def test_swapped_images_are_named():
     views = views_of(1)
     order = np.arange(VIEWS)
@@ -130,6 +117,7 @@ def test_swapped_images_are_named():
     assert [(f.kind, f.view, f.other) for f in check.faults] == [("swapped", 9, 20)]
 
 
+@pytest.mark.slow
 def test_a_skipped_image_is_named():
     views = views_of(1)
     kept = np.delete(np.arange(VIEWS), 11)

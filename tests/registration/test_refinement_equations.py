@@ -133,7 +133,7 @@ def numeric(point: OnePoint, unknowns: int, apply: Callable[[Array], State]) -> 
     return out
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_derivatives_of_an_object_are_those_of_the_residual(box: Body, seed: int):
     point = some_point(np.random.default_rng(seed), box)
     shared, view = point.row()
@@ -146,7 +146,7 @@ def test_derivatives_of_an_object_are_those_of_the_residual(box: Body, seed: int
     np.testing.assert_allclose(view, expected, atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_derivatives_of_the_table_are_those_of_the_residual(seed: int):
     point = some_point(np.random.default_rng(100 + seed), None)
     shared, view = point.row()
@@ -156,26 +156,6 @@ def test_derivatives_of_the_table_are_those_of_the_residual(seed: int):
     assert shared[TABLE][2] == pytest.approx(-1.0)
     expected = numeric(point, 6, lambda x: step_state(point.state, [], nothing, x[None]))
     np.testing.assert_allclose(view, expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_derivatives_hold_to_a_percent_where_a_refinement_ends(box: Body, seed: int):
-    # Off by a per cent in the depth and by twice a usual hand-eye's error.
-    rng = np.random.default_rng(200 + seed)
-    point = some_point(rng, box, bias=(1.01, -0.01))
-    xi = se3.log(se3.from_rt(se3.exp_so3([0.003, -0.002, 0.001]), [1e-3, 0, -1e-3]))
-    point.state = State(
-        poses=point.state.poses, T_world_table=None, hand_eye=xi, views=0.2 * xi[None],
-        bias=point.state.bias,
-    )  # fmt: skip
-    shared, _ = point.row()
-    no_view = np.zeros((1, 6))
-    expected = numeric(
-        point, OBJECTS + 6, lambda x: step_state(point.state, point.bodies, x, no_view)
-    )
-    for part_ in (HAND_EYE, BIAS, slice(OBJECTS, OBJECTS + 6)):
-        off = np.linalg.norm(shared[part_] - expected[part_])
-        assert off < 0.02 * np.linalg.norm(expected[part_])
 
 
 def test_noise_of_a_point_is_not_in_its_derivative(box: Body):
@@ -301,7 +281,7 @@ def random_rows(seed: int, objects: int = 2, views: int = 4, each: int = 15) -> 
     return Rows(system, rows, Ms, objects, views, sigmas)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(1))
 def test_step_and_covariance_are_those_of_gtsam(seed: int):
     import gtsam
     from gtsam.symbol_shorthand import C, O, T, V

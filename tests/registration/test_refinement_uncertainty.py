@@ -113,6 +113,7 @@ def test_covariance_in_a_view_is_that_of_samples_of_everything():
 # --- statistics ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_the_covariance_says():
     """The normalised square of six errors is 1 on average."""
     in_world: list[float] = []
@@ -134,6 +135,7 @@ def test_errors_are_as_large_as_the_covariance_says():
     assert 0.2 < np.mean(hands) < 3
 
 
+@pytest.mark.slow
 def test_pixels_are_off_by_as_much_as_said():
     said: list[float] = []
     true: list[float] = []

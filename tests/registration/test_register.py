@@ -58,6 +58,7 @@ def test_rough_start_ends_at_the_truth_and_beats_one_view(clutter, result):
     json.dumps(result.report)
 
 
+@pytest.mark.slow
 def test_the_answer_moves_with_the_world(clutter, starts, result):
     T = se3.random_transform(np.random.default_rng(3))
     frames = [
@@ -81,6 +82,7 @@ def test_order_of_frames_and_objects_does_not_matter(clutter, starts, result):
         np.testing.assert_allclose(a.T_world_obj, b.T_world_obj, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_common_move_of_all_starts_is_reported(clutter):
     shift = se3.from_translation([0.010, -0.006, 0.0])
     moved = [

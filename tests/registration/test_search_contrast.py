@@ -88,14 +88,6 @@ def test_what_cannot_be_seen_is_undecided():
     assert got.contrast < 0.1
 
 
-def test_without_rivals_there_is_no_contrast():
-    for near in (np.zeros((0, 4, 4)), np.eye(4)[None]):
-        got = decide(0.012, np.eye(4), near)
-        assert got.contrast is None
-        assert got.T_rival is None
-        assert not got.changed
-
-
 def test_a_fit_of_the_same_pose_that_ended_a_little_apart_is_no_rival():
     _, sought = scene(0.012)
     turn = se3.from_rt(se3.exp_so3([0.0, 0.0, np.radians(1.5)]), np.zeros(3))

@@ -42,17 +42,6 @@ def test_the_table_is_zero_and_the_block_has_its_height(rng):
     assert np.nanmax(np.abs(grid.heights[outside])) < 1e-3
 
 
-def test_unmeasured_cells_are_nan_and_flying_points_are_left_out():
-    x, y = np.meshgrid(np.arange(-0.05, 0.05, 0.001), np.arange(-0.05, 0.05, 0.001))
-    points = np.c_[x.ravel(), y.ravel(), np.zeros(x.size)]
-    points = points[np.hypot(points[:, 0], points[:, 1]) > 0.01]
-    flying = np.array([[0.03, 0.03, 0.12], [-0.03, 0.02, 0.07]])
-    grid = height_grid(cloud_of(np.r_[points, flying]), PLANE, GridConfig())
-    hole = np.hypot(*np.moveaxis(grid.centers(), -1, 0)) < 0.007
-    assert np.all(np.isnan(grid.heights[hole]))
-    assert np.nanmax(grid.heights) < 1e-6
-
-
 def rebuilt(mesh, templates, d):
     """The template's points as the mesh, put down by the same pose, shows them from above."""
     from realsim.rendering.rays import PlacedMesh, RayScene

@@ -88,15 +88,6 @@ def test_a_point_is_seen_where_its_pixel_is(distortion: tuple[float, ...]):
     np.testing.assert_allclose(uv, view.pixels, atol=1e-3)
 
 
-def test_points_in_world_lie_on_the_surface_and_move_with_the_camera():
-    T = se3.look_at([0.2, -0.1, 0.4], [0.0, 0.02, 0.0])
-    view = sample_view(CAMERA, frame(plane_depth(CAMERA, T), T), NOISE, EVERY)
-    np.testing.assert_allclose(view.world()[:, 2], 0, atol=1e-6)
-    np.testing.assert_array_equal(view.world(), view.world(T))
-    S = se3.random_transform(np.random.default_rng(0))
-    np.testing.assert_allclose(view.world(S @ T), se3.transform(S, view.world()), atol=1e-12)
-
-
 def test_slopes_are_kept_and_steps_are_not():
     # The table at 65 degrees from its normal: a steep slope is no edge. The reach is that of so
     # small an image.
