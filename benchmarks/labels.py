@@ -27,92 +27,56 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 import argparse
-import json
-import sys
-import time
-import traceback
 from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
 
-from figures import Found, document_of, print_table
-from labels_figures import FIGURES
-
-from realsim.app.console import Console
+from figures import Figure, Found, Goal, run
 
 PACKAGES = (
-    "realsim",
-    "numpy",
-    "numba",
-    "open3d-cpu",
-    "opencv-python-headless",
-    "mitsuba",
-    "pyoidn",
-)
-PARTS: dict[str, tuple[str, str]] = {
-    "cost": ("labels_cost", "label_cost"),
-    "exact": ("labels_exact", "exactness"),
-    "pictures": ("labels_pictures", "picture_cost"),
-    "stereo": ("labels_stereo", "stereo_cost"),
-    "depth": ("labels_depth", "depth_real"),
-    "real": ("labels_real", "real_masks"),
-    "generate": ("labels_generate", "generate_cost"),
+    "realsim", "numpy", "numba", "open3d-cpu", "opencv-python-headless", "mitsuba", "pyoidn",
+)  # fmt: skip
+PAPER_FRAMES_PER_GPU_H = 100 * 256 / (7 * 24)
+"""The paper: 100 scenes of 256 views in a week on one RTX 6000, grasps included."""
+FIGURES = {
+    "labels_over_cast_720p": Figure(unit="x", goal=Goal(high=0.75)),
+    "labels_over_cast_1080p": Figure(unit="x", goal=Goal(high=0.75)),
+    "labels_over_cast_distorted": Figure(unit="x"),
+    "labels_cpu_ms_720p": Figure(unit="ms"),
+    "labels_cpu_ms_1080p": Figure(unit="ms"),
+    "labels_peak_mb": Figure(unit="MB", goal=Goal(high=1500.0)),
+    "reproj_px_worst": Figure(unit="px", goal=Goal(high=1e-3)),
+    "amodal_px_diff": Figure(unit="px", goal=Goal(high=0.0)),
+    "visible_px_diff_share": Figure(unit="", goal=Goal(high=1e-4)),
+    "rgb_cpu_s": Figure(unit="s", goal=Goal(high=2.0)),
+    "photo_cpu_s": Figure(unit="s", rival="prototype 12"),
+    "stereo_over_labels": Figure(unit="x", goal=Goal(high=5.0)),
+    "noise_ratio_real": Figure(unit="x", goal=Goal(high=1.5)),
+    "holes_ratio_real": Figure(unit="x", goal=Goal(high=1.5)),
+    "boundary_px_real": Figure(unit="px"),
+    "generate_frames_per_cpu_h": Figure(
+        unit="1/h", rival=f"paper {PAPER_FRAMES_PER_GPU_H:.0f} per GPU hour, grasps included"
+    ),
 }
-"""Part -> module and function: imported when it runs, because Mitsuba must come before others that
-load the same compiler, and the peak of memory is that of the labels alone."""
 
 
-def part_of(name: str) -> Callable[[int, bool], Found]:
-    """Return the function that measures a part."""
-    module, function = PARTS[name]
-    return getattr(import_module(module), function)
+def part(module: str, function: str) -> Callable[[argparse.Namespace], Found]:
+    """Return a part that is imported when it runs.
+
+    Mitsuba must come before others that load the same compiler, and the peak of memory is that of
+    the labels alone.
+    """
+    return lambda a: getattr(import_module(module), function)(a.seed, a.quick)
 
 
-def arguments_of() -> argparse.Namespace:
-    """Return the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--quick", action="store_true", help="every figure from fewer frames")
-    parser.add_argument("--seed", type=int, default=0, help="of materials and scenes")
-    parser.add_argument(
-        "--part", action="append", dest="parts", choices=list(PARTS), help="run this one alone"
-    )
-    arguments = parser.parse_args()
-    arguments.parts = arguments.parts or list(PARTS)
-    return arguments
-
-
-def main() -> None:
-    """Run the parts, print the table, write the JSON."""
-    arguments = arguments_of()
-    console = Console()
-    begin = time.perf_counter()
-    found = Found()
-    failures: dict[str, str] = {}
-    for name in arguments.parts:
-        start = time.perf_counter()
-        try:
-            found.take(part_of(name)(arguments.seed, arguments.quick))
-        except KeyboardInterrupt:
-            sys.exit(130)
-        except Exception as error:
-            failures[name] = f"{type(error).__name__}: {error}"
-            print(f"\n{name}:\n{traceback.format_exc()}", file=sys.stderr)
-        console.warn(f"{name}: {time.perf_counter() - start:.0f} s")
-    seconds = time.perf_counter() - begin
-    print_table(console, "Labels and pictures", FIGURES, found)
-    for name, why in failures.items():
-        console.warn(f"the part {name} failed: {why}")
-    console.say(f"{seconds:.0f} s, load {os.getloadavg()[0]:.1f}")
-    if arguments.json:
-        document = document_of("labels", PACKAGES, FIGURES, arguments, found)
-        document |= {"wall_s": round(seconds, 1), "failures": failures}
-        arguments.json.write_text(json.dumps(document, indent=1, default=str))
-    if failures:
-        sys.exit(1)
-
+PARTS = {
+    "cost": part("labels_cost", "label_cost"),
+    "exact": part("labels_exact", "exactness"),
+    "pictures": part("labels_pictures", "picture_cost"),
+    "stereo": part("labels_stereo", "stereo_cost"),
+    "depth": part("labels_depth", "depth_real"),
+    "real": part("labels_real", "real_masks"),
+    "generate": part("labels_generate", "generate_cost"),
+}
 
 if __name__ == "__main__":
-    main()
+    run("labels", __doc__, PACKAGES, FIGURES, PARTS)

@@ -1,6 +1,6 @@
 """Simulated depth against real frames: noise, and holes on objects.
 
-`depth_real` is the part of the label benchmark; `python benchmarks/labels_depth.py` runs by itself.
+Imported by `labels.py`: `python benchmarks/labels.py --part depth`.
 Figures (simulated over real, or real over simulated: what is greater than 1; the worst frame):
   noise_ratio_real      median rms of 9x9 planes fitted to inverse depth
   holes_ratio_real      share of pixels without depth on the objects
@@ -15,8 +15,6 @@ What is fitted never is what is tested:
 """
 
 import os
-import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -71,8 +69,6 @@ class Compared:
     noise_px: tuple[float, float]
     """Real and simulated."""
     holes: tuple[float, float]
-    real_m: Array32
-    simulated_m: Array32
 
 
 def depth_real(seed: int, quick: bool) -> Found:
@@ -213,7 +209,7 @@ def _compare(
         holes = (hole_share(real, objects), hole_share(simulated, objects))
     return Compared(
         name=name, fitted_on=fitted_on, noise_ratio=b / a, holes_ratio=holes[1] / holes[0],
-        noise_px=(a, b), holes=holes, real_m=real, simulated_m=simulated,
+        noise_px=(a, b), holes=holes,
     )  # fmt: skip
 
 
@@ -278,10 +274,3 @@ def _apc(seed: int) -> list[Compared]:
         )
         for k, depth in testing
     ]  # fmt: skip
-
-
-if __name__ == "__main__":
-    start = time.process_time()
-    result = depth_real(0, "--quick" in sys.argv)
-    print(result.figures, result.over, *result.notes, sep="\n")
-    print(f"{time.process_time() - start:.1f} CPU s")

@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 from figures import Found
-from labels_figures import PAPER_FRAMES_PER_GPU_H
+from labels import PAPER_FRAMES_PER_GPU_H
 
 SIZE = "1280x720"
 

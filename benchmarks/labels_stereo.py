@@ -59,10 +59,3 @@ def _measured(sensor, renderer, intrinsics, views, seed: int) -> tuple[float, fl
             stereo.append(time.process_time() - between)
             filled.append(float(np.mean(depth[exact.depth_m > 0] > 0)))
     return float(np.mean(stereo)), float(np.mean(labels)), float(np.mean(filled))
-
-
-if __name__ == "__main__":
-    import sys
-
-    result = stereo_cost(0, "--quick" in sys.argv)
-    print(result.figures, result.over, *result.notes, sep="\n")

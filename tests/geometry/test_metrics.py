@@ -58,7 +58,7 @@ def test_every_symmetry_of_a_part_costs_nothing(name: str):
 
 
 @pytest.mark.parametrize("name", ["cylinder_can", "bowl", "capsule"])
-@pytest.mark.parametrize("deg, mm", [(0.5, 1.0), (15.0, 20.0), (80.0, 60.0)])
+@pytest.mark.parametrize("deg, mm", [(0.5, 1.0), (80.0, 60.0)])
 def test_an_axis_gives_what_sampling_every_hundredth_of_a_degree_gives(
     name: str, deg: float, mm: float
 ):

@@ -88,6 +88,7 @@ def solid_volume(mesh):
     return mass_properties(mesh, 1.0).volume_m3
 
 
+@pytest.mark.slow
 def test_faces_that_look_inwards_make_no_difference():
     bracket = part("l_bracket").mesh
     flipped = replace(bracket, faces=bracket.faces[:, ::-1])
@@ -165,6 +166,7 @@ def is_running(pid):
     return said.stdout.strip() not in ("", "Z", "Z+")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_no_process_is_left_behind(how, tmp_path):
     # A script without `if __name__ == "__main__"`, as a user writes it.
@@ -193,6 +195,7 @@ def test_no_process_is_left_behind(how, tmp_path):
         process.wait()
 
 
+@pytest.mark.slow
 def test_a_frozen_program_cuts_in_its_own_process(monkeypatch):
     monkeypatch.setattr(sys, "frozen", True, raising=False)
     cut = convex_parts(annulus(), QUICK)

@@ -30,6 +30,7 @@ def near(image: np.ndarray, color: np.ndarray) -> int:
     return int(np.sum(np.all(np.abs(image.astype(int) - color) < 12, axis=-1)))
 
 
+@pytest.mark.slow
 def test_a_sheet_does_not_depend_on_the_unit():
     mesh = part("l_bracket").mesh
     small, large = (
@@ -52,6 +53,7 @@ def test_open_rims_are_red_and_closed_meshes_have_none():
     assert near(closed, RIM) == 0 and near(opened, RIM) > 200
 
 
+@pytest.mark.slow
 def test_every_part_has_its_colour():
     left, right = part("cube").mesh.vertices, part("cube").mesh.vertices + np.array([0.05, 0, 0])
     mesh = Mesh(

@@ -63,7 +63,7 @@ def test_shadows_by_rays_and_lossy_materials_are_switched_on_alone() -> None:
     assert lost[square_seen].mean() > 0.9 and not lost[~square_seen].any()
 
 
-@pytest.mark.parametrize("name", ["d405", "structured_light"])
+@pytest.mark.parametrize("name", ["d405", pytest.param("structured_light", marks=pytest.mark.slow)])
 def test_a_matched_pair_sees_the_same_scene(name: str) -> None:
     kind = replace(profile(name), min_z_m=0.1)
     scene = [square(BACKGROUND, 0.6, 1.0, Material()), square(0, 0.4, 0.06, Material())]

@@ -41,7 +41,7 @@ def fitted(model: DepthSensorModel, kind: str = "d405") -> FittedDepthModel:
     "model",
     [
         DepthSensorModel.from_profile("d405"),
-        SOFT,
+        pytest.param(SOFT, marks=pytest.mark.slow),
         pytest.param(
             DepthSensorModel.from_profile("d405", correlation_px=2.5, correlation_aspect=0.6),
             marks=pytest.mark.slow,

@@ -61,6 +61,7 @@ def test_the_same_seed_gives_the_same_bytes(variant: str, denoise: bool) -> None
 
 
 @NEEDS_LLVM
+@pytest.mark.slow
 def test_both_variants_make_the_same_picture() -> None:
     a, b = (
         PhotorealRenderer(scene(), SKY, PhotorealConfig(variant=v, samples=64)).render(CAMERA, VIEW)
@@ -71,6 +72,7 @@ def test_both_variants_make_the_same_picture() -> None:
     assert np.allclose(a.depth_m, b.depth_m, rtol=1e-5, atol=0)
 
 
+@pytest.mark.slow
 def test_the_denoiser_removes_the_noise_and_keeps_the_picture() -> None:
     def at(samples: int, denoise: bool) -> np.ndarray:
         config = PhotorealConfig(variant="scalar", samples=samples, denoise=denoise, psf_px=0)
@@ -184,6 +186,7 @@ except InputError as error:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_without_llvm_the_scalar_variant_renders_and_says_so(tmp_path: Path) -> None:
     said = in_another_process("", tmp_path)
     assert said.startswith("scalar_rgb ")

@@ -51,11 +51,10 @@ def seam(image: np.ndarray, axis: int) -> tuple[float, float]:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_tiles_without_a_seam(kind: str) -> None:
-    for seed in (0, 1):
-        for name, image in images(made(kind, seed)[0]).items():
-            for axis in (0, 1):
-                wrap, inside = seam(image, axis)
-                assert wrap <= 1.02 * inside + 0.05, (kind, name, axis, wrap, inside)
+    for name, image in images(made(kind, 0)[0]).items():
+        for axis in (0, 1):
+            wrap, inside = seam(image, axis)
+            assert wrap <= 1.02 * inside + 0.05, (kind, name, axis, wrap, inside)
 
 
 def test_the_seam_of_a_cropped_tile_is_found() -> None:
@@ -66,7 +65,7 @@ def test_the_seam_of_a_cropped_tile_is_found() -> None:
     assert wrap > 1.5 * inside
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", KINDS[::5])
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(kind: str) -> None:
     a, c = images(made(kind, 0)[0]), images(made(kind, 1)[0])
     b = images(random_material(np.random.default_rng(0), kind))
@@ -77,25 +76,25 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(kind: str) -
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_reflectances_are_those_of_real_things(kind: str) -> None:
-    for seed in range(2):
-        m, _ = made(kind, seed)
-        assert m.base_color_image is not None
-        side = m.base_color_image.shape[0]
-        assert m.base_color_image.shape == (side, side, 3)
-        assert 256 <= side <= 1024
-        mean = float(luminance(light_of_bytes(m.base_color_image)).mean())
-        # Between charcoal and fresh snow.
-        assert 0.008 < mean < 0.9
-        assert 0.01 <= m.period_m <= 1.0
-        clipped = np.mean(np.all(m.base_color_image == 255, -1))
-        assert clipped < 0.02
-        if m.normal_image is not None:
-            n = (m.normal_image.astype(np.float64) - 128.0) / 127.0
-            np.testing.assert_allclose(np.linalg.norm(n, axis=-1), 1.0, atol=0.02)
-            assert n[..., 2].min() > 0.1
-            np.testing.assert_allclose(n.mean((0, 1))[:2], 0.0, atol=0.02)
+    m, _ = made(kind, 0)
+    assert m.base_color_image is not None
+    side = m.base_color_image.shape[0]
+    assert m.base_color_image.shape == (side, side, 3)
+    assert 256 <= side <= 1024
+    mean = float(luminance(light_of_bytes(m.base_color_image)).mean())
+    # Between charcoal and fresh snow.
+    assert 0.008 < mean < 0.9
+    assert 0.01 <= m.period_m <= 1.0
+    clipped = np.mean(np.all(m.base_color_image == 255, -1))
+    assert clipped < 0.02
+    if m.normal_image is not None:
+        n = (m.normal_image.astype(np.float64) - 128.0) / 127.0
+        np.testing.assert_allclose(np.linalg.norm(n, axis=-1), 1.0, atol=0.02)
+        assert n[..., 2].min() > 0.1
+        np.testing.assert_allclose(n.mean((0, 1))[:2], 0.0, atol=0.02)
 
 
+@pytest.mark.slow
 def test_a_material_costs_less_than_a_third_of_a_second() -> None:
     # Less than 0.3 s where nobody else computes.
     made("oak", 0)  # imports
