@@ -125,7 +125,7 @@ def test_any_bop_reader_reads_the_library(library: ModelLibrary):
     assert {i: m.name for i, m in models.items()} == {7: "cone", 8: "box"}
     info = json.loads((library.folder / "models_info.json").read_text())
     assert list(info) == ["7", "8"]
-    assert info["7"]["diameter"] == pytest.approx(1e3 * diameter(part("cone").mesh), rel=1e-6)
+    assert info["7"]["diameter"] == pytest.approx(1e3 * diameter(part("cone").mesh), rel=1e-3)
     assert len(info["7"]["symmetries_continuous"]) == 1
 
 
