@@ -55,6 +55,7 @@ def files_of(folder):
             for p in sorted(folder.rglob("*")) if p.is_file()}  # fmt: skip
 
 
+@pytest.mark.slow
 def test_what_is_streamed_is_what_is_written(school, written):
     import av
     import pyarrow.parquet as pq
@@ -87,6 +88,7 @@ def test_what_is_streamed_is_what_is_written(school, written):
     assert at == len(table) == len(frames["front"]) == len(frames["wrist"])
 
 
+@pytest.mark.slow
 def test_actions_are_the_next_states(written):
     import pyarrow.parquet as pq
 
@@ -102,6 +104,7 @@ def test_actions_are_the_next_states(written):
     assert all(r["action"][7] <= r["observation.state"][7] + 1e-6 for r in rows)
 
 
+@pytest.mark.slow
 def test_the_notes_tell_how_each_attempt_ended(school, written):
     notes = [json.loads(line) for line in (written / layout.NOTES).read_text().splitlines()]
     assert len(notes) == 3
@@ -109,15 +112,17 @@ def test_the_notes_tell_how_each_attempt_ended(school, written):
     assert all(n["success"] == (n["failure"] == "") for n in notes)
 
 
+@pytest.mark.slow
 def test_the_page_shows_pictures_and_points_at_the_videos(written):
     page = (written / "demonstrations.html").read_text()
-    assert page.count('<img alt="steps" src="data:image/jpeg;base64,') == 3
+    assert page.count('alt="steps" src="data:image/jpeg;base64,') == 3
     assert page.count('poster="data:image/jpeg;base64,') == page.count("<video ") == 6
     sources = re.findall(r'src="(videos/[^"#]+)#t=', page)
     assert len(sources) == 6
     assert all((written / s).is_file() for s in sources)
 
 
+@pytest.mark.slow
 def test_checksums_and_card_are_there(written):
     for line in (written / "SHA256SUMS").read_text().splitlines():
         digest, name = line.split("  ", 1)
@@ -157,6 +162,7 @@ def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
     assert files_of(tmp_path / "demos") == files_of(written)
 
 
+@pytest.mark.slow
 def test_requests_that_cannot_be_are_refused(school, written, tmp_path):
     out = ("--out", tmp_path / "demos")
     assert "INSTANCE:GRASP" in refused(school, *out, "--grasp", "first")

@@ -46,6 +46,7 @@ def twin(real):
     return run_render(real.folder, RenderRequest(), QUIET)
 
 
+@pytest.mark.slow
 def test_the_twins_masks_are_those_annotated_in_the_real_frames(real, twin):
     seen = 0
     for made, shot in enumerate(twin.real):
@@ -58,6 +59,7 @@ def test_the_twins_masks_are_those_annotated_in_the_real_frames(real, twin):
     assert twin.figures.mask_iou == twin.figures.mask_iou_least == 1.0
 
 
+@pytest.mark.slow
 def test_the_twins_stand_where_the_real_cameras_stood(real, twin):
     assert twin.real == (0, 2, 4)
     for made, shot in enumerate(twin.real):
@@ -67,6 +69,7 @@ def test_the_twins_stand_where_the_real_cameras_stood(real, twin):
     assert twin.twin.session.depth_unit_m == real.session.depth_unit_m
 
 
+@pytest.mark.slow
 def test_light_and_table_match_the_photographs(real, twin):
     look = twin.look.look
     assert look.has_colors
@@ -76,10 +79,12 @@ def test_light_and_table_match_the_photographs(real, twin):
         assert np.abs(ours.mean((0, 1)) - theirs.mean((0, 1))).max() < 0.05
 
 
+@pytest.mark.slow
 def test_depth_is_like_the_real_one(twin):
     assert 0.5 < twin.figures.noise_ratio < 2.0
 
 
+@pytest.mark.slow
 def test_the_result_is_a_sound_session_with_sheet_and_page(real, twin):
     assert twin.twin.folder == real.folder / "synthetic/real-embedded-disparity"
     assert twin.twin.verify() == []

@@ -22,24 +22,10 @@ from realsim.records import ObjectPose, Scene
 from realsim.store import SessionStore, load_grasps, save_scene
 from realsim_sim_bridge.school.sweep import SweepConfig
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings
-from school_sessions import GRASPS, QUICK, T_WORLD_TABLE, refused, registered, run, scene
+from school_sessions import GRASPS, QUICK, T_WORLD_TABLE, refused, run, scene
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[3] / "shared/data"))
 GRASPIT = DATA / "school/graspit_assets/scene.yaml"
-
-
-@pytest.fixture(scope="module")
-def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A registered session."""
-    return registered(tmp_path_factory.mktemp("pristine") / "s")
-
-
-@pytest.fixture(scope="module")
-def tried(pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
-    """The same session after a school, and what the command said."""
-    folder = tmp_path_factory.mktemp("tried") / "s"
-    shutil.copytree(pristine, folder)
-    return folder, run(folder, *QUICK, "--json-file", folder.parent / "counts.json")
 
 
 # --- a run --------------------------------------------------------------------------------------

@@ -16,24 +16,10 @@ from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.store import load_grasps
-from school_sessions import NAMES, QUICK, T_WORLD_TABLE, refused, registered, run, scene
+from school_sessions import NAMES, QUICK, T_WORLD_TABLE, refused, run, scene
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[3] / "shared/data"))
 GRASPIT = DATA / "school/graspit_assets/scene.yaml"
-
-
-@pytest.fixture(scope="module")
-def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A registered session."""
-    return registered(tmp_path_factory.mktemp("pristine") / "s")
-
-
-@pytest.fixture(scope="module")
-def tried(pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
-    """The same session after a school, and what the command said."""
-    folder = tmp_path_factory.mktemp("tried") / "s"
-    shutil.copytree(pristine, folder)
-    return folder, run(folder, *QUICK, "--json-file", folder.parent / "counts.json")
 
 
 @pytest.mark.parametrize("option", ["--force", "--friction", "--density"])

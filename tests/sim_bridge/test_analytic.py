@@ -26,26 +26,14 @@ from realsim_sim_bridge.grasping.candidates import (
 )
 from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
 from tried_grasps import assert_same
+from trimesh_solids import solid, wedge
 
 HAND = HandGeometry()
 FEW = AnalyticConfig(points=12)
 
 
-def solid(shape):
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
-
-
 def box(*size):
     return solid(trimesh.creation.box(size or (0.04, 0.06, 0.1)))
-
-
-def wedge(half_angle):
-    """Return a prism along z whose sides +y and -y open at +-half_angle along x."""
-    x, thin = np.array([-0.02, 0.02]), 0.008
-    end = thin + 0.04 * np.tan(half_angle)
-    outline = np.array([[x[0], -thin], [x[1], -end], [x[1], end], [x[0], thin]])
-    corners = np.concatenate([np.c_[outline, np.full(4, z)] for z in (-0.03, 0.03)])
-    return solid(trimesh.convex.convex_hull(corners))
 
 
 def labels_of(mesh, config=FEW, seed=0):

@@ -9,12 +9,9 @@ import trimesh
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface, antipodal_pairs
+from trimesh_solids import solid
 
 CONFIG = CandidateConfig(surface_points=500)
-
-
-def solid(shape):
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
 
 
 def pairs_of(mesh, config=CONFIG, max_width=0.078, seed=0):

@@ -7,7 +7,6 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.hand import HandGeometry
 from realsim.geometry.parts import part
-from realsim.records import Mesh
 from realsim_sim_bridge.grasping.candidates import (
     CandidateConfig,
     Surroundings,
@@ -15,12 +14,9 @@ from realsim_sim_bridge.grasping.candidates import (
     standing_object,
 )
 from realsim_sim_bridge.grasping.hand_free import boxes_free, lowest_corner
+from trimesh_solids import solid
 
 HAND = HandGeometry()
-
-
-def solid(shape):
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
 
 
 def box(x=0.05, y=0.05, z=0.05):

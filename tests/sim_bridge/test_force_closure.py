@@ -19,12 +19,9 @@ from realsim_sim_bridge.grasping.force_closure import (
     largest_balls,
 )
 from realsim_sim_bridge.grasping.pad_contacts import pad_contacts
+from trimesh_solids import solid
 
 HAND = HandGeometry()
-
-
-def solid(shape):
-    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
 
 
 def box(*size):

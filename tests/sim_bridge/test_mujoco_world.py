@@ -1,18 +1,18 @@
 """MuJoCo holds what Coulomb's law holds, drops what it drops, and repeats itself to the bit."""
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
 
+from held_boxes import held_box
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.motion import SlipMotion, lift_acceleration, oscillation_acceleration
 from realsim_sim_bridge.slip.mujoco_world import MODELS_KEPT, MujocoEngine
-from realsim_sim_bridge.slip.world import Closing, Grips, SlipBody, SlipPhysics
+from realsim_sim_bridge.slip.world import Closing, Grips, SlipPhysics
 
 pytest.importorskip("mujoco")
 
@@ -23,9 +23,7 @@ ENGINE = MujocoEngine(MujocoSettings())
 
 
 def cube(mass=0.125):
-    corners = np.array(list(product((-SIDE / 2, SIDE / 2), repeat=3)))
-    inertia = np.eye(3) * mass * SIDE**2 / 6
-    return SlipBody(parts=(corners,), mass_kg=mass, center_of_mass=np.zeros(3), inertia=inertia)
+    return held_box(mass)
 
 
 def grips(Ts_obj_grasp=None, R=DOWN, opening=SIDE + 0.008):

@@ -110,7 +110,7 @@ def test_the_same_seed_gives_the_same_trajectories():
     assert first.reasons == again.reasons
 
 
-@pytest.mark.parametrize("x", [-0.15, 0.0, 0.15])
+@pytest.mark.parametrize("x", [-0.15, 0.15])
 def test_the_perfect_reach_covers_the_table(x):
     Ts = [
         from_above(x, y, 0.05, yaw)

@@ -1,11 +1,11 @@
 """The slip test's physics: a box that must be held, Coulomb's limit, and the engine's traps."""
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
 
+from held_boxes import held_box
 from realsim.geometry import se3
 from realsim.geometry.hand import HandGeometry
 from realsim_sim_bridge.slip.bullet_world import BulletEngine
@@ -19,16 +19,14 @@ from realsim_sim_bridge.slip.motion import (
 )
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, batches, run_slip_test
-from realsim_sim_bridge.slip.world import Closing, Replay, SlipBody, SlipPhysics
+from realsim_sim_bridge.slip.world import Closing, Replay, SlipPhysics
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 SIDE = 0.05
 
 
 def cube(mass=0.125):
-    corners = np.array(list(product((-SIDE / 2, SIDE / 2), repeat=3)))
-    inertia = np.eye(3) * mass * SIDE**2 / 6
-    return SlipBody(parts=(corners,), mass_kg=mass, center_of_mass=np.zeros(3), inertia=inertia)
+    return held_box(mass)
 
 
 def trial(n=1, mass=0.125, R=DOWN):

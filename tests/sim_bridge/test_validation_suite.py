@@ -20,7 +20,6 @@ from realsim_sim_bridge.validation.config import (
     StageConfig,
     ValidationConfig,
 )
-from realsim_sim_bridge.validation.labels import refined
 from realsim_sim_bridge.validation.report import CheckResult, LimitRatio, ValidationReport, picture
 from realsim_sim_bridge.validation.suite import validate
 
@@ -143,13 +142,6 @@ def test_substeps_are_seen_in_the_settings_and_in_the_force(told_otherwise):
     assert {"settings read back", "coulomb limit, x", "capacity below the weight"} <= found
 
 
-def test_another_time_step_than_asked_is_seen(told_otherwise):
-    told_otherwise(fixedTimeStep=1 / 200)
-    report = run("settings")
-    assert "dt_s" in report.check("settings read back").detail
-    assert not report.check("settings read back").passed
-
-
 def test_a_wrong_force_fails_everywhere():
     found = failed(run("settings", "coulomb", "torque", make=StrongerEngine))
     assert {"settings read back", "finger force", "coulomb limit, z", "torque limit, spin"} <= found
@@ -233,15 +225,3 @@ def test_parts_that_there_are_not_are_named():
         run("friction")
     with pytest.raises(InputError, match="nothing to do"):
         run()
-
-
-@pytest.mark.parametrize("settings", [BulletSettings(), MujocoSettings()])
-def test_finer_settings_are_finer_in_what_they_say_and_play_at_true_speed(settings):
-    half, again = refined(settings, 2, 1), refined(settings, 1, 2)
-    assert half.replay.speed == again.replay.speed == 1
-    if isinstance(settings, BulletSettings):
-        assert half.rate_hz == 2 * settings.rate_hz and half.iterations == settings.iterations
-        assert again.iterations == 2 * settings.iterations and again.rate_hz == settings.rate_hz
-    else:
-        assert half.step_s == settings.step_s / 2
-        assert again.noslip_iterations > settings.noslip_iterations

@@ -38,6 +38,7 @@ def lowest_m(d, k):
     return float(se3.transform(d.motion.Ts_table_obj[k], mesh.vertices)[:, 2].min())
 
 
+@pytest.mark.slow
 def test_every_attempt_is_there_and_ends_as_it_is_stored(source, all_of_them, school):
     grasps = stored_grasps(school)[0]
     assert len(all_of_them) == len(source) == sum(len(t) for t in grasps.trajectories.values())
@@ -48,6 +49,7 @@ def test_every_attempt_is_there_and_ends_as_it_is_stored(source, all_of_them, sc
     assert kinds == {"", "close", "lift"}, "the school holds successes and two kinds of failures"
 
 
+@pytest.mark.slow
 def test_the_hand_is_at_the_goal_when_the_fingers_close(all_of_them):
     for d in all_of_them:
         closing = d.motion.phase == CLOSE
@@ -57,6 +59,7 @@ def test_the_hand_is_at_the_goal_when_the_fingers_close(all_of_them):
         np.testing.assert_array_equal(T, panda.forward(d.motion.joints_rad[closing]))
 
 
+@pytest.mark.slow
 def test_an_action_is_what_the_next_step_has(good):
     steps = list(good)
     for now, after in itertools.pairwise(steps):
@@ -68,6 +71,7 @@ def test_an_action_is_what_the_next_step_has(good):
     np.testing.assert_array_equal(steps[-1].action.joints_rad, steps[-1].joints_rad)
 
 
+@pytest.mark.slow
 def test_an_object_that_is_held_moves_with_the_hand_and_is_lifted(good):
     m = good.motion
     held = np.nonzero(m.held & (m.phase >= LIFT))[0]
@@ -78,6 +82,7 @@ def test_an_object_that_is_held_moves_with_the_hand_and_is_lifted(good):
     assert lifted == pytest.approx(0.20, abs=0.01)
 
 
+@pytest.mark.slow
 def test_fingers_stop_at_the_cube_and_are_told_to_press(good):
     assert good.goal.name == "cube"
     m = good.motion
@@ -87,6 +92,7 @@ def test_fingers_stop_at_the_cube_and_are_told_to_press(good):
     assert np.all(np.diff(m.opening_m) < 1e-3)
 
 
+@pytest.mark.slow
 def test_a_lost_object_falls_onto_the_table_and_stays_there(lost):
     assert lost
     for d in lost:
@@ -96,6 +102,7 @@ def test_a_lost_object_falls_onto_the_table_and_stays_there(lost):
         assert min(lowest_m(d, k) for k in range(len(m))) > -4e-3
 
 
+@pytest.mark.slow
 def test_a_failed_attempt_ends_where_it_failed(all_of_them):
     for d in all_of_them:
         if d.outcome.success or "lost" in d.outcome.failure or "touch" in d.outcome.failure:
@@ -130,6 +137,7 @@ def test_half_the_rate_is_every_second_step(school, source):
         np.testing.assert_allclose(a.Ts_table_obj, b.Ts_table_obj[::2], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_others_stand_still_and_everything_is_told_in_the_base(good):
     other = next(i for i in good.scenery.Ts_table_obj if i != good.name.instance)
     T = np.stack([s.Ts_base_obj[other] for s in good])
@@ -141,6 +149,7 @@ def test_the_others_stand_still_and_everything_is_told_in_the_base(good):
     np.testing.assert_allclose(goal, se3.invert(good.scenery.T_table_base), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_step_is_seen_the_same_each_time_and_steps_are_seen_differently(good):
     middle = len(good) // 2
     for camera in ("front", "wrist"):
@@ -150,6 +159,7 @@ def test_a_step_is_seen_the_same_each_time_and_steps_are_seen_differently(good):
         assert np.abs(first.astype(int) - good.step(0).look(camera)).mean() > 2.0
 
 
+@pytest.mark.slow
 def test_the_hand_sees_the_cube_between_its_fingers_once_it_is_held(good):
     k = int(np.nonzero(good.motion.held)[0][-1])
     picture = good.step(k).look("wrist").astype(int)

@@ -61,10 +61,6 @@ def test_the_same_seed_gives_the_same_cameras_and_another_one_others():
     assert not np.allclose(spread(20, 3), spread(20, 4))
 
 
-def test_one_camera_can_be_asked_for():
-    assert se3.check_rigid(spread(1), "camera").shape == (1, 4, 4)
-
-
 def test_a_camera_straight_above_is_still_rigid():
     se3.check_rigid(spread(50, elevation_deg=(80.0, 90.0)), "cameras")
 

@@ -152,10 +152,11 @@ def test_more_views_are_added_without_touching_the_first(tmp_path, written):
         write(tmp_path / "s", Ts=cameras(3))
 
 
-def test_the_seed_is_of_the_noise_and_not_of_the_labels(tmp_path, written):
+def test_the_seed_is_of_the_noise_and_not_of_the_labels(tmp_path):
+    write(tmp_path / "a", 1, seed=0)
     write(tmp_path / "b", 1, seed=1)
     write(tmp_path / "c", 1, SyntheticConfig(maps=("instance",), depth="clean"), seed=1)
-    a, b, c = (content(f) for f in (written[1].folder, tmp_path / "b", tmp_path / "c"))
+    a, b, c = (content(tmp_path / n) for n in "abc")
     for noisy in ("rgb/000000.png", "depth/000000.png"):
         assert a[noisy] != b[noisy]
     for exact in ("mask_visib/000000_000000.png", "labels/depth/000000.png"):

@@ -1,0 +1,19 @@
+"""Meshes made by trimesh."""
+
+import numpy as np
+import trimesh
+
+from realsim.records import Mesh
+
+
+def solid(shape: trimesh.Trimesh) -> Mesh:
+    return Mesh(vertices=np.array(shape.vertices), faces=np.array(shape.faces))
+
+
+def wedge(half_angle: float, length: float = 0.04, thin: float = 0.008, half_height: float = 0.03):
+    """Return a prism along z that grows along x: its sides +y and -y open at +-half_angle."""
+    end = thin + length * np.tan(half_angle)
+    x = np.array([-length / 2, length / 2])
+    outline = np.array([[x[0], -thin], [x[1], -end], [x[1], end], [x[0], thin]])
+    corners = np.concatenate([np.c_[outline, np.full(4, z)] for z in (-half_height, half_height)])
+    return solid(trimesh.convex.convex_hull(corners))
