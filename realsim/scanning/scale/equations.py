@@ -227,7 +227,7 @@ def _table_blocks(
     points, views = stacked([v.table for v in evidence.views])
     variance = np.square(evidence.noise.sigma(points[:, 2])) + TABLE_SIGMA_M**2
     variance *= _crowding([v.table_area_px for v in evidence.views], config)[views]
-    Ms = se3.invert(state.T_world_table) @ cameras
+    Ms = se3.invert(state.table) @ cameras
     places = np.einsum("nij,nj->ni", Ms[views, :3, :3], state.corrected(points)) + Ms[views, :3, 3]
     up = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     H, b = np.zeros((len(Ms), BLOCK, BLOCK)), np.zeros((len(Ms), BLOCK))
@@ -247,7 +247,7 @@ def add_contact(
     Of a wrong shape the lowest point is low because it is wrong there, so contact says little.
     """
     shape_m, config = rules
-    T_table_obj = se3.invert(state.T_world_table) @ state.poses[0]
+    T_table_obj = se3.invert(state.table) @ state.poses[0]
     place = se3.transform(T_table_obj, state.s * shape.hull)
     k = int(np.argmin(place[:, 2]))
     (x, y, z), m, up = place[k], state.s * shape.hull[k], T_table_obj[2, :3]

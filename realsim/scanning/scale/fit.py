@@ -94,7 +94,7 @@ def fit_scale(  # noqa: PLR0913 - keywords, each with a meaning of its own
         views=_views(seen, (state, look, explained), dropped),
         residual_mm=residual_per_vertex(mesh, shape, look),
         plane=SupportPlane(
-            T_world_table=state.T_world_table, rms_m=seen.plane.rms_m, inliers=seen.plane.inliers
+            T_world_table=state.table, rms_m=seen.plane.rms_m, inliers=seen.plane.inliers
         ),
         extent_mm=1e3 * best.scale * mesh.extent,
         candidates=tuple(

@@ -53,7 +53,7 @@ def outlines_of(
     shape: ScanShape, evidence: ScanEvidence, state: ScaleState, cameras: Array, config: ScaleConfig
 ) -> Rims:
     """Return the points of the model's outline in every view that its depth can show."""
-    T_table_world = se3.invert(state.T_world_table)
+    T_table_world = se3.invert(state.table)
     points: list[Array] = []
     ids: list[NDArray[np.int64]] = []
     offered = np.zeros(len(shape.patches.areas))

@@ -44,6 +44,12 @@ class ScaleState(State):
         return self.poses[0, :3, 3]
 
     @property
+    def table(self) -> Array:
+        """(4, 4) T_world_table, which a scale fit always has."""
+        assert self.T_world_table is not None, "a scan has a table"
+        return self.T_world_table
+
+    @property
     def bias_per_m(self) -> float:
         """Error of the depth, c of dz = c z^2 [1/m]."""
         return -float(self.bias[1])

@@ -111,12 +111,12 @@ def _one_view(
     on_object = seen.is_object[::every]
     directions = rotated(rays, T[:3, :3])
     hit = shape.cast(T[:3, 3], directions, state.s, state.R, state.t).astype(np.float64)
-    plane = SupportPlane(T_world_table=state.T_world_table)
+    plane = SupportPlane(T_world_table=state.table)
     table = np.minimum(table_depth(plane, T, rays.astype(np.float64)), 1e3)
     model = hit < table
     # So near to the table measured points are not told from it: an open vessel's floor.
-    origin = state.T_world_table[:3, 3]
-    up = state.T_world_table[:3, 2]
+    origin = state.table[:3, 3]
+    up = state.table[:3, 2]
     height = (T[:3, 3] - origin) @ up + np.where(model, hit, 0.0) * (directions @ up)
     z = np.minimum(hit, table)
     known = depth > 0
