@@ -149,7 +149,8 @@ def _built(kind: Any, value: Any) -> Any:
         return np.array(value, dtype=kind.__args__[1].__args__[0])
     if isinstance(kind, type) and issubclass(kind, Tagged):
         words: dict[str, Any] = {}
-        for known in kind.__subclasses__():  # a class with slots stands after the one without
+        each: list[Any] = kind.__subclasses__()
+        for known in each:  # a class with slots stands after the one without
             words[known.__dataclass_fields__["kind"].default] = known
         found = value.get("kind") if isinstance(value, dict) else None
         if found not in words:
