@@ -247,15 +247,6 @@ def test_the_whole_examination_is_quick_and_right_about_this_machine(tmp_path: P
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_session_that_is_none_is_refused(tmp_path: Path) -> None:
-    code = "from realsim.app.cli import main; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", code, "doctor", str(tmp_path / "gone")],
-        capture_output=True, text=True,
-    )  # fmt: skip
-    assert done.returncode == 2 and "gone" in done.stderr and "Traceback" not in done.stderr
-
-
 def test_a_port_that_is_refused_is_no_answer() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
