@@ -217,7 +217,7 @@ def measure_crb(a: argparse.Namespace) -> Found:
 
 def measure_coverage(a: argparse.Namespace) -> Found:
     """Measure how often the 95 % region of X holds the truth."""
-    found, count = Found(), 6 if a.quick else 200
+    found, count = Found(), 3 if a.quick else 200
     tasks = [(kind, COVERAGE_VIEWS, a.seed + s) for kind in ROBOTS for s in range(count)]
     trials = each(a, coverage_trial, tasks)
     for kind in ROBOTS:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.geometry.camera import project, undistort
+from realsim.geometry.robust import mad_sigma, tukey_weights
 from realsim_calibration.depth.board import (
     BoardAreaConfig,
     DepthBoardView,
@@ -22,8 +23,6 @@ from realsim_calibration.depth.board import (
 )
 from realsim_calibration.views import Array
 
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution whose median absolute deviation is 1."""
 POSE_STEP = 1e-5
 """Step of the numerical derivatives by the pose [rad, m]: errors of 1e-9 relative."""
 WINDOW_PX = 50.0
@@ -181,11 +180,11 @@ def robust_plane(xy: Array, values: Array, cut: float) -> tuple[Array, float]:
     c = np.array([float(np.median(values)), 0.0, 0.0])
     for step in range(2 * FIT_STEPS):
         r = np.abs(values - A @ c)
-        sigma = max(MAD_TO_SIGMA * float(np.median(r)), 1e-12)
+        sigma = max(mad_sigma(r), 1e-12)
         if step < FIT_STEPS:
             weights = 1.0 / np.maximum(r, sigma)
         else:
-            weights = np.square(np.maximum(0.0, 1.0 - np.square(r / (cut * sigma))))
+            weights = tukey_weights(np.square(r / (cut * sigma)))
         root = np.sqrt(weights)
         c = np.linalg.lstsq(root[:, None] * A, root * values, rcond=None)[0]
     return weights, sigma

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry.camera import distort, undistort
+from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.records import CameraIntrinsics
 
 Array = NDArray[np.float64]
@@ -255,7 +256,7 @@ def fit_lines(
         ranked = np.sort(np.where(usable, np.abs(distance), np.inf), axis=-1)
         half = (usable.sum(-1, keepdims=True) // 2).clip(max=usable.shape[-1] - 1)
         median = np.take_along_axis(ranked, half, axis=-1)[..., 0]
-        scale = np.maximum(1.4826 * median, config.residual_floor_px)
+        scale = np.maximum(MAD_TO_SIGMA * median, config.residual_floor_px)
         inside = np.abs(distance) <= config.outlier_sigmas * scale[..., None]
         weight = (usable & inside).astype(np.float64)
     rms = np.sqrt((weight * distance**2).sum(-1) / np.maximum(weight.sum(-1) - 2, 1.0))

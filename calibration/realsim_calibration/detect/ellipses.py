@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim_calibration.detect.edges import bilinear, fit_blurred_steps
 
 Array = NDArray[np.float64]
@@ -224,7 +225,7 @@ def _fit_change(
         H = np.swapaxes(Jw, 1, 2) @ J + 1e-9 * np.eye(5)
         change = np.linalg.solve(H, np.swapaxes(Jw, 1, 2) @ shift[..., None])[..., 0]
         residual = shift - (J @ change[..., None])[..., 0]
-        scale = 1.4826 * np.median(np.abs(residual), axis=-1, keepdims=True)
+        scale = MAD_TO_SIGMA * np.median(np.abs(residual), axis=-1, keepdims=True)
         scale = np.maximum(scale, config.residual_floor_px)
         weight = (usable & (np.abs(residual) <= config.outlier_sigmas * scale)).astype(np.float64)
     rms = np.sqrt((weight * residual**2).sum(-1) / np.maximum(weight.sum(-1) - 5, 1.0))

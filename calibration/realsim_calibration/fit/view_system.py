@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.compiled import njit
+from realsim.geometry import lens_loops
 from realsim.records import CameraIntrinsics
 
 Array = NDArray[np.float64]
@@ -104,18 +105,8 @@ def _point_rows(
         return
     x, y = p[0] / z, p[1] / z
     r2 = x * x + y * y
-    num = 1 + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
-    den = 1 + r2 * (lens[9] + r2 * (lens[10] + r2 * lens[11]))
-    radial = num / den
-    d_num = lens[4] + r2 * (2 * lens[5] + 3 * r2 * lens[8])
-    d_den = lens[9] + r2 * (2 * lens[10] + 3 * r2 * lens[11])
-    slope = 2 * (d_num - radial * d_den) / den
-    p1, p2 = lens[6], lens[7]
-    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    du_dx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
-    du_dy = x * y * slope + 2 * p1 * x + 2 * p2 * y
-    dv_dy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    u, v = lens_loops.bent(lens, x, y)
+    du_dx, du_dy, dv_dy, radial, den = lens_loops.bent_slopes(lens, x, y)
     for axis in range(2):
         f = lens[axis] * root
         a = du_dx if axis == 0 else du_dy

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.lens.bundle import (
     CAMERA_TERMS,
@@ -104,7 +105,7 @@ class Candidate:
 def robust_sigma(fit_residuals: Array, weight: Array, floor: float) -> float:
     """Return 1.4826 times the median absolute coordinate [px]."""
     scaled = np.abs(fit_residuals) * np.sqrt(weight)[:, None]
-    return max(1.4826 * float(np.median(scaled)), floor)
+    return max(MAD_TO_SIGMA * float(np.median(scaled)), floor)
 
 
 def _unit_sigma(fit: Fit, obs: Observations, config: IntrinsicsConfig) -> float:

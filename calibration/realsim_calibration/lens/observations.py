@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.records import CameraIntrinsics, Target
 from realsim_calibration.lens.bundle import Fit, Observations
 from realsim_calibration.lens.start import is_line
@@ -200,9 +201,9 @@ def find_outliers(corners: Corners, fit: Fit, config: OutlierConfig) -> tuple[Co
     obs = corners.obs
     distance = np.linalg.norm(fit.residuals, axis=-1)
     scaled = np.abs(fit.residuals) * np.sqrt(obs.weight)[:, None]
-    everyone = 1.4826 * float(np.median(scaled))
+    everyone = MAD_TO_SIGMA * float(np.median(scaled))
     cuts = list(zip(obs.offsets[:-1], obs.offsets[1:], strict=True))
-    own = np.array([1.4826 * float(np.median(scaled[a:b])) for a, b in cuts])
+    own = np.array([MAD_TO_SIGMA * float(np.median(scaled[a:b])) for a, b in cuts])
     view_px = np.array([float(np.median(distance[a:b])) for a, b in cuts])
     limit_px = max(config.view_ratio * float(np.median(view_px)), config.least_view_px)
     keep_view = view_px <= limit_px
