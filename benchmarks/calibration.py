@@ -109,24 +109,24 @@ def measure_real(a: argparse.Namespace) -> Found:
     if not (a.data / "handeye").is_dir():
         found.notes.append(f"{a.data} has no folder handeye: real sets are not run. Give --data.")
         return found
-    tasks = {name: image_tasks(a.data, name) for name in SOURCES}
+    step, number = (3, 1) if a.quick else (1, FOLDS)
+    tasks = {name: image_tasks(a.data, name, step) for name in SOURCES}
     seen = each(a, detect, [t for part in tasks.values() for t in part])
     sets: list[ImageSet] = []
     for name, part in tasks.items():
-        sets.append(image_set(a.data, name, seen[: len(part)]))
+        sets.append(image_set(a.data, name, seen[: len(part)], step))
         seen = seen[len(part) :]
     poses = read_koch(a.data)
     referee = Referee.start(sets, poses, seeds)
-    clean = folds(a, found, sets, seeds, "clean", FOLDS)
+    clean = folds(a, found, sets, seeds, "clean", number)
     for s in sets:
         px = px_by_seed(clean, s.name)
         found.cases[f"{s.name}_px by seed"] = px
         found.add(f"{s.name}_px", float(np.mean(px)), f"{len(px)} seeds x {len(s.Ts)} views")
-    joints = folds(a, found, sets, seeds, "with joints", FOLDS, joints=True)
+    joints = folds(a, found, sets, seeds, "with joints", number, joints=True)
     for key in {r.set_name for r in joints}:
         px = px_by_seed(joints, key)
         found.add(f"{key}_joints_px", float(np.mean(px)), f"{len(px)} seeds")
-    number = 1 if a.quick else FOLDS
     swapped = folds(a, found, sets, seeds, "poses swapped", number, swap=True)
     put_swapped(found, sets, [r for r in clean if r.number < number], swapped)
     put_koch(a, found, poses)
@@ -175,7 +175,7 @@ def put_swapped(
 def put_koch(a: argparse.Namespace, found: Found, poses: PoseSet) -> None:
     """Note the pose-only set, left out one by one, with and without the joints."""
     n = len(poses.A)
-    views, plain = (range(0, n, 4), range(0, n, 20)) if a.quick else (range(n), range(min(n, 20)))
+    views, plain = (range(0, n, 10), range(0, n, 20)) if a.quick else (range(n), range(min(n, 20)))
     tasks = [(poses, k, True) for k in views] + [(poses, k, False) for k in plain]
     mm = each(a, left_out_mm, tasks)
     for name, part in (("koch", mm[: len(views)]), ("koch_no_joints", mm[len(views) :])):

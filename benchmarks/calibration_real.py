@@ -136,23 +136,24 @@ def detect(task: tuple[Path, str]) -> TargetDetection:
     return find_target(load_image(path), parse_target(target))
 
 
-def image_tasks(data: Path, name: str) -> list[tuple[Path, str]]:
-    """Return what `detect` is to be given for a set."""
+def image_tasks(data: Path, name: str, step: int = 1) -> list[tuple[Path, str]]:
+    """Return what `detect` is to be given for a set, every `step`-th image of it."""
     source = SOURCES[name]
     folder = read_image_folder(data / "handeye" / source.images, data / "handeye" / source.poses)
-    return [(path, source.target) for path in folder.images]
+    return [(path, source.target) for path in folder.images[::step]]
 
 
-def image_set(data: Path, name: str, found: Sequence[TargetDetection]) -> ImageSet:
+def image_set(data: Path, name: str, found: Sequence[TargetDetection], step: int = 1) -> ImageSet:
     """Return a set of its detections, in the order of `image_tasks`; views without are left out."""
     source = SOURCES[name]
     folder = read_image_folder(data / "handeye" / source.images, data / "handeye" / source.poses)
     Ts = folder.Ts_base_ee(reading_from_text(source.reading))
-    keep = [k for k, d in enumerate(found) if len(d) >= MIN_POINTS]
+    good = [k for k, d in enumerate(found) if len(d) >= MIN_POINTS]
+    keep = [step * k for k in good]
     return ImageSet(
         name=name, target=parse_target(source.target), Ts=Ts[keep], arm=source.arm,
         joints=None if folder.joints is None else folder.joints[keep],
-        detections=tuple(found[k] for k in keep), labels=tuple(folder.labels[k] for k in keep),
+        detections=tuple(found[k] for k in good), labels=tuple(folder.labels[k] for k in keep),
     )  # fmt: skip
 
 
