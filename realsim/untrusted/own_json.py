@@ -22,6 +22,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_origin
 
 import msgspec
 import numpy as np
+from msgspec import inspect
+from msgspec.inspect import type_info
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
@@ -74,6 +76,9 @@ def from_json(data: Any, kind: type[Declared], what: str) -> Declared:
         told = str(error).replace("`$.", "`").replace(" - at `$`", "")
         if "missing" in told and isinstance(data, dict):
             told += f"; it has: {', '.join(map(str, data)) or 'nothing'}"
+        if "enum value" in told:
+            field = told.rsplit("`", 2)[-2].rpartition(".")[2].partition("[")[0]
+            told += f"; accepted: {', '.join(map(str, _words(type_info(kind), field)))}"
         raise InputError(f"{what}: {told[:1].lower()}{told[1:500]}.") from error
 
 
@@ -122,6 +127,18 @@ def read_object(path: Path | str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise InputError(f"{path} holds a {type(value).__name__}; an object is expected.")
     return {str(key): item for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType]
+
+
+def _words(kind: Any, field: str, inside: bool = False) -> list[Any]:
+    """Return the words that a field of this name may hold, wherever it stands in a declaration."""
+    if isinstance(kind, inspect.LiteralType):
+        return list(kind.values) if inside or not field else []
+    names = [n for n in ("type", "item_type", "value_type") if hasattr(kind, n)]
+    parts = [*(getattr(kind, n) for n in names), *getattr(kind, "types", ())]
+    found = [_words(part, field, inside) for part in parts]
+    for known in getattr(kind, "fields", ()):
+        found.append(_words(known.type, field, inside or known.encode_name == field))
+    return list(dict.fromkeys(word for words in found for word in words))
 
 
 def _plain(value: Any) -> Any:

@@ -327,7 +327,7 @@ def test_a_full_disk_leaves_the_library_as_it_was(
         (lambda text: text[: len(text) // 2], "not valid JSON"),
         (
             lambda text: text.replace('"doubtful"', '"fine"').replace('"accepted"', '"fine"'),
-            "'fine' - at `verdict`",
+            "'fine' - at `verdict`; accepted: accepted, ",
         ),
         (lambda text: text.replace('"format": 1', '"format": 99'), "format 99"),
         (lambda text: json.dumps({**json.loads(text), "matter": 3}), "got `int` - at `matter`"),
