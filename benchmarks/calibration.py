@@ -109,12 +109,14 @@ def measure_real(a: argparse.Namespace) -> Found:
     if not (a.data / "handeye").is_dir():
         found.notes.append(f"{a.data} has no folder handeye: real sets are not run. Give --data.")
         return found
-    step, number = (3, 1) if a.quick else (1, FOLDS)
-    tasks = {name: image_tasks(a.data, name, step) for name in SOURCES}
+    number = 1 if a.quick else FOLDS
+    tasks = {name: image_tasks(a.data, name) for name in SOURCES}
+    steps = {name: max(1, len(part) // 12) if a.quick else 1 for name, part in tasks.items()}
+    tasks = {name: part[:: steps[name]] for name, part in tasks.items()}
     seen = each(a, detect, [t for part in tasks.values() for t in part])
     sets: list[ImageSet] = []
     for name, part in tasks.items():
-        sets.append(image_set(a.data, name, seen[: len(part)], step))
+        sets.append(image_set(a.data, name, seen[: len(part)], steps[name]))
         seen = seen[len(part) :]
     poses = read_koch(a.data)
     referee = Referee.start(sets, poses, seeds)

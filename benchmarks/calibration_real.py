@@ -136,11 +136,11 @@ def detect(task: tuple[Path, str]) -> TargetDetection:
     return find_target(load_image(path), parse_target(target))
 
 
-def image_tasks(data: Path, name: str, step: int = 1) -> list[tuple[Path, str]]:
-    """Return what `detect` is to be given for a set, every `step`-th image of it."""
+def image_tasks(data: Path, name: str) -> list[tuple[Path, str]]:
+    """Return what `detect` is to be given for a set."""
     source = SOURCES[name]
     folder = read_image_folder(data / "handeye" / source.images, data / "handeye" / source.poses)
-    return [(path, source.target) for path in folder.images[::step]]
+    return [(path, source.target) for path in folder.images]
 
 
 def image_set(data: Path, name: str, found: Sequence[TargetDetection], step: int = 1) -> ImageSet:
