@@ -1,15 +1,25 @@
 """What a scale fit adds to registration's equations: derivatives are the residuals' differences."""
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.geometry.normal_equations import System, symmetric
-from realsim.registration.refinement.equations import OBJECTS, Blocks, Offsets, assemble
+from realsim.registration.refinement.equations import OBJECTS, TABLE_AT, Blocks, Offsets, assemble
 from realsim.scanning.scale.config import ScaleConfig
-from realsim.scanning.scale.equations import add_contact
-from realsim.scanning.scale.outlines import COLUMNS, add_outline
+from realsim.scanning.scale.equations import (
+    Round,
+    add_contact,
+    object_distances,
+    surface_blocks,
+    table_blocks,
+)
+from realsim.scanning.scale.outlines import COLUMNS, Rims, add_outline
+from realsim.scanning.scale.shape import ScanShape
 from realsim.scanning.scale.state import (
     OBJECT,
     PATCHES,
@@ -18,7 +28,7 @@ from realsim.scanning.scale.state import (
     ScaleState,
     moved_state,
 )
-from scanned_objects import shape_of
+from scanned_objects import evidence_of, shape_of
 
 Array = NDArray[np.float64]
 STEP = 1e-6
@@ -55,14 +65,114 @@ def differences(residual, state: ScaleState) -> Array:
     return out
 
 
-def row_of(system: System) -> tuple[float, Array]:
-    """Return residual and derivatives of a system that one measurement made."""
+def row_of(system: System, at: int = PATCHES, sign: float = 1.0) -> tuple[float, Array]:
+    """Return residual and derivatives of a system that one measurement made.
+
+    Args:
+        system: its equations.
+        at: an unknown by which the derivative is one, the patch's own for example...
+        sign: ...or minus one.
+    """
     joint = np.block([[system.A, system.B[0]], [system.B[0].T, system.D[0]]])
     right = np.concatenate([system.a, system.d[0]])
-    J = joint[PATCHES]  # the patch's own derivative is one
-    np.testing.assert_allclose(joint, np.outer(J, J), rtol=1e-6, atol=1e-7)
-    np.testing.assert_allclose(right, J * right[PATCHES], rtol=1e-6, atol=1e-9)
-    return -float(right[PATCHES]), J
+    w = joint[at, at]
+    J = sign * joint[at] / w
+    np.testing.assert_allclose(joint, w * np.outer(J, J), rtol=1e-6, atol=1e-7 * w)
+    np.testing.assert_allclose(right, sign * J * right[at], rtol=1e-6, atol=1e-9 * w)
+    return -sign * float(right[at]) / w, J
+
+
+def surface_row(shape: ScanShape, state: ScaleState, T: Array, point: Array) -> tuple[float, Array]:
+    """Return the row of one measured point (3,) of the object, in camera axes."""
+    views = np.zeros(1, np.int32)
+    held = Round(
+        points=point[None], views=views, variance=np.full(1, 1e-8), crowding=np.ones(1),
+        ids=np.zeros(1, np.int64), rims=Rims(points=[], ids=[], factors=[]),
+    )  # fmt: skip
+    seen, Ms = object_distances(shape, state, state.cameras(T[None]), point[None], views)
+    blocks, kernels = surface_blocks(seen, Ms, held, (np.zeros(1), 1e6, 0.0))
+    if kernels[0] == 0.0:
+        return np.nan, np.full(SHARED + 6, np.nan)
+    r, J = row_of(assemble([blocks], SHARED), PATCHES, -1.0)
+    assert r == pytest.approx(seen[1][0], abs=1e-9)
+    return r, J
+
+
+def seen_points(shape: ScanShape, state: ScaleState, T: Array, n: int) -> Iterator[Array]:
+    """Yield points (3,) in camera axes at which the field is zero, seen by the camera."""
+    eye, R = T[:3, 3], T[:3, :3]
+    aim = (state.s * shape.samples @ state.R.T + state.t - eye) @ R
+    rays = (aim / aim[:, 2:])[np.random.default_rng(5).permutation(len(aim))[:n]]
+    depths = shape.cast(eye, (rays @ R.T).astype(np.float32), state.s, state.R, state.t)
+    for ray, depth in zip(rays, depths.astype(np.float64), strict=True):
+        z, r = depth, np.inf
+        for _ in range(6):  # Newton along the ray to the interpolated field's own zero
+            if not np.isfinite(z):
+                break
+            r, J = surface_row(shape, state, T, z * ray)
+            along = J[-3:] @ ray
+            z = z - r / along if abs(along) > 0.3 else np.nan
+        if np.isfinite(z) and abs(r) < 1e-8:
+            yield z * ray
+
+
+@pytest.mark.parametrize("name", ["mug", pytest.param("bunny", marks=pytest.mark.slow)])
+def test_surface_derivatives_are_the_differences_of_the_residual(name: str):
+    shape, rng = shape_of(name), np.random.default_rng(2)
+    state = posed(rng)
+    T = camera_looking_at(state.t, rng)
+    compared = points = 0
+    for point in seen_points(shape, state, T, 30):
+        points += 1
+        _, J = surface_row(shape, state, T, point)
+        numeric = differences(lambda s, p=point: surface_row(shape, s, T, p)[0], state)
+        numeric[PATCHES] = -1.0
+        # At the border of two cells of the grid there is no derivative.
+        compared += np.allclose(J, numeric, atol=2e-3)
+        assert not J[[*range(TABLE_AT[0], OBJECTS), RIM]].any()
+    assert points > 8 and compared > 0.85 * points
+
+
+def test_the_noise_of_a_point_is_not_in_its_derivatives():
+    """Neither the camera's, the bias's, the object's nor the size's: errors in variables."""
+    shape, rng = shape_of("block"), np.random.default_rng(6)
+    state = posed(rng)
+    top = np.array([0.01, -0.005, shape.vertices[:, 2].max()])
+    eye = se3.transform(state.poses[0], state.s * top + [0.12, 0.05, 0.3])[0]
+    point = se3.transform(state.poses[0], state.s * top)[0]
+    T = se3.look_at(eye, point) @ se3.from_translation([0.01, -0.02, 0.0])
+    p = se3.transform(se3.invert(T), point)[0]
+    r, exact = surface_row(shape, state, T, p)
+    assert abs(r) < 2e-6
+    for error in (-2e-3, -5e-4, 5e-4):
+        r, J = surface_row(shape, state, T, p * (1 + error / p[2]))
+        assert abs(r) > 3e-4
+        np.testing.assert_allclose(J, exact, atol=3e-5)
+
+
+def test_table_derivatives_are_the_differences_of_the_height():
+    evidence, config = evidence_of("block", "exact"), ScaleConfig()
+
+    def row(state: ScaleState, T: Array, point: Array) -> tuple[float, Array]:
+        view = replace(evidence.views[0], table=point[None])
+        one = replace(evidence, views=(view,))
+        blocks = table_blocks(one, state, state.cameras(T[None]), config)
+        return row_of(assemble([blocks], SHARED), TABLE_AT[2], -1.0)
+
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        state = posed(rng)
+        on_table = se3.transform(state.table, np.array([*rng.uniform(-0.1, 0.1, 2), 0.0]))[0]
+        eye = se3.transform(state.table, np.array([*rng.uniform(-0.2, 0.2, 2), 0.3]))[0]
+        T = se3.look_at(eye, on_table) @ se3.from_translation([0.01, -0.02, 0.0])
+        point = se3.transform(se3.invert(T), on_table)[0]
+        r, J = row(state, T, point)
+        assert abs(r) < 1e-9
+        numeric = differences(lambda s, T=T, p=point: row(s, T, p)[0], state)
+        np.testing.assert_allclose(J, numeric, atol=1e-5)
+        assert not J[[*OBJECT, SIZE, RIM]].any()
+        _, noisy = row(state, T, 1.003 * point)  # by a millimetre
+        np.testing.assert_allclose(noisy, J, atol=1e-9)
 
 
 def outline_row(

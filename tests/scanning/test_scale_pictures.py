@@ -19,6 +19,7 @@ from realsim.scanning.scale.picture_overlays import (
 from realsim.scanning.scale.pictures import (
     ROUND_MM,
     candidates_png,
+    headline,
     residual_range_mm,
     residuals_png,
     views_png,
@@ -114,6 +115,19 @@ def test_the_range_is_round_and_not_ruled_by_outliers(fit):
 
 
 # --- figures ----------------------------------------------------------------------------------
+
+
+def test_every_verdict_is_written(fit):
+    for verdict in ("accepted", "doubtful", "rejected", "unchecked"):
+        assert headline(replace(fit, verdict=verdict)).startswith(verdict.upper())
+    low, high = fit.interval
+    for figure in (fit.scale, low, high):
+        assert f"{figure:.6g}" in headline(fit)
+
+
+def test_the_same_fit_gives_the_same_bytes(known, fit):
+    assert residuals_png(known.scan, fit, ONE) == residuals_png(known.scan, fit, ONE)
+    assert views_png(fit) == views_png(fit)
 
 
 def test_a_view_that_was_left_out_is_marked(fit):

@@ -29,6 +29,19 @@ def unconditioned(patches: SurfacePatches, length: float) -> Array:
     return (1 + r) * np.exp(-r) * (patches.normals @ patches.normals.T)
 
 
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("length", [0.005, 0.02, 0.1])
+def test_covariances_are_positive_and_conditioning_takes_variance_away(name: str, length: float):
+    patches = patches_of(name)
+    S = covariance_of(patches, length)
+    np.testing.assert_array_equal(S, S.T)
+    assert np.linalg.eigvalsh(S).min() > -1e-9
+    gone = unconditioned(patches, length) - S
+    assert np.linalg.eigvalsh(gone).min() > -1e-9
+    assert np.linalg.matrix_rank(gone, tol=1e-9) <= 7
+    assert np.all(np.diag(S) <= 1 + 1e-9)
+
+
 def modes_of(middles: Array, areas: Array) -> Array:
     """Return shift, turn and growth (7, K, 3) about the surface's middle, by hand."""
     q = middles - areas @ middles

@@ -141,6 +141,16 @@ def test_starts_move_with_the_world(mug: Case, mug_starts: list[Similarity]) -> 
     assert np.abs(_placed(moved[0], mug.given) - expected).max() < 0.003
 
 
+def test_the_unit_of_the_mesh_is_of_no_consequence(mug: Case, mug_starts: list[Similarity]) -> None:
+    mesh = mug.given.mesh
+    shape = make_shape(Mesh(vertices=1000 * mesh.vertices, faces=mesh.faces), ScaleConfig())
+    # Inside of a fit lengths are the same but for a rounding, and so all that follows.
+    assert 1000 * shape.unit == pytest.approx(1.0, rel=1e-9)
+    np.testing.assert_allclose(shape.vertices, mesh.vertices, atol=1e-9)
+    found = find_starts(shape, mug.cloud, TABLE, CONFIG)
+    assert found[0].scale == pytest.approx(mug_starts[0].scale, rel=0.01)
+
+
 @pytest.mark.slow
 def test_an_object_that_leans_is_found_too() -> None:
     # On a corner: 30 and 25 deg from every face.

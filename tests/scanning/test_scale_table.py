@@ -1,5 +1,6 @@
 """The table under the object, and which object is meant."""
 
+import re
 from dataclasses import replace
 from functools import lru_cache
 
@@ -97,6 +98,20 @@ def test_the_footprint_moves_with_the_world(seed: int):
 def places(known: Scanned) -> Array:
     """Return x, y (2, 2) in world of block and can."""
     return se3.transform(known.T_world_obj, np.array([[-0.06, 0, 0], [0.07, 0, 0]]))[:, :2]
+
+
+def test_several_objects_are_named_with_their_places_and_heights():
+    known = two_things()
+    with pytest.raises(
+        InputError, match=r"2 objects stand on the table.*--at x,y.*alone"
+    ) as caught:
+        object_of(known)
+    named = re.findall(r"x=(-?[\d.]+), y=(-?[\d.]+)[^;]*?(\d+) mm tall", str(caught.value))
+    found = np.array(named, dtype=float)
+    for where, tall in zip(places(known), (60, 105), strict=True):
+        nearest = found[np.argmin(np.linalg.norm(found[:, :2] - where, axis=1))]
+        assert np.linalg.norm(nearest[:2] - where) < 0.015
+        assert nearest[2] == pytest.approx(tall, abs=8)
 
 
 @pytest.mark.parametrize(("which", "tall"), [(0, 0.06), (1, 0.105)])

@@ -164,10 +164,10 @@ def linearised(
     offsets, cut, width = limits
     cameras = state.cameras(claimed_cameras(evidence.views))
     seen, Ms = object_distances(shape, state, cameras, held.points, held.views)
-    surface, kernels = _surface_blocks(seen, Ms, held, limits)
+    surface, kernels = surface_blocks(seen, Ms, held, limits)
     bodies = [
         surface,
-        _table_blocks(evidence, state, cameras, config),
+        table_blocks(evidence, state, cameras, config),
         outline_blocks(evidence, state, cameras, held.rims, offsets, (cut, width)),
     ]
     system = assemble(bodies, PATCHES + len(offsets))
@@ -189,7 +189,7 @@ def _crowding(areas_px: list[float], config: ScaleConfig) -> Array:
     return np.maximum(1.0, config.samples.noise_area_px / np.array(areas_px))
 
 
-def _surface_blocks(
+def surface_blocks(
     seen: Seen, Ms: Array, held: Round, limits: tuple[Array, float, float]
 ) -> tuple[Blocks, Array]:
     """Return what the object's points say in every view, and their kernel weights (N,)."""
@@ -220,7 +220,7 @@ def frame_of(Ms: Array) -> tuple[Array, Array, Array]:
     return np.zeros(3), np.ascontiguousarray(Ms[:, :3, 3]), np.ascontiguousarray(Ms[:, :3, 2])
 
 
-def _table_blocks(
+def table_blocks(
     evidence: ScanEvidence, state: ScaleState, cameras: Array, config: ScaleConfig
 ) -> Blocks:
     """Return what the table's points say in every view."""
