@@ -62,6 +62,12 @@ def test_a_measured_board_and_a_trusted_camera_halve_the_error(simulate):
     assert np.sqrt(np.mean(np.sum(np.square(errors)[:, 3:], -1))) < 0.35e-3
 
 
+def test_more_robot_noise_claims_more(simulate):
+    quiet, loud = (calibrate(simulate(1, robot=(r, r))) for r in (0.1e-3, 1e-3))
+    assert 4 < loud.sigma_mm / quiet.sigma_mm < 25
+    assert loud.held_out_px > 4 * quiet.held_out_px
+
+
 def test_order_of_views_does_not_matter(simulate):
     sim = simulate(3, views=12)
     order = np.random.default_rng(0).permutation(12)
@@ -131,6 +137,15 @@ def test_inverted_poses_are_told(simulate):
     sim = simulate(9)
     views = [replace(v, T_base_ee=se3.invert(v.T_base_ee)) for v in sim.views]
     with pytest.raises(InputError, match=r"hand poses are inverted.*as given: \d+\.\d+ deg"):
+        calibrate(sim, views)
+
+
+def test_a_shifted_pairing_is_told(simulate):
+    sim = simulate(9)
+    views = [
+        replace(v, T_base_ee=sim.views[(k + 1) % 24].T_base_ee) for k, v in enumerate(sim.views)
+    ]
+    with pytest.raises(InputError, match="images 0 to 23 fit the pose 1 earlier"):
         calibrate(sim, views)
 
 

@@ -1,12 +1,13 @@
 import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from realsim.geometry import se3
-from realsim_calibration import CLOSED_FORMS
+from realsim_calibration import CLOSED_FORMS, calibrate_from_poses
 from realsim_calibration.faults.gates import (
     GateConfig,
     rotation_mismatch_deg,
@@ -78,3 +79,9 @@ def test_closed_forms_are_more_consistent_than_the_stored_result(data):
 
 def _is_rigid(T):
     return np.abs(T[:3, :3].T @ T[:3, :3] - np.eye(3)).max() < 1e-5
+
+
+def test_the_rotation_outlier_is_named(data):
+    rejected = calibrate_from_poses(*data).hand_eye.rejected
+    assert [k for k, _ in rejected] == [9]
+    assert re.search(r"2\.6\d deg from where the other views put it", rejected[0][1])

@@ -352,6 +352,20 @@ def test_wrong_files_are_named(
         assert part in str(caught.value)
 
 
+def test_yaml_runs_no_code_and_aliases_do_not_grow(tmp_path: Path) -> None:
+    marker = tmp_path / "ran"
+    code = f"kind: !!python/object/apply:os.system ['touch {marker}']\n"
+    with pytest.raises(InputError, match="has the tag"):
+        read_target(write(tmp_path, "code.yaml", code))
+    assert not marker.exists()
+    nested = "a0: &a0 [x, x]\n" + "".join(
+        f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}, *a{k - 1}, *a{k - 1}]\n" for k in range(1, 40)
+    )
+    with pytest.raises(InputError) as caught:
+        read_target(write(tmp_path, "bomb.yaml", nested))
+    assert len(str(caught.value)) < 500
+
+
 def test_errors_keep_their_kind_and_name_the_file(tmp_path: Path) -> None:
     path = write(tmp_path, "a.json", json.dumps(CHESS | {"square_m": -1}))
     with pytest.raises(UnitError, match=r"a\.json"):
