@@ -101,6 +101,14 @@ def test_a_second_run_computes_nothing_and_starts_from_the_claimed_cameras(
     assert all(np.allclose(now[k], refined[k], rtol=0, atol=1e-14) for k in refined)
 
 
+def test_json_is_all_that_is_on_stdout(registered: tuple[Path, Result]) -> None:
+    folder, _ = registered
+    result = CliRunner().invoke(commands, ["register", str(folder), "--json"])
+    value = json.loads(result.stdout)
+    assert value["usable"] and {o["name"] for o in value["objects"]} == {"mug", "wedge"}
+    assert value["views"] == list(range(8)) and value["not_placed"] == []
+
+
 def test_nothing_said_names_the_three_ways(session: Path) -> None:
     error = run(session).exception
     assert isinstance(error, InputError)

@@ -142,3 +142,8 @@ def test_nothing_to_use_is_refused_by_name():
     small = replace(scene().frames[1], depth_m=np.ones((9, 16), np.float32))
     with pytest.raises(InputError, match="shape"):
         taken([scene().frames[0], small])
+
+
+def test_one_view_is_enough():
+    intake = taken(scene().frames[:1])
+    assert len(intake.views) == 1 and intake.plane is not None

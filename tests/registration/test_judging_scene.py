@@ -47,6 +47,18 @@ def test_a_right_scene_has_no_findings(table):
     assert findings(table, bodies, [b.T_start for b in bodies], [0.99] * 4) == []
 
 
+def test_a_common_shift_of_the_starts_is_named(table):
+    _, bodies, _, _ = table
+    shift = se3.from_translation([0.02, -0.01, 0.0])
+    moved = [replace(b, start=replace(b.start, T_world_obj=shift @ b.T_start)) for b in bodies]
+    poses = [b.T_start for b in bodies]
+    (found,) = findings(table, moved, poses, [0.99] * 4)
+    assert found.kind == "common shift"
+    assert "22.4 mm" in found.words
+    assert found.instances == tuple(b.start.instance for b in bodies)
+    assert findings(table, moved, poses, [0.99] * 4, with_starts=False) == []
+
+
 def test_sinking_alike_is_named(table):
     _, bodies, _, _ = table
     sunk = []

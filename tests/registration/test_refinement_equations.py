@@ -281,6 +281,34 @@ def random_rows(seed: int, objects: int = 2, views: int = 4, each: int = 15) -> 
     return Rows(system, rows, Ms, objects, views, sigmas)
 
 
+def dense(system: System) -> tuple[Array, Array]:
+    S, V = len(system.A), len(system.D)
+    N, n = np.zeros((S + 6 * V, S + 6 * V)), np.zeros(S + 6 * V)
+    N[:S, :S], n[:S] = system.A, system.a
+    for v in range(V):
+        at = slice(S + 6 * v, S + 6 * v + 6)
+        N[:S, at], N[at, :S] = system.B[v], system.B[v].T
+        N[at, at], n[at] = system.D[v], system.d[v]
+    return N, n
+
+
+@pytest.mark.parametrize("objects", [0, 4])
+def test_elimination_of_views_is_the_dense_solution(objects: int):
+    system = random_rows(3, objects, 5).system
+    N, n = dense(system)
+    np.testing.assert_allclose(N, N.T, atol=1e-9)
+    S = len(system.A)
+    shared, views = solve(system)
+    x = np.linalg.solve(N, n)
+    np.testing.assert_allclose(np.concatenate([shared, views.ravel()]), x, rtol=1e-8, atol=1e-10)
+    C, found = np.linalg.inv(N), covariances(system)
+    np.testing.assert_allclose(found.shared, C[:S, :S], rtol=1e-8, atol=1e-10)
+    for v in range(len(system.D)):
+        at = slice(S + 6 * v, S + 6 * v + 6)
+        np.testing.assert_allclose(found.cross[v], C[:S, at], rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(found.views[v], C[at, at], rtol=1e-8, atol=1e-10)
+
+
 @pytest.mark.parametrize("seed", range(1))
 def test_step_and_covariance_are_those_of_gtsam(seed: int):
     import gtsam

@@ -82,6 +82,18 @@ def test_order_of_frames_and_objects_does_not_matter(clutter, starts, result):
         np.testing.assert_allclose(a.T_world_obj, b.T_world_obj, atol=1e-6)
 
 
+def test_covariance_is_of_the_size_of_the_errors(clutter, result):
+    ratios = []
+    for t, o in zip(clutter.truth, result.scene.objects, strict=True):
+        xi = se3.log(se3.invert(t.T_world_obj) @ o.T_world_obj)
+        assert o.covariance is not None
+        assert np.all(np.linalg.eigvalsh(o.covariance) > 0)
+        ratios.append(float(xi @ np.linalg.solve(o.covariance, xi)) / 6)
+    # Six degrees of freedom: 1 on average; the floor and the 0.6 mm make it careful, not careless.
+    assert np.mean(ratios) < 3.0
+    assert np.max(ratios) > 0.005
+
+
 @pytest.mark.slow
 def test_a_common_move_of_all_starts_is_reported(clutter):
     shift = se3.from_translation([0.010, -0.006, 0.0])

@@ -18,10 +18,12 @@ from realsim.registration.register import Registration, RegistrationConfig, regi
 from realsim.registration.search.records import Wanted
 from realsim.registration.simulated import TableScene
 from table_faults import (
+    foreign,
+    shifted_view,
     without_any_depth,
     without_depth_on,
 )
-from table_scenes import named_scene
+from table_scenes import named_scene, part_models
 
 CONFIG = RegistrationConfig(field_cells=64, with_single_view=False)
 NAMES = ("wedge", "l_bracket", "elbow", "t_profile")
@@ -157,6 +159,16 @@ def test_a_mesh_in_millimetres_is_named_and_the_rest_goes_on(known: str):
         all_right(result, one.instance)
 
 
+@pytest.mark.slow
+def test_a_start_in_millimetres_is_named_and_the_rest_goes_on():
+    T = starts()[2].T_world_obj.copy()
+    T[:3, 3] *= 1e3
+    wanted = [replace(s, T_world_obj=T) if s.instance == 2 else s for s in starts()]
+    result = run(wanted)
+    all_right(result, 2)
+    assert "millimetres" in not_accepted(result, 2)
+
+
 def test_no_model_in_metres_is_refused():
     models = {i: in_millimetres(m) for i, m in scene().models.items()}
     with pytest.raises(InputError, match=r"none of the 4 models.*mixed up"):
@@ -192,7 +204,47 @@ def test_an_object_without_depth_is_not_accepted_and_the_rest_is_right(surface):
     assert not_accepted(result, 0)
 
 
+@pytest.mark.slow
+def test_unknown_ids_are_found_among_more_models():
+    extra = ["mug", "gear", "bowl", "flange", "tube"]
+    more = {part(n).obj_id: part_models()[part(n).obj_id] for n in extra}
+    models = {**more, **scene().models}
+    assert len(models) == 9
+    result = run(None, models=models)
+    found = [o for o in result.scene.objects if o.verdict == "accepted"]
+    assert sorted(o.obj_id for o in found) == sorted(p.obj_id for p in scene().truth)
+    for p in scene().truth:
+        (o,) = [o for o in found if o.obj_id == p.obj_id]
+        model = scene().models[p.obj_id]
+        assert 1e3 * mssd_symmetric(p.T_world_obj, o.T_world_obj, model) < RIGHT_MM
+    assert len({o.instance for o in result.scene.objects}) == len(result.scene.objects)
+
+
 # --- views ---------------------------------------------------------------------------------------
+
+
+SLIP = [0.03, 0.0, 0.02, 0.012, 0.006, 0.0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "fault", "words", "left_out"),
+    [
+        (2, without_any_depth, "empty", True),
+        (2, lambda f: foreign(f, named_scene(4, ("mug", "gear"), 8).frames[2]), "", True),
+        (5, lambda f: shifted_view(f, SLIP), "", False),
+    ],
+    ids=["empty", "foreign", "slipped"],
+)
+def test_a_faulty_view_is_named_and_does_no_harm(number, fault, words, left_out):
+    result = run(starts(), [fault(f) if f.index == number else f for f in scene().frames])
+    all_right(result)
+    said = [f.words for f in result.findings if f"view {number}" in f.words]
+    assert said and words in said[0]
+    if left_out:
+        assert sorted(result.cameras) == [k for k in range(8) if k != number]
+    if words:
+        assert len(result.findings) == 1 and sorted(result.cameras) == sorted(result.seen)
 
 
 def test_one_view_only_is_worse_and_says_so():
@@ -256,6 +308,9 @@ def test_what_cannot_be_registered_is_refused_by_name():
         run([replace(starts()[0], obj_id=99)])
     with pytest.raises(InputError, match="'best'; joint or top-down"):
         run(starts(), config=replace(CONFIG, method="best"))  # pyright: ignore[reportArgumentType]
+    small = replace(scene().frames[0], depth_m=np.zeros((5, 5), np.float32))
+    with pytest.raises(InputError, match="shape"):
+        run(starts(), [small])
     blind = [without_any_depth(f) for f in scene().frames]
     with pytest.raises(InputError, match="all zero"):
         run(starts(), blind)

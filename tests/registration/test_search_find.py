@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from realsim.errors import InputError
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.find_table import TableSearchConfig, find_table
 from realsim.registration.search.candidates import CandidateConfig
@@ -93,3 +94,16 @@ def test_one_too_many_is_not_placed_and_says_why(folder: Path):
     assert len(result.placed) + len(result.not_placed) == 2
     for missing in result.not_placed:
         assert "explains" in missing.reason or "looks like" in missing.reason
+
+
+def test_bad_questions_are_refused():
+    plane = find_table(views(), NOISE, TableSearchConfig()).plane
+    assert plane is not None
+    twice = [Wanted(obj_id=1, instance=0), Wanted(obj_id=1, instance=0)]
+    rest = (scene().intrinsics, scene().frames, views(), plane, NOISE)
+    with pytest.raises(InputError, match="same instance"):
+        find_objects(*rest, scene().models, twice, CONFIG)
+    with pytest.raises(InputError, match="no models"):
+        find_objects(*rest, {}, None, CONFIG)
+    with pytest.raises(InputError, match="needs both"):
+        find_objects(scene().intrinsics, [], [], plane, NOISE, scene().models, None, CONFIG)

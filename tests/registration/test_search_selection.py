@@ -71,6 +71,13 @@ def test_the_right_poses_are_chosen():
         assert s.agree > 0.9
 
 
+def test_two_of_one_model_never_share_a_pose():
+    canvas, pool, _ = material()
+    only = [Slot(choices=frozenset([1])), Slot(choices=frozenset([1]))]
+    got = select(canvas, pool, only, CONFIG)
+    assert sorted(map(str, got.chosen)) == ["1", "None"]
+
+
 def test_from_all_poses_those_of_the_objects_that_are_there():
     canvas, pool, _ = material()
     got = select_any(canvas, pool, CONFIG)

@@ -47,9 +47,9 @@ def kinds(found):
     return {f.index: f.kind for f in found}
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_sound_views_are_left_alone(seed):
-    assert findings(views_of(seed)) == ()
+@pytest.mark.parametrize(("seed", "views"), [(1, VIEWS), (2, VIEWS), (1, 1), (1, 2), (1, 3)])
+def test_sound_views_are_left_alone(seed, views):
+    assert findings(views_of(seed)[:views]) == ()
 
 
 def test_a_bad_hand_eye_is_no_fault_of_the_views():
@@ -85,6 +85,17 @@ def test_views_without_depth_are_named():
     assert kinds(found) == {2: "no_depth", 5: "little_depth", 7: "little_depth"}
     assert [f.exclude for f in found] == [True, False, True]
     assert "empty" in found[0].words and "3.0 %" in found[1].words
+
+
+def test_only_empty_views_are_all_named():
+    views = [
+        replace(
+            v, points=np.zeros((0, 3), np.float32), pixels=np.zeros((0, 2), np.int32),
+            measured_share=0.0,
+        )
+        for v in views_of(1)[:3]
+    ]  # fmt: skip
+    assert kinds(findings(views)) == {0: "no_depth", 1: "no_depth", 2: "no_depth"}
 
 
 @pytest.mark.parametrize(("mm", "deg"), [(15, 3), (30, 5)])
@@ -129,21 +140,24 @@ def test_a_slipped_mount_is_named_with_the_view_it_begins_at():
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def in_mm(T):
-    return se3.from_rt(T[:3, :3], 1e3 * T[:3, 3])
+def in_mm(Ts):
+    return se3.from_rt(Ts[:, :3, :3], 1e3 * Ts[:, :3, 3])
 
 
 @pytest.mark.parametrize(
     ("mistake", "words"),
     [
         (se3.invert, "world-to-camera: invert"),
-        (lambda T: T @ GL, "OpenGL's (y up, z backward): turn"),
-        (lambda T: se3.invert(T @ GL), "world-to-camera with OpenGL's"),
+        (lambda Ts: Ts @ GL, "OpenGL's (y up, z backward): turn"),
+        (lambda Ts: se3.invert(Ts @ GL), "world-to-camera with OpenGL's"),
         (in_mm, "camera poses seem to be in millimetres"),
+        (lambda Ts: np.roll(Ts, -1, axis=0), "previous view's pose"),
+        (lambda Ts: np.random.default_rng(0).permutation(Ts), "Neither inverted"),
     ],
 )
 def test_a_mistake_of_all_poses_is_named(mistake, words):
-    found = findings([with_pose(v, mistake(v.T_world_cam)) for v in views_of(1)])
+    wrong = mistake(np.stack([v.T_world_cam for v in views_of(1)]))
+    found = findings([with_pose(v, T) for v, T in zip(views_of(1), wrong, strict=True)])
     assert kinds(found) == {None: "all_disagree"}
     assert words in found[0].words
 
