@@ -142,6 +142,27 @@ def test_a_start_and_none_lead_to_the_same(name: str):
 
 
 @pytest.mark.slow
+def test_two_starts_lead_to_the_same():
+    known, plain = scanned("scalene"), fitted("scalene")
+    fit = fit_of(known, start=rough_start(known, 1))
+    assert abs(fit.scale - plain.scale) < 0.2 * plain.sigma
+
+
+@pytest.mark.slow
+def test_errors_are_of_the_size_that_sigma_says():
+    z = np.array([z_of(fitted(n, "lab", s)) for n in ("block", "bunny") for s in (0, 1)])
+    assert np.all(np.abs(z) < 3.5), z.round(2)
+    assert np.sqrt(np.mean(np.square(z))) < 1.7, z.round(2)
+
+
+@pytest.mark.slow
+def test_more_views_know_the_scale_better():
+    few, many = fitted("bunny", "lab", 0, 5), fitted("bunny")
+    assert many.sigma < few.sigma
+    assert few.scale == pytest.approx(UNIT_M, rel=0.008)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("amplitude", [0.0, 0.02])
 def test_intervals_hold_the_truth_over_many_seeds(amplitude: float):
     z: list[float] = []

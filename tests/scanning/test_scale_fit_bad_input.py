@@ -176,6 +176,21 @@ def test_an_object_cut_by_the_image_border_in_some_views():
 
 
 @pytest.mark.slow
+def test_poses_of_other_images_are_not_accepted():
+    known = scanned("bunny")
+    poses = [f.T_world_cam for f in known.frames]
+    frames = tuple(
+        replace(f, T_world_cam=T) for f, T in zip(known.frames, poses[3:] + poses[:3], strict=True)
+    )
+    try:
+        fit = fit_of(known, frames=frames)
+    except RealsimError as error:
+        assert "pose" in str(error) or "stand" in str(error)
+    else:
+        assert fit.verdict != "accepted"
+
+
+@pytest.mark.slow
 def test_a_start_that_is_turned_over_is_put_right_or_not_accepted():
     """The handle of a mug on the other side: most of it agrees, and it is wrong by 130 mm."""
     known = scanned("mug")
