@@ -54,9 +54,9 @@ def report(calibrated_arm: Maker) -> HandEyeReport:
 def page(
     report: HandEyeReport, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[list[Path], float]:
-    """Return the files of a report of 12 views with photographs, and the CPU time it took [s]."""
+    """Return the files of a report of 16 views with photographs, and the CPU time it took [s]."""
     repeated = tuple(
-        dataclasses.replace(report.views[k % len(report.views)], index=k) for k in range(12)
+        dataclasses.replace(report.views[k % len(report.views)], index=k) for k in range(16)
     )
     photo = np.full((720, 1280, 3), 200, np.uint8)
     cv2.circle(photo, (640, 360), 200, (40, 90, 160), -1)
