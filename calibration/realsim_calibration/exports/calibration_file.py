@@ -184,7 +184,7 @@ def _pretty(value: Any, indent: str = "") -> str:
 # --- reading ------------------------------------------------------------------------------------
 
 
-class _Transform(OwnFile, kw_only=True):
+class _Transform(OwnFile, frozen=True, kw_only=True):
     """A transform and its frames."""
 
     parent: str
@@ -196,7 +196,13 @@ class _Transform(OwnFile, kw_only=True):
     covariance: Array | None = None
 
 
-class _File(OwnFile, kw_only=True):
+class _Calibrated(_Transform, frozen=True, kw_only=True):
+    """A transform that was estimated: its covariance is there."""
+
+    covariance: Array
+
+
+class _File(OwnFile, frozen=True, kw_only=True):
     """The file; records with notes beside their fields are still plain."""
 
     schema: str
@@ -206,8 +212,8 @@ class _File(OwnFile, kw_only=True):
     mode: Mode
     warnings: list[str]
     frames: dict[str, str]
-    X: _Transform
-    X_alone: _Transform
+    X: _Calibrated
+    X_alone: _Calibrated
     Z: _Transform
     Z_alone: _Transform
     accuracy: dict[str, Real]
@@ -262,6 +268,8 @@ def _report(d: _File, path: str) -> HandEyeReport:
         robot_map = _record(
             d.robot_map, maps[d.robot_map["kind"]], f"{path}: robot_map", "kind", "note"
         )
+    if not d.intrinsics.get("covariance"):
+        raise InputError(f"{path}: intrinsics have no covariance. Write the file again.")
     camera, alone = (
         _record(v, CameraIntrinsics, f"{path}: intrinsics", "use", "covariance")
         for v in (d.intrinsics, d.intrinsics_alone)
@@ -277,7 +285,7 @@ def _report(d: _File, path: str) -> HandEyeReport:
         Z_alone=_matrix(d.Z_alone, f"{path}: Z_alone"),
         intrinsics_alone=alone,
         intrinsics=camera,
-        intrinsics_covariance=d.intrinsics.get("covariance"),
+        intrinsics_covariance=np.array(d.intrinsics["covariance"], dtype=np.float64),
         board=_record(d.board, BoardShape, f"{path}: board", "warp_mm"),
         robot_map=robot_map,
         map_name=d.map_name,
