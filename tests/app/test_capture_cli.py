@@ -275,11 +275,17 @@ def test_ports_in_use_are_known() -> None:
     assert not port_in_use("127.0.0.1", port)
 
 
-def test_a_replay_file_is_not_replaced_unasked(plans: Path, tmp_path: Path) -> None:
-    (tmp_path / "replay.html").write_text("precious")
+@pytest.mark.parametrize(
+    ("there", "told"),
+    [("precious", "no replay that this command wrote"), ("a replay by viser", "--overwrite")],
+)
+def test_a_replay_file_is_not_replaced_unasked(
+    plans: Path, tmp_path: Path, there: str, told: str
+) -> None:
+    (tmp_path / "replay.html").write_text(there)
     done = realsim("plan-show", plans / "plan.json", "--replay-file", tmp_path / "replay.html")
-    assert done.returncode == 2 and "--overwrite" in done.stderr
-    assert (tmp_path / "replay.html").read_text() == "precious"
+    assert done.returncode == 2 and told in done.stderr
+    assert (tmp_path / "replay.html").read_text() == there
 
 
 @pytest.mark.slow

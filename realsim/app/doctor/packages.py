@@ -45,6 +45,8 @@ _REQUIRED = (
     ("rich", "rich", "tables and progress"),
     ("matplotlib", "matplotlib", "plots of the reports"),
     ("pillow", "PIL", "textures"),
+    ("msgspec", "msgspec", "the project's own files"),
+    ("jinja2", "jinja2", "pages"),
     ("threadpoolctl", "threadpoolctl", "one thread where more cost time"),
     ("eaik", "eaik.IK_Robot", "inverse kinematics"),
     ("coacd", "coacd", "convex parts of meshes"),
