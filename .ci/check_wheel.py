@@ -18,7 +18,7 @@ for name in {names}:
 for generic in ("calibration", "capture_plans", "sim_bridge", "tests"):
     assert importlib.util.find_spec(generic) is None, generic
 from importlib.resources import files
-assert (files("realsim.app") / "report_page.html").is_file()
+assert (files("realsim.pages") / "page.html").is_file()
 from realsim.interop import import_open3d, import_pyrealsense2
 import_open3d(); import_pyrealsense2()
 from realsim_capture_plans.plan_files.plan_json import shipped_plan
