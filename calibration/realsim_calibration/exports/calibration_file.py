@@ -193,7 +193,6 @@ class _Transform(OwnFile, frozen=True, kw_only=True):
     matrix: Array
     translation_m: Array
     quaternion_xyzw: Array
-    covariance: Array | None = None
 
 
 class _Calibrated(_Transform, frozen=True, kw_only=True):

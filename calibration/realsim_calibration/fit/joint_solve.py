@@ -247,7 +247,7 @@ class JointProblem:
 
     def equations(self, state: JointState, roots: Array) -> Array:
         """Return every view's compressed equations (views, 24, 36) at a state [px]."""
-        arguments = (*self._arguments(state, state.errors), roots)
+        arguments: list[Any] = [*self._arguments(state, state.errors), roots]
         rows = all_equations(*arguments)
         rows[:, :, 12:SHARED][:, :, ~self.free] = 0.0
         return rows

@@ -228,7 +228,7 @@ def with_views(truth: LabTruth, views: Mapping[int, ArrayLike]) -> LabTruth:
     return replace(truth, views=tuple(rows))
 
 
-class _TruthFile(OwnFile, kw_only=True):
+class _TruthFile(OwnFile, frozen=True, kw_only=True):
     """truth.json: of the chain its errors alone; T_a_b maps b to a."""
 
     format: Literal["realsim-lab-truth"] = "realsim-lab-truth"

@@ -74,8 +74,8 @@ def draw_arm(axes: Any, curves: PlanCurves) -> None:
     for k, color in zip(_shown(curves), ARM_COLORS, strict=False):
         for vertices, faces in _posed(curves, k):
             # Triangles are sorted by their middles; long ones would be drawn over what is before.
-            fine, index = subdivide_to_size(vertices, faces, LONGEST_EDGE_M)
-            corner: Array = fine[index]
+            cut: Any = subdivide_to_size(vertices, faces, LONGEST_EDGE_M)
+            corner: Array = cut[0][cut[1]]
             triangles.append(corner)
             colors.append(_shaded(corner, color))
             everything.append(vertices)

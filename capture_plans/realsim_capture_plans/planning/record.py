@@ -301,12 +301,13 @@ def plan_of(content: dict[str, Any]) -> CapturePlan:
         k: tuple(v) if isinstance(v, list) else v for k, v in content["config"].items()
     }
     mount, cell = content["mount"], content["cell"]
+    mounted: dict[str, Any] = {**mount, "bracket": tuple(Shape(**s) for s in mount["bracket"])}
     return CapturePlan(
         kind=content["kind"],
         chain=DhChain(
             name=content["robot"], **content["dh"], limits=JointLimits(**content["limits"])
         ),
-        mount=Mount(**{**mount, "bracket": tuple(Shape(**s) for s in mount["bracket"])}),
+        mount=Mount(**mounted),
         cell=WorkCell(
             table=_box_of(cell["table"]),
             keep_out=_box_of(cell["keep_out"]),
