@@ -9,8 +9,10 @@ hash of the loop's file, of each compiled function and constant that it uses, an
 import contextlib
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar, overload
 
 import numba
@@ -20,7 +22,6 @@ from numba.core.registry import CPUDispatcher
 
 Loop = TypeVar("Loop", bound=Callable[..., Any])
 DIGITS = 24  # of the hash, in the names of the files
-_keys: dict[int, str] = {}  # by id of a compiled function
 
 
 @overload
@@ -34,16 +35,8 @@ def njit(function: Any = None, /, **options: Any) -> Any:
         function: The function, when used without brackets.
         options: Numba's own: `inline`, `fastmath`, `error_model`, `nogil`, `parallel`.
     """
-    if function is None:
-        return lambda loop: njit_with(loop, options)  # pyright: ignore[reportUnknownLambdaType]
-    return njit_with(function, options)
-
-
-def njit_with(function: Any, options: dict[str, Any]) -> Any:
-    """Return the compiled form of a function with Numba's options."""
-    compiled = numba.njit(cache=True, **options)(function)
-    _keys[id(compiled)] = _key(function)
-    return compiled
+    compiler = numba.njit(cache=True, **options)
+    return compiler if function is None else compiler(function)
 
 
 def cache_folder() -> Path:
@@ -54,18 +47,29 @@ def cache_folder() -> Path:
     return Path(home) / "realsim" / "numba"
 
 
+@cache
 def _key(function: Any) -> str:
     """Return a hash of all that decides what a function compiles to."""
-    code = function.__code__
-    said = hashlib.sha256(f"{numba.__version__}{code.co_name}".encode())
-    said.update(Path(code.co_filename).read_bytes())
-    for name in sorted(code.co_names):
-        used = function.__globals__.get(name)
+    said = hashlib.sha256(f"{numba.__version__}{function.__qualname__}".encode())
+    said.update(Path(function.__code__.co_filename).read_bytes())
+    for used in _used_by(function):
         if isinstance(used, CPUDispatcher):
-            said.update(_keys.get(id(used), str(name)).encode())
-        elif isinstance(used, int | float | tuple | np.ndarray):
-            said.update(np.asarray(used).tobytes())
+            said.update(_key(used.py_func).encode())
+        elif isinstance(used, np.ndarray):
+            said.update(f"{used.dtype}{used.shape}".encode() + used.tobytes())
+        elif isinstance(used, int | float | str | tuple):
+            said.update(repr(used).encode())
     return said.hexdigest()[:DIGITS]
+
+
+def _used_by(function: Any) -> Iterator[Any]:
+    """Yield what a function names, also by way of a module: `lens_loops.bent`."""
+    names = sorted(function.__code__.co_names)
+    for name in names:
+        used = function.__globals__.get(name)
+        yield used
+        if isinstance(used, ModuleType) and used.__name__.startswith("realsim"):
+            yield from (vars(used).get(inner) for inner in names)
 
 
 class _ByContent(caching._CacheLocator):  # pyright: ignore[reportPrivateUsage]
@@ -96,5 +100,5 @@ class _ByContent(caching._CacheLocator):  # pyright: ignore[reportPrivateUsage]
         return None
 
 
-places: Any = caching.CacheImpl._locator_classes  # pyright: ignore[reportPrivateUsage]
-places.insert(0, _ByContent)
+_places: Any = caching.CacheImpl._locator_classes  # pyright: ignore[reportPrivateUsage]
+_places.insert(0, _ByContent)

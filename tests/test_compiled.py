@@ -17,11 +17,11 @@ def called(x):
 """
 LOOP = """
 from realsim.compiled import njit
-from realsim_probe_called import called
+{brought}
 
 @njit(inline="always")
 def loop(x):
-    return 2.0 * called(x)
+    return 2.0 * {called}(x)
 
 @njit
 def outer(x):
@@ -29,11 +29,18 @@ def outer(x):
 """
 
 
-def clone(folder: Path, shift: float) -> ModuleType:
+BY_NAME = {"brought": "from realsim_probe_called import called", "called": "called"}
+BY_MODULE = {"brought": "import realsim_probe_called", "called": "realsim_probe_called.called"}
+
+
+def clone(folder: Path, shift: float, way: dict[str, str] = BY_NAME) -> ModuleType:
     """Write both files to a folder, as a clone would, and import them from there."""
     folder.mkdir()
     loaded: list[ModuleType] = []
-    texts = {"realsim_probe_called": CALLED.format(shift=shift), "realsim_probe_loop": LOOP}
+    texts = {
+        "realsim_probe_called": CALLED.format(shift=shift),
+        "realsim_probe_loop": LOOP.format(**way),
+    }
     for name, text in texts.items():
         (folder / f"{name}.py").write_text(text)
         spec = importlib.util.spec_from_file_location(name, folder / f"{name}.py")
@@ -56,12 +63,13 @@ def test_a_clone_finds_what_another_compiled(
     assert sum(second.outer.stats.cache_hits.values()) == 1
 
 
+@pytest.mark.parametrize("way", [BY_NAME, BY_MODULE])
 def test_a_change_in_a_called_function_s_constant_is_noticed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: dict[str, str]
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
-    assert clone(tmp_path / "a", 1.0).outer(1.0) == 5.0
-    assert clone(tmp_path / "b", 10.0).outer(1.0) == 23.0
+    assert clone(tmp_path / "a", 1.0, way).outer(1.0) == 5.0
+    assert clone(tmp_path / "b", 10.0, way).outer(1.0) == 23.0
 
 
 def test_a_home_that_cannot_be_written_compiles_all_the_same(
