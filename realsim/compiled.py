@@ -55,7 +55,7 @@ def _key(function: Any) -> str:
     for used in _used_by(function):
         if isinstance(used, CPUDispatcher):
             said.update(_key(used.py_func).encode())
-        elif isinstance(used, np.ndarray):
+        elif isinstance(used, np.ndarray | np.generic):
             said.update(f"{used.dtype}{used.shape}".encode() + used.tobytes())
         elif isinstance(used, int | float | str | tuple):
             said.update(repr(used).encode())

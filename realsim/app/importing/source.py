@@ -7,11 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from realsim.app.console import Console
-from realsim.app.importing.folder import (
-    FolderRequest,
-    camera_of_file,
-    open_image_folder,
-)
+from realsim.app.importing.folder import FolderRequest, camera_of_file, open_image_folder
 from realsim.app.importing.session import ImportSummary, import_session
 from realsim.errors import InputError
 from realsim.formats.folders import FolderChoice
