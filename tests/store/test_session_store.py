@@ -178,10 +178,9 @@ def test_bad_requests_say_what_would_do(tmp_path):
         SessionStore.open(tmp_path / "rgb")
     with pytest.raises(InputError, match="view 1 is already"):
         store.add_view(View(index=1), rgb, depth_m)
-    with pytest.raises(InputError, match="size"):
-        store.add_view(View(index=5), rgb[:, :32], depth_m)
-    with pytest.raises(InputError, match="size"):
-        store.add_view(View(index=5), rgb, depth_m[:24])
+    for images in ((rgb[:, :32], depth_m), (rgb, depth_m[:24])):
+        with pytest.raises(InputError, match="size"):
+            store.add_view(View(index=5), *images)
     with pytest.raises(InputError, match=r"view 9 .* 0, 1"):
         store.rgb(9)
     with pytest.raises(InputError, match="inside the session"):
