@@ -161,7 +161,7 @@ def jobs_of(
         keep: see `Job`.
         quick: few objects and views.
     """
-    objects, few, many = (6, 12, 24) if quick else (OBJECTS, 32, 256)
+    objects, few, many = (4, 8, 16) if quick else (OBJECTS, 32, 256)
     jobs: list[Job] = []
 
     def add(names: Sequence[str], key: SceneKey) -> None:

@@ -22,7 +22,7 @@ HARMLESS: tuple[Kind, ...] = ("foreign", "leftover")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Finding:
+class LibraryFinding:
     """One thing that is not as it should be."""
 
     path: str
@@ -37,7 +37,7 @@ class Finding:
         return self.kind in HARMLESS
 
 
-def check_library(library: LibraryReader) -> list[Finding]:
+def check_library(library: LibraryReader) -> list[LibraryFinding]:
     """Return everything that is not as it should be, by path.
 
     Raises:
@@ -47,17 +47,17 @@ def check_library(library: LibraryReader) -> list[Finding]:
     found = [f for e in entries for f in _of_entry(library, e)]
     found += _orphans(library.folder, entries)
     found += [
-        Finding(path=str(p.relative_to(library.folder)), kind="leftover",
+        LibraryFinding(path=str(p.relative_to(library.folder)), kind="leftover",
                 text="of a run that was killed; can be deleted")
         for p, _ in atomic.leftovers(library.folder) if ADDING not in p.parts
     ]  # fmt: skip
     if (library.folder / ADDING).is_dir():
         text = "of a run that was killed, or is adding a model now; the next one clears it"
-        found.append(Finding(path=ADDING, kind="leftover", text=text))
+        found.append(LibraryFinding(path=ADDING, kind="leftover", text=text))
     return sorted(found, key=lambda f: f.path)
 
 
-def _of_entry(library: LibraryReader, entry: LibraryEntry) -> Iterator[Finding]:
+def _of_entry(library: LibraryReader, entry: LibraryEntry) -> Iterator[LibraryFinding]:
     """Yield what is wrong with one model."""
     if entry.obj_id is None:
         place = f"{files.UNSCALED}/{entry.name}"
@@ -65,35 +65,35 @@ def _of_entry(library: LibraryReader, entry: LibraryEntry) -> Iterator[Finding]:
     else:
         report, mesh = files.properties_file(entry.obj_id), model_file(entry.obj_id)
     if not (library.folder / mesh).is_file():
-        yield Finding(path=mesh, kind="missing", text=f"the mesh of '{entry.name}'")
+        yield LibraryFinding(path=mesh, kind="missing", text=f"the mesh of '{entry.name}'")
         return
     if entry.properties is not None:
         yield from _against_checksums(library.folder, entry.properties)
         return
     if (library.folder / report).is_file():
-        yield Finding(path=report, kind="damaged", text=entry.problem)
+        yield LibraryFinding(path=report, kind="damaged", text=entry.problem)
     else:
         text = "not imported by realsim; `realsim scan complete` computes its properties"
-        yield Finding(path=report, kind="foreign", text=text)
+        yield LibraryFinding(path=report, kind="foreign", text=text)
     if entry.obj_id is not None:
         try:
             load_models(library.folder, [entry.obj_id])
         except InputError as error:
-            yield Finding(path=mesh, kind="damaged", text=str(error))
+            yield LibraryFinding(path=mesh, kind="damaged", text=str(error))
 
 
-def _against_checksums(folder: Path, properties: ModelProperties) -> Iterator[Finding]:
+def _against_checksums(folder: Path, properties: ModelProperties) -> Iterator[LibraryFinding]:
     """Yield the files that are not those that the properties are of."""
     for name, expected in properties.files.items():
         path = folder / name
         if not path.is_file():
-            yield Finding(path=name, kind="missing", text=f"of '{properties.name}'")
+            yield LibraryFinding(path=name, kind="missing", text=f"of '{properties.name}'")
         elif sha256(path.read_bytes()) != expected:
             text = f"not what the properties of '{properties.name}' were computed of"
-            yield Finding(path=name, kind="changed", text=text)
+            yield LibraryFinding(path=name, kind="changed", text=text)
 
 
-def _orphans(folder: Path, entries: list[LibraryEntry]) -> Iterator[Finding]:
+def _orphans(folder: Path, entries: list[LibraryEntry]) -> Iterator[LibraryFinding]:
     """Yield files in the library's places that no model has."""
     known = {e.obj_id for e in entries if e.obj_id is not None}
     names = {e.name for e in entries}
@@ -111,6 +111,6 @@ def _orphans(folder: Path, entries: list[LibraryEntry]) -> Iterator[Finding]:
             yield _orphan(folder, path)
 
 
-def _orphan(folder: Path, path: Path) -> Finding:
+def _orphan(folder: Path, path: Path) -> LibraryFinding:
     text = "no model of the library has this file; can be deleted, or its model imported again"
-    return Finding(path=str(path.relative_to(folder)), kind="orphan", text=text)
+    return LibraryFinding(path=str(path.relative_to(folder)), kind="orphan", text=text)

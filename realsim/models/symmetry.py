@@ -35,7 +35,7 @@ from realsim.models.symmetry_search import (
     FINE_SCALES,
     POLYHEDRA,
     Axis,
-    Fit,
+    IsometryFit,
     best_mirror,
     fits_of,
     found_axes,
@@ -111,12 +111,12 @@ def find_symmetries(mesh: Mesh, config: SymmetryConfig | None = None) -> Symmetr
     best = min([mirror.worst, *(a.fits[a.orders[0]].worst for a in axes if a.orders)])
     tolerance = min(max(config.tolerance, config.noise_factor * best), config.greatest_tolerance)
 
-    def passes(fits: list[Fit]) -> bool:
+    def passes(fits: list[IsometryFit]) -> bool:
         return all(f.worst <= tolerance and f.rms <= config.rms_tolerance for f in fits)
 
     chosen, fits = (
         _Trial(rotations=np.eye(3)[None], frame=np.eye(4)),
-        [Fit(worst=0, rms=0, share=1)],
+        [IsometryFit(worst=0, rms=0, share=1)],
     )
     for trial in _trials(surface, axes, config):
         fitted, fitted_fits = _fitted(surface, trial, config)
@@ -135,7 +135,9 @@ def find_symmetries(mesh: Mesh, config: SymmetryConfig | None = None) -> Symmetr
     )
 
 
-def _fitted(surface: Surface, trial: _Trial, config: SymmetryConfig) -> tuple[_Trial, list[Fit]]:
+def _fitted(
+    surface: Surface, trial: _Trial, config: SymmetryConfig
+) -> tuple[_Trial, list[IsometryFit]]:
     """Return a trial with its axes fitted to the surface as one, and how well it fits."""
     all_of = trial.elements(config.continuous_step_deg)[1:]
     some = all_of[:: math.ceil(len(all_of) / FIT_ELEMENTS)]

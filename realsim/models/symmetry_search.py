@@ -135,7 +135,7 @@ FINE_SCALES = (-0.04, -0.03, -0.03)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Fit:
+class IsometryFit:
     """How well an isometry maps the surface onto itself."""
 
     worst: float
@@ -154,7 +154,7 @@ class Axis:
     """(3,) unit."""
     point: Array
     """(3,) on it, near the centre [share of the diameter]."""
-    fits: dict[int, Fit]
+    fits: dict[int, IsometryFit]
     """Of the turn by 2 pi / n, per order n."""
     orders: tuple[int, ...]
     """Those worth pursuing, ascending."""
@@ -165,14 +165,14 @@ def moved_about(rotations: Array, frame: Array) -> Array:
     return frame @ se3.from_rt(rotations, np.zeros(3)) @ se3.invert(frame)
 
 
-def fits_of(surface: Surface, Ts: Array, config: SymmetryConfig, count: int) -> list[Fit]:
+def fits_of(surface: Surface, Ts: Array, config: SymmetryConfig, count: int) -> list[IsometryFit]:
     """Return how well each isometry (K, 4, 4) maps `count` points onto the surface, exactly."""
     d = surface.exact(Ts, count)
     worst = np.quantile(d, 1.0 - config.outliers, axis=1)
     rms = np.sqrt(np.mean(np.square(d), axis=1))
     share = np.mean(d <= config.near_distance, axis=1)
     return [
-        Fit(worst=float(w), rms=float(r), share=float(s))
+        IsometryFit(worst=float(w), rms=float(r), share=float(s))
         for w, r, s in zip(worst, rms, share, strict=True)
     ]
 
@@ -204,13 +204,13 @@ def _best(scores: Array, directions: Array, count: int) -> list[int]:
 
 def _refined_lines(
     surface: Surface, config: SymmetryConfig, angle: float, sign: float, count: int
-) -> list[tuple[Array, Array, Fit]]:
+) -> list[tuple[Array, Array, IsometryFit]]:
     """Return (direction, point, fit) of the best axes for one angle; sign -1 adds an inversion."""
     directions = _directions(surface, config)
     rotations = sign * se3.exp_so3(directions * angle)
     Ts = se3.from_rt(rotations, np.zeros(3))
     scores = np.minimum(surface.near(Ts, config.screening_points), CAP).mean(axis=1)
-    found: list[tuple[Array, Array, Fit]] = []
+    found: list[tuple[Array, Array, IsometryFit]] = []
     for i in _best(scores, directions, count):
         E = refinement(
             surface, Ts[i : i + 1], config.fitting_points, (*COARSE_SCALES, *FINE_SCALES)
@@ -224,7 +224,7 @@ def _refined_lines(
 def found_axes(surface: Surface, config: SymmetryConfig) -> list[Axis]:
     """Return the axes about which the surface is symmetric or nearly so, the best first."""
     primes = [n for n in range(2, config.orders + 1) if all(n % k for k in range(2, n))]
-    lines: list[tuple[Array, Array, Fit]] = []
+    lines: list[tuple[Array, Array, IsometryFit]] = []
     for p in primes:
         lines += _refined_lines(surface, config, 2 * math.pi / p, 1.0, KEPT.get(p, 1))
     lines.sort(key=lambda line: line[2].rms)
@@ -252,7 +252,7 @@ def _with_orders(surface: Surface, config: SymmetryConfig, direction: Array, poi
     return Axis(direction=direction, point=point, fits=fits, orders=likely)
 
 
-def best_mirror(surface: Surface, config: SymmetryConfig, axes: list[Axis]) -> Fit:
+def best_mirror(surface: Surface, config: SymmetryConfig, axes: list[Axis]) -> IsometryFit:
     """Return how well the best mirror image, turned at will, fits the surface.
 
     A shape equals its mirror image if an improper isometry maps it onto itself: a mirror plane,

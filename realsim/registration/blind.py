@@ -24,7 +24,7 @@ from realsim.records import ObjectModel
 from realsim.registration.body import Body
 from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud
-from realsim.registration.solver import Fit, FreeSpace, SolverConfig, solve_pose
+from realsim.registration.solver import FreeSpace, PoseFit, SolverConfig, solve_pose
 
 Array = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ class Uncertainty:
     """(6,) root mean square cosine along each principal axis, least first."""
 
 
-def uncertainty(body: Body, fit: Fit, stride: int, config: CovarianceConfig) -> Uncertainty:
+def uncertainty(body: Body, fit: PoseFit, stride: int, config: CovarianceConfig) -> Uncertainty:
     """Return how sure a fitted pose is.
 
     With H the information about the box centre, in units where the rotation is times the radius:
@@ -88,7 +88,7 @@ def uncertainty(body: Body, fit: Fit, stride: int, config: CovarianceConfig) -> 
     )
 
 
-def blind_motions(body: Body, fit: Fit, config: CovarianceConfig) -> Array:
+def blind_motions(body: Body, fit: PoseFit, config: CovarianceConfig) -> Array:
     """Return the motions (6, K) that the points do not determine.
 
     They are orthonormal, about the box centre, rotation first, turns times the body's radius [m].
@@ -97,7 +97,7 @@ def blind_motions(body: Body, fit: Fit, config: CovarianceConfig) -> Array:
     return vectors[:, _sensitivities(values, fit) < config.unobservable_sensitivity]
 
 
-def _principal_axes(body: Body, fit: Fit) -> tuple[Array, Array, Array]:
+def _principal_axes(body: Body, fit: PoseFit) -> tuple[Array, Array, Array]:
     """Return eigenvalues (6,) and vectors (6, 6) of the scaled information, and the scale (6,)."""
     radius = body.radius_m
     scale = np.array([radius, radius, radius, 1.0, 1.0, 1.0])
@@ -105,7 +105,7 @@ def _principal_axes(body: Body, fit: Fit) -> tuple[Array, Array, Array]:
     return np.maximum(values, 0.0), vectors, scale
 
 
-def _sensitivities(values: Array, fit: Fit) -> Array:
+def _sensitivities(values: Array, fit: PoseFit) -> Array:
     """Return the root mean square cosine (6,) along each principal axis; 0 without points."""
     return np.sqrt(values / fit.weight) if fit.weight > 0 else np.zeros(6)
 
@@ -159,7 +159,7 @@ class BlindAxis:
 class Kept:
     """The fit after the blind directions were set back, and what was done."""
 
-    fit: Fit
+    fit: PoseFit
     axes: tuple[BlindAxis, ...]
     report: dict[str, Any]
     """Empty if nothing is blind."""
@@ -241,7 +241,7 @@ def nearest_to_start(
 
 def keep_start(
     body: Body,
-    fit: Fit,
+    fit: PoseFit,
     data: tuple[Cloud, Comparer, FreeSpace | None],
     configs: tuple[BlindConfig, CovarianceConfig, SolverConfig],
 ) -> Kept:

@@ -33,7 +33,7 @@ WORST = ("accepted", "doubtful", "rejected")
 """Verdicts, better first."""
 
 
-class Finding(Protocol):
+class Defect(Protocol):
     """Something that is wrong with a view, or with the scene as a whole."""
 
     @property
@@ -73,7 +73,7 @@ class Judgement:
     """The judged objects and what is wrong with the scene."""
 
     objects: list[ObjectPose]
-    findings: Sequence[Finding]
+    findings: Sequence[Defect]
 
 
 def judge_objects(

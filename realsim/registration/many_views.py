@@ -27,7 +27,7 @@ from realsim.registration.refinement.config import RefineConfig
 from realsim.registration.refinement.equations import State
 from realsim.registration.refinement.refine import Refined, refine
 from realsim.registration.refinement.uncertainty import SeenPose, object_covariance, seen_poses
-from realsim.registration.solver import Fit, solve_pose
+from realsim.registration.solver import PoseFit, solve_pose
 from realsim.registration.views import ViewPoints
 
 Array = NDArray[np.float64]
@@ -235,7 +235,7 @@ def _misfit_covariance(body: Body, misfit_m: float) -> Array:
     return Ad @ C @ Ad.T
 
 
-def _blind_covariance(body: Body, fit: Fit, config: RegistrationConfig) -> Array:
+def _blind_covariance(body: Body, fit: PoseFit, config: RegistrationConfig) -> Array:
     """Return what nothing determines: the points' noise makes a turn of a can look half known."""
     motions = blind_motions(body, fit, config.covariance)
     motions = motions / np.array([body.radius_m] * 3 + [1.0] * 3)[:, None]

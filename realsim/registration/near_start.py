@@ -16,7 +16,7 @@ from realsim.records import SupportPlane
 from realsim.registration.body import Body
 from realsim.registration.compare import Comparer
 from realsim.registration.evidence import Cloud
-from realsim.registration.solver import Fit, FreeSpace, SolverConfig, solve_pose
+from realsim.registration.solver import FreeSpace, PoseFit, SolverConfig, solve_pose
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class SearchConfig:
 class BestStart:
     """The best hypothesis of one object."""
 
-    fit: Fit
+    fit: PoseFit
     gain_px: float
     """Rendered gain over the bare table, in pixels."""
     gain_per_pixel: float
@@ -138,7 +138,7 @@ def search(
     return BestStart(fit=refined[best], gain_px=gain_px, gain_per_pixel=per_pixel, report=report)
 
 
-def _preference(body: Body, fit: Fit, gain_px: float, config: SearchConfig) -> float:
+def _preference(body: Body, fit: PoseFit, gain_px: float, config: SearchConfig) -> float:
     """Return the gain less a small share for the turn from the start.
 
     A can looks the same from all sides: of poses that explain the images alike, the one nearest to
@@ -148,12 +148,12 @@ def _preference(body: Body, fit: Fit, gain_px: float, config: SearchConfig) -> f
     return gain_px - abs(gain_px) * config.turn_share * turn / np.pi
 
 
-def distinct_fits(body: Body, fits: list[Fit], same_m: float) -> list[Fit]:
+def distinct_fits(body: Body, fits: list[PoseFit], same_m: float) -> list[PoseFit]:
     """Return the fits that differ: of those within `same_m` at every box corner, the first."""
     low, high = body.model.mesh.bounds
     unit = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     corners = low + unit * (high - low)
-    kept: list[Fit] = []
+    kept: list[PoseFit] = []
     places: list[Array] = []
     for f in fits:
         place = se3.transform(f.T_world_obj, corners)
@@ -211,7 +211,7 @@ def joint_fit(
     clouds: Sequence[Cloud],
     views: tuple[Sequence[Comparer], Sequence[FreeSpace | None]],
     configs: tuple[JointConfig, SolverConfig],
-) -> tuple[list[Fit], list[Cloud], list[dict[str, Any]]]:
+) -> tuple[list[PoseFit], list[Cloud], list[dict[str, Any]]]:
     """Return every object's fit to the points that are its own.
 
     Every sweep assigns the points at the poses of the sweep before and then fits all objects, so
@@ -231,7 +231,7 @@ def joint_fit(
     comparers, spaces = views
     before = list(poses)
     current = list(poses)
-    fits: list[Fit] = []
+    fits: list[PoseFit] = []
     history: list[dict[str, Any]] = []
     for sweep in range(config.sweeps):
         own = assign_points(bodies, current, clouds, config)

@@ -36,7 +36,7 @@ from realsim.registration.finding import (
     wanted_objects,
 )
 from realsim.registration.intake import Intake, check_odometry, take_in
-from realsim.registration.judge import Finding, Poses, judge_objects
+from realsim.registration.judge import Defect, Poses, judge_objects
 from realsim.registration.judging.verdict import CONTRAST_DECIDED
 from realsim.registration.many_views import ManyViews, comparer_on, register_many
 from realsim.registration.near_rivals import Duel, duels
@@ -73,7 +73,7 @@ class Registration:
     Empty if cameras were not refined."""
     not_placed: tuple[NotPlaced, ...]
     """Objects that were wanted and not found, and why."""
-    findings: tuple[Finding, ...]
+    findings: tuple[Defect, ...]
     """What is wrong with views or with the scene."""
     report: Mapping[str, Any]
     """Plain JSON values: per object the search, the residuals, what was rejected; the cameras."""
@@ -145,7 +145,7 @@ class _Fit:
     """Per object how it was found, as JSON values."""
     seen: dict[int, dict[int, SeenPose]]
     """See `Registration`."""
-    findings: list[Finding]
+    findings: list[Defect]
     """What does not fit the objects."""
     report: dict[str, Any]
     """Of what all objects have in common, as JSON values."""
@@ -191,7 +191,7 @@ def _fit_many(task: SceneTask, found: FoundObjects) -> _Fit:
 
 def _views_off(
     intake: Intake, many: ManyViews, bodies: Sequence[Body], config: RegistrationConfig
-) -> list[Finding]:
+) -> list[Defect]:
     """Return the views that do not fit the registered objects, their cameras refined."""
     views = [
         replace(v, T_world_cam=T) for v, T in zip(intake.views, many.refined.cameras, strict=True)

@@ -86,7 +86,7 @@ class FreeSpace:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Fit:
+class PoseFit:
     """Where the solver ended and what it saw there."""
 
     T_world_obj: Array
@@ -106,7 +106,7 @@ class Fit:
     history_mm: tuple[float, ...] = field(default=())
     """RMS residual at the end of every stage [mm]."""
 
-    def at(self, T_world_obj: Array) -> "Fit":
+    def at(self, T_world_obj: Array) -> "PoseFit":
         """Return the fit's figures with another pose (4, 4)."""
         return replace(self, T_world_obj=T_world_obj)
 
@@ -224,7 +224,7 @@ def solve_pose(
     stages: tuple[Stage, ...],
     config: SolverConfig,
     free_space: FreeSpace | None = None,
-) -> Fit:
+) -> PoseFit:
     """Return the pose at which the measured points lie on the model's surface.
 
     Args:
@@ -269,7 +269,7 @@ def solve_pose(
                 break
         rms = np.sqrt(sums.square / sums.weight) if sums.weight > 0 else np.nan
         history.append(float(1e3 * rms))
-    return Fit(
+    return PoseFit(
         T_world_obj=se3.check_rigid(T, "the fitted pose"),
         information=sums.information,
         weight=sums.weight,

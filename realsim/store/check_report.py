@@ -23,7 +23,7 @@ DAMAGE: tuple[Kind, ...] = ("missing", "changed", "unreadable", "line")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Finding:
+class SessionFinding:
     """One thing that is not as it was written."""
 
     path: str
@@ -61,7 +61,7 @@ class CheckReport:
     beside: tuple[tuple[str, int], ...]
     """(folder or file, how many files) of what others wrote beside the session, such as models/:
     no checksum covers it, and none was meant to."""
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[SessionFinding, ...] = ()
     inner: tuple["CheckReport", ...] = ()
     """Reports of the sessions inside, such as the board views in calibration/capture."""
 
@@ -137,4 +137,4 @@ class Lists:
         default_factory=dict[int, list[tuple[int, str]]]
     )
     """The sound robot lines of every view."""
-    findings: list[Finding] = field(default_factory=list[Finding])
+    findings: list[SessionFinding] = field(default_factory=list[SessionFinding])

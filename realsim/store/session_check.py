@@ -15,7 +15,7 @@ from realsim import images
 from realsim.errors import RealsimError
 from realsim.records import CameraIntrinsics, View
 from realsim.store import atomic
-from realsim.store.check_report import CheckReport, Finding, Kind, Lists
+from realsim.store.check_report import CheckReport, Kind, Lists, SessionFinding
 from realsim.store.header import SESSION_FILE, checked_header
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.manifest import REMOVED, Entry, entry_from, entry_of, fault_of
@@ -33,7 +33,14 @@ from realsim.store.session_notes import (
 from realsim.store.view_images import depth_path, rgb_path
 from realsim.untrusted.own_json import from_json
 
-__all__ = ["CheckReport", "Finding", "check_session", "inner_sessions", "is_session", "read_lists"]
+__all__ = [
+    "CheckReport",
+    "SessionFinding",
+    "check_session",
+    "inner_sessions",
+    "is_session",
+    "read_lists",
+]
 
 DAMAGED = "damaged"
 """Folder of a session that takes what a repair takes out."""
@@ -73,7 +80,7 @@ def check_session(folder: Path | str, *, decode: bool = False) -> CheckReport:
         if fault is None:
             ok += 1
         elif path != CAMERA_FILE or not interrupted:
-            findings.append(Finding(path=path, kind=fault.kind, found=fault.found))
+            findings.append(SessionFinding(path=path, kind=fault.kind, found=fault.found))
     robot_damaged = any(f.path == ROBOT_FILE and f.is_damage for f in findings)
     ok += int(ROBOT_FILE in lists.entries and not robot_damaged)
     sound = set(_sound_views(folder, lists, camera, decode))
@@ -113,10 +120,10 @@ def read_lists(folder: Path) -> Lists:
         path = folder / name
         if not path.is_file():
             if name == MANIFEST_FILE:
-                lists.findings.append(Finding(path=name, kind="missing", found="no file"))
+                lists.findings.append(SessionFinding(path=name, kind="missing", found="no file"))
             continue
         if name == MANIFEST_FILE and not atomic.complete_lines(path):
-            lists.findings.append(Finding(path=name, kind="missing", found="no line in it"))
+            lists.findings.append(SessionFinding(path=name, kind="missing", found="no line in it"))
         for number, line in enumerate(atomic.complete_lines(path), start=1):
             try:
                 if name == MANIFEST_FILE:
@@ -131,7 +138,7 @@ def read_lists(folder: Path) -> Lists:
             except (ValueError, RealsimError) as error:
                 named = INDEX.search(line) if name == ROBOT_FILE else None
                 lists.findings.append(
-                    Finding(
+                    SessionFinding(
                         path=name, kind="line", found=f"line {number} {error}",
                         view=None if named is None else int(named[1]),
                     )
@@ -143,7 +150,7 @@ def read_lists(folder: Path) -> Lists:
             tail = LISTED.search(data[-half:].decode(errors="replace"))
             if name == MANIFEST_FILE and tail is not None:
                 found += f": the checksum of {tail[1]} is lost"
-            lists.findings.append(Finding(path=name, kind="torn", found=found))
+            lists.findings.append(SessionFinding(path=name, kind="torn", found=found))
     return lists
 
 
@@ -154,7 +161,7 @@ def _take_entry(entries: dict[str, Entry], entry: Entry) -> None:
         entries[entry.path] = entry
 
 
-def _camera_of(folder: Path, findings: list[Finding]) -> CameraIntrinsics | None:
+def _camera_of(folder: Path, findings: list[SessionFinding]) -> CameraIntrinsics | None:
     """Return the camera of the header; a header that cannot be used is a finding."""
     try:
         return from_json(
@@ -164,7 +171,9 @@ def _camera_of(folder: Path, findings: list[Finding]) -> CameraIntrinsics | None
         there = (folder / SESSION_FILE).is_file()
         found = str(error) if there else "no file"
         findings.append(
-            Finding(path=SESSION_FILE, kind="unreadable" if there else "missing", found=found)
+            SessionFinding(
+                path=SESSION_FILE, kind="unreadable" if there else "missing", found=found
+            )
         )
         return None
 
@@ -182,10 +191,10 @@ def _note_leftovers(folder: Path, lists: Lists) -> bool:
         found = f"{temporary.name}, of a run that is over"
         if whole:
             found += "; opening the session gives it its name"
-            lists.findings.append(Finding(path=path, kind="leftover", found=found))
+            lists.findings.append(SessionFinding(path=path, kind="leftover", found=found))
         else:
             name = temporary.relative_to(folder).as_posix()
-            lists.findings.append(Finding(path=name, kind="leftover", found=found))
+            lists.findings.append(SessionFinding(path=name, kind="leftover", found=found))
     return finished
 
 
@@ -201,7 +210,7 @@ def _check_robot_file(folder: Path, lists: Lists) -> bool:
         found = f"{len(data)} bytes, {entry.bytes} were listed"
         if len(data) >= entry.bytes:
             found = f"other bytes than were written among the first {entry.bytes}"
-        lists.findings.append(Finding(path=ROBOT_FILE, kind=kind, found=found))
+        lists.findings.append(SessionFinding(path=ROBOT_FILE, kind=kind, found=found))
         return False
     return len(data) > entry.bytes
 
@@ -218,12 +227,14 @@ def _sound_views(
             for k in known:
                 old = lists.findings[k]
                 whole = whole and not old.is_damage
-                lists.findings[k] = Finding(path=path, kind=old.kind, found=old.found, view=index)
+                lists.findings[k] = SessionFinding(
+                    path=path, kind=old.kind, found=old.found, view=index
+                )
             if known:
                 continue
             fault = None
             if path not in lists.entries and not (folder / path).is_file():
-                fault = Finding(path=path, kind="missing", found="no file", view=index)
+                fault = SessionFinding(path=path, kind="missing", found="no file", view=index)
             elif decode or path not in lists.entries:
                 fault = _image_fault(folder, path, index, camera)
             if fault is not None:
@@ -235,7 +246,7 @@ def _sound_views(
 
 def _image_fault(
     folder: Path, path: str, index: int, camera: CameraIntrinsics | None
-) -> Finding | None:
+) -> SessionFinding | None:
     """Decode an image; return what is wrong with it."""
     try:
         if path == depth_path(index):
@@ -243,10 +254,10 @@ def _image_fault(
         else:
             size = images.read_rgb(folder / path).shape[:2]
     except RealsimError as error:
-        return Finding(path=path, kind="unreadable", found=str(error), view=index)
+        return SessionFinding(path=path, kind="unreadable", found=str(error), view=index)
     if camera is not None and size != (camera.height, camera.width):
         found = f"{size[1]}x{size[0]}, the camera has {camera.width}x{camera.height}"
-        return Finding(path=path, kind="unreadable", found=found, view=index)
+        return SessionFinding(path=path, kind="unreadable", found=found, view=index)
     return None
 
 

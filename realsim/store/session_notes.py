@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from realsim.store import atomic
-from realsim.store.check_report import Finding, Lists
+from realsim.store.check_report import Lists, SessionFinding
 from realsim.store.header import SESSION_FILE
 from realsim.store.manifest import NAME as MANIFEST_FILE
 from realsim.store.opening import BEGUN_FILE, CAMERA_FILE, ROBOT_FILE
@@ -59,7 +59,7 @@ def note_unproven(lists: Lists, unproven: Iterable[str]) -> None:
             found = "no checksum: its line in the manifest is lost, or a run ended before it"
             if is_image(path):
                 found += "; the image can be read"
-            lists.findings.append(Finding(path=path, kind="unproven", found=found))
+            lists.findings.append(SessionFinding(path=path, kind="unproven", found=found))
 
 
 def note_times(folder: Path, lists: Lists) -> None:
@@ -75,7 +75,7 @@ def note_times(folder: Path, lists: Lists) -> None:
         if before is not None and moment < before[1] and _in_one_run(runs, index, before[0]):
             found = f"view {index} at {moment:.3f} s was stored after view {before[0]} at "
             found += f"{before[1]:.3f} s; a camera that was restarted counts anew"
-            lists.findings.append(Finding(path=ROBOT_FILE, kind="time", found=found))
+            lists.findings.append(SessionFinding(path=ROBOT_FILE, kind="time", found=found))
             return  # one restart shifts all that follow: the first is what matters
         before = (index, moment)
 
@@ -121,7 +121,7 @@ def note_repeated(folder: Path, lists: Lists) -> None:
             numbers = ", ".join(str(number) for number, _ in lines)
             found = f"view {index} has {len(lines)} lines ({numbers}); the last one counts"
             found += f"; {same} of them repeat another" if same else ""
-            lists.findings.append(Finding(path=ROBOT_FILE, kind="repeated", found=found))
+            lists.findings.append(SessionFinding(path=ROBOT_FILE, kind="repeated", found=found))
 
 
 def note_orphans(folder: Path, lists: Lists, lost: set[int]) -> None:
@@ -133,4 +133,4 @@ def note_orphans(folder: Path, lists: Lists, lost: set[int]) -> None:
                 continue
             if int(file.stem) not in lost:
                 found = "no line in robot.jsonl: the run ended before the view was complete"
-                lists.findings.append(Finding(path=path, kind="unlisted", found=found))
+                lists.findings.append(SessionFinding(path=path, kind="unlisted", found=found))

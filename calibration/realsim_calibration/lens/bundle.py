@@ -157,7 +157,7 @@ class Prior:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Fit:
+class LensFit:
     """A fit, and the normal equations there."""
 
     state: State
@@ -178,7 +178,7 @@ class Fit:
         _, J = self.prior.residuals(self.state.theta)
         return J.T @ J
 
-    def only_views(self, keep: Mask, obs: Observations) -> "Fit":
+    def only_views(self, keep: Mask, obs: Observations) -> "LensFit":
         """Return the views of a mask (views,): where they stand, not what they alone would say."""
         return replace(
             self,
@@ -335,7 +335,7 @@ def _step(
 
 def adjust(
     state: State, obs: Observations, prior: Prior, sigma_px: float, config: SolverConfig
-) -> Fit:
+) -> LensFit:
     """Return the fit of least cost near a state (Levenberg-Marquardt).
 
     Args:
@@ -376,7 +376,7 @@ def adjust(
         if promised < config.tolerance or damping > config.most_damping:
             break
     S, s, _ = _reduce(normal, 0.0)
-    return Fit(
+    return LensFit(
         state=state, sigma_px=sigma_px, residuals=normal.residuals, informations=S, gradients=s,
         prior=prior, cost=cost,
     )  # fmt: skip

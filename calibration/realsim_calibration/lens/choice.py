@@ -14,7 +14,7 @@ from realsim.errors import DegenerateError
 from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.lens.bundle import (
     GLOBALS,
-    Fit,
+    LensFit,
     Observations,
     SolverConfig,
     State,
@@ -126,7 +126,7 @@ def _square_errors(state: State, obs: Observations) -> Array:
     return np.sum((uv - obs.uv) ** 2, -1)
 
 
-def _without(fit: Fit, train: Mask) -> State:
+def _without(fit: LensFit, train: Mask) -> State:
     """Return the fit's state after one Newton step without the views outside `train`."""
     f = fit.prior.free
     H = (fit.informations[train].sum(0) + fit.prior_information)[np.ix_(f, f)]
@@ -140,7 +140,7 @@ def _without(fit: Fit, train: Mask) -> State:
 
 
 def held_out_errors(
-    fit: Fit, obs: Observations, folds: NDArray[np.int64], config: ChoiceConfig
+    fit: LensFit, obs: Observations, folds: NDArray[np.int64], config: ChoiceConfig
 ) -> Array:
     """Return the mean squared error [px^2] of every view (views,), its lens from other folds.
 
@@ -166,7 +166,7 @@ def held_out_errors(
 
 
 def score_models(
-    fits: dict[str, tuple[Fit, tuple[tuple[str, str], ...]]],
+    fits: dict[str, tuple[LensFit, tuple[tuple[str, str], ...]]],
     obs: Observations,
     folds: NDArray[np.int64],
     config: ChoiceConfig,

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import DegenerateError
 from realsim.geometry.camera import projection_jacobian, undistort
 from realsim.records import CameraIntrinsics
-from realsim_calibration.lens.bundle import CAMERA_TERMS, GLOBALS, Fit
+from realsim_calibration.lens.bundle import CAMERA_TERMS, GLOBALS, LensFit
 
 Array = NDArray[np.float64]
 BLEND = 4.0
@@ -55,7 +55,7 @@ class GlobalCovariance:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
-def global_covariance(fit: Fit) -> GlobalCovariance:
+def global_covariance(fit: LensFit) -> GlobalCovariance:
     """Return the honest covariance of a fit's globals.
 
     Raises:

@@ -10,7 +10,7 @@ from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim_calibration.fit.view_system import camera_record
 from realsim_calibration.lens.bundle import (
     CAMERA_TERMS,
-    Fit,
+    LensFit,
     Observations,
     Prior,
     SolverConfig,
@@ -93,7 +93,7 @@ class Candidate:
     """One lens model fitted to all views."""
 
     model: str
-    fit: Fit
+    fit: LensFit
     """With the undetermined terms held."""
     covariance: GlobalCovariance
     opened: GlobalCovariance
@@ -108,7 +108,7 @@ def robust_sigma(fit_residuals: Array, weight: Array, floor: float) -> float:
     return max(MAD_TO_SIGMA * float(np.median(scaled)), floor)
 
 
-def _unit_sigma(fit: Fit, obs: Observations, config: IntrinsicsConfig) -> float:
+def _unit_sigma(fit: LensFit, obs: Observations, config: IntrinsicsConfig) -> float:
     """Return the unit-weight sigma of a robust fit [px]: Huber's weights, degrees of freedom."""
     square = np.sum(fit.residuals**2, -1) * obs.weight
     limit = config.solver.huber_sigmas * fit.sigma_px
@@ -122,7 +122,7 @@ def _unit_sigma(fit: Fit, obs: Observations, config: IntrinsicsConfig) -> float:
 
 def settle(
     state: State, obs: Observations, prior: Prior, sigma: float, config: IntrinsicsConfig
-) -> Fit:
+) -> LensFit:
     """Return the fit with its own sigma: fit roughly until sigma stays, then fit."""
     rough = replace(config.solver, tolerance=config.rough_tolerance)
     for _ in range(config.sigma_rounds):
@@ -141,7 +141,7 @@ def model_prior(
 
 
 def fit_candidates(
-    obs: Observations, fit: Fit, prior: Prior, config: IntrinsicsConfig
+    obs: Observations, fit: LensFit, prior: Prior, config: IntrinsicsConfig
 ) -> dict[str, Candidate]:
     """Return every model fitted to all views, smallest first, undetermined terms held."""
     found: dict[str, Candidate] = {}
@@ -155,14 +155,14 @@ def fit_candidates(
 
 def fit_model(
     state: State, obs: Observations, prior: Prior, sigma: float, config: IntrinsicsConfig
-) -> Fit:
+) -> LensFit:
     """Return the fit of a model, its held terms put where they are held."""
     theta = np.where(prior.free, state.theta, prior.mean)
     start = replace(state, camera=theta[:CAMERA_TERMS], board=theta[CAMERA_TERMS:])
     return settle(start, obs, prior, sigma, config)
 
 
-def _hold_terms(obs: Observations, fit: Fit, model: str, config: IntrinsicsConfig) -> Candidate:
+def _hold_terms(obs: Observations, fit: LensFit, model: str, config: IntrinsicsConfig) -> Candidate:
     """Return the model with the terms held that the views do not determine.
 
     Radial terms go from the highest order down, until one is determined: a lower one without a
@@ -187,7 +187,11 @@ def _hold_terms(obs: Observations, fit: Fit, model: str, config: IntrinsicsConfi
 
 
 def _why_refused(
-    fit: Fit, covariance: GlobalCovariance, name: str, obs: Observations, config: IntrinsicsConfig
+    fit: LensFit,
+    covariance: GlobalCovariance,
+    name: str,
+    obs: Observations,
+    config: IntrinsicsConfig,
 ) -> str:
     """Return why a term is held, empty where it is not."""
     term = TERM_NAMES.index(name)

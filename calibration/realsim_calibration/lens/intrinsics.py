@@ -20,7 +20,7 @@ from realsim.records import CameraIntrinsics, Target
 from realsim_calibration.fit.view_system import camera_vector
 from realsim_calibration.lens.bundle import (
     CAMERA_TERMS,
-    Fit,
+    LensFit,
     Observations,
     Prior,
     adjust,
@@ -132,7 +132,7 @@ def _require_views(corners: Corners, start: CameraIntrinsics | None) -> None:
 
 def _first_fit(
     corners: Corners, start: CameraIntrinsics | None, config: IntrinsicsConfig
-) -> tuple[Corners, Fit, Prior, str]:
+) -> tuple[Corners, LensFit, Prior, str]:
     """Return a fit with a flexible lens to find outliers with, and the prior of all models.
 
     Views that fit no camera at all are left out.
@@ -160,10 +160,10 @@ def _first_fit(
 
 def _clean(
     corners: Corners,
-    fit: Fit,
+    fit: LensFit,
     start: CameraIntrinsics | None,
     config: IntrinsicsConfig,
-) -> tuple[Corners, Fit]:
+) -> tuple[Corners, LensFit]:
     """Return corners and fit without outlier corners and views, which are named."""
     for _ in range(config.outliers.rounds):
         cleaned, keep_views = find_outliers(corners, fit, config.outliers)
@@ -176,7 +176,7 @@ def _clean(
 
 
 def _check_focal(
-    corners: Corners, fit: Fit, start: CameraIntrinsics | None, config: IntrinsicsConfig
+    corners: Corners, fit: LensFit, start: CameraIntrinsics | None, config: IntrinsicsConfig
 ) -> None:
     """Raise unless the views determine the focal length; a start's prior always does.
 

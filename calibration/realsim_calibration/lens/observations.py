@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry.robust import MAD_TO_SIGMA
 from realsim.records import CameraIntrinsics, Target
-from realsim_calibration.lens.bundle import Fit, Observations
+from realsim_calibration.lens.bundle import LensFit, Observations
 from realsim_calibration.lens.start import is_line
 from realsim_calibration.views import TargetDetection
 
@@ -192,7 +192,9 @@ def _weights(parts: Sequence[TargetDetection], ratio: float) -> Array:
     return np.clip(weight, 1 / ratio, ratio)
 
 
-def find_outliers(corners: Corners, fit: Fit, config: OutlierConfig) -> tuple[Corners | None, Mask]:
+def find_outliers(
+    corners: Corners, fit: LensFit, config: OutlierConfig
+) -> tuple[Corners | None, Mask]:
     """Return the corners without outliers (None = there are none), and the views kept (views,).
 
     A corner is judged by the scatter of all corners or, where that is larger, by its own view's: a

@@ -26,7 +26,7 @@ READING = (
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Finding:
+class ReportFinding:
     """Something that the reader must know."""
 
     severity: Severity
@@ -48,7 +48,7 @@ class Section:
     state: State = "done"
     headline: str = ""
     """Its most important figures, in one line."""
-    findings: list[Finding] = field(default_factory=list[Finding])
+    findings: list[ReportFinding] = field(default_factory=list[ReportFinding])
     figures: dict[str, Figure] = field(default_factory=dict[str, Figure])
     series: dict[str, Any] = field(default_factory=dict[str, Any])
     """Name -> plain JSON values that plots of several sessions are drawn from."""
@@ -61,7 +61,7 @@ class Section:
 
     def say(self, severity: Severity, text: str) -> None:
         """Add a finding."""
-        self.findings.append(Finding(severity=severity, section=self.key, text=text))
+        self.findings.append(ReportFinding(severity=severity, section=self.key, text=text))
 
     def missing(self, text: str) -> None:
         """Say that the stage has not been run."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from realsim.app.report.figures import Figure, count, figures_to_json
-from realsim.app.report.section import SEVERITIES, Finding, Section
+from realsim.app.report.section import SEVERITIES, ReportFinding, Section
 from realsim.pages import Cell, Page
 
 SCHEMA, SCHEMA_VERSION = "realsim report", 1
@@ -36,7 +36,7 @@ class Report:
     sections: tuple[Section, ...]
 
     @property
-    def findings(self) -> list[Finding]:
+    def findings(self) -> list[ReportFinding]:
         """Return all findings, worst first, then in the order of the sections."""
         found = [f for s in self.sections for f in s.findings]
         return sorted(found, key=lambda f: SEVERITIES.index(f.severity))

@@ -38,7 +38,7 @@ class Moved(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Fit:
+class PointFit:
     """A pose from clicked points."""
 
     T_world_obj: Array
@@ -155,7 +155,7 @@ def on_table(T_world_obj: ArrayLike, mesh: Mesh, plane: SupportPlane) -> Array:
     return se3.from_rt(T[:3, :3], T[:3, 3] - float(heights.min()) * up)
 
 
-def from_points(points_obj: ArrayLike, points_world: ArrayLike) -> Fit:
+def from_points(points_obj: ArrayLike, points_world: ArrayLike) -> PointFit:
     """Return the pose that brings points of the object onto points of the scene.
 
     Rigid least squares (Kabsch 1976; Umeyama 1991 for the sign): with both sets centred and
@@ -184,7 +184,7 @@ def from_points(points_obj: ArrayLike, points_world: ArrayLike) -> Fit:
         f"placed by {len(obj)} points, which fit to {1e3 * rms:.1f} mm (RMS); the worst, point "
         f"{worst + 1}, is off by {1e3 * off[worst]:.1f} mm"
     )
-    return Fit(T_world_obj=T, rms_m=rms, words=words)
+    return PointFit(T_world_obj=T, rms_m=rms, words=words)
 
 
 def _pairs(points_obj: ArrayLike, points_world: ArrayLike) -> tuple[Array, Array]:

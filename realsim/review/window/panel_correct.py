@@ -345,7 +345,7 @@ class CorrectPanel:
         self._copy.see(with_model)
         self._text.content = text
 
-    def _by_points(self, fit: placing.Fit) -> None:
+    def _by_points(self, fit: placing.PointFit) -> None:
         with self._window.lock:
             self._end_clicks()
             if self._now is not None:

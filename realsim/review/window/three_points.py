@@ -31,7 +31,7 @@ class PointPlacer:
     def __init__(
         self,
         window: "Window",
-        placed: Callable[[placing.Fit], None],
+        placed: Callable[[placing.PointFit], None],
         ask: Callable[[str, bool], None],
     ) -> None:
         """Wait to be begun.
@@ -95,7 +95,7 @@ class PointPlacer:
         T = se3.from_rt(self._T[:3, :3], self._T[:3, 3] + offset)
         mm = 1e3 * float(np.linalg.norm(offset))
         words = f"shifted by one point: {mm:.1f} mm, not turned"
-        self._placed(placing.Fit(T_world_obj=T, rms_m=0.0, words=words))
+        self._placed(placing.PointFit(T_world_obj=T, rms_m=0.0, words=words))
 
     def _clicked(self, event: Any) -> None:
         if self._mesh is None:
