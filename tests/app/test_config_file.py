@@ -2,8 +2,6 @@
 
 import json
 import re
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ from realsim.app.config.settings import settings_of
 from realsim.app.config.template import template, toml_value
 from realsim.app.outputs import OutputFile
 from realsim.errors import InputError
+from typed_commands import realsim
 
 EVERY = walk(commands)
 
@@ -106,7 +105,7 @@ def test_every_option_of_every_command_is_in_the_template() -> None:
         assert set(here) == {spelling(option) for option in settable(command)}, path
 
 
-@pytest.mark.parametrize("value", ["", 'a "quoted" \\ text', "Grüße", 3, 2.5, True, False, [1, 2]])
+@pytest.mark.parametrize("value", ['a "quoted" \\ Grüße', 2.5, True, [1, 2]])
 def test_values_are_written_as_toml_reads_them(value: Any) -> None:
     assert tomllib.loads(f"x = {toml_value(value)}")["x"] == value
 
@@ -213,34 +212,24 @@ def test_the_first_file_that_is_there_is_read(monkeypatch: pytest.MonkeyPatch) -
     assert find_config(None) is None
 
 
-def run(*args: str) -> subprocess.CompletedProcess[str]:
-    code = "from realsim.app.cli import main; main()"
-    return subprocess.run([sys.executable, "-c", code, *args], capture_output=True, text=True)
-
-
 def test_a_file_in_the_current_folder_is_told_once_and_not_to_the_quiet() -> None:
     written("[board]\npaper = 'A3'\n", "realsim.toml")
-    loud = run("board", "tag:7,size=80mm", "--out", "a", "--json")
+    loud = realsim("board", "tag:7,size=80mm", "--out", "a", "--json")
     assert loud.returncode == 0 and loud.stderr.count("realsim.toml") == 1
     assert json.loads(loud.stdout)["paper"] == "A3"
-    quiet = run("board", "tag:7,size=80mm", "--out", "b", "--quiet")
+    quiet = realsim("board", "tag:7,size=80mm", "--out", "b", "--quiet")
     assert quiet.returncode == 0 and quiet.stderr == ""
-    named = run("--config", "realsim.toml", "board", "tag:7,size=80mm", "--out", "c")
+    named = realsim("--config", "realsim.toml", "board", "tag:7,size=80mm", "--out", "c")
     assert named.returncode == 0 and named.stderr == ""
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("--config", "gone.toml"), ("REALSIM_CONFIG", "gone.toml")]
-)
-def test_a_named_file_that_is_not_there_is_an_error(
-    name: str, value: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    args = ["--config", value] if name.startswith("--") else []
-    if not args:
-        monkeypatch.setenv(name, value)
-    done = run(*args, "scan", "list")
-    assert done.returncode == 2 and "gone.toml" in done.stderr and name in done.stderr
-    assert "Traceback" not in done.stderr
+def test_a_named_file_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, args in (("--config", ["--config", "gone.toml"]), ("REALSIM_CONFIG", [])):
+        if not args:
+            monkeypatch.setenv(name, "gone.toml")
+        done = realsim(*args, "scan", "list")
+        assert done.returncode == 2 and "gone.toml" in done.stderr and name in done.stderr
+        assert "Traceback" not in done.stderr
 
 
 # --- what it refuses ----------------------------------------------------------------------------
@@ -251,22 +240,15 @@ REFUSED = {
         "settings.toml, line 4", "no option 'view'", "did you mean views", "depth-bias",
     ],
     "[register]\nmethod = 'both'": ["line 2", '"both"', "joint", "top-down"],
-    "[demo]\nviews = 'many'": ["line 2", "a whole number"],
     "[demo]\nviews = 2": ["line 2", "2", "4<=x<=1024"],
     "[demo]\nviews = true": ["line 2", "true", "a whole number"],
-    "[demo]\nviews = 4.5": ["line 2", "4.5", "a whole number"],
-    "[demo]\nviews = [4]": ["line 2", "a whole number"],
-    "[demo]\nquiet = 1": ["line 2", "true or false"],
     "[demo]\nquiet = 'yes'": ["line 2", "true or false"],
     "[register]\ndepth-bias = 'off'\ndepth_bias = 'off'": ["twice"],
     "[school]\nforce = 20": ["line 2", "'force'", "school.run"],
     "[school.rum]\nforce = 20": ["line 1", "did you mean run"],
     "workers = 8": ["line 1", "'workers'", "outside of a command's table"],
-    "register = 3": ["line 1", "[register]"],
     "[register]\nsession = 'a'": ["no option 'session'"],
-    "[register]\nhelp = true": ["no option 'help'"],
     "[register\nviews = 1": ["settings.toml is not TOML", "line 1"],
-    "[register]\nviews = ": ["settings.toml is not TOML"],
 }  # fmt: skip
 
 
@@ -280,23 +262,22 @@ def test_what_cannot_be_used_is_named_with_its_line_and_what_would_do(text: str)
 
 def test_a_wrong_file_stops_work_but_not_help_doctor_and_config_template() -> None:
     written("[registre]\n", "realsim.toml")
-    assert run("scan", "list").returncode == 2
-    assert run("config", "show").returncode == 2
+    assert realsim("scan", "list").returncode == 2
+    assert realsim("config", "show").returncode == 2
     for args in (["--help"], ["config", "template"], ["completion", "bash"]):
-        assert run(*args).returncode == 0
+        assert realsim(*args).returncode == 0
 
 
-@pytest.mark.parametrize("data", [b"\xff\xfe\x00", b"\x00" * 9, b"[a]" * 3])
-def test_bytes_that_are_no_text_are_named(data: bytes) -> None:
-    Path("realsim.toml").write_bytes(data)
-    done = run("config", "show")
+def test_bytes_that_are_no_text_are_named() -> None:
+    Path("realsim.toml").write_bytes(b"\xff\xfe\x00")
+    done = realsim("config", "show")
     assert done.returncode == 2 and "realsim.toml" in done.stderr
     assert "Traceback" not in done.stderr
 
 
 def test_a_variable_that_cannot_be_used_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("REALSIM_DEMO_VIEWS", "many")
-    done = run("demo")
+    done = realsim("demo")
     assert done.returncode == 2 and "REALSIM_DEMO_VIEWS" in done.stderr
     assert "Traceback" not in done.stderr
 
