@@ -23,8 +23,7 @@ def with_a_box() -> np.ndarray:
     return depth
 
 
-@pytest.mark.parametrize("z", [0.15, 0.3, 0.6])
-@pytest.mark.parametrize("correlation", [0.0, 2.0])
+@pytest.mark.parametrize(("z", "correlation"), [(0.15, 0.0), (0.6, 2.0)])
 def test_sigma_z_grows_with_the_square_of_depth(z: float, correlation: float) -> None:
     model = replace(EXACT, disparity_noise_px=0.08, correlation_px=correlation)
     measured = model.measure(flat(z), CAMERA, np.random.default_rng(1))
@@ -78,14 +77,6 @@ def test_nothing_stays_nothing_and_the_range_ends() -> None:
     assert seen.min() >= 0.07 and seen.max() <= 1.5
 
 
-def test_same_seed_same_bytes() -> None:
-    a, b, c = (
-        DepthSensorModel().measure(with_a_box(), CAMERA, np.random.default_rng(s)).tobytes()
-        for s in (5, 5, 6)
-    )
-    assert a == b != c
-
-
 def test_the_shadow_lies_to_the_left_and_is_as_wide_as_the_step_in_disparity() -> None:
     model = replace(EXACT, occlusion=True)
     measured = model.measure(with_a_box(), CAMERA, np.random.default_rng(0))
@@ -128,13 +119,6 @@ def test_surfaces_seen_edge_on_are_lost() -> None:
     assert share(60.0) == 0.0
     assert share(77.5) == pytest.approx(0.5, abs=0.12)
     assert share(87.5) > 0.9
-
-
-def test_blobs_are_as_many_as_said() -> None:
-    model = replace(EXACT, blobs_per_megapixel=200.0, blob_radius_px=4.0)
-    lost = model.measure(flat(0.4), CAMERA, np.random.default_rng(0)) == 0
-    expected = 200e-6 * np.pi * 4.0**2
-    assert lost.mean() == pytest.approx(expected, rel=0.6)
 
 
 def test_mistakes_are_named() -> None:

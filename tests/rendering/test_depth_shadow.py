@@ -58,11 +58,9 @@ def brute_force_hidden(points: np.ndarray, eye: np.ndarray, things: list[PlacedM
     return hidden
 
 
-@pytest.mark.parametrize("camera", [SMALL, LENS], ids=["pinhole", "distorted"])
 @pytest.mark.parametrize("offset", [0.0, -0.03])
-def test_the_shadow_is_what_a_search_through_all_triangles_finds(
-    camera: CameraIntrinsics, offset: float
-) -> None:
+def test_the_shadow_is_what_a_search_through_all_triangles_finds(offset: float) -> None:
+    camera = LENS
     things = placed()
     depth = LabelRenderer(things).render(camera, np.eye(4)).depth_m
     mask = shadow_mask(
@@ -76,25 +74,6 @@ def test_the_shadow_is_what_a_search_through_all_triangles_finds(
     assert 0.02 < mask.mean() < 0.5
     # Where the line of sight grazes a surface (the rim of the ball) float32 decides.
     assert np.sum(mask.ravel() != expected) <= 3
-
-
-def test_the_shadow_is_what_the_second_camera_does_not_render() -> None:
-    things = placed()
-    fine = CameraIntrinsics(width=960, height=720, fx=900, fy=900, cx=479.5, cy=359.5)
-    depth = LabelRenderer(things).render(CAMERA, np.eye(4)).depth_m
-    mask = shadow_mask(RayScene(things), depth, CAMERA, np.eye(4), baseline_m=0.05, border=False)
-    T_right = np.eye(4)
-    T_right[0, 3] = 0.05
-    right = LabelRenderer(things).render(fine, T_right).depth_m
-    points = ray_table(CAMERA) * depth[..., None]
-    u = np.rint((points[..., 0] - 0.05) / depth * 900 + 479.5).astype(int)
-    v = np.rint(points[..., 1] / depth * 900 + 359.5).astype(int)
-    inside = (u >= 0) & (u < 960) & (v >= 0) & (v < 720)
-    seen_z = right[np.clip(v, 0, 719), np.clip(u, 0, 959)]
-    expected = inside & (seen_z < depth - 0.01)
-    # A pixel of the second picture that the silhouette cuts may show either side.
-    assert np.mean((mask != expected)[inside]) < 0.004
-    assert mask[inside].sum() == pytest.approx(expected.sum(), rel=0.05)
 
 
 def test_a_wall_behind_the_camera_hides_nothing() -> None:

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import camera, se3
-from realsim.geometry.colors import srgb_decoded, srgb_encoded
+from realsim.geometry.colors import srgb_encoded
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
 from realsim.rendering.developing import developed
-from realsim.rendering.embedded.materials import box_uv
 from realsim.rendering.photo import Lighting, PhotoRenderer, PlacedMesh
 
 VIEW = CameraIntrinsics(
@@ -119,28 +117,6 @@ def test_a_normal_image_turns_the_surface_towards_the_light() -> None:
         )
         light = lit(unit_square(), material, Environment(panorama=panorama))
         assert at(light, 0, 0)[0] == pytest.approx(expected, abs=0.06)
-
-
-def test_box_coordinates_follow_the_dominant_axis() -> None:
-    v = np.array([[0.0, 0, 0], [0, 1, 0], [0, 1, 2], [1, 0, 0], [1, 1, 0.1]])
-    mesh = Mesh(vertices=v, faces=np.array([[0, 1, 2], [0, 3, 4]]))
-    uv = box_uv(mesh, 0.5)
-    assert np.allclose(uv[0], 2 * v[[0, 1, 2]][:, [1, 2]])
-    assert np.allclose(uv[1], 2 * v[[0, 3, 4]][:, [0, 1]])
-
-
-@pytest.mark.parametrize("sky", [None, WHITE_SKY])
-def test_a_mesh_without_coordinates_is_named(sky: Environment | None) -> None:
-    material = Material(base_color_image=four_colors(), projection="uv", name="label")
-    placed = [PlacedMesh(3, unit_square(uv=False), np.eye(4), material)]
-    with pytest.raises(InputError, match=r"instance 3.*'label'.*projection='box'"):
-        PhotoRenderer(placed, None, sky)
-
-
-def test_srgb_goes_there_and_back() -> None:
-    x = np.linspace(0, 1, 101)
-    assert np.allclose(srgb_decoded(srgb_encoded(x)), x, atol=1e-6)
-    assert np.all(np.diff(srgb_encoded(x)) > 0)
 
 
 def test_development_is_srgb_below_the_shoulder_and_never_falls() -> None:

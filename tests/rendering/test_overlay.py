@@ -44,14 +44,6 @@ def test_fingertips_are_drawn_where_they_project() -> None:
             assert tuple(out[v, u]) == overlay.score_color(1.0)
 
 
-def test_nearer_grasps_cover_farther_ones() -> None:
-    R = se3.exp_so3([0, np.pi / 2, 0])
-    near, far = se3.from_rt(R, [0, 0, -0.1]), se3.from_rt(R, [0, 0, 0.1])
-    out = overlay.draw_grasps(black(), CAMERA, T_CAM_OBJ, grasps([1.0, 0.0], np.stack([near, far])))
-    tip = camera.project(CAMERA, se3.transform(T_CAM_OBJ @ near, [[0, 0, -0.07]]))[0]
-    assert tuple(out[round(tip[1]), round(tip[0])]) == overlay.score_color(1.0)
-
-
 def test_only_the_chosen_grasps_are_drawn_and_behind_the_camera_nothing() -> None:
     assert not overlay.draw_grasps(black(), CAMERA, T_CAM_OBJ, grasps([1.0, 0.5]), []).any()
     behind = se3.from_translation([0, 0, -0.4])
@@ -81,12 +73,6 @@ def test_outlines_keep_to_the_mask_and_its_rim() -> None:
     assert np.array_equal(color, rim)
     assert np.all(rgb == 100)  # the given picture is not touched
     assert np.array_equal(out[75, 100], [100, 100, 100]) and np.array_equal(out[0, 0], rgb[0, 0])
-
-
-def test_instance_colors_are_stable_and_distinct() -> None:
-    colors = [overlay.instance_color(i) for i in range(16)]
-    assert len(set(colors)) == 16
-    assert overlay.instance_color(18) == overlay.instance_color(2)
 
 
 def test_depth_picture_marks_missing_black_and_near_red() -> None:

@@ -88,8 +88,3 @@ def test_the_legend_goes_where_it_hides_least(corner: int) -> None:
     assert changed.mean() < 0.05  # small
     assert np.all(out == (0, 170, 130), axis=-1).any()
     assert np.all(out == overlay.score_color(1.0), axis=-1).any()
-
-
-def test_a_legend_of_nothing_is_no_legend() -> None:
-    rgb = np.full((100, 100, 3), 7, np.uint8)
-    assert np.array_equal(write_legend(rgb, [], np.zeros((100, 100), bool)), rgb)

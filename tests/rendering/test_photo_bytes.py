@@ -77,6 +77,7 @@ def test_the_look_without_an_environment_stays() -> None:
     assert np.abs(np.diff(rgb, axis=1)).mean() == pytest.approx(GOLDEN_STEP, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_bytes_do_not_depend_on_the_number_of_threads() -> None:
     threads = "3"
     limits = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "TBB_NUM_THREADS")

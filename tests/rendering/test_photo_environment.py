@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
-from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.photo import Lighting, LightSampling, PhotoRenderer, PlacedMesh
 
 LENS = np.array([-0.25, 0.09, 0.0006, -0.0009, 0.0])
@@ -69,8 +67,7 @@ def cluttered() -> list[PlacedMesh]:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("roughness", [0.05, 0.5, 1.0])
-@pytest.mark.parametrize("metallic", [0.0, 1.0])
+@pytest.mark.parametrize(("roughness", "metallic"), [(0.05, 1.0), (1.0, 0.0)])
 def test_white_surfaces_vanish_in_a_white_room(roughness: float, metallic: float) -> None:
     material = Material(base_color=(1.0, 1.0, 1.0), roughness=roughness, metallic=metallic)
     for mesh in (square(), ball(0.3)):
@@ -78,13 +75,7 @@ def test_white_surfaces_vanish_in_a_white_room(roughness: float, metallic: float
         assert np.abs(light - 1).max() < 0.02
 
 
-def test_light_is_linear_in_the_sky() -> None:
-    one, three = (light_of(cluttered(), even_sky(level)) for level in (1.0, 3.0))
-    # Which pixels are refined depends on their brightness, hence the median.
-    assert np.median(np.abs(three - 3 * one)) < 1e-4
-
-
-@pytest.mark.parametrize("tilt_deg", [0, 45, 90, 135, 180])
+@pytest.mark.parametrize("tilt_deg", [45, 135])
 def test_a_half_white_sky_lights_by_the_tilt(tilt_deg: float) -> None:
     # Matte white under a white upper half: (1 + cos tilt) / 2 of white (form factor of the sky).
     panorama = np.zeros((64, 128, 3), np.float32)
@@ -223,17 +214,6 @@ def test_colour_bleeds_off_a_sunlit_neighbour() -> None:
     assert ratio[0] > 1.15 and ratio[1] < 0.5 * ratio[0] + 0.6
 
 
-def test_a_mirror_shows_the_panorama_behind_the_viewer() -> None:
-    panorama = np.full((64, 128, 3), 0.1, np.float32)
-    panorama[:8] = (4.0, 0.1, 0.1)  # a red lamp overhead
-    mirror = Material(base_color=(1, 1, 1), metallic=1.0, roughness=0.05)
-    placed = [PlacedMesh(0, square(), np.eye(4), mirror)]
-    light = light_of(placed, Environment(panorama=panorama))
-    middle, aside = light[55:65, 75:85].mean((0, 1)), light[55:65, 20:28].mean((0, 1))
-    assert middle[0] == pytest.approx(4.0, rel=0.05) and middle[1] == pytest.approx(0.1, rel=0.05)
-    assert aside[0] < 1.0
-
-
 def test_a_mirror_shows_the_thing_above_it() -> None:
     mirror = Material(base_color=(1, 1, 1), metallic=1.0, roughness=0.05)
     green = Material(base_color=(0.0, 0.6, 0.0), roughness=1.0)
@@ -262,22 +242,6 @@ def test_the_background_is_the_panorama() -> None:
     assert np.median(differ) < 0.01  # but for the seams between its blocks
 
 
-def test_depth_is_that_of_the_labels_through_a_strong_lens() -> None:
-    T = se3.look_at([0.4, -0.7, 0.6], [0, 0, 0])
-    photo = PhotoRenderer(cluttered(), None, even_sky()).render(WIDE, T)
-    assert np.array_equal(photo.depth_m, LabelRenderer(cluttered()).render(WIDE, T).depth_m)
-
-
-def test_the_same_generator_gives_the_same_bytes() -> None:
-    sky = even_sky(0.5, sun=(1, 1, 1), sun_radius_deg=2.0)
-    T = se3.look_at([0.4, -0.7, 0.6], [0, 0, 0])
-    one, two = (PhotoRenderer(cluttered(), None, sky) for _ in range(2))
-    a, b = (r.render(WIDE, T, np.random.default_rng(5)).rgb for r in (one, two))
-    c = one.render(WIDE, T, np.random.default_rng(6)).rgb
-    assert np.array_equal(a, b) and not np.array_equal(a, c)
-    assert np.array_equal(one.render(WIDE, T).rgb, two.render(WIDE, T).rgb)
-
-
 def test_exposure_brightens_the_picture_not_the_light() -> None:
     T = se3.look_at([0.4, -0.7, 0.6], [0, 0, 0])
     dark, bright = (
@@ -294,10 +258,3 @@ def test_an_empty_scene_and_an_empty_view_show_the_sky() -> None:
         photo = PhotoRenderer(placed, None, sky).render(WIDE, away)
         assert np.all(photo.depth_m == 0)
         assert np.ptp(photo.rgb) == 0 and photo.rgb[0, 0, 0] == 188  # sRGB of one half
-
-
-def test_ray_counts_out_of_range_are_named() -> None:
-    with pytest.raises(InputError, match="ambient rays"):
-        LightSampling(ambient_rays=-1)
-    with pytest.raises(InputError, match="edge samples"):
-        LightSampling(edge_samples=0)

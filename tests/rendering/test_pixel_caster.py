@@ -81,19 +81,6 @@ def test_an_independent_caster_sees_the_same_through_every_lens(name: str) -> No
     assert different <= max(2, 1e-4 * seen)
 
 
-@pytest.mark.parametrize("name", LENSES)
-def test_hits_come_back_to_their_pixel(name: str) -> None:
-    import cv2
-
-    lens = a_camera(name)
-    T = views(1)[0]
-    hits = PixelCaster(a_scene(2)).cast(lens, T)
-    v, u = np.nonzero(hits.geometry >= 0)
-    points = camera.ray_table(lens)[v, u].astype(np.float64) * hits.depth_m[v, u, None]
-    uv = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens.K, lens.distortion)[0][:, 0]
-    assert np.abs(uv - np.stack([u, v], -1)).max() < 1e-3
-
-
 def test_a_lens_that_folds_back_shows_nothing_twice() -> None:
     # A wide picture through a barrel lens whose polynomial turns round inside the image.
     K = np.array([[90.0, 0, 159.3], [0, 91.0, 120.4], [0, 0, 1]])
@@ -204,14 +191,3 @@ def test_a_camera_inside_an_object_is_said() -> None:
     # Inside its box but outside its body is not inside.
     hole = PlacedMesh(3, a_mesh("ring"), T @ se3.from_translation([0, 0, 0.0]))
     assert LabelRenderer([hole]).render(lens, T).camera_inside == ()
-
-
-def test_windows_hold_the_masks() -> None:
-    labels = LabelRenderer(a_scene(7)).render(a_camera("d405"), views(1)[0])
-    for instance, mask in labels.amodal.items():
-        rows, columns = labels.windows[instance]
-        assert mask[rows, columns].sum() == mask.sum()
-        if mask.any():
-            inner = mask[rows, columns]
-            assert inner[0].any() and inner[-1].any() and inner[:, 0].any() and inner[:, -1].any()
-        assert np.array_equal(labels.visible(instance), labels.ids == instance)

@@ -1,6 +1,5 @@
 """Standing in a camera: outlines lie on the straightened photograph, whatever the lens."""
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -78,7 +77,7 @@ def drawn_in(rgb: NDArray[np.uint8], verdict: str) -> NDArray[np.bool_]:
     return np.all(np.abs(rgb.astype(int) - VERDICT_RGB[verdict]) < 30, axis=-1)
 
 
-@pytest.mark.parametrize("aspect", [0.7, 4 / 3, 2.4])
+@pytest.mark.parametrize("aspect", [0.7, 2.4])
 def test_outlines_lie_where_the_lens_and_its_straightening_put_them(
     views: CameraViews, aspect: float
 ) -> None:
@@ -93,16 +92,6 @@ def test_outlines_lie_where_the_lens_and_its_straightening_put_them(
         assert farthest(pixels, line) < 2.5
 
 
-def test_the_photograph_itself_is_straightened_to_the_same_place(views: CameraViews) -> None:
-    aspect = 4 / 3
-    pinhole = pinhole_of(LENS, aspect, 960)
-    rgb = views.picture(4, [], aspect=aspect).rgb
-    meshes = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in (TALL, FLAT)]
-    wanted = LabelRenderer(meshes).render(pinhole, T_CAM).ids >= 0
-    shown = rgb[..., 0] > 137
-    assert np.count_nonzero(wanted & shown) / np.count_nonzero(wanted | shown) > 0.985
-
-
 def test_straightening_is_exact_for_a_smooth_picture() -> None:
     """A picture whose brightness is the ray's own slope reads the same through any camera."""
     pinhole = pinhole_of(LENS, 4 / 3, 640)
@@ -115,7 +104,7 @@ def test_straightening_is_exact_for_a_smooth_picture() -> None:
     assert np.abs(out[..., :2] - (128 + 80 * xy))[middle].max() < 1.0
 
 
-@pytest.mark.parametrize("aspect", [0.5, 1.0, 1.78, 3.0])
+@pytest.mark.parametrize("aspect", [0.5, 3.0])
 def test_the_whole_photograph_is_on_the_canvas_and_touches_its_border(aspect: float) -> None:
     pinhole = pinhole_of(LENS, aspect, 800)
     assert pinhole.width / pinhole.height == pytest.approx(aspect, rel=2e-3)
@@ -141,14 +130,6 @@ def test_the_field_of_view_is_that_of_a_browser_s_camera(views: CameraViews) -> 
     np.testing.assert_array_equal(picture.T_world_cam, T_CAM)
 
 
-def test_objects_and_camera_moved_together_leave_the_picture(views: CameraViews) -> None:
-    W = se3.random_transform(np.random.default_rng(0))
-    moved = [replace(o, T_world_obj=W @ o.T_world_obj) for o in (TALL, FLAT)]
-    a = views.picture(4, [TALL, FLAT], aspect=1.5).rgb
-    b = views.picture(4, moved, aspect=1.5, T_world_cam=W @ T_CAM).rgb
-    assert np.mean(np.any(a != b, axis=-1)) < 1e-3
-
-
 def test_what_another_object_hides_is_dashed_and_the_highlighted_one_is_bold(
     views: CameraViews,
 ) -> None:
@@ -169,27 +150,6 @@ def test_an_object_behind_the_camera_or_without_a_model_is_not_drawn(views: Came
     away = replace(TALL, T_world_obj=T_CAM @ se3.from_translation([0, 0, -1.0]))
     unknown = replace(TALL, obj_id=99)
     np.testing.assert_array_equal(views.picture(4, [away, unknown], aspect=1.5).rgb, bare)
-
-
-@pytest.mark.slow
-def test_one_of_15_objects_is_redrawn_in_120_ms(views: CameraViews) -> None:
-    many = [
-        replace(
-            (TALL, FLAT)[k % 2], instance=k,
-            T_world_obj=se3.from_translation([0.03 * (k % 5) - 0.06, 0.04 * (k // 5), 0])
-            @ (TALL, FLAT)[k % 2].T_world_obj,
-        )
-        for k in range(15)
-    ]  # fmt: skip
-    views.picture(4, many, aspect=1.6)
-    times: list[float] = []
-    for k in range(5):
-        T = se3.from_translation([1e-3 * (k + 1), 0, 0]) @ TALL.T_world_obj
-        many[0] = replace(many[0], T_world_obj=T)
-        begun = time.process_time()
-        views.picture(4, many, aspect=1.6, highlight=0)
-        times.append(time.process_time() - begun)
-    assert min(times) < 0.12
 
 
 def test_bad_input_is_refused(views: CameraViews, tmp_path: Path) -> None:

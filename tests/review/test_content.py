@@ -10,7 +10,7 @@ import pytest
 from realsim import CameraIntrinsics, InputError, View
 from realsim.geometry import camera, depth, se3
 from realsim.rendering import overlay
-from realsim.review.content import clouds, content
+from realsim.review.content import content
 from realsim.review.content.config import GripperDrawing, SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.drawing import grasp_drawing
@@ -70,16 +70,7 @@ def test_levels_nest_and_grow(shown: SceneContent) -> None:
     assert len(np.unique(cloud.points, axis=0)) == len(cloud)
 
 
-def test_the_coarse_level_is_spread_over_all_that_was_measured(shown: SceneContent) -> None:
-    cloud = shown.cloud
-    gaps = nearest_m(cloud.points, cloud.points[cloud.level(0)])
-    rng = np.random.default_rng(0)
-    some = rng.choice(len(cloud), cloud.ends[0], replace=False)
-    at_random = nearest_m(cloud.points, cloud.points[some])
-    assert gaps.max() < at_random.max() and gaps.mean() < at_random.mean()
-
-
-@pytest.mark.parametrize("most", [1, 150, 1000, 10**9])
+@pytest.mark.parametrize("most", [150, 10**9])
 def test_pieces_are_the_cloud_in_order_and_no_message_is_large(
     shown: SceneContent, most: int
 ) -> None:
@@ -88,21 +79,6 @@ def test_pieces_are_the_cloud_in_order_and_no_message_is_large(
     np.testing.assert_array_equal(together, np.arange(min(most, len(shown.cloud))))
     assert pieces[0].stop <= shown.cloud.ends[0]
     assert all(0 < p.stop - p.start <= 700 for p in pieces)
-
-
-def test_the_cloud_is_the_same_each_time_and_holds_no_more_than_asked(
-    store: SessionStore, shown: SceneContent
-) -> None:
-    again = SceneContent.load(store, CONFIG).cloud
-    np.testing.assert_array_equal(again.points, shown.cloud.points)
-    np.testing.assert_array_equal(again.colors, shown.cloud.colors)
-    few = clouds.fused_cloud(store, shown.views, shown.region, voxel_m=0.004, most=500, coarse=100)
-    assert len(few) == 500
-
-
-def test_without_depth_there_is_an_empty_cloud(store: SessionStore, shown: SceneContent) -> None:
-    none = clouds.fused_cloud(store, [], shown.region, voxel_m=0.004, most=500, coarse=100)
-    assert len(none) == 0 and none.pieces(100, 10) == []
 
 
 # --- the scene --------------------------------------------------------------------------------
@@ -264,8 +240,3 @@ def test_score_colours_are_those_of_the_pictures() -> None:
     scores = np.append(np.linspace(0, 1, 101), np.nan)
     expected = [overlay.score_color(float(s)) for s in scores]
     np.testing.assert_array_equal(grasp_drawing.score_rgb(scores), expected)
-
-
-def test_linear_light_of_known_colours() -> None:
-    rgb = np.array([[0, 128, 255]], np.uint8)
-    np.testing.assert_array_equal(grasp_drawing.linear_rgb(rgb), [[0, 55, 255]])

@@ -3,7 +3,6 @@
 import io
 
 import numpy as np
-import pytest
 import trimesh
 
 from realsim import CameraIntrinsics, Mesh
@@ -11,7 +10,7 @@ from realsim.geometry import se3
 from realsim.models.simplify import deviation
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.review.content.config import SceneConfig
-from realsim.review.content.meshes import display_mesh, glb_of, within_budget
+from realsim.review.content.meshes import glb_of, within_budget
 from tests.support.reviewed_boxes import box
 
 CAMERA = CameraIntrinsics(width=400, height=300, fx=900.0, fy=900.0, cx=199.5, cy=149.5)
@@ -98,13 +97,3 @@ def test_a_texture_is_upright_and_no_larger_than_asked() -> None:
     assert image[4, 16, 0] > 200 > image[4, 16, 2] and image[28, 16, 2] > 200
     # trimesh turns glTF's V back upwards: the corner of v = 1 is the red edge.
     np.testing.assert_allclose(np.asarray(read.visual.uv), textured_square().uv, atol=1e-6)
-
-
-@pytest.mark.parametrize("mesh", [box((0.1, 0.2, 0.3)), textured_square()])
-def test_what_is_sent_as_verdict_and_as_looks_is_one_surface(mesh: Mesh) -> None:
-    sent = display_mesh(mesh, SceneConfig())
-    read = loaded(sent.glb)
-    np.testing.assert_array_equal(np.asarray(read.vertices, np.float32), sent.vertices)
-    np.testing.assert_array_equal(np.asarray(read.faces), sent.faces)
-    np.testing.assert_allclose(sent.low, mesh.bounds[0])
-    np.testing.assert_allclose(sent.high, mesh.bounds[1])

@@ -93,13 +93,6 @@ def test_it_does_not_depend_on_where_the_object_s_frame_lies() -> None:
     )
 
 
-def test_sigmas_and_exaggeration_scale_the_radii() -> None:
-    placed = at(np.eye(4), covariance(5))
-    one, six = ellipsoid_of(placed, 1.0), ellipsoid_of(placed, 2.0, 3.0)
-    assert one is not None and six is not None
-    np.testing.assert_allclose(six.radii_m, 6 * one.radii_m)
-
-
 def test_a_turn_about_the_own_axis_does_not_blur_the_middle_nor_count_as_a_turn() -> None:
     C = np.diag([0.01, 0.02, 0.0, 1e-4, 1e-4, 1e-4]) ** 2
     blurred = C.copy()
@@ -120,14 +113,6 @@ def test_a_turn_about_the_own_axis_does_not_blur_the_middle_nor_count_as_a_turn(
     np.testing.assert_allclose(plain.sigmas_deg, np.degrees([1.0, 0.02, 0.01]))
 
 
-def test_a_ball_has_no_turn() -> None:
-    axes = tuple((tuple(float(x) for x in a), (0.0, 0.0, 0.0)) for a in np.eye(3))
-    ball = replace(TUBE, symmetry_axes=axes)  # pyright: ignore[reportArgumentType]
-    turn = rotation_sigmas_deg(at(np.eye(4), covariance(7)), ball)
-    assert turn is not None and turn.sigmas_deg == ()
-    np.testing.assert_allclose(middle_of(ball), 0, atol=1e-12)
-
-
 def test_without_a_covariance_there_is_none() -> None:
     placed = at(np.eye(4), None)
     assert ellipsoid_of(placed) is None
@@ -136,7 +121,7 @@ def test_without_a_covariance_there_is_none() -> None:
         ellipsoid_of(at(np.eye(4), covariance(8)), sigmas=0.0)
 
 
-@pytest.mark.parametrize("divisions", [0, 1, 2, 3])
+@pytest.mark.parametrize("divisions", [0, 2])
 def test_the_sphere_is_closed_and_turned_outwards(divisions: int) -> None:
     sphere = unit_sphere(divisions)
     assert len(sphere.faces) == 20 * 4**divisions

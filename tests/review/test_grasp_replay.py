@@ -10,7 +10,6 @@ import viser
 
 from realsim import InputError, Mesh
 from realsim.geometry import se3
-from realsim.geometry.hand import HAND
 from realsim.records import STAGES
 from realsim.records.trajectories import PHASES
 from realsim.review.replay.grasp_replay import (
@@ -30,7 +29,6 @@ from realsim.review.replay.grasp_words import (
     slip_table,
     slip_words,
 )
-from realsim.review.replay.replay_nodes import BOX_FACES
 from tried_grasps import tried_set
 
 WIDTH_M = 0.03
@@ -81,7 +79,7 @@ def test_the_hand_comes_straight_along_the_approach_axis() -> None:
     np.testing.assert_array_equal(np.ptp(motion.Ts_world_obj, axis=0), np.zeros((4, 4)))
 
 
-@pytest.mark.parametrize("width_m", [0.0, 0.0123, 0.08, 0.11])
+@pytest.mark.parametrize("width_m", [0.0, 0.11])
 def test_time_increases_and_fingers_only_close(width_m: float) -> None:
     motion = approach(1, width_m)
     assert np.all(np.diff(motion.time_s) > 0)
@@ -98,12 +96,6 @@ def test_the_approach_moves_with_the_world() -> None:
     np.testing.assert_array_equal(a.time_s, b.time_s)
 
 
-def test_a_time_belongs_to_the_sample_before_it() -> None:
-    motion = carried()
-    assert [motion.at(t) for t in (-1.0, 0.0, 0.0199, 0.02, 9.0)] == [0, 0, 0, 1, len(motion) - 1]
-    assert motion.phase_name(0) == "close" and motion.phase_name(len(motion) - 1) == "lift"
-
-
 def test_motions_that_are_none_are_refused() -> None:
     good = carried()
     for broken in (
@@ -117,14 +109,6 @@ def test_motions_that_are_none_are_refused() -> None:
             replace(good, **broken)
     with pytest.raises(InputError, match="no sample"):
         replace(good, time_s=np.zeros(0))
-
-
-def test_the_plain_hand_is_open_by_its_opening() -> None:
-    palm, right, left = HAND.boxes(0.0)[0]
-    assert left[0, 1] == 0.0 == right[1, 1], "closed, the faces touch"
-    assert left[1, 1] == -right[0, 1] == HAND.finger_thickness_m
-    assert palm[1, 2] <= left[0, 2] + 0.01, "the fingers begin at the palm"
-    assert len(np.unique(BOX_FACES)) == 8 and BOX_FACES.shape == (12, 3)
 
 
 # --- the player ---------------------------------------------------------------------------------
@@ -222,16 +206,6 @@ def test_a_browser_that_is_gone_ends_the_replay(server: viser.ViserServer) -> No
     player.clear()
 
 
-def test_play_at_the_end_begins_again(server: viser.ViserServer) -> None:
-    player = player_of(server, Given(carried()))
-    player.show(0, 0, play=False)
-    player.seek(99.0)
-    assert player.time_s == pytest.approx(carried().time_s[-1])
-    player.play()
-    assert player.time_s < carried().time_s[-1]
-    player.clear()
-
-
 def test_the_arm_can_be_hidden_and_the_hand_stays(server: viser.ViserServer) -> None:
     given = carried()
     Ts = np.stack([given.Ts_world_hand] * 3, axis=1)
@@ -253,21 +227,6 @@ def test_the_arm_can_be_hidden_and_the_hand_stays(server: viser.ViserServer) -> 
     player.clear()
 
 
-def test_closing_is_told_once_for_each_motion_that_was_shown(server: viser.ViserServer) -> None:
-    told: list[int] = []
-    player = player_of(server, Given(carried()))
-    player.on_closed(lambda: told.append(1))
-    player.clear()
-    assert told == []
-    player.show(0, 0, play=False)
-    assert told == []
-    player.show(0, 1, play=False)
-    assert len(told) == 1, "the one before was taken away"
-    player.clear()
-    player.clear()
-    assert len(told) == 2
-
-
 # --- words --------------------------------------------------------------------------------------
 
 
@@ -275,9 +234,8 @@ def test_slips_are_read_as_numbers_lost_or_not_tried() -> None:
     assert [slip_words(v) for v in (np.nan, np.inf, 1.234)] == [NOT_TRIED, LOST, "1.23"]
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_words_of_every_grasp_say_stage_by_stage_what_is_stored(seed: int) -> None:
-    grasps = tried_set(np.random.default_rng(seed))
+def test_the_words_of_every_grasp_say_stage_by_stage_what_is_stored() -> None:
+    grasps = tried_set(np.random.default_rng(0))
     for row in range(len(grasps)):
         table = slip_table(grasps, row)
         assert [line.split("|")[1].strip() for line in table[2:]] == list(STAGES)

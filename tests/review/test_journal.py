@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim import InputError, ObjectPose, Scene
+from realsim import InputError, ObjectPose
 from realsim.geometry import se3
-from realsim.review import journal, reviewed_scene
+from realsim.review import journal
 
 
 def placed(instance: int = 0, x: float = 0.0) -> ObjectPose:
@@ -36,21 +36,16 @@ def random_journal(rng: np.random.Generator, n: int) -> list[journal.Entry]:
 
 def test_replay_of_concatenated_journals_is_replay_after_replay() -> None:
     rng = np.random.default_rng(1)
-    for _ in range(50):
+    for _ in range(20):
         a, b = random_journal(rng, 12), random_journal(rng, 9)
         b += [journal.new_entry("undo", placed(a[0].instance), "bob", undoes=a[0].id)]
         assert journal.replay(b, journal.replay(a)) == journal.replay(a + b)
         assert journal.replay(b, journal.replay(a)).standing == journal.replay(a + b).standing
 
 
-def test_a_line_read_twice_counts_once() -> None:
-    a = random_journal(np.random.default_rng(2), 20)
-    assert journal.replay(a + a) == journal.replay(a)
-
-
 def test_undo_is_the_inverse_and_undo_of_undo_the_identity() -> None:
     rng = np.random.default_rng(3)
-    for _ in range(30):
+    for _ in range(15):
         before = journal.replay(random_journal(rng, 8))
         line = journal.new_entry("accept", placed(1), "ada")
         undo = journal.new_entry("undo", placed(1), "ada", undoes=line.id)
@@ -66,15 +61,6 @@ def test_the_last_standing_decision_counts() -> None:
     assert journal.replay([no, yes]).decision(*key) == yes
     undo = journal.new_entry("undo", placed(), "ada", undoes=no.id)
     assert journal.replay([yes, no, undo]).decision(*key) == yes
-
-
-def test_a_decision_is_about_one_pose_only() -> None:
-    state = journal.replay([journal.new_entry("reject", placed(x=0.0), "ada", comment="floats")])
-    here = Scene(name="s", objects=(placed(x=0.0),))
-    moved = Scene(name="s", objects=(placed(x=0.001),))
-    assert reviewed_scene(here, state).objects[0].verdict == "rejected"
-    assert "floats" in reviewed_scene(here, state).objects[0].reasons[-1]
-    assert reviewed_scene(moved, state).objects[0].verdict == "unchecked"
 
 
 def test_file_round_trip(tmp_path: Path) -> None:

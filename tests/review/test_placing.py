@@ -15,7 +15,7 @@ MUG = part("mug").mesh
 MIDDLE = placing.middle_of(MUG)
 KINDS: tuple[placing.Kind, ...] = ("move", "turn")
 FRAMES: tuple[placing.Frame, ...] = ("table", "object", "camera")
-STEPS = [(k, f, a) for k in KINDS for f in FRAMES for a in placing.AXES]
+STEPS = [(k, f, "y") for k in KINDS for f in FRAMES]
 
 
 def random_poses(seed: int) -> tuple[Array, Array, Array]:
@@ -65,12 +65,6 @@ def test_a_turn_leaves_the_middle_where_it_is(frame: placing.Frame) -> None:
     assert found.mm < 1e-10
     assert found.deg == pytest.approx(5.0)
     assert found.greatest_mm > 1.0
-
-
-def test_a_move_moves_every_vertex_by_as_much() -> None:
-    T, table, cam = random_poses(5)
-    found = placing.moved(T, step(T, ("move", "table", "x"), 0.001, table, cam), MUG)
-    np.testing.assert_allclose(found, (1.0, 0.0, 1.0), atol=1e-6)
 
 
 def test_moves_go_along_the_named_axis() -> None:
@@ -134,11 +128,6 @@ def test_no_other_pose_fits_noisy_points_better() -> None:
     for xi in rng.normal(scale=1e-3, size=(50, 6)):
         other = se3.transform(found.T_world_obj @ se3.exp(xi), points)
         assert np.sqrt(np.mean(np.sum(np.square(other - world), -1))) > found.rms_m
-
-
-def test_a_mirrored_triangle_never_gives_a_mirrored_pose() -> None:
-    mirrored = TRIANGLE * [1, 1, -1]
-    assert np.linalg.det(placing.from_points(TRIANGLE, mirrored).T_world_obj) == pytest.approx(1.0)
 
 
 def test_points_on_a_line_are_refused() -> None:

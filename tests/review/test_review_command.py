@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from realsim import InputError
 from realsim.app.review.cli import review_command
-from realsim.app.review.run import ReviewRequest, open_all, run_review, write_page
+from realsim.app.review.run import ReviewRequest, open_all, write_page
 from realsim.review.reviewed_session import ReviewedSession
 from realsim.review.server import counted
 from realsim.store import SessionStore
@@ -88,14 +88,3 @@ def test_a_session_that_was_moved_is_told_at_the_end_and_its_decisions_counted(
     assert [e.action for e in session.entries_seen()] == ["reject"]
     assert counted([session]) == (1, 2) and session.has_pending
     assert "is gone" in session.trouble() and str(folder) in session.trouble()
-
-
-def test_other_machines_need_a_token_that_is_not_readable_by_others(tmp_path: Path) -> None:
-    from realsim.app.console import Console
-
-    path = tmp_path / "token"
-    path.write_text("a-secret-of-more-than-16")
-    path.chmod(0o644)
-    request = ReviewRequest(folders=(tmp_path,), host="0.0.0.0", token_file=path)
-    with pytest.raises(InputError, match="chmod 600"):
-        run_review(request, Console(quiet=True))

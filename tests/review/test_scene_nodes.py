@@ -158,17 +158,6 @@ def test_place_and_place_back_leaves_every_node_as_it_was(
         assert state[7:] == before[name][7:]
 
 
-def test_an_object_moves_by_two_small_messages(
-    server: viser.ViserServer, nodes: SceneNodes
-) -> None:
-    client = Client(server)
-    client.receive()
-    nodes.place(3, se3.random_transform(np.random.default_rng(1)))
-    new = client.receive()
-    assert {m["type"] for m in new} == {"SetPositionMessage", "SetOrientationMessage"}
-    assert {m["name"] for m in new} == {"/objects/3"}
-
-
 def test_switches_show_one_look_at_a_time_and_colours_follow_the_verdict(
     server: viser.ViserServer, nodes: SceneNodes
 ) -> None:
@@ -198,20 +187,6 @@ def test_switches_show_one_look_at_a_time_and_colours_follow_the_verdict(
         assert not states(server)[name][-2]
         switch(True)
         assert states(server)[name][-2]
-
-
-def test_a_swapped_object_stands_where_it_stood(
-    server: viser.ViserServer, nodes: SceneNodes, shown: SceneContent
-) -> None:
-    before = states(server)
-    nodes.swap(0, shown.models[9])
-    client = Client(server)
-    client.receive()
-    glbs = {m["name"]: bytes(m["props"]["glb_data"]) for m in client.of("GlbMessage")}
-    assert glbs["/objects/0/appearance"] == shown.meshes[9].glb
-    assert states(server) == before
-    nodes.swap(0, 1)
-    assert states(server) == before
 
 
 def test_colours_of_the_cloud_are_set_in_its_order_and_taken_back(
@@ -268,13 +243,6 @@ def test_grasps_are_one_node_at_their_poses_and_a_click_tells_the_row(
         assert clicked[-1] == expected[index]
     assert nodes.draw_grasps(GraspFilter(show=False)) == 0
     assert "/grasps" not in states(server)
-
-
-def test_no_more_grasps_are_drawn_than_the_browser_can_turn(
-    server: viser.ViserServer, shown: SceneContent
-) -> None:
-    few = SceneNodes(server.scene, shown, SceneConfig(most_grasps=7))
-    assert few.draw_grasps(GraspFilter()) <= 7
 
 
 def test_clicks_on_objects_and_cameras_tell_which(
@@ -380,24 +348,3 @@ def test_each_browser_has_its_own_scene_and_the_coarse_cloud_comes_first(
     told = [bool([m for m in c.receive() if m["type"] == "SetPositionMessage"])
             for c in (first, second)]  # fmt: skip
     assert sorted(told) == [False, True]
-
-
-def test_a_browser_that_leaves_stops_its_own_background(
-    server: viser.ViserServer, shown: SceneContent
-) -> None:
-    config = SceneConfig(voxel_m=0.004, coarse_points=50, piece_points=20, thumbnail_px=40)
-    made: list[SceneNodes] = []
-    ready = threading.Event()
-
-    def opened(client: viser.ClientHandle) -> None:
-        nodes = SceneNodes(client.scene, shown, config)
-        nodes.build()
-        made.append(nodes)
-        ready.set()
-
-    server.on_client_connect(opened)
-    client = Client(server)
-    assert ready.wait(20)
-    client.socket.close()
-    assert made[0].wait_for_cloud(20)
-    made[0].clear()

@@ -64,8 +64,7 @@ def off_mm(found: Snapped, placed: ObjectPose) -> float:
     return moved(placed.T_world_obj, found.T_world_obj, mesh).greatest_mm
 
 
-@pytest.mark.parametrize("instance", [0, 1])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(("instance", "seed"), [(0, 0), (1, 1)])
 def test_an_object_comes_back_from_10_mm_and_8_deg(
     snapper: Snapper, instance: int, seed: int
 ) -> None:
@@ -86,14 +85,6 @@ def test_what_is_in_its_place_stays_there(snapper: Snapper) -> None:
     found = snapper.snap(0, placed.obj_id, placed.T_world_obj)
     assert off_mm(found, placed) < 0.2
     assert found.is_better and "in its place" in found.words
-
-
-def test_a_snap_is_the_same_every_time_and_does_not_move_the_neighbours(snapper: Snapper) -> None:
-    start = pushed(TRUTH[1], 6.0, 5.0)
-    a, b = (snapper.snap(1, TRUTH[1].obj_id, start) for _ in range(2))
-    np.testing.assert_array_equal(a.T_world_obj, b.T_world_obj)
-    assert a.words == b.words
-    np.testing.assert_array_equal(snapper.scene.object(0).T_world_obj, TRUTH[0].T_world_obj)
 
 
 def test_where_nothing_was_measured_the_object_is_left_where_it_is(snapper: Snapper) -> None:
@@ -153,22 +144,6 @@ def test_excluded_views_are_not_looked_at(store: SessionStore) -> None:
         Snapper(store, SCENE, MODELS, excluded_views=range(8)).snap(0, TRUTH[0].obj_id, np.eye(4))
 
 
-def test_more_neighbours_in_the_scene_do_not_change_where_it_is_put(
-    store: SessionStore, snapper: Snapper
-) -> None:
-    start = pushed(TRUTH[1], 6.0, 5.0)
-    alone = snapper.snap(1, TRUTH[1].obj_id, start)
-    far = [
-        replace(TRUTH[0], instance=10 + k, T_world_obj=se3.from_translation([0.5, 0.3 * k, 0.0]))
-        for k in range(3)
-    ]
-    crowd = Snapper(store, replace(SCENE, objects=(*SCENE.objects, *far)), MODELS)
-    found = crowd.snap(1, TRUTH[1].obj_id, start)
-    # The views' spread is about the middle of the scene, but all eight are taken here.
-    mesh = MODELS[TRUTH[1].obj_id].mesh
-    assert moved(alone.T_world_obj, found.T_world_obj, mesh).greatest_mm < 0.05
-
-
 def test_progress_counts_up_to_its_end(store: SessionStore) -> None:
     seen: list[tuple[int, int]] = []
     new = Snapper(store, SCENE, MODELS)
@@ -182,13 +157,6 @@ def test_progress_counts_up_to_its_end(store: SessionStore) -> None:
         assert [n for n, _ in seen] == list(range(1, len(seen) + 1))
         assert seen[-1][0] == seen[-1][1]
     assert len(seen) < 8, "the images are read once"
-
-
-def test_bad_input_is_refused(snapper: Snapper) -> None:
-    with pytest.raises(InputError, match="no model"):
-        snapper.snap(0, 999, np.eye(4))
-    with pytest.raises(InputError):
-        snapper.snap(0, TRUTH[0].obj_id, 2 * np.eye(4))
 
 
 def test_the_bias_is_the_calibration_s_followed_by_the_registration_s(

@@ -170,19 +170,6 @@ def test_a_journal_that_vanishes_is_told_in_red_until_it_is_back(page: Page) -> 
     page.wait_message("can be read again", "#2b8a3e")
 
 
-def test_a_folder_that_vanishes_is_told_in_red_and_decisions_are_remembered(page: Page) -> None:
-    window, server = page.window, page.server
-    window.attempt(lambda: window.object.decide("reject"))
-    folder = server.sessions[0].store.folder
-    folder.rename(folder.with_name("elsewhere"))
-    page.wait_message("folder of the session is gone", RED)
-    window.attempt(lambda: window.object.decide("accept"))
-    assert not folder.exists() and RED in page.message
-    assert [e.action for e in server.decisions()] == ["reject"]
-    folder.with_name("elsewhere").rename(folder)
-    page.wait_message("can be read again", "#2b8a3e")
-
-
 def test_a_page_with_a_swap_to_a_missing_model_stays_usable(page: Page) -> None:
     window, session = page.window, page.server.sessions[0]
     placed = session.standing.scene.object(3)
@@ -200,19 +187,6 @@ def test_a_page_with_a_swap_to_a_missing_model_stays_usable(page: Page) -> None:
     assert session.standing.scene.object(3).obj_id == 7
 
 
-def test_cameras_come_back_after_a_replay_unless_they_were_off_before(page: Page) -> None:
-    show: Any = page.window.show
-    show.hide_cameras()
-    show.hide_cameras()
-    assert show._cameras.value is False
-    show.bring_back_cameras()
-    assert show._cameras.value is True
-    show._cameras.value = False
-    show.hide_cameras()
-    show.bring_back_cameras()
-    assert show._cameras.value is False
-
-
 def test_keys_change_and_save_nothing_while_a_snap_is_computed(page: Page) -> None:
     window, session = page.window, page.server.sessions[0]
     window.correct.nudge("x", 1, "move")
@@ -228,8 +202,3 @@ def test_keys_change_and_save_nothing_while_a_snap_is_computed(page: Page) -> No
     assert not session.standing.state.entries
     window.correct.enable(True)
     assert window.attempt(lambda: window.correct.nudge("x", -1, "move"))
-
-
-def test_the_models_own_symmetry_is_shown_where_nobody_has_marked_it(page: Page) -> None:
-    panel: Any = page.window.correct
-    page.wait(lambda: panel._marks.content.startswith("the model itself: "))

@@ -8,7 +8,6 @@ import pytest
 from realsim import ObjectModel, ObjectPose
 from realsim.geometry import se3
 from realsim.review import journal
-from realsim.review.scene_list import ObjectRow
 from realsim.review.window import window_text
 from tests.support.reviewed_boxes import MODELS, SCENE
 
@@ -48,12 +47,6 @@ def test_a_comment_cannot_fake_the_line_of_another_reviewer() -> None:
                  window_text.message_html(made, "ok"))  # fmt: skip
         for text in shown:
             assert not any(ord(c) < 32 or c in "\x85\u2028\u202e" for c in text)
-
-
-def test_a_missing_model_is_told_in_the_panel() -> None:
-    text = window_text.object_text(PLACED, PLACED, MODELS[7], None, "Copy it to models/obj_9.ply.")
-    assert "Its model is missing" in text and "obj\\_9.ply" in text
-    assert "model is missing" not in window_text.object_text(PLACED, PLACED, MODELS[7], None)
 
 
 def test_the_panel_says_what_was_computed_and_who_said_what() -> None:
@@ -106,30 +99,6 @@ def test_undo_names_whose_line_it_takes_back() -> None:
     assert window_text.undo_label(entry()) == "Undo: ada rejected"
     assert window_text.undo_label(None) == "Undo"
     assert len(window_text.undo_label(entry(reviewer="a" * 80))) <= 48
-
-
-def test_the_list_tells_the_judged_from_the_waiting() -> None:
-    row = ObjectRow(
-        session=0, instance=3, name="flat", computed="doubtful", verdict="doubtful", agree=0.71,
-        is_decided=False,
-    )  # fmt: skip
-    assert window_text.list_label(row, "000001", with_scene=False) == (
-        "3 flat \u00b7 doubtful \u00b7 fits 71.0 %"
-    )
-    assert window_text.list_label(row, "000001", with_scene=True).startswith("000001 \u00b7 3 flat")
-
-
-def test_letters_on_the_colours_of_the_verdicts_can_be_read() -> None:
-    def luminance(rgb: tuple[int, int, int]) -> float:
-        c = np.array(rgb) / 255
-        linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-        return float(linear @ [0.2126, 0.7152, 0.0722])
-
-    colors = [window_text.verdict_rgb(v) for v in ("accepted", "doubtful", "rejected", "unchecked")]
-    for rgb in colors:
-        assert 1.05 / (luminance(rgb) + 0.05) > 4.4
-    assert len(set(colors)) == 4
-    assert re.search(r"color:rgb\(\d+, \d+, \d+\)", window_text.color_dot("accepted"))
 
 
 def test_a_line_in_the_history_has_time_name_and_how() -> None:

@@ -107,15 +107,6 @@ def test_values_that_are_no_light_are_named_and_mended() -> None:
     assert clean == []
 
 
-def test_a_jpeg_is_taken_with_a_warning(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "room.jpg"), np.full((64, 128, 3), 255, np.uint8))
-    notes: list[str] = []
-    e = read_environment(tmp_path / "room.jpg", notes=notes)
-    np.testing.assert_allclose(e.panorama, 1.0, atol=1e-6)
-    assert "without high dynamic range" in notes[0]
-    assert "100.0 %" in notes[0]
-
-
 def test_bad_files_are_named(tmp_path: Path) -> None:
     square = write_hdr(tmp_path / "square.hdr", np.ones((64, 64, 3)))
     with pytest.raises(InputError, match=r"64x64.*twice as wide"):
