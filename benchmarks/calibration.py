@@ -16,6 +16,7 @@ import argparse
 import multiprocessing
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -81,12 +82,16 @@ FIGURES = {
 }
 
 
+@cache
+def pool(workers: int) -> ProcessPoolExecutor:
+    """Return the processes of all parts: what they import costs more than many a task."""
+    # Fresh processes: OpenCV's threads do not survive a fork.
+    return ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+
+
 def each(a: argparse.Namespace, function: Callable[[A], B], tasks: Iterable[A]) -> list[B]:
     """Return the results of all tasks, run side by side."""
-    # Fresh processes: OpenCV's threads do not survive a fork.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(a.workers, mp_context=context) as pool:
-        return list(pool.map(function, tasks))
+    return list(pool(a.workers).map(function, tasks))
 
 
 def rms(values: Sequence[float]) -> float:

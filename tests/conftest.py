@@ -15,7 +15,16 @@ Tests that only read use the folder as it is. A test that writes takes a copy:
 """
 
 import os
+import sys
 from pathlib import Path
+
+if sys.dont_write_bytecode:
+    # Without byte code on disk every process of the tests compiles all libraries anew: 4 CPU s.
+    # It is kept outside the tree, for this process and for those that it starts.
+    sys.dont_write_bytecode = False
+    sys.pycache_prefix = str(Path.home() / ".cache" / "realsim" / "bytecode")
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import pytest
 
