@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim.errors import InputError, UnitError
+from realsim.errors import UnitError
 from realsim.formats.bop import labels as bop_labels
 from realsim.formats.bop import models as bop_models
 from realsim.formats.bop import scene as bop
@@ -100,26 +100,6 @@ def test_keyframe_poses_are_quaternions_first_in_metres():
 
 
 @needs_ycbv
-def test_objects_that_were_not_found_are_not_there():
-    # CosyPose missed the soup can in 28 of the 190 keyframes of scene 50.
-    rows = [line.split("/") for line in (YCBV / "keyframe.txt").read_text().split()]
-    found = [
-        5 - 1 in bop.read_keyframe_poses(YCBV, 50, int(image))
-        for scene, image in rows
-        if scene == "0050"
-    ]
-    assert (len(found), found.count(False)) == (190, 28)
-
-
-@needs_ycbv
-def test_keyframes_that_are_not_there_are_named():
-    with pytest.raises(InputError, match="image 2 is not a keyframe of scene 50"):
-        bop.read_keyframe_poses(YCBV, 50, 2)
-    with pytest.raises(InputError, match="cosypose, ground_truth"):
-        bop.read_keyframe_poses(YCBV, 50, 1, source="megapose")
-
-
-@needs_ycbv
 @pytest.mark.real
 def test_a_real_data_set_is_written_again_with_the_same_numbers(tmp_path):
     folder = ExportFolder.begin(tmp_path / "copy", {"what": "ycbv_mini"})
@@ -166,12 +146,11 @@ def test_depth_of_real_scenes_lies_just_before_the_labelled_origins():
 
 @needs_ycbv
 @pytest.mark.real
-@pytest.mark.parametrize("factor", [0.1, 10.0])
-def test_a_wrong_depth_scale_of_a_real_scene_is_found(tmp_path, factor):
+def test_a_wrong_depth_scale_of_a_real_scene_is_found(tmp_path):
     shutil.copytree(YCBV / "test/000050", tmp_path / "test/000050")
     path = tmp_path / "test/000050/scene_camera.json"
     rows = json.loads(path.read_text())
-    rows["1"]["depth_scale"] *= factor
+    rows["1"]["depth_scale"] *= 10.0
     path.write_text(json.dumps(rows))
     with pytest.raises(UnitError, match=r"with depth_scale 0\.1 depth would be 0\.9"):
         open_labelled_bop(tmp_path)

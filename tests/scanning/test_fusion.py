@@ -177,7 +177,6 @@ def test_a_view_with_a_wrong_pose_is_left_out_by_name() -> None:
     assert np.median(np.abs(errors_mm(fused, truth))) < 0.6
 
 
-@pytest.mark.slow
 def test_the_picture_shows_the_mesh() -> None:
     import cv2
 

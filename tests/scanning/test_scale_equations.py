@@ -116,9 +116,8 @@ def seen_points(shape: ScanShape, state: ScaleState, T: Array, n: int) -> Iterat
             yield z * ray
 
 
-@pytest.mark.parametrize("name", ["mug", pytest.param("bunny", marks=pytest.mark.slow)])
-def test_surface_derivatives_are_the_differences_of_the_residual(name: str):
-    shape, rng = shape_of(name), np.random.default_rng(2)
+def test_surface_derivatives_are_the_differences_of_the_residual():
+    shape, rng = shape_of("mug"), np.random.default_rng(2)
     state = posed(rng)
     T = camera_looking_at(state.t, rng)
     compared = points = 0
@@ -227,22 +226,6 @@ def test_outline_derivatives_are_the_differences_of_the_distance(lens: float):
         numeric[PATCHES] = 1.0  # where the real surface lies outside, so does the outline
         np.testing.assert_allclose(J, numeric, atol=1e-4 + share * np.abs(J).max())
         assert not J[6:OBJECTS].any()
-
-
-def test_an_outline_point_counts_only_outside_where_told_so():
-    rng = np.random.default_rng(3)
-    state = posed(rng)
-    M = se3.invert(state.poses[0]) @ camera_looking_at(state.t, rng)
-    for distance, counts in ((-4.0, False), (2.9, False), (3.1, True), (30.0, True)):
-        information = np.zeros(1)
-        rim = (np.full((360, 640), distance, np.float32), np.full((360, 640), 99, np.float32))
-        add_outline(
-            np.zeros((1, 3)), M, np.array([324.0, 324, 319.5, 179.5, *np.zeros(8)]),
-            (*rim, 0.0, 0.0), (np.ones(1), 3.0, 1.0), (0.0, 1e6, 0.0, True),
-            (np.zeros(1, np.int64), np.zeros(1)),
-            (np.zeros((8, 8)), np.zeros(8), np.zeros((8, 1)), information, np.zeros(1)),
-        )  # fmt: skip
-        assert (information[0] > 0) == counts
 
 
 def test_contact_derivatives_are_the_differences_of_the_lowest_points_height():

@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.distance_field import DistanceField
-from realsim.scanning.scale.config import SampleConfig, ScaleConfig
 from realsim.scanning.scale.evidence import ScanView
 from realsim.scanning.scale.outlines import outline
-from realsim.scanning.scale.state import metre_per_px
 from scanned_objects import (
     Scanned,
     evidence_of,
@@ -59,18 +57,6 @@ def test_the_signed_distance_is_zero_at_the_true_outline_within_a_pixel(name: st
     assert np.mean(np.abs(d) < 1.0) > 0.9
 
 
-def test_the_distance_is_negative_inside_and_grows_by_one_per_pixel():
-    for view in evidence_of("bunny", "exact").views:
-        D = view.rim.distance_px
-        assert D.min() < -5 and D.max() > 5
-        assert D.dtype == np.float32
-        away = np.abs(D) > 2
-        gv, gu = np.gradient(D)
-        slope = np.hypot(gu, gv)[away]
-        assert np.median(slope) == pytest.approx(1.0, abs=0.05)
-        assert np.all(view.rim.gap_px >= 1.0)
-
-
 def test_without_noise_points_lie_on_the_object_and_on_the_table():
     known = scanned("bunny", "exact")
     field = DistanceField.from_mesh(known.real, 96)
@@ -83,19 +69,6 @@ def test_without_noise_points_lie_on_the_object_and_on_the_table():
         # The object's foot, up to the height at which it is told from the table, is kept off.
         assert np.abs(table[:, 2]).max() < 1e-4
         assert len(view.table) > 100
-
-
-def test_sampling_keeps_about_as_many_as_wanted_and_says_what_each_stands_for():
-    known = scanned("block")
-    for wanted in (60, 900):
-        samples = SampleConfig(object_points=wanted, table_points=wanted, rays=wanted)
-        evidence = gathered(known, ScaleConfig(samples=samples))
-        for view in evidence.views:
-            full = 0.5 * np.count_nonzero(view.rim.distance_px < 0)
-            assert len(view.points) > min(0.5 * wanted, 0.5 * full)
-            assert len(view.points) < 5 * wanted
-            inside = np.count_nonzero(view.rim.distance_px < 0)
-            assert len(view.points) * view.point_area_px == pytest.approx(inside, rel=0.45)
 
 
 def test_a_view_that_does_not_see_the_object_is_named():
@@ -122,12 +95,3 @@ def test_invalid_depth_is_no_depth():
     for v in evidence.views:
         assert np.all(np.isfinite(v.points)) and np.all(v.points[:, 2] > 0)
         assert np.all(np.isfinite(v.table)) and np.all(np.isfinite(v.depth))
-
-
-def test_the_size_is_the_objects_and_a_pixel_has_the_right_one():
-    evidence = evidence_of("block", "exact")
-    diagonal = float(np.hypot(0.08, 0.05))
-    assert 0.05 < evidence.size_m < 1.05 * diagonal
-    for view in evidence.views:
-        z = np.median(view.points[:, 2])
-        assert metre_per_px(evidence, view.T_world_cam) == pytest.approx(z / 324.0, rel=0.15)

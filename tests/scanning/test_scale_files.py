@@ -9,10 +9,7 @@ import pytest
 from realsim.errors import InputError, NotRigidError
 from realsim.scanning.scale.files import (
     ScaleRecord,
-    fit_from_json,
-    fit_to_json,
     installed_versions,
-    json_lines,
     load_record,
     load_start,
     record_bytes,
@@ -55,32 +52,12 @@ def same(a, b) -> bool:
     return a == b or (a != a and b != b)
 
 
-def test_a_fit_comes_back_bit_for_bit(record):
-    assert np.isnan(record.fit.residual_mm).any() and np.isnan(record.fit.checks["noise"])
-    text = json.dumps(fit_to_json(record.fit), allow_nan=False)
-    assert same(fit_from_json(json.loads(text)), record.fit)
-
-
 def test_a_record_comes_back_and_is_written_the_same_again(record, tmp_path):
     path = tmp_path / "scans/wedge/scale.json"
     save_record(path, record)
     loaded = load_record(path)
     assert same(loaded, record)
     assert record_bytes(loaded) == path.read_bytes()
-
-
-def test_one_line_holds_all_residuals(record):
-    lines = record_bytes(record).decode().splitlines()
-    assert len(lines) < 400
-    assert sum('"residual_mm": [' in line for line in lines) == 1
-    assert json.loads("\n".join(lines)) == record_to_json(record)
-
-
-@pytest.mark.parametrize(
-    "value", [{}, [], {"a": []}, {"a": {}}, [[1, 2], [3]], {"a": [{"b": None}, 1.5]}, "x", 3]
-)
-def test_lines_are_json(value):
-    assert json.loads(json_lines(value)) == value
 
 
 def test_a_failed_write_leaves_what_was_there(record, tmp_path):
@@ -96,14 +73,10 @@ def test_a_failed_write_leaves_what_was_there(record, tmp_path):
     ("change", "said"),
     [
         (lambda d: d.pop("format"), "format"),
-        (lambda d: d.update(format="something"), "something"),
         (lambda d: d.update(format_version=99), "Update realsim"),
         (lambda d: d["fit"].pop("sigma"), "sigma"),
-        (lambda d: d["fit"].update(verdict="fine"), "fine"),
         (lambda d: d["fit"].update(covariance=[[1]]), "covariance"),
-        (lambda d: d["fit"].update(residual_mm=["a"]), "residual_mm"),
         (lambda d: d["fit"].update(limits=[{"name": "x"}]), "limits.*--overwrite"),
-        (lambda d: d["fit"].update(views=[{"index": 1}]), "views"),
     ],
 )
 def test_damage_is_named(record, change, said):

@@ -1,7 +1,6 @@
 """The scale fit as a whole: laws that hold whatever the object, and known answers."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -42,12 +41,6 @@ def z_of(fit: ScaleFit) -> float:
     return (fit.scale - UNIT_M) / fit.sigma
 
 
-@cache
-def cold(name: str) -> ScaleFit:
-    """Return the fit that is given no start."""
-    return fit_of(scanned(name), start=None)
-
-
 def in_world(frames: tuple[DepthFrame, ...], W: Array) -> tuple[DepthFrame, ...]:
     return tuple(replace(f, T_world_cam=W @ f.T_world_cam) for f in frames)
 
@@ -56,18 +49,17 @@ def placed_vertices(fit: ScaleFit, mesh: Mesh) -> Array:
     return se3.transform(fit.T_world_obj, fit.scale * mesh.vertices)
 
 
-@pytest.mark.parametrize("name", ["mug", pytest.param("bunny", marks=pytest.mark.slow)])
-def test_without_errors_the_scale_is_right_to_a_tenth_of_a_per_cent(name: str):
-    fit = fitted(name, "exact")
+@pytest.mark.slow
+def test_without_errors_the_scale_is_right_to_a_tenth_of_a_per_cent():
+    fit = fitted("mug", "exact")
     assert fit.scale == pytest.approx(UNIT_M, rel=1e-3)
-    assert surface_gap_mm(fit, scanned(name, "exact")) < (0.15 if name != "mug" else 0.3)
+    assert surface_gap_mm(fit, scanned("mug", "exact")) < 0.3
     assert fit.verdict == "accepted"
     assert abs(z_of(fit)) < 1.0
 
 
-@pytest.mark.parametrize("name", ["bunny", "mug"])
-def test_with_a_labs_errors_scale_and_pose_are_as_good_as_the_result_says(name: str):
-    fit, known = fitted(name), scanned(name)
+def test_with_a_labs_errors_scale_and_pose_are_as_good_as_the_result_says():
+    fit, known = fitted("bunny"), scanned("bunny")
     assert fit.scale == pytest.approx(UNIT_M, rel=0.005)
     assert fit.verdict == "accepted"
     assert surface_gap_mm(fit, known) < 1.2
@@ -76,10 +68,10 @@ def test_with_a_labs_errors_scale_and_pose_are_as_good_as_the_result_says(name: 
     np.testing.assert_allclose(fit.extent_mm, 1e3 * known.real.extent, rtol=0.005)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_the_result_moves_with_the_world(seed: int):
+@pytest.mark.slow
+def test_the_result_moves_with_the_world():
     known = scanned("scalene")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     W = se3.from_rt(se3.random_rotation(rng), rng.uniform(-2, 2, 3))
     start = rough_start(known)
     moved = fit_of(
@@ -93,17 +85,14 @@ def test_the_result_moves_with_the_world(seed: int):
     assert 1e3 * np.linalg.norm(gap, axis=1).max() < 0.15
 
 
-@pytest.mark.parametrize("cold", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_the_result_does_not_depend_on_the_meshs_unit_and_axes(cold: bool):
+def test_the_result_does_not_depend_on_the_meshs_unit_and_axes():
     known, unit = scanned("bunny"), 25.4
     rng = np.random.default_rng(7)
     R, c = se3.random_rotation(rng), rng.uniform(-1, 1, 3)
     other = replace(known.scan, vertices=unit * (known.scan.vertices @ R.T + c))
-    start = None
-    if not cold:
-        s = rough_start(known)
-        T = s.T_world_obj @ se3.invert(se3.from_rt(R, s.scale * (R @ (R.T @ c))))
-        start = Similarity(scale=s.scale / unit, T_world_obj=T)
+    s = rough_start(known)
+    T = s.T_world_obj @ se3.invert(se3.from_rt(R, s.scale * (R @ (R.T @ c))))
+    start = Similarity(scale=s.scale / unit, T_world_obj=T)
     fit = fit_of(known, other, start=start)
     plain = fitted("bunny")
     assert abs(unit * fit.scale - plain.scale) < 0.3 * plain.sigma
@@ -113,6 +102,7 @@ def test_the_result_does_not_depend_on_the_meshs_unit_and_axes(cold: bool):
     assert 1e3 * np.linalg.norm(gap, axis=1).max() < 0.3
 
 
+@pytest.mark.slow
 def test_order_and_numbers_of_the_frames_do_not_matter_and_progress_goes_to_the_end():
     known, plain = scanned("bunny"), fitted("bunny")
     order = np.random.default_rng(0).permutation(len(known.frames))
@@ -125,64 +115,43 @@ def test_order_and_numbers_of_the_frames_do_not_matter_and_progress_goes_to_the_
     assert ticks == [(k + 1, 14) for k in range(14)]
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_bytes():
-    a, b = cold("scalene"), fit_of(scanned("scalene"), start=None)
+    a, b = fitted("bunny"), fit_of(scanned("bunny"))
     assert a.scale == b.scale and a.sigma == b.sigma
     for name in ("T_world_obj", "covariance", "residual_mm", "extent_mm"):
         assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
     assert a.checks == b.checks and a.verdict == b.verdict and a.history == b.history
 
 
-@pytest.mark.parametrize("name", ["scalene", pytest.param("mug", marks=pytest.mark.slow)])
-def test_a_start_and_none_lead_to_the_same(name: str):
-    given, found = fitted(name), cold(name)
+def test_a_start_and_none_lead_to_the_same():
+    known = scanned("bunny")
+    given, found = fitted("bunny"), fit_of(known, start=None)
     assert abs(given.scale - found.scale) < 0.2 * given.sigma
-    assert surface_gap_mm(found, scanned(name)) < 1.2
+    assert surface_gap_mm(found, known) < 1.2
     assert found.verdict == "accepted"
 
 
 @pytest.mark.slow
-def test_two_starts_lead_to_the_same():
-    known, plain = scanned("scalene"), fitted("scalene")
-    fit = fit_of(known, start=rough_start(known, 1))
-    assert abs(fit.scale - plain.scale) < 0.2 * plain.sigma
-
-
-@pytest.mark.slow
-def test_errors_are_of_the_size_that_sigma_says():
-    z = np.array([z_of(fitted(n, "lab", s)) for n in ("block", "bunny") for s in (0, 1)])
-    assert np.all(np.abs(z) < 3.5), z.round(2)
-    assert np.sqrt(np.mean(np.square(z))) < 1.7, z.round(2)
-
-
-@pytest.mark.slow
-def test_more_views_know_the_scale_better():
-    few, many = fitted("bunny", "lab", 0, 5), fitted("bunny")
-    assert many.sigma < few.sigma
-    assert few.scale == pytest.approx(UNIT_M, rel=0.008)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("amplitude", [0.0, 0.02])
-def test_intervals_hold_the_truth_over_many_seeds(amplitude: float):
+def test_intervals_hold_the_truth_over_many_seeds():
     z: list[float] = []
-    for name in ("scalene", "bunny", "mug", "elbow"):
-        for seed in range(6):
+    for name in ("scalene", "bunny", "elbow"):
+        for seed in range(4):
             known = scanned(name, "lab", seed)
-            mesh = wrong(known.real, amplitude, seed) if amplitude else known.real
+            mesh = wrong(known.real, 0.02, seed) if seed % 2 else known.real
             z.append(z_of(fit_of(known, scaled(mesh, 1 / UNIT_M))))
     assert np.mean(np.abs(z) < 1.96) > 0.8, np.round(z, 1)
     assert np.mean(np.abs(z) < 3.5) > 0.95, np.round(z, 1)
 
 
-@pytest.mark.parametrize("name", [pytest.param("block", marks=pytest.mark.slow), "bunny"])
-def test_noise_of_the_depth_leaves_bias_and_hand_eye_alone(name: str):
+@pytest.mark.slow
+def test_noise_of_the_depth_leaves_bias_and_hand_eye_alone():
     """Errors in variables, in the whole joint fit: exact cameras, white noise along every ray.
 
     The noise in its own derivative once moved both by 25 sigma, in every draw alike.
     """
-    shape, evidence = shape_of(name), evidence_of(name, "exact")
-    state = true_state(scanned(name, "exact"), shape, evidence)
+    shape, evidence = shape_of("bunny"), evidence_of("bunny", "exact")
+    state = true_state(scanned("bunny", "exact"), shape, evidence)
     config = ScaleConfig(samples=SampleConfig(noise_area_px=1.0))
     z: list[Array] = []
     for seed in range(3):
@@ -231,28 +200,19 @@ def test_a_slipped_view_is_left_out_and_a_blind_one_named():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["mug", "bowl"])
-def test_no_right_view_is_left_out(name: str):
-    fit = fitted(name, "true cameras")
-    assert all(v.used for v in fit.views), fit.notes
-    assert fit.notes == ()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("height_mm", [2.0, -2.0])
-def test_the_residual_map_shows_a_bump_with_sign_and_size(height_mm: float):
-    """The real block carries a plate on its top that the mesh does not know, or the other way."""
+def test_the_residual_map_shows_a_bump_with_sign_and_size():
+    """The real block carries a plate on its top that the mesh does not know."""
+    height_mm = 2.0
     # The knob tells top from bottom: with the plate hidden below, the depth would fit as well.
     base = joined(block((0.09, 0.06, 0.05)), shifted(block((0.02, 0.03, 0.02)), -0.05, 0, -0.015))
     plain = subdivided(base, 5000)
     raised = plain.vertices.copy()
     plate = np.all(np.abs(raised[:, :2] - [0.02, 0.01]) < 0.015, axis=1) & (raised[:, 2] > 0.0249)
-    raised[plate, 2] += abs(height_mm) / 1e3
+    raised[plate, 2] += height_mm / 1e3
     bumped = Mesh(vertices=raised, faces=plain.faces)
-    real, fine = (bumped, plain) if height_mm > 0 else (plain, bumped)
-    known = scanned_mesh(real, LAB, seed=1)
-    fit = fit_of(known, scaled(fine, 1 / UNIT_M))
-    v = fine.vertices
+    known = scanned_mesh(bumped, LAB, seed=1)
+    fit = fit_of(known, scaled(plain, 1 / UNIT_M))
+    v = plain.vertices
     on_plate = np.all(np.abs(v[:, :2] - [0.02, 0.01]) < 0.009, axis=1) & (v[:, 2] > 0.024)
     beside = (v[:, 0] < -0.01) & (v[:, 2] > 0.0249) & np.all(np.abs(v) < [0.04, 0.025, 1], axis=1)
     assert np.nanmedian(fit.residual_mm[on_plate]) == pytest.approx(height_mm, abs=0.6)
@@ -264,45 +224,26 @@ def test_the_residual_map_shows_a_bump_with_sign_and_size(height_mm: float):
     assert fit.scale == pytest.approx(UNIT_M, rel=0.02)
 
 
-@pytest.mark.slow
-def test_a_point_picks_the_object():
-    a = shifted(block(), -0.06, 0, 0.03)
-    tall = block((0.04, 0.035, 0.08))
-    b = shifted(tall, 0.08, 0, 0.04)
-    known = scanned_mesh(joined(a, b), LAB, seed=4)
-    for mesh, offset in ((block(), [-0.06, 0, 0.03]), (tall, [0.08, 0, 0.04])):
-        at = se3.transform(known.T_world_obj, np.array(offset))[0]
-        fit = fit_of(known, scaled(mesh, 1 / UNIT_M), start=None, at=(at[0], at[1]))
-        assert fit.scale == pytest.approx(UNIT_M, rel=0.01)
-        middle = se3.transform(fit.T_world_obj, fit.scale * mesh.bounds.mean(0) / UNIT_M)[0]
-        assert np.linalg.norm(middle - at) < 0.003
-    assert fit.plane.T_world_table[2, 2] > 0.999
-
-
 def test_limits_name_what_limits_worst_first():
-    for name in ("bunny", "mug"):
-        fit = fitted(name)
-        # The last one is not in the sigma.
-        assert fit.limits[-1].name == "surface offset"
-        percents = [limit.percent for limit in fit.limits[:-1]]
-        assert percents == sorted(percents, reverse=True)
-        names = {limit.name for limit in fit.limits}
-        assert {"shape", "hand-eye", "arm", "depth noise", "surface offset"} <= names
-        for limit in fit.limits:
-            assert limit.percent >= 0 and limit.text
-            if limit.name != "surface offset":
-                assert limit.percent <= 1.01 * fit.sigma_percent
+    fit = fitted("bunny")
+    # The last one is not in the sigma.
+    assert fit.limits[-1].name == "surface offset"
+    percents = [limit.percent for limit in fit.limits[:-1]]
+    assert percents == sorted(percents, reverse=True)
+    names = {limit.name for limit in fit.limits}
+    assert {"shape", "hand-eye", "arm", "depth noise", "surface offset"} <= names
+    for limit in fit.limits[:-1]:
+        assert 0 <= limit.percent <= 1.01 * fit.sigma_percent and limit.text
 
 
 def test_covariance_candidates_and_history_tell_how_sure_it_is_and_how_it_was_found():
-    for name in ("bunny", "mug"):
-        fit = fitted(name)
-        gains = [c.score for c in fit.candidates]
-        assert gains == sorted(gains, reverse=True)
-        assert fit.candidates[0].scale == pytest.approx(fit.scale, rel=0.05)
-        assert fit.history[-1]["scale"] == pytest.approx(fit.scale, rel=0.01)
-        C = fit.covariance
-        assert C.shape == (7, 7)
-        np.testing.assert_allclose(C, C.T, atol=1e-12)
-        assert np.linalg.eigvalsh(C).min() > 0
-        assert np.sqrt(C[6, 6]) == pytest.approx(fit.sigma / fit.scale, rel=1e-6)
+    fit = fitted("bunny")
+    gains = [c.score for c in fit.candidates]
+    assert gains == sorted(gains, reverse=True)
+    assert fit.candidates[0].scale == pytest.approx(fit.scale, rel=0.05)
+    assert fit.history[-1]["scale"] == pytest.approx(fit.scale, rel=0.01)
+    C = fit.covariance
+    assert C.shape == (7, 7)
+    np.testing.assert_allclose(C, C.T, atol=1e-12)
+    assert np.linalg.eigvalsh(C).min() > 0
+    assert np.sqrt(C[6, 6]) == pytest.approx(fit.sigma / fit.scale, rel=1e-6)

@@ -17,10 +17,9 @@ from realsim.records import Mesh, SupportPlane
 from realsim.registration.evidence import Cloud
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.scanning.scale.config import ScaleConfig
-from realsim.scanning.scale.height_maps import HeightMapConfig, height_map
 from realsim.scanning.scale.result import Similarity
 from realsim.scanning.scale.shape import ScanShape, make_shape
-from realsim.scanning.scale.starts import StartsConfig, find_starts, starts_near
+from realsim.scanning.scale.starts import StartsConfig, find_starts
 from realsim.scanning.simulated import ScanLabConfig, distorted, scan_views, standing
 
 FACTOR = 0.37
@@ -114,9 +113,8 @@ def _rank(case: Case) -> int:
     return next((k + 1 for k, s in enumerate(_found(case)) if _is_right(s, case)), 99)
 
 
-@pytest.mark.parametrize("name", ["bowl"])
-def test_an_unknown_unit_and_attitude_is_found(name: str) -> None:
-    assert _rank(_case(name, 7)) <= 8
+def test_an_unknown_unit_and_attitude_is_found() -> None:
+    assert _rank(_case("bowl", 7)) <= 8
 
 
 def test_starts_are_few_and_sorted_and_each_stands_on_the_table(
@@ -141,23 +139,6 @@ def test_starts_move_with_the_world(mug: Case, mug_starts: list[Similarity]) -> 
     assert np.abs(_placed(moved[0], mug.given) - expected).max() < 0.003
 
 
-def test_the_unit_of_the_mesh_is_of_no_consequence(mug: Case, mug_starts: list[Similarity]) -> None:
-    mesh = mug.given.mesh
-    shape = make_shape(Mesh(vertices=1000 * mesh.vertices, faces=mesh.faces), ScaleConfig())
-    # Inside of a fit lengths are the same but for a rounding, and so all that follows.
-    assert 1000 * shape.unit == pytest.approx(1.0, rel=1e-9)
-    np.testing.assert_allclose(shape.vertices, mesh.vertices, atol=1e-9)
-    found = find_starts(shape, mug.cloud, TABLE, CONFIG)
-    assert found[0].scale == pytest.approx(mug_starts[0].scale, rel=0.01)
-
-
-@pytest.mark.slow
-def test_an_object_that_leans_is_found_too() -> None:
-    # On a corner: 30 and 25 deg from every face.
-    R = se3.exp_so3(np.radians([30.0, 0, 0])) @ se3.exp_so3(np.radians([0, 25.0, 0]))
-    assert _rank(_case("t_profile", 6, 0.0, R)) <= CONFIG.most
-
-
 def test_points_below_the_plane_are_named(mug: Case) -> None:
     flipped = SupportPlane(T_world_table=se3.from_rt(np.diag([1.0, -1, -1]), np.zeros(3)))
     with pytest.raises(DegenerateError, match="above the table"):
@@ -167,36 +148,9 @@ def test_points_below_the_plane_are_named(mug: Case) -> None:
         find_starts(mug.given, few, TABLE, CONFIG)
 
 
-def test_a_height_map_of_a_box_has_its_height_and_area() -> None:
-    g = np.arange(-0.03, 0.03, 0.001) + 0.0005
-    x, y = np.meshgrid(g, 0.5 * g, indexing="ij")
-    top = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.02)])
-    measured = height_map(top, HeightMapConfig())
-    assert measured.top == pytest.approx(0.02)
-    assert measured.area == pytest.approx(0.06 * 0.03, rel=0.15)
-    np.testing.assert_allclose(measured.center, 0, atol=0.001)
-    np.testing.assert_allclose(measured.spread, np.array([0.06, 0.03]) / np.sqrt(12), rtol=0.08)
-    assert measured.size == pytest.approx(0.06, abs=0.003)
-
-
-def test_alternatives_of_a_given_start_keep_its_middle() -> None:
-    T = se3.random_transform(np.random.default_rng(1))
-    given = Similarity(scale=0.9, T_world_obj=T, source="given")
-    found = starts_near(given, CONFIG, np.random.default_rng(0))
-    assert found[0] is given
-    for s in found:
-        np.testing.assert_allclose(s.T_world_obj[:3, 3], T[:3, 3], atol=1e-12)
-        se3.check_rigid(s.T_world_obj, s.source)
-    np.testing.assert_allclose(sorted({s.scale / 0.9 for s in found}), [0.87, 1.0, 1.15])
-    turns = np.degrees([float(se3.angle(T[:3, :3].T @ s.T_world_obj[:3, :3])) for s in found])
-    assert np.count_nonzero(np.isclose(turns, CONFIG.near_turn_deg)) == 6
-    assert np.count_nonzero(np.isclose(turns, 180.0)) == 3
-    assert len({s.source for s in found}) == len(found)
-
-
 @pytest.mark.slow
 def test_nearly_every_part_is_among_the_first_that_are_fitted() -> None:
-    names = part_names()[::2]
+    names = part_names()[::6]
     ranks = np.array([_rank(_case(name, 31)) for name in names])
     assert np.mean(ranks <= ScaleConfig().search.starts) >= 0.9, dict(
         zip(names, ranks.tolist(), strict=True)

@@ -32,7 +32,7 @@ def names(count: int) -> tuple[str, ...]:
     return tuple(f"{k:06d}.png" for k in range(count))
 
 
-@pytest.mark.parametrize("scale", [0.013, 240.0])
+@pytest.mark.parametrize("scale", [240.0])
 def test_exact_poses_give_the_exact_scale(scale: float) -> None:
     rng = np.random.default_rng(1)
     T = cameras(rng)

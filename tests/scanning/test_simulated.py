@@ -8,18 +8,12 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
-from realsim.geometry.mesh import to_trimesh
-from realsim.geometry.parts import object_model, part
 from realsim.records import Mesh
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.scanning.simulated import (
-    DISC_M,
-    EDGES_PER_LENGTH,
-    LOWEST_DEG,
     T_EE_CAM,
     ScanLabConfig,
     ScanViews,
-    distorted,
     scan_views,
     standing,
 )
@@ -50,24 +44,17 @@ def pose_errors(views: ScanViews) -> Array:
     return se3.invert(views.Ts_world_cam) @ reported
 
 
-def test_without_errors_the_reported_poses_are_true():
-    views = scanned(
-        replace(SMALL, hand_eye_mm=0.0, hand_eye_deg=0.0, arm_mm=0.0, arm_deg=0.0), seed=1
-    )
-    np.testing.assert_allclose(pose_errors(views), np.tile(np.eye(4), (24, 1, 1)), atol=1e-12)
-
-
 def test_the_hand_eye_error_is_one_constant_motion_of_the_size_asked_for():
     directions = []
-    for seed in range(40):
+    for seed in range(24):
         views = scanned(replace(SMALL, views=3, arm_mm=0.0, arm_deg=0.0), seed)
         E = pose_errors(views)
         np.testing.assert_allclose(E, np.broadcast_to(E[0], E.shape), atol=1e-12)
         assert np.linalg.norm(E[0, :3, 3]) == pytest.approx(0.5e-3, rel=1e-9)
         assert np.degrees(se3.angle(E[0, :3, :3])) == pytest.approx(0.1, rel=1e-6)
         directions.append(E[0, :3, 3] / 0.5e-3)
-    # Evenly over the sphere: the mean of 40 unit vectors has 1/sqrt(120) per axis.
-    assert np.all(np.abs(np.mean(directions, axis=0)) < 4 / np.sqrt(120))
+    # Evenly over the sphere: the mean of 24 unit vectors has 1/sqrt(72) per axis.
+    assert np.all(np.abs(np.mean(directions, axis=0)) < 4 / np.sqrt(72))
 
 
 def test_the_arm_error_is_white_at_the_flange_with_the_sigmas_asked_for():
@@ -114,98 +101,3 @@ def test_without_noise_depth_is_that_of_the_true_geometry_at_the_true_poses():
         assert np.mean(off < 2e-6) > 0.9995
         assert np.mean(off[block_seen] < 2e-6) > 0.98
         assert block_seen.sum() > 300
-
-
-def test_the_same_seed_gives_the_same_bytes_and_another_one_does_not():
-    config = replace(SMALL, views=3, sensor=DepthSensorModel())
-    first, again, other = (scanned(config, seed) for seed in (6, 6, 7))
-    for a, b, c in zip(first.frames, again.frames, other.frames, strict=True):
-        assert a.depth_m.tobytes() == b.depth_m.tobytes()
-        assert a.T_world_cam.tobytes() == b.T_world_cam.tobytes()
-        assert a.T_world_cam.tobytes() != c.T_world_cam.tobytes()
-        assert a.depth_m.tobytes() != c.depth_m.tobytes()
-
-
-def test_views_look_at_the_object_from_above_and_the_first_straight_down():
-    mesh = block()
-    rng = np.random.default_rng(8)
-    T_world_obj = standing(mesh, np.eye(3), rng)
-    config = replace(SMALL, views=200)
-    views = scan_views(mesh, T_world_obj, config, rng)
-    middle = se3.transform(T_world_obj, mesh.vertices).mean(0)
-    axes, eyes = views.Ts_world_cam[:, :3, 2], views.Ts_world_cam[:, :3, 3]
-    np.testing.assert_allclose(axes[0], [0, 0, -1], atol=1e-9)
-    elevation = np.degrees(np.arcsin(-axes[:, 2]))
-    assert elevation.min() == pytest.approx(LOWEST_DEG, abs=1e-6)
-    to_middle = np.linalg.norm(eyes - middle, axis=1)
-    jitter = 0.01 * np.sqrt(3)
-    assert to_middle.min() > config.distance_m[0] - jitter
-    assert to_middle.max() < config.distance_m[1] + jitter
-    se3.check_rigid(views.Ts_world_cam, "true poses")
-    se3.check_rigid(np.stack([f.T_world_cam for f in views.frames]), "reported poses")
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_standing_puts_the_lowest_point_on_the_table_and_turns_by_the_rotation(seed: int):
-    rng = np.random.default_rng(seed)
-    mesh = object_model("bunny").mesh
-    R = se3.random_rotation(rng)
-    T = standing(mesh, R, rng)
-    placed = se3.transform(T, mesh.vertices)
-    assert abs(placed[:, 2].min()) < 1e-12
-    middle = (placed.min(0) + placed.max(0))[:2] / 2
-    assert np.all(np.abs(middle) <= DISC_M)
-    # What is left besides R is a yaw: the vertical stays.
-    np.testing.assert_allclose((T[:3, :3] @ R.T)[2], [0, 0, 1], atol=1e-12)
-
-
-def similarity_part(mesh: Mesh, moved: Mesh) -> tuple[float, Array]:
-    """Return RMS displacement [m] and its share (7,) that is shift [m], turn [rad] and scale.
-
-    By the middles of the faces, weighted with their areas.
-    """
-    corners = mesh.vertices[mesh.faces]
-    p = corners.mean(1)
-    u = moved.vertices[moved.faces].mean(1) - p
-    w = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
-    w /= w.sum()
-    q = p - w @ p
-    columns = [np.tile(e, (len(q), 1)) for e in np.eye(3)]
-    A = (
-        np.stack([*columns, *(np.cross(e, q) for e in np.eye(3)), q], -1)
-        * np.sqrt(w)[:, None, None]
-    )
-    x, *_ = np.linalg.lstsq(A.reshape(-1, 7), (u * np.sqrt(w)[:, None]).ravel(), rcond=None)
-    return float(np.sqrt(w @ np.sum(u**2, axis=1))), x
-
-
-@pytest.mark.parametrize("name", ["box", "mug"])
-@pytest.mark.parametrize("amplitude", [0.02])
-def test_a_distortion_has_the_size_asked_for_and_is_no_similarity(name: str, amplitude: float):
-    mesh = object_model(name).mesh
-    length = float(mesh.extent.max())
-    for seed in range(2):
-        base = distorted(mesh, 0.0, np.random.default_rng(seed))
-        moved = distorted(mesh, amplitude, np.random.default_rng(seed))
-        rms, x = similarity_part(base, moved)
-        assert rms == pytest.approx(amplitude * length, rel=0.03)
-        # Against 2 %: 0.1 % of scale would already spoil the benchmark's figures.
-        assert abs(x[6]) < 0.05 * amplitude
-        assert np.linalg.norm(x[:3]) < 0.05 * rms
-        assert np.linalg.norm(x[3:6]) * length / 2 < 0.1 * rms
-
-
-@pytest.mark.parametrize("name", ["box", "mug"])
-def test_short_edges_leave_the_surface_closed_and_where_it_is(name: str):
-    mesh = part(name).mesh
-    fine = distorted(mesh, 0.0, np.random.default_rng(0))
-    before, after = to_trimesh(mesh), to_trimesh(fine)
-    assert after.is_watertight
-    assert after.is_winding_consistent
-    assert after.volume == pytest.approx(before.volume, rel=1e-9)
-    assert after.area == pytest.approx(before.area, rel=1e-9)
-    assert after.edges_unique_length.max() <= mesh.extent.max() / EDGES_PER_LENGTH
-    assert fine.colors is not None
-    np.testing.assert_array_equal(fine.colors[: len(mesh.vertices)], mesh.colors)

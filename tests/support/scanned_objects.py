@@ -39,7 +39,7 @@ LAB = ScanLabConfig(views=10, width=640, height=360, focal_px=324.0, sensor=SENS
 TRUE = {"hand_eye_mm": 0.0, "hand_eye_deg": 0.0, "arm_mm": 0.0, "arm_deg": 0.0}
 EXACT = replace(LAB, sensor=DepthSensorModel.noiseless(), **TRUE)
 """No error of any kind."""
-LABS = {"lab": LAB, "exact": EXACT, "true cameras": replace(LAB, **TRUE)}
+LABS = {"lab": LAB, "exact": EXACT}
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,10 +143,6 @@ def scaled(mesh: Mesh, factor: float) -> Mesh:
 def mirrored(mesh: Mesh) -> Mesh:
     """Return the mirror image, its faces still outward."""
     return replace(mesh, vertices=mesh.vertices * [-1, 1, 1], faces=mesh.faces[:, ::-1].copy())
-
-
-def inside_out(mesh: Mesh) -> Mesh:
-    return replace(mesh, faces=mesh.faces[:, ::-1].copy())
 
 
 def joined(*meshes: Mesh) -> Mesh:
