@@ -52,25 +52,11 @@ def test_commands_are_found_in_code_only() -> None:
 
 @pytest.mark.parametrize(
     "line",
-    [
-        "realsim fly", "realsim demo --hihg 3", "realsim demo --views many", "realsim scan fly",
-        "realsim check", "realsim school settle", "realsim export A --to nothing --out B",
-    ],
-)  # fmt: skip
+    ["realsim fly", "realsim demo --hihg 3", "realsim demo --views many", "realsim check"],
+)
 def test_what_click_would_refuse_is_refused(line: str) -> None:
     with pytest.raises(click.UsageError):
         parse(line)
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "realsim demo --views 12 # a note", "realsim school A --force 20", "realsim --version",
-        "realsim scan import a.glb --unit none", "realsim school run --help",
-    ],
-)  # fmt: skip
-def test_what_click_would_take_is_taken(line: str) -> None:
-    parse(line)
 
 
 def test_unknown_options_are_named() -> None:
@@ -78,12 +64,6 @@ def test_unknown_options_are_named() -> None:
     assert unknown_of("demo", " --out A --hihg") == ["--hihg"]
     assert unknown_of("school", " SESSION --force 20") == []
     assert unknown_of("scan", " import MESH --unit m --hihg") == ["--hihg"]
-
-
-def test_anchors_are_those_of_github() -> None:
-    assert anchors("# A tour\n## Formats of others\n```\n# no\n```\n") == {
-        "a-tour", "formats-of-others",
-    }  # fmt: skip
 
 
 # --- the documents -----------------------------------------------------------------------------

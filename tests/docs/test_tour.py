@@ -1,5 +1,6 @@
 """The tour is true: its commands run in order on one data set and print what the text says."""
 
+import json
 import os
 import re
 import signal
@@ -15,12 +16,8 @@ from printed import agrees, missing_lines
 
 TOUR = (ROOT / "docs/tour/README.md", *sorted((ROOT / "docs/tour").glob("[0-9]*.md")))
 API = sorted((ROOT / "docs/api").glob("*.md"))
-GUIDES = [
-    p
-    for p in sorted((ROOT / "docs/how-to").glob("*.md"))
-    if any(b.kind == "sh" for b in blocks(p.read_text(encoding="utf-8")))
-]
-STAGES = ("plan", "capture", "calibrate", "register", "school", "annotate", "review")
+GUIDE = ROOT / "docs/how-to/calibrate-a-new-lab.md"
+"""A lab of its own, board views first: plan, capture, calibrate, and the figures of all three."""
 SERVER = "# Ctrl-C ends it"
 START_S = 60.0
 ENVIRONMENT = {
@@ -89,33 +86,16 @@ def printed_by(block: Block, folder: Path) -> str:
         ("camera 0.308 mm", "camera 0.31 mm", True),
         ("camera 0.308 mm", "camera 0.41 mm", False),
         ("views 24", "views 20", False),
-        ("views 24", "views 25", True),
-        ("faults 0", "faults 1", False),
         ("1 sigma 0.03 mm", "1 sigma 0.05 mm", True),
         ("1 sigma 0.03 mm", "1 sigma 0.06 mm", False),
         ("verdict accepted", "verdict doubtful", False),
-        ("moved 0.02 mm", "moved -0.03 mm", False),
     ],
 )
 def test_lines_are_compared_as_the_first_page_says(said: str, printed: str, same: bool) -> None:
     assert agrees(said, printed) is same
 
 
-def test_lines_must_come_in_their_order() -> None:
-    assert missing_lines("a 1\n...\nb 2", "x\na 1\ny\nb 2\n") == []
-    assert missing_lines("b 2\na 1", "a 1\nb 2\n") == ["a 1"]
-
-
 # --- the text ----------------------------------------------------------------------------------
-
-
-def test_seven_chapters_follow_the_loop() -> None:
-    chapters = TOUR[1:]
-    assert len(chapters) == len(STAGES)
-    for k, (chapter, stage) in enumerate(zip(chapters, STAGES, strict=True), start=1):
-        assert stage in chapter.stem and read(chapter).startswith(f"# {k}. ")
-        assert chapter.name in read(TOUR[0])
-        assert any(b.kind == "sh" for b in blocks(read(chapter)))
 
 
 @pytest.mark.parametrize("chapter", TOUR, ids=lambda p: p.stem)
@@ -134,20 +114,7 @@ def test_output_stands_below_what_prints_it(chapter: Path) -> None:
         assert kind != "text" or before in ("sh", "python")
 
 
-@pytest.mark.parametrize("chapter", TOUR, ids=lambda p: p.stem)
-def test_chapters_stay_short(chapter: Path) -> None:
-    assert read(chapter).count("\n") <= 90
-
-
 # --- all of it, run ----------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder in which everything is typed; the first test fills it."""
-    path = tmp_path_factory.mktemp("tour")
-    (path / "examples").symlink_to(ROOT / "examples")
-    return path
 
 
 def play(page: Path, folder: Path) -> list[str]:
@@ -165,24 +132,26 @@ def play(page: Path, folder: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_the_tour_prints_what_it_says(folder: Path) -> None:
-    wrong = [line for chapter in TOUR for line in play(chapter, folder)]
+def test_the_tour_prints_what_it_says(tmp_path: Path) -> None:
+    wrong = [line for chapter in TOUR for line in play(chapter, tmp_path)]
+    snippets_of_the_reference_run(tmp_path)
     assert not wrong, "\n\n".join(wrong)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", API, ids=lambda p: p.stem)
-def test_snippets_of_the_reference_run_on_the_tours_data(page: Path, folder: Path) -> None:
-    if not (folder / "demo/demo.json").is_file():
-        run(["realsim", "demo"], folder)
-    snippets = [b for b in blocks(read(page)) if b.kind == "python"]
-    assert all(printed_by(b, folder).strip() for b in snippets)
+def snippets_of_the_reference_run(folder: Path) -> None:
+    """Run them on the tour's data, each in an empty space of names, in one process."""
+    snippets = [b.text for page in API for b in blocks(read(page)) if b.kind == "python"]
+    (folder / "snippets.json").write_text(json.dumps(snippets))
+    code = (
+        "import json\n"
+        "for text in json.load(open('snippets.json')):\n"
+        "    print('--- next'); exec(compile(text, text, 'exec'), {'__name__': 'snippet'})"
+    )
+    printed = run([sys.executable, "-c", code], folder).split("--- next\n")[1:]
+    assert len(printed) == len(snippets) > 8 and all(text.strip() for text in printed)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("guide", GUIDES, ids=lambda p: p.stem)
-def test_guides_that_can_be_typed_print_what_they_say(guide: Path, folder: Path) -> None:
-    if not (folder / "demo/demo.json").is_file():
-        run(["realsim", "demo"], folder)
-    wrong = play(Path(guide), folder)
+def test_the_guide_to_a_new_lab_prints_what_it_says(tmp_path: Path) -> None:
+    wrong = play(GUIDE, tmp_path)
     assert not wrong, "\n\n".join(wrong)
