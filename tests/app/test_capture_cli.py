@@ -1,6 +1,5 @@
 """`realsim capture`: sessions begun and gone on with, board views in place, clear refusals."""
 
-import json
 import shutil
 import socket
 from functools import lru_cache
@@ -15,10 +14,8 @@ from realsim.geometry import se3
 from realsim.interop import import_pyrealsense2
 from realsim.records import CaptureSession
 from realsim.store import SessionStore
-from realsim.untrusted.own_json import read_values
 from realsim_capture_plans.arms.kinematics import UR5, UR5E
 from realsim_capture_plans.capturing.contact_sheet import SheetConfig, contact_sheet
-from realsim_capture_plans.capturing.log import CaptureLog
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
 from realsim_capture_plans.lab.devices import HOME
@@ -26,18 +23,7 @@ from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from typed_commands import realsim
 
-BOARD = "aprilgrid:7x5,tag=30mm,gap=10mm"
-"""What lies in the simulated lab."""
 Array = NDArray[np.float64]
-
-
-def look_at(eye: Array, center: Array, roll: float) -> Array:
-    z = (center - eye) / np.linalg.norm(center - eye)
-    y = np.array([np.sin(roll), np.cos(roll), 0.0])
-    x = np.cross(y, z) / np.linalg.norm(np.cross(y, z))
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), eye
-    return T
 
 
 def made_plan(kind: str, n: int, chain=UR5) -> CapturePlan:
@@ -48,7 +34,7 @@ def made_plan(kind: str, n: int, chain=UR5) -> CapturePlan:
     for k, turn in enumerate(np.linspace(0.0, 2 * np.pi, n, endpoint=False)):
         tilt = 0.35 if k % 3 else 0.1
         eye = center + 0.34 * np.array([tilt * np.cos(turn), tilt * np.sin(turn), 1.0])
-        T = look_at(eye, center, np.pi + 1.2 * np.sin(2.4 * k))
+        T = se3.look_at(eye, center, 1.2 * np.sin(2.4 * k))
         q = chain.inverse(T @ se3.invert(d405_mount().T_ee_cam))
         joints.append(q[np.argmin(np.abs(q - (joints[-1] if joints else home)).max(-1))])
     return CapturePlan(
@@ -63,7 +49,7 @@ def plans(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("plans")
     save_plan(made_plan("hemisphere", 4), folder / "plan.json")
     save_plan(made_plan("hemisphere", 5), folder / "other.json")
-    save_plan(made_plan("calibration", 12), folder / "board_plan.json")
+    save_plan(made_plan("calibration", 3), folder / "board_plan.json")
     save_plan(made_plan("hemisphere", 4, UR5E), folder / "ur5e.json")
     return folder
 
@@ -96,26 +82,6 @@ def test_a_session_has_plan_devices_log_and_sheet(plans: Path) -> None:
         assert np.corrcoef(photo[inner].ravel(), cell[inner].ravel())[0, 1] > 0.8
 
 
-@pytest.mark.slow
-def test_run_again_it_goes_on_and_takes_only_what_is_missing(plans: Path, tmp_path: Path) -> None:
-    out = tmp_path / "s"
-    some = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--views", "1,3-3")
-    assert some.returncode == 0, some.stderr
-    assert SessionStore.open(out).completed == {1, 3}
-    rest = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--no-input")
-    assert rest.returncode == 0 and "there already" in rest.stdout
-    store, reference = SessionStore.open(out), SessionStore.open(scene_session(plans))
-    assert store.completed == reference.completed and store.verify() == []
-    for k in range(4):
-        assert store.path(f"rgb/{k:06d}.png").read_bytes() == (
-            reference.path(f"rgb/{k:06d}.png").read_bytes()
-        )
-    again = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--retake", "2")
-    assert again.returncode == 0
-    store = SessionStore.open(out)
-    assert store.has("retaken/000002_1_rgb.png") and store.verify() == []
-
-
 def test_a_dry_run_leaves_nothing(plans: Path, tmp_path: Path) -> None:
     out = tmp_path / "s"
     done = realsim("capture", out, "--plan", plans / "plan.json", "--simulated", "--dry-run",
@@ -130,15 +96,11 @@ def test_a_dry_run_leaves_nothing(plans: Path, tmp_path: Path) -> None:
         (["--plan", "plan.json"], "--simulated"),
         (["--plan", "plan.json", "--simulated", "--robot-host", "1.2.3.4"], "--robot-host"),
         (["--plan", "ur5e.json", "--simulated"], "made for a UR5e, this arm is a UR5"),
-        (["--plan", "none.json", "--simulated"], "none.json"),
         (["--plan", "board_plan.json", "--simulated"], "--board does not say which"),
-        (["--plan", "plan.json", "--simulated", "--board", BOARD], "scene of objects"),
         (["--plan", "board_plan.json", "--simulated", "--board", "chessboard:9x6,square=20mm"],
          "has one board"),
         (["--plan", "plan.json", "--simulated", "--speed", "2"], "at most 1"),
-        (["--plan", "plan.json", "--simulated", "--views", "9"], "views 0 to 3"),
         (["--plan", "plan.json", "--simulated", "--views", "0-2,9-11"], "[9, 10, 11]"),
-        (["--plan", "plan.json", "--simulated", "--retake", "3-1"], "no range"),
         (["--plan", "plan.json", "--simulated", "--retake", "1-x"], "such as 1-3,7"),
     ],
 )  # fmt: skip
@@ -170,12 +132,6 @@ def test_another_session_and_a_strangers_folder_are_left_alone(plans: Path, tmp_
     assert [p.name for p in (tmp_path / "thesis").iterdir()] == ["thesis.tex"]
 
 
-def test_a_target_file_that_is_not_there_is_named(plans: Path, tmp_path: Path) -> None:
-    done = realsim("capture", tmp_path / "s", "--plan", plans / "board_plan.json", "--simulated",
-                   "--board", "nope.json")  # fmt: skip
-    assert done.returncode == 2 and "no such file: 'nope.json'" in done.stderr
-
-
 def test_an_imported_session_is_not_gone_on_with(plans: Path, tmp_path: Path) -> None:
     camera = SessionStore.open(scene_session(plans)).session.intrinsics
     session = CaptureSession(name="bag", intrinsics=camera, views=(), depth_unit_m=1e-4)
@@ -193,38 +149,24 @@ def needs_no_camera() -> None:
         pytest.skip("a RealSense is connected")
 
 
-@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
-def test_a_robot_that_does_not_answer_ends_with_1(
-    plans: Path, tmp_path: Path, dry: list[str]
-) -> None:
+def test_a_robot_that_does_not_answer_ends_with_1(plans: Path, tmp_path: Path) -> None:
     needs_no_camera()
     done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json",
-                   "--robot-host", "127.0.0.1", "--no-input", *dry)  # fmt: skip
+                   "--robot-host", "127.0.0.1", "--no-input")  # fmt: skip
     assert done.returncode == 1 and "127.0.0.1 refuses the robot's port" in done.stderr
     assert "the same command goes on" not in done.stdout + done.stderr
-    # A dry run does without a camera; otherwise both troubles are told.
-    assert ("no RealSense camera is connected" in done.stderr) is not bool(dry)
+    assert "no RealSense camera is connected" in done.stderr
     assert "Traceback" not in done.stderr and not (tmp_path / "s").exists()
 
 
-def test_a_host_of_no_address_is_named(plans: Path, tmp_path: Path) -> None:
-    done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json",
-                   "--robot-host", "robot.invalid", "--no-input", "--dry-run")  # fmt: skip
-    assert done.returncode in (1, 2) and "robot.invalid" in done.stderr
-    assert "Traceback" not in done.stderr and "goes on" not in done.stdout
-
-
-@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
-def test_a_robot_of_another_model_is_named_without_a_camera(
-    plans: Path, tmp_path: Path, dry: list[str]
-) -> None:
+def test_a_robot_of_another_model_is_named_without_a_camera(plans: Path, tmp_path: Path) -> None:
     needs_no_camera()
     with LoopbackController.start(robot="UR5e", speedup=10) as controller:
         done = realsim("capture", tmp_path / "s", "--plan", plans / "plan.json", "--robot-host",
-                       controller.host, "--no-input", *dry)  # fmt: skip
+                       controller.host, "--no-input", "--dry-run")  # fmt: skip
     assert done.returncode == 2, done.stderr
     assert "a UR5 is expected" in done.stderr and "UR5e" in done.stderr
-    assert ("no RealSense camera is connected" in done.stderr) is not bool(dry)
+    assert "no RealSense camera is connected" not in done.stderr
     assert "goes on from here" not in done.stdout and not (tmp_path / "s").exists()
 
 
@@ -250,15 +192,14 @@ def test_a_dry_run_drives_the_robot_without_a_camera(plans: Path, tmp_path: Path
     assert not (tmp_path / "s").exists()
 
 
-@pytest.mark.parametrize("columns", [1, 2, 6])
-def test_the_head_of_a_contact_sheet_is_whole(columns: int) -> None:
+def test_the_head_of_a_contact_sheet_is_whole() -> None:
     """Everything that is written shows: as much ink as on a sheet wide enough for one line."""
     title = "single_depth_color_640x480, D405 130322273305"
-    n = columns * columns
+    n = 4
     narrow = contact_sheet({}, {}, n, title, (640, 480), SheetConfig(largest_cell_px=80))
     wide = contact_sheet({}, {}, n, title, (640, 480),
                          SheetConfig(largest_cell_px=80, least_width_px=2000))  # fmt: skip
-    cells = columns * 60
+    cells = 2 * 60
     head, one_line = narrow[:-cells], wide[:-cells]
     assert one_line.shape[0] == 46 < head.shape[0] and head.shape[1] == 480
     assert np.all(head[:, -4:] == head[0, 0]) and np.all(head[-4:] == head[0, 0])
@@ -275,48 +216,13 @@ def test_ports_in_use_are_known() -> None:
     assert not port_in_use("127.0.0.1", port)
 
 
-@pytest.mark.parametrize(
-    ("there", "told"),
-    [("precious", "no replay that this command wrote"), ("a replay by viser", "--overwrite")],
-)
-def test_a_replay_file_is_not_replaced_unasked(
-    plans: Path, tmp_path: Path, there: str, told: str
-) -> None:
-    (tmp_path / "replay.html").write_text(there)
-    done = realsim("plan-show", plans / "plan.json", "--replay-file", tmp_path / "replay.html")
-    assert done.returncode == 2 and told in done.stderr
-    assert (tmp_path / "replay.html").read_text() == there
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("order", ["board first", "scene first"])
-def test_board_views_lie_where_the_calibration_looks_for_them(
-    plans: Path, tmp_path: Path, order: str
-) -> None:
-    out = tmp_path / "s"
-    jobs = [
-        ["--plan", plans / "board_plan.json", "--board", BOARD],
-        ["--plan", plans / "plan.json", "--views", "0"],
-    ]
-    for job in jobs if order == "board first" else jobs[::-1]:
-        done = realsim("capture", out, "--simulated", "--no-input", *job)
-        assert done.returncode == 0, done.stderr
-    store, board = SessionStore.open(out), SessionStore.open(out / "calibration/capture")
-    assert store.completed == {0} and board.completed == set(range(12))
-    assert store.verify() == [] and board.verify() == []
-    again = realsim("capture", out, "--simulated", *jobs[0])
-    assert again.returncode == 0, again.stderr
-    listed = {json.loads(line)["path"] for line in (out / "manifest.jsonl").read_text().split("\n")
-              if line}  # fmt: skip
-    assert "calibration/board.json" in listed
-    kind = read_values(out / "calibration/board.json")
-    assert (kind["rows"], kind["columns"]) == (5, 7)
-    notes = [e["notes"] for e in CaptureLog(board).views().values()]
-    assert notes == [[]] * 12  # the board was seen in every view
-    if order == "board first":
-        done = realsim("calibrate", out, "--quiet")
-        assert "Traceback" not in done.stderr and done.returncode in (0, 1), done.stderr
-        assert SessionStore.open(out).session.view(0).T_world_cam is not None
+def test_a_replay_file_is_not_replaced_unasked(plans: Path, tmp_path: Path) -> None:
+    for there, told in (("precious", "no replay that this command wrote"),
+                        ("a replay by viser", "--overwrite")):  # fmt: skip
+        (tmp_path / "replay.html").write_text(there)
+        done = realsim("plan-show", plans / "plan.json", "--replay-file", tmp_path / "replay.html")
+        assert done.returncode == 2 and told in done.stderr
+        assert (tmp_path / "replay.html").read_text() == there
 
 
 def test_a_session_without_its_header_is_sent_to_the_repair(plans: Path, tmp_path: Path) -> None:

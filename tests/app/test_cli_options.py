@@ -3,7 +3,6 @@
 import re
 
 import click
-import pytest
 
 from realsim.app.cli import COMMANDS, commands
 from realsim.app.command import Group, settable, spelling, variable, walk
@@ -37,25 +36,21 @@ def named(path: tuple[str, ...], option: click.Option) -> str:
     return f"{' '.join(path)} --{spelling(option)}"
 
 
-@pytest.mark.parametrize(("path", "option"), OPTIONS, ids=lambda v: getattr(v, "name", None))
-def test_every_option_is_explained_and_spelled_in_one_way(
-    path: tuple[str, ...], option: click.Option
-) -> None:
-    name = spelling(option)
-    assert option.help and len(option.help) <= 160, named(path, option)
-    assert re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name)
-    assert name not in OTHER_SPELLINGS, f"{named(path, option)}: say --{OTHER_SPELLINGS.get(name)}"
-    if name in SHARED:
-        kind, is_flag = SHARED[name]
-        assert isinstance(option.type, kind), named(path, option)
-        assert option.is_flag == is_flag, named(path, option)
+def test_every_option_is_explained_and_spelled_in_one_way() -> None:
+    for path, option in OPTIONS:
+        name, said = spelling(option), named(path, option)
+        assert option.help and len(option.help) <= 160, said
+        assert re.fullmatch(r"[a-z0-9]+(-[a-z0-9]+)*", name), said
+        assert name not in OTHER_SPELLINGS, f"{said}: say --{OTHER_SPELLINGS.get(name)}"
+        if name in SHARED:
+            kind, is_flag = SHARED[name]
+            assert isinstance(option.type, kind), said
+            assert option.is_flag == is_flag, said
 
 
-@pytest.mark.parametrize("path", EVERY, ids=" ".join)
-def test_every_command_that_works_has_json_and_quiet(path: tuple[str, ...]) -> None:
-    names = {spelling(option) for option in settable(EVERY[path])}
-    if path not in WITHOUT_RESULT:
-        assert {"json", "quiet"} <= names
+def test_every_command_that_works_has_json_and_quiet() -> None:
+    for path in EVERY.keys() - WITHOUT_RESULT:
+        assert {"json", "quiet"} <= {spelling(option) for option in settable(EVERY[path])}, path
 
 
 def test_the_shared_options_say_the_same_everywhere() -> None:
@@ -83,11 +78,11 @@ def test_every_command_is_listed_with_a_whole_sentence() -> None:
         assert f"{name} {sentence}" in text
 
 
-@pytest.mark.parametrize("path", EVERY, ids=" ".join)
-def test_the_help_fits_a_terminal_of_80_columns(path: tuple[str, ...]) -> None:
-    ctx = click.Context(EVERY[path], info_name="realsim", terminal_width=80)
-    text = EVERY[path].get_help(ctx).partition("Examples:")[0]
-    assert max(len(line) for line in text.splitlines()) <= 80
+def test_the_help_fits_a_terminal_of_80_columns() -> None:
+    for path, command in EVERY.items():
+        ctx = click.Context(command, info_name="realsim", terminal_width=80)
+        text = command.get_help(ctx).partition("Examples:")[0]
+        assert max(len(line) for line in text.splitlines()) <= 80, path
 
 
 def test_commands_are_lazy() -> None:

@@ -1,6 +1,7 @@
 """A session that is not as it was captured is refused; damaged notes and caches are redone."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,8 @@ CAMERA = CameraIntrinsics(width=240, height=180, fx=220.0, fy=220.0, cx=120.0, c
 QUIET = Console(quiet=True)
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> SessionStore:
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session of four views of a box on a table, with its start."""
     model = part("box")
     T = se3.from_translation([0.0, 0.0, -model.mesh.bounds[0, 2]])
@@ -33,7 +34,8 @@ def store(tmp_path: Path) -> SessionStore:
     table = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]]))
     renderer = LabelRenderer([PlacedMesh(0, model.mesh, T), PlacedMesh(-1, table, np.eye(4))])
     session = CaptureSession(name="box", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(tmp_path / "s", session, {"gravity_up_world": [0, 0, 1]})
+    folder = tmp_path_factory.mktemp("damaged") / "s"
+    store = SessionStore.create(folder, session, {"gravity_up_world": [0, 0, 1]})
     for k in range(4):
         eye = [0.35 * np.cos(1.5 * k), 0.35 * np.sin(1.5 * k), 0.35]
         T_world_cam = se3.look_at(eye, [0, 0, 0.04])
@@ -42,7 +44,19 @@ def store(tmp_path: Path) -> SessionStore:
         store.add_view(View(index=k, T_world_cam=T_world_cam), rgb, depth)
     save_models(store.folder / "models", {model.obj_id: model})
     stages.save_starts(store, [ObjectPose(obj_id=model.obj_id, instance=0, T_world_obj=T)], "test")
-    return store
+    return folder
+
+
+@pytest.fixture
+def store(pristine: Path, tmp_path: Path) -> SessionStore:
+    return SessionStore.open(Path(shutil.copytree(pristine, tmp_path / "s")))
+
+
+@pytest.fixture(scope="module")
+def registered(pristine: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = Path(shutil.copytree(pristine, tmp_path_factory.mktemp("registered") / "s"))
+    register_session(SessionStore.open(folder), QUIET)
+    return folder
 
 
 def starts_of(store: SessionStore) -> list[ObjectPose]:
@@ -52,9 +66,9 @@ def starts_of(store: SessionStore) -> list[ObjectPose]:
 
 @pytest.mark.parametrize("spoil", ["zero depth", "cut list", "lost photograph"])
 def test_a_changed_capture_is_refused_even_after_it_was_registered(
-    store: SessionStore, spoil: str
+    registered: Path, tmp_path: Path, spoil: str
 ) -> None:
-    register_session(store, QUIET)
+    store = SessionStore.open(Path(shutil.copytree(registered, tmp_path / "s")))
     if spoil == "zero depth":
         store.path("depth/000002.png").write_bytes(store.path("depth/000001.png").read_bytes())
     elif spoil == "cut list":
@@ -68,8 +82,8 @@ def test_a_changed_capture_is_refused_even_after_it_was_registered(
             stage(again, QUIET)
 
 
-def test_a_damaged_note_is_no_note(store: SessionStore) -> None:
-    register_session(store, QUIET)
+def test_a_damaged_note_is_no_note(registered: Path, tmp_path: Path) -> None:
+    store = SessionStore.open(Path(shutil.copytree(registered, tmp_path / "s")))
     store.path("stages/register.json").write_text('{"key": "abc')
     scene = register_session(store, QUIET)
     assert scene.objects[0].verdict == "accepted"
@@ -120,11 +134,10 @@ def test_two_runs_do_not_share_a_folder(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("damage", [b"", b"junk", None])
-def test_a_damaged_cache_file_is_thrown_away(tmp_path: Path, damage: bytes | None) -> None:
+def test_a_damaged_cache_file_is_thrown_away(tmp_path: Path) -> None:
     path = tmp_path / "kept.npz"
     write_arrays(path, {"a": np.arange(1000.0)}, {"n": 1})
     assert is_whole(path)
-    path.write_bytes(path.read_bytes()[:500] if damage is None else damage)
+    path.write_bytes(path.read_bytes()[:500])
     assert not is_whole(path)
     assert not path.exists()

@@ -1,4 +1,4 @@
-"""The whole loop in the simulated lab: it reaches its goals, and a kill costs nothing."""
+"""The whole loop in the simulated lab: a kill costs nothing."""
 
 import hashlib
 import json
@@ -9,11 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
-
-from realsim.app.console import Console
-from realsim.app.demo.run import DemoConfig, run_demo
 
 SMALL = ["--views", "6", "--objects", "2", "--grasps", "8", "--quiet"]
 
@@ -46,25 +42,9 @@ def digest(path: Path) -> str:
 
 
 @pytest.mark.slow
-def test_the_loop_reaches_its_goals(tmp_path: Path) -> None:
-    config = DemoConfig(views=24, objects=5, grasps_per_object=12)
-    result = run_demo(config, tmp_path / "demo", Console(quiet=True))
-    figures = result.errors.figures()
-    assert figures["handeye_mm"] <= 0.5
-    assert figures["handeye_deg"] <= 0.1
-    assert figures["object_mssd_mm"] <= 1.0
-    assert figures["mask_iou"] >= 0.95
-    assert all(o.covariance is not None for o in result.scene.objects)
-    tried = sum(int(np.isfinite(s.scores).sum()) for s in result.grasps)
-    assert tried > 20
-    assert result.report.stat().st_size > 100_000
-    # A second run finds everything done and gives the same report figures.
-    again = run_demo(config, tmp_path / "demo", Console(quiet=True))
-    assert again.errors.figures() == figures
-
-
-@pytest.mark.slow
-def test_a_demo_killed_in_every_stage_ends_like_one_left_alone(tmp_path: Path) -> None:
+def test_a_demo_killed_in_every_stage_ends_like_one_left_alone(
+    tmp_path: Path, demo_session: Path
+) -> None:
     def lines(path: Path) -> int:
         return path.read_text().count("\n") if path.is_file() else 0
 
@@ -79,15 +59,10 @@ def test_a_demo_killed_in_every_stage_ends_like_one_left_alone(tmp_path: Path) -
     finished = start_demo(killed)
     _, err = finished.communicate(timeout=400)
     assert finished.returncode == 0, err
-
-    alone = tmp_path / "alone"
-    undisturbed = start_demo(alone)
-    _, err = undisturbed.communicate(timeout=400)
-    assert undisturbed.returncode == 0, err
     for pattern in ("rgb/*.png", "depth/*.png", "mask_visib/*.png"):
         a = {p.name: digest(p) for p in (killed / "session").glob(pattern)}
-        b = {p.name: digest(p) for p in (alone / "session").glob(pattern)}
+        b = {p.name: digest(p) for p in demo_session.glob(pattern)}
         assert a == b and a, pattern
     for name in ("scene_gt.json", "registration/scene.json"):
         left = json.loads((killed / "session" / name).read_text())
-        assert left == json.loads((alone / "session" / name).read_text()), name
+        assert left == json.loads((demo_session / name).read_text()), name

@@ -1,8 +1,6 @@
 """`realsim demonstrations`: what is streamed is what is written, and a page shows it."""
 
 import hashlib
-import itertools
-import json
 import re
 
 import numpy as np
@@ -13,12 +11,11 @@ from realsim.app.demonstrations import run as demonstrations
 from realsim.app.demonstrations.cli import demonstrations_command
 from realsim.app.demonstrations.run import DemonstrationRequest, open_source
 from realsim.errors import InputError
-from realsim.formats.lerobot import episodes as layout
 from realsim_sim_bridge.demonstrations import lerobot_episodes
 from realsim_sim_bridge.demonstrations.lerobot_episodes import episode_columns
 from school_sessions import registered, run
 
-WEAK = ("--engine", "mujoco", "--grasps", "10", "--workers", "1", "--quiet", "--force", "4",
+WEAK = ("--engine", "mujoco", "--grasps", "8", "--workers", "1", "--quiet", "--force", "4",
         "--friction", "0.3")  # fmt: skip
 SMALL = ("--fps", "4", "--width", "64", "--height", "48", "--limit", "3", "--quiet",
          "--episodes-per-file", "2")  # fmt: skip
@@ -89,41 +86,13 @@ def test_what_is_streamed_is_what_is_written(school, written):
 
 
 @pytest.mark.slow
-def test_actions_are_the_next_states(written):
-    import pyarrow.parquet as pq
-
-    rows = [
-        r for f in sorted(written.glob("data/*/*.parquet")) for r in pq.read_table(f).to_pylist()
-    ]
-    for now, after in itertools.pairwise(rows):
-        if now["episode_index"] == after["episode_index"]:
-            assert now["action"][:7] == after["observation.state"][:7]
-            assert not now["next.done"]
-        else:
-            assert now["next.done"]
-    assert all(r["action"][7] <= r["observation.state"][7] + 1e-6 for r in rows)
-
-
-@pytest.mark.slow
-def test_the_notes_tell_how_each_attempt_ended(school, written):
-    notes = [json.loads(line) for line in (written / layout.NOTES).read_text().splitlines()]
-    assert len(notes) == 3
-    assert all(n["replay_agrees"] for n in notes)
-    assert all(n["success"] == (n["failure"] == "") for n in notes)
-
-
-@pytest.mark.slow
-def test_the_page_shows_pictures_and_points_at_the_videos(written):
+def test_page_checksums_and_card_are_there(written):
     page = (written / "demonstrations.html").read_text()
     assert page.count('alt="steps" src="data:image/jpeg;base64,') == 3
     assert page.count('poster="data:image/jpeg;base64,') == page.count("<video ") == 6
     sources = re.findall(r'src="(videos/[^"#]+)#t=', page)
     assert len(sources) == 6
     assert all((written / s).is_file() for s in sources)
-
-
-@pytest.mark.slow
-def test_checksums_and_card_are_there(written):
     for line in (written / "SHA256SUMS").read_text().splitlines():
         digest, name = line.split("  ", 1)
         assert hashlib.sha256((written / name).read_bytes()).hexdigest() == digest, name
@@ -160,17 +129,16 @@ def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
     assert result.exception is None, result.output
     assert asked == [0, 1, 2]
     assert files_of(tmp_path / "demos") == files_of(written)
+    assert "finished export" in refused(school, "--out", written)
 
 
-@pytest.mark.slow
-def test_requests_that_cannot_be_are_refused(school, written, tmp_path):
+def test_requests_that_cannot_be_are_refused(school, tmp_path):
     out = ("--out", tmp_path / "demos")
     assert "INSTANCE:GRASP" in refused(school, *out, "--grasp", "first")
     assert "no grasp 77" in refused(school, *out, "--grasp", "0:77")
     assert "even numbers" in refused(school, *out, "--width", "65")
     assert "--view 3" in refused(school, *out, "--view", "3")
     assert "no hand-eye calibration" in refused(school, *out, "--hand-eye")
-    assert "finished export" in refused(school, "--out", written)
     assert "inside" in refused(school, "--out", school / "demos")
     assert "weighs" in refused(school, *out, "--mass", "cube=0.5", "--limit", "1")
 

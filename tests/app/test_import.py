@@ -3,10 +3,6 @@
 import json
 import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +18,6 @@ from realsim.app.importing.source import (
     ImportRequest,
     kinds_of,
     open_source,
-    option_names,
     run_import,
 )
 from realsim.errors import InputError, UnitError
@@ -61,7 +56,7 @@ def test_everything_of_every_frame_is_in_the_session(tmp_path):
     assert len(cameras) == 10 and all("cam_R_w2c" in c for c in cameras.values())
 
 
-@pytest.mark.parametrize("stop", [0, 1, 5, 9])
+@pytest.mark.parametrize("stop", [0, 5])
 def test_an_import_goes_on_where_it_stopped(tmp_path, stop):
     with pytest.raises(InputError, match=f"frame {stop} cannot"):
         import_session(Recording(ten(), stop=stop), tmp_path / "s", QUIET)
@@ -125,10 +120,8 @@ def far(T: np.ndarray, scale: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("fault", "message"),
     [
-        (lambda f: replace(f, time_s=f.time_s - 1), "time stamps must increase"),
         (lambda f: replace(f, time_s=frame_of(4).time_s), "time stamps must increase"),
         (lambda f: replace(f, rgb=f.rgb[:20]), r"camera is of 40x30"),
-        (lambda f: replace(f, depth_counts=f.depth_counts[:, :20]), r"camera is of 40x30"),
         (lambda f: replace(f, T_base_ee=far(f.T_base_ee, 1e4)), "reading rotvec,mm"),
         (lambda f: replace(f, T_world_cam=far(f.T_world_cam, 1e4)), "millimetres"),
     ],
@@ -139,12 +132,6 @@ def test_a_frame_that_cannot_be_is_named_and_the_rest_stays(tmp_path, fault, mes
     with pytest.raises(InputError, match=rf"frame 5 \(f5\).*{message}"):
         import_session(Recording(frames), tmp_path / "s", QUIET)
     check_equal(tmp_path / "s", ten()[:5])
-
-
-def test_cameras_that_turn_in_one_place_are_doubted(tmp_path, capsys):
-    frames = [replace(f, T_world_cam=far(f.T_world_cam, 1e-3)) for f in ten()]
-    import_session(Recording(frames), tmp_path / "s", QUIET)
-    assert "metres in a file of millimetres" in capsys.readouterr().err
 
 
 # --- round trips through other formats --------------------------------------------------------
@@ -324,17 +311,10 @@ def test_an_option_that_says_nothing_is_refused(tmp_path):
         open_source(request, QUIET)
 
 
-def test_bag_messages_speak_of_options():
-    said = option_names("Give depth_unit_m=0.001, or the camera in a file (intrinsics=).")
-    assert said == "Give --depth-unit 0.001, or the camera in a file (--camera)."
-
-
 @pytest.mark.parametrize(
     ("place", "needle"),
     [
-        ("scenes/ycbv_mini", "54"),
         ("scenes/apc_shelf_multiview/scene-0000", "0.522 m with 0.0001"),
-        ("handeye/rtde_ur5e/Hand-Eye-Data", "1024x768"),
         ("bags/single_depth_color_640x480.bag", "Color"),
     ],
 )
@@ -379,34 +359,3 @@ def test_the_command_names_what_is_missing_and_then_imports(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "6 (6 now)" in done.stdout and SessionStore.open(tmp_path / "s").verify() == []
     assert realsim("import", folder).returncode == 2
-
-
-@pytest.mark.slow
-def test_a_killed_import_loses_nothing(tmp_path):
-    """The process is killed for real; the same command then gives the same session."""
-    folder = make_folder(tmp_path / "in", 30, size=(480, 640))
-    (folder / "K.txt").write_text("600 0 320\n0 600 240\n0 0 1\n")
-    out = tmp_path / "s"
-    options = ["--depth-unit", "0.001", "--depth-coding", "plain", "--quiet"]
-    code = "from realsim.app.cli import main; main()"
-    command = [sys.executable, "-c", code, "import", str(folder), str(out), *options]
-    seen = 0
-    for goal in (3, 17):
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        limit = time.monotonic() + 60
-        while process.poll() is None and time.monotonic() < limit:
-            if len(list(out.glob("rgb/*.png"))) >= goal:
-                process.send_signal(signal.SIGKILL)
-                break
-            time.sleep(0.002)
-        process.wait()
-        store = SessionStore.open(out)
-        assert store.verify() == [] and len(store.completed) >= max(seen, goal - 1)
-        seen = len(store.completed)
-        store.close()
-    assert realsim("import", folder, out, *options).returncode == 0
-    request = ImportRequest(source=folder, depth_unit=0.001, depth_coding="plain")
-    run_import(request, tmp_path / "t", QUIET)
-    for path in sorted((tmp_path / "t").glob("*/0*.png")):
-        assert path.read_bytes() == (out / path.relative_to(tmp_path / "t")).read_bytes()
-    assert (out / "robot.jsonl").read_bytes() == (tmp_path / "t/robot.jsonl").read_bytes()

@@ -1,7 +1,6 @@
 """`realsim register --from-review`: what reviewers said is where the registration starts from."""
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from realsim.records import ObjectPose
 from realsim.review import journal
 from realsim.review.corrections import decision_on
 from realsim.store import SessionStore, load_scene
-from registered_sessions import table_session, true_poses
+from shared_sessions import copy_of
 
 OFF = se3.exp(np.array([0.05, -0.05, 0.1, 0.004, -0.003, 0.005]))
 
@@ -24,18 +23,10 @@ def run(*args: object) -> Result:
     return CliRunner().invoke(register_command, [*map(str, args), "--quiet"])
 
 
-@pytest.fixture(scope="module")
-def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A session that was registered from the truth, nobody has reviewed it."""
-    store = table_session(tmp_path_factory.mktemp("reviewed") / "s")
-    stages.save_starts(store, true_poses(), "test")
-    assert run(store.folder).exit_code == 0
-    return store.folder
-
-
 @pytest.fixture
-def session(pristine: Path, tmp_path: Path) -> SessionStore:
-    return SessionStore.open(Path(shutil.copytree(pristine, tmp_path / "s")))
+def session(registered_session: Path, tmp_path: Path) -> SessionStore:
+    """A registered session that nobody has reviewed."""
+    return SessionStore.open(copy_of(registered_session, tmp_path / "s"))
 
 
 def say(store: SessionStore, action: journal.Action, placed: ObjectPose | None, **said: object):
@@ -106,10 +97,18 @@ def test_an_acceptance_outlives_a_registration_to_the_same_place_and_no_other(
     )
     say(session, "move", second, pose=far.T_world_obj, how="gizmo")
     say(session, "accept", far)
+    say(session, "exclude", None, view=99)
+    say(session, "symmetric", None, obj_id=9999, symmetry="z")
+    say(session, "reject", ObjectPose(obj_id=1, instance=77, T_world_obj=np.eye(4)))
+    with session.path(journal.JOURNAL_FILE).open("ab") as file:
+        file.write(b'{"torn\n')
     result = run(session.folder, "--from-review", "--json")
     words = [f["words"] for f in json.loads(result.stdout[result.stdout.index("{") :])["findings"]]
     told = [w for w in words if f"instance {second.instance} was accepted by ada" in w]
     assert len(told) == 1 and "look at it again" in told[0]
+    # Lines about what is not there and damaged ones are told.
+    for part in ("no view 99", "no model 9999", "no instance 77", "line 7 of", "not whole"):
+        assert part in " ".join(words), part
     state = journal.replay(journal.read(session.path(journal.JOURNAL_FILE)).entries)
     now = load_scene(session)
     assert decision_on(now.object(first.instance), state) is not None
@@ -131,22 +130,6 @@ def test_all_rejected_is_said(session: SessionStore) -> None:
     for placed in load_scene(session).objects:
         say(session, "reject", placed)
     assert "rejected every object" in str(run(session.folder, "--from-review").exception)
-
-
-def test_lines_about_what_is_not_there_and_damaged_ones_are_told(session: SessionStore) -> None:
-    first = load_scene(session).objects[0]
-    say(session, "accept", first)
-    say(session, "exclude", None, view=99)
-    say(session, "symmetric", None, obj_id=9999, symmetry="z")
-    stranger = ObjectPose(obj_id=1, instance=77, T_world_obj=np.eye(4))
-    say(session, "reject", stranger)
-    with session.path(journal.JOURNAL_FILE).open("ab") as file:
-        file.write(b'{"torn\n')
-    result = run(session.folder, "--from-review", "--json")
-    told = json.loads(result.stdout[result.stdout.index("{") :])["findings"]
-    words = " ".join(f["words"] for f in told)
-    for part in ("no view 99", "no model 9999", "no instance 77", "line 5 of", "not whole"):
-        assert part in words, part
 
 
 def test_a_journal_of_damage_alone_is_not_taken_for_none(session: SessionStore) -> None:

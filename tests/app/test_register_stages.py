@@ -28,15 +28,22 @@ from registered_sessions import (
     true_cameras,
     true_poses,
 )
+from shared_sessions import copy_of
 
 MODELS = models_of()
+VIEWS = 5
 QUIET = Console(quiet=True)
 
 
-@pytest.fixture
-def store(tmp_path: Path) -> SessionStore:
+@pytest.fixture(scope="module")
+def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A session of four views whose cameras are a little off."""
-    return table_session(tmp_path / "s", views=4)
+    return table_session(tmp_path_factory.mktemp("stages") / "s", views=4).folder
+
+
+@pytest.fixture
+def store(pristine: Path, tmp_path: Path) -> SessionStore:
+    return SessionStore.open(copy_of(pristine, tmp_path / "s"))
 
 
 def test_views_that_were_left_out_get_no_labels_and_are_named(store: SessionStore) -> None:
@@ -70,7 +77,7 @@ def test_an_interrupted_registration_is_finished_by_whoever_comes_next(
     np.testing.assert_allclose(cameras_now(store)[0], result.cameras.refined[0], atol=1e-15)
 
 
-@pytest.mark.parametrize("missing", ["all", "common_offset_mm", "common_sinking", "objects"])
+@pytest.mark.parametrize("missing", ["all", "objects"])
 def test_notes_of_a_registration_that_could_not_tell_everything(
     store: SessionStore, missing: str
 ) -> None:
@@ -105,7 +112,7 @@ def coloured(folder: Path, shift_px: int, *, blank: bool = False) -> SessionStor
     table = Mesh(vertices=corners, faces=np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
     placed = [PlacedMesh(o.instance, MODELS[o.obj_id].mesh, o.T_world_obj) for o in true_poses()]
     renderer = LabelRenderer([*placed, PlacedMesh(-1, table, np.eye(4))])
-    for k, T in enumerate(true_cameras(10)):
+    for k, T in enumerate(true_cameras(VIEWS)):
         labels = renderer.render(camera, T)
         grey = np.where(labels.ids >= 0, 200, 90).astype(np.uint8)
         grey = np.zeros_like(grey) if blank else np.roll(grey, shift_px, axis=1)
@@ -115,14 +122,14 @@ def coloured(folder: Path, shift_px: int, *, blank: bool = False) -> SessionStor
 
 
 def test_depth_that_does_not_lie_on_colour_is_said_in_pixels(tmp_path: Path) -> None:
-    remark = colour_remark(coloured(tmp_path / "off", 15), range(10))
+    remark = colour_remark(coloured(tmp_path / "off", 15), range(VIEWS))
     assert remark is not None and remark.kind == "not_aligned" and remark.view is None
-    assert "15 px to the left of" in remark.words and "of 5 views" in remark.words
+    assert "15 px to the left of" in remark.words and f"of {VIEWS} views" in remark.words
 
 
 def test_depth_that_lies_on_colour_or_cannot_be_told_is_not_spoken_of(tmp_path: Path) -> None:
-    assert colour_remark(coloured(tmp_path / "on", 0), range(10)) is None
-    assert colour_remark(coloured(tmp_path / "blank", 0, blank=True), range(10)) is None
+    assert colour_remark(coloured(tmp_path / "on", 0), range(VIEWS)) is None
+    assert colour_remark(coloured(tmp_path / "blank", 0, blank=True), range(VIEWS)) is None
     assert colour_remark(SessionStore.open(tmp_path / "on"), []) is None
 
 

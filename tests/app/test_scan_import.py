@@ -2,8 +2,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -30,13 +28,11 @@ def meshes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_ply(folder / "wrong side.ply", replace(wedge, faces=wedge.faces[:, ::-1]), "mm")
     flat = replace(wedge, vertices=wedge.vertices * [1, 1, 0])
     save_ply(folder / "flat.ply", flat, "mm")
-    (folder / "empty.stl").write_bytes(b"")
     (folder / "broken.obj").write_text("v 0 0 zero\nf 1 2 3\n")
     (folder / "points.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
         "property float z\nend_header\n0 0 0\n"
     )
-    (folder / "notes.txt").write_text("no mesh")
     return folder
 
 
@@ -85,8 +81,12 @@ def test_a_mesh_is_imported_listed_shown_and_checked(run, meshes: Path, tmp_path
 def test_what_a_person_should_look_at_ends_with_1(run, meshes: Path, tmp_path: Path):
     code, out, _ = scan_import(run, meshes, tmp_path / "m", "open.ply", "--unit", "mm")
     assert code == 1 and "open (object 1): doubtful" in out and "LOOK: open:" in out
-    code, out, _ = scan_import(run, meshes, tmp_path / "m", "wrong side.ply", "--unit", "mm")
-    assert code == 0 and "wrong_side (object 2): accepted" in out and "repaired:" in out
+    code, out, err = scan_import(run, meshes, tmp_path / "m", "wrong side.ply", "flat.ply",
+                                 "--unit", "mm")  # fmt: skip
+    assert code == 2 and "wrong_side (object 2): accepted" in out and "repaired:" in out
+    # One bad mesh does not keep the others out.
+    assert "flat.ply: not imported" in err and "unusable" in out
+    assert load_entries(tmp_path / "m") == ["open", "wrong_side"]
 
 
 def test_a_mesh_without_scale_waits_for_one(run, meshes: Path, tmp_path: Path):
@@ -120,31 +120,15 @@ def test_a_scaled_model_is_one_row_with_the_mark_of_its_source(run, meshes: Path
     assert "2 models and 2 unscaled meshes in" in run("scan", "check", library)[1]
 
 
-def test_help_loads_nothing_heavy():
-    code = (
-        "import sys; sys.argv = ['realsim', 'scan', '--help']\n"
-        "from realsim.app.cli import main\n"
-        "try: main()\n"
-        "finally: print(sorted({'numpy', 'scipy', 'trimesh', 'rich'} & set(sys.modules)))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert "scale" in done.stdout and done.stdout.splitlines()[-1] == "[]"
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["wedge.ply"], "does not state its unit"),
         (["wedge.ply", "--unit", "m"], "as mm"),
-        (["nothing.ply", "--unit", "mm"], "does not exist"),
-        (["notes.txt", "--unit", "mm"], "not a mesh format"),
-        (["empty.stl", "--unit", "mm"], "empty"),
         (["broken.obj", "--unit", "mm"], "broken.obj"),
         (["points.ply", "--unit", "mm"], "no triangles"),
         (["flat.ply", "--unit", "mm"], "flat"),
-        (["wedge.ply", "--unit", "mm", "--mass", "0"], "--mass is 0"),
         (["wedge.ply", "--unit", "mm", "--mass", "nan"], "--mass is nan"),
-        (["wedge.ply", "--unit", "mm", "--density", "-3"], "--density is -3"),
         (["wedge.ply", "--unit", "mm", "--mass", "1", "--density", "1"], "both given"),
         (["wedge.ply", "--unit", "mm", "--id", "0"], "the id 0"),
         (["wedge.ply", "--unit", "mm", "--name", "a/b"], "cannot be the name"),
@@ -160,13 +144,6 @@ def test_bad_input_is_named_and_leaves_nothing(run, meshes, tmp_path, words, sai
 
 def load_entries(library: Path) -> list[str]:
     return [e.name for e in ModelLibrary.open(library).entries()]
-
-
-def test_one_bad_mesh_does_not_keep_the_others_out(run, meshes: Path, tmp_path: Path):
-    library = tmp_path / "m"
-    code, out, err = scan_import(run, meshes, library, "wedge.ply", "flat.ply", "--unit", "mm")
-    assert code == 2 and "flat.ply: not imported" in err and "unusable" in out
-    assert load_entries(library) == ["wedge"]
 
 
 def test_nothing_is_replaced_unasked(run, meshes: Path, tmp_path: Path):

@@ -12,7 +12,6 @@ from realsim.app.register.files import write_result
 from realsim.app.school.inputs import SchoolRequest
 from realsim.app.school.run import run_in_session
 from realsim.app.stages import save_starts
-from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.images import depth_counts, png_bytes
 from realsim.records import CameraIntrinsics, Mesh
@@ -57,20 +56,6 @@ def add_grasps(session: Path) -> None:
     store = SessionStore.open(session)
     run_in_session(store, SchoolRequest(grasps=GRASPS, workers=1), console)
     run_annotate(session, console, maps="instance,depth", workers=1, check_depth=True)
-
-
-def board_inputs(root: Path, session: Path) -> None:
-    """Write photographs of a board with the tool's poses, out of a session that has both."""
-    store = SessionStore.open(session / "calibration/capture")
-    (root / "photos").mkdir()
-    lines = ["name,x,y,z,rx,ry,rz"]
-    for view in store.session.views:
-        name = f"{view.index:06d}.png"
-        shutil.copyfile(store.path(f"rgb/{name}"), root / "photos" / name)
-        assert view.T_base_ee is not None
-        twist = [*view.T_base_ee[:3, 3], *se3.log_so3(view.T_base_ee[:3, :3])]
-        lines.append(",".join([name, *(f"{v:.9f}" for v in twist)]))
-    (root / "poses.csv").write_text("\n".join(lines) + "\n")
 
 
 def plan_file(path: Path) -> None:
