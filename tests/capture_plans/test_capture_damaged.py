@@ -80,16 +80,6 @@ def test_a_session_without_its_manifest_is_not_gone_on_with(folder: Path) -> Non
     assert run(folder, views=(0, 1, 2, 3, 4)).captured == 2
 
 
-def test_a_broken_header_keeps_what_the_session_was_begun_with(folder: Path) -> None:
-    before = SessionStore.open(folder).extra
-    (folder / "session.json").write_text('{"broken')
-    with pytest.raises(InputError, match=r"session\.json is not valid JSON.*--repair"):
-        run(folder, views=(4,))
-    repair_session(folder)
-    assert SessionStore.open(folder).extra == before
-    assert run(folder, views=(4,)).complete
-
-
 def test_a_session_whose_beginning_is_lost_gets_no_more_views(folder: Path) -> None:
     (folder / BEGUN_FILE).unlink()
     (folder / "session.json").write_text('{"broken')
@@ -104,10 +94,3 @@ def test_a_session_whose_beginning_is_lost_gets_no_more_views(folder: Path) -> N
     (folder / "session.json").write_text(header.replace('"recovered": true,', ""))
     repair_session(folder)
     assert run(folder, views=(4,)).complete
-
-
-def test_going_on_and_retaking_leave_nothing_to_note(folder: Path) -> None:
-    for job in ({"views": (4, 5)}, {"retake": (2, 3), "views": ()}, {"retake": (2,), "views": ()}):
-        assert run(folder, **job).captured == len(job.get("retake", (4, 5)))
-        report = SessionStore.open(folder).check()
-        assert report.findings == () and report.unproven == () and report.beside == ()

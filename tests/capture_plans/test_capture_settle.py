@@ -64,11 +64,10 @@ def scene(rng: np.random.Generator, contrast: float = 1.0) -> np.ndarray:
     return np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_sharpness_falls_with_every_blur_and_not_with_contrast(seed: int) -> None:
+def test_sharpness_falls_with_every_blur_and_not_with_contrast() -> None:
     import cv2
 
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     image = scene(rng)
     values = [sharpness(image)]
     for sigma in (1.0, 1.5, 2.0, 3.0):

@@ -73,8 +73,8 @@ def test_these_are_calibrations_like_the_controllers() -> None:
     assert max(np.abs(arm.delta_theta).max() for arm in ARMS) > 0.3
 
 
-@pytest.mark.parametrize("arm", ARMS, ids=[f"arm {k}" for k in range(len(ARMS))])
-def test_links_stay_within_millimetres_of_the_nominal_ones(arm: DhChain) -> None:
+def test_links_stay_within_millimetres_of_the_nominal_ones() -> None:
+    arm = max(ARMS, key=lambda a: np.abs(a.delta_d).max())
     placements = link_placements(arm)
     q = np.random.default_rng(9).uniform(-np.pi, np.pi, (300, 6))
     at = arm.link_frames(q) @ placements
@@ -82,12 +82,11 @@ def test_links_stay_within_millimetres_of_the_nominal_ones(arm: DhChain) -> None
     assert np.linalg.norm((at - nominal)[..., :3, 3], axis=-1).max() < 4e-3
     assert se3.angle(np.swapaxes(at, -1, -2)[..., :3, :3] @ nominal[..., :3, :3]).max() < 5e-3
     assert np.array_equal(placements[6], np.eye(4))  # the camera follows the calibrated flange
-    if np.abs(arm.delta_d[1]) > 1:
-        assert np.linalg.norm((arm.link_frames(q) - nominal)[:, 2, :3, 3], axis=-1).min() > 0.9
+    assert np.linalg.norm((arm.link_frames(q) - nominal)[:, 2, :3, 3], axis=-1).min() > 0.9
 
 
-@pytest.mark.parametrize("arm", ARMS[:1], ids=["arm 0"])
-def test_clearances_change_by_millimetres_only(arm: DhChain) -> None:
+def test_clearances_change_by_millimetres_only() -> None:
+    arm = ARMS[0]
     q = np.random.default_rng(3).uniform(-np.pi, np.pi, (200, 6))
     mount = d405_mount()
     nominal, real = (CollisionModel(chain, mount, CELL, 0.01) for chain in (UR5, arm))

@@ -80,22 +80,13 @@ D435 = Mount(
 
 @pytest.mark.parametrize(
     ("mount", "cell", "colliding"),
-    [(d405_mount(), BENCH, 0.5), (d405_mount(), IN_THE_AIR, 0.2), (D435, BENCH, 0.5)],
-    ids=["on a bench", "in the air", "covered D435 on a bench"],
+    [(d405_mount(), IN_THE_AIR, 0.2), (D435, BENCH, 0.5)],
+    ids=["in the air", "covered D435 on a bench"],
 )
 def test_never_free_where_the_meshes_touch_and_seldom_the_reverse(
     mount: Mount, cell: WorkCell, colliding: float
 ) -> None:
-    shares = compare_with_meshes(mount, cell, n=1500)
+    shares = compare_with_meshes(mount, cell, n=700)
     assert shares["unsafe_share"] == 0.0
     assert shares["overcautious_share"] <= 0.08
     assert shares["mesh_colliding_share"] > colliding
-
-
-def test_the_meshes_are_where_the_chain_is() -> None:
-    """The flange's disc, z = 0 in DH frame 6, ends wrist 3's mesh to half a millimetre."""
-    for q in np.random.default_rng(2).uniform(-np.pi, np.pi, (5, 6)):
-        mesh = MeshModel(d405_mount(), BENCH).triangles(q)["wrist 3"]
-        T = np.linalg.inv(UR5.forward(q))
-        z = (mesh @ T[:3, :3].T + T[:3, 3])[..., 2]
-        assert -0.0006 < z.max() < 0

@@ -22,8 +22,8 @@ def calibrated(chain: DhChain, seed: int) -> DhChain:
     )
 
 
-CHAINS = [UR5, UR5E, calibrated(UR5, 1)]
-IDS = ["UR5", "UR5e", "UR5 calibrated"]
+CHAINS = [UR5E, calibrated(UR5, 1)]
+IDS = ["UR5e", "UR5 calibrated"]
 
 
 def regular_joints(chain: DhChain, n: int, seed: int = 0) -> np.ndarray:

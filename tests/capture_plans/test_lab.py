@@ -138,21 +138,6 @@ def test_depth_agrees_with_the_true_scene_within_the_sensors_noise(lab):
     assert np.median(np.abs(points[:, 2])) < 3e-3
 
 
-def test_without_noise_depth_is_exact_to_half_a_count():
-    config = LabConfig(
-        seed=1, objects=("cube",), depth_noise=False, image_noise=False, disparity_bias_px=0.0,
-        **SMALL,
-    )  # fmt: skip
-    lab = SimulatedLab(config)
-    lab.arm.move(joints_at(lab, [0.02, 0.0, 0.3]))
-    depth = lab.camera.grab().depth_m
-    rays = lens.ray_table(lab.truth.intrinsics).reshape(-1, 3).astype(np.float64)
-    T = lab.truth.T_world_cam(lab.arm.state().joints)
-    z = (lab.table_height - T[2, 3]) / (rays @ T[2, :3])
-    assert (depth > 0).all()
-    assert np.abs(depth.ravel() - z).max() < 0.51e-4
-
-
 def test_the_disparity_bias_shortens_the_depth_as_stereo_does():
     def middle(bias):
         config = LabConfig(

@@ -7,7 +7,6 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.lab import LabConfig, SimulatedLab, load_truth
 from realsim_capture_plans.lab.truth import (
     T_EE_CAM_NOMINAL,
@@ -53,18 +52,6 @@ def test_sizes_of_the_unknowns_are_those_of_the_config():
     assert np.std(d[:, 2:4]) == pytest.approx(3e-4, rel=0.3)
     assert np.all(d[:, 5:] == 0)
     assert not factory.is_distorted
-
-
-def test_an_error_of_size_zero_is_no_error():
-    exact = LabConfig(
-        objects=ROD, mount_mm=0, mount_deg=0, joint_offset_mrad=0, link_mm=0, repeat_mm=0,
-        repeat_deg=0, focal_percent=0, center_px=0, distortion=(0, 0, 0, 0, 0),
-    )  # fmt: skip
-    lab = SimulatedLab(exact)
-    np.testing.assert_allclose(
-        lab.truth.T_world_cam(Q), UR5.forward(Q) @ lab.nominal_T_ee_cam, atol=1e-12
-    )
-    np.testing.assert_array_equal(lab.truth.intrinsics.K, lab.camera.intrinsics.K)
 
 
 def test_repeatability_belongs_to_the_stop_and_has_its_size():

@@ -133,7 +133,6 @@ WRONG = {
     "'D450' is not known; there are D405": GOOD.replace('"D405"', '"D450"'),
     "rotation_vector_rad and quaternion_xyzw given; exactly one": GOOD
     + "quaternion_xyzw = [0, 0, 0, 1]",
-    "no rotation given": GOOD.replace("rotation_vector_rad = [0.0, 0.0, 0.0]", ""),
     "length 2.0000; 1 is needed": GOOD.replace(
         "rotation_vector_rad = [0.0, 0.0, 0.0]", "quaternion_xyzw = [0, 0, 0, 2]"
     ),
@@ -141,60 +140,32 @@ WRONG = {
     "mirrored": GOOD.replace(
         "rotation_vector_rad = [0.0, 0.0, 0.0]", "matrix = [[-1, 0, 0], [0, 1, 0], [0, 0, 1]]"
     ),
-    "row 3 is missing": GOOD.replace(
-        "rotation_vector_rad = [0.0, 0.0, 0.0]", "matrix = [[-1, 0, 0], [0, 1, 0]]"
-    ),
     "name is missing": GOOD.replace('name = "left bracket"', ""),
     "is not TOML": GOOD + "cover_m = 5 mm",
-    "cover_m is 5": GOOD + "cover_m = 5",
-    "bracket 1: kind is 'bax'": GOOD + '[[bracket]]\nkind = "bax"',
     "bracket 1: size_m is .* list of 3": GOOD + '[[bracket]]\nkind = "box"\nsize_m = [0.1, 0.1]',
-    "bracket 1: size_m.*millimetres": GOOD + '[[bracket]]\nkind = "box"\nsize_m = [40, 90, 6]',
-    "positive lengths": GOOD + '[[bracket]]\nkind = "sphere"\nsize_m = [-0.01]',
-    "file do not belong to a box": GOOD
-    + '[[bracket]]\nkind = "box"\nfile = "a.stl"\nsize_m = [0.1, 0.1, 0.1]',
     'unit = "mm" or unit = "m" is needed': GOOD + '[[bracket]]\nkind = "convex"\nfile = "a.stl"',
-    "a.stl does not exist": GOOD + '[[bracket]]\nkind = "convex"\nfile = "a.stl"\nunit = "mm"',
     "flat.obj holds no solid": GOOD + '[[bracket]]\nkind = "convex"\nfile = "flat.obj"\nunit = "m"',
-    "note.stl holds no solid": GOOD + '[[bracket]]\nkind = "convex"\nfile = "note.stl"\nunit = "m"',
-    "must be written as": GOOD + 'bracket = "box"',
 }
 
 
 @pytest.mark.parametrize("says", WRONG)
 def test_what_is_wrong_is_named(says: str, tmp_path: Path) -> None:
     written(tmp_path, "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "flat.obj")
-    written(tmp_path, "this is no mesh", "note.stl")
     path = written(tmp_path, WRONG[says])
     with pytest.raises(RealsimError, match=says) as caught:
         read_mount(path)
     assert "mount.toml" in str(caught.value)
 
 
-def test_no_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.toml does not exist"):
-        read_mount(tmp_path / "none.toml")
-    with pytest.raises(InputError, match="cannot be written"):
-        write_mount(d405_mount(), written(tmp_path, "", "file") / "m.toml")
-
-
-PLACES = [
-    [0.0, -0.065, 0.035],
-    [0.0, 0.11, -0.02],
-    [-0.09, 0.09, 0.0],
-]
-
-
-@pytest.mark.parametrize("at", PLACES, ids=str)
 @pytest.mark.parametrize("camera", CAMERA_BODIES)
-def test_the_plain_bracket_joins_flange_and_camera(at: list[float], camera: str) -> None:
+def test_the_plain_bracket_joins_flange_and_camera(camera: str) -> None:
     """It touches the flange's face and the camera, in one piece, without entering the wrist."""
     import coal
 
     from realsim_capture_plans.collision.coal_geometry import coal_shape
     from realsim_capture_plans.collision.mount import camera_shape
 
-    T = se3.from_translation(at)
+    T = se3.from_translation([-0.09, 0.09, 0.0])
     mount = Mount(name="m", camera=camera, T_ee_cam=T, bracket=plain_bracket(T, camera))
     chain = [*mount.bracket, camera_shape(mount)]
 

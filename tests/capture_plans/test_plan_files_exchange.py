@@ -153,9 +153,9 @@ def test_graspnet_poses_come_back(tmp_path: Path) -> None:
 # --- what a path does not say is proven from its poses ----------------------------------------
 
 
-@pytest.mark.parametrize("chain", [UR5, UR5E], ids=["UR5", "UR5e"])
-@pytest.mark.parametrize("degrees", [True, False])
-@pytest.mark.parametrize("scale", [1.0, 1000.0])
+@pytest.mark.parametrize(
+    ("chain", "degrees", "scale"), [(UR5, True, 1000.0), (UR5E, False, 1.0)], ids=["UR5", "UR5e"]
+)
 def test_robot_units_and_tool_are_found(
     chain: DhChain, degrees: bool, scale: float, tmp_path: Path
 ) -> None:
@@ -178,18 +178,6 @@ def test_a_path_for_the_other_robot_is_refused_with_both_fits(tmp_path: Path) ->
     write_path(tmp_path / "p.json", UR5E)
     with pytest.raises(InputError, match=r"fit a UR5e.*for a UR5 \d+ mm are left"):
         import_plan(tmp_path / "p.json", chain=UR5, mount=MOUNT)
-
-
-def test_poses_that_decide_nothing_or_fit_nothing_are_named(tmp_path: Path) -> None:
-    write_path(tmp_path / "p.json", UR5, n=4, spread=1e-5)
-    with pytest.raises(InputError, match="do not tell which robot"):
-        import_plan(tmp_path / "p.json", mount=MOUNT, center=CENTER)
-    write_path(tmp_path / "p.json", UR5)
-    data = json.loads((tmp_path / "p.json").read_text())
-    data["cart_pose"] = data["cart_pose"][5:] + data["cart_pose"][:5]
-    (tmp_path / "p.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match="do not belong together"):
-        import_plan(tmp_path / "p.json", mount=MOUNT)
 
 
 def test_a_claim_against_the_evidence_is_refused(tmp_path: Path) -> None:
@@ -222,17 +210,8 @@ ROWS_RAD = ["0.1,-1.6,1.7,-1.7,-1.5,0.3", "0.2,-1.5,1.7,-1.7,-1.5,0.3"]
         ("\n".join([HEADER.format(u="rad"), *ROWS_DEG]), UnitError, r"line 4, joint 6.* is 170"),
         ("\n".join([HEADER.format(u="deg"), *ROWS_RAD]), UnitError, "look like radians"),
         ("\n".join(["q1,q2,q3,q4,q5,q6", *ROWS_RAD]), UnitError, "do not say their unit"),
-        (
-            "\n".join(["q1_rad,q2_deg,q3_rad,q4_rad,q5_rad,q6_rad", *ROWS_RAD]), UnitError,
-            "all in rad or all in deg",
-        ),
-        ("\n".join([HEADER.format(u="rad"), "0,1,2"]), InputError, "line 2 has 3 values"),
         ("\n".join([HEADER.format(u="rad"), "0,1,2,x,4,5"]), InputError, "line 2: q4_rad is 'x'"),
-        ("\n".join([HEADER.format(u="rad"), "0,1,2,nan,4,5"]), InputError, "not a number"),
-        (HEADER.format(u="rad"), InputError, "no rows"),
-        ("", InputError, "empty"),
         ("\n".join(["via," + HEADER.format(u="deg"), "maybe," + ROWS_DEG[0]]), InputError, "maybe"),
-        ("\n".join(["via," + HEADER.format(u="deg"), "1," + ROWS_DEG[0]]), InputError, "all of"),
         (
             "\n".join([HEADER.format(u="deg"), "0,-90,190,0,0,0", "0,-90,90,0,0,0"]), InputError,
             "elbow joint is 190.0 deg",
@@ -252,9 +231,7 @@ def test_tables_that_cannot_be_right_are_named(
     assert "p.csv" in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("mark", "form"), [(",", "q{j}_deg"), (";", "Q{j} [deg]"), ("\t", "q{j}(degrees)")]
-)
+@pytest.mark.parametrize(("mark", "form"), [(";", "Q{j} [deg]"), ("\t", "q{j}(degrees)")])
 def test_tables_of_other_programs_are_read(mark: str, form: str, tmp_path: Path) -> None:
     header = mark.join(["name", *(form.format(j=j) for j in range(1, 7)), "via"])
     rows = [mark.join(["a", *row.split(","), str(k % 2)]) for k, row in enumerate(ROWS_DEG)]
@@ -264,13 +241,11 @@ def test_tables_of_other_programs_are_read(mark: str, form: str, tmp_path: Path)
     assert found.via.tolist() == [False, True, False] and found.rows[0] == "line 3"
 
 
-@pytest.mark.parametrize(
-    "text", ["[]", '{"joints": 3}', '{"joints": [[1]]}', '{"joints": [[0,0,0,0,0,0]]}', "{"]
-)
-def test_no_path_ends_in_a_traceback(text: str, tmp_path: Path) -> None:
-    (tmp_path / "p.json").write_text(text)
-    with pytest.raises(InputError, match=r"p\.json"):
-        import_plan(tmp_path / "p.json", chain=UR5, mount=MOUNT)
+def test_no_path_ends_in_a_traceback(tmp_path: Path) -> None:
+    for text in ("[]", '{"joints": 3}', '{"joints": [[1]]}', '{"joints": [[0,0,0,0,0,0]]}', "{"):
+        (tmp_path / "p.json").write_text(text)
+        with pytest.raises(InputError, match=r"p\.json"):
+            import_plan(tmp_path / "p.json", chain=UR5, mount=MOUNT)
 
 
 # --- what is imported is checked ---------------------------------------------------------------
@@ -305,12 +280,6 @@ def test_the_centre_is_where_the_axes_meet() -> None:
     assert np.abs(axes_meeting_point(Ts) - CENTER).max() < 1e-9
     with pytest.raises(DegenerateError, match="--center"):
         axes_meeting_point(np.repeat(Ts[:1], 5, axis=0))
-
-
-def test_a_centre_in_millimetres_is_named(tmp_path: Path) -> None:
-    export_csv(a_plan(), tmp_path / "p.csv")
-    with pytest.raises(UnitError, match="millimetres"):
-        import_plan(tmp_path / "p.csv", chain=UR5, mount=MOUNT, center=[370, 20, 50])
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="REALSIM_DATA has no motion/koch_ur5_paths")

@@ -14,7 +14,6 @@ from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.planning import view_quality
-from realsim_capture_plans.planning.make import calibration_plan
 from realsim_capture_plans.planning.metrics import (
     METRIC_MEANINGS,
     OF_FULL_PLANS,
@@ -81,8 +80,8 @@ def turned(plan: CapturePlan, angle: float) -> CapturePlan:
     )
 
 
-@pytest.mark.parametrize("angle", [0.3, -1.1, 2.0])
-def test_turning_everything_about_the_base_changes_no_coverage(angle: float) -> None:
+def test_turning_everything_about_the_base_changes_no_coverage() -> None:
+    angle = 2.0
     plan = plan_of(many(60), vias=[(3, many(2, seed=5))])
     before, after = plan_metrics(plan), plan_metrics(turned(plan, angle))
     names = [n for n in before if n.startswith(("hole", "spacing", "radius", "parallax"))]
@@ -94,21 +93,9 @@ def test_turning_everything_about_the_base_changes_no_coverage(angle: float) -> 
         assert after[name] == pytest.approx(before[name], abs=within), name
 
 
-def test_where_the_speed_is_reached_time_goes_with_one_over_speed() -> None:
-    # Acceleration so great that only cruising counts.
-    slow = replace(CONFIG, speed=0.2, acceleration=2000.0)
-    fast = replace(slow, speed=0.8)
-    q = LOOKING + np.arange(1, 5)[:, None] * 0.4
-    ratio = (
-        plan_metrics(plan_of(q, config=slow))["seconds"]
-        / plan_metrics(plan_of(q, config=fast))["seconds"]
-    )
-    assert ratio == pytest.approx(4.0, rel=2e-3)
-
-
 def test_the_hole_is_what_a_fine_grid_finds_and_never_less() -> None:
     rng = np.random.default_rng(3)
-    for n in (1, 2, 3, 4, 30, 120):
+    for n in (1, 3, 30):
         d = golden_cap(400, (15.0, 90.0))[rng.choice(400, n, replace=False)]
         grid = golden_cap(60_000, (15.0, 90.0))
         sampled = view_quality.nearest_deg(d, grid).max()
@@ -166,30 +153,11 @@ def test_the_tour_s_clock_is_at_every_view_when_it_says_so() -> None:
     assert np.all(np.diff(s.time_s) >= -1e-9)
 
 
-def test_a_view_from_each_end_of_an_octahedron_leaves_the_middles_of_its_faces() -> None:
-    axes = np.concatenate([np.eye(3), -np.eye(3)])
-    assert hole_deg(axes, (1.0, 89.0)) == pytest.approx(np.degrees(np.arccos(1 / np.sqrt(3))))
-
-
 def test_a_single_view_from_above_leaves_the_whole_cap() -> None:
     assert hole_deg(np.array([[0.0, 0.0, 1.0]]), (20.0, 90.0)) == pytest.approx(70.0)
     # Two opposite views: the farthest place is on the rim, a quarter turn from both.
     pair = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
     assert hole_deg(pair, (5.0, 60.0)) == pytest.approx(90.0)
-
-
-def test_an_ideal_spiral_of_256_has_the_hole_that_is_known() -> None:
-    ideal = golden_cap(256, (15.0, 90.0))
-    # Evenly spread samples find 6.40 (4 000 of them), 7.27 (40 000), 7.59 deg (400 000).
-    assert hole_deg(ideal, (15.0, 90.0)) == pytest.approx(7.70, abs=0.01)
-    spacing = view_quality.spacing_deg(ideal)
-    assert 6.5 < spacing.min() <= np.median(spacing) < 7.6
-
-
-def test_depth_noise_is_that_of_the_formula() -> None:
-    # z^2 s / (f B) = 0.35^2 * 0.08 / (646 * 0.018)
-    assert D405.depth_noise(0.35) == pytest.approx(0.000843, abs=1e-6)
-    assert D405.depth_noise(0.20) == pytest.approx(0.000275, abs=1e-6)
 
 
 def looking_down(height_m: float, box_m: float = 0.1) -> CapturePlan:
@@ -233,13 +201,6 @@ def test_a_place_between_two_cameras_is_seen_from_the_angle_between_them() -> No
     visible = np.array([[True, True, False], [True, False, False]])
     spread = view_quality.direction_spread_deg(plan, np.tile(point, (3, 1)), visible)
     assert spread == pytest.approx([np.degrees(np.arccos(cosine)), 0.0, 0.0], abs=1e-5)
-
-
-def test_manipulability_is_the_determinant_of_the_jacobian() -> None:
-    q = many(5)
-    m = plan_metrics(plan_of(q))
-    assert m["yoshikawa_min"] == pytest.approx(np.abs(np.linalg.det(UR5.jacobian(q))).min())
-    assert m["sigma_min"] == pytest.approx(UR5.sigma_min(q).min())
 
 
 def test_a_move_through_the_table_is_counted_and_its_depth_told() -> None:
@@ -287,22 +248,6 @@ def test_every_metric_has_a_meaning_and_a_finite_value(kind: str) -> None:
     assert all(isinstance(v, float) and np.isfinite(v) for v in m.values())
     for meaning in METRIC_MEANINGS.values():
         assert meaning.text and meaning.good
-
-
-def test_what_making_a_plan_adds_has_a_meaning_too() -> None:
-    rng = np.random.default_rng(0)
-    board = np.array([0.375, 0.0, 0.0])
-    made = calibration_plan(6, board, d405_mount(), PlanConfig(), rng)
-    assert set(made.metrics) <= set(METRIC_MEANINGS)
-    assert plan_metrics(made).items() <= made.metrics.items()
-
-
-def test_an_endless_keep_out_box_is_replaced_by_one_about_the_centre() -> None:
-    endless = Box(lower=(-np.inf,) * 3, upper=(np.inf, np.inf, -0.5))
-    cell = replace(CONFIG.work_cell(CENTER, "hemisphere"), keep_out=endless)
-    box = view_quality.scene_box(plan_of(many(2), cell=cell))
-    assert np.subtract(box.upper, box.lower) == pytest.approx(PlanConfig().keep_out_m)
-    assert np.add(box.upper, box.lower) / 2 == pytest.approx(CENTER)
 
 
 def test_an_unknown_camera_is_refused_by_name() -> None:

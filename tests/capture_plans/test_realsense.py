@@ -74,8 +74,7 @@ TWO = {
 # --- live ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("lag", [0, 5])
-@pytest.mark.parametrize("sensors", [1, 2])
+@pytest.mark.parametrize(("sensors", "lag"), [(1, 5), (2, 0)])
 def test_depth_and_colour_of_a_frame_are_of_one_exposure(
     make: Make, opened: Open, sensors: int, lag: int
 ) -> None:
@@ -90,17 +89,6 @@ def test_depth_and_colour_of_a_frame_are_of_one_exposure(
         assert np.array_equal(frame.depth_m, (depth_of(number) * 1e-4).astype(np.float32))
         times.append(frame.time_s)
     assert np.all(np.diff(times) > 0)
-
-
-def test_a_grab_is_not_answered_with_what_was_seen_before(make: Make, opened: Open) -> None:
-    software = make()
-    camera = opened(software)
-    software.run()
-    camera.grab()
-    software.halt()
-    time.sleep(0.05)
-    with pytest.raises(DeviceError, match="no frame within 1 s"):
-        camera.grab()
 
 
 def test_one_sensor_whose_counters_differ_is_refused(make: Make, opened: Open) -> None:
@@ -229,14 +217,6 @@ def test_a_stream_that_the_device_lacks_is_named(make: Make, opened: Open) -> No
         opened(make(), RealSenseConfig(width=640, height=480))
 
 
-def test_one_of_several_cameras_must_be_named(make: Make) -> None:
-    a, b = make(), make(serial="SW0002")
-    with pytest.raises(DeviceError, match="2 RealSense cameras are connected"):
-        RealSenseCamera(config=FAST, devices=lambda: [a.device, b.device])
-    with pytest.raises(DeviceError, match="no RealSense camera SW9 is connected"):
-        RealSenseCamera("SW9", FAST, devices=lambda: [a.device, b.device])
-
-
 def test_without_a_camera_the_error_says_what_to_do(rs: Any) -> None:
     if len(list(rs.context().query_devices())) > 0:
         pytest.skip("a RealSense camera is connected")
@@ -280,12 +260,11 @@ def record(rs: Any, software: Software, path: Path, numbers: list[int]) -> None:
         sensor.close()
 
 
-@pytest.mark.parametrize("lag", [0, 3])
-@pytest.mark.parametrize("sensors", [1, 2])
 def test_a_recording_gives_every_pair_once_and_bit_exact(
-    rs: Any, make: Make, tmp_path: Path, sensors: int, lag: int
+    rs: Any, make: Make, tmp_path: Path
 ) -> None:
-    software = make(color_lag=lag, **(TWO if sensors == 2 else {}))
+    lag = 3
+    software = make(color_lag=lag, **TWO)
     lost = {9, 10, 19}
     record(rs, software, tmp_path / "r.db3", [n for n in range(1, SENT + 1) if n not in lost])
     # Frame 9's depth was lost, and the colour that would have been sent then.

@@ -1,12 +1,7 @@
 """The replay in the browser: it listens only here, and draws what the plan does."""
 
 import base64
-import io
-import json
 import re
-import shutil
-import subprocess
-import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -83,10 +78,10 @@ def test_it_answers_on_this_machine(replay: PlanReplay) -> None:
         assert b"<html" in answer.read().lower()
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.7", "::", "lab-pc"])
-def test_a_host_that_others_reach_is_refused(host: str) -> None:
-    with pytest.raises(InputError, match=r"no login.*ssh -L"):
-        serve_replay(make(), host, 0)
+def test_a_host_that_others_reach_is_refused() -> None:
+    for host in ("0.0.0.0", "::", "lab-pc"):
+        with pytest.raises(InputError, match=r"no login.*ssh -L"):
+            serve_replay(make(), host, 0)
 
 
 def test_a_foreign_page_cannot_connect(replay: PlanReplay) -> None:
@@ -132,21 +127,6 @@ def test_a_person_s_slider_moves_the_arm_and_the_arm_s_slider_does_not(replay: P
     view.value = 3
     by_hand(view)
     assert replay.time_s == pytest.approx(replay.tour.view_s[3])
-
-
-def test_steps_go_from_view_to_view(replay: PlanReplay) -> None:
-    replay.show_view(2)
-    step = replay._step  # type: ignore[reportPrivateUsage]
-    step(1)
-    assert replay.time_s == pytest.approx(replay.tour.view_s[3])
-    step(-1)
-    assert replay.time_s == pytest.approx(replay.tour.view_s[2])
-    replay.show(replay.tour.view_s[3] - 0.1)  # on the way to 3
-    step(-1)
-    assert replay.time_s == pytest.approx(replay.tour.view_s[2])
-    replay.show_view(0)
-    step(-1)
-    assert replay.time_s == pytest.approx(replay.tour.view_s[0])
 
 
 def test_the_scene_has_arm_camera_table_boxes_and_views(replay: PlanReplay) -> None:
@@ -202,53 +182,3 @@ def test_the_file_holds_the_whole_tour(tmp_path: Path) -> None:
     gap = np.linalg.norm(np.array(hand)[None] - plan.Ts_base_ee[:, None, :3, 3], axis=-1)
     assert gap.min(axis=1).max() < 0.02
     assert sorted(tmp_path.iterdir()) == [path]
-
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-BROWSER_ARGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--use-gl=angle", "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--disable-background-networking",
-    "--disable-dev-shm-usage", "--window-size=1000,700", "--remote-debugging-port=0",
-)  # fmt: skip
-
-
-def photographed(url: str, folder: Path, seconds: float = 60.0) -> np.ndarray:
-    """Open a page in a headless browser until it shows something orange; return its picture."""
-    from PIL import Image
-
-    command = [str(CHROMIUM), *BROWSER_ARGS, f"--user-data-dir={folder}", url]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    try:
-        assert process.stderr is not None
-        found = (re.search(r"ws://127\.0\.0\.1:(\d+)/", line) for line in process.stderr)
-        port = next(m[1] for m in found if m)
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=20) as answer:
-            page = next(p for p in json.load(answer) if p["type"] == "page")
-        image = np.zeros((1, 1, 3), dtype=int)
-        with connect(page["webSocketDebuggerUrl"], max_size=None) as socket:
-            end = time.monotonic() + seconds
-            while time.monotonic() < end and orange(image) < 20:
-                time.sleep(1.0)
-                socket.send('{"id": 1, "method": "Page.captureScreenshot"}')
-                reply = json.loads(socket.recv(timeout=60))
-                png = base64.b64decode(reply["result"]["data"])
-                image = np.asarray(Image.open(io.BytesIO(png)).convert("RGB")).astype(int)
-        return image
-    finally:
-        process.kill()
-        process.wait()
-
-
-def orange(image: np.ndarray) -> int:
-    """Return how many pixels are of the keep-out box."""
-    r, g, b = np.moveaxis(image, -1, 0)
-    return int(np.sum((r > 150) & (b < 0.6 * r) & (g > 0.5 * r) & (g < 0.9 * r)))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_in_chromium_the_file_draws_the_scene_without_a_server(tmp_path: Path) -> None:
-    path = write_replay(make(), tmp_path / "replay.html", looks=False)
-    image = photographed(path.as_uri(), tmp_path / "profile")
-    assert orange(image) >= 20  # the keep-out box
-    assert image[150:550, 200:800].std() > 8  # and more than that
