@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from realsim.errors import InputError
 from realsim.formats.graspnet import gripper_frame as frame
-from realsim.formats.graspnet.grasp_labels import read_grasp_labels, write_grasp_labels
 from realsim.geometry import se3
 from realsim.geometry.hand import HandGeometry
 from realsim.records import Mesh
@@ -14,15 +12,12 @@ from realsim_sim_bridge.grasping.analytic import (
     AnalyticConfig,
     analytic_labels,
     gripper_boxes,
-    spread_points,
 )
 from realsim_sim_bridge.grasping.analytic_given import given_candidates, standing_labels
 from realsim_sim_bridge.grasping.analytic_select import select_analytic, select_rows
 from realsim_sim_bridge.grasping.candidates import (
     CandidateConfig,
     Surroundings,
-    sample_candidates,
-    standing_object,
 )
 from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closure
 from tried_grasps import assert_same
@@ -53,29 +48,11 @@ def test_the_same_seed_gives_the_same_labels(of_box):
     assert_same(labels_of(mesh), labels)
 
 
-def test_labels_and_their_file_are_the_same(tmp_path, of_box):
-    labels = of_box[1]
-    path = write_grasp_labels(tmp_path / "000_labels.npz", labels)
-    assert_same(read_grasp_labels(path, with_collision=True), labels)
-
-
-def test_a_coarser_look_is_part_of_the_finer_one(of_box):
-    mesh, labels = of_box
-    coarse = labels_of(mesh, AnalyticConfig(points=12, view_step=5))
-    assert coarse.view_tried.sum() == 60 and 0 < len(coarse) < len(labels)
-    fine = labels.rows(coarse.view_tried[labels.index[:, 1]])
-    np.testing.assert_array_equal(fine.index, coarse.index)
-    np.testing.assert_array_equal(fine.friction, coarse.friction)
-
-
 def inside_out(mesh):
     return Mesh(vertices=mesh.vertices, faces=mesh.faces[:, ::-1])
 
 
-@pytest.mark.parametrize(
-    "mesh",
-    [box(), inside_out(box()), wedge(0.2), solid(trimesh.creation.icosphere(3, 0.03))],
-)
+@pytest.mark.parametrize("mesh", [inside_out(box()), solid(trimesh.creation.icosphere(3, 0.03))])
 def test_the_friction_is_that_of_the_measure_closure_friction(mesh):
     """Two ways to the same number: rays of 14,400 lines a point, and the hand's closing axis."""
     labels = labels_of(mesh)
@@ -89,23 +66,12 @@ def test_the_friction_is_that_of_the_measure_closure_friction(mesh):
     assert len(some) > 50 and same.mean() > 0.97
 
 
-def test_the_fingers_pass_the_contacts_with_the_clearance(of_box):
-    mesh, labels = of_box
-    labels = labels.rows(np.arange(0, len(labels), 12))
-    Ts = labels.Ts_obj_grasp()
-    contacts = force_closure(mesh, Ts, np.full(len(Ts), 0.08), ClosureConfig(), HAND).axis_contacts
-    along = np.sum((contacts.points - Ts[:, None, :3, 3]) * Ts[:, None, :3, 1], axis=-1)
-    tight = 0.5 * labels.openings_m - np.abs(along).max(axis=1)
-    assert np.nanmedian(np.abs(tight - 0.002)) < 1e-6
-    assert labels.openings_m.max() <= 0.08
-
-
 # --- known answers ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("half_angle", [0.08, 0.25, 0.55])
-def test_what_closes_on_a_wedge_needs_the_friction_of_its_slopes(half_angle):
+def test_what_closes_on_a_wedge_needs_the_friction_of_its_slopes():
     """A line across slopes at +-a, itself tilted by any angle, written out by hand."""
+    half_angle = 0.25
     labels = labels_of(wedge(half_angle), AnalyticConfig(points=30))
     Ts = labels.Ts_obj_grasp()
     middle, y = Ts[:, :3, 3], Ts[:, :3, 1]
@@ -122,12 +88,6 @@ def test_what_closes_on_a_wedge_needs_the_friction_of_its_slopes(half_angle):
     level = np.ceil(needed * 10 - 1e-4) / 10
     assert on_slopes.sum() > 200 and needed.min() >= np.tan(half_angle) - 1e-6
     np.testing.assert_allclose(labels.friction[on_slopes], level, atol=1e-6)
-
-
-def test_a_box_wider_than_the_gripper_does_not_close_across():
-    labels = labels_of(box(0.2, 0.2, 0.03), AnalyticConfig(points=20))
-    y = labels.Ts_obj_grasp()[:, :3, 1]
-    assert len(labels) and np.all(np.abs(y[:, 2]) > 0.6)  # only across its 30 mm
 
 
 def test_a_box_that_nothing_can_hold_has_no_label():
@@ -156,17 +116,6 @@ def test_a_palm_in_the_object_collides_with_it():
     assert (~labels.collision).sum() > 20
 
 
-def test_points_are_on_the_surface_and_apart():
-    mesh = box()
-    points = spread_points(mesh, np.random.default_rng(0), 100, 0.005)
-    off = np.abs(np.abs(points) - np.abs(mesh.vertices).max(axis=0)).min(axis=1)
-    assert len(points) == 100 and off.max() < 1e-7
-    distance = np.linalg.norm(points[:, None] - points[None], axis=-1) + np.eye(100)
-    assert distance.min() >= 0.005
-    small = spread_points(box(0.006, 0.006, 0.006), np.random.default_rng(0), 100, 0.005)
-    assert 3 < len(small) < 30  # no more fit
-
-
 # --- the choice -------------------------------------------------------------------------------
 
 
@@ -192,35 +141,11 @@ def test_the_choice_is_free_spread_and_of_every_level(of_box):
     assert nearest(Ts[rows]) > 1.3 * nearest(Ts[chance])
 
 
-def test_all_are_chosen_where_fewer_are_than_asked_for(of_box):
-    labels = of_box[1]
-    free = np.flatnonzero(~labels.collision)
-    np.testing.assert_array_equal(select_rows(labels, 10**6, np.random.default_rng(0)), free)
-    assert len(select_rows(labels, 7, np.random.default_rng(0))) == 7
-    with pytest.raises(InputError, match="are asked for"):
-        select_rows(labels, -1, np.random.default_rng(0))
-
-
 # --- given grasps -----------------------------------------------------------------------------
 
 
 def standing(mesh):
     return se3.from_translation([0.3, 0.1, -mesh.vertices[:, 2].min()])
-
-
-def test_what_is_sampled_and_given_again_is_the_same():
-    mesh, config = box(), CandidateConfig(surface_points=100)
-    found = sample_candidates(
-        mesh, standing(mesh), Surroundings(), config, HAND, np.random.default_rng(0), 60
-    )
-    level = found.contact_depths_m == 0
-    again, rows = given_candidates(
-        mesh, standing(mesh), Surroundings(), found.Ts_obj_grasp[level], config, HAND
-    )
-    assert level.sum() > 10 and len(rows) == level.sum()
-    np.testing.assert_allclose(again.Ts_obj_grasp, found.Ts_obj_grasp[level], atol=1e-6)
-    np.testing.assert_allclose(again.widths_m, found.widths_m[level], atol=2e-6)
-    np.testing.assert_allclose(again.openings_m, found.openings_m[level], atol=1e-5)
 
 
 def test_given_grasps_keep_their_contacts_and_their_friction(of_box):
@@ -246,20 +171,6 @@ def test_given_grasps_keep_their_contacts_and_their_friction(of_box):
     np.testing.assert_allclose(
         found.Ts_obj_grasp[:, :3, :3], s.Ts_obj_grasp[rows, :3, :3], atol=1e-12
     )
-
-
-def test_a_neighbour_takes_the_given_grasps_it_stands_in(of_box):
-    mesh, labels = of_box
-    s = select_analytic(labels, 60, np.random.default_rng(0), obj_id=1)
-    T = standing(mesh)
-    _, rows = given_candidates(mesh, T, Surroundings(), s.Ts_obj_grasp, CandidateConfig(), HAND)
-    beside = standing_object(mesh, se3.from_translation([0.05, 0, 0]) @ T, 1, 500)
-    fewer, left = given_candidates(mesh, T, beside, s.Ts_obj_grasp, CandidateConfig(), HAND)
-    assert set(left) < set(rows) and fewer.counts["hand_in_neighbour"] > 0
-    nothing, none = given_candidates(
-        mesh, T, Surroundings(), np.zeros((0, 4, 4)), CandidateConfig(), HAND
-    )
-    assert len(none) == 0 and nothing.counts["kept"] == 0
 
 
 def test_labels_that_stand_are_those_the_hand_can_take(of_box):

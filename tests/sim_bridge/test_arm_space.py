@@ -23,7 +23,6 @@ from realsim_sim_bridge.arm.obstacles import (
     arm_spheres,
     hand_spheres,
     least_distance,
-    nearest_within,
     obstacles_of,
 )
 
@@ -94,15 +93,6 @@ def test_the_hand_s_boxes_are_inside_its_spheres_at_any_opening():
             assert gaps(corners, moved).max() < 1e-9
 
 
-def test_franka_s_hand_is_inside_the_hand_s_spheres():
-    folder = Path(np.__file__).parents[1] / "cmeel.prefix/share/example-robot-data/robots"
-    mesh = trimesh.load(folder / "panda_description/meshes/collision/hand.stl", force="mesh")
-    in_grasp = np.asarray(mesh.vertices) - [0.0, 0.0, panda.TCP_M]
-    rest = arm_spheres()
-    rest = rest[rest[:, 0] == 8]
-    assert gaps(in_grasp, np.concatenate([hand_spheres(HAND), rest])).max() < 0
-
-
 def test_the_grid_s_bound_is_below_the_distance_and_not_far_below():
     obstacles = cloud()
     tree = KDTree(obstacles.points)
@@ -111,16 +101,6 @@ def test_the_grid_s_bound_is_below_the_distance_and_not_far_below():
     bound = np.array([least_distance(obstacles, *p) for p in at])
     assert np.all(bound <= true)
     assert np.mean((true - bound)[true < 0.15]) < 0.02
-
-
-def test_the_nearest_point_within_reach_is_found():
-    obstacles = cloud()
-    at = np.random.default_rng(2).uniform([-0.4, -0.4, -0.1], [0.4, 0.4, 0.3], (500, 3))
-    true, row = KDTree(obstacles.points).query(at)
-    for p, d, r in zip(at, true, row, strict=True):
-        found, near = nearest_within(obstacles, *p, 0.06)
-        assert near == (r if d < 0.06 else -1)
-        assert found == (pytest.approx(d) if d < 0.06 else np.inf)
 
 
 def test_no_sphere_moves_farther_than_its_levers_say():
@@ -174,17 +154,6 @@ def test_what_stops_a_configuration_is_named():
     wrist = (upright() @ panda.link_frames(READY))[6, :3, 3]
     obstacles = obstacles_of(wall + wrist, np.full(len(wall), 7), np.zeros(len(wall), bool))
     assert space_of(obstacles).blame(READY[None], np.array([0.08]), with_hand=True)[0] == 7
-
-
-def test_a_hand_that_folds_into_the_shoulder_is_stopped():
-    q = random_joints(12000, seed=9)
-    frames = panda.link_frames(q)
-    high = se3.from_translation([0.0, 0.0, 2.0])
-    codes = space_of(T_table_base=high).blame(q, np.full(len(q), 0.08), with_hand=True)
-    hand_to_base = np.linalg.norm(frames[:, 8, :3, 3] - [0.0, 0.0, 0.07], axis=1)
-    assert np.all(codes[hand_to_base < 0.08] == IN_ITSELF)
-    assert (hand_to_base < 0.08).sum() > 3
-    assert np.mean(codes == FREE) > 0.8
 
 
 def test_clearances_that_cannot_be_checked_are_refused():

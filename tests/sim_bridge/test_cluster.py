@@ -18,64 +18,33 @@ PROGRAM = SUPPORT / "ray_on_loopback.py"
 LONGEST_S = 240
 
 
-def program(*arguments):
-    # Ray reads its variables when it is imported: every test has processes of its own.
+def outcome():
+    # Ray reads its variables when it is imported: it has a process of its own.
     kept = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
-    return subprocess.Popen(
-        [sys.executable, PROGRAM, *arguments],
+    done = subprocess.run(
+        [sys.executable, PROGRAM],
         env=kept | {"PYTHONPATH": str(SUPPORT), "OPENBLAS_NUM_THREADS": "1"},
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def outcome(*arguments):
-    process = program(*arguments)
-    out, err = process.communicate(timeout=LONGEST_S)
-    assert process.returncode == 0, err[-2000:]
+        capture_output=True, text=True, timeout=LONGEST_S, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
     # Ray tells of its nodes on the same way out.
-    return json.loads(next(line for line in out.splitlines() if line.startswith("{")))
+    return json.loads(next(line for line in done.stdout.splitlines() if line.startswith("{")))
 
 
 @pytest.mark.slow
 def test_two_nodes_of_which_one_is_killed_give_what_one_process_gives():
     pytest.importorskip("ray")
-    found = outcome("two-nodes")
+    found = outcome()
     assert found["killed"], "the node was killed before the last shard"
     assert found["same"] and found["unfinished"] == [[], []]
     assert not found["beyond_loopback"]
 
 
-@pytest.mark.slow
-def test_a_cluster_that_is_started_stays_on_loopback_and_has_a_token():
-    pytest.importorskip("ray")
-    found = outcome("started")
-    assert found["address"].startswith("127.0.0.1:") and found["mode"] == "token"
-    assert found["same"] and not found["beyond_loopback"]
-    assert found["left_in_environment"] == []
-
-
-@pytest.mark.slow
-def test_a_cluster_without_a_token_and_one_that_is_not_there_are_refused():
-    pytest.importorskip("ray")
-    node = program("open")
-    try:
-        address = json.loads(node.stdout.readline())["address"]
-        assert "lets in anyone without a token" in outcome("join", address)["error"]
-    finally:
-        node.communicate(timeout=60)
-    error = outcome("join", address)["error"]
-    assert "cannot be joined" in error and f"ray start --address={address}" in error
-
-
-@pytest.mark.parametrize(
-    "address", ["10.0.0.1", "ray://10.0.0.1:10001", "http://head:6379", ":6379", "head:port"]
-)
-def test_what_is_no_address_is_named(address):
-    with pytest.raises(InputError, match="no address of a Ray cluster"):
-        run_school(scene(at(0, 0)), {1: model()}, CONFIG, workers=ClusterConfig(address=address))
+def test_what_is_no_address_is_named():
+    for address in ("10.0.0.1", "ray://10.0.0.1:10001", ":6379", "head:port"):
+        cluster = ClusterConfig(address=address)
+        with pytest.raises(InputError, match="no address of a Ray cluster"):
+            run_school(scene(at(0, 0)), {1: model()}, CONFIG, workers=cluster)
 
 
 def test_a_cluster_is_not_joined_without_a_token(monkeypatch, tmp_path):

@@ -7,15 +7,13 @@ from hypothesis import strategies as st
 
 from held_boxes import held_box, held_from_above
 from realsim.geometry.hand import HandGeometry
-from realsim.records import MEASURES, GraspSet
 from realsim_sim_bridge.school.cross_check import (
     agreement,
-    agreement_of,
     cross_check,
     wilson_interval,
 )
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
-from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
+from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.world import SlipPhysics
 
@@ -75,49 +73,7 @@ def test_labels_are_counted_and_what_one_did_not_judge_is_left_out():
     assert found.mean_confidence == pytest.approx(np.mean([1, 0.5, 1, 0, 1 - 1 / 12]))
 
 
-def test_agreement_does_not_depend_on_which_engine_is_first():
-    rng = np.random.default_rng(1)
-    a, b = rng.integers(0, 13, (2, 200)) / 12
-    there, back = agreement(a, b), agreement(b, a)
-    assert there.share == back.share and there.mean_confidence == back.mean_confidence
-    assert (there.only_first, there.only_second) == (back.only_second, back.only_first)
-
-
-def test_nothing_to_compare_is_no_agreement():
-    found = agreement(np.zeros(0), np.zeros(0))
-    assert found.count == 0 and np.isnan(found.share) and found.interval == (0.0, 1.0)
-
-
-def test_the_sets_that_were_checked_are_put_together():
-    def a_set(scores, second):
-        n = len(scores)
-        return GraspSet(
-            obj_id=1, instance=0, Ts_obj_grasp=np.repeat(np.eye(4)[None], n, 0),
-            widths_m=np.full(n, 0.05), scores=scores, base_scores=np.floor(scores * 4) / 4,
-            slip_m=np.zeros((n, 4)), slip_rad=np.zeros((n, 4)), reachable=np.ones(n, dtype=bool),
-            failures=("",) * n, measures={} if second is None else {"second_score": second},
-        )  # fmt: skip
-
-    sets = [
-        a_set(np.array([1.0, 0.0]), np.array([1.0, 1.0])),
-        a_set(np.array([1.0]), np.array([1.0])),
-        a_set(np.array([1.0]), None),
-    ]
-    assert agreement_of(sets) == agreement(np.array([1.0, 0, 1]), np.array([1.0, 1, 1]))
-
-
 # --- the engines ----------------------------------------------------------------------------
-
-
-def test_an_engine_agrees_with_itself():
-    slips, found = checked(trial([0.0, 0.055]), SlipPhysics(force_n=5.0, friction=0.4), "pybullet")
-    tried = np.ones(2, dtype=bool)
-    base, score = score_stages(slips.slip_m, slips.slip_rad, tried, ScoreLimits())
-    assert np.array_equal(found["second_score"], score)
-    assert np.array_equal(found["second_base_score"], base)
-    assert np.array_equal(found["second_slip_m"], slips.slip_m, equal_nan=True)
-    assert np.all(found["confidence"] == 1.0)
-    assert 0.0 <= score[1] < score[0] == 1.0  # both labels occur
 
 
 def test_two_engines_agree_on_a_box_that_coulomb_s_law_decides():
@@ -129,9 +85,3 @@ def test_two_engines_agree_on_a_box_that_coulomb_s_law_decides():
     weak = checked(trial([0.0, 0.055]), SlipPhysics(force_n=1.0, friction=0.2), "mujoco")[1]
     assert np.all(strong["second_score"] == 1.0) and np.all(strong["confidence"] == 1.0)
     assert np.all(weak["second_score"] < 0.5) and np.all(weak["confidence"] > 0.8)
-
-
-def test_every_measure_has_its_name_and_shape():
-    found = checked(trial([0.0, 0.01, 0.02]), SlipPhysics(), "pybullet")[1]
-    for name, values in found.items():
-        assert values.shape == ((3, 4) if MEASURES[name].by_stage else (3,)), name

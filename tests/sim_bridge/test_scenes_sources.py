@@ -1,15 +1,11 @@
 """Scenes of other programs: recognised by content, with everything physics needs."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
 from realsim.geometry import se3
-from realsim.models.convex import ConvexConfig
 from realsim.records import Mesh, ObjectModel
 from realsim.store.atomic import write_json
 from realsim_sim_bridge.scenes.importers import from_bop, load_scene_source
@@ -17,10 +13,7 @@ from realsim_sim_bridge.scenes.school_scene import Matter
 from realsim_sim_bridge.scenes.stable_state import stable_state
 from realsim_sim_bridge.scenes.table_world import TableWorld
 
-DATA = Path(os.environ.get("REALSIM_DATA", "/nonexistent"))
-YCBV = DATA / "scenes/ycbv_mini"
 SIZE = (0.06, 0.08, 0.1)
-COARSE = Matter(convex=ConvexConfig(thresholds=(0.2,), time_limit_s=20.0, coarse_ratio=1.5))
 
 
 def block():
@@ -74,7 +67,7 @@ def write_bop(root, cameras=1, with_poses=False, depth=True):
     return root
 
 
-@pytest.mark.parametrize(("cameras", "with_poses"), [(1, False), (3, True), (3, False)])
+@pytest.mark.parametrize(("cameras", "with_poses"), [(3, True), (1, False)])
 def test_a_bop_scene_stands_on_the_table_that_its_depth_shows(tmp_path, cameras, with_poses):
     scene = load_scene_source(write_bop(tmp_path, cameras, with_poses))
     assert [o.obj_id for o in scene.scene.objects] == [4, 4]
@@ -116,18 +109,3 @@ def test_what_is_no_scene_is_named_with_what_was_found(tmp_path):
         load_scene_source(tmp_path / "photo.jpg")
     with pytest.raises(InputError, match="does not exist"):
         load_scene_source(tmp_path / "gone")
-
-
-@pytest.mark.real
-@pytest.mark.slow
-@pytest.mark.skipif(not YCBV.is_dir(), reason=f"no ycbv_mini under {DATA} (set REALSIM_DATA)")
-def test_annotated_poses_of_ycbv_sink_into_their_table_and_jump():
-    """The dataset's poses and its depth differ by millimetres; the check has to say so."""
-    scene = load_scene_source(YCBV, COARSE, scene_id=50)
-    assert any("into the table" in n for n in scene.notes)
-    with TableWorld(scene) as world:
-        report = stable_state(world)
-    assert not report.stable and len(report.objects) == 5
-    assert max(max(o.into.values(), default=0.0) for o in report.objects) > 0.004
-    # What has settled once stands, but for round things that go on rolling.
-    assert max(o.moved_m for o in report.objects) < 0.02

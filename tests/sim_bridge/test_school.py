@@ -29,14 +29,6 @@ def test_a_box_gets_good_grasps_and_scores_that_follow_from_the_set(one_set):
     assert np.all(one_set.scores[~one_set.reachable] == 0)
 
 
-def test_all_parameters_stand_beside_the_grasps(one_set):
-    p = one_set.parameters
-    assert p["config"]["slip"]["physics"]["force_n"] == 70.0
-    assert p["config"]["slip"]["motion"]["lift_height_m"] == 0.2
-    assert p["mass_kg"] == pytest.approx(0.125) and p["counts"]["kept"] == 6
-    assert len(p["openings_m"]) == 6 and len(p["joints_rad"]) == 6
-
-
 def test_the_same_scene_elsewhere_in_the_world_gives_the_same_grasps(one_set):
     T = se3.exp([0.3, -0.2, 1.0, 0.5, 0.1, 0.4])
     moved = Scene(

@@ -14,11 +14,9 @@ from scipy.stats import spearmanr
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import GraspSet
-from realsim_sim_bridge.school import summary as paper
 from realsim_sim_bridge.school.measure_statistics import LEAST_GRASPS, spearman
-from realsim_sim_bridge.school.summary import GOOD, OUTCOMES, outcomes_of, summarise
+from realsim_sim_bridge.school.summary import OUTCOMES, outcomes_of, summarise
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
-from tried_grasps import tried_set
 
 
 def scored_set(rng, n, *, obj_id=1, instance=0, tried=True, **measures):
@@ -53,7 +51,7 @@ def some_scenes(seed):
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_every_candidate_is_in_exactly_one_row(seed):
     scenes = some_scenes(seed)
     sets = [s for part in scenes.values() for s in part]
@@ -71,24 +69,6 @@ def test_every_candidate_is_in_exactly_one_row(seed):
         mean = found.share(found.good) * (found.score_good if found.good else 0)
         mean += found.share(found.bad) * (found.score_bad if found.bad else 0)
         assert mean == pytest.approx(found.score.mean)
-
-
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=10, deadline=None)
-def test_counts_add_up_and_the_order_does_not_matter(seed):
-    scenes = some_scenes(seed)
-    parts = [summarise(part) for part in scenes.values()]
-    whole = summarise(dict(reversed(scenes.items())))
-    assert whole.outcomes == {k: sum(p.outcomes[k] for p in parts) for k in OUTCOMES}
-    assert whole.per_object == summarise(scenes).per_object
-
-
-def test_the_papers_rows_sum_as_ours_do():
-    out = paper.PAPER_OUTCOMES
-    assert sum(out.values()) == paper.PAPER_CANDIDATES == paper.PAPER_GOOD + paper.PAPER_BAD
-    assert paper.PAPER_GOOD == sum(out[n] for n in GOOD)
-    assert paper.PAPER_BAD == sum(out[n] for n in ("no_trajectory", "fail_lift", "penalized"))
-    assert paper.PAPER_WITH_TRAJECTORY == paper.PAPER_CANDIDATES - out["no_trajectory"]
 
 
 # --- known answers ----------------------------------------------------------------------------
@@ -130,19 +110,6 @@ def test_each_outcome_is_told_by_base_and_score():
     assert found.score.sd == pytest.approx(np.nanstd(s.scores))
 
 
-def test_candidates_are_counted_per_object_over_scenes_and_per_scene():
-    rng = np.random.default_rng(0)
-    scenes = {
-        "a": [scored_set(rng, 10, obj_id=1), scored_set(rng, 20, obj_id=2, instance=1)],
-        "b": [scored_set(rng, 40, obj_id=1)],
-    }
-    found = summarise(scenes)
-    assert (found.scenes, found.objects, found.sets) == (2, 2, 3)
-    per = found.per_object["candidates"]
-    assert (per.mean, per.sd) == (35.0, 15.0)
-    assert (found.per_scene["candidates"].mean, found.per_scene["candidates"].sd) == (35.0, 5.0)
-
-
 def test_impossible_scores_are_named():
     with pytest.raises(InputError, match="at most its base score"):
         outcomes_of(by_hand([(True, 0.5, 0.75, 3)]))
@@ -150,13 +117,6 @@ def test_impossible_scores_are_named():
         outcomes_of(by_hand([(True, math.nan, 0.75, 3)]))
     with pytest.raises(InputError, match="a base score"):
         outcomes_of(by_hand([(True, 0.6, 0.5, 3)]))
-
-
-def test_nothing_at_all_has_a_summary_too():
-    found = summarise([])
-    assert found.candidates == 0 and math.isnan(found.score.mean)
-    assert json.loads(json.dumps(found.to_json(), allow_nan=False))["score"]["mean"] is None
-    assert len(found.to_rows()) > 15
 
 
 def test_rows_and_json_say_the_same():
@@ -175,8 +135,8 @@ def test_rows_and_json_say_the_same():
 # --- what was measured beside -----------------------------------------------------------------
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(LEAST_GRASPS, 200))
-@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(LEAST_GRASPS, 60))
+@settings(max_examples=10, deadline=None)
 def test_the_rank_correlation_is_scipys_ties_and_infinities_included(seed, n):
     rng = np.random.default_rng(seed)
     x = rng.integers(0, 5, n) / 4
@@ -190,18 +150,12 @@ def test_the_interval_holds_the_truth_about_as_often_as_it_says():
     rng = np.random.default_rng(1)
     truth = 6 / np.pi * np.arcsin(0.6 / 2)  # Spearman's of a normal pair with correlation 0.6
     hits = 0
-    for _ in range(60):
-        x = rng.normal(size=80)
-        y = 0.6 * x + 0.8 * rng.normal(size=80)
+    for _ in range(30):
+        x = rng.normal(size=40)
+        y = 0.6 * x + 0.8 * rng.normal(size=40)
         _, low, high = spearman(x, y, rng)
         hits += low <= truth <= high
-    assert hits >= 51  # 57 expected; 51 is below the 1st percentile of a 95 % interval
-
-
-def test_a_quality_that_is_the_same_for_all_has_no_correlation():
-    rng = np.random.default_rng(0)
-    assert all(map(math.isnan, spearman(np.ones(50), rng.normal(size=50), rng)))
-    assert all(map(math.isnan, spearman(np.arange(5.0), np.arange(5.0), rng)))
+    assert hits >= 25  # 28.5 expected; 25 is below the 2nd percentile of a 95 % interval
 
 
 def test_only_tried_grasps_are_compared_with_force_closure():
@@ -235,12 +189,6 @@ def test_only_tried_grasps_are_compared_with_force_closure():
     assert "dexnet_closure: closed: good, bad" in names
     assert "closure_friction: closed at some level up to 0.4: good, bad" in names
     assert found == summarise([s])  # the same draws
-
-
-def test_sets_without_measures_say_nothing_of_them():
-    s = tried_set(np.random.default_rng(0), 0, measures=())
-    found = summarise([s, scored_set(np.random.default_rng(1), 40)])
-    assert found.correlations == () and found.closures == ()
 
 
 def test_objects_of_one_number_and_other_meshes_are_different_objects():

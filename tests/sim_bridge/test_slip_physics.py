@@ -18,7 +18,7 @@ from realsim_sim_bridge.slip.motion import (
     pendulum_wrenches,
 )
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
-from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, batches, run_slip_test
+from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import Closing, Replay, SlipPhysics
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
@@ -92,8 +92,10 @@ def hold(load_share, force_n, friction, direction):
     return float(np.linalg.norm(now[0, :3, 3] - start[0, :3, 3]))
 
 
-@pytest.mark.parametrize(("force_n", "friction"), [(2.0, 0.25), (20.0, 0.25), (70.0, 1.0)])
-@pytest.mark.parametrize("direction", [(0, 0, -1), (1, 0, 0), (0.7071, 0, -0.7071)])
+@pytest.mark.parametrize(
+    ("force_n", "friction", "direction"),
+    [(2.0, 0.25, (1, 0, 0)), (70.0, 1.0, (0.7071, 0, -0.7071))],
+)
 def test_coulomb_s_limit_along_the_pad(force_n, friction, direction):
     assert hold(0.9, force_n, friction, direction) < 1e-3
     assert hold(1.1, force_n, friction, direction) > 2e-3
@@ -122,7 +124,7 @@ def turned_trial(n):
 
 
 def test_results_are_repeatable_to_the_bit():
-    a, b = run_slip_test(turned_trial(3)), run_slip_test(turned_trial(3))
+    a, b = run_slip_test(turned_trial(2)), run_slip_test(turned_trial(2))
     assert np.array_equal(a.slip_m, b.slip_m) and np.array_equal(a.slip_rad, b.slip_rad)
 
 
@@ -139,16 +141,6 @@ def test_no_grasp_depends_on_the_others_it_is_tried_with():
         assert np.array_equal(whole[::-1], getattr(backwards, name))
         assert np.array_equal(whole[2:3], getattr(alone, name))
         assert np.array_equal(whole, getattr(parted, name))
-
-
-def test_a_replay_at_speed_gives_the_labels_of_true_speed():
-    for force, lost in ((70.0, False), (5.0, True)):
-        physics = SlipPhysics(friction=0.05 if lost else 1.0, force_n=force)
-        slow = run(physics, BulletSettings.reference())
-        fast = run(physics, BulletSettings())
-        assert slow.failures[0].partition(":")[0] == fast.failures[0].partition(":")[0]
-        assert bool(slow.failures[0]) == lost
-        assert np.allclose(slow.duration_s, fast.duration_s, atol=0.06, equal_nan=True)
 
 
 def test_what_slips_in_a_fast_replay_is_judged_at_true_speed():
@@ -192,11 +184,6 @@ def test_a_hand_that_closes_on_nothing_fails_in_the_first_stage():
     slips = run_slip_test(beside)
     assert slips.failures[0] == "close: the fingers did not both touch the object"
     assert np.isinf(slips.slip_m[0, 0]) and np.isnan(slips.slip_m[0, 1:]).all()
-
-
-def test_no_grasps_give_no_slips():
-    assert run_slip_test(trial(0)).slip_m.shape == (0, 4)
-    assert batches(5, 2) == [slice(0, 2), slice(2, 4), slice(4, 5)]
 
 
 def test_the_motions_end_at_rest_and_go_where_they_should():

@@ -98,13 +98,11 @@ def test_the_shipped_settings_pass_a_small_suite():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
-def test_the_quick_suite_passes(engine):
-    if engine == "mujoco":
-        pytest.importorskip("mujoco")
+def test_the_quick_suite_passes():
+    pytest.importorskip("mujoco")
     told = []
     report = validate(
-        settings_of(engine), ValidationConfig.quick(), lambda *progress: told.append(progress)
+        settings_of("mujoco"), ValidationConfig.quick(), lambda *progress: told.append(progress)
     )
     assert failed(report) == set(), report.to_rows()
     assert [t[0] for t in told] == list(CHECKS)
@@ -138,13 +136,13 @@ def test_a_friction_pyramid_fails_between_the_axes_alone(told_otherwise):
 
 def test_substeps_are_seen_in_the_settings_and_in_the_force(told_otherwise):
     told_otherwise(numSubSteps=4)
-    found = failed(run("settings", "coulomb", "capacity"))
-    assert {"settings read back", "coulomb limit, x", "capacity below the weight"} <= found
+    found = failed(run("settings", "coulomb"))
+    assert {"settings read back", "coulomb limit, x"} <= found
 
 
 def test_a_wrong_force_fails_everywhere():
-    found = failed(run("settings", "coulomb", "torque", make=StrongerEngine))
-    assert {"settings read back", "finger force", "coulomb limit, z", "torque limit, spin"} <= found
+    found = failed(run("settings", "torque", make=StrongerEngine))
+    assert {"settings read back", "finger force", "torque limit, spin"} <= found
 
 
 def test_a_light_object_without_a_mass_floor_fails():
@@ -158,13 +156,6 @@ def test_soft_friction_in_mujoco_creeps():
     assert failed(run("creep", settings=MujocoSettings())) == set()
     report = run("creep", settings=MujocoSettings(impratio=1.0))
     assert {"no creep", "no creeping turn", "no creep on a cylinder"} <= failed(report)
-
-
-@pytest.mark.slow
-def test_labels_of_an_unconverged_solver_fail():
-    few = replace(SMALL.labels, grasps=3, finer=((1, 10),))
-    config = replace(SMALL, checks=("convergence",), labels=few)
-    assert failed(validate(BulletSettings(iterations=10), config))
 
 
 # --- the report ----------------------------------------------------------------------------------

@@ -1,18 +1,13 @@
-"""A program: Ray nodes on loopback, and the school on them; prints one JSON line.
+"""A program: two Ray nodes on loopback, of which one is killed in the middle of the school.
 
-python ray_on_loopback.py two-nodes     one of two nodes is killed in the middle of the school
-python ray_on_loopback.py started       the school starts a cluster of this machine itself
-python ray_on_loopback.py open          a node without a token, held until the input ends
-python ray_on_loopback.py join ADDRESS  the school on a cluster that runs already
+It prints what came of it as one JSON line.
 """
 
 import json
 import os
 import socket
-import sys
 import threading
 
-from realsim.errors import InputError
 from realsim_sim_bridge.school import ClusterConfig, run_school_results
 from school_scenes import at, model, same, same_motion, scene, small_worlds
 
@@ -32,9 +27,9 @@ def agree(a, b):
     )
 
 
-def nodes(count, mode):
+def nodes(count):
     """Start nodes whose every port is on loopback."""
-    os.environ.update(RAY_AUTH_MODE=mode, RAY_USAGE_STATS_ENABLED="0")
+    os.environ.update(RAY_AUTH_MODE="token", RAY_USAGE_STATS_ENABLED="0")
     os.environ.update(RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER="0", RAY_ENABLE_UV_RUN_RUNTIME_ENV="0")
     from ray.cluster_utils import Cluster
 
@@ -57,7 +52,7 @@ def listening_beyond_loopback(address):
 
 def two_nodes():
     os.environ["RAY_AUTH_TOKEN"] = "t" * 64
-    cluster, (other,) = nodes(2, "token")
+    cluster, (other,) = nodes(2)
     killed = []
 
     def kill_one(done, of):
@@ -76,46 +71,5 @@ def two_nodes():
     }
 
 
-def started():
-    before = dict(os.environ)
-    seen = {}
-
-    def look(*_):
-        import ray
-
-        context = ray.get_runtime_context()
-        seen["address"], seen["mode"] = context.gcs_address, os.environ["RAY_AUTH_MODE"]
-        seen["beyond_loopback"] = listening_beyond_loopback(context.gcs_address)
-
-    found = school(ClusterConfig(workers=2), look)
-    again = school(ClusterConfig(workers=1))
-    local = school(1)
-    return seen | {
-        "same": agree(found, local) and agree(again, local),
-        "left_in_environment": sorted(
-            name
-            for name in {*before, *os.environ}
-            if before.get(name) != os.environ.get(name) and name.startswith("RAY")
-        ),
-    }
-
-
-def joined(address):
-    os.environ.update(RAY_AUTH_TOKEN="t" * 64, RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER="0")
-    try:
-        school(ClusterConfig(address=address))
-    except InputError as error:
-        return {"error": str(error)}
-    return {"error": ""}
-
-
 if __name__ == "__main__":
-    what = sys.argv[1]
-    if what == "open":
-        held, _ = nodes(1, "disabled")
-        print(json.dumps({"address": held.address}), flush=True)
-        sys.stdin.read()
-        held.shutdown()
-    else:
-        jobs = {"two-nodes": two_nodes, "started": started}
-        print(json.dumps(joined(sys.argv[2]) if what == "join" else jobs[what]()), flush=True)
+    print(json.dumps(two_nodes()), flush=True)

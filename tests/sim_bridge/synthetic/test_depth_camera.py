@@ -8,14 +8,12 @@ import pytest
 from realsim import InputError, Mesh
 from realsim.geometry import se3
 from realsim.rendering.appearance import Material
-from realsim.rendering.depth_camera import DepthCamera, exposed
+from realsim.rendering.depth_camera import DepthCamera
 from realsim.rendering.depth_sensors.loss import look_of
 from realsim.rendering.depth_sensors.model import DepthSensorModel
-from realsim.rendering.depth_sensors.profiles import PROFILES
 from realsim.rendering.labels import LabelRenderer
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim_sim_bridge.synthetic.config import SyntheticConfig
-from realsim_sim_bridge.synthetic.frame import depth_camera
 from synthetic_scenes import INTRINSICS, cameras, synthetic_scene, table
 
 FAULTLESS = DepthSensorModel.noiseless()
@@ -92,14 +90,6 @@ def test_a_camera_with_a_signal_limit_knows_how_dark_each_surface_is():
     assert kept[0] > kept[1] + 0.2
 
 
-def test_a_dark_room_is_exposed_for_and_only_what_is_darker_still_is_lost():
-    seen = np.array([[True, True, True, False]])
-    for level in (0.1, 1.0):
-        found = exposed(level * np.array([[0.2, 0.4, 0.6, 1.0]], np.float32), seen)
-        assert found[0, :3] == pytest.approx([0.5, 1.0, 1.0])
-    assert np.all(exposed(np.ones((1, 4), np.float32), ~seen) == 1)
-
-
 def test_the_mean_look_of_a_mesh_is_its_own():
     v, f = np.eye(4)[:, :3], np.array([[0, 1, 2]], np.int32)
     grey = np.full((4, 3), 188, np.uint8)  # sRGB 188 is half of the light
@@ -114,19 +104,6 @@ def test_the_mean_look_of_a_mesh_is_its_own():
     assert plain.base_color == Material().base_color
 
 
-def test_the_figures_are_the_fitted_ones_or_the_profiles():
-    fitted = replace(FAULTLESS, bias_px=0.5, depth_unit_m=0.0005)
-    config = SyntheticConfig(depth_model=fitted)
-    assert depth_camera(synthetic_scene(), config).sensor is fitted
-    assert config.unit_m == 0.0005
-    assert replace(config, depth_unit_m=0.001).unit_m == 0.001
-    plain = SyntheticConfig(profile="d435")
-    assert plain.unit_m == PROFILES["d435"].depth_unit_m
-    camera = depth_camera(synthetic_scene(), plain)
-    assert camera.sensor == DepthSensorModel.from_profile("d435")
-
-
-@pytest.mark.parametrize("depth", ["stereo", "clean"])
-def test_a_fitted_model_with_another_kind_of_depth_is_refused(depth):
+def test_a_fitted_model_with_another_kind_of_depth_is_refused():
     with pytest.raises(InputError, match="'disparity'"):
-        SyntheticConfig(depth=depth, depth_model=FAULTLESS)
+        SyntheticConfig(depth="stereo", depth_model=FAULTLESS)

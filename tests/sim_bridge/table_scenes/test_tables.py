@@ -38,17 +38,6 @@ def test_an_outline_is_convex_and_counter_clockwise(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", table_names())
-def test_the_same_numbers_give_the_same_table_and_others_another(name: str) -> None:
-    a, b, c = (table(name, np.random.default_rng(s)) for s in (1, 1, 2))
-    assert np.array_equal(a.outline, b.outline)
-    assert all(
-        np.array_equal(p.mesh.vertices, q.mesh.vertices)
-        for p, q in zip(a.parts, b.parts, strict=True)
-    )
-    assert not np.allclose(a.size_m, c.size_m)
-
-
-@pytest.mark.parametrize("name", table_names())
 def test_objects_may_lie_only_where_no_rim_is(name: str) -> None:
     made = table(name, np.random.default_rng(6))
     low, high = made.inside.min(axis=0), made.inside.max(axis=0)

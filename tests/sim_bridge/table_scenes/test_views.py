@@ -18,7 +18,7 @@ from realsim_sim_bridge.scenes.table_world import TableWorld
 from realsim_sim_bridge.table_scenes.cameras import ViewConfig, intrinsics_of, views
 from realsim_sim_bridge.table_scenes.config import TableSceneConfig
 from realsim_sim_bridge.table_scenes.pool import open_pool
-from realsim_sim_bridge.table_scenes.sample import sample_layout
+from realsim_sim_bridge.table_scenes.sample import Layout, sample_layout
 from realsim_sim_bridge.table_scenes.scene import (
     BuiltScene,
     OwnLooks,
@@ -29,19 +29,23 @@ from realsim_sim_bridge.table_scenes.scene import (
 from realsim_sim_bridge.table_scenes.tables import corners
 
 CUBE = [corners((-0.05, -0.05, 0.0), (0.05, 0.05, 0.1))]
-SCENE = TableSceneConfig(objects=(3, 3))
+SCENE = TableSceneConfig(objects=(2, 2))
+
+
+@cache
+def _layout() -> Layout:
+    return sample_layout(1, 0, open_pool(["pybullet"]), SCENE)
 
 
 @cache
 def _built(own: OwnLooks = OwnLooks()) -> BuiltScene:  # noqa: B008 - frozen, and no argument of a user
-    pool = open_pool(["pybullet"])
-    return build_scene(sample_layout(1, 0, pool, SCENE), pool, SCENE, own=own)
+    return build_scene(_layout(), open_pool(["pybullet"]), SCENE, own=own)
 
 
 # --- cameras ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("radius", [(1.0, 2.0), (0.25, 0.5), (0.7, 0.7)])
+@pytest.mark.parametrize("radius", [(1.0, 2.0), (0.25, 0.5)])
 def test_cameras_are_as_far_away_as_asked_above_the_table_and_look_at_it(
     radius: tuple[float, float],
 ) -> None:
@@ -69,23 +73,16 @@ def test_no_camera_stands_in_an_object_or_a_rim() -> None:
         assert gap.min() > config.clearance_m
 
 
-def test_cameras_repeat_with_the_seed() -> None:
-    config = ViewConfig(count=8, radius_m=(0.25, 0.5))
-    a, b, c = (views(CUBE, config, np.random.default_rng(s)) for s in (3, 3, 4))
-    assert np.array_equal(a, b)
-    assert not np.allclose(a, c)
-
-
 def test_cameras_that_can_only_stand_in_something_are_refused() -> None:
     block = [corners((-1, -1, 0), (1, 1, 2.0))]
     with pytest.raises(InputError, match=r"stand in the objects.*larger --radius"):
         views(block, ViewConfig(count=4, radius_m=(0.3, 0.4), near_m=0.0), np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("radius", [(0.01, 0.05), (2.0, 1.0), (1.0, 9.0), (-1.0, 1.0)])
-def test_a_radius_that_cannot_be_is_refused(radius: tuple[float, float]) -> None:
-    with pytest.raises(InputError, match="least <= most"):
-        ViewConfig(radius_m=radius)
+def test_a_radius_that_cannot_be_is_refused() -> None:
+    for radius in ((0.01, 0.05), (2.0, 1.0), (1.0, 9.0), (-1.0, 1.0)):
+        with pytest.raises(InputError, match="least <= most"):
+            ViewConfig(radius_m=radius)
 
 
 @pytest.mark.parametrize(("profile", "fov_deg"), [("d435", 69.4), ("d405", 89.3)])
@@ -106,12 +103,11 @@ def _bytes(material: Material) -> list[bytes]:
 
 
 def test_the_same_seed_gives_the_same_looks_to_the_byte() -> None:
-    pool = open_pool(["pybullet"])
     a = _built().synthetic
-    b = build_scene(sample_layout(1, 0, pool, SCENE), pool, SCENE).synthetic
+    b = build_scene(_layout(), open_pool(["pybullet"]), SCENE).synthetic
     assert a.digests() == b.digests()
     assert [_bytes(m) for m in a.materials.values()] == [_bytes(m) for m in b.materials.values()]
-    assert set(a.materials) == {0, 1, 2}
+    assert set(a.materials) == {0, 1}
 
 
 def test_the_users_own_pictures_cover_table_floor_and_objects(tmp_path: Path) -> None:
@@ -137,7 +133,7 @@ def test_a_folder_without_pictures_is_refused(tmp_path: Path) -> None:
 def test_the_school_knows_the_parts_and_the_matter_that_were_dropped(tmp_path: Path) -> None:
     built = _built()
     write_models(tmp_path, built)
-    solids, unknown = known_solids(tmp_path, [1, 2, 3])
+    solids, unknown = known_solids(tmp_path, [1, 2])
     assert not unknown
     for obj_id, solid in built.solids.items():
         kept = solids[obj_id]
