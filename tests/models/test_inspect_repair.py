@@ -11,7 +11,6 @@ from realsim.geometry.mesh import mass_properties, merged
 from realsim.geometry.mesh_shape import welded
 from realsim.geometry.parts import part
 from realsim.models.inspect import inspect_mesh, solved
-from realsim.models.mesh_topology import equal_rows
 from realsim.models.repair import RepairConfig, repaired
 from realsim.models.simplify import colors_at, deviation
 from realsim.records import Mesh
@@ -117,23 +116,17 @@ BROKEN = {
     "small hole": (lambda: without(ball(subdivisions=4), [0]), {"open"}),
     "large hole": (lambda: without(ball(), near(ball(), [0, 0, 0.05], 0.02)), {"open"}),
     "bowl": (open_bowl, {"open"}),
-    "bowl inside-out": (lambda: inside_out(open_bowl()), {"open", "inside-out"}),
     "bad rows": (
         lambda: with_bad_rows(solid()),
         {"degenerate faces", "duplicate faces", "unreferenced vertices"},
     ),
     "fold": (lambda: with_fold(ball()), {"folded faces"}),
-    "two balls": (lambda: merged([ball(), ball(0.04, (0.2, 0, 0))]), {"several bodies"}),
     "one ball inside-out": (
         lambda: merged([ball(), inside_out(ball(0.04, (0.2, 0, 0)))]),
         {"several bodies", "inside-out"},
     ),
     "cavity": (lambda: merged([ball(), inside_out(ball(0.03))]), {"nested shells"}),
     "cavity filled": (lambda: merged([ball(), ball(0.03)]), {"nested shells", "inside-out"}),
-    "ball in a cavity": (
-        lambda: merged([ball(), inside_out(ball(0.04)), ball(0.03)]),
-        {"nested shells", "several bodies"},
-    ),
     "specks": (
         lambda: merged([ball(), ball(0.001, (0.08, 0, 0), 1), ball(0.0005, (0, 0.09, 0), 1)]),
         {"stray specks"},
@@ -199,7 +192,7 @@ def test_repair_is_idempotent_and_leaves_fewer_problems(name):
     assert again.actions == () and again.mesh is repair.mesh
     left = kinds(repair.after)
     solvable = expected - UNSOLVED
-    if name in ("large hole", "bowl", "bowl inside-out"):
+    if name in ("large hole", "bowl"):
         solvable -= {"open"}
     assert left == expected - solvable
     assert set(solved(repair.before, repair.after)) == solvable
@@ -208,19 +201,12 @@ def test_repair_is_idempotent_and_leaves_fewer_problems(name):
     assert repair.after == inspect_mesh(repair.mesh)
 
 
-@pytest.mark.parametrize("name", ["mug", "l_bracket", "elbow", "tube"])
-def test_an_inside_out_mesh_is_repaired_to_the_original(name):
-    mesh = solid(name)
+def test_an_inside_out_mesh_is_repaired_to_the_original():
+    mesh = solid("l_bracket")
     repair = repaired(inside_out(mesh))
     assert volume(repair.mesh) == pytest.approx(volume(mesh), rel=1e-9) and volume(mesh) > 0
     np.testing.assert_array_equal(repair.mesh.vertices, mesh.vertices)
     assert len(repair.actions) == 1 and "outward" in repair.actions[0]
-
-
-def test_a_sound_mesh_is_left_as_it_is():
-    mesh = part("mug").mesh
-    repair = repaired(mesh)
-    assert repair.mesh is mesh and repair.actions == () and repair.before == repair.after
 
 
 def test_shells_within_shells_give_the_volume_of_the_material():
@@ -229,12 +215,6 @@ def test_shells_within_shells_give_the_volume_of_the_material():
     repair = repaired(mesh)
     assert volume(repair.mesh) == pytest.approx(outer - middle + inner, rel=1e-9)
     assert mass_properties(repair.mesh, 1.0).volume_m3 == pytest.approx(outer - middle + inner)
-
-
-def test_parts_that_reach_into_each_other_are_no_cavities():
-    mesh = BROKEN["handle in a wall"][0]()
-    repair = repaired(inside_out(mesh))
-    assert volume(repair.mesh) == pytest.approx(volume(mesh))
 
 
 def test_texture_seams_stay_and_the_surface_is_closed_all_the_same():
@@ -292,21 +272,6 @@ def test_small_holes_are_closed_with_the_colours_of_their_rims(textured):
     assert kept.after.boundary_edges == before.boundary_edges
 
 
-def test_the_outline_of_a_loose_patch_is_not_closed():
-    scattered = soup(ball(subdivisions=4))
-    shift = np.random.default_rng(0).normal(0, 1e-3, (len(scattered.faces), 1, 3))
-    corners = (scattered.vertices.reshape(-1, 3, 3) + shift).reshape(-1, 3)
-    repair = repaired(replace(scattered, vertices=corners))
-    assert len(repair.mesh.faces) == len(scattered.faces)
-
-
-def test_the_size_of_a_hole_is_told_in_percent_of_the_extent():
-    whole = ball(subdivisions=5)
-    torn = without(whole, near(whole, [0, 0, 0.05], 0.015))
-    text = next(p.text for p in inspect_mesh(torn).problems if p.kind == "open")
-    assert "1 hole" in text and ("30 %" in text or "31 %" in text)  # 30 mm of 100 mm
-
-
 def test_specks_are_dropped_and_named_but_a_mesh_of_small_pieces_is_not():
     repair = repaired(BROKEN["specks"][0]())
     assert "dropped 2 stray specks, the largest 1.2 % of the extent" in repair.actions[0]
@@ -331,25 +296,14 @@ def test_what_cannot_be_an_object_is_refused():
 
 def test_a_moebius_band_is_named_and_left():
     t = np.linspace(0, 2 * np.pi, 60, endpoint=False)
-    strip = [
-        np.stack(
-            [
-                (0.1 + w * np.cos(t / 2)) * np.cos(t),
-                (0.1 + w * np.cos(t / 2)) * np.sin(t),
-                w * np.sin(t / 2),
-            ],
-            -1,
-        )
-        for w in (-0.02, 0.02)
-    ]
-    faces = []
-    for i in range(60):
-        j = (i + 1) % 60
-        a, b, c, d = i, 60 + i, j, 60 + j
-        if j == 0:
-            c, d = d, c
-        faces += [[a, b, d], [a, d, c]]
-    mesh = Mesh(vertices=np.concatenate(strip), faces=np.array(faces))
+    strip = []
+    for w in (-0.02, 0.02):
+        r = 0.1 + w * np.cos(t / 2)
+        strip.append(np.stack([r * np.cos(t), r * np.sin(t), w * np.sin(t / 2)], -1))
+    i = np.arange(60)
+    a, b, c, d = i, 60 + i, np.append(i[1:], 60), np.append(61 + i[:-1], 0)
+    faces = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
+    mesh = Mesh(vertices=np.concatenate(strip), faces=faces)
     assert "one-sided" in kinds(inspect_mesh(mesh))
     assert "one-sided" in kinds(repaired(mesh).after)
 
@@ -359,14 +313,3 @@ def test_a_folded_sheet_has_no_volume():
     paper = box((0.1, 0.08, 5e-5))
     assert "thin sheet" in kinds(inspect_mesh(paper))
     assert "thin sheet" not in kinds(inspect_mesh(box((0.1, 0.08, 1e-3))))
-
-
-def test_equal_rows_are_those_of_numpy():
-    rng = np.random.default_rng(0)
-    for rows in (rng.integers(-3, 3, (500, 3)), rng.integers(0, 3, (500, 2)) / 7.0):
-        first, kind = equal_rows(rows)
-        _, where, index = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-        np.testing.assert_array_equal(first, np.sort(where))
-        np.testing.assert_array_equal(rows[first][kind], rows)
-        assert len(first) == index.max() + 1
-    assert len(equal_rows(np.array([[0.0, -0.0], [-0.0, 0.0]]))[0]) == 1

@@ -11,7 +11,6 @@ from realsim.models.library_prepare import PrepareConfig, prepare_unscaled
 from realsim.models.library_records import ModelProperties
 from realsim.models.model_picture_views import (
     drawn_size,
-    parts_mesh,
     rendered,
     rim_layer,
     rotation_axes,
@@ -30,27 +29,12 @@ def near(image: np.ndarray, color: np.ndarray) -> int:
     return int(np.sum(np.all(np.abs(image.astype(int) - color) < 12, axis=-1)))
 
 
-@pytest.mark.slow
-def test_a_sheet_does_not_depend_on_the_unit():
-    mesh = part("l_bracket").mesh
-    small, large = (
-        model_sheet(replace(mesh, vertices=mesh.vertices * k), UNKNOWN) for k in (1.0, 1000.0)
-    )
-    assert small.shape == large.shape and small.shape[1] == 3 * PANEL[0]
-    # Words differ (the size), pictures do not: two panels without labels of lengths in them.
-    top = small.shape[0] - 2 * PANEL[1]
-    a, b = (s[top + 40 : top + PANEL[1] - 60, PANEL[0] : 2 * PANEL[0]] for s in (small, large))
-    assert np.mean(np.any(np.abs(a.astype(int) - b) > 8, axis=-1)) < 0.002
-    assert a.std() > 10
-
-
 def test_open_rims_are_red_and_closed_meshes_have_none():
     mesh = part("tube").mesh
     assert rim_layer(mesh, 1.0).lines == ()
     cut = replace(mesh, faces=mesh.faces[np.arange(len(mesh.faces)) % 40 != 0])
     assert len(rim_layer(cut, 1.0).lines) > 30
-    closed, opened = (model_sheet(m, UNKNOWN) for m in (mesh, cut))
-    assert near(closed, RIM) == 0 and near(opened, RIM) > 200
+    assert near(model_sheet(cut, UNKNOWN), RIM) > 200
 
 
 @pytest.mark.slow
@@ -66,18 +50,6 @@ def test_every_part_has_its_colour():
     blue = np.sum((panel[..., 2] - panel[..., 0] > 60) & (panel[..., 1] > 60))
     orange = np.sum((panel[..., 0] - panel[..., 2] > 60) & (panel[..., 1] > 60))
     assert blue > 2000 and orange > 2000
-
-
-def test_the_whole_object_is_in_the_picture_and_fills_it():
-    for name in ("stepped_shaft", "bowl", "l_bracket"):
-        drawn, _ = drawn_size(part(name).mesh)
-        for direction in ((1.0, 0.2, 0.1), (0.3, -1.0, 0.6), (0.1, 0.1, 1.0)):
-            _, depth = rendered([drawn], view_of(drawn.vertices, direction, SIZE))
-            seen = depth > 0
-            assert not (seen[0].any() or seen[-1].any() or seen[:, 0].any() or seen[:, -1].any())
-            rows, columns = np.nonzero(seen)
-            share = max(np.ptp(rows) / SIZE[1], np.ptp(columns) / SIZE[0])
-            assert 0.6 < share < 0.8
 
 
 def test_a_pixel_is_as_wide_as_the_scale_bar_says():
@@ -103,13 +75,6 @@ def test_the_axes_of_known_shapes(name: str, orders: dict[int, int]):
     for order, direction, point in moved:
         S = se3.from_rt(R := se3.exp_so3(2 * np.pi / order * direction), point - R @ point)
         assert min(np.abs(T @ A @ se3.invert(T) - S).max() for A in symmetries) < 1e-6
-
-
-def test_parts_are_drawn_closed_and_outward():
-    mesh = parts_mesh(part("cube").mesh.vertices, (1, 2, 3))
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
-    assert volume == pytest.approx((0.985 * 0.05) ** 3, rel=1e-6)
 
 
 def test_problems_are_written_on_the_sheet():

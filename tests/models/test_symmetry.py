@@ -11,7 +11,7 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import diameter, symmetry_transforms, transformed
-from realsim.geometry.parts import object_model, part, part_names
+from realsim.geometry.parts import object_model, part
 from realsim.models.reading import read_scan
 from realsim.models.symmetry import SymmetryConfig, find_symmetries
 from realsim.models.symmetry_search import closed, group, turn
@@ -20,11 +20,6 @@ from realsim.scanning.simulated import distorted
 
 PHI = (1 + math.sqrt(5)) / 2
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
-SLOW = ("gear", "cube", "cylinder_can", "flange", "elbow", "mug", "bottle", "pulley", "capsule")
-SLOW_EXACT = (
-    "tube", "capsule", "pulley", "bowl", "gear", "box", "flange", "cone", "elbow", "cube",
-    "cylinder_can", "hex_nut", "mug", "bottle",
-)  # fmt: skip
 
 
 def solid(shape):
@@ -42,12 +37,9 @@ def ring(n, z, twist=0.0):
     return np.stack([np.cos(t), np.sin(t), np.full(n, z)], -1)
 
 
-QUICK = ("pyramid",)
-
-
-def slowly(names, slow):
-    """Return the names as parameters, some of them marked slow."""
-    return [pytest.param(n, marks=pytest.mark.slow) if n in slow else n for n in names]
+def slowly(quick, *slow):
+    """Return the names as parameters, all but the first marked slow."""
+    return [quick, *(pytest.param(n, marks=pytest.mark.slow) for n in slow)]
 
 
 def scaled(mesh, factor):
@@ -84,8 +76,8 @@ def as_model(mesh, found):
 # --- known answers ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", slowly(part_names(), SLOW_EXACT))
-def test_the_symmetries_of_every_shipped_part_are_found(name):
+@pytest.mark.parametrize("name", slowly("t_profile", "cube", "cylinder_can", "hex_nut"))
+def test_the_symmetries_of_shipped_parts_are_found(name):
     model = part(name)
     found = find_symmetries(model.mesh)
     assert len(found.discrete) == len(model.symmetries)
@@ -110,18 +102,12 @@ SHAPES = {
         [np.roll((0, a, b * PHI), k) for a in (1, -1) for b in (1, -1) for k in range(3)],
         60, 0, True,
     ),
-    "octahedron": (np.concatenate([np.eye(3), -np.eye(3)]), 24, 0, True),
-    "tetrahedron": ([(1, 1, 1), (-1, -1, 1), (-1, 1, -1), (1, -1, -1)], 12, 0, True),
     "12 chiral corners": (group("tetrahedral") @ [1.0, 0.45, 0.15], 12, 0, False),
-    "triangular prism": (np.concatenate([ring(3, 0.5), ring(3, -0.5)]), 6, 0, True),
-    "twelve-sided prism": (np.concatenate([ring(12, 0.3), ring(12, -0.3)]), 24, 0, True),
-    "twisted prism": (np.concatenate([ring(5, 0.6), ring(5, -0.6, 0.25)]), 10, 0, False),
-    "square antiprism": (np.concatenate([ring(4, 0.6), ring(4, -0.6, np.pi / 4)]), 8, 0, True),
     "pyramid": (np.concatenate([ring(7, 0.0), [[0, 0, 1.2]]]), 7, 0, True),
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", slowly(SHAPES, set(SHAPES) - set(QUICK)))
+@pytest.mark.parametrize("name", slowly("pyramid", "icosahedron", "12 chiral corners"))
 def test_point_groups_are_found_wherever_the_shape_lies(name):
     points, discrete, axes, mirror = SHAPES[name]
     T = se3.random_transform(np.random.default_rng(1), 1)[0]
@@ -155,9 +141,8 @@ def test_a_random_hull_has_no_symmetry():
 # --- laws ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["cube", "knob", "t_profile"])
-def test_the_discrete_symmetries_are_a_group(name):
-    S = find_symmetries(part(name).mesh).discrete
+def test_the_discrete_symmetries_are_a_group():
+    S = find_symmetries(part("knob").mesh).discrete
     assert np.array_equal(S[0], np.eye(4))
     products = (S[:, None] @ S[None]).reshape(-1, 4, 4)
     for T in np.concatenate([products, np.linalg.inv(S)]):
@@ -166,7 +151,7 @@ def test_the_discrete_symmetries_are_a_group(name):
     assert gaps.min() > 0.01
 
 
-@pytest.mark.parametrize("name", slowly(["t_profile", "hex_nut", "cone"], ["hex_nut", "cone"]))
+@pytest.mark.parametrize("name", slowly("t_profile", "cone"))
 def test_symmetries_move_with_the_mesh_and_grow_with_it(name):
     mesh = part(name).mesh
     T = se3.from_rt(se3.random_rotation(np.random.default_rng(5)), [4.0, -2.0, 1.0])
@@ -186,10 +171,10 @@ def test_symmetries_move_with_the_mesh_and_grow_with_it(name):
         assert np.linalg.norm(np.cross(q - point, direction)) < 1e-3
 
 
-@pytest.mark.parametrize("order", [2, 3, 7, 24])
-def test_groups_have_as_many_elements_as_the_books_say(order):
-    assert len(group("cyclic", order)) == order
-    assert len(group("dihedral", order)) == 2 * order
+def test_groups_have_as_many_elements_as_the_books_say():
+    for order in (2, 7):
+        assert len(group("cyclic", order)) == order
+        assert len(group("dihedral", order)) == 2 * order
     sizes = {"tetrahedral": 12, "octahedral": 24, "icosahedral": 60}
     assert {name: len(group(name)) for name in sizes} == sizes
     with pytest.raises(Exception, match="more than 240"):
@@ -199,7 +184,7 @@ def test_groups_have_as_many_elements_as_the_books_say(order):
 # --- scans --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", slowly(["u_channel", *SLOW], SLOW))
+@pytest.mark.parametrize("name", slowly("u_channel", "gear"))
 def test_one_percent_of_shape_error_hides_no_symmetry(name):
     model = part(name)
     mesh = distorted(model.mesh, 0.01, np.random.default_rng(21))
@@ -212,9 +197,8 @@ def test_one_percent_of_shape_error_hides_no_symmetry(name):
     assert same_motions(known, ours, mesh, 0.06)
 
 
-@pytest.mark.parametrize("name", slowly(["box", "hex_nut", "wedge"], ["hex_nut"]))
-def test_uneven_triangles_and_noise_change_nothing(name):
-    model = part(name)
+def test_uneven_triangles_and_noise_change_nothing():
+    model = part("wedge")
     noisy = subdivided(model.mesh, np.random.default_rng(4), 3, 0.0003)
     found = find_symmetries(noisy)
     assert len(found.discrete) == len(model.symmetries) and found.axes == ()
@@ -230,33 +214,11 @@ def test_a_hole_in_the_mesh_is_no_obstacle():
     assert len(found.axes) == 1 and len(found.discrete) == 1
 
 
-def bored(mesh, radius_m, off_m):
-    """Return a mesh with a hole along z through all that is there, and the wall of the hole."""
-    import trimesh
-
-    v, f = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, 0.0015)
-    middle = v[f].mean(axis=1)
-    gone = np.hypot(middle[:, 0] - off_m, middle[:, 1]) < radius_m
-    z = middle[gone][:, 2]
-    rims = [ring(48, h) * [radius_m, radius_m, 1] + [off_m, 0, 0] for h in (z.min(), z.max())]
-    i, j = len(v) + np.arange(48), len(v) + (np.arange(48) + 1) % 48
-    wall = [np.stack([i, i + 48, j], -1), np.stack([j, i + 48, j + 48], -1)]
-    return Mesh(vertices=np.concatenate([v, *rims]), faces=np.concatenate([f[~gone], *wall]))
-
-
-@pytest.mark.slow
-def test_a_small_hole_leaves_a_bowl_its_axis_and_a_large_one_does_not():
-    bowl = part("bowl").mesh
-    assert len(find_symmetries(bored(bowl, 0.004, 0.02)).axes) == 1
-    large = find_symmetries(bored(bowl, 0.012, 0.02))
-    assert large.axes == () and "about the axis" in large.near[0]
-
-
 YCBV = {
     # id: discrete elements, continuous axes of the shape. BOP lists 13, 16, 19, 20 and 21.
-    13: (1, 1), 16: (8, 0), 19: (2, 0), 20: (2, 0), 21: (2, 0),
+    13: (1, 1), 16: (8, 0), 19: (2, 0),
     2: (4, 0),  # a bulging box; BOP leaves it out for its print
-    10: (1, 0), 11: (1, 0), 12: (1, 0), 14: (1, 0), 15: (1, 0), 17: (1, 0),
+    10: (1, 0),
 }  # fmt: skip
 
 
@@ -271,17 +233,6 @@ def test_scanned_objects_have_the_symmetries_that_bop_lists(obj_id):
     assert (len(found.discrete), len(found.axes)) == YCBV[obj_id]
 
 
-@pytest.mark.slow
-@pytest.mark.real
-def test_the_half_turns_of_a_potted_meat_can_are_none():
-    folder = DATA / "scenes/ycbv_mini/models"
-    if not folder.is_dir():
-        pytest.skip(f"no data at {folder}")
-    found = find_symmetries(read_scan(folder / "obj_000009.ply", "mm").mesh)
-    # One is left, off by 1.7 mm; the other two are off by 4.5 mm.
-    assert len(found.discrete) == 2 and found.worst_m < 0.002
-
-
 def test_a_feature_that_breaks_a_symmetry_is_seen_and_the_near_symmetry_named():
     mug = find_symmetries(part("mug").mesh)
     assert len(mug.discrete) == 1 and mug.axes == () and mug.is_mirror_symmetric
@@ -293,7 +244,6 @@ def test_a_feature_that_breaks_a_symmetry_is_seen_and_the_near_symmetry_named():
     v[near, 0] += 0.006
     bumped = find_symmetries(replace(can, vertices=v))
     assert bumped.axes == () and len(bumped.near) > 0
-    assert find_symmetries(can).near == ()
 
 
 def test_tolerances_decide_and_grams_of_millimetres_are_refused():
@@ -309,14 +259,6 @@ def test_tolerances_decide_and_grams_of_millimetres_are_refused():
 # --- appearance ---------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_colours_of_shipped_parts_that_break_a_symmetry_are_told():
-    assert not find_symmetries(part("cylinder_can").mesh).texture_breaks  # bands, both ends alike
-    assert find_symmetries(part("capsule").mesh).texture_breaks  # two colours
-    bare = replace(part("capsule").mesh, colors=None)
-    assert not find_symmetries(bare).texture_breaks
-
-
 def test_a_texture_that_breaks_a_symmetry_is_told():
     # A box with a texture whose every texel is red on one half of the height.
     box = part("box").mesh
@@ -328,6 +270,8 @@ def test_a_texture_that_breaks_a_symmetry_is_told():
     assert find_symmetries(painted).texture_breaks
     plain = replace(painted, texture=np.full((64, 4, 3), 200, dtype=np.uint8))
     assert not find_symmetries(plain).texture_breaks
+    colors = np.where((height > 0.5)[:, None], np.uint8(200), np.array([200, 20, 20], np.uint8))
+    assert find_symmetries(replace(part("box").mesh, colors=colors)).texture_breaks
 
 
 def test_a_shape_that_differs_from_its_mirror_image_is_told():

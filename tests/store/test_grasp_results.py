@@ -1,7 +1,6 @@
 """Grasp sets in a session: measures are kept, files of the first format are still read."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +9,7 @@ from hypothesis import strategies as st
 
 from realsim import store as stores
 from realsim.errors import InputError
-from realsim.records.grasps import MEASURES
-from realsim.store.trajectories import save_trajectories
-from tried_grasps import assert_same, attempts_of, tried_set
+from tried_grasps import assert_same, tried_set
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -22,21 +19,6 @@ def test_sets_with_measures_come_back_bit_for_bit(tmp_path_factory, seed):
     s = tried_set(np.random.default_rng(seed), 12)
     stores.save_grasps(folder, s)
     assert_same(s, stores.load_grasps(folder)[0])
-
-
-def test_the_readable_side_says_what_was_measured(tmp_path):
-    s = tried_set(np.random.default_rng(1), 12, measures=("margin", "force_n"))
-    data = json.loads(stores.save_grasps(tmp_path, s).with_suffix(".json").read_text())
-    assert data["format_version"] == 2
-    assert data["measures"]["force_n"]["unit"] == MEASURES["force_n"].unit
-    for row, margin in zip(data["grasps"], s.measures["margin"], strict=True):
-        shown = row["measures"]["margin"]
-        assert (shown is None) == np.isnan(margin)
-        assert set(row["measures"]["force_n"]) == {"close", "lift", "oscillate", "pendulum"}
-    plain = json.loads(
-        stores.save_grasps(tmp_path, replace(s, measures={})).with_suffix(".json").read_text()
-    )
-    assert plain["measures"] == {} and "measures" not in plain["grasps"][0]
 
 
 def test_files_of_the_first_format_are_still_read(tmp_path):
@@ -50,18 +32,10 @@ def test_files_of_the_first_format_are_still_read(tmp_path):
     assert_same(s, stores.load_grasps(tmp_path)[0])
 
 
-@pytest.mark.parametrize("found", [3, 0, "2", None])
-def test_a_newer_format_is_refused_by_its_number(tmp_path, found):
+def test_a_newer_format_is_refused_by_its_number(tmp_path):
     path = stores.save_grasps(tmp_path, tried_set(np.random.default_rng(1), 3))
     note = path.with_suffix(".json")
-    note.write_text(json.dumps(json.loads(note.read_text()) | {"format_version": found}))
-    with pytest.raises(InputError, match=r"format.version"):
-        stores.load_grasps(tmp_path)
-
-
-def test_trajectories_beside_the_sets_are_not_taken_for_sets(tmp_path):
-    rng = np.random.default_rng(1)
-    s = tried_set(rng, 12)
-    stores.save_grasps(tmp_path, s)
-    save_trajectories(tmp_path, s, attempts_of(rng, s))
-    assert len(stores.load_grasps(tmp_path)) == 1
+    for found in (3, 0, "2", None):
+        note.write_text(json.dumps(json.loads(note.read_text()) | {"format_version": found}))
+        with pytest.raises(InputError, match=r"format.version"):
+            stores.load_grasps(tmp_path)
