@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.geometry.parts import part
@@ -12,7 +11,6 @@ from realsim.records import CameraIntrinsics, Mesh, ObjectModel, ObjectPose
 from realsim.registration.register import DepthFrame
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 
-Array = NDArray[np.float64]
 CAMERA = CameraIntrinsics(width=320, height=180, fx=230.0, fy=230.0, cx=159.5, cy=89.5)
 NOISE_PER_M = 0.08 / (645.0 * 0.018)
 
@@ -97,9 +95,3 @@ def clutter() -> SyntheticScene:
 def make_scene():
     """The function `build_scene(objects, views, seed, noise_per_m)`."""
     return build_scene
-
-
-@pytest.fixture(scope="session")
-def move_start():
-    """The function `perturbed(pose, model, rng, mm, deg)`."""
-    return perturbed

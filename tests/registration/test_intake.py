@@ -13,7 +13,7 @@ from realsim.registration.config import RegistrationConfig
 from realsim.registration.evidence import DepthFrame, LazyFrame, correct_frame, read_frame
 from realsim.registration.intake import take_in
 from realsim.registration.simulated import TableScene
-from table_faults import foreign, shifted_view, without_any_depth
+from table_faults import without_any_depth
 from table_scenes import SMALL_LAB, small_scene
 
 CONFIG = RegistrationConfig()
@@ -115,17 +115,6 @@ def test_an_empty_view_is_left_out_and_named(value: float):
     found = {f.index: f for f in intake.findings}
     assert set(found) == {0, 5} and all(f.exclude for f in found.values())
     assert "view 5" in found[5].words and "empty" in found[5].words
-
-
-def test_a_view_of_another_scene_and_a_slipped_view_are_named():
-    frames = list(scene().frames)
-    frames[4] = foreign(frames[4], small_scene(1).frames[4])
-    frames[9] = shifted_view(frames[9], [0.02, -0.03, 0.01, 0.012, 0.0, 0.008])
-    intake = taken(frames)
-    assert {f.index for f in intake.findings} == {4, 9}
-    left = {f.index for f in intake.frames}
-    assert left == set(range(12)) - {f.index for f in intake.findings if f.exclude}
-    assert intake.plane is not None and abs(intake.plane.T_world_table[2, 3]) < 1e-3
 
 
 def test_nothing_to_use_is_refused_by_name():

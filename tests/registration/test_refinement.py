@@ -12,14 +12,12 @@ from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim.geometry.metrics import mssd_symmetric
 from realsim.geometry.parts import part
-from realsim.records.depth_bias import DepthBias
 from realsim.registration.body import Body, make_body
 from realsim.registration.config import RegistrationConfig
 from realsim.registration.intake import Intake, take_in
 from realsim.registration.refinement.config import CameraPrior, PointConfig, RefineConfig
 from realsim.registration.refinement.equations import BIAS, HAND_EYE
 from realsim.registration.refinement.refine import Refined, refine
-from realsim.registration.refinement.uncertainty import object_covariance
 from realsim.registration.simulated import (
     TableLabConfig,
     TableScene,
@@ -142,31 +140,6 @@ def test_results_move_with_the_world():
     assert np.abs(e).max() < 5e-6
 
 
-@pytest.mark.slow
-def test_order_of_views_and_of_objects_does_not_matter():
-    case, _ = noisy()
-    here = case.refined(ALL_POINTS)
-    rng = np.random.default_rng(1)
-    v, k = rng.permutation(len(case.intake.views)), rng.permutation(len(case.bodies))
-    bodies = [case.bodies[i] for i in k]
-    there = case.refined(
-        ALL_POINTS, views=[case.intake.views[i] for i in v], bodies=bodies,
-        poses=[b.T_start for b in bodies],
-    )  # fmt: skip
-    sorted_back = replace(
-        there, poses=there.poses[np.argsort(k)], cameras=there.cameras[np.argsort(v)]
-    )
-    seen_alike(here, sorted_back, 1e-4, 1e-4)
-    np.testing.assert_allclose(there.used[:-1], here.used[:-1][k], atol=2)
-
-
-@pytest.mark.slow
-def test_the_start_does_not_matter():
-    case = exact()
-    off = case.refined(ALL_POINTS, poses=starts_off(case))
-    seen_alike(case.refined(ALL_POINTS), off, 0.005, 0.005)
-
-
 def test_same_input_gives_the_same_bytes():
     case, a = noisy()
     b = case.refined(poses=starts_off(case))
@@ -190,48 +163,6 @@ def test_without_noise_the_hand_eye_is_found():
     # A robot without errors is found to be one, as far as that is believed.
     said = CameraPrior()
     assert refined.view_sigma[1] == pytest.approx(said.learn_factor[0] * said.view_mm)
-
-
-@pytest.mark.slow
-def test_an_object_without_points_stays_where_it_is():
-    case, _ = noisy()
-    T = case.bodies[0].T_start.copy()
-    T[:3, 3] += [0.0, 0.0, 0.4]
-    lost = replace(case.bodies[0], start=replace(case.bodies[0].start, T_world_obj=T))
-    bodies = [*case.bodies, lost]
-    with_lost = case.refined(bodies=bodies, poses=[b.T_start for b in bodies])
-    np.testing.assert_allclose(with_lost.poses[-1], T, atol=1e-9)
-    without = case.refined()
-    assert with_lost.used[len(case.bodies)] == 0
-    kept = replace(with_lost, poses=with_lost.poses[:-1])
-    seen_alike(without, kept, 0.002, 0.001)
-    # Nothing says where it is, and its covariance says so: metres and tens of degrees.
-    sigma = np.sqrt(np.diag(object_covariance(with_lost, lost, len(case.bodies))))
-    assert sigma[3:].min() > 0.3 and np.degrees(sigma[:3].min()) > 15
-
-
-def test_a_body_of_revolution_keeps_its_turn():
-    case = made(3, replace(SMALL_LAB, views=6), ("cylinder_can", "box"))
-    refined = case.refined()
-    can = case.bodies[0]
-    (axis, _), *_ = can.model.symmetry_axes
-    turn = se3.log_so3(can.T_start[:3, :3].T @ refined.poses[0][:3, :3]) @ np.asarray(axis)
-    assert abs(np.degrees(turn)) < 5.0
-
-
-@pytest.mark.slow
-def test_what_is_not_unknown_is_held():
-    case, _ = noisy()
-    held = case.refined(RefineConfig(fit_bias=False))
-    np.testing.assert_allclose(held.state.bias, [1, 0], atol=1e-9)
-    known = DepthBias(scale=1.002, offset_per_m=-0.003, covariance=np.diag([1e-12, 1e-12]))
-    told = case.refined(RefineConfig(bias=known))
-    np.testing.assert_allclose(told.state.bias, [1.002, -0.003], atol=2e-5)
-    rigid = case.refined(RefineConfig(prior=CameraPrior(hand_eye_mm=1e-6, hand_eye_deg=1e-6)))
-    assert np.abs(rigid.state.hand_eye).max() < 1e-7
-    alike = RefineConfig(prior=CameraPrior(view_mm=1e-5, view_deg=1e-5, learn_views=False))
-    same, free = case.refined(alike), case.refined()
-    assert np.all(same.state.views.std(0) < 0.35 * free.state.views.std(0))
 
 
 def test_objects_elsewhere_are_refused():
@@ -283,23 +214,3 @@ def test_a_disparity_bias_is_found():
 
 
 # --- statistics ----------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_strong_noise_does_not_pull_the_depth():
-    """Errors in variables: noise in derivatives or weights would pull the depth by millimetres."""
-    full = SMALL_LAB.sensor
-    loud = replace(full, disparity_noise_px=3 * full.disparity_noise_px)
-    config = replace(SMALL_LAB, sensor=loud, views=48)
-    rows: list[Array] = []
-    for seed in range(8):
-        case = made(seed, config)
-        refined = case.refined(RefineConfig(thin_share=-1.0))
-        z = refined.state.hand_eye[5] - case.hand_eye_true[5]
-        rows.append(np.array([refined.state.bias[0] - 1, refined.state.bias[1], z]))
-    errors = np.stack(rows)
-    scale, offset, z = errors.mean(0)
-    # What is left at three times a D405's noise, of a depth of 0.35 m: dz = -(z ds + z^2 do).
-    assert abs(0.35 * scale + 0.35**2 * offset) < 4e-4
-    assert abs(z) < 1.5e-4
-    assert np.abs(errors[:, 2]).max() < 5e-4

@@ -24,7 +24,7 @@ from table_scenes import named_scene
 Array = NDArray[np.float64]
 NAMES = ("wedge", "l_bracket", "elbow", "t_profile")
 """Parts without a symmetry about an axis: every turn is seen."""
-SEEDS = range(4)
+SEEDS = range(3)
 
 
 @lru_cache(maxsize=8)
@@ -58,21 +58,6 @@ def test_covariances_are_symmetric_and_positive():
     for C in matrices:
         np.testing.assert_allclose(C, C.T, atol=1e-9 * np.abs(C).max())
         assert np.linalg.eigvalsh(C).min() > 0
-
-
-def test_covariance_is_about_the_objects_origin():
-    """Samples of the centred twist, applied as the refinement does, spread as it says."""
-    _, bodies, refined = refined_scene(0)
-    body, k = bodies[1], 1
-    at = slice(OBJECTS + 6 * k, OBJECTS + 6 * k + 6)
-    rng = np.random.default_rng(0)
-    eta = rng.multivariate_normal(np.zeros(6), refined.covariance.shared[at, at], 20_000)
-    c = se3.from_translation(body.center_obj)
-    xi = se3.log(c @ se3.exp(eta) @ se3.invert(c))
-    C = object_covariance(refined, body, k)
-    scale = np.sqrt(np.diag(C))
-    np.testing.assert_allclose(np.cov(xi.T) / np.outer(scale, scale), C / np.outer(scale, scale),
-                               atol=0.04)  # fmt: skip
 
 
 def test_covariance_in_a_view_is_that_of_samples_of_everything():
@@ -133,21 +118,3 @@ def test_errors_are_as_large_as_the_covariance_says():
     assert 0.3 < np.mean(in_world) < 3 and 0.3 < np.median(in_world) < 3
     assert 0.3 < np.mean(in_views) < 3
     assert 0.2 < np.mean(hands) < 3
-
-
-@pytest.mark.slow
-def test_pixels_are_off_by_as_much_as_said():
-    said: list[float] = []
-    true: list[float] = []
-    for seed in SEEDS:
-        scene, bodies, _ = refined_scene(seed)
-        for k, (p, body) in enumerate(zip(scene.truth, bodies, strict=True)):
-            for s, T in zip(seen(seed)[k], scene.Ts_world_cam, strict=True):
-                here = project(scene.intrinsics, se3.transform(s.T_cam_obj, body.samples))
-                T_true = se3.invert(T) @ p.T_world_obj
-                there = project(scene.intrinsics, se3.transform(T_true, body.samples))
-                true.append(float(np.mean(np.sum((here - there) ** 2, axis=1))))
-                said.append(s.sigma_px**2)
-    assert 0.3 < np.mean(true) / np.mean(said) < 3
-    # 320 px wide: a quarter of a D405's pixels.
-    assert np.sqrt(np.median(true)) < 0.25

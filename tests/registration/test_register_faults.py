@@ -19,7 +19,6 @@ from realsim.registration.search.records import Wanted
 from realsim.registration.simulated import TableScene
 from table_faults import (
     foreign,
-    shifted_view,
     without_any_depth,
     without_depth_on,
 )
@@ -91,12 +90,6 @@ def not_accepted(result: Registration, instance: int) -> str:
     return " ".join(found.reasons)
 
 
-@lru_cache(maxsize=1)
-def ghost() -> ObjectModel:
-    """A part that is not in the scene."""
-    return part("mug")
-
-
 # --- sound input ---------------------------------------------------------------------------------
 
 
@@ -115,58 +108,20 @@ def test_sound_input_is_accepted_and_consistent():
 # --- objects -------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("claimed", [True, False])
-def test_a_model_that_is_not_in_the_scene(claimed: bool):
-    models = {**scene().models, ghost().obj_id: ghost()}
-    if claimed:
-        T = se3.from_translation([0.03, 0.03, 0.0])
-        result = run(
-            [*starts(), ObjectPose(obj_id=ghost().obj_id, instance=9, T_world_obj=T)],
-            models=models,
-        )
-    else:
-        result = run([*anywhere(), Wanted(obj_id=ghost().obj_id, instance=9)], models=models)
-    all_right(result)
-    assert not_accepted(result, 9)
-
-
 def in_millimetres(model: ObjectModel) -> ObjectModel:
     mesh = Mesh(vertices=1e3 * model.mesh.vertices, faces=model.mesh.faces)
     return replace(model, mesh=mesh)
 
 
-@pytest.mark.parametrize(
-    "known",
-    [
-        pytest.param("starts", marks=pytest.mark.slow),
-        pytest.param("ids", marks=pytest.mark.slow),
-        pytest.param("nothing", marks=pytest.mark.slow),
-    ],
-)
-def test_a_mesh_in_millimetres_is_named_and_the_rest_goes_on(known: str):
+@pytest.mark.slow
+def test_a_mesh_in_millimetres_is_named_and_the_rest_goes_on():
     one = scene().truth[1]
     models = {**scene().models, one.obj_id: in_millimetres(scene().models[one.obj_id])}
-    wanted = {"starts": starts(), "ids": anywhere(), "nothing": None}[known]
-    result = run(wanted, models=models)
+    result = run(anywhere(), models=models)
     (missing,) = result.not_placed
-    assert missing.obj_id == one.obj_id
+    assert (missing.obj_id, missing.instance) == (one.obj_id, one.instance)
     assert "millimetres and metres were mixed up" in missing.reason
-    others = {p.obj_id for p in scene().truth} - {one.obj_id}
-    assert {o.obj_id for o in result.scene.objects if o.verdict == "accepted"} == others
-    if known != "nothing":
-        assert missing.instance == one.instance
-        all_right(result, one.instance)
-
-
-@pytest.mark.slow
-def test_a_start_in_millimetres_is_named_and_the_rest_goes_on():
-    T = starts()[2].T_world_obj.copy()
-    T[:3, 3] *= 1e3
-    wanted = [replace(s, T_world_obj=T) if s.instance == 2 else s for s in starts()]
-    result = run(wanted)
-    all_right(result, 2)
-    assert "millimetres" in not_accepted(result, 2)
+    all_right(result, one.instance)
 
 
 def test_no_model_in_metres_is_refused():
@@ -196,10 +151,8 @@ def test_two_swapped_ids_are_named_and_the_objects_found():
     assert result.not_placed == ()
 
 
-@pytest.mark.parametrize("surface", ["black", pytest.param("transparent", marks=pytest.mark.slow)])
-def test_an_object_without_depth_is_not_accepted_and_the_rest_is_right(surface):
-    frames = without_depth_on(scene(), 0, surface)
-    result = run(starts(), frames)
+def test_an_object_without_depth_is_not_accepted_and_the_rest_is_right():
+    result = run(starts(), without_depth_on(scene(), 0))
     all_right(result, 0)
     assert not_accepted(result, 0)
 
@@ -223,28 +176,13 @@ def test_unknown_ids_are_found_among_more_models():
 # --- views ---------------------------------------------------------------------------------------
 
 
-SLIP = [0.03, 0.0, 0.02, 0.012, 0.006, 0.0]
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("number", "fault", "words", "left_out"),
-    [
-        (2, without_any_depth, "empty", True),
-        (2, lambda f: foreign(f, named_scene(4, ("mug", "gear"), 8).frames[2]), "", True),
-        (5, lambda f: shifted_view(f, SLIP), "", False),
-    ],
-    ids=["empty", "foreign", "slipped"],
-)
-def test_a_faulty_view_is_named_and_does_no_harm(number, fault, words, left_out):
-    result = run(starts(), [fault(f) if f.index == number else f for f in scene().frames])
+def test_a_foreign_view_is_named_and_does_no_harm():
+    other = named_scene(4, ("mug", "gear"), 8).frames[2]
+    result = run(starts(), [foreign(f, other) if f.index == 2 else f for f in scene().frames])
     all_right(result)
-    said = [f.words for f in result.findings if f"view {number}" in f.words]
-    assert said and words in said[0]
-    if left_out:
-        assert sorted(result.cameras) == [k for k in range(8) if k != number]
-    if words:
-        assert len(result.findings) == 1 and sorted(result.cameras) == sorted(result.seen)
+    assert any("view 2" in f.words for f in result.findings)
+    assert sorted(result.cameras) == [k for k in range(8) if k != 2]
 
 
 def test_one_view_only_is_worse_and_says_so():
@@ -261,20 +199,6 @@ def test_one_view_only_is_worse_and_says_so():
 # --- the paper's way -----------------------------------------------------------------------------
 
 
-@pytest.mark.slow
-def test_top_down_is_one_view_and_the_claimed_cameras():
-    config = replace(CONFIG, method="top-down")
-    result = run(starts(), config=config)
-    assert result.report["method"] == "top-down"
-    assert {o.instance for o in result.scene.objects} == {0, 1, 2, 3}
-    joint = run(starts())
-    one = np.median([error_mm(result, k) for k in range(4)])
-    assert one > 3 * np.median([error_mm(joint, k) for k in range(4)]) and one < 20
-    for f in scene().frames:
-        np.testing.assert_array_equal(result.cameras[f.index], f.T_world_cam)
-    assert result.seen == {}
-
-
 def test_top_down_needs_starts_and_says_so():
     config = replace(CONFIG, method="top-down")
     with pytest.raises(InputError, match="rough poses"):
@@ -287,6 +211,9 @@ def test_top_down_needs_starts_and_says_so():
     result = run(wanted, config=config)
     assert [o.instance for o in result.scene.objects] == [0]
     assert {n.instance for n in result.not_placed} == {1, 2, 3}
+    assert result.report["method"] == "top-down" and result.seen == {}
+    for f in scene().frames:
+        np.testing.assert_array_equal(result.cameras[f.index], f.T_world_cam)
     assert all("rough poses only" in n.reason for n in result.not_placed)
 
 
@@ -314,16 +241,3 @@ def test_what_cannot_be_registered_is_refused_by_name():
     blind = [without_any_depth(f) for f in scene().frames]
     with pytest.raises(InputError, match="all zero"):
         run(starts(), blind)
-
-
-@pytest.mark.slow
-def test_an_empty_table_holds_nothing():
-    """Every object without depth: nothing is placed, and each is named."""
-    frames = scene().frames
-    for p in scene().truth:
-        spoilt = replace(scene(), frames=frames)
-        frames = without_depth_on(spoilt, p.instance, "transparent")
-    result = run(anywhere(), frames)
-    assert all(o.verdict != "accepted" for o in result.scene.objects)
-    named = {o.instance for o in result.scene.objects} | {n.instance for n in result.not_placed}
-    assert named == {0, 1, 2, 3}

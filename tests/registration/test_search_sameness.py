@@ -7,17 +7,11 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import symmetry_transforms
 from realsim.geometry.metrics import mssd
 from realsim.geometry.parts import part
-from realsim.records import ObjectModel
 from realsim.registration.search.sameness import distinct, make_sameness
 from table_scenes import part_models
 
-BALL = ObjectModel(
-    obj_id=1, name="ball", mesh=part("cube").mesh,
-    symmetry_axes=(((1, 0, 0), (0, 0, 0)), ((0, 1, 0), (0, 0, 0)), ((0, 0, 1), (0, 0, 0))),
-)  # fmt: skip
 
-
-@pytest.mark.parametrize("obj_id", sorted(part_models())[::3])
+@pytest.mark.parametrize("obj_id", sorted(part_models())[::6])
 def test_symmetric_poses_are_the_same(obj_id: int):
     model = part_models()[obj_id]
     rng = np.random.default_rng(obj_id)
@@ -34,7 +28,7 @@ def test_symmetric_poses_are_the_same(obj_id: int):
         assert same.angle_deg(T[:3, :3], (T @ S)[:3, :3]) < 1e-4
 
 
-@pytest.mark.parametrize("name", ["gear", "bottle", "l_bracket", "cylinder_can"])
+@pytest.mark.parametrize("name", ["gear", "bottle"])
 def test_it_is_the_sampled_distance_with_the_sampling_gone(name: str):
     model = part(name)
     same = make_sameness(model)
@@ -45,15 +39,6 @@ def test_it_is_the_sampled_distance_with_the_sampling_gone(name: str):
     got = same.distance(T, other)
     # The twist is the turn that fits best in the mean, not at the worst corner.
     assert 0.9 * sampled - 3e-4 < got < 1.35 * sampled
-
-
-def test_of_a_ball_only_the_middle_counts():
-    same = make_sameness(BALL)
-    rng = np.random.default_rng(1)
-    T = se3.from_rt(se3.random_rotation(rng), [0.1, 0.2, 0.3])
-    U = se3.from_rt(se3.random_rotation(rng), [0.1, 0.2, 0.307])
-    assert same.distance(T, U) == pytest.approx(0.007)
-    assert same.angle_deg(T[:3, :3], U[:3, :3]) == 0.0
 
 
 def test_distinct_keeps_the_first_of_those_alike():

@@ -8,13 +8,11 @@ import pytest
 from realsim.geometry import se3
 from realsim.records import ObjectPose, SupportPlane
 from realsim.registration.body import Body, footprint, make_body
-from realsim.registration.compare import CompareConfig, make_comparer
 from realsim.registration.evidence import DepthNoise
 from realsim.registration.search.scoring import (
     Canvas,
     ScoreConfig,
     compose,
-    first_frames,
     likelihoods,
     make_canvas,
     render,
@@ -85,17 +83,3 @@ def test_the_truth_gains_more_than_anything_beside_it(n: int):
     for shift in ([0.008, 0, 0], [0, -0.008, 0], [0, 0, 0.006]):
         moved = render(canvas(), body, se3.from_translation(shift) @ T)
         assert score(canvas(), moved, others).gain < right.gain
-
-
-def test_likelihood_is_the_comparers():
-    scene = small_scene(SEED)
-    comparer = make_comparer(scene.intrinsics, scene.frames[:1], NOISE, PLANE, CompareConfig())
-    one = first_frames(canvas(), 1)
-    cells = np.flatnonzero(one.measured > 0).astype(np.int32)
-    for offset in (-0.02, -0.004, -0.001, 0.0, 0.002, 0.005, 0.03):
-        z = one.measured + np.float32(offset)
-        z[z == one.table] += np.float32(1e-6)
-        expected = comparer.likelihood(
-            one.measured[cells].astype(np.float64), z[cells].astype(np.float64)
-        )
-        np.testing.assert_allclose(likelihoods(one, z, cells), expected, atol=2e-3)

@@ -54,7 +54,7 @@ def rebuilt(mesh, templates, d):
     return p[:, 2], 1.0 - t
 
 
-@pytest.mark.parametrize("name", ["mug", "wedge", "bowl", "gear"])
+@pytest.mark.parametrize("name", ["mug", "wedge"])
 def test_template_heights_are_those_of_the_placed_mesh(name):
     model = part(name)
     templates = model_templates(model, FEW, None)

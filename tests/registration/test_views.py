@@ -15,7 +15,6 @@ from realsim.registration.views import SampleConfig, sample_view, sample_views, 
 Array = NDArray[np.float64]
 CAMERA = CameraIntrinsics(width=160, height=90, fx=115.0, fy=112.0, cx=80.3, cy=44.1)
 NOISE = DepthNoise(per_m=0.007, floor_m=2e-4)
-EVERY = SampleConfig(stride=1)
 
 
 def frame(depth: NDArray, T: Array | None = None, index: int = 0) -> DepthFrame:
@@ -57,7 +56,7 @@ def trusted_by_definition(depth: NDArray, config: SampleConfig) -> list[tuple[in
     return kept
 
 
-@pytest.mark.parametrize("stride, reach", [(1, 3), (3, 2), (4, 1)])
+@pytest.mark.parametrize("stride, reach", [(1, 3), (3, 2)])
 def test_trusted_pixels_are_those_of_the_definition(stride: int, reach: int):
     rng = np.random.default_rng(stride)
     steps = np.kron(rng.uniform(0.3, 0.45, (6, 8)), np.ones((15, 20)))
@@ -77,7 +76,7 @@ def test_trusted_pixels_are_those_of_the_definition(stride: int, reach: int):
     assert view.area_px == stride**2
 
 
-@pytest.mark.parametrize("distortion", [(), (-0.05, 0.02, 0.001, -0.002, 0.0)])
+@pytest.mark.parametrize("distortion", [(-0.05, 0.02, 0.001, -0.002, 0.0)])
 def test_a_point_is_seen_where_its_pixel_is(distortion: tuple[float, ...]):
     camera = replace(CAMERA, distortion=np.array(distortion))
     depth = np.full((90, 160), 0.4, np.float32)
@@ -86,22 +85,6 @@ def test_a_point_is_seen_where_its_pixel_is(distortion: tuple[float, ...]):
     np.testing.assert_allclose(view.points[:, 2], 0.4, rtol=1e-6)
     uv = project(camera, view.points.astype(np.float64))
     np.testing.assert_allclose(uv, view.pixels, atol=1e-3)
-
-
-def test_slopes_are_kept_and_steps_are_not():
-    # The table at 65 degrees from its normal: a steep slope is no edge. The reach is that of so
-    # small an image.
-    eye = 0.35 * np.array([np.sin(np.radians(65)), 0, np.cos(np.radians(65))])
-    T = se3.look_at(eye, [0, 0, 0])
-    slope = plane_depth(CAMERA, T)
-    slope[(slope <= 0) | (slope > 0.6)] = 0
-    view = sample_view(CAMERA, frame(slope, T), NOISE, replace(EVERY, edge_reach_px=1))
-    assert len(view.points) > 0.95 * np.count_nonzero(slope)
-    step = np.full((90, 160), 0.40, np.float32)
-    step[:, 80:] = 0.46
-    columns = set(sample_view(CAMERA, frame(step), NOISE, EVERY).pixels[:, 0])
-    reach = EVERY.edge_reach_px
-    assert columns == set(range(160)) - set(range(80 - reach, 80 + reach))
 
 
 def test_cloud_looks_back_at_the_cameras_with_their_noise():

@@ -17,9 +17,7 @@ LAB = TableLabConfig(
     views=12, width=320, height=180, focal_px=162.0, arm_mm=2.0, arm_deg=0.3, hand_eye_mm=0.0,
     hand_eye_deg=0.0,
 )  # fmt: skip
-CONFIG = ViewsConfig(
-    partners=4, surface_points=8000, prior=CameraPrior(hand_eye_mm=0.05, hand_eye_deg=0.01)
-)
+CONFIG = ViewsConfig(partners=4, prior=CameraPrior(hand_eye_mm=0.05, hand_eye_deg=0.01))
 QUICK = ViewsConfig(rounds=3, points_per_view=800, surface_points=2500)
 
 

@@ -15,10 +15,7 @@ from realsim.registration.simulated import (
     resized,
     scatter_objects,
     table_scene,
-    with_found_symmetries,
 )
-
-__all__ = ["SMALL_LAB", "named_scene", "part_models", "small_scene", "with_found_symmetries"]
 
 SMALL_LAB = resized(TableLabConfig(disc_m=0.12, distance_m=(0.25, 0.40), views=12), 320)
 """Images of 320x180 of a few objects close together; the errors are a real lab's."""
