@@ -41,7 +41,7 @@ from calibration_real import (
 from calibration_simulated import KINDS as ROBOTS
 from calibration_simulated import coverage_trial, efficiency_trial, solve_cpu_s
 from corner_accuracy import KINDS as TARGETS
-from corner_accuracy import measure
+from corner_accuracy import measure, opencv
 from figures import Figure, Found, Goal, run
 
 A = TypeVar("A")
@@ -262,22 +262,23 @@ def measure_faults(a: argparse.Namespace) -> Found:
     return found
 
 
-def _corners(task: tuple[str, str, int]) -> tuple[float, float]:
+def _corners(task: tuple[str, str, int]) -> tuple[float, float, float]:
     kind, level, views = task
-    seen = measure(kind, level, range(views))
-    return seen.rms_px, seen.row["found"]
+    seen, theirs = measure(kind, level, range(views)), measure(kind, level, range(views), opencv)
+    return seen.rms_px, seen.found_share, theirs.rms_px
 
 
 def measure_corners(a: argparse.Namespace) -> Found:
-    """Measure the points found on rendered targets, the worst kind."""
+    """Measure the points found on rendered targets, the worst kind; OpenCV's beside it."""
     found, views = Found(), 1 if a.quick else 6
     levels = {"moderate": "corner_rms_px", "strong": "corner_rms_strong_px"}
     tasks = [(kind, level, views) for level in levels for kind in TARGETS]
     results = dict(zip(tasks, each(a, _corners, tasks), strict=True))
     for level, key in levels.items():
-        px = {kind: r[0] for (kind, at, _), r in results.items() if at == level}
-        worst = max(px, key=lambda kind: px[kind] if np.isfinite(px[kind]) else np.inf)
-        found.add(key, px[worst], f"{len(px)} kinds x {views}; worst: {worst}")
+        px = {kind: (r[0], r[2]) for (kind, at, _), r in results.items() if at == level}
+        worst = max(px, key=lambda kind: px[kind][0] if np.isfinite(px[kind][0]) else np.inf)
+        found.add(key, px[worst][0], f"{len(px)} kinds x {views}; worst: {worst}")
+        found.rivals[key] = f"OpenCV {px[worst][1]:.3g} px"
         found.cases[key] = px
     found.add("corner_found_share", min(r[1] for r in results.values()), "least of all")
     return found

@@ -1,28 +1,15 @@
-"""Benchmark of the points found on rendered targets, whose true places are known.
+"""Points found on rendered targets, whose true places are known.
 
-    uv run python benchmarks/corner_accuracy.py [--views N] [--json FILE] [--kinds tags charuco ...]
+Imported by `calibration.py` (`--part corners`).
 
 Every view is a picture of a flat target at 0.5 m (1280x720 px, f = 900 px), tilted by up to 55 deg
-and rolled at random, rendered with 8x8 rays a pixel, blurred and made noisy. Figures: RMS of the
-points' 2-D error [px], the mean error (bias) [px], the share of the visible points that was found,
-the predicted sigma over the measured one, and CPU milliseconds a picture. OpenCV's own detectors
+and rolled at random, rendered with 8x8 rays a pixel, blurred and made noisy. OpenCV's own detectors
 are measured on the same pictures.
 """
 
-import os
-
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
-
-import argparse
-import json
-import platform
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import version
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,12 +43,7 @@ DISTANCE_M = 0.5
 MAX_TILT_DEG = 55.0
 LEVELS = {"moderate": (0.8, 4.0), "strong": (1.5, 6.0)}
 """(blur sigma [px], noise [gray levels])."""
-GOAL_PX = {"moderate": 0.10, "strong": 0.22}
 CAMERA = CameraIntrinsics(width=1280, height=720, fx=900.0, fy=900.0, cx=639.5, cy=359.5)
-LENS = CameraIntrinsics(
-    width=1280, height=720, fx=900.0, fy=900.0, cx=639.5, cy=359.5,
-    distortion=np.array([-0.25, 0.08, 0.001, -0.001]),
-)  # fmt: skip
 KINDS: dict[str, Target] = {
     "tags 36h11": TagBoard(rows=4, columns=6, tag_size_m=0.04, gap_m=0.01),
     "tags 36h10": TagBoard(rows=4, columns=6, tag_size_m=0.04, gap_m=0.01, family="tag36h10"),
@@ -168,19 +150,13 @@ def look(target: Target, rng: np.random.Generator) -> Array:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class Found:
+class PointErrors:
     """Errors of one target's points over all views."""
 
     errors: Array
     """(n, 2) found minus true [px]."""
-    sd_px: Array
-    """(n,) predicted 1-sigma of a coordinate [px]; NaN where not predicted."""
     visible: int
     """Points that were inside the pictures, 5 px from their border."""
-    views: int
-    found_views: int
-    cpu_ms: float
-    """CPU time a picture [ms]."""
 
     @property
     def rms_px(self) -> float:
@@ -188,35 +164,21 @@ class Found:
         return float(np.sqrt(np.mean(np.sum(self.errors**2, -1)))) if len(self.errors) else np.nan
 
     @property
-    def bias_px(self) -> float:
-        """Length of the mean error [px]."""
-        return float(np.linalg.norm(self.errors.mean(0))) if len(self.errors) else np.nan
-
-    @property
-    def row(self) -> dict[str, float]:
-        """The figures by name."""
-        return {
-            "rms_px": self.rms_px,
-            "bias_px": self.bias_px,
-            "found": len(self.errors) / max(self.visible, 1),
-            "views": self.found_views / max(self.views, 1),
-            "sd_ratio": float(np.sqrt(2 * np.mean(self.sd_px**2)) / self.rms_px)
-            if len(self.sd_px)
-            else np.nan,
-            "cpu_ms": self.cpu_ms,
-        }
+    def found_share(self) -> float:
+        """Found points of the visible ones."""
+        return len(self.errors) / max(self.visible, 1)
 
 
-Finder = Callable[[Image, Target], tuple[NDArray[np.int64], Array, Array]]
+Finder = Callable[[Image, Target], tuple[NDArray[np.int64], Array]]
 
 
-def ours(image: Image, target: Target) -> tuple[NDArray[np.int64], Array, Array]:
-    """Return point numbers, places and predicted sigmas of our own finder."""
+def ours(image: Image, target: Target) -> tuple[NDArray[np.int64], Array]:
+    """Return point numbers and places of our own finder."""
     d = find_target(image, target)
-    return d.point_ids, d.uv, np.full(len(d), np.nan) if d.sd_px is None else d.sd_px
+    return d.point_ids, d.uv
 
 
-def opencv(image: Image, target: Target) -> tuple[NDArray[np.int64], Array, Array]:
+def opencv(image: Image, target: Target) -> tuple[NDArray[np.int64], Array]:
     """Return the same of OpenCV's detectors, each with the refinement that suits it best."""
     import cv2
     from cv2 import aruco
@@ -259,7 +221,7 @@ def opencv(image: Image, target: Target) -> tuple[NDArray[np.int64], Array, Arra
         if ok:
             uv = np.asarray(corners, dtype=np.float64)
             ids = np.arange(len(uv))
-    return ids, uv.reshape(-1, 2), np.full(len(ids), np.nan)
+    return ids, uv.reshape(-1, 2)
 
 
 def _ends(target: Target) -> list[NDArray[np.int64]]:
@@ -273,92 +235,26 @@ def _ends(target: Target) -> list[NDArray[np.int64]]:
 
 
 @lru_cache(maxsize=64)
-def _view(kind: str, level: str, seed: int, ideal: bool) -> Image:
+def _view(kind: str, level: str, seed: int) -> Image:
     """Return the picture of a seed; all finders see the same."""
     rng = np.random.default_rng(seed)
     T = look(KINDS[kind], rng)
-    return photograph(KINDS[kind], T, rng, *LEVELS[level], CAMERA if ideal else LENS)
+    return photograph(KINDS[kind], T, rng, *LEVELS[level], CAMERA)
 
 
-def measure(
-    kind: str,
-    level: str,
-    seeds: Sequence[int],
-    finder: Finder = ours,
-    *,
-    ideal: bool = True,
-) -> Found:
-    """Return the errors of one kind of target, one view a seed; through LENS where not ideal."""
-    intrinsics = CAMERA if ideal else LENS
+def measure(kind: str, level: str, seeds: Sequence[int], finder: Finder = ours) -> PointErrors:
+    """Return the errors of one kind of target, one view a seed."""
     target = KINDS[kind]
     # Our numbering is right but for a half turn; OpenCV's may also start at any other end.
     ends = _ends(target) if finder is opencv or getattr(target, "half_turn", False) else None
-    errors, sd, visible, found_views, cpu = [], [], 0, 0, 0.0
+    errors, visible = [np.zeros((0, 2))], 0
     for seed in seeds:
         T = look(target, np.random.default_rng(seed))
-        image = _view(kind, level, seed, ideal)
-        truth = camera.project(intrinsics, se3.transform(T, target.points_board))
-        limit = [intrinsics.width - 6, intrinsics.height - 6]
+        truth = camera.project(CAMERA, se3.transform(T, target.points_board))
+        limit = [CAMERA.width - 6, CAMERA.height - 6]
         visible += int(np.all((truth > 5) & (truth < limit), axis=-1).sum())
-        start = time.process_time()
-        ids, uv, sigma = finder(image, target)
-        cpu += time.process_time() - start
-        if not len(ids):
-            continue
-        found_views += 1
-        choices = [uv - truth[end[ids]] for end in (ends or _ends(target)[:1])]
-        errors.append(min(choices, key=lambda e: float(np.sum(e**2))))
-        sd.append(sigma)
-    return Found(
-        errors=np.concatenate(errors) if errors else np.zeros((0, 2)),
-        sd_px=np.concatenate(sd) if sd else np.zeros(0),
-        visible=visible,
-        views=len(seeds),
-        found_views=found_views,
-        cpu_ms=1e3 * cpu / max(len(seeds), 1),
-    )
-
-
-def corner_rms_px(kind: str, level: str, seeds: Sequence[int]) -> float:
-    """Return the RMS 2-D error of a target's points [px]; kinds and levels as in the tables."""
-    return measure(kind, level, seeds).rms_px
-
-
-def main() -> None:
-    """Measure every kind at every level, print the table, write the JSON."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--views", type=int, default=6, help="pictures per kind and level")
-    parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=list(KINDS))
-    parser.add_argument("--no-opencv", action="store_true", help="skip the comparison")
-    args = parser.parse_args()
-    finders: dict[str, Finder] = {"ours": ours} if args.no_opencv else {
-        "ours": ours, "opencv": opencv
-    }  # fmt: skip
-    figures: dict[str, dict[str, float]] = {}
-    print(f"{'target':20}{'level':10}{'by':8}{'rms px':>8}{'goal':>6}{'bias':>8}{'found':>7}"
-          f"{'views':>7}{'sd/rms':>8}{'ms':>7}")  # fmt: skip
-    for kind in args.kinds:
-        for level in LEVELS:
-            for name, finder in finders.items():
-                row = measure(kind, level, range(args.views), finder).row
-                figures[f"{kind} | {level} | {name}"] = row
-                print(f"{kind:20}{level:10}{name:8}{row['rms_px']:8.3f}{GOAL_PX[level]:6.2f}"
-                      f"{row['bias_px']:8.3f}{row['found']:7.0%}{row['views']:7.0%}"
-                      f"{row['sd_ratio']:8.2f}{row['cpu_ms']:7.0f}")  # fmt: skip
-    if args.json:
-        document = {
-            "benchmark": "corner_accuracy",
-            "machine": {"cpu": platform.machine(), "cores": os.cpu_count()},
-            "versions": {p: version(p) for p in ("numpy", "opencv-python-headless")},
-            "views": args.views,
-            "goals_px": GOAL_PX,
-            "figures": figures,
-        }
-        args.json.write_text(json.dumps(document, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+        ids, uv = finder(_view(kind, level, seed), target)
+        if len(ids):
+            choices = [uv - truth[end[ids]] for end in (ends or _ends(target)[:1])]
+            errors.append(min(choices, key=lambda e: float(np.sum(e**2))))
+    return PointErrors(errors=np.concatenate(errors), visible=visible)

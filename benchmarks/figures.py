@@ -177,7 +177,8 @@ def run(
         text: its docstring, which is the help; the first line is the table's title.
         packages: whose versions are written.
         figures: what it measures; all of these keys are in the JSON of every run.
-        parts: what measures them: a function of the command line, or "module:function".
+        parts: what measures them: a function of the command line, or "module:function". One that
+            stands for several parts is called once for all of them.
         seed: used where the command line gives none.
         options: adds options of its own to the command line.
         end: adds what follows from all parts.
@@ -185,10 +186,11 @@ def run(
     arguments = _arguments_of(text, parts, seed, options)
     console, begin, found = Console(), time.perf_counter(), Found()
     failures: dict[str, str] = {}
-    for part in arguments.parts:
+    for what in dict.fromkeys(parts[part] for part in arguments.parts):
+        part = ", ".join(p for p in arguments.parts if parts[p] == what)
         start = time.perf_counter()
         try:
-            found.take(_part(parts[part])(arguments))
+            found.take(_part(what)(arguments))
         except KeyboardInterrupt:
             sys.exit(130)
         except Exception as error:

@@ -98,7 +98,7 @@ def damage(seed: int, quick: bool) -> Found:
         found.add(key, sums[name])
     found.cases["mutations"] = result.counts
     found.cases["offenders"] = [o._asdict() for o in result.offenders]
-    found.notes += [f"{o.kind}: --replay '{o.name}:{o.seed}'" for o in result.offenders]
+    found.notes += [f"{o.kind}: formats_mutations.py '{o.name}:{o.seed}'" for o in result.offenders]
     return found
 
 

@@ -1,7 +1,8 @@
 """Damaged files of every format: each is read correctly or refused, by realsim's own error.
 
-python benchmarks/formats_mutations.py [--count 10000] [--seed 0] [--format NAME] [--workers 2]
-                                       [--replay NAME:SEED] [--json FILE]
+Imported by `formats.py` (`--part damage`); one mutation alone, for a debugger:
+
+    uv run python benchmarks/formats_mutations.py NAME:SEED
 
 Classes: 'read' and 'refused' are right; 'traceback' (any other exception), 'nan' (a record with a
 number that is not finite, which the whole sample does not have), 'hang' (5 s of CPU or 20 s of
@@ -14,12 +15,9 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("MALLOC_ARENA_MAX", "2")  # an arena a thread would count as memory
 
-import argparse
-import json
 import sys
 import tempfile
-from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -106,44 +104,6 @@ def replay(name: str, seed: int) -> Outcome:
         return read_mutation(sample, files, seed, frozenset())
 
 
-def table(result: MutationResult) -> Iterable[str]:
-    """Yield the lines of a table, and of what went wrong."""
-    yield f"{'format':16}" + "".join(f"{c:>10}" for c in CLASSES)
-    for name, row in result.counts.items():
-        yield f"{name:16}" + "".join(f"{row[c]:10}" for c in CLASSES)
-    sums = Counter[str]()
-    for row in result.counts.values():
-        sums.update(row)
-    yield f"{'all':16}" + "".join(f"{sums[c]:10}" for c in CLASSES)
-    for o in result.offenders:
-        yield f"\n{o.kind}: --replay '{o.name}:{o.seed}' ({o.change[:200]!r})\n{o.detail}"
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--count", type=int, default=10_000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--format", action="append", choices=sorted(SAMPLES))
-    parser.add_argument("--replay", metavar="NAME:SEED")
-    parser.add_argument("--json", type=Path)
-    given = parser.parse_args()
-    if given.replay:
-        name, _, seed = given.replay.rpartition(":")
-        print("\n".join(map(str, replay(name, int(seed)))))
-        return
-    result = run_mutations(given.count, given.seed, given.workers, given.format)
-    print("\n".join(table(result)))
-    if given.json:
-        figures = {
-            "mutated_files": result.total(),
-            "mutated_tracebacks": result.offences,
-            "counts": result.counts,
-            "offenders": [o._asdict() for o in result.offenders],
-        }
-        given.json.write_text(json.dumps(figures, indent=1) + "\n")
-    sys.exit(result.offences > 0)
-
-
 if __name__ == "__main__":
-    main()
+    name, _, seed = sys.argv[1].rpartition(":")
+    print("\n".join(map(str, replay(name, int(seed)))))

@@ -1,6 +1,6 @@
 """Benchmark of registration: the pose of every object in every view, in a simulated lab.
 
-    uv run python benchmarks/registration.py [--quick] [--json FILE] [--seeds 100,101] [--parts ...]
+    uv run python benchmarks/registration.py [--quick] [--json FILE] [--seed 100] [--part NAME]
 
 14 of 30 objects in clutter; hand-eye off by 0.5 mm / 0.1 deg, every robot pose by 0.2 mm / 0.03
 deg. Errors are MSSD over all symmetries, continuous ones aligned exactly; medians over objects.
@@ -34,8 +34,8 @@ Parts and the figures they give (keys of the JSON's "figures"):
       apc_step_mm, apc_step_deg
                               a robot's scan of a shelf without any model: ICP between neighbouring
                               views after refinement
-Shares are 0 to 1. Seeds from 100 on are those of the published figures; use lower ones while
-developing.
+Shares are 0 to 1. Eight scenes from the seed on; seeds from 100 are those of the published figures,
+use lower ones while developing.
 """
 
 import os
@@ -44,16 +44,10 @@ for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
 import argparse
-import json
-import platform
-import sys
-import time
-from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from figures import Figure, Found, run
 from registration_figures import GOALS, Row, figures_of, per_part
 from registration_jobs import jobs_of, results
 
@@ -61,128 +55,57 @@ from realsim.app.console import Console
 
 PACKAGES = ("numpy", "scipy", "numba", "open3d-cpu", "opencv-python-headless", "pybullet")
 PARTS = ("rough", "cold", "unknown", "piles", "refined", "biased", "rival", "flags", "cost", "real")
-SEEDS = tuple(range(100, 108))
-MANY_SCENES = 4
-"""Scenes of 256 views: the first seeds."""
+QUICK_PARTS = ("cold", "refined", "rival")
+SCENES, MANY_SCENES = 8, 4
+"""Scenes; those of 256 views are the first seeds."""
+HEADER = ["part", "seed", "objects", "right", "median mm", "p90 mm", "not right"]
 
 
-def print_tables(
-    console: Console, rows: Sequence[Row], figures: dict[str, float], over: dict[str, str]
-) -> None:
-    """Print the scenes, the failures, and every figure beside its goal."""
-    header = ["part", "seed", "objects", "right", "median mm", "p90 mm", "not right"]
-    console.table(
-        "Scenes: what is not right (! = flagged), in brackets right but not accepted",
-        header,
-        per_part(rows),
-    )
-    for failure in dict.fromkeys(
-        f"{r.part}, seed {r.seed}: {r.failure}" for r in rows if r.failure
-    ):
-        console.warn(failure)
-    order = [k for k in GOALS if k in figures] + [k for k in figures if k not in GOALS]
-    table: list[list[str]] = []
-    for key in order:
-        goal = GOALS.get(key)
-        value = figures[key]
-        bounded = goal is not None and str(goal) != ">= -inf" and "inf" not in str(goal)
-        verdict = "" if not bounded or goal is None else "ok" if goal.met(value) else "FELL SHORT"
-        if not np.isfinite(value):
-            if goal is None:
-                continue
-            verdict = "not run"
-        wish = str(goal) if bounded else ""
-        table.append([key, f"{value:.4g}", wish, verdict, over.get(key, "")])
-    console.table("Registration", ["figure", "value", "goal", "", "over"], table)
-
-
-def document_of(
-    arguments: argparse.Namespace,
-    rows: Sequence[Row],
-    figures: dict[str, float],
-    notes: Sequence[str],
-    seconds: float,
-) -> dict[str, Any]:
-    """Return what is written; a figure that is not finite is null."""
-    return {
-        "benchmark": "registration",
-        "machine": {"cpu": platform.machine(), "cores": os.cpu_count()},
-        "versions": {name: version(name) for name in PACKAGES},
-        "seeds": arguments.seeds,
-        "many_scenes": arguments.many,
-        "parts": arguments.parts,
-        "quick": arguments.quick,
-        "wall_s": round(seconds, 1),
-        "figures": {k: v if np.isfinite(v) else None for k, v in figures.items()},
-        "goals": {k: str(goal) for k, goal in GOALS.items()},
-        "notes": list(notes),
-        "cases": [r.plain() for r in rows],
-    }
-
-
-def arguments_of() -> argparse.Namespace:
-    """Return the command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    numbers: Callable[[str], list[int]] = lambda text: [int(v) for v in text.split(",")]  # noqa: E731
-    words: Callable[[str], list[str]] = lambda text: text.split(",")  # noqa: E731
-    parser.add_argument("--json", type=Path, help="write the figures here")
-    parser.add_argument("--quick", action="store_true", help="one scene, few objects and views")
-    parser.add_argument("--seeds", type=numbers, help="100,...,107 (quick: 1)")
-    parser.add_argument("--many", type=int, default=MANY_SCENES, help="scenes of 256 views")
-    parser.add_argument("--parts", type=words, help=f"of {','.join(PARTS)}")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
-    parser.add_argument("--keep", type=Path, help="folder of images and fields, kept between runs")
-    arguments = parser.parse_args()
-    arguments.seeds = arguments.seeds or ([1] if arguments.quick else list(SEEDS))
-    arguments.parts = arguments.parts or (
-        ["cold", "refined", "rival"] if arguments.quick else list(PARTS)
-    )
-    unknown = [n for n in arguments.parts if n not in PARTS]
-    if unknown:
-        parser.error(f"there is no {', '.join(unknown)}; there are: {', '.join(PARTS)}")
-    return arguments
-
-
-def main() -> None:
-    """Run the jobs, print the tables, write the JSON."""
-    arguments = arguments_of()
-    console = Console()
-    begin = time.perf_counter()
-    rows: list[Row] = []
+def measure(given: argparse.Namespace) -> Found:
+    """Measure all parts: a scene is made once for those that look at it."""
+    console, found, rows = Console(), Found(), list[Row]()
     samples: dict[str, list[float]] = {}
     complete: dict[str, float] = {}
-    notes: list[str] = []
-    jobs = jobs_of(
-        arguments.seeds, arguments.parts, arguments.many, arguments.keep, arguments.quick
-    )
-    try:
-        with console.stage("scenes", f"{len(jobs)} jobs") as tick:
-            for count, (_, every) in enumerate(results(jobs, arguments.jobs), 1):
-                for done in every:
-                    rows += done.rows
-                    complete |= dict(done.figures)
-                    notes += done.notes
-                    for key, values in done.samples.items():
-                        samples.setdefault(key, []).extend(values)
-                tick(count, len(jobs))
-    except KeyboardInterrupt:
-        sys.exit(130)
+    if given.quick:
+        given.parts = [part for part in QUICK_PARTS if part in given.parts] or given.parts
+    seeds = range(given.seed, given.seed + (1 if given.quick else given.scenes))
+    jobs = jobs_of(seeds, given.parts, given.many, given.keep, given.quick)
+    with console.stage("scenes", f"{len(jobs)} jobs") as tick:
+        # Each process compiles: one does for a quick run.
+        for count, (_, every) in enumerate(results(jobs, 1 if given.quick else given.jobs), 1):
+            for done in every:
+                rows += done.rows
+                complete |= dict(done.figures)
+                found.notes += done.notes
+                for key, values in done.samples.items():
+                    samples.setdefault(key, []).extend(values)
+            tick(count, len(jobs))
     order = list(dict.fromkeys(r.part for r in rows))
     rows.sort(key=lambda r: (order.index(r.part), r.seed))
-    figures, over = figures_of(rows, samples)
+    console.table(
+        "Scenes: what is not right (! = flagged), in brackets right but not accepted",
+        HEADER, per_part(rows),
+    )  # fmt: skip
+    found.notes += dict.fromkeys(f"{r.part}, seed {r.seed}: {r.failure}" for r in rows if r.failure)
+    figures, found.over = figures_of(rows, samples)
     figures |= {k: float(np.mean(v)) for k, v in samples.items() if k.startswith("cpu_s_")}
-    figures |= complete
-    seconds = time.perf_counter() - begin
-    print_tables(console, rows, figures, over)
-    for note in notes:
-        console.say(note)
-    console.say(f"{seconds:.0f} s")
-    if arguments.json:
-        document = document_of(arguments, rows, figures, notes, seconds)
-        arguments.json.write_text(json.dumps(document, indent=1, default=str))
+    found.figures = {k: v for k, v in (figures | complete).items() if np.isfinite(v)}
+    found.cases["rows"] = [r.plain() for r in rows]
+    return found
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this benchmark."""
+    parser.add_argument("--scenes", type=int, default=SCENES, help="scenes (quick: 1)")
+    parser.add_argument("--many", type=int, default=MANY_SCENES, help="scenes of 256 views")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (quick: 1)")
+    parser.add_argument("--keep", type=Path, help="folder of images and fields, kept between runs")
 
 
 if __name__ == "__main__":
-    main()
+    figures = {key: Figure(unit="", goal=goal) for key, goal in GOALS.items()}
+    parts = dict.fromkeys(PARTS, measure)
+    run(
+        "registration", __doc__ or "", PACKAGES, figures, parts,
+        seed=100, options=options,
+    )  # fmt: skip
