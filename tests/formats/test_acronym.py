@@ -48,19 +48,12 @@ def rows_of(s, rows):
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(T_GRASP_HAND)))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_to_a_hand_frame_and_back_is_the_same_grasp(seed, frame):
     Ts = se3.random_transform(np.random.default_rng(seed), 10)
     back = grasp_poses(hand_poses(Ts, frame), frame)
     np.testing.assert_array_equal(back[:, :3, :3], Ts[:, :3, :3])  # signed permutations
     np.testing.assert_allclose(back, Ts, rtol=0, atol=4e-16 * (1 + np.abs(Ts).max()))
-
-
-@pytest.mark.parametrize("frame", sorted(T_GRASP_HAND))
-def test_the_frame_goes_with_the_object(frame):
-    rng = np.random.default_rng(0)
-    Ts, T = se3.random_transform(rng, 10), se3.random_transform(rng)
-    np.testing.assert_allclose(T @ hand_poses(Ts, frame), hand_poses(T @ Ts, frame), atol=1e-14)
 
 
 def test_the_axes_of_acronyms_hand_are_known():
@@ -79,7 +72,7 @@ def test_the_axes_of_acronyms_hand_are_known():
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_tried_grasps_written_and_read_are_the_same(tmp_path_factory, seed):
     s = tried_set(np.random.default_rng(seed), 30)
     path = write_acronym(tmp_path_factory.mktemp("a") / "mug.h5", s, OBJECT)
@@ -90,17 +83,6 @@ def test_tried_grasps_written_and_read_are_the_same(tmp_path_factory, seed):
     assert_same(OBJECT, found.obj)
     assert np.array_equal(found.object_in_gripper, held(kept))
     assert path.read_bytes() == write_acronym(path, s, OBJECT).read_bytes()
-
-
-def test_acronyms_own_reader_finds_what_it_looks_for(tmp_path):
-    """The very accesses of acronym_tools.load_grasps and load_mesh."""
-    s = tried_set(np.random.default_rng(1), 40)
-    data = h5py.File(write_acronym(tmp_path / "mug.h5", s, OBJECT), "r")
-    T = np.array(data["grasps/transforms"])
-    success = np.array(data["grasps/qualities/flex/object_in_gripper"])
-    assert data["object/file"][()] == b"meshes/mug.obj" and data["object/scale"][()] == 0.001
-    assert T.shape == (int(executed(s).sum()), 4, 4) and set(success.tolist()) == {0, 1}
-    assert success.dtype == np.int64
 
 
 def test_our_physics_does_not_pass_for_flex(tmp_path):
@@ -116,12 +98,6 @@ def test_our_physics_does_not_pass_for_flex(tmp_path):
     found = read_acronym(path)
     assert "not FleX" in found.simulator
     assert np.isnan(found.as_set(3).scores).all()  # a label is not a score
-
-
-def test_a_set_without_a_tried_grasp_is_a_file_too(tmp_path):
-    s = tried_set(np.random.default_rng(1), 0)
-    found = read_acronym(write_acronym(tmp_path / "none.h5", s, AcronymObject(file="a.obj")))
-    assert len(found.Ts_obj_grasp) == 0 and found.obj.mass_kg is None
 
 
 def link(file):
@@ -194,40 +170,13 @@ def test_real_grasps_close_on_the_mug_and_only_in_the_right_frame():
     assert found.obj.density == 150 and found.obj.friction == 1
     loaded = trimesh.load(next(MUG.glob("*.obj")), force="mesh", process=False)
     mesh = Mesh(vertices=np.asarray(loaded.vertices) * found.obj.scale, faces=loaded.faces)
-    points = sample_surface(mesh, 4000, np.random.default_rng(0))[0]
-    free, between = fingers_and_gap(found.Ts_obj_grasp, points)
-    # Fingers that are open touch nothing, and the pads have something between them: all 2000.
+    points = sample_surface(mesh, 1000, np.random.default_rng(0))[0]
+    Ts = found.Ts_obj_grasp[::10]
+    free, between = fingers_and_gap(Ts, points)
+    # Fingers that are open touch nothing, and the pads have something between them.
     assert free.all() and between.all()
-    Ts = found.Ts_obj_grasp[::4]
     unturned, _ = fingers_and_gap(grasp_poses(hand_poses(Ts, "acronym"), "panda_hand"), points)
     assert unturned.mean() < 0.6  # without the quarter turn the fingers stand in the mug
     deeper, _ = fingers_and_gap(Ts @ se3.from_translation([0, 0, 0.02]), points)
     _, short = fingers_and_gap(Ts @ se3.from_translation([0, 0, -0.02]), points)
     assert deeper.mean() < 0.95 and short.mean() < 0.9  # and the shift is right to 2 cm
-
-
-@pytest.mark.real
-@needs_mug
-def test_real_grasps_closing_rays_meet_the_mug():
-    import trimesh
-
-    from realsim.records import Mesh
-    from realsim.rendering.rays import PlacedMesh, RayScene
-
-    found = read_acronym(next(MUG.glob("*.h5")))
-    loaded = trimesh.load(next(MUG.glob("*.obj")), force="mesh", process=False)
-    mesh = Mesh(vertices=np.asarray(loaded.vertices) * found.obj.scale, faces=loaded.faces)
-    scene = RayScene([PlacedMesh(0, mesh, np.eye(4))])
-    Ts = found.Ts_obj_grasp[found.object_in_gripper]
-    x, z = np.meshgrid([-0.006, 0.0, 0.006], [-0.008, -0.004, 0.0, 0.004, 0.008])
-    for side in (1.0, -1.0):
-        pad = np.stack([x.ravel(), np.full(x.size, side * 0.04), z.ravel()], axis=1)
-        origins = se3.transform(Ts, pad).reshape(-1, 3)
-        inward = np.repeat(-side * Ts[:, :3, 1], len(pad), axis=0).astype(np.float32)
-        t, _ = scene.first_hits(origins, inward)
-        assert np.all((t.reshape(len(Ts), -1) < 0.08).any(axis=1))
-    # At the mounting face, where the unshifted frame is, the same rays meet nothing.
-    face = hand_poses(Ts, "panda_hand")
-    inward = np.ascontiguousarray(-face[:, :3, 1], dtype=np.float32)
-    t, _ = scene.first_hits(se3.transform(face, np.array([[0.0, 0.04, 0.0]]))[:, 0], inward)
-    assert np.mean(t < 0.08) < 0.1

@@ -11,12 +11,11 @@ from realsim.errors import InputError, UnitError
 from realsim.formats.bags import clocks, pixels, wire
 from realsim.formats.bags.joints import UR_JOINTS, JointTrack, prefixes
 from realsim.formats.bags.reproject import depth_in_colour
-from realsim.formats.bags.tf_tree import T_BASE_BASELINK, TfTree, arm_frames
+from realsim.formats.bags.tf_tree import TfTree, arm_frames
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.interop import quaternion_xyzw_from_R
 from realsim.records import CameraIntrinsics
-from realsim_capture_plans.arms.kinematics import UR5
 
 S = wire.NS_PER_S
 
@@ -26,7 +25,7 @@ TIMES = st.lists(st.integers(0, 10**6), min_size=1, max_size=30, unique=True).ma
 
 
 @given(TIMES, TIMES, st.integers(0, 10**9))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_pairs_are_one_to_one_symmetric_and_shift_with_the_clock(
     a: list[int], b: list[int], shift: int
 ) -> None:
@@ -39,15 +38,6 @@ def test_pairs_are_one_to_one_symmetric_and_shift_with_the_clock(
         assert abs(ta[i] - tb[j]) == np.abs(ta[i] - tb).min() == np.abs(ta - tb[j]).min()
     same = clocks.pairs(ta, ta, 1e-4)
     assert np.array_equal(same, np.stack([np.arange(len(ta))] * 2, -1))
-
-
-def test_clocks_apart_are_named_with_both_ranges() -> None:
-    a = np.array([100, 110]) * S
-    with pytest.raises(InputError) as caught:
-        clocks.check_overlap("colour", a, "joints", a + 1000 * S, "header")
-    for part in ("100.000 .. 110.000", "1100.000 .. 1110.000", "+1000.000 s", "clock=receive"):
-        assert part in str(caught.value)
-    clocks.check_overlap("colour", a, "joints", a + 11 * S, "header")  # a second apart: one clock
 
 
 # --- depth unit -----------------------------------------------------------------------------------
@@ -154,21 +144,6 @@ def ur_tree(base: str, tool: str, T: Any, link: str | None = "wrist_3_link") -> 
     return tree
 
 
-def test_base_link_of_a_ur_is_turned_into_the_controllers_base() -> None:
-    T = UR5.forward(np.array([0.3, -1.2, 1.5, -1.0, -1.5, 0.2]))
-    tree = ur_tree("base_link", "tool0", se3.invert(T_BASE_BASELINK) @ T)
-    found = arm_frames(tree, None, None, False)
-    assert found is not None
-    base, ee, turn, notes = found
-    pose = tree.lookup(base, ee, S, 0.25)
-    assert pose is not None
-    assert np.allclose(turn @ pose, T, atol=1e-12)
-    assert "180 deg" in notes[0]
-    other = arm_frames(ur_tree("base_link", "tool0", T, link=None), None, None, False)
-    assert other is not None
-    assert np.array_equal(other[2], np.eye(4))  # not known to be a UR: as it is
-
-
 def test_arm_frames_are_named_when_not_there_or_not_one() -> None:
     tree = ur_tree("base", "tool0", np.eye(4))
     send(tree, "elsewhere", "marker", np.eye(4), 0, True)
@@ -197,14 +172,7 @@ def test_arm_frames_are_named_when_not_there_or_not_one() -> None:
 CAMERA = CameraIntrinsics(width=80, height=60, fx=70, fy=71, cx=39.2, cy=30.1)
 
 
-def test_equal_cameras_give_the_image_back() -> None:
-    rng = np.random.default_rng(3)
-    counts = rng.integers(0, 60000, (60, 80), dtype=np.uint16)
-    assert np.array_equal(depth_in_colour(counts, CAMERA, CAMERA, np.eye(4), 1e-4), counts)
-
-
-@pytest.mark.parametrize("roll", [0.0, 0.3])
-@pytest.mark.parametrize("zoom", [0.5, 1.0, 1.7])
+@pytest.mark.parametrize(("zoom", "roll"), [(0.5, 0.3), (1.7, 0.0)])
 def test_a_plane_stays_a_plane_without_holes(zoom: float, roll: float) -> None:
     normal, distance = np.array([0.2, -0.1, 1.0]), 0.6
     rays = np.stack(np.meshgrid((np.arange(80) - CAMERA.cx) / CAMERA.fx,

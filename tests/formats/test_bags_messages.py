@@ -44,7 +44,7 @@ def header(form: str, stamp_ns: int, frame_id: str) -> Any:
     names=st.lists(st.text("joint_123", max_size=11), max_size=7),
     stamp=st.integers(0, 2**31 * S - 1),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_joint_states_are_read_as_the_full_deserialiser_reads_them(
     form: str, frame: str, names: list[str], stamp: int
 ) -> None:
@@ -57,44 +57,6 @@ def test_joint_states_are_read_as_the_full_deserialiser_reads_them(
     assert (found.stamp_ns, found.names) == (stamp, tuple(names))
     assert np.array_equal(found.position, q)
     assert np.array_equal(found.velocity, 2 * q)
-
-
-@pytest.mark.parametrize("form", FORMS)
-@given(frame=st.text("ab_", max_size=9), encoding=st.sampled_from(["rgb8", "16UC1", "x"]))
-@settings(max_examples=20, deadline=None)
-def test_images_are_views_with_all_their_fields(form: str, frame: str, encoding: str) -> None:
-    t = (ROS1 if form == "ros1" else ROS2).types
-    data = np.arange(24, dtype=np.uint8)
-    raw = t["sensor_msgs/msg/Image"](header(form, 5 * S + 3, frame), 4, 2, encoding, 1, 6, data)
-    content, is_ros2 = serialised(raw, form)
-    found = wire.image_of(content, is_ros2, compressed=False)
-    assert found._replace(pixels=data) == (5 * S + 3, frame, encoding, data, 2, 4, 6, True)
-    assert np.array_equal(found.pixels, data)
-    assert not found.pixels.flags.owndata
-    packed = t["sensor_msgs/msg/CompressedImage"](header(form, 9, frame), "jpeg", data)
-    found = wire.image_of(*serialised(packed, form), compressed=True)
-    assert (found.stamp_ns, found.frame_id, found.encoding) == (9, frame, "jpeg")
-    assert np.array_equal(found.pixels, data)
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_transforms_are_read(form: str) -> None:
-    t = (ROS1 if form == "ros1" else ROS2).types
-    stamped = [
-        t["geometry_msgs/msg/TransformStamped"](
-            header(form, S + k, "/base"),
-            f"link{'x' * k}",
-            t["geometry_msgs/msg/Transform"](
-                t["geometry_msgs/msg/Vector3"](1.0 + k, 2.0, 3.0),
-                t["geometry_msgs/msg/Quaternion"](0.0, 0.6, 0.0, 0.8),
-            ),
-        )
-        for k in range(3)
-    ]
-    found = wire.transforms_of(*serialised(t[TF](stamped), form))
-    assert [f.child for f in found] == ["link", "linkx", "linkxx"]
-    assert found[2].parent == "base"  # ROS1's leading slash means nothing
-    assert found[2].numbers == (3.0, 2.0, 3.0, 0.0, 0.6, 0.0, 0.8)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -197,7 +159,7 @@ def test_compressed_images() -> None:
 
 
 @given(st.floats(0.3, 8.0))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_inverse_depth_is_undone_within_its_quantisation(z: float) -> None:
     # As compressed_depth_image_transport quantises: A = q (q + 1), B = 1 - A / z_max.
     q, z_max = 100.0, 10.0

@@ -34,13 +34,6 @@ def real(name: str) -> Path:
 
 
 @pytest.mark.real
-def test_a_real_d435_without_a_frame_in_time_is_refused_with_the_gap() -> None:
-    """One colour frame at 360.714 s, depth at 360.815 and 360.982 s, 6 frames a second."""
-    with pytest.raises(InputError, match=r"within 83\.3 ms.*101\.6 ms.*max_pair_gap_s=0\.11"):
-        open_bag(real("single_depth_color_640x480.bag"))
-
-
-@pytest.mark.real
 def test_a_real_d435s_depth_lies_on_its_colour_image() -> None:
     path = real("single_depth_color_640x480.bag")
     source = open_bag(path, BagChoice(max_pair_gap_s=0.11))
@@ -73,23 +66,6 @@ def test_a_real_d435s_depth_lies_on_its_colour_image() -> None:
     assert right < 4
     for wrong in (se3.invert(T), np.eye(4), turned, shifted):
         assert distance_px(wrong) > 1.5 * right
-
-
-@pytest.mark.real
-@pytest.mark.parametrize(
-    ("name", "part"),
-    [
-        ("foxglove_example.bag", "turtlesim/Pose"),
-        ("rosbag2/rosbag2_py/test/resources/mcap/wbag", "std_msgs/String"),
-        ("rosbag2/rosbag2_py/test/resources/sqlite3/wbag", "std_msgs/String"),
-        ("rosbag2/rosbag2_py/test/resources/mcap/convert_a", "test_msgs/BasicTypes"),
-        ("rosbag2/rosbag2_py/test/resources/sqlite3/convert_b", "test_msgs/Strings"),
-    ],
-)
-def test_recordings_without_images_list_what_they_have(name: str, part: str) -> None:
-    with pytest.raises(InputError, match="has no images") as caught:
-        open_bag(real(name))
-    assert part in str(caught.value)
 
 
 # --- the SDK's recorder ---------------------------------------------------------------------------

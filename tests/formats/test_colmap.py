@@ -120,10 +120,6 @@ def test_several_cameras_are_named_and_chosen(tmp_path):
         open_colmap(tmp_path, camera_id=5)
 
 
-def test_equal_cameras_are_one(tmp_path):
-    assert len(open_colmap(make(tmp_path, poses(4), ("OPENCV",) * 4))) == 4
-
-
 def test_a_lens_without_a_place_is_refused(tmp_path):
     make(tmp_path, poses(2), ("SIMPLE_RADIAL_FISHEYE",))
     with pytest.raises(InputError, match=r"SIMPLE_RADIAL_FISHEYE.*image_undistorter"):

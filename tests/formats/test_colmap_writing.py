@@ -22,7 +22,7 @@ from realsim.formats.export_folder import ExportFolder
 from realsim.formats.session_scene import open_session_scene
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
-from tests.support.synthetic_scenes import DEPTH_UNIT_M, captured_session
+from tests.support.synthetic_scenes import captured_session
 
 LENSES = {
     "PINHOLE": [0.0] * 8,
@@ -79,20 +79,6 @@ def test_pycolmap_reads_every_bit(tmp_path, encode):
     assert [again[k] for k in (1, 2, 3)] == cameras
 
 
-def test_the_binary_files_are_those_that_colmap_writes(tmp_path):
-    """pycolmap writes what it read again byte by byte: rigs, frames, order and padding, too."""
-    cameras = [camera_row(k, camera(lens)) for k, lens in enumerate(LENSES, start=1)]
-    Ts = se3.random_transform(np.random.default_rng(1), 4)
-    images = [image_row(k + 1, 1 + k % 3, T, f"{k}.png") for k, T in enumerate(Ts)]
-    files = binary_files(cameras, images, np.ones((1, 3)) / 3, np.full((1, 3), 9, np.uint8))
-    (tmp_path / "theirs").mkdir()
-    for name, data in files.items():
-        (tmp_path / name).write_bytes(data)
-    pycolmap.Reconstruction(str(tmp_path)).write_binary(str(tmp_path / "theirs"))
-    for name, data in files.items():
-        assert (tmp_path / "theirs" / name).read_bytes() == data, name
-
-
 @pytest.mark.parametrize("encoding", ["binary", "text"])
 def test_a_session_comes_back(store, tmp_path, encoding):
     said = written(store, tmp_path / "out", encoding=encoding, depth=True)
@@ -108,23 +94,6 @@ def test_a_session_comes_back(store, tmp_path, encoding):
         assert np.array_equal(frame.rgb, store.rgb(view.index))
 
 
-def test_depth_beside_the_model_judges_it(store, tmp_path):
-    """With depth/ the images are whole frames, and a model in another unit is found out."""
-    written(store, tmp_path / "out", depth=True)
-    source = open_colmap(tmp_path / "out", depth_unit_m=DEPTH_UNIT_M)
-    assert source.depth_unit_m == DEPTH_UNIT_M
-    for view, frame in zip(store.session.views, source.frames(), strict=True):
-        theirs = cv2.imread(str(store.folder / f"depth/{view.index:06d}.png"), cv2.IMREAD_UNCHANGED)
-        assert np.array_equal(frame.depth_counts, theirs)
-    with pytest.raises(InputError, match=r"--scale (0\.9|1)"):
-        open_colmap(tmp_path / "out", depth_unit_m=DEPTH_UNIT_M, metres_per_unit=3.0)
-    with pytest.raises(InputError, match="--depth-unit"):
-        open_colmap(tmp_path / "out", depth_folder="depth")
-    with pytest.raises(InputError, match="no depth image"):
-        open_colmap(tmp_path / "out", depth_folder="images/none")
-    assert open_colmap(tmp_path / "out").depth_unit_m is None
-
-
 def test_points_lie_on_the_scene_with_its_colours(store, tmp_path):
     said = written(store, tmp_path / "out", points=500)
     model = pycolmap.Reconstruction(str(tmp_path / "out/sparse/0"))
@@ -137,29 +106,6 @@ def test_points_lie_on_the_scene_with_its_colours(store, tmp_path):
     none = written(store, tmp_path / "none", points=0)
     assert none.counts["points"] == 0
     assert len(pycolmap.Reconstruction(str(tmp_path / "none/sparse/0")).points3D) == 0
-
-
-def test_an_interrupted_export_is_finished_as_if_it_had_not_been(store, tmp_path):
-    written(store, tmp_path / "whole", points=300)
-    scene, ticks = open_session_scene(store), []
-
-    def stop():
-        ticks.append(1)
-        if len(ticks) == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        folder = ExportFolder.begin(tmp_path / "cut", {"what": "colmap"})
-        write_colmap(scene, folder, ColmapWriteConfig(points=300), progress=stop)
-    said = written(store, tmp_path / "cut", points=300)
-    assert said.frames == 3 and said.frames_written == 2
-    again = written(store, tmp_path / "cut", points=300)
-    assert again.frames_written == 0 and again.counts == said.counts
-    for path in sorted((tmp_path / "whole").rglob("*.bin")) + sorted(
-        (tmp_path / "whole").rglob("*.png")
-    ):
-        other = tmp_path / "cut" / path.relative_to(tmp_path / "whole")
-        assert other.read_bytes() == path.read_bytes()
 
 
 def test_what_cannot_be_written_is_said(store, tmp_path):

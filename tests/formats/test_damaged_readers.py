@@ -9,38 +9,20 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.formats.bags import open_bag
-from realsim.formats.bags.realsense import FrameTimes
-from realsim.formats.folders import read_cam_info
 from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_acronym
 from realsim.formats.grasps.graspgen import read_graspgen, write_graspgen
-from realsim.formats.grasps.hdf5 import read_grasps_hdf5, write_grasps_hdf5
 from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
 from realsim.geometry import mesh_files
 from realsim.geometry.mesh_files import load_mesh
 from realsim.models import mesh_loading
 from realsim.models.reading import read_scan
-from tried_grasps import tried_scene, tried_set
+from tried_grasps import tried_set
 from written_bags import recorded
 from written_meshes import as_trimesh, textured_box
 
 
 def a_set():
     return tried_set(np.random.default_rng(3), 8)
-
-
-@pytest.mark.parametrize("word", ["nan", "inf", "1e999", "-inf"])
-def test_a_camera_matrix_is_of_numbers(tmp_path: Path, word: str) -> None:
-    path = tmp_path / "cam.info.txt"
-    path.write_text(f"# Color camera intrinsic matrix\n35 0 {word}\n0 35 15\n0 0 1\n")
-    with pytest.raises(InputError, match="line 2"):
-        read_cam_info(path)
-
-
-def test_a_missing_camera_file_and_a_folder_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="does not exist"):
-        read_cam_info(tmp_path / "cam.info.txt")
-    with pytest.raises(InputError, match="is a folder"):
-        read_cam_info(tmp_path)
 
 
 @pytest.mark.parametrize("key", ["scale", "transforms"])
@@ -91,17 +73,6 @@ def test_acronyms_object_has_finite_numbers(tmp_path: Path, name: str) -> None:
         read_acronym(path)
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": NaN}', '{"a": 1, "a": 2}'])
-def test_parameters_in_hdf5_are_plain_json(tmp_path: Path, text: str) -> None:
-    path = write_grasps_hdf5(tmp_path / "g.h5", tried_scene(1))
-    with h5py.File(path, "r+") as file:
-        group = next(iter(file["sets"].values()))
-        del group["parameters"]
-        group["parameters"] = text
-    with pytest.raises(InputError, match="'parameters' is not JSON"):
-        read_grasps_hdf5(path)
-
-
 def test_a_heap_in_which_the_library_would_go_round_for_ever_is_refused(tmp_path: Path) -> None:
     obj = AcronymObject(file="mug.obj")
     path = write_acronym(tmp_path / "a.h5", a_set(), obj)
@@ -131,7 +102,6 @@ def edited_metadata(tmp_path: Path, old: str, new: str) -> Path:
     [
         ("message_count: ", "message_count: x"),
         ("name: /camera", "name: [/camera] #"),
-        ("name: /camera", "name: 3 #"),
     ],
 )
 def test_a_damaged_table_of_contents_is_refused(tmp_path: Path, old: str, new: str) -> None:
@@ -139,26 +109,17 @@ def test_a_damaged_table_of_contents_is_refused(tmp_path: Path, old: str, new: s
         open_bag(edited_metadata(tmp_path, old, new))
 
 
-@pytest.mark.parametrize("kind", ["ros1", "mcap"])
-def test_lengths_of_gigabytes_in_recordings_are_refused_or_not_believed(
-    tmp_path: Path, kind: str
-) -> None:
-    path = recorded(tmp_path, kind, 3).path
+def test_lengths_of_gigabytes_in_recordings_are_refused_or_not_believed(tmp_path: Path) -> None:
+    path = recorded(tmp_path, "mcap", 3).path
     file = path if path.is_file() else next(path.glob("*.mcap"))
     raw = file.read_bytes()
-    for at in range(8, 120, 3):
+    for at in range(8, 120, 20):
         file.write_bytes(raw[:at] + b"\xff\xff\xff\x7f" + raw[at + 4 :])
         try:
             source = open_bag(path)
             assert len(list(source.frames())) <= 3
         except InputError as error:
             assert "recording" in str(error)
-
-
-@pytest.mark.parametrize("text", ["timestamp=x;", "timestamp=nan;", "depth_units=inf;"])
-def test_a_realsenses_numbers_are_numbers(text: str) -> None:
-    with pytest.raises(InputError, match="damaged"):
-        FrameTimes().add(0, text)
 
 
 # --- textures -------------------------------------------------------------------------------------

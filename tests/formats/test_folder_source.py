@@ -1,6 +1,5 @@
 """A folder of images: what belongs together is joined by name, whatever the order and the gaps."""
 
-import os
 import random
 from pathlib import Path
 
@@ -18,13 +17,10 @@ from realsim.formats.folders import (
     read_cam_info,
 )
 from realsim.formats.folders.depth_evidence import coding_of, decoded, depth_evidence, read_counts
-from realsim.formats.folders.listing import join_names, join_states
+from realsim.formats.folders.listing import join_names
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 
-DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
-APC = DATA / "scenes/apc_shelf_multiview/scene-0000"
-RTDE = DATA / "handeye/rtde_ur5e/Hand-Eye-Data"
 CAMERA = CameraIntrinsics(width=40, height=30, fx=35, fy=35, cx=20, cy=15)
 MM = FolderChoice(depth_unit_m=0.001)
 
@@ -88,7 +84,7 @@ def test_every_frame_gets_its_own_parts(tmp_path, colour, depth):
     assert [f.time_s for f in source.frames(3)] == [3, 4, 5]
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(1))
 def test_gaps_and_order_do_not_change_what_belongs_together(tmp_path, seed):
     """Law: whatever files are taken away, each frame that is left is joined as before."""
     rng = random.Random(seed)
@@ -133,31 +129,7 @@ def test_numbers_with_other_prefixes_are_never_shifted():
         join_names(["12-30-05", "12-31-07"], ["12-30-06", "12-31-08"], "a", "b")
 
 
-def test_rows_without_names_count_only_without_gaps():
-    keys = ["0_10", "0_2", "0_1"] + [f"0_{k}" for k in range(3, 10)]
-    pairs = join_states(keys, states(range(1, 11), name="")).pairs
-    assert [pairs[k] for k in range(3)] == [9, 1, 0]
-    with pytest.raises(InputError, match="not numbered 0 to 8"):
-        join_states(keys[:-1], states(range(10), name="")[:-1])
-    with pytest.raises(InputError, match="names no image"):
-        join_states(keys, [*states([1]), *states([2], name="")])
-
-
 # --- what is refused --------------------------------------------------------------------------
-
-
-def test_two_images_of_one_name(tmp_path):
-    make(tmp_path, [1])
-    write(tmp_path, "rgb_0001.jpg", rgb_of(1))
-    with pytest.raises(InputError, match=r"rgb_0001\.jpg and rgb_0001\.png are two images"):
-        open_folder(tmp_path, CAMERA, choice=MM)
-
-
-def test_several_sizes(tmp_path):
-    make(tmp_path, range(3))
-    write(tmp_path, "rgb_0001.png", rgb_of(1, (60, 80)))
-    with pytest.raises(InputError, match=r"rgb_0001\.png is 80x60"):
-        open_folder(tmp_path, CAMERA, choice=MM)
 
 
 def test_no_camera_and_another_camera(tmp_path):
@@ -284,50 +256,3 @@ def test_cam_info_poses_are_read_as_written(tmp_path):
     np.testing.assert_allclose(T, se3.look_at([0.5, 0.1, 0.4], [0, 0, 0]), atol=1e-9)
     with pytest.raises(UnitError, match="millimetres"):
         read_cam_info(cam_info(tmp_path, 1000.0))
-
-
-@pytest.mark.skipif(not APC.is_dir(), reason=f"no shelf scan at {APC}")
-def test_real_scan_with_turned_bits():
-    info = read_cam_info(APC / "cam.info.txt")
-    camera = CameraIntrinsics.from_K(info.K, 640, 480)
-    with pytest.raises(InputError, match=r"0\.5\d\d m with 0\.0001"):
-        open_folder(APC, camera, [info.states])
-    choice = FolderChoice(depth_unit_m=1e-4)
-    source = open_folder(APC, camera, [info.states], choice=choice)
-    assert len(source) == 15 and any("turned" in n for n in source.notes)
-    frame = next(source.frames(7))
-    assert frame.name == "frame-000007.color.png"
-    # An independent reading: the sensor's own depth, brought over by the file's own extrinsics.
-    assert _error_of_aligned_depth(frame.depth_counts, info.K) < 0.008
-
-
-def _error_of_aligned_depth(counts: np.ndarray, K: np.ndarray) -> float:
-    """Return the median difference [m] from raw/ projected into the colour camera."""
-    lines = (APC / "cam.info.txt").read_text().split("#")
-
-    def matrix(title: str, n: int) -> np.ndarray:
-        text = next(t for t in lines if title in t).split("\n", 1)[1]
-        return np.array([float(w) for w in text.split()]).reshape(n, n)
-
-    Kd, T = matrix("Depth camera intrinsic", 3), matrix("Depth-to-color", 4)
-    raw = cv2.imread(str(APC / "raw/frame-000007.depth.png"), cv2.IMREAD_UNCHANGED)
-    z = ((raw >> 3) | (raw << 13)).astype(np.uint16) * 1e-4
-    v, u = np.nonzero(z)
-    rays = np.linalg.inv(Kd) @ np.stack([u, v, np.ones_like(u)])
-    p = T[:3, :3] @ (rays * z[v, u]) + T[:3, 3:]
-    uv = np.rint((K @ p)[:2] / p[2]).astype(int)
-    inside = np.all((uv >= 0) & (uv < [[640], [480]]), axis=0)
-    aligned = counts[uv[1, inside], uv[0, inside]] * 1e-4
-    there = aligned > 0
-    assert there.mean() > 0.4
-    return float(np.median(np.abs(aligned[there] - p[2, inside][there])))
-
-
-@pytest.mark.skipif(not RTDE.is_dir(), reason=f"no hand-eye data at {RTDE}")
-def test_real_depth_of_another_size():
-    camera = CameraIntrinsics(width=1920, height=1080, fx=1358, fy=1367, cx=967, cy=577)
-    with pytest.raises(InputError, match=r"1024x768 px, the colour images 1920x1080"):
-        open_folder(RTDE, camera, choice=MM)
-    source = open_folder(RTDE, camera, choice=FolderChoice(use_depth=False))
-    names = [Path(f[0]).stem for f in source.extra["frames"]]
-    assert names == sorted(names, key=int) and len(names) == 24

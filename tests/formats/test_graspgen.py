@@ -15,7 +15,7 @@ from tried_grasps import tried_set
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["acronym", "panda_hand", "grasp"]))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_tried_grasps_written_and_read_are_the_same(tmp_path_factory, seed, frame):
     s = tried_set(np.random.default_rng(seed), 25)
     path = tmp_path_factory.mktemp("gg") / "mug.json"

@@ -7,23 +7,17 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from pxr import Usd
 
 import placed_scenes
-from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.graspit.grasps import WorldGrasps
 from realsim.formats.graspit.scene import read_graspit_grasps, read_graspit_scene
 from realsim.formats.graspit.writing import (
     GraspitConfig,
     paired_grasps,
-    table_mesh,
     write_graspit,
-    yaml_text,
 )
 from realsim.formats.robot_scenes.placing import place_scene
 from realsim.geometry import se3
-from realsim.geometry.mesh import mass_properties
 from realsim.records import GraspSet
 
 DATA = Path(os.environ.get("REALSIM_DATA", "/nonexistent"))
@@ -107,19 +101,6 @@ def test_the_pairs_are_a_grasp_and_its_half_turn_in_world(tmp_path):
     assert np.allclose(Ts[:, 0], wanted, atol=1e-12)
 
 
-def test_the_usual_reader_of_yaml_finds_numbers_where_numbers_are(tmp_path):
-    """PyYAML takes 1e-05 for a text and `no` for false."""
-    yaml = pytest.importorskip("yaml")
-    rows = {"a": {"name": "no", "position": [1e-05, -2.5e-17, 3.0], "scale": [1, 1, 1]}, "p": "x/y"}
-    assert yaml.safe_load(yaml_text(rows)) == rows
-    scene = placed_scenes.placed_scene()
-    write(scene, grasps(), tmp_path / "s")
-    data = yaml.safe_load((tmp_path / "s/scene.yaml").read_text())
-    assert list(data) == ["grasp_path", "object1", "object2", "object3", "table"]
-    assert list(data["object1"]) == ["file_path", "name", "orientation", "position", "scale"]
-    assert data["object1"]["position"] == scene.objects[0].T_world_obj[:3, 3].tolist()
-
-
 def test_a_table_that_leans_in_world_becomes_level(tmp_path):
     scene = placed_scenes.turned_to(placed_scenes.placed_scene())
     told = write(scene, grasps(), tmp_path / "s")
@@ -130,15 +111,6 @@ def test_a_table_that_leans_in_world_becomes_level(tmp_path):
         assert np.allclose(p.T_world_obj, T @ o.T_world_obj, atol=1e-12)
     for a, b in zip(grasps(), read_graspit_grasps(found), strict=True):
         assert np.allclose(b.Ts_obj_grasp, a.Ts_obj_grasp, atol=1e-12)
-
-
-def test_meshes_go_as_usd_too_where_it_is_asked_for(tmp_path):
-    scene = placed_scenes.placed_scene()
-    told = write(scene, grasps(), tmp_path / "s", with_usd=True)
-    assert "file_path: assets/bracket.usd" in (tmp_path / "s/scene.yaml").read_text()
-    stage = Usd.Stage.Open(str(tmp_path / "s/assets/bracket.usd"))
-    assert stage.GetDefaultPrim().GetName() == "bracket" and not told.notes
-    same(read_graspit_scene(tmp_path / "s"), scene, grasps())
 
 
 def test_the_same_scene_gives_the_same_bytes_and_several_go_into_one_export(tmp_path):
@@ -178,21 +150,6 @@ def test_what_the_source_says_survives_and_what_moved_is_new(tmp_path):
     assert [line.split(":")[0] for line in changed if "orientation" not in line] == ["  position"]
     found = read_graspit_scene(tmp_path / "c")
     assert np.allclose(found.scene.objects[1].T_world_obj, moved.T_world_obj, atol=1e-12)
-
-
-def test_the_table_is_a_closed_box_under_the_plane():
-    table = placed_scenes.placed_scene().table
-    solid = mass_properties(table_mesh(table), 1.0)
-    assert solid.is_watertight
-    assert np.isclose(solid.volume_m3, np.prod([*table.size_m, table.thickness_m]))
-    assert np.isclose(table_mesh(table).bounds[1, 2], table.T_world_table[2, 3])
-
-
-def test_grasps_of_nothing_are_refused(tmp_path):
-    stranger = dataclasses.replace(grasps()[0], instance=9)
-    assert isinstance(stranger, WorldGrasps)
-    with pytest.raises(InputError, match="instance 9"):
-        write(placed_scenes.placed_scene(), [stranger], tmp_path / "s")
 
 
 @pytest.mark.real

@@ -20,11 +20,6 @@ def rounded(q):
     return " ".join(f"{x:.4f}" for x in q)
 
 
-def angles(texts, Rs):
-    qs = np.array([[float(x) for x in t.split()] for t in texts])
-    return se3.angle(np.swapaxes(se3.from_quaternion_wxyz(qs), -1, -2) @ Rs)
-
-
 def test_a_quaternion_that_was_read_is_written_again_up_to_its_sign():
     qs = np.random.default_rng(0).normal(size=(COUNT, 4))
     qs /= np.linalg.norm(qs, axis=1, keepdims=True)
@@ -34,15 +29,6 @@ def test_a_quaternion_that_was_read_is_written_again_up_to_its_sign():
         assert np.array(again.split(), float).tolist() in (
             np.array(text.split(), float).tolist(), (-np.array(text.split(), float)).tolist(),
         )  # fmt: skip
-
-
-def test_the_quaternion_is_never_farther_than_by_plain_rounding_and_often_nearer():
-    Rs = se3.random_rotation(np.random.default_rng(1), COUNT)
-    plain = angles([rounded(q) for q in se3.quaternion_wxyz(Rs)], Rs)
-    chosen = angles([quaternion_text(R) for R in Rs], Rs)
-    assert np.all(chosen <= plain + 1e-12)
-    assert chosen.max() < plain.max() and np.median(chosen) < 0.9 * np.median(plain)
-    assert np.degrees(chosen.max()) < 0.01
 
 
 def test_positions_are_off_by_half_of_the_last_digit_at_most():

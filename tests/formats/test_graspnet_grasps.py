@@ -1,7 +1,5 @@
 """GraspNet's grasps: the gripper frame, groups, labels, collisions, rectangles, broken files."""
 
-import io
-import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -81,7 +79,7 @@ def matrix_as_documented(towards, angle):
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_to_graspnets_gripper_and_back_is_the_same_grasp(seed):
     rng = np.random.default_rng(seed)
     Ts, depths = se3.random_transform(rng, 10), rng.uniform(0, 0.04, 10)
@@ -95,25 +93,6 @@ def test_to_graspnets_gripper_and_back_is_the_same_grasp(seed):
     np.testing.assert_allclose(
         np.linalg.norm(tips[:, None] - tips[None], axis=-1), distance, atol=1e-12
     )
-
-
-def test_graspnets_gripper_goes_with_the_object():
-    rng = np.random.default_rng(1)
-    Ts, T, d = se3.random_transform(rng, 10), se3.random_transform(rng), rng.uniform(0, 0.04, 10)
-    np.testing.assert_allclose(
-        T @ frame.graspnet_poses(Ts, d), frame.graspnet_poses(T @ Ts, d), atol=1e-14
-    )
-
-
-def test_a_group_that_is_written_is_read_to_single_precision(tmp_path):
-    group = a_group()
-    back = read_grasp_group(write_grasp_group(tmp_path / "g.npy", group))
-    np.testing.assert_allclose(back.Ts_a_grasp, group.Ts_a_grasp, rtol=0, atol=3 * SINGLE)
-    for name in ("scores", "openings_m", "heights_m", "depths_m"):
-        np.testing.assert_allclose(getattr(back, name), getattr(group, name), rtol=SINGLE)
-    np.testing.assert_array_equal(back.obj_ids, group.obj_ids)
-    again = write_grasp_group(tmp_path / "h.npy", back)
-    assert np.abs(np.load(again) - np.load(tmp_path / "g.npy")).max() < SINGLE
 
 
 def test_sets_in_a_view_and_back_are_the_same_grasps(tmp_path):
@@ -134,14 +113,6 @@ def test_sets_in_a_view_and_back_are_the_same_grasps(tmp_path):
         assert np.isnan(found.scores).all()  # another's score is not ours
 
 
-def test_moving_all_objects_moves_the_group():
-    rng = np.random.default_rng(3)
-    s, T_cam_obj, T = tried_set(rng, 30), se3.random_transform(rng), se3.random_transform(rng)
-    here = grasp_group([s], {s.instance: T_cam_obj}).moved(T)
-    there = grasp_group([s], {s.instance: T @ T_cam_obj})
-    np.testing.assert_allclose(here.Ts_a_grasp, there.Ts_a_grasp, atol=1e-13)
-
-
 def test_labels_that_are_written_are_read_to_the_last_bit(tmp_path):
     labels = some_labels()
     path = write_grasp_labels(tmp_path / "000_labels.npz", labels)
@@ -152,17 +123,6 @@ def test_labels_that_are_written_are_read_to_the_last_bit(tmp_path):
     assert_same(few, labels.rows(rows))
     again = write_grasp_labels(tmp_path / "again.npz", read_grasp_labels(path, with_collision=True))
     assert again.read_bytes() == path.read_bytes()
-
-
-def test_labels_as_grasps_in_a_group_are_the_labels(tmp_path):
-    labels = some_labels(4)
-    s = labels.as_set(5)
-    group = grasp_group([s], {0: np.eye(4)}, scores="friction")
-    np.testing.assert_allclose(group.scores, 1.1 - labels.friction, atol=1e-6)
-    path = write_grasp_group(tmp_path / "g.npy", group)
-    back = read_grasp_group(path).of_object(5, np.eye(4), from_labels=True)
-    np.testing.assert_allclose(back.measures["closure_friction"], labels.friction, atol=1e-6)
-    np.testing.assert_allclose(back.Ts_obj_grasp, labels.Ts_obj_grasp(), rtol=0, atol=1e-6)
 
 
 def test_which_views_were_looked_at_is_kept(tmp_path):
@@ -312,11 +272,6 @@ def test_a_broken_group_is_refused_with_the_reason(tmp_path, change, says):
         read_grasp_group(tmp_path / "g.npy")
 
 
-def test_an_unknown_object_of_a_network_is_no_object(tmp_path):
-    np.save(tmp_path / "g.npy", broken_group(put((slice(None), 16), -1)))
-    assert read_grasp_group(tmp_path / "g.npy").obj_ids.tolist() == [0, 0, 0]
-
-
 def small_file(path, **changes):
     """Write the labels of two points, with some arrays exchanged (None = left out)."""
     grid = (2, 300, 12, 4)
@@ -346,17 +301,3 @@ def small_file(path, **changes):
 def test_broken_labels_are_refused_with_the_reason(tmp_path, changes, says):
     with pytest.raises(InputError, match=says):
         read_grasp_labels(small_file(tmp_path / "l.npz", **changes))
-
-
-def test_a_header_that_claims_more_than_there_is_is_refused(tmp_path):
-    path = small_file(tmp_path / "l.npz")
-    header = io.BytesIO()
-    shape = (9999, 3)
-    np.lib.format.write_array_header_1_0(
-        header, {"descr": "<f4", "fortran_order": False, "shape": shape}
-    )
-    with zipfile.ZipFile(path) as old, zipfile.ZipFile(tmp_path / "n.npz", "w") as new:
-        for name in old.namelist():
-            new.writestr(name, header.getvalue() if name == "points.npy" else old.read(name))
-    with pytest.raises(InputError, match="claims the shape"):
-        read_grasp_labels(tmp_path / "n.npz")

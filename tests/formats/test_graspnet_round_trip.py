@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
-from labelled_scenes import MODELS, PLACES, TABLE, labelled_scene
+from labelled_scenes import MODELS, TABLE, labelled_scene
 from realsim import images
 from realsim.errors import InputError
 from realsim.formats.bop.models import save_models
@@ -13,9 +12,7 @@ from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.annotations import read_objects
-from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.formats.graspnet.opening import open_scene
-from realsim.formats.graspnet.scene import read_graspnet_scene
 from realsim.formats.graspnet.tree import open_graspnet
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
 from realsim.geometry import se3
@@ -119,28 +116,6 @@ def test_models_come_back_in_metres(tree):
         assert np.array_equal(model.mesh.colors, MODELS[i].mesh.colors)
 
 
-def test_the_other_readers_of_the_project_read_it(source, tree):
-    found = read_graspnet_scene(tree / "scenes/scene_0003")
-    for o, (obj_id, *_), seen in zip(
-        found.scene.objects, PLACES, source.frame(0).objects, strict=True
-    ):
-        T = se3.invert(TABLE) @ source.frame(0).T_world_cam @ seen.T_cam_obj
-        off = se3.invert(T) @ o.T_world_obj
-        assert o.obj_id == obj_id and np.linalg.norm(off[:3, 3]) < 1e-4
-    assert len(read_camera_poses(tree / HOME)) == 6
-
-
-def test_meta_files_are_what_scipy_reads(source, tree):
-    for index in source.indices:
-        meta = loadmat(tree / HOME / f"meta/{index:04d}.mat")
-        assert meta["cls_indexes"].tolist() == [[1, 7, 30]]
-        assert meta["factor_depth"].tolist() == [[1000.0]]
-        assert np.array_equal(meta["intrinsic_matrix"], source.frame(index).intrinsics.K)
-        assert meta["poses"].dtype == np.float32 and meta["poses"].shape == (3, 4, 3)
-        for k, o in enumerate(source.frame(index).objects):
-            assert np.array_equal(meta["poses"][..., k], o.T_cam_obj[:3].astype(np.float32))
-
-
 def test_points_lie_on_the_models_by_the_formulas_of_graspnetapi(tree):
     """generate_scene_pointcloud and generate_scene_model, aligned with the table."""
     home = tree / HOME
@@ -198,24 +173,6 @@ def test_bop_to_graspnet_to_bop_gives_the_same_poses_ids_and_pixels(source, tmp_
         for file in (bop.colour_file, bop.depth_file):
             other = getattr(again, file.__name__)(index)
             assert np.array_equal(images.read_image(file(index)), images.read_image(other))
-
-
-def test_graspnet_to_bop_to_graspnet_gives_the_same_cameras_annotations_and_labels(tree, tmp_path):
-    scene = opened(tree)
-    folder = ExportFolder.begin(tmp_path / "bop", {})
-    write_bop_scene(scene, folder, BopWriteConfig(camera=""))
-    save_models(tmp_path / "bop/models", scene.models())
-    # World is GraspNet's table, so that taking z = 0 of the world for it is right.
-    written(open_labelled_bop(tmp_path / "bop"), tmp_path / "again", table_is_world=True)
-    before, after = tree / HOME, tmp_path / "again" / HOME
-    for name in ("camera_poses.npy", "cam0_wrt_table.npy", "camK.npy"):
-        assert np.abs(np.load(before / name) - np.load(after / name)).max() < 1e-9
-    for index in range(6):
-        for kind in (f"label/{index:04d}.png", f"depth/{index:04d}.png", f"rgb/{index:04d}.png"):
-            assert np.array_equal(images.read_image(before / kind), images.read_image(after / kind))
-        path = f"annotations/{index:04d}.xml"
-        for a, b in zip(read_objects(before / path), read_objects(after / path), strict=True):
-            assert a.fields == b.fields
 
 
 def test_a_table_that_is_upside_down_is_named(tmp_path):

@@ -211,16 +211,3 @@ def test_a_hand_straight_down_has_its_fingertips_where_they_are_drawn(form, tmp_
         tip = T[:3, :3] @ form.tip + T[:3, 3]
         np.testing.assert_allclose(tip, [0.1, 0.02, 0.05 - (TIP - MOUNT)], atol=atol)
     assert len(form.raw(path)) == len(Ts)
-
-
-def test_every_format_reads_the_hand_of_every_other(tmp_path):
-    """Through all formats in a row, each reading what the one before wrote."""
-    s = tried(4)
-    keep = executed(s)
-    for k, kind in enumerate(FORMATS):
-        form = kind()
-        path, _ = written(form, tmp_path / str(k), s)
-        Ts = s.Ts_obj_grasp.copy()
-        Ts[keep] = form.read(path)
-        s = replace(s, Ts_obj_grasp=Ts)
-    np.testing.assert_allclose(s.Ts_obj_grasp, tried(4).Ts_obj_grasp, rtol=0, atol=2e-6)

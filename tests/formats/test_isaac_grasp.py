@@ -32,7 +32,7 @@ grasps:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_tried_grasps_written_and_read_are_the_same(tmp_path_factory, seed):
     s = tried_set(np.random.default_rng(seed), 25)
     path = tmp_path_factory.mktemp("ig") / "mug.yaml"
@@ -85,19 +85,6 @@ def test_every_yaml_reader_takes_tiny_numbers_for_numbers(tmp_path):
     reader.version = "1.1"
     for entry in reader.load(path)["grasps"].values():
         assert [type(x) for x in entry["position"]] == [float] * 3
-
-
-def test_openings_and_the_least_score_are_kept(tmp_path):
-    s = tried_set(np.random.default_rng(5), 40)
-    s = replace(s, parameters={"openings_m": np.linspace(0.02, 0.08, 40).tolist()})
-    found = read_isaac_grasp(
-        write_isaac_grasp(tmp_path / "a.yaml", s, object_frame='a "b"', least_score=0.5)
-    )
-    rows = [int(name.removeprefix("grasp_")) for name in found.names]
-    assert rows == np.flatnonzero(executed(s) & s.good).tolist() and rows
-    np.testing.assert_array_equal(found.openings_m, np.linspace(0.02, 0.08, 40)[rows])
-    none = write_isaac_grasp(tmp_path / "n.yaml", s, object_frame="a", least_score=1.1)
-    assert len(read_isaac_grasp(none).Ts_obj_grasp) == 0
 
 
 def test_a_width_that_the_hand_cannot_take_is_refused(tmp_path):

@@ -27,14 +27,6 @@ def test_coordinates_come_back_within_a_count_and_corners_are_no_hole():
     assert np.isnan(label_maps.coordinates_of(np.zeros((1, 3), np.uint16), low, high)).all()
 
 
-def test_a_flat_model_has_coordinates():
-    low, high = np.array([0.0, 0.0, 0.5]), np.array([1.0, 1.0, 0.5])
-    back = label_maps.coordinates_of(
-        label_maps.coordinate_counts([[0.25, 0.5, 0.5]], low, high), low, high
-    )
-    np.testing.assert_allclose(back, [[0.25, 0.5, 0.5]], atol=1e-5)
-
-
 def test_normals_come_back_and_nothing_stays_nothing():
     rng = np.random.default_rng(2)
     n = rng.normal(size=(40, 50, 3)).astype(np.float32)

@@ -204,14 +204,6 @@ def test_info_says_what_the_tables_hold(folder):
     assert {k for k, f in info["features"].items() if f["dtype"] == "video"} == set(CAMERAS)
 
 
-def test_tasks_are_a_pandas_frame_indexed_by_their_words(folder):
-    import pyarrow.parquet as pq
-
-    table = pq.read_table(folder / layout.TASKS)
-    assert table.to_pydict() == {"task_index": [0, 1], "task": ["grasp the a", "grasp the b"]}
-    assert json.loads(table.schema.metadata[b"pandas"])["index_columns"] == ["task"]
-
-
 @pytest.mark.parametrize("dies_at", [0, 3])
 def test_a_killed_export_goes_on_at_the_next_episode(folder, tmp_path, dies_at):
     first = Source(dies_at=dies_at)
@@ -223,24 +215,6 @@ def test_a_killed_export_goes_on_at_the_next_episode(folder, tmp_path, dies_at):
     assert written.frames == sum(LENGTHS)
     assert written.frames_written == sum(LENGTHS[dies_at:])
     assert files_of(tmp_path / "set") == files_of(folder)
-
-
-def test_an_episode_that_was_torn_is_begun_anew(folder, tmp_path):
-    with pytest.raises(KeyboardInterrupt):
-        write(tmp_path / "set", Source(dies_at=1))
-    kept = tmp_path / "set/.export/episodes/000000/episode.npz"
-    kept.write_bytes(kept.read_bytes()[:-20])
-    second = Source()
-    write(tmp_path / "set", second)
-    assert second.asked == [0, 1, 2, 3, 4]
-    assert files_of(tmp_path / "set") == files_of(folder)
-
-
-def test_columns_without_pictures_are_a_data_set(tmp_path):
-    written = write(tmp_path / "set", Source(cameras={}))
-    assert written.counts["videos"] == 0
-    assert json.loads((tmp_path / "set" / layout.INFO).read_text())["video_path"] is None
-    assert not (tmp_path / "set/videos").exists()
 
 
 @pytest.mark.parametrize(

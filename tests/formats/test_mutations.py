@@ -2,7 +2,6 @@
 
 import importlib
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import pytest
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 mutations: Any = importlib.import_module("formats_mutations")
-changes: Any = importlib.import_module("formats_mutations_changes")
+
 worker: Any = importlib.import_module("formats_mutations_worker")
 scenes: Any = importlib.import_module("formats_mutations_scenes")
 
@@ -23,27 +22,18 @@ def _report(result: Any) -> str:
 
 
 def test_damaged_files_are_refused_or_read() -> None:
-    result = mutations.run_mutations(120, 4_000, 2, SOUND)
-    assert result.total() == 120
+    result = mutations.run_mutations(40, 4_000, 1, SOUND[::5])
+    assert result.total() == 40
     assert result.offences == 0, _report(result)
-    assert result.total("refused") > 30  # the damage is real
-    assert result.total("read") > 10  # and not all is fatal
+    assert result.total("refused") > 10  # the damage is real
+    assert result.total("read") > 3  # and not all is fatal
 
 
 @pytest.mark.slow
 def test_many_damaged_files_are_refused_or_read() -> None:
-    result = mutations.run_mutations(1600, 50_000, 2, SOUND)
-    assert result.total() == 1600
+    result = mutations.run_mutations(300, 50_000, 2, SOUND)
+    assert result.total() == 300
     assert result.offences == 0, _report(result)
-
-
-def test_the_same_seed_makes_the_same_damage() -> None:
-    sample = mutations.SAMPLES["plain files"]
-    files = worker.sample_files(sample)
-    first = [changes.mutated(files, seed) for seed in range(40)]
-    time.sleep(1.1)  # some formats write the second into the file
-    assert [changes.mutated(files, seed) for seed in range(40)] == first
-    assert sum(changed != files for changed, _ in first) > 35
 
 
 # --- the harness sees what it is made to see -----------------------------------------------------
@@ -58,12 +48,8 @@ def _offence(kind: str) -> Any:
         data = (folder / "a.bin").read_bytes() if (folder / "a.bin").is_file() else b""
         if data == bytes(100):
             return []  # the whole sample
-        if kind == "traceback":
-            raise ZeroDivisionError
         if kind == "nan":
             return [{"x": float("nan")}]
-        if kind == "memory":
-            return [bytes(3 << 30)]
         if kind == "crash":
             import os
 
@@ -74,7 +60,7 @@ def _offence(kind: str) -> Any:
     return scenes.Sample(kind, _make, read)
 
 
-@pytest.mark.parametrize("kind", ["traceback", "nan", "memory", "crash"])
+@pytest.mark.parametrize("kind", ["nan", pytest.param("crash", marks=pytest.mark.slow)])
 def test_every_class_of_offence_is_seen_and_costs_one_mutation_only(kind: str) -> None:
     sample = _offence(kind)
     jobs = [worker.Job(kind, tuple(range(8)))]

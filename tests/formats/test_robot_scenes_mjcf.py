@@ -109,13 +109,6 @@ def test_the_cameras_frustum_is_that_of_its_intrinsics(scene, model):
     assert np.allclose(eye.up, -T[:3, 1], atol=1e-6)
 
 
-def test_distortion_that_has_no_place_is_told(scene, tmp_path):
-    lens = dataclasses.replace(placed_scenes.CAMERA, distortion=np.array([0.1, 0, 0, 0, 0]))
-    views = (dataclasses.replace(scene.cameras[0], intrinsics=lens),)
-    told = write(dataclasses.replace(scene, cameras=views), tmp_path / "s")
-    assert any("distortion of view_0" in n for n in told.notes)
-
-
 # --- what others write --------------------------------------------------------------------------
 
 
@@ -150,8 +143,8 @@ FREE_MESH = (
 )
 
 
-@pytest.mark.parametrize(("size", "scale"), [((50, 60, 100), 1.0), ((0.05, 0.06, 0.1), 0.001)])
-def test_a_mesh_whose_size_cannot_be_is_refused(tmp_path, size, scale):
+def test_a_mesh_whose_size_cannot_be_is_refused(tmp_path):
+    size, scale = (50, 60, 100), 1.0
     import trimesh
 
     (tmp_path / "m.stl").write_bytes(trimesh.creation.box(size).export(file_type="stl"))
@@ -164,24 +157,14 @@ def test_a_mesh_whose_size_cannot_be_is_refused(tmp_path, size, scale):
     ("world", "before", "what"),
     [
         (FREE_MESH, '<asset><mesh name="m" file="../m.stl"/></asset>', "leads out"),
-        (FREE_MESH, '<asset><mesh name="m" file="/etc/m.stl"/></asset>', "leads out"),
-        (FREE_MESH, '<compiler meshdir="/tmp"/>', "leads out"),
         (FREE_MESH, '<include file="../other.xml"/>', "leads out"),
         (FREE_MESH, '<include file="w.xml"/>', "circle"),
         (FREE_MESH, '<extension><plugin plugin="x.y"/></extension>', "loads programs"),
         ("<body><joint/><geom size='0.1'/></body>", "", "has joints"),
         ("<body><geom size='.1'/><body><geom size='.1'/></body></body>", "", "another body"),
         ("<bodyy/>", "", "bodyy"),
-        ("", "<!DOCTYPE x>", "."),
     ],
 )
 def test_what_cannot_be_read_is_named(tmp_path, world, before, what):
     with pytest.raises(InputError, match=what):
         read_mjcf_scene(mjcf(tmp_path, world, before))
-
-
-def test_a_file_that_takes_all_memory_ends_in_words(tmp_path):
-    """A height field of terabytes: MuJoCo's process is stopped, ours goes on."""
-    assets = '<asset><hfield name="h" nrow="100000" ncol="100000" size="1 1 1 1"/></asset>'
-    with pytest.raises(InputError, match="MuJoCo"):
-        read_mjcf_scene(mjcf(tmp_path, '<geom type="hfield" hfield="h"/>', assets))

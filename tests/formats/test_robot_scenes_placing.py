@@ -10,13 +10,9 @@ from realsim.errors import InputError
 from realsim.formats.robot_scenes.mesh_obj import look_of
 from realsim.formats.robot_scenes.placed_scene import (
     RigidBody,
-    file_name,
-    principal_inertia,
     seen_from,
-    unique_names,
 )
 from realsim.formats.robot_scenes.placing import PlacingConfig, place_scene
-from realsim.formats.robot_scenes.urdf import R_from_rpy, rpy_from_R
 from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties
 
@@ -103,36 +99,6 @@ def test_bodies_that_cannot_be_are_refused(change, what):
     with pytest.raises(InputError, match=what):
         dataclasses.replace(body, **change)
     assert isinstance(body, RigidBody)
-
-
-def test_names_are_files_and_prims_and_differ():
-    assert file_name("2 box/é") == "_2_box" and file_name("") == "object"
-    names = unique_names({0: "mug", 1: "Mug", 2: "table", 3: "can", 4: "mug_0"})
-    assert len({n.lower() for n in names.values()}) == 5 and names[3] == "can"
-    assert all(n == file_name(n) and n != "table" for n in names.values())
-    with pytest.raises(InputError, match="letters, digits"):
-        dataclasses.replace(placed_scenes.placed_scene().objects[0], name="a b")
-    scene = placed_scenes.placed_scene()
-    with pytest.raises(InputError, match="used twice"):
-        twice = tuple(dataclasses.replace(o, name="one") for o in scene.objects)
-        dataclasses.replace(scene, objects=twice)
-
-
-def test_principal_axes_give_the_inertia_back_and_are_right_handed():
-    inertia = placed_scenes.placed_scene().bodies[1].inertia
-    moments, R = principal_inertia(inertia)
-    assert np.allclose(R @ np.diag(moments) @ R.T, inertia, rtol=0, atol=1e-18)
-    assert np.isclose(np.linalg.det(R), 1.0) and np.all(np.diff(moments) >= 0)
-
-
-def test_roll_pitch_yaw_come_back_even_straight_up_and_down():
-    rng = np.random.default_rng(4)
-    steep = [R_from_rpy([0.3, s * np.pi / 2, 1.1]) for s in (1, -1)]
-    for R in [*se3.random_rotation(rng, 50), *steep, np.eye(3)]:
-        assert np.allclose(R_from_rpy(rpy_from_R(R)), R, rtol=0, atol=1e-14)
-    # Known answer: a yaw of a right angle takes x to y; a roll leaves x alone.
-    assert np.allclose(R_from_rpy([0, 0, np.pi / 2]) @ [1, 0, 0], [0, 1, 0])
-    assert np.allclose(R_from_rpy([0.7, 0, 0.2]), R_from_rpy([0, 0, 0.2]) @ R_from_rpy([0.7, 0, 0]))
 
 
 def test_colours_of_vertices_become_a_texture_of_the_faces_mean_colours():

@@ -1,7 +1,6 @@
 """Scenes as USD: Pixar's library finds everything that Isaac Sim needs."""
 
 import builtins
-import dataclasses
 import importlib
 
 import numpy as np
@@ -13,7 +12,6 @@ from realsim.errors import MissingLibraryError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.robot_scenes.mesh_reading import collision_parts
 from realsim.formats.robot_scenes.usd_scene import UsdConfig, write_usd_scene
-from realsim.models.reading import read_scan
 
 
 def write(scene, folder, **config):
@@ -132,40 +130,6 @@ def test_a_point_is_seen_at_its_pixel(scene, stage):
         seen = [(x + 1) / 2 * K.width - 0.5, (1 - y) / 2 * K.height - 0.5]
         at = (np.linalg.inv(view.T_world_cam) @ [*X, 1])[:3]
         assert np.allclose(seen, (K.K @ at)[:2] / at[2], atol=1e-3)
-
-
-def test_the_reader_of_scans_finds_the_same_surface_and_texture(scene, folder):
-    for obj_id, name in scene.body_names().items():
-        found = read_scan(folder / f"objects/{name}.usdc", unit=None).mesh
-        known = scene.bodies[obj_id].model.mesh
-        assert np.allclose(
-            found.vertices[found.faces], known.vertices[known.faces], rtol=0, atol=1e-7
-        )
-        assert found.texture is not None and found.uv is not None
-    box = scene.bodies[2].model.mesh
-    found = read_scan(folder / "objects/_2_box.usdc", unit=None).mesh
-    assert np.array_equal(found.texture, box.texture)
-    assert np.allclose(found.uv[found.faces], box.uv[box.faces], rtol=0, atol=1e-6)
-
-
-def test_an_object_that_stands_still_is_no_rigid_body_in_motion(scene, tmp_path):
-    fixed = (dataclasses.replace(scene.objects[0], is_fixed=True), *scene.objects[1:])
-    write(dataclasses.replace(scene, objects=fixed), tmp_path / "s")
-    stage = Usd.Stage.Open(str(tmp_path / "s/scene.usda"))
-    enabled = [
-        UsdPhysics.RigidBodyAPI(stage.GetPrimAtPath(f"/World/{o.name}"))
-        .GetRigidBodyEnabledAttr()
-        .Get()
-        for o in fixed
-    ]
-    assert enabled == [False, True, True]
-
-
-def test_the_same_scene_gives_the_same_bytes(scene, folder, tmp_path):
-    told = write(scene, tmp_path / "again")
-    sums = [(f / "SHA256SUMS").read_text() for f in (folder, tmp_path / "again")]
-    assert sums[0] == sums[1] and "objects/bracket.usdc" in sums[0]
-    assert told.objects == 3 and told.counts == {"bodies": 2, "cameras": 1}
 
 
 def test_without_the_extra_the_error_says_how_to_install_it(scene, tmp_path, monkeypatch):
