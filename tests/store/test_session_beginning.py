@@ -65,17 +65,6 @@ def test_a_lost_header_is_made_anew_from_what_is_there(
     assert repair_session(session).notes == () and bytes_of(session) == again
 
 
-def test_a_header_lost_before_the_first_view_is_what_it_was(tmp_path: Path) -> None:
-    session = CaptureSession(name="n", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    before = SessionStore.create(tmp_path, session, {"arm": "UR5", "lab": {"seed": 3}})
-    whole = (tmp_path / "session.json").read_bytes()
-    (tmp_path / "session.json").write_text('{"broken')
-    assert repair_session(tmp_path).after.sound
-    after = SessionStore.open(tmp_path)
-    assert after.extra == before.extra
-    assert json.loads(whole) == json.loads((tmp_path / "session.json").read_bytes())
-
-
 def test_the_capture_log_still_tells_the_devices(session: Path) -> None:
     store = SessionStore.open(session)
     begun = {"event": "begun", "arm": {"model": "UR5", "serial": "1"}, "camera": {"serial": "17"}}

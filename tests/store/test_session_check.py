@@ -119,18 +119,6 @@ def test_a_header_that_cannot_be_made_anew_is_left_alone(session: Path) -> None:
     assert bytes_of(session) == before
 
 
-def test_without_a_manifest_the_images_are_decoded(session: Path) -> None:
-    (session / MANIFEST).unlink()
-    flip(session / "rgb/000001.png", 3)
-    path = session / "depth/000004.png"
-    path.write_bytes((session / "rgb/000000.png").read_bytes())
-    report = check_session(session)
-    assert report.damaged_views == (1, 4)
-    repaired = repair_session(session)
-    assert repaired.after.sound and repaired.after.views == (0, 2, 3, 5)
-    assert any("nothing can tell" in note for note in repaired.notes)
-
-
 def test_what_a_kill_leaves_is_no_damage(session: Path) -> None:
     robot, manifest = (session / "robot.jsonl").read_bytes(), (session / MANIFEST).read_bytes()
     cameras = (session / "scene_camera.json").read_bytes()
