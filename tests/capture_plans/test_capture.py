@@ -280,20 +280,6 @@ def test_a_calibration_left_out_is_warned_of_once_and_the_controllers_pose_kept(
     assert gaps == pytest.approx(expected, abs=2e-3)
 
 
-def test_a_tool_offset_that_changes_is_told(tmp_path: Path) -> None:
-    arm = KinematicArm(joints=plan().home.copy())
-    offset = se3.from_translation([0.0, 0.0, 0.1])
-
-    class ToolArm(KinematicArm):
-        def state(self) -> ArmState:
-            late = len(self.path) > 5
-            return replace(super().state(), T_ee_tcp=offset if late else np.eye(4))
-
-    arm = ToolArm(joints=plan().home.copy())
-    summary = capture(plan(), arm, TableCamera(arm), new_store(tmp_path / "s", plan().content_hash))
-    assert len(summary.warnings) == 1 and "tool offset changed by 100.0 mm" in summary.warnings[0]
-
-
 def test_a_dry_run_goes_everywhere_slowly_and_keeps_nothing(
     tmp_path: Path, arm: KinematicArm
 ) -> None:

@@ -288,23 +288,6 @@ def test_a_stop_that_a_person_clears_costs_no_view(tmp_path: Path, reference: Se
     assert events.count("trouble") == 3 and events.count("recovered") == 2
 
 
-def test_a_stop_without_a_person_ends_the_run_and_the_same_call_goes_on(
-    tmp_path: Path, reference: SessionStore
-) -> None:
-    arm = StoppingArm({5: "protective stop"})
-    b = bench(tmp_path / "s", arm=arm)
-    with pytest.raises(ArmStoppedError, match="release it"):
-        b.capture()
-    done = len(b.store.completed)
-    assert 0 < done < VIEWS
-    arm.recover()
-    b.store = SessionStore.open(b.store.folder)
-    summary = b.capture()
-    assert (summary.skipped, summary.captured) == (done, VIEWS - done)
-    assert clear(arm.path)
-    assert_same_views(b.store, reference)
-
-
 def test_an_arm_moved_by_hand_during_a_pause_is_led_back(
     tmp_path: Path, reference: SessionStore
 ) -> None:

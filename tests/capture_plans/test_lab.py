@@ -136,17 +136,3 @@ def test_depth_agrees_with_the_true_scene_within_the_sensors_noise(lab):
     points = se3.transform(T, rays * frame.depth_m[empty][:, None])
     assert abs(np.median(points[:, 2]) - lab.table_height) < 3e-4
     assert np.median(np.abs(points[:, 2])) < 3e-3
-
-
-def test_the_disparity_bias_shortens_the_depth_as_stereo_does():
-    def middle(bias):
-        config = LabConfig(
-            seed=1, objects=("cube",), depth_noise=False, disparity_bias_px=bias, **SMALL
-        )
-        lab = SimulatedLab(config)
-        lab.arm.move(joints_at(lab, [0.0, 0.0, 0.35]))
-        return float(np.median(lab.camera.grab().depth_m)), lab.truth.intrinsics.fx
-
-    (z, fx), (biased, _) = middle(0.0), middle(0.5)
-    assert biased == pytest.approx(1 / (1 / z + 0.5 / (fx * 0.018)), abs=1.5e-4)
-    assert z - biased > 3e-3

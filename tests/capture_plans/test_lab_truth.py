@@ -97,20 +97,11 @@ def test_a_missing_broken_or_foreign_truth_is_refused(tmp_path):
         load_truth(tmp_path)
 
 
-def test_bad_configs_are_refused():
-    with pytest.raises(InputError, match="link_mm"):
-        LabConfig(link_mm=-1)
-    with pytest.raises(InputError, match="hex_nut"):
-        SimulatedLab(LabConfig(objects=("spoon",)))
-    with pytest.raises(InputError, match="different objects"):
-        SimulatedLab(LabConfig(n_objects=99))
-
-
 def test_the_operator_is_off_by_the_configured_amount_in_all_directions():
     lab = SimulatedLab(LabConfig(seed=3, n_objects=5))
     rng = np.random.default_rng(0)
     offs = []
-    for _ in range(80):
+    for _ in range(40):
         for start, true in zip(lab.operator_starts(rng), lab.truth.objects, strict=True):
             assert (start.obj_id, start.instance) == (true.obj_id, true.instance)
             assert start.verdict == "unchecked"

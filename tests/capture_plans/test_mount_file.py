@@ -56,7 +56,7 @@ def same(a: Mount, b: Mount) -> bool:
     )
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(seed=st.integers(0, 10**6), name=st.text(min_size=1).filter(str.strip))
 def test_what_is_written_is_read_back(
     seed: int, name: str, tmp_path_factory: pytest.TempPathFactory

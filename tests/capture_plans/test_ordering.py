@@ -83,19 +83,6 @@ def test_colliding_moves_are_gone_round() -> None:
     assert plain <= tour_seconds(clusters, path, CONFIG) < plain + 5.0
 
 
-def test_further_candidates_change_least_times_as_if_they_had_been_there() -> None:
-    rng = np.random.default_rng(7)
-    first = [rng.normal(size=(3, 6)) for _ in range(6)]
-    more = [rng.normal(size=(k % 3, 6)) for k in range(6)]
-    grown = Clusters.of(first, HOME, CONFIG).with_more(more, CONFIG)
-    both = [np.concatenate(pair) for pair in zip(first, more, strict=True)]
-    whole = Clusters.of(both, HOME, CONFIG)
-    assert np.array_equal(grown.joints, whole.joints) and np.array_equal(grown.first, whole.first)
-    assert np.allclose(grown.least_s, whole.least_s)
-    gaps = np.abs(both[1][:, None] - both[4][None]).max(-1)
-    assert whole.least_s[2, 5] == pytest.approx(float(move_seconds(gaps.min(), *PACE)))
-
-
 def test_move_times_are_continuous_and_trapezoidal() -> None:
     knee = CONFIG.speed**2 / CONFIG.acceleration
     just_below = float(move_seconds(knee * (1 - 1e-9), *PACE))

@@ -16,13 +16,11 @@ from realsim_capture_plans.planning.make import calibration_plan, hemisphere_pla
 from realsim_capture_plans.planning.moves import detour, ompl_path
 from realsim_capture_plans.planning.ordering import move_seconds
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
-from realsim_capture_plans.planning.view_quality import hole_deg, nearest_deg
+from realsim_capture_plans.planning.view_quality import hole_deg
 from realsim_capture_plans.planning.viewpoints import (
-    cap_rim,
     golden_cap,
     hemisphere_poses,
     reachable,
-    thin_directions,
 )
 
 CENTER = np.array([0.375, 0.0, 0.05])
@@ -95,21 +93,6 @@ def test_scene_views_cover_the_cap_nearly_as_well_as_an_ideal_spiral(
     assert scene_plan.metrics["hole_deg"] < 1.35 * ideal
 
 
-def test_thinning_leaves_the_smallest_hole_it_can_in_what_is_to_be_covered() -> None:
-    cap = np.concatenate([golden_cap(600, (15.0, 90.0)), cap_rim(600, (15.0, 90.0))])
-    # A wedge behind the base is out of reach but is to be covered from its edges.
-    azimuth = np.degrees(np.arctan2(cap[:, 1], cap[:, 0]))
-    out_of_reach = (np.abs(azimuth) > 172) & (cap[:, 2] < 0.5)
-    reached = cap[~out_of_reach]
-    holes = []
-    for wanted in (None, cap):
-        chosen = thin_directions(reached, 100, wanted)
-        assert len(set(chosen.tolist())) == 100
-        holes.append(nearest_deg(reached[chosen], cap).max())
-    edge = nearest_deg(reached, cap[out_of_reach]).max()
-    assert holes[1] <= holes[0] and holes[1] < max(1.05 * edge, 11.0)
-
-
 def test_board_views_roll_all_round_and_vary_tilt_and_distance(board_plan: CapturePlan) -> None:
     m = board_plan.metrics
     # One view per 15 degrees of roll: neighbours are at most two sectors apart.
@@ -134,12 +117,6 @@ def test_the_same_seed_gives_the_same_plan() -> None:
     assert make(4).content_hash == make(4).content_hash
 
 
-def test_one_view_is_a_plan_too() -> None:
-    n = 1
-    plan = hemisphere_plan(n, CENTER, d405_mount(), PlanConfig(), np.random.default_rng(0))
-    assert len(plan) == n and plan.metrics["colliding_legs"] == 0
-
-
 def test_the_plan_turns_with_the_scene() -> None:
     """Turning the scene about the base's axis turns the first joint: as many views are reached."""
     counts = []
@@ -160,7 +137,7 @@ def test_the_plan_turns_with_the_scene() -> None:
 
 def test_advice_prefers_the_places_that_reach_most() -> None:
     places = advise(
-        UR5, d405_mount(), PlanConfig(), 32, 0.05, distances_m=(0.4, 0.6), lifts_m=(0.0,)
+        UR5, d405_mount(), PlanConfig(), 16, 0.05, distances_m=(0.4, 0.6), lifts_m=(0.0,)
     )
     assert [p.center[0] for p in places] == [0.4, 0.6]
     assert places[0].reachable_share > places[1].reachable_share

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim.errors import DegenerateError, InputError, UnitError
+from realsim.errors import InputError, UnitError
 from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
 from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
@@ -21,7 +21,6 @@ from realsim_capture_plans.plan_files.exported import (
     table_frame,
 )
 from realsim_capture_plans.plan_files.imported import (
-    axes_meeting_point,
     colliding_legs,
     import_plan,
 )
@@ -271,15 +270,6 @@ def test_colliding_moves_are_named_and_stay(tmp_path: Path) -> None:
             tmp_path / "p.csv", chain=UR5, mount=MOUNT, center=CENTER, obstacles=boxes
         )
         assert plan.metrics["colliding_legs"] == count
-
-
-def test_the_centre_is_where_the_axes_meet() -> None:
-    rng = np.random.default_rng(0)
-    eyes = CENTER + se3.exp_so3(rng.normal(0, 0.3, (20, 3))) @ [0, 0, 0.4]
-    Ts = np.stack([se3.look_at(e, CENTER, r) for r, e in enumerate(eyes)])
-    assert np.abs(axes_meeting_point(Ts) - CENTER).max() < 1e-9
-    with pytest.raises(DegenerateError, match="--center"):
-        axes_meeting_point(np.repeat(Ts[:1], 5, axis=0))
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="REALSIM_DATA has no motion/koch_ur5_paths")

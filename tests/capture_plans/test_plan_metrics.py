@@ -16,8 +16,6 @@ from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.planning import view_quality
 from realsim_capture_plans.planning.metrics import (
     METRIC_MEANINGS,
-    OF_FULL_PLANS,
-    goal_of,
     plan_metrics,
 )
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
@@ -137,7 +135,7 @@ def test_the_tour_s_clock_is_at_every_view_when_it_says_so() -> None:
     assert tour.joints_at(tour.view_s + 0.2) == pytest.approx(plan.joints, abs=1e-12)
     assert tour.joints_at(0.0) == pytest.approx(plan.home)
     assert tour.joints_at(tour.total_s + 9.0) == pytest.approx(plan.joints[-1])
-    t = np.linspace(0.0, tour.total_s, 60_001)
+    t = np.linspace(0.0, tour.total_s, 20_001)
     q, speed = tour.joints_at(t), tour.speeds_at(t)
     assert np.abs(speed).max() <= config.speed + 1e-12
     step = t[1] - t[0]
@@ -151,13 +149,6 @@ def test_the_tour_s_clock_is_at_every_view_when_it_says_so() -> None:
     same = np.diff(s.leg) == 0
     assert np.abs(np.diff(s.joints, axis=0))[same].max() <= 0.05 + 1e-12
     assert np.all(np.diff(s.time_s) >= -1e-9)
-
-
-def test_a_single_view_from_above_leaves_the_whole_cap() -> None:
-    assert hole_deg(np.array([[0.0, 0.0, 1.0]]), (20.0, 90.0)) == pytest.approx(70.0)
-    # Two opposite views: the farthest place is on the rim, a quarter turn from both.
-    pair = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-    assert hole_deg(pair, (5.0, 60.0)) == pytest.approx(90.0)
 
 
 def looking_down(height_m: float, box_m: float = 0.1) -> CapturePlan:
@@ -190,17 +181,6 @@ def test_what_is_in_the_image_follows_from_the_focal_length() -> None:
     assert m["seen_by_min"] == 0.0
     assert m["seen_from_min_deg"] == 0.0
     assert "overlap_min" not in m and "spacing_min_deg" not in m
-
-
-def test_a_place_between_two_cameras_is_seen_from_the_angle_between_them() -> None:
-    plan = plan_of(np.stack([LOOKING, turned_base(0.6)]))
-    at = plan.Ts_base_cam[:, :3, 3]
-    point = at.mean(axis=0) - [0.0, 0.0, 0.3]
-    rays = at - point
-    cosine = rays[0] @ rays[1] / np.prod(np.linalg.norm(rays, axis=1))
-    visible = np.array([[True, True, False], [True, False, False]])
-    spread = view_quality.direction_spread_deg(plan, np.tile(point, (3, 1)), visible)
-    assert spread == pytest.approx([np.degrees(np.arccos(cosine)), 0.0, 0.0], abs=1e-5)
 
 
 def test_a_move_through_the_table_is_counted_and_its_depth_told() -> None:
@@ -255,30 +235,3 @@ def test_an_unknown_camera_is_refused_by_name() -> None:
     with pytest.raises(InputError, match=r"'Kinect'.*D405"):
         view_quality.sensor_of(replace(plan, mount=replace(plan.mount, camera="Kinect")))
     assert view_quality.sensor_of(plan) is SENSORS["D405"]
-
-
-def test_goals_know_what_a_value_of_this_plan_should_be() -> None:
-    small = plan_of(np.stack([LOOKING, LOOKING + 0.1]))
-    assert goal_of("sigma_min", METRIC_MEANINGS["sigma_min"], 0.04, small).met is False
-    assert goal_of("sigma_min", METRIC_MEANINGS["sigma_min"], 0.05, small).met is True
-    assert goal_of("colliding_legs", METRIC_MEANINGS["colliding_legs"], 1.0, small).met is False
-    # Holes shrink with the root of the number of views: 8 deg of 256 are 91 deg of 2.
-    hole = METRIC_MEANINGS["hole_deg"]
-    assert goal_of("hole_deg", hole, 80.0, small).met is True
-    assert goal_of("hole_deg", hole, 95.0, small).met is False
-    assert "2 views" in goal_of("hole_deg", hole, 95.0, small).text
-    # What does not follow from the number of views is left open.
-    assert goal_of("seconds", METRIC_MEANINGS["seconds"], 500.0, small).met is None
-    clearance = METRIC_MEANINGS["clearance_table_m"]
-    assert goal_of("clearance_table_m", clearance, 0.009, small).met is False
-    assert goal_of("clearance_table_m", clearance, 0.011, small).met is True
-
-
-def test_every_goal_in_words_is_understood_or_is_no_limit() -> None:
-    plan = plan_of(np.stack([LOOKING, LOOKING + 0.1]))
-    open_ones = {
-        name for name, m in METRIC_MEANINGS.items() if goal_of(name, m, 0.0, plan).met is None
-    }
-    for name in open_ones:
-        good = METRIC_MEANINGS[name].good
-        assert name in OF_FULL_PLANS or not good.startswith(("<", ">")), (name, good)

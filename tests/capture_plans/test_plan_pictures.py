@@ -13,12 +13,10 @@ from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.collision.shapes import Box, Shape
 from realsim_capture_plans.pictures.arm_looks import (
-    arm_parts,
     shape_mesh,
-    ur5_looks,
 )
 from realsim_capture_plans.pictures.drawing import PlanCurves
-from realsim_capture_plans.pictures.motion_charts import clearance_chart, joints_chart
+from realsim_capture_plans.pictures.motion_charts import clearance_chart
 from realsim_capture_plans.pictures.plan_pictures import plan_pictures
 from realsim_capture_plans.pictures.view_charts import board_chart, coverage_chart
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
@@ -130,17 +128,6 @@ def test_labels_of_worst_spots_do_not_lie_on_each_other(curves: PlanCurves) -> N
     assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
 
 
-def test_the_joints_picture_draws_the_plan_s_joints(curves: PlanCurves) -> None:
-    figure = joints_chart(curves)
-    for j in range(6):
-        t, q = figure.axes[j].lines[0].get_data()
-        at_views = np.interp(curves.tour.view_s, t, q)
-        assert at_views == pytest.approx(np.degrees(curves.plan.joints[:, j]), abs=1.0)
-    elbow = curves.tour.samples(0.02).joints[:, 2]
-    margin = min((UR5.limits.upper[2] - elbow).min(), (elbow - UR5.limits.lower[2]).min())
-    assert f"margin\n{np.degrees(margin):.0f}°" in texts(figure)
-
-
 def test_the_board_picture_shows_rolls_tilts_and_places_in_the_image() -> None:
     curves = PlanCurves.of(make("calibration", n=12))
     figure = board_chart(curves)
@@ -179,16 +166,3 @@ def test_a_shape_s_mesh_is_closed_faces_outward_and_has_its_volume(
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     there = {tuple(e) for e in edges.tolist()}
     assert len(there) == len(edges) and all((b, a) in there for a, b in there)
-
-
-def test_the_arm_s_looks_lie_in_its_collision_shapes() -> None:
-    plan = make()
-    outside, shapes = ur5_looks(plan), arm_parts(plan)
-    if outside is None:
-        pytest.skip("the extra 'looks' is not installed")
-    assert len(outside) == 7
-    for part in outside:
-        body = np.concatenate([s.vertices for s in shapes if s.frame == part.frame])
-        assert np.all(part.vertices.min(axis=0) > body.min(axis=0) - 0.002)
-        assert np.all(part.vertices.max(axis=0) < body.max(axis=0) + 0.002)
-    assert ur5_looks(replace(plan, chain=replace(UR5, name="UR5e"))) is None

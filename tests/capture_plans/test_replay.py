@@ -109,37 +109,6 @@ def test_the_arm_stands_where_the_tour_is(replay: PlanReplay) -> None:
         assert replay._view.value == view  # type: ignore[reportPrivateUsage]
 
 
-def test_a_person_s_slider_moves_the_arm_and_the_arm_s_slider_does_not(replay: PlanReplay) -> None:
-    from viser import GuiEvent
-
-    replay.show_view(1)
-    slider, view = replay._slider, replay._view  # type: ignore[reportPrivateUsage]
-    slider.value = 0.5  # what `show` does while playing
-    assert replay.time_s == pytest.approx(replay.tour.view_s[1])
-    person: Any = object()
-
-    def by_hand(control: Any) -> None:
-        for callback in control._impl.update_cb:
-            callback(GuiEvent(client_id=0, client=person, target=control))
-
-    by_hand(slider)
-    assert replay.time_s == pytest.approx(0.5)
-    view.value = 3
-    by_hand(view)
-    assert replay.time_s == pytest.approx(replay.tour.view_s[3])
-
-
-def test_the_scene_has_arm_camera_table_boxes_and_views(replay: PlanReplay) -> None:
-    names = set(replay.server.scene._handle_from_node_name)  # type: ignore[reportPrivateUsage]
-    assert {"/table", "/keep-out box", "/obstacles/lamp", "/views", "/arm/6/field of view"} <= names
-    parts = set(replay.scene.parts)
-    assert {"forearm", "wrist 3", "camera"} <= parts
-    # Every view's frustum begins at its camera.
-    lines = np.asarray(replay.server.scene._handle_from_node_name["/views"].points)  # type: ignore[reportPrivateUsage]
-    starts = lines.reshape(N, -1, 2, 3)[:, 0, 0]
-    assert starts == pytest.approx(replay.plan.Ts_base_cam[:, :3, 3], abs=1e-6)
-
-
 def test_parts_that_are_too_near_are_red_and_the_text_says_so(replay: PlanReplay) -> None:
     assert near_parts(replay.model, LOOKING) == set()
     near = near_parts(replay.model, DIVE)

@@ -179,18 +179,6 @@ def test_a_protective_stop_is_unlocked_only_when_asked(
     arm.move(HOME + 0.1, acceleration=4.0)
 
 
-def test_another_thread_can_stop_the_arm(arm: UrArm, controller: LoopbackController) -> None:
-    timer = threading.Timer(0.15, arm.stop)
-    timer.start()
-    with pytest.raises(ArmStoppedError, match=r"stop\(\) was called"):
-        arm.move(HOME + 1.5, speed=0.05)
-    timer.join()
-    first = controller.joints()
-    time.sleep(0.1)
-    assert controller.joints() == first
-    assert 0.01 < first[0] < 1.4
-
-
 def test_ctrl_c_stops_the_arm(arm: UrArm, controller: LoopbackController) -> None:
     # Tests that a shell runs in the background are born deaf to it.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -228,22 +216,6 @@ def test_a_lost_connection_is_noticed_and_recovered(
     controller.clear()
     arm.recover()
     arm.move(HOME, acceleration=4.0)
-
-
-def test_a_controller_that_dies_and_starts_again() -> None:
-    with LoopbackController.start(**options("UR5e")) as controller:
-        with UrArm(controller.host, config=CONFIG) as arm:
-            timer = threading.Timer(0.2, controller.kill)
-            timer.start()
-            with pytest.raises(ArmStoppedError, match="connection lost"):
-                arm.move(HOME + 1.5, speed=0.05)
-            timer.join()
-            with pytest.raises(ArmStoppedError, match="refuses"):
-                arm.recover()
-            controller.restart()
-            arm.recover()
-            arm.move(HOME + 0.1, acceleration=4.0)
-            np.testing.assert_allclose(arm.state().joints, HOME + 0.1, atol=1e-12)
 
 
 def test_the_end_of_ur_rtdes_process_is_a_lost_connection_not_a_crash(arm: UrArm) -> None:
