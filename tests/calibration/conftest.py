@@ -20,41 +20,9 @@ from realsim.records import (
 )
 from realsim_calibration.hand_eye import HandEyeConfig, calibrate_hand_eye_report
 from realsim_calibration.results import BoardShape, HandEyeReport, Mode, ViewReport
-from realsim_calibration.sheets import target_image
 from realsim_calibration.views import BoardView, TargetDetection
 
 Array = NDArray[np.float64]
-MODULES = 8  # of a 36h11 tag with its black border
-TEXTURE = 12  # texture pixels per module
-SUPER = 8  # supersampling of the renderer
-
-
-def render_homography(
-    board: TagBoard,
-    intrinsics: CameraIntrinsics,
-    T_cam_board: Array,
-    rng: np.random.Generator,
-    blur_px: float,
-    noise: float,
-) -> NDArray[np.uint8]:
-    """Return a photograph (no distortion): 8x supersampled, box filter, blur, noise."""
-    import cv2
-
-    per_m = MODULES * TEXTURE / board.tag_size_m
-    texture, (u, v) = target_image(board, per_m, 0.02)
-    to_texture = np.array([[per_m, 0, u], [0, per_m, v], [0, 0, 1]])
-    H = intrinsics.K @ T_cam_board[:3, [0, 1, 3]] @ np.linalg.inv(to_texture)
-    half = (SUPER - 1) / 2
-    big = np.array([[SUPER, 0, half], [0, SUPER, half], [0, 0, 1.0]]) @ H
-    paper = np.where(texture > 127, 215, 30).astype(np.uint8)
-    size = (intrinsics.width * SUPER, intrinsics.height * SUPER)
-    fine = cv2.warpPerspective(paper, big, size, flags=cv2.INTER_NEAREST, borderValue=120.0)
-    image = cv2.resize(
-        fine, (intrinsics.width, intrinsics.height), interpolation=cv2.INTER_AREA
-    ).astype(np.float64)
-    image = cv2.GaussianBlur(image, (0, 0), blur_px)
-    image = image + rng.normal(scale=noise, size=image.shape)
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
 def camera_at(
@@ -146,16 +114,6 @@ def one_thread() -> Iterator[None]:
         os.environ.setdefault(variable, "1")
     with threadpool_limits(limits=1):
         yield
-
-
-@pytest.fixture
-def render() -> Callable[..., NDArray[np.uint8]]:
-    return render_homography
-
-
-@pytest.fixture
-def look() -> Callable[..., Array]:
-    return camera_at
 
 
 @pytest.fixture

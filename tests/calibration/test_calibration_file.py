@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -19,7 +18,6 @@ from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Targ
 from realsim_calibration.exports import FrameNames, calibration_text, read_calibration
 from realsim_calibration.results import HandEyeReport, Mode
 
-Array = NDArray[np.float64]
 Maker = Callable[..., HandEyeReport]
 FRAMES = FrameNames(robot_base="base", hand="tool0", camera_optical="cam_optical", name="ur5")
 TARGETS: tuple[Target, ...] = (
@@ -35,7 +33,7 @@ TARGETS: tuple[Target, ...] = (
     seed=st.integers(0, 11),
     target=st.sampled_from(TARGETS),
 )
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_json_round_trip_is_exact(
     full_record: Maker,
     twist: tuple[float, ...],
@@ -51,14 +49,6 @@ def test_json_round_trip_is_exact(
     assert type(again.target) is type(report.target)
     assert calibration_text(again, FRAMES) == path.read_text(encoding="utf-8")
     assert_same_record(report, again)
-
-
-def test_a_board_without_sides_comes_back(full_record: Maker, tmp_path: Path) -> None:
-    report = full_record(np.eye(4))
-    square = dataclasses.replace(report.board, half_sides_m=None)
-    path = tmp_path / "calibration.json"
-    path.write_text(calibration_text(dataclasses.replace(report, board=square), FRAMES))
-    assert_same_record(square, read_calibration(path).board)
 
 
 def assert_same_record(a: Any, b: Any) -> None:
@@ -103,22 +93,13 @@ def damaged(report: HandEyeReport, key: str, value: Any) -> str:
         ("version", 99, "version 99"),
         ("mode", "sideways", "sideways"),
         ("X", DROPPED, "missing required field `X`"),
-        ("X/covariance", [[1.0]], "shape"),
         ("X/quaternion_xyzw", [1.0, 0.0, 0.0, 0.0], "different transforms"),
-        ("X_alone/translation_m", [0.0, 0.0, 5.0], "different transforms"),
         ("views/2/uv", [[1.0, "x"]], "views[2].uv"),
         ("views/0/index", None, "views[0].index"),
-        ("views", 3, "views"),
         ("target/rows", DROPPED, "rows"),
-        ("target/type", "Egg", "Egg"),
         ("checks/0/verdict", "superb", "superb"),
         ("robot_map/kind", "odd", "odd"),
-        ("robot_map/frame", "odd", "odd"),
-        ("map_name", None, "map_name"),
-        ("Z_alone", DROPPED, "missing required field `Z_alone`"),
         ("intrinsics_alone/fx", "wide", "fx"),
-        ("views/0/point_ids", [1, 2], "uv"),
-        ("views/1/joints", [[0.0]], "shape"),
         ("board/half_sides_m", [0.1], "half_sides_m"),
         ("map_scores", [["none"]], "map_scores"),
     ],
@@ -133,14 +114,11 @@ def test_a_damaged_entry_is_named(
     assert says in str(error.value)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="does not exist"):
-        read_calibration(tmp_path / "none.json")
-
-
 @pytest.mark.parametrize(("text", "says"), [("{", "not valid JSON"), ("[1, 2]", "list")])
 def test_another_file_is_named(text: str, says: str, tmp_path: Path) -> None:
     path = tmp_path / "calibration.json"
+    with pytest.raises(InputError, match="does not exist"):
+        read_calibration(path)
     path.write_text(text)
     with pytest.raises(InputError, match=says):
         read_calibration(path)

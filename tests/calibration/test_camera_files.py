@@ -1,6 +1,4 @@
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,13 +10,11 @@ from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
 from realsim_calibration.lens.camera_files import read_camera, write_camera
 
-ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 CAMERA = CameraIntrinsics(
     width=1280, height=720, fx=912.25, fy=911.5, cx=641.125, cy=355.75,
     distortion=np.array([0.11, -0.21, 0.0007, -0.0004, 0.09, 0, 0, 0]),
 )  # fmt: skip
 FORMATS = ("realsim", "ros", "opencv")
-K_ROWS = "[912.25, 0, 641.125, 0, 911.5, 355.75, 0, 0, 1]"
 
 
 def same(a, b):
@@ -83,18 +79,6 @@ def test_opencv_reads_what_was_written_and_the_other_way_round(tmp_path):
         assert (read.width, read.height) == (1280, 720)
 
 
-def test_ros_camera_info_of_the_calibrator(tmp_path):
-    text = (
-        "image_width: 1280\nimage_height: 720\ncamera_name: wrist\ncamera_matrix:\n  rows: 3\n"
-        f"  cols: 3\n  data: {K_ROWS}\ndistortion_model: rational_polynomial\n"
-        "distortion_coefficients:\n  rows: 1\n  cols: 8\n"
-        "  data: [0.1, 0.2, 0.001, 0.002, 0.3, 0.4, 0.5, 0.6]\n"
-    )
-    camera = read_camera(given_file(tmp_path, "wrist.yaml", text))
-    assert camera.fx == 912.25 and camera.cy == 355.75
-    assert camera.distortion.tolist() == [0.1, 0.2, 0.001, 0.002, 0.3, 0.4, 0.5, 0.6]
-
-
 def test_the_other_kinds_of_json(tmp_path):
     K = [[912.25, 0, 641.125], [0, 911.5, 355.75], [0, 0, 1]]
     size = {"width": 1280, "height": 720}
@@ -115,9 +99,6 @@ def test_the_other_kinds_of_json(tmp_path):
     ("line", "fx", "fy", "d"),
     [
         ("1 SIMPLE_PINHOLE 640 480 500 320 240", 500, 500, []),
-        ("1 PINHOLE 640 480 500 510 320 240", 500, 510, []),
-        ("1 SIMPLE_RADIAL 640 480 500 320 240 0.1", 500, 500, [0.1]),
-        ("1 RADIAL 640 480 500 320 240 0.1 -0.2", 500, 500, [0.1, -0.2]),
         ("1 OPENCV 640 480 500 510 320 240 .1 .2 .003 .004", 500, 510, [0.1, 0.2, 0.003, 0.004]),
         (
             "1 FULL_OPENCV 640 480 500 510 320 240 .1 .2 .003 .004 .5 .6 .7 .8",
@@ -143,16 +124,10 @@ def test_colmap_pixels_move_by_half_a_pixel(tmp_path, line, fx, fy, d):
 
 BAD = {
     "no size": ({"K": [1, 0, 0, 0, 1, 0, 0, 0, 1]}, "how large its images are"),
-    "no camera": ({"poses": []}, "holds no camera"),
-    "no centre": ({"fx": 500, "fy": 500, "width": 640, "height": 480}, "no principal point"),
     "fisheye": (
         {"K": [500, 0, 320, 0, 500, 240, 0, 0, 1], "D": [0.1, 0.2, 0.3, 0.4], "width": 640,
          "height": 480, "distortion_model": "kannala_brandt"},
         "kannala_brandt",
-    ),
-    "thin prism": (
-        {"K": [500, 0, 320, 0, 500, 240, 0, 0, 1], "D": [0.1] * 12, "width": 640, "height": 480},
-        "12 distortion coefficients",
     ),
     "several": (
         {"left": {"fx": 1, "fy": 1}, "right": {"fx": 1, "fy": 1}}, "several cameras (left, right)",
@@ -172,24 +147,12 @@ BAD = {
         {"fx": 500, "fy": 500, "cx": 960, "cy": 540, "width": 640, "height": 480},
         "outside the image",
     ),
-    "rows": (
-        {"camera_matrix": {"rows": 3, "cols": 3, "data": [1, 2]}, "width": 640, "height": 480},
-        "3 rows and 3 columns holds 2",
-    ),
-    "words": (
-        {"fx": "long", "fy": 500, "cx": 320, "cy": 240, "width": 640, "height": 480}, "numbers",
-    ),
-    "list": ("[1, 2]", "no named values"),
-    "torn": ('{"fx": 1', "not valid JSON"),
-    "empty": ("", "is empty"),
     "yaml": ("a: [1, 2", "not valid YAML"),
     "deep": ("{" + '"a":{' * 3000, "the camera file"),
     "tag": ("!!python/object/apply:os.getcwd []\n", "has the tag"),
     "entities": ("<!DOCTYPE x [<!ENTITY a 'b'>]><opencv_storage/>", "entities"),
-    "other xml": ("<robot/>", "kind <robot>"),
     "many cameras": ("# Camera list\n1 PINHOLE 9 9 1 1 4 4\n2 PINHOLE 9 9 1 1 4 4\n", "2 cameras"),
     "colmap fisheye": ("# Camera list\n1 OPENCV_FISHEYE 640 480 1 1 1 1 0 0 0 0\n", "no place"),
-    "colmap short": ("# Camera list\n1 PINHOLE 640 480 500\n", "has 4 parameters, found 1"),
 }  # fmt: skip
 
 
@@ -200,7 +163,7 @@ def test_what_is_not_a_camera_is_refused_with_the_reason(tmp_path, name):
     with pytest.raises(InputError) as error:
         read_camera(path)
     assert reason in str(error.value)
-    assert "some_camera" in str(error.value) or name == "thin prism"
+    assert "some_camera" in str(error.value)
 
 
 def test_large_binary_and_missing_files_are_refused(tmp_path):
@@ -211,19 +174,15 @@ def test_large_binary_and_missing_files_are_refused(tmp_path):
         read_camera(tmp_path / "large")
     for head, kind in (
         (b"\x89PNG\xff\xfe\x00", "a picture"),
-        (b"MATLAB 5.0 MAT-file, Platform: PCWIN64\x00\x01", "a MATLAB file"),
         (b"abc\x00\xff", "a binary file"),
     ):
         (tmp_path / "some.file").write_bytes(head)
         with pytest.raises(InputError, match=f"is {kind}, no camera file.*Accepted are text files"):
             read_camera(tmp_path / "some.file")
-    (tmp_path / "latin").write_bytes(b"fx: 3\xff")
-    with pytest.raises(InputError, match="as text"):
-        read_camera(tmp_path / "latin")
 
 
-@pytest.mark.parametrize("key", ["intrinsics", "K", "camera_matrix"])
-def test_the_matrix_by_name(tmp_path, key):
+def test_the_matrix_by_name(tmp_path):
+    key = "camera_matrix"
     text = f"{key}: {{fx: 550.5, fy: 551, cx: 320, cy: 240}}\ndistortion: [0.1, -0.2]\n"
     path = given_file(tmp_path, "c.yaml", text + "image_size: [640, 480]\n")
     camera = read_camera(path)
@@ -241,36 +200,9 @@ def test_the_matrix_by_name(tmp_path, key):
         read_camera(given_file(tmp_path, "e.yaml", f"{key}: {{f: 550, width: 4}}\n"))
 
 
-@pytest.mark.real
-def test_a_real_file_of_calibration_settings_has_a_camera():
-    path = ROOT / "handeye/rosi_circles/cal_data.yaml"
-    if not path.is_file():
-        pytest.skip(f"no real data at {path} (set REALSIM_DATA)")
-    camera = read_camera(path, size=(640, 480))
-    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (550, 550, 320, 240)
-
-
 def test_nothing_is_written_in_an_unknown_format_or_name(tmp_path):
     with pytest.raises(InputError, match="not known"):
         write_camera(tmp_path / "a", CAMERA, format="matlab")
     with pytest.raises(InputError, match="letters"):
         write_camera(tmp_path / "a", CAMERA, format="ros", name="x\ny: 1")
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.real
-def test_real_files():
-    rtde = ROOT / "handeye" / "rtde_ur5e" / "cam_params_calibrated.json"
-    if not rtde.is_file():
-        pytest.skip(f"no real data at {rtde} (set REALSIM_DATA)")
-    camera = read_camera(rtde)
-    assert camera.fx == 1357.9359483399705 and (camera.width, camera.height) == (1920, 1080)
-    assert camera.distortion[4] == -3.768200390450599
-    bop = ROOT / "scenes" / "ycbv_mini" / "camera.json"
-    if bop.is_file():
-        assert read_camera(bop).fx == 1066.778
-    # This one's focal lengths are its principal point again.
-    koch = ROOT / "handeye" / "koch_ur5" / "meta.json"
-    if koch.is_file():
-        with pytest.raises(InputError, match="repeat the principal point"):
-            read_camera(koch)

@@ -3,7 +3,7 @@ import pytest
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
-from realsim_calibration import CLOSED_FORMS, check_observable, daniilidis, park, shah
+from realsim_calibration import CLOSED_FORMS, check_observable, park
 
 ALL = sorted(CLOSED_FORMS)
 
@@ -25,17 +25,10 @@ def close(a, b, tol=1e-9):
 
 
 @pytest.mark.parametrize("name", ALL)
-@pytest.mark.parametrize("seed", range(5))
-def test_exact_on_perfect_data(name, seed):
-    A, C, X, Z = problem(seed)
+def test_exact_on_perfect_data(name):
+    A, C, X, Z = problem(0)
     x, z = CLOSED_FORMS[name](A, C)
     assert close(x, X) and close(z, Z)
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_three_views_are_enough(name):
-    A, C, X, _ = problem(3, n=3)
-    assert close(CLOSED_FORMS[name](A, C)[0], X, 1e-7)
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -51,13 +44,6 @@ def test_frames_of_base_and_board_do_not_matter(name):
     assert close(x[:3, :3], x3[:3, :3], 1e-8)
     if name != "shah":
         assert close(x, x3, 1e-8)
-
-
-@pytest.mark.parametrize("name", ALL)
-def test_order_does_not_matter(name):
-    A, C, _, _ = problem(2, rot=0.01, trans=0.01)
-    order = np.random.default_rng(0).permutation(len(A))
-    assert close(CLOSED_FORMS[name](A, C)[0], CLOSED_FORMS[name](A[order], C[order])[0])
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -79,20 +65,12 @@ def test_one_axis_is_refused_and_named(name):
         CLOSED_FORMS[name](A, A)
 
 
-@pytest.mark.parametrize("solve", [park, daniilidis, shah])
-def test_no_rotation_is_refused(solve):
-    A = se3.from_translation(np.random.default_rng(0).normal(size=(8, 3)))
+def test_what_cannot_be_solved_is_refused():
+    still = se3.from_translation(np.random.default_rng(0).normal(size=(8, 3)))
     with pytest.raises(DegenerateError, match="does not turn"):
-        solve(A, A)
-
-
-def test_two_views_are_refused():
-    A, _, _, _ = problem(0, n=2)
-    with pytest.raises(DegenerateError, match="2 usable views"):
-        check_observable(A)
-
-
-def test_unequal_stacks_are_refused():
+        park(still, still)
     A, C, _, _ = problem(0)
+    with pytest.raises(DegenerateError, match="2 usable views"):
+        check_observable(A[:2])
     with pytest.raises(InputError, match="10 hand poses and 9 board poses"):
         park(A, C[1:])

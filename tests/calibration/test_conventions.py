@@ -15,7 +15,7 @@ from realsim_calibration.faults.rotation_readings import (
     four_number_conventions,
     three_number_conventions,
 )
-from realsim_calibration.faults.tool_offset import describe_offset, tool_offset
+from realsim_calibration.faults.tool_offset import describe_offset
 
 MIDDLE = faults.BOARD.points_board.mean(0)
 CONVENTIONS = {c.name: c for c in (*three_number_conventions(), *four_number_conventions())}
@@ -28,11 +28,11 @@ def session(seed, **kind):
 # Laws
 
 
-@pytest.mark.parametrize("name", sorted(CONVENTIONS))
-def test_every_form_of_a_rotation_decodes_to_it(name):
+def test_every_form_of_a_rotation_decodes_to_it():
     R = se3.random_rotation(np.random.default_rng(0), 200)
-    forms = CONVENTIONS[name].decode(CONVENTIONS[name].encode(R))
-    assert np.abs(forms - R[:, None]).max() < 1e-9
+    for name, convention in CONVENTIONS.items():
+        forms = convention.decode(convention.encode(R))
+        assert np.abs(forms - R[:, None]).max() < 1e-9, name
 
 
 def test_euler_conventions_are_those_of_the_textbook():
@@ -75,73 +75,60 @@ def test_the_fit_does_not_depend_on_the_frames_of_base_tool_and_board():
     assert np.allclose(moved.X, se3.invert(R) @ first.X, atol=1e-4)
 
 
-def test_the_ratio_of_lengths_follows_the_unit():
-    s = session(2)
-    A = hand_side(s.T, s.eye_in_hand)
-    metre = fit_frames(A, s.C, MIDDLE)
-    A[:, :3, 3] *= 1000.0
-    millimetre = fit_frames(A, s.C, MIDDLE)
-    assert millimetre.length_ratio == pytest.approx(1000 * metre.length_ratio, rel=1e-6)
-    assert millimetre.score == pytest.approx(metre.score, rel=1e-4)
-
-
 def test_the_claimed_sigma_of_the_ratio_is_honest():
     z = []
-    for seed in range(24):
+    for seed in range(16):
         s = session(seed)
         fit = fit_frames(hand_side(s.T, s.eye_in_hand), s.C, MIDDLE)
         z.append((fit.length_ratio - 1) / fit.ratio_sd)
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 2.0
 
 
-def test_two_half_turns_are_none():
-    F = half_turn(MIDDLE)
-    assert np.allclose(F @ F, np.eye(4))
-    assert np.allclose(F[:3, :3] @ MIDDLE + F[:3, 3], MIDDLE)
-
-
 # Faults
 
 
-@pytest.mark.parametrize("trial", [0, pytest.param(1, marks=pytest.mark.slow)])
-@pytest.mark.parametrize(
-    "fault",
-    [
-        # The numbers may be turns of any count: all of them are searched, which takes seconds.
-        pytest.param(f, marks=pytest.mark.slow if f == "degrees_as_radians" else ())
-        for f in sorted(faults.FAULTS)
-    ],
-)
-def test_every_fault_is_named(fault, trial):
-    rng = np.random.default_rng([100, trial])
-    s = faults.FAULTS[fault](faults.draw_session(rng, views=(12, 24)), rng)
+# Faults that take as long, and that are told from the others by the same fits, are for slow runs;
+# degrees as radians may be turns of any count, and all of them are searched.
+SEARCHED = {
+    "base_turned", "board_in_mm", "board_size", "camera_inverted", "degrees_as_radians",
+    "duplicated", "euler_as_rotvec", "mispaired", "quaternion_order", "radians_as_degrees",
+    "rotvec_as_euler", "shifted_later", "tool_changed", "wrong_mode",
+}  # fmt: skip
+REPAIRED = {"euler_order", "robot_inverted", "flipped", "swapped", "robot_in_mm", "frozen"}
+
+
+@pytest.mark.parametrize("fault", sorted(faults.FAULTS.keys() - SEARCHED))
+def test_every_fault_is_named_and_what_is_repaired_is_clean(fault):
+    named_and_repaired(fault)
+
+
+@pytest.mark.slow
+def test_the_faults_that_are_searched_for_long_are_named():
+    for fault in sorted(SEARCHED):
+        named_and_repaired(fault)
+
+
+def named_and_repaired(fault):
+    rng = np.random.default_rng([100, 0])
+    s = faults.FAULTS[fault](faults.draw_session(rng, views=(12, 12)), rng)
     d = faults.ask(s)
     assert faults.named(s, d), (s.expected, s.views, d.fault, d.views, d.sentence)
     assert d.sentence and d.advice
     assert d.labels == tuple(str(k) for k in d.views)
-
-
-@pytest.mark.parametrize("seeds", [(0,), pytest.param((1, 2, 3), marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", sorted(faults.CLEAN))
-def test_clean_sessions_raise_no_alarm(kind, seeds):
-    for seed in seeds:
-        d = faults.ask(session(seed, **faults.CLEAN[kind]))
-        assert d.fault == "none", d.sentence
-        assert d.repaired_base_ee is None and not d.views
-
-
-@pytest.mark.slow
-def test_a_repair_makes_the_data_clean():
-    rng = np.random.default_rng(8)
-    clean = faults.draw_session(rng, views=(12, 16))
-    for fault in ("euler_order", "robot_inverted", "flipped", "swapped", "robot_in_mm", "frozen"):
-        d = faults.ask(faults.FAULTS[fault](clean, rng))
+    if fault in REPAIRED:
         again = diagnose(
             d.repaired_base_ee, d.repaired_cam_board, target=faults.BOARD,
-            mode="eye_in_hand" if clean.eye_in_hand else "eye_to_hand",
+            mode="eye_in_hand" if s.eye_in_hand else "eye_to_hand",
         )  # fmt: skip
-        assert d.note and again.fault == "none", (fault, again.sentence)
+        assert d.note and again.fault == "none", again.sentence
         assert len(d.repaired_rows) == len(d.repaired_base_ee)
+
+
+@pytest.mark.parametrize("kind", ["clean, 5 to 8 views", "clean, 10 deg, 3 mm 4 mrad"])
+def test_clean_sessions_raise_no_alarm(kind):
+    d = faults.ask(session(0, **faults.CLEAN[kind]))
+    assert d.fault == "none", d.sentence
+    assert d.repaired_base_ee is None and not d.views
 
 
 @pytest.mark.slow
@@ -162,12 +149,6 @@ def test_a_raw_reading_that_fits_is_named():
     )  # fmt: skip
     assert d.fault == "rotation_reading" and "in degrees" in d.sentence
     assert np.allclose(d.repaired_base_ee, s.T)
-
-
-def test_inverted_poses_ask_where_the_camera_is():
-    s = session(6)
-    d = faults.ask(faults.FAULTS["robot_inverted"](s, np.random.default_rng(0)))
-    assert "Either" in d.sentence and "eye in hand or eye to hand" in d.advice
 
 
 def test_a_small_print_error_is_a_scale_and_not_a_fault():
@@ -215,12 +196,11 @@ def readings(s):
 
 
 def test_the_reading_of_a_pose_file_is_proven():
-    for seed in range(2):
-        s = session(seed, views=(12, 16))
-        proof = prove_reading(readings(s), s.C, target=faults.BOARD)
-        assert proof.best == "rotation vector" and proof.decisive and proof.ratio > 3
-        assert proof.best_mode == ("eye_in_hand" if s.eye_in_hand else "eye_to_hand")
-        assert "fits" in proof.sentence and len(proof.fits) == 2 * len(readings(s))
+    s = session(1, views=(12, 12))
+    proof = prove_reading(readings(s), s.C, target=faults.BOARD)
+    assert proof.best == "rotation vector" and proof.decisive and proof.ratio > 3
+    assert proof.best_mode == ("eye_in_hand" if s.eye_in_hand else "eye_to_hand")
+    assert "fits" in proof.sentence and len(proof.fits) == 2 * len(readings(s))
 
 
 def test_inverted_poses_of_the_other_place_are_one_reading():
@@ -244,7 +224,7 @@ def test_no_reading_is_proven_where_none_fits():
 
 
 def test_turned_boards_are_found_even_if_half_are():
-    for seed in range(8):
+    for seed in range(4):
         rng = np.random.default_rng(seed)
         s = faults.draw_session(rng)
         n = len(s.C)
@@ -258,7 +238,7 @@ def test_turned_boards_are_found_even_if_half_are():
 
 
 def test_no_board_is_turned_in_clean_sessions():
-    for seed in range(20):
+    for seed in range(6):
         s = session(seed)
         found = synchronise_half_turns(s.T, s.C, MIDDLE)
         assert not found.flips.any() and not found.decisive
@@ -274,24 +254,6 @@ def test_a_tool_offset_is_described():
     )
     assert "-x" in describe_offset(se3.from_translation([-0.1, 0, 0]))
     assert "turned by 90.0 deg" in describe_offset(se3.exp([0, 0, np.pi / 2, 0, 0, 0]))
-
-
-def test_poses_of_another_robot_are_not_explained():
-    s, other = session(0, views=(20, 20)), session(1, views=(20, 20))
-    offset = tool_offset(s.T, other.T)
-    assert not offset.known and not offset.active and "model" in offset.advice
-
-
-def test_groups_of_a_changed_tool_are_those_given():
-    s = session(2, views=(20, 20))
-    T = s.T.copy()
-    T[8:] = T[8:] @ se3.from_translation([0.0, 0.03, 0.15])
-    offset = tool_offset(T, s.nominal)
-    assert offset.active and len(offset.offsets) == 2
-    assert np.array_equal(np.unique(offset.groups[:8]), [offset.groups[0]])
-    assert np.array_equal(np.unique(offset.groups[8:]), [offset.groups[-1]])
-    step = se3.invert(offset.offsets[offset.groups[0]]) @ offset.offsets[offset.groups[-1]]
-    assert np.allclose(step[:3, 3], [0, 0.03, 0.15], atol=3e-3)
 
 
 # Gates and motion
@@ -331,7 +293,7 @@ def turn_about_middle(w):
 
 
 def test_the_frame_gate_keeps_clean_views():
-    for seed in range(20):
+    for seed in range(6):
         s = session(seed)
         gate = frame_gate(
             s.T, s.C, [None] * len(s.T), MIDDLE, GateConfig(), eye_in_hand=s.eye_in_hand
@@ -368,17 +330,6 @@ def test_missing_motion_is_said():
     twice[0][3] = twice[0][9]
     repeated = check_motion(*twice, MIDDLE)
     assert repeated.identical == ((3, 9),) and "rows 3, 9" in repeated.sentences[-1]
-
-
-def test_a_board_in_one_place_of_the_image_is_said():
-    s = session(0)
-    C = s.C.copy()
-    q = C[:, :3, :3] @ MIDDLE + C[:, :3, 3]
-    C[:, :3, 3] += np.array([0, 0, 1]) * np.linalg.norm(q, axis=-1)[:, None] - q
-    T = s.T if s.eye_in_hand else se3.invert(s.T)
-    fit = fit_frames(T, s.C, MIDDLE)
-    T = fit.Z @ se3.invert(C) @ se3.invert(fit.X)
-    assert any("same place of the image" in t for t in check_motion(T, C, MIDDLE).sentences)
 
 
 @pytest.mark.slow

@@ -1,13 +1,9 @@
-"""The bias of a depth camera from board views: laws, statistics, refusals, the lab, real data."""
+"""The bias of a depth camera from board views: laws, statistics, refusals."""
 
-import json
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from board_depth import (
     BASELINE,
@@ -24,20 +20,18 @@ from board_depth import (
 )
 from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
-from realsim.geometry.camera import pixel_grid, project, undistort
+from realsim.geometry.camera import pixel_grid, undistort
 from realsim.records import CameraIntrinsics
 from realsim.records.depth_bias import DepthBias
 from realsim_calibration.depth.bias import estimate_depth_bias
 from realsim_calibration.depth.board import DepthBoardView
 from realsim_calibration.results import BoardShape
-from realsim_calibration.views import TargetDetection
 
 # ---- laws of the record
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_corrected_inverts_measured(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+def test_corrected_inverts_measured() -> None:
+    rng = np.random.default_rng(1)
     bias = DepthBias(scale=1 + rng.normal(scale=0.02), offset_per_m=rng.normal(scale=0.02))
     z = rng.uniform(0.1, 1.5, (20, 30))
     np.testing.assert_allclose(bias.corrected(bias.measured(z)), z, rtol=1e-12)
@@ -157,13 +151,12 @@ def test_own_depth_camera_beside_the_colour_camera() -> None:
 # ---- statistics
 
 
-@pytest.mark.parametrize("n", [6, pytest.param(12, marks=pytest.mark.slow)])
-def test_sigma_covers_the_truth(n: int) -> None:
+def test_sigma_covers_the_truth() -> None:
     """Noise growing with z^2, holes, fliers, corner noise, and an error common to each view."""
     truth = DepthBias(scale=1.008, offset_per_m=-0.012)
     squared: list[float] = []
-    for seed in range(24):
-        distances = np.linspace(0.2, 0.5, n)
+    for seed in range(14):
+        distances = np.linspace(0.2, 0.5, 6)
         report = run(views_of(truth, seed, distances=distances, pose_sd=(2e-3, 0.4e-3)))
         error = [report.bias.scale - truth.scale, report.bias.offset_per_m - truth.offset_per_m]
         squared.append(float(error @ np.linalg.solve(report.bias.covariance, error)))
@@ -178,21 +171,6 @@ def test_noise_is_measured_and_grows_with_the_square_of_distance() -> None:
     assert report.noise_exponent == pytest.approx(2.0, abs=0.3)
 
 
-def test_temporal_noise_needs_frames() -> None:
-    rng, views = np.random.default_rng(0), []
-    for k, distance in enumerate(np.linspace(0.2, 0.5, 5)):
-        T = pose_at(rng, distance)
-        frames = [sensed(exact_depth(T, CAMERA), DepthBias.none(), rng) for _ in range(4)]
-        views.append(
-            DepthBoardView(index=k, depth_m=np.stack(frames), detection=detected(T, rng, 0.05))
-        )
-    report = run(views)
-    for v in report.views:
-        expected = v.distance_m**2 * 0.08 / (CAMERA.fx * BASELINE)
-        assert v.temporal_noise_m == pytest.approx(expected, rel=0.5)
-    assert all(np.isnan(v.temporal_noise_m) for v in run(views_of(DepthBias.none())).views)
-
-
 def test_a_bad_view_does_not_bend_the_result() -> None:
     truth = DepthBias(scale=1.01, offset_per_m=-0.01)
     views = views_of(truth, 2)
@@ -203,19 +181,6 @@ def test_a_bad_view_does_not_bend_the_result() -> None:
     assert abs(report.bias.scale - clean.bias.scale) < 2 * sd[0]
     worst = max(report.views, key=lambda v: abs(v.unseen_m / v.distance_m))
     assert worst.index == 4
-
-
-def test_a_thing_in_front_of_the_board_is_left_out() -> None:
-    truth = DepthBias(scale=1.01, offset_per_m=-0.01)
-    views = views_of(truth, 4)
-    covered: list[DepthBoardView] = []
-    for v in views:
-        depth = v.depth_m.copy()
-        depth[:, 100:135] = np.minimum(depth[:, 100:135], np.float32(0.15))
-        covered.append(replace(v, depth_m=depth))
-    clean, report = run(views), run(covered)
-    assert report.bias.scale == pytest.approx(clean.bias.scale, abs=3e-3)
-    assert min(v.inlier_share for v in report.views if v.used) < 0.95
 
 
 # ---- refusals
@@ -232,11 +197,10 @@ def test_one_distance_gives_only_the_sum() -> None:
     assert report.bias.sigma_m(z) < 0.4e-3 < report.bias.sigma_m(0.8)
 
 
-@pytest.mark.parametrize("factor", [0.1, 10.0, 100.0, 1000.0])
-def test_a_wrong_unit_is_named(factor: float) -> None:
+def test_a_wrong_unit_is_named() -> None:
     views = views_of(DepthBias.none())
     with pytest.raises(UnitError, match=r"0\.001.*0\.0001"):
-        run([replace(v, depth_m=v.depth_m * np.float32(factor)) for v in views])
+        run([replace(v, depth_m=v.depth_m * np.float32(10.0)) for v in views])
 
 
 def test_a_wrong_board_size_is_named() -> None:
@@ -308,83 +272,3 @@ def test_counts_and_duplicates_are_refused() -> None:
     v = views_of(DepthBias.none())
     with pytest.raises(InputError, match="unique"):
         run([v[0], v[0]])
-
-
-# ---- the simulated lab, and real data
-
-
-@pytest.mark.slow
-def test_the_simulated_cameras_disparity_bias_is_found() -> None:
-    from realsim_capture_plans import PlanConfig, calibration_plan
-    from realsim_capture_plans.lab import LabConfig, SimulatedLab
-
-    lab = SimulatedLab(
-        LabConfig(seed=0, n_objects=1, width=640, height=360, disparity_bias_px=0.05)
-    )
-    lab.place_board()
-    rng, camera, board = np.random.default_rng(0), lab.truth.intrinsics, lab.board
-    plan = calibration_plan(10, lab.scene_center, lab.nominal_T_ee_cam, PlanConfig(), rng)
-    views: list[DepthBoardView] = []
-    for k, joints in enumerate(plan.joints):
-        lab.arm.move(joints)
-        frame = lab.camera.grab()
-        T = se3.invert(lab.truth.T_world_cam(lab.arm.state().joints)) @ lab.truth.T_world_board
-        uv = project(camera, se3.transform(T, board.points_board))
-        uv = uv + rng.normal(scale=0.1, size=uv.shape)
-        ids = np.flatnonzero(np.all((uv > 0) & (uv < [639, 359]), axis=-1))
-        detection = TargetDetection(point_ids=ids, uv=uv[ids], image_size=(640, 360))
-        views.append(DepthBoardView(index=k, depth_m=frame.depth_m, detection=detection))
-    report = estimate_depth_bias(views, board, camera, EXACT)
-    offset = -0.05 / (camera.fx * BASELINE)
-    sd = np.sqrt(np.diag(report.bias.covariance))
-    assert abs(report.bias.scale - 1.0) < 3 * sd[0] < 0.003
-    assert abs(report.bias.offset_per_m - offset) < 3 * sd[1] < abs(offset)
-    assert report.held_out_m < 0.3 * report.uncorrected_m
-
-
-REAL = Path(os.environ.get("REALSIM_DATA", "../shared/data")) / "handeye/rtde_ur5e"
-
-
-@pytest.mark.real
-@pytest.mark.skipif(not REAL.is_dir(), reason=f"{REAL} is not there (REALSIM_DATA)")
-def test_real_depth_that_is_not_aligned_is_refused() -> None:
-    """Depth 1024x768 of an L515 (0.25 mm) beside 1920x1080 colour, intrinsics unknown."""
-    import cv2
-
-    from realsim.images import read_depth, read_grey
-    from realsim.records import CharucoBoard
-
-    known = json.loads((REAL / "cam_params_calibrated.json").read_text())
-    camera = CameraIntrinsics.from_K(known["intrinsic"], 1920, 1080, known["distortion"])
-    target = CharucoBoard(
-        rows=7, columns=5, square_m=0.033, marker_m=0.02, dictionary="DICT_6X6_100"
-    )
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_100)
-    finder = cv2.aruco.CharucoDetector(cv2.aruco.CharucoBoard((5, 7), 0.033, 0.02, dictionary))
-    views: list[DepthBoardView] = []
-    for k in range(0, 24, 2):
-        corners, ids, _, _ = finder.detectBoard(read_grey(REAL / f"Hand-Eye-Data/{k}.jpg"))
-        depth = read_depth(REAL / f"Hand-Eye-Data/{k}.png", 0.00025)
-        if ids is None or len(ids) < 8:
-            continue
-        found = TargetDetection(
-            point_ids=ids.ravel(), uv=corners.reshape(-1, 2), image_size=(1920, 1080)
-        )
-        views.append(DepthBoardView(index=k, depth_m=depth, detection=found, name=f"{k}.png"))
-    assert len(views) >= 10
-    with pytest.raises(InputError, match=r"1024x768.*1920x1080: this depth is not aligned"):
-        estimate_depth_bias(views, target, camera)
-
-    def resized(unit: float) -> list[DepthBoardView]:
-        def grown(depth: NDArray[np.floating]) -> NDArray[np.floating]:
-            depth = depth * np.float32(unit / 0.00025)
-            return np.asarray(cv2.resize(depth, (1920, 1080), interpolation=cv2.INTER_NEAREST))
-
-        return [replace(v, depth_m=grown(v.depth_m)) for v in views]
-
-    with pytest.raises(InputError, match=r"turned by .*is the depth aligned to the colour image"):
-        estimate_depth_bias(resized(0.00025), target, camera)
-    with pytest.raises(UnitError, match="wrong by 4"):
-        estimate_depth_bias(resized(0.001), target, camera)
-    with pytest.raises(UnitError, match=r"wrong by 0\.4"):
-        estimate_depth_bias(resized(0.0001), target, camera)

@@ -1,11 +1,9 @@
 """What a calibration leaves behind: every format reads back as the same transform."""
 
 import ast
-import dataclasses
 import math
 import shlex
 import subprocess
-import sys
 import xml.etree.ElementTree as ET
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +20,6 @@ from ruamel.yaml import YAML
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records import CameraIntrinsics
 from realsim_calibration.exports import (
     FrameNames,
     note_lines,
@@ -32,7 +29,6 @@ from realsim_calibration.exports import (
     ros,
     write_exports,
 )
-from realsim_calibration.exports.frames import roll_pitch_yaw
 from realsim_calibration.results import HandEyeReport, Mode
 
 Array = NDArray[np.float64]
@@ -101,7 +97,7 @@ LINK = FrameNames(
 
 
 @given(X=transforms(), mode=st.sampled_from(["eye_in_hand", "eye_to_hand"]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_easy_handeye_reads_the_same_transform(full_record: Maker, X: Array, mode: Mode) -> None:
     report = full_record(X, mode)
     two = yaml11(ros.easy_handeye2_text(report, FRAMES))
@@ -115,7 +111,7 @@ def test_easy_handeye_reads_the_same_transform(full_record: Maker, X: Array, mod
 
 
 @given(X=transforms(), frames=st.sampled_from([FRAMES, LINK]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_ros_commands_and_launch_carry_the_same_transform(
     full_record: Maker, X: Array, frames: FrameNames
 ) -> None:
@@ -138,7 +134,7 @@ def test_ros_commands_and_launch_carry_the_same_transform(
 
 
 @given(X=transforms(), frames=st.sampled_from([FRAMES, LINK]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_urdf_reads_the_same_transform(full_record: Maker, X: Array, frames: FrameNames) -> None:
     """rpy about fixed axes: R = Rz Ry Rx, read with this formula and compared."""
     root = ET.fromstring(ros.urdf_text(full_record(X), frames))
@@ -156,21 +152,8 @@ def test_urdf_reads_the_same_transform(full_record: Maker, X: Array, frames: Fra
     assert same(T, X)
 
 
-@given(X=transforms(), near=st.floats(-1e-6, 1e-6), flip=st.sampled_from([-1, 1]))
-@settings(max_examples=200, deadline=None)
-def test_roll_pitch_yaw_near_the_lock(X: Array, near: float, flip: int) -> None:
-    for R in (
-        X[:3, :3],
-        X[:3, :3] @ se3.exp_so3([0, flip * (math.pi / 2 + near), 0]),
-        se3.exp_so3([0, 0, near]) @ se3.exp_so3([0, flip * (math.pi / 2 + near), 0]),
-    ):
-        r, p, y = roll_pitch_yaw(R)
-        back = se3.exp_so3([0, 0, y]) @ se3.exp_so3([0, p, 0]) @ se3.exp_so3([r, 0, 0])
-        assert np.abs(back - R).max() < 1e-11
-
-
 @given(X=transforms(), mode=st.sampled_from(["eye_in_hand", "eye_to_hand"]))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_opencv_reads_the_same_transform(full_record: Maker, X: Array, mode: Mode) -> None:
     report = full_record(X, mode)
     text = opencv_text(report, FRAMES)
@@ -218,11 +201,6 @@ def test_easy_handeye2_has_the_keys_of_its_message_and_no_others(full_record: Ma
     assert old["parameters"]["eye_on_hand"] is True and old["parameters"]["namespace"] == "/ur5/"
 
 
-def test_eye_to_hand_hangs_below_the_base(full_record: Maker) -> None:
-    report = full_record(se3.from_translation([1.0, 0, 0]), "eye_to_hand")
-    assert published_transform(report, FRAMES)[1:] == ("base", "cam_optical")
-
-
 def test_every_text_says_frames_units_accuracy_and_warnings(full_record: Maker) -> None:
     report = full_record(se3.from_translation([0.0, 0.0, 0.1]))
     notes = "\n".join(note_lines(report, FRAMES))
@@ -257,21 +235,6 @@ def test_the_shell_scripts_run_one_command_with_the_words(
     assert ran.stdout.split() == shlex.split(ros.ros2_command(report, FRAMES))[1:]
 
 
-def test_camera_info_is_plumb_bob_or_rational(full_record: Maker) -> None:
-    report = full_record(np.eye(4))
-    info = yaml11(ros.camera_info_text(report, FRAMES))
-    assert info["distortion_model"] == "plumb_bob"
-    assert info["distortion_coefficients"]["data"] == list(report.intrinsics_alone.distortion[:5])
-    assert info["camera_matrix"]["data"] == list(report.intrinsics_alone.K.ravel())
-    wide = CameraIntrinsics(
-        width=640, height=480, fx=300.0, fy=300.0, cx=319.5, cy=239.5,
-        distortion=np.linspace(0.01, 0.08, 8),
-    )  # fmt: skip
-    info = yaml11(ros.camera_info_text(dataclasses.replace(report, intrinsics_alone=wide), FRAMES))
-    assert info["distortion_model"] == "rational_polynomial"
-    assert len(info["distortion_coefficients"]["data"]) == 8
-
-
 def test_write_exports_writes_readable_files(full_record: Maker, tmp_path: Path) -> None:
     report = full_record(se3.exp([0.1, 0.2, 0.3, 0.04, 0.05, 0.06]))
     paths = write_exports(report, tmp_path / "out", frames=FRAMES)
@@ -285,8 +248,6 @@ def test_write_exports_writes_readable_files(full_record: Maker, tmp_path: Path)
         assert any("do not mix" in note for note in arrays["notes"])
         assert str(arrays["parent"]) == "tool0" and str(arrays["cam"]) == "cam_optical"
     assert np.abs(read_calibration(paths[0]).X - report.X).max() < 1e-12
-    launch = next(p for p in paths if p.name == "camera_pose.launch.py")
-    subprocess.run([sys.executable, "-m", "py_compile", str(launch)], check=True)
 
 
 # --- what is refused ----------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from realsim_calibration.detect.homography import (
     fit_homography,
     seen_from_front,
 )
+from realsim_calibration.detect.tags import DetectionConfig, detect_tags
 from realsim_calibration.detect.visible import explain_missing, what_is_visible
 from realsim_calibration.sheets import target_image
 
@@ -23,8 +24,6 @@ CAMERA = CameraIntrinsics(width=640, height=480, fx=600.0, fy=600.0, cx=319.5, c
 PER_M, MARGIN, SUPER = 8000.0, 240, 6  # page pixels per metre and about the target, rays a pixel
 TARGETS = {
     "tags": TagBoard(rows=3, columns=4, tag_size_m=0.032, gap_m=0.008),
-    "tag25h9": TagBoard(rows=2, columns=3, tag_size_m=0.035, gap_m=0.01, family="tag25h9"),
-    "tag36h10": TagBoard(rows=2, columns=3, tag_size_m=0.04, gap_m=0.01, family="tag36h10"),
     "tag16h5": TagBoard(rows=3, columns=3, tag_size_m=0.03, gap_m=0.01, family="tag16h5"),
     "kalibr": TagBoard(
         rows=3, columns=3, tag_size_m=0.04, gap_m=0.012, ids_from="bottom", corner_squares=True
@@ -36,7 +35,6 @@ TARGETS = {
     ),
     "chessboard": Chessboard(rows=6, columns=7, square_m=0.02),
     "circles": CircleGrid(rows=5, columns=7, pitch_m=0.025, large_origin=True),
-    "square circles": CircleGrid(rows=6, columns=6, pitch_m=0.025, large_origin=True),
     "asymmetric": CircleGrid(rows=7, columns=4, pitch_m=0.02, asymmetric=True),
 }  # fmt: skip
 
@@ -125,34 +123,6 @@ def test_points_of_every_target_are_sharp_unbiased_and_rightly_numbered(name):
     assert 0.6 < np.sqrt(2 * np.mean(sd**2)) / rms < 1.6
 
 
-@pytest.mark.parametrize("name", ["tags", "charuco", "chessboard", "circles", "asymmetric"])
-@pytest.mark.parametrize("quarter", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_turning_the_image_turns_the_points(name, quarter):
-    target = TARGETS[name]
-    image = picture(target, pose(target, 35.0))
-    d = find_target(image, target)
-    turned = find_target(np.ascontiguousarray(np.rot90(image, quarter)), target)
-    uv = turned.uv
-    size = np.array([639, 479]) if quarter % 2 == 0 else np.array([479, 639])
-    for _ in range(quarter):  # a turn back by a quarter: (u, v) -> (W - 1 - v, u)
-        uv = np.stack([size[::-1][0] - uv[:, 1], uv[:, 0]], -1)
-        size = size[::-1]
-    both, a, b = np.intersect1d(d.point_ids, turned.point_ids, return_indices=True)
-    assert len(both) >= 0.9 * len(target.points_board)
-    assert np.abs(d.uv[a] - uv[b]).max() < 0.05
-
-
-@pytest.mark.parametrize("name", ["tags", "charuco", "chessboard", "circles", "asymmetric"])
-@pytest.mark.parametrize("start", [0.0, pytest.param(90.0, marks=pytest.mark.slow)])
-def test_an_upside_down_camera_changes_no_number(name, start):
-    target = TARGETS[name]
-    for roll in (start, start + 180.0):
-        T = pose(target, 20.0, roll_deg=roll)
-        d = find_target(picture(target, T), target)
-        assert len(d) >= 0.9 * len(target.points_board)
-        assert np.abs(d.uv - truth(target, T)[d.point_ids]).max() < 0.3
-
-
 @pytest.mark.slow
 def test_targets_with_two_ends_are_numbered_clockwise_along_the_image():
     for target in (
@@ -200,7 +170,7 @@ def test_light_that_falls_off_does_not_pull_the_points():
 
 
 def test_tags_and_charuco_may_be_cut_and_covered():
-    for name in ("tags", "charuco", "kalibr"):
+    for name in ("tags", "charuco"):
         target = TARGETS[name]
         T = pose(target, 20.0, aim=(0.09, 0.0))
         image = picture(target, T, noise=2.0)
@@ -212,7 +182,7 @@ def test_tags_and_charuco_may_be_cut_and_covered():
         assert np.abs(d.uv - uv[d.point_ids]).max() < 0.25
 
 
-@pytest.mark.parametrize("name", ["chessboard", "circles", "asymmetric"])
+@pytest.mark.parametrize("name", ["chessboard", "asymmetric"])
 def test_a_cut_chessboard_or_grid_is_refused_with_what_was_seen(name):
     target = TARGETS[name]
     d = find_target(picture(target, pose(target, 10.0, roll_deg=0.0, aim=(0.17, 0.0))), target)
@@ -234,7 +204,7 @@ def test_a_glint_costs_the_chessboard_one_corner():
     assert np.abs(d.uv - uv[d.point_ids]).max() < 0.3
 
 
-@pytest.mark.parametrize("name", ["tags", "charuco", "chessboard", "circles"])
+@pytest.mark.parametrize("name", ["tags", "chessboard", "circles"])
 def test_two_equal_boards_are_refused(name):
     target = TARGETS[name]
     aims = ((-0.12, -0.01), (0.12, 0.01))
@@ -246,9 +216,7 @@ def test_two_equal_boards_are_refused(name):
     assert any("two equal" in r or "more than once" in r for r in d.rejected)
 
 
-@pytest.mark.parametrize(
-    "name", ["tags", "tag16h5", pytest.param("charuco", marks=pytest.mark.slow), "circles"]
-)
+@pytest.mark.parametrize("name", ["tags", "circles"])
 def test_a_mirrored_picture_gives_no_points(name):
     target = TARGETS[name]
     image = np.ascontiguousarray(picture(target, pose(target, 20.0))[:, ::-1])
@@ -256,7 +224,7 @@ def test_a_mirrored_picture_gives_no_points(name):
     assert len(d) == 0
     if name == "circles":
         assert "mirrored" in d.rejected[0]
-    elif name != "tag16h5":
+    else:
         assert "MIRRORED" in explain_missing(image, target, d)
 
 
@@ -266,18 +234,11 @@ def test_a_board_file_that_does_not_match_is_told_apart():
     cases = (
         (tags, replace(tags, ids_from="bottom"), "ids_from='top'"),
         (tags, replace(tags, rows=4, columns=3), "with 3 rows and 4 columns"),
-        (tags, replace(tags, first_id=200), "not a tag of this board"),
         (old, replace(old, legacy=False), "legacy=True"),
         (charuco, replace(charuco, rows=7, columns=5), "5 rows and 7 columns"),
-        (chess, replace(chess, columns=6), "7x6 inner corners, not of 6x6"),
         (chess, replace(chess, columns=8), "42 of 48 inner corners"),
-        (circles, replace(circles, columns=6), "larger"),
+        (replace(circles, large_origin=False), circles, "larger than the others"),
         (circles, replace(circles, rows=7, columns=5), "mirrored"),
-        (
-            TARGETS["asymmetric"],
-            replace(TARGETS["asymmetric"], asymmetric=False),
-            "asymmetric=True",
-        ),
     )
     for printed, claimed, words in cases:
         d = find_target(picture(printed, pose(printed, 20.0)), claimed)
@@ -285,20 +246,11 @@ def test_a_board_file_that_does_not_match_is_told_apart():
         assert any(words in r for r in d.rejected), (words, d.rejected)
 
 
-def test_a_missing_large_dot_is_named():
-    plain = replace(TARGETS["circles"], large_origin=False)
-    d = find_target(picture(plain, pose(plain, 20.0)), TARGETS["circles"])
-    assert len(d) == 0 and "larger than the others" in d.rejected[0]
-
-
 @pytest.mark.parametrize(
     ("name", "words"),
     [
         ("tags", "12 markers of DICT_APRILTAG_36h11, ids 0 to 11"),
-        pytest.param("tag16h5", "9 markers of DICT_APRILTAG_16h5", marks=pytest.mark.slow),
-        pytest.param("charuco old", "21 markers of DICT_5X5_50", marks=pytest.mark.slow),
         ("chessboard", "a chessboard with 7x6 inner corners"),
-        pytest.param("circles", "a grid of 7x5 dots", marks=pytest.mark.slow),
         ("asymmetric", "an asymmetric grid of 28 dots"),
     ],
 )
@@ -307,53 +259,38 @@ def test_what_is_visible_names_what_was_printed(name, words):
     assert words in what_is_visible(picture(target, pose(target, 20.0)))
 
 
-@pytest.mark.slow
-def test_a_board_file_of_other_markers_is_answered_with_those_in_view():
-    message = explain_missing(
-        picture(TARGETS["charuco old"], pose(TARGETS["charuco old"], 20.0)), TARGETS["charuco"]
-    )
-    assert "DICT_APRILTAG_36h11" in message and "DICT_5X5_50" in message and "Correct" in message
-
-
 @pytest.mark.parametrize(
     "image",
     [
-        np.zeros((480, 640, 3), np.uint8),
-        np.full((480, 640), 255, np.uint8),
-        np.random.default_rng(0).integers(0, 256, (240, 320), dtype=np.uint8),
-        pytest.param(
-            np.random.default_rng(0).integers(0, 256, (480, 640), dtype=np.uint8),
-            marks=pytest.mark.slow,
-        ),
+        np.zeros((240, 320, 3), np.uint8),
+        np.full((240, 320), 255, np.uint8),
+        np.random.default_rng(0).integers(0, 256, (120, 160), dtype=np.uint8),
     ],
-    ids=["black", "white", "noise", "more noise"],
+    ids=["black", "white", "noise"],
 )
 def test_nothing_is_found_in_nothing(image):
-    for target in TARGETS.values():
-        assert len(find_target(image, target)) == 0
-    assert "nothing that looks like a target" in what_is_visible(image)
+    for name in ("tag16h5", "chessboard", "circles", "asymmetric"):
+        assert len(find_target(image, TARGETS[name])) == 0
+    if np.ptp(image) == 0:  # all dictionaries are tried on noise, which takes very long
+        assert "nothing that looks like a target" in what_is_visible(image)
 
 
 def test_a_picture_out_of_focus_has_no_points_or_good_ones():
     for name in ("tags", "charuco", "chessboard", "circles"):
         target = TARGETS[name]
         T = pose(target, 20.0)
-        for blur in (3.0, 6.0):
-            d = find_target(picture(target, T, blur=blur), target)
-            if len(d):
-                e = np.linalg.norm(d.uv - truth(target, T)[d.point_ids], axis=-1)
-                assert np.sqrt(np.mean(e**2)) < 0.5, (name, blur)
+        d = find_target(picture(target, T, blur=3.0), target)
+        if len(d):
+            e = np.linalg.norm(d.uv - truth(target, T)[d.point_ids], axis=-1)
+            assert np.sqrt(np.mean(e**2)) < 0.5, name
 
 
 @pytest.mark.parametrize(
     "image",
     [
-        np.zeros((480, 640)),
         np.full((480, 640, 3), np.nan, np.float32),
         np.zeros((480, 640), np.uint16),
-        np.zeros((480, 640, 4), np.uint8),
         np.zeros((0, 0), np.uint8),
-        np.zeros((480, 640, 3), bool),
     ],
 )
 def test_what_is_no_8_bit_image_is_refused(image):
@@ -375,7 +312,7 @@ def test_intrinsics_of_another_size_and_unknown_dictionaries_are_refused():
 def test_codes_turned_on_the_page_and_wide_borders_are_understood():
     tags = TARGETS["tags"]
     T = pose(tags, 25.0)
-    for turned in (1, 2, 3):
+    for turned in (1, 2):
         d = find_target(picture(tags, T, page=tag_page(tags, turned=turned)), tags)
         assert len(d) == len(tags.points_board)
         assert np.abs(d.uv - truth(tags, T)).max() < 0.3
@@ -391,3 +328,27 @@ def test_bright_dots_on_black_are_found_too():
     T = pose(target, 25.0)
     d = find_target(255 - picture(target, T), target)
     assert len(d) == 35 and np.abs(d.uv - truth(target, T)).max() < 0.1
+
+
+def test_bad_tags_are_rejected_with_a_reason():
+    board = TARGETS["tags"]
+    image = picture(board, pose(board, 10.0))
+    pale = (118 + (image.astype(float) - 118) * 0.1).astype(np.uint8)
+    d = detect_tags(pale, board)
+    assert not len(d) and d.rejected and all("low contrast" in r for _, r in d.rejected)
+    d = detect_tags(image, board, DetectionConfig(min_side_px=100.0))
+    assert [i for i, _ in d.rejected] == board.ids.tolist()
+    assert all("too small" in r for _, r in d.rejected)
+
+
+def test_a_speck_on_an_edge_does_not_move_the_corners_and_a_blot_drops_the_tag():
+    import cv2
+
+    board = TARGETS["tags"]
+    T = pose(board, 10.0, distance=0.3)
+    image, uv = picture(board, T, noise=1.0), truth(board, T).reshape(-1, 4, 2)
+    x, y = (int(v) for v in np.rint(uv[0, :2].mean(0)))
+    speck = detect_tags(cv2.circle(image.copy(), (x, y), 4, 215, -1), board)
+    assert 0 in speck.ids and np.abs(speck.corners_px[0] - uv[0]).max() < 0.1
+    blot = detect_tags(cv2.circle(image.copy(), (x, y), 14, 215, -1), board)
+    assert 0 not in blot.ids and len(blot) == len(board.ids) - 1

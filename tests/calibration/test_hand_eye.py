@@ -6,9 +6,7 @@ import pytest
 from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
-from realsim_calibration import CLOSED_FORMS, JointConfig
-from realsim_calibration.detect.find import find_target
-from realsim_calibration.faults.gates import GateConfig, px_gate, rotation_mismatch_deg, screw_ratio
+from realsim_calibration import JointConfig
 from realsim_calibration.fit.board_pose import estimate_board_pose
 from realsim_calibration.hand_eye import (
     HandEyeConfig,
@@ -56,16 +54,11 @@ def test_truth_lies_within_the_claimed_sigma(simulate):
     assert outside <= 2
 
 
+@pytest.mark.slow
 def test_a_measured_board_and_a_trusted_camera_halve_the_error(simulate):
     config = HandEyeConfig(joint=JointConfig(scale_sd=0.0, robot_ratio=3.0))
-    errors = [error_of(calibrate(sim, config=config), sim) for sim in map(simulate, range(5))]
+    errors = [error_of(calibrate(sim, config=config), sim) for sim in map(simulate, range(4))]
     assert np.sqrt(np.mean(np.sum(np.square(errors)[:, 3:], -1))) < 0.35e-3
-
-
-def test_more_robot_noise_claims_more(simulate):
-    quiet, loud = (calibrate(simulate(1, robot=(r, r))) for r in (0.1e-3, 1e-3))
-    assert 4 < loud.sigma_mm / quiet.sigma_mm < 25
-    assert loud.held_out_px > 4 * quiet.held_out_px
 
 
 def test_order_of_views_does_not_matter(simulate):
@@ -203,18 +196,6 @@ def test_a_view_without_tags_and_a_repeated_index_are_handled(simulate):
         calibrate(sim, [*sim.views, sim.views[0]])
 
 
-def test_x_free_measures_do_not_depend_on_x(simulate):
-    sim = simulate(3, robot=(0.0, 0.0), pixel=0.0)
-    A = np.array([v.T_base_ee for v in sim.views])
-    C = se3.invert(A @ sim.T_ee_cam) @ sim.T_base_board
-    assert rotation_mismatch_deg(A, C) < 1e-5
-    assert abs(screw_ratio(A, C, GateConfig()) - 1) < 1e-6
-    X = se3.random_transform(np.random.default_rng(1))
-    assert abs(screw_ratio(A @ X, C, GateConfig()) - 1) < 1e-6
-    assert px_gate(np.array([1.0, 1.2, 0.8, 30.0, 1.1]), GateConfig()).keys() == {3}
-    assert not px_gate(np.array([0.1, 0.1, 0.8]), GateConfig())
-
-
 def test_board_pose_keeps_the_twin_apart(simulate):
     sim = simulate(4, views=6, pixel=0.05)
     for view, ee in zip(sim.views, sim.truth_ee, strict=True):
@@ -224,23 +205,3 @@ def test_board_pose_keeps_the_twin_apart(simulate):
         e = se3.log(se3.invert(truth) @ pose.T_cam_board)
         assert np.abs(e[:3]).max() < 2e-3 and np.abs(e[3:]).max() < 1e-3
         assert 0.03 < pose.rms_px < 0.12 and pose.twin_rms_px > pose.rms_px
-
-
-@pytest.mark.slow
-def test_from_rendered_images_to_the_hand_eye(simulate, render):
-    sim = simulate(11, views=10)
-    sim.intrinsics = replace(
-        sim.intrinsics0, width=640, height=360, fx=330.0, fy=330.0, cx=322.0, cy=178.0
-    )
-    nominal = replace(sim.intrinsics, fx=325.0, fy=325.0, cx=319.5, cy=179.5)
-    rng = np.random.default_rng(0)
-    views = []
-    for v, ee in zip(sim.views, sim.truth_ee, strict=True):
-        T_cam_board = se3.invert(ee @ sim.T_ee_cam) @ sim.T_base_board
-        image = render(sim.board, sim.intrinsics, T_cam_board, rng, 0.7, 3.0)
-        views.append(replace(v, detection=find_target(image, sim.board)))
-    h = calibrate_hand_eye(views, sim.board, nominal)
-    e = error_of(h, sim)
-    assert np.degrees(np.linalg.norm(e[:3])) < 0.4 and np.linalg.norm(e[3:]) < 3e-3
-    assert e @ np.linalg.solve(h.covariance, e) < 30
-    assert {name for name, _ in h.starts} == set(CLOSED_FORMS)

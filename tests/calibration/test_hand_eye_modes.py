@@ -7,9 +7,8 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project, undistort
 from realsim.geometry.dh import UR5_ARM, UR5E_ARM
-from realsim.records import Chessboard, HandEye
+from realsim.records import Chessboard
 from realsim_calibration import (
-    BoardView,
     HandEyeConfig,
     TargetDetection,
     calibrate,
@@ -78,10 +77,9 @@ def test_perfect_poses_alone_give_the_truth():
         calibrate_from_poses(A, se3.invert(C) @ np.diag([1.0, -1.0, -1.0, 1.0]))
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_white_robot_errors_get_no_map(simulate, seed):
+def test_white_robot_errors_get_no_map(simulate):
     # With many views a map's gain of one percent was beyond chance, and the map tripled the error.
-    sim = simulate(seed, views=90)
+    sim = simulate(0, views=90)
     r = calibrate_hand_eye_report(sim.views, sim.board, sim.intrinsics0)
     assert r.map_name == "none" and r.robot_map is None
     assert np.allclose(r.X, r.X_alone, atol=2e-5)
@@ -98,29 +96,6 @@ def test_the_arm_is_told_by_joints_and_poses():
     other = se3.random_transform(rng, 12)
     assert matching_arm(joints, other, arms, RobotErrorConfig()) is None
     assert matching_arm(joints[:3], Ts[:3], arms, RobotErrorConfig()) is None
-
-
-def test_camera_poses_of_an_arm_s_calibration_need_joints(calibrated_arm):
-    report = calibrated_arm(with_joints=True, with_map=True)
-    hand_eye = report.hand_eye
-    assert isinstance(hand_eye, HandEye)
-    view = report.used[0]
-    with pytest.raises(InputError, match="joint angles are needed"):
-        hand_eye.camera_poses(view.T_base_ee)
-    T = hand_eye.camera_poses(view.T_base_ee, view.joints)
-    moved = se3.log(se3.invert(view.T_base_ee @ hand_eye.T_ee_cam) @ T)
-    assert 0 < np.linalg.norm(moved[3:]) < 5e-3
-
-
-def test_a_view_says_its_name_in_messages(simulate):
-    sim = simulate(1, views=6)
-    views = [replace(v, name=f"img_{v.index}.png") for v in sim.views]
-    small = replace(views[2].detection, image_size=(640, 480))
-    with pytest.raises(InputError, match=r"img_2\.png is 640x480 px"):
-        calibrate_hand_eye_report(
-            [*views[:2], replace(views[2], detection=small), *views[3:]], sim.board, sim.intrinsics0
-        )
-    assert BoardView(index=3, T_base_ee=np.eye(4), detection=small).label == "3"
 
 
 def test_terms_that_the_lens_refused_cannot_fold_the_image(simulate):

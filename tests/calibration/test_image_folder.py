@@ -1,5 +1,4 @@
 import json
-import os
 import tempfile
 from pathlib import Path
 
@@ -20,11 +19,6 @@ from realsim_calibration.inputs import (
     reading_from_text,
 )
 
-ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
-HANDEYE = ROOT / "handeye"
-real = pytest.mark.skipif(
-    not HANDEYE.is_dir(), reason=f"no real data at {HANDEYE} (set REALSIM_DATA)"
-)
 READING = reading_from_text("quat_xyzw,m")
 
 
@@ -59,7 +53,7 @@ def write_rows(path, raw, names=None):
 # --- pairing ----------------------------------------------------------------------------------
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(
     n=st.integers(2, 30),
     order=st.randoms(use_true_random=False),
@@ -93,15 +87,6 @@ def test_names_pair_whatever_the_order(n, order, how, missing):
     assert left == {f"img_{k:04d}.png" for k in set(numbers) - set(mine)}
 
 
-def test_ten_comes_after_nine():
-    names = [f"0-{k}.jpg" for k in range(1, 13)]
-    found = pair(names, [None] * 12, [""] * 12, [f"line {k}" for k in range(1, 13)])
-    assert found.pairs == tuple((k, k) for k in range(12)) and "by number" in found.sentence
-    shuffled = sorted(names)  # 0-1, 0-10, 0-11, 0-12, 0-2, ...
-    found = pair(shuffled, [None] * 12, [""] * 12, [f"line {k}" for k in range(1, 13)])
-    assert all(shuffled[i] == f"0-{r + 1}.jpg" for i, r in found.pairs)
-
-
 def test_counts_that_differ_without_names_are_refused_with_both_sides():
     names = [f"{k}.png" for k in range(1, 41) if k not in (17, 23)]
     with pytest.raises(InputError) as error:
@@ -115,13 +100,6 @@ def test_shifted_numbers_are_refused():
     stems = [str(k) for k in range(24)]
     with pytest.raises(InputError, match=r"poses \+1: 1.png.*different starts"):
         pair(images, [None] * 24, stems, stems)
-
-
-def test_bare_order_says_that_nothing_confirms_it_and_names_gaps():
-    names = [f"{k}.png" for k in (1, 2, 4, 5)]
-    found = pair(names, [None] * 4, [""] * 4, ["line 1", "line 2", "line 3", "line 4"])
-    assert "No names confirm it" in found.sentence and "number 3 missing" in found.warnings[0]
-    assert found.pairs == ((0, 0), (1, 1), (2, 2), (3, 3))
 
 
 @pytest.mark.parametrize(
@@ -203,19 +181,6 @@ def test_a_list_of_pairs_decides_and_is_checked(tmp_path):
             read_image_folder(images, tmp_path / "cal.json")
 
 
-def test_a_listing_that_skips_poses_says_so(tmp_path):
-    make_images(tmp_path / "i", ["0.png", "1.png", "2.png"])
-    (tmp_path / "p").mkdir()
-    for k in range(4):
-        write_rows(tmp_path / "p" / f"{k}.txt", rows(1, k))
-    pairs = [{"pose": f"p/{k}.txt", "image": f"i/{k}.png"} for k in range(3)]
-    (tmp_path / "cal.json").write_text(json.dumps(pairs))
-    found = read_image_folder(tmp_path / "i", tmp_path / "p")
-    assert len(found) == 3 and any(
-        "Not on the list and not read: 3.txt" in n for n in found.poses.notes
-    )
-
-
 def test_files_that_differ_or_hold_several_poses_are_named(tmp_path):
     for k in range(3):
         write_rows(tmp_path / f"{k}.txt", rows(1, k))
@@ -259,43 +224,25 @@ def test_board_poses_of_other_count_are_refused(tmp_path):
 # --- images -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("ending", ["png", "bmp", "tif", "ppm"])
-def test_lossless_images_come_back_exactly(tmp_path, ending):
+def test_lossless_images_come_back_exactly(tmp_path):
     colour, grey = pixels(1), pixels(2)[..., 0]
-    assert np.array_equal(load_image(save(tmp_path / f"c.{ending}", colour)), colour)
-    loaded = load_image(save(tmp_path / f"g.{ending}", grey))
+    for ending in ("png", "tif"):
+        assert np.array_equal(load_image(save(tmp_path / f"c.{ending}", colour)), colour)
+    loaded = load_image(save(tmp_path / "g.png", grey))
     assert all(np.array_equal(loaded[..., c], grey) for c in range(3))
     opaque = np.dstack([colour, np.full(grey.shape, 255, np.uint8)])
     assert np.array_equal(load_image(save(tmp_path / "o.png", opaque)), colour)
 
 
-def test_jpeg_pixels_are_those_of_opencv(tmp_path):
-    import cv2
-
-    smooth = cv2.GaussianBlur(pixels(3, (120, 160)), (0, 0), 5)
-    path = save(tmp_path / "a.jpg", smooth)
-    theirs = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB).astype(int)
-    assert np.abs(load_image(path).astype(int) - theirs).max() <= 2
-
-
-@pytest.mark.parametrize("ending", ["jpg", "png", "bmp", "tif"])
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.9])
+@pytest.mark.parametrize(
+    ("ending", "share"), [("jpg", 0.9), ("png", 0.5), ("bmp", 0.02), ("tif", 0.9), ("jpg", 0.0)]
+)
 def test_truncated_images_are_refused(tmp_path, ending, share):
     path = save(tmp_path / f"a.{ending}", pixels(4, (200, 300)))
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
     with pytest.raises(InputError, match=r"a\.\w+ (is empty|is damaged|is not an image)"):
         load_image(path)
-
-
-def test_files_that_were_copied_in_part_are_refused(tmp_path):
-    for ending in ("jpg", "png"):
-        path = save(tmp_path / f"a.{ending}", pixels(5, (200, 300)))
-        data = path.read_bytes()
-        half = len(data) // 2
-        path.write_bytes(data[:half] + bytes(len(data) - half))
-        with pytest.raises(InputError, match=r"truncated|damaged"):
-            load_image(path)
 
 
 def test_images_that_are_no_plain_colour_are_refused(tmp_path):
@@ -327,7 +274,7 @@ def test_colour_of_16_bit_is_not_cut_down_in_silence(tmp_path):
         load_image(path)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     place=st.floats(0, 1), byte=st.integers(0, 255), ending=st.sampled_from(["png", "jpg", "tif"])
 )
@@ -346,49 +293,3 @@ def test_no_damage_whatever_ends_in_a_traceback(place, byte, ending):
 
 
 # --- real data --------------------------------------------------------------------------------
-
-
-@real
-def test_rtde_pairs_with_joints_and_depth():
-    place = HANDEYE / "rtde_ur5e" / "Hand-Eye-Data"
-    found = read_image_folder(place, place, reading=reading_from_text("rotvec,m"))
-    assert len(found) == len(list(place.glob("*.jpg"))) and not found.unpaired_images
-    assert found.labels[9:11] == ("9.jpg", "10.jpg") and found.joints.shape == (len(found), 6)
-    for label, depth, T in zip(found.labels, found.depths, found.Ts_base_ee(), strict=True):
-        pose = json.loads((place / label).with_suffix(".json").read_text())["pose_flange"]
-        assert np.allclose(T[:3, 3], pose[:3], atol=1e-15)
-        assert np.allclose(T[:3, :3], se3.exp_so3(pose[3:]), atol=1e-12)
-        assert depth.name == label.replace(".jpg", ".png")
-    assert load_image(found.images[0]).shape == (1080, 1920, 3)
-    with pytest.raises(InputError, match="more than 8 bits"):
-        load_image(found.depths[0])
-
-
-@real
-def test_rosi_pairs_by_its_list():
-    place = HANDEYE / "rosi_circles"
-    found = read_image_folder(place / "images", place / "poses")
-    assert len(found) == 15 and str(found.poses.stated) == "quat_xyzw,m"
-    assert [Path(w).stem for w in found.poses.where] == [Path(n).stem for n in found.labels]
-    assert found.labels[10] == "10.png" and not found.warnings
-
-
-@real
-def test_muligheder_line_i_belongs_to_image_i():
-    place = HANDEYE / "muligheder_ur5e"
-    found = read_image_folder(place / "images", place / "40_poses_test.txt")
-    assert len(found) == 40 and "by number" in found.pairing
-    for label, where in zip(found.labels, found.poses.where, strict=True):
-        assert label == f"0-{where.removeprefix('line ')}.jpg"
-    assert reading_from_text("rotvec,m") in found.poses.possible
-    assert not found.duplicate_images and not found.duplicate_poses
-
-
-@real
-def test_muligheder_without_one_image_is_refused(tmp_path):
-    place = HANDEYE / "muligheder_ur5e"
-    for k in range(1, 41):
-        if k != 17:
-            (tmp_path / f"0-{k}.jpg").symlink_to(place / "images" / f"0-{k}.jpg")
-    with pytest.raises(InputError, match=r"39 images and 40 poses.*number 17 missing"):
-        read_image_folder(tmp_path, place / "40_poses_test.txt")

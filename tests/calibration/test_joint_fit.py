@@ -1,12 +1,10 @@
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
 
 from realsim.geometry import camera, se3
 from realsim.geometry.dh import UR5E_ARM
-from realsim.interop import T_from_pose3, pose3_from_T
 from realsim.records import ArmErrorMap, CameraIntrinsics, RobotErrorMap
 from realsim_calibration.fit.joint_solve import (
     FLAT,
@@ -178,115 +176,6 @@ def test_the_linear_model_has_the_marginals_and_the_optimum_of_all_unknowns(simu
         assert np.allclose(fit.step[29:], state.weights, atol=0.02)
 
 
-class Graph:
-    """The joint fit as a factor graph of the points themselves: nothing here is compressed.
-
-    Residuals come from the camera model and the transforms of the library, derivatives from central
-    differences, priors and the robot's error from GTSAM's own factors.
-    """
-
-    def __init__(self, problem, sigma):
-        self.problem, self.setup, self.sigma = problem, problem.setup, sigma
-        self.x, self.z, self.k, self.b = (gtsam.symbol(c, 0) for c in "xzkb")
-        self.held = np.flatnonzero(~problem.free)
-        self.graph, self.values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-
-    def residual(self, n, T, shared):
-        """Return predicted minus measured (2 points,) [sigma] of a view at a state."""
-        setup, v = self.setup, self.setup.views[n]
-        X, Z, D = T
-        lens = CameraIntrinsics(width=1280, height=720, fx=shared[0], fy=shared[1], cx=shared[2],
-                                cy=shared[3], distortion=shared[4:12])  # fmt: skip
-        scale, aspect, *warp = shared[12:]
-        x, y = v.xy.T
-        lift = np.stack([x * x, x * y, y * y], -1) @ warp / setup.half_extent
-        board = setup.middle + scale * np.stack([x, (1 + aspect) * y, lift], -1)
-        seen = camera.project(lens, se3.transform(se3.invert(v.T_base_ee @ D @ X) @ Z, board))
-        return (seen - v.uv).ravel() / self.sigma
-
-    def view_factor(self, n):
-        def error(this, values, H):
-            keys = this.keys()
-            T = [T_from_pose3(values.atPose3(keys[k])) for k in (0, 1, 4)]
-            shared = np.concatenate([values.atVector(keys[2]), values.atVector(keys[3])])
-            if H is not None:
-                J = np.stack([self.slope(n, T, shared, c) for c in range(35)], -1)
-                J[:, 12 + self.held] = 0.0
-                parts = (slice(0, 6), slice(6, 12), slice(12, 24), slice(24, 29), slice(29, 35))
-                for k, part in enumerate(parts):
-                    H[k] = np.asfortranarray(J[:, part])
-            return self.residual(n, T, shared)
-
-        return error
-
-    def slope(self, n, T, shared, column):
-        """Return the derivative of a view's residuals by one of X | Z | lens, board | D."""
-        step = 1e-3 if 12 <= column < 16 else 1e-6
-        ends = []
-        for h in (step, -step):
-            moved, terms = list(T), shared.copy()
-            if 12 <= column < 29:
-                terms[column - 12] += h
-            else:
-                which = column // 6 if column < 12 else 2
-                moved[which] = T[which] @ se3.exp(
-                    h * np.eye(6)[column % 6 if column < 12 else column - 29]
-                )
-            ends.append(self.residual(n, moved, terms))
-        return (ends[0] - ends[1]) / (2 * step)
-
-    def solve(self, start, state):
-        """Return the optimum from a start; the robot's noise is that of the state's distance."""
-        noise = gtsam.noiseModel
-        self.values.insert(self.x, pose3_from_T(start.X))
-        self.values.insert(self.z, pose3_from_T(start.Z))
-        self.values.insert(self.k, start.camera)
-        self.values.insert(self.b, start.board)
-        center, covariance = self.problem.prior()
-        for key, part in ((self.k, slice(0, 12)), (self.b, slice(12, 17))):
-            model = noise.Gaussian.Covariance(covariance[part, part])
-            self.graph.add(gtsam.PriorFactorVector(key, center[part], model))
-        robot = np.repeat(RATIO, 3) * self.sigma * self.problem.unit_robot_sd(state)
-        for n, view in enumerate(self.setup.views):
-            d = gtsam.symbol("d", n)
-            self.values.insert(d, gtsam.Pose3())
-            self.graph.add(gtsam.PriorFactorPose3(d, gtsam.Pose3(), noise.Diagonal.Sigmas(robot)))
-            keys, unit = [self.x, self.z, self.k, self.b, d], noise.Unit.Create(2 * len(view.uv))
-            self.graph.add(gtsam.CustomFactor(unit, keys, self.view_factor(n)))
-        parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setRelativeErrorTol(1e-13)
-        parameters.setAbsoluteErrorTol(1e-10)
-        return gtsam.LevenbergMarquardtOptimizer(self.graph, self.values, parameters).optimize()
-
-
-def test_optimum_and_marginals_are_those_of_a_factor_graph_of_the_points(simulate):
-    sim = simulate(5, views=8)
-    problem, state, _ = fitted(sim)
-    graph = Graph(problem, 0.3)
-    start = problem.start(sim.T_ee_cam, sim.T_base_board)
-    best = graph.solve(replace(start, camera=camera_vector(sim.intrinsics)), state)
-    for key, ours in ((graph.x, state.X), (graph.z, state.Z)):
-        off = se3.log(se3.invert(T_from_pose3(best.atPose3(key))) @ ours)
-        assert np.abs(off).max() < 1e-6
-    theirs = gtsam.Marginals(graph.graph, best).marginalCovariance(graph.x)
-    fit = LinearModel(problem, state, problem.ones()).fit(None, RATIO, 0.3, rounds=0)
-    ours = np.linalg.inv(fit.information)[:6, :6]
-    scale = np.sqrt(np.outer(np.diag(theirs), np.diag(theirs)))
-    assert np.abs((ours - theirs) / scale).max() < 1e-4
-
-
-def test_leaving_a_view_out_by_woodbury_is_a_solve_without_it(simulate):
-    problem, state, _ = fitted(simulate(6, views=9))
-    model = LinearModel(problem, state, problem.ones())
-    fit = model.fit(None, RATIO, 0.3, rounds=0)
-    for n in (0, 4):
-        U = fit.view_rows[n]
-        robot = model._robot_rows(None, RATIO)[n] / 0.3
-        r = np.concatenate([robot[:, -1], model.rest[n, :, -1] / 0.3])
-        alone = np.linalg.solve(fit.information - U.T @ U, fit.information @ fit.step + U.T @ r)
-        assert np.allclose(alone, fit.step + fit.away[n], rtol=1e-6, atol=1e-9)
-
-
 def test_the_likelihood_finds_the_robots_share(simulate):
     from realsim_calibration.fit.noise_scale import estimate_ratio
 
@@ -315,18 +204,6 @@ def test_a_warped_print_shows_as_correlated_corners(simulate):
         views.append(replace(v, detection=replace(v.detection, uv=bent)))
     bent_white = whiteness(problem_of(sim, views), state, NoiseConfig())
     assert bent_white.excess > 1 and largest_ratio(bent_white, NoiseConfig()) == 0.3
-
-
-def test_a_map_moves_with_the_base_frame():
-    rng = np.random.default_rng(0)
-    Ts, G = se3.random_transform(rng, 20, 0.3), se3.random_transform(rng)
-    for kind in ("ee", "base"):
-        a, b = (map_basis(T, kind, 1.0, 1e-3) for T in (Ts, G @ Ts))
-        # The two priors allow the same errors: B B^T is the same (tool axes) between any two views.
-        assert np.allclose(
-            np.einsum("nrc,msc->nmrs", a.columns, a.columns),
-            np.einsum("nrc,msc->nmrs", b.columns, b.columns), atol=1e-12,
-        )  # fmt: skip
 
 
 def test_records_of_maps_give_the_basis_errors():

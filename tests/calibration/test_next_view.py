@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -32,8 +31,6 @@ from realsim_calibration.planning.view_proposals import (
     ViewLimits,
     describe_move,
     propose_views,
-    roll_range_deg,
-    second_turn_deg,
 )
 from realsim_calibration.results import HandEyeReport
 
@@ -57,20 +54,18 @@ def test_the_prediction_is_what_the_added_view_really_brings(few: HandEyeReport)
 
 
 @pytest.fixture(scope="module")
-def reports(few: HandEyeReport, calibrated_arm: Any) -> dict[str, HandEyeReport]:
+def reports(few: HandEyeReport) -> dict[str, HandEyeReport]:
     """Return calibrations that know X as well as their information, worse and better."""
     rng = np.random.default_rng(3)
     shake = rng.normal(size=(6, 6)) * np.sqrt(np.diag(few.X_covariance))[:, None]
     return {
         "as informed": few,
         "worse": replace(few, X_covariance=3 * few.X_covariance + 0.3 * shake @ shake.T),
-        "better": replace(few, X_covariance=0.4 * few.X_covariance),
         "both": replace(few, X_covariance=0.6 * few.X_covariance + 0.3 * shake @ shake.T),
-        "arm with joints": calibrated_arm(12, with_joints=True),
     }
 
 
-CASES = ["as informed", "worse", "better", "both", "arm with joints"]
+CASES = ["as informed", "worse", "both"]
 
 
 def plan_of(report: HandEyeReport, rng: np.random.Generator, n: int) -> Array:
@@ -122,14 +117,6 @@ def test_ranking_does_not_depend_on_the_base_frame(few: HandEyeReport) -> None:
         np.testing.assert_allclose([v.rms_mm for v in a], [v.rms_mm for v in b], rtol=1e-8)
 
 
-def test_ranking_does_not_depend_on_the_order_of_captured_views(few: HandEyeReport) -> None:
-    hands = np.stack([v.T_base_ee for v in few.views])
-    plan = random_hands(np.random.default_rng(5), 15)
-    a, b = rank_next_views(few, plan), rank_next_views(report_of(hands[[3, 1, 4, 0, 2]]), plan)
-    assert [v.plan_index for v in a] == [v.plan_index for v in b]
-    np.testing.assert_allclose([v.rms_mm for v in a], [v.rms_mm for v in b], rtol=1e-8)
-
-
 # ---- known answers
 
 
@@ -170,30 +157,6 @@ def test_bad_input_is_refused(few: HandEyeReport) -> None:
     blind = replace(few, information=np.zeros((29, 29)))
     with pytest.raises(DegenerateError, match="no information about X"):
         rank_next_views(blind, np.eye(4)[None])
-
-
-def test_board_geometry_gives_what_was_asked() -> None:
-    base = board_geometry(board_at(0, 0, 0), BOARD)
-    for tilt, azimuth, roll in ((30, 0, 0), (40, 100, 60), (20, -120, -170)):
-        g = board_geometry(board_at(tilt, azimuth, roll, 0.37), BOARD)
-        assert g.distance_m == pytest.approx(0.37)
-        assert g.tilt_deg == pytest.approx(tilt)
-        assert (g.azimuth_deg - azimuth + 180) % 360 - 180 == pytest.approx(0, abs=1e-6)
-    turned = board_geometry(board_at(0, 0, 50), BOARD)
-    assert abs((turned.roll_deg - base.roll_deg + 180) % 360 - 180) == pytest.approx(50)
-
-
-def test_roll_range_is_the_shortest_arc() -> None:
-    assert roll_range_deg([170, -170, 175]) == pytest.approx(20)
-    assert roll_range_deg([0, 90, 180, 270]) == pytest.approx(270)
-    assert roll_range_deg([12.0]) == 0.0
-
-
-def test_second_turn_sees_a_single_axis() -> None:
-    one = np.stack([se3.from_rt(se3.exp_so3([0, 0, a]), [a, 0, 0]) for a in (0.0, 0.4, 1.0)])
-    assert second_turn_deg(one) < 1e-6
-    two = np.concatenate([one, se3.from_rt(se3.exp_so3([0.6, 0, 0]), [0, 0, 0])[None]])
-    assert second_turn_deg(two) > 10
 
 
 # ---- statistics

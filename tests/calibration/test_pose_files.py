@@ -14,11 +14,9 @@ from hypothesis import strategies as st
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_calibration.faults.gates import rotation_mismatch_deg
 from realsim_calibration.inputs import (
     ROTATIONS,
     PoseReading,
-    read_board_poses,
     read_pose_file,
     reading_from_text,
 )
@@ -113,13 +111,10 @@ def save_json(stem, row):
 LAYOUTS = {
     "spaces": lambda d, r, n: write_lines(d / "a.txt", r, " ", head="# exported"),
     "commas": lambda d, r, n: write_lines(d / "a.csv", r, ","),
-    "comma and space": lambda d, r, n: write_lines(d / "a.csv", r, ", "),
     "named lines": lambda d, r, n: write_lines(d / "a.csv", r, ",", n),
-    "named lines, spaces": lambda d, r, n: write_lines(d / "a.txt", r, "  ", n),
     "decimal commas": lambda d, r, n: write_lines(d / "a.csv", r, ";", comma=True),
     "tabs": lambda d, r, n: write_lines(d / "a.tsv", r, "\t", n),
     "UR": lambda d, r, n: write_lines(d / "a.log", r, ", ", head="") and brackets(d / "a.log"),
-    "json lists": lambda d, r, n: as_json(d / "a.json", r.tolist()),
     "json nested": lambda d, r, n: as_json(d / "a.json", {"poses": square(r), "images": n}),
     "json by image": lambda d, r, n: as_json(d / "a.json", dict(zip(n, square(r), strict=True))),
     "json entries": lambda d, r, n: as_json(
@@ -128,15 +123,11 @@ LAYOUTS = {
     ),
     "yaml": lambda d, r, n: as_json(d / "a.yaml", r.tolist()),
     "opencv": lambda d, r, n: write_opencv(d / "a.yml", r),
-    "opencv json": lambda d, r, n: write_opencv(d / "a.json", r),
     "npy": lambda d, r, n: np.save(d / "a.npy", r) or d / "a.npy",
     "npz": lambda d, r, n: write_npz(d / "a.npz", r, n),
     "json files": lambda d, r, n: write_files(d / "p", r, save_json),
     "txt files": lambda d, r, n: write_files(
         d / "p", r, lambda p, row: np.savetxt(p.with_suffix(".txt"), row[None], fmt="%.17g")
-    ),
-    "column files": lambda d, r, n: write_files(
-        d / "p", r, lambda p, row: np.savetxt(p.with_suffix(".txt"), row, fmt="%.17g")
     ),
     "npy files": lambda d, r, n: write_files(
         d / "p", r, lambda p, row: np.save(p.with_suffix(".npy"), row)
@@ -163,7 +154,7 @@ def same_matrix(p, reading):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(3, 14),
@@ -177,33 +168,28 @@ def test_every_reading_survives_every_layout(layout, seed, n, reading, wide):
     with folder() as place:
         found = read_pose_file(LAYOUTS[layout](place, raw, names))
     check(found, reading, T)
-    if layout in ("named lines", "named lines, spaces", "tabs", "npz", "json by image"):
+    if layout in ("named lines", "tabs", "npz", "json by image"):
         assert list(found.labels) == names
     if layout == "json files":
         assert np.allclose(found.joints, np.linspace(-1, 1, 6), atol=1e-15)
         assert found.stems[-1] == f"pose_{n - 1}"
 
 
-@pytest.mark.parametrize("length", ["m", "mm"])
 @pytest.mark.parametrize(
     ("header", "text"),
     [
         ("x,y,z,qx,qy,qz,qw", "quat_xyzw"),
-        ("tx ty tz q_w q_x q_y q_z", "quat_wxyz"),
         ("qw;qx;qy;qz;pos_x;pos_y;pos_z", "quat_wxyz,rotation_first"),
         ("x,y,z,rx,ry,rz", "rotvec"),
         ("x,y,z,rx,ry,rz", "euler_zyz,rad"),
-        ("x,y,z,roll,pitch,yaw", "euler_xyz,deg"),
         ("yaw,pitch,roll,x,y,z", "euler_ZYX,deg,rotation_first"),
-        ("X,Y,Z,A,B,C", "euler_ZYX,deg"),
         ("X,Y,Z,W,P,R", "euler_xyz,deg"),
-        ("x,y,z,rotvec_x,rotvec_y,rotvec_z", "rotvec"),
         ("actual_TCP_pose_0 " + " ".join(f"actual_TCP_pose_{k}" for k in range(1, 6)), "rotvec"),
         ("x,y,z," + ",".join(f"r{r}{c}" for r in range(3) for c in range(3)), "matrix"),
     ],
 )
-def test_header_names_say_what_columns_are(header, text, length):
-    reading = reading_from_text(f"{text},{length}")
+def test_header_names_say_what_columns_are(header, text):
+    reading = reading_from_text(f"{text},mm")
     T = random_poses(5, 9)
     raw = reading.numbers(T, width=12 if text == "matrix" else None)
     separator = next(s for s in ";, " if s in header)
@@ -254,15 +240,6 @@ def test_time_and_index_columns_are_told_from_the_pose():
     assert counted.stems == tuple("345678")
 
 
-def test_words_before_the_numbers_are_names_only_if_they_differ():
-    raw = reading_from_text("rotvec,m").numbers(random_poses(11, 4))
-    with folder() as place:
-        same = read_pose_file(write_lines(place / "a.txt", raw, " ", ["pose:"] * 4))
-        numbered = read_pose_file(write_lines(place / "b.txt", raw, " ", ["0:", "1:", "2:", "3:"]))
-    assert same.labels == numbered.labels == (None,) * 4
-    assert same.stems == ("",) * 4 and numbered.stems == tuple("0123")
-
-
 def test_text_of_spreadsheets_and_windows():
     raw = reading_from_text("rotvec,m").numbers(random_poses(12, 4))
     text = "\r\n".join(" ".join(map(number, r)) for r in raw)
@@ -272,20 +249,6 @@ def test_text_of_spreadsheets_and_windows():
         ):
             (place / f"{k}.txt").write_bytes(data)
             assert np.array_equal(read_pose_file(place / f"{k}.txt").values, raw)
-
-
-def test_the_order_of_keys_means_nothing():
-    T = random_poses(13, 6)
-    keys = ["x", "y", "z", "qx", "qy", "qz", "qw"]
-    q = reading_from_text("quat_xyzw,m")
-    rng = np.random.default_rng(0)
-    tree = []
-    for row in q.numbers(T).tolist():
-        entry = dict(zip(keys, row, strict=True))
-        tree.append({k: entry[k] for k in rng.permutation(keys)})
-    with folder() as place:
-        found = read_pose_file(as_json(place / "a.json", tree))
-    assert found.stated is not None and np.abs(found.poses(found.stated) - T).max() < 1e-12
 
 
 def test_ros_poses_and_parts():
@@ -369,34 +332,6 @@ def test_numbers_leave_open_what_they_do_not_say():
 
 
 @real
-def test_rtde_folder_of_one_json_a_pose():
-    raw = read_pose_file(HANDEYE / "rtde_ur5e" / "Hand-Eye-Data")
-    assert len(raw) == len(list((HANDEYE / "rtde_ur5e" / "Hand-Eye-Data").glob("*.json")))
-    assert raw.stems[9:11] == ("9", "10") and raw.stated is None
-    assert any("pose_flange" in n for n in raw.notes)
-    first = json.loads((HANDEYE / "rtde_ur5e" / "Hand-Eye-Data" / "10.json").read_text())
-    assert np.array_equal(raw.joints[10], first["joints"])
-    assert str(raw.possible[0]) == "rotvec,rad,m"
-    assert np.array_equal(raw.poses(raw.possible[0])[10, :3, 3], first["pose_flange"][:3])
-
-
-@real
-def test_rosi_poses_are_stated_and_listed():
-    for place in ("poses", "cal_data.yaml", ""):
-        raw = read_pose_file(HANDEYE / "rosi_circles" / place)
-        assert len(raw) == 15 and str(raw.stated) == "quat_xyzw,m"
-        assert raw.labels[2] == "images/10.png" and raw.where[2] == "poses/10.yaml"
-
-
-@real
-def test_muligheder_lines():
-    raw = read_pose_file(HANDEYE / "muligheder_ur5e" / "40_poses_test.txt")
-    assert len(raw) == 40 and raw.stated is None and raw.where[39] == "line 40"
-    assert reading_from_text("rotvec,m") in raw.possible
-    assert {p.angle_unit for p in raw.possible} == {"rad"}
-
-
-@real
 def test_koch_files_agree_with_each_other_in_every_format():
     koch = HANDEYE / "koch_ur5"
     matrices = read_pose_file(koch / "robot_poses.yaml")
@@ -411,16 +346,3 @@ def test_koch_files_agree_with_each_other_in_every_format():
     assert [str(p) for p in near] == ["rotvec,rad,mm"]
     with pytest.raises(InputError, match="3 lists of poses"):
         read_pose_file(koch / "meta.json")
-
-
-@real
-def test_koch_board_poses_fit_the_robot_in_one_direction_only():
-    koch = HANDEYE / "koch_ur5"
-    both = read_board_poses(koch / "robot_poses.yaml", koch / "cam_poses.yaml")
-    assert len(both.robot) == len(both.board) == 20
-    mismatch = {
-        (a.inverted, b.inverted): rotation_mismatch_deg(both.robot.poses(a), both.board.poses(b))
-        for a in both.robot.possible
-        for b in both.board.possible
-    }
-    assert mismatch[False, False] < 1 < 20 < mismatch[True, False]

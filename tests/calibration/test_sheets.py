@@ -7,11 +7,8 @@ import cv2
 import numpy as np
 import pytest
 from cv2 import aruco
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from realsim.errors import InputError
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim_calibration.sheets import (
     PAPERS_MM,
@@ -21,24 +18,19 @@ from realsim_calibration.sheets import (
     target_image,
     write_sheet,
 )
-from realsim_calibration.sheets.artwork import outlines
 from realsim_calibration.targets.target_file import read_target, target_to_json
 from realsim_calibration.targets.target_text import parse_target
 
 pdfium = pytest.importorskip("pypdfium2", reason="rasterising a PDF needs pypdfium2")
 
-DPI = 200
+DPI = 150
 WITHIN_MM = 0.05
 SHEETS = {
-    "charuco:5x7,square=33mm,marker=20mm,dict=6X6_100": "A4",
     "charuco:6x8,square=28mm,marker=21mm,dict=tag36h11": "A4",
     "charuco:6x8,square=25.4mm,marker=0.75in,dict=4X4_50,legacy": "letter",
-    "chessboard:8x6,square=25mm": "A4",
     "chessboard:9x6,square=21.9mm": "letter",
     "circles:10x10,pitch=15mm,large-origin": "A4",
-    "circles:7x9,pitch=21mm": "A4",
     "circles:4x11,pitch=20mm,asymmetric": "A4",
-    "aprilgrid:6x4,tag=25mm,gap=8mm": "A4",
     "aprilgrid:3x5,tag=30mm,gap=12mm,family=tag25h9,first=4,from-bottom": "A4",
     "aprilgrid:4x5,tag=32mm,gap=9.6mm,from-bottom,corner-squares": "A4",
     "tag:7,size=80mm": "A4",
@@ -150,28 +142,6 @@ def test_every_point_is_printed_at_its_place(line: str, printed) -> None:
     assert error.max() < WITHIN_MM
 
 
-def test_the_first_corner_of_an_unambiguous_chessboard_is_next_to_black(printed) -> None:
-    target, report, raster = printed("chessboard:9x6,square=21.9mm")
-    assert not target.half_turn
-    # OpenCV's older detector starts next to a black field (the SB one next to a white one).
-    ok, corners = cv2.findChessboardCorners(raster.gray, (target.columns, target.rows))
-    assert ok
-    expected = np.array(report.origin_mm) + 1000 * target.points_board[:, :2]
-    error = raster.to_mm(np.reshape(corners, (-1, 2))) - expected
-    assert np.abs(error).max() < 1.0
-
-
-@pytest.mark.parametrize("line", SHEETS)
-def test_our_own_detection_finds_every_point_under_its_number(line: str, printed) -> None:
-    from realsim_calibration.detect.find import find_target
-
-    target, report, raster = printed(line)
-    detection = find_target(raster.gray, target)
-    assert len(detection) == len(target.points_board)
-    expected = np.array(report.origin_mm) + 1000 * detection.points(target)[:, :2]
-    assert np.linalg.norm(raster.to_mm(detection.uv) - expected, axis=-1).max() < WITHIN_MM
-
-
 @pytest.mark.parametrize("line", SHEETS)
 def test_rulers_and_page_have_their_length(line: str, printed) -> None:
     _, report, raster = printed(line)
@@ -262,31 +232,6 @@ def test_charuco_pictures_are_opencvs_own(line: str) -> None:
     assert np.array_equal(picture, reference)
 
 
-@given(
-    cells=st.integers(1, 6).flatmap(
-        lambda w: st.lists(st.lists(st.booleans(), min_size=w, max_size=w), min_size=1, max_size=6)
-    )
-)
-@settings(max_examples=150, deadline=None)
-def test_outlines_enclose_exactly_the_black_cells(cells: list[list[bool]]) -> None:
-    from matplotlib.path import Path as Outline
-
-    black = np.array(cells)
-    some = artwork_of(Chessboard(rows=3, columns=3, square_m=0.01))
-    artwork = replace(
-        some,
-        x_m=np.cumsum(np.arange(black.shape[1] + 1.0)),
-        y_m=np.cumsum(np.arange(black.shape[0] + 1.0)),
-        black=black,
-    )
-    x, y = ((v[1:] + v[:-1]) / 2 for v in (artwork.x_m, artwork.y_m))
-    centres = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-    inside = np.zeros(len(centres), dtype=int)
-    for loop in outlines(artwork):
-        inside += Outline(np.vstack([loop, loop[:1]])).contains_points(centres)
-    assert np.array_equal(inside % 2 == 1, black.ravel())
-
-
 @pytest.mark.parametrize("line", [
     *(line for line in SHEETS if "asymmetric" not in line),
     "chessboard:7x5,square=20mm", "chessboard:8x5,square=20mm", "circles:4x5,pitch=20mm",
@@ -322,10 +267,3 @@ def test_a_dot_has_its_centre_and_its_area() -> None:
         assert mean == pytest.approx(centre, abs=2e-3)
         width = first if k == 0 else usual
         assert own.sum() == pytest.approx(np.pi / 4 * (width * per_m) ** 2, rel=1e-3)
-
-
-@pytest.mark.parametrize(("per_m", "margin"), [(0.0, 0.0), (-1.0, 0.1), (1000.0, -0.1),
-                                               (np.nan, 0.0), (1e7, 0.0)])  # fmt: skip
-def test_a_picture_needs_a_sensible_resolution(per_m: float, margin: float) -> None:
-    with pytest.raises(InputError, match="pixels"):
-        target_image(parse_target("chessboard:8x6,square=25mm"), per_m, margin)

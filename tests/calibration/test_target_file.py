@@ -9,11 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from realsim.errors import InputError, UnitError
+from realsim.errors import InputError
 from realsim.records import CharucoBoard, Chessboard, CircleGrid, TagBoard, Target
 from realsim.untrusted.own_json import to_json
 from realsim_calibration.targets.marker_sets import (
-    dictionary_name,
     dictionary_names,
     dictionary_size,
 )
@@ -26,7 +25,6 @@ from realsim_calibration.targets.target_file import (
 from realsim_calibration.targets.target_text import (
     FORMS,
     describe,
-    format_length,
     format_target,
     parse_length,
     parse_target,
@@ -82,15 +80,8 @@ def targets(draw: st.DrawFn) -> Target:
     )
 
 
-def as_mm(values: dict[str, Any]) -> dict[str, Any]:
-    """The same file with its lengths in mm, written as decimal numbers."""
-    text = {k: format_length(v)[:-2] for k, v in values.items() if k.endswith("_m")}
-    changed = {f"{k}m": float(v) for k, v in text.items()}
-    return {k: v for k, v in values.items() if not k.endswith("_m")} | changed
-
-
 @given(target=targets())
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_every_target_comes_back_from_json_and_from_its_line(target: Target) -> None:
     through_file = target_from_json(json.loads(json.dumps(target_to_json(target))))
     assert fields_of(through_file) == fields_of(target)
@@ -98,18 +89,6 @@ def test_every_target_comes_back_from_json_and_from_its_line(target: Target) -> 
     assert fields_of(parse_target(line)) == fields_of(target)
     assert format_target(parse_target(line)) == line
     assert "\n" not in describe(target) and "\n" not in line
-
-
-@given(target=targets())
-@settings(max_examples=60, deadline=None)
-def test_yaml_and_json_files_mean_the_same(target: Target, tmp_path_factory: Any) -> None:
-    folder = tmp_path_factory.mktemp("t")
-    values = target_to_json(target)
-    (folder / "a.json").write_text(json.dumps(values))
-    lines = [f"{k}: {json.dumps(v)}" for k, v in values.items()]
-    (folder / "a.yaml").write_text("# a target\n" + "\n".join(lines) + "\n")
-    for name in ("a.json", "a.yaml"):
-        assert fields_of(read_target(folder / name)) == fields_of(target)
 
 
 @given(tenths=st.integers(5, 9999))
@@ -122,19 +101,6 @@ def test_millimetres_are_scaled_as_decimal_numbers(tenths: int) -> None:
     assert isinstance(board, Chessboard) and board.square_m == metres
 
 
-@given(value=st.floats(1e-4, 10.0))
-def test_lengths_come_back_from_text(value: float) -> None:
-    assert parse_length(format_length(value), "x") == value
-
-
-@given(target=targets())
-@settings(max_examples=50, deadline=None)
-def test_lengths_may_be_given_in_millimetres(target: Target) -> None:
-    back = fields_of(target_from_json(as_mm(target_to_json(target))))
-    for name, value in fields_of(target).items():
-        assert back[name] == (pytest.approx(value, rel=1e-12) if name.endswith("_m") else value)
-
-
 def test_the_documented_lines() -> None:
     charuco = parse_target("charuco:5x7,square=33mm,marker=20mm,dict=6X6_100")
     assert fields_of(charuco) == fields_of(
@@ -144,14 +110,8 @@ def test_the_documented_lines() -> None:
     assert fields_of(parse_target("chessboard:8x6,square=21.9mm")) == fields_of(
         Chessboard(rows=6, columns=8, square_m=0.0219)
     )
-    assert fields_of(parse_target("circles:10x10,pitch=25.4mm,large-origin")) == fields_of(
-        CircleGrid(rows=10, columns=10, pitch_m=0.0254, large_origin=True)
-    )
     assert fields_of(parse_target("circles:10x10,pitch=1in,large-origin")) == fields_of(
         CircleGrid(rows=10, columns=10, pitch_m=0.0254, large_origin=True)
-    )
-    assert fields_of(parse_target("circles:4x11,pitch=20mm,asymmetric")) == fields_of(
-        CircleGrid(rows=11, columns=4, pitch_m=0.02, asymmetric=True)
     )
     assert fields_of(
         parse_target("aprilgrid:6x4,tag=40mm,gap=10mm,family=25h9,first=3,from-bottom")
@@ -176,26 +136,13 @@ def test_every_form_accepts_its_own_usage_line() -> None:
     ("line", "names"),
     [
         ("", ["no kind of target", "charuco:", "chessboard:", "circles:", "aprilgrid:", "tag:"]),
-        ("checkers:8x6,square=2mm", ["'checkers'", "chessboard:"]),
         ("chessboard:8,square=2mm", ["'8'", "INNER CORNERS"]),
-        ("chessboard:8x6", ["lacks square="]),
         ("chessboard:8x6,square=21.9", ["'square=21.9'", "no unit", "mm", "square=21.9mm"]),
         ("chessboard:8x6,square=21.9ft", ["'ft'", "mm, cm, m, in"]),
-        ("chessboard:8x6,square=1e9mm", ["'square=1e9mm'"]),
         ("chessboard:8x6,square=5mm,square=6mm", ["'square'", "twice"]),
-        ("chessboard:8x6,square=5mm,legacy", ["'legacy'", "square="]),
-        ("chessboard:8x2,square=5mm", ["at least 3 rows"]),
-        ("chessboard:8x6,square=5m", ["millimetres"]),
-        ("chessboard:9999x6,square=5mm", ["9999", "500"]),
-        ("charuco:5x7,square=33mm,marker=20mm", ["lacks dict="]),
         ("charuco:5x7,square=33mm,marker=20mm,dict=6X6_99", ["'6X6_99'", "6X6_100"]),
-        ("charuco:5x7,square=20mm,marker=33mm,dict=6X6_100", ["exchanged"]),
         ("charuco:15x17,square=20mm,marker=13mm,dict=6X6_100", ["127", "100"]),
-        ("charuco:5x7,square=20mm,marker=13mm,dict=6X6_100,legacy=1", ["'legacy=1'", "no value"]),
-        ("aprilgrid:6x4,tag=40mm,gap=10mm,family=tag99h9", ["tag99h9", "tag36h11"]),
-        ("aprilgrid:6x4,tag=40mm,gap=10mm,first=x", ["'first=x'", "whole number"]),
         ("aprilgrid:6x4,tag=40mm,gap=10mm,first=570", ["570 to 593", "0 to 586"]),
-        ("tag:587,size=80mm", ["587", "0 to 586"]),
         ("tag:7," + "size=80mm," * 60, ["400 characters"]),
     ],
 )
@@ -211,7 +158,7 @@ kinds = st.sampled_from(sorted(FORMS))
 
 
 @given(line=st.text(max_size=60) | st.builds("{}:{}".format, kinds, nonsense))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=60, deadline=None)
 def test_no_line_gives_anything_but_a_target_or_an_input_error(line: str) -> None:
     try:
         assert parse_target(line).points_board.shape[1] == 3
@@ -231,38 +178,23 @@ def test_a_tag_board_of_the_store_is_read_without_kind() -> None:
     assert fields_of(target_from_json(to_json(board))) == fields_of(board)
 
 
-def test_optional_keys_have_the_record_s_defaults_and_names_are_canonical() -> None:
-    assert fields_of(target_from_json(CHARUCO | {"dictionary": "apriltag_36H11"})) == fields_of(
-        CharucoBoard(rows=7, columns=5, square_m=0.033, marker_m=0.02)
-    )
-    assert dictionary_name("tag36h11") == "DICT_APRILTAG_36h11"
-
-
 @pytest.mark.parametrize(
     ("values", "names"),
     [
         ([1, 2], ["a list", "kind"]),
-        (None, ["nothing"]),
-        ({}, ["kind", "target_type", "nothing"]),
         ({"kind": "chess"}, ["'chess'", "tag_board, charuco, chessboard, circle_grid"]),
         (CHESS | {"square_mm": 25}, ["'square_m'", "'square_mm'", "once"]),
         ({k: v for k, v in CHESS.items() if k != "square_m"}, ["'square_m' or 'square_mm'"]),
-        ({k: v for k, v in CHESS.items() if k != "rows"}, ["lacks 'rows'"]),
         (CHESS | {"sqare_mm": 25, "x": 1}, ["sqare_mm, x", "square_mm"]),
-        (CHESS | {"square_m": -0.1}, ["'square_m'", "-0.1"]),
-        (CHESS | {"square_m": 10**5000}, ["a huge number"]),
         (CHESS | {"square_m": 25}, ["millimetres"]),
-        (CHESS | {"rows": 6.0}, ["'rows'", "6.0", "whole"]),
-        (CHESS | {"rows": 600}, ["600", "500"]),
-        (CHESS | {"rows": [6]}, ["'rows'", "a list"]),
-        (TAGS | {"family": "tag36"}, ["'family'", "'tag36'", "tag36h11"]),
-        (TAGS | {"ids_from": "left"}, ["'ids_from'", "top, bottom"]),
         (TAGS | {"corner_squares": "yes"}, ["'corner_squares'", "true or false"]),
-        (TAGS | {"first_id": 580}, ["580 to 603", "0 to 586"]),
         (CHARUCO | {"dictionary": "5X5"}, ["'5X5'", "5X5_100"]),
-        (CHARUCO | {"marker_mm": 40}, ["exchanged"]),
+        ({"target_type": "aprilgrid", "tagCols": 6, "tagRows": 6, "tagSize": 0.088,
+          "tagSpacing": 0.0264}, ["0.0264", "share of tagSize", "in metres"]),
+        ({"target_type": "checkerboard", "targetCols": 6, "targetRows": 7,
+          "rowSpacingMeters": 0.05, "colSpacingMeters": 0.06}, ["0.05", "0.06", "square"]),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_object_names_the_key_and_what_is_accepted(values: Any, names: list[str]) -> None:
     with pytest.raises(InputError) as caught:
         target_from_json(values)
@@ -300,46 +232,13 @@ def test_kalibr_files(tmp_path: Path) -> None:
     )
 
 
-KALIBR_APRIL = {"target_type": "aprilgrid", "tagCols": 6, "tagRows": 6, "tagSize": 0.088,
-                "tagSpacing": 0.3}  # fmt: skip
-KALIBR_CHESS = {"target_type": "checkerboard", "targetCols": 6, "targetRows": 7,
-                "rowSpacingMeters": 0.06, "colSpacingMeters": 0.06}  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("values", "names"),
-    [
-        (KALIBR_APRIL | {"tagSpacing": 0.0264}, ["0.0264", "share of tagSize", "in metres"]),
-        (KALIBR_APRIL | {"tagSize": 88}, ["millimetres"]),
-        (KALIBR_APRIL | {"tagFamily": "t36h11"}, ["tagFamily", "tagSpacing"]),
-        (KALIBR_APRIL | {"target_type": "aprilboard"}, ["'aprilboard'", "aprilgrid"]),
-        (KALIBR_APRIL | {"target_type": "checkerboard"}, ["lacks targetCols", "unknown tagCols"]),
-        (KALIBR_CHESS | {"rowSpacingMeters": 0.05}, ["0.05", "0.06", "square"]),
-        (KALIBR_CHESS | {"targetCols": 6.5}, ["'targetCols'", "6.5"]),
-        ({"target_type": "circlegrid", "targetCols": 4, "targetRows": 11, "spacingMeters": 0.02},
-         ["lacks asymmetricGrid"]),
-        ({"target_type": "circlegrid", "targetCols": 4, "targetRows": 11, "spacingMeters": 0.02,
-          "asymmetricGrid": "no"}, ["'asymmetricGrid'", "true or false"]),
-    ],
-)  # fmt: skip
-def test_wrong_kalibr_objects(values: Any, names: list[str]) -> None:
-    with pytest.raises(InputError) as caught:
-        target_from_json(values)
-    for name in names:
-        assert name in str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("name", "content", "names"),
     [
         ("a.txt", "kind: chessboard", [".json, .yaml, .yml", "'.txt'"]),
-        ("a.yaml", "", ["nothing"]),
         ("a.json", "{", ["not valid JSON"]),
         ("a.json", b"{" + b" " * LARGEST_BYTES + b"}", ["at most 0.065536 MB"]),
         ("a.yaml", "kind: [chessboard", ["not valid YAML", "line"]),
-        ("a.yaml", "kind: !!python/object/apply:os.system ['true']", ["has the tag"]),
-        ("a.yaml", "kind: chessboard\nrows: 6\ncolumns: 8\nsquare_m: 25 mm\n", ["'25 mm'"]),
-        ("a.yaml", "kind: chessboard\nrows: {a: 1}\n", ["'rows'", "an object"]),
     ],
 )
 def test_wrong_files_are_named(
@@ -366,29 +265,14 @@ def test_yaml_runs_no_code_and_aliases_do_not_grow(tmp_path: Path) -> None:
     assert len(str(caught.value)) < 500
 
 
-def test_errors_keep_their_kind_and_name_the_file(tmp_path: Path) -> None:
-    path = write(tmp_path, "a.json", json.dumps(CHESS | {"square_m": -1}))
-    with pytest.raises(UnitError, match=r"a\.json"):
-        read_target(path)
-
-
 def test_descriptions_are_readable() -> None:
     lines = {
-        "charuco:6x8,square=28mm,marker=21mm,dict=4X4_50,legacy": (
-            "ChArUco board, 6 x 8 squares of 28 mm, markers of 21 mm from DICT_4X4_50, "
-            "legacy pattern"
-        ),
-        "chessboard:9x6,square=21.9mm": "Chessboard, 9 x 6 inner corners, squares of 21.9 mm",
         "chessboard:8x6,square=20mm": (
             "Chessboard, 8 x 6 inner corners, squares of 20 mm; looks the same turned by 180 deg"
-        ),
-        "circles:10x10,pitch=15mm,large-origin": (
-            "Circle grid, 10 x 10 dots, 15 mm apart, first dot larger"
         ),
         "aprilgrid:6x4,tag=25mm,gap=8mm,first=4": (
             "AprilGrid, 6 x 4 tags of 25 mm, gaps of 8 mm, tag36h11, ids 4 to 27 from the top"
         ),
-        "tag:7,size=80mm": "AprilTag 7 of tag36h11, edge 80 mm",
     }
     for line, text in lines.items():
         assert describe(parse_target(line)) == text

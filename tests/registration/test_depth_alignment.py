@@ -60,13 +60,13 @@ def test_simulated_depth_is_aligned():
     assert np.hypot(*found.shift_px) < 2
 
 
-@pytest.mark.parametrize(("dx", "dy", "side"), [(-14, 0, "14 px to the left"), (9, 12, "below")])
-def test_a_shift_is_measured(dx, dy, side):
+def test_a_shift_is_measured():
+    dx, dy = 9, 12
     still, found = pooled(*painted()), pooled(*painted(), dx=dx, dy=dy)
     assert found.kind == "not_aligned" and found.stretch == (1.0, 1.0)
     moved = np.array(found.shift_px) - still.shift_px
     assert np.allclose(moved, [dx, dy], atol=1.0)
-    assert side in found.words and f"{found.agreeing} of 4 views" in found.words
+    assert "below" in found.words and f"{found.agreeing} of 4 views" in found.words
     assert found.agreeing >= 3
 
 

@@ -201,6 +201,7 @@ def test_sigma_of_the_views_is_the_arms():
     assert refined.view_sigma[1] == pytest.approx(SMALL_LAB.arm_mm, rel=0.5)
 
 
+@pytest.mark.slow
 def test_a_disparity_bias_is_found():
     case = made(0, replace(SMALL_LAB, bias_px=0.1))
     refined = case.refined()

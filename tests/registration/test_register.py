@@ -75,6 +75,7 @@ def test_the_answer_moves_with_the_world(clutter, starts, result):
         assert 1e3 * mssd(T @ a.T_world_obj, b.T_world_obj, vertices) < 0.05
 
 
+@pytest.mark.slow
 def test_order_of_frames_and_objects_does_not_matter(clutter, starts, result):
     other = run(clutter, starts[::-1], clutter.frames[::-1])
     for a in result.scene.objects:

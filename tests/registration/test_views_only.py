@@ -18,7 +18,7 @@ LAB = TableLabConfig(
     hand_eye_deg=0.0,
 )  # fmt: skip
 CONFIG = ViewsConfig(partners=4, prior=CameraPrior(hand_eye_mm=0.05, hand_eye_deg=0.01))
-QUICK = ViewsConfig(rounds=3, points_per_view=800, surface_points=2500)
+QUICK = ViewsConfig(rounds=2, points_per_view=800, surface_points=2500)
 
 
 @pytest.fixture(scope="module")

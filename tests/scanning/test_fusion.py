@@ -101,6 +101,7 @@ def test_a_sphere_has_its_radius_and_is_closed() -> None:
     assert np.all(fused.mesh.colors[fused.measured] == RED)
 
 
+@pytest.mark.slow
 def test_a_box_has_its_size() -> None:
     fused = fuse_object(CAMERA, exact_frames((brick(),), CAMERA), None, AS_GIVEN)
     local = fused.mesh.vertices @ se3.exp_so3([0, 0, 0.4])

@@ -104,12 +104,6 @@ def test_no_table_is_named() -> None:
         fuse(frames_of((alone,), table=False))
 
 
-def test_walls_are_no_object() -> None:
-    wall = block(0.0, 0.0, (0.02, 0.6, 0.05))
-    with pytest.raises(InputError, match="wall"):
-        fuse(frames_of((wall,)), replace(CONFIG, greatest_size_m=0.3))
-
-
 def test_an_object_that_is_mostly_holes_is_not_accepted() -> None:
     frames: list[FusionFrame] = []
     for f in good():

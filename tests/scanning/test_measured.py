@@ -217,6 +217,7 @@ def test_the_pose_follows_the_scale_by_its_covariance(known, fit):
     assert tied.covariance[6, 6] < fit.covariance[6, 6]
 
 
+@pytest.mark.slow
 def test_right_pairs_are_rarely_called_wrong_and_wrong_ones_are_seen(known, fit):
     rng = np.random.default_rng(0)
     exact = replace(fit, residual_mm=np.zeros_like(fit.residual_mm))

@@ -80,6 +80,7 @@ def test_a_mesh_has_the_colour_of_its_residual(known, value, count):
     assert count(picture.astype(int)) > 0.9 * drawn.sum()
 
 
+@pytest.mark.slow
 def test_a_scale_that_is_too_great_is_blue_and_one_too_small_is_red():
     solid = known_scan("bottle", 1)  # without an inside, whose residuals have the other sign
     great, small = (

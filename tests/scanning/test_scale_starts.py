@@ -113,6 +113,7 @@ def _rank(case: Case) -> int:
     return next((k + 1 for k, s in enumerate(_found(case)) if _is_right(s, case)), 99)
 
 
+@pytest.mark.slow
 def test_an_unknown_unit_and_attitude_is_found() -> None:
     assert _rank(_case("bowl", 7)) <= 8
 
