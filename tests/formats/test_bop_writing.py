@@ -150,34 +150,6 @@ def test_a_pose_that_changed_is_written_and_the_rest_of_its_row_kept(tmp_path):
         assert p.entry["score"] == 0.25 and p.entry["cam_t_m2c"] != o.entry["cam_t_m2c"]
 
 
-class WithoutEntries(Moved):
-    """A scene of another format: no rows of BOP, but instances."""
-
-    def frame(self, index):
-        from dataclasses import replace
-
-        frame = self.scene.frame(index)
-        objects = tuple(replace(o, entry={"other": 1}, gt_info=None) for o in frame.objects)
-        return replace(frame, objects=objects, entry=None)
-
-
-def test_another_formats_scene_keeps_poses_and_instances(tmp_path):
-    write_boxes(tmp_path / "a")
-    scene = open_labelled_bop(tmp_path / "a")
-    export(WithoutEntries(scene, None), tmp_path / "b")
-    again = open_labelled_bop(tmp_path / "b")
-    for i in scene.indices:
-        a, b = scene.frame(i), again.frame(i)
-        assert set(b.entry) == {"cam_K", "depth_scale", "cam_R_w2c", "cam_t_w2c"}
-        assert a.depth_unit_m == b.depth_unit_m and np.array_equal(a.intrinsics.K, b.intrinsics.K)
-        np.testing.assert_allclose(a.T_world_cam, b.T_world_cam, atol=1e-15)
-        for o, p in zip(a.objects, b.objects, strict=True):
-            assert (o.obj_id, o.instance) == (p.obj_id, p.instance)
-            np.testing.assert_allclose(o.T_cam_obj, p.T_cam_obj, rtol=3e-16, atol=1e-16)
-            # The translations had few digits: they come back, digit by digit.
-            assert p.entry["cam_t_m2c"] == o.entry["cam_t_m2c"]
-
-
 # --- documents ----------------------------------------------------------------------------------
 
 

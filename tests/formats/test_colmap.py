@@ -140,21 +140,3 @@ def test_damage_is_named(tmp_path):
         find_model(tmp_path)
     with pytest.raises(InputError, match="no COLMAP model"):
         open_colmap(tmp_path / "images")
-
-
-@pytest.mark.parametrize("file", ["cameras", "images", "points3D", "rigs", "frames"])
-def test_a_file_that_was_cut_off_is_named(tmp_path, file):
-    """pycolmap itself reads a cut cameras.bin as other numbers, and a cut points3D.bin for ever."""
-    make(tmp_path, poses(3), ("OPENCV", "PINHOLE"))
-    model = pycolmap.Reconstruction(str(tmp_path / "sparse/0"))
-    for k in range(3):
-        track = pycolmap.Track()
-        model.add_point3D(np.full(3, float(k)), track, np.zeros(3, dtype=np.uint8))
-    model.write_binary(str(tmp_path / "sparse/0"))
-    assert len(read_model(tmp_path / "sparse/0").images) == 3
-    path = tmp_path / f"sparse/0/{file}.bin"
-    whole = path.read_bytes()
-    for data in (whole[:-1], whole[:-4], whole[: len(whole) // 2], whole[:5], b"", whole + b"x"):
-        path.write_bytes(data)
-        with pytest.raises(InputError, match=rf"{file}\.bin is damaged"):
-            read_model(tmp_path / "sparse/0")

@@ -125,17 +125,6 @@ def test_no_path_leads_out(tmp_path, path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_below_keeps_its_names_and_rows_apart(tmp_path):
-    export = ExportFolder.begin(tmp_path, ASKED)
-    for name in ("a", "b"):
-        inner = export.below(name)
-        inner.write_piece("frame 0", {"0.bin": name.encode()}, {"all.json": ("0", name)})
-        inner.write_json_object("all.json")
-    assert not export.has("frame 0") and export.below("a").has("frame 0")
-    assert (tmp_path / "b/0.bin").read_bytes() == b"b"
-    assert json.loads((tmp_path / "a/all.json").read_text()) == {"0": "a"}
-
-
 def test_a_refusal_leaves_nothing_of_a_new_export_and_all_of_an_old_one(tmp_path):
     begun = ExportFolder.begin(tmp_path / "export", ASKED)
     begun.write_piece("one", {"a/b/1": b"x"}, {"a/all.json": ("1", 1)})

@@ -255,14 +255,10 @@ def put(at, value):
     [
         (put((1, 13), np.nan), "grasp 1 has nan"),
         (put((2, 4), 2.0), "grasp 2 are no rotation"),
-        (put((2, 4), -1.0), "no rotation"),
         (put((0, 1), 80.0), "metres"),
-        (put((0, 13), 450.0), "metres"),
         (put((0, 16), 0.5), "no object id"),
         (put((0, 1), -0.1), "negative"),
         (lambda rows: rows[:, :16], "a GraspGroup is"),
-        (lambda rows: rows[0], "a GraspGroup is"),
-        (lambda rows: rows.astype(np.int64), "a GraspGroup is"),
         (lambda rows: rows.astype(object), "never objects"),
     ],
 )
@@ -288,13 +284,9 @@ def small_file(path, **changes):
     ("changes", "says"),
     [
         ({"points": np.full((2, 3), 80.0)}, "millimetres"),
-        ({"points": np.full((2, 3), np.nan)}, "metres"),
-        ({"points": np.zeros((3, 3))}, "the shape"),
         ({"scores": None}, "no array 'scores'"),
         ({"scores": np.full((2, 300, 12, 4), 90.0)}, "scores reach 90"),
         ({"offsets": np.full((2, 300, 12, 4, 3), 3.0)}, "in the order angle, depth, width"),
-        ({"collision": np.zeros((2, 300, 12, 4))}, "of kind b or u"),
-        ({"collision": np.zeros((2, 300, 12, 4), object)}, r"of type \|O"),
         ({"view_tried": np.ones(299, bool)}, "the shape"),
     ],
 )

@@ -93,20 +93,6 @@ def test_without_meta_files_poses_come_back_to_half_of_the_fourth_decimal(source
     assert 0.01 < worst_mm < HALF_DIGIT_MM and 0 < worst_deg < MOST_DEG
 
 
-def test_pixels_come_back(source, tree):
-    scene = opened(tree)
-    for index in source.indices:
-        rgb = images.read_rgb(source.colour_file(index))
-        assert np.array_equal(images.read_rgb(scene.colour_file(index)), rgb)
-        depth = images.read_image(source.depth_file(index))
-        assert np.array_equal(images.read_image(scene.depth_file(index)), depth)
-        for k in range(3):
-            assert np.array_equal(
-                scene.mask(index, k, visible=True), source.mask(index, k, visible=True)
-            )
-            assert scene.mask(index, k, visible=False) is None
-
-
 def test_models_come_back_in_metres(tree):
     models = opened(tree).models()
     assert models.keys() == MODELS.keys()

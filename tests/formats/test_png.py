@@ -128,19 +128,3 @@ def test_big_endian_counts_keep_their_values(tmp_path):
 def test_what_png_cannot_hold_is_refused(image):
     with pytest.raises(InputError, match=r"(can|cannot) be written"):
         encode_png(image)
-
-
-def usual_size(image):
-    """Return the size that OpenCV's encoder gives at its fastest level."""
-    pixels = image[..., ::-1] if image.ndim == 3 else image
-    ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    assert ok
-    return len(data)
-
-
-def test_a_noisy_photograph_is_not_larger_than_from_the_usual_encoder():
-    rng = np.random.default_rng(0)
-    y, x = np.mgrid[:360, :640]
-    scene = 120 + 60 * np.sin(x / 40) * np.cos(y / 55) + 30 * (np.hypot(x - 300, y - 200) < 90)
-    rgb = np.clip(scene[..., None] + rng.normal(0, 1.5, (360, 640, 3)), 0, 255).astype(np.uint8)
-    assert len(encode_png(rgb)) < usual_size(rgb)

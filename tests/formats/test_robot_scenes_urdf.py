@@ -1,6 +1,5 @@
 """Folders of URDFs: read back by PyBullet, at rest there, and read back by realsim."""
 
-import dataclasses
 import importlib.util
 import json
 import shutil
@@ -71,15 +70,6 @@ def test_the_world_in_one_file_holds_the_same_scene(scene, folder):
     placed_scenes.same_bodies(scene, found, 1e-14)
     assert not any(o.is_fixed for o in found.objects)
     assert any("gravity" in n for n in found.notes)
-
-
-def test_a_scene_in_any_world_frame_comes_back(scene, tmp_path):
-    turned = placed_scenes.turned_to(scene)
-    fixed = (dataclasses.replace(turned.objects[0], is_fixed=True), *turned.objects[1:])
-    turned = dataclasses.replace(turned, objects=fixed)
-    write(turned, tmp_path / "s")
-    placed_scenes.same_bodies(turned, read_urdf_scene(tmp_path / "s"))
-    placed_scenes.same_bodies(turned, read_urdf_scene(tmp_path / "s/world.urdf"), 1e-14)
 
 
 def test_pybullet_finds_masses_inertias_poses_and_parts(scene, loaded):
@@ -182,21 +172,16 @@ def test_a_mesh_whose_size_contradicts_its_scale_is_refused_with_the_size(tmp_pa
     ("shape", "joints", "what"),
     [
         ('<mesh filename="package://x/m.stl"/>', joint("a"), "ROS"),
-        ('<mesh filename="http://x/m.stl"/>', joint("a"), "only files"),
         ('<mesh filename="../m.stl"/>', joint("a"), "leads out"),
-        ('<mesh filename="/m.stl"/>', joint("a"), "leads out"),
         ('<mesh filename="gone.stl"/>', joint("a"), "does not exist"),
         ('<mesh filename="out.obj"/>', joint("a"), "leads out"),
         ('<mesh filename="two.obj"/>', joint("a"), "cannot be read as a mesh"),
-        ('<mesh filename=""/>', joint("a"), "."),
         ('<box size="0.1 nan 0.1"/>', joint("a"), "finite"),
-        ('<box size="0.1 0 0.1"/>', joint("a"), "positive"),
         ('<torus r="1"/>', joint("a"), "mesh, box, cylinder"),
         ('<box size="1 1 1"/>', joint("a", "revolute"), "'revolute'"),
         ('<box size="1 1 1"/>', joint("a", parent="b"), "no link"),
         ('<box size="1 1 1"/>', joint("a") + joint("a"), "two joints"),
         ('<box size="1 1 1"/>', joint("a") + joint("world", parent="a"), "circle"),
-        ('<box size="1 1 1"/>', joint("a", origin='<origin xyz="0 0"/>'), "3 finite"),
         ('<box size="1 1 1"/>', joint("a", origin='<origin xyz="0 0 1e400"/>'), "finite"),
     ],
 )
@@ -216,10 +201,8 @@ def test_what_cannot_be_read_is_named(tmp_path, shape, joints, what):
     [
         ({"format": "other"}, "'other'"),
         ({"objects": 3}, "no list"),
-        ({"gravity": [0, 0]}, "gravity"),
         ({"objects": [{"urdf": "../x.urdf", "obj_id": 1, "name": "x"}]}, "leads out"),
         ({"objects": [{"urdf": "table.urdf", "obj_id": -1}]}, "obj_id"),
-        ({"table": {"size_m": [0, 1]}}, "table"),
     ],
 )
 def test_a_damaged_scene_json_is_named(folder, tmp_path, change, what):
