@@ -10,6 +10,7 @@ from realsim.rendering.photo import Lighting, LightSampling, PhotoRenderer, Plac
 
 LENS = np.array([-0.25, 0.09, 0.0006, -0.0009, 0.0])
 WIDE = CameraIntrinsics(width=160, height=120, fx=110, fy=110, cx=79.2, cy=60.1, distortion=LENS)
+SMALL = CameraIntrinsics(width=80, height=60, fx=55, fy=55, cx=39.5, cy=29.5)
 SHARP = Lighting(psf_px=0.0)
 WHITE = Material(base_color=(1.0, 1.0, 1.0), roughness=1.0, name="white")
 ABOVE = se3.look_at([0, 0, 1.0], [0, 0, 0])
@@ -71,7 +72,7 @@ def cluttered() -> list[PlacedMesh]:
 def test_white_surfaces_vanish_in_a_white_room(roughness: float, metallic: float) -> None:
     material = Material(base_color=(1.0, 1.0, 1.0), roughness=roughness, metallic=metallic)
     for mesh in (square(), ball(0.3)):
-        light = light_of([PlacedMesh(0, mesh, np.eye(4), material)], even_sky())
+        light = light_of([PlacedMesh(0, mesh, np.eye(4), material)], even_sky(), ABOVE, SMALL)
         assert np.abs(light - 1).max() < 0.02
 
 

@@ -74,27 +74,6 @@ def test_one_of_another_photograph_size_or_quality_is_made_anew(store: SessionSt
     assert opened(store).of([3])[3] == thumbnail(darker, 40, 70)
 
 
-def test_the_folder_can_be_deleted_and_need_not_be_written(store: SessionStore) -> None:
-    first = dict(opened(store).of(INDICES))
-    for path in (store.folder / FOLDER).iterdir():
-        path.unlink()
-    (store.folder / FOLDER).rmdir()
-    # A file where the folder should be: nothing can be kept, as on a disk that may not be written.
-    (store.folder / FOLDER).write_bytes(b"")
-    assert dict(opened(store).of(INDICES)) == first
-
-
-def test_the_session_is_sound_and_unchanged_but_for_the_review(store: SessionStore) -> None:
-    def others() -> dict[Path, bytes]:
-        files = (p for p in store.folder.rglob("*") if p.is_file() and "review" not in p.parts)
-        return {p: p.read_bytes() for p in files}
-
-    before = others()
-    opened(store).of(INDICES)
-    assert others() == before
-    assert SessionStore.open(store.folder).verify() == []
-
-
 def test_progress_comes_to_its_end_and_a_missing_photograph_is_named(store: SessionStore) -> None:
     steps: list[tuple[int, int]] = []
     thumbnails = opened(store)

@@ -70,15 +70,6 @@ def test_the_approach_ends_in_the_grasp_with_closed_fingers() -> None:
     assert motion.opening_m[0] == HandApproach().opening_m
 
 
-def test_the_hand_comes_straight_along_the_approach_axis() -> None:
-    motion = approach()
-    Ts_grasp_hand = se3.invert(motion.Ts_world_hand[-1]) @ motion.Ts_world_hand
-    np.testing.assert_allclose(Ts_grasp_hand[:, :2, 3], 0.0, atol=1e-12)
-    np.testing.assert_allclose(Ts_grasp_hand[0, 2, 3], -HandApproach().approach_m, atol=1e-12)
-    assert np.all(np.diff(Ts_grasp_hand[:, 2, 3]) >= -1e-12)
-    np.testing.assert_array_equal(np.ptp(motion.Ts_world_obj, axis=0), np.zeros((4, 4)))
-
-
 @pytest.mark.parametrize("width_m", [0.0, 0.11])
 def test_time_increases_and_fingers_only_close(width_m: float) -> None:
     motion = approach(1, width_m)

