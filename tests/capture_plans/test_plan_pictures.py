@@ -2,7 +2,6 @@
 
 import sys
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -116,16 +115,6 @@ def test_a_plan_that_does_not_keep_its_clearance_is_said_not_to_be_driven() -> N
     assert "NOT KEPT" in shown and "move to view 3" in shown
     safe = PlanCurves.of(replace(plan, joints=LOOKING[None] + [[0.3, 0, 0, 0, 0, 0]], vias=()))
     assert "kept everywhere" in texts(clearance_chart(safe))
-
-
-def test_labels_of_worst_spots_do_not_lie_on_each_other(curves: PlanCurves) -> None:
-    from matplotlib.text import Annotation
-
-    figure = clearance_chart(curves)
-    figure.canvas.draw()
-    boxes = [a.get_bbox_patch().get_window_extent() for a in figure.findobj(Annotation)]
-    assert len(boxes) >= 2
-    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
 
 
 def test_the_board_picture_shows_rolls_tilts_and_places_in_the_image() -> None:

@@ -20,7 +20,6 @@ from realsim_sim_bridge.scenes.stable_state import (
 )
 from realsim_sim_bridge.scenes.stand_picture import stand_picture
 from realsim_sim_bridge.scenes.table_world import TableWorld, WorldConfig
-from realsim_sim_bridge.slip.bullet_shapes import drawn_in
 
 SIDE = 0.05
 ONE_SECOND = StandConfig(shortest_s=1.0, longest_s=1.0, rest_s=0.25)
@@ -153,13 +152,6 @@ def test_objects_inside_one_another_are_named_in_pairs():
     assert {a, b} == {"cube1 #0", "cube1 #1"} and depth == pytest.approx(0.01, abs=1e-4)
 
 
-def test_the_settled_scene_stands():
-    scene = school_scene(place(0, 0, SIDE / 2 + 0.01), place(0.1, 0, SIDE / 2 - 0.005, 1))
-    first = run(scene, StandConfig())
-    again = run(replace(scene, scene=first.settled(scene.scene)))
-    assert not first.stable and again.stable
-
-
 def test_every_parameter_is_read_back_and_a_lost_one_is_an_error(monkeypatch):
     scene = school_scene(place(0, 0, SIDE / 2))
     with TableWorld(scene, WorldConfig(friction=0.6)) as world:
@@ -254,11 +246,3 @@ def test_rows_and_picture_say_what_happened():
     teal = np.abs(rgb - [0x2A, 0x9D, 0x8F]).max(-1) < 12
     assert teal.sum() > 200  # the floating one's outline and arrow
     assert png == stand_picture(scene, report)
-
-
-@pytest.mark.parametrize("extents", [(0.05, 0.05, 0.05), (0.1, 0.03, 0.0008)])
-def test_a_hull_drawn_in_and_its_margin_are_the_hull_again(extents):
-    corners = box(extents).vertices
-    (core,), margin = drawn_in([corners], 0.0005)
-    assert margin == pytest.approx(min(0.0005, min(extents) / 4))
-    assert np.allclose(np.abs(core), np.array(extents) / 2 - margin, atol=1e-8)

@@ -71,14 +71,6 @@ def test_ctrl_c_says_how_to_go_on_and_the_next_run_does_no_shard_again(tmp_path,
     assert names(tmp_path, "") == ["instance_000000.grasps.npz"]
 
 
-def test_an_interrupted_run_without_a_folder_says_that_nothing_is_kept():
-    def stop(*_):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt, match="nothing of it is kept"):
-        run(progress=stop)
-
-
 def test_a_damaged_piece_is_made_again(tmp_path, whole):
     def stop(done, _):
         if done >= 5:

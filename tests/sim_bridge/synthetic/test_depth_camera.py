@@ -80,16 +80,6 @@ def replace_look(placed, material):
     return PlacedMesh(placed.instance, placed.mesh, placed.T_world_obj, material)
 
 
-def test_a_camera_with_a_signal_limit_knows_how_dark_each_surface_is():
-    limited = replace(FAULTLESS, signal_range_m=0.6)
-    kept = []
-    for material in (WHITE, Material(base_color=(0.1, 0.1, 0.1))):
-        scene = synthetic_scene(materials={0: material})
-        labels = exact(scene)
-        kept.append(np.mean(measured(scene, limited)[labels.ids == 0] > 0))
-    assert kept[0] > kept[1] + 0.2
-
-
 def test_the_mean_look_of_a_mesh_is_its_own():
     v, f = np.eye(4)[:, :3], np.array([[0, 1, 2]], np.int32)
     grey = np.full((4, 3), 188, np.uint8)  # sRGB 188 is half of the light

@@ -22,7 +22,6 @@ from synthetic_scenes import (
     captured_session,
     content,
     placed,
-    rejected,
     sky,
     synthetic_scene,
     table,
@@ -175,15 +174,6 @@ def test_foreign_folders_are_left_alone(tmp_path):
         write(tmp_path / "full")
     with pytest.raises(InputError, match="is a file"):
         write(tmp_path / "full/mine.txt")
-
-
-def test_a_rejected_object_is_left_out_and_named(tmp_path):
-    scene = rejected(two_boxes(), 3)
-    summary = write(tmp_path / "s", 1, synthetic=synthetic_scene(scene=scene))
-    store = SessionStore.open(tmp_path / "s")
-    assert summary.left_out == (3,)
-    assert [o.instance for o in load_scene(store).objects] == [0]
-    assert set(np.unique(store.read_image("labels/instance/000000.png"))) == {0, 1}
 
 
 def test_cameras_inside_an_object_or_without_one_in_sight_are_named_and_written(tmp_path):
