@@ -15,7 +15,6 @@ from realsim_calibration.faults.rotation_readings import (
     four_number_conventions,
     three_number_conventions,
 )
-from realsim_calibration.faults.tool_offset import describe_offset
 
 MIDDLE = faults.BOARD.points_board.mean(0)
 CONVENTIONS = {c.name: c for c in (*three_number_conventions(), *four_number_conventions())}
@@ -246,14 +245,6 @@ def test_no_board_is_turned_in_clean_sessions():
 
 
 # Tool offset
-
-
-def test_a_tool_offset_is_described():
-    assert describe_offset(se3.from_translation([0, 0, 0.2007])) == (
-        "200.7 mm along the flange's z"
-    )
-    assert "-x" in describe_offset(se3.from_translation([-0.1, 0, 0]))
-    assert "turned by 90.0 deg" in describe_offset(se3.exp([0, 0, np.pi / 2, 0, 0, 0]))
 
 
 # Gates and motion

@@ -84,17 +84,6 @@ def test_correcting_the_input_leaves_no_bias_and_order_does_not_matter() -> None
     np.testing.assert_allclose(turned.bias.covariance, report.bias.covariance, rtol=1e-9)
 
 
-def test_a_larger_board_makes_a_larger_world() -> None:
-    """Depth is known relative to the board: s times the board is s times the true depth."""
-    truth = DepthBias(scale=1.0, offset_per_m=0.0)
-    views = views_of(truth, noise_px=0.0, corner_px=0.0)
-    larger = replace(BOARD, tag_size_m=BOARD.tag_size_m * 1.01, gap_m=BOARD.gap_m * 1.01)
-    report = estimate_depth_bias(views, larger, CAMERA, EXACT)
-    assert report.bias.scale == pytest.approx(1 / 1.01, abs=5e-4)
-    honest = estimate_depth_bias(views, larger, CAMERA, replace(EXACT, board_scale_sd=0.01))
-    assert np.sqrt(honest.board_covariance[0, 0]) == pytest.approx(0.01, rel=0.03)
-
-
 def test_a_focal_length_error_is_within_its_sigma() -> None:
     truth = DepthBias(scale=1.0, offset_per_m=0.0)
     views = views_of(truth, noise_px=0.0, corner_px=0.0)

@@ -306,6 +306,3 @@ def test_predicted_sigmas_weigh_the_corners():
     weighed, same = (calibrate_intrinsics(s, BOARD, config=FOUR) for s in (blurred, blind))
     assert np.median(weighed.sd[:8] / same.sd[:8]) < 0.8
     assert np.all(np.abs(vector(weighed)[:8] - truth) < 4 * weighed.sd[:8])
-
-
-# --- real images ------------------------------------------------------------------------------

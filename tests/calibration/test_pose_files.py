@@ -1,5 +1,4 @@
 import json
-import os
 import shutil
 import tempfile
 from contextlib import contextmanager
@@ -19,12 +18,6 @@ from realsim_calibration.inputs import (
     PoseReading,
     read_pose_file,
     reading_from_text,
-)
-
-ROOT = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
-HANDEYE = ROOT / "handeye"
-real = pytest.mark.skipif(
-    not HANDEYE.is_dir(), reason=f"no real data at {HANDEYE} (set REALSIM_DATA)"
 )
 
 
@@ -326,23 +319,3 @@ def test_numbers_leave_open_what_they_do_not_say():
         still = np.tile(np.eye(4), (4, 1, 1))
         both = read_pose_file(as_json(place / "c.json", still.tolist()))
     assert {p.rotation for p in both.possible} == {"matrix", "matrix_column_major"}
-
-
-# --- real data ------------------------------------------------------------------------------------
-
-
-@real
-def test_koch_files_agree_with_each_other_in_every_format():
-    koch = HANDEYE / "koch_ur5"
-    matrices = read_pose_file(koch / "robot_poses.yaml")
-    assert str(matrices.stated) == "matrix,mm" and len(matrices) == 20
-    T = matrices.poses(matrices.stated)
-    listed = read_pose_file(koch / "meta.json", key="robot_poses")
-    assert np.abs(listed.poses(listed.stated) - T).max() < 1e-12
-    assert np.abs(np.degrees(listed.joints[0, 0]) + 61.03393202791763) < 1e-9
-    # the same poses as x y z a b c: of all readings the right one must be among those left open
-    cart = read_pose_file(koch / "meta.json", key="cart_pose")
-    near = [p for p in cart.possible if np.abs(cart.poses(p) - T).max() < 1e-6]
-    assert [str(p) for p in near] == ["rotvec,rad,mm"]
-    with pytest.raises(InputError, match="3 lists of poses"):
-        read_pose_file(koch / "meta.json")

@@ -1,5 +1,4 @@
 import io
-import json
 import shutil
 import tempfile
 from contextlib import contextmanager
@@ -21,11 +20,6 @@ def folder():
         yield path
     finally:
         shutil.rmtree(path)
-
-
-def write_json(path, tree):
-    path.write_text(json.dumps(tree))
-    return path
 
 
 # --- what is refused ---------------------------------------------------------------------------
@@ -95,29 +89,3 @@ def test_no_content_whatever_ends_in_a_traceback(data, ending):
             read_pose_file(path)
         except InputError as error:
             assert str(path) in str(error)
-
-
-json_trees = st.recursive(
-    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
-    lambda inner: (
-        st.lists(inner, max_size=7)
-        | st.dictionaries(
-            st.sampled_from(
-                "x y z qw qx position orientation pose poses R t q joints image data rows".split()
-            ),
-            inner,
-            max_size=5,
-        )
-    ),
-    max_leaves=30,
-)
-
-
-@settings(max_examples=40, deadline=None)
-@given(tree=json_trees)
-def test_no_tree_whatever_ends_in_a_traceback(tree):
-    with folder() as place:
-        try:
-            read_pose_file(write_json(place / "a.json", tree))
-        except InputError as error:
-            assert str(place) in str(error)

@@ -1,6 +1,5 @@
 """The printed sheets, measured as a camera would: the PDF is rasterised and read by OpenCV."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -215,21 +214,6 @@ def test_page_and_picture_show_the_same_without_seams(line: str, printed) -> Non
 
 
 # --- pictures ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("line", [line for line in SHEETS if line.startswith("charuco")])
-def test_charuco_pictures_are_opencvs_own(line: str) -> None:
-    # 24 mm markers of 6 or 8 modules and 32 mm fields fall on whole pixels.
-    target = replace(parse_target(line), square_m=0.032, marker_m=0.024)
-    picture, origin = target_image(target, 1000.0, 0.01)
-    board = aruco.CharucoBoard(
-        (target.columns, target.rows), target.square_m, target.marker_m,
-        aruco.getPredefinedDictionary(getattr(aruco, target.dictionary)),
-    )  # fmt: skip
-    board.setLegacyPattern(target.legacy)
-    reference = board.generateImage(picture.shape[::-1], marginSize=10)
-    assert origin == pytest.approx((9.5, 9.5))
-    assert np.array_equal(picture, reference)
 
 
 @pytest.mark.parametrize("line", [

@@ -10,7 +10,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records.depth_bias import DepthBias
 from realsim.registration.config import RegistrationConfig
-from realsim.registration.evidence import DepthFrame, LazyFrame, correct_frame, read_frame
+from realsim.registration.evidence import LazyFrame, correct_frame
 from realsim.registration.intake import take_in
 from realsim.registration.simulated import TableScene
 from table_faults import without_any_depth
@@ -42,21 +42,6 @@ class Reader:
         return self.image
 
 
-def test_a_lazy_frame_reads_when_asked_and_keeps_nothing():
-    reader = Reader(np.full((3, 4), 0.5, np.float32))
-    T = se3.random_transform(np.random.default_rng(0))
-    frame = LazyFrame(7, T, reader)
-    assert frame.index == 7 and frame.T_world_cam is T and reader.times == 0
-    assert frame.depth_m is reader.image and frame.depth_m is reader.image
-    assert reader.times == 2
-    kept = read_frame(frame)
-    assert reader.times == 3
-    assert kept.depth_m is reader.image and kept.depth_m is reader.image
-    assert reader.times == 3 and isinstance(frame, DepthFrame)
-    with pytest.raises(AttributeError):
-        frame.depth_m = reader.image  # pyright: ignore[reportAttributeAccessIssue]
-
-
 def test_a_corrected_frame_has_its_bias_taken_out_and_its_camera_moved():
     bias = DepthBias(scale=1.01, offset_per_m=-0.02)
     z = np.array([[0.0, 0.2, 0.4]], np.float32)
@@ -69,9 +54,6 @@ def test_a_corrected_frame_has_its_bias_taken_out_and_its_camera_moved():
     np.testing.assert_array_equal(frame.T_world_cam, T)
     twice = correct_frame(frame, np.eye(4), DepthBias(scale=2.0 / 1.5))
     np.testing.assert_allclose(twice.depth_m, 0.75 * z, atol=1e-7)
-
-
-# --- thinning out --------------------------------------------------------------------------------
 
 
 # --- what is taken in ----------------------------------------------------------------------------

@@ -133,14 +133,6 @@ def test_a_region_bounds_place_and_turn():
             assert error(model, only_turned, start)[1] < 38 + 4  # sampled symmetries
 
 
-def test_an_empty_or_unmeasured_table_has_no_hypotheses():
-    empty = np.zeros((120, 120), np.float32)
-    for heights in (empty, empty + np.float32(np.nan)):
-        grid = HeightGrid(heights=heights, origin=np.zeros(2), cell_m=0.003)
-        for name in NAMES:
-            assert match_templates(grid, templates_of(name), MatchConfig(), plane=PLANE) == []
-
-
 def test_a_flat_plate_is_found():
     box = part("box").mesh
     low, high = box.bounds

@@ -212,6 +212,3 @@ def test_a_disparity_bias_is_found():
     assert sigma[1] < 0.25 * abs(true)
     held = case.refined(RefineConfig(fit_bias=False))
     assert case.camera_errors(refined.cameras)[0] < 0.5 * case.camera_errors(held.cameras)[0]
-
-
-# --- statistics ----------------------------------------------------------------------------------

@@ -78,12 +78,6 @@ def test_two_of_one_model_never_share_a_pose():
     assert sorted(map(str, got.chosen)) == ["1", "None"]
 
 
-def test_from_all_poses_those_of_the_objects_that_are_there():
-    canvas, pool, _ = material()
-    got = select_any(canvas, pool, CONFIG)
-    assert sorted(c for c in got.chosen if c is not None) == [0, 1, 2, 3]
-
-
 def test_a_bad_first_choice_is_mended():
     canvas, pool, ids = material()
     bad = [n for n in range(len(pool)) if n >= 4 and ids[n] == pool[0].obj_id][1]

@@ -63,14 +63,6 @@ def test_wrong_poses_are_flagged_with_numbers(clutter, checker, move, word):
         assert any(word in r for r in checked.reasons), checked.reasons
 
 
-def test_objects_inside_each_other_are_flagged(clutter, checker):
-    poses = [t.T_world_obj for t in clutter.truth]
-    poses[1] = se3.from_translation(poses[0][:3, 3] - poses[1][:3, 3]) @ poses[1]
-    checked = checker[1](poses)
-    assert checked[0].checks["penetration_mm"] > 10
-    assert checked[1].verdict == "rejected"
-
-
 def test_solver_stays_at_the_truth_without_noise(make_scene):
     scene = make_scene([("wedge", (0.0, 0.0), 0.3, (0, 0, 0))], 5, 1, noise_per_m=0.0)
     truth = scene.truth[0]

@@ -115,15 +115,6 @@ def test_order_and_numbers_of_the_frames_do_not_matter_and_progress_goes_to_the_
     assert ticks == [(k + 1, 14) for k in range(14)]
 
 
-@pytest.mark.slow
-def test_the_same_input_gives_the_same_bytes():
-    a, b = fitted("bunny"), fit_of(scanned("bunny"))
-    assert a.scale == b.scale and a.sigma == b.sigma
-    for name in ("T_world_obj", "covariance", "residual_mm", "extent_mm"):
-        assert getattr(a, name).tobytes() == getattr(b, name).tobytes()
-    assert a.checks == b.checks and a.verdict == b.verdict and a.history == b.history
-
-
 def test_a_start_and_none_lead_to_the_same():
     known = scanned("bunny")
     given, found = fitted("bunny"), fit_of(known, start=None)

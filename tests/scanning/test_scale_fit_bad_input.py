@@ -15,7 +15,6 @@ from scanned_objects import (
     UNIT_M,
     block,
     fit_of,
-    fitted,
     joined,
     mirrored,
     real_mesh,
@@ -111,16 +110,6 @@ def test_an_open_mesh_is_fitted_too():
     fit = fit_of(known, replace(mesh, faces=mesh.faces[above]))
     assert fit.scale == pytest.approx(UNIT_M, rel=0.01)
     assert abs(fit.scale - UNIT_M) < 3.5 * fit.sigma
-
-
-@pytest.mark.slow
-def test_faces_that_are_there_twice_do_no_harm():
-    """Exporters write double-sided materials so; an edge of four faces is an edge all the same."""
-    known = scanned("block")
-    faces = known.scan.faces
-    twice = np.concatenate([faces, faces[:, ::-1]])
-    fit = fit_of(known, replace(known.scan, faces=twice))
-    assert abs(fit.scale - fitted("block").scale) < 1.0 * fit.sigma
 
 
 @pytest.mark.slow

@@ -8,11 +8,9 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.records import Mesh
-from realsim.rendering.rays import PlacedMesh, RayScene
 from realsim.scanning.scale.picture_overlays import (
     Photograph,
     overlays_png,
-    rendered_depth,
 )
 from realsim.scanning.scale.pictures import (
     candidates_png,
@@ -112,24 +110,6 @@ def test_what_cannot_be_drawn_is_named(known, fit):
 
 
 # --- overlays ---------------------------------------------------------------------------------
-
-
-def scene_of(known, fit) -> RayScene:
-    scaled = Mesh(vertices=fit.scale * known.scan.vertices, faces=known.scan.faces)
-    return RayScene([PlacedMesh(0, scaled, fit.T_world_obj)])
-
-
-def test_the_model_is_rendered_where_the_object_was_seen(known, fit):
-    camera = known.views.intrinsics
-    frame, T_true = known.views.frames[2], known.views.Ts_world_cam[2]
-    whole = (slice(0, camera.height), slice(0, camera.width))
-    depth = rendered_depth(scene_of(known, fit), camera, T_true, whole)
-    both = np.isfinite(depth) & (frame.depth_m > 0)
-    miss = np.abs(frame.depth_m[both] - depth[both])
-    assert both.sum() > 500 and np.median(miss) < 0.002
-    wrong = rendered_depth(scene_of(known, fit_of(known, 1.15)), camera, T_true, whole)
-    both = np.isfinite(wrong) & (frame.depth_m > 0)
-    assert np.median(np.abs(frame.depth_m[both] - wrong[both])) > 2 * np.median(miss)
 
 
 def test_overlays_are_drawn(known, fit):

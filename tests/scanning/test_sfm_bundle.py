@@ -8,9 +8,7 @@ from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
 from realsim.scanning.sfm.bundle import (
     adjust,
-    halves,
     point_covariances,
-    reliability,
     reprojection_errors,
 )
 from realsim.scanning.sfm.config import MappingConfig, RobotNoise, TrustConfig
@@ -115,15 +113,3 @@ def test_measured_depth_gives_the_ratio(factor: float) -> None:
     assert found.ratio == pytest.approx(factor, rel=2e-3)
     assert found.views == 10
     assert depth_scale(flat, lambda name: None, TrustConfig()) is None
-
-
-def test_halves_share_no_point_and_reliability_is_that_of_signal_in_noise() -> None:
-    rng = np.random.default_rng(7)
-    g = scene(rng)
-    a, b = halves(g)
-    assert sorted([*a.point_ids, *b.point_ids]) == list(g.point_ids)
-    assert abs(len(a.points) - len(b.points)) <= 8
-    s, e, f = rng.standard_normal((3, 4000, 6))
-    assert reliability(s + e, s + f) == pytest.approx(1 / 1.5, abs=0.03)
-    assert reliability(e, f) < 0.05
-    assert reliability(s, s) == 1.0
