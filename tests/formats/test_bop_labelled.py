@@ -10,7 +10,6 @@ import pytest
 from realsim.errors import InputError, UnitError
 from realsim.formats.bop.labels import rle_of
 from realsim.formats.bop.opening import open_labelled_bop
-from realsim.formats.bop.scene import find_scenes, read_scene
 from realsim.formats.bop.targets import read_targets
 from realsim.geometry import se3
 from tests.support.bop_scenes import HEIGHT, MODELS, WIDTH, K, edit, write_boxes
@@ -229,22 +228,3 @@ def test_files_that_do_not_belong_together_are_named(tmp_path):
         open_labelled_bop(tmp_path)
     with pytest.raises(InputError, match="has no image 2; it has 1, 5, 9"):
         scene.frame(2)
-
-
-BROKEN = {
-    "not JSON": "{", "a list": "[]", "words": '{"a": {}}', "NaN": '{"1": {"cam_K": [NaN]}}',
-    "a number": '{"1": 3}', "texts": '{"1": {"cam_K": ["a"], "depth_scale": 0.1}}',
-    "no scale": '{"1": {"cam_K": [90,0,47,0,91,35,0,0,1]}}',
-    "scale 0": '{"1": {"cam_K": [90,0,47,0,91,35,0,0,1], "depth_scale": 0}}',
-    "huge": '{"1": {"cam_K": [90,0,47,0,91,35,0,0,1], "depth_scale": 1e300}}',
-    "twice": '{"1": {}, "01": {}}', "nested": '{"1": {"cam_K": [[1,[2]],3]}}',
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("what", BROKEN)
-def test_broken_cameras_end_in_an_input_error(tmp_path, what):
-    folder = write_boxes(tmp_path, count=1)
-    (folder / "scene_camera.json").write_text(BROKEN[what])
-    for reader in (open_labelled_bop, lambda root: read_scene(find_scenes(root)[0])):
-        with pytest.raises(InputError):
-            reader(tmp_path)

@@ -2,11 +2,6 @@
 
 import hashlib
 import json
-import os
-import signal
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
@@ -42,41 +37,6 @@ def content(folder):
 def test_an_interrupted_export_ends_with_the_bytes_of_a_whole_one(tmp_path, stop_after):
     fill(tmp_path / "whole")
     fill(tmp_path / "torn", stop_after=stop_after)
-    fill(tmp_path / "torn")
-    assert content(tmp_path / "torn") == content(tmp_path / "whole")
-
-
-KILLED = """
-import sys, os
-from pathlib import Path
-sys.path.insert(0, sys.argv[2])
-import test_export_folder as t
-from realsim.formats import export_folder
-real = export_folder.ExportFolder._append
-count = 0
-def append(self, entry):
-    global count
-    count += 1
-    if count == int(sys.argv[3]):
-        with (self.folder / export_folder.PIECES).open("a") as file:
-            file.write('{"piece": "fra')
-            file.flush()
-        os.kill(os.getpid(), 9)
-    real(self, entry)
-export_folder.ExportFolder._append = append
-t.fill(Path(sys.argv[1]))
-"""
-
-
-@pytest.mark.parametrize("at", [4])
-def test_a_kill_within_a_piece_loses_this_piece_only(tmp_path, at):
-    fill(tmp_path / "whole")
-    command = [sys.executable, "-c", KILLED, tmp_path / "torn", Path(__file__).parent, str(at)]
-    done = subprocess.run(command, check=False, env={**os.environ, "PYTHONPATH": ""})
-    assert done.returncode == -signal.SIGKILL
-    begun = ExportFolder.begin(tmp_path / "torn", ASKED)
-    assert begun.resumed
-    assert [begun.has(f"frame {k}") for k in range(PIECES)] == [k < at - 1 for k in range(PIECES)]
     fill(tmp_path / "torn")
     assert content(tmp_path / "torn") == content(tmp_path / "whole")
 

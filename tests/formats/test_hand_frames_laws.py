@@ -15,10 +15,8 @@ from realsim.formats.graspit.grasps import read_grasp_file
 from realsim.formats.graspnet.grasp_group import grasp_group, read_grasp_group, write_grasp_group
 from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_acronym
 from realsim.formats.grasps.graspgen import read_graspgen, write_graspgen
-from realsim.formats.grasps.hdf5 import read_grasps_hdf5, write_grasps_hdf5
 from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
-from realsim.formats.grasps.parquet import read_grasps_parquet, write_grasps_parquet
-from realsim.formats.grasps.scene_grasps import SceneGrasps, executed
+from realsim.formats.grasps.scene_grasps import executed
 from realsim.geometry import se3
 from tried_grasps import tried_set
 
@@ -104,30 +102,6 @@ class GraspGroupNpy:
         return from_rt(rows[:, 4:13].reshape(-1, 3, 3), rows[:, 13:16])
 
 
-class RealsimHdf5:
-    rounding = 0.0
-    approach, closing = 2, 1
-    tip = (0, 0, TIP - MOUNT)
-
-    def write(self, path, s):
-        return write_grasps_hdf5(path, SceneGrasps(sets=(s,)))
-
-    def read(self, path):
-        return read_grasps_hdf5(path).sets[0].Ts_obj_grasp[self.rows]
-
-    def raw(self, path):
-        return self.read(path)
-
-
-class RealsimParquet(RealsimHdf5):
-    def write(self, path, s):
-        write_grasps_parquet(path, SceneGrasps(sets=(s,)))
-        return path
-
-    def read(self, path):
-        return read_grasps_parquet(path).sets[0].Ts_obj_grasp[self.rows]
-
-
 class GraspitHdf5:
     """Written here as the paper's authors write it: each grasp beside its half turn."""
 
@@ -150,7 +124,7 @@ class GraspitHdf5:
 
 
 FORMATS = [
-    Acronym, GraspGen, IsaacGrasp, GraspGroupNpy, RealsimHdf5, RealsimParquet, GraspitHdf5,
+    Acronym, GraspGen, IsaacGrasp, GraspGroupNpy, GraspitHdf5,
 ]  # fmt: skip
 
 

@@ -123,7 +123,7 @@ def tube_session(folder: Path) -> tuple[SessionStore, ObjectPose]:
     renderer = LabelRenderer([PlacedMesh(0, TUBE.mesh, T), table])
     session = CaptureSession(name="tube", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
     store = SessionStore.create(folder, session)
-    for k, T_cam in enumerate(true_cameras(6)):
+    for k, T_cam in enumerate(true_cameras(3)):
         labels = renderer.render(CAMERA, T_cam)
         rgb = np.zeros((*labels.ids.shape, 3), np.uint8)
         store.add_view(View(index=k, T_world_cam=T_cam), rgb, labels.depth_m)
