@@ -232,17 +232,6 @@ def test_an_arm_that_was_stopped_short_is_noticed(tmp_path: Path, arm: Kinematic
     assert stopped.value.stop == "off goal" and store.completed == set()
 
 
-def test_the_arm_goes_at_the_plans_speed_or_a_share_of_it(tmp_path: Path) -> None:
-    for scale in (1.0, 0.25):
-        arm = KinematicArm(joints=plan().home.copy())
-        store = new_store(tmp_path / str(scale), plan().content_hash)
-        capture(plan(), arm, TableCamera(arm), store, config=replace(QUICK, speed_scale=scale))
-        expected = scale * plan().config.speed, scale * plan().config.acceleration
-        assert set(arm.speeds) == {expected}
-    with pytest.raises(InputError, match="at most 1 is accepted"):
-        CaptureConfig(speed_scale=1.5)
-
-
 def test_another_arm_is_told_by_its_name_or_by_where_its_flange_is(tmp_path: Path) -> None:
     store = new_store(tmp_path / "s", plan().content_hash)
     named = KinematicArm(joints=plan().home.copy(), name="UR5e")

@@ -362,16 +362,3 @@ def test_a_doubt_that_stays_is_stored_with_a_note_and_three_in_a_row_are_asked_a
     b = bench(tmp_path / "nobody", spoil)
     summary = b.capture()
     assert summary.complete and [k for k, _ in summary.noted] == [5, 6, 7, 8]
-
-
-def test_skip_redo_and_stop(tmp_path: Path, reference: SessionStore) -> None:
-    b = bench(tmp_path / "s")
-    person = Person(keys={2: ["skip"], 5: ["redo"], 7: ["stop"]})
-    summary = b.capture(operator=person)
-    assert summary.left_out == (2,) and not summary.complete
-    assert b.store.completed == set(range(8)) - {2}
-    assert b.store.has("retaken/000005_1_rgb.png")  # the fifth one stored: number 2 was skipped
-    assert CaptureLog(b.store).views()[2]["event"] == "skipped"
-    summary = b.capture()
-    assert summary.captured == 2 and summary.complete
-    assert_same_views(b.store, reference)

@@ -20,19 +20,6 @@ Q = np.array([0.3, -1.2, 1.4, -1.7, -1.5, 0.4])
 ROD = ("stepped_shaft",)
 
 
-def test_the_same_seed_gives_the_same_lab_and_another_one_another():
-    a, b, c = (SimulatedLab(LabConfig(seed=s, n_objects=3)) for s in (4, 4, 5))
-    for of in (
-        lambda lab: lab.truth.T_world_cam(Q),
-        lambda lab: lab.truth.objects[0].T_world_obj,
-        lambda lab: lab.truth.T_world_board,
-        lambda lab: lab.truth.intrinsics.K,
-    ):
-        np.testing.assert_array_equal(of(a), of(b))
-        assert np.abs(of(a) - of(c)).max() > 1e-9
-    assert list(a.models) == list(b.models)
-
-
 def test_sizes_of_the_unknowns_are_those_of_the_config():
     configs = [LabConfig(seed=s) for s in range(60)]
     off = np.stack([se3.invert(T_EE_CAM_NOMINAL) @ true_mount(c) for c in configs])

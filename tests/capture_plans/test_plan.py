@@ -13,7 +13,7 @@ from realsim_capture_plans.collision.model import CollisionModel, interpolate
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.planning.advise import advice, advise
 from realsim_capture_plans.planning.make import calibration_plan, hemisphere_plan
-from realsim_capture_plans.planning.moves import detour, ompl_path
+from realsim_capture_plans.planning.moves import detour
 from realsim_capture_plans.planning.ordering import move_seconds
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from realsim_capture_plans.planning.view_quality import hole_deg
@@ -169,24 +169,6 @@ def test_a_detour_is_found_round_the_keep_out_box(scene_plan: CapturePlan) -> No
     assert np.all(model.edges_free(corners[:-1], corners[1:], config.edge_step_rad))
     again = detour(first, last, scene_plan.home, model, config, np.random.default_rng(2))
     assert np.array_equal(via, again)
-
-
-def test_ompl_finds_a_way_and_repeats_it(scene_plan: CapturePlan) -> None:
-    config = replace(scene_plan.config, keep_out_m=(0.16, 0.16, 0.26))
-    model = CollisionModel(
-        UR5, d405_mount(), config.work_cell(CENTER, "hemisphere"), config.clearance_m
-    )
-    q = scene_plan.joints[model.free(scene_plan.joints)]
-    a, b = np.triu_indices(len(q), 1)
-    blocked = np.flatnonzero(~model.edges_free(q[a], q[b], config.edge_step_rad))[:1]
-    for row in blocked:
-        ends = q[a[row]], q[b[row]]
-        paths = [ompl_path(*ends, model, config, np.random.default_rng(s)) for s in (0, 0, 1)]
-        assert paths[0] is not None and paths[1] is not None
-        assert np.array_equal(paths[0], paths[1])
-        assert np.array_equal(paths[0][[0, -1]], np.stack(ends))
-        legs = model.edges_free(paths[0][:-1], paths[0][1:], config.edge_step_rad)
-        assert np.all(legs)
 
 
 @pytest.mark.slow

@@ -10,10 +10,7 @@ import pytest
 
 from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.collision.mount import d405_mount
-from realsim_capture_plans.collision.shapes import Box, Shape
-from realsim_capture_plans.pictures.arm_looks import (
-    shape_mesh,
-)
+from realsim_capture_plans.collision.shapes import Box
 from realsim_capture_plans.pictures.drawing import PlanCurves
 from realsim_capture_plans.pictures.motion_charts import clearance_chart
 from realsim_capture_plans.pictures.plan_pictures import plan_pictures
@@ -125,33 +122,3 @@ def test_the_board_picture_shows_rolls_tilts_and_places_in_the_image() -> None:
     assert np.degrees(gap) == pytest.approx(curves.metrics["roll_gap_deg"])
     assert f"{curves.metrics['roll_gap_deg']:.0f}°" in texts(figure)
     assert "board's centre" in texts(figure)
-
-
-# --- the bodies that are drawn ----------------------------------------------------------------
-
-
-def volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Divergence theorem; positive where the triangles face outward."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    return float(np.sum(a * np.cross(b, c)) / 6)
-
-
-@pytest.mark.parametrize(
-    ("kind", "size", "expected"),
-    [
-        ("box", (0.1, 0.2, 0.3), 0.006),
-        ("sphere", (0.1,), 4 / 3 * np.pi * 1e-3),
-        ("cylinder", (0.1, 0.5), np.pi * 0.01 * 0.5),
-        ("capsule", (0.1, 0.5), np.pi * 0.01 * 0.5 + 4 / 3 * np.pi * 1e-3),
-    ],
-)
-def test_a_shape_s_mesh_is_closed_faces_outward_and_has_its_volume(
-    kind: Any, size: tuple[float, ...], expected: float
-) -> None:
-    vertices, faces = shape_mesh(
-        Shape(part="p", frame=0, kind=kind, size_m=size, T_frame_shape=np.eye(4))
-    )
-    assert volume(vertices, faces) == pytest.approx(expected, rel=0.05)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    there = {tuple(e) for e in edges.tolist()}
-    assert len(there) == len(edges) and all((b, a) in there for a, b in there)

@@ -13,7 +13,7 @@ from realsim.errors import InputError
 from realsim.formats.bop.models import load_models, save_models
 from realsim.geometry.mesh import diameter, mass_properties
 from realsim.geometry.parts import part
-from realsim.models import library_commit
+from realsim.models import library_commit, library_complete
 from realsim.models.library import ModelLibrary
 from realsim.models.library_check import check_library
 from realsim.models.library_complete import complete
@@ -314,7 +314,8 @@ def test_what_was_changed_missing_or_left_over_is_found(library: ModelLibrary):
 # --- other programs' folders ------------------------------------------------------------------
 
 
-def test_a_foreign_models_folder_is_a_library(tmp_path: Path):
+def test_a_foreign_models_folder_is_a_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(library_complete, "sheet_png", lambda *_: b"picture")
     models = {3: replace(part("box"), obj_id=3), 4: replace(part("cone"), obj_id=4)}
     save_models(tmp_path, models)
     before = content(tmp_path)

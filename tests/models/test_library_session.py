@@ -27,7 +27,9 @@ def textured() -> Mesh:
 
 
 @pytest.fixture
-def library(tmp_path: Path) -> ModelLibrary:
+def library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModelLibrary:
+    # Pictures have tests of their own, and take longer than all that is tested here.
+    monkeypatch.setattr("realsim.models.pictures.sheet_png", lambda *_: b"picture")
     return ModelLibrary.create(tmp_path / "models")
 
 

@@ -15,7 +15,7 @@ from realsim_sim_bridge.school.school import run_school
 from realsim_sim_bridge.slip.engines import MujocoSettings
 from school_sessions import NAMES, scene
 
-LABELS = AnalyticConfig(points=60, view_step=2)
+LABELS = AnalyticConfig(points=40, view_step=2)
 MODELS = {part(n).obj_id: part(n) for n in NAMES}
 
 

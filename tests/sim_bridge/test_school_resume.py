@@ -260,11 +260,6 @@ def test_another_version_is_refused(finished, monkeypatch):
         run(finished)
 
 
-def test_restart_discards_the_other_run(tmp_path, whole):
-    run(tmp_path, dataclasses.replace(CONFIG, seed=1))
-    assert is_whole_again(run(tmp_path, restart=True)[0], whole)
-
-
 def test_results_of_unknown_origin_are_refused(tmp_path):
     (tmp_path / "instance_000000.grasps.npz").write_bytes(b"")
     with pytest.raises(InputError, match=f"no {RUN_FILE}"):

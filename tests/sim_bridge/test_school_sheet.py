@@ -77,7 +77,7 @@ def test_the_same_sets_give_the_same_bytes_and_an_object_stands_as_it_is_told_to
 
 def test_no_two_words_overlap_and_all_are_on_the_sheet():
     name = "a name that is far too long for any panel of a sheet, with a number 000123"
-    sets = [replace(s, instance=100 + s.instance) for s in some_sets(4, 60, measures=("margin",))]
+    sets = [replace(s, instance=100 + s.instance) for s in some_sets(3, 60, measures=("margin",))]
     figure = sheet_figure(sets, {1: model(name=name)}, "A title that is also long " * 4, {})
     figure.canvas.draw()
     texts = [t for ax in figure.axes for t in (*ax.texts, ax.title, ax._left_title)]

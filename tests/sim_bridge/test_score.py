@@ -73,18 +73,6 @@ def stored(slip_m, reachable, scores):
     )
 
 
-def test_scores_are_recomputed_from_the_set_alone():
-    slips = [[0, 0, 0, 0], [0, 0.03, NAN, NAN], [NAN] * 4, [NAN] * 4]
-    grasp_set = stored(slips, [True, True, False, True], [1.0, 0.25 - 1 / 12, 0.0, NAN])
-    base, score = recompute_scores(grasp_set)
-    assert np.allclose(score, grasp_set.scores, equal_nan=True)
-    assert np.allclose(base, [1.0, 0.25, 0.0, NAN], equal_nan=True)
-    _, stricter = recompute_scores(
-        stored([[0, 0.01, 0, 0]], [True], [1.0]), ScoreLimits(slip_m=0.005)
-    )
-    assert stricter[0] == pytest.approx(0.25 - 1 / 12)
-
-
 def test_a_set_from_elsewhere_is_refused():
     grasp_set = replace(stored([[0, 0, 0, 0]], [True], [1.0]), parameters={})
     with pytest.raises(InputError, match=r"config\.score"):

@@ -12,9 +12,6 @@ from realsim.errors import InputError
 from realsim.geometry.mesh import mass_properties
 from realsim.models.library_session import known_solids
 from realsim.rendering.appearance import Material
-from realsim_sim_bridge.scenes.school_scene import SchoolScene
-from realsim_sim_bridge.scenes.stable_state import stable_state
-from realsim_sim_bridge.scenes.table_world import TableWorld
 from realsim_sim_bridge.table_scenes.cameras import ViewConfig, intrinsics_of, views
 from realsim_sim_bridge.table_scenes.config import TableSceneConfig
 from realsim_sim_bridge.table_scenes.pool import open_pool
@@ -144,14 +141,3 @@ def test_the_school_knows_the_parts_and_the_matter_that_were_dropped(tmp_path: P
         assert kept.matter.mass_kg == solid.matter.mass_kg
         mesh = built.synthetic.models[obj_id].mesh
         assert kept.matter.mass_kg == pytest.approx(mass_properties(mesh, 1000.0).mass_kg)
-
-
-def test_the_schools_own_world_says_that_everything_stands() -> None:
-    built = _built()
-    scene = SchoolScene(
-        scene=built.synthetic.scene, models=dict(built.synthetic.models), solids=built.solids
-    )
-    with TableWorld(scene) as world:
-        report = stable_state(world)
-    assert report.stable, [o.sentence for o in report.objects]
-    assert not report.inside
