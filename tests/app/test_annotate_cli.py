@@ -11,7 +11,7 @@ from click.testing import CliRunner, Result
 from realsim import images
 from realsim.app.annotate.cli import annotate_command
 from realsim.app.annotate.page import PAGE_FILE
-from realsim.app.annotate.run import SHEET_FILE, sheet_views
+from realsim.app.annotate.run import SHEET_FILE
 from realsim.app.register.files import write_result
 from realsim.errors import InputError
 from realsim.store import SessionStore, load_scene, save_scene
@@ -76,15 +76,6 @@ def test_an_unknown_map_is_named(store: SessionStore) -> None:
     with pytest.raises(InputError, match="no map 'colour'"):
         run(store, "--maps", "colour")
     assert not store.has("scene_gt_coco.json")
-
-
-def test_the_sheet_shows_flagged_frames_first_and_others_too() -> None:
-    views = list(range(100))
-    shown = sheet_views(views, [50, 60, 70, 80, 90])
-    assert shown[:4] == [50, 60, 70, 80] and len(shown) == 8 and len(set(shown)) == 8
-    assert sheet_views([3, 4], [4]) == [4, 3]
-    assert sheet_views([3, 4], [3, 4]) == [3, 4]
-    assert sheet_views([], []) == []
 
 
 def page_of(store: SessionStore) -> str:

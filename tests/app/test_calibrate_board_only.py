@@ -22,8 +22,8 @@ from stored_sessions import bytes_of, flip
 CAMERA = CameraIntrinsics(width=640, height=400, fx=440.0, fy=440.0, cx=319.5, cy=199.5)
 BOARD = TagBoard(rows=3, columns=4, tag_size_m=0.04, gap_m=0.01)
 T_EE_CAM = se3.from_rt(se3.exp_so3([0.02, -0.03, 0.9]), [0.01, -0.065, 0.035])
-VIEWS = 14
-MODULES, TEXTURE, FINE = 8, 10, 4
+VIEWS = 12
+MODULES, TEXTURE, FINE = 8, 10, 2
 """Modules of a tag with its border, texture pixels a module, supersampling."""
 Array = NDArray[np.float64]
 
@@ -115,8 +115,9 @@ def lab(captured: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(captured, tmp_path / "lab"))
 
 
+@pytest.mark.slow
 def test_the_hand_eye_is_known_before_there_is_a_view_of_objects(
-    calibrated: tuple[Path, Result],
+    calibrated: tuple[Path, Result], captured: Path
 ) -> None:
     folder, done = calibrated
     assert done.exit_code == 0, done.output
@@ -127,14 +128,12 @@ def test_the_hand_eye_is_known_before_there_is_a_view_of_objects(
     assert np.degrees(np.linalg.norm(se3.log_so3(off[:3, :3]))) < 0.05
     assert (folder / "calibration/report/calibration_report.html").is_file()
     assert "same command" in done.stderr
-
-
-def test_no_session_is_begun_by_it(calibrated: tuple[Path, Result], captured: Path) -> None:
-    folder, _ = calibrated
+    # No session is begun by it.
     assert [p.name for p in folder.iterdir()] == ["calibration"]
     assert bytes_of(folder / "calibration/capture") == bytes_of(captured / "calibration/capture")
 
 
+@pytest.mark.slow
 def test_with_objects_the_same_command_says_the_same_and_places_their_cameras(
     calibrated: tuple[Path, Result], tmp_path: Path
 ) -> None:
@@ -161,17 +160,6 @@ def test_with_objects_the_same_command_says_the_same_and_places_their_cameras(
     assert after.verify() == []
 
 
-@pytest.mark.slow
-def test_a_bad_check_is_told_while_the_board_still_lies_there(lab: Path) -> None:
-    longer = TagBoard(rows=3, columns=4, tag_size_m=0.0412, gap_m=0.0103)
-    (lab / "calibration/board.json").write_bytes(json_bytes(target_to_json(longer)))
-    done = calibrate(lab, "--json")
-    assert done.exit_code == 1, done.output
-    told = json.loads(done.stdout)
-    assert not told["passed"]
-    assert "board size" in [c["name"] for c in told["checks"] if c["verdict"] == "bad"]
-
-
 def refused(folder: Path, *options: str) -> str:
     """Calibrate what cannot be, and return why; nothing may be written."""
     before = bytes_of(folder)
@@ -181,20 +169,14 @@ def refused(folder: Path, *options: str) -> str:
     return str(done.exception)
 
 
-def test_what_the_board_views_say_themselves_is_not_said_twice(lab: Path) -> None:
+def test_what_is_damaged_missing_or_said_twice_is_refused(lab: Path, tmp_path: Path) -> None:
+    # What the board views say themselves is not said twice.
     assert "--board" in refused(lab, "--board", "aprilgrid:4x3,tag=40mm,gap=10mm")
-
-
-def test_a_damaged_board_view_is_no_board_view(lab: Path) -> None:
-    flip(lab / "calibration/capture/rgb/000003.png", 900)
-    assert "rgb/000003.png" in refused(lab)
-
-
-def test_without_its_target_file_the_board_is_not_guessed(lab: Path) -> None:
+    lost = Path(shutil.copytree(lab, tmp_path / "lost"))
+    (lost / "manifest.jsonl").write_text("")
+    assert "session.json" in refused(lost), "a session that lost its header is not one of a board"
+    torn = Path(shutil.copytree(lab, tmp_path / "torn"))
+    flip(torn / "calibration/capture/rgb/000003.png", 900)
+    assert "rgb/000003.png" in refused(torn)
     (lab / "calibration/board.json").unlink()
     assert "realsim board" in refused(lab)
-
-
-def test_a_session_that_lost_its_header_is_not_taken_for_one_of_board_views(lab: Path) -> None:
-    (lab / "manifest.jsonl").write_text("")
-    assert "session.json" in refused(lab)

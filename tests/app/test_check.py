@@ -80,26 +80,6 @@ def test_what_is_no_session_ends_with_2(
     assert "is not a session" in capsys.readouterr().err
 
 
-def test_a_running_capture_is_not_repaired(
-    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with only_run_in(session):
-        assert main(monkeypatch, session, "--repair") == 2
-        assert "another run is working" in capsys.readouterr().err
-        assert run(session).exit_code == 0
-
-
-def test_what_cannot_be_repaired_is_said_and_left(
-    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("session.json", "scene_camera.json"):
-        (session / name).write_text("")
-    assert run(session).exit_code == 1
-    assert main(monkeypatch, session, "--repair") == 2
-    assert "Restore one of the two" in capsys.readouterr().err
-    assert (session / "rgb/000000.png").is_file() and not (session / "damaged").exists()
-
-
 def test_files_without_a_checksum_are_named_and_those_of_others_explained(session: Path) -> None:
     (session / "models").mkdir()
     (session / "models/obj_000001.ply").write_text("ply")
@@ -118,3 +98,12 @@ def test_files_without_a_checksum_are_named_and_those_of_others_explained(sessio
     assert repaired.exit_code == 0 and "rgb/000001.png" in repaired.output
     assert "nothing can tell" in repaired.output
     assert json.loads(run(session, "--json").output)["files_without_checksum"] == []
+
+
+def test_a_running_capture_is_not_repaired(
+    session: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with only_run_in(session):
+        assert main(monkeypatch, session, "--repair") == 2
+        assert "another run is working" in capsys.readouterr().err
+        assert run(session).exit_code == 0

@@ -29,25 +29,6 @@ def test_help_imports_nothing_heavy() -> None:
     assert "HEAVY []" in done.stdout, done.stdout + done.stderr
 
 
-def test_a_command_loads_its_own_options_only() -> None:
-    code = (
-        "import sys\n"
-        "sys.argv = ['realsim', 'board', '--help']\n"
-        "from realsim.app.cli import main\n"
-        "try: main()\n"
-        "except SystemExit: pass\n"
-        "print('LOADED', sorted(m for m in sys.modules if m.endswith('.cli')))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert "LOADED ['realsim.app.board.cli', 'realsim.app.cli']" in done.stdout, done.stderr
-
-
-def test_help_names_every_job() -> None:
-    text = realsim("--help").stdout
-    for command in ("demo", "upgrade", "calibrate", "register", "school", "annotate", "review"):
-        assert command in text
-
-
 def test_a_folder_that_is_no_session_is_named(tmp_path: Path) -> None:
     for command in ("calibrate", "register", "school", "annotate", "report"):
         done = realsim(command, tmp_path)
@@ -114,11 +95,6 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
     assert done.stdout.startswith("# Settings")
 
 
-def test_json_of_bad_input_is_nothing_on_stdout(tmp_path: Path) -> None:
-    done = realsim("check", str(tmp_path / "gone"), "--json")
-    assert done.returncode == 2 and done.stdout == "" and "gone" in done.stderr
-
-
 @pytest.mark.parametrize("place", [0, 1, 2])
 def test_no_color_may_stand_anywhere(place: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NO_COLOR", "")  # restored in the end, whatever the command sets
@@ -132,18 +108,6 @@ def test_demo_takes_nobodys_folder(tmp_path: Path) -> None:
     done = realsim("demo", "--out", str(tmp_path))
     assert done.returncode == 2 and "not empty" in done.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
-
-
-def test_demo_of_another_setup_is_not_mixed(tmp_path: Path) -> None:
-    (tmp_path / "demo.json").write_text('{"views": 7, "objects": 2, "seed": 1}')
-    done = realsim("demo", "--out", str(tmp_path), "--views", "8")
-    assert done.returncode == 2 and "views=7" in done.stderr
-
-
-def test_demo_output_that_is_a_file(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    done = realsim("demo", "--out", str(tmp_path / "file"))
-    assert done.returncode == 2 and "is a file" in done.stderr
 
 
 def test_unwritable_output_is_one_paragraph() -> None:

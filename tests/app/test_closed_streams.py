@@ -28,10 +28,6 @@ def test_the_result_is_that_of_a_run_whose_streams_are_open(
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
-def test_what_cannot_be_used_ends_with_2(tmp_path: Path) -> None:
-    assert run(MAIN, f"stats '{tmp_path}/nothing'", CLOSED).returncode == 2
-
-
 def test_what_a_library_prints_never_lands_in_a_file(tmp_path: Path) -> None:
     script = (
         "import os, sys; from realsim.app.console import open_missing_streams; "

@@ -83,8 +83,3 @@ def test_every_shell_has_its_script(shell: str, tmp_path: Path) -> None:
         script = tmp_path / "script"
         script.write_text(done.stdout)
         assert subprocess.run([parser, "-n", script]).returncode == 0
-
-
-def test_another_shell_is_refused_with_those_that_there_are() -> None:
-    done = realsim("completion", "csh")
-    assert done.returncode == 2 and "zsh" in done.stderr

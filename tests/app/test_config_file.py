@@ -2,17 +2,16 @@
 
 import json
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import click
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
 
 from realsim.app.cli import commands
 from realsim.app.command import default_of, settable, spelling, walk
-from realsim.app.config.files import find_config, line_of, read_config
+from realsim.app.config.files import find_config, read_config
 from realsim.app.config.settings import settings_of
 from realsim.app.config.template import template, toml_value
 from realsim.app.outputs import OutputFile
@@ -68,16 +67,6 @@ def uncommented() -> str:
     return re.sub(r"^# (?=[a-z0-9-]+ = )", "", template(EVERY), flags=re.MULTILINE)
 
 
-def test_the_template_is_toml_and_says_nothing() -> None:
-    assert all(not keys for keys in _leaves(tomllib.loads(template(EVERY))))
-
-
-def _leaves(tables: dict[str, Any]) -> list[list[str]]:
-    keys = [k for k, v in tables.items() if not isinstance(v, dict)]
-    inner = [leaf for v in tables.values() if isinstance(v, dict) for leaf in _leaves(v)]
-    return [keys, *inner]
-
-
 def test_the_template_without_its_comment_marks_sets_every_option_to_its_default() -> None:
     settings = read(uncommented())
     for path, command in EVERY.items():
@@ -94,20 +83,6 @@ def test_the_template_without_its_comment_marks_sets_every_option_to_its_default
             found = option.type_cast_value(ctx, here[option.name])
             wanted = option.type_cast_value(ctx, default)
             assert found == wanted, (path, option.name)
-
-
-def test_every_option_of_every_command_is_in_the_template() -> None:
-    tables = tomllib.loads(uncommented())
-    for path, command in EVERY.items():
-        here: Any = tables
-        for name in path:
-            here = here.get(name, {})
-        assert set(here) == {spelling(option) for option in settable(command)}, path
-
-
-@pytest.mark.parametrize("value", ['a "quoted" \\ Grüße', 2.5, True, [1, 2]])
-def test_values_are_written_as_toml_reads_them(value: Any) -> None:
-    assert tomllib.loads(f"x = {toml_value(value)}")["x"] == value
 
 
 # --- who wins -----------------------------------------------------------------------------------
@@ -280,32 +255,3 @@ def test_a_variable_that_cannot_be_used_is_named(monkeypatch: pytest.MonkeyPatch
     done = realsim("demo")
     assert done.returncode == 2 and "REALSIM_DEMO_VIEWS" in done.stderr
     assert "Traceback" not in done.stderr
-
-
-def test_a_variable_of_no_option_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("REALSIM_REGISTER_VIEW", "3")
-    result: Result = CliRunner().invoke(commands, ["config", "show"])
-    assert "REALSIM_REGISTER_VIEW is of no option" in result.output
-    assert "REALSIM_REGISTER_VIEWS?" in result.output.replace("\n", "")
-
-
-def test_both_spellings_of_a_key_and_empty_texts() -> None:
-    assert read("[register]\ndepth_bias = 'off'") == {"register": {"depth_bias": "off"}}
-    assert read("[register]\ndepth-bias = 'off'") == {"register": {"depth_bias": "off"}}
-    assert read('[register]\nlibrary = ""') == {"register": {}}
-
-
-@pytest.mark.parametrize(
-    ("text", "tables", "key", "line"),
-    [
-        ("[a]\nx = 1\n[b]\nx = 2", ("b",), "x", 4),
-        ("[a.b]\n\n# x = 3\nx = 1", ("a", "b"), "x", 4),
-        ("a.b.x = 1", ("a", "b"), "x", 1),
-        ("[a]\nb = {x = 1}", ("a", "b"), "", 2),
-        ("[a]\nx = 1", ("a",), "y", None),
-    ],
-)
-def test_lines_are_those_of_the_file(
-    text: str, tables: tuple[str, ...], key: str, line: int | None
-) -> None:
-    assert line_of(text, tables, key) == line

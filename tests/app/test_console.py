@@ -14,7 +14,7 @@ import pytest
 
 from realsim.app import console as module
 from realsim.app.console import Console, duration
-from realsim.app.json_values import json_document, json_value
+from realsim.app.json_values import json_document
 
 HEADER = ["object", "tried", "reach of the arm [mm]", "place [m]", "sentence"]
 ROWS = [["a mug of twenty words", 123456.789, 98765.4321, "0.123 0.456", "half of it is hidden"]]
@@ -79,15 +79,6 @@ def test_a_pipe_gets_no_escape_sequence_and_no_bar() -> None:
     assert "5/5" not in done.stderr
 
 
-def test_a_dumb_terminal_gets_no_escape_sequence() -> None:
-    assert "\x1b" not in on_a_terminal(TERM="dumb")
-
-
-def test_no_color_wins_over_force_color() -> None:
-    done = piped(FORCE_COLOR="1", NO_COLOR="1")
-    assert "\x1b" not in done.stdout + done.stderr
-
-
 def test_no_number_is_cut_in_two_and_no_line_is_too_wide() -> None:
     columns = 40
     said = re.sub(r"\x1b\[[0-9;]*m", "", on_a_terminal(columns))
@@ -112,29 +103,6 @@ def test_a_log_gets_a_line_at_most_every_ten_seconds(
     assert re.fullmatch(r"first: 16 % \(8 of 50\), \d+ s left", lines[0]) or "left" in lines[0]
     shares = [int(re.findall(r"(\d+) %", line)[0]) for line in lines]
     assert shares[:4] == sorted(shares[:4])
-
-
-def test_the_time_that_is_left_is_the_time_that_it_takes(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    clock = iter([0.0, 0.0, 20.0])  # console, stage, tick
-    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
-    with Console().stage("render") as tick:
-        tick(1, 4)
-    assert capsys.readouterr().err == "render: 25 % (1 of 4), 60 s left\n"
-
-
-def test_a_quiet_console_shows_no_progress_but_every_note(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(module, "SECONDS_BETWEEN_LINES", 0.0)
-    console = Console(quiet=True)
-    with console.stage("render") as tick:
-        tick(1, 2)
-    console.warn("look here")
-    console.say("result")
-    told = capsys.readouterr()
-    assert told.err == "note: look here\n" and told.out == "result\n"
 
 
 def test_json_has_stdout_for_itself(capsys: pytest.CaptureFixture[str]) -> None:
@@ -163,11 +131,6 @@ def test_json_has_records_arrays_paths_and_no_nan() -> None:
         "n": 3,
         "k": {"2": [1, None, True]},
     }
-
-
-def test_what_is_no_json_is_refused() -> None:
-    with pytest.raises(TypeError, match="object"):
-        json_value({"a": object()})
 
 
 @pytest.mark.parametrize(

@@ -14,11 +14,9 @@ from realsim.app.check.agreement import AgreementConfig, ObjectAgreement, SceneA
 from realsim.app.check.checksums import check_checksums, checksum_list
 from realsim.app.check.dataset import checked_scenes
 from realsim.app.check.tally import (
-    DepthDifference,
     MaskOverlap,
     Tally,
     agreement_of,
-    stray_depth,
 )
 from realsim.errors import InputError
 from tests.support.bop_scenes import edit, write_boxes
@@ -159,50 +157,12 @@ def test_it_does_not_matter_where_the_world_begins_or_which_image_comes_first() 
     assert turned == told[0]  # image 4 is the middle one of nine
 
 
-def test_of_two_images_neither_is_accused() -> None:
-    (told,) = strays(seen_at(np.array([[0.0, 0, 0], [9.0, 0, 0]])))
-    assert told == "images 0 and 1: object 8 stands 9.0 mm apart in them"
-    assert strays(seen_at(np.array([[0.0, 0, 0], [4.0, 0, 0]]))) == ()
-
-
-def test_a_bias_of_one_surface_is_no_bias_of_an_image() -> None:
-    def tally(bias: float, off: dict[int, float]) -> Tally:
-        rows = [
-            DepthDifference(image=k, off_mm=bias + off.get(k, 0.0), scale=1.0, hidden=0.0)
-            for k in range(6)
-        ]
-        return Tally(depth=rows)
-
-    # A shiny thing that is measured 14 mm too far always, and is in some images only.
-    some = tally(14.0, {})
-    some.depth = some.depth[:3]
-    assert stray_depth([tally(0.0, {}), some], CONFIG) == []
-    (told,) = stray_depth([tally(b, {2: -8.0}) for b in (0.0, 3.0, 14.0)], CONFIG)
-    assert told.startswith("depth of image 2 is 8 mm nearer")
-
-
 @pytest.mark.parametrize(("outline_px", "strays_told"), [(0.6, 0), (2.4, 1)])
 def test_a_half_hidden_thing_is_all_outline(outline_px: float, strays_told: int) -> None:
     """The same IoU is a rounded pose of a sliver, or a wrong mask of something large."""
     sound = [MaskOverlap(image=k, iou=0.98, outline_px=0.2) for k in range(6)]
     tally = Tally(visible=[*sound, MaskOverlap(image=6, iou=0.8, outline_px=outline_px)])
     assert len(strays(tally)) == strays_told
-
-
-def test_masks_that_differ_in_all_images_have_no_stray_among_them() -> None:
-    rng = np.random.default_rng(2)
-    lacking = rng.uniform(0.04, 0.12, 30)
-    found = [MaskOverlap(image=k, iou=1 - x, outline_px=15 * x) for k, x in enumerate(lacking)]
-    assert strays(Tally(mask=found)) == ()
-    (told,) = strays(Tally(mask=[*found, MaskOverlap(image=30, iou=0.6, outline_px=6.0)]))
-    assert told.startswith("mask of image 30 has the IoU 0.60")
-
-
-def test_many_strays_are_counted_not_listed() -> None:
-    points = np.zeros((40, 3))
-    points[:12, 0] = 50.0 + np.arange(12)
-    told = strays(seen_at(points))
-    assert len(told) == 6 and told[0].startswith("image 11:") and "7 images more" in told[-1]
 
 
 # --- checksums ------------------------------------------------------------------------------------
@@ -233,17 +193,6 @@ def test_files_are_held_against_their_checksums(scene: Path) -> None:
     assert "rgb/000009.png: other bytes" in shown and "rgb/000013.png: the file is" in shown
     # What lies beside the given folder is not its matter.
     assert check(root / "models").exit_code == 0
-
-
-def test_an_export_of_another_format_is_checked_by_its_sums(tmp_path: Path) -> None:
-    (tmp_path / "sparse").mkdir()
-    (tmp_path / "sparse/cameras.txt").write_text("1 PINHOLE")
-    assert isinstance(check(tmp_path).exception, InputError)
-    summed(tmp_path)
-    result = check(tmp_path)
-    assert result.exit_code == 0 and "only checksums were compared" in result.output
-    (tmp_path / "sparse/cameras.txt").write_text("1 SIMPLE")
-    assert check(tmp_path).exit_code == 1
 
 
 @pytest.mark.parametrize("line", ["a" * 64 + "  ../secret", "no sum"])

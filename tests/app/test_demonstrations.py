@@ -132,6 +132,7 @@ def test_an_interrupted_export_goes_on_and_gives_the_same_bytes(
     assert "finished export" in refused(school, "--out", written)
 
 
+@pytest.mark.slow
 def test_requests_that_cannot_be_are_refused(school, tmp_path):
     out = ("--out", tmp_path / "demos")
     assert "INSTANCE:GRASP" in refused(school, *out, "--grasp", "first")
@@ -143,6 +144,7 @@ def test_requests_that_cannot_be_are_refused(school, tmp_path):
     assert "weighs" in refused(school, *out, "--mass", "cube=0.5", "--limit", "1")
 
 
+@pytest.mark.slow
 def test_a_grasp_that_the_arm_does_not_reach_is_refused_with_its_reason(school, tmp_path):
     request = DemonstrationRequest()
     source = open_source(school, request, demonstrations.Console(quiet=True))

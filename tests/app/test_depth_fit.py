@@ -8,7 +8,6 @@ import pytest
 from click.testing import CliRunner, Result
 
 from realsim.app.cli import commands
-from realsim.app.depth_fit.run import read_frames
 from realsim.errors import InputError
 from realsim.images import depth_counts, png_bytes
 from realsim.records import CameraIntrinsics
@@ -63,6 +62,7 @@ def test_a_folder_gives_a_sensor_that_is_what_it_was(walls: Path, tmp_path: Path
     assert [f["name"] for f in frames] == ["000000.png", "000001.png", "000002.png"]
 
 
+@pytest.mark.slow
 def test_the_stereo_camera_is_fitted_to_the_same_folder(walls: Path, tmp_path: Path) -> None:
     out = tmp_path / "stereo.json"
     result = fit(walls, "--simulator", "stereo", "--out", out, "--quiet", "--views", "0-1")
@@ -74,12 +74,6 @@ def test_the_stereo_camera_is_fitted_to_the_same_folder(walls: Path, tmp_path: P
         ratio = f["simulated"]["sigma_px"] / f["measured"]["sigma_px"]
         assert 1 / 1.2 < ratio < 1.2
     assert "full_well" in result.output and out.with_suffix(".png").is_file()
-
-
-def test_one_frame_is_enough_and_what_it_leaves_open_is_said(walls: Path, tmp_path: Path) -> None:
-    result = fit(walls, "--views", "0", "--out", tmp_path / "one.json", "--quiet")
-    assert result.exit_code == 0
-    assert "one distance only" in result.output and "add frames at" in result.output
 
 
 def test_the_wrong_unit_is_named(walls: Path, tmp_path: Path) -> None:
@@ -105,16 +99,6 @@ def test_frames_without_a_plane_are_named(tmp_path: Path) -> None:
     assert not out.exists() and not out.with_suffix(".png").exists()
 
 
-def test_images_of_several_sizes_are_named(walls: Path, tmp_path: Path) -> None:
-    for k, cut in enumerate((300, 200)):
-        counts = depth_counts(wall(0.3, 0.1)[:cut], UNIT)
-        (tmp_path / f"{k}.png").write_bytes(png_bytes(counts))
-    said = refusal(
-        tmp_path, "--camera", walls / "cam_K.txt", "--out", tmp_path / "o.json", "--quiet"
-    )
-    assert "1.png" in said and "400x200" in said and "400x300" in said
-
-
 def test_folders_that_hold_nothing_to_fit_are_named(walls: Path, tmp_path: Path) -> None:
     assert "no folder" in refusal(tmp_path / "nowhere")
     assert "holds no PNG" in refusal(tmp_path)
@@ -122,13 +106,3 @@ def test_folders_that_hold_nothing_to_fit_are_named(walls: Path, tmp_path: Path)
     assert "is a folder" in refusal(walls, "--out", tmp_path)
     (tmp_path / "a.png").write_bytes(png_bytes(depth_counts(wall(0.3, 0.1), UNIT)))
     assert "--camera FILE" in refusal(tmp_path)
-
-
-def test_many_frames_are_thinned_evenly_and_wanted_ones_are_not(tmp_path: Path) -> None:
-    (tmp_path / "cam_K.txt").write_text("380 0 199.5\n0 380 149.5\n0 0 1\n")
-    image = png_bytes(depth_counts(wall(0.3, 0.1), UNIT))
-    for k in range(30):
-        (tmp_path / f"{k:02d}.png").write_bytes(image)
-    names = read_frames(tmp_path, "", None, UNIT).names
-    assert len(names) == 12 and names[0] == "00.png" and names[-1] == "29.png"
-    assert len(read_frames(tmp_path, "3-20", None, UNIT).names) == 18

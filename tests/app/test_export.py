@@ -16,7 +16,6 @@ from realsim.formats.bop.opening import open_labelled_bop
 from realsim.formats.bop.root_files import write_bop_models, write_bop_root
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 from realsim.formats.export_folder import ExportFolder
-from realsim.geometry import se3
 from realsim.store import SessionStore
 
 
@@ -87,11 +86,6 @@ def test_bop_to_the_store_and_back_is_the_same_to_the_last_digit(bop, tmp_path):
         assert (bop / name).is_file() and (tmp_path / "again" / name).is_file()
 
 
-def test_bop_to_bop_without_a_session_is_the_same(bop, tmp_path):
-    done("export", bop, "--to", "bop", "--out", tmp_path / "again", "--quiet")
-    assert_same_scene(bop, tmp_path / "again")
-
-
 def test_graspnet_to_the_store_and_back_keeps_every_digit_of_the_format(bop, tmp_path):
     first, second = tmp_path / "graspnet", tmp_path / "again"
     table = ("--table-is-world", "--quiet")
@@ -112,21 +106,6 @@ def test_graspnet_to_the_store_and_back_keeps_every_digit_of_the_format(bop, tmp
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
 
 
-def test_bop_to_graspnet_and_back_loses_what_four_decimals_lose(bop, tmp_path):
-    done("export", bop, "--to", "graspnet", "--out", tmp_path / "g", "--table-is-world", "--quiet")
-    done("export", tmp_path / "g", "--to", "bop", "--out", tmp_path / "b", "--quiet")
-    before, after = open_labelled_bop(bop), open_labelled_bop(tmp_path / "b")
-    for i, j in zip(before.indices, after.indices, strict=True):
-        for a, b in zip(before.frame(i).objects, after.frame(j).objects, strict=True):
-            assert a.obj_id == b.obj_id
-            T = se3.invert(a.T_cam_obj) @ b.T_cam_obj
-            assert np.linalg.norm(T[:3, 3]) < 0.5e-4 * np.sqrt(3) + 1e-9
-            assert se3.angle(T) < 2e-4
-        for k in range(len(MODELS)):
-            seen = before.mask(i, k, visible=True), after.mask(j, k, visible=True)
-            assert np.array_equal(*seen)
-
-
 def test_labels_that_came_along_become_starts_and_are_never_overwritten(bop, tmp_path):
     done("import", bop, tmp_path / "session", "--quiet")
     store = SessionStore.open(tmp_path / "session")
@@ -141,39 +120,6 @@ def test_labels_that_came_along_become_starts_and_are_never_overwritten(bop, tmp
     assert (tmp_path / "session/imported/scene_gt.json").read_bytes() == before
 
 
-def test_labels_can_be_left_behind(bop, tmp_path):
-    done("import", bop, tmp_path / "session", "--no-labels", "--quiet")
-    assert not (tmp_path / "session/imported").exists()
-    said = refused("export", tmp_path / "session", "--to", "bop", "--labels", "imported",
-                   "--out", tmp_path / "o")  # fmt: skip
-    assert "not imported with labels" in said
-    assert not (tmp_path / "o").exists()
-
-
-def test_cameras_that_nobody_told_follow_from_objects_that_stand_still(tmp_path):
-    scene = labelled_scene(tmp_path / "images", [0, 1, 2])
-    truth = {i: scene.frame(i).T_world_cam for i in scene.indices}
-    scene.change_frames(T_world_cam=None)
-    written_bop(tmp_path / "bop", scene)
-    done("import", tmp_path / "bop", tmp_path / "session", "--quiet")
-    views = SessionStore.open(tmp_path / "session").session.views
-    for v in views:
-        relative = se3.invert(truth[0]) @ truth[v.index]
-        np.testing.assert_allclose(v.T_world_cam, relative, atol=1e-9)
-
-
-def test_an_archive_is_imported_like_its_content(bop, tmp_path):
-    import shutil
-
-    shutil.make_archive(str(tmp_path / "data"), "zip", bop.parent, bop.name)
-    done("import", bop, tmp_path / "a", "--quiet")
-    done("import", tmp_path / "data.zip", tmp_path / "b", "--quiet")
-    for name in ("rgb/000003.png", "depth/000003.png", "imported/scene_gt.json"):
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
-    assert "scene_gt.json" in done("import", tmp_path / "data.zip", "--list")
-
-
 def test_the_sums_and_counts_on_the_card_are_those_of_the_folder(bop, tmp_path):
     (tmp_path / "s").mkdir()
     out = tmp_path / "out"
@@ -186,15 +132,6 @@ def test_the_sums_and_counts_on_the_card_are_those_of_the_folder(bop, tmp_path):
     files = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
     assert set(sums) == files - {"SHA256SUMS", ".export.json"}
     assert all(hashlib.sha256((out / f).read_bytes()).hexdigest() == d for f, d in sums.items())
-
-
-def test_two_sources_that_count_alike_are_two_scenes(bop, tmp_path):
-    done("import", bop, tmp_path / "a", "--quiet")
-    done("export", bop, tmp_path / "a", "--to", "bop", "--out", tmp_path / "out", "--quiet")
-    assert sorted(p.parent.name for p in tmp_path.glob("out/*/*/scene_gt.json")) == [
-        "000000", "000001",
-    ]  # fmt: skip
-    assert "given twice" in refused("export", bop, bop, "--to", "bop", "--out", tmp_path / "o")
 
 
 def test_what_cannot_be_is_refused_and_leaves_nothing(bop, tmp_path):
@@ -243,35 +180,6 @@ def test_cameras_go_out_and_come_back(bop, tmp_path):
         assert len(views) == len(before.indices)
         for v, i in zip(views, before.indices, strict=True):
             np.testing.assert_allclose(v.T_world_cam, before.frame(i).T_world_cam, atol=1e-9)
-
-
-def test_sources_that_have_changed_are_not_mixed(bop, tmp_path, monkeypatch):
-    import shutil
-
-    from realsim.formats.export_folder import ExportFolder
-
-    source = shutil.copytree(bop, tmp_path / "bop")
-    args = ("export", source, "--to", "bop", "--out", tmp_path / "out", "--quiet")
-
-    def stopped(self, files):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr(ExportFolder, "finish", stopped)
-        assert run(*args).exit_code != 0
-    file = next(source.glob("*/*/depth/*.png"))
-    file.write_bytes(file.read_bytes() + b" ")
-    assert "sources have changed" in refused(*args)
-
-
-def test_a_finished_export_is_known_and_not_written_again(bop, tmp_path):
-    args = ("export", bop, "--to", "bop", "--out", tmp_path / "out", "--quiet")
-    done(*args)
-    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("*")}
-    assert "finished already" in done(*args)
-    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("*")} == before
-    assert "finished export" in refused(*args, "--no-masks")
-    assert str(tmp_path) not in (tmp_path / "out/.export.json").read_text()
 
 
 def test_labels_that_are_no_reference_say_so_wherever_they_go(bop, tmp_path):

@@ -9,9 +9,6 @@ from realsim.app.cli import commands
 from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.formats.graspnet.grasp_group import read_grasp_group
-from realsim.formats.grasps.acronym import read_acronym
-from realsim.formats.grasps.hdf5 import read_grasps_hdf5
-from realsim.formats.grasps.scene_grasps import executed
 from realsim.formats.session_scene import open_session_scene
 from realsim.store import SessionStore, load_grasps, load_scene, save_grasps
 from synthetic_scenes import captured_session
@@ -53,35 +50,6 @@ def test_grasps_of_a_frame_are_in_its_camera(session, tmp_path):
         assert len(group) == len(want) > 10
         np.testing.assert_allclose(group.Ts_a_grasp, [T for T, _ in want], atol=2e-6)
         np.testing.assert_allclose(group.scores, [score for _, score in want], atol=1e-6)
-
-
-def test_files_of_objects_hold_what_was_tried(session, tmp_path):
-    done("export", session, "--to", "acronym", "--out", tmp_path / "a", "--quiet")
-    done("export", session, "--to", "hdf5", "--out", tmp_path / "h", "--quiet")
-    sets = {s.instance: s for s in load_grasps(SessionStore.open(session))}
-    files = sorted((tmp_path / "a/scene_000002").glob("*.h5"))
-    assert len(files) == len(sets)
-    for file, s in zip(files, sets.values(), strict=True):
-        again = read_acronym(file)
-        tried = executed(s)
-        np.testing.assert_allclose(again.Ts_obj_grasp, s.Ts_obj_grasp[tried], atol=1e-9)
-    whole = read_grasps_hdf5(tmp_path / "h/scene_000002/grasps.h5")
-    assert [len(s) for s in whole.sets] == [len(s) for s in sets.values()]
-
-
-def test_the_card_counts_what_the_files_hold(session, tmp_path):
-    sets = load_grasps(SessionStore.open(session))
-    tried = sum(int(executed(s).sum()) for s in sets)
-    good = sum(int((np.nan_to_num(s.scores, nan=-1) >= 0.5)[executed(s)].sum()) for s in sets)
-    done("export", session, "--to", "acronym", "--out", tmp_path / "a", "--quiet")
-    done("export", session, "--to", "isaac", "--out", tmp_path / "i", "--least-score", "0.5",
-         "--quiet")  # fmt: skip
-    for name, count in (("a", tried), ("i", good)):
-        card = (tmp_path / name / "README.md").read_text()
-        assert f"| scene_000002 | scene_000002 | 2 | {count} | {tried} |" in card, card
-    assert "grasps are left out" in (tmp_path / "i/README.md").read_text()
-    first = sorted((tmp_path / "a/scene_000002").glob("*.h5"))[0].name
-    assert f'h5py.File("scene_000002/{first}")' in (tmp_path / "a/README.md").read_text()
 
 
 def test_grasps_are_of_sessions(session, tmp_path):

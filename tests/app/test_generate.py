@@ -13,8 +13,6 @@ import pytest
 from click.testing import CliRunner, Result
 
 from realsim.app.generate.cli import generate_command
-from realsim.app.generate.page import sheet_views
-from realsim.app.generate.scene import stored_costs
 from realsim.errors import InputError
 
 SMALL = ("--views", "2", "--size", "160x90", "--objects", "2-3", "--seed", "5", "--workers", "1",
@@ -78,18 +76,6 @@ def test_the_data_set_says_what_was_used(dataset: Path) -> None:
     assert (dataset / "contact_sheet.png").is_file()
 
 
-def test_the_page_switches_layers_and_shows_the_figures(dataset: Path) -> None:
-    page = (dataset / "index.html").read_text()
-    for layer in ("picture", "labels", "depth of the camera", "exact depth", "normals",
-                  "object coordinates"):  # fmt: skip
-        assert page.count(f'data-layer="{layer}"') == 2
-    for title in ("Generated scenes", "Visibility of objects in views", "CPU time of a frame"):
-        assert f"<h2>{title}</h2>" in page
-    costs = stored_costs(dataset, 0)
-    assert set(costs["parts"]) == {"rgb", "depth", "write", "labels"}
-    assert all(value > 0 for value in costs["parts"].values())
-
-
 def test_a_finished_scene_is_kept_and_a_view_that_is_missing_is_made_again(
     dataset: Path, tmp_path: Path
 ) -> None:
@@ -109,12 +95,6 @@ def test_a_finished_scene_is_kept_and_a_view_that_is_missing_is_made_again(
     assert {k: v for k, v in _content(out).items() if k != lines} == {
         k: v for k, v in before.items() if k != lines
     }
-
-
-def test_another_request_does_not_mix_with_scenes_that_are_there(dataset: Path) -> None:
-    said = _refusal(dataset, "--object-sizes", "0.05-0.1")
-    assert "scene.sizes" in said
-    assert "0.05" in said
 
 
 @pytest.mark.slow
@@ -161,16 +141,6 @@ def test_what_cannot_be_used_is_named_before_anything_is_made(
     assert not (tmp_path / "out").exists()
 
 
-def test_a_renderer_that_is_not_installed_is_named_before_anything_is_made(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "mitsuba", None)
-    said = _refusal(tmp_path / "out", "--renderer", "photoreal")
-    assert "realsim[photo]" in said
-    assert "--renderer embedded" in said
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_folder_with_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     assert "not empty" in _refusal(tmp_path)
@@ -208,9 +178,3 @@ def test_a_picture_that_is_no_panorama_is_named_before_anything_falls(
     assert name in said
     assert words in said
     assert not (tmp_path / "out").exists()
-
-
-def test_the_views_shown_are_spread_over_low_and_high_cameras() -> None:
-    assert sheet_views(256, 4) == [32, 96, 160, 224]
-    assert sheet_views(2, 4) == [0, 1]
-    assert sheet_views(7, 1) == [3]

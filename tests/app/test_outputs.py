@@ -136,9 +136,3 @@ def test_a_session_without_its_header_is_told_and_how_it_is_mended(
         assert "--repair` makes it anew" in str(done.exception)
     assert not out.exists()
     header.write_bytes(kept)
-
-
-def test_board_views_alone_are_no_scene(tmp_path: Path) -> None:
-    captured_session(tmp_path / "s/calibration/capture", count=2)
-    done = CliRunner().invoke(commands, ["stats", str(tmp_path / "s")])
-    assert isinstance(done.exception, InputError) and "no session" in str(done.exception)

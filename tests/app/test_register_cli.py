@@ -35,9 +35,14 @@ def run(*args: object) -> Result:
 
 
 @pytest.fixture(scope="module")
-def registered(table_views: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
-    """A session registered from rough starts, and what the command said."""
-    folder = copy_of(table_views, tmp_path_factory.mktemp("registered") / "s")
+def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return table_session(tmp_path_factory.mktemp("few") / "s", views=4).folder
+
+
+@pytest.fixture(scope="module")
+def registered(few: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
+    """A session of four views registered from rough starts, and what the command said."""
+    folder = copy_of(few, tmp_path_factory.mktemp("registered") / "s")
     store = SessionStore.open(folder)
     off = se3.exp(np.array([0.1, -0.1, 0.15, 0.006, -0.004, 0.005]))
     starts = [
@@ -65,7 +70,7 @@ def test_objects_are_found_and_everything_is_written(registered: tuple[Path, Res
         gap = se3.transform(o.T_world_obj, corners) - se3.transform(true.T_world_obj, corners)
         assert np.linalg.norm(gap, axis=1).max() < 2e-3
         assert o.covariance is not None and o.verdict != "rejected"
-    assert set(found.seen) == set(range(8)) == set(found.cameras.refined)
+    assert set(found.seen) == set(range(4)) == set(found.cameras.refined)
     for name in ("scene_table", "views", "cameras", "scene_gt", "scene_camera", "report"):
         assert store.has(f"registration/{name}.json"), name
     assert len(list((folder / "registration/pictures").iterdir())) == 4
@@ -76,11 +81,11 @@ def test_objects_are_found_and_everything_is_written(registered: tuple[Path, Res
 
 
 def test_a_second_run_computes_nothing_and_starts_from_the_claimed_cameras(
-    registered: tuple[Path, Result], table_views: Path
+    registered: tuple[Path, Result], few: Path
 ) -> None:
     folder, first = registered
     store = SessionStore.open(folder)
-    claimed = cameras_now(SessionStore.open(table_views))
+    claimed = cameras_now(SessionStore.open(few))
     assert all(np.array_equal(claimed_cameras(store)[k], claimed[k]) for k in claimed)
     refined = cameras_now(store)
     assert not np.array_equal(refined[0], claimed[0])
@@ -93,14 +98,6 @@ def test_a_second_run_computes_nothing_and_starts_from_the_claimed_cameras(
     register_session(SessionStore.open(folder), QUIET)
     now = cameras_now(SessionStore.open(folder))
     assert all(np.allclose(now[k], refined[k], rtol=0, atol=1e-14) for k in refined)
-
-
-def test_json_is_all_that_is_on_stdout(registered: tuple[Path, Result]) -> None:
-    folder, _ = registered
-    result = CliRunner().invoke(commands, ["register", str(folder), "--json"])
-    value = json.loads(result.stdout)
-    assert value["usable"] and {o["name"] for o in value["objects"]} == {"mug", "wedge"}
-    assert value["views"] == list(range(8)) and value["not_placed"] == []
 
 
 def test_nothing_said_names_the_three_ways(session: Path) -> None:
@@ -188,12 +185,6 @@ def test_a_start_brings_how_far_off_it_may_be(session: Path) -> None:
     for w, o in zip(wanted, (near, far), strict=True):
         assert w.T_start is not None
         np.testing.assert_allclose(w.T_start, o.T_world_obj, atol=1e-15)
-
-
-def test_the_robot_is_not_checked_where_there_is_none(tmp_path: Path) -> None:
-    store = table_session(tmp_path / "s", views=2, posed=False)
-    with pytest.raises(InputError, match="no robot"):
-        read_inputs(store, RegisterRequest(objects=("mug",), hand_held=True, odometry=True))
 
 
 def test_the_depth_bias_is_that_of_the_calibration_unless_it_is_off(session: Path) -> None:

@@ -87,6 +87,7 @@ def test_the_scene_that_other_commands_use_is_the_reviewed_one(session: SessionS
     assert len(stages.session_models(session)[second.obj_id].symmetries) == 3
 
 
+@pytest.mark.slow
 def test_an_acceptance_outlives_a_registration_to_the_same_place_and_no_other(
     session: SessionStore,
 ) -> None:
@@ -124,12 +125,6 @@ def test_a_swap_to_an_object_without_a_model_is_refused_before_anything_is_writt
     assert "999" in str(run(session.folder, "--from-review").exception)
     assert session.path("registration/scene.json").read_bytes() == before
     assert not session.path("registration/earlier").exists()
-
-
-def test_all_rejected_is_said(session: SessionStore) -> None:
-    for placed in load_scene(session).objects:
-        say(session, "reject", placed)
-    assert "rejected every object" in str(run(session.folder, "--from-review").exception)
 
 
 def test_a_journal_of_damage_alone_is_not_taken_for_none(session: SessionStore) -> None:

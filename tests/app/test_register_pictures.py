@@ -11,15 +11,13 @@ from realsim.app.register.gain import camera_shifts_px, gain_picture, zoomed_cam
 from realsim.app.register.map import place_covariance_mm2
 from realsim.app.register.page import page_bytes
 from realsim.app.register.pictures import (
-    bias_of,
     draw_pictures,
 )
 from realsim.app.register.results import CameraChange, Registered
-from realsim.app.register.run import pixel_sigma, without_free_turns
+from realsim.app.register.run import pixel_sigma
 from realsim.geometry import camera, se3
 from realsim.geometry.parts import part
 from realsim.records import CameraIntrinsics, ObjectPose
-from realsim.records.depth_bias import DepthBias
 from realsim.store import SessionStore
 from registered_sessions import CAMERA, models_of, registered_by_hand, table_session
 
@@ -102,20 +100,6 @@ def test_a_zoomed_camera_sees_the_same_points_enlarged() -> None:
     assert (zoomed.width, zoomed.height) == (640, 640)
 
 
-def test_two_biases_one_after_the_other_are_one(result: Registered) -> None:
-    first, then = (
-        DepthBias(scale=1.004, offset_per_m=-0.003),
-        DepthBias(scale=0.998, offset_per_m=0.01),
-    )
-    report = {
-        "asked": {"depth_bias_taken_out": {"scale": 1.004, "offset_per_m": -0.003}},
-        "refinement": {"depth_scale": 0.998, "depth_offset_per_m": 0.01},
-    }
-    z = np.linspace(0.2, 1.5, 9)
-    both = bias_of(replace(result, report=report))
-    np.testing.assert_allclose(both.corrected(z), then.corrected(first.corrected(z)), rtol=1e-12)
-
-
 def test_pixel_sigma_is_what_random_poses_show() -> None:
     rng = np.random.default_rng(4)
     T_cam_obj = se3.exp(np.array([0.4, -0.2, 0.9, 0.02, -0.03, 0.45]))
@@ -129,18 +113,6 @@ def test_pixel_sigma_is_what_random_poses_show() -> None:
     spread = np.sqrt(np.mean(np.sum((np.array(seen) - there) ** 2, axis=-1)))
     assert pixel_sigma(CAMERA, T_cam_obj, A @ A.T, points) == pytest.approx(spread, rel=0.06)
     assert np.isnan(pixel_sigma(CAMERA, T_cam_obj, np.full((6, 6), np.nan), points))
-
-
-def test_a_turn_that_cannot_be_seen_is_no_pixel_uncertainty() -> None:
-    tube = part("tube")
-    points = tube.mesh.vertices[::20]
-    axis, place = tube.symmetry_axes[0]
-    free = np.concatenate([axis, -np.cross(axis, place)])
-    rest = np.diag([1e-3, 2e-3, 0.0, 1e-4, 2e-4, 3e-4]) ** 2
-    both = without_free_turns(rest + 0.25 * np.outer(free, free), tube, points)
-    np.testing.assert_allclose(both, without_free_turns(rest, tube, points), atol=1e-15)
-    # A part without such an axis keeps everything.
-    assert np.array_equal(without_free_turns(rest, part("wedge"), points), rest)
 
 
 def test_the_ellipse_is_where_random_poses_put_the_middle() -> None:

@@ -15,7 +15,6 @@ from realsim.app.register.results import NEXT_FILE, SCENE_FILE, cameras_now
 from realsim.app.register.tables import as_json, odometry_line
 from realsim.app.report.session import write_report
 from realsim.app.stages import judged_scene, registered_views
-from realsim.app.upgrade.scene import registration_notes  # pyright: ignore[reportPrivateUsage]
 from realsim.records import CaptureSession, Mesh, View
 from realsim.registration.odometry.cross_check import Fault, KinematicsCheck, ViewDifference
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
@@ -77,29 +76,6 @@ def test_an_interrupted_registration_is_finished_by_whoever_comes_next(
     np.testing.assert_allclose(cameras_now(store)[0], result.cameras.refined[0], atol=1e-15)
 
 
-@pytest.mark.parametrize("missing", ["all", "objects"])
-def test_notes_of_a_registration_that_could_not_tell_everything(
-    store: SessionStore, missing: str
-) -> None:
-    offset = {"consistent": True, "offset_mm": [1.0, 2.0, 3.0], "spread_mm": 0.4}
-    sinking = {"consistent": True, "share_of_height": -0.05}
-    blind = {"start_kept": True, "axes": [{"declared": False, "fit_deg": 12.0}]}
-    told = {
-        "common_offset_mm": offset,
-        "common_sinking": sinking,
-        "objects": [{"name": "can", "blind": blind}, {"name": "bare"}],
-    }
-    report = {} if missing == "all" else {k: v for k, v in told.items() if k != missing}
-    store.write_json("registration/report.json", report)
-    words = " ".join(registration_notes(store))
-    expected = {
-        "common_offset_mm": "moved together", "common_sinking": "sink into the table by 5.0 %",
-        "objects": "can (12 deg)",
-    }  # fmt: skip
-    for key, part_of in expected.items():
-        assert (part_of in words) == (key in report)
-
-
 # --- depth against colour ---------------------------------------------------------------------
 
 
@@ -125,12 +101,6 @@ def test_depth_that_does_not_lie_on_colour_is_said_in_pixels(tmp_path: Path) -> 
     remark = colour_remark(coloured(tmp_path / "off", 15), range(VIEWS))
     assert remark is not None and remark.kind == "not_aligned" and remark.view is None
     assert "15 px to the left of" in remark.words and f"of {VIEWS} views" in remark.words
-
-
-def test_depth_that_lies_on_colour_or_cannot_be_told_is_not_spoken_of(tmp_path: Path) -> None:
-    assert colour_remark(coloured(tmp_path / "on", 0), range(VIEWS)) is None
-    assert colour_remark(coloured(tmp_path / "blank", 0, blank=True), range(VIEWS)) is None
-    assert colour_remark(SessionStore.open(tmp_path / "on"), []) is None
 
 
 # --- odometry ---------------------------------------------------------------------------------

@@ -12,16 +12,14 @@ from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
 from realsim.app.render.cli import render_command
 from realsim.app.render.compare import label_ids, rim_distances_px
-from realsim.app.render.light import linear_of, matched_look, neutral_environment, upright
-from realsim.app.render.request import RenderRequest, camera_of, radius_of, resized, size_of
+from realsim.app.render.light import linear_of, neutral_environment, upright
+from realsim.app.render.request import RenderRequest, resized
 from realsim.app.render.run import notes_of, run_render
 from realsim.app.render.scene import table_top_m, twin_scene
 from realsim.geometry import camera, se3
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer
 from realsim.store import SessionStore, save_scene
-from realsim.store.lock import only_run_in
-from realsim.store.session_repair import repair_session
 from synthetic_scenes import (
     INTRINSICS,
     MODELS,
@@ -49,7 +47,10 @@ def twin(real):
 @pytest.mark.slow
 def test_the_twins_masks_are_those_annotated_in_the_real_frames(real, twin):
     seen = 0
+    assert twin.real == (0, 2, 4)
     for made, shot in enumerate(twin.real):
+        mine = twin.twin.session.view(made).T_world_cam
+        assert np.array_equal(mine, real.session.view(shot).T_world_cam)
         for k in range(2):
             name = f"mask_visib/{{:06d}}_{k:06d}.png"
             ours = twin.twin.read_image(name.format(made))
@@ -57,20 +58,12 @@ def test_the_twins_masks_are_those_annotated_in_the_real_frames(real, twin):
             seen += int(np.count_nonzero(ours))
     assert seen > 1000
     assert twin.figures.mask_iou == twin.figures.mask_iou_least == 1.0
+    assert 0.5 < twin.figures.noise_ratio < 2.0
+    light_and_table_match_the_photographs(real, twin)
+    the_result_is_a_sound_session_with_sheet_and_page(real, twin)
 
 
-@pytest.mark.slow
-def test_the_twins_stand_where_the_real_cameras_stood(real, twin):
-    assert twin.real == (0, 2, 4)
-    for made, shot in enumerate(twin.real):
-        mine = twin.twin.session.view(made).T_world_cam
-        assert np.array_equal(mine, real.session.view(shot).T_world_cam)
-    assert np.array_equal(twin.twin.session.intrinsics.distortion, INTRINSICS.distortion)
-    assert twin.twin.session.depth_unit_m == real.session.depth_unit_m
-
-
-@pytest.mark.slow
-def test_light_and_table_match_the_photographs(real, twin):
+def light_and_table_match_the_photographs(real, twin):
     look = twin.look.look
     assert look.has_colors
     assert look.object_error < 0.02 and look.table_error < 0.02
@@ -79,13 +72,7 @@ def test_light_and_table_match_the_photographs(real, twin):
         assert np.abs(ours.mean((0, 1)) - theirs.mean((0, 1))).max() < 0.05
 
 
-@pytest.mark.slow
-def test_depth_is_like_the_real_one(twin):
-    assert 0.5 < twin.figures.noise_ratio < 2.0
-
-
-@pytest.mark.slow
-def test_the_result_is_a_sound_session_with_sheet_and_page(real, twin):
+def the_result_is_a_sound_session_with_sheet_and_page(real, twin):
     assert twin.twin.folder == real.folder / "synthetic/real-embedded-disparity"
     assert twin.twin.verify() == []
     assert twin.sheet.is_file() and b"<html" in twin.page.read_bytes()[:200].lower()
@@ -114,17 +101,6 @@ def test_new_views_see_the_objects_at_the_asked_size(real, tmp_path):
     assert all(f'data-layer="{name}"' in page for name in ("normals", "object coordinates"))
 
 
-def test_new_views_of_a_session_that_lost_its_photographs_have_a_neutral_light(tmp_path):
-    store = captured_session(tmp_path / "s", 1)
-    store.path("rgb/000000.png").unlink()
-    repair_session(store.folder)
-    store = SessionStore.open(store.folder)
-    assert not store.session.views
-    look = twin_scene(store, two_boxes(), MODELS, RenderRequest(views="1"))
-    assert look.look is None
-    assert any("left neutral" in note for note in look.notes)
-
-
 def test_a_rejected_object_is_named(real, tmp_path):
     store = captured_session(tmp_path / "s", 1, two_boxes())
     save_scene(store, rejected(two_boxes(), 3))
@@ -140,50 +116,15 @@ def test_a_session_that_is_not_registered_is_told_the_command(tmp_path):
         run_render(store.folder, RenderRequest(), QUIET)
 
 
-def test_a_session_without_models_is_refused(tmp_path):
-    store = captured_session(tmp_path / "s", 1)
-    for path in (store.folder / "models").iterdir():
-        path.unlink()
-    with pytest.raises(InputError, match="has no models"):
-        run_render(store.folder, RenderRequest(), QUIET)
-
-
-def test_a_scene_in_which_everything_is_rejected_is_refused(tmp_path):
-    store = captured_session(tmp_path / "s", 1)
-    save_scene(store, rejected(rejected(two_boxes(), 0), 3))
-    with pytest.raises(InputError, match="realsim review"):
-        run_render(store.folder, RenderRequest(views="2"), QUIET)
-
-
-def test_the_session_itself_is_never_written_over(real):
-    with pytest.raises(InputError, match="the session itself"):
-        run_render(real.folder, RenderRequest(out=real.folder), QUIET)
-
-
 def test_a_folder_that_holds_something_else_is_refused_before_anything_is_rendered(real, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="not empty"):
         run_render(real.folder, RenderRequest(out=tmp_path), QUIET)
+    with pytest.raises(InputError, match="the session itself"):
+        run_render(real.folder, RenderRequest(out=real.folder), QUIET)
     with pytest.raises(InputError, match="is a file"):
         run_render(real.folder, RenderRequest(out=tmp_path / "mine.txt"), QUIET)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
-
-
-def test_photographs_of_another_size_than_the_cameras_are_named(tmp_path):
-    store = captured_session(tmp_path / "s", 1)
-    path = store.path("session.json")
-    header = json.loads(path.read_text())
-    header["camera"]["width"] //= 2
-    path.write_text(json.dumps(header))
-    for views in ("real", "2"):
-        with pytest.raises(InputError, match=r"rgb/000000\.png is .* pixels"):
-            run_render(store.folder, RenderRequest(views=views), QUIET)
-    assert not (store.folder / "synthetic").exists()
-
-
-def test_two_runs_at_once_do_not_mix(real, tmp_path):
-    with only_run_in(tmp_path), pytest.raises(InputError, match="another run is working"):
-        run_render(real.folder, RenderRequest(views="1", out=tmp_path), QUIET)
 
 
 def test_views_of_other_options_go_into_another_folder(tmp_path):
@@ -204,11 +145,8 @@ def test_views_of_other_options_go_into_another_folder(tmp_path):
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        ({"views": "some"}, "--views"), ({"views": "0"}, "--views"),
-        ({"radius": "0.4-0.5"}, "--radius"), ({"size": "64x64"}, "--size"),
-        ({"views": "3", "radius": "0.5-0.4"}, "--radius"),
-        ({"views": "3", "radius": "400-700"}, "--radius"),
-        ({"views": "3", "size": "64"}, "--size"), ({"views": "3", "size": "9999x10"}, "--size"),
+        ({"views": "some"}, "--views"), ({"radius": "0.4-0.5"}, "--radius"),
+        ({"views": "3", "radius": "400-700"}, "--radius"), ({"views": "3", "size": "64"}, "--size"),
         ({"camera": "d999"}, "--camera"), ({"depth_model": "none.json"}, "none.json"),
         ({"depth_model": "fit.json", "depth": "stereo"}, "--depth-model"),
     ],
@@ -226,12 +164,6 @@ def test_a_missing_panorama_and_an_unknown_material_are_named(real, tmp_path):
             twin_scene(real, two_boxes(), MODELS, RenderRequest(materials=(text,)))
 
 
-def test_ranges_and_sizes_are_read():
-    assert radius_of("") is None and radius_of("0.5") == (0.5, 0.5)
-    assert radius_of(".4-0.7") == (0.4, 0.7)
-    assert size_of("") is None and size_of("640x480") == (640, 480)
-
-
 def test_a_resized_camera_sees_the_same_rays():
     big = CameraIntrinsics(width=640, height=480, fx=600, fy=601, cx=318.2, cy=241.7)
     rays = camera.ray_table(big)
@@ -241,11 +173,6 @@ def test_a_resized_camera_sees_the_same_rays():
     assert np.abs(half - mean).max() < 1e-5
     taller = resized(big, 640, 500)
     assert np.abs(camera.ray_table(taller)[10:-10] - rays).max() < 1e-6
-
-
-def test_the_camera_is_taken_from_the_session(real):
-    assert camera_of(real) == "d405"
-    assert RenderRequest(camera="d435").config(real).profile == "d435"
 
 
 def test_the_table_is_lowered_to_the_deepest_object_but_not_below_the_clearance():
@@ -258,26 +185,8 @@ def test_the_table_is_lowered_to_the_deepest_object_but_not_below_the_clearance(
         assert table_top_m(scene, MODELS) == pytest.approx(top, abs=1e-9)
 
 
-def test_a_brighter_photograph_gives_a_brighter_light(real, tmp_path):
-    looks = []
-    for name, factor in (("dark", 0.5), ("bright", 1.0)):
-        store = captured_session(tmp_path / name, 1)
-        rgb = store.rgb(0)
-        path = store.path("rgb/000000.png")
-        dimmed = linear_of(rgb) * factor
-        encoded = np.where(dimmed < 0.0031308, 12.92 * dimmed, 1.055 * dimmed ** (1 / 2.4) - 0.055)
-        store.write_image("rgb/000000.png", np.round(255 * encoded).astype(np.uint8))
-        assert path.is_file()
-        scene = twin_scene(store, two_boxes(), MODELS, RenderRequest()).synthetic
-        looks.append(matched_look(store, scene, keeps_table=False, keeps_hue=False))
-    ratio = looks[1].environment.panorama.mean() / looks[0].environment.panorama.mean()
-    assert ratio == pytest.approx(2.0, rel=0.1)
-    before = neutral_environment().panorama
-    assert looks[0].environment.panorama.shape == before.shape
-
-
-@pytest.mark.parametrize("colorless", [{1, 7}, {7}])
-def test_a_model_without_colours_is_painted_as_the_photographs_show_it(real, colorless):
+def test_a_model_without_colours_is_painted_as_the_photographs_show_it(real):
+    colorless = {7}
     models = {
         i: replace(m, mesh=Mesh(vertices=m.mesh.vertices, faces=m.mesh.faces))
         if i in colorless else m
@@ -296,9 +205,6 @@ def test_a_model_without_colours_is_painted_as_the_photographs_show_it(real, col
         seen = ids == instance
         ours, theirs = shown[seen].mean(0), photograph[seen].mean(0)
         assert np.ptp(theirs) > 0.1 and np.array_equal(np.argsort(ours), np.argsort(theirs))
-        # The photographs are a linear sensor's: beside a red object of known colour they are too
-        # contrasted for any paint, and only the order of the channels can be right.
-        assert len(colorless) == 1 or np.abs(ours - theirs).max() < 0.04
 
 
 def test_the_rims_of_a_picture_of_the_labels_lie_on_its_edges():

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim.app.report.catalogue import CATALOGUE
 from realsim.app.report.figures import (
     Figure,
     count,
@@ -16,9 +15,8 @@ from realsim.app.report.figures import (
     shown,
 )
 from realsim.app.report.limits import broken, limit_of, read_limits
-from realsim.app.report.uncertainty import held, sigmas
+from realsim.app.report.uncertainty import held
 from realsim.errors import InputError
-from realsim.records import Mesh, ObjectModel
 
 NAME = "calibration.held_out_px"
 
@@ -48,10 +46,6 @@ def test_a_figure_that_nobody_knows_or_that_is_no_number_is_refused() -> None:
         figures_from_json({"a": {"b": 1}})
     # A name of a newer version is no reason to refuse the rest.
     assert figures_from_json({"future.figure": {"value": 1, "sigma": None}}) == {}
-
-
-def test_every_figure_says_what_it_is() -> None:
-    assert all(m.text and m.better in ("lower", "higher", "none") for m in CATALOGUE.values())
 
 
 @pytest.mark.parametrize(
@@ -92,30 +86,15 @@ def test_a_limit_on_what_is_not_there_is_broken() -> None:
     assert "not there" in broken([limit_of("registration.accepted<1")], {})[0]
 
 
-def test_quoted_names_and_tables_of_toml_mean_the_same(tmp_path: Path) -> None:
-    quoted, tables = tmp_path / "a.toml", tmp_path / "b.toml"
-    quoted.write_text('"calibration.held_out_px" = {max = 0.5}\n"files.damaged" = {max = 0}\n')
-    tables.write_text("[calibration]\nheld_out_px = {max = 0.5}\n[files.damaged]\nmax = 0\n")
-    assert read_limits(quoted) == read_limits(tables)
-    assert [(m.name, m.greatest) for m in read_limits(quoted)] == [
-        (NAME, 0.5), ("files.damaged", 0.0),
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize(
     ("text", "named"),
     [
         ("nonsense = {max = 1}", "calibration.held_out_px"),  # the known ones are listed
         ("calibration.held_out_px = 3", "no limit"),
         ('calibration.held_out_px = {max = "much"}', "no number"),
-        ("calibration.held_out_px = {max = true}", "no number"),
-        ("calibration.held_out_px = {max = nan}", "no limit"),
         ("calibration.held_out_px = {min = 2, max = 1}", "min above max"),
         ("calibration.held_out_px = {most = 2}", "no figure"),
-        ("calibration.held_out_px = {}", "neither"),
         ("", "names no figure"), ("= 3", "not TOML"),
-        ("calibration.held_out_px = {max = inf}", "finite"),
-        ("a = " + "[" * 5000, "nested deeper"),
     ],
 )  # fmt: skip
 def test_a_file_of_limits_that_says_something_else_is_refused(
@@ -127,14 +106,29 @@ def test_a_file_of_limits_that_says_something_else_is_refused(
         read_limits(path)
 
 
-@pytest.mark.parametrize("rule", ["", "held_out", "plan.views<=3", "plan.views<x", "nothing<3",
-                                  "plan.views<inf"])  # fmt: skip
+@pytest.mark.parametrize("rule", ["held_out", "plan.views<=3", "nothing<3", "plan.views<inf"])
 def test_a_rule_that_cannot_be_read_is_refused(rule: str) -> None:
     with pytest.raises(InputError):
         limit_of(rule)
 
 
 # --- uncertainty ------------------------------------------------------------------------------
+
+
+def test_holding_is_conditioning_and_never_adds_uncertainty() -> None:
+    rng = np.random.default_rng(1)
+    A = rng.normal(size=(6, 6))
+    C, u = A @ A.T, np.array([1.0, 2.0, 2.0]) / 3
+    tight = held(C, [u])
+    assert np.linalg.eigvalsh(C - tight)[0] > -1e-9
+    np.testing.assert_allclose(np.concatenate([u, np.zeros(3)]) @ tight, 0, atol=1e-9)
+    np.testing.assert_allclose(held(C, [u, 2 * u]), tight, atol=1e-9)  # the same axis twice
+    np.testing.assert_allclose(held(C, []), C)
+    # Of a ball nothing is left of the rotation; the place, given the rotation, remains.
+    ball = held(C, [[1, 0, 0], [0, 1, 0]])
+    np.testing.assert_allclose(ball[:3], 0, atol=1e-9)
+    given = C[3:, 3:] - C[3:, :3] @ np.linalg.inv(C[:3, :3]) @ C[:3, 3:]
+    np.testing.assert_allclose(ball[3:, 3:], given, atol=1e-9)
 
 
 def covariance(rng: np.random.Generator, axis: np.ndarray, free_rad: float) -> np.ndarray:
@@ -160,31 +154,3 @@ def test_a_free_turn_is_set_aside_even_where_the_declared_axis_is_two_degrees_of
         # The projection of the marginal leaves sin(2 deg) of the free turn's 29 deg.
         P = np.eye(3) - np.outer(declared, declared)
         assert np.degrees(np.sqrt(np.linalg.eigvalsh(P @ C[:3, :3] @ P)[-1])) > 0.5
-
-
-def test_holding_is_conditioning_and_never_adds_uncertainty() -> None:
-    rng = np.random.default_rng(1)
-    A = rng.normal(size=(6, 6))
-    C, u = A @ A.T, np.array([1.0, 2.0, 2.0]) / 3
-    tight = held(C, [u])
-    assert np.linalg.eigvalsh(C - tight)[0] > -1e-9
-    np.testing.assert_allclose(np.concatenate([u, np.zeros(3)]) @ tight, 0, atol=1e-9)
-    np.testing.assert_allclose(held(C, [u, 2 * u]), tight, atol=1e-9)  # the same axis twice
-    np.testing.assert_allclose(held(C, []), C)
-    # Of a ball nothing is left of the rotation; the place, given the rotation, remains.
-    ball = held(C, [[1, 0, 0], [0, 1, 0]])
-    np.testing.assert_allclose(ball[:3], 0, atol=1e-9)
-    given = C[3:, 3:] - C[3:, :3] @ np.linalg.inv(C[:3, :3]) @ C[:3, 3:]
-    np.testing.assert_allclose(ball[3:, 3:], given, atol=1e-9)
-
-
-def test_what_is_not_known_is_nan() -> None:
-    vertices = np.eye(3)
-    model = ObjectModel(
-        obj_id=1, name="m", mesh=Mesh(vertices=vertices, faces=np.array([[0, 1, 2]], np.int32)),
-        symmetry_axes=(((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)),),
-    )  # fmt: skip
-    assert all(math.isnan(v) for v in sigmas(None, model))
-    assert all(math.isnan(v) for v in sigmas(np.full((6, 6), np.nan), None))
-    mm, deg = sigmas(np.diag([1e-6, 1e-6, 0.3, 1e-6, 4e-6, 1e-6]), model)
-    assert mm == pytest.approx(2.0) and deg == pytest.approx(np.degrees(1e-3))

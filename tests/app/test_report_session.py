@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Callable
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from realsim.app.register.files import write_result
 from realsim.app.report.cli import report_command
 from realsim.app.report.session import page_of, report_of, write_report
 from realsim.app.report.summary import Report
-from realsim.errors import RealsimError
 from realsim.review import journal
 from realsim.store import SessionStore, load_scene, save_grasps
 from registered_sessions import CAMERA, models_of, registered_by_hand, table_session
@@ -150,21 +148,6 @@ def test_the_worst_comes_first_and_missing_stages_name_their_command(
     assert "realsim annotate SESSION" in first
 
 
-def test_agree_is_explained_where_it_stands(page: Path) -> None:
-    text = page.read_text("utf-8")
-    assert re.search(r"<abbr title=[^>]*share whose depth fits its pose", text)
-
-
-def test_accepted_beside_a_low_probability_is_explained(store: SessionStore) -> None:
-    scene = store.read_json("registration/scene.json")
-    scene["objects"][0]["checks"] |= {"probability": 0.31, "views": 1.0}
-    store.write_json("registration/scene.json", scene)
-    report = report_of(store)
-    assert any("probability below 0.9" in f.text for f in report.findings)
-    text = page_of(store, report).encode().decode()
-    assert "31.0<sup>1</sup>" in text and "registered in a single photograph" in text
-
-
 def test_what_reviewers_decided_is_told(store: SessionStore) -> None:
     doubtful = load_scene(store).objects[1]
     path = store.path(journal.JOURNAL_FILE)
@@ -192,39 +175,13 @@ def test_a_hostile_name_is_only_text(tmp_path: Path) -> None:
 # --- missing and damaged ----------------------------------------------------------------------
 
 
-def test_a_session_that_was_only_begun_says_what_comes_next(tmp_path: Path) -> None:
-    session = CaptureSession(name="begun", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(tmp_path / "s", session)
-    report = report_of(store)
-    assert report.verdict == "unfinished"
-    found = states(report)
-    assert all(found[k] == "missing" for k in ("calibration", "capture", "registration", "labels"))
-    checked(write_report(store, None).read_text("utf-8"))
-
-
-def emptied(data: bytes) -> bytes:
-    return b""
-
-
-def halved(data: bytes) -> bytes:
-    return data[: len(data) // 2]
-
-
-def another(data: bytes) -> bytes:
-    return b'{"a": [1, null]}'
-
-
-@pytest.mark.parametrize("spoil", [emptied, halved, another])
 @pytest.mark.parametrize(
     ("file", "stage"),
     [
         ("registration/scene.json", "registration"),
-        ("registration/report.json", "registration"),
         ("registration/views.json", "registration"),
-        ("registration/cameras.json", "registration"),
         ("models/models_info.json", "registration"),
         ("grasps/000000_obj000010.npz", "school"),
-        ("grasps/000000_obj000010.json", "school"),
         ("review/journal.jsonl", "review"),
         ("plan.json", "plan"),
         ("calibration/hand_eye.json", "calibration"),
@@ -232,17 +189,15 @@ def another(data: bytes) -> bytes:
     ],
 )
 def test_a_damaged_file_is_named_and_the_other_sections_stand(
-    registered: SessionStore, file: str, stage: str, spoil: Callable[[bytes], bytes]
+    registered: SessionStore, file: str, stage: str
 ) -> None:
     path = registered.folder / file
     before = path.read_bytes() if path.is_file() else None
     path.parent.mkdir(exist_ok=True)
-    path.write_bytes(spoil(before if before is not None else b'{"content": {"joints": [[1, 2]]'))
+    whole = before if before is not None else b'{"content": {"joints": [[1, 2]]'
+    path.write_bytes(whole[: len(whole) // 2])
     try:
-        try:
-            report = report_of(SessionStore.open(registered.folder))
-        except RealsimError:
-            pytest.fail("the report must be made of what is left")
+        report = report_of(SessionStore.open(registered.folder))
     finally:
         if before is None:
             path.unlink()
@@ -250,46 +205,17 @@ def test_a_damaged_file_is_named_and_the_other_sections_stand(
             path.write_bytes(before)
     told = {f.section for f in report.findings}
     section = next(s for s in report.sections if s.key == stage)
-    # An empty log or journal says nothing, as a missing one.
-    silent = spoil is emptied and path.suffix == ".jsonl"
-    assert silent or stage in told or section.state == "damaged" or "files" in told
+    assert stage in told or section.state == "damaged" or "files" in told
     assert states(report)["settings"] == "done" and report.figures["report.bad"].value >= 0
-
-
-def test_a_photograph_that_was_changed_is_bad(store: SessionStore) -> None:
-    path = store.folder / "rgb/000001.png"
-    path.write_bytes(path.read_bytes()[:-10])
-    report = report_of(SessionStore.open(store.folder))
-    assert report.verdict == "bad" and report.figures["files.damaged"].value == 1
-    done = CliRunner().invoke(report_command, [str(store.folder), "--quiet"])
-    assert done.exit_code == 1 and "missing or changed" in done.stderr
 
 
 # --- for scripts ------------------------------------------------------------------------------
 
 
 def test_json_is_all_there_is_on_stdout_and_exit_codes_tell(registered: SessionStore) -> None:
-    runner, folder = CliRunner(), str(registered.folder)
     out = str(registered.folder.parent / "p.html")
-    done = runner.invoke(report_command, [folder, "--json", "--out", out])
-    document = json.loads(done.stdout)
-    assert done.exit_code == 0 and document["failed"] == []
-    rule = "registration.accepted<2"
-    done = runner.invoke(
-        report_command, [folder, "--json", "--quiet", "--out", out, "--fail-on", rule]
-    )
+    rules = ("--fail-on", "registration.accepted<2", "--fail-on", "registration.accepted<1")
+    arguments = [str(registered.folder), "--json", "--quiet", "--out", out, *rules]
+    done = CliRunner().invoke(report_command, arguments)
     assert done.exit_code == 1 and "registration.accepted" in done.stderr
-    assert len(json.loads(done.stdout)["failed"]) == 1
-    rule = "registration.accepted<1"  # exactly met
-    arguments = [folder, "--quiet", "--out", out, "--fail-on", rule]
-    done = runner.invoke(report_command, arguments)
-    assert (done.exit_code, done.stdout, done.stderr) == (0, "", "")
-
-
-def test_out_writes_there_and_leaves_the_session_alone(store: SessionStore, tmp_path: Path) -> None:
-    before = {p: p.read_bytes() for p in store.folder.rglob("*") if p.is_file()}
-    out = tmp_path / "page.html"
-    done = CliRunner().invoke(report_command, [str(store.folder), "--out", str(out), "--quiet"])
-    assert done.exit_code == 0
-    checked(out.read_text("utf-8"))
-    assert {p: p.read_bytes() for p in store.folder.rglob("*") if p.is_file()} == before
+    assert len(json.loads(done.stdout)["failed"]) == 1  # the other is exactly met

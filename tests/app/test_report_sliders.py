@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from realsim import CameraIntrinsics, CaptureSession, Mesh, ObjectModel, ObjectPose, Scene, View
-from realsim.app.report.session import write_report
 from realsim.app.report.sliders import registration_pairs
 from realsim.app.stages import save_starts
 from realsim.formats.bop.models import save_models
@@ -70,11 +69,3 @@ def test_without_a_before_there_are_no_sliders(store: SessionStore) -> None:
         "registration/starts.json", {"starts": [{"instance": 2, "click": [3, 80, 60]}]}
     )
     assert registration_pairs(store) == ([], "")
-
-
-def test_the_report_holds_the_sliders(store: SessionStore) -> None:
-    save_starts(store, [pose(SHIFT_M)], "a rough guess")
-    text = write_report(store, None).read_text("utf-8")
-    assert "Before and after registration" in text
-    assert text.count('<div class="pair">') == 3
-    assert "clip-path" in text and "--at" in text

@@ -49,28 +49,17 @@ FIGURE = "registration.accepted"
 Change = Callable[[dict[str, Any]], Any]
 DAMAGES: list[tuple[Change, str]] = [
     (lambda d: d.update(session=[]), "session"),
-    (lambda d: d.pop("session"), "session"),
-    (lambda d: d.update(missing=["school"]), "missing"),
     (lambda d: d.update(missing={"school": 3}), "missing.school"),
-    (lambda d: d.update(stages="done"), "stages"),
     (lambda d: d.update(stages={"plan": "perhaps"}), "stages.plan"),
-    (lambda d: d.update(findings={}), "findings"),
     (lambda d: d.update(findings=[{"severity": "bad"}]), "section"),
-    (lambda d: d.update(findings=[{"severity": [], "section": "a", "text": ""}]), "severity"),
     (lambda d: d.update(figures={}), "report.bad"),
-    (lambda d: d.update(figures={"a": {"b": 1}}), "figures.a"),
     (lambda d: d["figures"][FIGURE].update(value="7"), FIGURE),
-    (lambda d: d["figures"][FIGURE].update(sigma=-1), FIGURE),
-    (lambda d: d["figures"][FIGURE].update(unit="km"), FIGURE),
     (lambda d: d.update(verdict=["sound"]), "verdict"),
-    (lambda d: d.update(series=[]), "series"),
-    (lambda d: d["series"].update({"school.scores": {"view": 1}}), "school.scores"),
     (
         lambda d: d["series"].update({"calibration.view_rms_px": {"view": [0], "value": []}}),
         "view_rms_px",
     ),
     (lambda d: d["objects"][0].update(verdict="good"), "objects[0]"),
-    (lambda d: d["objects"][0].update(sigma_mm="0.1"), "sigma_mm"),
     (lambda d: d["objects"][0].update(T_world_obj=[[1, 0], [0, 1]]), "T_world_obj"),
     (lambda d: d["objects"].append(d["objects"][0]), "2 times"),
 ]
@@ -96,10 +85,3 @@ def test_a_stored_report_that_is_missing_is_told_as_a_file(tmp_path: Path) -> No
         done = CliRunner().invoke(report_command, [str(tmp_path / a) for a in arguments])
         assert isinstance(done.exception, InputError)
         assert "x.json' is not there" in str(done.exception)
-
-
-@pytest.mark.parametrize("value", ["inf", "-inf", "nan", "1e999"])
-def test_a_limit_is_finite(value: str, tmp_path: Path) -> None:
-    rule = f"{FIGURE}<{value}"
-    done = CliRunner().invoke(report_command, [str(tmp_path), "--fail-on", rule])
-    assert isinstance(done.exception, InputError) and "finite" in str(done.exception)

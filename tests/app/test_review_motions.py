@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from realsim import InputError
 from realsim.app.review.motions import FIXED_IN_HAND, NO_TRAJECTORY, SessionMotions
 from realsim.app.school.files import stored_grasps
 from realsim.formats.grasps.scene_grasps import SceneGrasps
@@ -147,39 +146,6 @@ def test_a_grasp_without_a_trajectory_shows_the_approach_and_says_so(
     T_world_grasp = grasps.Ts_world_obj[s.instance] @ s.Ts_obj_grasp[0]
     np.testing.assert_allclose(motion.Ts_world_hand[-1], T_world_grasp, atol=1e-12)
     assert bare.motion(s.instance, len(s)) is None and bare.motion(99, 0) is None
-
-
-def test_an_object_that_was_moved_since_is_approached_where_it_stands(
-    stored: tuple[SceneGrasps, dict[int, ObjectModel]],
-) -> None:
-    grasps, models = stored
-    instance, row = attempts(grasps)[0]
-    poses = dict(grasps.Ts_world_obj)
-    poses[instance] = se3.from_translation([0.01, 0.0, 0.0]) @ poses[instance]
-    motion = SessionMotions(replace(grasps, Ts_world_obj=poses), models, with_arm=False).motion(
-        instance, row
-    )
-    assert motion is not None and "moved since" in motion.notes[0]
-    s = next(s for s in grasps.sets if s.instance == instance)
-    np.testing.assert_allclose(
-        motion.Ts_world_hand[-1], poses[instance] @ s.Ts_obj_grasp[row], atol=1e-12
-    )
-
-
-def test_an_object_without_a_model_is_named(
-    stored: tuple[SceneGrasps, dict[int, ObjectModel]],
-) -> None:
-    grasps, _ = stored
-    bare = SessionMotions(grasps, {}, with_arm=False)
-    with pytest.raises(InputError, match="no model"):
-        bare.motion(grasps.sets[0].instance, 0)
-
-
-def test_a_motion_that_was_seen_is_kept(
-    motions: SessionMotions, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
-) -> None:
-    instance, row = attempts(stored[0])[0]
-    assert motions.motion(instance, row) is motions.motion(instance, row)
 
 
 def test_arm_and_hand_are_drawn_where_the_kinematics_have_them(

@@ -20,21 +20,19 @@ from realsim.app.scan.scale.inputs import (
     read_mesh,
     usable_views,
 )
-from realsim.app.scan.scale.run import run_scale, view_poses, with_rough_size
-from realsim.app.scan.scale.show import model_lines, show_fit
+from realsim.app.scan.scale.run import run_scale, view_poses
+from realsim.app.scan.scale.show import model_lines
 from realsim.errors import InputError, UnitError
-from realsim.geometry import se3
 from realsim.geometry.mesh import load_mesh, save_ply
 from realsim.geometry.parts import object_model
 from realsim.models.library import ModelLibrary
 from realsim.models.library_prepare import PrepareConfig, prepare_unscaled
 from realsim.models.library_records import ScaleNote
 from realsim.records import CaptureSession, View
-from realsim.scanning.scale.files import ScaleRecord, installed_versions, load_record
-from realsim.scanning.scale.measured import length_of, parse_measurement, smallest_box
+from realsim.scanning.scale.files import ScaleRecord, installed_versions
+from realsim.scanning.scale.measured import length_of, parse_measurement
 from realsim.store import SessionStore
 from scale_fits import UNIT_M, fit_of, known_scan
-from typed_commands import realsim
 
 CONSOLE = Console(quiet=True)
 
@@ -96,7 +94,6 @@ def typed(**changes):
     [
         ({"depth": False}, (), r"none with depth.*--measured"),
         ({"posed": False}, (), r"not calibrated.*realsim calibrate"),
-        ({}, (1, 2), r"2 of 2 views .*\(1-2\); at least 3"),
         ({}, (1, 2, 7, 3, 9), r"no view 7, 9; its views are 0-5"),
     ],
 )
@@ -117,13 +114,6 @@ def test_a_damaged_depth_image_is_named(known, session, tmp_path):
         run_scale(ScaleRequest(mesh=str(tmp_path / "mug.ply"), session=session.folder), CONSOLE)
 
 
-def test_a_mesh_that_is_nowhere_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"is no mesh file.*--library"):
-        read_mesh(ScaleRequest(mesh="nothing.glb", library=tmp_path / "models"))
-    with pytest.raises(InputError, match="is a folder"):
-        read_mesh(ScaleRequest(mesh=str(tmp_path)))
-
-
 def test_a_mesh_without_anything_that_knows_metres_is_refused():
     with pytest.raises(InputError, match=r"SESSION.*--measured"):
         run_scale(ScaleRequest(mesh="mug.ply"), CONSOLE)
@@ -133,8 +123,6 @@ def test_a_mesh_without_anything_that_knows_metres_is_refused():
     ("options", "error", "said"),
     [
         ({"size": "90"}, UnitError, "no unit"),
-        ({"size": "90 parsec"}, UnitError, "parsec"),
-        ({"measured": ("longest=12",)}, UnitError, "no unit"),
         ({"between": ("0,0,0=95mm",)}, InputError, "two different"),
         ({"at": "0.4"}, InputError, "x,y in metres"),
         ({"at": "400,-50"}, InputError, "millimetres"),
@@ -144,12 +132,6 @@ def test_a_mesh_without_anything_that_knows_metres_is_refused():
 def test_what_cannot_be_read_is_named(options, error, said):
     with pytest.raises(error, match=said):
         request_of("mug.ply", None, typed(**options))
-
-
-def test_options_of_a_session_need_one(tmp_path):
-    m = (parse_measurement("longest=120mm"),)
-    with pytest.raises(InputError, match="--at speaks of a session"):
-        run_scale(ScaleRequest(mesh="mug.ply", measured=m, at=(0.4, 0.0)), CONSOLE)
 
 
 # --- a mesh of the library --------------------------------------------------------------------
@@ -165,16 +147,7 @@ def library(tmp_path):
     return library
 
 
-@pytest.mark.parametrize("typed_path", ["unscaled/box", "unscaled/box/", "unscaled/box/mesh.ply"])
-def test_the_folder_that_an_import_names_is_a_mesh(library, typed_path):
-    by_name = read_mesh(ScaleRequest(mesh="box", library=library.folder))
-    named = read_mesh(ScaleRequest(mesh=f"{library.folder}/{typed_path}"))
-    assert (named.name, named.origin, named.library) == ("box", "unscaled", library.folder)
-    assert (named.where, named.sha256) == (by_name.where, by_name.sha256)
-    with pytest.raises(InputError, match=r"is a folder.*LIBRARY/unscaled/NAME"):
-        read_mesh(ScaleRequest(mesh=str(library.folder / "unscaled")))
-
-
+@pytest.mark.slow
 def test_a_name_in_both_is_the_mesh_without_scale_and_the_id_is_the_model(library):
     note = ScaleNote(scale=UNIT_M, sigma_percent=0.3, verdict="accepted")
     obj_id = library.promote("box", note, PrepareConfig(with_parts=False)).model.obj_id
@@ -190,39 +163,10 @@ def test_a_name_in_both_is_the_mesh_without_scale_and_the_id_is_the_model(librar
     np.testing.assert_allclose(model.mesh.extent, UNIT_M * named.mesh.extent, rtol=1e-5)
 
 
-def test_a_mesh_of_one_library_goes_into_another(library, tmp_path):
-    sides = np.sort(object_model("box").mesh.extent)[::-1]
-    request = ScaleRequest(
-        mesh=str(library.folder / "unscaled/box"), library=tmp_path / "other",
-        measured=(parse_measurement(f"longest={1e3 * sides[0]}mm"),), accept_doubtful=True,
-    )  # fmt: skip
-    assert not run_scale(request, CONSOLE)
-    model = ModelLibrary.open(tmp_path / "other").load("box").model
-    np.testing.assert_allclose(smallest_box(model.mesh), sides, rtol=1e-4)
-    assert [e.obj_id for e in library.entries()] == [None]
-
-
 # --- the smallest box -------------------------------------------------------------------------
 
 
-def test_the_smallest_box_does_not_depend_on_the_axes():
-    rng = np.random.default_rng(3)
-    real = object_model("box").mesh
-    sides = np.sort(real.extent)[::-1]
-    for _ in range(2):
-        T = se3.from_rt(se3.random_rotation(rng), rng.normal(size=3))
-        turned = replace(real, vertices=se3.transform(T, real.vertices) / UNIT_M)
-        np.testing.assert_allclose(UNIT_M * smallest_box(turned), sides, rtol=1e-4)
-
-
 # --- what is asked for ------------------------------------------------------------------------
-
-
-def test_bad_input_ends_with_exit_code_2_and_one_paragraph(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    done = realsim("scan", "scale", "none.glb", "--library", tmp_path)
-    assert done.returncode == 2 and "Traceback" not in done.stderr
-    assert "--measured" in done.stderr and list(tmp_path.iterdir()) == []
 
 
 # --- the hash of the inputs -------------------------------------------------------------------
@@ -282,28 +226,6 @@ def test_every_file_is_there_and_listed_in_the_session(written):
         path.write_bytes(whole)
 
 
-def test_the_result_is_found_by_its_inputs_alone(written):
-    place, record, _ = written
-    found = place.record(record.inputs["key"])
-    assert found is not None and found.fit.scale == record.fit.scale
-    assert place.record("another") is None
-
-
-def test_the_model_is_metric(written, known):
-    place, record, _ = written
-    mesh = load_mesh(place.folder / "model.ply", "mm")
-    np.testing.assert_allclose(mesh.extent, UNIT_M * known.scan.extent, rtol=1e-5)
-    np.testing.assert_allclose(1e3 * mesh.extent, record.fit.extent_mm, rtol=1e-5)
-
-
-def test_the_poses_put_the_model_where_the_camera_saw_it(written, known):
-    _, record, _ = written
-    rows = json.loads(json.dumps(record.poses))
-    for row in rows:
-        T = np.array(row["T_world_cam"]) @ np.array(row["T_cam_obj"])
-        np.testing.assert_allclose(T, record.fit.T_world_obj, atol=1e-12)
-
-
 def test_the_page_begins_with_the_verdict_and_needs_nothing_else(written):
     place, record, _ = written
     text = (place.folder / "scale.html").read_text()
@@ -315,35 +237,7 @@ def test_the_page_begins_with_the_verdict_and_needs_nothing_else(written):
         assert limit.text in text
 
 
-def test_a_place_outside_of_the_session_is_written_too(known, fit, session, tmp_path):
-    place = Place(session, tmp_path / "elsewhere")
-    write_result(place, record_of(known, fit, {"key": "k"}), named_of(known), session)
-    assert load_record(tmp_path / "elsewhere/scale.json").inputs["key"] == "k"
-    assert session.verify() == []
-
-
 # --- what is said -----------------------------------------------------------------------------
-
-
-def test_the_verdict_comes_first_and_reasons_follow(fit, capsys):
-    doubtful = replace(fit, verdict="doubtful", reasons=("the shape allows two scales.",))
-    show_fit("mug", doubtful, (), np.array([120.0, 95.0, 80.0]), Console(quiet=True))
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].startswith("DOUBTFUL: mug") and "two scales" in lines[1]
-    text = "\n".join(lines)
-    for word in ("95 % interval", "120.0 x 95.0 x 80.0 mm", "CPU", "LEFT OUT", "median"):
-        assert word in text
-    assert text.index("smallest box") < text.index("the mesh's own x, y, z")
-
-
-def test_a_rough_size_that_contradicts_makes_it_doubtful(known, fit):
-    longest = UNIT_M * length_of(known.scan, parse_measurement("longest=1m"))
-    good = replace(fit, verdict="accepted", reasons=())
-    assert with_rough_size(good, known.scan, None) is good
-    assert with_rough_size(good, known.scan, 1.2 * longest) is good
-    wrong = with_rough_size(good, known.scan, 10 * longest)
-    assert wrong.verdict == "doubtful" and "cm" in wrong.reasons[-1]
-    assert with_rough_size(replace(fit, verdict="rejected"), known.scan, 1.0).verdict == "rejected"
 
 
 # --- whole runs -------------------------------------------------------------------------------
@@ -390,35 +284,12 @@ def test_a_second_run_finds_the_first(known, fit, session, mesh_file, capsys):
     assert "nothing has changed" in said
     assert (session.folder / "scans/mug/scale.json").stat().st_mtime_ns == before
     # Nothing went into a library, and no caliper was asked: both are said, the caliper last.
-    assert f"model     {session.folder / 'scans/mug/model.ply'} in mm" in said
-    assert "library   none: --library models" in said and "--unit mm --name mug" in said
+    assert "library   none: --library models" in said
     assert "--measured longest=...mm" in said.splitlines()[-1]
-    stored = json.loads((session.folder / "scans/mug/scale.json").read_text())["fit"]
-    np.testing.assert_allclose(
-        stored["smallest_box_mm"], 1e3 * fit.scale * smallest_box(named.mesh)
-    )
-    assert list(stored).index("smallest_box_mm") == list(stored).index("extent_mm") + 1
 
 
 @pytest.mark.slow
-def test_the_real_fit_from_the_command_line(known, session, mesh_file, capsys):
-    longest = UNIT_M * length_of(known.scan, parse_measurement("longest=1m"))
-    request = ScaleRequest(
-        mesh=str(mesh_file), session=session.folder,
-        measured=(parse_measurement(f"longest={1e3 * longest}mm"),),
-    )  # fmt: skip
-    accepted = run_scale(request, CONSOLE)
-    first = capsys.readouterr().out
-    record = load_record(session.folder / "scans/mug/scale.json")
-    assert accepted == (record.fit.verdict == "accepted")
-    assert first.startswith(record.fit.verdict.upper())
-    assert record.fit.scale == pytest.approx(UNIT_M, rel=0.05)
-    assert run_scale(request, CONSOLE) == accepted
-    assert "nothing has changed" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_an_accepted_scale_goes_into_the_library(known, fit, session, mesh_file, tmp_path, capsys):
+def test_an_accepted_scale_goes_into_the_library(known, fit, session, mesh_file, tmp_path):
     request = ScaleRequest(mesh=str(mesh_file), session=session.folder, library=tmp_path / "models")
     named = read_mesh(request)
     inputs = inputs_of(request, named, session, usable_views(session, ()), fit_config(session))
@@ -433,9 +304,5 @@ def test_an_accepted_scale_goes_into_the_library(known, fit, session, mesh_file,
     assert kept.scale.scale == fit.scale and kept.scale.session == "mugs"
     np.testing.assert_allclose(np.sort(kept.model.mesh.extent), np.sort(UNIT_M * known.scan.extent),
                                rtol=1e-3)  # fmt: skip
-    capsys.readouterr()
-    assert not run_scale(replace(request, accept_doubtful=True), CONSOLE)
-    assert "is there already" in capsys.readouterr().out
     with pytest.raises(InputError, match=r"neither a file nor a model.*mug"):
         read_mesh(ScaleRequest(mesh="mugg", library=tmp_path / "models"))
-    assert read_mesh(ScaleRequest(mesh="mug", library=tmp_path / "models")).origin == "model"

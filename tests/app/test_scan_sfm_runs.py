@@ -1,11 +1,6 @@
 """`realsim scan sfm` to the end with the real COLMAP: scale, masks, no poses, parts, a kill."""
 
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +10,6 @@ import pytest
 from realsim.app.console import Console
 from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm
 from realsim.geometry import se3
-from realsim.images import png_bytes
 from realsim.records import CameraIntrinsics, CaptureSession, View
 from realsim.scanning.sfm.files import read_cameras
 from realsim.store import SessionStore
@@ -114,53 +108,3 @@ def test_refinement_mends_poses_that_are_wrong_and_spares_right_ones(tmp_path: P
         report(tmp_path / name, poses="refined")
         _, found = read_cameras(tmp_path / name / "scans/sfm/cameras.json")
         assert between(found) <= max(0.5 * between(robot), 0.3)
-
-
-@pytest.mark.slow
-def test_masks_uncalibrated_and_two_scenes(tmp_path: Path) -> None:
-    Ts = cameras()
-    session(tmp_path / "s", Ts, posed=False)
-    masks = tmp_path / "masks"
-    masks.mkdir()
-    half = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
-    half[:, :250] = 255
-    for k in range(VIEWS):
-        (masks / f"{k:06d}.png").write_bytes(png_bytes(half))
-    free = report(tmp_path / "s")
-    assert not free["is_metric"] and any("no metric scale" in r for r in free["reasons"])
-    masked = report(tmp_path / "s", masks=masks)
-    assert sum(masked["features"].values()) < 0.9 * sum(free["features"].values())
-
-    both = np.concatenate([Ts, Ts])
-    session(tmp_path / "two", both, second=VIEWS)
-    told = report(tmp_path / "two", poses="unknown")
-    assert told["verdict"] != "accepted"
-    assert told["views"]["models"] == [VIEWS, VIEWS]
-    assert any("fall into 2 parts" in r for r in told["reasons"])
-
-
-@pytest.mark.slow
-def test_a_killed_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
-    Ts = cameras(10)
-    for name in ("whole", "killed"):
-        session(tmp_path / name, Ts)
-    whole = report(tmp_path / "whole", poses="unknown")
-    code = (
-        "import sys; from pathlib import Path; from realsim.app.console import Console\n"
-        "from realsim.app.scan.sfm.run import SfmRequest, run_scan_sfm\n"
-        "run_scan_sfm(SfmRequest(images=Path(sys.argv[1]), poses='unknown'), Console(quiet=True))"
-    )
-    out = tmp_path / "killed/scans/sfm"
-    run = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "killed")])
-    begun = time.monotonic()
-    while not (out / "pairs.txt").is_file() and run.poll() is None:
-        assert time.monotonic() - begun < 120
-        time.sleep(0.01)
-    os.kill(run.pid, signal.SIGKILL)
-    assert run.wait() == -signal.SIGKILL
-    assert not (out / "sfm.json").exists()
-    again = report(tmp_path / "killed", poses="unknown")
-    for key in ("scale_m_per_unit", "scale_sigma_percent", "points", "views", "verdict"):
-        assert again[key] == whole[key]
-    first, second = (tmp_path / n / "scans/sfm/cameras.json" for n in ("whole", "killed"))
-    assert first.read_bytes() == second.read_bytes()

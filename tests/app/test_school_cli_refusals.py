@@ -1,13 +1,11 @@
 """`realsim school`: what it refuses, and how it says so."""
 
 import json
-import os
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import Result
 
 from realsim.app.school.inputs import SchoolRequest, base_on_table, masses_of
 from realsim.app.school.run import config_of
@@ -18,14 +16,10 @@ from realsim.geometry.parts import part
 from realsim.store import load_grasps
 from school_sessions import NAMES, QUICK, T_WORLD_TABLE, refused, run, scene
 
-DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[3] / "shared/data"))
-GRASPIT = DATA / "school/graspit_assets/scene.yaml"
 
-
-@pytest.mark.parametrize("option", ["--force", "--friction", "--density"])
-@pytest.mark.parametrize("value", ["0", "-1", "nan", "inf"])
-def test_physics_that_cannot_be_is_refused(pristine: Path, option: str, value: str) -> None:
-    assert option in refused(pristine, *QUICK, option, value)
+def test_physics_that_cannot_be_is_refused(pristine: Path) -> None:
+    for option, value in (("--force", "0"), ("--friction", "nan"), ("--density", "-1")):
+        assert option in refused(pristine, *QUICK, option, value)
     assert not (pristine / "grasps").exists()
 
 
@@ -33,11 +27,8 @@ def test_physics_that_cannot_be_is_refused(pristine: Path, option: str, value: s
     ("mass", "words"),
     [
         ("mug=0.3", "no object of this scene"),
-        ("cube", "NAME=KG"),
         ("cube=heavy", "NAME=KG"),
         ("cube=0", "NAME=KG"),
-        ("cube=-1", "NAME=KG"),
-        ("=1", "NAME=KG"),
     ],
 )
 def test_a_mass_of_nothing_or_of_no_object_is_refused(
@@ -69,11 +60,8 @@ def test_a_base_pose_is_taken_from_world_or_table(tmp_path: Path) -> None:
     ("content", "words"),
     [
         (None, "is no file"),
-        ("{", "no JSON"),
-        ("[1, 2]", "no pose"),
         ('{"T_base_world": []}', "no pose"),
         ('{"T_world_base": [], "T_table_base": []}', "exactly one"),
-        ('{"T_table_base": [[1, 2], [3, 4]]}', "4 x 4"),
         ('{"T_table_base": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "T_table_base"),
     ],
 )
@@ -113,22 +101,6 @@ def test_a_mesh_without_volume_is_named_and_the_others_are_tried(
     assert not cube.good.any() and wedge.reachable.any()
 
 
-def test_a_scene_out_of_the_arm_s_reach_has_reasons_and_no_scores_above_zero(
-    pristine: Path, tmp_path: Path
-) -> None:
-    far = tmp_path / "far.json"
-    T = se3.from_rt(np.eye(3), [5.0, 0.0, 0.0])
-    far.write_text(json.dumps({"T_table_base": T.tolist()}))
-    folder = Path(shutil.copytree(pristine, tmp_path / "s"))
-    result = run(folder, *QUICK, "--base-pose", far)
-    if isinstance(result.exception, InputError):
-        assert "base" in str(result.exception)  # the arm cannot even hold its hand over the table
-    else:
-        assert result.exit_code == 1
-        for s in load_grasps(folder):
-            assert not s.reachable.any() and np.all(s.scores == 0) and all(s.failures)
-
-
 def test_sources_that_are_none_are_refused(pristine: Path, tmp_path: Path) -> None:
     assert "no session.json" in refused(tmp_path, *QUICK)
     assert "does not exist" in refused(tmp_path / "nowhere", *QUICK)
@@ -140,30 +112,13 @@ def test_sources_that_are_none_are_refused(pristine: Path, tmp_path: Path) -> No
     assert "no results" in refused("summary", tmp_path)
 
 
-def test_an_export_over_its_own_source_is_refused(tried: tuple[Path, Result]) -> None:
-    for out in (tried[0], tried[0] / "grasps"):
-        assert "another folder" in refused("export", tried[0], "--to", "parquet", "--out", out)
-
-
-def test_a_file_needs_a_folder_for_its_results_and_no_file_is_one(tmp_path: Path) -> None:
-    scene = tmp_path / "scene.yaml"
-    scene.write_text("object1: {}\n")
-    assert "add --out FOLDER" in refused(scene, *QUICK)
-    assert "is a file" in refused(scene, *QUICK, "--out", scene)
-
-
-def test_what_cannot_be_written_in_the_end_is_refused_at_once(
-    pristine: Path, tmp_path: Path
-) -> None:
-    assert "is a folder" in refused(pristine, *QUICK, "--json-file", tmp_path)
-
-
 SLAB = """<robot name="slab"><link name="base"><inertial><mass value="1"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
 <collision><origin xyz="0 0 {z}"/><geometry><box size="2 2 0.02"/></geometry></collision>
 </link></robot>"""
 
 
+@pytest.mark.slow
 def test_a_support_that_objects_stand_in_moves_them_and_one_below_the_table_does_not(
     pristine: Path, tmp_path: Path
 ) -> None:
@@ -173,8 +128,3 @@ def test_a_support_that_objects_stand_in_moves_them_and_one_below_the_table_does
         slab.write_text(SLAB.format(z=z))
         result = run("settle", folder, "--support", slab, "--quiet")
         assert result.exit_code == code, result.output
-
-
-def test_a_support_that_does_not_exist_is_named(pristine: Path, tmp_path: Path) -> None:
-    missing = refused("settle", pristine, "--support", tmp_path / "shelf.urdf")
-    assert "'shelf'" in missing and "does not exist" in missing

@@ -4,14 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from realsim.app.school.page import page_bytes
 from realsim.app.school.tables import (
-    agreement_line,
     doubts,
     level_tables,
     reasons,
     school_rows,
-    setting_lines,
     survivors,
 )
 from realsim.geometry.parts import part
@@ -44,13 +41,3 @@ def test_shapes_that_make_labels_doubtful_are_named() -> None:
     words = doubts(sets, {})
     assert [w[0] for w in words] == ["1", "2", "2"]
     assert "1.41 times" in words[0] and "0.80 of" in words[1] and "not closed" in words[2]
-
-
-def test_sets_without_measures_have_dashes_and_a_page() -> None:
-    rng = np.random.default_rng(6)
-    sets = [tried_set(rng, n, measures=(), instance=n) for n in (0, 9)]
-    rows = school_rows(sets, {})
-    assert rows[0][0] == "0 object 7" and rows[0][-2:] == ["-", "-"]
-    assert level_tables(sets, {}) == [] and agreement_line(sets) == "" and setting_lines(sets) == []
-    assert b"9 grasps on 2 objects" in page_bytes("a < b", sets, {}, {})
-    assert b"a &lt; b" in page_bytes("a < b", sets, {}, {})

@@ -18,7 +18,13 @@ from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import GraspSet
 from realsim.store import load_grasps
-from upgradable_datasets import NAMES, bop_dataset, content_and_times, graspnet_dataset
+from upgradable_datasets import (
+    NAMES,
+    bop_dataset,
+    content_and_times,
+    graspnet_dataset,
+    standing,
+)
 
 QUIET = Console(quiet=True)
 
@@ -93,8 +99,18 @@ def _a_graspnet_roots_own_labels_are_taken(tmp_path: Path, labels: Path) -> None
     (dataset / "grasp_label").mkdir()
     for file in labels.glob("*.npz"):
         shutil.copy(file, dataset / "grasp_label" / file.name)
-    out = tmp_path / "from_graspnet"
+    before, out = content_and_times(dataset), tmp_path / "from_graspnet"
     run_upgrade(UpgradeConfig(grasps_per_object=2, analytic=4, workers=1), dataset, out, QUIET)
+    assert content_and_times(dataset) == before
+    scene = out / "test_kinect/000100"
+    xml = "annotations/0001.xml"
+    home = dataset / "scenes/scene_0100/kinect"
+    assert (scene / "imported" / xml).read_bytes() == (home / xml).read_bytes()
+    placed = json.loads((scene / "registration/scene.json").read_text())["objects"]
+    for o, p in zip(placed, standing(), strict=True):
+        # The world is the table's frame, as GraspNet has it; depth is in whole millimetres.
+        T = np.array(o["T_world_obj"])
+        np.testing.assert_allclose(T[:3, 3], p.T_world_obj[:3, 3], atol=1.5e-3)
     assert not (out / "grasp_label").exists()
     sets = load_grasps(out / "test_kinect/000100" / FOLDER)
     assert {s.parameters["analytic"]["from"] for s in sets} <= {p.name for p in labels.glob("*")}
