@@ -5,7 +5,7 @@ import re
 import click
 
 from realsim.app.cli import COMMANDS, commands
-from realsim.app.command import Group, settable, spelling, variable, walk
+from realsim.app.command import settable, spelling, variable, walk
 
 EVERY = walk(commands)
 OPTIONS = [(path, option) for path, command in EVERY.items() for option in settable(command)]
@@ -83,11 +83,3 @@ def test_the_help_fits_a_terminal_of_80_columns() -> None:
         ctx = click.Context(command, info_name="realsim", terminal_width=80)
         text = command.get_help(ctx).partition("Examples:")[0]
         assert max(len(line) for line in text.splitlines()) <= 80, path
-
-
-def test_commands_are_lazy() -> None:
-    group = Group("g", late={"demo": "realsim.app.demo.cli:demo_command"})
-    assert not group.commands
-    assert group.list_commands(click.Context(group)) == ["demo"]
-    assert group.get_command(click.Context(group), "demo") is not None
-    assert group.get_command(click.Context(group), "other") is None

@@ -230,16 +230,8 @@ def test_the_command_names_what_is_missing_and_then_imports(tmp_path):
     assert first.returncode == 2 and "Traceback" not in first.stderr
     assert "--depth-coding" in first.stderr or "--depth-unit" in first.stderr
     assert not (tmp_path / "s").exists()
-    done = realsim(
-        "import",
-        folder,
-        tmp_path / "s",
-        "--depth-unit",
-        0.001,
-        "--depth-coding",
-        "plain",
-        "--quiet",
-    )
+    options = ("--depth-unit", 0.001, "--depth-coding", "plain", "--quiet")
+    done = realsim("import", folder, tmp_path / "s", *options)
     assert done.returncode == 0, done.stderr
     assert "6 (6 now)" in done.stdout and SessionStore.open(tmp_path / "s").verify() == []
     assert realsim("import", folder).returncode == 2

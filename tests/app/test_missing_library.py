@@ -24,15 +24,3 @@ def test_a_missing_shared_library_ends_with_what_to_install(
     assert stop.value.code == 2
     said = capsys.readouterr().err
     assert "pinocchio" in said and "libgomp1" in said and "apt-get install" in said
-
-
-def test_another_failed_import_is_a_bug_and_shows_its_place(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def broken(*_: object, **__: object) -> None:
-        raise ImportError("cannot import name 'x'", name="realsim")
-
-    monkeypatch.setattr(applied, "apply_config", broken)
-    monkeypatch.setattr(sys, "argv", ["realsim", "config", "show"])
-    with pytest.raises(ImportError, match="cannot import name"):
-        main()

@@ -65,14 +65,6 @@ def test_a_file_that_the_command_did_not_write_is_refused(
     assert convert(name, tmp_path / f"new{suffix}") == tmp_path / f"new{suffix}"
 
 
-@pytest.mark.parametrize("name", FILES)
-def test_what_the_command_wrote_before_is_replaced(name: str, tmp_path: Path) -> None:
-    for suffix, texts in OUTPUTS[name][1].type.own.items():
-        path = tmp_path / f"earlier{suffix}"
-        path.write_text(" ".join(texts))
-        assert convert(name, path) == path
-
-
 @pytest.mark.parametrize("name", FOLDERS)
 def test_a_session_is_no_folder_for_results(name: str, session: Path, tmp_path: Path) -> None:
     for path in (session, session / "registration", session / "rgb/more", session / "session.json"):

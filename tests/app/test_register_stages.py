@@ -1,6 +1,5 @@
 """What other stages make of a registration: which views count, interrupted ones, notes, colour."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,13 +9,11 @@ import pytest
 from realsim.app.annotate.current import annotate_session
 from realsim.app.console import Console
 from realsim.app.register.colour import colour_remark
-from realsim.app.register.files import documents, remark_of, write_result
+from realsim.app.register.files import documents, write_result
 from realsim.app.register.results import NEXT_FILE, SCENE_FILE, cameras_now
-from realsim.app.register.tables import as_json, odometry_line
 from realsim.app.report.session import write_report
 from realsim.app.stages import judged_scene, registered_views
 from realsim.records import CaptureSession, Mesh, View
-from realsim.registration.odometry.cross_check import Fault, KinematicsCheck, ViewDifference
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore, atomic
 from registered_sessions import (
@@ -104,25 +101,3 @@ def test_depth_that_does_not_lie_on_colour_is_said_in_pixels(tmp_path: Path) -> 
 
 
 # --- odometry ---------------------------------------------------------------------------------
-
-
-def test_what_odometry_found_is_shown_and_survives_not_a_number(store: SessionStore) -> None:
-    fault = Fault(kind="view", view=2, other=None, mm=12.0, deg=1.0, words="view 2 is 12 mm off.")
-    view = ViewDifference(index=2, mm=12.0, deg=1.0, pairs=3, overlap=0.8)
-    check = KinematicsCheck(
-        views=(view,), faults=(fault,), noise_mm=0.43, noise_deg=0.06, pairs=3, unchecked=(),
-        cpu_s=0.1,
-    )  # fmt: skip
-    remark = remark_of(fault)
-    assert (remark.view, remark.kind, remark.words) == (2, "view", fault.words)
-    result = registered_by_hand(store)
-    assert odometry_line(result) == ""
-    told = replace(result, report=result.report | {"kinematics": check.as_json()})
-    assert "1 faults" in odometry_line(told) and "0.4 mm / 0.06 deg" in odometry_line(told)
-    none = replace(check, faults=(), noise_mm=float("nan"), noise_deg=float("nan"))
-    fresh = replace(result, report=result.report | {"kinematics": none.as_json()})
-    write_result(store, fresh, MODELS, {})
-    stored = replace(result, report=store.read_json("registration/report.json"))
-    assert "- mm / - deg" in odometry_line(fresh) == odometry_line(stored)
-    one, two = (as_json(r, MODELS)["kinematics"] for r in (fresh, stored))
-    assert json.dumps(one, allow_nan=False) == json.dumps(two, allow_nan=False)

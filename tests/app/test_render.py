@@ -15,8 +15,8 @@ from realsim.app.render.compare import label_ids, rim_distances_px
 from realsim.app.render.light import linear_of, neutral_environment, upright
 from realsim.app.render.request import RenderRequest, resized
 from realsim.app.render.run import notes_of, run_render
-from realsim.app.render.scene import table_top_m, twin_scene
-from realsim.geometry import camera, se3
+from realsim.app.render.scene import twin_scene
+from realsim.geometry import camera
 from realsim.rendering.depth_sensors.model import DepthSensorModel
 from realsim.rendering.photo import PhotoRenderer
 from realsim.store import SessionStore, save_scene
@@ -24,7 +24,6 @@ from synthetic_scenes import (
     INTRINSICS,
     MODELS,
     captured_session,
-    placed,
     rejected,
     two_boxes,
 )
@@ -173,16 +172,6 @@ def test_a_resized_camera_sees_the_same_rays():
     assert np.abs(half - mean).max() < 1e-5
     taller = resized(big, 640, 500)
     assert np.abs(camera.ray_table(taller)[10:-10] - rays).max() < 1e-6
-
-
-def test_the_table_is_lowered_to_the_deepest_object_but_not_below_the_clearance():
-    for sunk, top in ((0.0, 0.0), (0.001, -0.001), (0.02, -0.002)):
-        pose = placed(1, 0, 0, 0)
-        T = se3.from_translation([0, 0, -sunk]) @ pose.T_world_obj
-        deep = two_boxes(placed(7, 5, 0.1, 0.1))
-        moved = type(pose)(obj_id=1, instance=9, T_world_obj=T, verdict="accepted")
-        scene = type(deep)(name="s", objects=(*deep.objects, moved), plane=deep.plane)
-        assert table_top_m(scene, MODELS) == pytest.approx(top, abs=1e-9)
 
 
 def test_a_model_without_colours_is_painted_as_the_photographs_show_it(real):

@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from realsim.app.report import compare_page
 from realsim.app.report.cli import report_command
 from realsim.app.report.session import write_report
-from realsim.app.report.sources import SERIES_BY_VIEW, SERIES_OF_SHARES, read_stored
+from realsim.app.report.sources import read_stored
 from realsim.errors import InputError
 from registered_sessions import models_of, registered_by_hand, table_session
 
@@ -38,11 +37,6 @@ def test_what_a_report_says_is_read_as_it_was_written(
         o["T_world_obj"] for o in document["objects"]
     ]
     assert set(read.series) == set(document["series"])
-
-
-def test_the_plots_know_the_series_that_are_checked() -> None:
-    assert tuple(row[0] for row in compare_page.BY_VIEW) == SERIES_BY_VIEW
-    assert tuple(row[0] for row in compare_page.SHARES) == SERIES_OF_SHARES
 
 
 FIGURE = "registration.accepted"

@@ -52,6 +52,7 @@ def upgraded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Resu
 # --- laws -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_poses_end_where_the_parts_stand_and_the_originals_stay_beside(upgraded) -> None:
     dataset, out, _ = upgraded
     scene = "test/000001"
@@ -67,6 +68,7 @@ def test_poses_end_where_the_parts_stand_and_the_originals_stay_beside(upgraded)
     assert SessionStore.open(out / scene).verify() == []
 
 
+@pytest.mark.slow
 def test_one_broken_scene_does_not_stop_the_others(upgraded) -> None:
     _, out, done = upgraded
     assert done.exit_code == 1, done.output
@@ -76,6 +78,7 @@ def test_one_broken_scene_does_not_stop_the_others(upgraded) -> None:
     assert "test/000002 was left out" in done.output
 
 
+@pytest.mark.slow
 def test_tables_say_how_far_each_object_moved(upgraded) -> None:
     _, out, done = upgraded
     told = json.loads((out / "upgrade.json").read_text())
@@ -107,6 +110,7 @@ def test_a_second_run_does_nothing_again_and_takes_in_what_was_mended(upgraded, 
     assert json.loads((again / "upgrade.json").read_text())["summary"]["scenes"] == 2
 
 
+@pytest.mark.slow
 def test_other_images_are_not_mixed_into_an_upgrade(upgraded, tmp_path) -> None:
     dataset, out, _ = upgraded
     copy, again = tmp_path / "dataset", tmp_path / "out"

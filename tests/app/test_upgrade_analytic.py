@@ -50,12 +50,6 @@ def test_labels_and_scores_that_rank_alike_have_the_correlation_minus_one() -> N
     assert again is not None and again["score_vs_friction"]["rho"] == pytest.approx(1.0)
 
 
-def test_of_few_grasps_no_correlation_is_told() -> None:
-    found = agreement_of([tried([0.1, 0.2], [1.0, 0.0])])
-    assert found is not None and found["score_vs_friction"] is None
-    assert agreement_of([tried([], [])]) is None
-
-
 @pytest.mark.slow
 def test_analytic_grasps_are_tried_and_kept_beside_the_schools_own(tmp_path: Path) -> None:
     dataset, out = bop_dataset(tmp_path / "dataset"), tmp_path / "out"

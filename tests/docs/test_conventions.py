@@ -1,24 +1,16 @@
 """What docs/conventions.md states is what the code does: a statement, and the law behind it."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import trimesh
 from documents import ROOT
 from scipy.spatial.transform import Rotation
 
-from realsim import CameraIntrinsics, Mesh, ObjectModel, TagBoard, images
+from realsim import CameraIntrinsics, Mesh, TagBoard
 from realsim.formats import label_maps
-from realsim.formats.bop.models import load_models, save_models
 from realsim.formats.grasps.hand_frames import grasp_poses, hand_poses
 from realsim.geometry import camera, se3
-from realsim.geometry.parts import part
 from realsim.interop import colmap_from_opencv_px
-from realsim.records import MEASURES, STAGES
-from realsim.records.depth_bias import DepthBias
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
-from realsim_sim_bridge.slip.score import ScoreLimits, recompute_scores
 
 PAGE = " ".join((ROOT / "docs/conventions.md").read_text(encoding="utf-8").split())
 LENS = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.0, cy=23.0)
@@ -110,34 +102,6 @@ def test_label_maps_are_coded_as_the_table_says() -> None:
     assert np.abs(label_maps.normal_counts(n) - np.round((n + 1) * 32767.5)).max() <= 1
 
 
-def test_models_are_millimetres_on_disk_and_metres_in_memory(tmp_path: Path) -> None:
-    states("m in memory", "mm in a library's `obj_*.ply`")
-    mesh = part("box").mesh
-    save_models(tmp_path, {3: ObjectModel(obj_id=3, name="box", mesh=mesh)})
-    there = trimesh.load(tmp_path / "obj_000003.ply", process=False)
-    assert np.allclose(there.bounds, 1e3 * mesh.bounds, atol=1e-3)
-    assert np.allclose(load_models(tmp_path)[3].mesh.bounds, mesh.bounds, atol=1e-6)
-
-
-def test_depth_images_are_counts_of_the_stated_unit() -> None:
-    states("png * `depth_scale` = mm")
-    counts = images.depth_counts(np.array([[0.5, 0.0]]), 1e-4)  # depth_scale 0.1
-    assert counts.tolist() == [[5000, 0]]
-
-
-def test_the_bias_of_depth_is_that_of_its_inverse() -> None:
-    states("`1 / z_true = scale / z + offset`")
-    bias = DepthBias(scale=1.02, offset_per_m=-0.01)
-    z = 0.4
-    assert np.isclose(1 / bias.corrected(np.array([z]))[0], 1.02 / z - 0.01)
-
-
-def test_stages_and_measures_are_those_of_the_table() -> None:
-    states("close, lift, oscillate, pendulum")
-    assert STAGES == ("close", "lift", "oscillate", "pendulum")
-    states(*(f"`{name}`" for name in MEASURES))
-
-
 @pytest.mark.parametrize(("frame", "closing"), [("grasp", 1), ("panda_hand", 1), ("acronym", 0)])
 def test_frames_of_the_hand_are_those_of_the_table(frame: str, closing: int) -> None:
     states("mounting face (0.1034 m behind `grasp`), approach z, closing x")
@@ -145,13 +109,3 @@ def test_frames_of_the_hand_are_those_of_the_table(frame: str, closing: int) -> 
     assert np.allclose(hand[:3, 2], [0, 0, 1]) and np.allclose(np.abs(hand[:3, closing]), [0, 1, 0])
     assert np.isclose(hand[2, 3], 0.0 if frame == "grasp" else -0.1034)
     assert np.allclose(grasp_poses(hand, frame), np.eye(4))
-
-
-def test_a_quarter_of_the_base_score_is_a_stage() -> None:
-    states("a quarter for each stage passed in a row", "a grasp is good from 0.5")
-    from tried_grasps import tried_set
-
-    grasps = tried_set(np.random.default_rng(0))
-    base, _ = recompute_scores(grasps, ScoreLimits())
-    assert np.allclose(4 * base[np.isfinite(base)] % 1, 0)
-    assert np.array_equal(grasps.good, np.nan_to_num(grasps.scores, nan=-1) >= 0.5)
