@@ -34,10 +34,6 @@ def tilted_with_a_box() -> np.ndarray:
             "5bec6a4e236b7a7add9dbfb135c129b3dc60615450d969a4f64c8b4e723e228b",
         ),
         (
-            DepthSensorModel.noiseless(),
-            "4e58e98f742dfe2e1e1308a30d3b62609c2a6c7c23a97adbacd611789e30a665",
-        ),
-        (
             DepthSensorModel.noiseless(1 / 32),
             "4ff30763909fd153c564044751807868ba807c5d51c9676c1e85810bccf320f5",
         ),

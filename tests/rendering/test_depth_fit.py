@@ -28,7 +28,7 @@ def wall(z: float, tilt_u: float = 0.3, tilt_v: float = 0.2) -> np.ndarray:
     return (z / (1 + tilt_u * (u - 199.5) / 380 + tilt_v * (v - 149.5) / 380)).astype(np.float32)
 
 
-WALLS = (wall(0.3, 0.3, 0.2), wall(0.38, -0.2, 0.3), wall(0.5, 0.1, -0.3))
+WALLS = (wall(0.3, 0.3, 0.2), wall(0.5, 0.1, -0.3))
 
 
 @lru_cache
