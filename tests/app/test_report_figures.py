@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from realsim.app.register.uncertainty import held, sigmas
 from realsim.app.report.figures import (
     Figure,
     count,
@@ -15,8 +16,8 @@ from realsim.app.report.figures import (
     shown,
 )
 from realsim.app.report.limits import broken, limit_of, read_limits
-from realsim.app.report.uncertainty import held
 from realsim.errors import InputError
+from realsim.geometry.parts import part
 
 NAME = "calibration.held_out_px"
 
@@ -154,3 +155,11 @@ def test_a_free_turn_is_set_aside_even_where_the_declared_axis_is_two_degrees_of
         # The projection of the marginal leaves sin(2 deg) of the free turn's 29 deg.
         P = np.eye(3) - np.outer(declared, declared)
         assert np.degrees(np.sqrt(np.linalg.eigvalsh(P @ C[:3, :3] @ P)[-1])) > 0.5
+
+
+def test_a_free_turn_is_no_uncertainty_and_what_is_unknown_is_nan() -> None:
+    C = np.diag([1e-3, 2e-3, 0.5, 1e-4, 2e-4, 3e-4]) ** 2
+    tube = part("tube")  # turns about its z axis
+    assert sigmas(C, tube) == pytest.approx((0.3, np.degrees(2e-3)))
+    assert sigmas(C, None)[1] == pytest.approx(np.degrees(0.5))
+    assert np.isnan([*sigmas(None, tube), *sigmas(np.full((6, 6), np.nan), None)]).all()

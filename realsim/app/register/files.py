@@ -39,8 +39,8 @@ from realsim.app.register.results import (
     cameras_now,
     is_same_cameras,
     poses_from_json,
-    sigmas_of,
 )
+from realsim.app.register.uncertainty import sigmas
 from realsim.geometry import se3
 from realsim.records import ObjectModel, Scene, bop_units
 from realsim.store import SessionStore, atomic
@@ -107,7 +107,7 @@ def _seen_to_json(result: Registered, models: Mapping[int, ObjectModel]) -> Json
     for index in sorted(seen):
         rows: Json = {}
         for instance, pose in sorted(seen[index].items()):
-            mm, deg = sigmas_of(pose.covariance, models.get(scene.object(instance).obj_id))
+            mm, deg = sigmas(pose.covariance, models.get(scene.object(instance).obj_id))
             rows[str(instance)] = {
                 "sigma_px": to_json(pose.sigma_px),
                 "sigma_mm": to_json(mm),

@@ -8,8 +8,8 @@ from realsim.app.register.tables import (
     MISSING_HEADER,
     OBJECT_HEADER,
     VIEW_HEADER,
-    Rows,
     camera_line,
+    check_rows,
     depth_line,
     missing_rows,
     object_rows,
@@ -82,22 +82,10 @@ def page_bytes(
             page.section(title)
             page.picture(pictures[file], caption)
     page.section("Checks without ground truth")
-    page.table(*_checks(result, models))
+    page.table(*check_rows(result.scene.objects, models))
     return page.encode()
 
 
 def _method(result: Registered) -> str:
     """Return the method by name."""
     return str(result.report.get("asked", {}).get("method", "joint"))
-
-
-def _checks(result: Registered, models: Mapping[int, ObjectModel]) -> tuple[list[str], Rows]:
-    """Return every check of every object: one row a check, one column an object."""
-    objects = result.scene.objects
-    checks = sorted({name for o in objects for name in o.checks})
-    header = ["check", *[f"{o.instance} {models[o.obj_id].name}" for o in objects]]
-    rows = [
-        [name, *[f"{o.checks[name]:.3g}" if name in o.checks else "-" for o in objects]]
-        for name in checks
-    ]
-    return header, rows

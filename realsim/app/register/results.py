@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane, View
+from realsim.records import ObjectPose, Scene, SupportPlane, View
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.search.records import NotPlaced
 from realsim.store import SessionStore, load_scene
@@ -215,21 +215,3 @@ def cameras_from_json(value: Json) -> CameraChange:
 def poses_from_json(value: Json) -> dict[int, Array]:
     """Return poses by view."""
     return {int(k): np.array(T, dtype=np.float64) for k, T in value.items()}
-
-
-def sigmas_of(covariance: Array | None, model: ObjectModel | None = None) -> tuple[float, float]:
-    """Return the largest 1-sigma along and about any axis [mm, deg]; NaN = unknown.
-
-    Args:
-        covariance: (6, 6) of the right perturbation, rotation first [rad, m].
-        model: whose continuous symmetries are left out: a turn about them changes nothing.
-    """
-    if covariance is None or not np.all(np.isfinite(covariance)):
-        return float("nan"), float("nan")
-    turns = covariance[:3, :3]
-    for axis, _ in () if model is None else model.symmetry_axes:
-        unit = np.asarray(axis) / np.linalg.norm(axis)
-        P = np.eye(3) - np.outer(unit, unit)
-        turns = P @ turns @ P
-    shift, turn = (float(np.linalg.eigvalsh(C)[-1]) for C in (covariance[3:, 3:], turns))
-    return 1e3 * float(np.sqrt(max(shift, 0.0))), float(np.degrees(np.sqrt(max(turn, 0.0))))

@@ -1,6 +1,6 @@
 """What a registration found, as rows of tables and as words: for the console and for the page."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +8,8 @@ import numpy as np
 
 from realsim.app.console import Console
 from realsim.app.register.files import plain
-from realsim.app.register.results import Registered, sigmas_of
+from realsim.app.register.results import Registered
+from realsim.app.register.uncertainty import sigmas
 from realsim.records import ObjectModel, ObjectPose
 
 Rows = list[list[str]]
@@ -44,7 +45,7 @@ def object_rows(result: Registered, models: Mapping[int, ObjectModel]) -> Rows:
     rows: Rows = []
     common = shared_reasons(result)
     for o in worst_first(result):
-        mm, deg = sigmas_of(o.covariance, models.get(o.obj_id))
+        mm, deg = sigmas(o.covariance, models.get(o.obj_id))
         px = [p[o.instance].sigma_px for p in result.seen.values() if o.instance in p]
         px = [x for x in px if np.isfinite(x)]
         why = [r for r in o.reasons if r not in common]
@@ -78,6 +79,19 @@ def shared_reasons(result: Registered) -> tuple[str, ...]:
 def _figure(value: float, digits: int) -> str:
     """Return a number, or a dash for what is not known."""
     return f"{value:.{digits}f}" if np.isfinite(value) else "-"
+
+
+def check_rows(
+    objects: Sequence[ObjectPose], models: Mapping[int, ObjectModel]
+) -> tuple[list[str], Rows]:
+    """Return header and rows of every check: a row a check, a column an object."""
+    checks = sorted({name for o in objects for name in o.checks})
+    header = ["check", *[named(o.instance, o.obj_id, models) for o in objects]]
+    rows = [
+        [name, *[f"{o.checks[name]:.3g}" if name in o.checks else "-" for o in objects]]
+        for name in checks
+    ]
+    return header, rows
 
 
 def missing_rows(result: Registered, models: Mapping[int, ObjectModel]) -> Rows:
@@ -190,7 +204,7 @@ def as_json(result: Registered, models: Mapping[int, ObjectModel]) -> dict[str, 
     """Return what a program wants to know, as plain JSON values."""
     objects: list[dict[str, Any]] = []
     for o in worst_first(result):
-        mm, deg = sigmas_of(o.covariance, models.get(o.obj_id))
+        mm, deg = sigmas(o.covariance, models.get(o.obj_id))
         objects.append(
             {
                 "instance": o.instance,

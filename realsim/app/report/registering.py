@@ -12,26 +12,25 @@ from realsim.app.register.tables import (
     MISSING_HEADER,
     VIEW_HEADER,
     camera_line,
+    check_rows,
     depth_line,
     missing_rows,
-    named,
     odometry_line,
     table_line,
     view_rows,
     worst_first,
 )
+from realsim.app.register.uncertainty import sigmas
 from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count
 from realsim.app.report.section import Section, counted, drawn
-from realsim.app.report.uncertainty import sigmas
-from realsim.pages import Cell
+from realsim.pages import VERDICT_KIND, Cell
 from realsim.records import ObjectModel, ObjectPose
 from realsim.registration.judging.verdict import VerdictConfig
 from realsim.review.corrections import decision_on
 from realsim.review.journal import ReviewState
 from realsim.store import SessionStore
 
-VERDICT_KIND = {"accepted": "good", "doubtful": "warn", "rejected": "bad", "unchecked": "off"}
 AGREE = (
     "Here: of all pixels in which the object is visible and depth was measured, over all views, "
     "the share whose depth fits its pose within the sensor's noise. Registration uses it."
@@ -338,11 +337,5 @@ def _check_table(
     section: Section, objects: Sequence[ObjectPose], models: Mapping[int, ObjectModel]
 ) -> None:
     """Add every check of every object: a row a check, as columns they are wider than a screen."""
-    checks = sorted({name for o in objects for name in o.checks})
-    if checks:
-        header = ["check", *[named(o.instance, o.obj_id, models) for o in objects]]
-        rows = [
-            [name, *[f"{o.checks[name]:.3g}" if name in o.checks else "-" for o in objects]]
-            for name in checks
-        ]
-        section.page.table(header, rows, folded="All checks of all objects")
+    if any(o.checks for o in objects):
+        section.page.table(*check_rows(objects, models), folded="All checks of all objects")
