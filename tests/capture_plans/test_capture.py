@@ -278,6 +278,8 @@ def test_a_dry_run_goes_everywhere_slowly_and_keeps_nothing(
     visited = np.stack(arm.path)
     assert all(np.any(np.all(visited == q, axis=1)) for q in plan().joints)
     assert {s for s, _ in arm.speeds} == {0.25 * plan().config.speed}
+    with pytest.raises(InputError, match="at most 1 is accepted"):
+        CaptureConfig(speed_scale=1.5)
     assert list(tmp_path.iterdir()) == []
 
 
