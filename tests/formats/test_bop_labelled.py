@@ -228,3 +228,27 @@ def test_files_that_do_not_belong_together_are_named(tmp_path):
         open_labelled_bop(tmp_path)
     with pytest.raises(InputError, match="has no image 2; it has 1, 5, 9"):
         scene.frame(2)
+
+
+def test_models_that_are_missing_are_named(tmp_path):
+    write_boxes(tmp_path)
+    (tmp_path / "models/obj_000007.ply").unlink()
+    scene = open_labelled_bop(tmp_path)
+    assert any("object 7 has no mesh" in note for note in scene.notes)
+    assert set(scene.models()) == {1}
+    given = open_labelled_bop(tmp_path, models=MODELS)
+    assert set(given.models()) == {1, 7} and not any("no mesh" in n for n in given.notes)
+    with pytest.raises(InputError, match="has no models"):
+        open_labelled_bop(tmp_path, models=tmp_path)
+
+
+@pytest.mark.parametrize("scale", [0.5, 1 / 640])
+def test_a_camera_of_another_image_size_is_named(tmp_path, scale):
+    def shrink(cameras):
+        for row in cameras.values():
+            row["cam_K"] = [x * scale if k < 6 else x for k, x in enumerate(row["cam_K"])]
+
+    folder = write_boxes(tmp_path)
+    edit(folder / "scene_camera.json", shrink)
+    with pytest.raises(InputError, match="not seen where cam_K"):
+        open_labelled_bop(tmp_path)

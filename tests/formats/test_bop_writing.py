@@ -21,6 +21,7 @@ from realsim.formats.bop.targets import read_targets
 from realsim.formats.bop.writing import BopWriteConfig, write_bop_scene
 from realsim.formats.export_folder import ExportFolder
 from realsim.geometry import se3
+from realsim.images import read_rgb
 from tests.support.bop_scenes import MODELS, bbox, edit, write_boxes
 
 DOCUMENTS = ("scene_camera", "scene_gt", "scene_gt_info")
@@ -251,6 +252,30 @@ write_bop_models(scene.models(), folder, infos=scene.models_info())
 write_bop_root(folder, name="copy")
 folder.finish({})
 """
+
+
+def test_colour_may_be_jpeg_and_masks_left_out(tmp_path):
+    source = write_boxes(tmp_path / "a")
+    smooth = np.tile(np.arange(96, dtype=np.uint8), (72, 1))
+    cv2.imwrite(str(source / "rgb/000001.png"), np.dstack([smooth] * 3))
+    scene = open_labelled_bop(tmp_path / "a")
+    config = BopWriteConfig(colour="jpeg", masks=False)
+    written = export(scene, tmp_path / "b", config)
+    assert any("pixels changed" in note for note in written.notes) and written.counts["masks"] == 0
+    copy = open_labelled_bop(tmp_path / "b")
+    assert copy.colour_file(1).suffix == ".jpg"
+    off = np.abs(read_rgb(copy.colour_file(1)).astype(int) - read_rgb(scene.colour_file(1)))
+    assert off.mean() < 3
+    assert not (tmp_path / "b/test/000003/mask").exists()
+    # JPEG is copied as it is, and PNG made of it has its pixels.
+    export(copy, tmp_path / "c")
+    assert (tmp_path / "c/test/000003/rgb/000001.jpg").read_bytes() == copy.colour_file(
+        1
+    ).read_bytes()
+    export(copy, tmp_path / "d", BopWriteConfig(colour="png"))
+    assert np.array_equal(
+        read_rgb(tmp_path / "d/test/000003/rgb/000001.png"), read_rgb(copy.colour_file(1))
+    )
 
 
 def run_child(source, out, after):

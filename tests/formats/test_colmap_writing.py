@@ -158,3 +158,13 @@ def test_a_text_that_cannot_be_is_refused(tmp_path, file, text, said):
     assert len(open_colmap(text_model(tmp_path / "fine"))) == 1
     with pytest.raises(InputError, match=said):
         open_colmap(text_model(tmp_path / "wrong", **{file: text}))
+
+
+def test_a_binary_quaternion_that_is_none_is_refused(tmp_path):
+    row = image_row(1, 1, np.eye(4), "a.png")
+    bad = type(row)(image_id=1, camera_id=1, pose=(0.5, 0, 0, 0, 0, 0, 0), name="a.png")
+    none = np.zeros((0, 3))
+    for name, data in binary_files([camera_row(1, camera("PINHOLE"))], [bad], none, none).items():
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=r"image 1 of images.bin.*length 0\.5"):
+        read_model(tmp_path)

@@ -17,7 +17,7 @@ from realsim.formats.folders import (
     read_cam_info,
 )
 from realsim.formats.folders.depth_evidence import coding_of, decoded, depth_evidence, read_counts
-from realsim.formats.folders.listing import join_names
+from realsim.formats.folders.listing import join_names, join_states
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
 
@@ -130,6 +130,30 @@ def test_numbers_with_other_prefixes_are_never_shifted():
 
 
 # --- what is refused --------------------------------------------------------------------------
+
+
+def test_rows_without_names_count_only_without_gaps():
+    keys = ["0_10", "0_2", "0_1"] + [f"0_{k}" for k in range(3, 10)]
+    pairs = join_states(keys, states(range(1, 11), name="")).pairs
+    assert [pairs[k] for k in range(3)] == [9, 1, 0]
+    with pytest.raises(InputError, match="not numbered 0 to 8"):
+        join_states(keys[:-1], states(range(10), name="")[:-1])
+    with pytest.raises(InputError, match="names no image"):
+        join_states(keys, [*states([1]), *states([2], name="")])
+
+
+def test_two_images_of_one_name(tmp_path):
+    make(tmp_path, [1])
+    write(tmp_path, "rgb_0001.jpg", rgb_of(1))
+    with pytest.raises(InputError, match=r"rgb_0001\.jpg and rgb_0001\.png are two images"):
+        open_folder(tmp_path, CAMERA, choice=MM)
+
+
+def test_several_sizes(tmp_path):
+    make(tmp_path, range(3))
+    write(tmp_path, "rgb_0001.png", rgb_of(1, (60, 80)))
+    with pytest.raises(InputError, match=r"rgb_0001\.png is 80x60"):
+        open_folder(tmp_path, CAMERA, choice=MM)
 
 
 def test_no_camera_and_another_camera(tmp_path):

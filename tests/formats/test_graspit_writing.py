@@ -5,9 +5,12 @@ import dataclasses
 import h5py
 import numpy as np
 import pytest
+from pxr import Usd
 
 import placed_scenes
+from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
+from realsim.formats.graspit.grasps import WorldGrasps
 from realsim.formats.graspit.scene import read_graspit_grasps, read_graspit_scene
 from realsim.formats.graspit.writing import (
     GraspitConfig,
@@ -105,6 +108,15 @@ def test_a_table_that_leans_in_world_becomes_level(tmp_path):
         assert np.allclose(b.Ts_obj_grasp, a.Ts_obj_grasp, atol=1e-12)
 
 
+def test_meshes_go_as_usd_too_where_it_is_asked_for(tmp_path):
+    scene = placed_scenes.placed_scene()
+    told = write(scene, grasps(), tmp_path / "s", with_usd=True)
+    assert "file_path: assets/bracket.usd" in (tmp_path / "s/scene.yaml").read_text()
+    stage = Usd.Stage.Open(str(tmp_path / "s/assets/bracket.usd"))
+    assert stage.GetDefaultPrim().GetName() == "bracket" and not told.notes
+    same(read_graspit_scene(tmp_path / "s"), scene, grasps())
+
+
 def test_the_same_scene_gives_the_same_bytes_and_several_go_into_one_export(tmp_path):
     scene = placed_scenes.placed_scene()
     write(scene, grasps(), tmp_path / "a")
@@ -142,3 +154,10 @@ def test_what_the_source_says_survives_and_what_moved_is_new(tmp_path):
     assert [line.split(":")[0] for line in changed if "orientation" not in line] == ["  position"]
     found = read_graspit_scene(tmp_path / "c")
     assert np.allclose(found.scene.objects[1].T_world_obj, moved.T_world_obj, atol=1e-12)
+
+
+def test_grasps_of_nothing_are_refused(tmp_path):
+    stranger = dataclasses.replace(grasps()[0], instance=9)
+    assert isinstance(stranger, WorldGrasps)
+    with pytest.raises(InputError, match="instance 9"):
+        write(placed_scenes.placed_scene(), [stranger], tmp_path / "s")

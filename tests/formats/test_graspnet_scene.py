@@ -98,6 +98,18 @@ def test_a_bad_annotation_is_named(dataset, text, what):
         read_graspnet_scene(scene_of(dataset))
 
 
+def test_an_object_twice_and_a_quaternion_of_another_length_are_named(dataset):
+    path = scene_of(dataset) / "kinect/annotations/0000.xml"
+    text = path.read_text()
+    path.write_text(text.replace("<obj_id>27<", "<obj_id>0<"))
+    with pytest.raises(InputError, match="each once"):
+        read_graspnet_scene(scene_of(dataset))
+    path.write_text("<scene><obj><obj_id>0</obj_id><pos_in_world>0 0 0</pos_in_world>"
+                    "<ori_in_world>0 0 0 0</ori_in_world></obj></scene>")  # fmt: skip
+    with pytest.raises(InputError, match="length 0"):
+        read_graspnet_scene(scene_of(dataset))
+
+
 def test_missing_and_broken_files_are_named(dataset, tmp_path):
     with pytest.raises(InputError, match="no realsense or kinect/camera_poses"):
         read_graspnet_scene(tmp_path)

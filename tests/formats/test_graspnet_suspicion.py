@@ -8,7 +8,7 @@ import pytest
 
 from labelled_scenes import labelled_scene
 from realsim import images
-from realsim.errors import InputError, UnitError
+from realsim.errors import InputError, NotRigidError, UnitError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.annotations import annotation_bytes, read_objects
 from realsim.formats.graspnet.meta import meta_bytes, read_meta
@@ -225,6 +225,15 @@ def test_a_tree_is_found_from_its_root_its_scenes_a_scene_and_a_camera(root):
         open_graspnet(root, scenes=[4])
     with pytest.raises(InputError, match="no camera 'azure'"):
         open_graspnet(root, cameras=["azure"])
+
+
+def test_a_meta_file_with_a_mirrored_pose_is_refused(root):
+    m = read_meta(home(root) / "meta/0000.mat")
+    poses = m.poses.copy()
+    poses[0, :, :3] *= -1
+    (home(root) / "meta/0000.mat").write_bytes(meta_bytes(m.numbers, poses, m.K, 1000.0))
+    with pytest.raises(NotRigidError):
+        opened(root)
 
 
 def frame_folder(root, folder):

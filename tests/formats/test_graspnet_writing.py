@@ -5,14 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from labelled_scenes import INTRINSICS, labelled_scene
-from realsim import images
+from labelled_scenes import INTRINSICS, MODELS, labelled_scene
+from realsim import CameraIntrinsics, images
 from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
 from realsim.formats.graspnet.opening import open_scene
 from realsim.formats.graspnet.tree import open_graspnet
 from realsim.formats.graspnet.writing import GraspnetWriteConfig, write_graspnet_scene
 from realsim.geometry import se3
+from realsim.geometry.mesh import load_mesh
+from realsim.records import Mesh
 
 HOME = "scenes/scene_0003/realsense"
 
@@ -134,6 +136,15 @@ def test_another_depth_unit_is_converted_and_the_rounding_said(tmp_path):
     assert np.abs(before - after).max() <= 0.5e-3 + 1e-7
 
 
+def test_grey_images_and_other_formats_become_colour_pngs(source, tmp_path):
+    grey = np.arange(120 * 160, dtype=np.uint32).reshape(120, 160).astype(np.uint8)
+    source.colour_file(0).write_bytes(images.png_bytes(grey))
+    write(source, tmp_path / "out")
+    assert np.array_equal(
+        images.read_image(tmp_path / "out" / HOME / "rgb/0000.png"), np.dstack([grey] * 3)
+    )
+
+
 def test_numbers_are_mapped_beyond_graspnets_noted_and_never_doubled(source, tmp_path):
     result = write(source, tmp_path / "out", numbers={1: 5, 7: 300, 30: 0})
     assert any("up to 300" in n for n in result.notes)
@@ -166,6 +177,17 @@ def test_missing_masks_and_depth_are_refused_with_what_to_do(source, tmp_path):
         write(source, tmp_path / "nothing")
 
 
+def test_a_pixel_of_two_masks_is_the_nearer_objects(source, tmp_path):
+    both = source.masks[0, 0, True] | source.masks[0, 1, True]
+    source.masks[0, 0, True] = source.masks[0, 1, True] = both
+    result = write(source, tmp_path / "out")
+    assert any(f"{both.sum()} pixels were in two masks" in n for n in result.notes)
+    objects = source.frame(0).objects
+    nearer = min(objects[:2], key=lambda o: o.T_cam_obj[2, 3])
+    label = images.read_image(result.folder / "label/0000.png")
+    assert np.array_equal(label == nearer.obj_id, both)
+
+
 def test_an_upgraded_pose_is_written_and_not_the_sources_old_text(source, tmp_path):
     write(source, tmp_path / "out")
     scene = opened(tmp_path / "out")
@@ -177,6 +199,23 @@ def test_an_upgraded_pose_is_written_and_not_the_sources_old_text(source, tmp_pa
     after = opened(tmp_path / "again").frame(0)
     for a, b in zip(frame.objects, after.objects, strict=True):
         assert abs(b.T_cam_obj[0, 3] - a.T_cam_obj[0, 3] - 0.0004) < 1e-7
+
+
+def test_a_textured_model_comes_back_with_its_texture(source, tmp_path):
+    rng = np.random.default_rng(2)
+    plain = MODELS[1].mesh
+    mesh = Mesh(
+        vertices=plain.vertices, faces=plain.faces, uv=rng.uniform(0, 1, (8, 2)),
+        texture=rng.integers(0, 255, (16, 32, 3), dtype=np.uint8),
+    )  # fmt: skip
+    source.models_by_id = {1: replace(MODELS[1], mesh=mesh)}
+    result = write(source, tmp_path / "out")
+    assert any("no mesh of object(s) 006, 029" in n for n in result.notes)
+    found = load_mesh(tmp_path / "out/models/000/textured.obj", "m")
+    assert np.array_equal(found.texture, mesh.texture)
+    corners = np.abs(found.vertices[found.faces] - mesh.vertices[mesh.faces]).max()
+    assert corners < 1e-8
+    assert np.abs(found.uv[found.faces] - mesh.uv[mesh.faces]).max() < 1e-8
 
 
 def test_grasp_labels_go_along_with_a_graspnet_source_that_keeps_its_numbers(source, tmp_path):
@@ -198,3 +237,12 @@ def test_grasp_labels_go_along_with_a_graspnet_source_that_keeps_its_numbers(sou
     assert not (tmp_path / "again/grasp_label/050_labels.npz").exists()
     mapped = write(opened(tmp_path / "out"), tmp_path / "mapped", numbers={1: 0, 7: 7, 30: 29})
     assert mapped.counts["copied_labels"] == 0 and not (mapped.folder / "rect").exists()
+
+
+def test_images_of_several_cameras_keep_their_own_matrix_in_the_meta_files(source, tmp_path):
+    other = CameraIntrinsics(width=160, height=120, fx=150.2, fy=151.2, cx=78.9, cy=60.2)
+    source.frames[1] = replace(source.frames[1], intrinsics=other)
+    result = write(source, tmp_path / "out")
+    assert any("different camera matrices (up to 0.20 px)" in n for n in result.notes)
+    scene = opened(tmp_path / "out")
+    assert scene.frame(1).intrinsics.cx == 78.9 and scene.frame(0).intrinsics.cx == 78.7

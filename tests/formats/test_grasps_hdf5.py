@@ -87,6 +87,19 @@ def test_what_a_file_cannot_give_back_is_not_written(changed):
 # --- hostile files ----------------------------------------------------------------------------
 
 
+def test_sets_and_attempts_that_do_not_fit_together_are_refused():
+    scene = tried_scene(0)
+    s, t = scene.sets[0], scene.trajectories[4]
+    with pytest.raises(InputError, match="more than one grasp set"):
+        SceneGrasps(sets=(s, s))
+    with pytest.raises(InputError, match="instance 99"):
+        SceneGrasps(sets=(s,), Ts_world_obj={99: np.eye(4)})
+    with pytest.raises(InputError, match="increasing rows"):
+        SceneGrasps(sets=scene.sets, trajectories={4: replace(t, rows=t.rows + 1000)})
+    with pytest.raises(InputError, match="back in time"):
+        SceneGrasps(sets=scene.sets, trajectories={4: replace(t, time_s=-t.time_s)})
+
+
 def with_dataset(name, **how):
     def change(file):
         del file[f"{SET}/{name}"]

@@ -217,6 +217,13 @@ def test_a_killed_export_goes_on_at_the_next_episode(folder, tmp_path, dies_at):
     assert files_of(tmp_path / "set") == files_of(folder)
 
 
+def test_columns_without_pictures_are_a_data_set(tmp_path):
+    written = write(tmp_path / "set", Source(cameras={}))
+    assert written.counts["videos"] == 0
+    assert json.loads((tmp_path / "set" / layout.INFO).read_text())["video_path"] is None
+    assert not (tmp_path / "set/videos").exists()
+
+
 @pytest.mark.parametrize(
     ("source", "words"),
     [

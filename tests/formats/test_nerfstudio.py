@@ -221,3 +221,12 @@ def test_a_file_that_cannot_be_is_refused(tmp_path, top, said):
 def test_frames_that_cannot_be_are_refused(tmp_path, frames, said):
     with pytest.raises(InputError, match=said):
         open_nerfstudio(ngp(tmp_path / "x", frames, fl_x=40))
+
+
+def test_an_image_that_is_not_there_is_named(tmp_path):
+    folder = ngp(tmp_path / "x", fl_x=40)
+    (folder / "r_1.png").unlink()
+    source = open_nerfstudio(folder)
+    assert len(source) == 2 and any("r_1" in n for n in source.notes)
+    with pytest.raises(InputError, match=r"holds no transforms\.json"):
+        open_nerfstudio(tmp_path)

@@ -1,5 +1,7 @@
 """Scenes as MJCF: read back by MuJoCo, at rest there, and read back by realsim."""
 
+import dataclasses
+
 import mujoco
 import numpy as np
 import pytest
@@ -98,6 +100,13 @@ def test_the_cameras_frustum_is_that_of_its_intrinsics(scene, model):
 
 
 # --- what others write --------------------------------------------------------------------------
+
+
+def test_distortion_that_has_no_place_is_told(scene, tmp_path):
+    lens = dataclasses.replace(placed_scenes.CAMERA, distortion=np.array([0.1, 0, 0, 0, 0]))
+    views = (dataclasses.replace(scene.cameras[0], intrinsics=lens),)
+    told = write(dataclasses.replace(scene, cameras=views), tmp_path / "s")
+    assert any("distortion of view_0" in n for n in told.notes)
 
 
 def mjcf(tmp_path, world, before=""):

@@ -10,7 +10,9 @@ from realsim.errors import InputError
 from realsim.formats.robot_scenes.mesh_obj import look_of
 from realsim.formats.robot_scenes.placed_scene import (
     RigidBody,
+    file_name,
     seen_from,
+    unique_names,
 )
 from realsim.formats.robot_scenes.placing import PlacingConfig, place_scene
 from realsim.geometry import se3
@@ -99,6 +101,19 @@ def test_bodies_that_cannot_be_are_refused(change, what):
     with pytest.raises(InputError, match=what):
         dataclasses.replace(body, **change)
     assert isinstance(body, RigidBody)
+
+
+def test_names_are_files_and_prims_and_differ():
+    assert file_name("2 box/é") == "_2_box" and file_name("") == "object"
+    names = unique_names({0: "mug", 1: "Mug", 2: "table", 3: "can", 4: "mug_0"})
+    assert len({n.lower() for n in names.values()}) == 5 and names[3] == "can"
+    assert all(n == file_name(n) and n != "table" for n in names.values())
+    with pytest.raises(InputError, match="letters, digits"):
+        dataclasses.replace(placed_scenes.placed_scene().objects[0], name="a b")
+    scene = placed_scenes.placed_scene()
+    with pytest.raises(InputError, match="used twice"):
+        twice = tuple(dataclasses.replace(o, name="one") for o in scene.objects)
+        dataclasses.replace(scene, objects=twice)
 
 
 def test_colours_of_vertices_become_a_texture_of_the_faces_mean_colours():

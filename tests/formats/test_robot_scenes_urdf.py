@@ -113,6 +113,21 @@ MATTER = (
 )
 
 
+def test_several_scenes_go_into_one_export(scene, tmp_path):
+    out = ExportFolder.begin(tmp_path / "out", {})
+    steps = []
+    for name in ("a", "b"):
+        told = write_urdf_scene(
+            scene, out, UrdfConfig(under=f"scenes/{name}"), progress=lambda: steps.append(1)
+        )
+        assert told.folder == tmp_path / "out/scenes" / name
+        assert told.objects == 3 and told.counts["collision shapes"] == 3
+    out.finish({})
+    for name in ("a", "b"):
+        placed_scenes.same_bodies(scene, read_urdf_scene(tmp_path / "out/scenes" / name))
+    assert len(steps) == 4
+
+
 def urdf(tmp_path, links, joints="", name="w.urdf"):
     path = tmp_path / name
     path.write_text(f'<robot name="r"><link name="world"/>{links}{joints}</robot>')
@@ -166,6 +181,14 @@ def test_a_mesh_whose_size_contradicts_its_scale_is_refused_with_the_size(tmp_pa
     links = f'<link name="a">{MATTER}<collision>{shape}</collision></link>'
     with pytest.raises(UnitError, match=r"link 'a'.*m\.stl.*(100|0\.1)"):
         read_urdf_scene(urdf(tmp_path, links, joint("a")))
+
+
+def test_a_mesh_in_millimetres_with_its_scale_is_read(tmp_path):
+    stl(tmp_path, (50, 60, 100))
+    shape = '<geometry><mesh filename="m.stl" scale="0.001 0.001 0.001"/></geometry>'
+    links = f'<link name="a">{MATTER}<collision>{shape}</collision></link>'
+    found = read_urdf_scene(urdf(tmp_path, links, joint("a"))).bodies[1]
+    assert np.allclose(found.model.mesh.extent, [0.05, 0.06, 0.1])
 
 
 @pytest.mark.parametrize(

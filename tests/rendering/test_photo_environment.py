@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import CameraIntrinsics, Mesh
 from realsim.rendering.appearance import Environment, Material
@@ -259,3 +260,10 @@ def test_an_empty_scene_and_an_empty_view_show_the_sky() -> None:
         photo = PhotoRenderer(placed, None, sky).render(WIDE, away)
         assert np.all(photo.depth_m == 0)
         assert np.ptp(photo.rgb) == 0 and photo.rgb[0, 0, 0] == 188  # sRGB of one half
+
+
+def test_ray_counts_out_of_range_are_named() -> None:
+    with pytest.raises(InputError, match="ambient rays"):
+        LightSampling(ambient_rays=-1)
+    with pytest.raises(InputError, match="edge samples"):
+        LightSampling(edge_samples=0)

@@ -1,6 +1,7 @@
 """Who may enter the review page: host, origin, token, tunnel; asked with raw sockets."""
 
 import http.client
+import os
 import re
 import socket
 from collections.abc import Iterator
@@ -156,6 +157,12 @@ def test_own_pages_get_the_scene_and_so_do_programs_of_this_machine(server: Revi
     assert handshake(server, None) == 101
 
 
+def test_a_forwarded_port_is_our_own_page(server: ReviewServer) -> None:
+    """With `ssh -L 9000:127.0.0.1:8080` the browser calls us localhost:9000."""
+    assert asked(server, Host="localhost:9000", Origin="http://localhost:9000")[0] == 200
+    assert asked(server, Host="localhost:9000", Origin="http://localhost:9001")[0] == 403
+
+
 def test_no_link_can_give_the_page_orders(server: ReviewServer) -> None:
     """Viser's page would show the messages of any server that its address names."""
     assert asked(server, "/?websocket=wss://evil.example")[0] == 403
@@ -270,6 +277,14 @@ def test_a_token_file_must_be_ones_own_and_long(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least 16"):
         Door(token="short")
     assert len({local_pages.new_token() for _ in range(8)}) == 8
+
+
+def test_a_token_file_that_never_ends_is_refused(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe, 0o600)
+    for path in (pipe, Path("/dev/zero"), tmp_path):
+        with pytest.raises(InputError, match="no regular file"):
+            local_pages.token_of_file(path)
 
 
 def test_an_unregistered_session_is_refused(store: SessionStore, tmp_path: Path) -> None:

@@ -238,6 +238,14 @@ def test_a_disk_that_takes_nothing_is_told_in_plain_words(
     assert session.standing.state.entries == () and session.entries_seen() == []
 
 
+def test_too_long_names_and_comments_are_refused(session: ReviewedSession) -> None:
+    for said in ({"comment": "x" * 2001}, {"reviewer": "x" * 81}):
+        with pytest.raises(InputError, match="at most"):
+            session.decide("reject", seen(session, 3), **({"reviewer": "ada"} | said))
+    session.decide("reject", seen(session, 3), "x" * 80, comment="x" * 2000)
+    assert len(session.standing.state.entries) == 1
+
+
 def test_a_swap_to_a_missing_model_is_shown_and_can_be_undone(session: ReviewedSession) -> None:
     """The line may have been written where the model was."""
     placed = seen(session, 3)

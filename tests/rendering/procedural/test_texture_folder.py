@@ -89,6 +89,15 @@ def test_a_wide_picture_is_repeated_and_an_odd_one_stretched_with_a_note(tmp_pat
     assert any("32x20; it is stretched" in n for n in notes)
 
 
+def test_sixteen_bits_and_alpha_are_read(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a_rough.png"), np.full((8, 8), 257 * 77, np.uint16))
+    cv2.imwrite(str(tmp_path / "a_color.png"), np.full((8, 8, 4), (1, 2, 3, 128), np.uint8))
+    m = material_from_images(tmp_path, 0.1)
+    assert m.roughness_image is not None and m.base_color_image is not None
+    assert m.roughness_image[0, 0] == 77
+    assert tuple(m.base_color_image[0, 0]) == (3, 2, 1)
+
+
 def test_bad_packs_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds no picture"):
         material_from_images(tmp_path, 0.1)
