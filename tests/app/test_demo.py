@@ -28,7 +28,7 @@ def start_demo(out: Path) -> subprocess.Popen[str]:
 def kill_when(out: Path, reached: Callable[[Path], bool]) -> bool:
     """Start a demo and SIGKILL it as soon as `reached`; return whether it was caught alive."""
     process = start_demo(out)
-    deadline = time.monotonic() + 240
+    deadline = time.monotonic() + 900
     while process.poll() is None and time.monotonic() < deadline:
         if reached(out / "session"):
             process.send_signal(signal.SIGKILL)
@@ -64,7 +64,7 @@ def test_a_demo_killed_in_two_stages_ends_like_one_left_alone(
     caught = {name: kill_when(killed, moment) for name, moment in moments.items()}
     assert caught == {"capture": True, "school": True}
     finished = start_demo(killed)
-    said, err = finished.communicate(timeout=400)
+    said, err = finished.communicate(timeout=900)
     assert finished.returncode == 0, err
     assert goals(said) == goals((ROOT / "README.md").read_text()) != []
     for pattern in ("rgb/*.png", "depth/*.png", "mask_visib/*.png"):

@@ -148,6 +148,7 @@ def test_a_grasp_without_a_trajectory_shows_the_approach_and_says_so(
     assert bare.motion(s.instance, len(s)) is None and bare.motion(99, 0) is None
 
 
+@pytest.mark.slow
 def test_arm_and_hand_are_drawn_where_the_kinematics_have_them(
     school: Path, stored: tuple[SceneGrasps, dict[int, ObjectModel]]
 ) -> None:

@@ -132,7 +132,6 @@ def test_a_scaled_model_is_one_row_with_the_mark_of_its_source(run, meshes: Path
         (["flat.ply", "--unit", "mm"], "flat"),
         (["wedge.ply", "--unit", "mm", "--mass", "nan"], "--mass is nan"),
         (["wedge.ply", "--unit", "mm", "--mass", "1", "--density", "1"], "both given"),
-        (["wedge.ply", "--unit", "mm", "--id", "0"], "the id 0"),
         (["wedge.ply", "--unit", "mm", "--name", "a/b"], "cannot be the name"),
         (["wedge.ply", "--unit", "none", "--mass", "1"], "metric scale"),
         (["wedge.ply", "box.ply", "--unit", "mm", "--name", "x"], "of one model"),
