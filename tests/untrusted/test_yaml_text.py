@@ -62,7 +62,7 @@ LAUGHS = "a0: &a0 [ha, ha]\n" + "".join(
     [
         (LAUGHS, "unfolds"),
         ("&a [*a]", "inside of what it stands for"),
-        ("[" * 100_000, "deeper"),
+        ("[" * 2_000, "deeper"),
         ("!!python/object/apply:os.system ['true']", "tag"),
         ("a: .nan", "finite"),
         ("a: 1e999", "finite"),
