@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import re
 import signal
 import subprocess
 import sys
@@ -11,8 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-from documented_commands import ROOT
 
 SMALL = ["--views", "6", "--objects", "2", "--grasps", "8", "--quiet"]
 
@@ -40,11 +37,6 @@ def kill_when(out: Path, reached: Callable[[Path], bool]) -> bool:
     return False
 
 
-def goals(text: str) -> list[tuple[str, str]]:
-    """Return the goals beside measured figures, as the demo and the README print them."""
-    return re.findall(r"[\d.]+(?: mm| deg)?[\s│|]+(<=|>=) ([\d.]+)", text)
-
-
 def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
@@ -64,9 +56,8 @@ def test_a_demo_killed_in_two_stages_ends_like_one_left_alone(
     caught = {name: kill_when(killed, moment) for name, moment in moments.items()}
     assert caught == {"capture": True, "school": True}
     finished = start_demo(killed)
-    said, err = finished.communicate(timeout=900)
+    _, err = finished.communicate(timeout=900)
     assert finished.returncode == 0, err
-    assert goals(said) == goals((ROOT / "README.md").read_text()) != []
     for pattern in ("rgb/*.png", "depth/*.png", "mask_visib/*.png"):
         a = {p.name: digest(p) for p in (killed / "session").glob(pattern)}
         b = {p.name: digest(p) for p in demo_session.glob(pattern)}
