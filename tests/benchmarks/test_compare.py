@@ -1,5 +1,6 @@
 """Benchmark results compared: worse is told, noise is not, and the page is the one on disk."""
 
+import importlib
 import json
 import subprocess
 import sys
@@ -56,3 +57,11 @@ def test_runs_kept_together_know_their_noise(tmp_path: Path) -> None:
     kept = json.loads((tmp_path / "kept").read_text())
     assert kept["figures"] == {"error_mm": 0.2} and kept["seeds"] == [0, 1, 2]
     assert kept["noise"]["error_mm"] == pytest.approx(0.3)
+
+
+def test_the_page_of_what_was_measured_is_made_of_the_kept_runs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(COMPARE.parent)
+    compare = importlib.import_module("compare")
+    assert compare.PAGE.read_text() == compare.page_of(compare.load(compare.MEASURED))
