@@ -254,13 +254,6 @@ def T_world_cam_from_gl(T_world_gl: ArrayLike) -> Array:
     return np.asarray(T_world_gl, dtype=np.float64) @ T_CAM_GL
 
 
-def opengl_view_matrix(T_world_cam: ArrayLike) -> list[float]:
-    """Return pybullet's view matrix: T_gl_world, 16 numbers, column by column."""
-    T_gl_world = se3.invert(T_world_gl_from_cam(T_world_cam))
-    columns: list[float] = T_gl_world.T.ravel().tolist()
-    return columns
-
-
 # --- arrays -----------------------------------------------------------------------------------
 
 

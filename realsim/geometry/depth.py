@@ -67,37 +67,6 @@ def points_from_depth(
     return points, np.stack([u, v], -1).astype(np.int64) * stride
 
 
-def normals_from_depth(
-    depth_m: NDArray[np.float32], intrinsics: CameraIntrinsics, jump: float = 0.02
-) -> Array:
-    """Return the surface normal (H, W, 3) at every pixel, towards the camera; NaN where unknown.
-
-    The normal is the cross product of the central differences of the points to the left and right
-    and above and below. It is unknown where one of the four is missing or lies across a depth jump.
-
-    Args:
-        depth_m: (H, W) depth along z [m]; 0 = none.
-        intrinsics: the camera.
-        jump: depth difference between the two points of a difference that breaks the surface [m].
-    """
-    check_depth(depth_m, intrinsics)
-    z = np.where(depth_m > 0, depth_m, np.nan).astype(np.float64)
-    points = ray_table(intrinsics).astype(np.float64) * z[..., None]
-    normals = np.full(points.shape, np.nan)
-    du = points[1:-1, 2:] - points[1:-1, :-2]
-    dv = points[2:, 1:-1] - points[:-2, 1:-1]
-    n = np.cross(dv, du)
-    length = np.linalg.norm(n, axis=-1, keepdims=True)
-    known = (np.abs(du[..., 2]) < jump) & (np.abs(dv[..., 2]) < jump) & (length[..., 0] > 0)
-    known &= np.isfinite(z[1:-1, 1:-1])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        n = n / length
-    towards = np.sum(n * points[1:-1, 1:-1], axis=-1) > 0
-    n = np.where(towards[..., None], -n, n)
-    normals[1:-1, 1:-1][known] = n[known]
-    return normals
-
-
 def edge_mask(
     depth_m: NDArray[np.float32], jump: ArrayLike, margin_px: int = 1
 ) -> NDArray[np.bool_]:

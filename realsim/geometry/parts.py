@@ -115,16 +115,11 @@ def object_model(name: str) -> ObjectModel:
     raise InputError(f"there is no object '{name}'; there are: {', '.join(object_names())}.")
 
 
-def pybullet_model_ids() -> tuple[int, ...]:
-    """Return the ids of the meshes that can be taken from the installed pybullet_data."""
-    return tuple(_BULLET)
-
-
 def pybullet_models(ids: Sequence[int]) -> tuple[ObjectModel, ...]:
     """Return object models of meshes that come with PyBullet; PyBullet itself is not imported.
 
     Args:
-        ids: some of `pybullet_model_ids()`.
+        ids: obj_ids; a wrong one is answered with those that there are.
 
     Raises:
         InputError: an id is not known.

@@ -215,23 +215,6 @@ def draw_axes(
     return out
 
 
-def draw_points(
-    rgb: Image, pixels: ArrayLike, color: Color = (255, 80, 80), radius_px: float = 2.5
-) -> Image:
-    """Return the picture with dots at pixels (N, 2); NaN and far-away ones are left out."""
-    import cv2
-
-    out = rgb.copy()
-    uv = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-    near = np.isfinite(uv).all(-1) & (np.abs(np.nan_to_num(uv)) < 8 * max(rgb.shape)).all(-1)
-    scale = 1 << SHIFT
-    for x, y in np.round(uv[near] * scale).astype(int):
-        at = (int(x), int(y))
-        cv2.circle(out, at, int((radius_px + 1) * scale), INK, -1, cv2.LINE_AA, SHIFT)
-        cv2.circle(out, at, int(radius_px * scale), color, -1, cv2.LINE_AA, SHIFT)
-    return out
-
-
 def depth_picture(
     depth_m: ArrayLike, low_m: float | None = None, high_m: float | None = None
 ) -> Image:

@@ -10,7 +10,6 @@ from realsim.geometry.clouds import fit_plane_ransac, plane_frame, voxel_mean
 from realsim.geometry.depth import (
     depth_noise_per_m,
     edge_mask,
-    normals_from_depth,
     points_from_depth,
 )
 from realsim.records import CameraIntrinsics
@@ -43,14 +42,6 @@ def test_depth_of_another_camera_or_in_counts_is_refused():
         points_from_depth(np.ones((61, 80), np.float32), CAMERA)
     with pytest.raises(InputError, match="metres"):
         points_from_depth(np.ones((60, 80), np.uint16), CAMERA)  # type: ignore[arg-type]
-
-
-def test_normals_of_a_plane_face_the_camera():
-    normals = normals_from_depth(tilted_plane_depth(PINHOLE), PINHOLE, jump=0.1)
-    expected = np.array([0.4, -0.2, -1.0]) / np.linalg.norm([0.4, -0.2, -1.0])
-    inner = normals[1:-1, 1:-1].reshape(-1, 3)
-    np.testing.assert_allclose(inner, np.broadcast_to(expected, inner.shape), atol=1e-4)
-    assert np.isnan(normals[0]).all()
 
 
 def test_edges_are_found_and_slopes_are_not():

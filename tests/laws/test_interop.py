@@ -52,14 +52,6 @@ def test_pybullet():
     np.testing.assert_allclose(interop.T_from_pybullet(position, xyzw), T, atol=1e-15)
 
 
-def test_the_view_matrix_is_pybullets_own():
-    import pybullet
-
-    T_world_cam = se3.look_at([0.5, 0.2, 0.6], [0.1, 0.0, 0.0])
-    theirs = pybullet.computeViewMatrix([0.5, 0.2, 0.6], [0.1, 0.0, 0.0], [0, 0, 1])
-    np.testing.assert_allclose(interop.opengl_view_matrix(T_world_cam), theirs, atol=1e-6)
-
-
 def test_viser():
     from viser import transforms
 

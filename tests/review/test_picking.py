@@ -9,8 +9,7 @@ from realsim.geometry import se3
 from realsim.geometry.distance_field import raycasting_scene
 from realsim.geometry.parts import part
 from realsim.interop import import_open3d
-from realsim.records import ObjectPose
-from realsim.review.placing.picking import ray_on_cloud, ray_on_mesh, ray_on_objects
+from realsim.review.placing.picking import ray_on_cloud, ray_on_mesh
 
 Array = NDArray[np.float64]
 MUG = part("mug")
@@ -57,27 +56,6 @@ def test_what_lies_behind_the_eye_is_not_met() -> None:
     eye = np.array([0.0, 0.0, 1.0])
     assert ray_on_mesh(eye, [0, 0, 1], WEDGE.mesh, np.eye(4)) is None
     assert ray_on_mesh(eye, [0, 0, -1], WEDGE.mesh, np.eye(4)) is not None
-
-
-def test_of_two_objects_the_nearer_is_met() -> None:
-    poses = [
-        ObjectPose(obj_id=m.obj_id, instance=k, T_world_obj=se3.from_translation([0, 0, z]))
-        for k, (m, z) in enumerate([(MUG, 0.0), (WEDGE, 0.3), (MUG, -0.4)])
-    ]
-    models = {m.obj_id: m for m in (MUG, WEDGE)}
-    center = WEDGE.mesh.bounds.mean(0)
-    above = ray_on_objects(center + np.array([0, 0, 1]), [0, 0, -1], poses, models)
-    below = ray_on_objects(
-        [*MUG.mesh.bounds.mean(0)[:2], -1.0], [0, 0, 1], poses[::-1], models
-    )  # fmt: skip
-    assert above is not None and above.instance == 1
-    assert below is not None and below.instance == 2
-    # Without its model an object cannot be met.
-    instance_below = ray_on_objects(
-        center + np.array([0, 0, 1]), [0, 0, -1], poses, {MUG.obj_id: MUG}
-    )
-    assert instance_below is None or instance_below.instance != 1
-    assert ray_on_objects([0, 0, 1], [1, 0, 0], poses, models) is None
 
 
 # --- clouds -----------------------------------------------------------------------------------

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.records import ObjectPose, Scene, SupportPlane, View
+from realsim.records import Scene, View
 from realsim.registration.refinement.uncertainty import SeenPose
 from realsim.registration.search.records import NotPlaced
 from realsim.store import SessionStore, load_scene
-from realsim.untrusted.own_json import array_from_json, from_json, number_from_json
+from realsim.untrusted.own_json import array_from_json, number_from_json
 
 Array = NDArray[np.float64]
 Json = dict[str, Any]
@@ -151,20 +151,6 @@ def load_seen(store: SessionStore) -> dict[int, dict[int, SeenPose]]:
         }
         for index, rows in views.items()
     }
-
-
-def load_table_scene(store: SessionStore) -> Scene:
-    """Return the scene in the table's frame: its world is the table, z up out of it."""
-    value: Json = store.read_json(TABLE_FILE)
-    rows = [row | {"T_world_obj": row["T_table_obj"]} for row in value["objects"]]
-    plane = None
-    if value["frame"] == "table":
-        plane = SupportPlane(
-            T_world_table=np.eye(4), rms_m=number_from_json(value["rms_m"]),
-            inliers=int(value["inliers"]),
-        )  # fmt: skip
-    objects = tuple(from_json(row, ObjectPose, "an object's pose") for row in rows)
-    return Scene(name=str(value["name"]), objects=objects, plane=plane)
 
 
 def load_registered(store: SessionStore) -> Registered:

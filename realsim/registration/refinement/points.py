@@ -56,13 +56,6 @@ def join_views(views: Sequence[ViewPoints]) -> AllPoints:
     )
 
 
-@njit(inline="always")
-def _square_gap(p: Array32, q: Array) -> float:
-    """Return the square of the distance of two points (3,)."""
-    x, y, z = p[0] - q[0], p[1] - q[1], p[2] - q[2]
-    return x * x + y * y + z * z
-
-
 @njit
 def _sorted_in(
     points: Array32,

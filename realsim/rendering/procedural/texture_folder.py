@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.geometry.colors import light_of_bytes, srgb_encoded
+from realsim.geometry.colors import srgb_encoded
 from realsim.rendering.appearance import LEAST_ROUGHNESS, Material
 from realsim.rendering.procedural.hdri import HDR, PICTURES, read_picture
 
@@ -259,13 +259,3 @@ def _square(image: Image, path: Path, notes: list[str]) -> Image:
     if image.shape[:2] != (side, side):
         image = np.asarray(cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA), np.uint8)
     return np.ascontiguousarray(image)
-
-
-def linear_mean(material: Material) -> NDArray[np.float64]:
-    """Return the mean linear reflectance (3,) of a material: what it looks like from afar."""
-    factor = np.asarray(material.base_color, np.float64)
-    if material.base_color_image is None:
-        return factor
-    values = np.arange(256)
-    decode = light_of_bytes(values)
-    return factor * decode[material.base_color_image].mean(axis=(0, 1))

@@ -1,15 +1,12 @@
 """What a click meets: the ray from the browser's camera against models and measured points."""
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.records import Mesh, ObjectModel, ObjectPose
+from realsim.records import Mesh
 
 Array = NDArray[np.float64]
 SLOPE = 3.0
@@ -22,14 +19,6 @@ CLICK_M = 0.002
 """Least radius of the cone [m]: the spacing of the cloud's points."""
 PARALLEL = 1e-12
 """Least sine of the angle between a ray and a triangle, so to speak, that it can meet."""
-
-
-class Hit(NamedTuple):
-    """The object that a ray meets first."""
-
-    instance: int
-    point_obj: Array
-    """(3,) where, in the object's frame [m]."""
 
 
 def ray_on_mesh(
@@ -61,34 +50,6 @@ def ray_on_mesh(
         return None
     t = _first_triangle(o, d, mesh.vertices, mesh.faces)
     return o + t * d if np.isfinite(t) else None
-
-
-def ray_on_objects(
-    origin: ArrayLike,
-    direction: ArrayLike,
-    placed: Sequence[ObjectPose],
-    models: Mapping[int, ObjectModel],
-) -> Hit | None:
-    """Return the object that a ray meets first and where, or None.
-
-    Args:
-        origin: (3,) of the ray in world [m].
-        direction: (3,) in world, any length.
-        placed: the objects; those without a model are passed over.
-        models: by obj_id.
-    """
-    o, _ = _ray(origin, direction)
-    nearest, found = np.inf, None
-    for one in placed:
-        if one.obj_id not in models:
-            continue
-        point = ray_on_mesh(origin, direction, models[one.obj_id].mesh, one.T_world_obj)
-        if point is None:
-            continue
-        away = float(np.linalg.norm(one.T_world_obj[:3, :3] @ point + one.T_world_obj[:3, 3] - o))
-        if away < nearest:
-            nearest, found = away, Hit(one.instance, point)
-    return found
 
 
 def ray_on_cloud(
