@@ -36,7 +36,7 @@ from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.day import Day, Pupil
 from realsim_sim_bridge.school.workers import Workers, local_workers
 
-FULL, QUICK = 80, 6
+FULL, QUICK = 80, 3
 """Candidates per object."""
 SHARD_GRASPS, SHARD_GRASPS_QUICK = 24, 8
 """Of a job: small ones, so that the last one does not decide."""
