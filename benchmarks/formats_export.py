@@ -18,7 +18,7 @@ WORKER = Path(__file__).with_name("formats_export_worker.py")
 TARGET = 100_000
 """Frames of the goal."""
 SIZES = {"bop": (5_000, 20_000), "graspnet": (1_000, 4_000)}
-QUICK_SIZES = {"bop": (200, 1_000), "graspnet": (64, 192)}
+QUICK_SIZES = {"bop": (100, 500), "graspnet": (32, 96)}
 FRAMES = 0
 """Frames of the larger BOP export; 0 = as in SIZES. Set by formats.py."""
 

@@ -27,7 +27,7 @@ def generate_cost(seed: int, quick: bool) -> Found:
         command = [
             str(Path(sys.executable).with_name("realsim")), "generate", f"{folder}/out", "--scenes",
             str(scenes), "--views", str(views), "--size", SIZE, "--seed", str(seed), "--workers",
-            "2", "--quiet", *(("--objects", "4-5") if quick else ()),
+            "1" if quick else "2", "--quiet", *(("--objects", "4-5") if quick else ()),
         ]  # fmt: skip
         before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

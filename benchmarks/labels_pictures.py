@@ -56,7 +56,7 @@ def picture_cost(seed: int, quick: bool) -> Found:
         f"{setup:.1f} s"
     )
     found.rivals["rgb_cpu_s"] = f"one cast of every pixel {np.mean(casts[1:] or casts):.2f} s"
-    _photoreal(found, placed, environment, camera, views[: 2 if quick else 4], 2 if quick else 1)
+    _photoreal(found, placed, environment, camera, views[: 2 if quick else 4], 4 if quick else 1)
     return found
 
 

@@ -22,7 +22,7 @@ def stereo_cost(seed: int, quick: bool) -> Found:
     """Return the CPU of a simulated stereo depth over that of its labels, the worst camera's."""
     found = Found()
     placed, intrinsics = scene(), camera_720p()
-    views = cameras(6 if quick else 48, 0.5, 0.7)
+    views = cameras(3 if quick else 48, 0.5, 0.7)
     renderer = LabelRenderer(placed)
     ratios: dict[str, float] = {}
     for name in NAMES:
