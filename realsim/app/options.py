@@ -15,9 +15,17 @@ QUIET = click.option("--quiet", is_flag=True, help="No progress; only the result
 JSON = click.option("--json", "as_json", is_flag=True, help="The result as JSON on stdout.")
 
 
-def json_file(what: str, key: str, *keys: str) -> Decorator:
-    """Return the option that writes the JSON into a file as well; `keys` tell its own files."""
-    own = OutputFile({".json": [f'"{name}"' for name in (key, *keys)]}, "document")
+def json_file(what: str, key: str, *keys: str, top: bool = False) -> Decorator:
+    """Return the option that writes the JSON into a file as well; `keys` tell its own files.
+
+    Args:
+        what: the help.
+        key: of the document.
+        keys: more of them.
+        top: they count at the document's top alone, where another command's holds this one inside.
+    """
+    marks = [f'\n "{name}"' if top else f'"{name}"' for name in (key, *keys)]
+    own = OutputFile({".json": marks}, "document")
     return click.option("--json-file", type=own, default=None, metavar="FILE", help=what)
 
 

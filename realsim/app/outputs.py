@@ -18,6 +18,8 @@ from realsim.errors import InputError
 Marks = Mapping[str, Sequence[str]]
 """Suffix -> texts that every file of the option's own has; none = the suffix is enough."""
 SESSION_FILES = ("session.json", "session.begun.json", "robot.jsonl", "manifest.jsonl")
+SESSION_PLAN = "plan.json"
+"""What a session was captured by; elsewhere the usual name of a plan."""
 SESSION_FOLDERS = (
     "annotations", "calibration", "depth", "grasps", "imported", "labels", "mask", "mask_visib",
     "models", "registration", "review", "rgb", "stages",
@@ -58,7 +60,8 @@ class OutputFolder(click.Path):
 
         Args:
             files: names that are the same in every run.
-            own: one of them and the texts in it, which tell an earlier run's from others' files.
+            own: pattern of one of them, and the texts in each, which tell an earlier run's files
+                from others'.
             goes_on: the command looks itself at what is there, to go on with it.
         """
         super().__init__(path_type=Path)
@@ -111,7 +114,8 @@ def require_free_file(
         )
     if not os.access(folder, os.W_OK):
         raise InputError(f"the folder '{path.parent}' for {name} may not be written by you.")
-    if path.name in SESSION_FILES:
+    of_session = any((folder / file).is_file() for file in SESSION_FILES)
+    if path.name in SESSION_FILES or (of_session and path.name == SESSION_PLAN):
         raise InputError(f"{shown} is a name of a session's own files; give another name.")
     is_own = path.is_file() and has_texts(path, own[path.suffix.lower()])
     others = [p for p in (path.with_suffix(suffix) for suffix in beside) if os.path.lexists(p)]
@@ -146,7 +150,8 @@ def require_free_folder(
                 "replaced; give another folder."
             )
     there = [path / file for file in files if os.path.lexists(path / file)]
-    if there and not (own[0] and (path / own[0]).is_file() and has_texts(path / own[0], own[1])):
+    marked = [file for file in path.glob(own[0]) if file.is_file()] if own[0] else []
+    if there and not (marked and all(has_texts(file, own[1]) for file in marked)):
         raise InputError(
             f"{name} '{path}': {there[0]} is there, made by something else or of something else; "
             "it is not replaced. Give another folder, or delete it first."

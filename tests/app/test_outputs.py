@@ -11,6 +11,7 @@ from realsim.app.cli import commands
 from realsim.app.command import walk
 from realsim.app.outputs import OutputFile, OutputFolder
 from realsim.errors import InputError
+from realsim.store import atomic
 from synthetic_scenes import captured_session
 
 NAMES = {"out", "dest", "static", "replay_file", "json_file"}
@@ -121,6 +122,9 @@ def test_a_session_without_its_header_is_told_and_how_it_is_mended(
         ["export", session, "--to", "bop", "--out", out], ["stats", session],
         ["export", session.parent, "--to", "bop", "--out", out], ["stats", session.parent],
         ["import", session, out], ["report", session], ["review", session, "--no-browser"],
+        ["school", session], ["school", "settle", session], ["school", "summary", session],
+        ["calibrate", session], ["depth-fit", session, "--out", tmp_path / "sensor.json"],
+        ["demonstrations", session, "--out", out],
     ):  # fmt: skip
         done = CliRunner().invoke(commands, [str(w) for w in words])
         assert isinstance(done.exception, InputError), (words, done.output)
@@ -128,3 +132,44 @@ def test_a_session_without_its_header_is_told_and_how_it_is_mended(
         assert "--repair` makes it anew" in str(done.exception)
     assert not out.exists()
     header.write_bytes(kept)
+
+
+def test_overwrite_is_for_what_the_command_wrote(session: Path, tmp_path: Path) -> None:
+    plan = "shipped:ur5_d405_hemisphere_256"
+
+    def convert_to(folder: Path) -> object:
+        words = ["plan-convert", plan, str(folder), "--overwrite", "--quiet"]
+        return CliRunner().invoke(commands, words).exception
+
+    own, foreign, driven = tmp_path / "own", tmp_path / "foreign", tmp_path / "driven"
+    assert convert_to(own) is None and convert_to(own) is None  # its own files it may replace
+    for folder, name in ((foreign, "camera_poses.npy"), (driven, "plan.json")):
+        folder.mkdir()
+        (folder / name).write_bytes(b"not to be lost" if folder is foreign else
+                                    (own / "plan.json").read_bytes())  # fmt: skip
+        before = contents(folder)
+        assert "is there, made by something else" in str(convert_to(folder))
+        assert contents(folder) == before
+    for inside in (session, session / "rgb"):
+        assert "part of the session" in str(convert_to(inside))
+    (session / "plan.json").write_bytes((own / "plan.json").read_bytes())
+    words = ["plan", "--views", "4", "--out", str(session / "plan.json"), "--overwrite"]
+    assert "a session's own files" in str(CliRunner().invoke(commands, words).exception)
+    (session / "plan.json").unlink()
+
+
+def test_a_document_that_holds_another_commands_is_not_its_own(tmp_path: Path) -> None:
+    held = {"with_trajectory": 1, "closures": []}
+    for document, accepted in ((held, True), ({"statistics": {}, "school": held}, False)):
+        path = tmp_path / "a.json"
+        atomic.write_json(path, document)
+        if accepted:
+            assert convert("school summary --json-file", path) == path
+        else:
+            with pytest.raises(InputError, match="not replaced"):
+                convert("school summary --json-file", path)
+
+
+def test_a_session_keeps_its_calibration_itself(session: Path, tmp_path: Path) -> None:
+    words = ["calibrate", str(session), "--out", str(tmp_path / "elsewhere")]
+    assert "keeps its calibration itself" in str(CliRunner().invoke(commands, words).exception)

@@ -7,6 +7,9 @@ from realsim.app.calibrate.show import report_document, show_hand_eye, show_next
 from realsim.app.console import Console
 from realsim.errors import InputError
 
+OUT = Path("calibration")
+"""Where the calibration of a plain folder goes, if nobody says."""
+
 
 def run_calibrate(source: Path, console: Console, *, live: bool, **options: Any) -> bool:
     """Calibrate what `source` holds; return whether no check is bad.
@@ -15,7 +18,9 @@ def run_calibrate(source: Path, console: Console, *, live: bool, **options: Any)
         InputError: source or options cannot be used.
     """
     from realsim.app.calibrate.session import has_board_views_only
+    from realsim.store.opening import require_header
 
+    require_header(source)
     if (source / "session.json").is_file() or has_board_views_only(source):
         _refuse_folder_options(options)
         return _run_session(source, console)
@@ -79,6 +84,11 @@ def _refuse_folder_options(options: dict[str, Any]) -> None:
     """Raise if an option was given that a session answers itself."""
     mine = ("board", "poses", "reading", "key", "board_poses", "camera", "robot", "eye_to_hand")
     given = [f"--{name.replace('_', '-')}" for name in mine if options.get(name)]
+    if options.get("out", OUT) != OUT:
+        raise InputError(
+            f"--out {options['out']}: a session keeps its calibration itself, in calibration/. "
+            "Leave --out away, or copy that folder afterwards."
+        )
     if given:
         raise InputError(
             f"{', '.join(given)}: a session says these itself (calibration/board.json, robot.jsonl "

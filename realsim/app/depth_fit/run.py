@@ -12,6 +12,7 @@ from realsim.app.outputs import require_free_file
 from realsim.errors import InputError
 from realsim.records import CameraIntrinsics
 from realsim.rendering.depth_sensors.profiles import DepthProfile, profile
+from realsim.store.opening import require_header
 
 Item = TypeVar("Item")
 CAMERA_NAMES = ("camera.json", "intrinsics.json", "cam_K.txt", "camera.yaml", "intrinsics.yaml")
@@ -136,6 +137,7 @@ def read_frames(source: Path, views: str, camera: Path | None, unit_m: float) ->
     Raises:
         InputError: there are none, or the camera is not known.
     """
+    require_header(source)
     if (source / "session.json").is_file():
         return _of_session(source, views)
     if not source.is_dir():

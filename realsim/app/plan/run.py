@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from realsim.app.console import Console, Tick
-from realsim.app.outputs import require_free_file
+from realsim.app.outputs import require_free_file, require_free_folder
 from realsim.app.plan.request import Place, PlanRequest
 from realsim.errors import InputError
 from realsim.untrusted.json_text import read_json
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 PICTURES = "_pictures"
 """Added to a plan's name: the folder of its pictures beside it."""
+GRASPNET_FILES = ("plan.json", "camera_poses.npy", "cam0_wrt_table.npy")
+GRASPNET_MARK = ("camera_poses.npy", ("NUMPY", ", 4, 4)"))
 PLAN_MARKS = {
     ".json": ('"realsim capture plan"',),
     ".csv": ("view,via,q1_rad",),
@@ -193,10 +195,12 @@ def run_convert(
         InputError: the source is neither, the target has no known form or is there already.
     """
     writer = _writer(dest)
+    if not dest.suffix:
+        require_free_folder(dest, "DEST", GRASPNET_FILES, GRASPNET_MARK)
+    elif dest.exists():
+        require_free_file(dest, "DEST", PLAN_MARKS, "plan")
     if dest.exists() and not overwrite:
         raise InputError(f"{dest} is there already; --overwrite replaces it, or name another.")
-    if dest.exists() and dest.suffix:
-        require_free_file(dest, "DEST", PLAN_MARKS, "plan")
     plan = _source_plan(source, place, joints_unit, console)
     files = writer(plan, dest)
     free = show_colliding(plan, console) if plan.kind == "imported" else True

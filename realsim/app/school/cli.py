@@ -12,6 +12,11 @@ from realsim.app.outputs import GOES_ON, OutputFolder
 
 ENGINES = ("pybullet", "mujoco")
 FORMATS = ("acronym", "graspgen", "isaac", "hdf5", "parquet")
+PICTURE = OutputFolder(("settle.png",))
+VALIDATION = OutputFolder(
+    tuple(f"validation_{name}.{end}" for name in ENGINES for end in ("json", "png")),
+    own=("validation_*.json", ('"checks"', '"ratios"')),
+)
 
 
 class RunByDefault(Group):
@@ -146,7 +151,7 @@ def run_command(
               type=click.Choice([*ENGINES, "both"]), help="Which physics.")  # fmt: skip
 @click.option("--quick", is_flag=True, help="Every part with fewer samples: about a minute.")
 @json_file("Write the reports there, too.", "checks", "ratios", "cpu_s")
-@click.option("--out", type=OutputFolder(), default=None, help="Folder for reports and pictures.")
+@click.option("--out", type=VALIDATION, default=None, help="Folder for reports and pictures.")
 @JSON
 @QUIET
 def validate_command(
@@ -178,7 +183,7 @@ def validate_command(
 @click.option("--density", type=float, default=None, help="Of the others [kg/m^3].")
 @click.option("--support", "supports", multiple=True, type=FOLDER, metavar="URDF",
               help="A bin or shelf, in the table's frame; repeat.")  # fmt: skip
-@click.option("--out", type=OutputFolder(), default=None, help="Folder for the picture.")
+@click.option("--out", type=PICTURE, default=None, help="Folder for the picture.")
 @json_file("Write the table there, too.", "stable", "simulated_s")
 @JSON
 @QUIET
@@ -236,7 +241,7 @@ def export_command(
     examples=("realsim school summary demo/session", "realsim school summary demo/session --json"),
 )  # fmt: skip
 @click.argument("sources", type=FOLDER, nargs=-1, required=True, metavar="SESSION...")
-@json_file("Write the counts there, too.", "with_trajectory", "closures")
+@json_file("Write the counts there, too.", "with_trajectory", "closures", top=True)
 @JSON
 @QUIET
 def summary_command(

@@ -15,6 +15,7 @@ from realsim.errors import InputError
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, Scene, names_of
 from realsim.store import SessionStore
+from realsim.store.opening import require_header
 
 Array = NDArray[np.float64]
 
@@ -100,7 +101,12 @@ class SchoolInputs:
 
 
 def is_session(source: Path) -> bool:
-    """Return whether the source is a session of realsim."""
+    """Return whether the source is a session of realsim.
+
+    Raises:
+        InputError: it is one whose header is lost.
+    """
+    require_header(source)
     return (source / "session.json").is_file()
 
 

@@ -11,6 +11,11 @@ from realsim.app.option_values import numbers_of, point_of
 from realsim.app.options import FOLDER, JSON, QUIET, json_file, overwrite
 from realsim.app.outputs import OutputFolder
 
+RESULT = OutputFolder(
+    ("scale.json", "model.ply", "model.png", "scale.html", "residuals.png", "views.png",
+     "candidates.png", "overlays.png"),
+    own=("scale.json", ('"smallest_box_mm"', '"versions"')),
+)  # fmt: skip
 UP = click.Choice(["x", "y", "z", "-x", "-y", "-z"])
 
 
@@ -33,7 +38,7 @@ UP = click.Choice(["x", "y", "z", "-x", "-y", "-z"])
 @click.option("--measured", multiple=True, help="A length by caliper: longest=120.4mm+-0.3mm.")
 @click.option("--between", multiple=True, help="Two points and a length: 'x,y,z x,y,z=95mm'.")
 @click.option("--views", default="", help="Only these views, such as 1-24.")
-@click.option("--out", type=OutputFolder(), default=None, help="Folder.  [SESSION/scans/NAME]")
+@click.option("--out", type=RESULT, default=None, help="Folder.  [SESSION/scans/NAME]")
 @json_file("scale.json once more.", "scale", "sigma", "verdict")
 @click.option("--id", "obj_id", type=int, default=None, help="BOP id in the library.")
 @click.option("--density", type=float, default=None, help="For the library [kg/m^3].  [1000]")
