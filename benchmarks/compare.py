@@ -103,7 +103,8 @@ def page_of(documents: dict[str, Document]) -> str:
     lines = [
         "# Measured", "",
         "Written by `benchmarks/compare.py --page` from `benchmarks/measured/`; do not edit.",
-        "Quick runs take fewer samples. Noise is the spread over runs that were kept together.", "",
+        "Goals are those of full runs; quick ones take fewer samples, some of them a single one. Noise "
+        "is the spread over runs that were kept together.", "",
     ]  # fmt: skip
     for name, document in documents.items():
         machine, goals = document.get("machine") or {}, document.get("goals") or {}
@@ -115,7 +116,8 @@ def page_of(documents: dict[str, Document]) -> str:
             noise = document.get("noise", {}).get(key)
             said = "not measured" if value is None else f"{value:.4g}"
             spread = "" if noise is None else f"{noise:.2g}"
-            lines.append(f"| {key} | {said} | {spread} | {goals.get(key, '')} |")
+            goal = goals.get(key, "")
+            lines.append(f"| {key} | {said} | {spread} | {'' if 'inf' in goal else goal} |")
         lines.append("")
     return "\n".join(lines)
 
