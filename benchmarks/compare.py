@@ -103,7 +103,7 @@ def page_of(documents: dict[str, Document]) -> str:
     lines = [
         "# Measured", "",
         "Written by `benchmarks/compare.py --page` from `benchmarks/measured/`; do not edit.",
-        "Goals are those of full runs; quick ones take fewer samples, some of them a single one. Noise "
+        "Goals are those of full runs; quick ones take fewer samples, some of them one. Noise "
         "is the spread over runs that were kept together.", "",
     ]  # fmt: skip
     for name, document in documents.items():
