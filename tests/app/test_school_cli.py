@@ -151,10 +151,15 @@ def test_things_that_stand_settle_and_one_in_the_air_does_not(
     save_scene(
         SessionStore.open(folder), Scene(name="two", objects=(lifted, wedge), plane=there.plane)
     )
-    result = run("settle", folder, "--quiet", "--json-file", tmp_path / "settle.json")
+    words = ("settle", folder, "--quiet", "--out", tmp_path)
+    result = run(*words, "--json-file", tmp_path / "settle.json")
     assert result.exit_code == 1 and "floats" in result.output
     verdicts = [o["verdict"] for o in json.loads((tmp_path / "settle.json").read_text())["objects"]]
     assert verdicts == ["floats", "stands"]
+    assert run(*words).exit_code == 1  # its own picture is replaced, another one is not
+    (tmp_path / "settle.png").write_bytes(b"a photograph")
+    assert "not replaced" in refused(*words)
+    assert (tmp_path / "settle.png").read_bytes() == b"a photograph"
 
 
 @pytest.mark.real

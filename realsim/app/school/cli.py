@@ -12,7 +12,7 @@ from realsim.app.outputs import GOES_ON, OutputFolder
 
 ENGINES = ("pybullet", "mujoco")
 FORMATS = ("acronym", "graspgen", "isaac", "hdf5", "parquet")
-PICTURE = OutputFolder(("settle.png",))
+PICTURE = OutputFolder(("settle.png",), own=("settle.png", ("realsim settle",)))
 VALIDATION = OutputFolder(
     tuple(f"validation_{name}.{end}" for name in ENGINES for end in ("json", "png")),
     own=("validation_*.json", ('"checks"', '"ratios"')),

@@ -51,8 +51,9 @@ def stand_picture(scene: SchoolScene, report: StandReport) -> bytes:
         ax.grid(alpha=0.2)
     _legend(figure, report)
     buffer = io.BytesIO()
-    # Without the software's name and date the same scene gives the same bytes.
-    figure.savefig(buffer, format="png", metadata={"Software": None})
+    # Without Matplotlib's version and a date the same scene gives the same bytes; by this name the
+    # command knows a picture of its own, which it may replace.
+    figure.savefig(buffer, format="png", metadata={"Software": "realsim settle"})
     return buffer.getvalue()
 
 
