@@ -18,6 +18,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.geometry.dh import UR5E_ARM
 from realsim.records import CameraIntrinsics, Chessboard
+from realsim.robots.kinematics import UR5E
 from realsim_calibration import (
     BoardView,
     HandEyeConfig,
@@ -34,7 +35,6 @@ from realsim_calibration.fit.joint_solve import (
 from realsim_calibration.fit.linear_model import LinearModel
 from realsim_calibration.fit.robust_fit import solve
 from realsim_calibration.fit.view_system import camera_vector
-from realsim_capture_plans.arms.kinematics import UR5E
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator

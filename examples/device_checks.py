@@ -12,8 +12,8 @@ import time
 import numpy as np
 
 from realsim import InputError
+from realsim.robots.kinematics import CHAINS
 from realsim_capture_plans import Arm, DepthCamera
-from realsim_capture_plans.arms.kinematics import CHAINS
 
 STEP_RAD = 0.05
 """A move of three degrees shows unit, sign and order of the joints, and hurts nobody."""

@@ -1,9 +1,9 @@
 """Where the robot goes and what executes it: plans, devices, the simulated lab."""
 
-from realsim_capture_plans.arms.kinematics import UR5 as UR5
-from realsim_capture_plans.arms.kinematics import UR5E as UR5E
-from realsim_capture_plans.arms.kinematics import DhChain as DhChain
-from realsim_capture_plans.arms.kinematics import JointLimits as JointLimits
+from realsim.robots.kinematics import UR5 as UR5
+from realsim.robots.kinematics import UR5E as UR5E
+from realsim.robots.kinematics import DhChain as DhChain
+from realsim.robots.kinematics import JointLimits as JointLimits
 from realsim_capture_plans.capturing.capture import CaptureConfig as CaptureConfig
 from realsim_capture_plans.capturing.capture import CaptureSummary as CaptureSummary
 from realsim_capture_plans.capturing.capture import capture as capture

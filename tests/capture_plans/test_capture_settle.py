@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from realsim_capture_plans.arms.kinematics import UR5
+from realsim.robots.kinematics import UR5
 from realsim_capture_plans.capturing.checks import (
     CheckConfig,
     sharpness,

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from realsim.records import CameraIntrinsics, CaptureSession
+from realsim.robots.kinematics import UR5
 from realsim.store import SessionStore
-from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.capturing.capture import CaptureJob, capture
 from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
 from realsim_capture_plans.capturing.operator import TerminalOperator

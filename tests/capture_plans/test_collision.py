@@ -7,12 +7,12 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
-from realsim_capture_plans.collision.arm_shapes import arm_shapes
-from realsim_capture_plans.collision.coal_geometry import pinocchio_model
+from realsim.robots.arm_shapes import arm_shapes
+from realsim.robots.coal_geometry import pinocchio_model
+from realsim.robots.kinematics import UR5, UR5E, DhChain
+from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.model import GROUPS, CollisionModel, interpolate
 from realsim_capture_plans.collision.mount import camera_shape, d405_mount
-from realsim_capture_plans.collision.shapes import Box, Mount, Shape, WorkCell
 
 INF = np.inf
 EVERYWHERE = Box(lower=(-INF, -INF, -INF), upper=(INF, INF, 0.0))

@@ -7,11 +7,11 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import UR5, DhChain
-from realsim_capture_plans.collision.arm_shapes import link_placements
+from realsim.robots.arm_shapes import link_placements
+from realsim.robots.kinematics import UR5, DhChain
+from realsim.robots.shapes import Box, WorkCell
 from realsim_capture_plans.collision.model import GROUPS, CollisionModel
 from realsim_capture_plans.collision.mount import d405_mount
-from realsim_capture_plans.collision.shapes import Box, WorkCell
 
 CELL = WorkCell(
     table=Box(lower=(-0.6, -0.8, -np.inf), upper=(1.0, 0.8, 0.0)),

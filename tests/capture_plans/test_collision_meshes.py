@@ -5,10 +5,10 @@ import pytest
 
 from realsim.errors import MissingLibraryError
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import UR5
-from realsim_capture_plans.collision.arm_shapes import LINK_NAMES, arm_shapes
+from realsim.robots.arm_shapes import LINK_NAMES, arm_shapes
+from realsim.robots.kinematics import UR5
+from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.mount import d405_mount, plain_bracket
-from realsim_capture_plans.collision.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.ur5_meshes import (
     MeshModel,
     compare_with_meshes,

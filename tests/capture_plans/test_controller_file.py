@@ -12,7 +12,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_capture_plans.arms.controller_file import (
+from realsim.robots.controller_file import (
     LINKS,
     LISTS,
     PLACES,
@@ -21,7 +21,7 @@ from realsim_capture_plans.arms.controller_file import (
     flange_gap_m,
     read_controller_calibration,
 )
-from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
+from realsim.robots.kinematics import UR5, UR5E, DhChain
 
 UR10 = DhChain.of(UR_ARMS["UR10"])
 CONF = {

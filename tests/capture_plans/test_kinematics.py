@@ -7,7 +7,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
+from realsim.robots.kinematics import UR5, UR5E, DhChain
 
 
 def calibrated(chain: DhChain, seed: int) -> DhChain:

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from realsim.errors import InputError, RealsimError, UnitError
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import UR5
+from realsim.robots.kinematics import UR5
+from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.cell_files import (
     read_mount,
     read_work_cell_obstacles,
@@ -18,7 +19,6 @@ from realsim_capture_plans.collision.cell_files import (
 )
 from realsim_capture_plans.collision.model import CollisionModel
 from realsim_capture_plans.collision.mount import CAMERA_BODIES, d405_mount, plain_bracket
-from realsim_capture_plans.collision.shapes import Box, Mount, Shape, WorkCell
 
 CELL = WorkCell(
     table=Box(lower=(-0.6, -0.8, -np.inf), upper=(1.0, 0.8, 0.0)),
@@ -162,7 +162,7 @@ def test_the_plain_bracket_joins_flange_and_camera(camera: str) -> None:
     """It touches the flange's face and the camera, in one piece, without entering the wrist."""
     import coal
 
-    from realsim_capture_plans.collision.coal_geometry import coal_shape
+    from realsim.robots.coal_geometry import coal_shape
     from realsim_capture_plans.collision.mount import camera_shape
 
     T = se3.from_translation([-0.09, 0.09, 0.0])

@@ -11,9 +11,9 @@ import pytest
 
 from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import UR5, UR5E, DhChain
+from realsim.robots.kinematics import UR5, UR5E, DhChain
+from realsim.robots.shapes import Box
 from realsim_capture_plans.collision.mount import d405_mount
-from realsim_capture_plans.collision.shapes import Box
 from realsim_capture_plans.plan_files import plan_json
 from realsim_capture_plans.plan_files.plan_json import load_plan, plan_to_json, save_plan
 from realsim_capture_plans.planning.ordering import move_seconds

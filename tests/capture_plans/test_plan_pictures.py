@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realsim_capture_plans.arms.kinematics import UR5
+from realsim.robots.kinematics import UR5
+from realsim.robots.shapes import Box
 from realsim_capture_plans.collision.mount import d405_mount
-from realsim_capture_plans.collision.shapes import Box
 from realsim_capture_plans.pictures.drawing import PlanCurves
 from realsim_capture_plans.pictures.motion_charts import clearance_chart
 from realsim_capture_plans.pictures.plan_pictures import plan_pictures

@@ -18,7 +18,7 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.interop import T_from_rotation_vector_pose
-from realsim_capture_plans.arms.kinematics import CHAINS, UR5, UR5E
+from realsim.robots.kinematics import CHAINS, UR5, UR5E
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError
 from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_connection import UrConfig

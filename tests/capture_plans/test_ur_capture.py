@@ -8,8 +8,8 @@ import pytest
 
 from realsim.geometry import se3
 from realsim.records import CaptureSession
+from realsim.robots.kinematics import UR5
 from realsim.store import SessionStore
-from realsim_capture_plans.arms.kinematics import UR5
 from realsim_capture_plans.capturing.capture import CaptureJob, capture
 from realsim_capture_plans.capturing.operator import Command, NoOperator
 from realsim_capture_plans.collision.mount import d405_mount

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim_capture_plans.arms.kinematics import CHAINS
+from realsim.robots.kinematics import CHAINS
 from realsim_capture_plans.capturing import checks
 from realsim_capture_plans.capturing.checks import Check, CheckConfig, Earlier, Measured
 from realsim_capture_plans.devices.interfaces import (

@@ -37,9 +37,9 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
+from realsim.robots.shapes import SIZES, Box, Kind, Mount, Shape
 from realsim.untrusted.toml_text import read_toml
 from realsim_capture_plans.collision.mount import FLANGE, camera_body, plain_bracket
-from realsim_capture_plans.collision.shapes import SIZES, Box, Kind, Mount, Shape
 
 
 class Fields:

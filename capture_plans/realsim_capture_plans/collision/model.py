@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim_capture_plans.arms.kinematics import JOINTS, DhChain
-from realsim_capture_plans.collision.arm_shapes import (
+from realsim.robots.arm_shapes import (
     arm_shapes,
     finite_box,
     link_placements,
 )
-from realsim_capture_plans.collision.coal_geometry import Body, Geometry
+from realsim.robots.coal_geometry import Body, Geometry
+from realsim.robots.kinematics import JOINTS, DhChain
+from realsim.robots.shapes import Mount, WorkCell
 from realsim_capture_plans.collision.mount import camera_shape
 from realsim_capture_plans.collision.pairs import choose_pairs
-from realsim_capture_plans.collision.shapes import Mount, WorkCell
 
 Array = NDArray[np.float64]
 GROUPS = ("self", "tool", "table", "scene")

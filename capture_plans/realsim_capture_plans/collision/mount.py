@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_capture_plans.collision.shapes import Kind, Mount, Shape
+from realsim.robots.shapes import Kind, Mount, Shape
 
 FLANGE = 6
 """DH frame that camera and bracket are fixed in."""

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim_capture_plans.arms.kinematics import JOINTS
-from realsim_capture_plans.collision.coal_geometry import Body, Geometry, Pair
+from realsim.robots.coal_geometry import Body, Geometry, Pair
+from realsim.robots.kinematics import JOINTS
 
 Array = NDArray[np.float64]
 KEPT_APART = {(4, 6)}

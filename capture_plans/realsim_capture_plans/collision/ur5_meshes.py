@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import MissingLibraryError
-from realsim_capture_plans.arms.kinematics import UR5
-from realsim_capture_plans.collision.arm_shapes import LINK_NAMES
-from realsim_capture_plans.collision.coal_geometry import coal_shape
+from realsim.robots.arm_shapes import LINK_NAMES
+from realsim.robots.coal_geometry import coal_shape
+from realsim.robots.kinematics import UR5
+from realsim.robots.shapes import Mount, WorkCell
 from realsim_capture_plans.collision.model import CollisionModel, bodies_of
-from realsim_capture_plans.collision.shapes import Mount, WorkCell
 
 Array = NDArray[np.float64]
 URDF = "ur_description/urdf/ur5_robot.urdf"

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError, RealsimError
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import rigid
-from realsim_capture_plans.arms.kinematics import JOINTS, JointLimits
+from realsim.robots.kinematics import JOINTS, JointLimits
 
 Array = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.interop import T_from_rotation_vector_pose
-from realsim_capture_plans.arms.kinematics import CHAINS, JOINTS, DhChain, JointLimits
+from realsim.robots.kinematics import CHAINS, JOINTS, DhChain, JointLimits
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, checked_goal
 from realsim_capture_plans.devices.ur_connection import Identity, UrConfig, UrConnection
 

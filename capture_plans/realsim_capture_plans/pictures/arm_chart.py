@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
-from realsim_capture_plans.collision.shapes import Box
+from realsim.robots.shapes import Box
 from realsim_capture_plans.pictures.arm_looks import arm_parts, part_frames
 from realsim_capture_plans.pictures.drawing import (
     BLUE,

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from realsim.errors import MissingLibraryError
 from realsim.geometry import se3
 from realsim.models.convex_hulls import hull_triangles
-from realsim_capture_plans.arms.kinematics import JOINTS
-from realsim_capture_plans.collision.arm_shapes import (
+from realsim.robots.arm_shapes import (
     LINK_NAMES,
     arm_shapes,
     link_placements,
 )
+from realsim.robots.kinematics import JOINTS
+from realsim.robots.shapes import Shape
 from realsim_capture_plans.collision.mount import camera_shape
-from realsim_capture_plans.collision.shapes import Shape
 from realsim_capture_plans.collision.ur5_meshes import BASE_LINK_FROM_BASE, URDF, robots_folder
 from realsim_capture_plans.planning.record import CapturePlan
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from realsim import local_pages
 from realsim.geometry import se3
 from realsim.interop import viser_wxyz_position
+from realsim.robots.shapes import Box
 from realsim.store.atomic import write_text
 from realsim_capture_plans.collision.model import CollisionModel
-from realsim_capture_plans.collision.shapes import Box
 from realsim_capture_plans.pictures.arm_chart import box_edges, frustum_lines
 from realsim_capture_plans.pictures.arm_looks import (
     Part,

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import CHAINS, JOINTS, DhChain
+from realsim.robots.kinematics import CHAINS, JOINTS, DhChain
 
 Array = NDArray[np.float64]
 JointUnit = Literal["rad", "deg"]

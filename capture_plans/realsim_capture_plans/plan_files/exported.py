@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.formats.graspnet.cameras import FIRST, POSES
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import JOINTS
+from realsim.robots.kinematics import JOINTS
 from realsim_capture_plans.plan_files.joint_paths import CAMERA_COLUMNS
 from realsim_capture_plans.plan_files.plan_json import save_plan
 from realsim_capture_plans.planning.record import CapturePlan

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import CHAINS, DhChain
+from realsim.robots.kinematics import CHAINS, DhChain
+from realsim.robots.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.collision.model import interpolate
-from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.plan_files.evidence import FITS_M, MILLIMETRES_FROM_M, JointUnit
 from realsim_capture_plans.plan_files.joint_paths import JointPath, read_path
 from realsim_capture_plans.planning.metrics import JOINT_NAMES, Meaning

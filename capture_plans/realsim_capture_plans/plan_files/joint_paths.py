@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
+from realsim.robots.kinematics import JOINTS, DhChain
 from realsim.untrusted.files import checked_text
 from realsim.untrusted.json_text import read_json
-from realsim_capture_plans.arms.kinematics import JOINTS, DhChain
 from realsim_capture_plans.plan_files.evidence import (
     JointUnit,
     Reading,

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError, RealsimError, UnitError
+from realsim.robots.kinematics import CHAINS
 from realsim.untrusted.json_text import read_json
-from realsim_capture_plans.arms.kinematics import CHAINS
 from realsim_capture_plans.plan_files.evidence import (
     MILLIMETRES_FROM_M,
     check_joint_unit,

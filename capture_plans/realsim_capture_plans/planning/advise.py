@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from realsim.errors import InputError
-from realsim_capture_plans.arms.kinematics import DhChain
+from realsim.robots.kinematics import DhChain
+from realsim.robots.shapes import Mount
 from realsim_capture_plans.collision.model import CollisionModel
-from realsim_capture_plans.collision.shapes import Mount
 from realsim_capture_plans.planning.record import PlanConfig
 from realsim_capture_plans.planning.view_quality import hole_deg
 from realsim_capture_plans.planning.viewpoints import (

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.records.checked_arrays import frozen
-from realsim_capture_plans.arms.kinematics import JOINTS, DhChain, JointLimits
+from realsim.robots.kinematics import JOINTS, DhChain, JointLimits
+from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.model import CollisionModel
-from realsim_capture_plans.collision.shapes import Box, Mount, Shape, WorkCell
 
 Array = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
-from realsim_capture_plans.arms.kinematics import DhChain
+from realsim.robots.kinematics import DhChain
+from realsim.robots.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.collision.model import CollisionModel
 from realsim_capture_plans.collision.mount import d405_mount
-from realsim_capture_plans.collision.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.planning.record import PlanConfig
 from realsim_capture_plans.planning.view_quality import SENSORS
 from realsim_capture_plans.planning.viewpoints import Candidates, reachable

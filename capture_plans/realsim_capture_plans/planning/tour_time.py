@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from realsim_capture_plans.arms.kinematics import JOINTS
+from realsim.robots.kinematics import JOINTS
 from realsim_capture_plans.planning.ordering import move_seconds
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 

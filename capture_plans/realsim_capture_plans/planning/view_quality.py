@@ -13,7 +13,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
 from realsim.records import CameraIntrinsics
-from realsim_capture_plans.collision.shapes import Box
+from realsim.robots.shapes import Box
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from realsim_capture_plans.planning.viewpoints import board_roll, golden_cap, plane_axes
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import DhChain
+from realsim.robots.kinematics import DhChain
 from realsim_capture_plans.collision.model import CollisionModel
 from realsim_capture_plans.planning.record import PlanConfig
 

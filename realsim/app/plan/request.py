@@ -7,8 +7,8 @@ from typing import Any, Literal
 import numpy as np
 
 from realsim.errors import InputError, UnitError
-from realsim_capture_plans.arms.kinematics import CHAINS, DhChain
-from realsim_capture_plans.collision.shapes import Box, Mount
+from realsim.robots.kinematics import CHAINS, DhChain
+from realsim.robots.shapes import Box, Mount
 from realsim_capture_plans.planning.record import PlanConfig
 
 DEFAULT_VIEWS = {"hemisphere": 256, "calibration": 24}
@@ -39,7 +39,7 @@ class Place:
 
     def chain(self) -> DhChain | None:
         """Return the arm, calibrated if a file was given; None where none was named."""
-        from realsim_capture_plans.arms.controller_file import read_controller_calibration
+        from realsim.robots.controller_file import read_controller_calibration
 
         if not self.robot:
             if self.calibration is not None:

@@ -13,9 +13,9 @@ from realsim.app.console import Console, Tick
 from realsim.app.outputs import require_free_file, require_free_folder
 from realsim.app.plan.request import Place, PlanRequest
 from realsim.errors import InputError
+from realsim.robots.kinematics import CHAINS, DhChain
+from realsim.robots.shapes import Mount
 from realsim.untrusted.json_text import read_json
-from realsim_capture_plans.arms.kinematics import CHAINS, DhChain
-from realsim_capture_plans.collision.shapes import Mount
 from realsim_capture_plans.plan_files.evidence import JointUnit
 from realsim_capture_plans.planning.metrics import METRIC_MEANINGS, goal_of, plan_metrics
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from realsim.errors import RealsimError
-from realsim_capture_plans.arms.kinematics import CHAINS
+from realsim.robots.kinematics import CHAINS
 from realsim_capture_plans.devices.ur_loopback.robot import Controller, ControllerSetup
 from realsim_capture_plans.devices.ur_loopback.server import LoopbackServer
 

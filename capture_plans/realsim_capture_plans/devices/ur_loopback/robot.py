@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.interop import T_from_rotation_vector_pose, rotation_vector_pose_from_T
-from realsim_capture_plans.arms.kinematics import DhChain
+from realsim.robots.kinematics import DhChain
 
 Array = NDArray[np.float64]
 

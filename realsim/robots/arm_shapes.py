@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import CHAINS, JOINTS, DhChain
-from realsim_capture_plans.collision.shapes import Box, Shape
+from realsim.robots.kinematics import CHAINS, JOINTS, DhChain
+from realsim.robots.shapes import Box, Shape
 
 Array = NDArray[np.float64]
 Axis = Literal["x", "y", "z"]

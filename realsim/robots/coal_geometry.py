@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim_capture_plans.arms.kinematics import JOINTS, DhChain
-from realsim_capture_plans.collision.shapes import Shape
+from realsim.robots.kinematics import JOINTS, DhChain
+from realsim.robots.shapes import Shape
 
 Array = NDArray[np.float64]
 Pair = tuple[int, int]

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.dh import JOINTS, UR5_ARM, UR5E_ARM, DhArm
+from realsim.robots.kinematics import DhChain
 from realsim.untrusted.files import checked_text
-from realsim_capture_plans.arms.kinematics import DhChain
 
 Array = NDArray[np.float64]
 LISTS = ("theta", "a", "d", "alpha")

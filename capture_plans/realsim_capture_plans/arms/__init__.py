@@ -1,1 +1,0 @@
-"""The arm: kinematics both ways, limits, and the controller's own calibration."""

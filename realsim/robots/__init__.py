@@ -1,0 +1,1 @@
+"""Arms and hands as data: a folder with a `robot.toml`, and what everybody reads out of it."""

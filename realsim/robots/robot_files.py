@@ -1,0 +1,187 @@
+"""Folders of robots: found by name, read with limits, and what their files stand for.
+
+A robot is a folder with a `robot.toml`, and where it has a URDF, with that and its meshes. Robots
+are found by the folder's name among those that ship, in the folders that `REALSIM_ROBOTS` names,
+and by a path. Capitals, hyphens and underscores do not matter: "UR5e" is the folder `ur5e`.
+"""
+
+import hashlib
+import os
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from realsim.errors import InputError, MissingLibraryError
+from realsim.untrusted.files import checked_bytes
+from realsim.untrusted.own_json import OwnFile, from_json
+from realsim.untrusted.toml_text import read_toml
+
+Kind = Literal["arm", "hand"]
+FILE = "robot.toml"
+VARIABLE = "REALSIM_ROBOTS"
+"""Folders of robots of the user's own, divided as in PATH."""
+SHIPPED = Path(__file__).parent / "shipped"
+PACKAGE = "package://"
+MOST_FILES = 500
+"""A robot's folder holds a few dozen files; a folder with more is another one."""
+MOST_BYTES = 100e6
+"""Largest file of a robot [bytes]."""
+
+
+class RobotFile(OwnFile, kw_only=True):
+    """What every `robot.toml` says."""
+
+    name: str
+    """As people write it: "UR5e"."""
+    title: str = ""
+    """The whole name: "Universal Robots UR5e"."""
+    sources: tuple[str, ...] = ()
+    """Where the figures come from."""
+
+
+Declared = TypeVar("Declared", bound=RobotFile)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class RobotFolder:
+    """Where a robot was found."""
+
+    path: Path
+    name: str
+    """The folder's name, by which the robot is found."""
+    digest: str
+    """SHA-256 of all files in the folder: two robots of one name are told apart by it."""
+
+    def file(self, named: str, what: str) -> Path:
+        """Return a file that `robot.toml` or a URDF names.
+
+        Args:
+            named: relative to the folder, or `package://PACKAGE/...` in an installed Python
+                package, a package of ROS beside the folder, or example-robot-data.
+            what: the file's role, for messages.
+
+        Raises:
+            InputError: it is not there.
+            MissingLibraryError: its package is not installed.
+        """
+        if not named.startswith(PACKAGE):
+            found = self.path / named
+            if found.is_file() and found.resolve().is_relative_to(self.path.resolve()):
+                return found
+            raise InputError(
+                f"{self.path / FILE}: {what} '{named[:200]}' is not in the folder {self.path}. "
+                "Put it there and name it relative to the folder, or as package://PACKAGE/FILE."
+            )
+        package, _, rest = named.removeprefix(PACKAGE).partition("/")
+        for root in self._roots(package):
+            found = root / rest
+            if found.is_file() and found.resolve().is_relative_to(root.resolve()):
+                return found
+        raise MissingLibraryError(
+            f"{self.path / FILE}: {what} '{named[:200]}' is not there: neither an installed Python "
+            f"package '{package}' nor a folder '{package}' beside {self.path} holds it."
+        )
+
+    def _roots(self, package: str) -> list[Path]:
+        roots = [self.path / package, self.path.parent / package, self.path]
+        if package.isidentifier():
+            spec = find_spec(package)
+            if spec is not None and spec.submodule_search_locations:
+                roots.insert(0, Path(next(iter(spec.submodule_search_locations))))
+        return roots
+
+
+def robot_file(name: str, kind: type[Declared]) -> tuple[Declared, RobotFolder]:
+    """Return what a robot's `robot.toml` says, and its folder.
+
+    Args:
+        name: of a robot that ships or lies in a folder of `REALSIM_ROBOTS`, or a path.
+        kind: the declaration of an arm or a hand; its field `kind` says which.
+
+    Raises:
+        InputError: there is no such robot, it is of the other kind, or its file is not as declared.
+    """
+    word: Kind = kind.__struct_defaults__[kind.__struct_fields__.index("kind")]  # pyright: ignore
+    path = _folder(name, word)
+    where = path / FILE
+    _, values = read_toml(where)
+    found = values.get("kind")
+    if found != word:
+        told = f"is a '{found}'" if found in ("arm", "hand") else "does not say its kind"
+        raise InputError(f'{where} {told}; kind = "{word}" is needed here. {_known(word)}')
+    return from_json(values, kind, str(where)), RobotFolder(
+        path=path, name=path.name, digest=_digest(path)
+    )
+
+
+def names_of(kind: Kind) -> dict[str, Path]:
+    """Return the folders of all arms or hands that are found by name, sorted by name."""
+    found: dict[str, Path] = {}
+    for root in reversed(_shelves()):
+        for file in sorted(root.glob(f"*/{FILE}")):
+            if _kind_of(file) == kind:
+                found[file.parent.name] = file.parent
+    return dict(sorted(found.items()))
+
+
+def same_name(first: str, second: str) -> bool:
+    """Return whether two names are of one robot: capitals and hyphens do not matter."""
+    return _plain(first) == _plain(second)
+
+
+def _folder(name: str, kind: Kind) -> Path:
+    given = Path(name).expanduser()
+    if os.sep in name or (given / FILE).is_file():
+        if not (given / FILE).is_file():
+            there = "has no" if given.is_dir() else "does not exist and so has no"
+            raise InputError(
+                f"the folder {given} {there} {FILE}. A robot is a folder with a {FILE}; "
+                "`realsim robots` lists those that are found by name."
+            )
+        return given
+    for known, path in names_of(kind).items():
+        if same_name(known, name):
+            return path
+    raise InputError(f"there is no {kind} '{name[:80]}'. {_known(kind)}")
+
+
+def _known(kind: Kind) -> str:
+    return (
+        f"There are: {', '.join(names_of(kind))}. For one of your own give its folder, or name the "
+        f"folder above it in {VARIABLE}."
+    )
+
+
+def _shelves() -> list[Path]:
+    """Return the folders in which robots lie, the user's first."""
+    own = [Path(p).expanduser() for p in os.environ.get(VARIABLE, "").split(os.pathsep) if p]
+    for path in own:
+        if not path.is_dir():
+            raise InputError(f"{VARIABLE} names {path}, which is no folder.")
+    return [*own, SHIPPED]
+
+
+def _kind_of(file: Path) -> Any:
+    try:
+        return read_toml(file)[1].get("kind")
+    except InputError:
+        return None  # told when it is asked for by name
+
+
+def _plain(name: str) -> str:
+    return name.casefold().replace("-", "_").replace(" ", "_")
+
+
+def _digest(folder: Path) -> str:
+    files = sorted(f for f in folder.rglob("*") if f.is_file() and "__pycache__" not in f.parts)
+    if len(files) > MOST_FILES:
+        raise InputError(
+            f"{folder} holds {len(files)} files; a robot's folder has {MOST_FILES} at the most. "
+            "Give the folder of the robot itself."
+        )
+    total = hashlib.sha256()
+    for file in files:
+        total.update(f"{file.relative_to(folder).as_posix()}\0".encode())
+        total.update(hashlib.sha256(checked_bytes(file, MOST_BYTES)).digest())
+    return total.hexdigest()
