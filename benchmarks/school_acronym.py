@@ -17,11 +17,11 @@ from school_cases import PATIENT, in_processes, slip_config
 
 from realsim.formats.grasps.acronym import read_acronym
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.geometry.mesh import mass_properties
 from realsim.models.convex import ConvexConfig, convex_parts
 from realsim.models.properties import physical_properties
 from realsim.records import Mesh
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.slip_test import SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import SlipBody
 from realsim_sim_bridge.validation.specimens import ready_trial
@@ -70,7 +70,7 @@ def acronym(seed: int, keep: Path, quick: bool) -> Found:
     Ts = given.Ts_obj_grasp[rows]
     # The mug stands as its mesh was drawn; what the table frame's place is does not matter.
     standing = se3.from_rt(Ts[:, :3, :3], np.zeros(3))
-    trial = ready_trial(body, Ts, standing, HandGeometry().max_opening_m)
+    trial = ready_trial(body, Ts, standing, find_hand().max_opening_m)
     halves = [
         _Half(engine=engine, trial=trial.part(slice(k, None, 2)))
         for engine in ENGINES

@@ -16,7 +16,7 @@ from matplotlib.patheffects import withStroke
 
 from realsim.formats.graspnet.gripper_frame import BASE_M, graspnet_poses
 from realsim.formats.grasps.hand_frames import FINGERTIP_Z_M, TCP_Z_M, hand_poses
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 
 AXES = ("#c8553d", "#2a9d8f", "#3a6ea5")
 INK, PALE, PAPER = "#22303c", "#8d9aa7", "#ffffff"
@@ -56,7 +56,7 @@ def on_page(points: Any) -> np.ndarray:
 
 def draw_solids(ax: Any) -> None:
     """Draw hand and box, the nearer faces over the farther ones."""
-    hand = HandGeometry().boxes(OPENING_M)[0]
+    hand = find_hand().boxes(OPENING_M)[0]
     faces: list[tuple[float, np.ndarray, str]] = []
     for box, color in [*((b, HAND) for b in hand), (BOX_M, BOX)]:
         for k in range(3):

@@ -12,6 +12,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from msgspec import structs
+
 from realsim.errors import InputError, MissingLibraryError
 from realsim.untrusted.files import checked_bytes
 from realsim.untrusted.own_json import OwnFile, from_json
@@ -102,7 +104,7 @@ def robot_file(name: str, kind: type[Declared]) -> tuple[Declared, RobotFolder]:
     Raises:
         InputError: there is no such robot, it is of the other kind, or its file is not as declared.
     """
-    word: Kind = kind.__struct_defaults__[kind.__struct_fields__.index("kind")]  # pyright: ignore
+    word: Kind = next(f.default for f in structs.fields(kind) if f.name == "kind")
     path = _folder(name, word)
     where = path / FILE
     _, values = read_toml(where)

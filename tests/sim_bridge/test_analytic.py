@@ -6,8 +6,8 @@ import trimesh
 
 from realsim.formats.graspnet import gripper_frame as frame
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.records import Mesh
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.grasping.analytic import (
     AnalyticConfig,
     analytic_labels,
@@ -23,7 +23,7 @@ from realsim_sim_bridge.grasping.force_closure import ClosureConfig, force_closu
 from tried_grasps import assert_same
 from trimesh_solids import solid, wedge
 
-HAND = HandGeometry()
+HAND = find_hand()
 FEW = AnalyticConfig(points=12)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.arm_space import FREE, ArmSpace, ArmSpaceConfig
 from realsim_sim_bridge.arm.joint_path import PlannerConfig, connect
@@ -30,7 +30,7 @@ def walled(height):
     points = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
     obstacles = obstacles_of(points, np.full(len(points), 3), np.zeros(len(points), bool))
     T = se3.from_translation([0.0, 0.0, 0.02])
-    return ArmSpace(T, obstacles, ArmSpaceConfig(), HandGeometry())
+    return ArmSpace(T, obstacles, ArmSpaceConfig(), find_hand())
 
 
 def is_free(space, path):

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.arm_space import (
     FREE,
@@ -27,7 +27,7 @@ from realsim_sim_bridge.arm.obstacles import (
 )
 
 READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
-HAND = HandGeometry()
+HAND = find_hand()
 
 
 def random_joints(n, seed=0):

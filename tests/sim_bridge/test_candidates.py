@@ -5,7 +5,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.grasping.candidates import (
     CandidateConfig,
     Surroundings,
@@ -15,7 +15,7 @@ from realsim_sim_bridge.grasping.candidates import (
 from realsim_sim_bridge.grasping.hand_free import boxes_free, lowest_corner
 from trimesh_solids import solid
 
-HAND = HandGeometry()
+HAND = find_hand()
 
 
 def box(x=0.05, y=0.05, z=0.05):

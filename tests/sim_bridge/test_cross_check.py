@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from held_boxes import held_box, held_from_above
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.school.cross_check import (
     agreement,
     cross_check,
@@ -26,7 +26,7 @@ def checked(t, physics, second):
     config = SlipConfig(physics=physics)
     slips = run_slip_test(t, config)
     engine = make_engine(settings_of(second))
-    return slips, cross_check(t, slips, config, ScoreLimits(), HandGeometry(), engine)
+    return slips, cross_check(t, slips, config, ScoreLimits(), find_hand(), engine)
 
 
 # --- the interval ---------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.bullet_world import BulletEngine
 from realsim_sim_bridge.slip.engines import (
     ENGINES,
@@ -59,7 +59,7 @@ def crawl_mm(settings):
         Ts_obj_grasp=trial.Ts_obj_grasp,
         openings_m=trial.openings_m,
     )
-    with BulletEngine(settings).world(trial.body, grips, SlipPhysics(), HandGeometry()) as world:
+    with BulletEngine(settings).world(trial.body, grips, SlipPhysics(), find_hand()) as world:
         world.close(Closing())
         seen = world.play(np.zeros((3, 240, 6)), 60, 1.0).Ts_world_body[:, :, :3, 3]
     return 1e3 * np.linalg.norm(seen[:, -1] - seen[:, 0], axis=-1).max()

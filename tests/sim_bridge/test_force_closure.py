@@ -8,8 +8,8 @@ import trimesh
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.records import Mesh
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.candidates import CandidateConfig, Surroundings, sample_candidates
 from realsim_sim_bridge.grasping.force_closure import (
@@ -21,7 +21,7 @@ from realsim_sim_bridge.grasping.force_closure import (
 from realsim_sim_bridge.grasping.pad_contacts import pad_contacts
 from trimesh_solids import solid
 
-HAND = HandGeometry()
+HAND = find_hand()
 
 
 def box(*size):

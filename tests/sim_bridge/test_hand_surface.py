@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.records import Mesh
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface
 from realsim_sim_bridge.grasping.candidates import (
     IN_OBJECT,
@@ -21,7 +21,7 @@ from realsim_sim_bridge.grasping.surroundings import (
     surface_tree,
 )
 
-HAND = HandGeometry()
+HAND = find_hand()
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 
 

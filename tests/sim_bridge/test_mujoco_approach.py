@@ -5,14 +5,14 @@ from itertools import product
 import numpy as np
 
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.mujoco_approach import (
     CLEARANCE_M,
     advanced_fingers,
     surface_triangles,
 )
 
-HAND = HandGeometry()
+HAND = find_hand()
 
 
 def box(center, size):

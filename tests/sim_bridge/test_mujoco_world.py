@@ -8,7 +8,7 @@ import pytest
 from held_boxes import held_box
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.engines import MujocoSettings
 from realsim_sim_bridge.slip.motion import SlipMotion, lift_acceleration, oscillation_acceleration
 from realsim_sim_bridge.slip.mujoco_world import MujocoEngine
@@ -43,7 +43,7 @@ def scattered(n, seed=0):
 
 
 def world(body=None, given=None, physics=None, engine=ENGINE):
-    return engine.world(body or cube(), given or grips(), physics or SlipPhysics(), HandGeometry())
+    return engine.world(body or cube(), given or grips(), physics or SlipPhysics(), find_hand())
 
 
 def constant(force, steps, n=1, ramp=100):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.chain import follow_lines, frames_into
 from realsim_sim_bridge.arm.panda import panda_urdf
@@ -90,7 +90,7 @@ def test_followed_lines_are_straight_and_their_slopes_are_derivatives():
 def test_pybullet_has_the_same_forward_kinematics(tmp_path):
     import pybullet
 
-    geometry = HandGeometry()
+    geometry = find_hand()
     path = tmp_path / "panda.urdf"
     path.write_text(panda_urdf(geometry, hand_urdf(geometry, PadModel())), encoding="utf-8")
     client = pybullet.connect(pybullet.DIRECT)

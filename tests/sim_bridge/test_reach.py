@@ -7,8 +7,8 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.records.trajectories import PHASES
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.lifted_object import touched_when_lifted
 from realsim_sim_bridge.arm.obstacles import obstacles_of
@@ -62,7 +62,7 @@ def reach_of(Ts, neighbours=None, config=None, obj=None, geometry=None, motion=N
         middle_xy=(0.0, 0.0),
     )
     rng = np.random.default_rng(seed)
-    return check_reach(task, config or ReachConfig(), geometry or HandGeometry(), rng, motion)
+    return check_reach(task, config or ReachConfig(), geometry or find_hand(), rng, motion)
 
 
 # --- laws ---------------------------------------------------------------------------------------
@@ -113,7 +113,7 @@ def test_an_object_in_the_way_of_the_hand_is_named():
 
 
 def test_a_swept_hand_meets_what_a_thousand_poses_meet():
-    rng, hand = np.random.default_rng(0), HandGeometry()
+    rng, hand = np.random.default_rng(0), find_hand()
     n, k = 60, 1000
     Ts = np.stack([from_above(*rng.uniform(-0.1, 0.1, 3), rng.uniform(0, 3)) for _ in range(n)])
     Ts[:, :3, :3] = se3.exp_so3(rng.uniform(-1, 1, (n, 3))) @ Ts[:, :3, :3]
@@ -155,7 +155,7 @@ def test_contradictions_are_refused():
     with pytest.raises(InputError, match="lift"):
         reach_of(T, motion=SlipMotion(lift_height_m=0.1))
     with pytest.raises(InputError, match="mount"):
-        reach_of(T, geometry=replace(HandGeometry(), mount_z_m=-0.15))
+        reach_of(T, geometry=replace(find_hand(), mount_z_m=-0.15))
 
 
 # --- the lifted object --------------------------------------------------------------------------

@@ -5,7 +5,7 @@ import pytest
 
 from held_boxes import held_box, held_from_above
 from realsim.errors import InputError
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.school.sweep import SweepConfig, find_levels, run_sweep
 from realsim_sim_bridge.slip.engines import make_engine, settings_of
 from realsim_sim_bridge.slip.score import ScoreLimits
@@ -22,7 +22,7 @@ def measured(t, sweep, physics=None, engine="pybullet"):
     config = SlipConfig(physics=physics or SlipPhysics(), engine=settings_of(engine))
     engine = make_engine(config.engine)
     slips = run_slip_test(t, config, engine=engine)
-    return run_sweep(t, slips, config, ScoreLimits(), HandGeometry(), engine, sweep)
+    return run_sweep(t, slips, config, ScoreLimits(), find_hand(), engine, sweep)
 
 
 # --- the search, on a law that is known --------------------------------------------------------

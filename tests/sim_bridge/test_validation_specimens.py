@@ -5,7 +5,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.slip.motion import SlipMotion
 from realsim_sim_bridge.slip.slip_test import SlipConfig
@@ -33,7 +33,7 @@ def test_two_parts_have_the_moments_of_the_whole():
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_grasps_on_the_edge_fit_the_hand_and_do_not_hang_on_the_mass(shape):
-    hand = HandGeometry()
+    hand = find_hand()
     light, heavy = edge_trial(shape, 0.01, 5, 7), edge_trial(shape, 2.0, 5, 7)
     assert np.array_equal(light.Ts_obj_grasp, heavy.Ts_obj_grasp)
     assert heavy.body.mass_kg == pytest.approx(2.0)

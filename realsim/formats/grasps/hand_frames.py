@@ -17,16 +17,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HAND
+from realsim.robots.hand import find_hand
 
 Array = NDArray[np.float64]
 HandFrame = Literal["grasp", "panda_hand", "acronym"]
+_FRANKA = find_hand()
 
-TCP_Z_M = -HAND.mount_z_m
+TCP_Z_M = -_FRANKA.mount_z_m
 """z of the tool centre point in panda_hand [m]: Franka's own setting of the hand."""
-FINGERTIP_Z_M = round(TCP_Z_M + HAND.tip_beyond_tcp_m, 6)
+FINGERTIP_Z_M = round(TCP_Z_M + _FRANKA.tip_beyond_tcp_m, 6)
 """z of the fingertips in panda_hand [m] (franka_description; ACRONYM's gripper marker)."""
-FINGER_OPEN_M = HAND.max_opening_m / 2.0
+FINGER_OPEN_M = _FRANKA.max_opening_m / 2.0
 """Position of each finger's joint when the hand is fully open [m]."""
 
 _QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])

@@ -19,12 +19,12 @@ import viser
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.geometry.hand import HAND, HandGeometry
 from realsim.records import Mesh
 from realsim.records.checked_arrays import Array, frozen
 from realsim.records.trajectories import PHASES
 from realsim.review.replay.grasp_words import escaped
 from realsim.review.replay.replay_nodes import ReplayNodes
+from realsim.robots.hand import Hand, find_hand
 
 SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x")
 PHASE_WORDS = {
@@ -189,7 +189,7 @@ class ReplayConfig:
     """Frames per second: the school looks as often, and a dozen nodes a frame are 30 kB/s."""
     slider_hz: float = 4.0
     """How often the slider follows [1/s]: it tells where one is, the scene tells the rest."""
-    hand: HandGeometry = HAND
+    hand: Hand = field(default_factory=find_hand)
     """What is drawn where the motion brings no meshes of the hand."""
 
 

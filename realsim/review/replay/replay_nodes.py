@@ -7,10 +7,10 @@ import numpy as np
 import viser
 
 from realsim.geometry import mesh as mesh_tools
-from realsim.geometry.hand import HandGeometry
 from realsim.interop import viser_wxyz_position
 from realsim.records import Mesh
 from realsim.records.checked_arrays import Array
+from realsim.robots.hand import Hand
 
 PLAIN_RGB = (176, 182, 190)
 """Colour of what has none of its own."""
@@ -26,7 +26,7 @@ BOX_FACES = np.array(
 class ReplayNodes:
     """What is drawn of a motion; only positions and orientations change while it plays."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, hand: HandGeometry) -> None:
+    def __init__(self, scene: viser.SceneApi, name: str, hand: Hand) -> None:
         """Start with nothing drawn.
 
         Args:

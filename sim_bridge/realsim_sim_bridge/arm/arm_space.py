@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.chain import frames_into
 from realsim_sim_bridge.arm.obstacles import (
@@ -106,7 +106,7 @@ class ArmSpace:
         T_table_base: Array,
         obstacles: Obstacles,
         config: ArmSpaceConfig,
-        geometry: HandGeometry,
+        geometry: Hand,
     ):
         """Prepare the checks.
 
@@ -142,9 +142,7 @@ class ArmSpace:
         )
 
 
-def _body(
-    T_table_base: Array, spheres: Array, config: ArmSpaceConfig, geometry: HandGeometry
-) -> _Body:
+def _body(T_table_base: Array, spheres: Array, config: ArmSpaceConfig, geometry: Hand) -> _Body:
     """Return spheres (S, 5) of link, centre and radius with their levers."""
     links = spheres[:, 0].astype(np.int64)
     sides = np.where(links == FINGER_SIDE[0], 1.0, np.where(links == FINGER_SIDE[1], -1.0, 0.0))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.compiled import njit
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.arm import panda
 
 Array = NDArray[np.float64]
@@ -223,7 +223,7 @@ def arm_spheres() -> Array:
     return np.concatenate([np.array(_ARM, dtype=np.float64), *behind])
 
 
-def hand_spheres(geometry: HandGeometry) -> Array:
+def hand_spheres(geometry: Hand) -> Array:
     """Return the spheres (S, 5) that contain the hand's boxes: as `arm_spheres`, grasp frame.
 
     The fingers are those of the closed hand; an open one's are moved along y by half the opening.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.geometry import se3
-from realsim.geometry.hand import HAND, HandGeometry
+from realsim.robots.hand import Hand, find_hand
 
 Array = NDArray[np.float64]
 
@@ -22,9 +22,10 @@ ALPHA = np.array([0.0, -np.pi / 2, np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, 
 D_M = np.array([0.333, 0.0, 0.316, 0.0, 0.384, 0.0, 0.0])
 FLANGE_M = 0.107
 """Distance of the flange from joint 7's frame [m]."""
-TCP_M = -HAND.mount_z_m
+_FRANKA = find_hand()
+TCP_M = -_FRANKA.mount_z_m
 """Distance of the tool centre point from the flange [m]."""
-HAND_TURN = -np.pi / 4
+HAND_TURN = float(np.radians(_FRANKA.mount_turn_deg))
 """The hand is mounted turned by this about the flange's axis [rad]."""
 LOWER = np.array([-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973])
 UPPER = np.array([2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
@@ -216,7 +217,7 @@ FLANGE_KG = 0.001
 the flange's own mass is in link 7."""
 
 
-def panda_urdf(geometry: HandGeometry, hand: str = "") -> str:
+def panda_urdf(geometry: Hand, hand: str = "") -> str:
     """Return the URDF of the arm: links link0 to link7, joints joint1 to joint7, and link `flange`.
 
     Args:

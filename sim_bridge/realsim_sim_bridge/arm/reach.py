@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.records.trajectories import GraspTrajectories
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.arm_space import AT_LIMITS, FREE, IN_TABLE, ArmSpace, Codes, in_words
 from realsim_sim_bridge.arm.chain import follow_lines
@@ -86,7 +86,7 @@ class ReachTask:
 def check_reach(
     task: ReachTask,
     config: ReachConfig,
-    geometry: HandGeometry,
+    geometry: Hand,
     rng: np.random.Generator,
     motion: SlipMotion | None = None,
 ) -> Reach:
@@ -132,7 +132,7 @@ class _ReachCheck:
     """The check of one object's grasps; a `branch` is one solution at one grasp."""
 
     def __init__(
-        self, task: ReachTask, config: ReachConfig, geometry: HandGeometry, motion: SlipMotion
+        self, task: ReachTask, config: ReachConfig, geometry: Hand, motion: SlipMotion
     ) -> None:
         self._task, self._config, self._geometry, self._motion = task, config, geometry, motion
         self._T_table_base = base_on_table(task.middle_xy, config)

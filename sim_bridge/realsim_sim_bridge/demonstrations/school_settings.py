@@ -13,6 +13,7 @@ from realsim.geometry.mesh import mass_properties
 from realsim.models.convex import convex_parts
 from realsim.models.library_records import KnownSolid
 from realsim.records import GraspSet, Mesh, ObjectModel
+from realsim.robots.hand import Hand, hand_of_json
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.slip.world import SlipBody
 
@@ -63,6 +64,8 @@ def _value(hint: Any, value: Any, name: str) -> Any:
     """Return a field's value in its own type."""
     if get_origin(hint) in (Union, types.UnionType):
         return _one_of(get_args(hint), value, name)
+    if hint is Hand:
+        return hand_of_json(value, name)
     if is_dataclass(hint) and isinstance(hint, type):
         return _read(hint, value)
     if get_origin(hint) is Literal:

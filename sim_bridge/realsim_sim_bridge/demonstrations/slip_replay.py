@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.records import STAGES, GraspSet
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.slip.score import score_stages
@@ -69,7 +69,7 @@ class RecordedEngine(Engine):
         self._worlds = 0
 
     def world(
-        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: HandGeometry
+        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: Hand
     ) -> HandWorld:
         """Return the engine's world, watched.
 

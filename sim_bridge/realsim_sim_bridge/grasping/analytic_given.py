@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from realsim.formats.graspnet.grasp_labels import GraspLabels
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.records import Mesh
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig, RaySurface
 from realsim_sim_bridge.grasping.candidates import (
     FREE,
@@ -39,7 +39,7 @@ def given_candidates(
     surroundings: Surroundings,
     Ts_obj_grasp: Array,
     config: CandidateConfig,
-    geometry: HandGeometry,
+    geometry: Hand,
     *,
     centred: bool = True,
 ) -> tuple[Candidates, Rows]:
@@ -112,7 +112,7 @@ def standing_labels(
     T_table_obj: Array,
     surroundings: Surroundings,
     config: CandidateConfig,
-    geometry: HandGeometry,
+    geometry: Hand,
     rng: np.random.Generator,
 ) -> GraspLabels:
     """Return the labels whose grasps the hand can take where the object stands.
@@ -149,7 +149,7 @@ def _placed(
     Ts: Array,
     widths_m: Array,
     config: CandidateConfig,
-    geometry: HandGeometry,
+    geometry: Hand,
 ) -> tuple[HandPoses, Rows]:
     """Return the grasps in their first free stand, and how far each got (N,)."""
     poses = HandPoses(

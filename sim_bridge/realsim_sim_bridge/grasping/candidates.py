@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.records import Mesh
 from realsim.records.checked_arrays import rows_of
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.grasping.analytic_select import farthest_rows, grasp_features
 from realsim_sim_bridge.grasping.antipodal import (
     AntipodalPairs,
@@ -68,7 +68,7 @@ class HandPoses:
 
 
 def turned_poses(
-    pairs: AntipodalPairs, config: CandidateConfig, geometry: HandGeometry, rng: np.random.Generator
+    pairs: AntipodalPairs, config: CandidateConfig, geometry: Hand, rng: np.random.Generator
 ) -> HandPoses:
     """Return k fully open grasps per pair, evenly turned about its closing axis.
 
@@ -100,7 +100,7 @@ class Stand:
         T_table_obj: Array,
         neighbours: SurfaceTree | None,
         config: CandidateConfig,
-        geometry: HandGeometry,
+        geometry: Hand,
     ) -> None:
         self._surface, self._T_table_obj, self._neighbours = surface, T_table_obj, neighbours
         self._config, self._geometry = config, geometry
@@ -205,7 +205,7 @@ def sample_candidates(
     T_table_obj: Array,
     surroundings: Surroundings,
     config: CandidateConfig,
-    geometry: HandGeometry,
+    geometry: Hand,
     rng: np.random.Generator,
     limit: int,
 ) -> Candidates:
@@ -250,7 +250,7 @@ def sample_candidates(
     return Candidates(**{f.name: getattr(chosen, f.name) for f in fields(chosen)}, counts=counts)
 
 
-def _reach_of_hands(mesh: Mesh, T_table_obj: Array, geometry: HandGeometry) -> tuple[Array, float]:
+def _reach_of_hands(mesh: Mesh, T_table_obj: Array, geometry: Hand) -> tuple[Array, float]:
     """Return a sphere on the table (centre (3,), radius [m]) that no hand at the object leaves."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     boxes = geometry.boxes(geometry.max_opening_m)

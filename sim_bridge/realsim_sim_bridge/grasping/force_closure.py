@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from realsim.compiled import njit
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.geometry.mesh import hull_vertices, mass_properties
 from realsim.records import Mesh
+from realsim.robots.hand import Hand, find_hand
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.pad_contacts import PadContacts, pad_contacts
 
@@ -281,7 +281,7 @@ def force_closure(
     Ts_obj_grasp: Array,
     openings_m: Array,
     config: ClosureConfig | None = None,
-    geometry: HandGeometry | None = None,
+    geometry: Hand | None = None,
     center_of_mass: Array | None = None,
     *,
     contact_depths_m: Array | None = None,
@@ -301,7 +301,7 @@ def force_closure(
     Raises:
         InputError: the mesh has no volume, or the numbers of grasps and openings differ.
     """
-    config, geometry = config or ClosureConfig(), geometry or HandGeometry()
+    config, geometry = config or ClosureConfig(), geometry or find_hand()
     Ts = np.asarray(Ts_obj_grasp, dtype=np.float64).reshape(-1, 4, 4)
     openings = np.asarray(openings_m, dtype=np.float64).reshape(-1)
     if len(openings) != len(Ts):

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ def pad_contacts(
     surface: RaySurface,
     Ts_obj_grasp: Array,
     openings_m: Array,
-    geometry: HandGeometry,
+    geometry: Hand,
     rays: int,
     softness_m: float,
 ) -> PadContacts:

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, field
 
-from realsim.geometry.hand import HandGeometry
 from realsim.models.convex import ConvexConfig
+from realsim.robots.hand import Hand, find_hand
 from realsim_sim_bridge.arm.reach import ReachConfig
 from realsim_sim_bridge.grasping.analytic import AnalyticConfig
 from realsim_sim_bridge.grasping.candidates import CandidateConfig
@@ -25,7 +25,7 @@ class SchoolConfig:
     """Lighter objects are not tried [kg]: below a gram a mesh has the wrong unit."""
     greatest_mass_kg: float = 20.0
     """Heavier ones neither [kg]: the arm carries 3."""
-    hand: HandGeometry = field(default_factory=HandGeometry)
+    hand: Hand = field(default_factory=find_hand)
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
     analytic: AnalyticConfig | None = None
     """Try analytic grasps, with the friction from which they close, instead of sampled ones."""

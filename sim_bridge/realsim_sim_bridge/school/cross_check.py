@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.geometry.hand import HandGeometry
 from realsim.records import GraspSet
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
@@ -29,7 +29,7 @@ def cross_check(
     slips: Slips,
     config: SlipConfig,
     limits: ScoreLimits,
-    geometry: HandGeometry,
+    geometry: Hand,
     second: Engine,
 ) -> dict[str, Array]:
     """Return what a second engine says of the grasps of a trial.

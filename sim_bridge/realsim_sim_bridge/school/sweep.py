@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, SlipTrial, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
@@ -122,7 +122,7 @@ def sweep_margins(
     slips: Slips,
     config: SlipConfig,
     limits: ScoreLimits,
-    geometry: HandGeometry,
+    geometry: Hand,
     engine: Engine,
     sweep: SweepConfig | None = None,
 ) -> dict[str, Array]:
@@ -145,7 +145,7 @@ def run_sweep(
     slips: Slips,
     config: SlipConfig,
     limits: ScoreLimits,
-    geometry: HandGeometry,
+    geometry: Hand,
     engine: Engine,
     sweep: SweepConfig | None = None,
 ) -> Sweep:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from realsim import interop
 from realsim.errors import RealsimError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.bullet_shapes import drawn_in, hand_urdf
 from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
 
@@ -46,7 +46,7 @@ class BulletPair:
         self,
         body: SlipBody,
         physics: SlipPhysics,
-        geometry: HandGeometry,
+        geometry: Hand,
         settings: "BulletSettings",
     ) -> None:
         """Build the pair.
@@ -83,7 +83,7 @@ class BulletPair:
 
     # --- what is in it ------------------------------------------------------------------------
 
-    def _add_hand(self, folder: Path, geometry: HandGeometry) -> int:
+    def _add_hand(self, folder: Path, geometry: Hand) -> int:
         """Load the hand; its fingers stand still until they are driven."""
         engine, settings = self.engine, self._settings
         urdf = folder / "hand.urdf"

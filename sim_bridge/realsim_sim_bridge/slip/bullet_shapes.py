@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.world import PadModel
 
 # --- The Franka Hand as a URDF for PyBullet: a fixed palm and two fingers that slide along y -----
@@ -14,7 +14,7 @@ from realsim_sim_bridge.slip.world import PadModel
 Array = NDArray[np.float64]
 
 
-def hand_urdf(geometry: HandGeometry, pads: PadModel | None) -> str:
+def hand_urdf(geometry: Hand, pads: PadModel | None) -> str:
     """Return the URDF of the hand: a fixed palm and two fingers that slide along y.
 
     The joint positions are the distances [m] of the finger faces from the middle.

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.bullet_pair import BulletPair
 from realsim_sim_bridge.slip.world import (
     Closing,
@@ -35,15 +35,15 @@ class BulletEngine(Engine):
     def __init__(self, settings: "BulletSettings") -> None:
         """Keep the settings."""
         self.settings = settings
-        self._kept: tuple[SlipBody, SlipPhysics, HandGeometry, BulletPair] | None = None
+        self._kept: tuple[SlipBody, SlipPhysics, Hand, BulletPair] | None = None
 
     def world(
-        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: HandGeometry
+        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: Hand
     ) -> "BulletWorld":
         """Return a world with these pairs."""
         return BulletWorld(self._pair(body, physics, geometry), body, grips, physics)
 
-    def _pair(self, body: SlipBody, physics: SlipPhysics, geometry: HandGeometry) -> BulletPair:
+    def _pair(self, body: SlipBody, physics: SlipPhysics, geometry: Hand) -> BulletPair:
         """Return the pair of this body, built if it is another one than the last."""
         if self._kept is not None:
             kept_body, kept_physics, kept_geometry, pair = self._kept

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 
 from realsim.compiled import njit
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import Hand
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ def surface_triangles(parts: tuple[Array, ...]) -> Array:
 
 
 def advanced_fingers(
-    triangles_obj: Array, Ts_obj_grasp: Array, openings_m: Array, geometry: HandGeometry
+    triangles_obj: Array, Ts_obj_grasp: Array, openings_m: Array, geometry: Hand
 ) -> Array:
     """Return the distance (K,) of each finger's face from the middle after the approach [m].
 

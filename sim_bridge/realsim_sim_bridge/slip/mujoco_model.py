@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.mujoco_approach import surface_triangles
 from realsim_sim_bridge.slip.world import PadModel, SlipBody, SlipPhysics
 
@@ -58,7 +58,7 @@ class PairModel:
     """(T, 3, 3) surface of the convex parts, object frame [m]."""
     reach_m: float
     """Greatest distance of a vertex from the centre of mass [m]."""
-    geometry: HandGeometry
+    geometry: Hand
 
 
 def load_mujoco() -> Any:
@@ -71,7 +71,7 @@ def load_mujoco() -> Any:
 
 
 def compile_pair(
-    body: SlipBody, physics: SlipPhysics, geometry: HandGeometry, settings: "MujocoSettings"
+    body: SlipBody, physics: SlipPhysics, geometry: Hand, settings: "MujocoSettings"
 ) -> PairModel:
     """Compile the model.
 
@@ -168,7 +168,7 @@ def _set_options(spec: Any, physics: SlipPhysics, settings: "MujocoSettings") ->
 def _add_finger(
     spec: Any,
     finger: int,
-    geometry: HandGeometry,
+    geometry: Hand,
     physics: SlipPhysics,
     settings: "MujocoSettings",
 ) -> None:

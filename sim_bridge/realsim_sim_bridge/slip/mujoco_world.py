@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip import mujoco_state
 from realsim_sim_bridge.slip.mujoco_approach import advanced_fingers
 from realsim_sim_bridge.slip.mujoco_model import (
@@ -66,7 +66,7 @@ class MujocoEngine(Engine):
         self._models: OrderedDict[str, PairModel] = OrderedDict()
 
     def world(
-        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: HandGeometry
+        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: Hand
     ) -> HandWorld:
         """Return a world with these pairs.
 
@@ -75,7 +75,7 @@ class MujocoEngine(Engine):
         """
         return MujocoWorld(self.pair(body, physics, geometry), grips, physics, self.settings)
 
-    def pair(self, body: SlipBody, physics: SlipPhysics, geometry: HandGeometry) -> PairModel:
+    def pair(self, body: SlipBody, physics: SlipPhysics, geometry: Hand) -> PairModel:
         """Return the compiled model, from those kept if it is there."""
         key = _content(body, physics, geometry)
         if key not in self._models:

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.records import STAGES
 from realsim.records.checked_arrays import rows_of
+from realsim.robots.hand import Hand, find_hand
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
 from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
 from realsim_sim_bridge.slip.score import ScoreLimits
@@ -118,7 +118,7 @@ def run_slip_test(
     trial: SlipTrial,
     config: SlipConfig | None = None,
     limits: ScoreLimits | None = None,
-    geometry: HandGeometry | None = None,
+    geometry: Hand | None = None,
     engine: Engine | None = None,
 ) -> Slips:
     """Return the slips of all grasps of the trial.
@@ -136,9 +136,7 @@ def run_slip_test(
     """
     config = config or SlipConfig()
     engine = engine or make_engine(config.engine)
-    return _SlipTest(
-        trial, config, limits or ScoreLimits(), geometry or HandGeometry(), engine
-    ).run()
+    return _SlipTest(trial, config, limits or ScoreLimits(), geometry or find_hand(), engine).run()
 
 
 def batches(n: int, size: int) -> list[slice]:
@@ -154,7 +152,7 @@ class _SlipTest:
         trial: SlipTrial,
         config: SlipConfig,
         limits: ScoreLimits,
-        geometry: HandGeometry,
+        geometry: Hand,
         engine: Engine,
     ) -> None:
         self._trial, self._config, self._limits = trial, config, limits

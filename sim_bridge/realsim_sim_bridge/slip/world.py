@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.geometry.mesh_shape import MassProperties
 from realsim.models.model_records import ConvexParts, PhysicalProperties
 from realsim.records.checked_arrays import rows_of
+from realsim.robots.hand import Hand
 
 # --- An object as the physics engines need it ----------------------------------------------------
 
@@ -265,7 +265,7 @@ class Engine(ABC):
 
     @abstractmethod
     def world(
-        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: HandGeometry
+        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: Hand
     ) -> HandWorld:
         """Return a world with these pairs."""
 

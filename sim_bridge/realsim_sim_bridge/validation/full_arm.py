@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from realsim import interop
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.records import STAGES
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.panda import panda_urdf
 from realsim_sim_bridge.slip.bullet_shapes import hand_urdf
@@ -265,7 +265,7 @@ class _ArmWorld:
         engine, physics = self._engine, self._config.physics
         with tempfile.TemporaryDirectory() as folder:
             urdf = Path(folder) / "arm.urdf"
-            geometry = HandGeometry()
+            geometry = find_hand()
             urdf.write_text(panda_urdf(geometry, hand_urdf(geometry, physics.pads)))
             self._arm: int = engine.loadURDF(
                 str(urdf),

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.motion import min_jerk
 from realsim_sim_bridge.slip.slip_test import SlipConfig, batches
 from realsim_sim_bridge.slip.world import Engine, Grips, SlipBody
@@ -176,7 +176,7 @@ def _hold(
         Ts_obj_grasp=upright,
         openings_m=np.full(n, SIDE_M + 0.006),
     )
-    with engine.world(body, grips, config.physics, HandGeometry()) as world:
+    with engine.world(body, grips, config.physics, find_hand()) as world:
         closed = world.close(config.closing)
         start = world.states().Ts_world_body
         steps, ramp = round((ramp_s + hold_s) / world.dt), round(ramp_s / world.dt)

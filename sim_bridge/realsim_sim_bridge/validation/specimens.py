@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.hand import HandGeometry
 from realsim.geometry.mesh import Mesh, mass_properties
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.slip.slip_test import SlipTrial
 from realsim_sim_bridge.slip.world import SlipBody
@@ -87,7 +87,7 @@ def edge_trial(
     body = specimen(shape, mass_kg)
     corners = np.concatenate(body.parts)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    hand = HandGeometry()
+    hand = find_hand()
     rng = np.random.default_rng([seed, sorted(_SHAPES).index(shape)])
     found: list[tuple[Array, Array]] = []
     while len(found) < grasps:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.geometry.hand import HandGeometry
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
 from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
@@ -124,9 +124,7 @@ def _asked(
 def _found(engine: Engine, slip: SlipConfig, mass_kg: float) -> dict[str, float]:
     """Return what the engine says of a closed world, with the friction that its rule makes."""
     trial = cube_trial(mass_kg, DOWN[None])
-    with engine.world(
-        trial.body, trial.grips(slip.headroom_m), slip.physics, HandGeometry()
-    ) as world:
+    with engine.world(trial.body, trial.grips(slip.headroom_m), slip.physics, find_hand()) as world:
         world.close(slip.closing)
         found: dict[str, Any] = world.settings()
     pair = found["finger_friction"], found["object_friction"]

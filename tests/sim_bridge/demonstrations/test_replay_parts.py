@@ -68,7 +68,12 @@ def test_a_configuration_of_another_version_is_refused(change):
 def test_a_field_that_a_version_did_not_have_takes_its_default():
     stored = json.loads(json.dumps(dataclasses.asdict(CONFIG)))
     del stored["slip"]["headroom_m"], stored["sweep"]
-    assert school_config_of(grasps_with({"config": stored})) == CONFIG
+    sizes = "max_opening_m finger_length_m tip_beyond_tcp_m finger_width_m finger_thickness_m"
+    stored["hand"] = {n: stored["hand"][n] for n in [*sizes.split(), "mount_z_m"]}
+    assert school_config_of(grasps_with({"config": stored})) == CONFIG  # Franka's, before names
+    stored["hand"]["mount_z_m"] = -0.15
+    with pytest.raises(InputError, match="without a name"):
+        school_config_of(grasps_with({"config": stored}))
 
 
 def test_a_box_that_is_dropped_lands_on_its_face():
