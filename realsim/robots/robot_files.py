@@ -31,7 +31,7 @@ MOST_BYTES = 100e6
 """Largest file of a robot [bytes]."""
 
 
-class RobotFile(OwnFile, kw_only=True):
+class RobotFile(OwnFile, frozen=True, kw_only=True):
     """What every `robot.toml` says."""
 
     name: str
