@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
-from realsim.geometry.dh import UR5_ARM, UR5E_ARM, DhArm
+from realsim.geometry.dh import DhArm
 from realsim.records import ArmErrorMap, Target
+from realsim.robots.arm import UR5 as UR5_ARM
+from realsim.robots.arm import UR5E as UR5E_ARM
 from realsim_calibration import (
     BoardView,
     HandEyeReport,

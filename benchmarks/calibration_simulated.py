@@ -16,9 +16,9 @@ from scipy.stats import chi2
 from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.geometry.camera import project
-from realsim.geometry.dh import UR5E_ARM
 from realsim.records import CameraIntrinsics, Chessboard
-from realsim.robots.kinematics import UR5E
+from realsim.robots.arm import UR5E
+from realsim.robots.arm import UR5E as UR5E_ARM
 from realsim_calibration import (
     BoardView,
     HandEyeConfig,

@@ -34,7 +34,7 @@ Images = list[tuple[NDArray[np.uint8], NDArray[np.uint16]]]
 def photographs() -> tuple[Any, Images]:
     """Return the lab's camera and some of its frames: colour, depth in millimetres."""
     from realsim.geometry import se3
-    from realsim.robots.kinematics import UR5
+    from realsim.robots.arm import UR5
     from realsim_capture_plans.lab.lab import SimulatedLab
 
     lab = SimulatedLab()

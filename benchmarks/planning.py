@@ -30,7 +30,7 @@ from figures import Figure, Found, Goal, run
 from numpy.typing import NDArray
 
 from realsim.errors import MissingLibraryError
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from realsim_capture_plans import PlanConfig, d405_mount
 from realsim_capture_plans.collision.model import interpolate
 from realsim_capture_plans.planning.advise import DISTANCES_M, advise

@@ -7,7 +7,7 @@ camera has a lens that its maker does not know of. The calibration gets what a r
 import numpy as np
 
 from realsim.geometry import camera, se3
-from realsim.geometry.dh import UR5_ARM
+from realsim.robots.arm import UR5 as UR5_ARM
 from realsim_calibration import BoardView, TargetDetection, calibrate_hand_eye
 from realsim_capture_plans import PlanConfig, calibration_plan
 from realsim_capture_plans.lab import LabConfig, SimulatedLab

@@ -12,7 +12,7 @@ import time
 import numpy as np
 
 from realsim import InputError
-from realsim.robots.kinematics import CHAINS
+from realsim.robots.arm import known_chains
 from realsim_capture_plans import Arm, DepthCamera
 
 STEP_RAD = 0.05
@@ -84,7 +84,7 @@ def _plain_json(what: str, description: object) -> list[str]:
 
 def _flange(arm: Arm) -> list[str]:
     """Return whether the flange is where the named arm's chain puts it."""
-    chain = CHAINS.get(arm.name)
+    chain = known_chains().get(arm.name)
     if chain is None:
         return []  # nothing to compare with
     state = arm.state()

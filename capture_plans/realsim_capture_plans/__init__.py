@@ -1,7 +1,7 @@
 """Where the robot goes and what executes it: plans, devices, the simulated lab."""
 
-from realsim.robots.kinematics import UR5 as UR5
-from realsim.robots.kinematics import UR5E as UR5E
+from realsim.robots.arm import UR5 as UR5
+from realsim.robots.arm import UR5E as UR5E
 from realsim.robots.kinematics import DhChain as DhChain
 from realsim.robots.kinematics import JointLimits as JointLimits
 from realsim_capture_plans.capturing.capture import CaptureConfig as CaptureConfig

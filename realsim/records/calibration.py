@@ -112,13 +112,15 @@ class ArmErrorMap(RobotMap):
     arm: DhArm
     """The arm as it is said to be."""
     errors: Array
-    """(24,) to be added to its theta, alpha [rad], a, d [m], six each."""
+    """(4 n,) to be added to its theta, alpha [rad], a, d [m], n of each."""
     T_flange_tool: Array
     """(4, 4) the controller's tool frame in the flange [m]."""
 
     def __post_init__(self) -> None:
-        """Freeze the arrays."""
-        object.__setattr__(self, "errors", frozen(self.errors, np.float64, (24,), "errors"))
+        """Freeze the arrays, and keep of an arm its numbers alone."""
+        size = 4 * self.arm.joints
+        object.__setattr__(self, "arm", self.arm.bare())
+        object.__setattr__(self, "errors", frozen(self.errors, np.float64, (size,), "errors"))
         object.__setattr__(self, "T_flange_tool", rigid(self.T_flange_tool, "T_flange_tool"))
 
     def corrected(self, T: ArrayLike, joints: ArrayLike) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim.robots.kinematics import JOINTS, DhChain
+from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Shape
 
 Array = NDArray[np.float64]
@@ -15,21 +15,23 @@ Pair = tuple[int, int]
 
 
 def pinocchio_model(chain: DhChain) -> tuple[Any, Array]:
-    """Return the chain as a pinocchio model, and (7, 4, 4) where DH frame i is in joint i [m].
+    """Return the chain as a pinocchio model, and (n + 1, 4, 4) where link i is in joint i [m].
 
-    Joint i turns about z of frame i - 1; frame i is `Tz(d) Tx(a) Rx(alpha)` behind it. Frame 0 is
-    the world.
+    Joint i turns about z of frame i - 1; frame i is `Tz(d) Tx(a) Rx(alpha)` behind it, the last one
+    the flange. Frame 0 is the world, which is the base.
     """
     import pinocchio as pin  # pyright: ignore[reportMissingImports]
 
-    model = pin.Model()
-    frames = np.tile(np.eye(4), (JOINTS + 1, 1, 1))
+    model, n = pin.Model(), chain.joints
+    frames = np.tile(np.eye(4), (n + 1, 1, 1))
     theta, alpha = chain.theta + chain.delta_theta, chain.alpha + chain.delta_alpha
     a, d = chain.a + chain.delta_a, chain.d + chain.delta_d
-    for i in range(JOINTS):
+    behind = chain.T_base_0
+    for i in range(n):
         zero = se3.from_rt(se3.exp_so3([0.0, 0.0, theta[i]]), np.zeros(3))
-        model.addJoint(i, pin.JointModelRZ(), pin.SE3(frames[i] @ zero), f"joint {i + 1}")
-        frames[i + 1] = se3.from_rt(se3.exp_so3([alpha[i], 0.0, 0.0]), [a[i], 0.0, d[i]])
+        model.addJoint(i, pin.JointModelRZ(), pin.SE3(behind @ zero), f"joint {i + 1}")
+        behind = se3.from_rt(se3.exp_so3([alpha[i], 0.0, 0.0]), [a[i], 0.0, d[i]])
+        frames[i + 1] = behind if i + 1 < n else behind @ chain.T_n_ee
     return model, frames
 
 
@@ -122,7 +124,7 @@ class PairDistances:
         self._distances = pin.computeDistances
 
     def __call__(self, joints: Array) -> Array:
-        """Return the distances (N, P) [m] of the pairs at joints (N, 6); negative = penetration."""
+        """Return the distances (N, P) [m] of the pairs at joints (N, n); negative = penetration."""
         rows = np.empty((len(joints), len(self._results)))
         for row, q in zip(rows, np.ascontiguousarray(joints), strict=True):
             self._distances(self.model, self.data, self.geometry, self.work, q)
@@ -153,7 +155,7 @@ class Collider:
         self._collide = pin.computeCollisions
 
     def __call__(self, q: Array) -> bool:
-        """Return whether any pair is nearer than the margin at joints q (6,)."""
+        """Return whether any pair is nearer than the margin at joints q (n,)."""
         return bool(self._collide(self._pairs.model, self._data, self._boxes, q, True))
 
 

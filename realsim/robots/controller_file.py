@@ -25,7 +25,9 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.dh import JOINTS, UR5_ARM, UR5E_ARM, DhArm
+from realsim.geometry.dh import DhArm
+from realsim.robots.arm import ur_chains
+from realsim.robots.dh_of_chain import Screws, normals, screws
 from realsim.robots.kinematics import DhChain
 from realsim.untrusted.files import checked_text
 
@@ -40,9 +42,8 @@ MODEL_GAP_M = 0.015
 of real arms move it by 1 to 5 mm, the numbers of another model by 64 mm and more."""
 SPREAD = 96
 """Joint configurations that calibrated and nominal flange are compared at."""
-PARALLEL_RAD = 1e-6
-"""Axes nearer to parallel than this count as parallel [rad]: 1 micrometre at the arm's length.
-Their common normal would lie a thousand kilometres away, where 64 bits do not hold micrometres."""
+JOINTS = 6
+"""Of a UR."""
 BASE_TILT = 1e-6
 """Most that the first joint's axis may differ from the base's z [rad, m]."""
 LARGEST_BYTES = 1_000_000
@@ -50,30 +51,28 @@ LARGEST_BYTES = 1_000_000
 
 
 def _ur(name: str, a: tuple[float, float], d: tuple[float, float, float, float]) -> DhArm:
-    return replace(
-        UR5_ARM,
+    return DhArm(
         name=name,
         a=np.array([0.0, a[0], a[1], 0.0, 0.0, 0.0]),
         d=np.array([d[0], 0.0, 0.0, d[1], d[2], d[3]]),
+        alpha=np.array([1.0, 0.0, 0.0, 1.0, -1.0, 0.0]) * (np.pi / 2),
     )
 
 
-UR_ARMS = {
-    arm.name: arm
-    for arm in (
-        UR5_ARM,
-        UR5E_ARM,
-        _ur("UR3", (-0.24365, -0.21325), (0.1519, 0.11235, 0.08535, 0.0819)),
-        _ur("UR10", (-0.612, -0.5723), (0.1273, 0.163941, 0.1157, 0.0922)),
-        _ur("UR3e", (-0.24355, -0.2132), (0.15185, 0.13105, 0.08535, 0.0921)),
-        _ur("UR10e", (-0.6127, -0.57155), (0.1807, 0.17415, 0.11985, 0.11655)),
-        _ur("UR16e", (-0.4784, -0.36), (0.1807, 0.17415, 0.11985, 0.11655)),
-        _ur("UR20", (-0.8620, -0.7287), (0.2363, 0.2010, 0.1593, 0.1543)),
-        _ur("UR30", (-0.6370, -0.5037), (0.2363, 0.2010, 0.1593, 0.1543)),
-    )
-}
-"""Nominal numbers of the models that a file may have come from (Universal Robots: DH parameters for
-calculations), to say which one it was."""
+OTHER_URS = (
+    _ur("UR3", (-0.24365, -0.21325), (0.1519, 0.11235, 0.08535, 0.0819)),
+    _ur("UR10", (-0.612, -0.5723), (0.1273, 0.163941, 0.1157, 0.0922)),
+    _ur("UR16e", (-0.4784, -0.36), (0.1807, 0.17415, 0.11985, 0.11655)),
+    _ur("UR20", (-0.8620, -0.7287), (0.2363, 0.2010, 0.1593, 0.1543)),
+    _ur("UR30", (-0.6370, -0.5037), (0.2363, 0.2010, 0.1593, 0.1543)),
+)
+"""Nominal numbers of models that a file may have come from beside the arms that ship (Universal
+Robots: DH parameters for calculations), to say which one it was."""
+
+
+def ur_arms() -> dict[str, DhArm]:
+    """Return the UR arms that ship and `OTHER_URS` by name."""
+    return {arm.name: arm for arm in (*ur_chains().values(), *OTHER_URS)}
 
 
 def read_controller_calibration(path: Path | str, chain: DhChain) -> DhChain:
@@ -140,41 +139,14 @@ def dh_of_links(links: Array, near: DhArm) -> dict[str, Array]:
     return numbers
 
 
-def _screws(
-    T: Array, near_a: float, near_alpha: float, near_b: float
-) -> tuple[float, float, float, float, float, float]:
-    """Return b, phi, a, alpha, psi, c of T = Tz(b) Rz(phi) Tx(a) Rx(alpha) Rz(psi) Tz(c).
+def _screws(T: Array, near_a: float, near_alpha: float, near_b: float) -> Screws:
+    """Return the screws of a transform whose normal points as in the nominal arm."""
+    normal, parallel = normals(T)
 
-    The near values choose where T leaves a choice: the sign of the common normal, and, between
-    parallel axes, its place.
-    """
-    z, axis, p = np.array([0.0, 0.0, 1.0]), T[:3, 2], T[:3, 3]
-    normal = np.cross(z, axis)
-    sine = float(np.linalg.norm(normal))
-    if sine > PARALLEL_RAD:
-        normal = normal / sine
-    else:
-        flat = np.array([p[0], p[1], 0.0])
-        length = float(np.linalg.norm(flat))
-        normal = flat / length if length > PARALLEL_RAD else np.array([1.0, 0.0, 0.0])
+    def off(s: Screws) -> float:
+        return abs(s.a - near_a) + abs(s.alpha - near_alpha)
 
-    def along(n: Array) -> tuple[float, float]:
-        alpha = math.atan2(float(np.cross(z, axis) @ n), float(axis[2]))
-        return float(p @ n), alpha if sine > PARALLEL_RAD else 0.0
-
-    def off(n: Array) -> float:
-        a, alpha = along(n)
-        return abs(a - near_a) + abs(alpha - near_alpha)
-
-    n = min((normal, -normal), key=off)
-    a, alpha = along(n)
-    if sine > PARALLEL_RAD:
-        b, _, c = np.linalg.solve(np.stack([z, n, axis], -1), p).tolist()
-    else:
-        b, c = near_b, float(p[2]) - near_b
-    phi = math.atan2(float(n[1]), float(n[0]))
-    R_rest = se3.exp_so3([-alpha, 0.0, 0.0]) @ se3.exp_so3([0.0, 0.0, -phi]) @ T[:3, :3]
-    return b, phi, a, alpha, math.atan2(float(R_rest[1, 0]), float(R_rest[0, 0])), c
+    return min((screws(T, n, parallel, near_b) for n in (normal, -normal)), key=off)
 
 
 def _with_deltas(arm: DhArm, lists: dict[str, Array]) -> DhArm:
@@ -199,7 +171,7 @@ def _checked(path: Path, chain: DhChain, calibrate: Callable[[DhArm], DhArm]) ->
     gap = flange_gap_m(calibrated, nominal)
     if gap <= MODEL_GAP_M:
         return DhChain.of(calibrated, chain.limits)
-    others = {name: flange_gap_m(calibrate(arm), arm) for name, arm in UR_ARMS.items()}
+    others = {name: flange_gap_m(calibrate(arm), arm) for name, arm in ur_arms().items()}
     others.pop(chain.name, None)
     best = min(others, key=lambda name: others[name])
     if others[best] <= MODEL_GAP_M:
@@ -211,7 +183,7 @@ def _checked(path: Path, chain: DhChain, calibrate: Callable[[DhArm], DhArm]) ->
         )
     else:
         remedy = (
-            f"No other known model fits ({', '.join(UR_ARMS)}); numbers of the file were changed "
+            f"No other known model fits ({', '.join(ur_arms())}); numbers of the file were changed "
             "or lost. Copy it from the controller again."
         )
     raise InputError(

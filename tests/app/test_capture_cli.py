@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.interop import import_pyrealsense2
 from realsim.records import CaptureSession
-from realsim.robots.kinematics import UR5, UR5E
+from realsim.robots.arm import UR5, UR5E
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.contact_sheet import SheetConfig, contact_sheet
 from realsim_capture_plans.collision.mount import d405_mount

@@ -12,7 +12,7 @@ import pytest
 from realsim.app.cli import main
 from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
-from realsim.robots.kinematics import UR5, UR5E
+from realsim.robots.arm import UR5, UR5E
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.plan_files.exported import table_frame
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from realsim.geometry import se3
-from realsim.geometry.dh import UR5_ARM
+from realsim.robots.arm import UR5 as UR5_ARM
 from realsim_calibration.faults.diagnose import diagnose
 from realsim_calibration.faults.tool_offset import tool_offset
 

@@ -6,8 +6,9 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project, undistort
-from realsim.geometry.dh import UR5_ARM, UR5E_ARM
 from realsim.records import Chessboard
+from realsim.robots.arm import UR5 as UR5_ARM
+from realsim.robots.arm import UR5E as UR5E_ARM
 from realsim_calibration import (
     HandEyeConfig,
     TargetDetection,

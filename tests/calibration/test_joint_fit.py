@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from realsim.geometry import camera, se3
-from realsim.geometry.dh import UR5E_ARM
 from realsim.records import ArmErrorMap, CameraIntrinsics, RobotErrorMap
+from realsim.robots.arm import UR5E as UR5E_ARM
 from realsim_calibration.fit.joint_solve import (
     FLAT,
     JointConfig,

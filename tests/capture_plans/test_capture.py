@@ -22,7 +22,8 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, CaptureSession
-from realsim.robots.kinematics import UR5, UR5E, JointLimits
+from realsim.robots.arm import UR5, UR5E
+from realsim.robots.kinematics import JointLimits
 from realsim.store import SessionStore, atomic
 from realsim_capture_plans.capturing.capture import (
     PLAN_FILE,

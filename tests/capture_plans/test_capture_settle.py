@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from realsim_capture_plans.capturing.checks import (
     CheckConfig,
     sharpness,

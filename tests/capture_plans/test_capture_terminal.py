@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from realsim.records import CameraIntrinsics, CaptureSession
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import CaptureJob, capture
 from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog

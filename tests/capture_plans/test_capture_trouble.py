@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, Mesh
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import (
     CaptureConfig,

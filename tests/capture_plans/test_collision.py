@@ -7,9 +7,9 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.robots.arm_shapes import arm_shapes
+from realsim.robots.arm import UR5, UR5E, arm_of
 from realsim.robots.coal_geometry import pinocchio_model
-from realsim.robots.kinematics import UR5, UR5E, DhChain
+from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.model import GROUPS, CollisionModel, interpolate
 from realsim_capture_plans.collision.mount import camera_shape, d405_mount
@@ -109,7 +109,7 @@ def test_height_above_a_table_is_the_lowest_point() -> None:
     )
     mount, q = d405_mount(), joints(400, 5)
     frames = UR5.link_frames(q)
-    shapes = [s for s in arm_shapes(UR5) if s.frame >= 2] + [camera_shape(mount), *mount.bracket]
+    shapes = [s for s in arm_of(UR5).shapes if s.frame >= 2] + [camera_shape(mount), *mount.bracket]
     low = np.min([lowest(s, frames[:, s.frame]) for s in shapes], axis=0)
     found = model(mount=mount, cell=cell).clearance(q)["table"]
     hanging = (low < 0) & (low > -depth)  # else shoulder and base, which never change, are lowest
@@ -185,7 +185,7 @@ def test_a_cell_in_millimetres_and_an_unknown_arm_are_named() -> None:
     far = replace(CELL, obstacles=(("wall", Box(lower=(700, 0, 0), upper=(750, 900, 900))),))
     with pytest.raises(InputError, match=r"'wall'.*millimetres"):
         model(cell=far)
-    with pytest.raises(InputError, match="'UR16e'; there are shapes for UR5, UR5e"):
+    with pytest.raises(InputError, match=r"no arm 'UR16e'\. There are: .*ur5, ur5e"):
         model(replace(UR5, name="UR16e"))
     with pytest.raises(InputError, match="called 'UR5' but its nominal"):
         model(replace(UR5E, name="UR5"))

@@ -7,8 +7,9 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.robots.arm_shapes import link_placements
-from realsim.robots.kinematics import UR5, DhChain
+from realsim.robots.arm import UR5, arm_of
+from realsim.robots.kinematics import DhChain
+from realsim.robots.link_shapes import link_placements
 from realsim.robots.shapes import Box, WorkCell
 from realsim_capture_plans.collision.model import GROUPS, CollisionModel
 from realsim_capture_plans.collision.mount import d405_mount
@@ -64,7 +65,7 @@ ARMS = [factory_arm(seed) for seed in range(3)]
 
 def test_links_stay_within_millimetres_of_the_nominal_ones() -> None:
     arm = max(ARMS, key=lambda a: np.abs(a.delta_d).max())
-    placements = link_placements(arm)
+    placements = link_placements(arm_of(arm))
     q = np.random.default_rng(9).uniform(-np.pi, np.pi, (300, 6))
     at = arm.link_frames(q) @ placements
     nominal = UR5.link_frames(q)
@@ -93,4 +94,4 @@ def test_another_arms_calibration_is_refused() -> None:
         CollisionModel(other, d405_mount(), CELL, 0.01)
     uncancelled = replace(UR5, delta_d=np.array([0.0, 11.198, -92.527, 0.0, 0.0, 0.0]))
     with pytest.raises(InputError, match="calibration file another arm's"):
-        link_placements(uncancelled)
+        link_placements(arm_of(uncancelled))

@@ -5,8 +5,7 @@ import pytest
 
 from realsim.errors import MissingLibraryError
 from realsim.geometry import se3
-from realsim.robots.arm_shapes import LINK_NAMES, arm_shapes
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5, arm_of
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.mount import d405_mount, plain_bracket
 from realsim_capture_plans.collision.ur5_meshes import (
@@ -49,12 +48,12 @@ def quartered(triangles: np.ndarray) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("frame", range(7), ids=LINK_NAMES)
+@pytest.mark.parametrize("frame", range(7), ids=arm_of(UR5).link_names)
 def test_every_triangle_lies_inside_our_shapes(frame: int) -> None:
     """A triangle with all corners in one convex shape is inside it; others are cut in four."""
-    shapes = [s for s in arm_shapes(UR5) if s.frame == frame]
+    shapes = [s for s in arm_of(UR5).shapes if s.frame == frame]
     q = np.array([0.3, -0.8, 1.2, 0.5, -2.0, 0.7])
-    triangles = MeshModel(d405_mount(), BENCH).triangles(q)[LINK_NAMES[frame]]
+    triangles = MeshModel(d405_mount(), BENCH).triangles(q)[arm_of(UR5).link_names[frame]]
     T = np.linalg.inv(UR5.link_frames(q)[frame])
     left = triangles @ T[:3, :3].T + T[:3, 3]
     assert len(left) > 400

@@ -12,18 +12,20 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.geometry.dh import DhArm
+from realsim.robots.arm import UR5, UR5E
 from realsim.robots.controller_file import (
     LINKS,
     LISTS,
     PLACES,
-    UR_ARMS,
     dh_of_links,
     flange_gap_m,
     read_controller_calibration,
+    ur_arms,
 )
-from realsim.robots.kinematics import UR5, UR5E, DhChain
+from realsim.robots.kinematics import DhChain
 
-UR10 = DhChain.of(UR_ARMS["UR10"])
+UR10 = DhChain.of(ur_arms()["UR10"], UR5.limits)
 CONF = {
     "theta": [-8.20642406610186392e-05, -0.103609197138685979, 0.673631891251821102,
               -0.57016974724960845, -4.59636351675856217e-05, 9.74999561134540574e-07],
@@ -134,7 +136,7 @@ def test_any_arm_of_six_axes_comes_back_from_its_dh_numbers() -> None:
         rows[0, [0, 1, 3, 4]] = 0.0
         links = link_transforms(rows.tolist())
         numbers = dh_of_links(links, UR5)
-        chain = DhChain(name="x", **{k: numbers[k] for k in LISTS})
+        chain = DhArm(name="x", **{k: numbers[k] for k in LISTS})
         q = spread(20)
         assert np.abs(chain.forward(q) - by_links(links, q)).max() < 1e-9
 

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.robots.kinematics import UR5, UR5E, DhChain
+from realsim.robots.arm import UR5, UR5E, find_arm
+from realsim.robots.kinematics import DhChain
+from realsim.robots.robot_files import names_of
 
 
 def calibrated(chain: DhChain, seed: int) -> DhChain:
@@ -82,7 +83,22 @@ def test_known_poses_of_the_nominal_ur5() -> None:
     assert 40 < gap_mm < 100
 
 
-def test_a_calibration_given_as_nominal_numbers_is_refused() -> None:
+def test_an_arm_without_a_closed_form_is_solved_all_the_same() -> None:
     general = replace(UR5, alpha=UR5.alpha + np.array([0.01, 0.02, -0.015, 0.02, 0.01, 0.0]))
-    with pytest.raises(InputError, match="delta_"):
-        general.inverse(general.forward([0.1, -1.2, 1.3, -0.5, -1.4, 0.2]))
+    T = general.forward([0.1, -1.2, 1.3, -0.5, -1.4, 0.2])
+    found = general.inverse(T)
+    assert len(found)
+    np.testing.assert_allclose(general.forward(found), np.tile(T, (len(found), 1, 1)), atol=1e-8)
+
+
+def test_poses_of_every_arm_that_ships_are_reached_inside_its_limits() -> None:
+    """What a dense search finds is found: poses of random joints, of six joints and of seven."""
+    for name in names_of("arm"):
+        chain = find_arm(name).chain
+        limits = chain.limits
+        low, high = np.maximum(limits.lower, -np.pi), np.minimum(limits.upper, np.pi)
+        Ts = chain.forward(np.random.default_rng(8).uniform(low, high, (200, chain.joints)))
+        q, of = chain.inverse_branches(Ts)
+        assert len(np.unique(of)) >= 199, name
+        assert np.all(limits.contains(q)), name
+        np.testing.assert_allclose(chain.forward(q), Ts[of], atol=1e-8)

@@ -6,7 +6,7 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import camera as lens
 from realsim.geometry import se3
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from realsim_capture_plans.devices.interfaces import Arm, DepthCamera, Frame
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
 

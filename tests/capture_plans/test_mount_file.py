@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from realsim.errors import InputError, RealsimError, UnitError
 from realsim.geometry import se3
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.cell_files import (
     read_mount,

@@ -8,7 +8,7 @@ import pytest
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from realsim_capture_plans.collision.model import CollisionModel, interpolate
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.planning.advise import advice, advise

@@ -11,7 +11,8 @@ import pytest
 from realsim.errors import InputError, UnitError
 from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
-from realsim.robots.kinematics import UR5, UR5E, DhChain
+from realsim.robots.arm import UR5, UR5E
+from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.plan_files.exported import (

@@ -10,7 +10,7 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from realsim.robots.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.planning import view_quality

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from realsim.robots.shapes import Box
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.pictures.drawing import PlanCurves

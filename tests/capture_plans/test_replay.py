@@ -14,7 +14,7 @@ from websockets.sync.client import connect
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from realsim.robots.shapes import Box
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.pictures.replay import (

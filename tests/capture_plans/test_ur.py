@@ -18,7 +18,7 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.interop import T_from_rotation_vector_pose
-from realsim.robots.kinematics import CHAINS, UR5, UR5E
+from realsim.robots.arm import UR5, UR5E, known_chains
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError
 from realsim_capture_plans.devices.ur import UrArm
 from realsim_capture_plans.devices.ur_connection import UrConfig
@@ -78,7 +78,9 @@ def test_arrives_where_it_is_sent_whatever_the_tool(cb3: LoopbackController) -> 
             arm.move(goal, speed=2.0, acceleration=3.0)
             state = arm.state()
             np.testing.assert_allclose(state.joints, goal, atol=1e-12)
-            np.testing.assert_allclose(state.T_base_ee, CHAINS[robot].forward(goal), atol=1e-12)
+            np.testing.assert_allclose(
+                state.T_base_ee, known_chains()[robot].forward(goal), atol=1e-12
+            )
             np.testing.assert_allclose(state.T_ee_tcp, T_from_rotation_vector_pose(TCP))
             times.append(state.time_s)
     assert np.all(np.diff(times) > 0)

@@ -8,7 +8,7 @@ import pytest
 
 from realsim.geometry import se3
 from realsim.records import CaptureSession
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import CaptureJob, capture
 from realsim_capture_plans.capturing.operator import Command, NoOperator

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from realsim.errors import RealsimError
 from realsim.geometry import camera, se3
-from realsim.geometry.dh import UR5_ARM
+from realsim.robots.arm import UR5 as UR5_ARM
 from realsim_calibration import (
     BoardView,
     TargetDetection,

@@ -10,7 +10,7 @@ from realsim.formats.bags import scan as stored_module
 from realsim.formats.bags.tf_tree import T_BASE_BASELINK
 from realsim.formats.frame_source import FrameSource
 from realsim.geometry import se3
-from realsim.robots.kinematics import UR5
+from realsim.robots.arm import UR5
 from written_bags import (
     COLOUR,
     DEPTH,

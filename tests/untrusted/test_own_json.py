@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from realsim import store as stores
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.dh import ARMS
 from realsim.records import (
     ArmErrorMap,
     CameraIntrinsics,
@@ -32,6 +31,7 @@ from realsim.records import (
 )
 from realsim.records.calibration import RobotMap
 from realsim.records.depth_bias import DepthBias
+from realsim.robots.arm import UR5
 from realsim.untrusted.own_json import OwnFile, Real, from_json, read_own, to_json
 
 few = settings(max_examples=10, deadline=None)
@@ -145,7 +145,7 @@ def test_reading_undoes_writing_bit_for_bit(make, seed):
     assert through_text(to_json(back)) == text
 
 
-ARM = ArmErrorMap(arm=ARMS["UR5"], errors=np.arange(24.0), T_flange_tool=np.eye(4))
+ARM = ArmErrorMap(arm=UR5.bare(), errors=np.arange(24.0), T_flange_tool=np.eye(4))
 POSES = RobotErrorMap(
     frame="base", mean=np.zeros(12), sd_m=np.nan, weights=np.ones((6, 12)), reach=np.ones((3, 12))
 )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.robots.kinematics import CHAINS
+from realsim.robots.arm import known_chains
 from realsim_capture_plans.capturing import checks
 from realsim_capture_plans.capturing.checks import Check, CheckConfig, Earlier, Measured
 from realsim_capture_plans.devices.interfaces import (
@@ -294,9 +294,14 @@ def check_arm(plan: CapturePlan, arm: Arm, config: CheckConfig) -> ArmState:
         InputError: by its name or by its flange pose it is another one.
     """
     remedy = "Use the plan of this arm, or make one: `realsim plan --robot`."
-    if arm.name in CHAINS and arm.name != plan.robot:
+    if arm.name in known_chains() and arm.name != plan.robot:
         raise InputError(
             f"the plan was made for a {plan.robot}, this arm is a {arm.name}. {remedy}"
+        )
+    if len(arm.limits.lower) != plan.chain.joints:
+        raise InputError(
+            f"the plan, made for a {plan.robot}, moves {plan.chain.joints} joints; {arm.name} has "
+            f"{len(arm.limits.lower)}. {remedy}"
         )
     if not np.all(arm.limits.contains(plan.joints)):
         raise InputError(
@@ -305,7 +310,8 @@ def check_arm(plan: CapturePlan, arm: Arm, config: CheckConfig) -> ArmState:
     state = arm.state()
     gap_mm, _ = checks.pose_gap(state, plan.chain.forward(state.joints))
     if gap_mm > config.wrong_arm_mm:
-        gaps = {n: checks.pose_gap(state, c.forward(state.joints))[0] for n, c in CHAINS.items()}
+        alike = known_chains(len(state.joints)).items()
+        gaps = {n: checks.pose_gap(state, c.forward(state.joints))[0] for n, c in alike}
         likely = min(gaps, key=lambda name: gaps[name])
         hint = f" It moves like a {likely}." if gaps[likely] < config.wrong_arm_mm else ""
         raise InputError(

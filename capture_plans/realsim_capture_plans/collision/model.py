@@ -6,19 +6,20 @@ pinocchio, both once; every question is then answered in C++. Distances are exac
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
-from realsim.robots.arm_shapes import (
-    arm_shapes,
+from realsim.robots.arm import RobotArm, arm_of
+from realsim.robots.coal_geometry import Body, Geometry
+from realsim.robots.kinematics import DhChain
+from realsim.robots.link_shapes import (
     finite_box,
     link_placements,
 )
-from realsim.robots.coal_geometry import Body, Geometry
-from realsim.robots.kinematics import JOINTS, DhChain
 from realsim.robots.shapes import Mount, WorkCell
 from realsim_capture_plans.collision.mount import camera_shape
 from realsim_capture_plans.collision.pairs import choose_pairs
@@ -54,15 +55,16 @@ class CollisionModel:
         """
         if not (np.isfinite(clearance_m) and clearance_m >= 0):
             raise InputError(f"clearance_m is {clearance_m}; a length of 0 m or more is needed.")
+        arm = arm_of(chain)
         self.chain, self.mount, self.cell = chain, mount, cell
         self.clearance_m = float(clearance_m)
-        self._bodies = bodies_of(chain, mount, cell)
-        placements = link_placements(chain)
+        self._bodies = bodies_of(arm, mount, cell)
+        placements = link_placements(arm)
         geometry = Geometry(chain, placements, self._bodies)
         # Which pairs the design keeps apart is seen on the nominal arm: the calibration's
         # millimetres would make constant distances look as if they changed.
-        drawn = Geometry(chain.nominal(), np.tile(np.eye(4), (JOINTS + 1, 1, 1)), self._bodies)
-        chosen = choose_pairs(self._bodies, drawn, self.clearance_m)
+        drawn = Geometry(chain.nominal(), np.tile(np.eye(4), (arm.joints + 1, 1, 1)), self._bodies)
+        chosen = choose_pairs(arm, self._bodies, drawn, self.clearance_m)
         order = sorted(
             range(len(chosen.pairs)), key=lambda k: (LEAST_FIRST.index(chosen.groups[k]), k)
         )
@@ -86,40 +88,46 @@ class CollisionModel:
         )
 
     def clearance(self, joints: ArrayLike) -> dict[str, Array]:
-        """Return the least distance (N,) [m] per group at joints (N, 6); negative = penetration.
+        """Return the least distance (N,) [m] per group at joints (N, n); negative = penetration.
 
         The keys are `GROUPS`; a group without pairs that can meet is infinitely far.
         """
-        distance = self._distances(_checked_joints(joints))
+        distance = self._distances(_checked_joints(joints, self.chain.joints))
         return {
             group: np.min(distance[:, self._groups == group], axis=1, initial=np.inf)
             for group in GROUPS
         }
 
     def free(self, joints: ArrayLike) -> NDArray[np.bool_]:
-        """Return (N,) whether joints (N, 6) keep the clearance in every group."""
+        """Return (N,) whether joints (N, n) keep the clearance in every group."""
         hits = self._hits
-        return np.array([not hits(q) for q in _checked_joints(joints)], dtype=bool)
+        return np.array(
+            [not hits(q) for q in _checked_joints(joints, self.chain.joints)], dtype=bool
+        )
 
     def nearest(self, q: ArrayLike) -> tuple[str, str, str, float]:
-        """Return group, the two parts and the distance [m] of the nearest pair at joints (6,)."""
-        distance = self._distances(_checked_joints(np.asarray(q, dtype=np.float64)[None]))[0]
+        """Return group, the two parts and the distance [m] of the nearest pair at joints (n,)."""
+        distance = self._distances(
+            _checked_joints(np.asarray(q, dtype=np.float64)[None], self.chain.joints)
+        )[0]
         k = int(np.argmin(distance))
         i, j = self._pairs[k]
         return str(self._groups[k]), self._bodies[i].part, self._bodies[j].part, float(distance[k])
 
     def edges_free(self, q_from: ArrayLike, q_to: ArrayLike, step_rad: float) -> NDArray[np.bool_]:
-        """Return (E,) whether straight joint-space moves (E, 6) -> (E, 6) stay free.
+        """Return (E,) whether straight joint-space moves (E, n) -> (E, n) stay free.
 
         The ends are checked first, then the middle, then the quarters, until the first hit: what
         a move runs into is wide, so that a coarse look finds it.
 
         Args:
-            q_from: (E, 6) starts [rad].
-            q_to: (E, 6) goals [rad].
+            q_from: (E, n) starts [rad].
+            q_to: (E, n) goals [rad].
             step_rad: greatest joint step between the configurations that are checked [rad].
         """
-        starts, ends = (_checked_joints(np.atleast_2d(np.asarray(q))) for q in (q_from, q_to))
+        starts, ends = (
+            _checked_joints(np.atleast_2d(np.asarray(q)), self.chain.joints) for q in (q_from, q_to)
+        )
         if len(starts) != len(ends):
             raise InputError(f"{len(starts)} starts and {len(ends)} goals do not make moves.")
         counts = _counts(starts, ends, step_rad)
@@ -131,14 +139,22 @@ class CollisionModel:
         return free
 
 
-def bodies_of(chain: DhChain, mount: Mount, cell: WorkCell) -> tuple[Body, ...]:
+def bodies_of(arm: RobotArm, mount: Mount, cell: WorkCell) -> tuple[Body, ...]:
     """Return everything that the model knows: links, camera and bracket, the cell's boxes.
 
     Raises:
         InputError: no shapes for this arm or camera, or a box that is nowhere near.
     """
-    links = [Body(shape, "link") for shape in arm_shapes(chain)]
-    carried = [Body(s, "mount", mount.cover_m) for s in (camera_shape(mount), *mount.bracket)]
+    if not arm.shapes:
+        raise InputError(
+            f"the arm '{arm.name}' has no bodies to be kept apart: neither rods nor blocks in its "
+            f"robot.toml, nor shapes in its URDF. Without them nothing can be planned."
+        )
+    links = [Body(shape, "link") for shape in arm.shapes]
+    carried = [
+        Body(replace(s, frame=arm.joints), "mount", mount.cover_m)
+        for s in (camera_shape(mount), *mount.bracket)
+    ]
     table = [Body(finite_box("table", cell.table, BOX_REACH_M), "table")]
     scene = [
         Body(finite_box(name, box, BOX_REACH_M), "scene")
@@ -150,7 +166,7 @@ def bodies_of(chain: DhChain, mount: Mount, cell: WorkCell) -> tuple[Body, ...]:
 def interpolate(
     q_from: ArrayLike, q_to: ArrayLike, step_rad: float
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Return configurations (M, 6) along straight moves, ends included, and each one's move."""
+    """Return configurations (M, n) along straight moves, ends included, and each one's move."""
     a, b = np.atleast_2d(np.asarray(q_from, float)), np.atleast_2d(np.asarray(q_to, float))
     counts = _counts(a, b, step_rad)
     owner = np.repeat(np.arange(len(a)), counts + 1)
@@ -182,15 +198,15 @@ def _coarse_to_fine(steps: int) -> Array:
     return fractions
 
 
-def _checked_joints(joints: ArrayLike) -> Array:
-    """Return joints (N, 6), contiguous.
+def _checked_joints(joints: ArrayLike, count: int) -> Array:
+    """Return joints (N, n), contiguous.
 
     Raises:
         InputError: another shape, or numbers that are not finite (which would count as free).
     """
     q = np.ascontiguousarray(joints, dtype=np.float64)
-    if q.ndim != 2 or q.shape[1] != JOINTS:
-        raise InputError(f"joints have the shape {q.shape}; (N, {JOINTS}) is needed.")
+    if q.ndim != 2 or q.shape[1] != count:
+        raise InputError(f"joints have the shape {q.shape}; (N, {count}) is needed.")
     if not np.all(np.isfinite(q)):
         raise InputError("joints hold NaN or infinite numbers; nothing can be said about those.")
     return q

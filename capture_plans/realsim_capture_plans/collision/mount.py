@@ -10,7 +10,7 @@ from realsim.geometry import se3
 from realsim.robots.shapes import Kind, Mount, Shape
 
 FLANGE = 6
-"""DH frame that camera and bracket are fixed in."""
+"""What `Shape.frame` is of camera and bracket, on whatever arm: the model puts in its flange."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import MissingLibraryError
-from realsim.robots.arm_shapes import LINK_NAMES
+from realsim.robots.arm import UR5, arm_of
 from realsim.robots.coal_geometry import coal_shape
-from realsim.robots.kinematics import UR5
 from realsim.robots.shapes import Mount, WorkCell
 from realsim_capture_plans.collision.model import CollisionModel, bodies_of
 
@@ -26,7 +25,7 @@ URDF_LINKS = (
     "base_link", "shoulder_link", "upper_arm_link", "forearm_link",
     "wrist_1_link", "wrist_2_link", "wrist_3_link",
 )  # fmt: skip
-"""In the order of `LINK_NAMES`."""
+"""In the order of the arm's `link_names`."""
 BASE_LINK_FROM_BASE = np.diag([-1.0, -1.0, 1.0, 1.0])
 """ROS's `base_link` is the controller's base, turned by 180 degrees about z."""
 
@@ -72,7 +71,7 @@ class MeshModel:
         tool0 = self._model.frames[self._model.getFrameId("tool0")]
         mounts: list[int] = []
         boxes: list[int] = []
-        for k, body in enumerate(bodies_of(UR5, mount, cell)):
+        for k, body in enumerate(bodies_of(arm_of(UR5), mount, cell)):
             if body.role == "link":
                 continue
             at = (
@@ -113,7 +112,7 @@ class MeshModel:
         q = np.ascontiguousarray(joints, dtype=np.float64)
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._work, q)
         found: dict[str, Array] = {}
-        for name, k in zip(LINK_NAMES, self._links, strict=True):
+        for name, k in zip(arm_of(UR5).link_names, self._links, strict=True):
             mesh = self._geometry.geometryObjects[k].geometry
             corners = np.array([mesh.vertex(i) for i in range(mesh.num_vertices)])
             faces = np.array(

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError, RealsimError
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import rigid
-from realsim.robots.kinematics import JOINTS, JointLimits
+from realsim.robots.kinematics import JointLimits
 
 Array = NDArray[np.float64]
 
@@ -56,8 +56,10 @@ class ArmState:
     def __post_init__(self) -> None:
         """Check shapes and freeze the arrays."""
         joints = np.array(self.joints, dtype=np.float64)
-        if joints.shape != (JOINTS,) or not np.all(np.isfinite(joints)):
-            raise InputError(f"the arm's joints are {joints.tolist()}; 6 finite angles are needed.")
+        if joints.ndim != 1 or not len(joints) or not np.all(np.isfinite(joints)):
+            raise InputError(
+                f"the arm's joints are {joints.tolist()}; one finite angle a joint is needed."
+            )
         joints.setflags(write=False)
         object.__setattr__(self, "joints", joints)
         for name in ("T_base_ee", "T_ee_tcp"):
@@ -95,11 +97,13 @@ def checked_goal(joints: ArrayLike, limits: JointLimits) -> Array:
     """Return the goal (6,) of a move [rad].
 
     Raises:
-        InputError: it is not 6 finite angles within the limits.
+        InputError: it is not one finite angle a joint within the limits.
     """
     goal = np.array(joints, dtype=np.float64)
-    if goal.shape != (JOINTS,) or not np.all(np.isfinite(goal)):
-        raise InputError(f"the goal is {goal.tolist()}; {JOINTS} finite angles are needed.")
+    if goal.shape != limits.lower.shape or not np.all(np.isfinite(goal)):
+        raise InputError(
+            f"the goal is {goal.tolist()}; {len(limits.lower)} finite angles are needed."
+        )
     bad = np.flatnonzero((goal < limits.lower) | (goal > limits.upper))
     if len(bad):
         degrees = (

@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.interop import T_from_rotation_vector_pose
-from realsim.robots.kinematics import CHAINS, JOINTS, DhChain, JointLimits
+from realsim.robots.arm import ur_chains
+from realsim.robots.kinematics import DhChain, JointLimits
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, checked_goal
 from realsim_capture_plans.devices.ur_connection import Identity, UrConfig, UrConnection
 
@@ -130,7 +131,7 @@ class UrArm:
         """
         self._connection.check_offset()
         seen = self._connection.look()
-        T_ee_tcp = T_from_rotation_vector_pose(self._connection.offset or [0.0] * JOINTS)
+        T_ee_tcp = T_from_rotation_vector_pose(self._connection.offset or [0.0] * 6)
         return ArmState(
             joints=np.array(seen["joints"]),
             T_base_ee=T_from_rotation_vector_pose(seen["tcp"]) @ se3.invert(T_ee_tcp),
@@ -192,7 +193,7 @@ class UrArm:
             InputError: the robot is not what was expected.
         """
         state = self.state()
-        chains = dict(CHAINS) if chain is None else {**CHAINS, chain.name: chain}
+        chains = dict(ur_chains()) if chain is None else {**ur_chains(), chain.name: chain}
         gaps = {name: _gap_m(state, known) for name, known in chains.items()}
         found = self._identity.model
         name = self._expected or found or min(gaps, key=lambda name: gaps[name])
@@ -200,8 +201,8 @@ class UrArm:
         where = f"at {self._connection.host} (PolyScope {self._identity.polyscope})"
         if name not in chains:
             raise InputError(
-                f"the robot {where} is a {name}; known are {', '.join(sorted(CHAINS))}. For "
-                "another model give its chain."
+                f"the robot {where} is a {name}; known are {', '.join(ur_chains())}. For another "
+                "model give its chain."
             )
         limit = self._config.model_gap_m
         if (found is not None and found != name) or gaps[name] > limit:
@@ -240,7 +241,7 @@ class UrArm:
         """
         c = self._config
         turned_at = over_at = still_at = time.monotonic()
-        turned = still = np.full(JOINTS, np.inf)
+        turned = still = np.full(self._chain.joints, np.inf)
         while True:
             seen = self._connection.look()
             self._connection.refuse_trouble(seen)
@@ -292,9 +293,9 @@ def _expected_name(model: str | None, chain: DhChain | None) -> str | None:
         return None if chain is None else chain.name
     if chain is not None and chain.name != model:
         raise InputError(f"the model is {model}, but the chain is a {chain.name}'s; give one.")
-    if chain is None and model not in CHAINS:
+    if chain is None and model not in ur_chains():
         raise InputError(
-            f"the model {model} is not known; known are {', '.join(sorted(CHAINS))}. For another "
+            f"the model {model} is not known; known are {', '.join(ur_chains())}. For another "
             "model give its chain."
         )
     return model

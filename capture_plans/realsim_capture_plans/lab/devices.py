@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.records import CameraIntrinsics
-from realsim.robots.kinematics import UR5, DhChain, JointLimits
+from realsim.robots.arm import UR5
+from realsim.robots.kinematics import DhChain, JointLimits
 from realsim_capture_plans.devices.interfaces import Arm, ArmState, Frame, checked_goal
 from realsim_capture_plans.lab.truth import NOISE, LabConfig, LabTruth, factory_intrinsics, stream
 from realsim_capture_plans.planning.ordering import move_seconds

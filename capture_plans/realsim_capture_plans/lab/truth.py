@@ -16,7 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose
-from realsim.robots.kinematics import UR5, DhChain
+from realsim.robots.arm import UR5
+from realsim.robots.kinematics import DhChain
 from realsim.untrusted.own_json import OwnFile, read_own, to_json
 
 Array = NDArray[np.float64]

@@ -1,6 +1,6 @@
 """Meshes of the arm, its camera and its mount, for drawing only: each fixed in one DH frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -9,12 +9,8 @@ from numpy.typing import NDArray
 from realsim.errors import MissingLibraryError
 from realsim.geometry import se3
 from realsim.models.convex_hulls import hull_triangles
-from realsim.robots.arm_shapes import (
-    LINK_NAMES,
-    arm_shapes,
-    link_placements,
-)
-from realsim.robots.kinematics import JOINTS
+from realsim.robots.arm import arm_of
+from realsim.robots.link_shapes import link_placements
 from realsim.robots.shapes import Shape
 from realsim_capture_plans.collision.mount import camera_shape
 from realsim_capture_plans.collision.ur5_meshes import BASE_LINK_FROM_BASE, URDF, robots_folder
@@ -42,8 +38,8 @@ class Part:
 
 
 def part_frames(plan: CapturePlan, joints: Array) -> Array:
-    """Return where the drawn links are (..., 7, 4, 4) [m] at joints (..., 6) [rad]."""
-    return plan.chain.link_frames(joints) @ link_placements(plan.chain)
+    """Return where the drawn links are (..., n + 1, 4, 4) [m] at joints (..., n) [rad]."""
+    return plan.chain.link_frames(joints) @ link_placements(arm_of(plan.chain))
 
 
 def arm_parts(plan: CapturePlan) -> list[Part]:
@@ -52,12 +48,16 @@ def arm_parts(plan: CapturePlan) -> list[Part]:
     Raises:
         InputError: there are no shapes for this arm.
     """
-    return [*map(_part, arm_shapes(plan.chain)), *camera_parts(plan)]
+    return [*map(_part, arm_of(plan.chain).shapes), *camera_parts(plan)]
 
 
 def camera_parts(plan: CapturePlan) -> list[Part]:
     """Return what is fixed to the flange: camera and bracket."""
-    return [_part(shape) for shape in (camera_shape(plan.mount), *plan.mount.bracket)]
+    flange = plan.chain.joints
+    return [
+        _part(replace(shape, frame=flange))
+        for shape in (camera_shape(plan.mount), *plan.mount.bracket)
+    ]
 
 
 def _part(shape: Shape) -> Part:
@@ -121,9 +121,9 @@ def ur5_looks(plan: CapturePlan) -> list[Part] | None:
         model, urdf, pin.GeometryType.VISUAL, package_dirs=[str(folder.parent.parent)]
     )
     data = model.createData()
-    pin.forwardKinematics(model, data, np.zeros(JOINTS))
+    pin.forwardKinematics(model, data, np.zeros(plan.chain.joints))
     # The nominal links are where the drawn links of a calibrated arm are, too.
-    T_link_base = se3.invert(plan.chain.nominal().link_frames(np.zeros(JOINTS)))
+    T_link_base = se3.invert(plan.chain.nominal().link_frames(np.zeros(plan.chain.joints)))
     parts: list[Part] = []
     for one in visual.geometryObjects:
         frame = int(one.parentJoint)
@@ -132,7 +132,7 @@ def ur5_looks(plan: CapturePlan) -> list[Part] | None:
         T_link_mesh = T_link_base[frame] @ BASE_LINK_FROM_BASE @ T_ros_mesh
         parts.append(
             Part(
-                name=LINK_NAMES[frame],
+                name=arm_of(plan.chain).link_names[frame],
                 frame=frame,
                 vertices=se3.transform(T_link_mesh, np.asarray(mesh.vertices, dtype=np.float64)),
                 faces=np.asarray(mesh.faces, dtype=np.int64),

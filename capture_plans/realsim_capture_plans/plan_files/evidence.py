@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.robots.kinematics import CHAINS, JOINTS, DhChain
+from realsim.robots.arm import known_chains
+from realsim.robots.kinematics import DhChain
 
 Array = NDArray[np.float64]
 JointUnit = Literal["rad", "deg"]
@@ -129,11 +130,11 @@ def _reading(
 def why_poses_disagree(joints: ArrayLike, Ts_base_ee: ArrayLike, chain: DhChain) -> str:
     """Return in words why flange poses (N, 4, 4) do not follow from joints (N, 6) by this chain."""
     q, Ts = np.asarray(joints, dtype=np.float64), np.asarray(Ts_base_ee, dtype=np.float64)
-    others = tuple(c for c in CHAINS.values() if c.name != chain.name)
+    others = tuple(c for c in known_chains(chain.joints).values() if c.name != chain.name)
     found = readings(q, Ts, (chain, *others), tool=False)
     best = found[0] if found else None
     if best is None or best.gap_m > EXACT_M:
-        nominal = readings(q, Ts, tuple(CHAINS.values()), tool=False)
+        nominal = readings(q, Ts, tuple(known_chains(chain.joints).values()), tool=False)
         if nominal and nominal[0].gap_m <= FITS_M:
             best = nominal[0]
     if best is None or best.gap_m > FITS_M:
@@ -171,13 +172,14 @@ def proven_reading(
         InputError: nothing fits, the poses decide nothing, or they are another robot's.
     """
     q, Ts = np.asarray(joints, dtype=np.float64), np.asarray(Ts_base_tcp, dtype=np.float64)
-    known = tuple(c for c in CHAINS.values() if chain is None or c.name != chain.name)
+    alike = known_chains(q.shape[-1])
+    known = tuple(c for c in alike.values() if chain is None or c.name != chain.name)
     found = readings(q, Ts, known if chain is None else (chain, *known), tool=True)
     if not found or found[0].gap_m > FITS_M:
         best = f" The best is {found[0].text()}." if found else ""
         raise InputError(
             f"{source}: its joints and its tool poses do not belong together, whatever the robot "
-            f"({', '.join(CHAINS)}), the units and the tool offset.{best} Is a column missing, or "
+            f"({', '.join(alike)}), the units and the tool offset.{best} Is a column missing, or "
             "are poses and joints of different moments?"
         )
     best = found[0]
@@ -217,7 +219,7 @@ def check_joint_unit(rows: Array, unit: JointUnit, names: list[str], source: str
 
     size = np.abs(rows)
     i, j = np.unravel_index(int(np.argmax(size)), size.shape)
-    largest = f"{names[i]}, joint {j + 1} of {JOINTS} is {rows[i, j]:.6g}"
+    largest = f"{names[i]}, joint {j + 1} of {rows.shape[1]} is {rows[i, j]:.6g}"
     if unit == "rad" and size[i, j] > FULL_TURN_RAD + ROUNDING_RAD:
         raise UnitError(
             f"{source}: joints that should be in radians look like degrees: {largest}, and no "

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.formats.graspnet.cameras import FIRST, POSES
 from realsim.geometry import se3
-from realsim.robots.kinematics import JOINTS
 from realsim_capture_plans.plan_files.joint_paths import CAMERA_COLUMNS
 from realsim_capture_plans.plan_files.plan_json import save_plan
 from realsim_capture_plans.planning.record import CapturePlan
@@ -40,7 +39,7 @@ def export_csv(plan: CapturePlan, path: Path | str) -> None:
     """
     from realsim.store.atomic import write_text
 
-    header = ["view", "via", *(f"q{j + 1}_rad" for j in range(JOINTS)), *CAMERA_COLUMNS]
+    header = ["view", "via", *(f"q{j + 1}_rad" for j in range(plan.chain.joints)), *CAMERA_COLUMNS]
     quaternions = se3.quaternion_wxyz(plan.Ts_base_cam[:, :3, :3])
     lines = [",".join(header)]
 

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import DegenerateError, InputError, UnitError
 from realsim.geometry import se3
-from realsim.robots.kinematics import CHAINS, DhChain
+from realsim.robots.arm import known_chains
+from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.collision.model import interpolate
 from realsim_capture_plans.plan_files.evidence import FITS_M, MILLIMETRES_FROM_M, JointUnit
@@ -81,7 +82,8 @@ def import_plan(
     if chain is None:
         if found.reading is None:
             raise InputError(
-                f"{path} does not say which robot it is for; choose --robot ({', '.join(CHAINS)})."
+                f"{path} does not say which robot it is for; choose --robot "
+                f"({', '.join(known_chains())})."
             )
         chain = found.reading.chain
     return plan_of_path(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
-from realsim.robots.kinematics import JOINTS, DhChain
+from realsim.robots.kinematics import DhChain
 from realsim.untrusted.files import checked_text
 from realsim.untrusted.json_text import read_json
 from realsim_capture_plans.plan_files.evidence import (
@@ -27,6 +27,7 @@ from realsim_capture_plans.plan_files.evidence import (
 )
 from realsim_capture_plans.plan_files.plan_json import LARGEST_BYTES
 
+JOINTS = 6
 Array = NDArray[np.float64]
 YES = ("1", "true", "yes")
 NO = ("0", "false", "no", "")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError, RealsimError, UnitError
-from realsim.robots.kinematics import CHAINS
+from realsim.robots.arm import known_chains
 from realsim.untrusted.json_text import read_json
 from realsim_capture_plans.plan_files.evidence import (
     MILLIMETRES_FROM_M,
@@ -168,17 +168,17 @@ def _check_units(content: dict[str, Any], source: str) -> None:
 
 def _check_model(plan: CapturePlan, source: str) -> None:
     """Raise if the arm has the name of one model and the numbers of another."""
-    known = CHAINS.get(plan.robot)
-    if known is None:
+    arms = known_chains(plan.chain.joints)
+    if plan.robot not in arms:
         return
 
     def off(name: str) -> float:
-        arm = CHAINS[name]
         parts = ("a", "d", "alpha", "theta")
-        return max(float(np.abs(getattr(plan.chain, p) - getattr(arm, p)).max()) for p in parts)
+        given, own = plan.chain, arms[name]
+        return max(float(np.abs(getattr(given, p) - getattr(own, p)).max()) for p in parts)
 
     if off(plan.robot) > NOMINAL:
-        alike = [name for name in CHAINS if off(name) <= NOMINAL]
+        alike = [name for name in arms if off(name) <= NOMINAL]
         whose = f"those of a {alike[0]}" if alike else "of no known model"
         raise InputError(
             f"{source} says that its robot is a {plan.robot}, but its DH numbers are {whose}. "

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
-from realsim.robots.kinematics import UR5, DhChain
+from realsim.robots.arm import UR5
+from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box, Mount
 from realsim_capture_plans.planning.metrics import plan_metrics
 from realsim_capture_plans.planning.moves import NoFreeMoveError, connect

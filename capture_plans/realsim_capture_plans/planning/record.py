@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.records.checked_arrays import frozen
-from realsim.robots.kinematics import JOINTS, DhChain, JointLimits
+from realsim.robots.kinematics import DhChain, JointLimits
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.model import CollisionModel
 
@@ -168,7 +168,8 @@ class CapturePlan:
     def __post_init__(self) -> None:
         """Check shapes, place the flange and the camera, and freeze the arrays."""
         n = len(self.joints)
-        shapes = {"home": (JOINTS,), "joints": (n, JOINTS), "center_world": (3,)}
+        q = self.chain.joints
+        shapes = {"home": (q,), "joints": (n, q), "center_world": (3,)}
         for name, shape in shapes.items():
             array = frozen(getattr(self, name), np.float64, shape, f"the plan's {name}")
             if not np.all(np.isfinite(array)):
@@ -180,7 +181,7 @@ class CapturePlan:
         for k, via in self.vias:
             if not 0 <= k < n:
                 raise InputError(f"via points of move {k}: the plan has the moves 0 to {n - 1}.")
-            vias.append((k, frozen(via, np.float64, (None, JOINTS), f"via points of move {k}")))
+            vias.append((k, frozen(via, np.float64, (None, q), f"via points of move {k}")))
         object.__setattr__(self, "vias", tuple(vias))
         Ts_base_ee = self.chain.forward(self.joints)
         for name, Ts in (

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from realsim.robots.kinematics import JOINTS
 from realsim_capture_plans.planning.ordering import move_seconds
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
@@ -111,7 +110,7 @@ class TourTime:
         joints = self.start[leg] + part[:, None] * (self.goal - self.start)[leg]
         time = self.begin_s[leg] + self._seconds_to(leg, part * self.leading_rad[leg])
         return TourSamples(
-            joints=joints.reshape(-1, JOINTS), time_s=time, leg=leg, move=self.move[leg]
+            joints=joints.reshape(-1, joints.shape[-1]), time_s=time, leg=leg, move=self.move[leg]
         )
 
     def _ramp_s(self, leg: Ints) -> Array:

@@ -8,8 +8,9 @@ import numpy as np
 
 from realsim.app.console import Tick
 from realsim.errors import InputError, RealsimError
-from realsim.geometry.dh import ARMS, DhArm
+from realsim.geometry.dh import DhArm
 from realsim.records import Target
+from realsim.robots.arm import known_chains
 from realsim.store import SessionStore
 from realsim.untrusted.own_json import to_json
 from realsim_calibration import (
@@ -87,7 +88,8 @@ def arm_of(views: Sequence[BoardView]) -> DhArm | None:
     if any(q is None for q in joints) or not views:
         return None
     Ts = np.array([v.T_base_ee for v in views])
-    return matching_arm(np.array(joints), Ts, tuple(ARMS.values()), RobotErrorConfig())
+    arms = [chain.bare() for chain in known_chains(len(joints[0])).values()]
+    return matching_arm(np.array(joints), Ts, arms, RobotErrorConfig())
 
 
 def write_results(

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from realsim.app.calibrate.board_views import arm_of
 from realsim.app.console import Console
 from realsim.errors import InputError
-from realsim.geometry.dh import ARMS, DhArm
+from realsim.geometry.dh import DhArm
 from realsim.records import CameraIntrinsics, Target
+from realsim.robots.arm import find_arm
 from realsim.store.atomic import write_json, write_text
 from realsim_calibration import (
     BoardView,
@@ -313,12 +314,10 @@ def _arm(name: str, views: Sequence[BoardView], console: Console) -> DhArm | Non
     """
     has_joints = bool(views) and all(v.joints is not None for v in views)
     if name:
-        by_name = {arm_name.lower(): arm for arm_name, arm in ARMS.items()}
-        if name.lower() not in by_name:
-            raise InputError(f"the arm '{name}' is not known; {', '.join(ARMS)} are.")
+        arm = find_arm(name).chain.bare()
         if not has_joints:
             raise InputError(f"--robot {name} needs joint angles with every pose; there are none.")
-        return by_name[name.lower()]
+        return arm
     arm = arm_of(views) if has_joints else None
     if arm is not None:
         console.say(f"joints and poses are those of a {arm.name}: its own errors are modelled.")
@@ -347,7 +346,7 @@ def _from_pose_files(
         reading = _proven(given.robot, boards, None, request, console)
     Ts, joints = given.robot.poses(reading), given.robot.joints
     labels = [where or str(k) for k, where in enumerate(given.robot.where)]
-    arm = ARMS.get(request.robot) if request.robot else None
+    arm = find_arm(request.robot).chain.bare() if request.robot else None
     with console.stage("calibrate", f"{len(Ts)} pose pairs"):
         report = calibrate_from_poses(
             Ts, boards, labels=labels, joints=joints, config=config.hand_eye, arm=arm

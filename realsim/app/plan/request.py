@@ -7,7 +7,8 @@ from typing import Any, Literal
 import numpy as np
 
 from realsim.errors import InputError, UnitError
-from realsim.robots.kinematics import CHAINS, DhChain
+from realsim.robots.arm import find_arm
+from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box, Mount
 from realsim_capture_plans.planning.record import PlanConfig
 
@@ -48,7 +49,7 @@ class Place:
                     "model."
                 )
             return None
-        nominal = CHAINS[self.robot]
+        nominal = find_arm(self.robot).chain
         if self.calibration is None:
             return nominal
         return read_controller_calibration(self.calibration, nominal)

@@ -13,7 +13,8 @@ from realsim.app.console import Console, Tick
 from realsim.app.outputs import require_free_file, require_free_folder
 from realsim.app.plan.request import Place, PlanRequest
 from realsim.errors import InputError
-from realsim.robots.kinematics import CHAINS, DhChain
+from realsim.robots.arm import find_arm, known_chains
+from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Mount
 from realsim.untrusted.json_text import read_json
 from realsim_capture_plans.plan_files.evidence import JointUnit
@@ -55,7 +56,7 @@ def run_plan(request: PlanRequest, console: Console, *, advise: bool) -> bool:
         DegenerateError: fewer views are reachable than asked for.
     """
     place, config = request.place, request.config()
-    chain, mount = place.chain() or CHAINS["UR5"], place.camera_mount()
+    chain, mount = place.chain() or find_arm("ur5").chain, place.camera_mount()
     if advise:
         show_advice(request, chain, mount, config, console)
         return True
@@ -251,7 +252,8 @@ def _source_plan(
         chain = chain or found.reading.chain
     if chain is None:
         raise InputError(
-            f"{source} does not say which robot it is for; choose --robot ({', '.join(CHAINS)})."
+            f"{source} does not say which robot it is for; choose --robot "
+            f"({', '.join(known_chains())})."
         )
     plan = plan_of_path(
         found,

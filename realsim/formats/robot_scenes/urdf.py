@@ -44,16 +44,6 @@ def rpy_from_R(R: ArrayLike) -> Array:
     return np.array([roll, pitch, yaw])
 
 
-def R_from_rpy(rpy: ArrayLike) -> Array:
-    """Return the rotation (3, 3) of roll, pitch, yaw (3,) [rad]."""
-    roll, pitch, yaw = np.asarray(rpy, dtype=np.float64)
-    x, y, z = (
-        se3.exp_so3(angle * axis) for angle, axis in zip((roll, pitch, yaw), np.eye(3), strict=True)
-    )
-    product: Array = z @ y @ x
-    return product
-
-
 SCENE_FILE, SCRIPT, WORLD_FILE = "scene.json", "load_pybullet.py", "world.urdf"
 FORMAT, VERSION = "realsim URDF scene", 1
 ABOUT = (

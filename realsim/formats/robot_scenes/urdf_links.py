@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats.robot_scenes.mesh_reading import colliding, scene_mesh
-from realsim.formats.robot_scenes.urdf import R_from_rpy
-from realsim.geometry import se3
 from realsim.geometry.mesh import mass_properties, merged, transformed
 from realsim.records import Mesh
+from realsim.robots.urdf import floats, origin_of, sizes
 from realsim.untrusted.xml_tree import read_xml
 
 Array = NDArray[np.float64]
@@ -219,57 +218,24 @@ def _box(element: Element, where: str) -> tuple[Array, Array] | None:
     box = shapes[0].find("geometry/box") if len(shapes) == 1 else None
     if box is None:
         return None
-    return origin_of(shapes[0], where), _sizes(box, "size", 3, where)
+    return origin_of(shapes[0], where), sizes(box, "size", 3, where)
 
 
 def _primitive(shape: Element, where: str) -> Mesh:
     import trimesh
 
     if shape.tag == "box":
-        solid = trimesh.creation.box(_sizes(shape, "size", 3, where))
+        solid = trimesh.creation.box(sizes(shape, "size", 3, where))
     elif shape.tag == "cylinder":
-        radius, length = (float(_sizes(shape, n, 1, where)[0]) for n in ("radius", "length"))
+        radius, length = (float(sizes(shape, n, 1, where)[0]) for n in ("radius", "length"))
         solid = trimesh.creation.cylinder(radius, length, sections=ROUND_SIDES)
     elif shape.tag == "sphere":
-        solid = trimesh.creation.icosphere(radius=float(_sizes(shape, "radius", 1, where)[0]))
+        solid = trimesh.creation.icosphere(radius=float(sizes(shape, "radius", 1, where)[0]))
     else:
         raise InputError(
             f"{where} has a <{shape.tag[:40]}>; mesh, box, cylinder and sphere are read."
         )
     return Mesh(vertices=np.array(solid.vertices), faces=np.array(solid.faces))
-
-
-def _sizes(shape: Element, key: str, count: int, where: str) -> Array:
-    values = floats(shape.get(key, ""), (count,), f"the {key} of a {shape.tag} of {where}")
-    if not np.all((values > 0) & (values < 1e3)):
-        raise InputError(f"{where} has a {shape.tag} of {values.tolist()} m; positive ones are.")
-    return values
-
-
-def origin_of(element: Element, where: str) -> Array:
-    """Return the transform (4, 4) of an element's <origin>; without one it is the identity."""
-    origin = element.find("origin")
-    if origin is None:
-        return np.eye(4)
-    xyz = floats(origin.get("xyz", "0 0 0"), (3,), f"the xyz of an origin of {where}")
-    rpy = floats(origin.get("rpy", "0 0 0"), (3,), f"the rpy of an origin of {where}")
-    return se3.from_rt(R_from_rpy(rpy), xyz)
-
-
-def floats(text: str, counts: tuple[int, ...], name: str) -> Array:
-    """Return the finite numbers of an attribute.
-
-    Raises:
-        InputError: other than as many finite numbers as one of the counts.
-    """
-    try:
-        values = np.array([float(word) for word in text.split()], dtype=np.float64)
-    except ValueError:
-        values = np.full(1, np.nan)
-    if len(values) not in counts or not np.all(np.isfinite(values)):
-        wanted = " or ".join(map(str, counts))
-        raise InputError(f"{name} is '{text[:60]}'; {wanted} finite numbers are expected.")
-    return values
 
 
 def _name(element: Element, where: str) -> str:

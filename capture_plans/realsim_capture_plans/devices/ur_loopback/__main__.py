@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from realsim.errors import RealsimError
-from realsim.robots.kinematics import CHAINS
+from realsim.robots.arm import ur_chains
 from realsim_capture_plans.devices.ur_loopback.robot import Controller, ControllerSetup
 from realsim_capture_plans.devices.ur_loopback.server import LoopbackServer
 
@@ -40,7 +40,7 @@ def _parser() -> argparse.ArgumentParser:
         "middle of the next move.",
     )
     parser.add_argument("--host", default="127.0.0.2", help="loopback address (127.0.0.2)")
-    parser.add_argument("--robot", choices=sorted(CHAINS), default="UR5e")
+    parser.add_argument("--robot", choices=sorted(ur_chains()), default="UR5e")
     parser.add_argument("--tcp", type=_numbers, default=[0.0] * 6, help="x,y,z,rx,ry,rz [m, rad]")
     parser.add_argument("--joints", type=_numbers, help="where the arm stands [rad]")
     parser.add_argument("--delta-a", type=_numbers, help="calibration of the DH a's [m]")
@@ -54,7 +54,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _controller(options: argparse.Namespace) -> Controller:
-    chain = CHAINS[options.robot]
+    chain = ur_chains()[options.robot]
     for name in ("delta_a", "delta_theta"):
         if getattr(options, name) is not None:
             chain = replace(chain, **{name: np.array(getattr(options, name))})

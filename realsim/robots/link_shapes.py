@@ -1,0 +1,152 @@
+"""The bodies of an arm's links: convex shapes fixed in the frames of the nominal links.
+
+`link_placements` says where the links are on a chain with its controller's calibration. Two joint
+axes that are parallel but for a milliradian have their common normal tens of metres away, and the
+calibrated DH frames 2 and 3 sit there, turned by as much as they like, while the links themselves
+are where they always were. So the links are placed from the nominal chain: link i's nominal frame
+is moved rigidly with the calibrated frame i, from where both agree best.
+"""
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from realsim.errors import InputError
+from realsim.geometry import se3
+from realsim.geometry.mesh_files import load_mesh
+from realsim.robots.shapes import Box, Kind, Shape
+from realsim.robots.urdf import UrdfShape
+
+if TYPE_CHECKING:
+    from realsim.robots.arm import RobotArm
+
+Array = NDArray[np.float64]
+Axis = Literal["x", "y", "z"]
+Rod = tuple[
+    str, int, Literal["cylinder", "capsule"], Axis, float, float, float, tuple[float, float]
+]
+"""Part, DH frame, kind, axis, from and to along the axis, radius, the two other coordinates in
+the order of the axes [mm]."""
+Block = tuple[str, int, tuple[float, float, float], tuple[float, float, float]]
+"""Part, DH frame, least and greatest corner [mm]."""
+PLACEMENT_SAMPLES = 64
+"""Joint vectors over which nominal and calibrated link frames are brought together."""
+LARGEST_MM_SCALE = 0.02
+"""A URDF whose meshes are in millimetres scales them by 0.001."""
+_KINDS: dict[str, Kind] = {
+    "box": "box", "cylinder": "cylinder", "capsule": "capsule", "sphere": "sphere"
+}  # fmt: skip
+CALIBRATION_LIMIT_M = 0.020
+"""A controller's calibration moves a link by 1-5 mm; another arm's calibration by 100 mm."""
+
+
+def rod_shape(rod: Rod) -> Shape:
+    """Return a round body."""
+    part, frame, kind, axis, start, end, radius, across = rod
+    k = "xyz".index(axis)
+    center = np.insert(np.array(across, dtype=np.float64), k, (start + end) / 2)
+    axes = np.roll(np.eye(3), k + 1, axis=0)  # its third column is the rod's axis
+    return Shape(
+        part=part,
+        frame=frame,
+        kind=kind,
+        size_m=(radius / 1e3, (end - start) / 1e3),
+        T_frame_shape=se3.from_rt(axes, center / 1e3),
+    )
+
+
+def block_shape(block: Block) -> Shape:
+    """Return a box."""
+    part, frame, low, high = block
+    lower, upper = np.array(low) / 1e3, np.array(high) / 1e3
+    x, y, z = (upper - lower).tolist()
+    return Shape(
+        part=part,
+        frame=frame,
+        kind="box",
+        size_m=(x, y, z),
+        T_frame_shape=se3.from_translation((lower + upper) / 2),
+    )
+
+
+def link_shape(shape: UrdfShape, part: str, frame: int, T_frame_link: Array) -> Shape:
+    """Return a URDF's shape as a convex body; a mesh becomes its convex hull.
+
+    Raises:
+        InputError: the mesh cannot be read, or is flat.
+        UnitError: its size contradicts metres.
+    """
+    T = T_frame_link @ shape.T_link_shape
+    if shape.file is None:
+        return Shape(part=part, frame=frame, kind=_KINDS[shape.kind], size_m=shape.size_m,
+                     T_frame_shape=T)  # fmt: skip
+    scale = np.array(shape.size_m)
+    unit = "mm" if np.abs(scale).max() < LARGEST_MM_SCALE else "m"
+    mesh = load_mesh(shape.file, unit, [])  # what it looks like does not matter
+    points = mesh.vertices * scale * (1e3 if unit == "mm" else 1.0)
+    try:
+        corners = points[ConvexHull(points).vertices]
+    except (QhullError, ValueError) as error:
+        raise InputError(
+            f"{shape.file}, the shape of {part}, has no volume; a solid is needed."
+        ) from error
+    return Shape(part=part, frame=frame, kind="convex", size_m=(), T_frame_shape=T, points=corners)
+
+
+def link_placements(arm: "RobotArm") -> Array:
+    """Return (n + 1, 4, 4): where link i's nominal frame is in the calibrated DH frame i [m].
+
+    The identity for base and flange: what is fixed to the flange is placed by the calibrated
+    chain exactly. In between the mean of `C_i(q)^-1 N_i(q)` over joint vectors q, which is the
+    same for all q but for the calibration's millimetres.
+
+    Raises:
+        InputError: the calibration moves a link farther than any calibration does.
+    """
+    chain, n = arm.chain, arm.joints
+    nominal = chain.nominal()
+    placements = np.tile(np.eye(4), (n + 1, 1, 1))
+    if np.array_equal(chain.link_frames(np.ones(n)), nominal.link_frames(np.ones(n))):
+        return placements
+    q = np.random.default_rng(0).uniform(-np.pi, np.pi, (PLACEMENT_SAMPLES, n))
+    is_at, should = chain.link_frames(q), nominal.link_frames(q)
+    for i in range(1, n + 1):
+        between = se3.invert(is_at[:, i]) @ should[:, i]
+        if i < n:
+            R = se3.mean_rotation(between[:, :3, :3])
+            # The rotations' scatter swings the far-away origin; the mean keeps what is common.
+            at = np.mean(is_at[:, i, :3, :3].swapaxes(-1, -2) @ _offset(should, is_at, i), axis=0)
+            placements[i] = se3.from_rt(R, at[:, 0])
+        moved = is_at[:, i] @ placements[i]
+        shift = float(np.linalg.norm(moved[:, :3, 3] - should[:, i, :3, 3], axis=-1).max())
+        if shift > CALIBRATION_LIMIT_M:
+            raise InputError(
+                f"the calibration moves the {arm.link_names[i]} of a nominal {chain.name} by up to "
+                f"{shift * 1e3:.0f} mm; an arm's own calibration moves it by 1 to 5 mm. Is the "
+                "calibration file another arm's, or the model another?"
+            )
+    return placements
+
+
+def _offset(should: Array, is_at: Array, i: int) -> Array:
+    return (should[:, i, :3, 3] - is_at[:, i, :3, 3])[..., None]
+
+
+def finite_box(name: str, box: Box, reach_m: float) -> Shape:
+    """Return a box as a shape in base; bounds beyond `reach_m` end there [m]."""
+    lower, upper = np.clip(box.lower, -reach_m, reach_m), np.clip(box.upper, -reach_m, reach_m)
+    if np.any(upper <= lower):
+        raise InputError(
+            f"'{name}' from {box.lower} to {box.upper} m lies beyond {reach_m} m of the arm's "
+            "base. Boxes are in metres in the controller's base; were millimetres given?"
+        )
+    x, y, z = (upper - lower).tolist()
+    return Shape(
+        part=name,
+        frame=0,
+        kind="box",
+        size_m=(x, y, z),
+        T_frame_shape=se3.from_translation((lower + upper) / 2),
+    )
