@@ -114,7 +114,7 @@ def read_chain(folder: RobotFolder, file: str, base: str, flange: str) -> UrdfCh
             mimic joint, limits in degrees, a mesh that is not there.
     """
     path = folder.file(file, "the URDF")
-    root = read_xml(path)
+    root = read_xml(path, namespaces=False)
     if root.tag != "robot":
         raise InputError(f"{path} begins with <{root.tag[:60]}>; a URDF begins with <robot>.")
     return _Reader(folder, path, root).chain(base, flange)

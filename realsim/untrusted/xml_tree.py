@@ -19,29 +19,32 @@ DEEPEST = 100
 """Elements in elements; the kinematic chain of a robot is nested 30 deep."""
 
 
-def read_xml(path: Path | str, *, most_bytes: float = MOST_BYTES) -> ElementTree.Element:
+def read_xml(
+    path: Path | str, *, most_bytes: float = MOST_BYTES, namespaces: bool = True
+) -> ElementTree.Element:
     """Return the root of an XML file.
 
     Args:
         path: the file.
         most_bytes: largest file that is read [bytes].
+        namespaces: whether prefixes stand for something; URDF has those that nobody declared.
 
     Raises:
         InputError: it is missing, too large, not XML, has a doctype or entities of its own, more
             than a million elements, or is nested deeper than 100.
     """
     path = Path(path)
-    return parsed_xml(checked_bytes(path, most_bytes), str(path))
+    return parsed_xml(checked_bytes(path, most_bytes), str(path), namespaces)
 
 
-def parsed_xml(data: bytes, where: str) -> ElementTree.Element:
+def parsed_xml(data: bytes, where: str, namespaces: bool = True) -> ElementTree.Element:
     """Return the root of an XML document; `where` names it in messages.
 
     Raises:
         InputError: as `read_xml`.
     """
     builder = _Builder(where)
-    parser = expat.ParserCreate(namespace_separator="}")
+    parser = expat.ParserCreate(namespace_separator="}" if namespaces else None)
     parser.buffer_text = True
     parser.StartElementHandler = builder.start
     parser.EndElementHandler = builder.end
