@@ -185,7 +185,7 @@ def calibrate_from_poses(
         Ts_base_ee: (N, 4, 4) the controller's tool poses [m].
         Ts_cam_board: (N, 4, 4) the target in the camera [m].
         labels: a name per view.
-        joints: (N, 6) joint angles [rad].
+        joints: (N, n) joint angles [rad].
         config: as for images; its joint fit is replaced by one with lens and board held.
         grid: the virtual grid.
         arm: the arm's kinematics, used with the joints.

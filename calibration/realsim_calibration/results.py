@@ -67,7 +67,7 @@ class ViewReport:
     T_base_ee: Array
     """(4, 4) as the controller gave it [m]."""
     joints: Array | None
-    """(6,) joint angles [rad]; None where they are not known."""
+    """(n,) joint angles [rad]; None where they are not known."""
     point_ids: NDArray[np.int64]
     """(n,) which points of the target were detected."""
     uv: Array
@@ -129,7 +129,7 @@ class HandEyeReport:
     map_scores: tuple[tuple[str, float], ...]
     """(candidate, geometric mean of the unseen views' RMS [px]), "none" first."""
     joint_offsets: Array | None
-    """(6, 2) joint zero offsets and their 1-sigma [rad] where joints and arm are known. Those of
+    """(n, 2) joint zero offsets and their 1-sigma [rad] where joints and arm are known. Those of
     the first and the last joint cannot be told from another board or camera place."""
     sigma_px: float
     """Unit-weight standard deviation of a corner coordinate [px]."""
@@ -162,7 +162,7 @@ class HandEyeReport:
     def __post_init__(self) -> None:
         """Check the arrays' shapes and freeze them."""
         _freeze(self, X=(4, 4), Z=(4, 4), X_alone=(4, 4), Z_alone=(4, 4), X_covariance=(6, 6),
-                X_alone_covariance=(6, 6), intrinsics_covariance=(12, 12), joint_offsets=(6, 2),
+                X_alone_covariance=(6, 6), intrinsics_covariance=(12, 12), joint_offsets=(None, 2),
                 information=(None, None))  # fmt: skip
 
     @property

@@ -103,6 +103,7 @@ def screen(
         DegenerateError: too few views, or a motion that does not determine the hand-eye.
     """
     in_hand = config.mode == "eye_in_hand"
+    _require_joints_of(arm, views)
     candidates, rejected = _candidates(views, target, intrinsics0, config)
     candidates, turned = _counted_from_one_end(candidates, target, intrinsics0)
     A, C = _stacks(candidates)
@@ -143,9 +144,19 @@ def screen(
 
 
 def joints_of(candidates: Sequence[Candidate]) -> Array | None:
-    """Return the joints (views, 6) [rad], None where a view has none."""
+    """Return the joints (views, n) [rad], None where a view has none."""
     found = [c.view.joints for c in candidates]
     return None if any(q is None for q in found) else np.array(found, dtype=np.float64)
+
+
+def _require_joints_of(arm: DhArm | None, views: Sequence[BoardView]) -> None:
+    """Raise if the views' joints are not as many as the arm's."""
+    for view in views:
+        if arm is not None and view.joints is not None and len(view.joints) != arm.joints:
+            raise InputError(
+                f"view {view.label} has {len(view.joints)} joint angles, and a {arm.name} has "
+                f"{arm.joints} joints. Name the arm that the views were taken with, or none."
+            )
 
 
 def _given(candidates: list[Candidate]) -> Array:

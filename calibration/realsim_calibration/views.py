@@ -78,7 +78,7 @@ class BoardView:
     name: str = ""
     """File name of the image, for messages; the index where it is empty."""
     joints: Array | None = None
-    """(6,) joint angles [rad]; None where they are not known."""
+    """(n,) joint angles [rad]; None where they are not known."""
 
     def __post_init__(self) -> None:
         """Check that the pose is rigid and freeze it."""

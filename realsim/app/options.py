@@ -46,6 +46,41 @@ def seed(what: str = "Of everything random: the same seed, the same result.") ->
     return click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help=what)
 
 
+class ArmName(click.ParamType[str]):
+    """An arm that is found by name, or the folder of one: see `realsim.robots`."""
+
+    name = "arm"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the text; whether there is such an arm is seen when it is looked for."""
+        return str(value)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[Any]:
+        """Return the names that begin so, or let the shell find a folder."""
+        from click.shell_completion import CompletionItem
+
+        from realsim.robots.robot_files import names_of
+
+        found = [CompletionItem(n) for n in names_of("arm") if n.startswith(incomplete.lower())]
+        return found or [CompletionItem(incomplete, type="dir")]
+
+
+def arm(what: str, default: str | None = None) -> Decorator:
+    """Return the option that names the arm; its older name `--robot` still works."""
+
+    def older(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
+        if value is not None:
+            ctx.default_map = {**(ctx.default_map or {}), "arm": value}
+
+    new = click.option(
+        "--arm", type=ArmName(), default=default, show_default=True, metavar="NAME", help=what
+    )
+    old = click.option("--robot", hidden=True, is_eager=True, expose_value=False, callback=older)
+    return lambda command: new(old(command))
+
+
 class PlanName(click.ParamType[str]):
     """A plan file, or one that comes with realsim: `shipped:NAME`."""
 

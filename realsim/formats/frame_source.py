@@ -29,7 +29,7 @@ class SourceFrame:
     depth_counts: NDArray[np.uint16] | None = None
     """(H, W) counts of the source's depth unit on the colour image's pixels, 0 = none."""
     joints: Array | None = None
-    """(6,) joint angles [rad] at the time of the frame."""
+    """(n,) joint angles [rad] at the time of the frame."""
     T_base_ee: Array | None = None
     """(4, 4) flange in the robot's base [m]."""
     T_world_cam: Array | None = None

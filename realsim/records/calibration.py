@@ -124,7 +124,7 @@ class ArmErrorMap(RobotMap):
         object.__setattr__(self, "T_flange_tool", rigid(self.T_flange_tool, "T_flange_tool"))
 
     def corrected(self, T: ArrayLike, joints: ArrayLike) -> Array:
-        """Return where the robot really is (..., 4, 4) at poses (..., 4, 4) and joints (..., 6)."""
+        """Return where the robot really is (..., 4, 4) at poses (..., 4, 4) and joints (..., n)."""
         moved = se3.invert(self.arm.forward(joints)) @ self.arm.corrected(self.errors).forward(
             joints
         )
@@ -196,7 +196,7 @@ class HandEye:
 
         Args:
             Ts_base_ee: the controller's poses [m].
-            joints: (..., 6) joint angles [rad]; needed where the robot's error is one of its arm.
+            joints: (..., n) joint angles [rad]; needed where the robot's error is one of its arm.
 
         Raises:
             InputError: the robot's error map needs joints and there are none.

@@ -100,7 +100,7 @@ class View:
     T_base_ee: Array | None = None
     """(4, 4) the controller's tool pose in its base [m]; None for data sets without a robot."""
     joints: Array | None = None
-    """(6,) joint angles [rad]; None where they are not known."""
+    """(n,) joint angles [rad]; None where they are not known."""
     T_world_cam: Array | None = None
     """(4, 4) camera in world [m]; None before calibration."""
     time_s: float = 0.0

@@ -71,7 +71,7 @@ def a_plan(n: int = 3) -> CapturePlan:
 
 def test_a_plan_is_made_and_written(realsim: Callable[..., Done]) -> None:
     done = realsim(
-        "plan", "--views", 4, "--quiet", "--out", "a.json", "--robot", "ur5e", "--no-pictures"
+        "plan", "--views", 4, "--quiet", "--out", "a.json", "--arm", "ur5e", "--no-pictures"
     )
     assert done.code == 0, done.err
     plan = load_plan("a.json")
@@ -122,7 +122,7 @@ def test_a_plan_that_collides_ends_with_1_and_is_named(realsim: Callable[..., Do
     rows = np.stack([plan.home, plan.home + np.eye(6)[1], plan.home])
     header = ",".join(f"q{j}_rad" for j in range(1, 7))
     Path("p.csv").write_text("\n".join([header, *(",".join(map(repr, q)) for q in rows.tolist())]))
-    where = ("--robot", "UR5", "--center", "0.4,0.1,0.05")
+    where = ("--arm", "UR5", "--center", "0.4,0.1,0.05")
     done = realsim("plan-convert", "p.csv", "p.json", *where)
     assert done.code == 1 and "view 0 -> view 1" in done.err and "table" in done.err
     assert load_plan("p.json").metrics["colliding_legs"] == 2

@@ -7,8 +7,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import project, undistort
 from realsim.records import Chessboard
-from realsim.robots.arm import UR5 as UR5_ARM
-from realsim.robots.arm import UR5E as UR5E_ARM
+from realsim.robots.arm import find_arm, known_chains
 from realsim_calibration import (
     HandEyeConfig,
     TargetDetection,
@@ -86,17 +85,50 @@ def test_white_robot_errors_get_no_map(simulate):
     assert np.allclose(r.X, r.X_alone, atol=2e-5)
 
 
-def test_the_arm_is_told_by_joints_and_poses():
+@pytest.mark.parametrize("name", ["ur5e", "panda"])
+def test_the_arm_is_told_by_joints_and_poses(name):
     rng = np.random.default_rng(5)
-    joints = rng.uniform(-2, 2, (12, 6))
+    arm = find_arm(name).chain
+    joints = rng.uniform(arm.limits.lower, arm.limits.upper, (12, arm.joints)) / 3
     tool = se3.from_rt(se3.exp_so3([0.3, 0.1, -0.2]), [0.01, 0.02, 0.15])
-    bent = UR5E_ARM.corrected(rng.normal(size=24) * np.repeat([3e-4, 3e-4], 12))
+    bent = arm.corrected(rng.normal(size=4 * arm.joints) * 3e-4)
     Ts = bent.forward(joints) @ tool
-    arms = (UR5_ARM, UR5E_ARM)
-    assert matching_arm(joints, Ts, arms, RobotErrorConfig()) is UR5E_ARM
+    # A Panda and an FR3 are one arm by their numbers; those of other joint counts are passed over.
+    arms = [arm, *(c for c in known_chains().values() if c is not arm)]
+    assert matching_arm(joints, Ts, arms, RobotErrorConfig()) is arm
     other = se3.random_transform(rng, 12)
     assert matching_arm(joints, other, arms, RobotErrorConfig()) is None
     assert matching_arm(joints[:3], Ts[:3], arms, RobotErrorConfig()) is None
+
+
+def test_a_bent_pandas_errors_are_found_in_its_views(simulate):
+    arm = find_arm("panda").chain
+    sim = simulate(1, views=60, robot=(0.0, 0.0))
+    rng = np.random.default_rng(1)
+    bent = arm.corrected(rng.normal(size=28) * np.repeat([1e-3, 3e-4], 14))
+    # The pictures stay: the hand is really there, so the bent arm's joints are those that reach it.
+    T_base = se3.from_translation([0.0, 0.0, 0.1])
+    views, real = [], []
+    for k, ee in enumerate(sim.truth_ee):
+        q, of = bent.inverse_branches((T_base @ ee)[None])
+        if len(of):
+            joints = q[int(np.argmin(np.abs(q - find_arm("panda").home).max(-1)))]
+            told = arm.forward(joints) @ se3.exp(rng.normal(scale=5e-5, size=6))
+            views.append(replace(sim.views[k], T_base_ee=told, joints=joints))
+            real.append(T_base @ ee)
+    assert len(views) > 30
+    plain = calibrate_hand_eye_report(views, sim.board, sim.intrinsics0)
+    found = calibrate_hand_eye_report(views, sim.board, sim.intrinsics0, arm=arm.bare())
+    assert found.map_name == "arm" and found.joint_offsets.shape == (7, 2)
+    Ts = np.array([v.T_base_ee for v in views])
+    mended = found.robot_map.corrected(Ts, np.array([v.joints for v in views])) @ found.X
+
+    def apart_mm(cameras):
+        # What is left after the best common move: where the base lies is no error of the arm.
+        gap = se3.invert(np.array(real) @ sim.T_ee_cam) @ cameras
+        return 1e3 * np.linalg.norm(gap[:, :3, 3] - np.median(gap[:, :3, 3], axis=0), axis=1).mean()
+
+    assert apart_mm(mended) < 0.5 * apart_mm(Ts @ plain.X_alone)
 
 
 def test_terms_that_the_lens_refused_cannot_fold_the_image(simulate):
@@ -114,3 +146,12 @@ def test_terms_that_the_lens_refused_cannot_fold_the_image(simulate):
     corner = np.array([[0.0, 0.0], [1279.0, 0.0], [0.0, 719.0], [1279.0, 719.0]])
     _, valid = undistort(camera, corner)
     assert valid.all()
+
+
+def test_joints_of_another_arm_are_named(simulate):
+    sim = simulate(1, views=12)
+    views = [replace(v, joints=np.zeros(6)) for v in sim.views]
+    with pytest.raises(InputError, match="6 joint angles, and a Panda has 7"):
+        calibrate_hand_eye_report(
+            views, sim.board, sim.intrinsics0, arm=find_arm("panda").chain.bare()
+        )

@@ -5,7 +5,7 @@ import pytest
 
 from realsim.geometry import camera, se3
 from realsim.records import ArmErrorMap, CameraIntrinsics, RobotErrorMap
-from realsim.robots.arm import UR5E as UR5E_ARM
+from realsim.robots.arm import find_arm
 from realsim_calibration.fit.joint_solve import (
     FLAT,
     JointConfig,
@@ -220,13 +220,18 @@ def test_records_of_maps_give_the_basis_errors():
             record.beyond(Ts).max() == 0
             and record.beyond(Ts @ se3.exp([2, 0, 0, 3, 0, 0])).min() > 1
         )
-    joints = rng.uniform(-2, 2, (15, 6))
+
+
+@pytest.mark.parametrize("name", ["ur5e", "panda"])
+def test_an_arms_basis_is_the_derivative_of_the_corrected_arm(name):
+    rng, arm = np.random.default_rng(2), find_arm(name).chain.bare()
+    joints = rng.uniform(-2, 2, (15, arm.joints))
     tool = se3.from_rt(se3.exp_so3([0.1, 0.2, 0.3]), [0.0, 0.01, 0.2])
-    held = UR5E_ARM.forward(joints) @ tool
-    basis = arm_basis(UR5E_ARM, joints, held, RobotErrorConfig())
+    held = arm.forward(joints) @ tool
+    basis = arm_basis(arm, joints, held, RobotErrorConfig())
     assert np.allclose(basis.T_flange_tool, tool, atol=1e-12)
-    w = rng.normal(size=24)
-    record = map_record(basis, w, held, UR5E_ARM)
+    w = rng.normal(size=4 * arm.joints)
+    record = map_record(basis, w, held, arm)
     assert isinstance(record, ArmErrorMap)
     exact = se3.log(se3.invert(held) @ record.corrected(held, joints))
     assert np.allclose(exact, basis.columns @ w, atol=3e-6)  # the basis is linear, the arm is not

@@ -107,7 +107,7 @@ def test_csv_of_another_robot_or_mount_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="mm from those of this robot"):
         other = d405_mount(se3.from_translation([0.0, 0.065, 0.035]))
         import_plan(tmp_path / "p.csv", chain=UR5, mount=other)
-    with pytest.raises(InputError, match="--robot"):
+    with pytest.raises(InputError, match="--arm"):
         import_plan(tmp_path / "p.csv", mount=MOUNT)
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from realsim_calibration.fit.joint_solve import JointProblem, JointState
 from realsim_calibration.fit.linear_model import LinearModel
-from realsim_calibration.fit.robot_error import ARM_ANGLES, ErrorBasis, RobotErrorConfig
+from realsim_calibration.fit.robot_error import ErrorBasis, RobotErrorConfig
 
 Array = NDArray[np.float64]
 CURVATURE_STEP = 0.3
@@ -138,7 +138,7 @@ def estimate_arm(
     """
 
     def factors(x: Array) -> Array:
-        return np.repeat(np.exp(np.clip(x[2:], -7.0, 7.0)), ARM_ANGLES)
+        return np.repeat(np.exp(np.clip(x[2:], -7.0, 7.0)), len(basis.unit) // 2)
 
     def deviance(x: Array) -> float:
         ratio, price = _ratio_prior(x[:2], config.most, config)
@@ -147,7 +147,7 @@ def estimate_arm(
 
     start = np.array([*[float(np.log(config.bound))] * 2, 0.0, 0.0])
     x = _search(deviance, start, 2 * config.evaluations)
-    # Twenty-four errors tell their own size only roughly: E[scale^2] is above the likeliest one.
+    # So few errors tell their own size only roughly: E[scale^2] is above the likeliest one.
     x[2:] += [_log_variance(deviance, x, k, errors.scale_log_sd) for k in (2, 3)]
     return _ratio_prior(x[:2], config.most, config)[0], basis.scaled(factors(x))
 

@@ -4,7 +4,7 @@ The controller's pose is off by e_i = B_i w + noise (right twist, rotation first
 error of every view per prior standard deviation of each weight:
 
     ee, base   linear in the pose's features, in tool or base axes: needs no joints (RobotErrorMap)
-    arm        errors of the arm's 24 Denavit-Hartenberg numbers: needs joints (ArmErrorMap)
+    arm        errors of the arm's 4 n Denavit-Hartenberg numbers: needs joints (ArmErrorMap)
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim.geometry.dh import JOINTS, DhArm
+from realsim.geometry.dh import DH_NUMBERS, DhArm
 from realsim.records import ArmErrorMap, RobotErrorMap
 from realsim.records.calibration import MAP_FEATURES
 
@@ -24,8 +24,6 @@ LEAST_SPREAD_M = 1e-4
 """Positions that differ by less carry no feature."""
 MIN_ARM_VIEWS = 6
 """Fewer poses do not tell one arm from another."""
-ARM_ANGLES = 12
-"""The first twelve of an arm's errors are angles, the others lengths."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -58,7 +56,7 @@ class RobotErrorConfig:
     """... and this many times better than any other arm."""
     scale_log_sd: float = 0.7
     """1-sigma of the logarithm of the re-estimated scales: a factor of 2 either way. Of an arm's
-    24 errors a capture shows a dozen, too few to tell the size of the hidden ones alone."""
+    24 or more errors a capture shows a dozen, too few to tell the size of the hidden ones alone."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -113,13 +111,14 @@ def map_basis(Ts: Array, kind: Literal["ee", "base"], strength: float, unit: flo
 
 
 def arm_basis(arm: DhArm, joints: Array, Ts: Array, config: RobotErrorConfig) -> ErrorBasis:
-    """Return the basis of errors of an arm at joints (views, 6) and controller poses (views, 4, 4).
+    """Return the basis of errors of an arm at joints (views, n) and controller poses (views, 4, 4).
 
     The controller's tool frame may stand off the flange: that constant is taken from the poses.
     """
     G = tool_in_flange(arm, joints, Ts)
     to_tool = se3.adjoint(se3.invert(G))
-    unit = np.repeat([config.arm_angle_sd, config.arm_length_sd], ARM_ANGLES)
+    # Of an arm's 4 n errors the first half are angles, the others lengths.
+    unit = np.repeat([config.arm_angle_sd, config.arm_length_sd], 2 * arm.joints)
     columns = to_tool @ arm.error_basis(joints) * unit
     return ErrorBasis(name="arm", kind="arm", columns=columns, unit=unit, T_flange_tool=G)
 
@@ -136,17 +135,25 @@ def matching_arm(
     """Return the arm whose kinematics explain the controller's poses, None where none does.
 
     The tool may stand anywhere on the flange, and the base may be turned: an arm fits when its
-    flange and the poses differ by two constants, better than any other by far.
+    flange and the poses differ by two constants, better than any other by far. Arms of the same
+    numbers count as one, the first.
     """
-    if joints.shape[-1] != JOINTS or len(joints) < MIN_ARM_VIEWS:
+    alike = [arm for arm in arms if arm.joints == joints.shape[-1]]
+    if not alike or len(joints) < MIN_ARM_VIEWS:
         return None
     misfits = sorted(
-        ((arm_misfit_m(arm, joints, Ts), arm) for arm in arms), key=lambda pair: pair[0]
+        ((arm_misfit_m(arm, joints, Ts), arm) for arm in alike), key=lambda pair: pair[0]
     )
-    best = misfits[0]
-    rest = misfits[1][0] if len(misfits) > 1 else np.inf
-    sure = best[0] < config.arm_fit_m and rest > config.arm_margin * best[0]
-    return best[1] if sure else None
+    least, best = misfits[0]
+    rest = min((m for m, arm in misfits[1:] if not _same_numbers(arm, best)), default=np.inf)
+    return best if least < config.arm_fit_m and rest > config.arm_margin * least else None
+
+
+def _same_numbers(first: DhArm, second: DhArm) -> bool:
+    """Return whether two arms' DH numbers are the same; base and flange do not tell them apart."""
+    return all(
+        np.allclose(getattr(first, name), getattr(second, name), atol=1e-6) for name in DH_NUMBERS
+    )
 
 
 def arm_misfit_m(arm: DhArm, joints: Array, Ts: Array) -> float:

@@ -261,12 +261,13 @@ def _covariance(
 
 
 def _offsets(best: _Choice, state: JointState, covariance: Array) -> Array | None:
-    """Return the joint zero offsets and their 1-sigma (6, 2) [rad] of an arm's fit."""
+    """Return the joint zero offsets and their 1-sigma (n, 2) [rad] of an arm's fit."""
     if best.basis is None or best.basis.kind != "arm":
         return None
-    unit = best.basis.unit[:6]
-    sd = np.sqrt(np.diag(covariance)[29:35])
-    return np.stack([state.weights[:6] * unit, sd * unit], -1)
+    joints = len(best.basis.unit) // 4
+    unit = best.basis.unit[:joints]
+    sd = np.sqrt(np.diag(covariance)[SHARED : SHARED + joints])
+    return np.stack([state.weights[:joints] * unit, sd * unit], -1)
 
 
 def _views(

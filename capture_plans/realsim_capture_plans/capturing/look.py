@@ -293,7 +293,7 @@ def check_arm(plan: CapturePlan, arm: Arm, config: CheckConfig) -> ArmState:
     Raises:
         InputError: by its name or by its flange pose it is another one.
     """
-    remedy = "Use the plan of this arm, or make one: `realsim plan --robot`."
+    remedy = "Use the plan of this arm, or make one: `realsim plan --arm`."
     if arm.name in known_chains() and arm.name != plan.robot:
         raise InputError(
             f"the plan was made for a {plan.robot}, this arm is a {arm.name}. {remedy}"

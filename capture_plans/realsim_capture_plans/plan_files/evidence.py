@@ -19,11 +19,11 @@ from realsim.robots.kinematics import DhChain
 Array = NDArray[np.float64]
 JointUnit = Literal["rad", "deg"]
 FULL_TURN_RAD = 2 * np.pi
-"""No joint of a UR arm turns farther than this from zero."""
+"""No joint of the usual arms turns farther than this from zero."""
 ROUNDING_RAD = 0.02
 """A controller reports a joint at its limit up to a degree beyond it."""
 MILLIMETRES_FROM_M = 3.0
-"""Coordinates beyond this are not metres: no UR reaches half as far."""
+"""Coordinates beyond this are not metres: no arm that is known here reaches half as far."""
 LEAST_TURN_DEG = 6.5
 """A path in which no joint ever exceeds this many degrees hardly moves; angles that are all smaller
 are radians."""
@@ -39,6 +39,8 @@ NOMINAL_OFF_M = 0.005
 from its own nominal numbers."""
 EXACT_M = 1e-4
 """Poses computed from the same joints agree to this [m], however they were rounded."""
+NOMINAL = 1e-6
+"""A robot of a known name has that model's nominal numbers to this [m or rad]."""
 TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
 """ROS base_link in the controller's base."""
 
@@ -77,8 +79,16 @@ class Reading:
         )
 
 
+def same_arm(first: DhChain, second: DhChain) -> bool:
+    """Return whether two chains are one in all nominal numbers, as a Panda's and an FR3's are."""
+    parts = ("a", "d", "alpha", "theta", "T_base_0", "T_n_ee")
+    return first.joints == second.joints and all(
+        np.abs(getattr(first, p) - getattr(second, p)).max() <= NOMINAL for p in parts
+    )
+
+
 def readings(joints: Array, Ts: Array, chains: tuple[DhChain, ...], *, tool: bool) -> list[Reading]:
-    """Return every way to read joints (N, 6) and poses (N, 4, 4), the best first.
+    """Return every way to read joints (N, n) and poses (N, 4, 4), the best first.
 
     Args:
         joints: as they were written.
@@ -98,7 +108,9 @@ def readings(joints: Array, Ts: Array, chains: tuple[DhChain, ...], *, tool: boo
             T[:, :3, 3] *= 1.0 if length == "m" else 1e-3
             offsets = T_flange_base @ (T if base == "base" else TURNED @ T)
             found.append(_reading(chain, unit, length, base, offsets, tool))
-    return sorted(found, key=lambda r: r.gap_m)
+    # What makes metres of millimetres and radians of degrees lets all positions fall together, and
+    # small gaps are then no proof: orientations that fit go first.
+    return sorted(found, key=lambda r: (r.gap_m > FITS_M, r.gap_deg > FITS_DEG, r.gap_m))
 
 
 def _reading(
@@ -128,7 +140,7 @@ def _reading(
 
 
 def why_poses_disagree(joints: ArrayLike, Ts_base_ee: ArrayLike, chain: DhChain) -> str:
-    """Return in words why flange poses (N, 4, 4) do not follow from joints (N, 6) by this chain."""
+    """Return in words why flange poses (N, 4, 4) do not follow from joints (N, n) by this chain."""
     q, Ts = np.asarray(joints, dtype=np.float64), np.asarray(Ts_base_ee, dtype=np.float64)
     others = tuple(c for c in known_chains(chain.joints).values() if c.name != chain.name)
     found = readings(q, Ts, (chain, *others), tool=False)
@@ -160,7 +172,7 @@ def why_poses_disagree(joints: ArrayLike, Ts_base_ee: ArrayLike, chain: DhChain)
 def proven_reading(
     joints: ArrayLike, Ts_base_tcp: ArrayLike, chain: DhChain | None, source: str
 ) -> Reading:
-    """Return how joints (N, 6) and tool poses (N, 4, 4) must be read.
+    """Return how joints (N, n) and tool poses (N, 4, 4) must be read.
 
     Args:
         joints: as they were written.
@@ -190,21 +202,22 @@ def proven_reading(
         ours = "" if own is None else f", for a {chain.name} {1e3 * own.gap_m:.0f} mm are left"
         raise InputError(
             f"{source} is a path of another robot: its joints and tool poses fit {best.text()}"
-            f"{ours}. Driven by a {chain.name} the camera would be elsewhere. Choose --robot "
+            f"{ours}. Driven by a {chain.name} the camera would be elsewhere. Choose --arm "
             f"{best.chain.name}, or take a path of this robot."
         )
-    second = next((r for r in found if r.chain is not best.chain), None)
+    turned = [r for r in found if best.gap_deg > FITS_DEG or r.gap_deg <= FITS_DEG]
+    second = next((r for r in turned if not same_arm(r.chain, best.chain)), None)
     undecided = max(CLEARLY * best.gap_m, NOMINAL_OFF_M)
     if chain is None and second is not None and second.gap_m < undecided:
         raise InputError(
             f"{source}: its poses do not tell which robot it is: {best.text()}, and "
-            f"{second.text()}. Say which with --robot."
+            f"{second.text()}. Say which with --arm."
         )
     return best
 
 
 def check_joint_unit(rows: Array, unit: JointUnit, names: list[str], source: str) -> None:
-    """Raise if joints (N, 6) can hardly be in the unit that they claim.
+    """Raise if joints (N, n) can hardly be in the unit that they claim.
 
     Args:
         rows: joints as they were written.
@@ -223,7 +236,7 @@ def check_joint_unit(rows: Array, unit: JointUnit, names: list[str], source: str
     if unit == "rad" and size[i, j] > FULL_TURN_RAD + ROUNDING_RAD:
         raise UnitError(
             f"{source}: joints that should be in radians look like degrees: {largest}, and no "
-            "joint of a UR turns farther than 2 pi = 6.283 rad. Convert them, or name the unit deg."
+            "joint turns farther than 2 pi = 6.283 rad. Convert them, or name the unit deg."
         )
     if unit == "deg" and len(rows) > 1 and size[i, j] < LEAST_TURN_DEG:
         raise UnitError(

@@ -82,7 +82,7 @@ def import_plan(
     if chain is None:
         if found.reading is None:
             raise InputError(
-                f"{path} does not say which robot it is for; choose --robot "
+                f"{path} does not say which robot it is for; choose --arm "
                 f"({', '.join(known_chains())})."
             )
         chain = found.reading.chain
@@ -200,8 +200,8 @@ def checked_center(center: ArrayLike) -> Array:
         raise InputError(f"the scene centre is {c.tolist()}; x,y,z in the robot's base [m].")
     if np.any(np.abs(c) > MILLIMETRES_FROM_M):
         raise UnitError(
-            f"the scene centre is {c.tolist()} m, and a UR5 reaches 0.85 m. These look like "
-            f"millimetres: {(c * 1e-3).tolist()} m?"
+            f"the scene centre is {c.tolist()} m, farther than any arm reaches. These look "
+            f"like millimetres: {(c * 1e-3).tolist()} m?"
         )
     return c
 
@@ -233,6 +233,6 @@ def _check_camera(path: JointPath, views: NDArray[np.intp], Ts_base_cam: Array) 
     if float(np.median(gap)) > FITS_M:
         raise InputError(
             f"{path.source}: its camera poses are {1e3 * float(np.median(gap)):.0f} mm from those "
-            "of this robot and this mount. Give the robot (--robot) and the mount (--mount) that "
+            "of this robot and this mount. Give the robot (--arm) and the mount (--mount) that "
             "the file was written for, or take out the cam_ columns."
         )

@@ -20,6 +20,7 @@ from realsim.untrusted.json_text import read_json
 from realsim_capture_plans.plan_files.evidence import (
     MILLIMETRES_FROM_M,
     check_joint_unit,
+    same_arm,
     why_poses_disagree,
 )
 from realsim_capture_plans.planning.record import (
@@ -42,8 +43,6 @@ POSE_RAD = 1e-5
 """The same for orientations [rad]."""
 SAME_JOINT_RAD = 1e-9
 """Corners of the segments may differ from the content's joints by this [rad]."""
-NOMINAL = 1e-6
-"""A robot of a known name has that model's nominal numbers to this [m or rad]."""
 
 
 def plan_to_json(plan: CapturePlan) -> dict[str, Any]:
@@ -161,7 +160,7 @@ def _check_units(content: dict[str, Any], source: str) -> None:
     for name, length in lengths.items():
         if np.any(np.abs(length) > MILLIMETRES_FROM_M):
             raise UnitError(
-                f"{source}: {name} is {length.tolist()} m, and a UR reaches no farther than 1.8 m. "
+                f"{source}: {name} is {length.tolist()} m, farther than any arm reaches. "
                 "These look like millimetres; write metres."
             )
 
@@ -171,14 +170,8 @@ def _check_model(plan: CapturePlan, source: str) -> None:
     arms = known_chains(plan.chain.joints)
     if plan.robot not in arms:
         return
-
-    def off(name: str) -> float:
-        parts = ("a", "d", "alpha", "theta")
-        given, own = plan.chain, arms[name]
-        return max(float(np.abs(getattr(given, p) - getattr(own, p)).max()) for p in parts)
-
-    if off(plan.robot) > NOMINAL:
-        alike = [name for name in arms if off(name) <= NOMINAL]
+    if not same_arm(plan.chain, arms[plan.robot]):
+        alike = [name for name in arms if same_arm(plan.chain, arms[name])]
         whose = f"those of a {alike[0]}" if alike else "of no known model"
         raise InputError(
             f"{source} says that its robot is a {plan.robot}, but its DH numbers are {whose}. "

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 
 from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET
+from realsim.app.options import FOLDER, JSON, QUIET, arm
 from realsim.app.outputs import GOES_ON
 
 
@@ -26,7 +26,7 @@ from realsim.app.outputs import GOES_ON
 @click.option("--board-poses", type=FOLDER, default=None, help="Camera poses instead of images.")
 @click.option("--camera", type=FOLDER, default=None, help="File with known intrinsics.")
 @click.option("--eye-to-hand", is_flag=True, help="The camera stands still, the target moves.")
-@click.option("--robot", default="", help="UR5 or UR5e; found out where joints are given.")
+@arm("Name or folder; found out where joints are given.")
 @click.option(
     "--out",
     type=GOES_ON,

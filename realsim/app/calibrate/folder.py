@@ -75,8 +75,8 @@ class FolderRequest:
     camera: Path | None = None
     """File with known intrinsics."""
     mode: Literal["eye_in_hand", "eye_to_hand"] = "eye_in_hand"
-    robot: str = ""
-    """Name of the arm; empty = the one that joints and poses prove, if any."""
+    arm: str = ""
+    """Name or folder of the arm; empty = the one that joints and poses prove, if any."""
 
 
 def made_of(images: Path) -> str:
@@ -116,11 +116,11 @@ def calibrate_folder(request: FolderRequest, console: Console) -> tuple[Calibrat
     views = [
         BoardView(
             index=k, T_base_ee=Ts[k], detection=found, name=folder.labels[k],
-            joints=None if joints is None or joints.shape[1] != 6 else joints[k],
+            joints=None if joints is None else joints[k],
         )
         for k, found in enumerate(detections)
     ]  # fmt: skip
-    arm = _arm(request.robot, views, console)
+    arm = _arm(request.arm, views, console)
     with console.stage("calibrate", f"{len(views)} views"):
         result = calibrate(views, target, intrinsics0=camera, arm=arm, config=config)
     return result, write_calibration(result, request, folder.images, console)
@@ -316,7 +316,7 @@ def _arm(name: str, views: Sequence[BoardView], console: Console) -> DhArm | Non
     if name:
         arm = find_arm(name).chain.bare()
         if not has_joints:
-            raise InputError(f"--robot {name} needs joint angles with every pose; there are none.")
+            raise InputError(f"--arm {name} needs joint angles with every pose; there are none.")
         return arm
     arm = arm_of(views) if has_joints else None
     if arm is not None:
@@ -346,7 +346,7 @@ def _from_pose_files(
         reading = _proven(given.robot, boards, None, request, console)
     Ts, joints = given.robot.poses(reading), given.robot.joints
     labels = [where or str(k) for k, where in enumerate(given.robot.where)]
-    arm = find_arm(request.robot).chain.bare() if request.robot else None
+    arm = find_arm(request.arm).chain.bare() if request.arm else None
     with console.stage("calibrate", f"{len(Ts)} pose pairs"):
         report = calibrate_from_poses(
             Ts, boards, labels=labels, joints=joints, config=config.hand_eye, arm=arm

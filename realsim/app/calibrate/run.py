@@ -82,7 +82,7 @@ def _run_session(source: Path, console: Console) -> bool:
 
 def _refuse_folder_options(options: dict[str, Any]) -> None:
     """Raise if an option was given that a session answers itself."""
-    mine = ("board", "poses", "reading", "key", "board_poses", "camera", "robot", "eye_to_hand")
+    mine = ("board", "poses", "reading", "key", "board_poses", "camera", "arm", "eye_to_hand")
     given = [f"--{name.replace('_', '-')}" for name in mine if options.get(name)]
     if options.get("out", OUT) != OUT:
         raise InputError(
@@ -117,5 +117,5 @@ def _request(source: Path, options: dict[str, Any]) -> Any:
         key=options["key"],
         camera=inside(options["camera"]),
         mode="eye_to_hand" if options["eye_to_hand"] else "eye_in_hand",
-        robot=options["robot"],
+        arm=options["arm"] or "",
     )

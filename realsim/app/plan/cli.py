@@ -8,11 +8,10 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.option_values import port_in_use
-from realsim.app.options import FOLDER, JSON, QUIET, PlanName, overwrite, seed
+from realsim.app.options import FOLDER, JSON, QUIET, PlanName, arm, overwrite, seed
 from realsim.app.outputs import GOES_ON, OutputFile
 
 REPLAY = OutputFile({".html": ("viser",), ".viser": ("viser",)}, "replay")
-ROBOT = click.Choice(["UR5", "UR5e"], case_sensitive=False)
 
 
 @click.command(
@@ -21,11 +20,11 @@ ROBOT = click.Choice(["UR5", "UR5e"], case_sensitive=False)
     examples=(
         "realsim plan --views 24 --out plan.json",
         "realsim plan --board --out board_plan.json --no-pictures",
-        "realsim plan --robot UR5e --advise --views 64",
+        "realsim plan --arm panda --advise --views 64",
     ),
 )
 @click.option("--views", type=click.IntRange(1, 4096), default=None, help="[256; 24 of a board]")
-@click.option("--robot", type=ROBOT, default="UR5", show_default=True, help="The arm's model.")
+@arm("The arm, or its folder.", default="ur5")
 @click.option(
     "--calibration", type=FOLDER, default=None,
     help="The arm's own calibration: the controller's calibration.conf, or ROS's YAML.",
@@ -125,7 +124,7 @@ def plan_show_command(
 )
 @click.argument("source", type=PlanName())
 @click.argument("dest", type=GOES_ON)
-@click.option("--robot", type=ROBOT, default=None, help="Arm of a path without tool poses.")
+@arm("Arm of a path without tool poses.")
 @click.option("--calibration", type=FOLDER, default=None, help="The arm's own calibration.")
 @click.option("--mount", type=FOLDER, default=None, help="Mount file.  [a D405 on a bracket]")
 @click.option("--center", default="", help="Scene centre x,y,z [m].  [where the cameras look]")
@@ -140,18 +139,17 @@ def plan_show_command(
 @JSON
 @QUIET
 def plan_convert_command(
-    source: str, dest: Path, joints_unit: Any, overwrite: bool, robot: str | None, as_json: bool,
+    source: str, dest: Path, joints_unit: Any, overwrite: bool, as_json: bool,
     quiet: bool, **place: Any,
 ) -> None:  # fmt: skip
     """Read other people's joint paths, and write plans for other programs.
 
     \b
     SOURCE  a realsim plan (.json or shipped:NAME), a joint path with tool
-            poses (.json), or a table (.csv with q1_rad ... q6_rad or
-            q1_deg ..., and via)
+            poses (.json), or a table (.csv with q1_rad ... or q1_deg ..., and via)
     DEST    .json    realsim plan
             .csv     table of joints and expected camera poses
-            .script  URScript program
+            .script  URScript program, of a UR
             FOLDER   GraspNet's camera_poses.npy and cam0_wrt_table.npy
 
     Robot, units and tool offset of a path are proven from its tool poses.
@@ -162,7 +160,7 @@ def plan_convert_command(
     from realsim.app.plan.request import Place
     from realsim.app.plan.run import run_convert
 
-    where = Place(robot=robot or "", **place)
+    where = Place(**place)
     console = Console(quiet=quiet, as_json=as_json)
     if not run_convert(source, dest, where, console, joints_unit=joints_unit, overwrite=overwrite):
         sys.exit(1)

@@ -23,8 +23,8 @@ LONGEST_M = 3.0
 class Place:
     """Arm, mount and surroundings, as the command line gives them."""
 
-    robot: str = ""
-    """Name of the arm's model; empty = UR5, or what a path's own poses prove."""
+    arm: str | None = None
+    """Name or folder of the arm; None = what a path's own poses prove."""
     calibration: Path | None = None
     """The controller's calibration.conf, or the YAML of ROS's ur_calibration."""
     mount: Path | None = None
@@ -42,14 +42,14 @@ class Place:
         """Return the arm, calibrated if a file was given; None where none was named."""
         from realsim.robots.controller_file import read_controller_calibration
 
-        if not self.robot:
+        if self.arm is None:
             if self.calibration is not None:
                 raise InputError(
-                    f"--calibration {self.calibration} needs --robot: the file does not name its "
+                    f"--calibration {self.calibration} needs --arm: the file does not name its "
                     "model."
                 )
             return None
-        nominal = find_arm(self.robot).chain
+        nominal = find_arm(self.arm).chain
         if self.calibration is None:
             return nominal
         return read_controller_calibration(self.calibration, nominal)

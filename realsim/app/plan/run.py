@@ -252,7 +252,7 @@ def _source_plan(
         chain = chain or found.reading.chain
     if chain is None:
         raise InputError(
-            f"{source} does not say which robot it is for; choose --robot "
+            f"{source} does not say which robot it is for; choose --arm "
             f"({', '.join(known_chains())})."
         )
     plan = plan_of_path(
