@@ -15,6 +15,7 @@ from realsim.errors import RealsimError
 
 COMMANDS = {
     "demo": "realsim.app.demo.cli:demo_command",
+    "robots": "realsim.app.robots.cli:ROBOTS",
     "plan": "realsim.app.plan.cli:plan_command",
     "plan-show": "realsim.app.plan.cli:plan_show_command",
     "plan-convert": "realsim.app.plan.cli:plan_convert_command",

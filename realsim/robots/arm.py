@@ -109,6 +109,8 @@ class RobotArm:
     """Visual meshes of a URDF: link, and the shape with its pose in that link's DH frame."""
     kept_apart: frozenset[tuple[int, int]]
     joint_names: tuple[str, ...]
+    urdf_mass_kg: float
+    """Of the URDF's base and links; 0 = not known."""
 
     @property
     def name(self) -> str:
@@ -231,6 +233,7 @@ def _arm_of(file: ArmFile, folder: RobotFolder) -> RobotArm:
         looks=_looks(urdf, arm),
         kept_apart=frozenset(file.kept_apart),
         joint_names=urdf.joint_names if urdf else tuple(f"joint{i + 1}" for i in range(arm.joints)),
+        urdf_mass_kg=urdf.mass_kg if urdf else 0.0,
     )
 
 

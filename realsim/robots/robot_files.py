@@ -20,6 +20,7 @@ from realsim.untrusted.own_json import OwnFile, from_json
 from realsim.untrusted.toml_text import read_toml
 
 Kind = Literal["arm", "hand"]
+KINDS: tuple[Kind, ...] = ("arm", "hand")
 FILE = "robot.toml"
 VARIABLE = "REALSIM_ROBOTS"
 """Folders of robots of the user's own, divided as in PATH."""
@@ -125,6 +126,27 @@ def names_of(kind: Kind) -> dict[str, Path]:
             if _kind_of(file) == kind:
                 found[file.parent.name] = file.parent
     return dict(sorted(found.items()))
+
+
+def kind_of(name: str) -> Kind:
+    """Return whether a robot, by its name or folder, is an arm or a hand.
+
+    Raises:
+        InputError: there is none, or its file does not say.
+    """
+    given = Path(name).expanduser()
+    if os.sep not in name and not (given / FILE).is_file():
+        for kind in KINDS:
+            if any(same_name(known, name) for known in names_of(kind)):
+                return kind
+        known = "; ".join(f"{kind}s: {', '.join(names_of(kind))}" for kind in KINDS)
+        raise InputError(f"there is no robot '{name[:80]}'. There are {known}.")
+    path = _folder(name, "arm")
+    found = read_toml(path / FILE)[1].get("kind")
+    for kind in KINDS:
+        if found == kind:
+            return kind
+    raise InputError(f'{path / FILE} has kind = {found!r}; "arm" and "hand" are accepted.')
 
 
 def same_name(first: str, second: str) -> bool:

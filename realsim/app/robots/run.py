@@ -1,0 +1,119 @@
+"""List the robots that are found by name; prove one."""
+
+from pathlib import Path
+
+import numpy as np
+
+from realsim.app.console import Console
+from realsim.app.robots.pictures import robot_picture
+from realsim.errors import RealsimError
+from realsim.pages import Cell, Page
+from realsim.robots.arm import RobotArm, find_arm
+from realsim.robots.check_arm import Finding, check_arm
+from realsim.robots.hand import Hand, find_hand
+from realsim.robots.robot_files import kind_of, names_of
+from realsim.store.atomic import write_bytes
+
+HEADER = ["name", "robot", "joints", "reach or opening", "payload or force"]
+
+
+def list_robots(page: Path, console: Console) -> None:
+    """Print all robots that are found by name, and write the page with their pictures."""
+    rows: list[list[str]] = []
+    document = Page(title="realsim robots", about="found by name: --arm, --hand")
+    for kind, title in (("arm", "Arms"), ("hand", "Hands")):
+        document.section(title, key=kind)
+        with console.stage(f"draw the {title.lower()}") as tick:
+            names = names_of(kind)
+            for k, name in enumerate(names):
+                try:
+                    robot = find_arm(name) if kind == "arm" else find_hand(name)
+                except RealsimError as error:
+                    rows.append([name, f"cannot be used: {error}", "", "", ""])
+                    document.text(f"{name}: {error}", "note")
+                    continue
+                rows.append(_row(name, robot))
+                document.picture(robot_picture(robot), f"{name}: {robot.title}; {_told(robot)}")
+                tick(k + 1, len(names))
+    write_bytes(page, document.encode())
+    console.table("Robots", HEADER, rows)
+    console.say(f"pictures: {page}")
+    console.result({"robots": [dict(zip(HEADER, row, strict=True)) for row in rows], "page": page})
+
+
+def check_robot(name: str, page: Path | None, console: Console) -> bool:
+    """Print what was found of a robot, and return whether all is right.
+
+    Raises:
+        InputError: there is no such robot, or its files do not make one.
+    """
+    robot: RobotArm | Hand
+    findings: list[Finding]
+    if kind_of(name) == "arm":
+        robot, findings = check_arm(name)
+    else:
+        from realsim.robots.check_hand import check_hand
+
+        robot, findings = check_hand(name)
+    wrong = [f for f in findings if not f.is_right]
+    rows = [[f.what, f.found, "right" if f.is_right else "WRONG"] for f in findings]
+    console.table(f"{robot.title} ({robot.name})", ["what", "found", ""], rows)
+    for finding in wrong:
+        console.warn(f"{finding.what}: {finding.found}. {finding.advice}")
+    console.say("nothing is wrong." if not wrong else f"{len(wrong)} of {len(findings)} are wrong.")
+    console.result({"name": robot.name, "right": not wrong, "findings": findings})
+    if page is not None:
+        write_bytes(page, _check_page(robot, findings).encode())
+        console.say(f"page: {page}")
+    return not wrong
+
+
+def _check_page(robot: RobotArm | Hand, findings: list[Finding]) -> Page:
+    page = Page(title=f"realsim robots: {robot.name}", about=f"{robot.title}; {_told(robot)}")
+    wrong = [f for f in findings if not f.is_right]
+    page.verdict(
+        "bad" if wrong else "good",
+        f"{len(wrong)} wrong." if wrong else "Nothing is wrong.",
+        "",
+        [[f.what, f.advice] for f in wrong],
+    )
+    page.picture(robot_picture(robot), robot.title)
+    page.table(
+        ["what", "found", ""],
+        [
+            [
+                f.what,
+                f.found,
+                Cell("right", kind="good") if f.is_right else Cell("wrong", kind="bad"),
+            ]
+            for f in findings
+        ],
+    )
+    return page
+
+
+def _row(name: str, robot: RobotArm | Hand) -> list[str]:
+    if isinstance(robot, Hand):
+        size = f"{1e3 * robot.max_opening_m:.0f} mm"
+        force = f"{robot.least_force_n:g} to {robot.greatest_force_n:g} N"
+        return [name, robot.title, "", size, force]
+    size, payload = f"{reach_m(robot):.2f} m", f"{robot.payload_kg:g} kg"
+    return [name, robot.title, str(robot.joints), size, payload]
+
+
+def _told(robot: RobotArm | Hand) -> str:
+    """Return the row's figures as a sentence's end."""
+    row = _row("", robot)
+    if isinstance(robot, Hand):
+        law = (
+            f"arc of {1e3 * robot.arc_radius_m:.1f} mm" if robot.arc_radius_m else "parallel slide"
+        )
+        return f"opens {row[3]}, {law}, {row[4]}"
+    return f"{row[2]} joints, reaches {row[3]}, carries {row[4]}"
+
+
+def reach_m(arm: RobotArm) -> float:
+    """Return how far the flange gets from the base's origin [m]."""
+    limits = arm.chain.limits
+    q = np.random.default_rng(0).uniform(limits.lower, limits.upper, (4000, arm.joints))
+    return float(np.linalg.norm(arm.chain.forward(q)[:, :3, 3], axis=1).max())
