@@ -1,0 +1,183 @@
+"""Arms as data: what is read agrees with other software's reading, and what is wrong is named."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from realsim.errors import InputError, RealsimError
+from realsim.geometry import se3
+from realsim.robots.arm import find_arm
+from realsim.robots.check_arm import check_arm
+from realsim.robots.compiled_chain import (
+    chain_numbers,
+    follow_lines,
+    frames_into,
+    jacobian_into,
+)
+from realsim.robots.dh_of_chain import dh_of_chain
+from realsim.robots.robot_files import VARIABLE, names_of
+
+ARMS = tuple(names_of("arm"))
+
+
+def forward(steps: np.ndarray, q: np.ndarray) -> np.ndarray:
+    T = steps[0]
+    for angle, step in zip(q, steps[1:], strict=True):
+        T = T @ se3.from_rt(se3.exp_so3([0.0, 0.0, angle]), np.zeros(3)) @ step
+    return T
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(1, 8), st.integers(0, 2**32 - 1))
+def test_every_chain_of_turning_joints_has_dh_numbers(joints: int, seed: int) -> None:
+    """Axes at any angle, parallel, intersecting or the same: the flange stays where it was."""
+    rng = np.random.default_rng(seed)
+    turns = rng.choice([0.0, np.pi / 2, -np.pi / 2, np.pi, 0.7], (joints + 1, 3))
+    shifts = rng.choice([0.0, 0.0, 0.1, -0.3], (joints + 1, 3))
+    steps = se3.from_rt(se3.exp_so3(turns), shifts)
+    arm = dh_of_chain("any", steps)
+    for q in rng.uniform(-3, 3, (3, joints)):
+        np.testing.assert_allclose(arm.forward(q), forward(steps, q), atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_every_arm_that_ships_is_right(name: str) -> None:
+    """Frames as pinocchio reads them, free at home, poses reached: nothing is wrong."""
+    _, findings = check_arm(name)
+    assert not [f for f in findings if not f.is_right]
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda", "xarm6"])
+def test_the_compiled_chain_says_what_the_other_says(name: str) -> None:
+    arm = find_arm(name)
+    n = arm.joints
+    T_tool = se3.from_rt(se3.exp_so3([0.2, -0.4, 0.9]), [0.01, 0.02, 0.1])
+    numbers = chain_numbers(arm.chain, T_tool)
+    T_a_base = se3.from_rt(se3.exp_so3([0.3, 0.1, -2.0]), [1.0, 2.0, 3.0])
+    q = arm.home + 0.3
+    frames, J = np.empty((n + 2, 3, 4)), np.empty((6, n))
+    frames_into(numbers, q, T_a_base, frames)
+    links = T_a_base @ arm.chain.link_frames(q)
+    np.testing.assert_allclose(frames[1:n], links[1:n, :3], atol=1e-12)
+    np.testing.assert_allclose(frames[n + 1], (links[n] @ T_tool)[:3], atol=1e-12)
+    jacobian_into(frames, J)
+    for i in range(n):
+        ends = [T_a_base @ arm.chain.forward(q + s * 1e-6 * np.eye(n)[i]) @ T_tool for s in (-1, 1)]
+        np.testing.assert_allclose(J[3:, i], (ends[1] - ends[0])[:3, 3] / 2e-6, atol=1e-8)
+    # Followed lines end where they should, for whatever number of joints.
+    T = arm.chain.forward(arm.home) @ T_tool
+    path, _, worst = follow_lines(
+        numbers, arm.home[None], T[None], np.array([[0.0, 0.0, 1.0]]), np.linspace(0, 0.05, 4)
+    )
+    assert worst[0] < 1e-9
+    rise = (arm.chain.forward(path[0]) @ T_tool)[:, 2, 3] - T[2, 3]
+    np.testing.assert_allclose(rise, np.linspace(0, 0.05, 4), atol=1e-9)
+
+
+# --- an arm of one's own, and its mistakes --------------------------------------------------------
+
+SIX = """<robot name="six"><link name="base"><collision><geometry>
+<cylinder radius="0.05" length="0.1"/></geometry></collision></link>
+{links}
+{joints}
+</robot>"""
+BALL = '<sphere radius="0.03"/>'
+AXES = ("0 0 1", "0 1 0", "0 1 0", "1 0 0", "0 1 0", "1 0 0")
+PLACES = ("0 0 0.2", "0 0 0.1", "0 0 0.35", "0.1 0 0", "0.25 0 0", "0.08 0 0")
+TOML = """kind = "arm"
+name = "six"
+payload_kg = 2.0
+home_rad = [0.0, 0.3, 0.6, 0.0, 0.7, 0.0]
+[urdf]
+file = "six.urdf"
+base = "base"
+flange = "flange"
+[limits]
+acceleration_rad_s2 = [5.0, 5.0, 5.0, 5.0, 5.0, 5.0]
+"""
+
+
+def six_joints(folder: Path) -> Path:
+    """Write an arm of six joints that is in no package."""
+    parents = ("base", *(f"l{i + 1}" for i in range(5)))
+    joints = "".join(
+        f'<joint name="j{i + 1}" type="revolute"><parent link="{parents[i]}"/>'
+        f'<child link="l{i + 1}"/><origin xyz="{PLACES[i]}"/><axis xyz="{AXES[i]}"/>'
+        f'<limit lower="-2.9" upper="2.9" velocity="2" effort="50"/></joint>'
+        for i in range(6)
+    )
+    joints += (
+        '<joint name="face" type="fixed"><parent link="l6"/><child link="flange"/>'
+        '<origin xyz="0.05 0 0" rpy="0 1.5707963 0"/></joint>'
+    )
+    links = "".join(
+        f'<link name="l{i + 1}"><collision><geometry><sphere radius="0.03"/></geometry>'
+        "</collision></link>"
+        for i in range(6)
+    )
+    folder.mkdir(parents=True)
+    (folder / "six.urdf").write_text(
+        SIX.format(links=links + '<link name="flange"/>', joints=joints)
+    )
+    (folder / "robot.toml").write_text(TOML)
+    return folder
+
+
+def test_an_arm_of_ones_own_needs_no_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = six_joints(tmp_path / "robots" / "one_of_six")
+    arm, findings = check_arm(str(folder))
+    assert not [f for f in findings if not f.is_right]
+    q = np.random.default_rng(1).uniform(-2.5, 2.5, (20, 6))
+    found, of = arm.chain.inverse_branches(arm.chain.forward(q))
+    assert set(of) == set(range(20))
+    np.testing.assert_allclose(arm.chain.forward(found), arm.chain.forward(q)[of], atol=1e-8)
+    # Found by name once its shelf is known, whatever the capitals.
+    monkeypatch.setenv(VARIABLE, str(folder.parent))
+    assert "one_of_six" in names_of("arm")
+    assert find_arm("One-of-Six").name == "six"
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "said"),
+    [
+        ("six.urdf", 'link name="flange"', 'link name="flansch"', "which is no link of this file"),
+        ("six.urdf", 'upper="2.9"', 'upper="166"', r"Are these degrees\?"),
+        ("six.urdf", 'type="revolute"', 'type="prismatic"', "are revolute, continuous or fixed"),
+        ("six.urdf", BALL, '<mesh filename="gone.stl"/>', "gone.stl.*not there"),
+        ("six.urdf", "<axis", '<mimic joint="j9"/><axis', "mimics 'j9', which is no joint"),
+        ("robot.toml", "home_rad = [0.0, ", "home_rad = [0.0, 0.0, ", "6 angles within the limits"),
+        ("robot.toml", "payload_kg", "payload_lb", "payload_lb"),
+        ("robot.toml", '"flange"', '"tool0"', "no link 'tool0'"),
+        ("robot.toml", 'kind = "arm"', 'kind = "hand"', "is a 'hand'"),
+        ("robot.toml", "[limits]", "[limits]\nlower_rad = [-170, -170, -170, -170, -170, -170]",
+         r"Are these degrees\?"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_an_arm_is_named(
+    tmp_path: Path, file: str, old: str, new: str, said: str
+) -> None:
+    folder = six_joints(tmp_path / f"a{abs(hash((old, new)))}")
+    text = (folder / file).read_text()
+    (folder / file).write_text(text.replace(old, new, 1))
+    with pytest.raises(RealsimError, match=said):
+        find_arm(str(folder)).shapes  # noqa: B018 - meshes are read here
+
+
+def test_a_description_that_can_be_read_and_is_wrong_is_told(tmp_path: Path) -> None:
+    folder = six_joints(tmp_path / "wrong")
+    text = (folder / "six.urdf").read_text().replace('velocity="2"', 'velocity="120"')
+    (folder / "six.urdf").write_text(
+        text.replace('<sphere radius="0.03"/>', '<sphere radius="0.4"/>')
+    )
+    wrong = {f.what for f in check_arm(str(folder))[1] if not f.is_right}
+    assert {"joint speeds", "self-collision at home"} <= wrong
+
+
+def test_a_folder_that_is_no_robot_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"has no robot\.toml"):
+        find_arm(str(tmp_path) + "/")
+    with pytest.raises(InputError, match=r"no arm 'ur55'\. There are: .*ur5,"):
+        find_arm("ur55")
