@@ -29,11 +29,12 @@ Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 Box = tuple[Point, Point]
 """Least and greatest corner [m]."""
-Bar = tuple[float, float, float, float, float]
-"""y and z of the pivot, length, half the width along x, half the thickness [m]; as `BarFile`."""
+Bar = tuple[float, float, float, float, float, float, float, float]
+"""y and z of pivot, one end and the other, half the width along x, half the thickness [m]."""
 
 FRANKA = "franka_hand"
 """The hand that is meant where none is named."""
+QUARTERS = np.pi / 2.0 * np.arange(-4, 5)
 PALM_DEPTH_M, PALM_HEIGHT_M = 0.060, 0.060
 """The palm of a hand that describes none: across the closing axis, and along the approach [m]."""
 
@@ -73,15 +74,15 @@ class BoxFile(OwnFile, frozen=True, kw_only=True):
 class BarFile(OwnFile, frozen=True, kw_only=True):
     """A bar of the linkage at +y that turns with the crank."""
 
-    pivot_y_m: float
-    pivot_z_m: float
-    """Where it hangs in the palm [m], frame `grasp`."""
-    length_m: float
-    """Distance of its joints [m]."""
+    pivot_m: tuple[float, float]
+    """y and z of the axis about which it turns, as the crank does [m], frame `grasp`."""
+    from_m: tuple[float, float]
+    to_m: tuple[float, float]
+    """y and z of its ends when the hand is closed [m]."""
     half_width_m: float
     """Along x [m]."""
     half_thickness_m: float
-    """Around the line between its joints [m]."""
+    """Around the line between its ends [m]."""
 
 
 class MountFile(OwnFile, frozen=True, kw_only=True):
@@ -277,27 +278,34 @@ class Hand:
             left[:, k, 0, 2] += low
             left[:, k, 1, 2] += high
         for k, bar in enumerate(self.bars, len(self.finger_boxes)):
-            left[:, k] = self._bar_boxes(bar, inner, outer, low, high)
+            left[:, k] = self._bar_boxes(bar, inner, outer)
         right[...] = left
         right[..., 0, 1], right[..., 1, 1] = -left[..., 1, 1], -left[..., 0, 1]
         return boxes
 
-    def _bar_boxes(self, bar: Bar, inner: Array, outer: Array, low: Array, high: Array) -> Array:
-        """Return the boxes (N, 2, 3) around a bar that turns with the crank, and its sweep.
+    def _bar_boxes(self, bar: Bar, inner: Array, outer: Array) -> Array:
+        """Return the boxes (N, 2, 3) around a bar while the pad goes from y = outer to inner (N,).
 
-        Its far end is at the pivot plus the crank, scaled to the bar's length.
+        An end's circle is farthest along an axis at a quarter of the turn, or where it stops.
         """
-        y, z, length, half_width, half = bar
-        share, base = length / self.arc_radius_m, float(self._height(-self.arc_axis_y_m))
-        ends_y = y + share * (np.stack([inner, outer]) - self.arc_axis_y_m)
-        ends_z = z + share * (np.stack([low, high]) + base)
+        pivot, half_width, half = np.array(bar[:2]), bar[6], bar[7]
+        crank = [self._crank(y) - self._crank(0.0) for y in (outer, inner)]
+        extents: list[Array] = []
+        for end in (np.array(bar[2:4]) - pivot, np.array(bar[4:6]) - pivot):
+            began, ended = (np.arctan2(end[1], end[0]) + turn for turn in crank)
+            angles = np.clip(QUARTERS, began[:, None], ended[:, None])
+            circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+            extents.append(pivot + np.linalg.norm(end) * circle)
+        points = np.concatenate(extents, axis=1)
         boxes = np.empty((len(inner), 2, 3))
         boxes[:, 0, 0], boxes[:, 1, 0] = -half_width, half_width
-        boxes[:, 0, 1] = np.minimum(ends_y.min(axis=0), y) - half
-        boxes[:, 1, 1] = np.maximum(ends_y.max(axis=0), y) + half
-        boxes[:, 0, 2] = np.minimum(ends_z.min(axis=0), z) - half
-        boxes[:, 1, 2] = np.maximum(ends_z.max(axis=0), z) + half
+        boxes[:, 0, 1:], boxes[:, 1, 1:] = points.min(axis=1) - half, points.max(axis=1) + half
         return boxes
+
+    def _crank(self, y: Array | float) -> Array:
+        """Return the crank's angle from y to z [rad] where the face of the pad is at y [m]."""
+        across = y - self.arc_axis_y_m
+        return np.arctan2(self._height(across), across)
 
 
 def find_hand(name: str = FRANKA) -> Hand:
@@ -369,7 +377,7 @@ def hand_of(file: HandFile, folder: RobotFolder) -> Hand:
         palm_boxes=palm,
         finger_boxes=(own, *((b.low_m, b.high_m) for b in file.finger)),
         bars=tuple(
-            (b.pivot_y_m, b.pivot_z_m, b.length_m, b.half_width_m, b.half_thickness_m)
+            (*b.pivot_m, *b.from_m, *b.to_m, b.half_width_m, b.half_thickness_m)
             for b in file.bar
         ),
         mount_z_m=back if distance is None else -distance,

@@ -33,8 +33,13 @@ if TYPE_CHECKING:
     from realsim_sim_bridge.slip.engines import BulletSettings
 
 Array = NDArray[np.float64]
-FINGERS = (0, 1)
-"""PyBullet's link numbers of the two fingers; 0 is the one at +y."""
+FINGERS = ("left_slide", "right_slide")
+"""Joints of the two fingers; the first is at +y."""
+LIFTS = ("left_lift", "right_lift")
+LIFT_N = 1e4
+"""What holds the fingers of an arc at their height [N]: their drive locks itself."""
+LIFT_PULL = 0.5
+"""Share of the height's error that is taken back in a step."""
 FAR_AWAY = (0.0, 0.0, 50.0)
 """Where the object waits while contacts of the grasp before are forgotten [m]."""
 
@@ -74,6 +79,7 @@ class BulletPair:
             frictionERP=settings.friction_erp,
         )
         self.engine.setGravity(0.0, 0.0, 0.0)
+        self._geometry = geometry
         with tempfile.TemporaryDirectory() as folder:
             self.hand = self._add_hand(Path(folder), geometry)
             T_body_obj = se3.invert(self._T_obj_body)
@@ -95,6 +101,10 @@ class BulletPair:
             useFixedBase=True,
             flags=engine.URDF_USE_SELF_COLLISION_EXCLUDE_ALL_PARENTS,
         )
+        names = [engine.getJointInfo(hand, j)[1].decode() for j in range(engine.getNumJoints(hand))]
+        self._fingers = [names.index(name) for name in FINGERS]
+        """PyBullet's link numbers of the two fingers."""
+        self._lifts = [names.index(name) for name in LIFTS if name in names]
         # Never together with a link's settings: see the head of this file.
         engine.changeDynamics(hand, -1, linearDamping=0.0, angularDamping=0.0)
         wanted: dict[str, float] = {
@@ -103,17 +113,18 @@ class BulletPair:
             "rollingFriction": 0.0,
         }
         if self._physics.pads:
-            wanted["contactStiffness"] = settings.stiffness
+            wanted["contactStiffness"] = settings.stiffness or self._physics.pads.stiffness_n_per_m
             wanted["contactDamping"] = settings.damping
-        for finger in FINGERS:
+        for finger in self._fingers:
             engine.changeDynamics(hand, finger, **wanted)
             self._check(hand, finger, wanted)
             if self._physics.pads:
                 engine.changeDynamics(hand, finger, frictionAnchor=int(settings.friction_anchor))
                 self._check(hand, finger, wanted)
         gear = engine.createConstraint(
-            hand, 0, hand, 1, engine.JOINT_GEAR, [0, 1, 0], [0, 0, 0], [0, 0, 0]
-        )
+            hand, self._fingers[0], hand, self._fingers[1], engine.JOINT_GEAR,
+            [0, 1, 0], [0, 0, 0], [0, 0, 0],
+        )  # fmt: skip
         engine.changeConstraint(
             gear, gearRatio=-1, erp=settings.gear_erp, maxForce=settings.gear_force_n
         )
@@ -171,20 +182,42 @@ class BulletPair:
         position, xyzw = interop.pybullet_from_T(T_hand_body)
         engine.resetBasePositionAndOrientation(self.object, position, xyzw)
         engine.resetBaseVelocity(self.object, twist[3:].tolist(), twist[:3].tolist())
-        for finger in FINGERS:
+        for side, finger in enumerate(self._fingers):
+            engine.resetJointState(self.hand, finger, float(fingers_m[side]), float(speeds[side]))
+        for side, lift in enumerate(self._lifts):
             engine.resetJointState(
-                self.hand, finger, float(fingers_m[finger]), float(speeds[finger])
+                self.hand, lift, float(self._geometry.z_pad(2 * fingers_m[side]))
             )
+        self.follow_arc(still=True)
 
     def drive(self, speed: float) -> None:
         """Let the fingers close at a speed [m/s] each, with at most the hand's force."""
-        for finger in FINGERS:
+        for finger in self._fingers:
             self.engine.setJointMotorControl2(
                 self.hand,
                 finger,
                 self.engine.VELOCITY_CONTROL,
                 targetVelocity=-speed,
                 force=self._physics.force_n,
+            )
+
+    def follow_arc(self, *, still: bool = False) -> None:
+        """Put the fingers of an arc where it has them in the next step; `still`: and stay there."""
+        if not self._lifts:
+            return
+        fingers, speeds = self.fingers()
+        heights = self._geometry.z_pad(2.0 * fingers)
+        rising = 0.0 * speeds if still else self._geometry.slope(fingers) * speeds
+        for side, lift in enumerate(self._lifts):
+            self.engine.setJointMotorControl2(
+                self.hand,
+                lift,
+                self.engine.POSITION_CONTROL,
+                targetPosition=float(heights[side]),
+                targetVelocity=float(rising[side]),
+                positionGain=LIFT_PULL,
+                velocityGain=1.0,
+                force=LIFT_N,
             )
 
     def drag(self, rate_per_s: float) -> None:
@@ -213,22 +246,22 @@ class BulletPair:
 
     def fingers(self) -> Array:
         """Return the fingers' positions [m] and speeds [m/s] (2, 2): row 0 positions."""
-        return np.array([self.engine.getJointState(self.hand, f)[:2] for f in FINGERS]).T
+        return np.array([self.engine.getJointState(self.hand, f)[:2] for f in self._fingers]).T
 
     def finger_forces(self) -> Array:
         """Return the normal force of each finger on the object (2,) [N]."""
         forces = np.zeros(2)
-        for finger in FINGERS:
+        for side, finger in enumerate(self._fingers):
             contacts = self.engine.getContactPoints(
                 bodyA=self.hand, bodyB=self.object, linkIndexA=finger
             )
-            forces[finger] = sum(c[9] for c in contacts)
+            forces[side] = sum(c[9] for c in contacts)
         return forces
 
     def settings(self) -> dict[str, float]:
         """Return what the engine says its settings are."""
         engine = self.engine
-        finger = engine.getDynamicsInfo(self.hand, FINGERS[0])
+        finger = engine.getDynamicsInfo(self.hand, self._fingers[0])
         held = engine.getDynamicsInfo(self.object, -1)
         parameters = engine.getPhysicsEngineParameters()
         return {
@@ -241,7 +274,7 @@ class BulletPair:
             "dt_s": float(parameters["fixedTimeStep"]),
             "iterations": float(parameters["numSolverIterations"]),
             "substeps": float(parameters["numSubSteps"]),
-            "force_n": abs(float(engine.getJointState(self.hand, FINGERS[0])[3])),
+            "force_n": abs(float(engine.getJointState(self.hand, self._fingers[0])[3])),
         }
 
 

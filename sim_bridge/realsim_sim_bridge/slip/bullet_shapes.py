@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.world import PadModel
 
-# --- The Franka Hand as a URDF for PyBullet: a fixed palm and two fingers that slide along y -----
+# --- A hand as a URDF for PyBullet: a fixed palm and two fingers that slide along y --------------
+# Those of an arc hang on a link that slides along z, which is put where the arc has it.
 
 
 Array = NDArray[np.float64]
@@ -17,40 +18,52 @@ Array = NDArray[np.float64]
 def hand_urdf(geometry: Hand, pads: PadModel | None) -> str:
     """Return the URDF of the hand: a fixed palm and two fingers that slide along y.
 
-    The joint positions are the distances [m] of the finger faces from the middle.
+    The positions of the joints `left_slide` and `right_slide` are the distances [m] of the finger
+    faces from the middle; `left_lift` and `right_lift`, of an arc only, are the fingers' z [m].
 
     Args:
         geometry: sizes of the hand.
         pads: the sphere pads, or None for bare boxes.
     """
-    palm, _, finger = geometry.boxes(0.0)[0]
     mass = pads.finger_mass_kg if pads else PadModel().finger_mass_kg
     fingers = ""
     for name, side in (("left", 1.0), ("right", -1.0)):
-        low, high = finger.copy()
-        if pads:
-            low[1] += pads.protrusion_m
-        parts = _box(low, high, side)
+        parts, parent = "", "palm"
+        for low, high in np.array(geometry.finger_boxes):
+            if pads:
+                low[1] = max(low[1], pads.protrusion_m)
+            parts += _box(low, high, side)
         if pads:
             parts += "".join(
                 f'<collision><origin xyz="{x} {side * pads.sphere_radius_m} {z}"/>'
                 f'<geometry><sphere radius="{pads.sphere_radius_m}"/></geometry></collision>'
                 for x, z in pads.centers_xz().tolist()
             )
+        if geometry.arc_radius_m:
+            parent = f"{name}_carrier"
+            fingers += (
+                f'<link name="{parent}"><inertial><mass value="{CARRIER_KG}"/>{_FINGER_INERTIA}'
+                f'</inertial></link><joint name="{name}_lift" type="prismatic">'
+                f'<parent link="palm"/><child link="{parent}"/><axis xyz="0 0 1"/>'
+                '<limit lower="-1" upper="1" effort="1e6" velocity="10"/></joint>'
+            )
         fingers += (
             f'<link name="{name}"><inertial><mass value="{mass}"/>{_FINGER_INERTIA}</inertial>'
             f"{parts}</link>"
-            f'<joint name="{name}_slide" type="prismatic"><parent link="palm"/>'
+            f'<joint name="{name}_slide" type="prismatic"><parent link="{parent}"/>'
             f'<child link="{name}"/><axis xyz="0 {side:g} 0"/>'
             f'<limit lower="0" upper="{geometry.max_opening_m / 2}" effort="1000" velocity="1"/>'
             "</joint>"
         )
+    palm = "".join(_box(low, high, 1.0) for low, high in np.array(geometry.palm_boxes))
     return (
         '<robot name="hand"><link name="palm"><inertial><mass value="0.7"/>'
-        f"{_PALM_INERTIA}</inertial>{_box(palm[0], palm[1], 1.0)}</link>{fingers}</robot>"
+        f"{_PALM_INERTIA}</inertial>{palm}</link>{fingers}</robot>"
     )
 
 
+CARRIER_KG = 0.05
+"""Mass of what carries a finger along z [kg]; it is driven where the arc has it."""
 _FINGER_INERTIA = '<inertia ixx="3e-5" iyy="3e-5" izz="3e-5" ixy="0" ixz="0" iyz="0"/>'
 _PALM_INERTIA = '<inertia ixx="2e-3" iyy="1e-3" izz="2e-3" ixy="0" ixz="0" iyz="0"/>'
 

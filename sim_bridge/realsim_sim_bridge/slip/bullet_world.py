@@ -101,6 +101,7 @@ class BulletWorld(HandWorld):
         seen: list[tuple[Array, Array]] = []
         while len(seen) * sample < duration_s / self.dt:
             for _ in range(sample):
+                pair.follow_arc()
                 pair.engine.stepSimulation()
             seen.append((pair.pose(), pair.finger_forces()))
             at, forces = seen[-1][0][:3, 3], seen[-1][1]

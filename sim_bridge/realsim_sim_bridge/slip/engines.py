@@ -16,10 +16,8 @@ class BulletSettings:
     """Steps per second of simulated time."""
     iterations: int = 200
     """Most solver iterations a step; at 50 the 5 cm box turns 1.9 deg instead of 0.14."""
-    stiffness: float = 40000.0
-    """Contact stiffness of the pads [N/m]: shares the load between spheres. At 10 kN/m they sink in
-    by a millimetre, and at curved places every twentieth grasp ends otherwise than with stiff
-    contacts."""
+    stiffness: float | None = None
+    """Contact stiffness of the pads [N/m]; None = what the hand's pads have."""
     damping: float = 1.0
     """Contact damping [N s/m]; at 100 and more the sharing is lost."""
     friction_anchor: bool = True

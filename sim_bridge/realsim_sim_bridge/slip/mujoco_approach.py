@@ -40,7 +40,11 @@ def advanced_fingers(
         openings_m: (K,) distances of the finger faces [m].
         geometry: sizes of the fingers.
     """
-    _, _, finger = geometry.boxes(0.0)[0]
+    # All that the finger at +y sweeps: of an arc more than at any one opening.
+    zero, widest = np.zeros(1), np.array([geometry.max_opening_m])
+    count = len(geometry.finger_boxes)
+    swept = geometry.swept_boxes(zero, widest)[0, -geometry.side_boxes :][:count]
+    finger = np.stack([swept[:, 0].min(axis=0), swept[:, 1].max(axis=0)])
     halves = np.asarray(openings_m, dtype=np.float64) / 2.0
     Ts_grasp_obj = np.ascontiguousarray(se3.invert(Ts_obj_grasp))
     extents = _extents(np.ascontiguousarray(triangles_obj), Ts_grasp_obj, finger, halves)

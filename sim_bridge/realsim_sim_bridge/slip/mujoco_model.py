@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 FINGER_NAMES = ("left", "right")
+LIFT_NAMES = ("left_lift", "right_lift")
+LOCKED_KG = 1e6
+"""Mass of a finger along z while its height is locked [kg]: 200 N move it 4 um in a rollout."""
 SIDES = (1.0, -1.0)
 """Finger 0 is at +y."""
 OBJECT = "object"
@@ -59,6 +62,12 @@ class PairModel:
     reach_m: float
     """Greatest distance of a vertex from the centre of mass [m]."""
     geometry: Hand
+    lifting: Array | None
+    """(5,) z of the fingers of an arc as a polynomial of y, the constant first; None = a slide."""
+    plain: NDArray[np.int64]
+    """(20,) where MuJoCo's own row of state has what a row of `mujoco_state` holds."""
+    lifts: NDArray[np.int64]
+    """(2, F) where it has position and speed of the fingers along z; F = 0 for a slide."""
 
 
 def load_mujoco() -> Any:
@@ -82,18 +91,22 @@ def compile_pair(
     T_obj_body, moments = body.principal_frame()
     spec: Any = mujoco.MjSpec()
     _set_options(spec, physics, settings)
-    low, high = geometry.boxes(0.0)[0, 0]
-    palm = _add_box(spec.worldbody, low, high, 1.0)
-    _set_contact(palm, HAND_SIDE, physics, settings)
+    for low, high in np.array(geometry.palm_boxes):
+        _set_contact(_add_box(spec.worldbody, low, high, 1.0), HAND_SIDE, physics, settings)
     for finger in range(2):
         _add_finger(spec, finger, geometry, physics, settings)
-    _couple_fingers(spec, settings)
+    _couple(spec, FINGER_NAMES[0], FINGER_NAMES[1], [0.0, 1.0], settings)  # y0 = y1
+    lifting = lift_law(geometry)
+    for finger, lift in zip(FINGER_NAMES, LIFT_NAMES, strict=True):
+        if lifting is not None:
+            _couple(spec, lift, finger, lifting, settings)
     parts = [se3.transform(se3.invert(T_obj_body), part) for part in body.parts]
     _add_object(spec, parts, body.mass_kg, moments, physics, settings)
     _add_drive(spec, physics, settings)
     try:
         model = spec.compile()
-        _keep_tolerance(model)
+        lifts = lift_joints(model)
+        _keep_tolerance(model, [int(joint.dofadr[0]) for joint in lifts])
         triangles = surface_triangles(body.parts)
     except (ValueError, RuntimeError) as error:
         raise InputError(
@@ -107,27 +120,73 @@ def compile_pair(
         triangles_obj=triangles,
         reach_m=body.reach(),
         geometry=geometry,
+        lifting=lifting,
+        **_columns(model, lifts),
     )
 
 
-def _keep_tolerance(model: Any) -> None:
-    """Let the solver be as exact as if the carriage were not there.
+# --- Fingers on an arc: a second slide along z, coupled to the first while the hand closes --------
+# The drive of such a hand locks itself (Robotiq's is a screw), so that a load along z does not open
+# or close it. Coupled, it would: the joints' reaction along y is the load times the arc's slope. So
+# the coupling holds while the hand closes, and the fingers' height is locked, by a mass that no
+# load moves, while loads are played.
 
-    Its tolerance is relative to the mean inertia of the model, most of which is the carriage's.
+
+def lift_law(hand: Hand) -> Array | None:
+    """Return the polynomial (5,) of a finger's z over its y [m], constant first; None = a slide."""
+    if not hand.arc_radius_m:
+        return None
+    y = np.linspace(0.0, hand.max_opening_m / 2.0, 201)
+    fit = np.polynomial.Polynomial.fit(y, hand.z_pad(2.0 * y), 4)
+    return np.asarray(fit.convert().coef, dtype=np.float64)
+
+
+def lift_joints(model: Any) -> list[Any]:
+    """Return the joints along z of a compiled model's fingers."""
+    names = {model.joint(j).name for j in range(model.njnt)}
+    return [model.joint(name) for name in LIFT_NAMES if name in names]
+
+
+def lock_lifts(model: Any, locked: bool, settings: "MujocoSettings") -> None:
+    """Hold the fingers' height, or let it follow the arc."""
+    for joint in lift_joints(model):
+        model.dof_armature[joint.dofadr[0]] = LOCKED_KG if locked else settings.armature_kg
+        follows = model.eq_obj1id == joint.id
+        model.eq_active0[follows] = not locked
+
+
+def _columns(model: Any, lifts: list[Any]) -> dict[str, NDArray[np.int64]]:
+    """Return the fields `plain` and `lifts` of a compiled model."""
+    at = [1 + int(joint.qposadr[0]) for joint in lifts]
+    speed = [1 + int(model.nq) + int(joint.dofadr[0]) for joint in lifts]
+    width = 1 + int(model.nq) + int(model.nv)
+    return {
+        "plain": np.delete(np.arange(width), [*at, *speed]),
+        "lifts": np.array([at, speed], dtype=np.int64).reshape(2, -1),
+    }
+
+
+def _keep_tolerance(model: Any, lifts: list[int]) -> None:
+    """Let the solver be as exact as if the carriage and the locked heights were not there.
+
+    Its tolerance is relative to the mean inertia of the model, most of which is theirs.
     """
-    model.opt.tolerance *= model.dof_M0[:-1].mean() / model.stat.meaninertia
+    model.opt.tolerance *= np.delete(model.dof_M0[:-1], lifts).mean() / model.stat.meaninertia
 
 
 def set_drag(model: Any, rate_per_s: float) -> None:
     """Let the object's speeds decay at a rate [1/s]."""
     matter = model.body(OBJECT)
-    model.dof_damping[2:5] = rate_per_s * matter.mass[0]
-    model.dof_damping[5:8] = rate_per_s * matter.inertia
+    first = int(matter.dofadr[0])
+    model.dof_damping[first : first + 3] = rate_per_s * matter.mass[0]
+    model.dof_damping[first + 3 : first + 6] = rate_per_s * matter.inertia
 
 
 def read_settings(model: Any) -> dict[str, float]:
     """Return what the compiled model says."""
     hand = model.geom_contype == HAND_SIDE
+    fingers = [int(model.joint(name).dofadr[0]) for name in FINGER_NAMES]
+    matter = model.body(OBJECT)
     return {
         "finger_friction": float(model.geom_friction[hand, 0].min()),
         "object_friction": float(model.geom_friction[~hand, 0].min()),
@@ -137,9 +196,9 @@ def read_settings(model: Any) -> dict[str, float]:
         "impratio": float(model.opt.impratio),
         "noslip_iterations": float(model.opt.noslip_iterations),
         "elliptic_cone": float(model.opt.cone),
-        "armature_kg": float(model.dof_armature[:2].min()),
-        "finger_damping": float(model.dof_damping[:2].max()),
-        "object_drag_per_s": float(model.dof_damping[2] / model.body(OBJECT).mass[0]),
+        "armature_kg": float(model.dof_armature[fingers].min()),
+        "finger_damping": float(model.dof_damping[fingers].max()),
+        "object_drag_per_s": float(model.dof_damping[matter.dofadr[0]] / matter.mass[0]),
         "gravity": float(np.linalg.norm(model.opt.gravity)),
     }
 
@@ -190,9 +249,14 @@ def _add_finger(
         solref_limit=[settings.contact_time_s, 1.0],
         solimp_limit=STIFF,
     )
-    low, high = geometry.boxes(0.0)[0, 2]
+    if geometry.arc_radius_m:
+        body.add_joint(
+            name=LIFT_NAMES[finger],
+            type=mujoco.mjtJoint.mjJNT_SLIDE,
+            axis=[0.0, 0.0, 1.0],
+            armature=LOCKED_KG,
+        )
     if pads:
-        low[1] += pads.protrusion_m
         for x, z in pads.centers_xz():
             pad = body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -200,7 +264,10 @@ def _add_finger(
                 pos=[x, side * pads.sphere_radius_m, z],
             )
             _set_contact(pad, HAND_SIDE, physics, settings)
-    _set_contact(_add_box(body, low, high, side), HAND_SIDE, physics, settings)
+    for low, high in np.array(geometry.finger_boxes):
+        if pads:
+            low[1] = max(low[1], pads.protrusion_m)
+        _set_contact(_add_box(body, low, high, side), HAND_SIDE, physics, settings)
     # The sensor adds up the normal forces of the body's contacts inside its site: the whole finger.
     body.add_site(name=name, type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1.0, 0.0, 0.0])
     spec.add_sensor(
@@ -234,19 +301,21 @@ def _add_drive(spec: Any, physics: SlipPhysics, settings: "MujocoSettings") -> N
         clutch.wrap_joint(CARRIAGE, -1.0)
 
 
-def _couple_fingers(spec: Any, settings: "MujocoSettings") -> None:
-    """Keep both fingers at the same distance from the middle, as the real hand's drive does."""
+def _couple(
+    spec: Any, led: str, leading: str, law: "Array | list[float]", settings: "MujocoSettings"
+) -> None:
+    """Keep one joint's position where a polynomial of another's has it, as a linkage does."""
     mujoco = load_mujoco()
 
     gear = spec.add_equality(
         type=mujoco.mjtEq.mjEQ_JOINT,
         objtype=mujoco.mjtObj.mjOBJ_JOINT,
-        name1=FINGER_NAMES[0],
-        name2=FINGER_NAMES[1],
+        name1=led,
+        name2=leading,
         solref=[settings.contact_time_s, 1.0],
         solimp=STIFF,
     )
-    gear.data[:5] = [0.0, 1.0, 0.0, 0.0, 0.0]  # a polynomial: y0 = y1
+    gear.data[:5] = [*law, *[0.0] * (5 - len(law))]
 
 
 def _add_object(

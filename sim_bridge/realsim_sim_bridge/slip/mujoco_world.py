@@ -23,6 +23,7 @@ from realsim_sim_bridge.slip.mujoco_model import (
     PairModel,
     compile_pair,
     load_mujoco,
+    lock_lifts,
     read_settings,
     set_drag,
 )
@@ -94,7 +95,7 @@ class MujocoWorld(HandWorld):
     ) -> None:
         """Place the hands open and the objects where the grips say."""
         mujoco = load_mujoco()
-        self._pair, self._physics = pair, physics
+        self._pair, self._physics, self._settings = pair, physics, settings
         self.dt = settings.step_s
         self.alive = np.ones(len(grips.openings_m), dtype=np.bool_)
         # A copy, because the drag is set in it.
@@ -111,6 +112,7 @@ class MujocoWorld(HandWorld):
         self._Ts_obj_grasp = grips.Ts_obj_grasp
         Ts_grasp_body = se3.invert(grips.Ts_obj_grasp) @ pair.T_obj_body
         self._rows = mujoco_state.rows_at(Ts_grasp_body, grips.openings_m / 2.0)
+        self._lock(True)
         self._open = self.alive.copy()
         """Hands that have not been closed or put anywhere yet."""
 
@@ -144,6 +146,7 @@ class MujocoWorld(HandWorld):
         self._start_near_objects()
         self._speed = closing.speed
         set_drag(self._model, closing.drag_per_s)
+        self._lock(False)
         every = max(1, round(closing.sample_s / self.dt))
         arrival_s = self._rows[:, mujoco_state.FINGERS].max(axis=1) / closing.speed
         looks = np.ceil((arrival_s + closing.settle_s) / (every * self.dt)).astype(np.int64)
@@ -167,6 +170,7 @@ class MujocoWorld(HandWorld):
             lost[k] = (shift > closing.lost_m) | ~sound
             going[k] = ~lost[k] & ~((moved < closing.settled_m) & pressed) & (look + 1 < looks[k])
         set_drag(self._model, 0.0)
+        self._lock(True)
         self._speed = PRESSING_SPEED
         return seen.held(last, ~lost).motion(self._Rs_world_hand)
 
@@ -231,6 +235,24 @@ class MujocoWorld(HandWorld):
         )[:, None]
         self._open[k] = False
 
+    def _lock(self, locked: bool) -> None:
+        """Hold the height of fingers on an arc, or let it follow."""
+        lock_lifts(self._model, locked, self._settings)
+        self._locked = locked
+
+    def _with_lifts(self, rows: Array) -> Array:
+        """Return MuJoCo's own rows of state (K, 20 + 2 F) of rows (K, 20): heights by the arc."""
+        pair = self._pair
+        if pair.lifting is None:
+            return rows
+        full = np.empty((len(rows), len(pair.plain) + pair.lifts.size))
+        full[:, pair.plain] = rows
+        y, law = rows[:, mujoco_state.FINGERS], np.polynomial.Polynomial(pair.lifting)
+        full[:, pair.lifts[0]] = law(y)
+        speeds = 0.0 if self._locked else law.deriv()(y) * rows[:, mujoco_state.FINGER_SPEEDS]
+        full[:, pair.lifts[1]] = speeds
+        return full
+
     def _run(
         self, k: Rows, steps: int, wrenches: Array | None
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
@@ -255,7 +277,8 @@ class MujocoWorld(HandWorld):
             # v @ R turns into the hand's axes; MuJoCo takes the force first.
             control[..., self._load.start : self._load.stop - 3] = wrenches[..., 3:] @ R
             control[..., self._load.start + 3 : self._load.stop] = wrenches[..., :3] @ R
-        states = self._space("states", n, steps, mujoco_state.WIDTH)
+        pair = self._pair
+        states = self._space("states", n, steps, len(pair.plain) + pair.lifts.size)
         forces = self._space("forces", n, steps, 2)
         begin = self._rows[k]
         begin[:, mujoco_state.TIME] = begin[:, mujoco_state.CARRIAGE] = 0.0
@@ -263,7 +286,7 @@ class MujocoWorld(HandWorld):
         self._rollout.rollout(
             [self._model] * n,
             [self._data],
-            begin,
+            self._with_lifts(begin),
             control,
             control_spec=self._control_spec,
             skip_checks=True,
@@ -271,6 +294,8 @@ class MujocoWorld(HandWorld):
             state=states,
             sensordata=forces,
         )
+        if pair.lifting is not None:
+            states = states[..., pair.plain]
         # A rollout stops the clock at a warning and repeats the state from there.
         late = np.abs(states[:, -1, mujoco_state.TIME] - steps * self.dt) > 0.5 * self.dt
         sound = ~late & np.isfinite(states[:, -1]).all(axis=1)

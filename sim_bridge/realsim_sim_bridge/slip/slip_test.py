@@ -54,6 +54,11 @@ class SlipConfig:
     """Fingers that stand farther than this outside the object start here [m]: closing through air
     takes time and changes nothing."""
 
+    @classmethod
+    def of(cls, hand: Hand) -> "SlipConfig":
+        """Return the slip test as a hand does it: with its force, pads, friction and speed."""
+        return cls(physics=SlipPhysics.of(hand), closing=Closing.of(hand))
+
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class SlipTrial:

@@ -68,6 +68,9 @@ class SlipBody:
 
 # --- How the fingers touch: sphere pads, the same in every engine --------------------------------
 
+SPREAD = 0.3
+"""Distance of the outer spheres from the pad's middle, in sizes of the pad."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PadModel:
@@ -88,6 +91,21 @@ class PadModel:
     """z of the spheres' centres [m]."""
     finger_mass_kg: float = 0.1
     """Mass of a finger [kg]."""
+    stiffness_n_per_m: float = 40_000.0
+    """Contact stiffness of a sphere in PyBullet [N/m]: shares the load between them. At 10 kN/m
+    they sink in by a millimetre, and at curved places every twentieth grasp ends otherwise than
+    with stiff contacts. MuJoCo's contacts are as stiff as its time step allows."""
+
+    @classmethod
+    def of(cls, hand: Hand) -> "PadModel":
+        """Return the spheres of a hand: the pattern of Franka's, spread over what presses."""
+        x, z = (SPREAD * size for size in hand.patch_m)
+        return cls(
+            x_m=(-x, x),
+            z_m=(-z, 0.0, z),
+            finger_mass_kg=hand.finger_mass_kg,
+            stiffness_n_per_m=hand.stiffness_n_per_m,
+        )
 
     def centers_xz(self) -> NDArray[np.float64]:
         """Return x and z (S, 2) of the spheres' centres [m], grasp frame."""
@@ -115,6 +133,11 @@ class SlipPhysics:
     """Least normal force of a finger that counts as contact [N]; a weak hand's is a tenth of its
     force."""
 
+    @classmethod
+    def of(cls, hand: Hand) -> "SlipPhysics":
+        """Return what is true of a hand: its usual force, its pads and their friction."""
+        return cls(force_n=hand.force_n, friction=hand.friction, pads=PadModel.of(hand))
+
     @property
     def contact_n(self) -> float:
         """Least normal force that counts as contact [N]."""
@@ -139,6 +162,11 @@ class Closing:
     """Closing ends when both fingers press and nothing moved more than this in a sample [m]."""
     lost_m: float = 0.05
     """An object that moved so far is lost [m]."""
+
+    @classmethod
+    def of(cls, hand: Hand) -> "Closing":
+        """Return how a hand closes: at its top speed, but at no more than was validated."""
+        return cls(speed=min(hand.closing_speed, cls().speed))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -115,7 +115,8 @@ def _asked(
         asked["dt_s"] = 1.0 / settings.rate_hz
         asked |= {"iterations": float(settings.iterations), "substeps": 0.0}
         if physics.pads:
-            asked |= {"contact_stiffness": settings.stiffness, "contact_damping": settings.damping}
+            stiffness = settings.stiffness or physics.pads.stiffness_n_per_m
+            asked |= {"contact_stiffness": stiffness, "contact_damping": settings.damping}
     else:
         asked["dt_s"] = settings.step_s
     return asked
