@@ -23,6 +23,7 @@ from figures import Figure, Found, Goal, run
 from realsim.app.console import Console
 from realsim.app.demo.run import DemoConfig, run_demo
 from realsim.app.truth import GOALS
+from realsim.robots.hand import find_hand
 from realsim_sim_bridge.slip.engines import BulletSettings
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
@@ -64,7 +65,7 @@ def loops(given: argparse.Namespace) -> Found:
 def held_box(given: argparse.Namespace) -> Found:
     """Slip-test a 5 cm box of 0.125 kg in our setting and in a bare PyBullet world."""
     del given
-    trial = cube_trial(0.125, DOWN[None])  # grasped from above, through its middle
+    trial = cube_trial(0.125, DOWN[None], find_hand())  # grasped from above, through its middle
     bare = SlipConfig(
         physics=SlipPhysics(pads=None, mass_floor_kg=0.0),
         engine=BulletSettings(iterations=50, friction_anchor=False, replay=Replay()),

@@ -39,7 +39,7 @@ class SuiteJob:
 
 def run_suite(job: SuiteJob) -> ValidationReport:
     """Return the report of a part."""
-    config = ValidationConfig.quick() if job.quick else ValidationConfig()
+    config = ValidationConfig().quick() if job.quick else ValidationConfig()
     part = job.part
     if part == "light":
         part = "convergence"

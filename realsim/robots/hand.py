@@ -224,6 +224,15 @@ class Hand:
             return np.zeros_like(w)
         return self._height(w / 2.0 - self.arc_axis_y_m) - self._height(-self.arc_axis_y_m)
 
+    def grasps_of_pads(self, Ts_a_pads: Array, widths_m: NDArray[np.float64] | float) -> Array:
+        """Return T_a_grasp (N, 4, 4) of hands whose pads, closed to widths (N,) [m], stand there.
+
+        Args:
+            Ts_a_pads: (N, 4, 4) axes as of `grasp`, origin between the middles of the pads [m].
+            widths_m: (N,) or one for all [m].
+        """
+        return along_approach(Ts_a_pads, -self.z_pad(widths_m))
+
     def z_range(self, least_m: Array, most_m: Array) -> tuple[Array, Array]:
         """Return the least and greatest z (N,) [m] of the pads between two openings (N,) [m]."""
         ends = self.z_pad(least_m), self.z_pad(most_m)
@@ -283,6 +292,12 @@ class Hand:
         right[..., 0, 1], right[..., 1, 1] = -left[..., 1, 1], -left[..., 0, 1]
         return boxes
 
+    def bar_boxes(self, openings_m: NDArray[np.float64] | float) -> Array:
+        """Return those of `boxes` (N, b, 2, 3) [m] that are around bars of the linkage."""
+        boxes, side, own = self.boxes(openings_m), self.side_boxes, len(self.finger_boxes)
+        right, left = boxes[:, -2 * side : -side], boxes[:, -side:]
+        return np.concatenate([right[:, own:], left[:, own:]], axis=1)
+
     def _bar_boxes(self, bar: Bar, inner: Array, outer: Array) -> Array:
         """Return the boxes (N, 2, 3) around a bar while the pad goes from y = outer to inner (N,).
 
@@ -306,6 +321,13 @@ class Hand:
         """Return the crank's angle from y to z [rad] where the face of the pad is at y [m]."""
         across = y - self.arc_axis_y_m
         return np.arctan2(self._height(across), across)
+
+
+def along_approach(Ts_a_b: Array, distances_m: NDArray[np.float64] | float) -> Array:
+    """Return poses (N, 4, 4), moved along their z by distances (N,) or one for all [m]."""
+    moved = np.array(Ts_a_b, dtype=np.float64)
+    moved[:, :3, 3] += np.asarray(distances_m, dtype=np.float64)[..., None] * moved[:, :3, 2]
+    return moved
 
 
 def find_hand(name: str = FRANKA) -> Hand:
@@ -377,8 +399,7 @@ def hand_of(file: HandFile, folder: RobotFolder) -> Hand:
         palm_boxes=palm,
         finger_boxes=(own, *((b.low_m, b.high_m) for b in file.finger)),
         bars=tuple(
-            (*b.pivot_m, *b.from_m, *b.to_m, b.half_width_m, b.half_thickness_m)
-            for b in file.bar
+            (*b.pivot_m, *b.from_m, *b.to_m, b.half_width_m, b.half_thickness_m) for b in file.bar
         ),
         mount_z_m=back if distance is None else -distance,
         mount_turn_deg=file.mount.turn_deg,

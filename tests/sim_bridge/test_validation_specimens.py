@@ -34,7 +34,7 @@ def test_two_parts_have_the_moments_of_the_whole():
 @pytest.mark.parametrize("shape", SHAPES)
 def test_grasps_on_the_edge_fit_the_hand_and_do_not_hang_on_the_mass(shape):
     hand = find_hand()
-    light, heavy = edge_trial(shape, 0.01, 5, 7), edge_trial(shape, 2.0, 5, 7)
+    light, heavy = edge_trial(shape, 0.01, 5, 7, hand), edge_trial(shape, 2.0, 5, 7, hand)
     assert np.array_equal(light.Ts_obj_grasp, heavy.Ts_obj_grasp)
     assert heavy.body.mass_kg == pytest.approx(2.0)
     corners = np.concatenate(light.body.parts)
@@ -42,7 +42,7 @@ def test_grasps_on_the_edge_fit_the_hand_and_do_not_hang_on_the_mass(shape):
         seen = se3.transform(se3.invert(T), corners)
         assert np.abs(seen[:, 1]).max() < hand.max_opening_m / 2
         assert seen[:, 2].min() > hand.palm_face_z_m
-    beside = edge_trial(shape, 0.01, 5, 7, 5e-5)
+    beside = edge_trial(shape, 0.01, 5, 7, hand, 5e-5)
     moved = np.linalg.norm((beside.Ts_obj_grasp - light.Ts_obj_grasp)[:, :3, 3], axis=1)
     assert np.allclose(moved, 5e-5)
 
@@ -77,6 +77,6 @@ def test_joint_paths_carry_the_hand_as_the_stages_do():
 
 @pytest.mark.slow
 def test_the_arm_carries_what_the_hand_holds():
-    held = carry_cube(0.125, np.eye(4), with_hand(SlipConfig(), 10.0, 0.3))
+    held = carry_cube(0.125, np.eye(4), with_hand(SlipConfig(), 10.0, 0.3), find_hand())
     assert held.passed and held.tracking_rad < np.radians(0.5)
     assert held.slip_m.max() < 2e-3 and np.degrees(held.slip_rad.max()) < 1.0

@@ -99,7 +99,7 @@ def test_the_quick_suite_passes():
     pytest.importorskip("mujoco")
     told = []
     report = validate(
-        settings_of("mujoco"), ValidationConfig.quick(), lambda *progress: told.append(progress)
+        settings_of("mujoco"), ValidationConfig().quick(), lambda *progress: told.append(progress)
     )
     assert failed(report) == set(), report.to_rows()
     assert [t[0] for t in told] == list(CHECKS)

@@ -18,6 +18,9 @@ VALIDATION = OutputFolder(
     own=("validation_*.json", ('"checks"', '"ratios"')),
 )
 
+HAND = click.option("--hand", default="franka_hand", show_default=True, metavar="NAME",
+                    help="Hand, by its name (`realsim robots`) or its folder.")  # fmt: skip
+
 
 class RunByDefault(Group):
     """A group whose command `run` needs no name: `realsim school SESSION` runs the school."""
@@ -68,14 +71,17 @@ def SCHOOL() -> None:
     default=None,
     help="Folder, where SOURCE is no session.",
 )
+@HAND
 @click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000),
               help="Candidates to try on each object, at most.")  # fmt: skip
 @click.option("--engine", default="pybullet", show_default=True, type=click.Choice(ENGINES),
               help="Which physics.")  # fmt: skip
 @click.option("--cross-check", is_flag=True, help="The other engine tries them, too.")
 @click.option("--sweep", is_flag=True, help="Least friction and force that each survives.")
-@click.option("--force", "force_n", type=float, default=None, help="Of each finger [N].  [70]")
-@click.option("--friction", type=float, default=None, help="Coulomb coefficient.  [1.0]")
+@click.option(
+    "--force", "force_n", type=float, default=None, help="Of each finger [N].  [the hand's]"
+)
+@click.option("--friction", type=float, default=None, help="Coulomb coefficient.  [the hand's]")
 @click.option("--density", type=float, default=None,
               help="Of objects that are not weighed [kg/m^3].  [the models' own]")  # fmt: skip
 @click.option(
@@ -149,14 +155,16 @@ def run_command(
 )  # fmt: skip
 @click.option("--engine", default="both", show_default=True,
               type=click.Choice([*ENGINES, "both"]), help="Which physics.")  # fmt: skip
+@HAND
 @click.option("--quick", is_flag=True, help="Every part with fewer samples: about a minute.")
 @json_file("Write the reports there, too.", "checks", "ratios", "cpu_s")
 @click.option("--out", type=VALIDATION, default=None, help="Folder for reports and pictures.")
 @JSON
 @QUIET
 def validate_command(
-    engine: str, quick: bool, json_file: Path | None, out: Path | None, as_json: bool, quiet: bool
-) -> None:
+    engine: str, hand: str, quick: bool, json_file: Path | None, out: Path | None, as_json: bool,
+    quiet: bool,
+) -> None:  # fmt: skip
     """Check that the physics obeys Coulomb's law and does not depend on its solver's settings.
 
     Exit codes: 0 all checks are green, 1 one is red, 2 an engine is not installed.
@@ -165,7 +173,8 @@ def validate_command(
     from realsim.app.school.validate import validate_engines
 
     names = ENGINES if engine == "both" else (engine,)
-    if not validate_engines(names, quick, json_file, out, Console(quiet=quiet, as_json=as_json)):
+    console = Console(quiet=quiet, as_json=as_json)
+    if not validate_engines(names, hand, quick, json_file, out, console):
         sys.exit(1)
 
 

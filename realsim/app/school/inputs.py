@@ -30,6 +30,8 @@ class SchoolRequest:
     grasps: int = 60
     """Candidates kept per object, at most."""
     seed: int = 0
+    hand: str = "franka_hand"
+    """Its name or its folder."""
     engine: str = "pybullet"
     """'pybullet' or 'mujoco'."""
     cross_check: bool = False

@@ -15,10 +15,12 @@ from realsim.app.school.inputs import (
     session_inputs,
 )
 from realsim.app.school.settle import warn_of_falls
+from realsim.errors import InputError
 from realsim.records import GraspSet, Scene
 from realsim.store import SessionStore
 
 if TYPE_CHECKING:
+    from realsim.robots.hand import Hand
     from realsim_sim_bridge.school import SchoolConfig
 
 LOCAL_CLUSTER = "local"
@@ -29,16 +31,20 @@ def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
     """Return the school's config for a request.
 
     Raises:
-        InputError: an engine that there is not or that is not installed, or a base pose that
-            cannot be read.
+        InputError: a hand or an engine that there is not or that is not installed, or a base pose
+            that cannot be read.
     """
+    from realsim.robots.hand import find_hand
     from realsim_sim_bridge.school import SchoolConfig
     from realsim_sim_bridge.school.sweep import SweepConfig
     from realsim_sim_bridge.slip.engines import make_engine, settings_of
 
-    config = SchoolConfig(seed=request.seed, max_candidates=request.grasps)
+    hand = find_hand(request.hand)
+    config = SchoolConfig.of(hand)
+    config = replace(config, seed=request.seed, max_candidates=request.grasps)
     physics = config.slip.physics
     if request.force_n is not None:
+        _require_force(hand, request.force_n)
         physics = replace(physics, force_n=request.force_n)
     if request.friction is not None:
         physics = replace(physics, friction=request.friction)
@@ -61,6 +67,16 @@ def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
         rows = tuple(tuple(row) for row in base_on_table(request.base_pose, scene).tolist())
         config = replace(config, reach=replace(config.reach, T_table_base=rows))
     return config
+
+
+def _require_force(hand: "Hand", force_n: float) -> None:
+    """Raise if a hand cannot press so hard."""
+    if force_n > hand.greatest_force_n:
+        raise InputError(
+            f"--force {force_n:g} N is more than the {hand.title} can: "
+            f"{hand.least_force_n:g} to {hand.greatest_force_n:g} N. Give another force, or a "
+            "hand of your own whose robot.toml says more."
+        )
 
 
 def run(source: Path, out: Path | None, request: SchoolRequest, console: Console) -> SchoolOutcome:

@@ -14,20 +14,23 @@ HEADER = ["", "check", "found", "limit", "behind it"]
 
 
 def validate_engines(
-    names: Sequence[str], quick: bool, json_file: Path | None, out: Path | None, console: Console
-) -> bool:
+    names: Sequence[str], hand: str, quick: bool, json_file: Path | None, out: Path | None,
+    console: Console,
+) -> bool:  # fmt: skip
     """Run the validation suite, show its table, and return whether every check is green.
 
     Args:
         names: of the engines.
+        hand: its name or folder.
         quick: the suite's short form.
         json_file: file for all reports.
         out: folder for a report and a picture each.
         console: progress and tables go there.
 
     Raises:
-        InputError: an engine is not installed.
+        InputError: an engine is not installed, or there is no such hand.
     """
+    from realsim.robots.hand import find_hand
     from realsim_sim_bridge.slip.engines import make_engine, settings_of
     from realsim_sim_bridge.validation.config import ValidationConfig
     from realsim_sim_bridge.validation.suite import validate
@@ -35,7 +38,8 @@ def validate_engines(
     settings = {name: settings_of(name) for name in names}
     for each in settings.values():
         make_engine(each)  # before the first suite runs for minutes
-    config = ValidationConfig.quick() if quick else ValidationConfig()
+    config = ValidationConfig.of(find_hand(hand))
+    config = config.quick() if quick else config
     reports: dict[str, ValidationReport] = {}
     for name, each in settings.items():
         with console.stage("validate", name) as tick:

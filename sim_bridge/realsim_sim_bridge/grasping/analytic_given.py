@@ -49,7 +49,7 @@ def given_candidates(
         mesh: the object [m].
         T_table_obj: (4, 4) where it stands; z of the table is up.
         surroundings: the other objects.
-        Ts_obj_grasp: (N, 4, 4) [m].
+        Ts_obj_grasp: (N, 4, 4) with the origin where the middles of the pads are to meet [m].
         config: clearances, openings, and how far the hand may stand back.
         geometry: the hand.
         centred: move the hand along the closing axis to the middle of its contacts.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.records import Mesh
 from realsim.records.checked_arrays import rows_of
-from realsim.robots.hand import Hand
+from realsim.robots.hand import Hand, along_approach
 from realsim_sim_bridge.grasping.analytic_select import farthest_rows, grasp_features
 from realsim_sim_bridge.grasping.antipodal import (
     AntipodalPairs,
@@ -56,7 +56,8 @@ class HandPoses:
     openings_m: Array
     """(N,) distance of the finger faces before closing [m]."""
     contact_depths_m: Array
-    """(N,) z of the contacts in the grasp frame [m]: 0 = middle of the pads, + = to their tips."""
+    """(N,) z of the contacts in the grasp frame [m]: + = towards the tips. 0 = in the middle of the
+    pads of a slide; those of an arc are at `Hand.z_pad` of the width."""
 
     def __len__(self) -> int:
         """Return the number of grasps."""
@@ -72,7 +73,7 @@ def turned_poses(
 ) -> HandPoses:
     """Return k fully open grasps per pair, evenly turned about its closing axis.
 
-    The contacts are in the middle of the pads.
+    Their origins are between the contacts: `Stand` moves the hand to where its pads are there.
     """
     k, widths = config.rotations, pairs.widths_m
     closing = (pairs.points[:, 1] - pairs.points[:, 0]) / widths[:, None]
@@ -110,6 +111,7 @@ class Stand:
     def placed(self, poses: HandPoses) -> tuple[HandPoses, NDArray[np.int64]]:
         """Return the poses in their first free stand, and how far the best stand of each got (N,).
 
+        The poses that come have their origins between the contacts, in the middle of the pads.
         Rows that are not FREE are as they came.
         """
         n = len(poses)
@@ -125,7 +127,7 @@ class Stand:
                 free = outcome == FREE
                 Ts[rest[free]] = tried.Ts_obj_grasp[free]
                 openings[rest[free]] = tried.openings_m[free]
-                depths[rest[free]] = depth
+                depths[rest[free]] = tried.contact_depths_m[free]
         placed = HandPoses(
             Ts_obj_grasp=Ts, widths_m=poses.widths_m, openings_m=openings, contact_depths_m=depths
         )
@@ -133,14 +135,14 @@ class Stand:
 
     def _stands(self, poses: HandPoses, depth_m: float, margin_m: float) -> HandPoses:
         """Return the poses, moved back so that the contacts are at z = depth, with an opening."""
-        Ts = poses.Ts_obj_grasp.copy()
-        Ts[:, :3, 3] -= depth_m * Ts[:, :3, 2]
+        depths = depth_m + self._geometry.z_pad(poses.widths_m)
+        Ts = along_approach(poses.Ts_obj_grasp, -depths)
         openings = np.minimum(poses.widths_m + 2 * margin_m, self._geometry.max_opening_m)
         return HandPoses(
             Ts_obj_grasp=Ts,
             widths_m=poses.widths_m,
             openings_m=openings,
-            contact_depths_m=np.full(len(Ts), depth_m),
+            contact_depths_m=depths,
         )
 
     def _outcome(self, poses: HandPoses) -> NDArray[np.int64]:
@@ -161,13 +163,17 @@ class Stand:
         return outcome
 
     def _free_of_object(self, poses: HandPoses) -> Mask:
-        """Return whether the open hand is free of the object (N,).
+        """Return whether the open hand is free of the object (N,), and a linkage when closed, too.
 
         A hand whose boxes cross no triangle is wholly outside or, if the object is greater than
         the palm, wholly inside: its boxes hang together.
         """
         boxes = self._geometry.boxes(poses.openings_m)
-        free = hands_free(boxes, poses.Ts_obj_grasp, self._tree, self._config.clearance_m)
+        clearance_m = self._config.clearance_m
+        free = hands_free(boxes, poses.Ts_obj_grasp, self._tree, clearance_m)
+        if self._geometry.bars:
+            bars = self._geometry.bar_boxes(poses.widths_m[free])
+            free[free] = hands_free(bars, poses.Ts_obj_grasp[free], self._tree, clearance_m)
         if self._surface.size_m > self._geometry.palm_width_m:
             middle = boxes[free, 0].mean(axis=1)
             palm = se3.transform(poses.Ts_obj_grasp[free], middle[:, None])[:, 0]

@@ -24,9 +24,9 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import hull_vertices, mass_properties
 from realsim.records import Mesh
-from realsim.robots.hand import Hand, find_hand
+from realsim.robots.hand import Hand, along_approach, find_hand
 from realsim_sim_bridge.grasping.antipodal import RaySurface
-from realsim_sim_bridge.grasping.pad_contacts import PadContacts, pad_contacts
+from realsim_sim_bridge.grasping.pad_contacts import PadContacts, pad_contacts, pad_heights
 
 # --- The Ferrari-Canny quality of two soft fingers: exact, and quick enough for every grasp ------
 # A finger that presses with force 1 along its inward normal n at p can add friction f (|f| <= mu,
@@ -311,11 +311,14 @@ def force_closure(
     center = mass_properties(mesh, 1.0).center_of_mass if center_of_mass is None else center_of_mass
     length = float(np.linalg.norm(hull_vertices(mesh.vertices) - center, axis=1).max())
     surface = RaySurface(mesh)
-    axis = pad_contacts(surface, _at_depth(Ts, contact_depths_m), openings, geometry, 1, 0.0)
+    heights = pad_heights(surface, Ts, openings, geometry)
+    depths = heights if contact_depths_m is None else contact_depths_m
+    axis = pad_contacts(surface, along_approach(Ts, depths), openings, geometry, 1, 0.0)
     needed = np.full(len(Ts), np.inf)
     needed[axis.both] = _needed_friction(axis.points[axis.both], axis.normals[axis.both])
 
-    contacts = pad_contacts(surface, Ts, openings, geometry, config.pad_rays, config.softness_m)
+    pads = along_approach(Ts, heights)
+    contacts = pad_contacts(surface, pads, openings, geometry, config.pad_rays, config.softness_m)
     both = contacts.both
     quality = np.zeros(len(Ts))
     quality[both] = largest_balls(
@@ -336,15 +339,6 @@ def force_closure(
         contacts=contacts,
         axis_contacts=axis,
     )
-
-
-def _at_depth(Ts: Array, depths_m: Array | None) -> Array:
-    """Return the grasps (N, 4, 4), moved along their approach by depths (N,) [m]."""
-    if depths_m is None:
-        return Ts
-    moved = Ts.copy()
-    moved[:, :3, 3] += np.asarray(depths_m, dtype=np.float64)[:, None] * Ts[:, :3, 2]
-    return moved
 
 
 def _needed_friction(points: Array, normals: Array) -> Array:

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
-from realsim.robots.hand import Hand
+from realsim.robots.hand import Hand, along_approach
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 
 Array = NDArray[np.float64]
+ROUNDS = 8
 SQUARE_LEVER = 0.3826
 """Mean distance of a unit square's points from its middle."""
 
@@ -33,7 +34,7 @@ class PadContacts:
 
 def pad_contacts(
     surface: RaySurface,
-    Ts_obj_grasp: Array,
+    Ts_obj_pads: Array,
     openings_m: Array,
     geometry: Hand,
     rays: int,
@@ -46,23 +47,22 @@ def pad_contacts(
 
     Args:
         surface: the object.
-        Ts_obj_grasp: (N, 4, 4) [m].
+        Ts_obj_pads: (N, 4, 4) axes as of `grasp`, origin between the middles of the pads [m].
         openings_m: (N,) distance of the pads before closing [m].
-        geometry: the hand; its pads are as wide as a finger and end at its tip, the tool centre
-            point in their middle.
+        geometry: the hand.
         rays: per side of a pad.
         softness_m: how deep a pad gives way [m].
     """
-    n, cell = len(Ts_obj_grasp), (np.arange(rays) + 0.5) / rays * 2 - 1
-    width, length = geometry.finger_width_m, 2 * geometry.tip_beyond_tcp_m
+    n, cell = len(Ts_obj_pads), (np.arange(rays) + 0.5) / rays * 2 - 1
+    width, length = geometry.pad_width_m, geometry.pad_length_m
     x, z = np.meshgrid(0.5 * width * cell, 0.5 * length * cell, indexing="ij")
     side = np.array([-1.0, 1.0])
     origins = np.empty((n, 2, rays * rays, 3))
     origins[..., 0], origins[..., 2] = x.ravel(), z.ravel()
     origins[..., 1] = 0.5 * openings_m[:, None, None] * side[:, None]
     shape = origins.shape
-    origins = se3.transform(Ts_obj_grasp, origins.reshape(n, 2 * rays * rays, 3)).reshape(shape)
-    inward = -side[:, None] * Ts_obj_grasp[:, None, :3, 1]
+    origins = se3.transform(Ts_obj_pads, origins.reshape(n, 2 * rays * rays, 3)).reshape(shape)
+    inward = -side[:, None] * Ts_obj_pads[:, None, :3, 1]
     directions = np.broadcast_to(inward[:, :, None], origins.shape)
 
     t, face = surface.first_hits(origins.reshape(-1, 3), directions.reshape(-1, 3))
@@ -88,3 +88,22 @@ def pad_contacts(
     # Each ray stands for a cell of the pad.
     of_cell = SQUARE_LEVER * np.sqrt(width * length) / rays
     return PadContacts(points=middle, normals=normal, levers_m=np.hypot(spread, of_cell))
+
+
+def pad_heights(
+    surface: RaySurface, Ts_obj_grasp: Array, openings_m: Array, geometry: Hand
+) -> Array:
+    """Return z (N,) [m] of the pads' middles, grasp frame, when the hand has closed; 0 of a slide.
+
+    On an arc it depends on the width, and the width on where the pads meet: a few rounds settle it,
+    for the pads rise by less than they close. Where they meet nothing it is the open hand's.
+    """
+    heights = geometry.z_pad(openings_m)
+    if not geometry.arc_radius_m:
+        return heights
+    for _ in range(ROUNDS):
+        Ts = along_approach(Ts_obj_grasp, heights)
+        points = pad_contacts(surface, Ts, openings_m, geometry, 1, 0.0).points
+        widths = np.linalg.norm(points[:, 1] - points[:, 0], axis=-1)
+        heights = geometry.z_pad(np.where(np.isfinite(widths), widths, openings_m))
+    return heights

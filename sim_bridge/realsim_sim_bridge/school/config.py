@@ -37,3 +37,8 @@ class SchoolConfig:
     """Frictions and forces at which each grasp is tried besides, for its margin; None = none."""
     second_engine: BulletSettings | MujocoSettings | None = None
     """The engine that judges every grasp a second time; None = none does."""
+
+    @classmethod
+    def of(cls, hand: Hand) -> "SchoolConfig":
+        """Return the School with a hand: its force, pads, friction and speed."""
+        return cls(hand=hand, slip=SlipConfig.of(hand))

@@ -1,8 +1,10 @@
 """What the validation suite tries, and what it asks for."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from realsim.robots.hand import Hand, find_hand
 from realsim_sim_bridge.slip.slip_test import SlipConfig
+from realsim_sim_bridge.slip.world import Closing, PadModel, SlipPhysics
 
 CHECKS = (
     "settings",
@@ -134,6 +136,7 @@ class LabelConfig:
 class ValidationConfig:
     """Everything the validation suite can be told."""
 
+    hand: Hand = field(default_factory=find_hand)
     slip: SlipConfig = field(default_factory=SlipConfig)
     """Physics, closing and stages of the slip test; its engine's settings are not used."""
     checks: tuple[str, ...] = CHECKS
@@ -143,10 +146,16 @@ class ValidationConfig:
     labels: LabelConfig = field(default_factory=LabelConfig)
 
     @classmethod
-    def quick(cls, slip: SlipConfig | None = None) -> "ValidationConfig":
+    def of(cls, hand: Hand) -> "ValidationConfig":
+        """Return the suite for a hand, with its pads; forces and frictions are the suite's own."""
+        pads = PadModel.of(hand)
+        slip = SlipConfig(physics=SlipPhysics(pads=pads), closing=Closing.of(hand))
+        return cls(hand=hand, slip=slip)
+
+    def quick(self) -> "ValidationConfig":
         """Return the suite's short form: every part, with fewer samples; less than a minute."""
-        return cls(
-            slip=slip or SlipConfig(),
+        return replace(
+            self,
             limits=LimitConfig(
                 cases=((2.0, 0.25), (20.0, 0.25), (70.0, 1.0)),
                 directions_deg=(0.0, 45.0, 90.0, 270.0),

@@ -6,7 +6,7 @@ in common is the hand's motion alone.
 """
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from realsim import interop
 from realsim.geometry import se3
 from realsim.records import STAGES
-from realsim.robots.hand import find_hand
+from realsim.robots.hand import Hand, find_hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.panda import panda_urdf
+from realsim_sim_bridge.slip.bullet_pair import LIFT_N, LIFT_PULL
 from realsim_sim_bridge.slip.bullet_shapes import hand_urdf
 from realsim_sim_bridge.slip.motion import SlipMotion, min_jerk, pendulum_angle
 from realsim_sim_bridge.slip.score import ScoreLimits
@@ -121,10 +122,11 @@ def arm_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
     R_down = se3.from_rt(panda.forward(READY)[:3, :3], np.zeros(3))
     for mass, force_n, friction, beside_m in labels.arm_cases:
         slip = with_hand(config.slip, force_n, friction)
-        T_obj_grasp = se3.from_translation([beside_m, 0.0, 0.0])
-        arm = carry_cube(mass, T_obj_grasp, slip)
+        T_obj_pads = se3.from_translation([beside_m, 0.0, 0.0])
+        T_obj_grasp = config.hand.grasps_of_pads(T_obj_pads[None], SIDE_M)[0]
+        arm = carry_cube(mass, T_obj_grasp, slip, config.hand)
         trial = ready_trial(cube(mass), T_obj_grasp[None], R_down[None], SIDE_M + 2 * HEADROOM_M)
-        hand = run_slip_test(trial, slip, engine=engine)
+        hand = run_slip_test(trial, slip, geometry=config.hand, engine=engine)
         agree = arm.passed == bool(hand.passed[0])
         same += agree
         tracking = max(tracking, arm.tracking_rad)
@@ -157,17 +159,19 @@ def arm_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
     ]  # fmt: skip
 
 
-def carry_cube(mass_kg: float, T_obj_grasp: Array, config: SlipConfig) -> CarriedCube:
+def carry_cube(mass_kg: float, T_obj_grasp: Array, config: SlipConfig, hand: Hand) -> CarriedCube:
     """Close on a weightless cube in the ready pose, turn gravity on and play the stages.
 
     Args:
         mass_kg: of the cube.
         T_obj_grasp: (4, 4) where it is grasped; the hand points down, the cube as it comes [m].
         config: the hand's force and friction, and the motions.
+        hand: what grasps, on a mount that puts its frame `grasp` where Franka's is.
     """
+    hand = replace(hand, mount_z_m=find_hand().mount_z_m)
     slip_m, slip_rad = np.full(len(STAGES), np.nan), np.full(len(STAGES), np.nan)
     limits = ScoreLimits()
-    with _ArmWorld(mass_kg, T_obj_grasp, config) as world:
+    with _ArmWorld(mass_kg, T_obj_grasp, config, hand) as world:
         q, tracking = READY.copy(), 0.0
         for stage in range(len(STAGES)):
             if stage == 0:
@@ -190,13 +194,13 @@ def carry_cube(mass_kg: float, T_obj_grasp: Array, config: SlipConfig) -> Carrie
 class _ArmWorld:
     """An arm with a hand and a cube in PyBullet."""
 
-    def __init__(self, mass_kg: float, T_obj_grasp: Array, config: SlipConfig) -> None:
+    def __init__(self, mass_kg: float, T_obj_grasp: Array, config: SlipConfig, hand: Hand) -> None:
         with interop.quiet_output():
             import pybullet
             from pybullet_utils.bullet_client import BulletClient
 
             self._engine: Any = BulletClient(connection_mode=pybullet.DIRECT)
-        self._config, self.dt = config, 1.0 / RATE_HZ
+        self._config, self._hand, self.dt = config, hand, 1.0 / RATE_HZ
         self._engine.setPhysicsEngineParameter(
             fixedTimeStep=self.dt, numSolverIterations=ITERATIONS, numSubSteps=0,
             deterministicOverlappingPairs=1, solverResidualThreshold=0.0,
@@ -241,6 +245,7 @@ class _ArmWorld:
                 targetVelocities=speed, forces=panda.TORQUE.tolist(),
                 positionGains=[PULL] * panda.JOINTS, velocityGains=[1.0] * panda.JOINTS,
             )  # fmt: skip
+            self._follow_arc()
             engine.stepSimulation()
             if t % max(1, round(sample_s / self.dt)) == 0 or t == len(path):
                 now = self._in_hand()
@@ -252,6 +257,16 @@ class _ArmWorld:
                 if slip > lost_m:
                     return float("inf"), float("inf"), tracking
         return slip, turn, tracking
+
+    def _follow_arc(self) -> None:
+        """Put fingers on an arc where it has them in the next step."""
+        for carrier, finger in self._carriers:
+            y = self._engine.getJointState(self._arm, finger)[0]
+            self._engine.setJointMotorControl2(
+                self._arm, carrier, self._engine.POSITION_CONTROL,
+                targetPosition=float(self._hand.z_pad(2.0 * y)), positionGain=LIFT_PULL,
+                velocityGain=1.0, force=LIFT_N,
+            )  # fmt: skip
 
     def _in_hand(self) -> Array:
         """Return the cube's pose (4, 4) in the grasp frame, as the engine has both."""
@@ -265,8 +280,7 @@ class _ArmWorld:
         engine, physics = self._engine, self._config.physics
         with tempfile.TemporaryDirectory() as folder:
             urdf = Path(folder) / "arm.urdf"
-            geometry = find_hand()
-            urdf.write_text(panda_urdf(geometry, hand_urdf(geometry, physics.pads)))
+            urdf.write_text(panda_urdf(self._hand, hand_urdf(self._hand, physics.pads)))
             self._arm: int = engine.loadURDF(
                 str(urdf),
                 useFixedBase=True,
@@ -278,6 +292,12 @@ class _ArmWorld:
         link = {info[12].decode(): j for j, info in enumerate(names)}
         self._joints = [link[f"link{i + 1}"] for i in range(panda.JOINTS)]
         self._fingers, self._palm = (link["left"], link["right"]), link["palm"]
+        carriers = [link[n] for n in ("left_carrier", "right_carrier") if n in link]
+        self._carriers = list(zip(carriers, self._fingers, strict=False))
+        """What carries a finger along z, and the finger; none but of an arc."""
+        for carrier, _ in self._carriers:
+            z = self._hand.z_pad(SIDE_M + 2 * HEADROOM_M)
+            engine.resetJointState(self._arm, carrier, float(z))
         # Never together with a link's settings: PyBullet then drops these.
         engine.changeDynamics(self._arm, -1, linearDamping=0.0, angularDamping=0.0)
         for joint, angle in zip(self._joints, READY.tolist(), strict=True):

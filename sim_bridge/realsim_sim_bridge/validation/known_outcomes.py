@@ -25,7 +25,12 @@ def box_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
     stages = config.stages
     checks: list[CheckResult] = []
     for mass in stages.box_masses_kg:
-        slips = run_slip_test(cube_trial(mass, _approaches()), config.slip, engine=engine)
+        slips = run_slip_test(
+            cube_trial(mass, _approaches(), config.hand),
+            config.slip,
+            geometry=config.hand,
+            engine=engine,
+        )
         label = f"{1e3 * mass:g} g"
         size = f"{label} cube of 5 cm, {config.slip.physics.force_n:g} N"
         failed = "; ".join(dict.fromkeys(f for f in slips.failures if f))
@@ -100,8 +105,8 @@ def _carry(
     """Return why the cube fell, what friction can carry [N], and both in words."""
     force_n, friction = case
     slip = with_hand(config.slip, force_n, friction)
-    trial = cube_trial(config.stages.capacity_mass_kg, DOWN[None])
-    failure = run_slip_test(trial, slip, engine=engine).failures[0]
+    trial = cube_trial(config.stages.capacity_mass_kg, DOWN[None], config.hand)
+    failure = run_slip_test(trial, slip, geometry=config.hand, engine=engine).failures[0]
     capacity = 2.0 * friction * force_n
     words = f"{capacity:g} N ({force_n:g} N, mu {friction:g}): {failure or 'held'}"
     return failure, capacity, words

@@ -50,8 +50,13 @@ def edge_labels(engine: Engine, config: ValidationConfig, shift_m: float = 0.0) 
     passed: list[Mask] = []
     for mass in labels.masses_kg:
         for shape in labels.shapes:
-            trial: SlipTrial = edge_trial(shape, mass, labels.grasps, labels.seed, shift_m)
-            passed.append(run_slip_test(trial, edge_config(config, mass), engine=engine).passed)
+            trial: SlipTrial = edge_trial(
+                shape, mass, labels.grasps, labels.seed, config.hand, shift_m
+            )
+            tried = run_slip_test(
+                trial, edge_config(config, mass), geometry=config.hand, engine=engine
+            )
+            passed.append(tried.passed)
     return EdgeLabels(
         passed=np.concatenate(passed),
         masses_kg=np.repeat(labels.masses_kg, len(labels.shapes) * labels.grasps),

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.geometry import se3
-from realsim.robots.hand import find_hand
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.motion import min_jerk
 from realsim_sim_bridge.slip.slip_test import SlipConfig, batches
 from realsim_sim_bridge.slip.world import Engine, Grips, SlipBody
@@ -137,6 +137,7 @@ class Held:
 def hold(
     engine: Engine,
     config: SlipConfig,
+    hand: Hand,
     body: SlipBody,
     loads: Array,
     *,
@@ -148,13 +149,14 @@ def hold(
     Args:
         engine: the engine.
         config: the physics and the closing.
+        hand: what holds.
         body: 5 cm wide where the hand closes, about its centre.
         loads: (K, 6) wrench on each: torque about the centre and force, grasp axes.
         ramp_s: time in which the loads grow [s].
         hold_s: time for which they then stand [s].
     """
     parts = [
-        _hold(engine, config, body, loads[rows], ramp_s, hold_s)
+        _hold(engine, config, hand, body, loads[rows], ramp_s, hold_s)
         for rows in batches(len(loads), engine.pairs_per_world)
     ]
     return Held(
@@ -166,17 +168,23 @@ def hold(
 
 
 def _hold(
-    engine: Engine, config: SlipConfig, body: SlipBody, loads: Array, ramp_s: float, hold_s: float
+    engine: Engine,
+    config: SlipConfig,
+    hand: Hand,
+    body: SlipBody,
+    loads: Array,
+    ramp_s: float,
+    hold_s: float,
 ) -> Held:
     """Return the same of the pairs of one world."""
     n = len(loads)
     upright = np.tile(np.eye(4), (n, 1, 1))
     grips = Grips(
         Ts_table_grasp=upright,
-        Ts_obj_grasp=upright,
+        Ts_obj_grasp=hand.grasps_of_pads(upright, SIDE_M),
         openings_m=np.full(n, SIDE_M + 0.006),
     )
-    with engine.world(body, grips, config.physics, find_hand()) as world:
+    with engine.world(body, grips, config.physics, hand) as world:
         closed = world.close(config.closing)
         start = world.states().Ts_world_body
         steps, ramp = round((ramp_s + hold_s) / world.dt), round(ramp_s / world.dt)

@@ -110,8 +110,8 @@ def creep_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
             for size, load in zip(sizes, loads, strict=True)
         ]
         held = hold(
-            engine, slip, _cube(config, slip), np.stack(wrenches), ramp_s=limits.ramp_s,
-            hold_s=limits.creep_s,
+            engine, slip, config.hand, _cube(config, slip), np.stack(wrenches),
+            ramp_s=limits.ramp_s, hold_s=limits.creep_s,
         )  # fmt: skip
         k = int(np.argmax(held.creep_m))
         if held.creep_m[k] >= worst_m:
@@ -147,6 +147,7 @@ def curved_check(engine: Engine, config: ValidationConfig) -> CheckResult:
         held = hold(
             engine,
             slip,
+            config.hand,
             specimen("cylinder", _mass(config, slip)),
             load * pulled,
             ramp_s=limits.ramp_s,
@@ -171,7 +172,15 @@ def force_check(engine: Engine, config: ValidationConfig) -> CheckResult:
     worst, seen = 0.0, ""
     for force_n, friction in config.limits.cases:
         slip = with_hand(config.slip, force_n, friction)
-        held = hold(engine, slip, _cube(config, slip), np.zeros((1, 6)), ramp_s=0.05, hold_s=0.05)
+        held = hold(
+            engine,
+            slip,
+            config.hand,
+            _cube(config, slip),
+            np.zeros((1, 6)),
+            ramp_s=0.05,
+            hold_s=0.05,
+        )
         error = float(100 * np.abs(held.finger_n / force_n - 1.0).max())
         seen += f"{', ' if seen else ''}{held.finger_n.min():.4g} of {force_n:g} N"
         worst = max(worst, error) if np.isfinite(error) else float("nan")
@@ -208,7 +217,13 @@ def _ratio(
     ascending = np.sort(np.array(shares))
     wrenches = ascending[:, None] * _limit(load, slip) * load.wrench()
     held = hold(
-        engine, slip, _cube(config, slip), wrenches, ramp_s=limits.ramp_s, hold_s=limits.hold_s
+        engine,
+        slip,
+        config.hand,
+        _cube(config, slip),
+        wrenches,
+        ramp_s=limits.ramp_s,
+        hold_s=limits.hold_s,
     )
     low, high = bracket(ascending, _slipped(held, config))
     return LimitRatio(group=group, load=load.name, case=_case(slip), held=low, slipped=high)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import Mesh, mass_properties
-from realsim.robots.hand import find_hand
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.slip.slip_test import SlipTrial
 from realsim_sim_bridge.slip.world import SlipBody
@@ -60,17 +60,15 @@ def ready_trial(
     )
 
 
-def cube_trial(mass_kg: float, rotations: Array) -> SlipTrial:
+def cube_trial(mass_kg: float, rotations: Array, hand: Hand) -> SlipTrial:
     """Return grasps of the cube in its centre, with the hand at rotations (N, 3, 3)."""
     n = len(rotations)
-    return ready_trial(
-        cube(mass_kg), np.tile(np.eye(4), (n, 1, 1)), se3.from_rt(rotations, np.zeros(3)),
-        SIDE_M + 0.008,
-    )  # fmt: skip
+    Ts = hand.grasps_of_pads(np.tile(np.eye(4), (n, 1, 1)), SIDE_M)
+    return ready_trial(cube(mass_kg), Ts, se3.from_rt(rotations, np.zeros(3)), SIDE_M + 0.008)
 
 
 def edge_trial(
-    shape: str, mass_kg: float, grasps: int, seed: int, shift_m: float = 0.0
+    shape: str, mass_kg: float, grasps: int, seed: int, hand: Hand, shift_m: float = 0.0
 ) -> SlipTrial:
     """Return grasps of a shape that close beside its centre, in all positions to gravity.
 
@@ -82,12 +80,13 @@ def edge_trial(
         mass_kg: its mass [kg].
         grasps: number of grasps.
         seed: of the draw.
+        hand: what grasps it.
         shift_m: moves every grasp along a drawn direction [m].
     """
     body = specimen(shape, mass_kg)
     corners = np.concatenate(body.parts)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    hand = find_hand()
+    z_pad = hand.z_pad(high[1] - low[1])
     rng = np.random.default_rng([seed, sorted(_SHAPES).index(shape)])
     found: list[tuple[Array, Array]] = []
     while len(found) < grasps:
@@ -96,6 +95,7 @@ def edge_trial(
         tilt = se3.exp_so3(rng.uniform(-0.5, 0.5, 3))
         shift = rng.normal(size=3)
         T_obj_grasp = se3.from_rt(turn, at + shift_m * shift / np.linalg.norm(shift))
+        T_obj_grasp[:3, 3] -= z_pad * T_obj_grasp[:3, 2]
         in_hand = se3.transform(se3.invert(T_obj_grasp), corners)
         fits = np.abs(in_hand[:, 1]).max() < hand.max_opening_m / 2 - CLEARANCE_M
         if fits and in_hand[:, 2].min() > hand.palm_face_z_m + CLEARANCE_M and _met(body, at):

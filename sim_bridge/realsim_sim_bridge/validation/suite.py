@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.robots.hand import find_hand
+from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
 from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
@@ -48,7 +48,7 @@ def settings_check(
         slip = with_hand(config.slip, force_n, friction)
         for mass in MASSES_KG:
             asked = _asked(slip, mass, settings)
-            found = _found(engine, slip, mass)
+            found = _found(engine, slip, mass, config.hand)
             for name, value in asked.items():
                 error = abs(found.get(name, float("nan")) - value) / (abs(value) or 1.0)
                 if not error <= worst:
@@ -69,13 +69,15 @@ def repeat_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]
     differing = held = same = tried = alone = 0
     apart_m = 0.0
     for shape in labels.shapes:
-        trial = edge_trial(shape, mass, COMPANY, labels.seed)
-        together = run_slip_test(trial, slip, engine=engine)
-        again = run_slip_test(trial, slip, engine=engine)
+        trial = edge_trial(shape, mass, COMPANY, labels.seed, config.hand)
+        together = run_slip_test(trial, slip, geometry=config.hand, engine=engine)
+        again = run_slip_test(trial, slip, geometry=config.hand, engine=engine)
         differing += sum(not a for a in _equal_bits(together, again))
         held, tried = held + int(together.passed.sum()), tried + len(trial)
         for k in (0, COMPANY - 1):
-            one = run_slip_test(trial.part(slice(k, k + 1)), slip, engine=engine)
+            one = run_slip_test(
+                trial.part(slice(k, k + 1)), slip, geometry=config.hand, engine=engine
+            )
             alone += 1
             same += bool(together.passed[k] == one.passed[0])
             if together.passed[k] and one.passed[0]:
@@ -122,10 +124,10 @@ def _asked(
     return asked
 
 
-def _found(engine: Engine, slip: SlipConfig, mass_kg: float) -> dict[str, float]:
+def _found(engine: Engine, slip: SlipConfig, mass_kg: float, hand: Hand) -> dict[str, float]:
     """Return what the engine says of a closed world, with the friction that its rule makes."""
-    trial = cube_trial(mass_kg, DOWN[None])
-    with engine.world(trial.body, trial.grips(slip.headroom_m), slip.physics, find_hand()) as world:
+    trial = cube_trial(mass_kg, DOWN[None], hand)
+    with engine.world(trial.body, trial.grips(slip.headroom_m), slip.physics, hand) as world:
         world.close(slip.closing)
         found: dict[str, Any] = world.settings()
     pair = found["finger_friction"], found["object_friction"]
@@ -202,7 +204,11 @@ def validate(
     return ValidationReport(
         engine=engine.name,
         version=engine.version(),
-        settings={"engine": asdict(engine_settings), "physics": asdict(config.slip.physics)},
+        settings={
+            "engine": asdict(engine_settings),
+            "physics": asdict(config.slip.physics),
+            "hand": {"name": config.hand.name, "digest": config.hand.digest},
+        },
         checks=tuple(checks),
         ratios=tuple(ratios),
         cpu_s=time.process_time() - began,
