@@ -220,6 +220,16 @@ class BulletPair:
                 force=LIFT_N,
             )
 
+    def anchor(self, anchored: bool) -> None:
+        """Let sticking contacts remember where they first touched, or not.
+
+        Bullet anchors a contact a step before it touches: fingers that come along an arc would pull
+        the object the way that they still go.
+        """
+        if self._lifts and self._physics.pads and self._settings.friction_anchor:
+            for finger in self._fingers:
+                self.engine.changeDynamics(self.hand, finger, frictionAnchor=int(anchored))
+
     def drag(self, rate_per_s: float) -> None:
         """Let the object's speeds decay at a rate [1/s]."""
         self.engine.changeDynamics(

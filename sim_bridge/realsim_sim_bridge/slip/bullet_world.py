@@ -84,10 +84,12 @@ class BulletWorld(HandWorld):
         sample = max(1, round(closing.sample_s / self.dt))
         pair = self._pair
         pair.drag(closing.drag_per_s)
+        pair.anchor(False)
         seen = [
             self._close(k, closing, sample) if self.alive[k] else [] for k in range(len(self.alive))
         ]
         pair.drag(0.0)
+        pair.anchor(True)
         return self._motion(seen, max((len(s) for s in seen), default=0), sample)
 
     def _close(self, k: int, closing: Closing, sample: int) -> list[tuple[Array, Array]]:

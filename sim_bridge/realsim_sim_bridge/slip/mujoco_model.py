@@ -32,8 +32,9 @@ Array = NDArray[np.float64]
 
 FINGER_NAMES = ("left", "right")
 LIFT_NAMES = ("left_lift", "right_lift")
-LOCKED_KG = 1e6
-"""Mass of a finger along z while its height is locked [kg]: 200 N move it 4 um in a rollout."""
+LOCKED_KG = 1e8
+"""Mass of a finger along z while its height is locked [kg]: at 1e6 a load creeps by 0.01 mm in
+5 s."""
 SIDES = (1.0, -1.0)
 """Finger 0 is at +y."""
 OBJECT = "object"
@@ -150,7 +151,10 @@ def lift_joints(model: Any) -> list[Any]:
 def lock_lifts(model: Any, locked: bool, settings: "MujocoSettings") -> None:
     """Hold the fingers' height, or let it follow the arc."""
     for joint in lift_joints(model):
-        model.dof_armature[joint.dofadr[0]] = LOCKED_KG if locked else settings.armature_kg
+        at = int(joint.dofadr[0])
+        model.dof_armature[at] = LOCKED_KG if locked else settings.armature_kg
+        # Of bodies that only slide MuJoCo takes the sum that it made at compile time.
+        model.dof_M0[at] = model.dof_armature[at] + model.body_mass[model.dof_bodyid[at]]
         follows = model.eq_obj1id == joint.id
         model.eq_active0[follows] = not locked
 
