@@ -18,6 +18,7 @@ from realsim.geometry.dh import DhArm
 from realsim.robots.dh_of_chain import dh_of_chain
 from realsim.robots.kinematics import DhChain, JointLimits
 from realsim.robots.link_shapes import Block, Rod, block_shape, link_shape, rod_shape
+from realsim.robots.mjcf import read_mjcf_chain
 from realsim.robots.robot_files import FILE, RobotFile, RobotFolder, names_of, robot_file, same_name
 from realsim.robots.shapes import Shape
 from realsim.robots.urdf import UrdfChain, UrdfShape, read_chain
@@ -29,6 +30,8 @@ WRIST_JOINTS = 3
 """The last joints of most arms are the wrist."""
 DH_GAP_M = 1e-4
 """Numbers in DH and a URDF's own chain may differ by this [m]; right angles are made right ones."""
+CONTINUOUS_RAD = 2 * np.pi
+"""A joint that a file lets turn for ever turns one turn each way: what is carried has a cable."""
 DEGREES_RAD = 4 * np.pi
 """A joint that turns farther than two turns each way has its limits in degrees."""
 
@@ -54,7 +57,7 @@ class DhTable(OwnFile, frozen=True, kw_only=True):
 
 
 class UrdfTable(OwnFile, frozen=True, kw_only=True):
-    """[urdf] of `robot.toml`."""
+    """[urdf] or [mjcf] of `robot.toml`."""
 
     file: str
     base: str
@@ -75,6 +78,7 @@ class ArmFile(RobotFile, frozen=True, kw_only=True):
     three."""
     dh: DhTable | None = None
     urdf: UrdfTable | None = None
+    mjcf: UrdfTable | None = None
     links: tuple[str, ...] = ()
     """What messages call the base and the moving links."""
     rods: tuple[Rod, ...] = ()
@@ -82,7 +86,7 @@ class ArmFile(RobotFile, frozen=True, kw_only=True):
     blocks: tuple[Block, ...] = ()
     """... and boxes."""
     kept_apart: tuple[tuple[int, int], ...] = ()
-    """Links, numbered as the DH frames, that can never meet beside the neighbours."""
+    """Links, numbered from the base (0), that can never meet beside the neighbours."""
     mass_kg: float = 0.0
 
 
@@ -184,15 +188,19 @@ def arm_of(chain: DhChain) -> RobotArm:
 
 def _arm_of(file: ArmFile, folder: RobotFolder) -> RobotArm:
     where = folder.path / FILE
-    if (file.dh is None) == (file.urdf is None):
+    ways = [f"[{name}]" for name in ("dh", "urdf", "mjcf") if getattr(file, name) is not None]
+    if len(ways) != 1:
         raise InputError(
-            f"{where} has {'both' if file.dh else 'neither'} [dh] and [urdf]; the kinematics come "
-            "from one of them."
+            f"{where} has {' and '.join(ways) or 'no kinematics'}; exactly one of [dh], [urdf] and "
+            "[mjcf] is needed."
         )
     urdf = None
     if file.urdf is not None:
         urdf = read_chain(folder, file.urdf.file, file.urdf.base, file.urdf.flange)
-        arm = _dh_of_urdf(file, urdf)
+        arm = _dh_of_urdf(file.name, file.urdf, urdf)
+    elif file.mjcf is not None:
+        urdf = read_mjcf_chain(folder, file.mjcf.file, file.mjcf.base, file.mjcf.flange)
+        arm = _dh_of_urdf(file.name, file.mjcf, urdf)
     else:
         assert file.dh is not None  # one of them is there
         alpha, a, d = file.dh.alpha_rad, file.dh.a_m, file.dh.d_m
@@ -237,18 +245,17 @@ def _arm_of(file: ArmFile, folder: RobotFolder) -> RobotArm:
     )
 
 
-def _dh_of_urdf(file: ArmFile, urdf: UrdfChain) -> DhArm:
-    assert file.urdf is not None  # the caller read it
+def _dh_of_urdf(name: str, table: UrdfTable, urdf: UrdfChain) -> DhArm:
     steps = np.array(urdf.steps)
-    steps[-1] = steps[-1] @ se3.from_translation([0.0, 0.0, file.urdf.flange_out_m])
-    arm = dh_of_chain(file.name, steps)
+    steps[-1] = steps[-1] @ se3.from_translation([0.0, 0.0, table.flange_out_m])
+    arm = dh_of_chain(name, steps)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (32, arm.joints))
     gap = np.linalg.norm(arm.forward(q)[:, :3, 3] - _forward(steps, q)[:, :3, 3], axis=1).max()
     if gap > DH_GAP_M:
         raise InputError(
-            f"{file.urdf.file}: the flange of the URDF's chain and of its Denavit-Hartenberg "
+            f"{table.file}: the flange of the file's chain and of its Denavit-Hartenberg "
             f"numbers are {1e3 * gap:.2f} mm apart: axes that are nearly parallel or nearly at "
-            "right angles, as of a calibrated arm. Give the nominal URDF, and the calibration "
+            "right angles, as of a calibrated arm. Give the nominal file, and the calibration "
             "apart."
         )
     return arm
@@ -276,6 +283,8 @@ def _limits(
         ("acceleration_rad_s2", given.acceleration_rad_s2, None),
     ):
         row = np.array(own, dtype=np.float64) if own else other
+        if row is not None and not own:
+            row = np.clip(row, -CONTINUOUS_RAD, CONTINUOUS_RAD)
         if row is None or row.shape != (joints,) or not np.all(np.isfinite(row)):
             raise InputError(
                 f"{where}: [limits] {key} is {None if row is None else row.tolist()}; one finite "

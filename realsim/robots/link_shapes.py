@@ -7,6 +7,7 @@ are where they always were. So the links are placed from the nominal chain: link
 is moved rigidly with the calibrated frame i, from where both agree best.
 """
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -79,20 +80,24 @@ def link_shape(shape: UrdfShape, part: str, frame: int, T_frame_link: Array) -> 
         UnitError: its size contradicts metres.
     """
     T = T_frame_link @ shape.T_link_shape
-    if shape.file is None:
+    if shape.file is None and shape.points is None:
         return Shape(part=part, frame=frame, kind=_KINDS[shape.kind], size_m=shape.size_m,
                      T_frame_shape=T)  # fmt: skip
-    scale = np.array(shape.size_m)
-    unit = "mm" if np.abs(scale).max() < LARGEST_MM_SCALE else "m"
-    mesh = load_mesh(shape.file, unit, [])  # what it looks like does not matter
-    points = mesh.vertices * scale * (1e3 if unit == "mm" else 1.0)
+    points = _mesh_points(shape.file, shape.size_m) if shape.points is None else shape.points
     try:
         corners = points[ConvexHull(points).vertices]
     except (QhullError, ValueError) as error:
         raise InputError(
-            f"{shape.file}, the shape of {part}, has no volume; a solid is needed."
+            f"{shape.file or shape.link}, the shape of {part}, has no volume; a solid is needed."
         ) from error
     return Shape(part=part, frame=frame, kind="convex", size_m=(), T_frame_shape=T, points=corners)
+
+
+def _mesh_points(file: Path | None, scale: tuple[float, ...]) -> Array:
+    assert file is not None  # a shape of no kind is a mesh
+    unit = "mm" if max(map(abs, scale)) < LARGEST_MM_SCALE else "m"
+    mesh = load_mesh(file, unit, [])  # what it looks like does not matter
+    return mesh.vertices * np.array(scale) * (1e3 if unit == "mm" else 1.0)
 
 
 def link_placements(arm: "RobotArm") -> Array:

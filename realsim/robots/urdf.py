@@ -32,6 +32,8 @@ class UrdfShape(NamedTuple):
     """A mesh's."""
     link: str
     """Name of the link that it stands under."""
+    points: Array | None = None
+    """(P, 3) of a mesh that was read already [m]."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -178,7 +180,7 @@ class _Reader:
             where = f"the joint '{joint.get('name', '')[:60]}' of {self._path}"
             T = T @ origin_of(joint, where)
             if joint.get("type") in TURNING:
-                R_axis = _onto_z(joint, where)
+                R_axis = onto_z(_axis(joint, where))
                 steps.append(T @ R_axis)
                 names.append(joint.get("name", ""))
                 rows.append(_limits(joint, where))
@@ -273,15 +275,18 @@ class _Reader:
         return float(floats(value, (1,), f"the mass of the link '{link}' of {self._path}")[0])
 
 
-def _onto_z(joint: Element, where: str) -> Array:
-    """Return a turn (4, 4) whose z is the joint's axis, its other axes as near as can be."""
+def _axis(joint: Element, where: str) -> Array:
     element = joint.find("axis")
     text = "1 0 0" if element is None else element.get("xyz", "1 0 0")
     axis = floats(text, (3,), f"the axis of {where}")
     length = float(np.linalg.norm(axis))
     if length < 1e-6:
         raise InputError(f"{where} has the axis {axis.tolist()}; a direction is needed.")
-    axis = axis / length
+    return axis / length
+
+
+def onto_z(axis: Array) -> Array:
+    """Return a turn (4, 4) whose z is an axis (3,) of length 1, x and y as near as can be."""
     normal = np.cross([0.0, 0.0, 1.0], axis)
     sine = float(np.linalg.norm(normal))
     if sine < 1e-12:

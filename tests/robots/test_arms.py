@@ -140,6 +140,37 @@ def test_an_arm_of_ones_own_needs_no_code(tmp_path: Path, monkeypatch: pytest.Mo
     assert find_arm("One-of-Six").name == "six"
 
 
+def test_an_mjcf_is_read_as_the_urdf_of_the_same_arm(tmp_path: Path) -> None:
+    """Reference angles, a site as the flange, a mesh and a capsule; a slide is refused."""
+    of_urdf = find_arm(str(six_joints(tmp_path / "urdf")))
+    text = '<site name="face" pos="0.05 0 0" euler="0 90 0"/>'
+    for i in reversed(range(6)):
+        ref = ' ref="20"' if i == 2 else ""
+        text = (
+            f'<body name="l{i + 1}" pos="{PLACES[i]}"{" euler=" + chr(34) + "0 20 0" + chr(34) if ref else ""}>'
+            f'<joint name="j{i + 1}" type="hinge" axis="{AXES[i]}" range="-166 166"{ref}/>'
+            f'<geom type="capsule" size="0.03 0.02"/>{text}</body>'
+        )
+    folder = tmp_path / "mjcf"
+    folder.mkdir()
+    xml = f'<mujoco><worldbody><body name="base"><geom type="box" size=".05 .05 .05"/>{text}</body></worldbody></mujoco>'
+    (folder / "six.xml").write_text(xml)
+    toml = (
+        TOML.replace("[urdf]", "[mjcf]")
+        .replace("six.urdf", "six.xml")
+        .replace('"flange"', '"face"')
+    )
+    toml += "speed_rad_s = [2.0, 2.0, 2.0, 2.0, 2.0, 2.0]\n"
+    (folder / "robot.toml").write_text(toml)
+    of_mjcf = find_arm(str(folder))
+    q = np.random.default_rng(0).uniform(-2, 2, (20, 6))
+    np.testing.assert_allclose(of_mjcf.chain.forward(q), of_urdf.chain.forward(q), atol=1e-6)
+    assert [s.kind for s in of_mjcf.shapes] == ["box", *["capsule"] * 6]
+    (folder / "six.xml").write_text(xml.replace('"hinge"', '"slide"', 1))
+    with pytest.raises(InputError, match="is no hinge"):
+        find_arm(str(folder))
+
+
 @pytest.mark.parametrize(
     ("file", "old", "new", "said"),
     [
