@@ -145,15 +145,16 @@ def test_an_mjcf_is_read_as_the_urdf_of_the_same_arm(tmp_path: Path) -> None:
     of_urdf = find_arm(str(six_joints(tmp_path / "urdf")))
     text = '<site name="face" pos="0.05 0 0" euler="0 90 0"/>'
     for i in reversed(range(6)):
-        ref = ' ref="20"' if i == 2 else ""
+        turned, ref = (' euler="0 20 0"', ' ref="20"') if i == 2 else ("", "")
         text = (
-            f'<body name="l{i + 1}" pos="{PLACES[i]}"{" euler=" + chr(34) + "0 20 0" + chr(34) if ref else ""}>'
+            f'<body name="l{i + 1}" pos="{PLACES[i]}"{turned}>'
             f'<joint name="j{i + 1}" type="hinge" axis="{AXES[i]}" range="-166 166"{ref}/>'
             f'<geom type="capsule" size="0.03 0.02"/>{text}</body>'
         )
     folder = tmp_path / "mjcf"
     folder.mkdir()
-    xml = f'<mujoco><worldbody><body name="base"><geom type="box" size=".05 .05 .05"/>{text}</body></worldbody></mujoco>'
+    base = '<body name="base"><geom type="box" size=".05 .05 .05"/>'
+    xml = f"<mujoco><worldbody>{base}{text}</body></worldbody></mujoco>"
     (folder / "six.xml").write_text(xml)
     toml = (
         TOML.replace("[urdf]", "[mjcf]")
