@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from franka_server import FrankaServer
+from realsim.app.doctor.devices import robot_findings
 from realsim.geometry import se3
 from realsim.interop import import_pyrealsense2
 from realsim.records import CaptureSession
-from realsim.robots.arm import UR5, UR5E
+from realsim.robots.arm import UR5, UR5E, find_arm
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.contact_sheet import SheetConfig, contact_sheet
 from realsim_capture_plans.collision.mount import d405_mount
@@ -179,6 +181,44 @@ def test_a_dry_run_drives_the_robot_without_a_camera(plans: Path, tmp_path: Path
         stopped = realsim(*command, "--dry-run", "--views", "0")
         assert stopped.returncode == 1 and "protective stop" in stopped.stderr
     assert not (tmp_path / "s").exists()
+
+
+def seven_joint_plan(arm: str, path: Path) -> CapturePlan:
+    """Write a plan of two views near where franky-sim's arm begins."""
+    home = np.array([0.0, 0.0, 0.0, -np.pi / 2, 0.0, np.pi / 2, np.pi / 4])
+    center, config = np.array([0.5, 0.0, 0.01]), PlanConfig()
+    plan = CapturePlan(
+        kind="hemisphere", chain=find_arm(arm).chain, mount=d405_mount(),
+        cell=config.work_cell(center, "hemisphere"), home=home,
+        joints=home + np.array([[0.05], [-0.05]]) * np.eye(7)[0], center_world=center, vias=(),
+        reference_view=0, config=config,
+    )  # fmt: skip
+    save_plan(plan, path)
+    return plan
+
+
+def test_an_arm_without_a_driver_is_told_where_to_write_one(tmp_path: Path) -> None:
+    seven_joint_plan("iiwa14", tmp_path / "plan.json")
+    done = realsim("capture", tmp_path / "s", "--plan", tmp_path / "plan.json", "--robot-host",
+                   "127.0.0.1", "--no-input", "--dry-run")  # fmt: skip
+    assert done.returncode == 2 and "docs/how-to/write-a-device-driver.md" in done.stderr
+
+
+@pytest.mark.slow
+def test_the_plan_of_a_franka_drives_a_franka(tmp_path: Path) -> None:
+    needs_no_camera()
+    plan = seven_joint_plan("FR3", tmp_path / "plan.json")
+    server = FrankaServer("127.0.23.1")
+    try:
+        (found,) = robot_findings(server.host)
+        assert found.kind == "ok" and "FCI" in found.found
+        done = realsim("capture", tmp_path / "s", "--plan", tmp_path / "plan.json",
+                       "--robot-host", server.host, "--no-input", "--dry-run")  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert "nothing is looked at" in done.stdout
+        np.testing.assert_allclose(server.joints(), plan.joints[1], atol=5e-3)
+    finally:
+        server.close()
 
 
 def test_the_head_of_a_contact_sheet_is_whole() -> None:

@@ -93,6 +93,8 @@ def serve(host: str) -> None:
             # Of franky-sim, O_T_EE and O_T_EE_d are one array: both are where it should be.
             T = self.robot.kinematics(np.array(state.q))
             state = state.replace(O_T_EE=self.robot.to_franka_pose(T))
+            if not self.current_motion_id:  # a robot that holds commands no speed
+                state = state.replace(dq_d=(0.0,) * 7, ddq_d=(0.0,) * 7)
             if self.mode is not None:
                 state = state.replace(
                     robot_mode=self.mode, errors=tuple(i == self.error for i in range(41))

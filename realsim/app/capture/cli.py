@@ -24,7 +24,7 @@ from realsim.app.outputs import GOES_ON
 @click.argument("out", type=GOES_ON)
 @click.option("--plan", required=True, type=PlanName(),
               help="Plan file, or shipped:ur5_d405_hemisphere_256.")  # fmt: skip
-@click.option("--robot-host", default="", help="IP address of the UR5's controller.")
+@click.option("--robot-host", default="", help="IP address of the arm's controller.")
 @click.option("--simulated", is_flag=True, help="The simulated lab instead of a robot.")
 @click.option("--camera", default=None, help="Serial number of the RealSense.  [the only one]")
 @click.option("--board", default="", help="Capture board views: target file, or one line.")

@@ -13,6 +13,8 @@ from realsim_capture_plans.planning.record import CapturePlan
 
 if TYPE_CHECKING:
     from realsim.app.capture.run import CaptureRequest
+    from realsim_capture_plans.devices.franka import FrankaArm
+    from realsim_capture_plans.devices.ur import UrArm
     from realsim_capture_plans.lab import SimulatedLab
 
 Devices = tuple[Arm, DepthCamera | None, "SimulatedLab | None"]
@@ -32,7 +34,7 @@ def open_devices(
     """
     if request.simulated == bool(request.robot_host):
         raise InputError(
-            "say what to capture with: --robot-host IP (a UR5 or UR5e and a RealSense), or "
+            "say what to capture with: --robot-host IP (the plan's arm and a RealSense), or "
             "--simulated (the simulated lab)."
         )
     if request.simulated:
@@ -66,13 +68,12 @@ def _real(
         DeviceError: one of them is not there, or both.
     """
     from realsim_capture_plans.devices.realsense import RealSenseCamera
-    from realsim_capture_plans.devices.ur import UrArm
 
     arm: Arm | None = None
     camera: DepthCamera | None = None
     troubles: list[RealsimError] = []
     try:
-        real_arm = UrArm(request.robot_host, model=plan.robot, chain=plan.chain)
+        real_arm = _arm(request.robot_host, plan)
         stack.callback(real_arm.close)
         check_arm(plan, real_arm, CheckConfig())
         arm = real_arm
@@ -88,6 +89,28 @@ def _real(
     if arm is None or troubles:
         raise _both(troubles)
     return arm, camera
+
+
+def _arm(host: str, plan: CapturePlan) -> "FrankaArm | UrArm":
+    """Return the plan's arm, connected by the driver for arms of its name.
+
+    Raises:
+        InputError: there is no driver for it, or it is another arm.
+        ArmStoppedError: it cannot be reached, or is not ready.
+    """
+    from realsim_capture_plans.devices.franka import MODELS, FrankaArm
+    from realsim_capture_plans.devices.ur import UrArm
+
+    name = plan.robot.lower()
+    if name.startswith("ur"):
+        return UrArm(host, model=plan.robot, chain=plan.chain)
+    if name.startswith(MODELS):
+        return FrankaArm(host, plan.chain)
+    raise InputError(
+        f"the plan is for a {plan.robot}; drivers come for the arms of Universal Robots (UR...) "
+        "and of Franka (Panda, FR3). For another one write a driver: "
+        "docs/how-to/write-a-device-driver.md."
+    )
 
 
 def _no_camera() -> bool:

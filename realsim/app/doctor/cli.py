@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     ),
 )
 @click.argument("session", type=FOLDER, required=False)
-@click.option("--robot-host", default="", help="IP address of the UR5's controller, to be asked.")
+@click.option("--robot-host", default="", help="IP address of the arm's controller, to be asked.")
 @JSON
 @QUIET
 @click.pass_context

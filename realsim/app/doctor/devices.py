@@ -1,6 +1,7 @@
 """Cameras and the robot: what is connected."""
 
 import socket
+from dataclasses import replace
 from typing import Any
 
 from realsim.app.doctor.finding import Finding
@@ -9,6 +10,8 @@ from realsim.app.doctor.isolation import Outcome
 GROUP = "Devices"
 PORTS = {29999: "dashboard", 30004: "RTDE"}
 """Of a Universal Robots controller: power and programs, real-time data."""
+FRANKA_PORT = 1337
+"""Of a Franka controller, open where its control interface (FCI) is active."""
 TIMEOUT_S = 2.0
 """For one port of the robot [s]: in a lab's network it answers within milliseconds."""
 
@@ -51,7 +54,14 @@ def robot_findings(host: str, timeout_s: float = TIMEOUT_S) -> list[Finding]:
             found=f"'{shown:.60}' is no host name: between dots there are 1 to 63 characters",
             todo="give the address from the robot's network settings, such as 192.168.1.10",
         )]  # fmt: skip
-    return [_port(host, port, use, timeout_s) for port, use in PORTS.items()]
+    found = [_port(host, port, use, timeout_s) for port, use in PORTS.items()]
+    if all(finding.kind != "ok" for finding in found):
+        fci = _port(host, FRANKA_PORT, "a Franka's control interface, FCI", timeout_s)
+        if fci.kind == "ok":
+            return [fci]
+        franka = f" A Franka's control interface (port {FRANKA_PORT}) is closed, too: activate FCI."
+        found = [replace(finding, todo=finding.todo + franka) for finding in found]
+    return found
 
 
 def _is_host(host: str) -> bool:

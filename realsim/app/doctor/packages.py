@@ -65,6 +65,7 @@ _REQUIRED = (
 _EXTRAS = (
     ("looks", "example-robot-data", "", "the UR5's own meshes in the replay"),
     ("usd", "usd-core", "pxr.Usd", "USD files, scenes for Isaac Sim"),
+    ("franka", "franky-control", "franky", "captures with a Franka arm"),
     ("lerobot", "av", "av", "demonstrations with videos"),
     ("mujoco", "mujoco", "mujoco", "the Robot School's second engine"),
     ("cluster", "ray", "ray", "the Robot School on several machines"),
