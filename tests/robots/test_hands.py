@@ -1,0 +1,173 @@
+"""Hands as data: their law is the linkage's own, their boxes hold, and what is wrong is named."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import brentq
+
+from realsim.errors import InputError
+from realsim.robots.check_hand import check_hand, pad_frames, path_error
+from realsim.robots.hand import find_hand, hand_of_json
+from realsim.robots.robot_files import names_of
+
+HANDS = {name: find_hand(name) for name in names_of("hand")}
+LOOPS = {
+    "robotiq_2f85": {
+        "crank": (0.0376009, 0.0430400), "rocker": (0.0371170, 0.0434560),
+        "coupler": (0.0179014, -0.0065146), "pad": (0.0255, 0.03242),
+    },
+    "robotiq_2f140": {
+        "crank": (0.0646366, 0.0763028), "rocker": (0.0646366, 0.0763028),
+        "coupler": (0.0179014, -0.0065146), "pad": (0.0309703, 0.0457554),
+    },
+}  # fmt: skip
+"""Links of the finger at +y when the joint is at 0 [m]: the middles of the holes in the meshes of
+airo-models 0.0.12 (2F-85) and robosuite 1.5.2 (2F-140), and where the face of the pad is."""
+CRANK_AXIS, ROCKER_AXIS = np.array([0.0306011, 0.054904]), np.array([0.0127, 0.06142])
+"""In the frame of the hand's base [m]; robosuite's and airo-models'."""
+
+
+def turned(v, angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * v[0] - s * v[1], s * v[0] + c * v[1]])
+
+
+def four_bar(name, angles):
+    """Return the middles (S, 2, 3) of both pads' faces when the loop of links is closed."""
+    links = {key: np.array(v) for key, v in LOOPS[name].items()}
+    length = np.linalg.norm(links["rocker"])
+    faces = []
+    for angle in angles:
+        end = CRANK_AXIS + turned(links["crank"], angle)
+
+        def open_by(turn, end=end):
+            return np.linalg.norm(end - turned(links["coupler"], turn) - ROCKER_AXIS) - length
+
+        turn = brentq(open_by, -0.2, 0.2)
+        y, z = end + turned([-links["pad"][0], links["pad"][1]], turn)
+        faces.append([[0.0, y, z], [0.0, -y, z]])
+    return np.array(faces)
+
+
+def arc_error_mm(name):
+    """Return how far the arc is from the four-bar linkage, over the whole stroke [mm]."""
+    hand = find_hand(name)
+    angles = np.linspace(-0.1, 0.85, 300)
+    faces = four_bar(name, angles)
+    width = faces[:, 0, 1] - faces[:, 1, 1]
+    stroke = (width >= -1e-4) & (width <= hand.max_opening_m + 1e-3)
+    assert width[stroke].max() >= hand.max_opening_m and width[stroke].min() < 1e-3
+    return 1e3 * path_error(hand, faces[stroke])[1]
+
+
+@pytest.mark.parametrize("name", sorted(LOOPS))
+def test_the_arc_is_the_linkage_s_own(name):
+    assert arc_error_mm(name) < 0.05
+
+
+@pytest.fixture
+def own_2f85(tmp_path):
+    """A folder of the 2F-85 with airo-models' URDF, which has a prefix that XML does not allow."""
+    airo = pytest.importorskip("airo_models")
+    text = Path(airo.get_urdf_path("robotiq_2f_85")).read_text()
+    text = "\n".join(line for line in text.splitlines() if "drake:" not in line)
+    (tmp_path / "hand.urdf").write_text(text)
+    told = (names_of("hand")["robotiq_2f85"] / "robot.toml").read_text()
+    links = 'urdf = "hand.urdf"\nurdf_pads = ["right_inner_finger_pad", "left_inner_finger_pad"]\n'
+    links += "urdf_pad_face_m = [0.0, -0.0034797, 0.0]\n"  # 25.5 mm inside the crank's end
+    (tmp_path / "robot.toml").write_text(told.replace("[arc]", links + "[arc]"))
+    return tmp_path
+
+
+def test_the_arc_is_the_urdf_s_through_its_mimic_joints(own_2f85):
+    hand, findings = check_hand(str(own_2f85))
+    assert all(f.is_right for f in findings), findings
+    pads = ("right_inner_finger_pad", "left_inner_finger_pad")
+    Ts = pad_frames(own_2f85 / "hand.urdf", pads)
+    faces = Ts[..., :3, 3] - 0.0034797 * Ts[..., :3, 1]
+    assert path_error(hand, faces)[1] < 0.2e-3
+    assert path_error(replace(hand, arc_radius_m=0.08), faces)[1] > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "told"),
+    [
+        ("hand.urdf", 'mimic joint="finger_joint"', 'mimic joint="thumb"', "mimics 'thumb'"),
+        ("hand.urdf", 'multiplier="-1"', 'multiplier="-0.9"', "pads turn by"),
+        ("robot.toml", "max_opening_m = 0.085", "max_opening_m = 85.0", "write 0.085"),
+        ("robot.toml", "radius_m = 0.05715", "radius_m = 0.070", "mm of the law"),
+        ("robot.toml", "usual_n = 70.0", "usual_n = 7.0", "least of 20 N"),
+        ("robot.toml", "distance_m = 0.155046", "distance_m = 0.1", "into the arm"),
+        ("robot.toml", "mass_kg = 0.925", "mass_kg = 0.15", "of it 0.1 kg"),
+        ("robot.toml", "length_m = 0.0375\nfriction", "length_m = 0.05\nfriction", "beyond"),
+        ("robot.toml", "max_opening_m", "max_opening", "max_opening"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_named(own_2f85, file, old, new, told):
+    text = (own_2f85 / file).read_text()
+    assert old in text
+    (own_2f85 / file).write_text(text.replace(old, new))
+    try:
+        said = [f"{f.what}: {f.found}" for f in check_hand(str(own_2f85))[1] if not f.is_right]
+    except InputError as error:
+        said = [str(error)]
+    assert any(told in line for line in said), said
+
+
+def test_pads_that_never_meet_are_named_with_the_gap(tmp_path):
+    four = "max_opening_m = 0.06\nfinger_length_m = 0.04\nfinger_width_m = 0.02\n"
+    text = f'kind = "hand"\nname = "mine"\n{four}finger_thickness_m = 0.01\n'
+    (tmp_path / "robot.toml").write_text(text)
+    hand, findings = check_hand(str(tmp_path))
+    assert all(f.is_right for f in findings) and hand.name == tmp_path.name
+    (tmp_path / "robot.toml").write_text(
+        text + "[[finger]]\nlow_m = [-0.01, -0.004, -0.03]\nhigh_m = [0.01, 0.01, 0.01]\n"
+    )
+    wrong = [f for f in check_hand(str(tmp_path))[1] if not f.is_right]
+    assert [f.what for f in wrong] == ["pads meet"] and "8.0 mm inside" in wrong[0].found
+
+
+@pytest.mark.parametrize("name", sorted(HANDS))
+def test_every_hand_that_ships_is_right_and_goes_through_json(name):
+    hand, findings = check_hand(name)
+    assert all(f.is_right for f in findings), findings
+    assert hand_of_json(json.loads(json.dumps(asdict(hand))), "a file") == hand == find_hand(name)
+    T = hand.T_ee_grasp
+    assert np.allclose(T[:3, 3], [0, 0, -hand.mount_z_m]) and np.isclose(np.linalg.det(T), 1)
+
+
+@given(st.sampled_from(sorted(HANDS)), st.integers(0, 2**32 - 1))
+def test_what_is_swept_holds_every_opening_on_the_way(name, seed):
+    hand, rng = HANDS[name], np.random.default_rng(seed)
+    near, far = np.sort(rng.uniform(0.0, hand.max_opening_m, (2, 50)), axis=0)
+    between = near + (far - near) * rng.uniform(size=50)
+    swept, one = hand.swept_boxes(near, far), hand.boxes(between)
+    assert np.all(swept[:, :, 0] <= one[:, :, 0] + 1e-12)
+    assert np.all(swept[:, :, 1] >= one[:, :, 1] - 1e-12)
+    y, h = between / 2, 1e-6
+    slope = (hand.z_pad(2 * (y + h)) - hand.z_pad(2 * (y - h))) / (2 * h)
+    inside = (y > h) & (y < hand.max_opening_m / 2 - h)
+    np.testing.assert_allclose(hand.slope(y)[inside], slope[inside], atol=1e-6)
+
+
+def test_bars_of_a_linkage_are_inside_their_boxes():
+    """Points of the 2F-85's knuckles, turned with the crank, stay in the boxes at every opening."""
+    hand = find_hand("robotiq_2f85")
+    w = np.linspace(0.0, hand.max_opening_m, 40)
+    crank = np.arctan2(
+        hand.z_pad(w) + np.sqrt(hand.arc_radius_m**2 - hand.arc_axis_y_m**2),
+        w / 2 - hand.arc_axis_y_m,
+    )
+    boxes = hand.bar_boxes(w)[:, len(hand.bars) :]
+    for k, bar in enumerate(hand.bars):
+        pivot = np.array(bar[:2])
+        for share in (0.0, 0.4, 1.0):
+            at = (1 - share) * np.array(bar[2:4]) + share * np.array(bar[4:6]) - pivot
+            points = np.array([pivot + turned(at, a - crank[0]) for a in crank])
+            assert np.all(points >= boxes[:, k, 0, 1:] + bar[7] - 1e-12)
+            assert np.all(points <= boxes[:, k, 1, 1:] - bar[7] + 1e-12)
