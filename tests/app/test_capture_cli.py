@@ -208,7 +208,7 @@ def test_an_arm_without_a_driver_is_told_where_to_write_one(tmp_path: Path) -> N
 def test_the_plan_of_a_franka_drives_a_franka(tmp_path: Path) -> None:
     needs_no_camera()
     plan = seven_joint_plan("FR3", tmp_path / "plan.json")
-    server = FrankaServer("127.0.23.1")
+    server = FrankaServer()
     try:
         (found,) = robot_findings(server.host)
         assert found.kind == "ok" and "FCI" in found.found

@@ -8,6 +8,7 @@ franky-sim knows no errors and no stops: what the robot's protocol says of them 
 
 import contextlib
 import queue
+import random
 import subprocess
 import sys
 import threading
@@ -25,11 +26,13 @@ READY = "ready"
 class FrankaServer:
     """A running server at `host`; it ends with `close`, `kill` or with this process."""
 
-    def __init__(self, host: str) -> None:
-        """Start it and wait until it is ready."""
-        self.host = host
+    def __init__(self) -> None:
+        """Start it at a loopback address that hardly anybody else has, and wait for it."""
+        self.host = (
+            f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(2, 254)}"
+        )
         self._process: subprocess.Popen[str] = subprocess.Popen(
-            [sys.executable, __file__, host],
+            [sys.executable, __file__, self.host],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert self._line() == READY

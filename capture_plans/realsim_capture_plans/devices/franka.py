@@ -96,9 +96,8 @@ class FrankaArm:
             ) from error
         self._host, self._chain, self._who = host, chain, f"{chain.name} at {host}"
         self._config = FrankaConfig() if config is None else config
-        self._held: list[
-            Any
-        ] = []  # franky's robot: nothing else may keep it, or it stays connected
+        # franky's robot: whatever else keeps it keeps the connection.
+        self._held: list[Any] = []
         self._connect()
 
     @property
@@ -215,14 +214,17 @@ class FrankaArm:
         began = since = time.monotonic()
         while True:
             seen = self._look()
-            self._refuse_trouble(seen)
+            moving = seen.robot_mode.name == "Move"  # a packet may still say so after a move's end
+            if not moving:
+                self._refuse_trouble(seen)
             now, quick = time.monotonic(), float(np.abs([seen.dq, seen.dq_d]).max())
             off = 0.0 if goal is None else float(np.abs(np.array(seen.q) - goal).max())
-            if quick > c.still_rad_s or off > c.arrival_rad:
+            if moving or quick > c.still_rad_s or off > c.arrival_rad:
                 since = now
             elif goal is None or now - since >= c.still_s:
                 return seen
             if now - began > c.settle_limit_s:
+                self._refuse_trouble(seen)
                 raise off_goal(
                     self._who,
                     f"after {c.settle_limit_s:g} s it is {off:.4f} rad off its goal and turns with "
