@@ -3,7 +3,7 @@
 from realsim.robots.arm import UR5 as UR5
 from realsim.robots.arm import UR5E as UR5E
 from realsim.robots.kinematics import DhChain as DhChain
-from realsim.robots.kinematics import JointLimits as JointLimits
+from realsim.robots.limits import JointLimits as JointLimits
 from realsim_capture_plans.capturing.capture import CaptureConfig as CaptureConfig
 from realsim_capture_plans.capturing.capture import CaptureSummary as CaptureSummary
 from realsim_capture_plans.capturing.capture import capture as capture

@@ -16,7 +16,8 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.robots.dh_of_chain import dh_of_chain
-from realsim.robots.kinematics import DhChain, JointLimits
+from realsim.robots.kinematics import DhChain
+from realsim.robots.limits import JointLimits
 from realsim.robots.link_shapes import Block, Rod, block_shape, link_shape, rod_shape
 from realsim.robots.mjcf import read_mjcf_chain
 from realsim.robots.robot_files import FILE, RobotFile, RobotFolder, names_of, robot_file, same_name
@@ -283,7 +284,7 @@ def _limits(
         ("acceleration_rad_s2", given.acceleration_rad_s2, None),
     ):
         row = np.array(own, dtype=np.float64) if own else other
-        if row is not None and not own:
+        if row is not None and not own and key in ("lower_rad", "upper_rad"):
             row = np.clip(row, -CONTINUOUS_RAD, CONTINUOUS_RAD)
         if row is None or row.shape != (joints,) or not np.all(np.isfinite(row)):
             raise InputError(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from realsim.compiled import njit
 from realsim.geometry.dh import DhArm
-from realsim.robots.kinematics import DhChain
+from realsim.robots.limits import LimitedArm
 
 Array = NDArray[np.float64]
 
@@ -19,6 +19,8 @@ NEWTON_STEPS = 6
 """Most Newton steps per followed pose: 2 cm apart, the error is below 1e-9 after three."""
 NEWTON_END = 1e-10
 """A pose is reached when the error [m, rad] is below this."""
+SOLVED = 1e-12
+"""A seed has become a solution when the error [m, rad] is below this."""
 DAMPING = 1e-10
 """Keeps the step finite at a singularity, where the error then stays large [m^2]."""
 LARGEST_STEP_RAD = 0.5
@@ -48,7 +50,7 @@ class ChainNumbers(NamedTuple):
     """(n,) [rad]."""
 
 
-def chain_numbers(chain: DhChain, T_ee_tool: Array | None = None) -> ChainNumbers:
+def chain_numbers(chain: LimitedArm, T_ee_tool: Array | None = None) -> ChainNumbers:
     """Return a chain for compiled code, its calibration included.
 
     Args:
@@ -249,7 +251,7 @@ def solve_from(chain: Any, q: Any, Ts: Any, steps: int, damping: float) -> Any:
         for _ in range(steps):
             frames_into(chain, q[m], still, frames)
             error = gap_to(frames, Ts[m, :3, :3], Ts[m, 0, 3], Ts[m, 1, 3], Ts[m, 2, 3], gap)
-            if error < NEWTON_END:
+            if error < SOLVED:
                 arrived[m] = True
                 break
             jacobian_into(frames, J)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.compiled_chain import chain_numbers, solve_from
-from realsim.robots.kinematics import DhChain
+from realsim.robots.limits import LimitedArm
 
 Array = NDArray[np.float64]
 CLOSED = 6
@@ -27,18 +27,20 @@ TRIED_VALUES = (0.31, -0.77, 1.13)
 """Values at which a held joint must leave a solvable arm [rad]; none is special for any arm."""
 TABLE = 16384
 """Random configurations inside the limits."""
-NEAREST = 48
+NEAREST = 24
 """Of these start at each pose."""
 TURN_M = 0.25
 """A rotation matrix's differences count as so many metres: half the length of a forearm."""
-STEPS, TABLE_DAMPING = 40, 0.02
+STEPS, TABLE_DAMPING = 18, 0.02
 """Of a seed from the table: its steps, and their damping."""
+TRIED, BEYOND = 1000, 1.3
+"""Configurations whose nearest in the table say how far a pose in reach can be from it, times."""
 SAME_RAD = 1e-4
 """Seeds that end nearer than this in all joints are one."""
 
 
 def seeds_of(
-    chain: DhChain, Ts_base_ee: Array, held_values: int = HELD_VALUES
+    chain: LimitedArm, Ts_base_ee: Array, held_values: int = HELD_VALUES
 ) -> tuple[Array, NDArray[np.intp]]:
     """Return joints (M, n) near to or at all known inverses of poses, and each one's pose (M,).
 
@@ -83,7 +85,7 @@ NO_CLOSED_FORM = -1
 """What `held_joint` says of an arm that is solved from a table."""
 
 
-def held_joint(chain: DhChain) -> int | None:
+def held_joint(chain: LimitedArm) -> int | None:
     """Return the joint that is held, None if none need be, or `NO_CLOSED_FORM`.
 
     Of several the last is taken, beginning at the flange.
@@ -91,7 +93,7 @@ def held_joint(chain: DhChain) -> int | None:
     return _held_joint(_key(chain))
 
 
-def is_sampled(chain: DhChain) -> bool:
+def is_sampled(chain: LimitedArm) -> bool:
     """Return whether a joint is held at some values, between which solutions may be missed."""
     return held_joint(chain) not in (None, NO_CLOSED_FORM)
 
@@ -99,7 +101,7 @@ def is_sampled(chain: DhChain) -> bool:
 Key = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]
 
 
-def _key(chain: DhChain) -> Key:
+def _key(chain: LimitedArm) -> Key:
     return tuple(chain.alpha), tuple(chain.a), tuple(chain.d)
 
 
@@ -147,16 +149,15 @@ def _branches(solver: Any, targets: Array, theta: Array) -> tuple[Array, NDArray
     return np.array(seeds, dtype=np.float64) - theta, np.array(owner, dtype=np.intp)
 
 
-def seeds_from_table(chain: DhChain, Ts_base_ee: Array) -> tuple[Array, NDArray[np.intp]]:
+def seeds_from_table(chain: LimitedArm, Ts_base_ee: Array) -> tuple[Array, NDArray[np.intp]]:
     """Return joints (M, n) inside the limits that reach poses (N, 4, 4), and each one's pose."""
     numbers = chain_numbers(chain)
-    table, features = _table(chain)
-    wanted = _features(Ts_base_ee)
-    # |f - w|^2 without |w|^2, which is the same for the whole row.
-    far = np.einsum("kf,kf->k", features, features) - 2.0 * wanted @ features.T
-    near = np.argpartition(far, NEAREST, axis=1)[:, :NEAREST]
+    table, features, farthest = _table(chain)
+    squares = _squares(_features(Ts_base_ee), features)
+    near = np.argpartition(squares, NEAREST, axis=1)[:, :NEAREST]
     near.sort(axis=1)
-    of = np.repeat(np.arange(len(Ts_base_ee), dtype=np.intp), NEAREST)
+    asked = np.nonzero(squares.min(axis=1) < farthest**2)[0]
+    near, of = near[asked], np.repeat(asked, NEAREST)
     q = np.ascontiguousarray(table[near.ravel()])
     poses = np.ascontiguousarray(Ts_base_ee[of])
     arrived = solve_from(numbers, q, poses, STEPS, TABLE_DAMPING)
@@ -167,19 +168,30 @@ def seeds_from_table(chain: DhChain, Ts_base_ee: Array) -> tuple[Array, NDArray[
     return q[first], of[first]
 
 
-_tables: dict[tuple[Any, ...], tuple[Array, Array]] = {}
+_tables: dict[tuple[Any, ...], tuple[Array, Array, float]] = {}
 
 
-def _table(chain: DhChain) -> tuple[Array, Array]:
-    """Return configurations (K, n) and the features (K, 12) of their flange poses."""
+def _table(chain: LimitedArm) -> tuple[Array, Array, float]:
+    """Return configurations (K, n), the features (K, 12) of their flange poses, and a distance [m].
+
+    A pose that is farther than that from all of them is out of reach.
+    """
     limits = chain.limits
     key = (*_key(chain), *limits.lower.tolist(), *limits.upper.tolist(), chain.T_base_0.tobytes())
     if key not in _tables:
         low, high = np.maximum(limits.lower, -np.pi), np.minimum(limits.upper, np.pi)
         low, high = np.where(low < high, (low, high), (limits.lower, limits.upper))
-        q = np.random.default_rng(0).uniform(low, high, (TABLE, chain.joints))
-        _tables[key] = q, _features(chain.forward(q))
+        q = np.random.default_rng(0).uniform(low, high, (TABLE + TRIED, chain.joints))
+        features = _features(chain.forward(q))
+        gaps = _squares(features[TABLE:], features[:TABLE]).min(axis=1)
+        _tables[key] = q[:TABLE], features[:TABLE], BEYOND * float(np.sqrt(gaps.max()))
     return _tables[key]
+
+
+def _squares(a: Array, b: Array) -> Array:
+    """Return squared distances (N, K) of rows (N, F) and (K, F)."""
+    sums = np.einsum("kf,kf->k", b, b) - 2.0 * a @ b.T
+    return sums + np.einsum("nf,nf->n", a, a)[:, None]
 
 
 def _features(Ts: Array) -> Array:

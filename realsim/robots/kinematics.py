@@ -7,15 +7,15 @@ then moved by Newton steps onto the chain as it is, a factory calibration includ
 inverse is exact for every chain.
 """
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.geometry.dh import DhArm, checked_row
+from realsim.robots import inverse
+from realsim.robots.limits import LimitedArm
 
 Array = NDArray[np.float64]
 NEWTON_STEPS = 25
@@ -29,63 +29,8 @@ SAME_SOLUTION_RAD = 1e-5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class JointLimits:
-    """How far and how fast each joint may go."""
-
-    lower: Array
-    """(n,) least joint angle [rad]."""
-    upper: Array
-    """(n,) greatest joint angle [rad]."""
-    speed: Array
-    """(n,) greatest joint speed [rad/s]."""
-    acceleration: Array
-    """(n,) greatest joint acceleration [rad/s^2]."""
-
-    def __post_init__(self) -> None:
-        """Check the order of the limits and freeze the arrays."""
-        n = len(checked_row(self.lower, "joint limits: lower"))
-        for name in ("lower", "upper", "speed", "acceleration"):
-            row = checked_row(getattr(self, name), f"joint limits: {name}", n)
-            object.__setattr__(self, name, row)
-        if np.any(self.lower >= self.upper):
-            raise InputError("joint limits: every lower limit must be below its upper limit.")
-        if np.any(self.speed <= 0) or np.any(self.acceleration <= 0):
-            raise InputError("joint limits: speeds and accelerations must be positive.")
-
-    def contains(self, joints: ArrayLike) -> NDArray[np.bool_]:
-        """Return (...) whether joints (..., n) [rad] are inside the limits."""
-        q = np.asarray(joints, dtype=np.float64)
-        return np.all((q >= self.lower) & (q <= self.upper), axis=-1)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True, slots=True)
-class DhChain(DhArm):
-    """An arm that can also be asked backwards, with its limits."""
-
-    limits: JointLimits
-
-    @classmethod
-    def of(cls, arm: DhArm, limits: JointLimits) -> "DhChain":
-        """Return the chain of an arm.
-
-        Raises:
-            InputError: the limits are those of another number of joints.
-        """
-        numbers = {f.name: getattr(arm, f.name) for f in fields(DhArm)}
-        return cls(**numbers, limits=limits)
-
-    def __post_init__(self) -> None:
-        """Check that limits and numbers are of as many joints."""
-        super(DhChain, self).__post_init__()
-        if len(self.limits.lower) != self.joints:
-            raise InputError(
-                f"{self.name}: limits of {len(self.limits.lower)} joints, numbers of {self.joints}."
-            )
-
-    def nominal(self) -> "DhChain":
-        """Return the chain without its calibration."""
-        zero = np.zeros(self.joints)
-        return replace(self, delta_a=zero, delta_d=zero, delta_alpha=zero, delta_theta=zero)
+class DhChain(LimitedArm):
+    """An arm that can also be asked backwards."""
 
     def sigma_min(self, joints: ArrayLike) -> Array:
         """Return the least singular value (...) of the Jacobian (rad and m taken as they are)."""
@@ -112,8 +57,6 @@ class DhChain(DhArm):
         Returns:
             joints (M, n) [rad] and the number (M,) of the pose that each reaches.
         """
-        from realsim.robots import inverse
-
         Ts = np.asarray(Ts_base_ee, dtype=np.float64)
         q, of = self._exact(*inverse.seeds_of(self, Ts), Ts)
         missed = np.setdiff1d(np.arange(len(Ts)), of)

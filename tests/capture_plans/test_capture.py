@@ -23,7 +23,7 @@ from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, CaptureSession
 from realsim.robots.arm import UR5, UR5E
-from realsim.robots.kinematics import JointLimits
+from realsim.robots.limits import JointLimits
 from realsim.store import SessionStore, atomic
 from realsim_capture_plans.capturing.capture import (
     PLAN_FILE,

@@ -24,7 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError, MissingLibraryError, RealsimError
 from realsim.geometry import se3
-from realsim.robots.kinematics import DhChain, JointLimits
+from realsim.robots.kinematics import DhChain
+from realsim.robots.limits import JointLimits
 from realsim_capture_plans.devices.franka_messages import lost, named, off_goal, stopped, trouble
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, checked_goal
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError, RealsimError
 from realsim.records import CameraIntrinsics
 from realsim.records.checked_arrays import rigid
-from realsim.robots.kinematics import JointLimits
+from realsim.robots.limits import JointLimits
 
 Array = NDArray[np.float64]
 

@@ -20,7 +20,8 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.interop import T_from_rotation_vector_pose
 from realsim.robots.arm import ur_chains
-from realsim.robots.kinematics import DhChain, JointLimits
+from realsim.robots.kinematics import DhChain
+from realsim.robots.limits import JointLimits
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, checked_goal
 from realsim_capture_plans.devices.ur_connection import Identity, UrConfig, UrConnection
 

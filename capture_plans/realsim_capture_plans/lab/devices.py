@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.records import CameraIntrinsics
 from realsim.robots.arm import UR5
-from realsim.robots.kinematics import DhChain, JointLimits
+from realsim.robots.kinematics import DhChain
+from realsim.robots.limits import JointLimits
 from realsim_capture_plans.devices.interfaces import Arm, ArmState, Frame, checked_goal
 from realsim_capture_plans.lab.truth import NOISE, LabConfig, LabTruth, factory_intrinsics, stream
 from realsim_capture_plans.planning.ordering import move_seconds

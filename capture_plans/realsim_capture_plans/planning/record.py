@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from realsim.errors import InputError
 from realsim.records.checked_arrays import frozen
-from realsim.robots.kinematics import DhChain, JointLimits
+from realsim.robots.kinematics import DhChain
+from realsim.robots.limits import JointLimits
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
 from realsim_capture_plans.collision.model import CollisionModel
 
