@@ -15,7 +15,7 @@ from matplotlib.patches import FancyArrowPatch, Polygon
 from matplotlib.patheffects import withStroke
 
 from realsim.formats.graspnet.gripper_frame import BASE_M, graspnet_poses
-from realsim.formats.grasps.hand_frames import FINGERTIP_Z_M, TCP_Z_M, hand_poses
+from realsim.formats.grasps.hand_frames import hand_poses
 from realsim.robots.hand import find_hand
 
 AXES = ("#c8553d", "#2a9d8f", "#3a6ea5")
@@ -25,7 +25,7 @@ OPENING_M, WIDTH_M, DEPTH_M = 0.066, 0.046, 0.02
 BOX_M = np.array([[-0.017, -WIDTH_M / 2, -DEPTH_M], [0.017, WIDTH_M / 2, 0.034]])
 """The box, least and greatest corner in `grasp` [m]: its upper face is DEPTH_M above the contacts.
 """
-TIP_M = FINGERTIP_Z_M - TCP_Z_M
+TIP_M = find_hand().tip_beyond_tcp_m
 ARROW_M = 0.042
 AZIMUTH, ELEVATION = np.deg2rad(24.0), np.deg2rad(11.0)
 LIGHT = np.array([-0.55, 0.1, -0.83])
@@ -150,7 +150,7 @@ def draw_graspnets_gripper(ax: Any) -> None:
 
 def panels() -> list[Panel]:
     """Return the panels in reading order."""
-    mount = f"origin: the hand's mounting face,\n{1e3 * TCP_Z_M:.1f} mm behind grasp"
+    mount = f"origin: the hand's mounting face,\n{-1e3 * find_hand().mount_z_m:.1f} mm behind grasp"
     acronym = {"z": "approach", "x": "closing"}
     ours = {"z": "approach", "y": "closing"}
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])

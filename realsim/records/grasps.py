@@ -1,5 +1,6 @@
 """What physics said of the grasps of one object."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -113,9 +114,52 @@ class GraspSet:
         return len(self.Ts_obj_grasp)
 
     @property
+    def hand(self) -> tuple[str, str]:
+        """Name and digest of the hand that the grasps are of; without one they are Franka's."""
+        config = self.parameters.get("config")
+        told = config.get("hand") if isinstance(config, dict) else None
+        return hand_named(told)
+
+    @property
+    def Ts_obj_pads(self) -> Array:
+        """(N, 4, 4) the grasps, origin between the middles of the closed pads [m].
+
+        The grasps themselves, but for hands whose pads run on an arc.
+        """
+        heights = self.parameters.get("pad_heights_m")
+        if heights is None:
+            return self.Ts_obj_grasp
+        pads = np.array(self.Ts_obj_grasp)
+        pads[:, :3, 3] += np.array(heights, dtype=np.float64)[:, None] * pads[:, :3, 2]
+        return pads
+
+    @property
     def good(self) -> NDArray[np.bool_]:
         """(N,) whether the grasp is good: score >= 0.5."""
         return np.nan_to_num(self.scores, nan=-1.0) >= 0.5
+
+
+def hand_named(told: Any) -> tuple[str, str]:
+    """Return name and digest of a hand as a set's parameters have it; "" = no digest."""
+    known = told if isinstance(told, dict) else {}
+    return str(known.get("name", "franka_hand")), str(known.get("digest", ""))
+
+
+def require_one_hand(sets: Iterable[GraspSet], where: str) -> None:
+    """Check that the sets are of one hand.
+
+    Raises:
+        InputError: they are of two; both are named.
+    """
+    hands = {s.hand: s.instance for s in sets}
+    names = {name for name, _ in hands}
+    told = [f"{name} ({digest[:8]})" if digest else name for name, digest in hands]
+    versions = {digest for _, digest in hands if digest}
+    if len(names) > 1 or len(versions) > 1:
+        raise InputError(
+            f"{where} mixes grasps of the hands {' and '.join(told)}; grasps of one hand are kept "
+            "together. Run `realsim school` again with one --hand, or keep the others elsewhere."
+        )
 
 
 def _checked_measures(measures: dict[str, Array], n: int) -> dict[str, Array]:

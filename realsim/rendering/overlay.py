@@ -178,7 +178,7 @@ def draw_grasps(
     """
     out = rgb.copy()
     chosen = np.arange(len(grasps)) if indices is None else np.asarray(indices, dtype=np.int64)
-    Ts_cam_grasp = np.asarray(T_cam_obj, dtype=np.float64) @ grasps.Ts_obj_grasp[chosen]
+    Ts_cam_grasp = np.asarray(T_cam_obj, dtype=np.float64) @ grasps.Ts_obj_pads[chosen]
     depth = Ts_cam_grasp[:, 2, 3]
     for k in np.argsort(-depth):
         g = int(chosen[k])

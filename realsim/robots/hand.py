@@ -133,6 +133,13 @@ class HandFile(RobotFile, frozen=True, kw_only=True):
     """Of a finger as the physics moves it [kg]."""
     closing_speed_m_s: float = 0.1
     """Greatest speed of each finger [m/s]; the default is Franka's."""
+    frame_link: str = ""
+    """Link of its URDF at the mounting face, z = approach, y = closing; the folder's name where it
+    is left away."""
+    joint: str = ""
+    """Joint that drives it, as its URDF calls it; '' = not known."""
+    joint_zero_m: float = 0.0
+    """Opening at which that joint is at 0 [m]: of an arc, whose joint closes it."""
     urdf: str = ""
     """The hand's URDF; '' = none. `realsim robots check` compares its pads' path with the law."""
     urdf_pads: tuple[str, ...] = ()
@@ -188,6 +195,10 @@ class Hand:
     """Of each finger on the object [N]: the usual one."""
     closing_speed: float
     """Greatest speed of each finger [m/s]."""
+    frame_link: str
+    joint: str
+    joint_zero_m: float
+    """As `HandFile` has them."""
 
     def __post_init__(self) -> None:
         """Check the numbers.
@@ -249,6 +260,16 @@ class Hand:
         if not self.arc_radius_m:
             return np.zeros_like(y)
         return (self.arc_axis_y_m - y) / self._height(y - self.arc_axis_y_m)
+
+    def joint_position(self, openings_m: NDArray[np.float64] | float) -> Array:
+        """Return the driven joint's position (N,) at openings (N,) [m].
+
+        Of a slide half the opening [m]; of an arc how far the crank has closed since zero [rad].
+        """
+        half = np.asarray(openings_m, dtype=np.float64) / 2.0
+        if not self.arc_radius_m:
+            return half
+        return self._crank(half) - self._crank(self.joint_zero_m / 2.0)
 
     def _height(self, across: NDArray[np.float64] | float) -> Array:
         """Return how far above its axis the crank ends [m], so far beside it."""
@@ -409,6 +430,9 @@ def hand_of(file: HandFile, folder: RobotFolder) -> Hand:
         greatest_force_n=file.force.greatest_n,
         force_n=file.force.usual_n,
         closing_speed=file.closing_speed_m_s,
+        frame_link=file.frame_link or folder.name,
+        joint=file.joint,
+        joint_zero_m=file.joint_zero_m,
     )
 
 

@@ -67,7 +67,7 @@ def test_the_approach_ends_in_the_grasp_with_closed_fingers() -> None:
         np.tile(T_world_obj @ T_obj_grasp, (closing.sum(), 1, 1)), atol=1e-12,
     )  # fmt: skip
     assert motion.opening_m[-1] == pytest.approx(WIDTH_M, abs=1e-12)
-    assert motion.opening_m[0] == HandApproach().opening_m
+    assert motion.opening_m[0] == HandApproach().hand.max_opening_m
 
 
 @pytest.mark.parametrize("width_m", [0.0, 0.11])

@@ -18,11 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
+from realsim.formats.grasps.hand_frames import hand_of_set
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet, Mesh, ObjectModel
 from realsim.records.trajectories import PHASES, GraspTrajectories
 from realsim.review.replay.grasp_replay import GraspMotion, HandApproach, hand_approach
+from realsim.robots.hand import FRANKA
 from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.reach_config import base_on_table
 from realsim_sim_bridge.demonstrations.pictures import drawn_mesh, panda_meshes
@@ -147,7 +149,7 @@ class SessionMotions:
         m, scenery = demonstration.motion, demonstration.scenery
         T_world_table = self._table()
         T_world_base = T_world_table @ scenery.T_table_base
-        meshes, Ts_world_link = self._arm(m.joints_rad, m.opening_m, T_world_base)
+        meshes, Ts_world_link, arm_links = self._arm(s, m.joints_rad, m.opening_m, T_world_base)
         return GraspMotion(
             instance=s.instance,
             row=row,
@@ -159,7 +161,8 @@ class SessionMotions:
             obj_mesh=self._mesh(s.obj_id),
             Ts_world_link=Ts_world_link,
             link_meshes=meshes,
-            arm_links=max(len(meshes) - HAND_PARTS, 0),
+            arm_links=arm_links,
+            hand=hand_of_set(s),
             notes=demonstration.notes,
         )
 
@@ -196,7 +199,7 @@ class SessionMotions:
         Ts_world_obj = np.tile(T_world_obj, (len(t), 1, 1))
         Ts_world_obj[lifted] = Ts_world_hand[lifted] @ se3.invert(s.Ts_obj_grasp[row])
         width: Array = np.where(closed, np.maximum(opening, s.widths_m[row]), opening)
-        meshes, Ts_world_link = self._arm(joints, width, T_world_base)
+        meshes, Ts_world_link, arm_links = self._arm(s, joints, width, T_world_base)
         return GraspMotion(
             instance=s.instance,
             row=row,
@@ -208,7 +211,8 @@ class SessionMotions:
             obj_mesh=self._mesh(s.obj_id),
             Ts_world_link=Ts_world_link,
             link_meshes=meshes,
-            arm_links=max(len(meshes) - HAND_PARTS, 0),
+            arm_links=arm_links,
+            hand=hand_of_set(s),
             notes=(f"{FIXED_IN_HAND}: {why}",),
         )
 
@@ -220,11 +224,11 @@ class SessionMotions:
             self._grasps.Ts_world_obj[s.instance],
             s.Ts_obj_grasp[row],
             float(s.widths_m[row]),
-            HandApproach(rate_hz=float(self._rate)),
+            HandApproach(rate_hz=float(self._rate), hand=hand_of_set(s)),
             obj_mesh=self._mesh(s.obj_id),
             notes=notes,
         )
-        if not self._with_arm:
+        if not self._with_arm or s.hand[0] != FRANKA:
             return made
         try:
             meshes, Ts = _hand_links(made.Ts_world_hand, made.opening_m)
@@ -233,13 +237,19 @@ class SessionMotions:
         return replace(made, link_meshes=meshes, Ts_world_link=Ts)
 
     def _arm(
-        self, joints: Array, opening_m: Array, T_world_base: Array
-    ) -> tuple[tuple[Mesh, ...], Array]:
-        """Return arm and hand as they are drawn; none where their meshes are not there."""
+        self, s: GraspSet, joints: Array, opening_m: Array, T_world_base: Array
+    ) -> tuple[tuple[Mesh, ...], Array, int]:
+        """Return arm and hand as they are drawn, and how many of the links are the arm.
+
+        Of hands but Franka's no meshes are known, and of none where theirs are not there.
+        """
         if self._with_arm:
             with contextlib.suppress(InputError, ImportError):
-                return _links(joints, opening_m, T_world_base)
-        return (), np.zeros((len(joints), 0, 4, 4))
+                meshes, Ts = _links(joints, opening_m, T_world_base)
+                arm_links = len(meshes) - HAND_PARTS
+                shown = len(meshes) if s.hand[0] == FRANKA else arm_links
+                return meshes[:shown], Ts[:, :shown], arm_links
+        return (), np.zeros((len(joints), 0, 4, 4)), 0
 
     def _table(self) -> Array:
         """Return T_world_table (4, 4).

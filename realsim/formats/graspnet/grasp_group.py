@@ -165,7 +165,7 @@ def _group_of(
             "GraspGroup says how far the gripper is open."
         )
     return GraspGroup(
-        Ts_a_grasp=Ts_a_obj[grasps.instance] @ grasps.Ts_obj_grasp[rows],
+        Ts_a_grasp=Ts_a_obj[grasps.instance] @ grasps.Ts_obj_pads[rows],
         scores=value[rows],
         openings_m=openings,
         heights_m=np.full(len(rows), HEIGHT_M),

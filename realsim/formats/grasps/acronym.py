@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.grasps.hand_frames import FINGER_OPEN_M, grasp_poses, hand_poses
+from realsim.formats.grasps.hand_frames import grasp_poses, hand_poses, require_panda
 from realsim.formats.grasps.hdf5 import COLUMNS, known_measures
 from realsim.formats.grasps.scene_grasps import (
     check_values,
@@ -38,6 +38,7 @@ from realsim.formats.hdf5_checked import CheckedGroup, opened
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
 from realsim.records.grasps import MEASURES
+from realsim.robots.hand import find_hand
 from realsim.store import atomic
 
 Array = NDArray[np.float64]
@@ -101,7 +102,7 @@ def write_acronym(path: Path | str, grasps: GraspSet, obj: AcronymObject) -> Pat
     """Write the tried grasps of one object, whole or not at all.
 
     Raises:
-        InputError: the set holds what no grasp has.
+        InputError: the set holds what no grasp has, or is of another hand than the Panda's.
     """
     path = Path(path)
     atomic.write_bytes(path, acronym_bytes(grasps, obj))
@@ -113,13 +114,14 @@ def acronym_bytes(grasps: GraspSet, obj: AcronymObject) -> bytes:
     import h5py
 
     check_values(grasps)
+    require_panda(grasps, "an ACRONYM file")
     rows = np.flatnonzero(executed(grasps))
     buffer = io.BytesIO()
     with h5py.File(buffer, "w") as file:
         _put_object(file.create_group("object"), obj)
         gripper = file.create_group("gripper")
         gripper["type"] = "panda"
-        gripper["configuration"] = np.array([FINGER_OPEN_M])
+        gripper["configuration"] = np.array([find_hand().max_opening_m / 2.0])
         file["grasps/transforms"] = hand_poses(grasps.Ts_obj_grasp[rows], "acronym")
         flex = file.create_group(FLEX)
         flex["object_in_gripper"] = held(grasps)[rows].astype(np.int64)

@@ -9,12 +9,13 @@ of franka_description's hand (closing = y) write frame="panda_hand".
 
 The label is true where the fingers still held the object after all four stages. Grasps that physics
 has not tried have none and are left out. What has no counterpart (frame, rows, scores, widths) is
-under the key `realsim`, which GraspGen does not read.
+under the key `realsim`, which GraspGen does not read. The hand's frame has its origin at the
+mounting face that the hand's description says.
 
 Source: NVlabs/GraspGen, docs/GRASP_DATASET_FORMAT.md and docs/GRIPPER_DESCRIPTION.md.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.grasps.hand_frames import HandFrame, grasp_poses, hand_poses, known_frame
+from realsim.formats.grasps.hand_frames import (
+    HandFrame,
+    grasp_poses,
+    hand_of_set,
+    hand_poses,
+    known_frame,
+)
 from realsim.formats.grasps.scene_grasps import check_values, executed, held, untried_set
 from realsim.geometry import se3
 from realsim.records import GraspSet
+from realsim.robots.hand import find_hand
 from realsim.store import atomic
 from realsim.untrusted.own_json import array_from_json, read_object, to_json
 
@@ -81,16 +89,18 @@ def write_graspgen(
         InputError: the set holds what no grasp has.
     """
     check_values(grasps)
+    hand = hand_of_set(grasps)
     rows = np.flatnonzero(executed(grasps))
     value = {
         "object": {"file": file, "scale": float(scale)},
         "grasps": {
-            "transforms": hand_poses(grasps.Ts_obj_grasp[rows], frame).tolist(),
+            "transforms": hand_poses(grasps.Ts_obj_grasp[rows], frame, hand).tolist(),
             "object_in_gripper": held(grasps)[rows].tolist(),
         },
         "realsim": {
             "version": version("realsim"),
             "frame": known_frame(frame),
+            "hand": {"name": hand.name, "digest": hand.digest, "mount_z_m": hand.mount_z_m},
             "rows": rows.tolist(),
             "scores": to_json(grasps.scores[rows]),
             "widths_m": to_json(grasps.widths_m[rows]),
@@ -123,6 +133,8 @@ def read_graspgen(path: Path | str, frame: HandFrame | None = None) -> GraspGenG
         scale = float(obj.get("scale", 1.0))
         mesh = str(obj["file"])
         used = known_frame(frame or ours.get("frame", "acronym"))
+        mount_z = float(ours.get("hand", {}).get("mount_z_m", find_hand().mount_z_m))
+        hand = replace(find_hand(), mount_z_m=mount_z)
         scores, widths = _ours(ours, "scores", len(Ts)), _ours(ours, "widths_m", len(Ts))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(
@@ -135,7 +147,7 @@ def read_graspgen(path: Path | str, frame: HandFrame | None = None) -> GraspGenG
         )
     if not (np.isfinite(scale) and scale > 0):
         raise InputError(f"{path}: the scale is {scale}; a number above 0 is expected.")
-    Ts = se3.check_rigid(grasp_poses(Ts, used), f"{path}: transforms") if len(Ts) else Ts
+    Ts = se3.check_rigid(grasp_poses(Ts, used, hand), f"{path}: transforms") if len(Ts) else Ts
     return GraspGenGrasps(
         file=mesh, scale=scale, Ts_obj_grasp=Ts, object_in_gripper=label.astype(np.bool_),
         scores=scores, widths_m=widths,

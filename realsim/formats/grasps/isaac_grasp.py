@@ -12,9 +12,11 @@
         cspace_position: {panda_finger_joint1: 0.012}
         pregrasp_cspace_position: {panda_finger_joint1: 0.04}
 
-The gripper's frame is franka_description's panda_hand. The confidence is our score, the number in
-the name is the grasp's row in its set. The joint is half the distance of the fingers; joint 2
-mimics it. Grasps that physics has not tried have no score and are left out.
+The gripper's frame is franka_description's panda_hand, of other hands that at the mounting face
+with the same axes; frame and joint are called as the hand's description says. The confidence is our
+score, the number in the name is the grasp's row in its set. The joint is half the distance of the
+fingers, joint 2 mimics it; of an arc it is the crank's angle. Grasps that physics has not tried
+have no score and are left out.
 
 Source: Isaac Sim, Grasp Editor, "What is an Isaac Grasp File?"; Isaac ROS names the two frames
 object_frame and gripper_frame, which are read, too.
@@ -30,10 +32,11 @@ from numpy.typing import NDArray
 
 from realsim import interop
 from realsim.errors import InputError
-from realsim.formats.grasps.hand_frames import FINGER_OPEN_M, HandFrame, grasp_poses, hand_poses
+from realsim.formats.grasps.hand_frames import HandFrame, grasp_poses, hand_of_set, hand_poses
 from realsim.formats.grasps.scene_grasps import check_values, executed, untried_set
 from realsim.geometry import se3
 from realsim.records import GraspSet
+from realsim.robots.hand import Hand
 from realsim.store import atomic
 from realsim.untrusted.values import mapping, number, numbers
 from realsim.untrusted.yaml_text import read_yaml
@@ -86,16 +89,18 @@ def write_isaac_grasp(
     """
     check_values(grasps)
     rows = np.flatnonzero(executed(grasps) & (np.nan_to_num(grasps.scores, nan=-1) >= least_score))
-    Ts = hand_poses(grasps.Ts_obj_grasp[rows], "panda_hand")
-    widths, openings = grasps.widths_m[rows], _openings(grasps)[rows]
-    _require_panda(widths)
-    _require_panda(openings)
+    hand = hand_of_set(grasps)
+    Ts = hand_poses(grasps.Ts_obj_grasp[rows], "panda_hand", hand)
+    widths, openings = grasps.widths_m[rows], _openings(grasps, hand)[rows]
+    _require_fits(widths, hand)
+    _require_fits(openings, hand)
+    closed, opened = _joint(hand, widths), _joint(hand, openings)
     xyzw = interop.quaternion_xyzw_from_R(Ts) if len(rows) else np.zeros((0, 4))
     lines = [
         "format: isaac_grasp",
         f"format_version: {FORMAT_VERSION}",
         f"object_frame_link: {json.dumps(object_frame)}",
-        'gripper_frame_link: "panda_hand"',
+        f"gripper_frame_link: {json.dumps(hand.frame_link)}",
         "grasps:" if len(rows) else "grasps: {}",
     ]
     for k, row in enumerate(rows.tolist()):
@@ -105,34 +110,50 @@ def write_isaac_grasp(
             f"    confidence: {_number(grasps.scores[row])}",
             f"    position: [{', '.join(_number(t) for t in Ts[k, :3, 3])}]",
             f"    orientation: {{w: {w}, xyz: [{x}, {y}, {z}]}}",
-            f"    cspace_position: {{{FINGER}: {_number(widths[k] / 2)}}}",
-            f"    pregrasp_cspace_position: {{{FINGER}: {_number(openings[k] / 2)}}}",
+            f"    cspace_position: {{{hand.joint}: {_number(closed[k])}}}",
+            f"    pregrasp_cspace_position: {{{hand.joint}: {_number(opened[k])}}}",
         ]
     path = Path(path)
     atomic.write_text(path, "\n".join(lines) + "\n")
     return path
 
 
-def _openings(grasps: GraspSet) -> Array:
+def _openings(grasps: GraspSet, hand: Hand) -> Array:
     """Return the distance of the fingers (N,) before they close [m]."""
     stored = grasps.parameters.get("openings_m")
     if isinstance(stored, list) and np.shape(stored) == (len(grasps),):  # pyright: ignore[reportUnknownArgumentType]
         return np.array(stored, dtype=np.float64)
-    return np.full(len(grasps), 2 * FINGER_OPEN_M)
+    return np.full(len(grasps), hand.max_opening_m)
 
 
-def _require_panda(widths_m: Array, most_m: float = 2 * FINGER_OPEN_M) -> None:
-    """Check that the widths are known and fit between the Panda's fingers.
+def _joint(hand: Hand, openings_m: Array) -> Array:
+    """Return the positions (N,) of the hand's joint at openings (N,): [m], on an arc [rad].
+
+    Raises:
+        InputError: the hand's description does not name its joint.
+    """
+    if not hand.joint:
+        raise InputError(
+            f"the hand '{hand.name}' does not say what its joint is called, which an isaac_grasp "
+            'file names. Add joint = "..." to its robot.toml and run `realsim school` again, or '
+            "export with --to graspgen, hdf5 or parquet."
+        )
+    return hand.joint_position(openings_m)
+
+
+def _require_fits(widths_m: Array, hand: Hand) -> None:
+    """Check that the widths are known and fit between the hand's fingers.
 
     Raises:
         InputError: one is NaN or wider than the hand opens.
     """
+    most_m = hand.max_opening_m
     wrong = ~((widths_m >= 0) & (widths_m <= most_m))
     if np.any(wrong):
         at = int(np.flatnonzero(wrong)[0])
         raise InputError(
-            f"grasp {at} has the width {widths_m[at]:g} m; 0 to {most_m:g} m, what the Panda's "
-            "hand opens, is needed to say where its fingers are."
+            f"grasp {at} has the width {widths_m[at]:g} m; 0 to {most_m:g} m, what the "
+            f"{hand.title} opens, is needed to say where its fingers are."
         )
 
 

@@ -16,6 +16,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
 from realsim.records.checked_arrays import Array, rigid
+from realsim.records.grasps import require_one_hand
 from realsim.records.trajectories import GraspTrajectories
 
 
@@ -51,6 +52,7 @@ class SceneGrasps:
                     f"{what} name instance {unknown[0]}, which has no grasp set; there are: "
                     f"{', '.join(map(str, instances)) or 'none'}."
                 )
+        require_one_hand(self.sets, f"the scene '{self.name}'" if self.name else "a scene")
         object.__setattr__(self, "sets", tuple(sorted(self.sets, key=lambda s: s.instance)))
         ids = {s.obj_id for s in self.sets}
         names = {i: self.names[i] for i in sorted(ids & set(self.names)) if self.names[i]}

@@ -137,7 +137,7 @@ def visible_grasps(
         T_world_obj = content.scene.object(grasps.instance).T_world_obj
         if Ts_world_obj is not None:
             T_world_obj = Ts_world_obj.get(grasps.instance, T_world_obj)
-        T_cam_grasp = se3.invert(T_world_cam) @ T_world_obj @ grasps.Ts_obj_grasp
+        T_cam_grasp = se3.invert(T_world_cam) @ T_world_obj @ grasps.Ts_obj_pads
         half = 0.5 * grasps.widths_m[:, None] * T_cam_grasp[:, :3, 1]
         contacts = np.stack([T_cam_grasp[:, :3, 3] - half, T_cam_grasp[:, :3, 3] + half], 1)
         seen = _unhidden(contacts.reshape(-1, 3), depth_m, content).reshape(-1, 2).any(1)

@@ -58,11 +58,13 @@ class GraspMotion:
     obj_mesh: Mesh | None = None
     """What is drawn of it while it is carried; None = nothing."""
     Ts_world_link: Array = field(default_factory=lambda: np.zeros((0, 0, 4, 4)))
-    """(S, L, 4, 4) arm and hand as they are drawn [m]; L = 0 = a plain hand of boxes."""
+    """(S, L, 4, 4) arm and hand as they are drawn [m]; L = 0 = a plain hand of boxes alone."""
     link_meshes: tuple[Mesh, ...] = ()
     """(L,) their meshes."""
     arm_links: int = 0
     """How many of the first links are the arm, which a person may hide: it is often in the way."""
+    hand: Hand = field(default_factory=find_hand)
+    """Drawn as plain boxes where the links hold no hand."""
     notes: tuple[str, ...] = ()
     """What a person should know of it."""
 
@@ -126,8 +128,8 @@ class HandApproach:
     """Of the hand [m/s]."""
     closing_m_s: float = 0.05
     """Of each finger [m/s]: Franka's hand at its usual speed."""
-    opening_m: float = 0.08
-    """Distance of the finger faces before they close [m]: that of Franka's open hand."""
+    hand: Hand = field(default_factory=find_hand)
+    """What closes, from fully open."""
     rate_hz: float = 20.0
     """Samples per second: as many as are drawn."""
 
@@ -155,7 +157,7 @@ def hand_approach(
         obj_mesh: the object's mesh.
         notes: what is said of the motion.
     """
-    opened = max(config.opening_m, width_m)
+    opened = max(config.hand.max_opening_m, width_m)
     arrive = config.approach_m / config.speed_m_s
     end = arrive + (opened - width_m) / (2.0 * config.closing_m_s)
     # Both ends are samples: the grasp itself and the closed hand are shown exactly.
@@ -177,6 +179,7 @@ def hand_approach(
         phase=np.where(closing, PHASES.index("close"), PHASES.index("approach")),
         Ts_world_obj=np.tile(T_world_obj, (len(t), 1, 1)),
         obj_mesh=obj_mesh,
+        hand=config.hand,
         notes=notes,
     )
 
@@ -189,8 +192,6 @@ class ReplayConfig:
     """Frames per second: the school looks as often, and a dozen nodes a frame are 30 kB/s."""
     slider_hz: float = 4.0
     """How often the slider follows [1/s]: it tells where one is, the scene tells the rest."""
-    hand: Hand = field(default_factory=find_hand)
-    """What is drawn where the motion brings no meshes of the hand."""
 
 
 class ReplayPlayer:
@@ -224,7 +225,7 @@ class ReplayPlayer:
         self._motions, self._config = motions, config or ReplayConfig()
         self._atomic, self._connected, self._on_carried = atomic, connected, on_carried
         self._closed: list[Callable[[], None]] = []
-        self._nodes = ReplayNodes(scene, name, self._config.hand)
+        self._nodes = ReplayNodes(scene, name)
         self._lock = threading.RLock()
         self._motion: GraspMotion | None = None
         self._time = 0.0
@@ -282,7 +283,7 @@ class ReplayPlayer:
             return None
         with self._lock:
             self._motion, self._time = motion, 0.0
-            self._nodes.draw(motion.link_meshes, motion.obj_mesh, motion.arm_links)
+            self._nodes.draw(motion.link_meshes, motion.obj_mesh, motion.hand, motion.arm_links)
             self._nodes.show_arm(self._arm.value)
             self._arm.visible = motion.arm_links > 0
             self._slider.max = max(round(float(motion.time_s[-1]), 2), 0.01)

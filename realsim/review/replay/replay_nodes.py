@@ -7,10 +7,11 @@ import numpy as np
 import viser
 
 from realsim.geometry import mesh as mesh_tools
+from realsim.geometry import se3
 from realsim.interop import viser_wxyz_position
 from realsim.records import Mesh
 from realsim.records.checked_arrays import Array
-from realsim.robots.hand import Hand
+from realsim.robots.hand import Hand, find_hand
 
 PLAIN_RGB = (176, 182, 190)
 """Colour of what has none of its own."""
@@ -26,37 +27,38 @@ BOX_FACES = np.array(
 class ReplayNodes:
     """What is drawn of a motion; only positions and orientations change while it plays."""
 
-    def __init__(self, scene: viser.SceneApi, name: str, hand: Hand) -> None:
+    def __init__(self, scene: viser.SceneApi, name: str) -> None:
         """Start with nothing drawn.
 
         Args:
             scene: of a server or of one client.
             name: of the node under which everything is.
-            hand: sizes of the plain hand.
         """
-        self._scene, self._name, self._hand = scene, name, hand
+        self._scene, self._name, self._hand = scene, name, find_hand()
         self._links: list[Any] = []
         self._boxes: list[Any] = []
-        """Palm, finger at +y, finger at -y; empty where the links hold the hand."""
+        """As `Hand.boxes` has them; empty where the links hold the hand."""
         self._object: Any = None
         self._arm_links, self._arm_shown = 0, True
 
-    def draw(self, link_meshes: Sequence[Mesh], obj_mesh: Mesh | None, arm_links: int = 0) -> None:
+    def draw(
+        self, link_meshes: Sequence[Mesh], obj_mesh: Mesh | None, hand: Hand, arm_links: int = 0
+    ) -> None:
         """Draw these meshes in place of those before; hidden until they are put somewhere.
 
         Args:
-            link_meshes: (L,) of arm and hand; none = the plain hand.
+            link_meshes: (L,) of arm and hand.
             obj_mesh: of what is carried; None = nothing.
+            hand: drawn as boxes where no link is beyond the arm.
             arm_links: how many of the first links are the arm.
         """
         self.clear()
-        self._arm_links = arm_links
+        self._arm_links, self._hand = arm_links, hand
         for k, mesh in enumerate(link_meshes):
             self._links.append(self._add(f"link_{k}", mesh))
-        if not link_meshes:
-            palm, right, left = self._hand.boxes(0.0)[0]
-            for part, box in (("palm", palm), ("finger_left", left), ("finger_right", right)):
-                self._boxes.append(self._add_box(part, *box))
+        if len(link_meshes) == arm_links:
+            for k, box in enumerate(self._hand.boxes(0.0)[0]):
+                self._boxes.append(self._add_box(f"hand_{k}", *box))
         if obj_mesh is not None:
             self._object = self._add("object", obj_mesh)
 
@@ -73,10 +75,11 @@ class ReplayNodes:
         """
         for k, (node, T) in enumerate(zip(self._links, Ts_world_link, strict=True)):
             _place(node, T, shown=self._arm_shown or k >= self._arm_links)
-        for node, side in zip(self._boxes, (0, 1, -1), strict=False):
-            T = np.array(T_world_hand)
-            T[:3, 3] += T[:3, 1] * side * opening_m / 2.0
-            _place(node, T)
+        if self._boxes:
+            # The boxes keep their sizes but for those around bars that turn, which are moved along.
+            closed, now = (self._hand.boxes(w)[0].mean(axis=1) for w in (0.0, opening_m))
+            for node, shift in zip(self._boxes, now - closed, strict=True):
+                _place(node, T_world_hand @ se3.from_translation(shift))
         if self._object is not None:
             if T_world_obj is not None:
                 _place(self._object, T_world_obj)

@@ -141,9 +141,10 @@ def grasps_in_view(
     T_cam_world = se3.invert(T)
     Ts = [T_cam_world @ np.asarray(o, dtype=np.float64) @ g.Ts_obj_grasp for o, g in grasp_sets]
     # One cast for all objects: a cast has a price, whatever the number of its lines.
-    Ts_cam_grasp = np.concatenate([np.zeros((0, 4, 4)), *Ts])
     widths_m = np.concatenate([np.zeros(0), *(g.widths_m for _, g in grasp_sets)])
-    pads_cam = contact_points(Ts_cam_grasp, widths_m, config.clearance_m).reshape(-1, 3)
+    Ts_pads = [T_cam_world @ np.asarray(o, dtype=np.float64) @ g.Ts_obj_pads for o, g in grasp_sets]
+    Ts_cam_pads = np.concatenate([np.zeros((0, 4, 4)), *Ts_pads])
+    pads_cam = contact_points(Ts_cam_pads, widths_m, config.clearance_m).reshape(-1, 3)
     seen = in_image(intrinsics, pads_cam)
     if region is not None:
         seen &= ~is_behind(region, intrinsics, pads_cam)

@@ -128,5 +128,8 @@ def _parameters(task: ObjectTask, prepared: Prepared) -> dict[str, Any]:
         "joints_rad": [q if q[0] == q[0] else nothing for q in prepared.joints.tolist()],
         **prepared.notes,
     }
+    hand = task.config.hand
+    if hand.arc_radius_m:
+        parameters["pad_heights_m"] = hand.z_pad(prepared.widths_m).tolist()
     # Through JSON: what is kept is what is returned (tuples become lists).
     return json.loads(json.dumps(parameters))

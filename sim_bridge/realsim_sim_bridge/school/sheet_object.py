@@ -112,7 +112,7 @@ def _picture(ax: Any, s: GraspSet, mesh: Mesh, T_up_obj: Array, size: tuple[int,
     finger = min(FINGER_M, FINGER_SHARE * float(np.linalg.norm(mesh.extent)))
     rows = shown_rows(s)
     hands = [
-        [factor * se3.transform(T_up_obj @ s.Ts_obj_grasp[row], line)
+        [factor * se3.transform(T_up_obj @ s.Ts_obj_pads[row], line)
          for line in _hand_lines(float(np.nan_to_num(s.widths_m[row])), finger)]
         for row in rows
     ]  # fmt: skip

@@ -32,9 +32,9 @@ Array = NDArray[np.float64]
 
 FINGER_NAMES = ("left", "right")
 LIFT_NAMES = ("left_lift", "right_lift")
-LOCKED_KG = 1e8
-"""Mass of a finger along z while its height is locked [kg]: at 1e6 a load creeps by 0.01 mm in
-5 s."""
+LOCKED_KG = 1e7
+"""Mass of a finger along z while its height is locked [kg]: at 1e6 loads creep, for it is moved,
+and at 1e8 the solver is no longer exact enough."""
 SIDES = (1.0, -1.0)
 """Finger 0 is at +y."""
 OBJECT = "object"
