@@ -214,7 +214,7 @@ ROWS_RAD = ["0.1,-1.6,1.7,-1.7,-1.5,0.3", "0.2,-1.5,1.7,-1.7,-1.5,0.3"]
         ("\n".join(["via," + HEADER.format(u="deg"), "maybe," + ROWS_DEG[0]]), InputError, "maybe"),
         (
             "\n".join([HEADER.format(u="deg"), "0,-90,190,0,0,0", "0,-90,90,0,0,0"]), InputError,
-            "elbow joint is 190.0 deg",
+            "elbow is 190.0 deg",
         ),
         (
             "\n".join([HEADER.format(u="deg").replace(",", ";"), "0,5;1;2;3;4;5"]), InputError,

@@ -18,7 +18,7 @@ from realsim.robots.shapes import Box, Mount, WorkCell
 from realsim_capture_plans.collision.model import interpolate
 from realsim_capture_plans.plan_files.evidence import FITS_M, MILLIMETRES_FROM_M, JointUnit
 from realsim_capture_plans.plan_files.joint_paths import JointPath, read_path
-from realsim_capture_plans.planning.metrics import JOINT_NAMES, Meaning
+from realsim_capture_plans.planning.metrics import Meaning, joint_names
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
 Array = NDArray[np.float64]
@@ -213,7 +213,7 @@ def _check_limits(path: JointPath, chain: DhChain) -> None:
     if len(beyond):
         i, j = beyond[0]
         raise InputError(
-            f"{path.source}, {path.rows[i]}: the {JOINT_NAMES[j]} joint is "
+            f"{path.source}, {path.rows[i]}: {joint_names(chain)[j]} is "
             f"{np.degrees(path.joints[i, j]):.1f} deg; a {chain.name} goes from "
             f"{np.degrees(low[j]):.0f} to {np.degrees(high[j]):.0f} deg ({len(beyond)} such "
             "values in all). Take out a whole turn, or the row."

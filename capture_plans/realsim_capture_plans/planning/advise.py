@@ -14,6 +14,7 @@ from realsim.errors import InputError
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Mount
 from realsim_capture_plans.collision.model import CollisionModel
+from realsim_capture_plans.planning.elbow import bend
 from realsim_capture_plans.planning.record import PlanConfig
 from realsim_capture_plans.planning.view_quality import hole_deg
 from realsim_capture_plans.planning.viewpoints import (
@@ -115,7 +116,7 @@ def _placement(
     )
     poses, item = hemisphere_poses(center, directions, here.radius_m, POSES, 0.0)
     found = reachable(poses, item, mount.T_ee_cam, model, here.sigma_min)
-    one_side = found.where(np.sin(found.joints[:, 2]) * better_elbow(found) > 0)
+    one_side = found.where(bend(chain, found.joints) * better_elbow(found, chain) > 0)
     holes: list[float] = []
     for ok in (np.unique(found.item), np.unique(one_side.item)):
         few = len(ok) < n

@@ -16,8 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
 from realsim.robots.arm import UR5
+from realsim.robots.inverse import CLOSED, held_joint
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box, Mount
+from realsim_capture_plans.planning.elbow import bend
 from realsim_capture_plans.planning.metrics import plan_metrics
 from realsim_capture_plans.planning.moves import NoFreeMoveError, connect
 from realsim_capture_plans.planning.ordering import Clusters
@@ -50,6 +52,8 @@ SECOND_TRY = 6
 ELBOW_WORTH = 1.15
 """The other side of the elbow is used where the hole would be larger by this factor without it: the
 way there and back takes about 8 s."""
+SAMPLED_SHARE = 4
+"""Of an arm whose inverse is sampled, one in so many poses is tried."""
 MOST_MISSED = 0.25
 """Where more than this share of the directions is missed, the scene stands badly: no second try."""
 
@@ -87,8 +91,8 @@ def hemisphere_plan(
     items = np.unique(found.item)
     tried = len(directions)
     home, one_side = _home(task, found, n, tried)
-    side = float(np.sign(np.sin(home[2])))
-    strict = one_side.where(np.sin(one_side.joints[:, 2]) * side > 0)
+    side = float(np.sign(bend(chain, home)))
+    strict = one_side.where(bend(chain, one_side.joints) * side > 0)
     if _largest_hole(directions, items, strict, n) < ELBOW_WORTH * _largest_hole(
         directions, items, one_side, n
     ):
@@ -97,17 +101,17 @@ def hemisphere_plan(
     def more(chosen: Ints) -> Candidates:
         """Return the candidates of the chosen directions, tried more densely."""
         poses, item = hemisphere_poses(
-            task.center, directions[chosen], config.radius_m, config.dense_poses, 0.5
+            task.center, directions[chosen], config.radius_m, _poses(task, config.dense_poses), 0.5
         )
         dense = task.reach(poses, chosen[item], "more ways to the chosen views")
-        both = on_one_elbow(one_side.joined(dense), side)
+        both = on_one_elbow(one_side.joined(dense), chain, side)
         return well_seen(both, seen_share(both.Ts_base_cam, task), config.seen_share)
 
     def choose(ok: Ints) -> Ints:
         return ok[thin_directions(directions[ok], n, directions)]
 
     def between(direction: Ints, joints: Array) -> tuple[Array, Ints]:
-        """Return candidates (K, 6) near joints (N, 6), and the row that each belongs to."""
+        """Return candidates (K, n) near joints (N, n), and the row that each belongs to."""
         return nearest_views(task, directions[direction], joints)
 
     plan = _driven(task, one_side, home, n, choose, more, between)
@@ -136,9 +140,8 @@ def reachable_directions(task: PlanTask, n: int) -> tuple[Array, Candidates]:
     # The spiral ends half a turn short of the rim, where the cells of its last views reach out.
     directions = np.concatenate([cap, cap_rim(tried, config.elevation_deg)]) @ spin.T
     tried = len(directions)
-    poses, item = hemisphere_poses(
-        task.center, directions, config.radius_m, config.poses_per_direction, 0.0
-    )
+    per_direction = _poses(task, config.poses_per_direction)
+    poses, item = hemisphere_poses(task.center, directions, config.radius_m, per_direction, 0.0)
     found = task.reach(poses, item, "which directions are reachable")
     missed = np.setdiff1d(np.arange(tried), found.item)
     if len(missed) and len(missed) < tried * MOST_MISSED:
@@ -149,6 +152,14 @@ def reachable_directions(task: PlanTask, n: int) -> tuple[Array, Candidates]:
         second = task.reach(poses, missed[item], "a second try at the rest")
         found = found.joined(second)
     return directions, found
+
+
+def _poses(task: PlanTask, count: int) -> int:
+    """Return how many camera poses are tried where an arm in closed form tries `count`.
+
+    Each costs a sampled inverse twenty times as much; a redundant arm's brings as many candidates.
+    """
+    return count if held_joint(task.model.chain) is None else -(-count // SAMPLED_SHARE)
 
 
 def calibration_plan(  # noqa: PLR0913 - a plan's own facts, one by one
@@ -227,8 +238,9 @@ def _home(task: PlanTask, found: Candidates, n: int, tried: int) -> tuple[Array,
     count = len(np.unique(found.item))
     if count < n:
         raise DegenerateError(_too_few(task, n, count, tried))
-    one_side = on_one_elbow(found, better_elbow(found))
-    return choose_home(one_side), one_side
+    chain = task.model.chain
+    one_side = on_one_elbow(found, chain, better_elbow(found, chain))
+    return choose_home(one_side, chain), one_side
 
 
 def _driven(
@@ -247,11 +259,11 @@ def _driven(
     Args:
         task: arm, mount, what must stay free.
         found: what is reachable.
-        home: (6,) where the tour begins [rad].
+        home: (n,) where the tour begins [rad].
         n: number of views.
         choose: returns n of the items it is given.
         more: returns the candidates of chosen items.
-        between: returns candidates of items (N,) near joints (N, 6), and the row of each.
+        between: returns candidates of items (N,) near joints (N, n), and the row of each.
 
     Raises:
         DegenerateError: fewer than n items are left.
@@ -327,14 +339,14 @@ def closer_candidates(
     views: Ints,
     joints: Array,
 ) -> list[Array]:
-    """Return further candidates (Ki, 6) of every view: near the middle of its neighbours' joints.
+    """Return further candidates (Ki, n) of every view: near the middle of its neighbours' joints.
 
     Args:
         between: returns candidates of items near joints.
         chosen: (N,) item of every view.
-        home: (6,) where the tour begins [rad].
+        home: (n,) where the tour begins [rad].
         views: (N,) in tour order.
-        joints: (N, 6) of the views in that order [rad].
+        joints: (N, n) of the views in that order [rad].
     """
     before = np.concatenate([home[None], joints[:-1]])
     after = np.concatenate([joints[1:], joints[-1:]])
@@ -345,13 +357,13 @@ def closer_candidates(
 
 
 def nearest_views(task: PlanTask, directions: Array, joints: Array) -> tuple[Array, Ints]:
-    """Return the views in directions (N, 3) that lie nearest to joints (N, 6), as far as free.
+    """Return the views in directions (N, 3) that lie nearest to joints (N, n), as far as free.
 
     Radius and roll are those of the camera at these joints, as near as the direction allows; of the
     arm's branches and turns the one nearest to these joints is taken.
 
     Returns:
-        joints (K, 6) [rad] and the row (K,) that each belongs to.
+        joints (K, n) [rad] and the row (K,) that each belongs to.
     """
     config, chain = task.config, task.model.chain
     Ts = chain.forward(joints) @ task.mount.T_ee_cam
@@ -362,7 +374,12 @@ def nearest_views(task: PlanTask, directions: Array, joints: Array) -> tuple[Arr
     roll = np.arctan2(turn[:, 1, 0] - turn[:, 0, 1], turn[:, 0, 0] + turn[:, 1, 1])
     poses = look_at_poses(eyes, task.center, roll)
     good = np.flatnonzero(seen_share(poses, task) >= config.seen_share)
-    q, of = chain.inverse_branches(poses[good] @ se3.invert(task.mount.T_ee_cam))
+    Ts_base_ee = poses[good] @ se3.invert(task.mount.T_ee_cam)
+    if chain.joints > CLOSED:  # of all ways to hold a redundant arm the nearest
+        q, arrived = chain.refine(joints[good], Ts_base_ee)
+        q, of = q[arrived], np.flatnonzero(arrived)
+    else:
+        q, of = chain.inverse_branches(Ts_base_ee)
     row = good[of]
     q = joints[row] + np.remainder(q - joints[row] + np.pi, 2 * np.pi) - np.pi
     gap = np.abs(q - joints[row]).max(-1)

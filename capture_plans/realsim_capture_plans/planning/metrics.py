@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from realsim.robots.kinematics import DhChain
 from realsim_capture_plans.collision.model import GROUPS, CollisionModel
 from realsim_capture_plans.planning import view_quality
 from realsim_capture_plans.planning.record import CapturePlan
@@ -27,7 +28,9 @@ OF_FULL_PLANS = (
 """Goals that say nothing about smaller plans."""
 ROUNDING = 1e-4
 """A value this near to its goal meets it."""
-JOINT_NAMES = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
+UR_JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
+MOST_JOINTS = 9
+"""Joints of other arms whose turns are explained."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -87,6 +90,17 @@ def _limit(good: str, views: int, clearance_m: float) -> tuple[str, float] | Non
         return words[good]
     found = re.match(r"(<=|>=|<|>) ([0-9.]+)", good)
     return None if found is None else (found[1], float(found[2]))
+
+
+def joint_names(chain: DhChain) -> tuple[str, ...]:
+    """Return what the arm's joints are called: a UR's have names, others numbers from 1."""
+    if chain.name.startswith("UR") and chain.joints == len(UR_JOINTS):
+        return UR_JOINTS
+    return tuple(f"joint_{k + 1}" for k in range(chain.joints))
+
+
+def _words(name: str) -> str:
+    return f"{'' if name.startswith('joint') else 'joint '}{name.replace('_', ' ')}"
 
 
 def _meaning(
@@ -151,10 +165,10 @@ METRIC_MEANINGS: dict[str, Meaning] = {
     ),
     **{
         f"turn_{name}_deg": _meaning(
-            f"greatest turn of joint {name.replace('_', ' ')} away from home: winds up cables",
+            f"greatest turn of {_words(name)} away from home: winds up cables",
             "deg", "< 240", "less",
         )
-        for name in JOINT_NAMES
+        for name in (*UR_JOINTS, *(f"joint_{k + 1}" for k in range(MOST_JOINTS)))
     },
     **{
         f"clearance_{group}_m": _meaning(
@@ -327,7 +341,7 @@ def _motion(plan: CapturePlan) -> dict[str, float]:
         "limit_margin_deg": float(np.degrees(margin)),
         **{
             f"turn_{name}_deg": angle
-            for name, angle in zip(JOINT_NAMES, turn.tolist(), strict=True)
+            for name, angle in zip(joint_names(plan.chain), turn.tolist(), strict=True)
         },
     }
 
@@ -335,7 +349,7 @@ def _motion(plan: CapturePlan) -> dict[str, float]:
 def _dexterity(plan: CapturePlan) -> dict[str, float]:
     """Return how far from singular the views are.
 
-    Yoshikawa (1985), Manipulability of robotic mechanisms: w = sqrt(det J J^T) = |det J|.
+    Yoshikawa (1985), Manipulability of robotic mechanisms: w = sqrt(det J J^T).
     """
     J = plan.chain.jacobian(plan.joints)
     sigma = np.linalg.svd(J, compute_uv=False)

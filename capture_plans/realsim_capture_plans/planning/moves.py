@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from realsim.errors import DegenerateError
 from realsim.geometry import se3
 from realsim_capture_plans.collision.model import CollisionModel
+from realsim_capture_plans.planning.elbow import raised
 from realsim_capture_plans.planning.ordering import Clusters, move_seconds, tour, tour_seconds
 from realsim_capture_plans.planning.record import PlanConfig
 
@@ -32,7 +33,7 @@ SHORTCUTS = 60
 
 
 Closer = Callable[[Ints, Array], list[Array]]
-"""Given the views (N,) in tour order and their joints (N, 6), returns further candidates (Ki, 6) of
+"""Given the views (N,) in tour order and their joints (N, n), returns further candidates (Ki, n) of
 every view, by its number."""
 
 
@@ -50,11 +51,11 @@ def connect(
     rng: np.random.Generator,
     closer: Closer | None = None,
 ) -> tuple[Array, tuple[tuple[int, Array], ...], Clusters]:
-    """Return the views' joints (N, 6) in tour order, the via points of moves, and the clusters.
+    """Return the views' joints (N, n) in tour order, the via points of moves, and the clusters.
 
     Args:
-        candidates: per view, (Ki, 6) free joints near home [rad].
-        home: (6,) free joints where the tour begins [rad].
+        candidates: per view, (Ki, n) free joints near home [rad].
+        home: (n,) free joints where the tour begins [rad].
         model: what must stay free.
         config: speeds, step of the collision check.
         rng: drives the search for the tour and for ways round.
@@ -143,7 +144,7 @@ def detour(
     config: PlanConfig,
     rng: np.random.Generator,
 ) -> Array:
-    """Return via points (K, 6) that make a move free: the quickest of those that were found.
+    """Return via points (K, n) that make a move free: the quickest of those that were found.
 
     Raises:
         NoFreeMoveError: neither simple via points nor OMPL make the move free.
@@ -183,22 +184,15 @@ def _proposals(q_from: Array, q_to: Array, home: Array, model: CollisionModel) -
         q, arrived = chain.refine(ends, drawn_back)
         if np.all(arrived) and np.all(chain.limits.contains(q)):
             yield from (q, q[:1], q[1:], np.stack([q[0], home, q[1]]))
-            yield np.concatenate([q[:1], _upright(ends), q[1:]])
+            yield np.concatenate([q[:1], raised(chain, ends), q[1:]])
     yield home[None]
-    yield _upright(ends)
-
-
-def _upright(ends: Array) -> Array:
-    """Return both ends with the arm stretched up: where an elbow may change its side."""
-    tall = ends.copy()
-    tall[:, 1:3] = -np.pi / 2, 0.0
-    return tall
+    yield raised(chain, ends)
 
 
 def ompl_path(
     q_from: Array, q_to: Array, model: CollisionModel, config: PlanConfig, rng: np.random.Generator
 ) -> Array | None:
-    """Return a free path (K, 6) found by OMPL's RRT-Connect, or None.
+    """Return a free path (K, n) found by OMPL's RRT-Connect, or None.
 
     A new planner after `setSeed` draws the same numbers again, so plans repeat; the search ends
     after a number of checks, not after a time.
@@ -249,7 +243,7 @@ def ompl_path(
 def _shortened(
     path: Array, model: CollisionModel, config: PlanConfig, rng: np.random.Generator
 ) -> Array:
-    """Return the path (K, 6) with corners left out wherever the straight move is free."""
+    """Return the path (K, n) with corners left out wherever the straight move is free."""
     for _ in range(SHORTCUTS):
         if len(path) <= 2:
             break

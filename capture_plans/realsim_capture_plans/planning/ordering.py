@@ -51,7 +51,7 @@ class Clusters:
     """Home and the candidates of every view, one after the other."""
 
     joints: Array
-    """(M, 6) joint vectors [rad]; row 0 is home."""
+    """(M, n) joint vectors [rad]; row 0 is home."""
     first: Ints
     """(N + 2,) row of the first candidate of home, of view 0, 1, ... and one past the last."""
     least_s: Array
@@ -61,7 +61,7 @@ class Clusters:
 
     @classmethod
     def of(cls, candidates: list[Array], home: Array, config: "PlanConfig") -> "Clusters":
-        """Return the clusters of views with candidates (Ki, 6) and of home (6,).
+        """Return the clusters of views with candidates (Ki, n) and of home (n,).
 
         Raises:
             InputError: a view has no candidate.
@@ -74,7 +74,7 @@ class Clusters:
         return cls(joints=joints, first=first, least_s=_timed(least, config), _least_rad=least)
 
     def with_more(self, further: list[Array], config: "PlanConfig") -> "Clusters":
-        """Return the clusters with further candidates (Ki, 6) behind those of every view."""
+        """Return the clusters with further candidates (Ki, n) behind those of every view."""
         own = [self.joints[a:b] for a, b in zip(self.first[:-1], self.first[1:], strict=True)]
         none = np.zeros((0, self.joints.shape[1]))
         pairs = zip(own, [none, *further], strict=True)
@@ -151,7 +151,7 @@ def tour_seconds(
 
 
 def _rows(clusters: list[Array]) -> tuple[Array, Ints]:
-    """Return all candidates (M, 6), and the first row of each cluster and one past the last."""
+    """Return all candidates (M, n), and the first row of each cluster and one past the last."""
     first = np.concatenate([[0], np.cumsum([len(c) for c in clusters])]).astype(np.intp)
     return np.ascontiguousarray(np.concatenate(clusters), dtype=np.float64), first
 

@@ -112,7 +112,7 @@ class PlanConfig:
         if self.radius_m[1] > 2.0 or self.board_distance_m[1] > 2.0:
             raise InputError(
                 f"PlanConfig: radii {self.radius_m} and distances {self.board_distance_m} are in "
-                "metres and a UR5 reaches 0.85 m. Were millimetres given?"
+                "metres, farther than arms reach. Were millimetres given?"
             )
         if min(self.speed, self.acceleration, self.clearance_m, self.edge_step_rad) <= 0:
             raise InputError("PlanConfig: speed, acceleration, clearance, step must be positive.")
@@ -149,13 +149,13 @@ class CapturePlan:
     cell: WorkCell
     """What the moves were checked against."""
     home: Array
-    """(6,) where the tour begins [rad]."""
+    """(n,) where the tour begins [rad]."""
     joints: Array
-    """(N, 6) joints at each view [rad]."""
+    """(N, n) joints at each view [rad]."""
     center_world: Array
     """(3,) what the views look at [m]."""
     vias: tuple[tuple[int, Array], ...]
-    """(move k, (K, 6) joints to pass) of the moves that are not straight."""
+    """(move k, (K, n) joints to pass) of the moves that are not straight."""
     reference_view: int
     """The most top-down view."""
     config: PlanConfig
@@ -207,7 +207,7 @@ class CapturePlan:
         return len(self.joints)
 
     def move(self, k: int) -> Array:
-        """Return the corners (K, 6) of move k, its start and its view included [rad]."""
+        """Return the corners (K, n) of move k, its start and its view included [rad]."""
         start = self.home if k == 0 else self.joints[k - 1]
         via = [q for edge, q in self.vias if edge == k]
         return np.concatenate([start[None], *via, self.joints[k][None]])

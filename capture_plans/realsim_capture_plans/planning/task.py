@@ -1,7 +1,7 @@
 """What is to be planned: arm, mount, work cell, what counts as seen; checked once."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -71,11 +71,17 @@ def plan_task(  # noqa: PLR0913, PLR0917 - hands on what both kinds of plan are 
         raise InputError(f"the scene centre is {c.tolist()}; (x, y, z) in base [m] is needed.")
     if np.abs(c).max() > GREATEST_CENTER_M:
         raise InputError(
-            f"the scene centre {c.tolist()} m is {np.abs(c).max():.0f} m from the base and the arm "
-            "reaches 0.85 m. Were millimetres given? Metres are needed."
+            f"the scene centre {c.tolist()} m is {np.abs(c).max():.0f} m from the base, farther "
+            "than any arm reaches. Were millimetres given? Metres are needed."
         )
     carried = mount if isinstance(mount, Mount) else d405_mount(mount)
     cell = config.work_cell(c, kind, obstacles)
+    # One speed for all joints: that of the slowest at the most.
+    config = replace(
+        config,
+        speed=min(config.speed, float(chain.limits.speed.min())),
+        acceleration=min(config.acceleration, float(chain.limits.acceleration.min())),
+    )
     return PlanTask(
         kind=kind,
         center=c,

@@ -34,7 +34,7 @@ class Problem(NamedTuple):
     """What the searches ask: candidates, collisions that are known, and how fast the arm is."""
 
     joints: Array
-    """(M, 6) candidates [rad]."""
+    """(M, n) candidates [rad]."""
     first: Ints
     """(N + 2,) first row of every cluster, and one past the last."""
     owner: Ints
@@ -82,6 +82,8 @@ def _seconds(a: int, b: int, p: Problem) -> float:
         abs(q[a, 4] - q[b, 4]),
         abs(q[a, 5] - q[b, 5]),
     )
+    for k in range(6, q.shape[1]):  # all arms have the first six
+        d = max(d, abs(q[a, k] - q[b, k]))
     v, acc = p.speed, p.acceleration
     t = d / v + v / acc if d >= v * v / acc else 2.0 * np.sqrt(d / acc)
     if p.suspects[p.owner[a], p.owner[b]]:

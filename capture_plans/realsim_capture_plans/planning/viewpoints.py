@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.geometry import se3
 from realsim.robots.kinematics import DhChain
 from realsim_capture_plans.collision.model import CollisionModel
+from realsim_capture_plans.planning.elbow import bend
 from realsim_capture_plans.planning.record import PlanConfig
 
 Array = NDArray[np.float64]
@@ -35,7 +36,7 @@ class Candidates:
     """Collision-free joint vectors and the view item and camera pose that each one reaches."""
 
     joints: Array
-    """(M, 6) angles in (-pi, pi] [rad]."""
+    """(M, n) angles inside the limits, of several whole turns one [rad]."""
     item: Ints
     """(M,) direction or view number."""
     Ts_base_cam: Array
@@ -133,6 +134,8 @@ def reachable(
 ) -> Candidates:
     """Return every joint vector that reaches a pose, is free and is not singular.
 
+    Of an arm whose inverse is sampled, those that `DhChain.inverse_branches` finds.
+
     Args:
         Ts_base_cam: (P, 4, 4) camera poses wanted [m].
         item: (P,) what each pose belongs to.
@@ -143,7 +146,7 @@ def reachable(
     """
     chain = model.chain
     T_cam_ee = se3.invert(T_ee_cam)
-    joints: list[Array] = [np.zeros((0, 6))]
+    joints: list[Array] = [np.zeros((0, chain.joints))]
     pose: list[Ints] = [np.zeros(0, dtype=np.intp)]
     for first in range(0, len(Ts_base_cam), BATCH):
         q, of = chain.inverse_branches(Ts_base_cam[first : first + BATCH] @ T_cam_ee)
@@ -234,7 +237,7 @@ def _patched(directions: Array, chosen: Ints, target: Array) -> Ints:
 
 
 def with_turns(joints: Array, home: Array, chain: DhChain, config: PlanConfig) -> Array:
-    """Return joints (M, 6) with all their whole turns (K, 6) inside the limits and near home.
+    """Return joints (M, n) with all their whole turns (K, n) inside the limits and near home.
 
     At most `config.branch_limit` of them; every joint within `config.turn_reach_rad` of home.
     """
@@ -255,18 +258,19 @@ def with_turns(joints: Array, home: Array, chain: DhChain, config: PlanConfig) -
     return q[np.linspace(0, len(q) - 1, config.branch_limit).astype(np.intp)]
 
 
-def choose_home(found: Candidates) -> Array:
-    """Return the joints (6,) of the most top-down item from which all other items are nearest."""
+def choose_home(found: Candidates, chain: DhChain) -> Array:
+    """Return the joints (n,) of the most top-down item from which all other items are nearest."""
     top = found.joints[found.item == found.item[np.argmin(found.Ts_base_cam[:, 2, 2])]]
     items = np.unique(found.item)
     total = np.zeros(len(top))
+    turns = chain.limits.upper - chain.limits.lower >= 2 * np.pi - 1e-9
     for i in items[np.linspace(0, len(items) - 1, HOME_COMPARISONS).astype(int)]:
         gap = np.abs(top[:, None] - found.joints[found.item == i][None])
-        total += np.minimum(gap, 2 * np.pi - gap).max(-1).min(1)
+        total += np.where(turns, np.minimum(gap, 2 * np.pi - gap), gap).max(-1).min(1)
     return np.array(top[int(np.argmin(total))])
 
 
-def on_one_elbow(found: Candidates, side: float) -> Candidates:
+def on_one_elbow(found: Candidates, chain: DhChain, side: float) -> Candidates:
     """Return the candidates whose elbow bends to one side, and all of items that have no such.
 
     Changing sides leads through the stretched arm and takes several seconds: it is for views that
@@ -274,16 +278,16 @@ def on_one_elbow(found: Candidates, side: float) -> Candidates:
 
     Args:
         found: the candidates.
-        side: +1 or -1, the sign of the elbow's sine.
+        chain: the arm.
+        side: +1 or -1, the sign of `bend`.
     """
-    return _preferred(found, np.sin(found.joints[:, 2]) * side > 0)
+    return _preferred(found, bend(chain, found.joints) * side > 0)
 
 
-def better_elbow(found: Candidates) -> float:
+def better_elbow(found: Candidates, chain: DhChain) -> float:
     """Return the side, +1 or -1, to which the elbow bends in candidates of more items."""
-    counts = [
-        len(np.unique(found.item[np.sin(found.joints[:, 2]) * side > 0])) for side in (1.0, -1.0)
-    ]
+    bent = bend(chain, found.joints)
+    counts = [len(np.unique(found.item[bent * side > 0])) for side in (1.0, -1.0)]
     return 1.0 if counts[0] >= counts[1] else -1.0
 
 

@@ -146,7 +146,8 @@ def plan_convert_command(
 
     \b
     SOURCE  a realsim plan (.json or shipped:NAME), a joint path with tool
-            poses (.json), or a table (.csv with q1_rad ... or q1_deg ..., and via)
+            poses (.json), or a table (.csv with q1_rad ... or q1_deg ...,
+            and via)
     DEST    .json    realsim plan
             .csv     table of joints and expected camera poses
             .script  URScript program, of a UR
