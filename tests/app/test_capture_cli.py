@@ -18,7 +18,6 @@ from realsim.store import SessionStore
 from realsim_capture_plans.capturing.contact_sheet import SheetConfig, contact_sheet
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.ur_loopback import LoopbackController
-from realsim_capture_plans.lab.devices import HOME
 from realsim_capture_plans.plan_files.plan_json import save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 from typed_commands import realsim
@@ -30,7 +29,7 @@ VIEWS = 2
 def made_plan(kind: str, n: int, chain=UR5) -> CapturePlan:
     """Views round the middle of the lab's table, tilted and turned."""
     center, config = np.array([0.45, 0.0, 0.01]), PlanConfig()
-    home = HOME + np.pi * np.eye(6)[0]
+    home = find_arm("ur5").home + np.pi * np.eye(6)[0]
     joints: list[Array] = []
     for k, turn in enumerate(np.linspace(0.0, 2 * np.pi, n, endpoint=False)):
         tilt = 0.35 if k % 3 else 0.1

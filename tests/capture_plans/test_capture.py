@@ -22,7 +22,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.camera import ray_table
 from realsim.records import CameraIntrinsics, CaptureSession
-from realsim.robots.arm import UR5, UR5E
+from realsim.robots.arm import UR5, UR5E, find_arm
 from realsim.robots.limits import JointLimits
 from realsim.store import SessionStore, atomic
 from realsim_capture_plans.capturing.capture import (
@@ -36,9 +36,10 @@ from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
 from realsim_capture_plans.capturing.look import SettleConfig
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError, DeviceError, Frame
-from realsim_capture_plans.lab.devices import HOME
 from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+UR5_HOME = find_arm("ur5").home
 
 VIEWS = 10
 QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
@@ -112,7 +113,7 @@ class TableCamera:
 def plan() -> CapturePlan:
     """A ring of views that look down at the middle of the table, every third over a via point."""
     center, config = np.array([0.40, 0.0, 0.0]), PlanConfig()
-    home = HOME + np.pi * np.eye(6)[0]  # turned to the side where the table is
+    home = UR5_HOME + np.pi * np.eye(6)[0]  # turned to the side where the table is
     joints: list[NDArray[np.float64]] = []
     for turn in np.linspace(0.0, 2 * np.pi, VIEWS, endpoint=False):
         eye = center + 0.32 * np.array([0.25 * np.cos(turn), 0.25 * np.sin(turn), 1.0])

@@ -3,14 +3,16 @@
 import numpy as np
 import pytest
 
-from realsim.robots.arm import UR5
+from realsim.robots.arm import UR5, find_arm
 from realsim_capture_plans.capturing.checks import (
     CheckConfig,
     sharpness,
 )
 from realsim_capture_plans.capturing.look import SettleConfig, until_still
 from realsim_capture_plans.devices.interfaces import ArmState, ArmStoppedError
-from realsim_capture_plans.lab.devices import HOME, SimulatedArm
+from realsim_capture_plans.lab.devices import SimulatedArm
+
+UR5_HOME = find_arm("ur5").home
 
 
 class RingingArm(SimulatedArm):
@@ -22,7 +24,7 @@ class RingingArm(SimulatedArm):
 
     def state(self) -> ArmState:
         swing = np.exp(-self.now_s / self.decay_s) * np.cos(2 * np.pi * 8.0 * self.now_s)
-        q = HOME + self.amplitude_rad * swing * np.eye(6)[1]
+        q = UR5_HOME + self.amplitude_rad * swing * np.eye(6)[1]
         return ArmState(joints=q, T_base_ee=UR5.forward(q), time_s=self.now_s)
 
     def wait(self, seconds: float) -> None:
@@ -35,7 +37,7 @@ def test_the_wait_ends_when_the_swing_is_below_the_tolerance(amplitude: float) -
     state, waited = until_still(arm, config, clock=lambda: arm.now_s, sleep=arm.wait)
     left = amplitude * np.exp(-arm.now_s / 0.1)
     assert left <= config.tolerance_rad
-    assert np.abs(state.joints - HOME).max() <= config.tolerance_rad
+    assert np.abs(state.joints - UR5_HOME).max() <= config.tolerance_rad
     # Not much later than needed either: the tolerance plus two windows.
     needed = 0.1 * np.log(max(amplitude / (config.tolerance_rad / 2), 1.0))
     assert config.window_s <= waited <= needed + 3 * config.window_s

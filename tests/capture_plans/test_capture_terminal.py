@@ -20,15 +20,17 @@ from typing import Any
 import numpy as np
 
 from realsim.records import CameraIntrinsics, CaptureSession
-from realsim.robots.arm import UR5
+from realsim.robots.arm import UR5, find_arm
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import CaptureJob, capture
 from realsim_capture_plans.capturing.log import LOG_FILE, CaptureLog
 from realsim_capture_plans.capturing.operator import TerminalOperator
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import Frame
-from realsim_capture_plans.lab.devices import HOME, SimulatedArm
+from realsim_capture_plans.lab.devices import SimulatedArm
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+UR5_HOME = find_arm("ur5").home
 
 VIEWS = 40
 CAMERA = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.5)
@@ -37,7 +39,7 @@ CAMERA = CameraIntrinsics(width=64, height=48, fx=60.0, fy=60.0, cx=31.5, cy=23.
 def plan() -> CapturePlan:
     """The wrist turns a little from view to view, above the middle of the table."""
     config = PlanConfig()
-    home = HOME + np.pi * np.eye(6)[0]
+    home = UR5_HOME + np.pi * np.eye(6)[0]
     joints = home + 0.02 * np.arange(1, VIEWS + 1)[:, None] * np.eye(6)[5]
     center = np.array([0.45, 0.0, 0.0])
     return CapturePlan(

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, CaptureSession, Mesh
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim.robots.arm import UR5
+from realsim.robots.arm import UR5, find_arm
 from realsim.store import SessionStore
 from realsim_capture_plans.capturing.capture import (
     CaptureConfig,
@@ -33,8 +33,10 @@ from realsim_capture_plans.capturing.operator import CaptureStatus, Command, NoO
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.devices.interfaces import ArmStoppedError, DeviceError, Frame, Stop
 from realsim_capture_plans.lab import LabConfig, SimulatedLab
-from realsim_capture_plans.lab.devices import HOME, SimulatedArm, SimulatedDepthCamera
+from realsim_capture_plans.lab.devices import SimulatedArm, SimulatedDepthCamera
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+
+UR5_HOME = find_arm("ur5").home
 
 Array = NDArray[np.float64]
 VIEWS = 9
@@ -47,7 +49,7 @@ QUICK = CaptureConfig(still=SettleConfig(window_s=0.0))
 def plan() -> CapturePlan:
     """An arc of views round the lab's objects."""
     center, config = np.array([0.45, 0.0, 0.03]), PlanConfig()
-    home = HOME + np.pi * np.eye(6)[0]
+    home = UR5_HOME + np.pi * np.eye(6)[0]
     joints: list[Array] = []
     for turn in np.linspace(0.0, np.pi, VIEWS):
         eye = center + 0.36 * np.array([-0.3 * np.sin(turn), 0.3 * np.cos(turn), 0.95])

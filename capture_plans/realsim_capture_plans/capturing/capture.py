@@ -113,6 +113,12 @@ def _check_session(plan: CapturePlan, camera: DepthCamera, store: "SessionStore"
                 f"'{store.folder}' was imported, not captured: it has no plan to go on with. "
                 "Choose a new folder."
             )
+        if (begun := store.extra.get("arm")) not in (None, plan.robot):
+            raise InputError(
+                f"the session '{store.folder}' was begun with a {begun}, and this plan is for a "
+                f"{plan.robot}. Views of two arms do not go together: choose a new folder, or go "
+                f"on with the plan in {store.folder / PLAN_FILE}."
+            )
         raise InputError(
             f"the session was begun with the plan {str(expected)[:12]}..., this plan is "
             f"{plan.content_hash[:12]}... Choose a new folder, or go on with the plan in "

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from realsim.records import CameraIntrinsics
-from realsim.robots.arm import UR5
+from realsim.robots.arm import UR5, find_arm
 from realsim.robots.kinematics import DhChain
 from realsim.robots.limits import JointLimits
 from realsim_capture_plans.devices.interfaces import Arm, ArmState, Frame, checked_goal
@@ -26,12 +26,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-HOME = np.radians([0.0, -90.0, 90.0, -90.0, -90.0, 0.0])
-"""(6,) where the arm stands when it is switched on: folded, the tool looking down [rad]."""
-
 
 class SimulatedArm:
-    """A UR5 without errors of its own knowledge: the errors are in where it really stands.
+    """An arm without errors of its own knowledge: the errors are in where it really stands.
 
     The reported pose is the nominal forward kinematics of the commanded joints. The true flange,
     which only the lab's truth knows, is elsewhere by the errors of the chain and the repeatability.
@@ -41,12 +38,12 @@ class SimulatedArm:
     def __init__(self, chain: DhChain = UR5) -> None:
         """Switch the arm on at its home position."""
         self._chain = chain
-        self._joints = HOME.copy()
+        self._joints = np.array(find_arm(chain.name).home)
         self._time_s = 0.0
 
     @property
     def name(self) -> str:
-        """Model name, a key of `kinematics.CHAINS`."""
+        """Name of the arm."""
         return self._chain.name
 
     @property
@@ -63,10 +60,10 @@ class SimulatedArm:
         """Do nothing: this arm never stops by itself."""
 
     def move(self, joints: ArrayLike, speed: float = 1.05, acceleration: float = 1.4) -> None:
-        """Go to joints (6,) [rad] at the speed [rad/s] and acceleration [rad/s^2] of moveJ.
+        """Go to joints (n,) [rad] at the speed [rad/s] and acceleration [rad/s^2] of moveJ.
 
         Raises:
-            InputError: the goal is not 6 finite angles within the limits; the arm has not moved.
+            InputError: the goal is not n finite angles within the limits; the arm has not moved.
         """
         goal = checked_goal(joints, self.limits)
         way = np.abs(goal - self._joints).max()

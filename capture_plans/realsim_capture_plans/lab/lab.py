@@ -16,10 +16,12 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.parts import object_model, part_names
 from realsim.records import Mesh, ObjectModel, ObjectPose, TagBoard
+from realsim.robots.arm import find_arm
 from realsim_capture_plans.lab import truth as lab_truth
 from realsim_capture_plans.lab.devices import SimulatedArm, SimulatedDepthCamera
 from realsim_capture_plans.lab.placement import CrowdedError, PlacementConfig, place_objects
 from realsim_capture_plans.lab.truth import LabConfig, LabTruth
+from realsim_capture_plans.planning.elbow import reach_m
 
 if TYPE_CHECKING:
     from realsim.rendering.rays import PlacedMesh
@@ -35,7 +37,11 @@ BOARD_HEIGHT_M = 0.005
 BOARD_TILT_DEG = 0.5
 """Angle by which the plate rocks on the table [deg]."""
 TABLE_CENTER = (0.45, 0.0)
-"""Middle of the work space in base [m]: where a UR5 reaches most of a hemisphere."""
+"""Middle of the work space in base [m]: where arms of `LONG_ARM_M` reach most of a hemisphere;
+before a shorter arm it lies nearer."""
+LONG_ARM_M = 0.65
+"""From shoulder to wrist of an arm that is as long as any needs to be here [m]: a Panda has 0.70, a
+UR5 0.82."""
 TABLE_SIZE_M = (1.3, 1.5, 0.03)
 """Slab of the table: depth, width, thickness [m]."""
 SINGLE_SURFACE_MESHES = ("bunny", "blob_033")
@@ -46,7 +52,7 @@ AIM_HEIGHT_M = 0.03
 
 
 class SimulatedLab:
-    """A UR5 with a D405 at a table, in software. The same seed gives the same bytes."""
+    """An arm with a D405 at a table, in software. The same seed gives the same bytes."""
 
     def __init__(self, config: LabConfig | None = None) -> None:
         """Furnish the lab; the table is empty at first.
@@ -62,17 +68,20 @@ class SimulatedLab:
         self.board = BOARD
         self.nominal_T_ee_cam = lab_truth.T_EE_CAM_NOMINAL.copy()
         self.table_height = 0.0
-        self.scene_center = np.array([*TABLE_CENTER, self.table_height + AIM_HEIGHT_M])
+        nominal = find_arm(config.arm).chain
+        self._middle = np.array([*TABLE_CENTER, self.table_height])
+        self._middle[0] *= min(1.0, reach_m(nominal) / LONG_ARM_M)
+        self.scene_center = self._middle + np.array([0.0, 0.0, AIM_HEIGHT_M])
         instances = _instances(config)
         self.models: dict[int, ObjectModel] = {m.obj_id: m for m in instances}
         self.truth = self._build_truth(instances)
-        self.arm = SimulatedArm()
+        self.arm = SimulatedArm(nominal)
         self._on_table: Sequence[PlacedMesh] = self._table_only()
         self.camera = SimulatedDepthCamera(config, self.truth, self.arm, lambda: self._on_table)
 
     def _build_truth(self, instances: Sequence[ObjectModel]) -> LabTruth:
         config = self.config
-        Ts = _layout(config, instances, np.array([*TABLE_CENTER, self.table_height]))
+        Ts = _layout(config, instances, self._middle)
         return LabTruth(
             seed=config.seed,
             T_ee_cam=lab_truth.true_mount(config),
@@ -97,7 +106,7 @@ class SimulatedLab:
         face_up = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
         R = se3.exp_so3([0.0, 0.0, yaw]) @ se3.exp_so3([*tilt, 0.0]) @ face_up
         middle = np.array([*self.board.size_m, 0.0]) / 2
-        center = np.array([*TABLE_CENTER, self.table_height + BOARD_HEIGHT_M])
+        center = self._middle + np.array([0.0, 0.0, BOARD_HEIGHT_M])
         return se3.from_rt(R, center - R @ middle)
 
     def _table_only(self) -> list["PlacedMesh"]:
@@ -151,7 +160,7 @@ class SimulatedLab:
 
         Args:
             folder: a folder of its own, beside the session and never in it.
-            views: {number: joints (6,)} of the captured views, whose true camera poses are then
+            views: {number: joints (n,)} of the captured views, whose true camera poses are then
                 written too. They follow from the seed and the joints, so they may also come from
                 a session that another process captured.
         """

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectPose
-from realsim.robots.arm import UR5
+from realsim.robots.arm import find_arm
 from realsim.robots.kinematics import DhChain
 from realsim.untrusted.own_json import OwnFile, read_own, to_json
 
@@ -41,6 +41,8 @@ class LabConfig:
 
     seed: int = 0
     """Everything else follows from it."""
+    arm: str = "UR5"
+    """Name or folder of the arm."""
     n_objects: int = 5
     """Objects on the table, drawn from the shipped parts and PyBullet's meshes."""
     objects: tuple[str, ...] | None = None
@@ -112,7 +114,7 @@ class TrueView:
     index: int
     """Number of the view in its session."""
     joints: Array
-    """(6,) commanded joints [rad]."""
+    """(n,) commanded joints [rad]."""
     T_world_cam: Array
     """(4, 4) true camera in world [m]."""
 
@@ -142,19 +144,19 @@ class LabTruth:
     """The captured views that were asked for when the truth was written."""
 
     def T_base_ee(self, joints: ArrayLike) -> Array:
-        """Return where the flange (4, 4) [m] really stands at commanded joints (6,) [rad]."""
+        """Return where the flange (4, 4) [m] really stands at commanded joints (n,) [rad]."""
         q = np.asarray(joints, dtype=np.float64)
         noise = stream(self.seed, _REPEAT, q).normal(size=6)
         noise *= np.repeat([self.repeat_rad, self.repeat_m], 3)
         return self.chain.forward(q) @ se3.exp(noise)
 
     def T_world_cam(self, joints: ArrayLike) -> Array:
-        """Return where the camera (4, 4) [m] really stands at commanded joints (6,) [rad]."""
+        """Return where the camera (4, 4) [m] really stands at commanded joints (n,) [rad]."""
         return self.T_base_ee(joints) @ self.T_ee_cam
 
 
 def stream(seed: int, purpose: int, joints: Array | None = None) -> np.random.Generator:
-    """Return the generator of one purpose, and of one stop of the arm if joints (6,) are given."""
+    """Return the generator of one purpose, and of one stop of the arm if joints (n,) are given."""
     key = [seed, purpose]
     if joints is not None:
         # Shifted, because seeds are not negative and joints are.
@@ -205,11 +207,13 @@ def true_chain(config: LabConfig) -> DhChain:
     """Return the arm as it was really built."""
     rng = stream(config.seed, _CHAIN)
     link = config.link_mm / 1e3
+    nominal = find_arm(config.arm).chain
+    n = nominal.joints
     return replace(
-        UR5,
-        delta_a=rng.normal(scale=1.0, size=6) * link,
-        delta_d=rng.normal(scale=1.0, size=6) * link,
-        delta_theta=rng.normal(scale=1.0, size=6) * config.joint_offset_mrad / 1e3,
+        nominal,
+        delta_a=rng.normal(scale=1.0, size=n) * link,
+        delta_d=rng.normal(scale=1.0, size=n) * link,
+        delta_theta=rng.normal(scale=1.0, size=n) * config.joint_offset_mrad / 1e3,
     )
 
 
@@ -221,7 +225,7 @@ def offset(rng: np.random.Generator, distance_m: float, angle_rad: float) -> Arr
 
 
 def with_views(truth: LabTruth, views: Mapping[int, ArrayLike]) -> LabTruth:
-    """Return the truth with the true camera of every view {number: joints (6,)}."""
+    """Return the truth with the true camera of every view {number: joints (n,)}."""
     rows: list[TrueView] = []
     for index, joints in sorted(views.items()):
         q = np.asarray(joints, dtype=np.float64)
@@ -236,6 +240,7 @@ class _TruthFile(OwnFile, frozen=True, kw_only=True):
     version: Literal[1] = 1
     units: str = "m, rad, px; T_a_b maps b to a"
     seed: int
+    arm: str = "UR5"
     T_ee_cam: Array
     intrinsics: CameraIntrinsics
     chain: dict[str, Array]
@@ -258,7 +263,7 @@ def write_truth(folder: Path | str, truth: LabTruth) -> Path:
     path = Path(folder) / TRUTH_FILE
     deltas = {name: getattr(truth.chain, name) for name in _DELTAS}
     same = {name: getattr(truth, name) for name in _AS_THEY_ARE}
-    write_json(path, to_json(_TruthFile(chain=deltas, **same)))
+    write_json(path, to_json(_TruthFile(arm=truth.chain.name, chain=deltas, **same)))
     return path
 
 
@@ -273,4 +278,4 @@ def load_truth(folder: Path | str) -> LabTruth:
         raise InputError(f"there is no {TRUTH_FILE} in {folder}; only a simulated lab writes one.")
     found = read_own(path, _TruthFile)
     same = {name: getattr(found, name) for name in _AS_THEY_ARE}
-    return LabTruth(chain=replace(UR5, **found.chain), **same)
+    return LabTruth(chain=replace(find_arm(found.arm).chain, **found.chain), **same)

@@ -6,12 +6,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.errors import MissingLibraryError
+from realsim.errors import MissingLibraryError, RealsimError
 from realsim.geometry import se3
+from realsim.geometry.mesh_files import load_mesh
 from realsim.models.convex_hulls import hull_triangles
 from realsim.robots.arm import arm_of
-from realsim.robots.link_shapes import link_placements
+from realsim.robots.link_shapes import LARGEST_MM_SCALE, link_placements, link_shape
 from realsim.robots.shapes import Shape
+from realsim.robots.urdf import UrdfShape
 from realsim_capture_plans.collision.mount import camera_shape
 from realsim_capture_plans.collision.ur5_meshes import BASE_LINK_FROM_BASE, URDF, robots_folder
 from realsim_capture_plans.planning.record import CapturePlan
@@ -100,8 +102,35 @@ def _round_points(shape: Shape) -> Array:
     return np.concatenate([cap, cap * [1.0, 1.0, -1.0]])
 
 
-def ur5_looks(plan: CapturePlan) -> list[Part] | None:
-    """Return the UR5's own outside for its collision shapes; None where it cannot be had.
+def arm_looks(plan: CapturePlan) -> list[Part] | None:
+    """Return the arm's own outside for its collision shapes; None where it cannot be had."""
+    arm = arm_of(plan.chain)
+    if not arm.looks:
+        return _ur5_looks(plan)
+    try:
+        return [
+            Part(name=arm.link_names[link], frame=link, vertices=vertices, faces=faces)
+            for link, shape in arm.looks
+            for vertices, faces in [_look(shape)]
+        ]
+    except RealsimError:
+        return None
+
+
+def _look(shape: UrdfShape) -> tuple[Array, NDArray[np.int64]]:
+    """Return vertices (V, 3) in the link's frame [m] and triangles (F, 3) of a URDF's shape."""
+    if shape.file is None:
+        body = link_shape(shape, shape.link, 0, np.eye(4))
+        vertices, faces = shape_mesh(body)
+        return se3.transform(body.T_frame_shape, vertices), faces
+    millimetres = np.abs(shape.size_m).max() < LARGEST_MM_SCALE
+    mesh = load_mesh(shape.file, "mm" if millimetres else "m", [])
+    vertices = mesh.vertices * np.array(shape.size_m) * (1e3 if millimetres else 1.0)
+    return se3.transform(shape.T_link_shape, vertices), mesh.faces.astype(np.int64)
+
+
+def _ur5_looks(plan: CapturePlan) -> list[Part] | None:
+    """Return the UR5's outside as example-robot-data has it; None of other arms and without it.
 
     The meshes stand in ROS's `base_link`, which is turned by 180 deg about z against the
     controller's base; where each is in our links follows from both kinematics at zero.

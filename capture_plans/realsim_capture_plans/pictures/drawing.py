@@ -18,7 +18,7 @@ from realsim_capture_plans.planning.view_quality import Sensor, sensor_of
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 SKY, PURPLE, BLACK, GREY = "#56B4E9", "#CC79A7", "#000000", "#8C8C8C"
 """Okabe and Ito's colours, told apart by the colour-blind; RED is their vermillion."""
-JOINT_COLORS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
+JOINT_COLORS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE, BLACK)
 GROUP_COLORS = {"self": BLUE, "tool": PURPLE, "table": GREEN, "scene": ORANGE}
 DPI = 110
 """A picture 11 inches wide fills a laptop's screen and is some 100 kB."""

@@ -15,9 +15,10 @@ from realsim_capture_plans.pictures.drawing import (
     new_figure,
     plain,
 )
+from realsim_capture_plans.planning.metrics import joint_names
+from realsim_capture_plans.planning.record import CapturePlan
 
 Array = NDArray[np.float64]
-JOINT_LABELS = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
 GROUP_LABELS = {
     "self": "arm to itself",
     "tool": "arm to camera",
@@ -43,18 +44,19 @@ ZOOM_BEFORE_S, ZOOM_AFTER_S = 3.0, 5.0
 
 def joints_chart(curves: PlanCurves) -> Any:
     """Return the figure: every joint between its limits over the tour, and the speeds."""
-    figure = new_figure(11.0, 11.0)
-    grid = figure.add_gridspec(7, 2, height_ratios=[1] * 6 + [1.7])
     tour, plan = curves.tour, curves.plan
+    n, labels = plan.chain.joints, _labels(plan)
+    figure = new_figure(11.0, 2.5 + 1.4 * n)
+    grid = figure.add_gridspec(n + 1, 2, height_ratios=[1] * n + [1.7])
     t = np.linspace(0.0, tour.total_s, FINE_TIMES)
     q = np.degrees(tour.joints_at(t))
     lower, upper = np.degrees(plan.chain.limits.lower), np.degrees(plan.chain.limits.upper)
     via_moves = sorted({k for k, via in plan.vias if len(via)})
     shared: Any = None
-    for j in range(6):
+    for j in range(n):
         axes = figure.add_subplot(grid[j, :], sharex=shared)
         shared = shared or axes
-        axes.plot(t, q[:, j], color=JOINT_COLORS[j], linewidth=1.1)
+        axes.plot(t, q[:, j], color=_color(j), linewidth=1.1)
         for limit in (lower[j], upper[j]):
             axes.axhline(limit, color=RED, linewidth=1.2, linestyle="--")
         axes.axhline(np.degrees(plan.home[j]), color=GREY, linewidth=0.8, linestyle=":")
@@ -65,18 +67,18 @@ def joints_chart(curves: PlanCurves) -> Any:
         axes.set_ylim(lower[j] - 0.06 * span, upper[j] + 0.06 * span)
         axes.set_yticks([round(lower[j]), 0, round(upper[j])])
         margin = min(q[:, j].min() - lower[j], upper[j] - q[:, j].max())
-        axes.set_ylabel(f"{JOINT_LABELS[j]}\n[deg]", fontsize=9)
+        axes.set_ylabel(f"{labels[j]}\n[deg]", fontsize=9)
         axes.text(1.005, 0.5, f"margin\n{margin:.0f}°", transform=axes.transAxes, fontsize=9,
-                  va="center", color=JOINT_COLORS[j])  # fmt: skip
-        axes.tick_params(labelbottom=j == 5)
+                  va="center", color=_color(j))  # fmt: skip
+        axes.tick_params(labelbottom=j == n - 1)
         plain(axes)
     shared.set_xlim(0.0, tour.total_s)
     named = ", ".join(str(k) for k in via_moves[:VIAS_NAMED]) or "none"
     if len(via_moves) > VIAS_NAMED:
         named += f" and {len(via_moves) - VIAS_NAMED} more"
-    figure.axes[5].set_xlabel("time of the tour [s]")
-    _draw_speeds(figure.add_subplot(grid[6, 0]), curves)
-    _draw_slowest(figure.add_subplot(grid[6, 1]), curves)
+    figure.axes[n - 1].set_xlabel("time of the tour [s]")
+    _draw_speeds(figure.add_subplot(grid[n, 0]), curves)
+    _draw_slowest(figure.add_subplot(grid[n, 1]), curves)
     figure.suptitle(
         f"Joints over the tour: {len(plan)} views, {tour.total_s:.0f} s with "
         f"{plan.config.settle_s:g} s of settling at each\n"
@@ -84,6 +86,15 @@ def joints_chart(curves: PlanCurves) -> Any:
         fontsize=12,
     )
     return figure
+
+
+def _labels(plan: CapturePlan) -> list[str]:
+    """Return what the joints are called in pictures."""
+    return [name.replace("_", " ") for name in joint_names(plan.chain)]
+
+
+def _color(joint: int) -> str:
+    return JOINT_COLORS[joint % len(JOINT_COLORS)]
 
 
 def _draw_speeds(axes: Any, curves: PlanCurves) -> None:
@@ -106,8 +117,8 @@ def _draw_slowest(axes: Any, curves: PlanCurves) -> None:
     first = max(0.0, tour.begin_s[legs[0]] - ZOOM_BEFORE_S)
     t = np.linspace(first, min(tour.total_s, tour.end_s[legs[-1]] + ZOOM_AFTER_S), FINE_TIMES // 4)
     speed = tour.speeds_at(t)
-    for j in range(6):
-        axes.plot(t, speed[:, j], color=JOINT_COLORS[j], linewidth=1.2, label=JOINT_LABELS[j])
+    for j, label in enumerate(_labels(curves.plan)):
+        axes.plot(t, speed[:, j], color=_color(j), linewidth=1.2, label=label)
     for sign in (-1, 1):
         axes.axhline(sign * config.speed, color=RED, linewidth=1.0, linestyle="--")
     axes.set_xlim(t[0], t[-1])

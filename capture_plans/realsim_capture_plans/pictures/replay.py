@@ -19,10 +19,10 @@ from realsim_capture_plans.collision.model import CollisionModel
 from realsim_capture_plans.pictures.arm_chart import box_edges, frustum_lines
 from realsim_capture_plans.pictures.arm_looks import (
     Part,
+    arm_looks,
     arm_parts,
     camera_parts,
     part_frames,
-    ur5_looks,
 )
 from realsim_capture_plans.pictures.motion_charts import GROUP_LABELS
 from realsim_capture_plans.planning.record import CapturePlan
@@ -274,9 +274,10 @@ class ReplayScene:
         """
         self._scene = server.scene
         self._plan = plan
-        self._frames = [self._scene.add_frame(f"/arm/{i}", show_axes=False) for i in range(7)]
+        links = range(plan.chain.joints + 1)
+        self._frames = [self._scene.add_frame(f"/arm/{i}", show_axes=False) for i in links]
         self.parts: dict[str, list[tuple[Any, tuple[int, int, int]]]] = {}
-        outside = ur5_looks(plan) if looks else None
+        outside = arm_looks(plan) if looks else None
         self.looks_drawn = outside is not None
         bodies = arm_parts(plan) if outside is None else [*outside, *camera_parts(plan)]
         for k, part in enumerate(bodies):
@@ -290,7 +291,7 @@ class ReplayScene:
         server.initial_camera.look_at = tuple(centre + np.array(LOOK_AT_M))
 
     def pose(self, joints: Array) -> None:
-        """Move the arm to joints (6,) [rad]."""
+        """Move the arm to joints (n,) [rad]."""
         for frame, T in zip(self._frames, part_frames(self._plan, joints), strict=True):
             frame.wxyz, frame.position = viser_wxyz_position(T)
 

@@ -21,6 +21,7 @@ from realsim.formats.graspnet.cameras import FIRST, POSES
 from realsim.geometry import se3
 from realsim_capture_plans.plan_files.joint_paths import CAMERA_COLUMNS
 from realsim_capture_plans.plan_files.plan_json import save_plan
+from realsim_capture_plans.planning.metrics import UR_JOINTS, joint_names
 from realsim_capture_plans.planning.record import CapturePlan
 
 Array = NDArray[np.float64]
@@ -34,7 +35,7 @@ def export_csv(plan: CapturePlan, path: Path | str) -> None:
     """Write one row per configuration in driving order; `import_plan` reads it back.
 
     Columns: view (of a via point: the view that it leads to), via (1 = only passed; the first one
-    is home), q1_rad ... q6_rad, and at views the expected camera pose in base, cam_x_m ... cam_qz.
+    is home), q1_rad ... qn_rad, and at views the expected camera pose in base, cam_x_m ... cam_qz.
     Numbers come back bit for bit.
     """
     from realsim.store.atomic import write_text
@@ -65,7 +66,16 @@ def urscript(plan: CapturePlan) -> str:
     It moves nothing unless the arm stands at the plan's home: only the moves from there on have
     been checked. Nothing is blended, so the path is the straight one in joint space. Where moves
     collide in the model (an imported plan's may), it says so and waits for the operator.
+
+    Raises:
+        InputError: the plan is not a Universal Robots arm's.
     """
+    if joint_names(plan.chain) != UR_JOINTS:
+        raise InputError(
+            f"URScript drives Universal Robots' arms, and this plan is a {plan.robot}'s. Write a "
+            "table instead (.csv: joints and expected camera poses in the order of the tour), and "
+            "drive it with that arm's own program."
+        )
     from realsim_capture_plans.plan_files.imported import colliding_legs
 
     c = plan.config

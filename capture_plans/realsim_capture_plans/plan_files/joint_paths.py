@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
+from realsim.robots.arm import known_chains
 from realsim.robots.kinematics import DhChain
 from realsim.untrusted.files import checked_text
 from realsim.untrusted.json_text import read_json
@@ -27,7 +28,6 @@ from realsim_capture_plans.plan_files.evidence import (
 )
 from realsim_capture_plans.plan_files.plan_json import LARGEST_BYTES
 
-JOINTS = 6
 Array = NDArray[np.float64]
 YES = ("1", "true", "yes")
 NO = ("0", "false", "no", "")
@@ -49,7 +49,7 @@ class JointPath:
     source: str
     """The file, for messages."""
     joints: Array
-    """(N, 6) [rad]."""
+    """(N, n) [rad]."""
     via: NDArray[np.bool_]
     """(N,) rows that are only passed; the others are views."""
     rows: tuple[str, ...]
@@ -80,11 +80,21 @@ def read_path(
     if path.suffix.lower() == ".json":
         return _json_path(path, chain, joints_unit)
     if path.suffix.lower() in (".csv", ".tsv", ".txt"):
-        return _csv_path(path, joints_unit)
+        return _csv_path(path, chain, joints_unit)
     raise InputError(
-        f"{path} is no joint path: .json (joints, cart_pose, via_points) and .csv (columns q1_rad "
-        "... q6_rad or q1_deg ... q6_deg) are read."
+        f"{path} is no joint path: .json (joints, cart_pose, via_points) and .csv (columns q1_rad, "
+        "q2_rad ... or q1_deg ..., one for each joint) are read."
     )
+
+
+def _check_count(path: Path, count: int, chain: DhChain | None) -> None:
+    """Raise if the joints are not as many as the arm's."""
+    if chain is not None and count != chain.joints:
+        alike = ", ".join(known_chains(count)) or "none that is found by name"
+        raise InputError(
+            f"{path} has {count} joint angles in a row, and a {chain.name} has {chain.joints} "
+            f"joints. Choose the arm that it is for with --arm ({alike})."
+        )
 
 
 def _json_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> JointPath:
@@ -93,10 +103,11 @@ def _json_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> Joi
     if not isinstance(data, dict) or "joints" not in data:
         keys = sorted(data)[:6] if isinstance(data, dict) else type(data).__name__
         raise InputError(
-            f"{path} holds {keys}; a joint path has the list 'joints' (six per row), and beside it "
-            "'cart_pose' and 'via_points'. A realsim plan needs no import."
+            f"{path} holds {keys}; a joint path has the list 'joints' (a row a view), and beside "
+            "it 'cart_pose' and 'via_points'. A realsim plan needs no import."
         )
-    rows = _matrix(data["joints"], JOINTS, f"{path}: 'joints'")
+    rows = _matrix(data["joints"], None, f"{path}: 'joints'")
+    _check_count(path, rows.shape[1], chain)
     names = tuple(f"row {k}" for k in range(len(rows)))
     flags = data.get("via_points", ["0"] * len(rows))
     if not isinstance(flags, list) or len(flags) != len(rows):
@@ -134,11 +145,12 @@ def _json_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> Joi
     return JointPath(source=str(path), joints=q, via=via, rows=names, reading=reading)
 
 
-def _csv_path(path: Path, unit: JointUnit | None) -> JointPath:
-    """Return a path of columns q1_rad ... q6_rad (or _deg) and, if there is one, `via`."""
+def _csv_path(path: Path, chain: DhChain | None, unit: JointUnit | None) -> JointPath:
+    """Return a path of columns q1_rad ... qn_rad (or _deg) and, if there is one, `via`."""
     table, lines = _csv_table(path)
     header = list(table)
     columns, unit = _joint_columns(path, header, unit)
+    _check_count(path, len(columns), chain)
     names = tuple(f"line {n}" for n in lines)
     rows = np.stack([_numbers(path, table[c], c, lines) for c in columns], axis=-1)
     check_joint_unit(rows, unit, list(names), str(path))
@@ -195,22 +207,23 @@ def _joint_columns(
     """Return the names of the joints' columns and their unit."""
     found: dict[int, tuple[str, str]] = {}
     for name in header:
-        if match := re.fullmatch(r"q_?([1-6])(?:[ _]*[\[(]?([a-z]+)[\])]?)?", name):
+        if match := re.fullmatch(r"q_?([1-9][0-9]?)(?:[ _]*[\[(]?([a-z]+)[\])]?)?", name):
             found[int(match[1])] = (name, match[2] or "")
-    if sorted(found) != list(range(1, JOINTS + 1)):
+    numbers = range(1, max(found, default=0) + 1)
+    if not found or sorted(found) != list(numbers):
         raise InputError(
             f"{path}: the first line is '{', '.join(header)[:120]}'; a header with the columns "
-            "q1_rad ... q6_rad or q1_deg ... q6_deg is needed (and 'via', if some rows are only "
-            "passed)."
+            "q1_rad, q2_rad ... or q1_deg, q2_deg ..., one for each joint, is needed (and 'via', "
+            "if some rows are only passed)."
         )
     said = {u for _, u in found.values()}
     if said == {""}:
         if unit is None:
             raise UnitError(
-                f"{path}: the columns q1 ... q6 do not say their unit. Name them q1_rad or q1_deg, "
-                "or say it with --joints-unit."
+                f"{path}: the columns q1, q2 ... do not say their unit. Name them q1_rad or "
+                "q1_deg, or say it with --joints-unit."
             )
-        return [found[j][0] for j in range(1, JOINTS + 1)], unit
+        return [found[j][0] for j in numbers], unit
     units: set[JointUnit | None] = {UNIT_NAMES.get(u) for u in said}
     named = units.pop()
     if units or named is None:
@@ -220,7 +233,7 @@ def _joint_columns(
         )
     if unit is not None and unit != named:
         raise UnitError(f"{path}: its columns say {named}, --joints-unit says {unit}.")
-    return [found[j][0] for j in range(1, JOINTS + 1)], named
+    return [found[j][0] for j in numbers], named
 
 
 def _numbers(path: Path, values: list[str], name: str, lines: list[int]) -> Array:
@@ -237,15 +250,17 @@ def _numbers(path: Path, values: list[str], name: str, lines: list[int]) -> Arra
     return out
 
 
-def _matrix(value: Any, width: int, name: str) -> Array:
-    """Return rows of numbers as (N, width)."""
+def _matrix(value: Any, width: int | None, name: str) -> Array:
+    """Return rows of numbers as (N, width); None = any width that all have."""
+    wanted = "as many" if width is None else width
     try:
         rows = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: rows of {width} numbers are needed ({error}).") from error
-    if rows.ndim != 2 or rows.shape[1] != width or not len(rows) or not np.isfinite(rows).all():
+        raise InputError(f"{name}: rows of {wanted} numbers are needed ({error}).") from error
+    fits = rows.ndim == 2 and rows.size and rows.shape[1] == (width or rows.shape[1])
+    if not fits or not np.isfinite(rows).all():
         raise InputError(
-            f"{name} has the shape {rows.shape}; at least one row of {width} finite numbers is "
+            f"{name} has the shape {rows.shape}; at least one row of {wanted} finite numbers is "
             "needed."
         )
     return rows

@@ -147,13 +147,26 @@ def _named(message: str, source: str) -> str:
 
 
 def _check_units(content: dict[str, Any], source: str) -> None:
-    """Raise if joints look like degrees or lengths like millimetres."""
-    joints = np.array([content["home"], *content["joints"]], dtype=np.float64)
-    names = ["home", *(f"view {k}" for k in range(len(joints) - 1))]
+    """Raise if joints are not the arm's, look like degrees, or lengths like millimetres."""
+    rows, count = [content["home"], *content["joints"]], len(content["dh"]["a"])
+    names = ["home", *(f"view {k}" for k in range(len(rows) - 1))]
+    for name, row in zip(names, rows, strict=True):
+        if len(row) != count:
+            raise InputError(
+                f"{source}: {name} has {len(row)} joint angles, and its arm, a "
+                f"{content['robot']}, has {count} joints. Make the plan anew for the arm that "
+                "will drive it: `realsim plan --arm`."
+            )
+    joints = np.array(rows, dtype=np.float64)
     check_joint_unit(joints, "rad", names, source)
     lengths = {
         "center_world": np.array(content["center_world"], dtype=np.float64),
         "the mount's T_ee_cam": np.array(content["mount"]["T_ee_cam"], dtype=np.float64)[:3, 3],
+        **{
+            name: np.array(content["dh"][name], dtype=np.float64)[:3, 3]
+            for name in ("T_base_0", "T_n_ee")
+            if name in content["dh"]
+        },
         "dh a": np.array(content["dh"]["a"], dtype=np.float64),
         "dh d": np.array(content["dh"]["d"], dtype=np.float64),
     }

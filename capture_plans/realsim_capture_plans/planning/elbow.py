@@ -34,17 +34,26 @@ def bend(chain: DhChain, joints: Array) -> Array:
 @lru_cache(maxsize=16)
 def elbow_of(chain: DhChain) -> tuple[int, float] | None:
     """Return the elbow's number, from 0, and the angle at which the arm is stretched [rad]."""
-    nominal = chain.nominal()
-
-    def apart(q: Array) -> Array:
-        frames = nominal.link_frames(q)[..., :3, 3]
-        return np.sum((frames[..., -1 - BEFORE_FLANGE, :] - frames[..., SHOULDER, :]) ** 2, axis=-1)
-
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (SAMPLES, chain.joints))
-    waves = [wave_of(apart, q, k) for k in range(chain.joints)]
+    nominal = chain.nominal()
+    waves = [wave_of(lambda q: _apart_m2(nominal, q), q, k) for k in range(chain.joints)]
     elbow = int(np.argmax([np.abs(wave).mean() for wave in waves]))
     wave = waves[elbow]
     return (elbow, float(np.angle(wave.mean()))) if np.abs(wave).mean() > LEAST_M2 else None
+
+
+def reach_m(chain: DhChain) -> float:
+    """Return how far the wrist is from the shoulder where the arm is stretched [m]."""
+    straight = np.zeros((1, chain.joints))
+    found = elbow_of(chain)
+    if found is not None:
+        straight[:, found[0]] = found[1]
+    return float(np.sqrt(_apart_m2(chain.nominal(), straight)[0]))
+
+
+def _apart_m2(chain: DhChain, q: Array) -> Array:
+    frames = chain.link_frames(q)[..., :3, 3]
+    return np.sum((frames[..., -1 - BEFORE_FLANGE, :] - frames[..., SHOULDER, :]) ** 2, axis=-1)
 
 
 def wave_of(value: Callable[[Array], Array], q: Array, k: int) -> NDArray[np.complex128]:

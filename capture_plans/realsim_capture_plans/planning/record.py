@@ -229,6 +229,9 @@ def plan_content(plan: CapturePlan) -> dict[str, Any]:
     schema version of the file.
     """
     dh = _plain(plan.chain)
+    for name in ("T_base_0", "T_n_ee"):  # plans of arms that need none are as they always were
+        if np.array_equal(getattr(plan.chain, name), np.eye(4)):
+            del dh[name]
     names = (
         "mount", "cell", "home", "center_world", "reference_view", "joints", "vias", "config",
         "metrics",

@@ -10,7 +10,8 @@ from realsim.app.console import Tick
 from realsim.errors import InputError, RealsimError
 from realsim.geometry.dh import DhArm
 from realsim.records import Target
-from realsim.robots.arm import known_chains
+from realsim.robots.arm import find_arm, known_chains
+from realsim.robots.robot_files import same_name
 from realsim.store import SessionStore
 from realsim.untrusted.own_json import to_json
 from realsim_calibration import (
@@ -52,12 +53,18 @@ class SessionFiles(Protocol):
 
 
 def read_board_views(
-    store: SessionFiles, views_store: SessionStore, tick: Tick
+    store: SessionFiles, views_store: SessionStore, arm: str, tick: Tick
 ) -> tuple[list[BoardView], Target, DhArm | None]:
     """Return the board views with the points found, the target, and the arm if it can be told.
 
+    Args:
+        store: what holds the target's file.
+        views_store: the board views.
+        arm: name or folder of the arm; empty = the one that the session names or the poses prove.
+        tick: told how far the work is.
+
     Raises:
-        InputError: no target file, or a view without a robot pose.
+        InputError: no target file, a view without a robot pose, or views of another arm.
     """
     from realsim_calibration.targets.target_file import target_from_json
 
@@ -68,6 +75,14 @@ def read_board_views(
         )
     target = target_from_json(store.read_json(BOARD_FILE))
     views, camera = views_store.session.views, views_store.session.intrinsics
+    taken_with = str(views_store.extra.get("arm", ""))
+    named = find_arm(arm).chain if arm else None
+    if named is not None and taken_with and not same_name(taken_with, named.name):
+        raise InputError(
+            f"the views of '{views_store.folder}' were captured with a {taken_with}, and --arm "
+            f"{arm} is a {named.name}: its joints and links say nothing of these views. Leave "
+            f"--arm out, or give --arm {taken_with}."
+        )
     seen: list[BoardView] = []
     for k, view in enumerate(views):
         if view.T_base_ee is None:
@@ -79,16 +94,20 @@ def read_board_views(
             )
         )
         tick(k + 1, len(views))
-    return seen, target, arm_of(seen)
+    return seen, target, arm_of(seen, taken_with) if named is None else named.bare()
 
 
-def arm_of(views: Sequence[BoardView]) -> DhArm | None:
-    """Return the arm that the joints and poses of all views prove, None where they do not."""
-    joints = [v.joints for v in views]
-    if any(q is None for q in joints) or not views:
+def arm_of(views: Sequence[BoardView], name: str = "") -> DhArm | None:
+    """Return the arm that the joints and poses of all views prove, None where they do not.
+
+    Of several with the same numbers the one of this name is taken, or else the first.
+    """
+    joints = [v.joints for v in views if v.joints is not None]
+    if len(joints) < len(views) or len({len(q) for q in joints}) != 1:
         return None
     Ts = np.array([v.T_base_ee for v in views])
-    arms = [chain.bare() for chain in known_chains(len(joints[0])).values()]
+    known = known_chains(len(joints[0]))
+    arms = [known[key].bare() for key in sorted(known, key=lambda k: not same_name(k, name))]
     return matching_arm(np.array(joints), Ts, arms, RobotErrorConfig())
 
 

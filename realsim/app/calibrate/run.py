@@ -23,7 +23,7 @@ def run_calibrate(source: Path, console: Console, *, live: bool, **options: Any)
     require_header(source)
     if (source / "session.json").is_file() or has_board_views_only(source):
         _refuse_folder_options(options)
-        return _run_session(source, console)
+        return _run_session(source, console, options["arm"] or "")
     if not source.is_dir():
         raise InputError(
             f"'{source}' is not a folder; a session (it holds session.json) or a folder of images "
@@ -53,7 +53,7 @@ def run_calibrate(source: Path, console: Console, *, live: bool, **options: Any)
     return not any(c.verdict == "bad" for c in result.checks)
 
 
-def _run_session(source: Path, console: Console) -> bool:
+def _run_session(source: Path, console: Console, arm: str) -> bool:
     """Calibrate a session, also one that has board views only; return whether no check is bad."""
     from realsim.app.calibrate.session import (
         calibrate_board_only,
@@ -65,9 +65,9 @@ def _run_session(source: Path, console: Console) -> bool:
 
     board_only = has_board_views_only(source)
     if board_only:
-        hand_eye = calibrate_board_only(source, console)
+        hand_eye = calibrate_board_only(source, console, arm)
     else:
-        hand_eye = calibrate_session(open_session(source), console)
+        hand_eye = calibrate_session(open_session(source), console, arm)
     show_hand_eye(hand_eye, console)
     console.say(f"report and pictures: {source / 'calibration' / 'report'}")
     if board_only:
@@ -82,7 +82,7 @@ def _run_session(source: Path, console: Console) -> bool:
 
 def _refuse_folder_options(options: dict[str, Any]) -> None:
     """Raise if an option was given that a session answers itself."""
-    mine = ("board", "poses", "reading", "key", "board_poses", "camera", "arm", "eye_to_hand")
+    mine = ("board", "poses", "reading", "key", "board_poses", "camera", "eye_to_hand")
     given = [f"--{name.replace('_', '-')}" for name in mine if options.get(name)]
     if options.get("out", OUT) != OUT:
         raise InputError(

@@ -16,8 +16,13 @@ from realsim.store.session_check import is_session
 from realsim.untrusted.own_json import read_values
 
 
-def calibrate_session(store: SessionStore, console: Console) -> HandEye:
+def calibrate_session(store: SessionStore, console: Console, arm: str = "") -> HandEye:
     """Calibrate the hand-eye from the board views and place every camera of the session.
+
+    Args:
+        store: the session.
+        console: told how far the work is.
+        arm: name or folder of the arm; empty = the one that the session names or the poses prove.
 
     Raises:
         InputError: there are no board views, or no calibration/board.json.
@@ -35,16 +40,16 @@ def calibrate_session(store: SessionStore, console: Console) -> HandEye:
     views_store = SessionStore.open(folder)
     require_sound(views_store)
     views = views_store.session.views
-    key = content_key(
+    key = arm + content_key(
         folder / "robot.jsonl", store.folder / "calibration/board.json", folder / "session.json"
     )
     with console.stage("calibrate", f"{len(views)} board views") as tick:
         if is_current(store, "calibrate", key):
             hand_eye = load_hand_eye(store)
         else:
-            seen, target, arm = read_board_views(store, views_store, tick)
+            seen, target, known = read_board_views(store, views_store, arm, tick)
             camera = views_store.session.intrinsics
-            report = calibrate_hand_eye_report(seen, target, camera, arm=arm)
+            report = calibrate_hand_eye_report(seen, target, camera, arm=known)
             hand_eye = report.hand_eye
             write_results(report, seen, store, views_store)
             save_hand_eye(store, hand_eye)
@@ -97,7 +102,7 @@ def has_board_views_only(folder: Path) -> bool:
     return not is_session(folder) and (folder / BOARD_VIEWS / "session.json").is_file()
 
 
-def calibrate_board_only(folder: Path, console: Console) -> HandEye:
+def calibrate_board_only(folder: Path, console: Console, arm: str = "") -> HandEye:
     """Calibrate the hand-eye from the board views; no camera of a session is placed yet.
 
     Nothing is noted as done: once there is a session, `realsim calibrate` does it anew, lists the
@@ -113,8 +118,8 @@ def calibrate_board_only(folder: Path, console: Console) -> HandEye:
     views_store = SessionStore.open(folder / BOARD_VIEWS)
     require_sound(views_store)
     with console.stage("calibrate", f"{len(views_store.session.views)} board views") as tick:
-        seen, target, arm = read_board_views(files, views_store, tick)
-        report = calibrate_hand_eye_report(seen, target, views_store.session.intrinsics, arm=arm)
+        seen, target, known = read_board_views(files, views_store, arm, tick)
+        report = calibrate_hand_eye_report(seen, target, views_store.session.intrinsics, arm=known)
         write_results(report, seen, files, views_store)
         files.write_json(HAND_EYE_FILE, hand_eye_to_json(report.hand_eye))
     return report.hand_eye

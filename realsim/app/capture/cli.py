@@ -8,7 +8,7 @@ import click
 
 from realsim.app.command import Command
 from realsim.app.option_values import numbers_of
-from realsim.app.options import JSON, QUIET, PlanName, seed
+from realsim.app.options import JSON, QUIET, PlanName, arm, seed
 from realsim.app.outputs import GOES_ON
 
 
@@ -24,6 +24,7 @@ from realsim.app.outputs import GOES_ON
 @click.argument("out", type=GOES_ON)
 @click.option("--plan", required=True, type=PlanName(),
               help="Plan file, or shipped:ur5_d405_hemisphere_256.")  # fmt: skip
+@arm("Name or folder of the arm.  [the plan's]")
 @click.option("--robot-host", default="", help="IP address of the arm's controller.")
 @click.option("--simulated", is_flag=True, help="The simulated lab instead of a robot.")
 @click.option("--camera", default=None, help="Serial number of the RealSense.  [the only one]")

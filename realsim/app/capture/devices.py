@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from realsim.errors import InputError, RealsimError
 from realsim.records import Target
+from realsim.robots.arm import find_arm
 from realsim_capture_plans.capturing.checks import CheckConfig
 from realsim_capture_plans.capturing.look import check_arm
 from realsim_capture_plans.devices.interfaces import Arm, DepthCamera, DeviceError
@@ -37,6 +38,8 @@ def open_devices(
             "say what to capture with: --robot-host IP (the plan's arm and a RealSense), or "
             "--simulated (the simulated lab)."
         )
+    if request.arm:
+        _check_named(request.arm, plan)
     if request.simulated:
         yield _simulated(request, plan, target)
         return
@@ -45,10 +48,21 @@ def open_devices(
         yield arm, camera, None
 
 
+def _check_named(name: str, plan: CapturePlan) -> None:
+    """Refuse an arm that the plan was not made for; a folder's arm is known by its name then."""
+    arm = find_arm(name)
+    if arm.name != plan.robot or arm.joints != plan.chain.joints:
+        raise InputError(
+            f"--arm {name} is a {arm.name} with {arm.joints} joints, and the plan was made for a "
+            f"{plan.robot} with {plan.chain.joints}. Leave --arm out to go with the plan, or make "
+            f"one for this arm: `realsim plan --arm {name}`."
+        )
+
+
 def _simulated(request: "CaptureRequest", plan: CapturePlan, target: Target | None) -> Devices:
     from realsim_capture_plans.lab import LabConfig, SimulatedLab
 
-    lab = SimulatedLab(LabConfig(seed=request.seed, n_objects=request.objects))
+    lab = SimulatedLab(LabConfig(seed=request.seed, arm=plan.robot, n_objects=request.objects))
     check_arm(plan, lab.arm, CheckConfig())
     if target is None:
         lab.place_objects()

@@ -58,6 +58,8 @@ class CaptureRequest:
     """The session's folder."""
     plan: str
     """Plan file, or shipped:NAME."""
+    arm: str | None = None
+    """Name or folder of the arm; None is the plan's."""
     robot_host: str = ""
     """Address of the robot's controller; empty with `simulated`."""
     simulated: bool = False

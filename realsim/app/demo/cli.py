@@ -1,17 +1,20 @@
 """`realsim demo`: its options."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from realsim.app.command import Command
-from realsim.app.options import JSON, QUIET, seed, workers
+from realsim.app.options import JSON, QUIET, arm, seed, workers
 from realsim.app.outputs import GOES_ON
 
 
 @click.command(
     "demo", cls=Command,
-    examples=("realsim demo", "realsim demo --out small --views 12 --objects 2 --grasps 20"),
+    examples=(
+        "realsim demo", "realsim demo --arm panda --out small --views 12 --objects 2 --grasps 20"
+    ),
 )  # fmt: skip
 @click.option(
     "--out",
@@ -20,6 +23,7 @@ from realsim.app.outputs import GOES_ON
     show_default=True,
     help="Folder to fill.",
 )
+@arm("The arm that captures, or its folder.", default="ur5")
 @click.option("--views", default=24, show_default=True, type=click.IntRange(4, 1024),
               help="Of the scene.")  # fmt: skip
 @click.option("--objects", default=5, show_default=True, type=click.IntRange(1, 40),
@@ -30,17 +34,12 @@ from realsim.app.outputs import GOES_ON
 @workers(help="Processes of the Robot School.")
 @JSON
 @QUIET
-def demo_command(
-    out: Path, views: int, objects: int, seed: int, grasps: int, workers: int, as_json: bool,
-    quiet: bool,
-) -> None:  # fmt: skip
+def demo_command(out: Path, as_json: bool, quiet: bool, grasps: int, **setup: Any) -> None:
     """Run the whole loop in a simulated lab and compare it with the truth."""
     from realsim.app.console import Console
     from realsim.app.demo.run import DemoConfig, demo_document, run_demo, show_demo
 
-    config = DemoConfig(
-        views=views, objects=objects, seed=seed, grasps_per_object=grasps, workers=workers
-    )
+    config = DemoConfig(grasps_per_object=grasps, **setup)
     console = Console(quiet=quiet, as_json=as_json)
     result = run_demo(config, out, console)
     show_demo(result, console)

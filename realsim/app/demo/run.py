@@ -25,6 +25,7 @@ from realsim.app.stages import (
 )
 from realsim.errors import InputError
 from realsim.records import CaptureSession, GraspSet, HandEye, Scene
+from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
 from realsim.store.lock import only_run_in
 
@@ -41,6 +42,8 @@ BOARD_VIEW_SHARE = 24
 class DemoConfig:
     """What the demo captures."""
 
+    arm: str = "ur5"
+    """Name or folder of the arm."""
     views: int = 24
     """Views of the scene."""
     objects: int = 5
@@ -82,11 +85,11 @@ def run_demo(config: DemoConfig, out: Path, console: Console) -> DemoResult:
     _claim(out, config)
     # One BLAS thread: on small matrices the spinning of more costs more than the work.
     with only_run_in(out), threadpool_limits(limits=1):
-        lab = SimulatedLab(LabConfig(seed=config.seed, n_objects=config.objects))
+        lab = SimulatedLab(LabConfig(seed=config.seed, arm=config.arm, n_objects=config.objects))
         store = _capture_all(lab, config, out, console)
         joints = {v.index: v.joints for v in store.session.views if v.joints is not None}
         lab.write_truth(out / "truth", joints)
-        hand_eye = calibrate_session(store, console)
+        hand_eye = calibrate_session(store, console, config.arm)
         scene = register_session(store, console)
         grasps = school_session(
             store, console, grasps_per_object=config.grasps_per_object, seed=config.seed,
@@ -111,7 +114,7 @@ def _claim(out: Path, config: DemoConfig) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"'{out}' is a file; give --out a folder that may be made or filled.")
     if note.is_file():
-        found = json.loads(note.read_text())
+        found = {"arm": DemoConfig.arm} | json.loads(note.read_text())
         if found != wanted:
             told = ", ".join(f"{k}={v}" for k, v in found.items())
             raise InputError(
@@ -153,7 +156,10 @@ def _capture_all(
         ):
             if not (out / name).is_file():
                 rng = np.random.default_rng([config.seed, 1, len(plans)])
-                plan = make(n, lab.scene_center, lab.nominal_T_ee_cam, PlanConfig(), rng)
+                plan = make(
+                    n, lab.scene_center, lab.nominal_T_ee_cam, PlanConfig(), rng,
+                    chain=find_arm(config.arm).chain,
+                )  # fmt: skip
                 save_plan(plan, out / name)
             plans.append(load_plan(out / name))
             tick(len(plans), 2)

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from realsim.app.command import Command
-from realsim.app.options import FOLDER, JSON, QUIET, overwrite
+from realsim.app.options import FOLDER, JSON, QUIET, arm, overwrite
 from realsim.app.outputs import GOES_ON
 
 
@@ -42,12 +42,13 @@ from realsim.app.outputs import GOES_ON
 @click.option("--poses-of", default=None, type=click.Choice(["tool", "camera"]), help="[tool]")
 @click.option("--reading", default=None, help="How poses are read: rotvec,m  quat_xyzw,mm  ...")
 @click.option("--key", default=None, help="Entry of the pose file, where there are several.")
+@arm("Name or folder of the arm.  [of a bag a UR]")
 @click.option("--colour-topic", default=None, help="ROS topic of the colour images.")
 @click.option("--depth-topic", default=None, help="ROS topic of the depth images.")
 @click.option("--joints-topic", default=None, help="ROS topic of the joint states.")
 @click.option("--camera-info-topic", default=None, help="ROS topic of the colour camera's values.")
 @click.option("--depth-camera-info-topic", default=None, help="The same of the depth camera.")
-@click.option("--joint-prefix", default=None, help="Before shoulder_pan_joint, with two arms.")
+@click.option("--joint-prefix", default=None, help="Before the joints' names, with two arms.")
 @click.option("--base-frame", default=None, help="tf frame of the robot's base.")
 @click.option("--ee-frame", default=None, help="tf frame of the flange.")
 @click.option("--world-frame", default=None, help="tf frame to give camera poses in.")

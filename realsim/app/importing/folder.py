@@ -27,6 +27,7 @@ from realsim.formats.folders import (
 from realsim.formats.folders.listing import shown
 from realsim.formats.folders.source import require_one_size
 from realsim.records import CameraIntrinsics
+from realsim.robots.arm import find_arm, known_chains
 
 Array = NDArray[np.float64]
 CAMERA_NAME = re.compile(r"cam|intrin|calib|^k$", re.IGNORECASE)
@@ -39,7 +40,6 @@ POSE_PLACES = (".", "poses", "pose", "robot", "robot_poses", "tcp")
 SMALLEST_BOP_SCALE = 0.02
 """depth_scale in a camera.json is millimetres per count in BOP (0.1, 1) and metres per count in
 other programs (0.001): below this it is not BOP's, and is not taken."""
-JOINTS = 6
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -57,6 +57,8 @@ class FolderRequest:
     """How the poses are read, as in `realsim calibrate --reading`."""
     key: str = ""
     """Which entry of the pose file holds them."""
+    arm: str | None = None
+    """Name or folder of the arm that the joints must be of."""
     poses_of: str = "tool"
     """"tool" (flange in base) or "camera" (camera in world)."""
 
@@ -251,7 +253,16 @@ def _poses(
             "--no-poses."
         )
     Ts = raw.poses(reading)
-    joints = raw.joints if raw.joints is not None and raw.joints.shape[1] == JOINTS else None
+    joints = raw.joints
+    if joints is not None and request.arm:
+        arm = find_arm(request.arm)
+        if joints.shape[1] != arm.joints:
+            alike = ", ".join(known_chains(joints.shape[1])) or "none that is found by name"
+            raise InputError(
+                f"{raw.path} has {joints.shape[1]} joint angles a pose, and --arm {request.arm}, a "
+                f"{arm.name}, has {arm.joints} joints. Name the arm that they are of ({alike}), or "
+                "leave --arm out."
+            )
     field = {"tool": "T_base_ee", "camera": "T_world_cam"}[request.poses_of]
     states = [
         FrameState(

@@ -45,6 +45,7 @@ ONLY_FOR: dict[str, tuple[str, ...]] = {
     "no_depth": ("folder", "bag", "bop", "graspnet", "colmap", "nerfstudio"),
     "colour_topic": ("bag",),
     "depth_topic": ("bag",),
+    "arm": ("folder", "bag"),
     "joints_topic": ("bag",),
     "camera_info_topic": ("bag",),
     "depth_camera_info_topic": ("bag",),
@@ -72,6 +73,7 @@ BAG_OPTIONS = {
     "intrinsics": "--camera ",
     "depth_unit_m": "--depth-unit ",
     "without_depth": "--no-depth ",
+    "joint_names": "--arm ",
     "joint_prefix": "--joint-prefix ",
     "base_frame": "--base-frame ",
     "ee_frame": "--ee-frame ",
@@ -106,6 +108,8 @@ class ImportRequest:
     poses_of: str = "tool"
     colour_topic: str | None = None
     depth_topic: str | None = None
+    arm: str | None = None
+    """Name or folder of the arm; None = a UR's joints in a recording, any in a folder."""
     joints_topic: str | None = None
     camera_info_topic: str | None = None
     depth_camera_info_topic: str | None = None
@@ -337,6 +341,7 @@ def folder_request(request: ImportRequest) -> FolderRequest:
         reading=request.reading,
         key=request.key,
         poses_of=request.poses_of,
+        arm=request.arm,
     )
 
 
@@ -406,6 +411,17 @@ def _open_colmap(request: ImportRequest, console: Console) -> FrameSource:
     )
 
 
+def _joint_names(arm: str | None) -> tuple[str, ...]:
+    """Return what messages call the arm's joints; ROS's driver has its own names of a UR's."""
+    from realsim.formats.bags.joints import UR_JOINTS
+    from realsim.robots.arm import find_arm
+
+    if arm is None:
+        return UR_JOINTS
+    found = find_arm(arm)
+    return UR_JOINTS if found.name.startswith("UR") else found.joint_names
+
+
 def _open_bag(request: ImportRequest, console: Console) -> FrameSource:
     from realsim.formats.bags import BagChoice, open_bag
 
@@ -416,6 +432,7 @@ def _open_bag(request: ImportRequest, console: Console) -> FrameSource:
         joints=request.joints_topic,
         camera_info=request.camera_info_topic,
         depth_camera_info=request.depth_camera_info_topic,
+        joint_names=_joint_names(request.arm),
         joint_prefix=request.joint_prefix,
         base_frame=request.base_frame,
         ee_frame=request.ee_frame,

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats.bags.clocks import Times, check_overlap
+from realsim.formats.bags.joints import UR_JOINTS
 from realsim.formats.bags.scan import Scan
 from realsim.formats.bags.tf_tree import arm_frames
 from realsim.formats.bags.topics import BagChoice, Topics
@@ -49,7 +50,8 @@ def arm_at(times_ns: Times, scan: Scan, topics: Topics, choice: BagChoice) -> Ar
     joints = _joints(times_ns, scan, topics, gap, speeds, notes)
     tree = scan.tree
     Ts: Array | None = None
-    frames = arm_frames(tree, choice.base_frame, choice.ee_frame, joints is not None)
+    is_ur = joints is not None and choice.joint_names == UR_JOINTS
+    frames = arm_frames(tree, choice.base_frame, choice.ee_frame, is_ur)
     if frames is not None:
         base, ee, T_base_frame, found = frames
         notes += found
@@ -62,7 +64,7 @@ def arm_at(times_ns: Times, scan: Scan, topics: Topics, choice: BagChoice) -> Ar
         if joints is None:
             speeds[:] = [tree.speed(base, ee, int(t), gap) for t in times_ns]
     elif joints is None:
-        notes.append("neither a UR's joints nor tf to its flange were recorded: images alone.")
+        notes.append("neither the arm's joints nor tf to its flange were recorded: images alone.")
     Ts_world: Array | None = None
     if choice.world_frame is not None:
         Ts_world = _world(scan, times_ns, choice.world_frame, topics.colour.frame_id, gap, notes)
@@ -82,7 +84,7 @@ def arm_at(times_ns: Times, scan: Scan, topics: Topics, choice: BagChoice) -> Ar
 def _joints(
     times_ns: Times, scan: Scan, topics: Topics, gap: float, speeds: Array, notes: list[str]
 ) -> Array | None:
-    """Return joints (N, 6) with NaN in gaps, and fill in the speeds; None without a track."""
+    """Return joints (N, n) with NaN in gaps, and fill in the speeds; None without a track."""
     track = scan.joints
     if track is None or not len(track.times_ns):
         return None

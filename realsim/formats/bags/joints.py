@@ -1,7 +1,7 @@
-"""Joint readings of a UR arm, by name and never by order, at any moment of a recording."""
+"""Joint readings of an arm, by name and never by order, at any moment of a recording."""
 
 from array import array
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -24,27 +24,27 @@ SPEED_WINDOW_NS = NS_PER_S // 20
 neighbours 2 ms apart would only show the encoders' noise."""
 
 
-def prefixes(names: Iterable[str]) -> list[str]:
-    """Return what stands before the UR's joint names, for every arm whose six are all there."""
+def prefixes(names: Iterable[str], joints: Sequence[str] = UR_JOINTS) -> list[str]:
+    """Return what stands before the joints' names, for every arm whose joints are all there."""
     names = set(names)
-    first = UR_JOINTS[0]
-    starts = sorted(n[: -len(first)] for n in names if n.endswith(first))
-    return [s for s in starts if all(s + joint in names for joint in UR_JOINTS)]
+    first = joints[0]
+    starts = sorted(n[: len(n) - len(first)] for n in names if n.endswith(first))
+    return [s for s in starts if all(s + joint in names for joint in joints)]
 
 
 class JointTrack:
     """The readings of one arm over time; grown by `add`, asked by `at`."""
 
-    def __init__(self, prefix: str) -> None:
+    def __init__(self, prefix: str, joints: Sequence[str] = UR_JOINTS) -> None:
         """Start empty; `prefix` stands before the joints' names."""
-        self._names = [prefix + joint for joint in UR_JOINTS]
+        self._names = [prefix + joint for joint in joints]
         self._columns: dict[tuple[str, ...], list[int] | None] = {}
         self._times = array("q")
         self._q = array("d")
         self._dq = array("d")
         self._has_velocity = True
         self.times_ns: Times = np.zeros(0, dtype=np.int64)
-        self.q: Array = np.zeros((0, len(UR_JOINTS)))
+        self.q: Array = np.zeros((0, len(self._names)))
         self.dq: Array | None = None
 
     def add(self, message: JointMessage, time_ns: int) -> bool:
@@ -71,7 +71,7 @@ class JointTrack:
         """Sort what was added; of readings with one time stamp the first counts."""
         times, order = np.unique(np.frombuffer(self._times, np.int64), return_index=True)
         self.times_ns = times
-        self.q = np.frombuffer(self._q, np.float64).reshape(-1, len(UR_JOINTS))[order]
+        self.q = np.frombuffer(self._q, np.float64).reshape(-1, len(self._names))[order]
         if self._has_velocity and len(self._dq):
             dq = np.frombuffer(self._dq, np.float64).reshape(self.q.shape[0], -1)[order]
             # Some publishers fill the field with zeros: that is no evidence of standing still.
@@ -91,7 +91,7 @@ class JointTrack:
             )
 
     def at(self, time_ns: int, max_gap_s: float) -> tuple[Array, float] | None:
-        """Return joints (6,) [rad] and the leading joint's speed [rad/s], or None in a gap."""
+        """Return joints (n,) [rad] and the leading joint's speed [rad/s], or None in a gap."""
         weight = between(self.times_ns, time_ns, max_gap_s)
         if weight is None:
             return None

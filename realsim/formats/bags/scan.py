@@ -106,7 +106,7 @@ def scan(recording: Recording, topics: Topics, choice: BagChoice) -> Scan:
             "recording instead, which is less exact."
         )
     images = [ImageTimes(t) for t in (topics.colour, topics.depth) if t is not None]
-    track = JointTrack(topics.joint_prefix) if topics.joints else None
+    track = JointTrack(topics.joint_prefix, choice.joint_names) if topics.joints else None
     tree = TfTree()
     handlers = _handlers(recording, topics, images, track, tree, by_receive)
     for topic, receive_ns, data in recording.messages(list(handlers)):

@@ -14,6 +14,7 @@ from realsim.errors import InputError
 from realsim.formats.bags import cameras, clocks, pixels
 from realsim.formats.bags import realsense as rs
 from realsim.formats.bags.arm import ArmAtFrames, arm_at
+from realsim.formats.bags.joints import UR_JOINTS
 from realsim.formats.bags.pixels import counts_of, unit_of
 from realsim.formats.bags.recording import Recording
 from realsim.formats.bags.scan import ImageTimes, Messages, Scan, StoredImages, scan
@@ -297,7 +298,9 @@ def _content_key(recording: Recording, topics: Topics, found: Scan, choice: BagC
         digest.update(image.stamp_ns.tobytes() + image.receive_ns.tobytes())
     counts = sorted((t.name, t.count) for t in recording.topics.values())
     arm = (topics.joints, topics.joint_prefix, topics.tf)
-    said = {n: str(getattr(choice, n)) for n in CHOICE_NAMES if n != "intrinsics"}
+    # A UR's joints were the only ones once: recordings of it keep their digest.
+    usual = {"intrinsics", *(["joint_names"] if choice.joint_names == UR_JOINTS else [])}
+    said = {n: str(getattr(choice, n)) for n in CHOICE_NAMES if n not in usual}
     digest.update(json.dumps([counts, arm, said, found.clock]).encode())
     return digest.hexdigest()
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from realsim.errors import InputError
 from realsim.formats.bags import camera_info as ci
-from realsim.formats.bags.joints import prefixes
+from realsim.formats.bags.joints import UR_JOINTS, prefixes
 from realsim.formats.bags.pixels import ImageKind, kind_of
 from realsim.formats.bags.recording import Recording
 from realsim.formats.bags.wire import image_of, joints_of
@@ -41,9 +41,11 @@ class BagChoice:
     depth_unit_m: float | None = None
     """Metres per count of 16-bit depth, where the recording does not say it."""
     joints: str | None = None
-    """Topic of the JointState messages; needed where several hold a UR's six joints."""
+    """Topic of the JointState messages; needed where several hold the arm's joints."""
+    joint_names: tuple[str, ...] = UR_JOINTS
+    """The arm's joints from the base outwards, as messages call them behind a prefix."""
     joint_prefix: str | None = None
-    """What stands before `shoulder_pan_joint` and the others, where there are two arms."""
+    """What stands before the joints' names, where there are two arms."""
     base_frame: str | None = None
     """Frame of tf that is the robot's base; else `base`, else `base_link`."""
     ee_frame: str | None = None
@@ -256,7 +258,8 @@ def _info(infos: list[str], image: ImageTopic, wanted: str | None, option: str) 
 
 
 def _joints(recording: Recording, topics: Topics, choice: BagChoice) -> None:
-    """Find the topic and the prefix of the UR's six joints."""
+    """Find the topic and the prefix of the arm's joints."""
+    first, *_, last = choice.joint_names
     found: list[tuple[str, str]] = []
     seen: set[str] = set()
     for topic in recording.of_type(JOINT_STATE):
@@ -267,10 +270,10 @@ def _joints(recording: Recording, topics: Topics, choice: BagChoice) -> None:
                 if n >= JOINT_MESSAGES_LOOKED_AT:
                     break
             seen.update(names)
-            found += [(topic.name, p) for p in prefixes(names)]
+            found += [(topic.name, p) for p in prefixes(names, choice.joint_names)]
     if choice.joints is not None and not any(t == choice.joints for t, _ in found):
         raise InputError(
-            f"joints={choice.joints} holds no UR joints (shoulder_pan_joint ... wrist_3_joint); "
+            f"joints={choice.joints} does not hold the joints {first} ... {last}; "
             f"names there: {', '.join(sorted(seen)) or 'none'}. JointState topics: "
             f"{', '.join(t.name for t in recording.of_type(JOINT_STATE)) or 'none'}."
         )
@@ -279,7 +282,7 @@ def _joints(recording: Recording, topics: Topics, choice: BagChoice) -> None:
         if not found:
             raise InputError(
                 f"joint_prefix={choice.joint_prefix!r}: no joint {choice.joint_prefix}"
-                f"shoulder_pan_joint and so on; names there: {', '.join(sorted(seen)) or 'none'}."
+                f"{first} and so on; names there: {', '.join(sorted(seen)) or 'none'}."
             )
     if len(found) > 1:
         options = ", ".join(f"joints={t} joint_prefix={p!r}" for t, p in found)
@@ -290,4 +293,7 @@ def _joints(recording: Recording, topics: Topics, choice: BagChoice) -> None:
         topics.joints, topics.joint_prefix = found[0]
     elif seen:
         shown = ", ".join(sorted(seen)[:12])
-        topics.notes.append(f"joints were not imported: no UR arm's six are among {shown}.")
+        topics.notes.append(
+            f"joints were not imported: {first} ... {last} are not all among {shown}. Joints of "
+            "another arm are read where it is named (--arm)."
+        )
