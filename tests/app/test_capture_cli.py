@@ -86,7 +86,8 @@ def test_a_session_has_plan_devices_log_and_sheet(plans: Path) -> None:
     [
         (["--plan", "plan.json"], "--simulated"),
         (["--plan", "plan.json", "--simulated", "--robot-host", "1.2.3.4"], "--robot-host"),
-        (["--plan", "ur5e.json", "--simulated"], "made for a UR5e, this arm is a UR5"),
+        (["--plan", "ur5e.json", "--simulated", "--arm", "panda"],
+         "--arm panda is a Panda with 7 joints, and the plan was made for a UR5e with 6"),
         (["--plan", "board_plan.json", "--simulated"], "--board does not say which"),
         (["--plan", "plan.json", "--simulated", "--speed", "2"], "at most 1"),
         (["--plan", "plan.json", "--simulated", "--views", "0-1,9-11"], "[9, 10, 11]"),
