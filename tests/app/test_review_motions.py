@@ -12,8 +12,8 @@ from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.records import ObjectModel
 from realsim.records.trajectories import PHASES
-from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.arm.reach_config import base_on_table, home_joints
+from realsim.robots.hand import find_hand
+from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm, home_joints
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of
 from school_sessions import registered, run
 
@@ -80,8 +80,9 @@ def test_the_hand_closes_in_the_grasp_and_comes_from_home(
         )
         x, y = s.parameters["middle_xy_m"]
         reach = school_config_of(s).reach
-        T_world_base = grasps.T_world_table @ base_on_table((x, y), reach)
-        home = T_world_base @ panda.forward(home_joints(reach, (x, y)))
+        arm = grasping_arm(reach, find_hand())
+        T_world_base = grasps.T_world_table @ base_on_table((x, y), reach, arm)
+        home = T_world_base @ arm.forward(home_joints(reach, arm, (x, y)))
         np.testing.assert_allclose(motion.Ts_world_hand[0], home, atol=SAME)
         assert motion.phase_name(0) == "reach"
 
@@ -161,7 +162,7 @@ def test_arm_and_hand_are_drawn_where_the_kinematics_have_them(
     base = motion.Ts_world_link[:, 0]
     np.testing.assert_allclose(base, np.tile(base[0], (len(motion), 1, 1)), atol=1e-12)
     Ts_grasp_hand = se3.invert(motion.Ts_world_hand) @ motion.Ts_world_link[:, 8]
-    expected = se3.from_translation([0.0, 0.0, -panda.TCP_M])
+    expected = se3.from_translation([0.0, 0.0, find_hand().mount_z_m])
     np.testing.assert_allclose(Ts_grasp_hand, np.tile(expected, (len(motion), 1, 1)), atol=1e-9)
     apart = np.linalg.norm(
         motion.Ts_world_link[:, 9, :3, 3] - motion.Ts_world_link[:, 10, :3, 3], axis=1

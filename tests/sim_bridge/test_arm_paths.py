@@ -7,9 +7,10 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
+from realsim.robots.arm import find_arm
 from realsim.robots.hand import find_hand
-from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.arm_space import FREE, ArmSpace, ArmSpaceConfig
+from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.joint_path import PlannerConfig, connect
 from realsim_sim_bridge.arm.obstacles import obstacles_of
 from realsim_sim_bridge.arm.timing import (
@@ -18,7 +19,8 @@ from realsim_sim_bridge.arm.timing import (
     timed_path,
 )
 
-READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
+PANDA = GraspingArm(find_arm("panda"), find_hand())
+READY = PANDA.arm.home
 SIDE, LOW = np.eye(7)[0], np.eye(7)[1]
 LEFT, RIGHT = READY - 0.9 * SIDE + 0.5 * LOW, READY + 0.9 * SIDE + 0.5 * LOW
 OPEN = 0.08
@@ -30,7 +32,7 @@ def walled(height):
     points = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
     obstacles = obstacles_of(points, np.full(len(points), 3), np.zeros(len(points), bool))
     T = se3.from_translation([0.0, 0.0, 0.02])
-    return ArmSpace(T, obstacles, ArmSpaceConfig(), find_hand())
+    return ArmSpace(T, obstacles, ArmSpaceConfig(), PANDA)
 
 
 def is_free(space, path):
@@ -48,7 +50,7 @@ def test_the_planner_goes_round_what_blocks_the_straight_move():
     path = plan(space)
     assert path is not None and len(path) > 2
     assert np.array_equal(path[0], LEFT) and np.array_equal(path[-1], RIGHT)
-    assert is_free(space, path) and panda.within_limits(path).all()
+    assert is_free(space, path) and PANDA.within_limits(path).all()
 
 
 def test_a_plan_depends_on_its_seed_alone():
@@ -72,7 +74,7 @@ def test_the_planner_gives_up_on_a_closed_wall():
 
 def assert_limits_hold(q, t, config):
     """Divided differences are means of the derivatives: they may not exceed a limit either."""
-    velocity, acceleration = config.limits()
+    velocity, acceleration = config.limits(PANDA.limits)
     dt = np.diff(t)[:, None]
     speed = np.diff(q, axis=0) / dt
     assert np.all(np.abs(speed) <= velocity * (1 + 1e-6))
@@ -87,11 +89,11 @@ def test_straight_moves_take_as_long_as_topp_ra_says():
 
     toppra.setup_logging("ERROR")
     config = TimingConfig()
-    velocity, acceleration = config.limits()
+    velocity, acceleration = config.limits(PANDA.limits)
     rng = np.random.default_rng(0)
     for scale in (0.05, 0.5, 2.0):
         start, end = READY, READY + scale * rng.uniform(-1, 1, 7)
-        _, mine = straight_times((end - start)[None], config)
+        _, mine = straight_times((end - start)[None], PANDA.limits, config)
         solver = toppra.algorithm.TOPPRA(
             [
                 toppra.constraint.JointVelocityConstraint(np.stack([-velocity, velocity], 1)),
@@ -112,7 +114,7 @@ def test_limits_hold_along_a_path_with_corners(rounding):
     for _ in range(2):
         corners = READY + rng.uniform(-0.5, 0.5, (4, 7))
         config = TimingConfig(sample_hz=200.0)
-        q, duration = timed_path(corners, lambda path: rounding, config)
+        q, duration = timed_path(corners, lambda path: rounding, PANDA.limits, config)
         t = np.arange(len(q)) / 200.0
         assert t[-1] < duration <= t[-1] + 1 / 200.0 + 1e-9
         assert np.allclose(q[0], corners[0])
@@ -131,8 +133,8 @@ def test_a_rounded_path_is_used_only_where_it_is_free_and_is_quicker():
         return True
 
     config = TimingConfig()
-    rounded, quick = timed_path(corners, ask, config)
-    stopping, slow = timed_path(corners, lambda path: False, config)
+    rounded, quick = timed_path(corners, ask, PANDA.limits, config)
+    stopping, slow = timed_path(corners, lambda path: False, PANDA.limits, config)
     assert len(asked) == 1 and quick < slow
     # What was checked is what is driven.
     dense = np.concatenate([np.linspace(a, b, 50) for a, b in pairwise(asked[0])])

@@ -45,9 +45,9 @@ def askew(n):
         Ts_obj_grasp=Ts,
         Ts_table_grasp=Ts,
         openings_m=np.full(n, 0.06),
-        joint5_axes=np.tile([0.0, 1.0, 0.0], (n, 1)),
-        joint5_points=np.tile([-0.088, 0.0, -0.21], (n, 1)),
-        joint5_ranges=np.tile([-2.0, 2.0], (n, 1)),
+        swing_axes=np.tile([0.0, 1.0, 0.0], (n, 1)),
+        swing_points=np.tile([-0.088, 0.0, -0.21], (n, 1)),
+        swing_ranges=np.tile([-2.0, 2.0], (n, 1)),
     )
 
 

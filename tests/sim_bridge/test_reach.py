@@ -1,15 +1,14 @@
 """Whether grasps are reached, why not, and what the arm does over time."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records.trajectories import PHASES
+from realsim.robots.arm import find_arm
 from realsim.robots.hand import find_hand
-from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.lifted_object import touched_when_lifted
 from realsim_sim_bridge.arm.obstacles import obstacles_of
 from realsim_sim_bridge.arm.reach import (
@@ -19,6 +18,7 @@ from realsim_sim_bridge.arm.reach import (
     check_reach,
     home_joints,
 )
+from realsim_sim_bridge.arm.reach_config import ChosenArm, chosen_arm
 from realsim_sim_bridge.arm.swept_hand import first_touched
 from realsim_sim_bridge.arm.timing import TimingConfig
 from realsim_sim_bridge.grasping.candidates import Surroundings
@@ -27,6 +27,7 @@ from realsim_sim_bridge.slip.motion import SlipMotion, min_jerk, pendulum_angle
 
 DOWN = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 OPENING, WIDTH = 0.06, 0.05
+PANDA = GraspingArm(find_arm("panda"), find_hand())
 
 
 def from_above(x, y, z, yaw=0.0):
@@ -51,7 +52,7 @@ def box_points(low, high, instance, step=0.004):
     return Surroundings(points=points, instances=np.full(len(points), instance))
 
 
-def reach_of(Ts, neighbours=None, config=None, obj=None, geometry=None, motion=None, seed=0):
+def reach_of(Ts, neighbours=None, config=None, obj=None, arm=PANDA, motion=None, seed=0):
     n = len(Ts)
     task = ReachTask(
         Ts_table_grasp=np.asarray(Ts),
@@ -62,7 +63,7 @@ def reach_of(Ts, neighbours=None, config=None, obj=None, geometry=None, motion=N
         middle_xy=(0.0, 0.0),
     )
     rng = np.random.default_rng(seed)
-    return check_reach(task, config or ReachConfig(), geometry or find_hand(), rng, motion)
+    return check_reach(task, config or ReachConfig(), arm, rng, motion)
 
 
 # --- laws ---------------------------------------------------------------------------------------
@@ -72,9 +73,9 @@ def test_a_grasp_from_above_is_reached_at_its_pose():
     T = from_above(0.05, 0.02, 0.03)
     reach = reach_of([T])
     assert reach.reachable[0] and reach.reasons[0] == ""
-    T_table_base = base_on_table((0.0, 0.0), ReachConfig())
-    assert np.allclose(T_table_base @ panda.forward(reach.joints[0]), T, atol=1e-6)
-    lifted = T_table_base @ panda.forward(reach.joints_lifted[0])
+    T_table_base = base_on_table((0.0, 0.0), ReachConfig(), PANDA)
+    assert np.allclose(T_table_base @ PANDA.forward(reach.joints[0]), T, atol=1e-6)
+    lifted = T_table_base @ PANDA.forward(reach.joints_lifted[0])
     assert np.allclose(lifted[:3, 3] - T[:3, 3], [0, 0, 0.2], atol=1e-6)
 
 
@@ -90,8 +91,32 @@ def test_a_lab_s_arm_beside_the_table_reaches_too():
     beside = ReachConfig(T_table_base=se3.from_translation([-0.5, 0.0, 0.0]))
     reach = reach_of(some_grasps(), config=beside)
     assert reach.reachable.mean() > 0.7
-    T = se3.from_translation([-0.5, 0.0, 0.0]) @ panda.forward(reach.joints[reach.reachable])
+    T = se3.from_translation([-0.5, 0.0, 0.0]) @ PANDA.forward(reach.joints[reach.reachable])
     assert np.allclose(T, np.array(some_grasps())[reach.reachable], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "hand"), [("ur5", "franka_hand"), ("iiwa14", "parallel"), ("xarm6", "franka_hand")]
+)
+def test_every_arm_reaches_from_where_it_hangs_and_does_the_stages(name, hand):
+    arm, config = GraspingArm(find_arm(name), find_hand(hand)), ReachConfig(arm=chosen_arm(name))
+    reach = reach_of(some_grasps(), config=config, arm=arm)
+    assert reach.reachable.mean() >= 0.7
+    T = base_on_table((0.0, 0.0), config, arm) @ arm.forward(reach.joints[reach.reachable])
+    assert np.allclose(T, np.array(some_grasps())[reach.reachable], atol=1e-6)
+    paths = reach.trajectories
+    assert paths.joints_rad.shape[1] == arm.joints and arm.within_limits(paths.joints_rad).all()
+    swing = paths.phase == PHASES.index("pendulum")
+    moved = np.ptp(paths.joints_rad[swing & (np.roll(swing, 1))], axis=0)
+    assert np.argmax(moved / np.ptp(paths.joints_rad, axis=0).clip(1e-9)) >= 0 and moved.max() > 0.5
+    assert all(f"joint {arm.swing_joint + 1}" in n for n in reach.notes if n.startswith("pendulum"))
+
+
+def test_an_arm_that_has_become_another_is_refused():
+    with pytest.raises(InputError, match=r"'panda' .* is another than the one that was chosen"):
+        ChosenArm(name="panda", digest="0" * 64).found()
+    with pytest.raises(InputError, match="no arm 'puma'"):
+        chosen_arm("puma")
 
 
 # --- reasons ------------------------------------------------------------------------------------
@@ -142,7 +167,7 @@ def test_a_home_that_is_blocked_is_said():
 
 def test_a_base_from_which_home_cannot_be_reached_is_refused():
     with pytest.raises(InputError, match=r"wrist would be .* from the shoulder"):
-        home_joints(ReachConfig(base_height_m=3.0))
+        home_joints(ReachConfig(base_height_m=3.0), PANDA)
     with pytest.raises(InputError, match=r"rigid|transform"):
         ReachConfig(T_table_base=np.eye(3))
     far = ReachConfig(T_table_base=se3.from_translation([-3.0, 0.0, 0.0]))
@@ -151,11 +176,8 @@ def test_a_base_from_which_home_cannot_be_reached_is_refused():
 
 
 def test_contradictions_are_refused():
-    T = [from_above(0.0, 0.0, 0.05)]
     with pytest.raises(InputError, match="lift"):
-        reach_of(T, motion=SlipMotion(lift_height_m=0.1))
-    with pytest.raises(InputError, match="mount"):
-        reach_of(T, geometry=replace(find_hand(), mount_z_m=-0.15))
+        reach_of([from_above(0.0, 0.0, 0.05)], motion=SlipMotion(lift_height_m=0.1))
 
 
 # --- the lifted object --------------------------------------------------------------------------
@@ -200,7 +222,7 @@ def test_an_attempt_has_its_phases_in_order_and_ends_where_it_was_lifted():
     reach = reach_of(some_grasps())
     paths = reach.trajectories
     assert np.array_equal(paths.rows, np.nonzero(reach.reachable)[0])
-    home = home_joints(ReachConfig())
+    home = home_joints(ReachConfig(), PANDA)
     for row in paths.rows.tolist():
         at = paths.attempt(row)
         phase, t, q = paths.phase[at], paths.time_s[at], paths.joints_rad[at]
@@ -220,12 +242,12 @@ def test_an_attempt_has_its_phases_in_order_and_ends_where_it_was_lifted():
 def test_limits_hold_at_all_samples():
     timing = TimingConfig(sample_hz=100.0)
     reach = reach_of(some_grasps(), config=ReachConfig(timing=timing))
-    velocity, acceleration = timing.limits()
+    velocity, acceleration = timing.limits(PANDA.limits)
     paths, checked = reach.trajectories, 0
     for row in paths.rows.tolist():
         at = paths.attempt(row)
         phase, t, q = paths.phase[at], paths.time_s[at], paths.joints_rad[at]
-        assert panda.within_limits(q).all()
+        assert PANDA.within_limits(q).all()
         dt = np.diff(t)[:, None]
         speed = np.diff(q, axis=0) / dt
         going = phase[1:] <= PHASES.index("approach")
@@ -235,7 +257,7 @@ def test_limits_hold_at_all_samples():
         for stage, name in enumerate(("lift", "oscillate", "pendulum")):
             if reach.stage_possible[row, stage]:
                 during = phase[:-1] == PHASES.index(name)
-                assert np.all(np.abs(speed[during]) <= panda.VELOCITY * (1 + 2e-3))
+                assert np.all(np.abs(speed[during]) <= PANDA.limits.speed * (1 + 2e-3))
                 checked += 1
     assert checked > 20
 
@@ -243,12 +265,12 @@ def test_limits_hold_at_all_samples():
 def test_the_stages_are_the_slip_test_s_motions():
     reach = reach_of(some_grasps())
     paths, motion, rate = reach.trajectories, SlipMotion(), 50.0
-    T_table_base = base_on_table((0.0, 0.0), ReachConfig())
+    T_table_base = base_on_table((0.0, 0.0), ReachConfig(), PANDA)
     seen = 0
     for row in paths.rows.tolist():
         at = paths.attempt(row)
         phase, t, q = paths.phase[at], paths.time_s[at], paths.joints_rad[at]
-        T = T_table_base @ panda.forward(q)
+        T = T_table_base @ PANDA.forward(q)
 
         def during(name, phase=phase, t=t):
             mine = np.nonzero(phase == PHASES.index(name))[0]
@@ -274,8 +296,8 @@ def test_the_stages_are_the_slip_test_s_motions():
         mine, clock = during("pendulum")
         mine = mine[: round(motion.pendulum_s * rate)]
         lift = reach.joints_lifted[row]
-        low = max(panda.LOWER[4] - lift[4], -np.radians(60))
-        high = min(panda.UPPER[4] - lift[4], np.radians(60))
+        low = max(PANDA.limits.lower[4] - lift[4], -np.radians(60))
+        high = min(PANDA.limits.upper[4] - lift[4], np.radians(60))
         swing = pendulum_angle(motion, 1 / rate, low, high)[0]
         assert np.allclose(q[mine, 4] - lift[4], swing, atol=1e-12)
         assert np.array_equal(np.delete(q[mine], 4, axis=1), np.tile(np.delete(lift, 4), (160, 1)))

@@ -36,9 +36,9 @@ def trial(n=1, mass=0.125, R=DOWN):
         Ts_obj_grasp=Ts,
         Ts_table_grasp=Ts,
         openings_m=np.full(n, SIDE + 0.008),
-        joint5_axes=np.tile([0.0, 1.0, 0.0], (n, 1)),
-        joint5_points=np.tile([-0.088, 0.0, -0.21], (n, 1)),
-        joint5_ranges=np.tile([-2.0, 2.0], (n, 1)),
+        swing_axes=np.tile([0.0, 1.0, 0.0], (n, 1)),
+        swing_points=np.tile([-0.088, 0.0, -0.21], (n, 1)),
+        swing_ranges=np.tile([-2.0, 2.0], (n, 1)),
     )
 
 

@@ -6,14 +6,13 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
-from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.slip.motion import SlipMotion
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.validation.config import LabelConfig
 from realsim_sim_bridge.validation.full_arm import carry_cube, stage_joints
 from realsim_sim_bridge.validation.known_outcomes import peak_load
 from realsim_sim_bridge.validation.loads import with_hand
-from realsim_sim_bridge.validation.specimens import READY, edge_trial, specimen
+from realsim_sim_bridge.validation.specimens import READY, edge_trial, panda, specimen
 
 SHAPES = LabelConfig().shapes
 
@@ -61,11 +60,11 @@ def test_the_peak_load_is_what_lift_and_oscillation_ask_for():
 
 def test_joint_paths_carry_the_hand_as_the_stages_do():
     motion, dt = SlipMotion(), 0.01
-    start = panda.forward(READY)
-    lift = panda.forward(stage_joints(1, READY, motion, dt))
+    start = panda().forward(READY)
+    lift = panda().forward(stage_joints(1, READY, motion, dt))
     assert np.allclose(lift[-1, :3, 3] - start[:3, 3], [0, 0, motion.lift_height_m], atol=1e-4)
     assert np.allclose(lift[:, :3, :3], start[:3, :3], atol=1e-3)
-    shake = panda.forward(stage_joints(2, READY, motion, dt))[:, :3, 3] - start[:3, 3]
+    shake = panda().forward(stage_joints(2, READY, motion, dt))[:, :3, 3] - start[:3, 3]
     ends = [2 * motion.oscillation_m, 2 * motion.oscillation_m, 0.0]
     assert np.allclose(np.ptp(shake, axis=0), ends, atol=1e-3)
     swing = stage_joints(3, READY, motion, dt)

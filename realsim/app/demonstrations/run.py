@@ -149,6 +149,7 @@ def _cameras(
         view_camera,
         wrist_camera,
     )
+    from realsim_sim_bridge.demonstrations.school_settings import school_config_of
 
     size = request.width, request.height
     if (request.view is not None or request.hand_eye) and not is_session(source):
@@ -162,7 +163,8 @@ def _cameras(
         assert grasps.T_world_table is not None, "a session's school has had a table"
         T_table_cam = se3.invert(grasps.T_world_table) @ T_world_cam
         fixed = view_camera(FRONT, intrinsics, T_table_cam, request.width)
-    wrist = wrist_camera(None, size)
+    hand = school_config_of(grasps.sets[0]).hand
+    wrist = wrist_camera(None, size, hand)
     if request.hand_eye:
         from realsim.app.stages import open_session
         from realsim.store import load_hand_eye
@@ -172,10 +174,10 @@ def _cameras(
             raise InputError(
                 f"session '{source}' has no hand-eye calibration; leave --hand-eye away."
             )
-        wrist = wrist_camera(load_hand_eye(store).T_ee_cam, size)
+        wrist = wrist_camera(load_hand_eye(store).T_ee_cam, size, hand)
         if not sees_fingertips(wrist):
             console.warn(
-                "mounted on the Panda's flange as the session's hand-eye calibration says, the "
+                "mounted on the arm's flange as the session's hand-eye calibration says, the "
                 "hand's camera does not see its fingertips: the session's robot or tool frame is "
                 "another one. Without --hand-eye it is on the usual mount."
             )

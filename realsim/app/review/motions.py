@@ -24,10 +24,10 @@ from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet, Mesh, ObjectModel
 from realsim.records.trajectories import PHASES, GraspTrajectories
 from realsim.review.replay.grasp_replay import GraspMotion, HandApproach, hand_approach
-from realsim.robots.hand import FRANKA
-from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.arm.reach_config import base_on_table
-from realsim_sim_bridge.demonstrations.pictures import drawn_mesh, panda_meshes
+from realsim.robots.hand import FRANKA, find_hand
+from realsim_sim_bridge.arm.grasping_arm import GraspingArm
+from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm
+from realsim_sim_bridge.demonstrations.pictures import drawn_mesh, hand_meshes, robot_meshes
 from realsim_sim_bridge.demonstrations.records import DemonstrationConfig
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of
 from realsim_sim_bridge.demonstrations.source import DemonstrationSource
@@ -40,8 +40,6 @@ SAME_GRASP = 1e-5
 that the school allows a followed pose, for the rounding of the files."""
 KEPT = 16
 """Motions kept: going back to a grasp costs nothing."""
-HAND_PARTS = 3
-"""The last of the drawn meshes: hand and two fingers."""
 CLOSE = PHASES.index("close")
 
 
@@ -96,7 +94,7 @@ class SessionMotions:
     def warm(self) -> None:
         """Read the arm's meshes: 3 s that the first click need not wait for."""
         if self._with_arm:
-            _hand_links(np.eye(4)[None], np.zeros(1))
+            hand_meshes(find_hand(), np.eye(4)[None], np.zeros(1))
 
     def motion(self, instance: int, row: int) -> GraspMotion | None:
         """Return the motion of a grasp; None where there is no such grasp, or its object no pose.
@@ -149,7 +147,8 @@ class SessionMotions:
         m, scenery = demonstration.motion, demonstration.scenery
         T_world_table = self._table()
         T_world_base = T_world_table @ scenery.T_table_base
-        meshes, Ts_world_link, arm_links = self._arm(s, m.joints_rad, m.opening_m, T_world_base)
+        arm = scenery.arm
+        meshes, Ts_world_link, links = self._drawn_arm(arm, m.joints_rad, m.opening_m, T_world_base)
         return GraspMotion(
             instance=s.instance,
             row=row,
@@ -161,8 +160,8 @@ class SessionMotions:
             obj_mesh=self._mesh(s.obj_id),
             Ts_world_link=Ts_world_link,
             link_meshes=meshes,
-            arm_links=arm_links,
-            hand=hand_of_set(s),
+            arm_links=links,
+            hand=arm.hand,
             notes=demonstration.notes,
         )
 
@@ -183,8 +182,9 @@ class SessionMotions:
         joints = np.stack([np.interp(t, times, q) for q in attempts.joints_rad[samples].T], axis=1)
         opening = np.interp(t, times, attempts.opening_m[samples])
         at = np.clip(np.searchsorted(times, t + 1e-9, side="right") - 1, 0, len(times) - 1)
-        T_world_base = self._table() @ _base_of(s)
-        Ts_world_hand = T_world_base @ panda.forward(joints)
+        T_table_base, arm = _base_of(s)
+        T_world_base = self._table() @ T_table_base
+        Ts_world_hand = T_world_base @ arm.forward(joints)
         T_world_obj = self._grasps.Ts_world_obj[s.instance]
         T_world_grasp = T_world_obj @ s.Ts_obj_grasp[row]
         closed = phases[at] >= CLOSE
@@ -199,7 +199,7 @@ class SessionMotions:
         Ts_world_obj = np.tile(T_world_obj, (len(t), 1, 1))
         Ts_world_obj[lifted] = Ts_world_hand[lifted] @ se3.invert(s.Ts_obj_grasp[row])
         width: Array = np.where(closed, np.maximum(opening, s.widths_m[row]), opening)
-        meshes, Ts_world_link, arm_links = self._arm(s, joints, width, T_world_base)
+        meshes, Ts_world_link, links = self._drawn_arm(arm, joints, width, T_world_base)
         return GraspMotion(
             instance=s.instance,
             row=row,
@@ -211,8 +211,8 @@ class SessionMotions:
             obj_mesh=self._mesh(s.obj_id),
             Ts_world_link=Ts_world_link,
             link_meshes=meshes,
-            arm_links=arm_links,
-            hand=hand_of_set(s),
+            arm_links=links,
+            hand=arm.hand,
             notes=(f"{FIXED_IN_HAND}: {why}",),
         )
 
@@ -231,24 +231,25 @@ class SessionMotions:
         if not self._with_arm or s.hand[0] != FRANKA:
             return made
         try:
-            meshes, Ts = _hand_links(made.Ts_world_hand, made.opening_m)
+            meshes, Ts = hand_meshes(find_hand(), made.Ts_world_hand, made.opening_m)
         except (InputError, ImportError):
             return made
         return replace(made, link_meshes=meshes, Ts_world_link=Ts)
 
-    def _arm(
-        self, s: GraspSet, joints: Array, opening_m: Array, T_world_base: Array
+    def _drawn_arm(
+        self, arm: GraspingArm, joints: Array, opening_m: Array, T_world_base: Array
     ) -> tuple[tuple[Mesh, ...], Array, int]:
-        """Return arm and hand as they are drawn, and how many of the links are the arm.
+        """Return arm and hand as they are drawn, and how many meshes are the arm's.
 
-        Of hands but Franka's no meshes are known, and of none where theirs are not there.
+        There are none where they cannot be read; hands but Franka's are drawn as their boxes.
         """
         if self._with_arm:
             with contextlib.suppress(InputError, ImportError):
-                meshes, Ts = _links(joints, opening_m, T_world_base)
-                arm_links = len(meshes) - HAND_PARTS
-                shown = len(meshes) if s.hand[0] == FRANKA else arm_links
-                return meshes[:shown], Ts[:, :shown], arm_links
+                meshes, Ts = robot_meshes(arm, joints, opening_m, T_world_base)
+                hand, _ = hand_meshes(arm.hand, Ts[:1, -1], opening_m[:1])
+                links = len(meshes) - len(hand)
+                shown = len(meshes) if arm.hand.name == FRANKA else links
+                return meshes[:shown], Ts[:, :shown], links
         return (), np.zeros((len(joints), 0, 4, 4)), 0
 
     def _table(self) -> Array:
@@ -267,8 +268,8 @@ class SessionMotions:
         return self._drawn[obj_id]
 
 
-def _base_of(s: GraspSet) -> Array:
-    """Return T_table_base (4, 4) of the arm that a set was tried with.
+def _base_of(s: GraspSet) -> tuple[Array, GraspingArm]:
+    """Return T_table_base (4, 4) of the arm that a set was tried with, and the arm.
 
     Raises:
         InputError: the set does not say.
@@ -277,7 +278,9 @@ def _base_of(s: GraspSet) -> Array:
     if not isinstance(middle, list) or len(middle) != 2:  # pyright: ignore[reportUnknownArgumentType]
         raise InputError(f"the grasps of instance {s.instance} do not say where the arm stood")
     x, y = (float(v) for v in middle)  # pyright: ignore[reportUnknownArgumentType, reportUnknownVariableType]
-    return base_on_table((x, y), school_config_of(s).reach)
+    config = school_config_of(s)
+    arm = grasping_arm(config.reach, config.hand)
+    return base_on_table((x, y), config.reach, arm), arm
 
 
 def _shown_until(s: GraspSet, row: int, times: Array, phases: NDArray[np.int64]) -> float:
@@ -286,26 +289,3 @@ def _shown_until(s: GraspSet, row: int, times: Array, phases: NDArray[np.int64])
     # Before anything is passed, the closing hand is shown.
     last = CLOSE + max(round(base * len(STAGES)) - 1, 0)
     return float(times[phases <= last][-1])
-
-
-def _links(joints: Array, openings_m: Array, T_world_base: Array) -> tuple[tuple[Mesh, ...], Array]:
-    """Return the arm's and the hand's meshes (L) and where they are (S, L, 4, 4)."""
-    placed = [
-        panda_meshes(q, float(opening), T_world_base)
-        for q, opening in zip(joints, openings_m, strict=True)
-    ]
-    meshes = tuple(p.mesh for p in placed[0])
-    return meshes, np.array([[p.T_world_obj for p in parts] for parts in placed])
-
-
-def _hand_links(Ts_world_hand: Array, openings_m: Array) -> tuple[tuple[Mesh, ...], Array]:
-    """Return the hand's meshes (3) and where they are (S, 3, 4, 4), without an arm."""
-    # An arm at zero, whose base stands where the hand is at the wanted place.
-    zero = np.zeros(panda.JOINTS)
-    T_hand_base = se3.invert(panda.forward(zero))
-    placed = [
-        panda_meshes(zero, float(opening), T @ T_hand_base)[-HAND_PARTS:]
-        for T, opening in zip(Ts_world_hand, openings_m, strict=True)
-    ]
-    meshes = tuple(p.mesh for p in placed[0])
-    return meshes, np.array([[p.T_world_obj for p in parts] for parts in placed])

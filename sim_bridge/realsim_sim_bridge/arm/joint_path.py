@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.compiled import njit
-from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.arm_space import FREE, ArmSpace, blame_move, room_for
 
 Array = NDArray[np.float64]
@@ -38,11 +37,11 @@ def connect(
     config: PlannerConfig,
     rng: np.random.Generator,
 ) -> Array | None:
-    """Return a free path (M, 7) of corner points from start to goal, or None if none was found.
+    """Return a free path (M, n) of corner points from start to goal, or None if none was found.
 
     Args:
-        start: (7,) free joint angles [rad].
-        goal: (7,) free joint angles [rad].
+        start: (n,) free joint angles [rad].
+        goal: (n,) free joint angles [rad].
         space: what must not be touched; arm and hand are checked.
         opening_m: distance of the finger faces [m].
         config: how hard to look.
@@ -62,7 +61,6 @@ def connect(
 
 # --- compiled -----------------------------------------------------------------------------------
 
-_LOWER, _UPPER = panda.LOWER.copy(), panda.UPPER.copy()
 _EDGES_PER_GROWTH = 16
 """A greedy tree adds at most so many edges for one target: the joint space is shorter."""
 
@@ -81,7 +79,7 @@ def _uniform(state: Any) -> float:
 @njit
 def _distance(a: Any, b: Any) -> float:
     total = 0.0
-    for k in range(7):
+    for k in range(len(a)):
         total += (a[k] - b[k]) ** 2
     return np.sqrt(total)
 
@@ -110,7 +108,7 @@ def _grow(
             return count, nearest, True
         share = min(extension / length, 1.0)
         there = nodes[count]
-        for k in range(7):
+        for k in range(len(there)):
             there[k] = nodes[nearest, k] + share * (target[k] - nodes[nearest, k])
         if share == 1.0:
             there[:] = target
@@ -128,11 +126,11 @@ def _grow(
 
 @njit
 def _branch(nodes: Any, parents: Any, node: int) -> Any:
-    """Return the nodes from `node` to the root (M, 7)."""
+    """Return the nodes from `node` to the root (M, n)."""
     count, at = 0, node
     while at >= 0:
         count, at = count + 1, parents[at]
-    path = np.empty((count, 7))
+    path = np.empty((count, nodes.shape[1]))
     for n in range(count):
         path[n] = nodes[node]
         node = parents[node]
@@ -143,18 +141,25 @@ def _branch(nodes: Any, parents: Any, node: int) -> Any:
 def _connect(
     start: Any, goal: Any, opening: float, body: Any, obstacles: Any, config: Any, state: Any
 ) -> Any:
-    """Return a free path (M, 7) of corner points, or None."""
+    """Return a free path (M, n) of corner points, or None."""
     extension, iterations, shortcuts = config
     check = (opening, body, obstacles, room_for(body))
     size = iterations * (_EDGES_PER_GROWTH + 1) + 2
-    nodes, parents = np.empty((2, size, 7)), np.full((2, size), -1, dtype=np.int64)
+    n = len(start)
+    nodes, parents = np.empty((2, size, n)), np.full((2, size), -1, dtype=np.int64)
     nodes[0, 0], nodes[1, 0] = start, goal
     counts = np.ones(2, dtype=np.int64)
-    target = np.empty(7)
+    target = np.empty(n)
+    lower, upper = body.chain.lower.copy(), body.chain.upper.copy()
+    for k in range(n):
+        if upper[k] - lower[k] > 2 * np.pi:
+            # A turn is enough: there the arm is wherever it can be.
+            lower[k] = max(lower[k], start[k] - np.pi)
+            upper[k] = min(upper[k], start[k] + np.pi)
     for i in range(iterations):
         a, b = i % 2, 1 - i % 2
-        for k in range(7):
-            target[k] = _LOWER[k] + (_UPPER[k] - _LOWER[k]) * _uniform(state)
+        for k in range(n):
+            target[k] = lower[k] + (upper[k] - lower[k]) * _uniform(state)
         if i < 2:
             # First straight at each other.
             target[:] = nodes[b, 0]
@@ -192,7 +197,7 @@ def _shortened(path: Any, shortcuts: int, check: Any, state: Any) -> Any:
         if blame_move(start, end, opening, body, obstacles, room) != FREE:
             continue
         head, tail = path[: i + 1], path[j:]
-        middle = np.empty((2, 7))
+        middle = np.empty((2, path.shape[1]))
         middle[0], middle[1] = start, end
         # An end that is a corner itself is there already.
         first, last = (1 if a == i else 0), (1 if b == j else 2)

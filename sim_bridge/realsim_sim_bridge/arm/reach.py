@@ -1,4 +1,4 @@
-"""Does the Panda reach a grasp: inverse kinematics, straight approach, lift, and the way there.
+"""Does an arm reach a grasp: inverse kinematics, straight approach, lift, and the way there.
 
 The arm stands where a lab's does, or hangs above the table with its base tilted by 90 degrees (the
 paper's "perfect reach"). For each candidate the closed-form solutions at the grasp are followed
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records.trajectories import GraspTrajectories
-from realsim.robots.hand import Hand
-from realsim_sim_bridge.arm import panda
+from realsim.robots.compiled_chain import follow_lines
 from realsim_sim_bridge.arm.arm_space import AT_LIMITS, FREE, IN_TABLE, ArmSpace, Codes, in_words
-from realsim_sim_bridge.arm.chain import follow_lines
+from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.joint_path import connect
 from realsim_sim_bridge.arm.lifted_object import touched_when_lifted
 from realsim_sim_bridge.arm.obstacles import obstacles_of
@@ -48,9 +47,9 @@ class Reach:
     reachable: Mask
     """(N,) whether there is a collision-free trajectory to closure, and a free lift."""
     joints: Array
-    """(N, 7) joint angles at the grasp [rad]; NaN where there are none."""
+    """(N, n) joint angles at the grasp [rad]; NaN where there are none."""
     joints_lifted: Array
-    """(N, 7) after the lift [rad]; NaN likewise."""
+    """(N, n) after the lift [rad]; NaN likewise."""
     reasons: tuple[str, ...]
     """(N,) why not; '' = reachable."""
     planned: int
@@ -86,7 +85,7 @@ class ReachTask:
 def check_reach(
     task: ReachTask,
     config: ReachConfig,
-    geometry: Hand,
+    arm: GraspingArm,
     rng: np.random.Generator,
     motion: SlipMotion | None = None,
 ) -> Reach:
@@ -95,13 +94,12 @@ def check_reach(
     Args:
         task: the grasps and what is around them.
         config: the arm's place and moves.
-        geometry: the hand.
+        arm: the arm with its hand.
         rng: chance for the planner alone.
         motion: the stages' motions; None = the slip test's own with the configuration's lift.
 
     Raises:
-        InputError: home cannot be reached, the hand is mounted at another distance than the
-            kinematics have, or the motion's lift is not the configuration's.
+        InputError: home cannot be reached, or the motion's lift is not the configuration's.
     """
     motion = motion or SlipMotion(lift_height_m=config.lift_m)
     if abs(motion.lift_height_m - config.lift_m) > 1e-9:
@@ -109,13 +107,7 @@ def check_reach(
             f"the slip test lifts by {motion.lift_height_m} m and the arm is asked to lift by "
             f"{config.lift_m} m; make slip.motion.lift_height_m and reach.lift_m equal."
         )
-    if abs(geometry.mount_z_m + panda.TCP_M) > 1e-6:
-        raise InputError(
-            f"the hand's mounting face is at z = {geometry.mount_z_m} m of the grasp frame; the "
-            f"arm's kinematics have the tool centre point {panda.TCP_M} m from the flange, so "
-            f"mount_z_m must be {-panda.TCP_M}."
-        )
-    return _ReachCheck(task, config, geometry, motion).run(rng)
+    return _ReachCheck(task, config, arm, motion).run(rng)
 
 
 IK, AT_GRASP, APPROACH, LIFT, BEFORE, HOME = range(6)
@@ -132,10 +124,10 @@ class _ReachCheck:
     """The check of one object's grasps; a `branch` is one solution at one grasp."""
 
     def __init__(
-        self, task: ReachTask, config: ReachConfig, geometry: Hand, motion: SlipMotion
+        self, task: ReachTask, config: ReachConfig, arm: GraspingArm, motion: SlipMotion
     ) -> None:
-        self._task, self._config, self._geometry, self._motion = task, config, geometry, motion
-        self._T_table_base = base_on_table(task.middle_xy, config)
+        self._task, self._config, self._arm, self._motion = task, config, arm, motion
+        self._T_table_base = base_on_table(task.middle_xy, config, arm)
         self._T_base_table = se3.invert(self._T_table_base)
         self._Ts_base_grasp = self._T_base_table @ task.Ts_table_grasp
         own, others = task.obj, task.neighbours
@@ -144,8 +136,8 @@ class _ReachCheck:
             np.concatenate([own.instances, others.instances]),
             np.arange(len(own.points) + len(others.points)) < len(own.points),
         )
-        self._space = ArmSpace(self._T_table_base, obstacles, config.space, geometry)
-        self._home = home_joints(config, task.middle_xy)
+        self._space = ArmSpace(self._T_table_base, obstacles, config.space, arm)
+        self._home = home_joints(config, arm, task.middle_xy)
         n, back, up = (
             len(task.widths_m),
             _distances(config.approach_m, config),
@@ -155,8 +147,8 @@ class _ReachCheck:
         self._reasons = ["no inverse kinematics at the grasp"] * n
         self._got = np.full(n, IK)
         self._done = np.zeros(n, dtype=np.bool_)
-        self._approach = np.full((n, 2, len(back), panda.JOINTS), np.nan)
-        self._lift = np.full((n, 2, len(up), panda.JOINTS), np.nan)
+        self._approach = np.full((n, 2, len(back), arm.joints), np.nan)
+        self._lift = np.full((n, 2, len(up), arm.joints), np.nan)
         self._bent: dict[int, Array] = {}
 
     def run(self, rng: np.random.Generator) -> Reach:
@@ -191,13 +183,13 @@ class _ReachCheck:
 
     def _in_workspace(self) -> Codes:
         """Return the rows whose wrist is within reach, and say of the others how far it is."""
-        out = panda.wrist_distance(self._Ts_base_grasp)
-        for row in np.nonzero(out > panda.WRIST_REACH_M)[0].tolist():
+        out, reach = self._arm.wrist_distance(self._Ts_base_grasp), self._arm.wrist_reach_m
+        for row in np.nonzero(out > reach)[0].tolist():
             self._reasons[row] += (
                 f": the wrist would be {out[row]:.2f} m from the arm's shoulder, its reach is "
-                f"{panda.WRIST_REACH_M:.2f} m"
+                f"{reach:.2f} m"
             )
-        return np.nonzero(out <= panda.WRIST_REACH_M)[0].astype(np.int64)
+        return np.nonzero(out <= reach)[0].astype(np.int64)
 
     def _hand_is_free(self, rows: Codes) -> Mask:
         """Return whether hand and lifted object are free on the straight moves, and say if not."""
@@ -205,8 +197,8 @@ class _ReachCheck:
         Ts = task.Ts_table_grasp[rows]
         out = -config.approach_m * Ts[:, :3, 2]
         up = np.tile([0.0, 0.0, config.lift_m], (len(rows), 1))
-        open_hand = self._geometry.boxes(task.openings_m[rows])
-        closed_hand = self._geometry.boxes(task.widths_m[rows])
+        open_hand = self._arm.hand.boxes(task.openings_m[rows])
+        closed_hand = self._arm.hand.boxes(task.widths_m[rows])
         obstacles, clearance = self._space.obstacles, config.hand_clearance_m
         approach = first_touched(open_hand, Ts, out, obstacles, clearance, own_too=True)
         Ts_out = Ts.copy()
@@ -233,12 +225,12 @@ class _ReachCheck:
         """Keep of each row the first branch that is free all the way from home.
 
         Returns:
-            approach and lift, joints and slopes (2, W, 7), of the first branch of each other row
+            approach and lift, joints and slopes (2, W, n), of the first branch of each other row
             that is free but for the move from home.
         """
         config = self._config
-        owner, q = panda.inverse_all(
-            self._Ts_base_grasp[rows], config.joint7_samples, config.limit_margin_rad
+        owner, q = self._arm.inverse(
+            self._Ts_base_grasp[rows], config.held_values, config.limit_margin_rad, self._home
         )
         owner = rows[owner]
         order = np.lexsort((np.linalg.norm(q - self._home, axis=1), owner))
@@ -270,7 +262,7 @@ class _ReachCheck:
         return int(self._space.blame(self._home[None], widest, with_hand=True)[0])
 
     def _follow(self, at: Codes, q: Array) -> tuple[Codes, Array, Array]:
-        """Follow approach and lift from q (B, 7); return what is left: rows and both moves."""
+        """Follow approach and lift from q (B, n); return what is left: rows and both moves."""
         still = self._T_base_table[:3, :3]
         Ts = self._Ts_base_grasp[at]
         approach, free = self._line(q, Ts, -Ts[:, :3, 2], self._back, at, APPROACH)
@@ -282,7 +274,7 @@ class _ReachCheck:
     def _line(
         self, q: Array, Ts: Array, directions: Array, distances: Array, at: Codes, move: int
     ) -> tuple[Array, Mask]:
-        """Return joints and slopes (B, 2, W, 7) along lines, and which are free."""
+        """Return joints and slopes (B, 2, W, n) along lines, and which are free."""
         joints, slopes, inside = self._followed(q, Ts, directions, distances)
         codes = np.full(len(at), AT_LIMITS)
         codes[inside] = self._blame(joints[inside], at[inside])
@@ -291,19 +283,20 @@ class _ReachCheck:
     def _followed(
         self, q: Array, Ts: Array, directions: Array, distances: Array
     ) -> tuple[Array, Array, Mask]:
-        """Return joints and slopes (B, W, 7) along lines, and whether they keep the limits."""
+        """Return joints and slopes (B, W, n) along lines, and whether they keep the limits."""
         config = self._config
         joints, slopes, error = follow_lines(
+            self._arm.numbers,
             np.ascontiguousarray(q),
             np.ascontiguousarray(Ts),
             np.ascontiguousarray(directions),
             distances,
         )
-        within = panda.within_limits(joints, config.limit_margin_rad).all(axis=1)
+        within = self._arm.within_limits(joints, config.limit_margin_rad).all(axis=1)
         return joints, slopes, within & (error < config.tolerance)
 
     def _blame(self, paths: Array, at: Codes, *, with_hand: bool = False) -> Codes:
-        """Return what stops paths (B, W, 7) of the rows `at`."""
+        """Return what stops paths (B, W, n) of the rows `at`."""
         openings = np.ascontiguousarray(self._task.openings_m[at], dtype=np.float64)
         return self._space.blame_moves(paths, openings, with_hand=with_hand)
 
@@ -353,7 +346,7 @@ class _ReachCheck:
                 def is_free(q: Array, at: Codes = at) -> bool:
                     return bool(self._blame(q[None], at, with_hand=True)[0] == FREE)
 
-                bent[attempt] = timed_path(self._bent[row], is_free, timing)
+                bent[attempt] = timed_path(self._bent[row], is_free, self._arm.limits, timing)
         lifted = self._lift[rows, 0, -1]
         Ts = self._Ts_base_grasp[rows].copy()
         Ts[:, :3, 3] += self._config.lift_m * self._T_base_table[:3, 2]
@@ -362,6 +355,7 @@ class _ReachCheck:
         x, y = (self._shaken(lifted, Ts, axis, sides) for axis in (0, 1))
         return stage_motions(
             Attempts(
+                arm=self._arm,
                 rows=rows,
                 home=self._home,
                 bent=bent,
@@ -389,5 +383,5 @@ def _distances(length_m: float, config: ReachConfig) -> Array:
 
 
 def _as_line(moves: Array, distances: Array, possible: Mask) -> Line:
-    """Return joints and slopes (A, 2, W, 7) as a line."""
+    """Return joints and slopes (A, 2, W, n) as a line."""
     return Line(nodes=distances, joints=moves[:, 0], slopes=moves[:, 1], possible=possible)

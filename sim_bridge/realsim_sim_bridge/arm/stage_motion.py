@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.records.trajectories import PHASES, GraspTrajectories
-from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.timing import (
     TimingConfig,
     sample_times,
@@ -100,19 +100,19 @@ class Line:
     nodes: Array
     """(W,) distances along it [m], increasing from 0."""
     joints: Array
-    """(A, W, 7) [rad]."""
+    """(A, W, n) [rad]."""
     slopes: Array
-    """(A, W, 7) derivative of the joints by the distance [rad/m]."""
+    """(A, W, n) derivative of the joints by the distance [rad/m]."""
     possible: NDArray[np.bool_]
     """(A,) whether it is followed within the joint limits; only then the joints mean anything."""
 
     def at(self, distances: Array) -> Array:
-        """Return joints (A, S, 7) at distances (S,) [m]."""
+        """Return joints (A, S, n) at distances (S,) [m]."""
         values, slopes = basis(distances, self.nodes)
         return values @ self.joints + slopes @ self.slopes
 
     def speeds(self, distances: Array, speeds: Array) -> Array:
-        """Return the greatest speed (A, 7) [rad/s] of each joint at distances and speeds (S,)."""
+        """Return the greatest speed (A, n) [rad/s] of each joint at distances and speeds (S,)."""
         values, slopes = basis_slope(distances, self.nodes)
         rates = values @ self.joints + slopes @ self.slopes
         return np.max(np.abs(rates) * np.abs(speeds)[:, None], axis=1)
@@ -122,12 +122,13 @@ class Line:
 class Attempts:
     """What A attempts consist of."""
 
+    arm: GraspingArm
     rows: Rows
     """(A,) row of the candidates, increasing."""
     home: Array
-    """(7,) [rad]."""
+    """(n,) [rad]."""
     bent: dict[int, tuple[Array, float]]
-    """Samples (S, 7) and duration [s] of the way to the pre-grasp where it is not straight, by
+    """Samples (S, n) and duration [s] of the way to the pre-grasp where it is not straight, by
     attempt."""
     approach: Line
     """From the grasp backwards."""
@@ -180,7 +181,7 @@ class _Part:
     counts: Rows
     """(A,) samples of each attempt."""
     joints: Array
-    """(S, 7) [rad]."""
+    """(S, n) [rad]."""
     openings: Array
     """(S,) [m]."""
 
@@ -196,7 +197,7 @@ def _ragged(durations: Array, config: TimingConfig) -> tuple[Rows, Rows, Array]:
 def _reach(attempts: Attempts, config: TimingConfig) -> _Part:
     """From home to the pre-grasp."""
     moves = attempts.approach.joints[:, -1] - attempts.home
-    ramps, durations = straight_times(moves, config)
+    ramps, durations = straight_times(moves, attempts.arm.limits, config)
     for a, (_, duration) in attempts.bent.items():
         durations[a] = duration
     counts, row, t = _ragged(durations, config)
@@ -211,7 +212,7 @@ def _reach(attempts: Attempts, config: TimingConfig) -> _Part:
 def _approach(attempts: Attempts, config: TimingConfig) -> _Part:
     """Straight on to the grasp, with a trapezoid of speed that all joints can follow."""
     line = attempts.approach
-    velocity, acceleration = config.limits()
+    velocity, acceleration = config.limits(attempts.arm.limits)
     first, second = greatest_slopes(line.joints, line.slopes, line.nodes)
     tiny = 1e-12
     # |q''| v^2 may take half of the acceleration, |q'| a the rest.
@@ -228,7 +229,7 @@ def _approach(attempts: Attempts, config: TimingConfig) -> _Part:
     back = length * (1.0 - trapezoid_share(t, ramps[row], durations[row]))
     left_node = np.clip(np.searchsorted(line.nodes, back, side="right") - 1, 0, len(line.nodes) - 2)
     values, slopes = basis(back, line.nodes)
-    joints = np.zeros((len(row), panda.JOINTS))
+    joints = np.zeros((len(row), attempts.arm.joints))
     for node in (left_node, left_node + 1):
         at = np.arange(len(row)), node
         joints += values[at][:, None] * line.joints[row, node]
@@ -249,12 +250,12 @@ def _close(attempts: Attempts, config: TimingConfig) -> _Part:
 def _stage(
     attempts: Attempts, possible: NDArray[np.bool_], duration: float, joints: Array
 ) -> _Part:
-    """Return a stage that lasts equally long for all, or not at all: joints (A, S, 7)."""
+    """Return a stage that lasts equally long for all, or not at all: joints (A, S, n)."""
     count = joints.shape[1]
     return _Part(
         np.where(possible, duration, 0.0),
         np.where(possible, count, 0),
-        joints[possible].reshape(-1, panda.JOINTS),
+        joints[possible].reshape(-1, attempts.arm.joints),
         np.repeat(np.minimum(attempts.widths_m, attempts.openings_m)[possible], count),
     )
 
@@ -283,23 +284,25 @@ def _wave(motion: SlipMotion, t: Array) -> Array:
     return motion.oscillation_m * (1 - np.cos(2 * np.pi * motion.oscillation_hz * t))
 
 
-def swing_range(lifted: Array, motion: SlipMotion) -> tuple[Array, Array]:
-    """Return how far (A,) joint 5 swings down and up from the lifted joints (A, 7) [rad]."""
-    sweep = np.radians(motion.pendulum_deg)
-    low = np.clip(panda.LOWER[4] - lifted[:, 4], -sweep, 0.0)
-    return low, np.clip(panda.UPPER[4] - lifted[:, 4], 0.0, sweep)
+def swing_range(arm: GraspingArm, lifted: Array, motion: SlipMotion) -> tuple[Array, Array]:
+    """Return how far (A,) the hand swings down and up from the lifted joints (A, n) [rad]."""
+    sweep, j = np.radians(motion.pendulum_deg), arm.swing_joint
+    low = np.clip(arm.limits.lower[j] - lifted[:, j], -sweep, 0.0)
+    return low, np.clip(arm.limits.upper[j] - lifted[:, j], 0.0, sweep)
 
 
 def _swing(attempts: Attempts, motion: SlipMotion, config: TimingConfig) -> _Part:
-    """Joint 5 up, down and back (`slip.motion.pendulum_angle`)."""
+    """The joint that swings the hand up, down and back (`slip.motion.pendulum_angle`)."""
     lifted = attempts.lift.joints[:, -1]
-    low, high = swing_range(lifted, motion)
+    low, high = swing_range(attempts.arm, lifted, motion)
     t, quarter = sample_times(motion.pendulum_s, config.sample_hz), motion.pendulum_s / 4
     up = min_jerk(1.0, quarter, t)[0]
     down = min_jerk(1.0, 2 * quarter, t - quarter)[0]
     back = min_jerk(1.0, quarter, t - 3 * quarter)[0]
     joints = np.repeat(lifted[:, None], len(t), axis=1)
-    joints[..., 4] += high[:, None] * (up - down) + low[:, None] * (down - back)
+    joints[..., attempts.arm.swing_joint] += high[:, None] * (up - down) + low[:, None] * (
+        down - back
+    )
     return _stage(attempts, attempts.lift.possible, motion.pendulum_s, joints)
 
 
@@ -321,11 +324,12 @@ def _possible(attempts: Attempts, motion: SlipMotion) -> tuple[NDArray[np.bool_]
         attempts.along_x.speeds(_wave(motion, t), speed),
         attempts.along_y.speeds(_wave(motion, t), speed),
     )
-    low, high = swing_range(attempts.lift.joints[:, -1], motion)
+    arm = attempts.arm
+    low, high = swing_range(arm, attempts.lift.joints[:, -1], motion)
     quarter = motion.pendulum_s / 4
-    swing = np.zeros((count, panda.JOINTS))
+    swing = np.zeros((count, arm.joints))
     # A minimum-jerk move's peak speed is 15/8 of its mean.
-    swing[:, 4] = 1.875 * np.max([high, (high - low) / 2, -low], axis=0) / quarter
+    swing[:, arm.swing_joint] = 1.875 * np.max([high, (high - low) / 2, -low], axis=0) / quarter
     reached = (
         attempts.lift.possible,
         attempts.along_x.possible & attempts.along_y.possible,
@@ -334,27 +338,27 @@ def _possible(attempts: Attempts, motion: SlipMotion) -> tuple[NDArray[np.bool_]
     for stage, (name, speeds, within) in enumerate(
         zip(MOVED_STAGES, (lift, shake, swing), reached, strict=True)
     ):
-        slow = np.all(speeds <= panda.VELOCITY, axis=1)
+        slow = np.all(speeds <= arm.limits.speed, axis=1)
         possible[:, stage] = within & slow
         for a in np.nonzero(~possible[:, stage])[0].tolist():
-            notes[a].append(_why(name, bool(within[a]), speeds[a]))
+            notes[a].append(_why(name, bool(within[a]), speeds[a], arm.limits.speed))
     full = np.radians(motion.pendulum_deg) - 1e-9
     for a in np.nonzero((high < full) | (-low < full))[0].tolist():
         notes[a].append(
-            f"pendulum: joint 5's limits leave {np.degrees(low[a]):.0f} to "
+            f"pendulum: joint {arm.swing_joint + 1}'s limits leave {np.degrees(low[a]):.0f} to "
             f"{np.degrees(high[a]):+.0f} deg"
         )
     return possible, tuple("; ".join(said) for said in notes)
 
 
-def _why(stage: str, within: bool, speeds: Array) -> str:
+def _why(stage: str, within: bool, speeds: Array, limits: Array) -> str:
     """Return why the arm cannot do a stage."""
     if not within:
         return f"{stage}: the motion leaves the joint limits or the arm's reach"
-    joint = int(np.argmax(speeds / panda.VELOCITY))
+    joint = int(np.argmax(speeds / limits))
     return (
         f"{stage}: joint {joint + 1} would need {speeds[joint]:.2f} rad/s, its limit is "
-        f"{panda.VELOCITY[joint]:g}"
+        f"{limits[joint]:g}"
     )
 
 
@@ -366,7 +370,7 @@ def _joined(attempts: Attempts, parts: list[_Part], config: TimingConfig) -> Gra
     counts = np.stack([part.counts for part in parts])
     totals = counts.sum(axis=0) + 1
     starts = np.concatenate([[0], np.cumsum(totals)])
-    joints, openings = np.empty((starts[-1], panda.JOINTS)), np.empty(starts[-1])
+    joints, openings = np.empty((starts[-1], attempts.arm.joints)), np.empty(starts[-1])
     time_s, phase = np.empty(starts[-1]), np.empty(starts[-1], dtype=np.int64)
     at, clock = starts[:-1].copy(), np.zeros(len(totals))
     for number, part in enumerate(parts):

@@ -1,4 +1,4 @@
-"""Time along a path in joint space, within the Panda's limits.
+"""Time along a path in joint space, within an arm's limits.
 
 A straight move from rest to rest under limits on each joint's speed and acceleration has a closed
 answer: the position along it follows a trapezoid of speed whose limits are those of the joint that
@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim_sim_bridge.arm import panda
+from realsim.robots.kinematics import JointLimits
 
 Array = NDArray[np.float64]
 FreePath = Callable[[Array], bool]
-"""(M, 7) joint angles -> whether the straight moves between them are free."""
+"""(M, n) joint angles -> whether the straight moves between them are free."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -60,9 +60,9 @@ class TimingConfig:
                 "positive, times not negative, and 5 grid points or more."
             )
 
-    def limits(self) -> tuple[Array, Array]:
-        """Return speeds [rad/s] and accelerations [rad/s^2] (7,) of the way to the grasp."""
-        return self.velocity_share * panda.VELOCITY, self.acceleration_share * panda.ACCELERATION
+    def limits(self, arm: JointLimits) -> tuple[Array, Array]:
+        """Return speeds [rad/s] and accelerations [rad/s^2] (n,) of the way to the grasp."""
+        return self.velocity_share * arm.speed, self.acceleration_share * arm.acceleration
 
 
 def trapezoid(length: Array, speed: Array, acceleration: Array) -> tuple[Array, Array]:
@@ -91,9 +91,9 @@ def trapezoid_share(t: Array, ramp: Array | float, duration: Array | float) -> A
     return done / np.where(whole > 0, whole, 1.0)
 
 
-def straight_times(moves: Array, config: TimingConfig) -> tuple[Array, Array]:
-    """Return ramp and duration (N,) [s] of straight joint moves (N, 7) [rad], rest to rest."""
-    velocity, acceleration = config.limits()
+def straight_times(moves: Array, limits: JointLimits, config: TimingConfig) -> tuple[Array, Array]:
+    """Return ramp and duration (N,) [s] of straight joint moves (N, n) [rad], rest to rest."""
+    velocity, acceleration = config.limits(limits)
     size = np.abs(moves)
     # Each joint does its share of a common trapezoid from 0 to 1.
     with np.errstate(divide="ignore"):
@@ -104,18 +104,20 @@ def straight_times(moves: Array, config: TimingConfig) -> tuple[Array, Array]:
     return trapezoid(np.where(rests, 0.0, 1.0), speed, rate)
 
 
-def timed_path(corners: Array, is_free: FreePath, config: TimingConfig) -> tuple[Array, float]:
-    """Return joint angles (S, 7) at the sample rate along a path with corners (M, 7), and its time.
+def timed_path(
+    corners: Array, is_free: FreePath, limits: JointLimits, config: TimingConfig
+) -> tuple[Array, float]:
+    """Return joint angles (S, n) at the sample rate along a path with corners (M, n), and its time.
 
     The samples are at k / sample_hz, from the start to before the end; limits hold everywhere.
     """
-    rounded = _rounded(corners, is_free, config)
-    return rounded if rounded is not None else _stopping(corners, config)
+    rounded = _rounded(corners, is_free, limits, config)
+    return rounded if rounded is not None else _stopping(corners, limits, config)
 
 
-def _stopping(corners: Array, config: TimingConfig) -> tuple[Array, float]:
+def _stopping(corners: Array, limits: JointLimits, config: TimingConfig) -> tuple[Array, float]:
     """Return samples and duration of straight moves with a stop at each corner."""
-    ramps, durations = straight_times(np.diff(corners, axis=0), config)
+    ramps, durations = straight_times(np.diff(corners, axis=0), limits, config)
     ends = np.concatenate([[0.0], np.cumsum(durations)])
     t = sample_times(float(ends[-1]), config.sample_hz)
     leg = np.clip(np.searchsorted(ends, t, side="right") - 1, 0, len(durations) - 1)
@@ -135,7 +137,9 @@ _DENSE = 12
 """Points per leg of the spline at which it is checked."""
 
 
-def _rounded(corners: Array, is_free: FreePath, config: TimingConfig) -> tuple[Array, float] | None:
+def _rounded(
+    corners: Array, is_free: FreePath, limits: JointLimits, config: TimingConfig
+) -> tuple[Array, float] | None:
     """Return samples and duration of the rounded path by TOPP-RA, or None if it is not free."""
     import toppra
     import toppra.algorithm
@@ -152,9 +156,9 @@ def _rounded(corners: Array, is_free: FreePath, config: TimingConfig) -> tuple[A
     path: Any = toppra.SplineInterpolator(at / at[-1], knots, "natural")
     dense = path(np.linspace(0.0, 1.0, _DENSE * (len(corners) - 1) + 1))
     dense[0], dense[-1] = corners[0], corners[-1]
-    if not panda.within_limits(dense).all() or not is_free(dense):
+    if not limits.contains(dense).all() or not is_free(dense):
         return None
-    velocity, acceleration = config.limits()
+    velocity, acceleration = config.limits(limits)
     constraints: list[Any] = [
         toppra.constraint.JointVelocityConstraint(np.stack([-velocity, velocity], axis=1)),
         toppra.constraint.JointAccelerationConstraint(
@@ -168,12 +172,14 @@ def _rounded(corners: Array, is_free: FreePath, config: TimingConfig) -> tuple[A
     timed: Any = solver.compute_trajectory()
     if timed is None:
         return None
-    return _slowed(timed, corners[-1], config)
+    return _slowed(timed, corners[-1], limits, config)
 
 
-def _slowed(timed: Any, end: Array, config: TimingConfig) -> tuple[Array, float]:
+def _slowed(
+    timed: Any, end: Array, limits: JointLimits, config: TimingConfig
+) -> tuple[Array, float]:
     """Return samples and duration, slowed until they keep the limits: TOPP-RA does on its grid."""
-    velocity, acceleration = config.limits()
+    velocity, acceleration = config.limits(limits)
     slower = 1.0
     while True:
         duration = float(timed.duration) * slower

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from realsim.geometry import se3
 from realsim.records.trajectories import PHASES, GraspTrajectories
-from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.demonstrations.falling import FallConfig, fall
 from realsim_sim_bridge.demonstrations.slip_replay import HeldStage, SlipReplay
 from realsim_sim_bridge.slip.world import SlipBody
@@ -39,7 +39,7 @@ class AttemptMotion:
     time_s: Array
     """(S,) since the attempt's start [s]."""
     joints_rad: Array
-    """(S, 7) [rad]."""
+    """(S, n) [rad]."""
     opening_m: Array
     """(S,) distance of the finger faces [m]: they stop where the object is."""
     command_m: Array
@@ -64,6 +64,7 @@ class AttemptMotion:
 class Attempt:
     """What an attempt consists of, before it is put on one clock."""
 
+    arm: GraspingArm
     trajectories: GraspTrajectories
     row: int
     """Of the grasp set."""
@@ -113,7 +114,7 @@ def attempt_motion(
     planned = attempt.trajectories.joints_rad[rows]
     joints = np.stack([np.interp(t, times, q) for q in planned.T], axis=1)
     at = np.clip(np.searchsorted(times, t + 1e-9, side="right") - 1, 0, len(times) - 1)
-    Ts_base_ee = panda.forward(joints)
+    Ts_base_ee = attempt.arm.forward(joints)
     closing = float(times[phases == CLOSE][0])
     opening, command = _fingers(attempt, clock, t, opened, closing)
     held = (t >= clock.touch_s) & (t < clock.lost_s)
@@ -235,7 +236,7 @@ def _carried(attempt: Attempt, clock: _Clock, t: float, planned: Array, times: A
             stage, begin = k, b
     T_grasp_obj = _between(attempt.replay.stages[stage], t - begin)
     joints = np.array([np.interp(t, times, q) for q in planned.T])
-    return _on_table(attempt, attempt.T_table_base @ panda.forward(joints) @ T_grasp_obj)
+    return _on_table(attempt, attempt.T_table_base @ attempt.arm.forward(joints) @ T_grasp_obj)
 
 
 def _on_table(attempt: Attempt, T_table_obj: Array) -> Array:

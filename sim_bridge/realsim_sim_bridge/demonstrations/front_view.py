@@ -20,7 +20,8 @@ from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, ObjectModel
 from realsim.records.trajectories import PHASES
-from realsim_sim_bridge.arm import panda
+from realsim.robots.hand import Hand, find_hand
+from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.demonstrations.records import DemonstrationCamera
 
 # --- Where demonstrations are seen from: from a view of the session, from the hand ---------------
@@ -50,7 +51,9 @@ def view_intrinsics(view_deg: float, size_px: tuple[int, int] = SIZE_PX) -> Came
 
 
 def wrist_camera(
-    T_ee_cam: Array | None = None, size_px: tuple[int, int] = SIZE_PX
+    T_ee_cam: Array | None = None,
+    size_px: tuple[int, int] = SIZE_PX,
+    hand: Hand | None = None,
 ) -> DemonstrationCamera:
     """Return a camera in the hand.
 
@@ -58,6 +61,7 @@ def wrist_camera(
         T_ee_cam: (4, 4) camera in the arm's flange, as a hand-eye calibration gives it [m];
             None = the usual mount.
         size_px: width and height of its pictures.
+        hand: the one that is on the flange; None = Franka's.
     """
     if T_ee_cam is None:
         z = np.array(WRIST_LOOKS_M) - WRIST_AT_M
@@ -65,16 +69,10 @@ def wrist_camera(
         x = np.array([0.0, 1.0, 0.0])
         T = se3.from_rt(np.stack([x, np.cross(z, x), z], axis=-1), np.array(WRIST_AT_M))
     else:
-        T = flange_in_grasp() @ T_ee_cam
+        T = se3.invert((hand or find_hand()).T_ee_grasp) @ T_ee_cam
     return DemonstrationCamera(
         name=WRIST, intrinsics=view_intrinsics(WRIST_VIEW_DEG, size_px), T_frame_cam=T, on_hand=True
     )
-
-
-def flange_in_grasp() -> Array:
-    """Return T_grasp_flange (4, 4) of a Panda [m]."""
-    turn = se3.from_rt(se3.exp_so3([0.0, 0.0, panda.HAND_TURN]), np.zeros(3))
-    return se3.invert(turn @ se3.from_translation([0.0, 0.0, panda.TCP_M]))
 
 
 def sees_fingertips(camera: DemonstrationCamera) -> bool:
@@ -227,6 +225,7 @@ def happening(
     models: Mapping[int, ObjectModel],
     Ts_table_obj: Mapping[int, Array],
     T_table_base: Array,
+    arm: GraspingArm,
 ) -> Happening:
     """Return what happens in all attempts of a scene.
 
@@ -235,6 +234,7 @@ def happening(
         models: the objects, by instance.
         Ts_table_obj: (4, 4) where they stand [m], by instance.
         T_table_base: (4, 4) the arm's base [m].
+        arm: the arm with its hand.
     """
     extremes = {i: _extremes(model) for i, model in models.items()}
     standing = [se3.transform(T, extremes[i]) for i, T in Ts_table_obj.items()]
@@ -247,13 +247,13 @@ def happening(
             rows = attempts.attempt(row)
             joints, phase = attempts.joints_rad[rows], attempts.phase[rows]
             at = _turning_points(phase)
-            Ts = T_table_base @ panda.forward(joints[at])
+            Ts = T_table_base @ arm.forward(joints[at])
             moving.append(_placed(Ts, FINGERS_M))
             in_hand = se3.transform(se3.invert(s.Ts_obj_grasp[row]), extremes[s.instance])
             moving.append(_placed(Ts[phase[at] >= CLOSE], in_hand))
             closed.append(joints[np.argmax(phase >= CLOSE)])
-    frames = T_table_base @ panda.link_frames(np.array(closed))
-    origins = np.concatenate([frames[:, :-1, :3, 3], _flange(frames[:, -1])[:, None]], axis=1)
+    frames = T_table_base @ arm.frames(np.array(closed))
+    origins = frames[:, :-1, :3, 3]
     share = np.linspace(0.0, 1.0, ON_A_LINK)[:, None, None, None]
     links = (1.0 - share) * origins[None, :, :-1] + share * origins[None, :, 1:]
     stand = np.concatenate(standing)
@@ -277,11 +277,6 @@ def _turning_points(phase: NDArray[np.int64]) -> NDArray[np.int64]:
     ways = np.nonzero((phase >= APPROACH) & (phase <= LIFT))[0]
     ends = ways[np.nonzero(np.diff(phase[ways]))[0]]
     return np.unique(np.concatenate([ways[:1], ends, ways[-1:]]))
-
-
-def _flange(Ts_table_grasp: Array) -> Array:
-    """Return where the hand is mounted (A, 3) [m]."""
-    return Ts_table_grasp[:, :3, 3] - panda.TCP_M * Ts_table_grasp[:, :3, 2]
 
 
 def _placed(Ts: Array, points: Array) -> Array:

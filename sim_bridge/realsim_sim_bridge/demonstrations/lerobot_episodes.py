@@ -5,6 +5,7 @@ LeRobot's training takes the others for nothing, so that what only a simulation 
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,6 @@ from realsim import interop
 from realsim.formats.lerobot.episodes import LeRobotEpisode, LeRobotFeature
 from realsim.geometry import se3
 from realsim.records.trajectories import PHASES
-from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.demonstrations.records import Rgb
 from realsim_sim_bridge.demonstrations.source import Demonstration, DemonstrationSource
 
@@ -22,12 +22,11 @@ Array = NDArray[np.float64]
 STATE, ACTION, GOAL = "observation.state", "action", "observation.goal.grasp_pose"
 EE, OBJECT, DELTA = "ee_pose", "object_pose", "delta_ee"
 IMAGES = "observation.images."
-JOINT_NAMES = tuple(f"joint{i + 1}" for i in range(panda.JOINTS))
 POSE_NAMES = ("x", "y", "z", "qx", "qy", "qz", "qw")
 FEATURES = {
-    STATE: LeRobotFeature(dtype="float32", names=(*JOINT_NAMES, "opening")),
+    STATE: LeRobotFeature(dtype="float32"),
     GOAL: LeRobotFeature(dtype="float32", names=POSE_NAMES),
-    ACTION: LeRobotFeature(dtype="float32", names=(*JOINT_NAMES, "opening_command")),
+    ACTION: LeRobotFeature(dtype="float32"),
     DELTA: LeRobotFeature(dtype="float32", names=("rx", "ry", "rz", "x", "y", "z")),
     EE: LeRobotFeature(dtype="float32", names=POSE_NAMES),
     OBJECT: LeRobotFeature(dtype="float32", names=POSE_NAMES),
@@ -38,7 +37,7 @@ FEATURES = {
     "next.success": LeRobotFeature(dtype="bool"),
 }
 CONVENTIONS = (
-    (STATE, "joints 1 to 7 [rad] and the distance of the finger faces [m]"),
+    (STATE, "the joints [rad] and the distance of the finger faces [m]"),
     (GOAL, "the grasp to be taken, in the arm's base: position [m], quaternion x y z w; the frame "
            "is between the fingertips, z = approach, y = closing axis"),
     (ACTION, "absolute joint targets: the joints of the next step [rad]; commanded distance of the "
@@ -60,8 +59,6 @@ CONVENTIONS = (
 class LeRobotDemonstrations:
     """Chosen attempts of a source; a `LeRobotSource`."""
 
-    robot_type = "panda"
-
     def __init__(self, source: DemonstrationSource, name: str, chosen: Sequence[int]) -> None:
         """Choose attempts.
 
@@ -74,6 +71,11 @@ class LeRobotDemonstrations:
         self.tasks = sorted({source.goal(k).language for k in self._chosen})
 
     @property
+    def robot_type(self) -> str:
+        """The arm's name."""
+        return self._source.arm.arm.folder.name
+
+    @property
     def fps(self) -> int:
         """Steps per second."""
         return self._source.config.rate_hz
@@ -81,7 +83,11 @@ class LeRobotDemonstrations:
     @property
     def features(self) -> Mapping[str, LeRobotFeature]:
         """The columns."""
-        return FEATURES
+        names = self._source.arm.arm.joint_names
+        return FEATURES | {
+            STATE: replace(FEATURES[STATE], names=(*names, "opening")),
+            ACTION: replace(FEATURES[ACTION], names=(*names, "opening_command")),
+        }
 
     @property
     def cameras(self) -> Mapping[str, tuple[int, int]]:

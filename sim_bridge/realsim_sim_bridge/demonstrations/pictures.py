@@ -4,10 +4,13 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from realsim.errors import InputError
 from realsim.geometry import se3
@@ -16,78 +19,151 @@ from realsim.models.simplify import colors_at, simplified
 from realsim.records import Mesh
 from realsim.rendering.photo import Lighting, PhotoRenderer
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim_sim_bridge.arm import panda
+from realsim.robots.arm import RobotArm
+from realsim.robots.hand import FRANKA, Hand
+from realsim.robots.link_shapes import LARGEST_MM_SCALE
+from realsim_sim_bridge.arm.grasping_arm import GraspingArm
+from realsim_sim_bridge.arm.link_spheres import solid_points
 from realsim_sim_bridge.demonstrations.records import DemonstrationCamera, Rgb
 
-# --- What the Panda looks like: the meshes that PyBullet's package brings, drawn with few triangles
-# Its frames are those of `arm.panda`: link i's mesh is in joint i's frame, the hand's in the frame
-# of its mounting face, and a finger's slides along y by half the opening.
+# --- What arm and hand look like: an arm as its own meshes, drawn with few triangles, or as its
+# bodies; a hand as its boxes, but for Franka's, whose meshes come with PyBullet.
 
 
 Array = NDArray[np.float64]
 LINK_FACES = 1500
 """Triangles of a link: at 320 x 240 none is seen, and a frame is prepared in 30 instead of 600
 ms."""
-WHITE = 235
-"""Grey level of parts that come without colours: the arm's white lacquer."""
+WHITE, DARK = 235, 70
+"""Grey levels of parts that come without colours: an arm's white lacquer, and a hand."""
 FINGER_Z_M = 0.0584
-"""Where the fingers' frame is along the hand's approach axis (panda.urdf) [m]."""
-FINGER_TURNS = (0.0, np.pi)
-"""Turn of each finger's frame about the hand's axis: that at +y, that at -y [rad]."""
+"""Where the fingers' frame is along the axis of Franka's hand, from its mount (panda.urdf) [m]."""
 
 
-def panda_meshes(joints_rad: Array, opening_m: float, T_table_base: Array) -> list[PlacedMesh]:
-    """Return arm, hand and fingers where they are, table frame.
+def robot_meshes(
+    arm: GraspingArm, joints_rad: Array, openings_m: Array, T_table_base: Array
+) -> tuple[tuple[Mesh, ...], Array]:
+    """Return what an arm and its hand are drawn as, and where that is.
 
     Args:
-        joints_rad: (7,) [rad].
-        opening_m: distance of the finger faces [m].
+        arm: the arm with its hand.
+        joints_rad: (S, n) [rad].
+        openings_m: (S,) distance of the finger faces [m].
         T_table_base: (4, 4) [m].
 
+    Returns:
+        the meshes (L), the hand's last, and T_table_mesh (S, L, 4, 4).
+
     Raises:
-        InputError: PyBullet's package does not have the meshes.
+        InputError: a mesh cannot be read.
     """
-    looks = _looks()
-    frames = T_table_base @ panda.link_frames(joints_rad)
-    placed = [
-        PlacedMesh(BACKGROUND, mesh, frames[i]) for i, mesh in enumerate(looks[: panda.JOINTS + 1])
+    links, meshes = _arm_looks(arm.arm)
+    frames = T_table_base @ arm.frames(joints_rad)
+    hand, Ts = hand_meshes(arm.hand, frames[:, -1], openings_m)
+    return (*meshes, *hand), np.concatenate([frames[:, list(links)], Ts], axis=1)
+
+
+def hand_meshes(
+    hand: Hand, Ts_table_grasp: Array, openings_m: Array
+) -> tuple[tuple[Mesh, ...], Array]:
+    """Return what a hand is drawn as (L), and T_table_mesh (S, L, 4, 4) at poses (S, 4, 4)."""
+    meshes, sides = _hand_looks(hand)
+    Ts = np.tile(Ts_table_grasp[:, None], (1, len(meshes), 1, 1))
+    shift = np.zeros((len(openings_m), len(meshes), 3))
+    shift[..., 1] = openings_m[:, None] / 2.0 * sides
+    shift[..., 2] = hand.z_pad(openings_m)[:, None] * np.abs(sides)
+    Ts[..., :3, 3] += np.einsum("sij,slj->sli", Ts_table_grasp[:, :3, :3], shift)
+    return meshes, Ts
+
+
+@lru_cache(maxsize=4)
+def _arm_looks(arm: RobotArm) -> tuple[tuple[int, ...], tuple[Mesh, ...]]:
+    """Return the links of an arm that are drawn, and their meshes in the links' frames."""
+    found: dict[int, list[Mesh]] = {}
+    for link, look in arm.looks:
+        if look.file is not None:
+            scale = np.array(look.size_m)
+            unit = "mm" if np.abs(scale).max() < LARGEST_MM_SCALE else "m"
+            mesh = _drawn(look.file, unit)
+            points = mesh.vertices * scale * (1e3 if unit == "mm" else 1.0)
+            found.setdefault(link, []).append(
+                replace(mesh, vertices=se3.transform(look.T_link_shape, points))
+            )
+    for shape in arm.shapes:
+        if not any(link == shape.frame for link, _ in arm.looks):
+            hull = ConvexHull(solid_points(shape))
+            found.setdefault(shape.frame, []).append(_grey(hull.points, _outwards(hull), WHITE))
+    parts = [(link, mesh) for link, meshes in sorted(found.items()) for mesh in meshes]
+    return tuple(link for link, _ in parts), tuple(mesh for _, mesh in parts)
+
+
+@lru_cache(maxsize=4)
+def _hand_looks(hand: Hand) -> tuple[tuple[Mesh, ...], Array]:
+    """Return the meshes of a closed hand, frame `grasp`, and which finger (+1, -1) each is of."""
+    if hand.name == FRANKA:
+        palm, finger = (
+            _drawn(_package_file(f"franka_panda/meshes/visual/{name}.obj"), "m")
+            for name in ("hand", "finger")
+        )
+        mount = np.array([0.0, 0.0, hand.mount_z_m])
+        other = finger.vertices * [-1.0, -1.0, 1.0]
+        fingers = [
+            replace(finger, vertices=points + mount + [0.0, 0.0, FINGER_Z_M])
+            for points in (finger.vertices, other)
+        ]
+        sides = np.array([0.0, 1.0, -1.0])
+        return (replace(palm, vertices=palm.vertices + mount), *fingers), sides
+    boxes, palms, side = hand.boxes(0.0)[0], len(hand.palm_boxes), hand.side_boxes
+    parts: list[tuple[Array, float]] = [(box, 0.0) for box in boxes[:palms]]
+    for first, sign in ((palms, -1.0), (palms + side, 1.0)):
+        parts += [(box, sign) for box in boxes[first : first + len(hand.finger_boxes)]]
+    meshes = [
+        _grey(np.array(list(product(*zip(*box, strict=True)))), BOX_FACES, DARK) for box, _ in parts
     ]
-    T_hand = frames[-1] @ se3.from_translation([0.0, 0.0, -panda.TCP_M])
-    placed.append(PlacedMesh(BACKGROUND, looks[-2], T_hand))
-    slide = se3.from_translation([0.0, opening_m / 2.0, 0.0])
-    for turn in FINGER_TURNS:
-        T_finger = se3.from_rt(se3.exp_so3([0.0, 0.0, turn]), [0.0, 0.0, FINGER_Z_M]) @ slide
-        placed.append(PlacedMesh(BACKGROUND, looks[-1], T_hand @ T_finger))
-    return placed
+    return tuple(meshes), np.array([sign for _, sign in parts])
 
 
-@lru_cache(maxsize=1)
-def _looks() -> tuple[Mesh, ...]:
-    """Return the meshes of links 0 to 7, the hand and a finger."""
+def _package_file(name: str) -> Path:
+    """Return a file of PyBullet's package.
+
+    Raises:
+        InputError: it is not there.
+    """
     import pybullet_data
 
-    folder = Path(pybullet_data.getDataPath()) / "franka_panda" / "meshes"
-    # The package has no finer ones of the foot and of the flange.
-    files = ["collision/link0.obj", *(f"visual/link{i}.obj" for i in range(1, 7)),
-             "collision/link7.obj", "visual/hand.obj", "visual/finger.obj"]  # fmt: skip
-    missing = [name for name in files if not (folder / name).is_file()]
-    if missing:
+    path = Path(pybullet_data.getDataPath()) / name
+    if not path.is_file():
         raise InputError(
-            f"the Panda's mesh {folder / missing[0]} is missing, so that the arm cannot be drawn; "
-            "it comes with the package pybullet. Install that again."
+            f"the mesh {path} is missing, so that the hand cannot be drawn; it comes with the "
+            "package pybullet. Install that again."
         )
-    meshes: list[Mesh] = []
-    for name in files:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # colours that two of the files name are not there
-            mesh = simplified(load_mesh(folder / name, "m"), LINK_FACES)
-        colors = mesh.colors
-        if mesh.texture is not None:
-            colors = colors_at(mesh, mesh.vertices)
-        if colors is None:
-            colors = np.full((len(mesh.vertices), 3), WHITE, np.uint8)
-        meshes.append(Mesh(vertices=mesh.vertices, faces=mesh.faces, colors=colors))
-    return tuple(meshes)
+    return path
+
+
+def _drawn(path: Path, unit: Literal["m", "mm"]) -> Mesh:
+    """Return a mesh with few triangles and colours."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # colours that some files name are not there
+        mesh = simplified(load_mesh(path, unit), LINK_FACES)
+    colors = colors_at(mesh, mesh.vertices) if mesh.texture is not None else mesh.colors
+    if colors is None:
+        return _grey(mesh.vertices, mesh.faces, WHITE)
+    return Mesh(vertices=mesh.vertices, faces=mesh.faces, colors=colors)
+
+
+def _grey(vertices: Array, faces: NDArray[np.int32], level: int) -> Mesh:
+    """Return a mesh of one grey."""
+    colors = np.full((len(vertices), 3), level, np.uint8)
+    return Mesh(vertices=vertices, faces=faces, colors=colors)
+
+
+def _outwards(hull: ConvexHull) -> NDArray[np.int32]:
+    """Return the triangles of a hull, corners counter-clockwise seen from outside."""
+    a, b, c = (hull.points[hull.simplices[:, k]] for k in range(3))
+    inwards = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces = hull.simplices.astype(np.int32)
+    faces[inwards] = faces[inwards][:, ::-1]
+    return faces
 
 
 TABLE_M, TABLE_THICKNESS_M = 1.8, 0.03
@@ -107,6 +183,7 @@ class StepPictures:
         self,
         cameras: Mapping[str, DemonstrationCamera],
         objects: Mapping[int, tuple[Mesh, Array]],
+        arm: GraspingArm,
         joints_rad: Array,
         opening_m: float,
         T_table_base: Array,
@@ -118,14 +195,15 @@ class StepPictures:
         Args:
             cameras: by name.
             objects: mesh and T_table_obj (4, 4) [m], by instance.
-            joints_rad: (7,) [rad].
+            arm: the arm with its hand.
+            joints_rad: (n,) [rad].
             opening_m: distance of the finger faces [m].
             T_table_base: (4, 4) [m].
             T_table_ee: (4, 4) the hand's grasp frame [m].
             middle_xy: middle of the scene on the table [m].
         """
         self._cameras, self._objects = cameras, objects
-        self._joints, self._opening = joints_rad, opening_m
+        self._arm, self._joints, self._opening = arm, joints_rad, opening_m
         self._T_table_base, self._T_table_ee = T_table_base, T_table_ee
         self._middle = middle_xy
         self._renderer: PhotoRenderer | None = None
@@ -147,7 +225,10 @@ class StepPictures:
         table[:2, 3] = self._middle
         placed = [PlacedMesh(BACKGROUND, table_slab(), table)]
         placed += [PlacedMesh(i, mesh, T) for i, (mesh, T) in sorted(self._objects.items())]
-        return placed + panda_meshes(self._joints, self._opening, self._T_table_base)
+        meshes, Ts = robot_meshes(
+            self._arm, self._joints[None], np.array([self._opening]), self._T_table_base
+        )
+        return placed + [PlacedMesh(BACKGROUND, m, T) for m, T in zip(meshes, Ts[0], strict=True)]
 
 
 def drawn_mesh(mesh: Mesh) -> Mesh:
@@ -167,9 +248,15 @@ def drawn_mesh(mesh: Mesh) -> Mesh:
 def table_slab() -> Mesh:
     """Return the table: a closed box under the plane z = 0 [m]."""
     h, t = TABLE_M / 2, TABLE_THICKNESS_M
-    corners = np.array([[x, y, z] for x in (-h, h) for y in (-h, h) for z in (-t, 0.0)])
-    faces = [
+    corners = np.array(list(product((-h, h), (-h, h), (-t, 0.0))))
+    return Mesh(vertices=corners, faces=BOX_FACES)
+
+
+BOX_FACES = np.array(
+    [
         [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
         [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ]  # fmt: skip
-    return Mesh(vertices=corners, faces=np.array(faces, dtype=np.int32))
+    ],
+    dtype=np.int32,
+)  # fmt: skip
+"""Triangles of a box whose corners are `product` of its ends."""

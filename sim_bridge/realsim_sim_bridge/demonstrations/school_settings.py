@@ -18,6 +18,8 @@ from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.slip.world import SlipBody
 
 T = TypeVar("T")
+_RENAMED = {"joint7_samples": "held_values"}
+"""Fields of older files by what they are called now."""
 
 
 def school_config_of(grasps: GraspSet) -> SchoolConfig:
@@ -51,7 +53,7 @@ def _read(kind: type[T], value: Any) -> T:
     """
     if not isinstance(value, dict):
         raise TypeError(f"{kind.__name__} is {type(value).__name__}")
-    given: dict[str, Any] = {str(k): v for k, v in value.items()}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+    given: dict[str, Any] = {_RENAMED.get(str(k), str(k)): v for k, v in value.items()}  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
     hints = get_type_hints(kind)
     names = [f.name for f in fields(kind)]  # pyright: ignore[reportArgumentType]
     unknown = sorted(set(given) - set(names))

@@ -16,7 +16,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
 from realsim.robots.hand import Hand
-from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.arm.reach_config import grasping_arm
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.slip.score import score_stages
 from realsim_sim_bridge.slip.slip_test import SlipTrial, run_slip_test
@@ -208,7 +208,7 @@ def replay_grasp(
     Args:
         grasps: the set.
         row: which of its grasps.
-        joints_lifted: (7,) the arm after the lift [rad]: the axis of the swing depends on it.
+        joints_lifted: (n,) the arm after the lift [rad]: the axis of the swing depends on it.
         T_table_obj: (4, 4) where the object stands [m].
         body: its convex parts and matter.
         config: what the set was made with.
@@ -217,7 +217,7 @@ def replay_grasp(
     Raises:
         InputError: the set does not hold the openings of its grasps.
     """
-    trial = _trial(grasps, row, joints_lifted, T_table_obj, body)
+    trial = _trial(grasps, row, joints_lifted, T_table_obj, body, config)
     engine.begin()
     slips = run_slip_test(trial, config.slip, config.score, config.hand, engine)
     base, score = score_stages(
@@ -250,7 +250,12 @@ def replay_grasp(
 
 
 def _trial(
-    grasps: GraspSet, row: int, joints_lifted: Array, T_table_obj: Array, body: SlipBody
+    grasps: GraspSet,
+    row: int,
+    joints_lifted: Array,
+    T_table_obj: Array,
+    body: SlipBody,
+    config: SchoolConfig,
 ) -> SlipTrial:
     """Return one grasp, ready for the slip test; as `school.object_slips.trial_of`."""
     openings = grasps.parameters.get("openings_m")
@@ -259,16 +264,17 @@ def _trial(
             f"the grasps of instance {grasps.instance} do not say how far the hand was open "
             "(parameters.openings_m), so that none can be replayed; run `realsim school` again."
         )
-    axes, points = panda.joint5_in_grasp(joints_lifted[None])
+    arm = grasping_arm(config.reach, config.hand)
+    axes, points, ranges = arm.swing_in_grasp(joints_lifted[None])
     Ts = grasps.Ts_obj_grasp[[row]]
     return SlipTrial(
         body=body,
         Ts_obj_grasp=Ts,
         Ts_table_grasp=T_table_obj @ Ts,
         openings_m=np.array([openings[row]], dtype=np.float64),
-        joint5_axes=axes,
-        joint5_points=points,
-        joint5_ranges=np.array([[panda.LOWER[4], panda.UPPER[4]]]) - joints_lifted[4],
+        swing_axes=axes,
+        swing_points=points,
+        swing_ranges=ranges,
     )
 
 

@@ -22,7 +22,8 @@ from realsim.geometry import se3
 from realsim.models.library_records import KnownSolid
 from realsim.records import Mesh, ObjectModel
 from realsim.records.trajectories import PHASES
-from realsim_sim_bridge.arm.reach_config import base_on_table
+from realsim_sim_bridge.arm.grasping_arm import GraspingArm
+from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm
 from realsim_sim_bridge.demonstrations.attempt_motion import Attempt, AttemptMotion, attempt_motion
 from realsim_sim_bridge.demonstrations.falling import FallConfig
 from realsim_sim_bridge.demonstrations.front_view import (
@@ -79,6 +80,8 @@ class Scenery:
     """(4, 4) where everything stands at first [m], by instance."""
     T_table_base: Array
     middle_xy: tuple[float, float]
+    arm: GraspingArm
+    """The arm that attempts, with its hand."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -131,6 +134,7 @@ class Demonstration:
         pictures = StepPictures(
             scenery.cameras,
             {i: (scenery.looks[i], T) for i, T in Ts_table_obj.items()},
+            scenery.arm,
             m.joints_rad[k],
             float(m.opening_m[k]),
             scenery.T_table_base,
@@ -206,6 +210,9 @@ class DemonstrationSource(Sequence[Demonstration]):
                 "or the school was told not to keep them. There is nothing to demonstrate."
             )
         self._configs = {i: school_config_of(s) for i, s in self._sets.items()}
+        first = self._configs[next(iter(self._sets))]
+        self.arm: GraspingArm = grasping_arm(first.reach, first.hand)
+        """The arm that attempted, with its hand."""
         self.scenery = self._scenery(cameras)
         self._bodies: dict[int, SlipBody] = {}
         self._engine: tuple[object, RecordedEngine] | None = None
@@ -305,11 +312,12 @@ class DemonstrationSource(Sequence[Demonstration]):
         middle = (float(given[0]), float(given[1]))  # pyright: ignore[reportUnknownArgumentType]
         models = {i: self._models[s.obj_id] for i, s in self._sets.items()}
         Ts_table_obj = {i: T_table_world @ self._grasps.Ts_world_obj[i] for i in self._sets}
-        T_table_base = base_on_table(middle, self._configs[first.instance].reach)
-        asked = (FrontView(), wrist_camera()) if cameras is None else tuple(cameras)
+        T_table_base = base_on_table(middle, self._configs[first.instance].reach, self.arm)
+        usual = FrontView(), wrist_camera(hand=self.arm.hand)
+        asked = usual if cameras is None else tuple(cameras)
         if len({c.name for c in asked}) != len(asked):
             raise InputError("two cameras have the same name; pictures would be mixed up.")
-        seen = happening(self._grasps, models, Ts_table_obj, T_table_base)
+        seen = happening(self._grasps, models, Ts_table_obj, T_table_base, self.arm)
         chosen = [placed_front(c, seen) if isinstance(c, FrontView) else c for c in asked]
         drawn = {o: drawn_mesh(self._models[o].mesh) for o in {s.obj_id for s in self._grasps.sets}}
         return Scenery(
@@ -319,6 +327,7 @@ class DemonstrationSource(Sequence[Demonstration]):
             Ts_table_obj=Ts_table_obj,
             T_table_base=T_table_base,
             middle_xy=middle,
+            arm=self.arm,
         )
 
     def _replayed(self, name: AttemptName) -> Demonstration:
@@ -332,6 +341,7 @@ class DemonstrationSource(Sequence[Demonstration]):
             self._recorder(name.instance),
         )  # fmt: skip
         attempt = Attempt(
+            arm=self.arm,
             trajectories=attempts,
             row=name.grasp,
             replay=replay,

@@ -222,7 +222,8 @@ class Day:
             return
         why = f"{MOST_DEATHS} workers ended in the middle of it; of the last: {how}"
         if job.rows is None:
-            job.pupil.take_prepared(not_prepared(f"the preparation failed: {why}"), keep=False)
+            nothing = not_prepared(job.pupil.task, f"the preparation failed: {why}")
+            job.pupil.take_prepared(nothing, keep=False)
             job.pupil.given_up.append((np.zeros(0, dtype=np.int64), why))
         else:
             job.pupil.given_up.append((job.rows, why))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from realsim.records import STAGES, GraspSet
 from realsim.records.grasps import MEASURES
-from realsim_sim_bridge.arm import panda
+from realsim_sim_bridge.arm.reach_config import grasping_arm
 from realsim_sim_bridge.school.kept_sets import SchoolResult
 from realsim_sim_bridge.school.object_task import ObjectTask, Prepared
 from realsim_sim_bridge.school.run_record import versions
@@ -25,18 +25,17 @@ def trial_of(task: ObjectTask, prepared: Prepared, rows: Rows) -> SlipTrial:
     """Return some rows of the candidates, ready for the slip test."""
     assert prepared.body is not None, "rows are tested only of objects with a body"
     lifted = prepared.joints_lifted[rows]
-    axes, points = panda.joint5_in_grasp(lifted)
+    arm = grasping_arm(task.config.reach, task.config.hand)
+    axes, points, ranges = arm.swing_in_grasp(lifted)
     Ts = prepared.Ts_obj_grasp[rows]
     return SlipTrial(
         body=prepared.body,
         Ts_obj_grasp=Ts,
         Ts_table_grasp=task.T_table_obj @ Ts,
         openings_m=prepared.openings_m[rows],
-        joint5_axes=axes,
-        joint5_points=points,
-        joint5_ranges=np.stack(
-            [panda.LOWER[4] - lifted[:, 4], panda.UPPER[4] - lifted[:, 4]], axis=-1
-        ),
+        swing_axes=axes,
+        swing_points=points,
+        swing_ranges=ranges,
     )
 
 
@@ -117,7 +116,7 @@ def _measures(prepared: Prepared, tested: list[Tested]) -> dict[str, Array]:
 
 def _parameters(task: ObjectTask, prepared: Prepared) -> dict[str, Any]:
     """Return everything the scores depend on, as plain JSON values."""
-    nothing = [None] * panda.JOINTS
+    nothing = [None] * prepared.joints.shape[1]
     parameters: dict[str, Any] = {
         "config": asdict(task.config),
         "inputs": task.inputs(),

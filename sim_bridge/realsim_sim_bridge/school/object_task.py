@@ -16,8 +16,8 @@ from realsim.models.convex import convex_parts
 from realsim.models.library_records import KnownSolid
 from realsim.records import Mesh
 from realsim.records.trajectories import GraspTrajectories
-from realsim_sim_bridge.arm import panda
 from realsim_sim_bridge.arm.reach import Reach, ReachTask, check_reach
+from realsim_sim_bridge.arm.reach_config import grasping_arm
 from realsim_sim_bridge.grasping.analytic import AnalyticConfig, analytic_labels
 from realsim_sim_bridge.grasping.analytic_given import given_candidates, standing_labels
 from realsim_sim_bridge.grasping.analytic_select import select_rows
@@ -164,9 +164,9 @@ class Prepared:
     """(N,) [m]."""
     reachable: NDArray[np.bool_]
     joints: Array
-    """(N, 7) at the grasp [rad]; NaN where not reachable."""
+    """(N, n) at the grasp [rad]; NaN where not reachable."""
     joints_lifted: Array
-    """(N, 7) after the lift [rad]; NaN likewise."""
+    """(N, n) after the lift [rad]; NaN likewise."""
     reasons: tuple[str, ...]
     """(N,) why not reachable."""
     trajectories: GraspTrajectories | None
@@ -199,7 +199,7 @@ def prepare(task: ObjectTask) -> Prepared:
         notes["analytic"] = analytic.counts
     body, why_not = _body(task, notes)
     if body is None:
-        return _untried(found, why_not, notes)
+        return _untried(found, why_not, notes, config.reach.arm.found().joints)
     reach = reach_of(task, found, rng)
     notes["counts"] |= {"reachable": int(reach.reachable.sum()), "by_a_planned_path": reach.planned}
     notes["arm"] = {"stage_possible": reach.stage_possible.tolist(), "notes": list(reach.notes)}
@@ -263,13 +263,14 @@ def reach_of(task: ObjectTask, found: Candidates, rng: np.random.Generator) -> R
         neighbours=task.neighbours,
         middle_xy=task.middle_xy,
     )
-    return check_reach(reach, config.reach, config.hand, rng, config.slip.motion)
+    arm = grasping_arm(config.reach, config.hand)
+    return check_reach(reach, config.reach, arm, rng, config.slip.motion)
 
 
-def _untried(found: Candidates, why_not: str, notes: dict[str, Any]) -> Prepared:
+def _untried(found: Candidates, why_not: str, notes: dict[str, Any], joints: int) -> Prepared:
     """Return the candidates of an object that cannot be tried."""
     n = len(found.widths_m)
-    nowhere = np.full((n, panda.JOINTS), np.nan)
+    nowhere = np.full((n, joints), np.nan)
     return Prepared(
         Ts_obj_grasp=found.Ts_obj_grasp,
         widths_m=found.widths_m,
@@ -295,16 +296,17 @@ def _with_names(reason: str, names: dict[int, str]) -> str:
     return re.sub(r"the object of instance (\d+)", named, reason)
 
 
-def not_prepared(why: str) -> Prepared:
+def not_prepared(task: ObjectTask, why: str) -> Prepared:
     """Return what there is of an object whose preparation could not be finished: no candidate."""
     nothing = np.zeros(0)
+    joints = np.zeros((0, task.config.reach.arm.found().joints))
     return Prepared(
         Ts_obj_grasp=np.zeros((0, 4, 4)),
         widths_m=nothing,
         openings_m=nothing,
         reachable=np.zeros(0, dtype=np.bool_),
-        joints=np.zeros((0, panda.JOINTS)),
-        joints_lifted=np.zeros((0, panda.JOINTS)),
+        joints=joints,
+        joints_lifted=joints,
         reasons=(),
         trajectories=None,
         measures={},

@@ -26,7 +26,7 @@ RESULTS = "instance_*.npz"
 FINISHED_FILE = "finished"
 """Empty; there when the run has been finished."""
 Restart = bool | Literal["finished"]
-RESULTS_VERSION = 3
+RESULTS_VERSION = 4
 """Raised whenever the same inputs give other results with the same versions of all packages."""
 PACKAGES = ("realsim", "numpy", "numba", "scipy", "coacd", "eaik", "coal", "pin", "ompl", "toppra")
 """Besides the engines: what the grasps and trajectories come from."""

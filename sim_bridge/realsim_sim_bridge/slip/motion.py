@@ -166,13 +166,13 @@ def stage_wrenches(
         shake = oscillation_acceleration(motion, dt)
         return field_wrenches(shake, mass, motion.gravity, len(trial))
     sweep = np.radians(motion.pendulum_deg)
-    low, high = np.clip(trial.joint5_ranges, -sweep, sweep).T
+    low, high = np.clip(trial.swing_ranges, -sweep, sweep).T
     angles = np.stack(
         [pendulum_angle(motion, dt, a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
     )
     R = trial.Ts_table_grasp[:, :3, :3]
-    axes = np.einsum("kij,kj->ki", R, trial.joint5_axes)
-    points = np.einsum("kij,kj->ki", R, trial.joint5_points)
+    axes = np.einsum("kij,kj->ki", R, trial.swing_axes)
+    points = np.einsum("kij,kj->ki", R, trial.swing_points)
     moments = trial.body.principal_frame()[1]
     turned = Ts_world_body[:, :3, :3]
     inertias = np.einsum("kij,j,klj->kil", turned, moments, turned)

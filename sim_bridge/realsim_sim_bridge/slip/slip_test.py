@@ -71,11 +71,11 @@ class SlipTrial:
     """(N, 4, 4) the same where the object stands; gravity is the table's -z."""
     openings_m: Array
     """(N,) distance of the finger faces before closing [m]."""
-    joint5_axes: Array
-    """(N, 3) unit axis of joint 5 in the grasp frame, in the arm's configuration."""
-    joint5_points: Array
+    swing_axes: Array
+    """(N, 3) unit axis of the joint that swings the hand, grasp frame, as the arm stands."""
+    swing_points: Array
     """(N, 3) a point on it, in the grasp frame [m]."""
-    joint5_ranges: Array
+    swing_ranges: Array
     """(N, 2) least and greatest angle it may swing from there [rad]."""
 
     def __len__(self) -> int:

@@ -17,19 +17,19 @@ from numpy.typing import NDArray
 from realsim import interop
 from realsim.geometry import se3
 from realsim.records import STAGES
+from realsim.robots.compiled_chain import follow_lines
 from realsim.robots.hand import Hand, find_hand
-from realsim_sim_bridge.arm import panda
-from realsim_sim_bridge.arm.panda import panda_urdf
 from realsim_sim_bridge.slip.bullet_pair import LIFT_N, LIFT_PULL
 from realsim_sim_bridge.slip.bullet_shapes import hand_urdf
 from realsim_sim_bridge.slip.motion import SlipMotion, min_jerk, pendulum_angle
 from realsim_sim_bridge.slip.score import ScoreLimits
 from realsim_sim_bridge.slip.slip_test import SlipConfig, run_slip_test
 from realsim_sim_bridge.slip.world import Engine
+from realsim_sim_bridge.validation.arm_urdf import arm_urdf
 from realsim_sim_bridge.validation.config import ValidationConfig
 from realsim_sim_bridge.validation.loads import with_hand
 from realsim_sim_bridge.validation.report import CheckResult
-from realsim_sim_bridge.validation.specimens import READY, SIDE_M, cube, ready_trial
+from realsim_sim_bridge.validation.specimens import READY, SIDE_M, cube, panda, ready_trial
 
 # --- The joint angles of a Panda that move its hand as each stage of the slip test does ----------
 
@@ -41,40 +41,25 @@ def stage_joints(stage: int, q: Array, motion: SlipMotion, dt: float) -> Array:
     """Return the joints' path (T, 7) [rad] of a stage, from q (7,) on."""
     if STAGES[stage] == "pendulum":
         sweep = np.radians(motion.pendulum_deg)
-        low, high = np.clip([panda.LOWER[4] - q[4], panda.UPPER[4] - q[4]], -sweep, sweep)
+        j = panda().swing_joint
+        low, high = np.clip(panda().swing_in_grasp(q)[2], -sweep, sweep)
         path = np.tile(q, (round(motion.pendulum_s / dt), 1))
         angle = pendulum_angle(motion, dt, float(low), float(high))[0]
-        path[: len(angle), 4] += angle[: len(path)]
+        path[: len(angle), j] += angle[: len(path)]
         return path
-    return _follow(q, _hand_path(stage, motion, dt))
-
-
-def _hand_path(stage: int, motion: SlipMotion, dt: float) -> Array:
-    """Return where the hand is (T, 3) [m], since the start of the stage, table axes."""
     if STAGES[stage] == "lift":
         t = dt * np.arange(1.0, round((motion.lift_s + motion.lift_hold_s) / dt) + 1)
-        up = min_jerk(motion.lift_height_m, motion.lift_s, t)[0]
-        return np.stack([0 * up, 0 * up, up], axis=-1)
+        return _along(q, 2, min_jerk(motion.lift_height_m, motion.lift_s, t)[0])
     count = round(motion.oscillation_cycles / motion.oscillation_hz / dt)
     phase = 2 * np.pi * motion.oscillation_hz * dt * np.arange(1, count + 1)
     wave = motion.oscillation_m * (1.0 - np.cos(phase))
-    rest = np.zeros(count)
-    along_x, along_y = (wave, rest, rest), (rest, wave, rest)
-    return np.concatenate([np.stack(along_x, axis=-1), np.stack(along_y, axis=-1)])
+    return np.concatenate([_along(q, axis, wave) for axis in (0, 1)])
 
 
-def _follow(q: Array, positions: Array) -> Array:
-    """Return joint angles (T, 7) that carry the hand along positions (T, 3) without turning it."""
-    start = panda.forward(q)
-    path = np.empty((len(positions), panda.JOINTS))
-    for t, position in enumerate(positions):
-        frames = panda.link_frames(q)
-        error = np.empty(6)
-        error[:3] = se3.log_so3(start[:3, :3] @ frames[-1, :3, :3].T)
-        error[3:] = start[:3, 3] + position - frames[-1, :3, 3]
-        q = q + np.linalg.pinv(panda.jacobian(frames)) @ error
-        path[t] = q
-    return path
+def _along(q: Array, axis: int, distances: Array) -> Array:
+    """Return joint angles (T, 7) that carry the hand along an axis of the base, T distances [m]."""
+    T = panda().forward(q)[None]
+    return follow_lines(panda().numbers, q[None], T, np.eye(3)[[axis]], distances)[0][0]
 
 
 RATE_HZ = 1000.0
@@ -119,7 +104,7 @@ def arm_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
     labels = config.labels
     same, slip_m, turn_rad, tracking = 0, 0.0, 0.0, 0.0
     told: list[str] = []
-    R_down = se3.from_rt(panda.forward(READY)[:3, :3], np.zeros(3))
+    R_down = se3.from_rt(panda().forward(READY)[:3, :3], np.zeros(3))
     for mass, force_n, friction, beside_m in labels.arm_cases:
         slip = with_hand(config.slip, force_n, friction)
         T_obj_pads = se3.from_translation([beside_m, 0.0, 0.0])
@@ -168,7 +153,8 @@ def carry_cube(mass_kg: float, T_obj_grasp: Array, config: SlipConfig, hand: Han
         config: the hand's force and friction, and the motions.
         hand: what grasps, on a mount that puts its frame `grasp` where Franka's is.
     """
-    hand = replace(hand, mount_z_m=find_hand().mount_z_m)
+    usual = find_hand()
+    hand = replace(hand, mount_z_m=usual.mount_z_m, mount_turn_deg=usual.mount_turn_deg)
     slip_m, slip_rad = np.full(len(STAGES), np.nan), np.full(len(STAGES), np.nan)
     limits = ScoreLimits()
     with _ArmWorld(mass_kg, T_obj_grasp, config, hand) as world:
@@ -207,7 +193,7 @@ class _ArmWorld:
         )  # fmt: skip
         self._engine.setGravity(0.0, 0.0, 0.0)
         self._add_arm()
-        self._add_cube(mass_kg, panda.forward(READY) @ se3.invert(T_obj_grasp))
+        self._add_cube(mass_kg, panda().forward(READY) @ se3.invert(T_obj_grasp))
 
     def __enter__(self) -> "_ArmWorld":
         return self
@@ -242,8 +228,8 @@ class _ArmWorld:
         for t, (target, speed) in enumerate(zip(path.tolist(), speeds.tolist(), strict=True), 1):
             engine.setJointMotorControlArray(
                 self._arm, self._joints, engine.POSITION_CONTROL, targetPositions=target,
-                targetVelocities=speed, forces=panda.TORQUE.tolist(),
-                positionGains=[PULL] * panda.JOINTS, velocityGains=[1.0] * panda.JOINTS,
+                targetVelocities=speed, forces=panda().arm.torque.tolist(),
+                positionGains=[PULL] * len(q), velocityGains=[1.0] * len(q),
             )  # fmt: skip
             self._follow_arc()
             engine.stepSimulation()
@@ -280,7 +266,8 @@ class _ArmWorld:
         engine, physics = self._engine, self._config.physics
         with tempfile.TemporaryDirectory() as folder:
             urdf = Path(folder) / "arm.urdf"
-            urdf.write_text(panda_urdf(self._hand, hand_urdf(self._hand, physics.pads)))
+            hand = hand_urdf(self._hand, physics.pads)
+            urdf.write_text(arm_urdf(panda().arm, self._hand, hand))
             self._arm: int = engine.loadURDF(
                 str(urdf),
                 useFixedBase=True,
@@ -290,7 +277,7 @@ class _ArmWorld:
         count = engine.getNumJoints(self._arm)
         names = [engine.getJointInfo(self._arm, j) for j in range(count)]
         link = {info[12].decode(): j for j, info in enumerate(names)}
-        self._joints = [link[f"link{i + 1}"] for i in range(panda.JOINTS)]
+        self._joints = [link[f"link{i + 1}"] for i in range(panda().joints)]
         self._fingers, self._palm = (link["left"], link["right"]), link["palm"]
         carriers = [link[n] for n in ("left_carrier", "right_carrier") if n in link]
         self._carriers = list(zip(carriers, self._fingers, strict=False))

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh import Mesh, mass_properties
-from realsim.robots.hand import Hand
-from realsim_sim_bridge.arm import panda
+from realsim.robots.arm import find_arm
+from realsim.robots.hand import Hand, find_hand
+from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.slip.slip_test import SlipTrial
 from realsim_sim_bridge.slip.world import SlipBody
 
@@ -24,6 +25,12 @@ READY = np.array([0.0, -np.pi / 4, 0.0, -3 * np.pi / 4, 0.0, np.pi / 2, np.pi / 
 """Franka's ready pose (7,) [rad]: its joint 5 swings in the suite."""
 CLEARANCE_M = 0.003
 """Between object and palm [m]."""
+
+
+@lru_cache(maxsize=1)
+def panda() -> GraspingArm:
+    """Return the arm of the suite, with its own hand."""
+    return GraspingArm(find_arm("panda"), find_hand())
 
 
 def cube(mass_kg: float) -> SlipBody:
@@ -48,15 +55,16 @@ def ready_trial(
 ) -> SlipTrial:
     """Return grasps (N, 4, 4) carried by an arm in its ready pose."""
     n = len(Ts_obj_grasp)
-    axis, point = panda.joint5_in_grasp(READY)
+    arm, j = panda(), panda().swing_joint
+    axis, point, _ = arm.swing_in_grasp(READY)
     return SlipTrial(
         body=body,
         Ts_obj_grasp=Ts_obj_grasp,
         Ts_table_grasp=Ts_table_grasp,
         openings_m=np.full(n, opening_m),
-        joint5_axes=np.tile(axis, (n, 1)),
-        joint5_points=np.tile(point, (n, 1)),
-        joint5_ranges=np.tile([panda.LOWER[4], panda.UPPER[4]], (n, 1)),
+        swing_axes=np.tile(axis, (n, 1)),
+        swing_points=np.tile(point, (n, 1)),
+        swing_ranges=np.tile([arm.limits.lower[j], arm.limits.upper[j]], (n, 1)),
     )
 
 
