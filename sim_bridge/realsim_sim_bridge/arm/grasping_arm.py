@@ -10,7 +10,7 @@ from realsim.robots.arm import RobotArm
 from realsim.robots.compiled_chain import ChainNumbers, chain_numbers
 from realsim.robots.hand import Hand
 from realsim.robots.inverse import seeds_of
-from realsim.robots.kinematics import JointLimits
+from realsim.robots.limits import JointLimits
 
 Array = NDArray[np.float64]
 

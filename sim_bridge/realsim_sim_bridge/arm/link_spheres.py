@@ -256,4 +256,5 @@ def _cover(link: int, box: Array, cell_m: float, side: float) -> Spheres:
     pieces = size / counts
     grid = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in counts), indexing="ij"), axis=-1)
     centers = box[0] + grid.reshape(-1, 3) * pieces
-    return _of_link(link, centers, np.full(len(centers), np.linalg.norm(pieces) / 2), side)
+    radius = float(np.linalg.norm(pieces)) / 2
+    return _of_link(link, centers, np.full(len(centers), radius), side)

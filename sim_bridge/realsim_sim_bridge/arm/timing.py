@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.robots.kinematics import JointLimits
+from realsim.robots.limits import JointLimits
 
 Array = NDArray[np.float64]
 FreePath = Callable[[Array], bool]
