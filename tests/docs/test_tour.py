@@ -18,6 +18,7 @@ TOUR = (ROOT / "docs/tour/README.md", *sorted((ROOT / "docs/tour").glob("[0-9]*.
 API = sorted((ROOT / "docs/api").glob("*.md"))
 GUIDE = ROOT / "docs/how-to/calibrate-a-new-lab.md"
 """A lab of its own, board views first: plan, capture, calibrate, and the figures of all three."""
+GRIPPER = ROOT / "docs/how-to/your-own-gripper.md"
 SERVER = "# Ctrl-C ends it"
 START_S = 60.0
 ENVIRONMENT = {
@@ -123,6 +124,10 @@ def play(page: Path, folder: Path) -> list[str]:
     for block in blocks(read(page)):
         if block.kind in ("sh", "python"):
             printed = printed_by(block, folder)
+        elif block.kind == "toml":
+            file = folder / block.text.splitlines()[0].removeprefix("# ")
+            file.parent.mkdir()
+            file.write_text(block.text, encoding="utf-8")
         elif block.kind == "text":
             wrong += [
                 f"{page.name}: not printed: {line}\n{printed[-2500:]}"
@@ -154,4 +159,12 @@ def snippets_of_the_reference_run(folder: Path) -> None:
 @pytest.mark.slow
 def test_the_guide_to_a_new_lab_prints_what_it_says(tmp_path: Path) -> None:
     wrong = play(GUIDE, tmp_path)
+    assert not wrong, "\n\n".join(wrong)
+
+
+@pytest.mark.slow
+def test_a_gripper_that_is_not_in_the_package_is_described_proven_and_simulated(
+    tmp_path: Path,
+) -> None:
+    wrong = play(GRIPPER, tmp_path)
     assert not wrong, "\n\n".join(wrong)

@@ -4,20 +4,22 @@
 """
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import h5py
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
+from realsim.errors import InputError
 from realsim.formats.graspit.grasps import read_grasp_file
 from realsim.formats.graspnet.grasp_group import grasp_group, read_grasp_group, write_grasp_group
 from realsim.formats.grasps.acronym import AcronymObject, read_acronym, write_acronym
 from realsim.formats.grasps.graspgen import read_graspgen, write_graspgen
 from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
-from realsim.formats.grasps.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import SceneGrasps, executed
 from realsim.geometry import se3
+from realsim.robots.hand import find_hand
 from tried_grasps import tried_set
 
 MOUNT, TIP = 0.1034, 0.1122
@@ -185,3 +187,54 @@ def test_a_hand_straight_down_has_its_fingertips_where_they_are_drawn(form, tmp_
         tip = T[:3, :3] @ form.tip + T[:3, 3]
         np.testing.assert_allclose(tip, [0.1, 0.02, 0.05 - (TIP - MOUNT)], atol=atol)
     assert len(form.raw(path)) == len(Ts)
+
+
+def of_hand(name, seed=3):
+    """Return tried grasps of a hand, as the School leaves them."""
+    s, hand = tried_set(np.random.default_rng(seed), 25), find_hand(name)
+    known = {"config": {"hand": asdict(hand)}}
+    if hand.arc_radius_m:
+        known["pad_heights_m"] = hand.z_pad(s.widths_m).tolist()
+    return replace(s, parameters=json.loads(json.dumps(known)))
+
+
+def test_another_hand_s_frame_and_joint_are_its_description_s(tmp_path):
+    """The flange of the 2F-85, and its joint, which closes from 85.4 mm on by 0.81 rad."""
+    s, hand = of_hand("robotiq_2f85"), find_hand("robotiq_2f85")
+    tried = executed(s)
+    T = np.array(json.loads(write_graspgen(tmp_path / "a.json", s, file="a.obj").read_text())[
+        "grasps"]["transforms"])  # fmt: skip
+    grasps = s.Ts_obj_grasp[tried]
+    np.testing.assert_allclose(T[:, :3, 3], grasps[:, :3, 3] - 0.155046 * grasps[:, :3, 2])
+    found = read_graspgen(tmp_path / "a.json").Ts_obj_grasp
+    np.testing.assert_allclose(found, grasps, rtol=0, atol=1e-15)
+
+    data = YAML(typ="safe").load(write_isaac_grasp(tmp_path / "a.yaml", s, object_frame="a"))
+    assert data["gripper_frame_link"] == "robotiq_2f85"
+    for row in np.flatnonzero(tried):
+        joint = data["grasps"][f"grasp_{row}"]["cspace_position"]["finger_joint"]
+        # The URDF's chain: where the pad is when its joint is there.
+        y = 0.0306011 + 0.0376009 * np.cos(joint) - 0.0430400 * np.sin(joint) - 0.0255
+        assert 2 * y == pytest.approx(s.widths_m[row], abs=2e-5)
+    Ts = grasp_group([s], {s.instance: np.eye(4)}).Ts_a_grasp
+    scored = ~np.isnan(s.scores)
+    np.testing.assert_array_equal(Ts, s.Ts_obj_pads[scored])
+    moved = np.linalg.norm((s.Ts_obj_pads - s.Ts_obj_grasp)[:, :3, 3], axis=1)
+    np.testing.assert_allclose(moved, np.abs(hand.z_pad(s.widths_m)), atol=1e-12)
+
+
+def test_what_is_the_panda_s_alone_and_two_hands_at_once_are_refused(tmp_path):
+    panda, robotiq, four = of_hand("franka_hand"), of_hand("robotiq_2f85"), of_hand("parallel")
+    with pytest.raises(InputError, match=r"'robotiq_2f85'; an ACRONYM file.*--to graspgen"):
+        write_acronym(tmp_path / "a.h5", robotiq, AcronymObject(file="a.obj"))
+    with pytest.raises(InputError, match=r"'parallel' does not say.*joint = "):
+        write_isaac_grasp(tmp_path / "a.yaml", four, object_frame="a")
+    nameless = tried_set(np.random.default_rng(3), 25)
+    assert nameless.hand[0] == panda.hand[0] == "franka_hand"
+    SceneGrasps(sets=(panda, replace(nameless, instance=panda.instance + 1)))
+    with pytest.raises(InputError, match=r"franka_hand .*and robotiq_2f85"):
+        SceneGrasps(sets=(panda, replace(robotiq, instance=panda.instance + 1)))
+    other = json.loads(json.dumps(panda.parameters))
+    other["config"]["hand"]["digest"] = "0" * 64
+    with pytest.raises(InputError, match=r"franka_hand \(.{8}\) and franka_hand \(00000000\)"):
+        SceneGrasps(sets=(panda, replace(panda, instance=panda.instance + 1, parameters=other)))
