@@ -331,7 +331,7 @@ class Hand:
             began, ended = (np.arctan2(end[1], end[0]) + turn for turn in crank)
             angles = np.clip(QUARTERS, began[:, None], ended[:, None])
             circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-            extents.append(pivot + np.linalg.norm(end) * circle)
+            extents.append(pivot + float(np.linalg.norm(end)) * circle)
         points = np.concatenate(extents, axis=1)
         boxes = np.empty((len(inner), 2, 3))
         boxes[:, 0, 0], boxes[:, 1, 0] = -half_width, half_width

@@ -6,13 +6,17 @@ import pytest
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import find_hand
+from realsim.robots.robot_files import names_of
+from realsim_sim_bridge.grasping.antipodal import RaySurface
 from realsim_sim_bridge.grasping.candidates import (
     CandidateConfig,
     Surroundings,
     sample_candidates,
     standing_object,
 )
+from realsim_sim_bridge.grasping.force_closure import force_closure
 from realsim_sim_bridge.grasping.hand_free import boxes_free, lowest_corner
+from realsim_sim_bridge.grasping.pad_contacts import pad_heights
 from trimesh_solids import solid
 
 HAND = find_hand()
@@ -24,13 +28,13 @@ def box(x=0.05, y=0.05, z=0.05):
     return solid(trimesh.creation.box((x, y, z)))
 
 
-def candidates(mesh, height=0.025, seed=0, surroundings=None, limit=60):
+def candidates(mesh, height=0.025, seed=0, surroundings=None, limit=60, hand=HAND):
     return sample_candidates(
         mesh,
         se3.from_translation([0.0, 0.0, height]),
         surroundings or Surroundings(),
         CandidateConfig(surface_points=400),
-        HAND,
+        hand,
         np.random.default_rng(seed),
         limit,
     )
@@ -47,6 +51,30 @@ def test_contacts_lie_on_the_surface_and_inside_both_friction_cones():
         assert np.allclose(np.abs(contact).max(axis=1), 0.025, atol=1e-6)
         face = np.argmax(np.abs(contact), axis=1)
         assert np.all(np.abs(np.take_along_axis(y, face[:, None], 1)) >= np.sqrt(0.5) - 1e-6)
+
+
+@pytest.mark.parametrize("name", sorted(names_of("hand")))
+def test_every_hand_s_pads_close_on_the_contacts(name):
+    """The pads, where the law has them at that width, touch the faces; the linkage is free."""
+    hand, mesh = find_hand(name), box()
+    found = candidates(mesh, hand=hand)
+    assert len(found) > 20
+    depths = found.contact_depths_m - hand.z_pad(found.widths_m)
+    for depth in np.unique(depths.round(9)):
+        assert np.abs(np.array([0.0, 0.003, 0.006]) - depth).min() < 1e-9
+    closure = force_closure(
+        mesh, found.Ts_obj_grasp, found.openings_m, None, hand,
+        contact_depths_m=found.contact_depths_m,
+    )  # fmt: skip
+    width = np.linalg.norm(np.diff(closure.axis_contacts.points, axis=1)[:, 0], axis=-1)
+    np.testing.assert_allclose(width, found.widths_m, atol=1e-6)
+    surface = RaySurface(mesh)
+    heights = pad_heights(surface, found.Ts_obj_grasp, found.openings_m, hand)
+    facing = np.abs(found.Ts_obj_grasp[:, :3, 1]).max(axis=1) > 1 - 1e-9  # flat on both faces
+    np.testing.assert_allclose(heights[facing], hand.z_pad(found.widths_m[facing]), atol=1e-4)
+    corners = mesh.vertices
+    bars = hand.bar_boxes(found.widths_m)
+    assert boxes_free(bars, found.Ts_obj_grasp, corners, 0.0).all()
 
 
 def test_each_filter_s_counts_add_up_to_what_came_in():

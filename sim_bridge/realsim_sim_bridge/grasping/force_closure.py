@@ -311,9 +311,14 @@ def force_closure(
     center = mass_properties(mesh, 1.0).center_of_mass if center_of_mass is None else center_of_mass
     length = float(np.linalg.norm(hull_vertices(mesh.vertices) - center, axis=1).max())
     surface = RaySurface(mesh)
-    heights = pad_heights(surface, Ts, openings, geometry)
-    depths = heights if contact_depths_m is None else contact_depths_m
-    axis = pad_contacts(surface, along_approach(Ts, depths), openings, geometry, 1, 0.0)
+    if contact_depths_m is None:
+        heights = pad_heights(surface, Ts, openings, geometry)
+        axis = pad_contacts(surface, along_approach(Ts, heights), openings, geometry, 1, 0.0)
+    else:
+        at_depth = along_approach(Ts, contact_depths_m)
+        axis = pad_contacts(surface, at_depth, openings, geometry, 1, 0.0)
+        widths = np.linalg.norm(axis.points[:, 1] - axis.points[:, 0], axis=-1)
+        heights = geometry.z_pad(np.where(axis.both, widths, openings))
     needed = np.full(len(Ts), np.inf)
     needed[axis.both] = _needed_friction(axis.points[axis.both], axis.normals[axis.both])
 

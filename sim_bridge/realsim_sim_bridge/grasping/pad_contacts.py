@@ -10,7 +10,9 @@ from realsim.robots.hand import Hand, along_approach
 from realsim_sim_bridge.grasping.antipodal import RaySurface
 
 Array = NDArray[np.float64]
-ROUNDS = 8
+STEPS = 40
+RAYS = 3
+"""Steps in which a hand on an arc is closed to find where, and rays per side of a pad."""
 SQUARE_LEVER = 0.3826
 """Mean distance of a unit square's points from its middle."""
 
@@ -95,15 +97,20 @@ def pad_heights(
 ) -> Array:
     """Return z (N,) [m] of the pads' middles, grasp frame, when the hand has closed; 0 of a slide.
 
-    On an arc it depends on the width, and the width on where the pads meet: a few rounds settle it,
-    for the pads rise by less than they close. Where they meet nothing it is the open hand's.
+    On an arc it depends on the width, and the width on where the pads meet: the fingers are closed
+    in steps until what is between the pads is as wide. Where nothing is it stays the open
+    hand's.
     """
     heights = geometry.z_pad(openings_m)
     if not geometry.arc_radius_m:
         return heights
-    for _ in range(ROUNDS):
-        Ts = along_approach(Ts_obj_grasp, heights)
-        points = pad_contacts(surface, Ts, openings_m, geometry, 1, 0.0).points
-        widths = np.linalg.norm(points[:, 1] - points[:, 0], axis=-1)
-        heights = geometry.z_pad(np.where(np.isfinite(widths), widths, openings_m))
+    closing = np.ones(len(openings_m), dtype=np.bool_)
+    for share in np.linspace(1.0, 0.0, STEPS + 1):
+        k = np.flatnonzero(closing)
+        Ts = along_approach(Ts_obj_grasp[k], geometry.z_pad(share * openings_m[k]))
+        points = pad_contacts(surface, Ts, openings_m[k], geometry, RAYS, 0.0).points
+        widths = np.sum((points[:, 1] - points[:, 0]) * Ts[:, :3, 1], axis=-1)
+        met = widths >= (share - 1.0 / STEPS) * openings_m[k]
+        heights[k[met]] = geometry.z_pad(widths[met])
+        closing[k[met]] = False
     return heights
