@@ -80,11 +80,11 @@ def hand_poses(rng: np.random.Generator) -> tuple[Array, Array]:
     return np.array(hands), np.array(seen)
 
 
-def board_views(folder: Path) -> Path:
+def board_views(folder: Path, **header: str) -> Path:
     """Write what `realsim capture --board` leaves in a new session's folder; return that."""
     rng = np.random.default_rng(0)
     session = CaptureSession(name="lab", intrinsics=CAMERA, views=(), depth_unit_m=1e-4)
-    store = SessionStore.create(folder / "calibration/capture", session)
+    store = SessionStore.create(folder / "calibration/capture", session, header)
     depth = np.zeros((CAMERA.height, CAMERA.width), np.uint16)
     for k, (hand, T_cam_board) in enumerate(zip(*hand_poses(rng), strict=True)):
         view = View(index=k, T_base_ee=hand, time_s=float(k))
@@ -172,11 +172,15 @@ def refused(folder: Path, *options: str) -> str:
 def test_what_is_damaged_missing_or_said_twice_is_refused(lab: Path, tmp_path: Path) -> None:
     # What the board views say themselves is not said twice.
     assert "--board" in refused(lab, "--board", "aprilgrid:4x3,tag=40mm,gap=10mm")
+    assert "needs joint angles" in refused(lab, "--arm", "ur5")
     lost = Path(shutil.copytree(lab, tmp_path / "lost"))
     (lost / "manifest.jsonl").write_text("")
     assert "session.json" in refused(lost), "a session that lost its header is not one of a board"
     torn = Path(shutil.copytree(lab, tmp_path / "torn"))
     flip(torn / "calibration/capture/rgb/000003.png", 900)
     assert "rgb/000003.png" in refused(torn)
+    other = board_views(tmp_path / "other", arm="Panda")
+    text = refused(other, "--arm", "ur5e")
+    assert "captured with a Panda" in text and "is a UR5e" in text and "--arm Panda" in text
     (lab / "calibration/board.json").unlink()
     assert "realsim board" in refused(lab)

@@ -211,6 +211,10 @@ def test_another_plan_is_refused(tmp_path: Path, arm: KinematicArm) -> None:
     store = new_store(tmp_path / "s", "0" * 64)
     with pytest.raises(InputError, match="begun with the plan 000000000000"):
         capture(plan(), arm, TableCamera(arm), store)
+    session = store.session
+    other = SessionStore.create(tmp_path / "p", session, {"plan_hash": "0" * 64, "arm": "Panda"})
+    with pytest.raises(InputError, match="begun with a Panda, and this plan is for a UR5"):
+        capture(plan(), arm, TableCamera(arm), other)
     assert arm.path == []
 
 

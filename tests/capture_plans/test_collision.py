@@ -7,7 +7,7 @@ import pytest
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.robots.arm import UR5, UR5E, arm_of
+from realsim.robots.arm import UR5, UR5E, arm_of, find_arm
 from realsim.robots.coal_geometry import pinocchio_model
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box, Mount, Shape, WorkCell
@@ -171,6 +171,13 @@ MOUNTS = {
 def test_a_mount_that_runs_into_the_wrist_is_named(says: str) -> None:
     with pytest.raises(InputError, match=says):
         model(mount=MOUNTS[says])
+
+
+@pytest.mark.parametrize(("arm", "link"), [("panda", "flange"), ("iiwa14", "link 7")])
+def test_a_camera_inside_another_arms_wrist_is_named(arm: str, link: str) -> None:
+    inside = d405_mount(se3.from_translation([0.0, 0.0, -0.02]))
+    with pytest.raises(InputError, match=f"camera .* mm inside the {link}.*T_ee_cam"):
+        model(find_arm(arm).chain, inside)
 
 
 def test_a_table_through_the_shoulder_is_named() -> None:

@@ -68,6 +68,13 @@ def test_truth_survives_the_disk_and_knows_every_view(tmp_path):
     for a, b in zip(read.objects, lab.truth.objects, strict=True):
         np.testing.assert_allclose(a.T_world_obj, b.T_world_obj, atol=1e-15)
         assert (a.obj_id, a.instance) == (b.obj_id, b.instance)
+    assert read.chain.name == "UR5"
+    panda = SimulatedLab(LabConfig(seed=2, objects=ROD, arm="panda"))
+    q = panda.arm.state().joints
+    panda.write_truth(tmp_path / "P-truth", {0: q})
+    again = load_truth(tmp_path / "P-truth")
+    assert again.chain.joints == 7 and np.all(again.chain.delta_theta != 0)
+    np.testing.assert_array_equal(again.T_world_cam(q), panda.truth.T_world_cam(q))
     first = path.read_bytes()
     lab.write_truth(tmp_path / "S-truth", {7: Q, 3: Q + 0.1})
     assert path.read_bytes() == first

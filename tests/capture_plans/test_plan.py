@@ -8,10 +8,11 @@ import pytest
 
 from realsim.errors import DegenerateError, InputError
 from realsim.geometry import se3
-from realsim.robots.arm import UR5
+from realsim.robots.arm import UR5, find_arm
 from realsim_capture_plans.collision.model import CollisionModel, interpolate
 from realsim_capture_plans.collision.mount import d405_mount
 from realsim_capture_plans.planning.advise import advice, advise
+from realsim_capture_plans.planning.elbow import elbow_of, raised, reach_m
 from realsim_capture_plans.planning.make import calibration_plan, hemisphere_plan
 from realsim_capture_plans.planning.moves import detour
 from realsim_capture_plans.planning.ordering import move_seconds
@@ -38,17 +39,26 @@ def board_plan() -> CapturePlan:
     return calibration_plan(N, BOARD, d405_mount(), PlanConfig(), np.random.default_rng(1))
 
 
-@pytest.fixture(params=["scene_plan", "board_plan"])
+@pytest.fixture(scope="module")
+def panda_plan() -> CapturePlan:
+    """By an arm of seven joints, of which every pose leaves one free."""
+    config = PlanConfig(least_directions=40, elevation_deg=(40.0, 90.0), closer_rounds=2)
+    arm = find_arm("panda").chain
+    return hemisphere_plan(8, CENTER, d405_mount(), config, np.random.default_rng(1), chain=arm)
+
+
+@pytest.fixture(params=["scene_plan", "board_plan", "panda_plan"])
 def plan(request: pytest.FixtureRequest) -> CapturePlan:
     return request.getfixturevalue(request.param)
 
 
 def test_exactly_n_poses_that_follow_from_the_joints(plan: CapturePlan) -> None:
-    assert len(plan) == N
-    assert np.abs(UR5.forward(plan.joints) - plan.Ts_base_ee).max() < 1e-9
+    arm = plan.chain
+    assert len(plan) == (N if arm is UR5 else 8) and plan.joints.shape[1] == arm.joints
+    assert np.abs(arm.forward(plan.joints) - plan.Ts_base_ee).max() < 1e-9
     assert np.abs(plan.Ts_base_ee @ plan.mount.T_ee_cam - plan.Ts_base_cam).max() < 1e-12
-    assert np.all(UR5.limits.contains(plan.joints))
-    assert np.all(UR5.sigma_min(plan.joints) >= plan.config.sigma_min)
+    assert np.all(arm.limits.contains(plan.joints))
+    assert np.all(arm.sigma_min(plan.joints) >= plan.config.sigma_min)
 
 
 def test_every_move_keeps_the_clearance_on_a_finer_grid_than_planned(plan: CapturePlan) -> None:
@@ -62,7 +72,7 @@ def test_every_move_keeps_the_clearance_on_a_finer_grid_than_planned(plan: Captu
 
 
 def test_moves_join_up_and_metrics_are_theirs(plan: CapturePlan) -> None:
-    corners = [plan.move(k) for k in range(N)]
+    corners = [plan.move(k) for k in range(len(plan))]
     assert np.array_equal(corners[0][0], plan.home)
     for before, after in pairwise(corners):
         assert np.array_equal(before[-1], after[0])
@@ -147,8 +157,13 @@ def test_advice_prefers_the_places_that_reach_most() -> None:
 
 
 def test_too_few_reachable_views_say_how_many_and_what_to_do() -> None:
-    with pytest.raises(DegenerateError, match=r"only \d+ are reachable.*0\.30-0\.40"):
-        hemisphere_plan(24, [1.25, 0.4, 0.05], d405_mount(), PlanConfig(), np.random.default_rng(0))
+    # A small arm is told nearer places and radii that it reaches.
+    says = r"only \d+ are reachable.*for a UR3e .*--center 0\.[23]\d*,0,0\.05"
+    with pytest.raises(DegenerateError, match=says):
+        hemisphere_plan(
+            24, [1.25, 0.4, 0.05], d405_mount(), PlanConfig(), np.random.default_rng(0),
+            chain=find_arm("ur3e").chain,
+        )  # fmt: skip
     with pytest.raises(InputError, match="millimetres"):
         PlanConfig(radius_m=(280.0, 420.0))
 
@@ -169,6 +184,36 @@ def test_a_detour_is_found_round_the_keep_out_box(scene_plan: CapturePlan) -> No
     assert np.all(model.edges_free(corners[:-1], corners[1:], config.edge_step_rad))
     again = detour(first, last, scene_plan.home, model, config, np.random.default_rng(2))
     assert np.array_equal(via, again)
+
+
+@pytest.mark.parametrize(
+    ("name", "elbow", "stretched"),
+    [("ur5", 2, 0.0), ("ur10e", 2, 0.0), ("iiwa14", 3, 0.0), ("panda", 3, -0.467)],
+)
+def test_an_elbow_is_found_where_the_arm_is_longest(
+    name: str, elbow: int, stretched: float
+) -> None:
+    chain = find_arm(name).chain
+    found = elbow_of(chain)
+    assert found is not None and found[0] == elbow
+    assert found[1] == pytest.approx(stretched, abs=1e-3)
+    q = np.random.default_rng(0).uniform(-1, 1, (20, chain.joints))
+
+    def lengths(q: np.ndarray) -> np.ndarray:
+        frames = chain.link_frames(q)[..., :3, 3]
+        return np.linalg.norm(frames[:, -3] - frames[:, 1], axis=-1)
+
+    q[:, elbow] = stretched
+    longest, tall = lengths(q), raised(chain, q)
+    assert np.allclose(longest, reach_m(chain), atol=1e-6)
+    for step in (-0.05, 0.05):
+        other, lower = q.copy(), tall.copy()
+        other[:, elbow] += step
+        lower[:, 1] += step
+        assert np.all(lengths(other) < longest)
+        assert np.all(
+            chain.link_frames(lower)[:, -3, 2, 3] < chain.link_frames(tall)[:, -3, 2, 3] + 1e-9
+        )
 
 
 @pytest.mark.slow

@@ -119,6 +119,14 @@ def test_a_plan_of_another_robot_is_named(tmp_path: Path) -> None:
     assert "those of a UR5" in text
 
 
+def test_joints_of_another_arm_are_named(tmp_path: Path) -> None:
+    def one_more(data: dict[str, Any]) -> None:
+        data["content"]["joints"][2].append(0.0)
+
+    text = refused(rewritten(a_plan(), one_more), tmp_path / "p.json")
+    assert "view 2 has 7 joint angles" in text and "a UR5, has 6 joints" in text
+
+
 def test_degrees_and_millimetres_are_named(tmp_path: Path) -> None:
     path = tmp_path / "p.json"
 

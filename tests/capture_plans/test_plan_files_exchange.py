@@ -3,6 +3,7 @@
 import json
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from realsim.errors import InputError, UnitError
 from realsim.formats.graspnet.cameras import read_camera_poses
 from realsim.geometry import se3
-from realsim.robots.arm import UR5, UR5E
+from realsim.robots.arm import UR5, UR5E, find_arm
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box
 from realsim_capture_plans.collision.mount import d405_mount
@@ -26,8 +27,13 @@ from realsim_capture_plans.plan_files.imported import (
     import_plan,
 )
 from realsim_capture_plans.plan_files.joint_paths import read_path
-from realsim_capture_plans.plan_files.plan_json import load_plan
-from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
+from realsim_capture_plans.plan_files.plan_json import load_plan, save_plan
+from realsim_capture_plans.planning.record import (
+    CapturePlan,
+    PlanConfig,
+    plan_content,
+    plan_of,
+)
 
 HOME = np.array([0.1, -1.6, 1.7, -1.7, -1.5, 0.3])
 CENTER = np.array([0.37, 0.02, 0.05])
@@ -133,6 +139,29 @@ def test_urscript_drives_the_same_corners_and_nothing_else(tmp_path: Path) -> No
     views = re.findall(r'sleep\(([\d.]+)\)\n  textmsg\("realsim view ", (\d+)\)', text)
     assert [int(k) for _, k in views] == list(range(len(plan)))
     assert "r=" not in text and "e-" not in "".join(m[0] for m in moves)
+
+
+def test_a_seven_joint_plan_goes_out_and_comes_back(tmp_path: Path) -> None:
+    arm = find_arm("panda")
+    rng = np.random.default_rng(0)
+    plan = replace(
+        a_plan(), chain=arm.chain, home=arm.home, vias=(),
+        joints=arm.home + rng.normal(0, 0.1, (9, 7)),
+    )  # fmt: skip
+    save_plan(plan, tmp_path / "p.json")
+    assert load_plan(tmp_path / "p.json").content_hash == plan.content_hash
+    export_csv(plan, tmp_path / "p.csv")
+    back = import_plan(tmp_path / "p.csv", chain=plan.chain, mount=MOUNT, center=CENTER)
+    assert np.array_equal(back.joints, plan.joints) and np.array_equal(back.home, plan.home)
+    with pytest.raises(InputError, match=r"7 joint angles in a row, and a UR5 has 6.*Panda"):
+        import_plan(tmp_path / "p.csv", chain=UR5, mount=MOUNT, center=CENTER)
+    with pytest.raises(InputError, match=r"URScript drives Universal.*Panda.*\.csv"):
+        export_urscript(plan, tmp_path / "p.script")
+    # Only a flange that stands off the last DH frame is written: files of a UR stay as they were.
+    far = replace(arm.chain, T_n_ee=se3.from_translation([0.0, 0.0, 0.1]))
+    content = plan_content(replace(plan, chain=far))
+    assert "T_base_0" not in content["dh"] and "T_n_ee" not in plan_content(plan)["dh"]
+    assert np.array_equal(plan_of(content).chain.T_n_ee, far.T_n_ee)
 
 
 def test_graspnet_poses_come_back(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from realsim_capture_plans.lab import truth as lab_truth
 from realsim_capture_plans.lab.devices import SimulatedArm, SimulatedDepthCamera
 from realsim_capture_plans.lab.placement import CrowdedError, PlacementConfig, place_objects
 from realsim_capture_plans.lab.truth import LabConfig, LabTruth
+from realsim_capture_plans.planning.advise import LONG_ARM_M
 from realsim_capture_plans.planning.elbow import reach_m
 
 if TYPE_CHECKING:
@@ -37,11 +38,8 @@ BOARD_HEIGHT_M = 0.005
 BOARD_TILT_DEG = 0.5
 """Angle by which the plate rocks on the table [deg]."""
 TABLE_CENTER = (0.45, 0.0)
-"""Middle of the work space in base [m]: where arms of `LONG_ARM_M` reach most of a hemisphere;
-before a shorter arm it lies nearer."""
-LONG_ARM_M = 0.65
-"""From shoulder to wrist of an arm that is as long as any needs to be here [m]: a Panda has 0.70, a
-UR5 0.82."""
+"""Middle of the work space in base [m]: where most arms reach most of a hemisphere; before an
+arm shorter than `LONG_ARM_M` it lies nearer."""
 TABLE_SIZE_M = (1.3, 1.5, 0.03)
 """Slab of the table: depth, width, thickness [m]."""
 SINGLE_SURFACE_MESHES = ("bunny", "blob_033")

@@ -5,6 +5,7 @@ a height of the table; obstacles and the table's outline are left to the plan it
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from realsim.errors import InputError
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Mount
 from realsim_capture_plans.collision.model import CollisionModel
-from realsim_capture_plans.planning.elbow import bend
+from realsim_capture_plans.planning.elbow import bend, reach_m
 from realsim_capture_plans.planning.record import PlanConfig
 from realsim_capture_plans.planning.view_quality import hole_deg
 from realsim_capture_plans.planning.viewpoints import (
@@ -38,6 +39,15 @@ DIRECTIONS = 400
 """Directions tried per place: shares to 1 %, holes to 1 degree."""
 POSES = 16
 """Camera poses tried per direction."""
+LONG_ARM_M = 0.65
+"""Before an arm that reaches less from shoulder to wrist [m] nearer places are tried."""
+QUICK_DIRECTIONS, QUICK_POSES = 60, 6
+"""The same of a quick look at where else the scene might be."""
+QUICK_DISTANCES_M = (0.32, 0.40, 0.50)
+RADIUS_SHARES = (1.0, 0.8, 0.65)
+"""Shares of the radii that a quick look tries: the greatest that suffices is proposed."""
+SUFFICES = 0.9
+"""Share of the best place's directions with which greater radii are as good."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -63,7 +73,7 @@ def advise(
     n: int,
     aim_height_m: float,
     *,
-    distances_m: Sequence[float] = DISTANCES_M,
+    distances_m: Sequence[float] | None = None,
     lifts_m: Sequence[float] = LIFTS_M,
     tick: Callable[[int, int], None] | None = None,
 ) -> list[Placement]:
@@ -75,7 +85,8 @@ def advise(
         config: radii, elevations, clearances, and the table's height now.
         n: number of views planned.
         aim_height_m: of the scene's centre above the table [m].
-        distances_m: from the base's axis to the scene's centre.
+        distances_m: from the base's axis to the scene's centre; None are `DISTANCES_M`, nearer
+            before a short arm.
         lifts_m: added to the table's height.
         tick: called with (places tried, places).
 
@@ -84,13 +95,60 @@ def advise(
     """
     if n < 1:
         raise InputError(f"places for {n} views were asked for; at least 1 view is needed.")
-    places = [(x, config.table_height_m + lift) for lift in lifts_m for x in distances_m]
+    tried = _within_reach(DISTANCES_M, chain) if distances_m is None else distances_m
+    places = [(x, config.table_height_m + lift) for lift in lifts_m for x in tried]
     found: list[Placement] = []
     for k, (x, height) in enumerate(places):
         found.append(_placement(chain, mount, config, n, (x, 0.0, height + aim_height_m), height))
         if tick is not None:
             tick(k + 1, len(places))
     return sorted(found, key=lambda p: (round(p.one_elbow_hole_deg), p.hole_deg))
+
+
+def _within_reach(distances_m: Sequence[float], chain: DhChain) -> list[float]:
+    share = min(1.0, reach_m(chain) / LONG_ARM_M)
+    return [round(share * x, 3) for x in distances_m]
+
+
+def better_place(chain: DhChain, mount: Mount, config: PlanConfig, aim_height_m: float) -> str:
+    """Return in a sentence where more views of a scene are reachable, by a quick look.
+
+    Args:
+        chain: the arm.
+        mount: the camera on the flange.
+        config: radii, elevations, clearances, the table's height.
+        aim_height_m: of the scene's centre above the table [m].
+    """
+    found: list[tuple[Placement, PlanConfig]] = []
+    for share in RADIUS_SHARES:
+        near, far = config.radius_m
+        smaller = replace(config, radius_m=(round(share * near, 3), round(share * far, 3)))
+        for x in _within_reach(QUICK_DISTANCES_M, chain):
+            center = (x, 0.0, config.table_height_m + aim_height_m)
+            with suppress(InputError):  # the keep-out box would reach into the arm
+                here = _placement(
+                    chain, mount, smaller, 1, center, config.table_height_m, QUICK_DIRECTIONS,
+                    QUICK_POSES,
+                )  # fmt: skip
+                found.append((here, smaller))
+    most = max((place.reachable_share for place, _ in found), default=0.0)
+    if most == 0.0:
+        return (
+            f"With the mount '{mount.name}' a {chain.name} reaches no view of a scene in front of "
+            f"it on a table at z = {config.table_height_m:g} m: check --table-height and --mount."
+        )
+    good = [one for one in found if one[0].reachable_share >= SUFFICES * most]
+    place, smaller = max(good, key=lambda one: (one[1].radius_m, one[0].reachable_share))
+    x, _, z = place.center
+    radius = (
+        ""
+        if smaller.radius_m == config.radius_m
+        else f" with --radius {smaller.radius_m[0]:g},{smaller.radius_m[1]:g}"
+    )
+    return (
+        f"A {chain.name} reaches about {100 * place.reachable_share:.0f} % of the directions at "
+        f"--center {x:g},0,{z:g}{radius}; `realsim plan --advise` looks more closely."
+    )
 
 
 def _placement(
@@ -100,6 +158,8 @@ def _placement(
     n: int,
     center: tuple[float, float, float],
     table_height_m: float,
+    least_directions: int = DIRECTIONS,
+    poses_each: int = POSES,
 ) -> Placement:
     """Return what can be seen of a scene at one place."""
     x0, *rest = config.table_rectangle_m
@@ -110,11 +170,11 @@ def _placement(
         config, table_height_m=table_height_m, table_rectangle_m=(x0, rest[0], rest[1], rest[2])
     )
     model = CollisionModel(chain, mount, here.work_cell(center, "hemisphere"), here.clearance_m)
-    count = max(DIRECTIONS, n)
+    count = max(least_directions, n)
     directions = np.concatenate(
         [golden_cap(count, here.elevation_deg), cap_rim(count, here.elevation_deg)]
     )
-    poses, item = hemisphere_poses(center, directions, here.radius_m, POSES, 0.0)
+    poses, item = hemisphere_poses(center, directions, here.radius_m, poses_each, 0.0)
     found = reachable(poses, item, mount.T_ee_cam, model, here.sigma_min)
     one_side = found.where(bend(chain, found.joints) * better_elbow(found, chain) > 0)
     holes: list[float] = []

@@ -19,6 +19,7 @@ from realsim.robots.arm import UR5
 from realsim.robots.inverse import CLOSED, held_joint
 from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Box, Mount
+from realsim_capture_plans.planning.advise import better_place
 from realsim_capture_plans.planning.elbow import bend
 from realsim_capture_plans.planning.metrics import plan_metrics
 from realsim_capture_plans.planning.moves import NoFreeMoveError, connect
@@ -215,17 +216,18 @@ def calibration_plan(  # noqa: PLR0913 - a plan's own facts, one by one
 
 
 def _too_few(task: PlanTask, n: int, reachable_count: int, tried: int) -> str:
-    c = task.config
+    c, chain = task.config, task.model.chain
     x, y, z = task.center.tolist()
+    elsewhere = better_place(chain, task.mount, c, max(0.0, z - c.table_height_m))
     if task.kind == "hemisphere":
         asked = f"radii {c.radius_m} m, elevations {c.elevation_deg} deg"
     else:
         asked = f"distances {c.board_distance_m} m, tilts to {c.board_tilt_deg} deg"
     return (
         f"{n} views were asked for, but of {tried} tried about ({x:.3f}, {y:.3f}, {z:.3f}) m only "
-        f"{reachable_count} are reachable and free ({asked}). Bring the centre to 0.30-0.40 m in "
-        "front of the base, allow smaller radii or distances, raise the least elevation, or make "
-        "the keep-out box smaller."
+        f"{reachable_count} are reachable and free for a {chain.name} ({asked}). {elsewhere} Else "
+        "allow smaller radii or distances, raise the least elevation, or make the keep-out box "
+        "smaller."
     )
 
 

@@ -94,7 +94,14 @@ def read_board_views(
             )
         )
         tick(k + 1, len(views))
-    return seen, target, arm_of(seen, taken_with) if named is None else named.bare()
+    if named is None:
+        return seen, target, arm_of(seen, taken_with)
+    if any(view.joints is None for view in seen):
+        raise InputError(
+            f"--arm {arm} needs joint angles with every view; those of '{views_store.folder}' have "
+            "none. Leave --arm out."
+        )
+    return seen, target, named.bare()
 
 
 def arm_of(views: Sequence[BoardView], name: str = "") -> DhArm | None:

@@ -18,6 +18,7 @@ from realsim.robots.kinematics import DhChain
 from realsim.robots.shapes import Mount
 from realsim.untrusted.json_text import read_json
 from realsim_capture_plans.plan_files.evidence import JointUnit
+from realsim_capture_plans.planning.advise import better_place
 from realsim_capture_plans.planning.metrics import METRIC_MEANINGS, goal_of, plan_metrics
 from realsim_capture_plans.planning.record import CapturePlan, PlanConfig
 
@@ -42,6 +43,8 @@ LOOKING_BACK = -0.2
 """Cosine between optical axis and tool z below which a camera looks back."""
 NO_PLAN_DEG = 180.0
 """The advice's hole where a place has fewer reachable views than were asked for [deg]."""
+LEAST_SHARE = 0.75
+"""A plan that reaches less of the directions is told where it would reach more."""
 NAMED_LEGS = 12
 """Colliding pieces of moves that are printed one by one."""
 Progress = Callable[[str, int, int], None]
@@ -69,6 +72,12 @@ def run_plan(request: PlanRequest, console: Console, *, advise: bool) -> bool:
     save_plan(plan, out)
     show_plan(plan, plan.metrics, console)
     free = show_colliding(plan, console)
+    if plan.kind == "hemisphere" and plan.metrics["reachable_share"] < LEAST_SHARE:
+        above = float(plan.center_world[2]) - config.table_height_m
+        console.warn(
+            f"only {100 * plan.metrics['reachable_share']:.0f} % of the directions are reachable "
+            f"from here: the views leave one side out. {better_place(chain, mount, config, above)}"
+        )
     console.say(f"plan: {out}")
     files: list[Path] = []
     if pictures:
