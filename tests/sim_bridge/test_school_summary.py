@@ -198,3 +198,22 @@ def test_objects_of_one_number_and_other_meshes_are_different_objects():
         for mesh in ("one", "other", "one")
     ]
     assert summarise({"a": sets[:1], "b": sets[1:2], "c": sets[2:]}).objects == 2
+
+
+def test_hands_are_compared_on_the_objects_that_all_of_them_tried():
+    rng = np.random.default_rng(1)
+
+    def tried(hand, obj_id, n):
+        of = {"config": {"hand": {"name": hand, "digest": ""}}}
+        return dataclasses.replace(scored_set(rng, n, obj_id=obj_id), parameters=of)
+
+    franka = [tried("franka_hand", i, 30) for i in (1, 2)]
+    robotiq = [tried("robotiq_2f85", i, 20) for i in (2, 3)]
+    assert summarise({"a": franka}).hands == ()
+    found = summarise({"a": franka, "b": robotiq})
+    assert [(h.hand, h.objects) for h in found.hands] == [("franka_hand", 1), ("robotiq_2f85", 1)]
+    for h, s in zip(found.hands, (franka[1], robotiq[0]), strict=True):
+        scores = s.scores[~np.isnan(s.scores)]
+        assert (h.judged, h.good) == (len(scores), int(np.sum(scores >= 0.5)))
+        assert h.score == pytest.approx(scores.mean())
+    assert any(name.startswith("robotiq_2f85, on the 1 objects") for name, _, _ in found.to_rows())

@@ -100,6 +100,9 @@ def rows_of(summary: "SchoolSummary") -> list[tuple[str, str, str]]:
         if count:
             failed = "no stage" if stage == "none" else stage
             rows.append((f"  penalized, failed first: {failed}", here(count), NOTHING))
+    for h in summary.hands:
+        on = f"{h.hand}, on the {h.objects} objects of all hands: good, mean score"
+        rows.append((on, f"{_counted(h.good, h.judged)}, {_number(h.score)}", NOTHING))
     return rows + _measured_rows(summary)
 
 
@@ -163,6 +166,19 @@ class Spread:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
+class HandResult:
+    """One hand on the objects that every hand has tried."""
+
+    hand: str
+    objects: int
+    judged: int
+    """Candidates with a score."""
+    good: int
+    score: float
+    """Mean of those; NaN of none."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
 class SchoolSummary:
     """What became of all candidates."""
 
@@ -183,6 +199,8 @@ class SchoolSummary:
     per_object: dict[str, Spread]
     per_scene: dict[str, Spread]
     """Numbers of candidates, good and bad ones: of an object over all scenes, and of a scene."""
+    hands: tuple["HandResult", ...] = ()
+    """Where grasps of several hands are summed up: each hand on the objects that all have tried."""
     correlations: tuple[RankCorrelation, ...] = ()
     closures: tuple[ClosureConfusion, ...] = ()
 
@@ -266,6 +284,7 @@ def summarise(
         score_bad=_spread(scored[~is_good]).mean,
         per_object=_numbers(list(by_object.values())),
         per_scene=_numbers(list(by_scene.values())),
+        hands=_hands_on_same_objects(by_object),
         correlations=rank_correlations(sets, rng or np.random.default_rng(0)),
         closures=closure_confusions(sets),
     )
@@ -279,6 +298,27 @@ def _identity(s: GraspSet) -> tuple[str, ...]:
     inputs: Any = s.parameters.get("inputs")
     mesh: Any = inputs.get("mesh") if isinstance(inputs, dict) else None
     return (str(s.obj_id), str(mesh))
+
+
+def _hands_on_same_objects(
+    by_object: Mapping[tuple[str, ...], Sequence[GraspSet]],
+) -> tuple[HandResult, ...]:
+    """Return each hand's results on the objects that all hands have tried; nothing of one hand."""
+    names = sorted({s.hand[0] for sets in by_object.values() for s in sets})
+    if len(names) < 2:
+        return ()
+    shared = [sets for sets in by_object.values() if {s.hand[0] for s in sets} == set(names)]
+    results: list[HandResult] = []
+    for name in names:
+        scores = _joined([s.scores for sets in shared for s in sets if s.hand[0] == name])
+        scores = scores[~np.isnan(scores)]
+        results.append(
+            HandResult(
+                hand=name, objects=len(shared), judged=len(scores),
+                good=int(np.sum(scores >= GOOD_FROM)), score=_spread(scores).mean,
+            )
+        )  # fmt: skip
+    return tuple(results)
 
 
 def outcomes_of(s: GraspSet) -> NDArray[np.int64]:
