@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -168,3 +169,17 @@ def test_a_gripper_that_is_not_in_the_package_is_described_proven_and_simulated(
 ) -> None:
     wrong = play(GRIPPER, tmp_path)
     assert not wrong, "\n\n".join(wrong)
+
+
+@pytest.mark.slow
+def test_an_arm_that_is_not_in_the_package_is_proven_planned_for_and_captured_with(
+    tmp_path: Path,
+) -> None:
+    robots = Path("examples/robots")
+    shutil.copytree(ROOT / robots, tmp_path / robots)
+    wrong = play(ROOT / "docs/how-to/your-own-arm.md", tmp_path)
+    assert not wrong, "\n\n".join(wrong)
+    header = json.loads((tmp_path / "own/session.json").read_text())
+    assert header["extra"]["arm"] == "SixJoint"
+    plan = json.loads((tmp_path / "own.json").read_text())["content"]
+    assert plan["robot"] == "SixJoint" and plan["metrics"]["colliding_legs"] == 0
