@@ -16,8 +16,9 @@ from realsim.formats.grasps.parquet import read_grasps_parquet
 from realsim.geometry import se3
 from realsim.geometry.parts import part
 from realsim.records import ObjectPose, Scene
+from realsim.robots.hand import find_hand
 from realsim.store import SessionStore, load_grasps, save_scene
-from school_sessions import GRASPS, QUICK, T_WORLD_TABLE, refused, run, scene
+from school_sessions import GRASPS, QUICK, T_WORLD_TABLE, refused, registered, run, scene
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[3] / "shared/data"))
 GRASPIT = DATA / "school/graspit_assets/scene.yaml"
@@ -68,8 +69,32 @@ def test_a_second_run_computes_nothing_and_other_parameters_are_refused(
     assert after == before
     message = refused(folder, *QUICK, "--friction", "0.5")
     assert "friction: 1.0 -> 0.5" in message and "--restart" in message
+    message = refused(folder, *QUICK, "--hand", "parallel")
+    assert 'hand.name: "franka_hand" -> "parallel"' in message
+    message = refused(folder, *QUICK, "--hand", "parallel", "--force", "200")
+    assert "is more than A plain parallel gripper (parallel) can: 1 to 140 N" in message
     again = run(folder, *QUICK, "--friction", "0.5", "--restart")
     assert again.exit_code == 0 and "friction 0.5" in again.output
+
+
+@pytest.mark.slow
+def test_a_hand_on_an_arc_goes_from_the_scene_to_the_exports(tmp_path: Path) -> None:
+    """The pads meet where the contacts are, the set keeps the hand, the exports speak of it."""
+    folder = registered(tmp_path / "s")
+    assert run(folder, *QUICK, "--hand", "robotiq_2f85").exit_code == 0
+    hand = find_hand("robotiq_2f85")
+    sets = stored_grasps(folder)[0].sets
+    assert any(s.good.any() for s in sets)
+    for s in sets:
+        assert s.hand == (hand.name, hand.digest)
+        assert s.parameters["config"]["slip"]["physics"]["friction"] == hand.friction
+        back = np.sum((s.Ts_obj_grasp - s.Ts_obj_pads)[:, :3, 3] * s.Ts_obj_grasp[:, :3, 2], axis=1)
+        assert back == pytest.approx(-hand.z_pad(s.widths_m), abs=1e-12)
+    for target in ("isaac", "graspgen", "hdf5", "parquet"):
+        assert run("export", folder, "--to", target, "--out", tmp_path / target).exit_code == 0
+    assert "Panda's hand alone" in refused(
+        "export", folder, "--to", "acronym", "--out", tmp_path / "acronym"
+    )
 
 
 @pytest.mark.slow

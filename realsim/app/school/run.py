@@ -73,7 +73,7 @@ def _require_force(hand: "Hand", force_n: float) -> None:
     """Raise if a hand cannot press so hard."""
     if force_n > hand.greatest_force_n:
         raise InputError(
-            f"--force {force_n:g} N is more than the {hand.title} can: "
+            f"--force {force_n:g} N is more than {hand.title} ({hand.name}) can: "
             f"{hand.least_force_n:g} to {hand.greatest_force_n:g} N. Give another force, or a "
             "hand of your own whose robot.toml says more."
         )
