@@ -164,8 +164,12 @@ def _folder(name: str, kind: Kind) -> Path:
                 "`realsim robots` lists those that are found by name."
             )
         return given
-    for known, path in names_of(kind).items():
+    there_are = names_of(kind)
+    for known, path in there_are.items():
         if same_name(known, name):
+            return path
+    for path in there_are.values():  # plans and sessions keep the name that the file says
+        if same_name(str(read_toml(path / FILE)[1].get("name")), name):
             return path
     raise InputError(f"there is no {kind} '{name[:80]}'. {_known(kind)}")
 

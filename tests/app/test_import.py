@@ -21,9 +21,11 @@ from realsim.app.importing.source import (
 from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.records import CaptureSession
+from realsim.robots.arm import find_arm
 from realsim.store import SessionStore
 from sources_in_memory import CAMERA, Recording, frame_of, ten
 from typed_commands import realsim
+from written_bags import recorded, stamp
 
 DATA = Path(os.environ.get("REALSIM_DATA", Path(__file__).parents[2] / "../shared/data"))
 QUIET = Console(quiet=True)
@@ -145,6 +147,41 @@ def test_a_folder_with_camera_and_poses(tmp_path):
     view = SessionStore.open(tmp_path / "c").session.views[2]
     assert view.T_base_ee is None
     np.testing.assert_allclose(view.T_world_cam, frame_of(2).T_base_ee, atol=1e-9)
+
+
+def test_seven_joints_come_too_and_are_the_named_arms(tmp_path):
+    folder = make_folder(tmp_path / "in")
+    file = folder / "poses/robot.txt"
+    header, *rows = file.read_text().splitlines()
+    q = {row.split()[0]: np.arange(7) / 10 + k for k, row in enumerate(rows)}
+    lines = [f"{row} {' '.join(map(str, q[row.split()[0]]))}" for row in rows]
+    names = " ".join(f"q{k + 1}_rad" for k in range(7))
+    file.write_text("\n".join([f"{header} {names}", *lines]) + "\n")
+    request = ImportRequest(source=folder, depth_unit=0.001, depth_coding="plain", arm="panda")
+    summary = run_import(request, tmp_path / "s", QUIET)
+    assert summary.with_joints == 6
+    for v in SessionStore.open(tmp_path / "s").session.views:
+        np.testing.assert_allclose(v.joints, q[f"rgb_{v.index:03d}.png"])
+    with pytest.raises(InputError, match=r"7 joint angles.*--arm ur5, a UR5, has 6.*Panda"):
+        open_source(replace(request, arm="ur5"), QUIET)
+
+
+def test_a_recordings_joints_are_those_of_the_named_arm(tmp_path):
+    called = find_arm("panda").joint_names
+    q = np.linspace(-1.0, 1.0, 7)
+
+    def panda(bag) -> None:
+        for k in range(3):
+            for d in (-5, 5):
+                bag.joints(q + k, stamp(k) + d * 10**6, prefix="left_", called=called)
+
+    sent = recorded(tmp_path, n=3, joints=False, change=panda)
+    request = ImportRequest(source=sent.path, arm="panda")
+    frames = list(open_source(request, QUIET).frames())
+    assert np.allclose([f.joints for f in frames], [q, q + 1, q + 2])
+    plain = open_source(replace(request, arm=None), QUIET)
+    assert next(plain.frames()).joints is None
+    assert any("shoulder_pan_joint" in note and "--arm" in note for note in plain.notes)
 
 
 def test_poses_are_read_as_said_or_not_at_all(tmp_path):

@@ -138,6 +138,9 @@ def test_an_arm_of_ones_own_needs_no_code(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setenv(VARIABLE, str(folder.parent))
     assert "one_of_six" in names_of("arm")
     assert find_arm("One-of-Six").name == "six"
+    # Plans and sessions keep the name that stands in the file: it is found by that, too.
+    monkeypatch.setattr("realsim.robots.arm._found", {})
+    assert find_arm("six").folder.name == "one_of_six"
 
 
 def test_an_mjcf_is_read_as_the_urdf_of_the_same_arm(tmp_path: Path) -> None:

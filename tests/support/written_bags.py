@@ -93,9 +93,12 @@ class Bag:
         )  # fmt: skip
         self.messages.append((t, topic, message))
 
-    def joints(self, q: Any, t: int, dq: Any = None, prefix: str = "", receive: int = 0) -> None:
-        order = sorted(range(6), key=lambda i: UR_JOINTS[i])  # as the driver: by the alphabet
-        names = [prefix + UR_JOINTS[i] for i in order]
+    def joints(
+        self, q: Any, t: int, dq: Any = None, prefix: str = "", receive: int = 0,
+        called: Sequence[str] = UR_JOINTS,
+    ) -> None:  # fmt: skip
+        order = sorted(range(len(called)), key=lambda i: called[i])  # as drivers: by the alphabet
+        names = [prefix + called[i] for i in order]
         velocity = np.zeros(0) if dq is None else np.asarray(dq, float)[order]
         message = self.t["sensor_msgs/msg/JointState"](
             self.header(t, ""), names, np.asarray(q, float)[order], velocity, np.zeros(0)
