@@ -31,6 +31,7 @@ from school_cases import (
 )
 
 from realsim.formats.grasps.scene_grasps import executed
+from realsim_sim_bridge.arm.reach_config import PANDA, chosen_arm
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.object_task import candidates_of, chance_of, reach_of
 from realsim_sim_bridge.school.school import run_school
@@ -190,6 +191,8 @@ def _warm_up() -> None:
 # the joints over time of all four stages where the arm gets there.
 
 
+ARMS = (PANDA, "ur5", "iiwa14", "xarm6")
+"""Arms that plan: two of seven joints, one with a closed form, one without."""
 PLANNED, PLANNED_QUICK = 220, 120
 """Grasps per object that are planned; the paper has 220."""
 
@@ -211,7 +214,7 @@ def _rates(job: tuple[int, Path, bool]) -> Found:
     found = Found()
     total = _stepped(school_case(seed, keep, quick), config)
     turned, above = total["turned"], total["turned"] - total["hand_in_table"]
-    sample_s, plan_s = total["sample_s"], total["plan_s"]
+    sample_s = total["sample_s"]
     found.add(
         "candidates_per_s",
         turned / sample_s,
@@ -222,12 +225,16 @@ def _rates(job: tuple[int, Path, bool]) -> Found:
         above / sample_s,
         f"the {above:.0f} that are not stopped by the table; {total['free']:.0f} are free",
     )
-    found.add(
-        "plans_per_s",
-        total["plans"] / plan_s,
-        f"{total['plans']:.0f} grasps, {total['reachable']:.0f} reached, with joints over time; "
-        f"{total['planned']:.0f} round obstacles",
-    )
+    for arm in ARMS:
+        chosen = replace(config, reach=replace(config.reach, arm=chosen_arm(arm)))
+        _stepped(two_boxes(), chosen, objects=1)
+        mine = total if arm == PANDA else _stepped(school_case(seed, keep, quick), chosen)
+        found.add(
+            "plans_per_s" if arm == PANDA else f"plans_per_s_{arm}",
+            mine["plans"] / mine["plan_s"],
+            f"{mine['plans']:.0f} grasps, {mine['reachable']:.0f} reached, with joints over time; "
+            f"{mine['planned']:.0f} round obstacles",
+        )
     return found
 
 

@@ -14,8 +14,10 @@ from realsim.records import ObjectModel
 from realsim.records.trajectories import PHASES
 from realsim.robots.hand import find_hand
 from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm, home_joints
+from realsim_sim_bridge.demonstrations.lerobot_episodes import LeRobotDemonstrations
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of
-from school_sessions import registered, run
+from realsim_sim_bridge.demonstrations.source import DemonstrationSource
+from school_sessions import refused, registered, run
 
 WEAK = ("--engine", "mujoco", "--grasps", "8", "--workers", "1", "--quiet", "--force", "4",
         "--friction", "0.3")  # fmt: skip
@@ -168,3 +170,32 @@ def test_arm_and_hand_are_drawn_where_the_kinematics_have_them(
         motion.Ts_world_link[:, 9, :3, 3] - motion.Ts_world_link[:, 10, :3, 3], axis=1
     )
     np.testing.assert_allclose(apart, motion.opening_m, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_ur5_with_another_hand_is_tried_replayed_drawn_exported_and_not_mixed(
+    tmp_path: Path,
+) -> None:
+    folder = registered(tmp_path / "session")
+    arm = ("--arm", "ur5", "--hand", "parallel")
+    result = run("run", folder, *(w for w in WEAK if w != "--quiet"), *arm)
+    assert result.exception is None, result.output
+    grasps, models = stored_grasps(folder)
+    reach = school_config_of(grasps.sets[0]).reach
+    assert (reach.arm.name, len(reach.arm.digest)) == ("ur5", 64)
+    for index, (instance, row) in enumerate(attempts(grasps)[:2]):
+        motion = SessionMotions.of_session(folder).motion(instance, row)
+        assert motion is not None and not any(FIXED_IN_HAND in n for n in motion.notes)
+        assert motion.arm_links == len(motion.link_meshes) > 6  # the UR5's own bodies
+        moved = np.ptp(motion.Ts_world_link[..., :3, 3], axis=0).max(axis=1)
+        assert moved[0] == 0.0 and moved.max() > 0.2, index
+    source = DemonstrationSource(grasps, models)
+    episodes = LeRobotDemonstrations(source, "ur5", (0,))
+    names = episodes.features["action"].names
+    assert episodes.robot_type == "ur5" and names is not None and len(names) == 6 + 1
+    assert episodes.features["observation.state"].names == (*names[:-1], "opening")
+    assert source[0].motion.joints_rad.shape[1] == 6
+    assert source[0].step(0).look("front").std() > 10
+    message = refused("run", folder, *WEAK, "--hand", "parallel")
+    assert 'config.reach.arm.name: "ur5" -> "panda"' in message
+    assert "no arm 'puma'" in refused("run", folder, *WEAK, "--arm", "puma")

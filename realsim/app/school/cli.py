@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from realsim.app.command import Command, Group
-from realsim.app.options import FOLDER, JSON, QUIET, json_file, seed, workers
+from realsim.app.options import FOLDER, JSON, QUIET, arm, json_file, seed, workers
 from realsim.app.outputs import GOES_ON, OutputFolder
 
 ENGINES = ("pybullet", "mujoco")
@@ -61,6 +61,7 @@ def SCHOOL() -> None:
     cls=Command,
     examples=(
         "realsim school demo/session --grasps 8 --restart",
+        "realsim school demo/session --arm ur5 --hand parallel --grasps 4 --restart",
         "realsim school run demo/session --grasps 4 --force 20 --restart --json",
     ),
 )
@@ -71,6 +72,7 @@ def SCHOOL() -> None:
     default=None,
     help="Folder, where SOURCE is no session.",
 )
+@arm("Arm that grasps, or its folder.", default="panda")
 @HAND
 @click.option("--grasps", default=60, show_default=True, type=click.IntRange(1, 2000),
               help="Candidates to try on each object, at most.")  # fmt: skip

@@ -30,6 +30,8 @@ class SchoolRequest:
     grasps: int = 60
     """Candidates kept per object, at most."""
     seed: int = 0
+    arm: str = "panda"
+    """Name or folder of the arm."""
     hand: str = "franka_hand"
     """Its name or its folder."""
     engine: str = "pybullet"

@@ -17,6 +17,7 @@ from realsim.app.school.inputs import (
 from realsim.app.school.settle import warn_of_falls
 from realsim.errors import InputError
 from realsim.records import GraspSet, Scene
+from realsim.robots.robot_files import same_name
 from realsim.store import SessionStore
 
 if TYPE_CHECKING:
@@ -31,16 +32,20 @@ def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
     """Return the school's config for a request.
 
     Raises:
-        InputError: a hand or an engine that there is not or that is not installed, or a base pose
-            that cannot be read.
+        InputError: an arm, a hand or an engine that is not there or not installed, or a base
+            pose that cannot be read.
     """
     from realsim.robots.hand import find_hand
+    from realsim_sim_bridge.arm.reach_config import chosen_arm
     from realsim_sim_bridge.school import SchoolConfig
     from realsim_sim_bridge.school.sweep import SweepConfig
     from realsim_sim_bridge.slip.engines import make_engine, settings_of
 
     hand = find_hand(request.hand)
     config = SchoolConfig.of(hand)
+    arm = chosen_arm(request.arm)
+    arm.found()  # as with the engine below: what is not there is said at once
+    config = replace(config, reach=replace(config.reach, arm=arm))
     config = replace(config, seed=request.seed, max_candidates=request.grasps)
     physics = config.slip.physics
     if request.force_n is not None:
@@ -114,11 +119,20 @@ def try_grasps(
     inputs: SchoolInputs, config: "SchoolConfig", request: SchoolRequest, console: Console
 ) -> SchoolOutcome:
     """Run the school and write everything that comes out of it."""
+    _say_arm(inputs, config, console)
     warn_of_falls(inputs, console)
     outcome = _tried(inputs, config, request, console)
     with console.stage("write", "files and pictures"):
         write_outcome(outcome)
     return outcome
+
+
+def _say_arm(inputs: SchoolInputs, config: "SchoolConfig", console: Console) -> None:
+    """Say in a line that another arm grasps than the one that held the camera."""
+    captured = "" if inputs.store is None else str(inputs.store.extra.get("arm", ""))
+    name = config.reach.arm.found().name
+    if captured and not same_name(captured, name):
+        console.say(f"arm       {name} grasps; the session was captured with {captured}")
 
 
 def _tried(

@@ -1,6 +1,7 @@
 """Where the arm stands, and which moves it must be able to make."""
 
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.arm import ArmFile, RobotArm, find_arm
 from realsim.robots.hand import Hand
-from realsim.robots.robot_files import robot_file
+from realsim.robots.robot_files import names_of, robot_file
 from realsim_sim_bridge.arm.arm_space import FREE, ArmSpace, ArmSpaceConfig
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.joint_path import PlannerConfig
@@ -53,8 +54,20 @@ def chosen_arm(name: str = PANDA) -> ChosenArm:
     Raises:
         InputError: there is none, or its file is not as declared.
     """
+    return _panda() if name == PANDA else _chosen(name)
+
+
+@cache
+def _panda() -> ChosenArm:
+    return _chosen(PANDA)
+
+
+def _chosen(name: str) -> ChosenArm:
     _, folder = robot_file(name, ArmFile)
-    return ChosenArm(name=name if "/" in name else folder.name, digest=folder.digest)
+    is_known = names_of("arm").get(folder.name) == folder.path
+    return ChosenArm(
+        name=folder.name if is_known else str(folder.path.resolve()), digest=folder.digest
+    )
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -126,8 +139,9 @@ PANDA_SIZE_M, PANDA_SHOULDER_M = 0.887, 0.333
 """Of a Panda: what `_size_m` says of it, and its shoulder's height over its base [m]."""
 PANDA_HEIGHT_M, PANDA_BACK_M = 0.70, 0.60
 """Where a Panda hangs [m]."""
-WRIST_OVER_TABLE_M = 0.25
-"""Height of the wrist over the table at a grasp from above [m], whatever the arm."""
+WRIST_OVER_TABLE_M, OVER_HOME_M = 0.25, 0.35
+"""Height of the wrist over the table at a grasp from above, and least height of the base over the
+hand at home [m], whatever the arm: a small one would have its wrist at its shoulder."""
 
 
 def grasping_arm(config: ReachConfig, hand: Hand) -> GraspingArm:
@@ -148,6 +162,7 @@ def base_on_table(middle_xy: tuple[float, float], config: ReachConfig, arm: Gras
     scale = round(_size_m(arm) / PANDA_SIZE_M, 2)
     if height is None:
         height = WRIST_OVER_TABLE_M + scale * (PANDA_HEIGHT_M - WRIST_OVER_TABLE_M)
+        height = max(height, config.home_height_m + OVER_HOME_M)
     if back is None:
         beside = PANDA_BACK_M - PANDA_SHOULDER_M
         back = round(arm.shoulder_m + scale * beside, 9)

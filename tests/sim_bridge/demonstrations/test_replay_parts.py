@@ -70,6 +70,8 @@ def test_a_field_that_a_version_did_not_have_takes_its_default():
     del stored["slip"]["headroom_m"], stored["sweep"]
     sizes = "max_opening_m finger_length_m tip_beyond_tcp_m finger_width_m finger_thickness_m"
     stored["hand"] = {n: stored["hand"][n] for n in [*sizes.split(), "mount_z_m"]}
+    del stored["reach"]["arm"]  # the Panda's, before arms had names
+    stored["reach"]["joint7_samples"] = stored["reach"].pop("held_values")
     assert school_config_of(grasps_with({"config": stored})) == CONFIG  # Franka's, before names
     stored["hand"]["mount_z_m"] = -0.15
     with pytest.raises(InputError, match="without a name"):
