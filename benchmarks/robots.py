@@ -69,8 +69,9 @@ def shelf(given: argparse.Namespace) -> Found:
     """Check every robot that ships, and count the code of those of the examples."""
     found = Found()
     right = {"arm": 0, "hand": 0}
-    for kind, check in (("arm", check_arm), ("hand", check_hand)):
-        for robot in names_of(kind):
+    shelves = {"arm": (names_of("arm"), check_arm), "hand": (names_of("hand"), check_hand)}
+    for kind, (names, check) in shelves.items():
+        for robot in names:
             wrong = [f for f in check(robot)[1] if not f.is_right]
             right[kind] += not wrong
             found.notes += [f"{robot}: {f.what}: {f.found}" for f in wrong]
@@ -137,7 +138,7 @@ def _searched(arm: RobotArm, Ts: Array, starts: int, rng: np.random.Generator) -
     for k, T in enumerate(Ts):
         goal = pin.SE3(T) * end.inverse()
         for _ in range(starts):
-            q = rng.uniform(np.maximum(low, -np.pi), np.minimum(high, np.pi))
+            q, size = rng.uniform(np.maximum(low, -np.pi), np.minimum(high, np.pi)), np.inf
             for _ in range(SEARCH_STEPS):
                 pin.forwardKinematics(model, data, q)
                 error = pin.log6(data.oMi[arm.joints].actInv(goal))
@@ -228,7 +229,7 @@ def arc(given: argparse.Namespace) -> Found:
     """Compare the arcs of the Robotiq hands with their closed loops of links."""
     del given
     sys.path.append(str(Path(__file__).parents[1] / "tests" / "support"))
-    from robotiq_linkages import LOOPS, arc_error_mm
+    from robotiq_linkages import LOOPS, arc_error_mm  # pyright: ignore[reportMissingImports]
 
     errors = {name: arc_error_mm(name) for name in LOOPS}
     return Found(

@@ -10,7 +10,7 @@ those of the published figures, use lower ones while developing. Parts and the f
                       two cores, counted in CPU seconds
               mujoco_marginal_grasps_per_s, marginal_speed_dropped_share
                       the same at 500 kg/m^3, friction 0.3 and twelve weights carried
-  steps       plans_per_s (the Panda's), plans_per_s_ur5, plans_per_s_iiwa14, plans_per_s_xarm6,
+  steps       plans_per_s (the Panda's; other arms: benchmarks/robots.py),
                       candidates_per_s, candidates_above_table_per_s
                       of one core: collision-free trajectories; turned hands, those not in the table
   validation  coulomb_worst_pct, torque_worst_pct, box_score, box_slip_mm, box_slip_deg,
@@ -49,10 +49,6 @@ FIGURES = {
     "mujoco_grasps_per_s": Figure(unit="1/s", goal=Goal(low=40.0), rival=RATE),
     "mujoco_marginal_grasps_per_s": Figure(unit="1/s", goal=Goal(low=25.0)),
     "plans_per_s": Figure(unit="1/s core", goal=Goal(low=400.0)),
-    **{
-        f"plans_per_s_{a}": Figure(unit="1/s core", goal=Goal(low=150.0))
-        for a in ("ur5", "iiwa14", "xarm6")
-    },
     "candidates_per_s": Figure(unit="1/s core", goal=Goal(low=5000.0)),
     "candidates_above_table_per_s": Figure(unit="1/s core", goal=Goal(low=5000.0)),
     "coulomb_worst_pct": Figure(unit="%", goal=Goal(high=3.0)),

@@ -13,6 +13,7 @@ import time
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from figures import Found
@@ -31,7 +32,8 @@ from school_cases import (
 )
 
 from realsim.formats.grasps.scene_grasps import executed
-from realsim_sim_bridge.arm.reach_config import PANDA, chosen_arm
+from realsim.robots.hand import find_hand
+from realsim_sim_bridge.arm.reach_config import ReachConfig, chosen_arm
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.school.object_task import candidates_of, chance_of, reach_of
 from realsim_sim_bridge.school.school import run_school
@@ -86,14 +88,22 @@ def _started(size: Size) -> Spent:
     return cost
 
 
-def _chain(engine: str, case: SchoolCase, size: Size, start: Spent) -> Found:
+def pair_rate(seed: int, keep: Path, quick: bool, arm: str, hand: str) -> tuple[float, str]:
+    """Return how many grasps of an arm with a hand MuJoCo tries a second, and what it was of."""
+    size = Size(seed=seed, keep=keep, quick=quick, candidates=QUICK if quick else FULL)
+    robot = {"hand": find_hand(hand), "reach": ReachConfig(arm=chosen_arm(arm))}
+    found = _chain("mujoco", school_case(seed, keep, quick), size, _started(size), **robot)
+    return found.figures["mujoco_grasps_per_s"], found.over["mujoco_grasps_per_s"]
+
+
+def _chain(engine: str, case: SchoolCase, size: Size, start: Spent, **robot: Any) -> Found:
     """Return the rate at 70 N and friction 1, two processes in one scene."""
     slip = slip_config(engine, "plain", 1.0)
     with spent() as cost:
         sets = run_school(
             case.scene,
             case.models,
-            size.config(engine, slip),
+            replace(size.config(engine, slip), **robot),
             workers=PROCESSES,
             solids=case.solids,
         )
@@ -191,24 +201,29 @@ def _warm_up() -> None:
 # the joints over time of all four stages where the arm gets there.
 
 
-ARMS = (PANDA, "ur5", "iiwa14", "xarm6")
-"""Arms that plan: two of seven joints, one with a closed form, one without."""
 PLANNED, PLANNED_QUICK = 220, 120
 """Grasps per object that are planned; the paper has 220."""
 
 
 def first_steps(seed: int, keep: Path, quick: bool) -> Found:
     """Return how many candidates and plans a core makes per second."""
-    return in_processes(_rates, [(seed, keep, quick)])[0]
+    return in_processes(_rates, [(seed, keep, quick, "panda")])[0]
 
 
-def _rates(job: tuple[int, Path, bool]) -> Found:
+def plan_rate(seed: int, keep: Path, quick: bool, arm: str) -> tuple[float, str]:
+    """Return how many trajectories of an arm with Franka's hand a core plans a second."""
+    found = in_processes(_rates, [(seed, keep, quick, arm)])[0]
+    return found.figures["plans_per_s"], found.over["plans_per_s"]
+
+
+def _rates(job: tuple[int, Path, bool, str]) -> Found:
     """Return both rates of this process, compiled code warm."""
-    seed, keep, quick = job
+    seed, keep, quick, arm = job
     config = SchoolConfig(
         seed=seed,
         max_candidates=PLANNED_QUICK if quick else PLANNED,
         candidates=candidate_config(quick),
+        reach=ReachConfig(arm=chosen_arm(arm)),
     )
     _stepped(two_boxes(), config, objects=1)
     found = Found()
@@ -225,16 +240,12 @@ def _rates(job: tuple[int, Path, bool]) -> Found:
         above / sample_s,
         f"the {above:.0f} that are not stopped by the table; {total['free']:.0f} are free",
     )
-    for arm in ARMS:
-        chosen = replace(config, reach=replace(config.reach, arm=chosen_arm(arm)))
-        _stepped(two_boxes(), chosen, objects=1)
-        mine = total if arm == PANDA else _stepped(school_case(seed, keep, quick), chosen)
-        found.add(
-            "plans_per_s" if arm == PANDA else f"plans_per_s_{arm}",
-            mine["plans"] / mine["plan_s"],
-            f"{mine['plans']:.0f} grasps, {mine['reachable']:.0f} reached, with joints over time; "
-            f"{mine['planned']:.0f} round obstacles",
-        )
+    found.add(
+        "plans_per_s",
+        total["plans"] / total["plan_s"],
+        f"{total['plans']:.0f} grasps, {total['reachable']:.0f} reached, with joints over time; "
+        f"{total['planned']:.0f} round obstacles",
+    )
     return found
 
 

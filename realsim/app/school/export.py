@@ -10,10 +10,8 @@ import numpy as np
 from realsim.app.console import Console
 from realsim.app.school.files import MODELS, stored_grasps
 from realsim.app.school.tables import (
-    HAND_HEADER,
     SUMMARY_HEADER,
     agreement_line,
-    by_hand,
     setting_lines,
 )
 from realsim.errors import InputError
@@ -145,9 +143,6 @@ def summarise(sources: Sequence[Path], json_file: Path | None, console: Console)
     number = "one scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
     console.table(f"Robot School of {number}", SUMMARY_HEADER, summary.to_rows())
     sets = [s for part in scenes.values() for s in part]
-    hands = by_hand(sets)
-    if hands:
-        console.table("By hand, on the objects that all of them tried", HAND_HEADER, hands)
     settings = setting_lines(sets)
     if len(settings) > 1:
         console.warn(

@@ -167,26 +167,6 @@ def agreement_line(sets: Sequence[GraspSet]) -> str:
     )
 
 
-def by_hand(sets: Sequence[GraspSet]) -> list[list[str]]:
-    """Return a row for each hand, of the objects that all hands tried; none where there is one."""
-    hands: dict[str, list[GraspSet]] = {}
-    for s in sets:
-        hands.setdefault(s.hand[0], []).append(s)
-    if len(hands) < 2:
-        return []
-    common = set[int].intersection(*({s.obj_id for s in mine} for mine in hands.values()))
-    rows: list[list[str]] = []
-    for name, mine in hands.items():
-        same = [s for s in mine if s.obj_id in common]
-        scores = np.concatenate([np.zeros(0), *(s.scores for s in same)])
-        tried = scores[~np.isnan(scores)]
-        reached = sum(int(s.reachable.sum()) for s in same)
-        share = [f"{100 * n / max(len(tried), 1):.0f} %" for n in (reached, np.sum(tried >= 0.5))]
-        mean = f"{tried.mean():.2f}" if len(tried) else "-"
-        rows.append([name, str(len(common)), str(len(scores)), *share, mean])
-    return rows
-
-
 def setting_lines(sets: Sequence[GraspSet]) -> list[str]:
     """Return what the labels hang on, a line for each setting: engine, force, friction, density."""
     densities: dict[str, set[str]] = {}
@@ -252,7 +232,6 @@ def doubts(sets: Sequence[GraspSet], models: Names) -> list[str]:
     return words
 
 
-HAND_HEADER = ["hand", "objects", "grasps", "reachable", "good", "mean score"]
 SUMMARY_HEADER = ["property", "here", "in the paper"]
 
 

@@ -101,8 +101,12 @@ def rows_of(summary: "SchoolSummary") -> list[tuple[str, str, str]]:
             failed = "no stage" if stage == "none" else stage
             rows.append((f"  penalized, failed first: {failed}", here(count), NOTHING))
     for h in summary.hands:
-        on = f"{h.hand}, on the {h.objects} objects of all hands: good, mean score"
-        rows.append((on, f"{_counted(h.good, h.judged)}, {_number(h.score)}", NOTHING))
+        on = f"{h.hand}, on the {h.objects} objects of all hands: "
+        rows += [
+            (on + "reached", _counted(h.reached, h.judged), NOTHING),
+            (on + "good", _counted(h.good, h.judged), NOTHING),
+            (on + "mean score", _number(h.score), NOTHING),
+        ]
     return rows + _measured_rows(summary)
 
 
@@ -173,9 +177,11 @@ class HandResult:
     objects: int
     judged: int
     """Candidates with a score."""
+    reached: int
+    """Of these, what the arm gets to."""
     good: int
     score: float
-    """Mean of those; NaN of none."""
+    """Mean of the judged; NaN of none."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -310,11 +316,14 @@ def _hands_on_same_objects(
     shared = [sets for sets in by_object.values() if {s.hand[0] for s in sets} == set(names)]
     results: list[HandResult] = []
     for name in names:
-        scores = _joined([s.scores for sets in shared for s in sets if s.hand[0] == name])
-        scores = scores[~np.isnan(scores)]
+        mine = [s for sets in shared for s in sets if s.hand[0] == name]
+        scores = _joined([s.scores for s in mine])
+        known = ~np.isnan(scores)
+        reached = _joined([s.reachable for s in mine])[known]
+        scores = scores[known]
         results.append(
             HandResult(
-                hand=name, objects=len(shared), judged=len(scores),
+                hand=name, objects=len(shared), judged=len(scores), reached=int(reached.sum()),
                 good=int(np.sum(scores >= GOOD_FROM)), score=_spread(scores).mean,
             )
         )  # fmt: skip
