@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.errors import InputError
+from realsim.errors import InputError, RealsimError
 from realsim.formats.grasps.hand_frames import hand_of_set
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
@@ -232,7 +232,7 @@ class SessionMotions:
             return made
         try:
             meshes, Ts = hand_meshes(find_hand(), made.Ts_world_hand, made.opening_m)
-        except (InputError, ImportError):
+        except (RealsimError, ImportError):
             return made
         return replace(made, link_meshes=meshes, Ts_world_link=Ts)
 
@@ -244,7 +244,7 @@ class SessionMotions:
         There are none where they cannot be read; hands but Franka's are drawn as their boxes.
         """
         if self._with_arm:
-            with contextlib.suppress(InputError, ImportError):
+            with contextlib.suppress(RealsimError, ImportError):
                 meshes, Ts = robot_meshes(arm, joints, opening_m, T_world_base)
                 hand, _ = hand_meshes(arm.hand, Ts[:1, -1], opening_m[:1])
                 links = len(meshes) - len(hand)

@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh_files import load_mesh
 from realsim.models.simplify import colors_at, simplified
 from realsim.records import Mesh
 from realsim.rendering.photo import Lighting, PhotoRenderer
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
-from realsim.robots.arm import RobotArm
+from realsim.robots.arm import RobotArm, find_arm
 from realsim.robots.hand import FRANKA, Hand
 from realsim.robots.link_shapes import LARGEST_MM_SCALE
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
@@ -36,6 +35,7 @@ LINK_FACES = 1500
 ms."""
 WHITE, DARK = 235, 70
 """Grey levels of parts that come without colours: an arm's white lacquer, and a hand."""
+FRANKA_MESH = "package://pybullet_data/franka_panda/meshes/visual/{}.obj"
 FINGER_Z_M = 0.0584
 """Where the fingers' frame is along the axis of Franka's hand, from its mount (panda.urdf) [m]."""
 
@@ -56,6 +56,7 @@ def robot_meshes(
 
     Raises:
         InputError: a mesh cannot be read.
+        MissingLibraryError: the package with the meshes is not installed.
     """
     links, meshes = _arm_looks(arm.arm)
     frames = T_table_base @ arm.frames(joints_rad)
@@ -101,8 +102,9 @@ def _arm_looks(arm: RobotArm) -> tuple[tuple[int, ...], tuple[Mesh, ...]]:
 def _hand_looks(hand: Hand) -> tuple[tuple[Mesh, ...], Array]:
     """Return the meshes of a closed hand, frame `grasp`, and which finger (+1, -1) each is of."""
     if hand.name == FRANKA:
+        folder = find_arm("panda").folder
         palm, finger = (
-            _drawn(_package_file(f"franka_panda/meshes/visual/{name}.obj"), "m")
+            _drawn(folder.file(FRANKA_MESH.format(name), "a mesh of Franka's hand"), "m")
             for name in ("hand", "finger")
         )
         mount = np.array([0.0, 0.0, hand.mount_z_m])
@@ -121,23 +123,6 @@ def _hand_looks(hand: Hand) -> tuple[tuple[Mesh, ...], Array]:
         _grey(np.array(list(product(*zip(*box, strict=True)))), BOX_FACES, DARK) for box, _ in parts
     ]
     return tuple(meshes), np.array([sign for _, sign in parts])
-
-
-def _package_file(name: str) -> Path:
-    """Return a file of PyBullet's package.
-
-    Raises:
-        InputError: it is not there.
-    """
-    import pybullet_data
-
-    path = Path(pybullet_data.getDataPath()) / name
-    if not path.is_file():
-        raise InputError(
-            f"the mesh {path} is missing, so that the hand cannot be drawn; it comes with the "
-            "package pybullet. Install that again."
-        )
-    return path
 
 
 def _drawn(path: Path, unit: Literal["m", "mm"]) -> Mesh:
