@@ -34,7 +34,6 @@ Bar = tuple[float, float, float, float, float, float, float, float]
 
 FRANKA = "franka_hand"
 """The hand that is meant where none is named."""
-QUARTERS = np.pi / 2.0 * np.arange(-4, 5)
 PALM_DEPTH_M, PALM_HEIGHT_M = 0.060, 0.060
 """The palm of a hand that describes none: across the closing axis, and along the approach [m]."""
 
@@ -217,22 +216,34 @@ class Hand:
         """
         pivot, half_width, half = np.array(bar[:2]), bar[6], bar[7]
         crank = [self._crank(y) - self._crank(0.0) for y in (outer, inner)]
-        extents: list[Array] = []
-        for end in (np.array(bar[2:4]) - pivot, np.array(bar[4:6]) - pivot):
-            began, ended = (np.arctan2(end[1], end[0]) + turn for turn in crank)
-            angles = np.clip(QUARTERS, began[:, None], ended[:, None])
-            circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-            extents.append(pivot + float(np.linalg.norm(end)) * circle)
-        points = np.concatenate(extents, axis=1)
         boxes = np.empty((len(inner), 2, 3))
         boxes[:, 0, 0], boxes[:, 1, 0] = -half_width, half_width
-        boxes[:, 0, 1:], boxes[:, 1, 1:] = points.min(axis=1) - half, points.max(axis=1) + half
+        places: list[Array] = []
+        for end in (np.array(bar[2:4]) - pivot, np.array(bar[4:6]) - pivot):
+            began, ended = (np.arctan2(end[1], end[0]) + turn for turn in crank)
+            spans = [_cosines(began - shift, ended - shift) for shift in (0.0, np.pi / 2.0)]
+            places.append(np.linalg.norm(end) * np.array(spans))
+        low = np.minimum(*(place[:, 0] for place in places))
+        high = np.maximum(*(place[:, 1] for place in places))
+        boxes[:, 0, 1:] = (pivot[:, None] + low - half).T
+        boxes[:, 1, 1:] = (pivot[:, None] + high + half).T
         return boxes
 
     def _crank(self, y: Array | float) -> Array:
         """Return the crank's angle from y to z [rad] where the face of the pad is at y [m]."""
         across = y - self.arc_axis_y_m
         return np.arctan2(self._height(across), across)
+
+
+def _cosines(began: Array, ended: Array) -> tuple[Array, Array]:
+    """Return the least and the greatest cosine (N,) between two angles (N,), began <= ended."""
+    ends, turn = np.stack([np.cos(began), np.cos(ended)]), 2.0 * np.pi
+    passes_0 = np.ceil(began / turn) * turn <= ended
+    passes_pi = np.ceil((began - np.pi) / turn) * turn + np.pi <= ended
+    return (
+        np.where(passes_pi, -1.0, ends.min(axis=0)),
+        np.where(passes_0, 1.0, ends.max(axis=0)),
+    )
 
 
 def along_approach(Ts_a_b: Array, distances_m: NDArray[np.float64] | float) -> Array:
