@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 INK, MUTED, FAINT = "#22303c", "#8a99a8", "#dfe5ea"
 GOOD, WARN, BAD = "#1b9e8a", "#e69f00", "#c8502f"
 VERDICT_COLORS = {"accepted": GOOD, "doubtful": WARN, "rejected": BAD, "unchecked": MUTED}
-CHECK_COLORS = {"good": GOOD, "warn": WARN, "bad": BAD, "unknown": MUTED}
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 """Of several series in one plot (Okabe and Ito, Color Universal Design, 2008)."""
 AXIS_COLORS = ("#c8553d", "#4c9a3f", "#2b6ca3")

@@ -82,6 +82,8 @@ class ArmFile(RobotFile, frozen=True, kw_only=True):
     mjcf: UrdfTable | None = None
     links: tuple[str, ...] = ()
     """What messages call the base and the moving links."""
+    joint_names: tuple[str, ...] = ()
+    """What recordings and exports call the joints; else the URDF's names, or joint1, joint2 ..."""
     rods: tuple[Rod, ...] = ()
     """The links' bodies in DH frames: round ones ..."""
     blocks: tuple[Block, ...] = ()
@@ -241,7 +243,7 @@ def _arm_of(file: ArmFile, folder: RobotFolder) -> RobotArm:
         shapes_of=cache(lambda: _shapes(file, urdf, arm, names)),
         looks=_looks(urdf, arm),
         kept_apart=frozenset(file.kept_apart),
-        joint_names=urdf.joint_names if urdf else tuple(f"joint{i + 1}" for i in range(arm.joints)),
+        joint_names=_joint_names(file, urdf, arm.joints, str(where)),
         urdf_mass_kg=urdf.mass_kg if urdf else 0.0,
     )
 
@@ -269,6 +271,14 @@ def _forward(steps: Array, q: Array) -> Array:
         turn[:, 2] = q[:, i]
         T = T @ se3.from_rt(se3.exp_so3(turn), np.zeros((len(q), 3))) @ steps[i + 1]
     return T
+
+
+def _joint_names(file: ArmFile, urdf: UrdfChain | None, joints: int, where: str) -> tuple[str, ...]:
+    names = file.joint_names or (urdf.joint_names if urdf else ())
+    names = names or tuple(f"joint{i + 1}" for i in range(joints))
+    if len(set(names)) != joints:
+        raise InputError(f"{where}: joint_names is {names}; {joints} different names are needed.")
+    return names
 
 
 def _limits(

@@ -32,37 +32,29 @@ ACCEPTED = (
 )
 KINDS = ("auto", "bag", "folder", "bop", "graspnet", "colmap", "nerfstudio", "realsense")
 ONLY_FOR: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(
+        ("colour_topic", "depth_topic", "joints_topic", "camera_info_topic",
+         "depth_camera_info_topic", "joint_prefix", "base_frame", "ee_frame", "world_frame",
+         "clock", "max_pair_gap", "only_still"),
+        ("bag",),
+    ),
+    **dict.fromkeys(
+        ("depth_coding", "poses", "reading", "key", "poses_of", "no_poses"),
+        ("folder",),
+    ),
     "depth_unit": ("folder", "bag", "colmap", "nerfstudio"),
-    "depth_coding": ("folder",),
-    "poses": ("folder",),
-    "reading": ("folder",),
-    "key": ("folder",),
-    "poses_of": ("folder",),
-    "no_poses": ("folder",),
     "depths": ("folder", "colmap"),
     "images": ("folder", "colmap", "nerfstudio"),
     "camera": ("folder", "bag"),
     "no_depth": ("folder", "bag", "bop", "graspnet", "colmap", "nerfstudio"),
-    "colour_topic": ("bag",),
-    "depth_topic": ("bag",),
     "arm": ("folder", "bag"),
-    "joints_topic": ("bag",),
-    "camera_info_topic": ("bag",),
-    "depth_camera_info_topic": ("bag",),
-    "joint_prefix": ("bag",),
-    "base_frame": ("bag",),
-    "ee_frame": ("bag",),
-    "world_frame": ("bag",),
-    "clock": ("bag",),
-    "max_pair_gap": ("bag",),
-    "only_still": ("bag",),
     "scene": ("bop", "graspnet"),
     "camera_name": ("bop", "graspnet"),
     "models": ("bop", "graspnet"),
     "no_labels": ("bop", "graspnet"),
     "camera_id": ("colmap", "nerfstudio"),
     "scale": ("colmap", "nerfstudio"),
-}
+}  # fmt: skip
 """Options that say something of some kinds only; with another they are refused, not ignored."""
 BAG_OPTIONS = {
     "colour": "--colour-topic ",
@@ -411,17 +403,6 @@ def _open_colmap(request: ImportRequest, console: Console) -> FrameSource:
     )
 
 
-def _joint_names(arm: str | None) -> tuple[str, ...]:
-    """Return what messages call the arm's joints; ROS's driver has its own names of a UR's."""
-    from realsim.formats.bags.joints import UR_JOINTS
-    from realsim.robots.arm import find_arm
-
-    if arm is None:
-        return UR_JOINTS
-    found = find_arm(arm)
-    return UR_JOINTS if found.name.startswith("UR") else found.joint_names
-
-
 def _open_bag(request: ImportRequest, console: Console) -> FrameSource:
     from realsim.formats.bags import BagChoice, open_bag
 
@@ -432,7 +413,6 @@ def _open_bag(request: ImportRequest, console: Console) -> FrameSource:
         joints=request.joints_topic,
         camera_info=request.camera_info_topic,
         depth_camera_info=request.depth_camera_info_topic,
-        joint_names=_joint_names(request.arm),
         joint_prefix=request.joint_prefix,
         base_frame=request.base_frame,
         ee_frame=request.ee_frame,
@@ -444,6 +424,10 @@ def _open_bag(request: ImportRequest, console: Console) -> FrameSource:
         intrinsics=camera,
         depth_unit_m=request.depth_unit,
     )
+    if request.arm is not None:
+        from realsim.robots.arm import find_arm
+
+        choice = replace(choice, joint_names=find_arm(request.arm).joint_names)
     try:
         return open_bag(request.source, choice)
     except InputError as error:

@@ -6,7 +6,7 @@ back along the approach and up along the table's normal without changing branch,
 first; the first whose moves are free and that can be reached from home is kept.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -337,6 +337,9 @@ class _ReachCheck:
     def _motions(self) -> StageMotions:
         """Return all reachable grasps' attempts over time."""
         task, motion, timing = self._task, self._motion, self._config.timing
+        # A slower hand than Franka's closes at its own speed.
+        closing = min(timing.close_speed, self._arm.hand.closing_speed)
+        timing = replace(timing, close_speed=closing)
         rows = np.nonzero(self._done)[0].astype(np.int64)
         bent: dict[int, tuple[Array, float]] = {}
         for attempt, row in enumerate(rows.tolist()):

@@ -353,7 +353,7 @@ class DemonstrationSource(Sequence[Demonstration]):
                 for i, T in self.scenery.Ts_table_obj.items()
                 if i != name.instance
             ],
-            closing_speed=config.reach.timing.close_speed,
+            closing_speed=min(config.reach.timing.close_speed, config.hand.closing_speed),
         )
         motion = attempt_motion(attempt, self.config.rate_hz, self.config.fall_s, FallConfig())
         return Demonstration(

@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,7 @@ def analytic_grasps(
     Raises:
         InputError: the file is not one of labels, or the mesh has no area.
     """
+    config = replace(config, max_opening_m=task.config.hand.max_opening_m)
     most = max(config.levels)
     if task.labels_file is not None:
         labels = read_grasp_labels(task.labels_file, friction_at_most=most)

@@ -21,9 +21,6 @@ from realsim.records import STAGES
 
 Array = NDArray[np.float64]
 
-MIN_JERK_SPEED = 1.875
-"""Peak speed of a minimum-jerk move, in units of distance / duration."""
-
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SlipMotion:
