@@ -256,7 +256,7 @@ def _driven(
 ) -> CapturePlan:
     """Return the plan of n chosen items: an order, a candidate of each, and free moves between.
 
-    An item that no free move leads to is left out, and the choice is made again.
+    Items that no free move leads to are left out, and the choice is made again.
 
     Args:
         task: arm, mount, what must stay free.
@@ -288,7 +288,7 @@ def _driven(
             joints, vias, clusters = connect(near, home, task.model, config, task.rng, closer)
             break
         except NoFreeMoveError as error:
-            ok = ok[ok != chosen[error.view]]
+            ok = np.setdiff1d(ok, chosen[list(error.views)])
             if len(ok) < n:
                 raise
     task.progress("order and moves", 1, 1)

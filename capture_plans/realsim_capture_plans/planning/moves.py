@@ -38,9 +38,9 @@ every view, by its number."""
 
 
 class NoFreeMoveError(DegenerateError):
-    """No free move to a view was found; `view` is its number among the candidates given."""
+    """No free move to some views was found; `views` are their numbers among the candidates."""
 
-    view: int = -1
+    views: tuple[int, ...] = ()
 
 
 def connect(
@@ -62,7 +62,7 @@ def connect(
         closer: proposes further candidates that suit the neighbours in a tour.
 
     Raises:
-        NoFreeMoveError: no free move to a view was found; its `view` says which.
+        NoFreeMoveError: no free move to some views was found; its `views` says which.
     """
     clusters = Clusters.of(candidates, home, config)
     path = tour(clusters, config, rng, steps=config.tour_steps)
@@ -78,12 +78,18 @@ def connect(
     joints = clusters.joints[path]
     start = np.concatenate([home[None], joints[:-1]])
     vias: list[tuple[int, Array]] = []
+    shut_in: set[int] = set()
+    trouble: NoFreeMoveError | None = None
     for k in bad:
         try:
             vias.append((k, detour(start[k], joints[k], home, model, config, rng)))
         except NoFreeMoveError as error:
-            error.view = _harder_end(clusters, path, k, model, config)
-            raise
+            shut_in.add(_harder_end(clusters, path, k, model, config))
+            trouble = error
+    if trouble is not None:
+        # All at once: a tour of what is left is searched anew, which takes most of the time.
+        trouble.views = tuple(sorted(shut_in))
+        raise trouble
     return joints, tuple(vias), clusters
 
 
