@@ -40,7 +40,9 @@ def ROBOTS() -> None:
     """  # noqa: D301 - click's own mark for lines that stay as they are
 
 
-@ROBOTS.command("list", cls=Command, examples=("realsim robots", "realsim robots --page all.html"))
+@ROBOTS.command(
+    "list", cls=Command, examples=("realsim robots list", "realsim robots list --page all.html")
+)
 @click.option(
     "--page", type=PAGE, default=Path("robots.html"), show_default=True, help="Page with pictures."
 )
