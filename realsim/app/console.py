@@ -140,7 +140,9 @@ class Console:
 
     def warn(self, text: str) -> None:
         """Print one line that the user must not miss."""
-        self._err.print(f"[yellow]note:[/yellow] {text}", soft_wrap=True)
+        from rich.markup import escape
+
+        self._err.print(f"[yellow]note:[/yellow] {escape(text)}", soft_wrap=True)
 
     def result(self, document: object) -> None:
         """Print the command's whole result as JSON, if it was asked for; once in a command.

@@ -5,6 +5,7 @@ of the links. Planning, capture, the School, replays, exports and pictures read 
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
@@ -12,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.errors import InputError
+from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
 from realsim.geometry.dh import DhArm
 from realsim.robots.dh_of_chain import dh_of_chain
@@ -161,8 +162,14 @@ def find_arm(name: str) -> RobotArm:
 
 
 def known_chains(joints: int | None = None) -> dict[str, DhChain]:
-    """Return the chains of all arms that are found by name, with so many joints, by `name`."""
-    found = [find_arm(name).chain for name in names_of("arm")]
+    """Return the chains of all arms that are found by name, with so many joints, by `name`.
+
+    One of the user's that cannot be used is left out: it is told where it is asked for.
+    """
+    found: list[DhChain] = []
+    for name in names_of("arm"):
+        with suppress(RealsimError):
+            found.append(find_arm(name).chain)
     return {c.name: c for c in found if joints in (None, c.joints)}
 
 
@@ -219,6 +226,8 @@ def _arm_of(file: ArmFile, folder: RobotFolder) -> RobotArm:
             f"{where}: home_rad is {home.tolist()}; {arm.joints} angles within the limits are "
             f"needed [rad]: {limits.lower.round(4).tolist()} to {limits.upper.round(4).tolist()}."
         )
+    if not 0.0 < file.payload_kg < np.inf:
+        raise InputError(f"{where}: payload_kg is {file.payload_kg}; kilograms above 0 are needed.")
     wrist = tuple(i - 1 for i in file.wrist_joints) or tuple(range(arm.joints))[-WRIST_JOINTS:]
     if not all(0 <= i < arm.joints for i in wrist):
         raise InputError(
@@ -309,12 +318,16 @@ def _limits(
         )
     torque = np.array(given.torque_nm) if given.torque_nm else urdf.torque if urdf else np.zeros(0)
     torque = torque if torque.shape == (joints,) else np.full(joints, np.nan)
-    limits = JointLimits(
-        lower=rows["lower_rad"],
-        upper=rows["upper_rad"],
-        speed=rows["speed_rad_s"],
-        acceleration=rows["acceleration_rad_s2"],
-    )
+    try:
+        limits = JointLimits(
+            lower=rows["lower_rad"],
+            upper=rows["upper_rad"],
+            speed=rows["speed_rad_s"],
+            acceleration=rows["acceleration_rad_s2"],
+        )
+    except InputError as error:
+        told = "; ".join(f"{key} {row.tolist()}" for key, row in rows.items())
+        raise InputError(f"{where}: {error} Found: {told}.") from error
     return limits, torque
 
 

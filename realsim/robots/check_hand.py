@@ -22,6 +22,10 @@ PATH_M = 2e-4
 """Greatest distance of the URDF's pads from the law [m]."""
 TURN_DEG = 0.5
 """Fingers that turn by more on the way do not keep their orientation [deg]."""
+FARTHEST_M = 1.0
+"""No hand is longer [m]."""
+LEAST_FREE_M = 0.005
+"""Fingers stand out of the palm by this at the least [m]."""
 STEPS = 101
 """Positions of the driven joint at which the URDF's pads are looked at."""
 
@@ -90,6 +94,19 @@ def _mount(hand: Hand) -> Finding:
     back = min(low[2] for low, _ in hand.palm_boxes)
     found = f"flange {-1e3 * hand.mount_z_m:.1f} mm behind the grasp, turned by "
     found += f"{hand.mount_turn_deg:g} deg"
+    if -hand.mount_z_m > FARTHEST_M or abs(hand.mount_turn_deg) > 360.0:
+        return Finding(
+            what="mount", found=f"{found}; that is no hand in metres", is_right=False,
+            advice=f"distance_m of [mount] is in metres, at most {FARTHEST_M:g}; turn_deg is at "
+            "most a whole turn.",
+        )  # fmt: skip
+    if hand.palm_face_z_m > hand.tip_beyond_tcp_m - LEAST_FREE_M:
+        return Finding(
+            what="mount", found=f"the palm reaches to z = {1e3 * hand.palm_face_z_m:.1f} mm, the "
+            f"fingers to {1e3 * hand.tip_beyond_tcp_m:.1f} mm", is_right=False,
+            advice="Nothing fits between the fingers: the [[palm]] boxes end before the fingers' "
+            "tips. The origin of `grasp` is between the pads' middles, z points out of the hand.",
+        )  # fmt: skip
     if hand.mount_z_m <= back + 1e-6:
         return Finding(what="mount", found=found)
     return Finding(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from realsim.errors import InputError
+from realsim.errors import InputError, UnitError
 from realsim.geometry import se3
 from realsim.geometry.mesh_files import load_mesh
 from realsim.robots.shapes import Box, Kind, Shape
@@ -96,7 +96,14 @@ def link_shape(shape: UrdfShape, part: str, frame: int, T_frame_link: Array) -> 
 def _mesh_points(file: Path | None, scale: tuple[float, ...]) -> Array:
     assert file is not None  # a shape of no kind is a mesh
     unit = "mm" if max(map(abs, scale)) < LARGEST_MM_SCALE else "m"
-    mesh = load_mesh(file, unit, [])  # what it looks like does not matter
+    try:
+        mesh = load_mesh(file, unit, [])  # what it looks like does not matter
+    except UnitError as error:
+        raise UnitError(
+            f"{file}, a mesh of a URDF with scale {scale}, would have an extent that no link has. "
+            'A mesh in millimetres needs scale="0.001 0.001 0.001" in the URDF, one in metres '
+            '"1 1 1".'
+        ) from error
     return mesh.vertices * np.array(scale) * (1e3 if unit == "mm" else 1.0)
 
 

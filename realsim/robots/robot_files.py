@@ -7,6 +7,7 @@ and by a path. Capitals, hyphens and underscores do not matter: "UR5e" is the fo
 
 import hashlib
 import os
+import re
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,6 +27,7 @@ VARIABLE = "REALSIM_ROBOTS"
 """Folders of robots of the user's own, divided as in PATH."""
 SHIPPED = Path(__file__).parent / "shipped"
 PACKAGE = "package://"
+NAME = re.compile(r"[\w][\w .+-]{0,59}")
 MOST_FILES = 500
 """A robot's folder holds a few dozen files; a folder with more is another one."""
 MOST_BYTES = 100e6
@@ -113,18 +115,18 @@ def robot_file(name: str, kind: type[Declared]) -> tuple[Declared, RobotFolder]:
     if found != word:
         told = f"is a '{found}'" if found in ("arm", "hand") else "does not say its kind"
         raise InputError(f'{where} {told}; kind = "{word}" is needed here. {_known(word)}')
-    return from_json(values, kind, str(where)), RobotFolder(
-        path=path, name=path.name, digest=_digest(path)
-    )
+    file = from_json(values, kind, str(where))
+    if not NAME.fullmatch(file.name):
+        raise InputError(
+            f"{where}: name is {file.name[:80]!r}; 1 to 60 letters, digits, spaces, dots, hyphens "
+            "and underscores are needed."
+        )
+    return file, RobotFolder(path=path, name=path.name, digest=_digest(path))
 
 
 def names_of(kind: Kind) -> dict[str, Path]:
     """Return the folders of all arms or hands that are found by name, sorted by name."""
-    found: dict[str, Path] = {}
-    for root in reversed(_shelves()):
-        for file in sorted(root.glob(f"*/{FILE}")):
-            if _kind_of(file) == kind:
-                found[file.parent.name] = file.parent
+    found = {p.name: p for root in reversed(_shelves()) for p in _on_shelf(root, kind)}
     return dict(sorted(found.items()))
 
 
@@ -135,13 +137,16 @@ def kind_of(name: str) -> Kind:
         InputError: there is none, or its file does not say.
     """
     given = Path(name).expanduser()
-    if os.sep not in name and not (given / FILE).is_file():
+    if os.sep not in name:
         for kind in KINDS:
             if any(same_name(known, name) for known in names_of(kind)):
                 return kind
         known = "; ".join(f"{kind}s: {', '.join(names_of(kind))}" for kind in KINDS)
-        raise InputError(f"there is no robot '{name[:80]}'. There are {known}.")
-    path = _folder(name, "arm")
+        if not given.is_dir():
+            raise InputError(f"there is no robot '{name[:80]}'. There are {known}.")
+    if not (given / FILE).is_file():
+        raise InputError(f"the folder {given} has no {FILE}; a robot is a folder with one.")
+    path = given
     found = read_toml(path / FILE)[1].get("kind")
     for kind in KINDS:
         if found == kind:
@@ -156,22 +161,36 @@ def same_name(first: str, second: str) -> bool:
 
 def _folder(name: str, kind: Kind) -> Path:
     given = Path(name).expanduser()
-    if os.sep in name or (given / FILE).is_file():
-        if not (given / FILE).is_file():
-            there = "has no" if given.is_dir() else "does not exist and so has no"
+    if os.sep not in name:
+        # A folder that is called so, or whose file says so: plans keep the name of the file.
+        paths = [p for root in _shelves() for p in _on_shelf(root, kind)]
+        found = [p for p in paths if same_name(p.name, name)]
+        found += [p for p in paths if p not in found and same_name(_name_in(p), name)]
+        if len(found) > 1:
             raise InputError(
-                f"the folder {given} {there} {FILE}. A robot is a folder with a {FILE}; "
-                "`realsim robots` lists those that are found by name."
+                f"more than one {kind} is called '{name[:80]}': "
+                f"{', '.join(str(p) for p in found)}. Give the folder of the one that is meant, or "
+                "rename one."
             )
-        return given
-    there_are = names_of(kind)
-    for known, path in there_are.items():
-        if same_name(known, name):
-            return path
-    for path in there_are.values():  # plans and sessions keep the name that the file says
-        if same_name(str(read_toml(path / FILE)[1].get("name")), name):
-            return path
-    raise InputError(f"there is no {kind} '{name[:80]}'. {_known(kind)}")
+        if found:
+            return found[0]
+        if not given.is_dir():
+            raise InputError(f"there is no {kind} '{name[:80]}'. {_known(kind)}")
+    if not (given / FILE).is_file():
+        there = "has no" if given.is_dir() else "does not exist and so has no"
+        raise InputError(
+            f"the folder {given} {there} {FILE}. A robot is a folder with a {FILE}; "
+            "`realsim robots` lists those that are found by name."
+        )
+    return given
+
+
+def _on_shelf(root: Path, kind: Kind) -> list[Path]:
+    return [f.parent for f in sorted(root.glob(f"*/{FILE}")) if _kind_of(f) == kind]
+
+
+def _name_in(folder: Path) -> str:
+    return str(read_toml(folder / FILE)[1].get("name"))
 
 
 def _known(kind: Kind) -> str:

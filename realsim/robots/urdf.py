@@ -127,7 +127,16 @@ class _Reader:
         self._folder, self._path = folder, path
         self._links = {e.get("name", ""): e for e in root.findall("link")}
         self._joints = root.findall("joint")
-        self._above = {self._end(j, "child"): j for j in self._joints}
+        self._above: dict[str, Element] = {}
+        for joint in self._joints:
+            child = self._end(joint, "child")
+            if child in self._above:
+                raise InputError(
+                    f"{path}: the link '{child[:60]}' hangs on two joints, "
+                    f"'{self._above[child].get('name', '')[:60]}' and "
+                    f"'{joint.get('name', '')[:60]}'; links form a tree."
+                )
+            self._above[child] = joint
         self._check_mimics()
 
     def _check_mimics(self) -> None:
@@ -179,6 +188,11 @@ class _Reader:
         for joint in joints:
             where = f"the joint '{joint.get('name', '')[:60]}' of {self._path}"
             T = T @ origin_of(joint, where)
+            if joint.get("type") in TURNING and joint.find("mimic") is not None:
+                raise InputError(
+                    f"{where} follows another joint (<mimic>); an arm's joints are driven one by "
+                    "one. Such a linkage has no chain that can be planned."
+                )
             if joint.get("type") in TURNING:
                 R_axis = onto_z(_axis(joint, where))
                 steps.append(T @ R_axis)

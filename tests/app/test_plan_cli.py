@@ -156,7 +156,7 @@ def test_a_plan_goes_out_and_comes_back(realsim: Callable[..., Done]) -> None:
     ("args", "says"),
     [
         (["p.json", "p.xyz"], ".script"),
-        (["p.json", "q.csv", "--robot", "UR5e"], "cannot be changed"),
+        (["p.json", "q.csv", "--robot", "UR5e"], "the plan is for a UR5"),
         (["bare.csv", "q.json", "--robot", "UR5"], "--joints-unit"),
         (["bare.csv", "q.json", "--robot", "UR5", "--joints-unit", "deg"], "look like radians"),
         (["degrees.csv", "q.json", "--robot", "UR5"], "look like degrees"),

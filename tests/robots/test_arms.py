@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from realsim.errors import InputError, RealsimError
 from realsim.geometry import se3
-from realsim.robots.arm import find_arm
+from realsim.robots.arm import ArmFile, find_arm, known_chains
 from realsim.robots.check_arm import check_arm
 from realsim.robots.compiled_chain import (
     chain_numbers,
@@ -18,7 +18,7 @@ from realsim.robots.compiled_chain import (
     jacobian_into,
 )
 from realsim.robots.dh_of_chain import dh_of_chain
-from realsim.robots.robot_files import VARIABLE, names_of
+from realsim.robots.robot_files import VARIABLE, names_of, robot_file
 
 ARMS = tuple(names_of("arm"))
 
@@ -134,13 +134,20 @@ def test_an_arm_of_ones_own_needs_no_code(tmp_path: Path, monkeypatch: pytest.Mo
     found, of = arm.chain.inverse_branches(arm.chain.forward(q))
     assert set(of) == set(range(20))
     np.testing.assert_allclose(arm.chain.forward(found), arm.chain.forward(q)[of], atol=1e-8)
-    # Found by name once its shelf is known, whatever the capitals.
+    # Found by name once its shelf is known, whatever the capitals, beside one that is broken.
+    (six_joints(folder.parent / "broken") / "six.urdf").write_text("<robot")
+    broken = (folder.parent / "broken" / "robot.toml").read_text()
+    (folder.parent / "broken" / "robot.toml").write_text(broken.replace('"six"', '"other"'))
     monkeypatch.setenv(VARIABLE, str(folder.parent))
     assert "one_of_six" in names_of("arm")
     assert find_arm("One-of-Six").name == "six"
+    assert "UR5" in known_chains() and "other" not in known_chains()
     # Plans and sessions keep the name that stands in the file: it is found by that, too.
     monkeypatch.setattr("realsim.robots.arm._found", {})
     assert find_arm("six").folder.name == "one_of_six"
+    six_joints(folder.parent / "two")
+    with pytest.raises(InputError, match="more than one arm is called 'six'"):
+        robot_file("six", ArmFile)
 
 
 def test_an_mjcf_is_read_as_the_urdf_of_the_same_arm(tmp_path: Path) -> None:
@@ -183,6 +190,10 @@ def test_an_mjcf_is_read_as_the_urdf_of_the_same_arm(tmp_path: Path) -> None:
         ("six.urdf", 'type="revolute"', 'type="prismatic"', "are revolute, continuous or fixed"),
         ("six.urdf", BALL, '<mesh filename="gone.stl"/>', "gone.stl.*not there"),
         ("six.urdf", "<axis", '<mimic joint="j9"/><axis', "mimics 'j9', which is no joint"),
+        ("six.urdf", '<axis xyz="1', '<mimic joint="j1"/><axis xyz="1', "follows another joint"),
+        ("six.urdf", '<child link="l6"/>', '<child link="l5"/>', "hangs on two joints"),
+        ("robot.toml", "payload_kg = 2.0", "payload_kg = nan", "kilograms above 0"),
+        ("robot.toml", '"six"', '"../six"', "name is '../six'"),
         ("robot.toml", "home_rad = [0.0, ", "home_rad = [0.0, 0.0, ", "6 angles within the limits"),
         ("robot.toml", "payload_kg", "payload_lb", "payload_lb"),
         ("robot.toml", '"flange"', '"tool0"', "no link 'tool0'"),

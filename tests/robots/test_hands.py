@@ -56,6 +56,7 @@ def test_the_arc_is_the_urdf_s_through_its_mimic_joints(own_2f85):
         ("robot.toml", "radius_m = 0.05715", "radius_m = 0.070", "mm of the law"),
         ("robot.toml", "usual_n = 70.0", "usual_n = 7.0", "least of 20 N"),
         ("robot.toml", "distance_m = 0.155046", "distance_m = 0.1", "into the arm"),
+        ("robot.toml", "distance_m = 0.155046", "distance_m = 155.046", "no hand in metres"),
         ("robot.toml", "mass_kg = 0.925", "mass_kg = 0.15", "of it 0.1 kg"),
         ("robot.toml", "length_m = 0.0375\nfriction", "length_m = 0.05\nfriction", "beyond"),
         ("robot.toml", "max_opening_m", "max_opening", "max_opening"),

@@ -91,17 +91,24 @@ def advise(
         tick: called with (places tried, places).
 
     Raises:
-        InputError: n is not positive.
+        InputError: n is not positive, or the arm cannot stand before the scene anywhere.
     """
     if n < 1:
         raise InputError(f"places for {n} views were asked for; at least 1 view is needed.")
     tried = _within_reach(DISTANCES_M, chain) if distances_m is None else distances_m
     places = [(x, config.table_height_m + lift) for lift in lifts_m for x in tried]
     found: list[Placement] = []
+    trouble: InputError | None = None
     for k, (x, height) in enumerate(places):
-        found.append(_placement(chain, mount, config, n, (x, 0.0, height + aim_height_m), height))
+        try:
+            center = (x, 0.0, height + aim_height_m)
+            found.append(_placement(chain, mount, config, n, center, height))
+        except InputError as error:  # the keep-out box would reach into the arm
+            trouble = error
         if tick is not None:
             tick(k + 1, len(places))
+    if trouble is not None and not found:
+        raise trouble
     return sorted(found, key=lambda p: (round(p.one_elbow_hole_deg), p.hole_deg))
 
 

@@ -75,6 +75,7 @@ def plan_command(advise: bool, as_json: bool, quiet: bool, **options: Any) -> No
     ),
 )
 @click.argument("source", metavar="PLAN", type=PlanName())
+@arm("Folder of the plan's arm, where it is not found by name.")
 @click.option("--replay", is_flag=True, help="Drive it on the screen, in the browser.")
 @click.option("--replay-file", type=REPLAY, default=None, help="Write the replay as a file.")
 @click.option("--host", default="127.0.0.1", show_default=True, help="Address of the replay.")

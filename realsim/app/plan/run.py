@@ -151,8 +151,8 @@ def show_advice(
 
 
 def run_show(
-    text: str, console: Console, *, pictures: bool, replay: bool, replay_file: Path | None,
-    host: str, port: int,
+    text: str, console: Console, *, arm: str | None = None, pictures: bool, replay: bool,
+    replay_file: Path | None, host: str, port: int,
 ) -> bool:  # fmt: skip
     """Show a plan: its metrics, its pictures, its replay; return whether all moves are free.
 
@@ -161,7 +161,7 @@ def run_show(
     """
     from realsim_capture_plans.plan_files.plan_json import PREFIX, resolve_plan
 
-    plan = resolve_plan(text)
+    plan = _of_arm(resolve_plan(text), arm)
     metrics = plan.metrics | plan_metrics(plan)
     show_plan(plan, metrics, console)
     free = show_colliding(plan, console)
@@ -181,6 +181,20 @@ def run_show(
 
         _serve(serve_replay(plan, host, port), console)
     return free
+
+
+def _of_arm(plan: CapturePlan, arm: str | None) -> CapturePlan:
+    """Return a plan, if its arm is the one that was named: a name or a folder of one's own.
+
+    Raises:
+        InputError: it is another arm's.
+    """
+    if arm is not None and find_arm(arm).name != plan.robot:
+        raise InputError(
+            f"the plan is for a {plan.robot}, --arm {arm} is a {find_arm(arm).name}. Leave --arm "
+            "out, or give the folder of the plan's arm."
+        )
+    return plan
 
 
 def _serve(replay: "PlanReplay", console: Console) -> None:
@@ -212,11 +226,12 @@ def run_convert(
     if dest.exists() and not overwrite:
         raise InputError(f"{dest} is there already; --overwrite replaces it, or name another.")
     plan = _source_plan(source, place, joints_unit, console)
+    document = _document(plan, plan.metrics)  # asks for the arm, before anything is written
     files = writer(plan, dest)
     free = show_colliding(plan, console) if plan.kind == "imported" else True
     for path in files:
         console.say(str(path))
-    console.result(_document(plan, plan.metrics) | {"files": files})
+    console.result(document | {"files": files})
     return free
 
 
@@ -239,12 +254,12 @@ def _source_plan(
         data = read_json(path, most_bytes=LARGEST_BYTES)
         is_plan = isinstance(data, dict) and data.get("schema") == SCHEMA
     if is_plan or not path.exists():
-        if is_plan and (place != Place() or joints_unit):
+        if is_plan and (replace(place, arm=None) != Place() or joints_unit):
             raise InputError(
                 f"{source} is a realsim plan: its robot, mount and scene are in it and cannot be "
                 "changed by options. Make it anew with `realsim plan`."
             )
-        return resolve_plan(source)
+        return _of_arm(resolve_plan(source), place.arm)
     chain = place.chain()
     found = read_path(path, chain, joints_unit)
     if found.reading is not None:

@@ -11,7 +11,7 @@ from realsim.pages import Cell, Page
 from realsim.robots.arm import RobotArm, find_arm
 from realsim.robots.check_arm import Finding, check_arm
 from realsim.robots.hand import Hand, find_hand
-from realsim.robots.robot_files import kind_of, names_of
+from realsim.robots.robot_files import KINDS, kind_of, names_of
 from realsim.store.atomic import write_bytes
 
 HEADER = ["name", "robot", "joints", "reach or opening", "payload or force"]
@@ -21,19 +21,21 @@ def list_robots(page: Path, console: Console) -> None:
     """Print all robots that are found by name, and write the page with their pictures."""
     rows: list[list[str]] = []
     document = Page(title="realsim robots", about="found by name: --arm, --hand")
-    for kind, title in (("arm", "Arms"), ("hand", "Hands")):
+    for kind in KINDS:
+        title = f"{kind.capitalize()}s"
         document.section(title, key=kind)
         with console.stage(f"draw the {title.lower()}") as tick:
             names = names_of(kind)
             for k, name in enumerate(names):
                 try:
                     robot = find_arm(name) if kind == "arm" else find_hand(name)
+                    picture = robot_picture(robot)
                 except RealsimError as error:
                     rows.append([name, f"cannot be used: {error}", "", "", ""])
                     document.text(f"{name}: {error}", "note")
                     continue
                 rows.append(_row(name, robot))
-                document.picture(robot_picture(robot), f"{name}: {robot.title}; {_told(robot)}")
+                document.picture(picture, f"{name}: {robot.title}; {_told(robot)}")
                 tick(k + 1, len(names))
     write_bytes(page, document.encode())
     console.table("Robots", HEADER, rows)
