@@ -131,6 +131,13 @@ class RobotArm:
         return self.shapes_of()
 
     @property
+    def reach_m(self) -> float:
+        """How far the flange gets from the base's origin, over random joints [m]."""
+        limits = self.chain.limits
+        q = np.random.default_rng(0).uniform(limits.lower, limits.upper, (4000, self.joints))
+        return float(np.linalg.norm(self.chain.forward(q)[:, :3, 3], axis=1).max())
+
+    @property
     def joints(self) -> int:
         """How many joints it has."""
         return self.chain.joints

@@ -55,7 +55,7 @@ def check_arm(name: str) -> tuple[RobotArm, list[Finding]]:
     q = rng.uniform(low, high, (SAMPLES, arm.joints))
     return arm, [
         *_frames(arm, file, q),
-        _reach(arm, q),
+        _reach(arm),
         *_speeds(arm),
         *_bodies(arm, q),
         _inverse(arm, q),
@@ -96,8 +96,8 @@ def _frames(arm: RobotArm, file: ArmFile, q: Array) -> list[Finding]:
     ]
 
 
-def _reach(arm: RobotArm, q: Array) -> Finding:
-    reach = float(np.linalg.norm(arm.chain.forward(q)[:, :3, 3], axis=1).max())
+def _reach(arm: RobotArm) -> Finding:
+    reach = arm.reach_m
     return Finding(
         what="reach of the flange",
         found=f"{reach:.2f} m from the base",

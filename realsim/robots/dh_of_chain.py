@@ -58,7 +58,7 @@ def screws(T: Array, normal: Array, parallel: bool, b: float) -> Screws:
         T: from a joint's frame to the next one's.
         normal: of `normals`, or its opposite.
         parallel: whether the axes are; then the normal stands at `b`.
-        b: see there [m].
+        b: where along the first axis the normal of parallel axes stands [m].
     """
     z, axis, p = np.array([0.0, 0.0, 1.0]), T[:3, 2], T[:3, 3]
     alpha = math.atan2(float(np.cross(z, axis) @ normal), float(axis[2]))
@@ -93,7 +93,7 @@ def dh_of_chain(name: str, steps: Array) -> DhArm:
         normal, parallel = normals(T)
         if i == n - 1 and parallel and np.hypot(*T[:2, 3]) < PARALLEL_RAD:
             # The flange on the last axis: its x is the normal, and nothing is left over.
-            found = screws(T, _flat(T[:3, 0]), True, _end(T))
+            found = screws(T, _flat(T[:3, 0]), True, float(T[2, 3]))
         else:
             found = min(
                 (screws(T, way, parallel, -c) for way in (normal, -normal)),
@@ -124,10 +124,6 @@ def _beginning(T: Array) -> tuple[Array, float, float]:
 
 def _flat(x: Array) -> Array:
     return np.array([x[0], x[1], 0.0]) / np.hypot(x[0], x[1])
-
-
-def _end(T: Array) -> float:
-    return float(T[2, 3])
 
 
 def _wrapped(angle: float) -> float:

@@ -63,7 +63,7 @@ class RobotFolder:
 
         Args:
             named: relative to the folder, or `package://PACKAGE/...` in an installed Python
-                package, a package of ROS beside the folder, or example-robot-data.
+                package, or in a ROS package in the folder or beside it.
             what: the file's role, for messages.
 
         Raises:

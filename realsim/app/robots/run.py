@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from realsim.app.console import Console
 from realsim.app.robots.pictures import robot_picture
 from realsim.errors import RealsimError
@@ -99,7 +97,7 @@ def _row(name: str, robot: RobotArm | Hand) -> list[str]:
         size = f"{1e3 * robot.max_opening_m:.0f} mm"
         force = f"{robot.least_force_n:g} to {robot.greatest_force_n:g} N"
         return [name, robot.title, "", size, force]
-    size, payload = f"{reach_m(robot):.2f} m", f"{robot.payload_kg:g} kg"
+    size, payload = f"{robot.reach_m:.2f} m", f"{robot.payload_kg:g} kg"
     return [name, robot.title, str(robot.joints), size, payload]
 
 
@@ -112,10 +110,3 @@ def _told(robot: RobotArm | Hand) -> str:
         )
         return f"opens {row[3]}, {law}, {row[4]}"
     return f"{row[2]} joints, reaches {row[3]}, carries {row[4]}"
-
-
-def reach_m(arm: RobotArm) -> float:
-    """Return how far the flange gets from the base's origin [m]."""
-    limits = arm.chain.limits
-    q = np.random.default_rng(0).uniform(limits.lower, limits.upper, (4000, arm.joints))
-    return float(np.linalg.norm(arm.chain.forward(q)[:, :3, 3], axis=1).max())
