@@ -105,7 +105,9 @@ def serve(host: str) -> None:
             return state
 
         def process_commands(self) -> None:
-            with contextlib.suppress(queue.Empty):
+            # Before its first step the arm has no state (ValueError): a word waits until then.
+            with contextlib.suppress(queue.Empty, ValueError):
+                _ = self.robot.state
                 word, *rest = words.get_nowait()
                 self.answer = self.obey(word, rest)
             super().process_commands()
