@@ -58,6 +58,27 @@ MEASURES = {
         unit="1", meaning="smallest friction of GraspNet's levels that closes; inf = none"
     ),
     "dexnet_closure": Measure(unit="1", meaning="1 = force closure as Dex-Net tests it, 0 = none"),
+    "score_paper": Measure(
+        unit="1",
+        meaning="share of the stages passed in a row by the paper's limits, those of closing too",
+    ),
+    "safety": Measure(
+        unit="1",
+        meaning="load that the closed grasp bears over the stage's peak load; close: the weight",
+        by_stage=True,
+    ),
+    "p_hold": Measure(unit="1", meaning="probability that a robot lifts the object and holds it"),
+    "p_hold_error": Measure(unit="1", meaning="standard error of p_hold by its draws"),
+    "p_hold_draws": Measure(unit="1", meaning="number of draws behind p_hold"),
+    "share_blocked": Measure(unit="1", meaning="share of draws whose fingers touch while open"),
+    "share_missed": Measure(unit="1", meaning="share of draws in which a pad meets nothing"),
+    "share_skewed": Measure(
+        unit="1", meaning="share of draws whose pads meet the object outside the friction cone"
+    ),
+    "share_overloaded": Measure(
+        unit="1", meaning="share of draws in which a stage's load is greater than the grasp bears"
+    ),
+    "share_palm": Measure(unit="1", meaning="share of draws whose palm touches; it fails none"),
 }
 """The columns that a grasp set may carry besides its score. NaN = not measured."""
 
