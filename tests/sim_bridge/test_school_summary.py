@@ -64,6 +64,9 @@ def test_every_candidate_is_in_exactly_one_row(seed):
         out["no_trajectory"] + out["fail_close"] + out["fail_lift"] + out["penalized"]
     )
     assert found.with_trajectory + out["no_trajectory"] == found.judged
+    paper = found.by_paper
+    assert sum(paper.outcomes.values()) == found.candidates and paper.outcomes["penalized"] == 0
+    assert paper.with_trajectory == found.with_trajectory
     assert sum(found.penalized_by.values()) == out["penalized"]
     if found.judged:
         mean = found.share(found.good) * (found.score_good if found.good else 0)
@@ -124,7 +127,8 @@ def test_rows_and_json_say_the_same():
     rows = {label: here for label, here, _ in found.to_rows()}
     data = json.loads(json.dumps(found.to_json(), allow_nan=False))
     assert rows["candidates"] == f"{data['candidates']:,}"
-    assert rows["good (s >= 0.5)"] == f"{data['good']:,} ({100 * data['shares']['good']:.2f} %)"
+    for row, of in (("good (s >= 0.5)", data["by_paper"]), ("nominal score: good", data)):
+        assert rows[row] == f"{of['good']:,} ({100 * of['shares']['good']:.2f} %)"
     published = {label: theirs for label, _, theirs in found.to_rows()}
     assert published["with trajectory"] == "2,014,689 (88.54 %)"
     assert published["good (s >= 0.5)"] == "1,887,185 (82.94 %)"

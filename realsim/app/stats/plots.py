@@ -46,9 +46,10 @@ def figures(stats: Statistics) -> list[tuple[str, bytes]]:
 
 def _outcomes(stats: Statistics) -> bytes:
     figure, (ax,) = columns(1)
-    names = [n for n in OUTCOME_NAMES if stats.school.outcomes[n] or n in PAPER_OUTCOMES]
+    school = stats.school.by_paper or stats.school
+    names = [n for n in OUTCOME_NAMES if school.outcomes[n] or n in PAPER_OUTCOMES]
     rows = np.arange(len(names))
-    here = [100 * stats.school.share(stats.school.outcomes[n]) for n in names]
+    here = [100 * school.share(school.outcomes[n]) for n in names]
     paper = [100 * PAPER_OUTCOMES.get(n, 0) / PAPER_CANDIDATES for n in names]
     colors = [GOOD if n in GOOD_OUTCOMES else BAD for n in names]
     ax.barh(rows - 0.2, here, 0.38, color=colors)
@@ -60,7 +61,7 @@ def _outcomes(stats: Statistics) -> bytes:
                     color=MUTED)  # fmt: skip
     ax.set_yticks(rows, [OUTCOME_NAMES[n] for n in names])
     ax.invert_yaxis()
-    titled(ax, f"{stats.school.judged:,} candidates with a score", "share [%]", "")
+    titled(ax, f"{school.judged:,} candidates, score_paper", "share [%]", "")
     return png(figure)
 
 

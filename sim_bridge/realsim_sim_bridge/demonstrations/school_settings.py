@@ -1,7 +1,7 @@
 """The school's configuration out of the parameters that every grasp set carries."""
 
 import types
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -15,6 +15,7 @@ from realsim.models.library_records import KnownSolid
 from realsim.records import GraspSet, Mesh, ObjectModel
 from realsim.robots.hand import Hand, hand_of_json
 from realsim_sim_bridge.school.config import SchoolConfig
+from realsim_sim_bridge.slip.score import limits_of
 from realsim_sim_bridge.slip.world import SlipBody
 
 T = TypeVar("T")
@@ -33,7 +34,8 @@ def school_config_of(grasps: GraspSet) -> SchoolConfig:
         missing = [n for n in ("slip", "score", "hand", "reach") if n not in (stored or {})]
         if missing:
             raise TypeError(f"{missing[0]} is not there")
-        return _read(SchoolConfig, stored)
+        # What older files do not say of closing was not done as it is now.
+        return replace(_read(SchoolConfig, stored), score=limits_of(grasps.parameters))
     except (TypeError, ValueError, InputError) as error:
         raise InputError(
             f"the grasps of instance {grasps.instance} do not say what they were tried with "

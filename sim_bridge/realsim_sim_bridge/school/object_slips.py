@@ -14,7 +14,7 @@ from realsim_sim_bridge.school.kept_sets import SchoolResult
 from realsim_sim_bridge.school.object_task import ObjectTask, Prepared
 from realsim_sim_bridge.school.run_record import versions
 from realsim_sim_bridge.school.shards import Tested
-from realsim_sim_bridge.slip.score import score_stages
+from realsim_sim_bridge.slip.score import score_paper, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipTrial
 
 Array = NDArray[np.float64]
@@ -77,7 +77,8 @@ def result_of(
         slip_rad=slip_rad,
         reachable=prepared.reachable,
         failures=tuple(failures),
-        measures=_measures(prepared, tested),
+        measures=_measures(prepared, tested)
+        | {"score_paper": score_paper(slip_m, slip_rad, tried)},
         parameters=_parameters(task, prepared),
     )
     return SchoolResult(
@@ -122,6 +123,7 @@ def _parameters(task: ObjectTask, prepared: Prepared) -> dict[str, Any]:
         "inputs": task.inputs(),
         "versions": versions(task.config),
         "density": task.density,
+        "score_rule": task.config.score.rule(),
         "middle_xy_m": list(task.middle_xy),
         "openings_m": prepared.openings_m.tolist(),
         "joints_rad": [q if q[0] == q[0] else nothing for q in prepared.joints.tolist()],

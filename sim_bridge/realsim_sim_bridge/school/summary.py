@@ -6,16 +6,16 @@ Every candidate is in exactly one outcome, so the outcomes sum to the candidates
     bad  = no trajectory + fail close + fail lift + penalized
 
 The paper counts what fails to close as "no trajectory to closure"; here it has a row of its own.
-Its row "fail horizontal (s = 0.50)" needs a stage that fails without a penalty. By equation 3 a
-stage fails by the very slip that is penalized, so a grasp that fails the horizontal shaking scores
-0.42 at most and is counted as penalized; `penalized_by` says where such grasps stopped.
+Beside its table stands `score_paper`, whose 0.50 for what fails the oscillation is good there. The
+nominal score (equation 3 on our stages) has rows of its own: by it a stage fails by the very slip
+that is penalized, so such a grasp scores 0.42 at most; `penalized_by` says where they stopped.
 
 Source: GraspIT, table "GraspIT v1 Statistics" and equation 3.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ from realsim_sim_bridge.school.measure_statistics import (
     closure_confusions,
     rank_correlations,
 )
+from realsim_sim_bridge.slip.score import judged, score_paper
 
 # --- The summary as the paper prints it, beside the paper's own figures --------------------------
 
@@ -62,50 +63,54 @@ OUTCOME_NAMES = {
 
 def rows_of(summary: "SchoolSummary") -> list[tuple[str, str, str]]:
     """Return (property, here, in the paper) as texts."""
+    by_paper = summary.by_paper or summary
 
     def here(count: int) -> str:
-        return _counted(count, summary.judged)
+        return _counted(count, by_paper.judged)
 
     def paper(count: int) -> str:
         return _counted(count, PAPER_CANDIDATES)
 
+    of_object, of_scene = by_paper.per_object, by_paper.per_scene
     rows = [
         ("scenes", f"{summary.scenes:,}", "1,035"),
         ("objects", f"{summary.objects:,}", "7,396"),
         ("candidates", f"{summary.candidates:,}", f"{PAPER_CANDIDATES:,}"),
-        ("without a score", f"{summary.outcomes['not_tried']:,}", NOTHING),
-        ("with trajectory", here(summary.with_trajectory), paper(PAPER_WITH_TRAJECTORY)),
-        ("good (s >= 0.5)", here(summary.good), paper(PAPER_GOOD)),
-        ("bad (s < 0.5)", here(summary.bad), paper(PAPER_BAD)),
-        ("mean score", _mean_and_sigma(summary.score, 2), "0.72 ± 0.30"),
-        ("mean score of good", _number(summary.score_good), "0.85"),
-        ("mean score of bad", _number(summary.score_bad), "0.13"),
-        ("candidates per object", _mean_and_sigma(summary.per_object["candidates"]), "307 ± 649"),
-        ("candidates per scene", _mean_and_sigma(summary.per_scene["candidates"]), "2198 ± 1866"),
-        ("good per object", _mean_and_sigma(summary.per_object["good"]), "255 ± 567"),
-        ("bad per object", _mean_and_sigma(summary.per_object["bad"]), "52 ± 155"),
-        ("good per scene", _mean_and_sigma(summary.per_scene["good"]), "1823 ± 1612"),
-        ("bad per scene", _mean_and_sigma(summary.per_scene["bad"]), "375 ± 423"),
+        ("without a score", f"{by_paper.outcomes['not_tried']:,}", NOTHING),
+        ("with trajectory", here(by_paper.with_trajectory), paper(PAPER_WITH_TRAJECTORY)),
+        ("good (s >= 0.5)", here(by_paper.good), paper(PAPER_GOOD)),
+        ("bad (s < 0.5)", here(by_paper.bad), paper(PAPER_BAD)),
+        ("mean score", _mean_and_sigma(by_paper.score, 2), "0.72 ± 0.30"),
+        ("mean score of good", _number(by_paper.score_good), "0.85"),
+        ("mean score of bad", _number(by_paper.score_bad), "0.13"),
+        ("candidates per object", _mean_and_sigma(of_object["candidates"]), "307 ± 649"),
+        ("candidates per scene", _mean_and_sigma(of_scene["candidates"]), "2198 ± 1866"),
+        ("good per object", _mean_and_sigma(of_object["good"]), "255 ± 567"),
+        ("bad per object", _mean_and_sigma(of_object["bad"]), "52 ± 155"),
+        ("good per scene", _mean_and_sigma(of_scene["good"]), "1823 ± 1612"),
+        ("bad per scene", _mean_and_sigma(of_scene["bad"]), "375 ± 423"),
     ]
     for name, label in OUTCOME_NAMES.items():
         published = PAPER_OUTCOMES.get(name)
-        rows.append(
-            (
-                label,
-                here(summary.outcomes[name]),
-                NOTHING if published is None else paper(published),
-            )
-        )
-    for stage, count in summary.penalized_by.items():
-        if count:
-            failed = "no stage" if stage == "none" else stage
-            rows.append((f"  penalized, failed first: {failed}", here(count), NOTHING))
+        told = NOTHING if published is None else paper(published)
+        rows.append((label, here(by_paper.outcomes[name]), told))
+    counts = {"good": summary.good, "penalized": summary.outcomes["penalized"]}
+    counts |= {
+        f"penalized, failed first: {'no stage' if stage == 'none' else stage}": count
+        for stage, count in summary.penalized_by.items()
+        if count
+    }
+    rows += [
+        (f"nominal score: {name}", _counted(count, summary.judged), NOTHING)
+        for name, count in counts.items()
+    ]
+    rows.append(("nominal score: mean", _mean_and_sigma(summary.score, 2), NOTHING))
     for h in summary.hands:
         on = f"{h.hand}, on the {h.objects} objects of all hands: "
         rows += [
             (on + "reached", _counted(h.reached, h.judged), NOTHING),
-            (on + "good", _counted(h.good, h.judged), NOTHING),
-            (on + "mean score", _number(h.score), NOTHING),
+            (on + "good by the nominal score", _counted(h.good, h.judged), NOTHING),
+            (on + "mean nominal score", _number(h.score), NOTHING),
         ]
     return rows + _measured_rows(summary)
 
@@ -209,6 +214,8 @@ class SchoolSummary:
     """Where grasps of several hands are summed up: each hand on the objects that all have tried."""
     correlations: tuple[RankCorrelation, ...] = ()
     closures: tuple[ClosureConfusion, ...] = ()
+    by_paper: "SchoolSummary | None" = None
+    """The same by `score_paper` in place of the nominal score; None = this is it."""
 
     @property
     def candidates(self) -> int:
@@ -251,6 +258,8 @@ class SchoolSummary:
         values["shares"] = shares | {
             name: self.share(getattr(self, name)) for name in ("with_trajectory", "good", "bad")
         }
+        if self.by_paper is not None:
+            values["by_paper"] = self.by_paper.to_json()
         for entry, c in zip(values["closures"], self.closures, strict=True):
             entry |= {"agree": c.agree, "balanced_accuracy": c.balanced_accuracy}
         return _plain(values)
@@ -270,6 +279,24 @@ def summarise(
         InputError: a set holds scores that equation 3 cannot give.
     """
     by_scene = dict(scenes) if isinstance(scenes, Mapping) else {"": scenes}
+    sets = [s for part in by_scene.values() for s in part]
+    nominal = _counted_up(by_scene)
+    return replace(
+        nominal,
+        correlations=rank_correlations(sets, rng or np.random.default_rng(0)),
+        closures=closure_confusions(sets),
+        by_paper=_counted_up({name: [_by_paper(s) for s in of] for name, of in by_scene.items()}),
+    )
+
+
+def _by_paper(s: GraspSet) -> GraspSet:
+    """Return a set with `score_paper`, as its slips tell it, in place of its scores."""
+    score = score_paper(s.slip_m, s.slip_rad, judged(s))
+    return replace(s, scores=score, base_scores=score)
+
+
+def _counted_up(by_scene: Mapping[str, Sequence[GraspSet]]) -> SchoolSummary:
+    """Return what became of the candidates by the sets' scores."""
     sets = [s for part in by_scene.values() for s in part]
     outcome = [outcomes_of(s) for s in sets]
     scores = _joined([s.scores for s in sets])
@@ -291,8 +318,6 @@ def summarise(
         per_object=_numbers(list(by_object.values())),
         per_scene=_numbers(list(by_scene.values())),
         hands=_hands_on_same_objects(by_object),
-        correlations=rank_correlations(sets, rng or np.random.default_rng(0)),
-        closures=closure_confusions(sets),
     )
 
 

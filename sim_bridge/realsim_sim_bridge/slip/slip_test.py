@@ -297,15 +297,16 @@ class _SlipTest:
 
     def _judge(self, stage: int, rows: Rows) -> None:
         """Note which grasps failed in this stage and why; they do not go on."""
-        limits = self._limits
+        limit_m, limit_rad = (limits[stage] for limits in self._limits.by_stage())
         for row in rows[self._going[rows]].tolist():
-            slip, turn_deg = self._slip_m[row, stage], np.degrees(self._slip_rad[row, stage])
+            slip, turn = self._slip_m[row, stage], self._slip_rad[row, stage]
             if np.isinf(slip):
                 why = "the object was lost"
             elif self._end_n[row] <= self._config.physics.contact_n:
                 why = "the fingers did not both touch the object"
                 self._slip_m[row, stage] = self._slip_rad[row, stage] = np.inf
-            elif slip > limits.slip_m or turn_deg > limits.slip_deg:
+            elif slip > limit_m or turn > limit_rad:
+                turn_deg = np.degrees(turn)
                 why = f"the object slipped {1e3 * slip:.1f} mm and turned {turn_deg:.1f} deg"
             else:
                 continue
