@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from realsim.records.checked_arrays import Array, frozen
 
 STAGES = ("close", "lift", "oscillate", "pendulum")
 """The four stages of the slip test, in order."""
+FEW_DRAWS, LARGE_ERROR = 8, 0.1
+"""Of fewer draws, or of a larger standard error, a p_hold is marked where it is shown."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -23,6 +25,8 @@ class Measure:
     meaning: str
     by_stage: bool = False
     """True: one value a stage (N, 4); False: one a grasp (N,)."""
+    is_share: bool = False
+    """Whether its values are within [0, 1]: probabilities and shares of something."""
 
 
 MEASURES = {
@@ -39,7 +43,9 @@ MEASURES = {
     "second_slip_m": Measure(unit="m", meaning="slip by the second engine", by_stage=True),
     "second_slip_rad": Measure(unit="rad", meaning="turn by the second engine", by_stage=True),
     "confidence": Measure(
-        unit="1", meaning="agreement of the two engines, 0 to 1: 1 - |difference of the scores|"
+        unit="1",
+        meaning="agreement of the two engines, 0 to 1: 1 - |difference of the scores|",
+        is_share=True,
     ),
     "least_friction": Measure(
         unit="1",
@@ -49,7 +55,9 @@ MEASURES = {
         unit="N", meaning="smallest finger force at which all four stages are passed; inf likewise"
     ),
     "margin": Measure(
-        unit="1", meaning="share of the swept frictions and forces at which it is passed"
+        unit="1",
+        meaning="share of the swept frictions and forces at which it is passed",
+        is_share=True,
     ),
     "ferrari_canny": Measure(
         unit="1", meaning="radius of the largest ball in the hull of the contact wrenches"
@@ -61,24 +69,39 @@ MEASURES = {
     "score_paper": Measure(
         unit="1",
         meaning="share of the stages passed in a row by the paper's limits, those of closing too",
+        is_share=True,
     ),
     "safety": Measure(
         unit="1",
         meaning="load that the closed grasp bears over the stage's peak load; close: the weight",
         by_stage=True,
     ),
-    "p_hold": Measure(unit="1", meaning="probability that a robot lifts the object and holds it"),
-    "p_hold_error": Measure(unit="1", meaning="standard error of p_hold by its draws"),
+    "p_hold": Measure(
+        unit="1", meaning="probability that a robot lifts the object and holds it", is_share=True
+    ),
+    "p_hold_error": Measure(
+        unit="1", meaning="standard error of p_hold by its draws", is_share=True
+    ),
     "p_hold_draws": Measure(unit="1", meaning="number of draws behind p_hold"),
-    "share_blocked": Measure(unit="1", meaning="share of draws whose fingers touch while open"),
-    "share_missed": Measure(unit="1", meaning="share of draws in which a pad meets nothing"),
+    "share_blocked": Measure(
+        unit="1", meaning="share of draws whose fingers touch while open", is_share=True
+    ),
+    "share_missed": Measure(
+        unit="1", meaning="share of draws in which a pad meets nothing", is_share=True
+    ),
     "share_skewed": Measure(
-        unit="1", meaning="share of draws whose pads meet the object outside the friction cone"
+        unit="1",
+        meaning="share of draws whose pads meet the object outside the friction cone",
+        is_share=True,
     ),
     "share_overloaded": Measure(
-        unit="1", meaning="share of draws in which a stage's load is greater than the grasp bears"
+        unit="1",
+        meaning="share of draws in which a stage's load is greater than the grasp bears",
+        is_share=True,
     ),
-    "share_palm": Measure(unit="1", meaning="share of draws whose palm touches; it fails none"),
+    "share_palm": Measure(
+        unit="1", meaning="share of draws whose palm touches; it fails none", is_share=True
+    ),
 }
 """The columns that a grasp set may carry besides its score. NaN = not measured."""
 
@@ -155,9 +178,45 @@ class GraspSet:
         return pads
 
     @property
+    def label(self) -> Literal["p_hold", "score"]:
+        """What the grasps are coloured, ranked and filtered by: p_hold if any has one."""
+        known = self.measures.get("p_hold", np.zeros(0))
+        return "p_hold" if np.any(~np.isnan(known)) else "score"
+
+    @property
+    def labels(self) -> Array:
+        """(N,) value of `label` in [0, 1]; NaN = not known. Out of reach nothing is held: 0."""
+        if self.label == "score":
+            return self.scores
+        p = self.measures["p_hold"]
+        out_of_reach = ~self.reachable & (self.scores == 0)
+        return np.where(np.isnan(p) & out_of_reach, 0.0, p)
+
+    @property
+    def unsure(self) -> NDArray[np.bool_]:
+        """(N,) whether p_hold is known of too few draws, or with too large an error."""
+        nothing = np.full(len(self), np.nan)
+        few = self.measures.get("p_hold_draws", nothing) < FEW_DRAWS
+        few |= self.measures.get("p_hold_error", nothing) > LARGE_ERROR
+        return few & ~np.isnan(self.measures.get("p_hold", nothing))
+
+    @property
     def good(self) -> NDArray[np.bool_]:
         """(N,) whether the grasp is good: score >= 0.5."""
         return np.nan_to_num(self.scores, nan=-1.0) >= 0.5
+
+
+def joined_measure(sets: Iterable[GraspSet], name: str) -> Array:
+    """Return a measure of all sets (N,) or (N, 4), one after the other; NaN = not measured."""
+    stages = (len(STAGES),) * MEASURES[name].by_stage
+    parts = [s.measures.get(name, np.full((len(s), *stages), np.nan)) for s in sets]
+    return np.concatenate([np.zeros((0, *stages)), *parts])
+
+
+def label_words(sets: Iterable[GraspSet]) -> str:
+    """Return by what the grasps of several sets are coloured: 'p_hold', 'score', or both."""
+    used = {s.label for s in sets if not np.all(np.isnan(s.labels))}
+    return "p_hold, else score" if len(used) > 1 else "".join(used) or "score"
 
 
 def hand_named(told: Any) -> tuple[str, str]:

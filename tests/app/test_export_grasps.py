@@ -42,14 +42,14 @@ def test_grasps_of_a_frame_are_in_its_camera(session, tmp_path):
         group = read_grasp_group(tmp_path / f"out/scene_000002/{index:06d}.npy")
         poses = {o.instance: o.T_cam_obj for o in scene.frame(index).objects}
         want = [
-            (poses[s.instance] @ T, score)
+            (poses[s.instance] @ T, label)
             for s in sets
-            for T, score in zip(s.Ts_obj_grasp, s.scores, strict=True)
-            if np.isfinite(score)
+            for T, label in zip(s.Ts_obj_grasp, s.labels, strict=True)
+            if np.isfinite(label)
         ]
         assert len(group) == len(want) > 10
         np.testing.assert_allclose(group.Ts_a_grasp, [T for T, _ in want], atol=2e-6)
-        np.testing.assert_allclose(group.scores, [score for _, score in want], atol=1e-6)
+        np.testing.assert_allclose(group.scores, [label for _, label in want], atol=1e-6)
 
 
 def test_grasps_are_of_sessions(session, tmp_path):

@@ -24,10 +24,14 @@ def test_tried_grasps_written_and_read_are_the_same(tmp_path_factory, seed, fram
     np.testing.assert_allclose(found.Ts_obj_grasp, s.Ts_obj_grasp[rows], rtol=0, atol=1e-15)
     np.testing.assert_array_equal(found.object_in_gripper, held(s)[rows])
     np.testing.assert_array_equal(found.scores, s.scores[rows])
+    np.testing.assert_array_equal(found.base_scores, s.base_scores[rows])
     np.testing.assert_array_equal(found.widths_m, s.widths_m[rows])
     assert (found.file, found.scale) == ("mug.obj", 0.5)
     again = found.as_set(5, 1)
     assert np.isnan(again.scores).all() and again.obj_id == 5
+    assert list(again.measures) == list(s.measures)
+    for name, values in again.measures.items():
+        np.testing.assert_array_equal(values, s.measures[name][rows])
 
 
 def test_the_file_has_graspgens_keys_and_axes(tmp_path):
@@ -70,6 +74,8 @@ def test_a_file_of_graspgens_own_is_read_in_its_convention(tmp_path):
         lambda v: v["grasps"].update(object_in_gripper=[2, 0]),
         lambda v: v["grasps"].update(transforms=np.zeros((2, 4, 4)).tolist()),
         lambda v: v.update(realsim={"frame": "elsewhere"}),
+        lambda v: v.update(realsim={"measures": {"p_hold": [0.5]}}),
+        lambda v: v.update(realsim={"measures": {"goodness": [0.5, 0.5]}}),
     ],
 )
 def test_what_is_no_graspgen_file_is_refused(tmp_path, change):

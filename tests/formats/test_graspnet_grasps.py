@@ -28,6 +28,7 @@ from realsim.formats.graspnet.grasp_labels import (
 from realsim.formats.graspnet.rect import read_rect, rect_grasps, write_rect
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics
+from realsim.records.grasps import MEASURES
 from tried_grasps import assert_same, tried_set
 
 SINGLE = 2e-7
@@ -97,20 +98,37 @@ def test_to_graspnets_gripper_and_back_is_the_same_grasp(seed):
 
 def test_sets_in_a_view_and_back_are_the_same_grasps(tmp_path):
     rng = np.random.default_rng(2)
-    sets = [tried_set(rng, 30, obj_id=3, instance=0), tried_set(rng, 20, obj_id=9, instance=1)]
-    Ts_cam_obj = {0: se3.random_transform(rng), 1: se3.random_transform(rng)}
+    plain = tuple(name for name in MEASURES if name != "p_hold")
+    sets = [
+        tried_set(rng, 30, obj_id=3, instance=0),
+        tried_set(rng, 20, obj_id=9, instance=1, measures=plain),
+        tried_set(rng, 20, obj_id=3, instance=2, measures=("p_hold",)),
+    ]
+    assert [s.label for s in sets] == ["p_hold", "score", "p_hold"]
+    Ts_cam_obj = {s.instance: se3.random_transform(rng) for s in sets}
     group = grasp_group(sets, Ts_cam_obj)
     back = read_grasp_group(write_grasp_group(tmp_path / "g.npy", group))
     for s in sets:
         found = back.of_object(s.obj_id, Ts_cam_obj[s.instance], s.instance)
-        rows = ~np.isnan(s.scores)
+        rows = ~np.isnan(s.labels)
         assert 0 < rows.sum() < len(s)
         np.testing.assert_allclose(found.Ts_obj_grasp, s.Ts_obj_grasp[rows], rtol=0, atol=2e-6)
         np.testing.assert_allclose(found.parameters["openings_m"], s.widths_m[rows], rtol=SINGLE)
         np.testing.assert_allclose(
-            found.parameters["source"]["scores"], s.scores[rows], rtol=SINGLE
+            found.parameters["source"]["scores"], s.labels[rows], rtol=SINGLE
         )
         assert np.isnan(found.scores).all()  # another's score is not ours
+        np.testing.assert_array_equal(found.widths_m, s.widths_m[rows])
+        for name, values in s.measures.items():
+            np.testing.assert_array_equal(found.measures[name], values[rows])
+    with np.load(tmp_path / "g.labels.npz") as beside:
+        np.testing.assert_array_equal(
+            beside["score"], np.concatenate([s.scores[~np.isnan(s.labels)] for s in sets])
+        )
+    write_grasp_group(tmp_path / "few.npy", grasp_group(sets[:1], Ts_cam_obj))
+    (tmp_path / "few.npy").replace(tmp_path / "g.npy")
+    with pytest.raises(InputError, match="shape"):
+        read_grasp_group(tmp_path / "g.npy")
 
 
 def test_labels_that_are_written_are_read_to_the_last_bit(tmp_path):

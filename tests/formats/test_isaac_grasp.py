@@ -12,6 +12,7 @@ from realsim.errors import InputError
 from realsim.formats.grasps.hand_frames import hand_poses
 from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
 from realsim.formats.grasps.scene_grasps import executed
+from realsim.records.grasps import MEASURES
 from tried_grasps import tried_set
 
 EXAMPLE = """
@@ -33,15 +34,25 @@ grasps:
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=10, deadline=None)
 def test_tried_grasps_written_and_read_are_the_same(tmp_path_factory, seed):
-    s = tried_set(np.random.default_rng(seed), 25)
+    rng = np.random.default_rng(seed)
+    some = tuple(name for name in MEASURES if rng.random() < 0.7)
+    s = tried_set(rng, 25, measures=some)
     path = tmp_path_factory.mktemp("ig") / "mug.yaml"
-    found, rows = read_isaac_grasp(write_isaac_grasp(path, s, object_frame="mug")), executed(s)
+    found = read_isaac_grasp(write_isaac_grasp(path, s, object_frame="mug"))
+    rows = executed(s) & ~np.isnan(s.labels)
     np.testing.assert_allclose(found.Ts_obj_grasp, s.Ts_obj_grasp[rows], rtol=0, atol=1e-14)
-    np.testing.assert_array_equal(found.confidences, s.scores[rows])
+    np.testing.assert_array_equal(found.confidences, s.labels[rows])
+    np.testing.assert_array_equal(found.scores, s.scores[rows])
+    np.testing.assert_array_equal(found.base_scores, s.base_scores[rows])
+    again = found.as_set(7)
+    assert list(again.measures) == (list(some) if rows.any() else [])
+    for name, values in again.measures.items():
+        np.testing.assert_array_equal(values, s.measures[name][rows])
+    assert f"# confidence: {s.label}" in path.read_text()
     np.testing.assert_array_equal(found.widths_m, s.widths_m[rows])
     np.testing.assert_array_equal(found.openings_m, 0.08)
     assert found.names == tuple(f"grasp_{row}" for row in np.flatnonzero(rows))
-    assert np.isnan(found.as_set(1).scores).all()
+    assert np.isnan(again.scores).all()
 
 
 def test_the_specifications_example_is_read(tmp_path):
@@ -62,7 +73,7 @@ def test_the_quaternion_is_scalar_first_and_turns_the_right_way(tmp_path):
     data = YAML(typ="safe").load(write_isaac_grasp(tmp_path / "a.yaml", s, object_frame="a"))
     assert data["format"] == "isaac_grasp" and data["format_version"] == 1.0
     assert data["gripper_frame_link"] == "panda_hand"
-    for row in np.flatnonzero(executed(s)):
+    for row in np.flatnonzero(executed(s) & ~np.isnan(s.labels)):
         entry = data["grasps"][f"grasp_{row}"]
         w, (x, y, z) = entry["orientation"]["w"], entry["orientation"]["xyz"]
         R = np.array(
@@ -93,6 +104,8 @@ def test_a_width_that_the_hand_cannot_take_is_refused(tmp_path):
         ("confidence: 1.0", "confidence: 1.5"),
         ("w: 0.00332", "w: 1.0"),
         ("-0.04346", "left"),
+        ("cspace_position", "realsim: {goodness: 1.0}\n    cspace_position"),
+        ("cspace_position", "realsim: {safety: 1.0}\n    cspace_position"),
         ("grasps:", "other:"),
         ("grasps:", "grasps: !!python/object:os.system"),
     ],

@@ -19,6 +19,7 @@ from realsim import (
 )
 from realsim.formats.bop import scene as bop
 from realsim.geometry import se3
+from realsim.records.grasps import joined_measure
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.store import SessionStore
 from realsim_sim_bridge.annotation.annotate import AnnotationConfig, annotate
@@ -66,7 +67,10 @@ def grasp_set(instance: int, obj_id: int, n: int = 6) -> GraspSet:
     )  # fmt: skip
 
 
-GRASPS = [grasp_set(0, 1), grasp_set(3, 7)]
+GRASPS = [
+    grasp_set(0, 1),
+    replace(grasp_set(3, 7), measures={"p_hold": np.linspace(0, 1, 6), "safety": np.ones((6, 4))}),
+]
 
 
 def make_session(folder: Path) -> SessionStore:
@@ -136,6 +140,8 @@ def test_grasps_of_a_view_are_the_objects_grasps_in_its_camera(annotated: Sessio
         np.testing.assert_allclose(got["Ts_cam_grasp"], np.concatenate(expected), atol=1e-12)
         np.testing.assert_array_equal(got["instance"], [0] * 6 + [3] * 6)
         np.testing.assert_array_equal(got["scores"], np.concatenate([g.scores for g in GRASPS]))
+        for name in ("p_hold", "safety"):
+            np.testing.assert_array_equal(got[name], joined_measure(GRASPS, name))
         reachable = np.concatenate([g.reachable for g in GRASPS])
         np.testing.assert_array_equal(got["reachable"], reachable)
         np.testing.assert_array_equal(got["visibility"], got["contact_seen"].sum(1))

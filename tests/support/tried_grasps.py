@@ -23,7 +23,8 @@ def tried_set(rng, n=20, *, obj_id=7, instance=2, measures=tuple(MEASURES)):
     values = {}
     for name in measures:
         shape = (n, 4) if MEASURES[name].by_stage else (n,)
-        values[name] = rng.choice([np.nan, np.inf, 0.25, -0.0, 1 / 3], shape)
+        known = [np.nan, 0.25, -0.0, 1 / 3] + [np.inf] * (not MEASURES[name].is_share)
+        values[name] = rng.choice(known, shape)
     return GraspSet(
         obj_id=obj_id,
         instance=instance,

@@ -50,10 +50,10 @@ def _files(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> Written
         if request.target in LABELLED_ONLY:
             rows = executed(s)
         if request.target == "isaac":
-            rows &= np.nan_to_num(s.scores, nan=-1.0) >= request.least_score
+            rows &= s.labels >= request.least_score  # NaN is not
         count += int(rows.sum())
     if request.target in LABELLED_ONLY and count < all_of_them:
-        score = f", or that have a score below {request.least_score:g}," * (request.least_score > 0)
+        score = f", or whose label is below {request.least_score:g}," * (request.least_score > 0)
         notes.append(
             f"{all_of_them - count} of {all_of_them} grasps are left out: those that physics did "
             f"not try{score} are no grasps to this format."
@@ -66,7 +66,7 @@ def _files(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> Written
 
 def _grasp_groups(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> WrittenScene:
     """Write the grasps of every frame in its camera, as graspnetAPI's GraspGroup."""
-    from realsim.formats.graspnet.grasp_group import grasp_group, grasp_group_bytes
+    from realsim.formats.graspnet.grasp_group import grasp_group, grasp_group_files
 
     session, inner = session_of(scene), folder.below(job.place.name)
     grasps = session.grasps()
@@ -84,7 +84,7 @@ def _grasp_groups(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> 
         count += len(group)
         piece = f"{index:06d}"
         if not inner.has(piece):
-            inner.write_piece(piece, {f"{piece}.npy": grasp_group_bytes(group)})
+            inner.write_piece(piece, grasp_group_files(f"{piece}.npy", group))
             written += 1
         job.tick()
     return WrittenScene(
@@ -112,7 +112,9 @@ GRASPS: dict[str, Target] = {
             ("row", "score, width, height, depth, rotation (9, row-major), translation, object"),
             ("frame", "x = approach, y = closing, origin `depth` before the contacts"),
             ("poses", "in the frame's camera (OpenCV axes)"),
-            ("score", "of the slip test, 0 to 1, higher is better; not GraspNet's friction"),
+            ("score", "p_hold, of sets without it the slip test's score; 0 to 1, higher is better;"
+             " not GraspNet's friction"),
+            ("beside", "000000.labels.npz: score, stages, p_hold, error, safety; a row a grasp"),
             ("object", "GraspNet's number: realsim's id - 1"),
         ),
         loading='import numpy as np\ngrasps = np.load("{scene}/{file:*.npy}")',
@@ -123,18 +125,20 @@ GRASPS: dict[str, Target] = {
     "acronym": _target(
         "ACRONYM", "HDF5, one file an object",
         (("frame", "mounting face, 0.1034 m behind the contacts; z = approach, x = closing"),
-         ("label", "1 = still held after all four stages; scores under qualities/realsim")),
+         ("label", "1 = still held after all four stages; scores, p_hold, its error and safety "
+          "under qualities/realsim")),
         'import h5py\nfile = h5py.File("{scene}/{file:*.h5}")',
     ),
     "graspgen": _target(
         "GraspGen", "JSON, one file an object",
-        (("frame", "as ACRONYM's"), ("label", "1 = still held after all four stages")),
+        (("frame", "as ACRONYM's"),
+         ("label", "1 = still held after all four stages; the rest under the key realsim")),
         'import json\ngrasps = json.load(open("{scene}/{file:*.json}"))["grasps"]',
     ),
     "isaac": _target(
         "isaac_grasp", "YAML, one file an object",
         (("frame", "panda_hand: mounting face; z = approach, y = closing"),
-         ("confidence", "the score")),
+         ("confidence", "p_hold, of sets without it the score; a comment says which")),
         'import yaml\ngrasps = yaml.safe_load(open("{scene}/{file:*.yaml}"))["grasps"]',
         ("least_score",),
     ),

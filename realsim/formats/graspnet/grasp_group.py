@@ -8,12 +8,15 @@ closes. The score is higher for better grasps: a network's confidence of any ran
 1.1 - friction where the grasps come from labels (loadGrasp). Objects count from 0, realsim's ids
 are one more; -1, which networks write, is an object that is not known: id 0 here.
 
-What the format has no place for: which of several instances of an object, contact widths, stages.
+What the format has no place for: which of several instances of an object, contact widths, stages,
+how sure a score is. `write_grasp_group` puts what is known of that beside it, 000000.labels.npz:
+instance, row of its set, score, base_score, width_m and all measures (p_hold, its error, safety by
+stage), one entry a grasp in the same order.
 """
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -22,12 +25,13 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats.graspnet.gripper_frame import HEIGHT_M, grasp_poses, graspnet_poses
-from realsim.formats.grasps.scene_grasps import untried_set
+from realsim.formats.grasps.scene_grasps import measures_of_json, untried_set
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.records.checked_arrays import Array, frozen
+from realsim.records.grasps import MEASURES, joined_measure
 from realsim.store import atomic
-from realsim.untrusted.arrays import read_npy
+from realsim.untrusted.arrays import read_npy, read_npz
 
 COLUMNS = 17
 MOST_BYTES = 300e6
@@ -43,6 +47,8 @@ FARTHEST_M = 20.0
 ROTATION_TOLERANCE = 1e-3
 """How far R^T R may be from the identity: single precision, of networks' own products."""
 Scores = Literal["school", "friction"]
+OWN = ("instance", "row", "score", "base_score", "width_m")
+"""Columns of the file beside a group, besides those of MEASURES."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -61,6 +67,8 @@ class GraspGroup:
     """(N,) how far the fingertips are beyond GraspNet's translation [m]."""
     obj_ids: NDArray[np.int64]
     """(N,) realsim's ids: GraspNet's number + 1; 0 = not known."""
+    known: dict[str, Array] = field(default_factory=dict[str, Array])
+    """(N,) or (N, 4) what else is known, by the names of OWN and MEASURES; empty of others'."""
 
     def __post_init__(self) -> None:
         """Check that all arrays speak of the same grasps and freeze them."""
@@ -71,6 +79,11 @@ class GraspGroup:
         for name in ("scores", "openings_m", "heights_m", "depths_m"):
             object.__setattr__(self, name, frozen(getattr(self, name), np.float64, (n,), name))
         object.__setattr__(self, "obj_ids", frozen(self.obj_ids, np.int64, (n,), "obj_ids"))
+        known = {k: np.asarray(v, dtype=np.float64) for k, v in self.known.items()}
+        measures = {k: v.tolist() for k, v in known.items() if k not in OWN}
+        own = {k: frozen(known[k], np.float64, (n,), k) for k in OWN if k in known}
+        checked = own | measures_of_json(measures, n, "a group of grasps")
+        object.__setattr__(self, "known", checked)
 
     def __len__(self) -> int:
         """Return the number of grasps."""
@@ -91,7 +104,10 @@ class GraspGroup:
             instance: of the object.
             from_labels: whether the scores are 1.1 - friction; else they are a network's.
         """
-        rows = np.flatnonzero(self.obj_ids == obj_id)
+        of = self.obj_ids == obj_id
+        if "instance" in self.known:
+            of &= self.known["instance"] == instance
+        rows = np.flatnonzero(of)
         T_obj_a = se3.invert(se3.check_rigid(T_a_obj, "the object's pose"))
         grasps = untried_set(
             T_obj_a @ self.Ts_a_grasp[rows],
@@ -102,11 +118,13 @@ class GraspGroup:
                 "openings_m": self.openings_m[rows].tolist(),
                 "depths_m": self.depths_m[rows].tolist(),
             },
+            measures={name: self.known[name][rows] for name in MEASURES if name in self.known},
+            widths_m=self.known["width_m"][rows] if "width_m" in self.known else None,
         )
         if not from_labels:
             return grasps
         friction = MOST_FRICTION - self.scores[rows]
-        return replace(grasps, measures={"closure_friction": friction})
+        return replace(grasps, measures=grasps.measures | {"closure_friction": friction})
 
 
 def grasp_group(
@@ -116,19 +134,22 @@ def grasp_group(
     scores: Scores = "school",
     depth_m: float = DEPTH_M,
 ) -> GraspGroup:
-    """Return the grasps of a scene in one frame; those without a score are left out.
+    """Return the grasps of a scene in one frame; those without a label are left out.
 
     Args:
         sets: grasps of the objects.
         Ts_a_obj: (4, 4) of each object by instance [m]: in the view's camera, as a rule.
-        scores: "school": the score of physics, 0 to 1; "friction": 1.1 - closure_friction, as
-            graspnetAPI makes it of labels, of grasps that close below 1.1.
+        scores: "school": p_hold, of sets without it the score, 0 to 1; "friction": 1.1 -
+            closure_friction, as graspnetAPI makes it of labels, of grasps that close below 1.1.
         depth_m: of all grasps whose set's parameters have no depths_m.
 
     Raises:
         InputError: a set's object has no pose, or its grasps have no width.
     """
     groups = [_group_of(s, Ts_a_obj, scores, depth_m) for s in sets]
+    kept = np.concatenate([np.zeros(0, np.bool_), *(~np.isnan(_value(s, scores)) for s in sets)])
+    known = {k: np.concatenate([np.zeros(0), *(g.known[k] for g in groups)]) for k in OWN}
+    measured = [k for k in MEASURES if any(k in s.measures for s in sets)]
 
     def column(name: str) -> NDArray[np.float64]:
         return np.concatenate([np.zeros(0), *(getattr(g, name) for g in groups)])
@@ -140,7 +161,16 @@ def grasp_group(
         heights_m=column("heights_m"),
         depths_m=column("depths_m"),
         obj_ids=column("obj_ids").astype(np.int64),
+        known=known | {k: joined_measure(sets, k)[kept] for k in measured},
     )
+
+
+def _value(grasps: GraspSet, scores: Scores) -> Array:
+    """Return what a group's score is made of (N,); NaN = left out."""
+    if scores == "school":
+        return grasps.labels
+    friction = grasps.measures.get("closure_friction", np.full(len(grasps), np.nan))
+    return np.where(friction < MOST_FRICTION, MOST_FRICTION - friction, np.nan)
 
 
 def _group_of(
@@ -152,11 +182,7 @@ def _group_of(
             f"{', '.join(map(str, sorted(Ts_a_obj))) or 'none'}."
         )
     nothing = np.full(len(grasps), np.nan)
-    if scores == "school":
-        value = grasps.scores
-    else:
-        friction = grasps.measures.get("closure_friction", nothing)
-        value = np.where(friction < MOST_FRICTION, MOST_FRICTION - friction, np.nan)
+    value = _value(grasps, scores)
     rows = np.flatnonzero(~np.isnan(value))
     openings = _stored(grasps, "openings_m", grasps.widths_m)[rows]
     if np.any(np.isnan(openings)):
@@ -171,7 +197,12 @@ def _group_of(
         heights_m=np.full(len(rows), HEIGHT_M),
         depths_m=_stored(grasps, "depths_m", nothing + depth_m, depth_m)[rows],
         obj_ids=np.full(len(rows), grasps.obj_id, dtype=np.int64),
-    )
+        known={
+            "instance": np.full(len(rows), float(grasps.instance)), "row": rows.astype(np.float64),
+            "score": grasps.scores[rows], "base_score": grasps.base_scores[rows],
+            "width_m": grasps.widths_m[rows],
+        },
+    )  # fmt: skip
 
 
 def _stored(grasps: GraspSet, name: str, other: Array, fill: float = np.nan) -> Array:
@@ -199,18 +230,39 @@ def grasp_group_bytes(group: GraspGroup) -> bytes:
     return buffer.getvalue()
 
 
+def grasp_group_files(name: str, group: GraspGroup) -> dict[str, bytes]:
+    """Return file names and contents of a group: the npy and, where more is known, the npz."""
+    files = {name: grasp_group_bytes(group)}
+    if group.known:
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **group.known)
+        files = {str(_beside(Path(name))): buffer.getvalue()} | files
+    return files
+
+
+def _beside(path: Path) -> Path:
+    """Return the file beside a group of what its columns do not say."""
+    return path.with_suffix(".labels.npz")
+
+
 def write_grasp_group(path: Path | str, group: GraspGroup) -> Path:
-    """Write grasps as graspnetAPI's save_npy does, in single precision, whole or not at all."""
+    """Write grasps as graspnetAPI's save_npy does, in single precision, and what else is known.
+
+    Each file is whole or not there.
+    """
     path = Path(path)
-    atomic.write_bytes(path, grasp_group_bytes(group))
+    _beside(path).unlink(missing_ok=True)  # of other grasps
+    for name, data in grasp_group_files(path.name, group).items():
+        atomic.write_bytes(path.with_name(name), data)
     return path
 
 
 def read_grasp_group(path: Path | str) -> GraspGroup:
-    """Return the grasps of a GraspGroup npy file, in its order.
+    """Return the grasps of a GraspGroup npy file, in its order, and what stands beside it.
 
     Raises:
-        InputError: it is none, a number is not finite, a rotation is none, or it is not in metres.
+        InputError: it is none, a number is not finite, a rotation is none, it is not in metres, or
+            the file beside it is of other grasps.
     """
     path = Path(path)
     rows = read_npy(path, most_bytes=MOST_BYTES)
@@ -239,6 +291,7 @@ def read_grasp_group(path: Path | str) -> GraspGroup:
         heights_m=rows[:, 2],
         depths_m=rows[:, 3],
         obj_ids=ids.astype(np.int64) + 1,
+        known=read_npz(_beside(path)) if _beside(path).is_file() else {},
     )
 
 

@@ -8,14 +8,15 @@ for a gripper whose offset is the identity write the default; for one that is de
 of franka_description's hand (closing = y) write frame="panda_hand".
 
 The label is true where the fingers still held the object after all four stages. Grasps that physics
-has not tried have none and are left out. What has no counterpart (frame, rows, scores, widths) is
-under the key `realsim`, which GraspGen does not read. The hand's frame has its origin at the
+has not tried have none and are left out. What has no counterpart (frame, rows, widths, scores,
+base scores and all measures: p_hold, its error, safety by stage) is under the key `realsim`, which
+GraspGen does not read. The hand's frame has its origin at the
 mounting face that the hand's description says.
 
 Source: NVlabs/GraspGen, docs/GRASP_DATASET_FORMAT.md and docs/GRIPPER_DESCRIPTION.md.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,14 @@ from realsim.formats.grasps.hand_frames import (
     hand_poses,
     known_frame,
 )
-from realsim.formats.grasps.scene_grasps import check_values, executed, held, untried_set
+from realsim.formats.grasps.scene_grasps import (
+    check_values,
+    executed,
+    held,
+    measures_json,
+    measures_of_json,
+    untried_set,
+)
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.robots.hand import find_hand
@@ -57,14 +65,18 @@ class GraspGenGrasps:
     """(N,) whether the simulator of the file found the object held."""
     scores: Array | None = None
     """(N,) our score, where realsim wrote the file."""
+    base_scores: Array | None = None
+    """(N,) likewise."""
     widths_m: Array | None = None
     """(N,) [m], likewise."""
+    measures: dict[str, Array] = field(default_factory=dict[str, Array])
+    """(N,) or (N, 4) by the names of MEASURES, likewise."""
 
     def as_set(self, obj_id: int, instance: int = 0) -> GraspSet:
         """Return the grasps as a set that our physics has not tried; the label is not a score."""
         return untried_set(
             self.Ts_obj_grasp, obj_id=obj_id, instance=instance, widths_m=self.widths_m,
-            parameters={"source": {"from": "GraspGen", "file": self.file}},
+            parameters={"source": {"from": "GraspGen", "file": self.file}}, measures=self.measures,
         )  # fmt: skip
 
 
@@ -103,7 +115,9 @@ def write_graspgen(
             "hand": {"name": hand.name, "digest": hand.digest, "mount_z_m": hand.mount_z_m},
             "rows": rows.tolist(),
             "scores": to_json(grasps.scores[rows]),
+            "base_scores": to_json(grasps.base_scores[rows]),
             "widths_m": to_json(grasps.widths_m[rows]),
+            "measures": measures_json(grasps, rows),
             "left_out": len(grasps) - len(rows),
         },
     }
@@ -135,7 +149,8 @@ def read_graspgen(path: Path | str, frame: HandFrame | None = None) -> GraspGenG
         used = known_frame(frame or ours.get("frame", "acronym"))
         mount_z = float(ours.get("hand", {}).get("mount_z_m", find_hand().mount_z_m))
         hand = replace(find_hand(), mount_z_m=mount_z)
-        scores, widths = _ours(ours, "scores", len(Ts)), _ours(ours, "widths_m", len(Ts))
+        columns = {k: _ours(ours, k, len(Ts)) for k in ("scores", "base_scores", "widths_m")}
+        measures = measures_of_json(ours.get("measures", {}), len(Ts), str(path))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(
             f"{path} is no file of GraspGen's grasps ({error!r}): object.file, object.scale, "
@@ -150,7 +165,7 @@ def read_graspgen(path: Path | str, frame: HandFrame | None = None) -> GraspGenG
     Ts = se3.check_rigid(grasp_poses(Ts, used, hand), f"{path}: transforms") if len(Ts) else Ts
     return GraspGenGrasps(
         file=mesh, scale=scale, Ts_obj_grasp=Ts, object_in_gripper=label.astype(np.bool_),
-        scores=scores, widths_m=widths,
+        measures=measures, **columns,
     )  # fmt: skip
 
 

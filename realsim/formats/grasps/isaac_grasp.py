@@ -6,24 +6,27 @@
     gripper_frame_link: panda_hand
     grasps:
       "grasp_0":
-        confidence: 0.75
+        confidence: 0.83
         position: [x, y, z]                     # of the gripper's frame in the object's [m]
         orientation: {w: 1.0, xyz: [0.0, 0.0, 0.0]}
         cspace_position: {panda_finger_joint1: 0.012}
         pregrasp_cspace_position: {panda_finger_joint1: 0.04}
+        realsim: {score: 1.0, base_score: 1.0, p_hold: 0.83, p_hold_error: 0.09, ...}
 
 The gripper's frame is franka_description's panda_hand, of other hands that at the mounting face
-with the same axes; frame and joint are called as the hand's description says. The confidence is our
-score, the number in the name is the grasp's row in its set. The joint is half the distance of the
-fingers, joint 2 mimics it; of an arc it is the crank's angle. Grasps that physics has not tried
-have no score and are left out.
+with the same axes; frame and joint are called as the hand's description says. The confidence is
+p_hold where the set has it, else the score; a comment in the file says which. Under `realsim`,
+which other readers leave alone, stand both scores and all measures, one number or one a stage;
+null = not measured. The number in the name is the grasp's row in its set. The joint is half the
+distance of the fingers, joint 2 mimics it; of an arc it is the crank's angle. Grasps that physics
+has not tried, or whose confidence is not known, are left out.
 
 Source: Isaac Sim, Grasp Editor, "What is an Isaac Grasp File?"; Isaac ROS names the two frames
 object_frame and gripper_frame, which are read, too.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +36,18 @@ from numpy.typing import NDArray
 from realsim import interop
 from realsim.errors import InputError
 from realsim.formats.grasps.hand_frames import HandFrame, grasp_poses, hand_of_set, hand_poses
-from realsim.formats.grasps.scene_grasps import check_values, executed, untried_set
+from realsim.formats.grasps.scene_grasps import (
+    check_values,
+    executed,
+    measures_json,
+    measures_of_json,
+    untried_set,
+)
 from realsim.geometry import se3
 from realsim.records import GraspSet
 from realsim.robots.hand import Hand
 from realsim.store import atomic
+from realsim.untrusted.own_json import to_json
 from realsim.untrusted.values import mapping, number, numbers
 from realsim.untrusted.yaml_text import read_yaml
 
@@ -46,6 +56,11 @@ FORMAT_VERSION = 1.0
 FINGER = "panda_finger_joint1"
 WIDEST_M = 1.0
 """A finger that has moved farther is in millimetres [m]."""
+CONFIDENCES = {
+    "p_hold": "p_hold, the probability that a robot lifts the object and holds it",
+    "score": "score of one nominal attempt, no probability",
+}
+"""What the confidence is, by the set's label."""
 UNIT_TOLERANCE = 1e-3
 """How far a quaternion's length may be from 1: files written by hand have five decimals."""
 
@@ -63,12 +78,18 @@ class IsaacGrasps:
     """(N,) distance of the fingers [m]; NaN = the file names no such joint."""
     openings_m: Array
     """(N,) distance of the fingers before closing [m]; NaN likewise."""
+    scores: Array
+    """(N,) our score, where realsim wrote the file; else NaN."""
+    base_scores: Array
+    """(N,) likewise."""
+    measures: dict[str, Array] = field(default_factory=dict[str, Array])
+    """(N,) or (N, 4) by the names of MEASURES, likewise."""
 
     def as_set(self, obj_id: int, instance: int = 0) -> GraspSet:
         """Return the grasps as a set that our physics has not tried."""
         return untried_set(
             self.Ts_obj_grasp, obj_id=obj_id, instance=instance, widths_m=self.widths_m,
-            parameters={"source": {"from": "isaac_grasp"}},
+            parameters={"source": {"from": "isaac_grasp"}}, measures=self.measures,
         )  # fmt: skip
 
 
@@ -82,13 +103,16 @@ def write_isaac_grasp(
         grasps: the set; its parameters' openings_m are the fingers' distance before closing, where
             they are there, else the hand opens fully.
         object_frame: name of the object's frame.
-        least_score: grasps below it are left out.
+        least_score: grasps of less confidence are left out.
 
     Raises:
         InputError: the set holds what no grasp has, or a width that the hand cannot take.
     """
     check_values(grasps)
-    rows = np.flatnonzero(executed(grasps) & (np.nan_to_num(grasps.scores, nan=-1) >= least_score))
+    labels = grasps.labels
+    rows = np.flatnonzero(executed(grasps) & (labels >= least_score))  # NaN is not
+    ours = {"score": to_json(grasps.scores[rows]), "base_score": to_json(grasps.base_scores[rows])}
+    ours |= measures_json(grasps, rows)
     hand = hand_of_set(grasps)
     Ts = hand_poses(grasps.Ts_obj_grasp[rows], "panda_hand", hand)
     widths, openings = grasps.widths_m[rows], _openings(grasps, hand)[rows]
@@ -101,17 +125,19 @@ def write_isaac_grasp(
         f"format_version: {FORMAT_VERSION}",
         f"object_frame_link: {json.dumps(object_frame)}",
         f"gripper_frame_link: {json.dumps(hand.frame_link)}",
+        f"# confidence: {CONFIDENCES[grasps.label]}",
         "grasps:" if len(rows) else "grasps: {}",
     ]
     for k, row in enumerate(rows.tolist()):
         x, y, z, w = (_number(q) for q in xyzw[k])
         lines += [
             f'  "grasp_{row}":',
-            f"    confidence: {_number(grasps.scores[row])}",
+            f"    confidence: {_number(labels[row])}",
             f"    position: [{', '.join(_number(t) for t in Ts[k, :3, 3])}]",
             f"    orientation: {{w: {w}, xyz: [{x}, {y}, {z}]}}",
             f"    cspace_position: {{{hand.joint}: {_number(closed[k])}}}",
             f"    pregrasp_cspace_position: {{{hand.joint}: {_number(opened[k])}}}",
+            f"    realsim: {{{', '.join(f'{n}: {_flow(v[k])}' for n, v in ours.items())}}}",
         ]
     path = Path(path)
     atomic.write_text(path, "\n".join(lines) + "\n")
@@ -157,6 +183,13 @@ def _require_fits(widths_m: Array, hand: Hand) -> None:
         )
 
 
+def _flow(value: Any) -> str:
+    """Return a number or a list of them, as `to_json` made them, in YAML's words."""
+    if isinstance(value, list):
+        return f"[{', '.join(map(_flow, value))}]"
+    return _number(value) if isinstance(value, float) else json.dumps(value)
+
+
 def _number(x: float) -> str:
     """Return a float that every YAML reader takes for one: 1e-05 is a text in YAML 1.1."""
     text = repr(float(x))
@@ -199,6 +232,13 @@ def read_isaac_grasp(path: Path | str, frame: HandFrame = "panda_hand") -> Isaac
                 "and orientation {w, xyz: [x, y, z]} of unit length are expected."
             ) from error
     table = np.stack(rows) if rows else np.zeros((0, 10))
+    told = [mapping(entry.get("realsim", {}), f"{path}: realsim") for entry in listed.values()]
+    scores, base_scores = (
+        np.array([number(t[key], f"{path}: {key}", 0, 1) if key in t else np.nan for t in told])
+        for key in ("score", "base_score")
+    )
+    others = {key for t in told for key in t} - {"score", "base_score"}
+    columns = {key: [t.get(key) for t in told] for key in others}
     R = interop.R_from_quaternion_xyzw(table[:, 3:7]) if rows else np.zeros((0, 3, 3))
     Ts = grasp_poses(se3.from_rt(R, table[:, :3]), frame)
     return IsaacGrasps(
@@ -207,6 +247,9 @@ def read_isaac_grasp(path: Path | str, frame: HandFrame = "panda_hand") -> Isaac
         confidences=table[:, 7],
         widths_m=table[:, 8],
         openings_m=table[:, 9],
+        scores=scores,
+        base_scores=base_scores,
+        measures=measures_of_json(columns, len(rows), str(path)),
     )
 
 

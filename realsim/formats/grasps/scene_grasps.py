@@ -16,8 +16,9 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
 from realsim.records.checked_arrays import Array, rigid
-from realsim.records.grasps import require_one_hand
+from realsim.records.grasps import MEASURES, require_one_hand
 from realsim.records.trajectories import GraspTrajectories
+from realsim.untrusted.own_json import array_from_json, to_json
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -83,8 +84,8 @@ def check_values(grasps: GraspSet) -> None:
     """Check that every number of a set means something.
 
     Raises:
-        InputError: a width is negative or infinite, a score outside 0 to 1, a base score no
-            quarter, a slip negative, a reason that no file can hold, or parameters that are not
+        InputError: a width is negative or infinite, a score or share outside 0 to 1, a base score
+            no quarter, a slip negative, a reason that no file can hold, or parameters that are not
             plain JSON values.
     """
     who = f"the grasp set of instance {grasps.instance}"
@@ -96,6 +97,9 @@ def check_values(grasps: GraspSet) -> None:
     for name in ("slip_m", "slip_rad"):
         values: Array = getattr(grasps, name)
         _require(values, values >= 0, who, f"a value of {name}", "0 or more, inf = lost")
+    for name, values in grasps.measures.items():
+        if MEASURES[name].is_share:
+            _require(values, _within(values, 0.0, 1.0), who, f"a {name}", "0 to 1")
     for text in grasps.failures:
         if "\0" in text or not _is_text(text):
             raise InputError(f"{who} has a reason that is no plain text: {text[:40]!r}.")
@@ -145,6 +149,33 @@ def parameters_json(grasps: GraspSet) -> str:
     return text
 
 
+def measures_json(grasps: GraspSet, rows: NDArray[np.int64]) -> dict[str, Any]:
+    """Return what was measured of some rows as plain JSON values, by name."""
+    return {name: to_json(values[rows]) for name, values in grasps.measures.items()}
+
+
+def measures_of_json(told: Any, n: int, where: str) -> dict[str, Array]:
+    """Return the measures of n grasps that `measures_json` made JSON of.
+
+    Raises:
+        InputError: they are no measures, or of another number of grasps.
+    """
+    try:
+        unknown = sorted(set(told) - set(MEASURES))
+        found = {
+            name: array_from_json(told[name], (n, len(STAGES)) if kind.by_stage else (n,))
+            for name, kind in MEASURES.items()
+            if name in told
+        }
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{where}: the measures are not those of {n} grasps ({error}).") from error
+    if unknown:
+        raise InputError(
+            f"{where}: '{unknown[0]}' is no measure of a grasp; there are: {', '.join(MEASURES)}."
+        )
+    return found
+
+
 def executed(grasps: GraspSet) -> NDArray[np.bool_]:
     """Return (N,) which grasps physics has tried: the first stage was executed."""
     return ~np.isnan(grasps.slip_m[:, 0])
@@ -158,6 +189,7 @@ def held(grasps: GraspSet) -> NDArray[np.bool_]:
 def untried_set(
     Ts_obj_grasp: Array, *, obj_id: int, instance: int = 0, widths_m: Array | None = None,
     parameters: dict[str, Any] | None = None, reason: str = "not tried",
+    measures: dict[str, Array] | None = None,
 ) -> GraspSet:  # fmt: skip
     """Return grasps that came from elsewhere as a set that physics has not tried.
 
@@ -168,6 +200,7 @@ def untried_set(
         widths_m: (N,) [m]; None = not known.
         parameters: where they came from, as plain JSON values.
         reason: kept for every grasp.
+        measures: what the file says of them, by the names of MEASURES.
     """
     n = len(Ts_obj_grasp)
     nothing = np.full((n, len(STAGES)), np.nan)
@@ -182,6 +215,7 @@ def untried_set(
         slip_rad=nothing,
         reachable=np.zeros(n, dtype=np.bool_),
         failures=(reason,) * n,
+        measures=measures or {},
         parameters=parameters or {},
     )
 

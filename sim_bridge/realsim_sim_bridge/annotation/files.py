@@ -3,7 +3,7 @@
 mask/000000_000001.png        silhouette of object 1 of view 0, also where something hides it
 mask_visib/000000_000001.png  its visible part
 labels/instance/000000.png    instances; labels/depth, coordinates, normals alike
-grasps/views/000000.npz       grasps in that camera: pose, score, seen, reachable
+grasps/views/000000.npz       grasps in that camera: pose, score, p_hold, seen, reachable
 annotations/000000.json       camera, poses, boxes, counts, agreement with the measured depth
 annotations/objects.json      per object: verdict, checks, mass properties, box
 annotations/surfaces/         per model: points on its surface with normals
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats.bop import labels as bop_labels
+from realsim.records.grasps import joined_measure
 from realsim.rendering.labels import Labels
 from realsim.store import SessionStore
 from realsim.untrusted.own_json import to_json
@@ -29,7 +30,12 @@ from realsim_sim_bridge.annotation.config import MAPS
 from realsim_sim_bridge.annotation.frame_grasps import GraspsInView
 from realsim_sim_bridge.annotation.frame_labels import FrameLabel
 from realsim_sim_bridge.annotation.frame_maps import map_path
-from realsim_sim_bridge.annotation.inputs import FORMAT_VERSION, FrameInputs, FrameView
+from realsim_sim_bridge.annotation.inputs import (
+    FORMAT_VERSION,
+    LABEL_MEASURES,
+    FrameInputs,
+    FrameView,
+)
 
 OBJECTS_FILE = "annotations/objects.json"
 INFO_KEYS = (
@@ -63,26 +69,33 @@ def grasps_bytes(grasps: Sequence[GraspsInView]) -> bytes:
     """Return the grasps of all objects in one view's camera, object after object, as npz.
 
     Arrays: instance (N,), obj_id (N,), Ts_cam_grasp (N, 4, 4) [m], widths_m (N,), scores (N,),
-    visibility (N,) 0 hidden 1 partly 2 visible, contact_seen (N, 2), reachable (N,).
+    base_scores (N,), visibility (N,) 0 hidden 1 partly 2 visible, contact_seen (N, 2), reachable
+    (N,), and those of LABEL_MEASURES that a set has: (N,), safety (N, 4); NaN = not known.
     """
-    counts = [len(g.scores) for g in grasps]
+    sets = [g.grasp_set for g in grasps]
 
-    def joined(name: str, shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
-        empty = np.zeros((0, *shape), dtype)
-        return np.concatenate([empty, *(np.asarray(getattr(g, name), dtype) for g in grasps)])
+    def joined(parts: Sequence[Any], shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+        return np.concatenate([np.zeros((0, *shape), dtype), *parts]).astype(dtype)
 
     buffer = io.BytesIO()
     # Not compressed: poses have no pattern, and deflating them would cost more than the masks do.
     np.savez(
         buffer,
-        instance=np.repeat(np.array([g.instance for g in grasps], np.int32), counts),
-        obj_id=np.repeat(np.array([g.obj_id for g in grasps], np.int32), counts),
-        Ts_cam_grasp=joined("Ts_cam_grasp", (4, 4), np.float64),
-        widths_m=joined("widths_m", (), np.float64),
-        scores=joined("scores", (), np.float64),
-        visibility=joined("visibility", (), np.uint8),
-        contact_seen=joined("contact_seen", (2,), np.bool_),
-        reachable=joined("reachable", (), np.bool_),
+        allow_pickle=False,
+        instance=joined([np.full(len(s), s.instance) for s in sets], (), np.int32),
+        obj_id=joined([np.full(len(s), s.obj_id) for s in sets], (), np.int32),
+        Ts_cam_grasp=joined([g.Ts_cam_grasp for g in grasps], (4, 4), np.float64),
+        widths_m=joined([s.widths_m for s in sets], (), np.float64),
+        scores=joined([s.scores for s in sets], (), np.float64),
+        base_scores=joined([s.base_scores for s in sets], (), np.float64),
+        visibility=joined([g.visibility for g in grasps], (), np.uint8),
+        contact_seen=joined([g.contact_seen for g in grasps], (2,), np.bool_),
+        reachable=joined([s.reachable for s in sets], (), np.bool_),
+        **{
+            name: joined_measure(sets, name)
+            for name in LABEL_MEASURES
+            if any(name in s.measures for s in sets)
+        },
     )
     return buffer.getvalue()
 

@@ -145,7 +145,7 @@ def _seen(inputs: FrameInputs, labels: Labels, depth_m: Depth) -> _Seen:
 def _counts(grasps: Sequence[GraspsInView]) -> dict[int, dict[str, int]]:
     """Return per instance how many grasps are visible, partly visible and hidden."""
     return {
-        g.instance: {
+        g.grasp_set.instance: {
             code.name.lower(): int(np.count_nonzero(g.visibility == code))
             for code in GraspVisibility
         }

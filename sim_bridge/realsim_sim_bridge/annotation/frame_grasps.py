@@ -43,16 +43,10 @@ class GraspVisibility(IntEnum):
 class GraspsInView:
     """The grasps of one object instance in one view."""
 
-    obj_id: int
-    instance: int
     Ts_cam_grasp: Array
     """(N, 4, 4) grasp in camera [m]."""
-    widths_m: Array
-    """(N,) distance of the contacts [m]."""
-    scores: Array
-    """(N,) in [0, 1]; NaN = not tried."""
-    reachable: Mask
-    """(N,) whether the arm reaches it."""
+    grasp_set: GraspSet
+    """Widths, scores and measures of the same N grasps."""
     contact_seen: Mask
     """(N, 2) whether the contact at -y and at +y is seen."""
 
@@ -154,14 +148,6 @@ def grasps_in_view(
     ends = np.cumsum([len(g) for _, g in grasp_sets])
     contact_seen = np.split(seen.reshape(-1, 2), ends[:-1])
     return [
-        GraspsInView(
-            obj_id=grasps.obj_id,
-            instance=grasps.instance,
-            Ts_cam_grasp=Ts_of,
-            widths_m=grasps.widths_m,
-            scores=grasps.scores,
-            reachable=grasps.reachable,
-            contact_seen=seen_of,
-        )
+        GraspsInView(Ts_cam_grasp=Ts_of, grasp_set=grasps, contact_seen=seen_of)
         for (_, grasps), Ts_of, seen_of in zip(grasp_sets, Ts, contact_seen, strict=False)
     ]

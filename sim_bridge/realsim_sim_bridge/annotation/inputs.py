@@ -26,8 +26,10 @@ from realsim.store.session_store import depth_path, rgb_path
 from realsim.untrusted.own_json import to_json
 from realsim_sim_bridge.annotation.config import AnnotationConfig
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Part of every digest: a new version annotates anew."""
+LABEL_MEASURES = ("p_hold", "p_hold_error", "p_hold_draws", "safety")
+"""What every frame says of its grasps beside the score."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
@@ -150,8 +152,10 @@ def _scene_digest(
         digest.update(f"{obj_id} {model.name} ".encode())
         digest.update(model.mesh.vertices.tobytes() + model.mesh.faces.tobytes())
     for g in grasp_sets:
-        digest.update(f"{g.instance} {g.obj_id} {len(g)} ".encode())
-        for array in (g.Ts_obj_grasp, g.widths_m, g.scores, g.reachable):
+        names = [name for name in LABEL_MEASURES if name in g.measures]
+        digest.update(f"{g.instance} {g.obj_id} {len(g)} {names} ".encode())
+        columns = (g.Ts_obj_grasp, g.widths_m, g.scores, g.base_scores, g.reachable)
+        for array in (*columns, *(g.measures[name] for name in names)):
             digest.update(np.ascontiguousarray(array).tobytes())
     for p in surroundings:
         for array in (p.T_world_obj, p.mesh.vertices, p.mesh.faces):
