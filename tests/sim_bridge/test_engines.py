@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from realsim_sim_bridge.slip.engines import (
 )
 from realsim_sim_bridge.slip.mujoco_model import lift_law
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import Closing, Grips, Replay, SlipBody, SlipPhysics
 from realsim_sim_bridge.validation.specimens import cube_trial
 
@@ -126,3 +128,69 @@ def test_pads_of_an_arc_are_where_it_has_them_while_they_close():
             off = np.abs(lifts - hand.z_pad(2 * pair.fingers()[0])).max()
             assert off < (1e-4 if step > 5 else 1e-3)  # the fingers begin to move at once
         assert 0.0245 < pair.fingers()[0].min() < 0.0255  # it has arrived
+
+
+# --- closing on a table ---------------------------------------------------------------------------
+
+
+def block(side, low=0.0, off=(0.0, 0.0)):
+    """Return corners of a box of sides (3,) [m] that stands at `low` on z, at `off` on x and y."""
+    corners = np.array(list(product((-0.5, 0.5), (-0.5, 0.5), (0.0, 1.0)))) * side
+    return corners + np.array([*off, low])
+
+
+def standing(engine, corners, stand, physics=None, closing=None, off_m=0.0):
+    """Return what a hand that closes from above at z = 2 cm does to a body of 100 g, in steps."""
+    body = SlipBody(
+        parts=(corners,), mass_kg=0.1, center_of_mass=corners.mean(axis=0), inertia=1e-4 * np.eye(3)
+    )
+    Ts = se3.from_rt(DOWN, [0.0, off_m, 0.02])[None]
+    grips = Grips(Ts_table_grasp=Ts, Ts_obj_grasp=Ts, openings_m=np.array([0.07]))
+    made = make_engine(settings_of(engine))
+    with made.world(body, grips, physics or SlipPhysics(), find_hand(), stand) as world:
+        start = world.states().Ts_world_body[0]
+        motion = world.close(closing or Closing())
+    return start, motion.Ts_world_body[0], motion.finger_n[0]
+
+
+def table(neighbours=(), gravity=9.81):
+    return Stand.around([block([0.04] * 3)], neighbours, friction=0.4, gravity=gravity)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_table_far_below_and_no_weight_are_no_table(engine):
+    free = Closing(drag_per_s=0.0)
+    far = replace(table(gravity=0.0), height_m=-10.0)
+    cube = block([0.04] * 3)
+    pushed, alone = (standing(engine, cube, s, None, free, 0.004)[1] for s in (far, None))
+    np.testing.assert_allclose(pushed, alone, atol=1e-9)
+    assert np.ptp(alone[:, 1, 3]) > 1e-3
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_what_stands_stays_and_the_table_forbids_to_go_down(engine):
+    cube = block([0.04] * 3)
+    start, seen, _ = standing(engine, cube, table(), off_m=0.2)
+    assert np.abs(seen[:, :3, 3] - start[:3, 3]).max() < 3e-5
+    assert np.abs(seen[:, :3, :3] - start[:3, :3]).max() < 5e-4
+    # A roof whose sides slope by 31 degrees: fingers that hardly rub squeeze it downwards.
+    roof = np.concatenate([block([0.04, 0.05, 0.0]), block([0.04, 0.02, 0.0], 0.025)])
+    slippery = SlipPhysics(friction=0.1, force_n=20.0)
+    down = {}
+    for name, stand in (("free", None), ("stands", table())):
+        start, seen, forces = standing(engine, roof, stand, slippery)
+        down[name] = start[2, 3] - seen[-1, 2, 3]
+    assert down["stands"] < 1e-3 < 0.01 < down["free"] and forces[-1].min() > 1.0
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_neighbour_blocks_and_its_overlap_throws_nothing(engine):
+    cube = block([0.04] * 3)
+    beside = block([0.04] * 3, off=(0.0, -0.037))  # 3 mm in
+    stand = table([beside, block([0.01] * 3, 0.01), block([0.04] * 3, off=(0.0, 0.2))])
+    assert stand.moved_m == pytest.approx(0.003) and stand.left_out == 1
+    assert len(stand.obstacles) == 1 and stand.height_m == 0.0
+    start, seen, _ = standing(engine, cube, stand, off_m=-0.015)
+    assert np.abs(seen[:, :3, 3] - start[:3, 3]).max() < 1e-3
+    start, seen, forces = standing(engine, cube, table(), off_m=-0.015)
+    assert start[1, 3] - seen[-1, 1, 3] > 0.01 and forces[-1].min() > 60.0

@@ -80,9 +80,9 @@ class StrongerEngine:
     def __getattr__(self, name):
         return getattr(self._engine, name)
 
-    def world(self, body, grips, physics, geometry):
+    def world(self, body, grips, physics, geometry, stand=None):
         stronger = replace(physics, force_n=1.5 * physics.force_n)
-        return self._engine.world(body, grips, stronger, geometry)
+        return self._engine.world(body, grips, stronger, geometry, stand)
 
 
 # --- what must be green --------------------------------------------------------------------------

@@ -20,6 +20,7 @@ from realsim_sim_bridge.arm.reach_config import grasping_arm
 from realsim_sim_bridge.school.config import SchoolConfig
 from realsim_sim_bridge.slip.score import score_stages
 from realsim_sim_bridge.slip.slip_test import SlipTrial, run_slip_test
+from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import (
     Closing,
     Engine,
@@ -69,7 +70,12 @@ class RecordedEngine(Engine):
         self._worlds = 0
 
     def world(
-        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: Hand
+        self,
+        body: SlipBody,
+        grips: Grips,
+        physics: SlipPhysics,
+        geometry: Hand,
+        stand: Stand | None = None,
     ) -> HandWorld:
         """Return the engine's world, watched.
 
@@ -78,7 +84,7 @@ class RecordedEngine(Engine):
         """
         self._worlds += 1
         again = self._worlds > 1
-        world = self._engine.world(body, grips, physics, geometry)
+        world = self._engine.world(body, grips, physics, geometry, stand)
         return _RecordedWorld(world, self.stages, 1 if again else self.replay.speed, again)
 
 

@@ -27,6 +27,7 @@ from realsim.errors import RealsimError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.bullet_shapes import drawn_in, hand_urdf
+from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody, SlipPhysics
 
 if TYPE_CHECKING:
@@ -42,6 +43,11 @@ LIFT_PULL = 0.5
 """Share of the height's error that is taken back in a step."""
 FAR_AWAY = (0.0, 0.0, 50.0)
 """Where the object waits while contacts of the grasp before are forgotten [m]."""
+AWAY = (0.0, 0.0, -50.0)
+"""Where the table and the neighbours are while loads are played [m]."""
+TABLE_M = (1.0, 1.0, 0.2)
+"""Size of the table under the object [m]: a box, not Bullet's infinite plane, on which a resting
+box starts with 27 mm/s."""
 
 
 class BulletPair:
@@ -53,8 +59,9 @@ class BulletPair:
         physics: SlipPhysics,
         geometry: Hand,
         settings: "BulletSettings",
+        stand: Stand | None = None,
     ) -> None:
-        """Build the pair.
+        """Build the pair, and what the object stands on while the fingers close.
 
         Raises:
             RealsimError: PyBullet does not take the shape, or a setting.
@@ -85,7 +92,11 @@ class BulletPair:
             T_body_obj = se3.invert(self._T_obj_body)
             parts = [se3.transform(T_body_obj, part) for part in body.parts]
             cores, margin = drawn_in(parts, settings.collision_margin_m)
-            self.object = self._add_object(self._shape(cores, Path(folder)), margin)
+            self.object = self._add_object(self._shape(cores, Path(folder) / "object.obj"), margin)
+            self._stands = [] if stand is None else self._add_stand(stand, Path(folder))
+        self.stand = stand
+        self.weight_n = 0.0 if stand is None else stand.gravity * self._mass
+        """Of the object in the engine [N]."""
 
     # --- what is in it ------------------------------------------------------------------------
 
@@ -130,9 +141,11 @@ class BulletPair:
         )
         return hand
 
-    def _shape(self, parts: list[Array], folder: Path) -> int:
-        """Return the collision shape of convex parts (V, 3) in the body's principal frame."""
-        path = folder / "parts.obj"
+    def _shape(self, parts: list[Array], path: Path) -> int:
+        """Return the collision shape of convex parts (V, 3), body frame, through a file.
+
+        Bullet keeps what it has read by the file's name: no two shapes may have the same.
+        """
         path.write_text(wavefront(parts))
         shape: int = self.engine.createCollisionShape(
             self.engine.GEOM_MESH, fileName=str(path), meshScale=[1.0, 1.0, 1.0]
@@ -158,6 +171,27 @@ class BulletPair:
         self.engine.changeDynamics(obj, -1, localInertiaDiagonal=self._moments.tolist(), **wanted)
         self._check(obj, -1, wanted)
         return obj
+
+    def _add_stand(self, stand: Stand, folder: Path) -> list[int]:
+        """Add the table and, where there are any, the neighbours; the hand does not meet them."""
+        engine, settings = self.engine, self._settings
+        # Bullet multiplies the two coefficients.
+        rough = {"lateralFriction": stand.friction / self._physics.friction}
+        half = [size / 2.0 for size in TABLE_M]
+        wanted = [(engine.createCollisionShape(engine.GEOM_BOX, halfExtents=half), rough)]
+        if stand.obstacles:
+            cores, margin = drawn_in(list(stand.obstacles), settings.collision_margin_m)
+            beside = self._shape(cores, folder / "beside.obj")
+            wanted.append((beside, rough | {"collisionMargin": margin}))
+        found: list[int] = []
+        for shape, values in wanted:
+            body: int = engine.createMultiBody(0.0, shape, basePosition=AWAY)
+            engine.changeDynamics(body, -1, **values)
+            self._check(body, -1, values)
+            for link in range(-1, engine.getNumJoints(self.hand)):
+                engine.setCollisionFilterPair(self.hand, body, link, -1, 0)
+            found.append(body)
+        return found
 
     def _check(self, body: int, link: int, wanted: dict[str, float]) -> None:
         """Raise if the engine did not take a setting."""
@@ -189,6 +223,19 @@ class BulletPair:
                 self.hand, lift, float(self._geometry.z_pad(2 * fingers_m[side]))
             )
         self.follow_arc(still=True)
+
+    def place_stand(self, T_hand_table: Array | None) -> None:
+        """Put the table under the hand and the neighbours where they are, or all of it away."""
+        for n, body in enumerate(self._stands):
+            position, xyzw = AWAY, (0.0, 0.0, 0.0, 1.0)
+            if T_hand_table is not None:
+                T = T_hand_table
+                if n == 0:
+                    assert self.stand is not None, "a table is a stand's"
+                    top = self.stand.height_m - TABLE_M[2] / 2.0
+                    T = T @ se3.from_translation([*se3.invert(T)[:2, 3], top])
+                position, xyzw = interop.pybullet_from_T(T)
+            self.engine.resetBasePositionAndOrientation(body, position, xyzw)
 
     def drive(self, speed: float) -> None:
         """Let the fingers close at a speed [m/s] each, with at most the hand's force."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.bullet_pair import BulletPair
+from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import (
     Closing,
     Engine,
@@ -38,18 +39,26 @@ class BulletEngine(Engine):
         self._kept: tuple[SlipBody, SlipPhysics, Hand, BulletPair] | None = None
 
     def world(
-        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: Hand
+        self,
+        body: SlipBody,
+        grips: Grips,
+        physics: SlipPhysics,
+        geometry: Hand,
+        stand: Stand | None = None,
     ) -> "BulletWorld":
         """Return a world with these pairs."""
-        return BulletWorld(self._pair(body, physics, geometry), body, grips, physics)
+        return BulletWorld(self._pair(body, physics, geometry, stand), body, grips, physics)
 
-    def _pair(self, body: SlipBody, physics: SlipPhysics, geometry: Hand) -> BulletPair:
+    def _pair(
+        self, body: SlipBody, physics: SlipPhysics, geometry: Hand, stand: Stand | None
+    ) -> BulletPair:
         """Return the pair of this body, built if it is another one than the last."""
         if self._kept is not None:
             kept_body, kept_physics, kept_geometry, pair = self._kept
-            if kept_body is body and kept_physics == physics and kept_geometry == geometry:
+            same = kept_body is body and pair.stand is stand
+            if same and kept_physics == physics and kept_geometry == geometry:
                 return pair
-        pair = BulletPair(body, physics, geometry, self.settings)
+        pair = BulletPair(body, physics, geometry, self.settings, stand)
         self._kept = (body, physics, geometry, pair)
         return pair
 
@@ -64,6 +73,7 @@ class BulletWorld(HandWorld):
         n = len(grips.openings_m)
         self._pair, self._physics = pair, physics
         self.dt = pair.dt
+        self._Ts_hand_table = se3.invert(grips.Ts_table_grasp)
         self._R_world_hand = grips.Ts_table_grasp[:, :3, :3]
         self._Ts_hand_body = se3.invert(grips.Ts_obj_grasp) @ body.principal_frame()[0]
         self._twists = np.zeros((n, 6))
@@ -83,20 +93,23 @@ class BulletWorld(HandWorld):
         """Close all hands; see `HandWorld`. Each pair ends where it came to rest."""
         sample = max(1, round(closing.sample_s / self.dt))
         pair = self._pair
-        pair.drag(closing.drag_per_s)
+        pair.drag(closing.drag_per_s if pair.stand is None else 0.0)
         pair.anchor(False)
         seen = [
             self._close(k, closing, sample) if self.alive[k] else [] for k in range(len(self.alive))
         ]
         pair.drag(0.0)
+        pair.place_stand(None)
         pair.anchor(True)
         return self._motion(seen, max((len(s) for s in seen), default=0), sample)
 
     def _close(self, k: int, closing: Closing, sample: int) -> list[tuple[Array, Array]]:
         """Close hand k and return what is seen every `sample` steps."""
         pair = self._pair
+        pair.place_stand(self._Ts_hand_table[k])
         self._take(k)
         pair.drive(closing.speed)
+        weight: list[float] = (-pair.weight_n * self._R_world_hand[k, 2]).tolist()
         duration_s = float(self._fingers[k].max()) / closing.speed + closing.settle_s
         start = before = self._Ts_hand_body[k, :3, 3]
         fingers = self._fingers[k]
@@ -104,6 +117,8 @@ class BulletWorld(HandWorld):
         while len(seen) * sample < duration_s / self.dt:
             for _ in range(sample):
                 pair.follow_arc()
+                if pair.weight_n:
+                    pair.push([0.0, 0.0, 0.0], weight)
                 pair.engine.stepSimulation()
             seen.append((pair.pose(), pair.finger_forces()))
             at, forces = seen[-1][0][:3, 3], seen[-1][1]

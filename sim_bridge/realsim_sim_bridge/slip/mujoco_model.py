@@ -23,6 +23,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.mujoco_approach import surface_triangles
+from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import PadModel, SlipBody, SlipPhysics
 
 if TYPE_CHECKING:
@@ -37,12 +38,14 @@ LOCKED_KG = 1e7
 and at 1e8 the solver is no longer exact enough."""
 SIDES = (1.0, -1.0)
 """Finger 0 is at +y."""
-OBJECT = "object"
+OBJECT, HULL, STAND = "object", "hull", "stand"
 CARRIAGE = "carriage"
 CARRIAGE_KG_PER_N = 150.0
 """Mass of the carriage [kg per N of the hand's force]: 2 F slow it by 1.3 cm/s in a second."""
 HAND_SIDE, OBJECT_SIDE = 1, 2
 """Collision bits: the hand's geoms meet the object's and nothing else."""
+TABLE_SIDE = 4
+"""The table meets the object's hull alone, in at most four points, and not its parts."""
 STIFF = (0.99, 0.999, 0.001, 0.5, 2.0)
 """`solimp` of joint limits and of the fingers' coupling: with the default one, 2 x 70 N push the
 fingers millimetres past their limits."""
@@ -63,6 +66,8 @@ class PairModel:
     reach_m: float
     """Greatest distance of a vertex from the centre of mass [m]."""
     geometry: Hand
+    stand: Stand | None
+    """What the object stands on while the fingers close; it is off while loads are played."""
     lifting: Array | None
     """(5,) z of the fingers of an arc as a polynomial of y, the constant first; None = a slide."""
     plain: NDArray[np.int64]
@@ -81,7 +86,11 @@ def load_mujoco() -> Any:
 
 
 def compile_pair(
-    body: SlipBody, physics: SlipPhysics, geometry: Hand, settings: "MujocoSettings"
+    body: SlipBody,
+    physics: SlipPhysics,
+    geometry: Hand,
+    settings: "MujocoSettings",
+    stand: Stand | None = None,
 ) -> PairModel:
     """Compile the model.
 
@@ -104,6 +113,8 @@ def compile_pair(
     parts = [se3.transform(se3.invert(T_obj_body), part) for part in body.parts]
     _add_object(spec, parts, body.mass_kg, moments, physics, settings)
     _add_drive(spec, physics, settings)
+    if stand is not None:
+        _add_stand(spec, stand, np.concatenate(parts), settings)
     try:
         model = spec.compile()
         lifts = lift_joints(model)
@@ -121,6 +132,7 @@ def compile_pair(
         triangles_obj=triangles,
         reach_m=body.reach(),
         geometry=geometry,
+        stand=stand,
         lifting=lifting,
         **_columns(model, lifts),
     )
@@ -176,35 +188,6 @@ def _keep_tolerance(model: Any, lifts: list[int]) -> None:
     Its tolerance is relative to the mean inertia of the model, most of which is theirs.
     """
     model.opt.tolerance *= np.delete(model.dof_M0[:-1], lifts).mean() / model.stat.meaninertia
-
-
-def set_drag(model: Any, rate_per_s: float) -> None:
-    """Let the object's speeds decay at a rate [1/s]."""
-    matter = model.body(OBJECT)
-    first = int(matter.dofadr[0])
-    model.dof_damping[first : first + 3] = rate_per_s * matter.mass[0]
-    model.dof_damping[first + 3 : first + 6] = rate_per_s * matter.inertia
-
-
-def read_settings(model: Any) -> dict[str, float]:
-    """Return what the compiled model says."""
-    hand = model.geom_contype == HAND_SIDE
-    fingers = [int(model.joint(name).dofadr[0]) for name in FINGER_NAMES]
-    matter = model.body(OBJECT)
-    return {
-        "finger_friction": float(model.geom_friction[hand, 0].min()),
-        "object_friction": float(model.geom_friction[~hand, 0].min()),
-        "dt_s": float(model.opt.timestep),
-        "object_mass_kg": float(model.body(OBJECT).mass[0]),
-        "force_n": float(model.tendon_frictionloss.min()),
-        "impratio": float(model.opt.impratio),
-        "noslip_iterations": float(model.opt.noslip_iterations),
-        "elliptic_cone": float(model.opt.cone),
-        "armature_kg": float(model.dof_armature[fingers].min()),
-        "finger_damping": float(model.dof_damping[fingers].max()),
-        "object_drag_per_s": float(model.dof_damping[matter.dofadr[0]] / matter.mass[0]),
-        "gravity": float(np.linalg.norm(model.opt.gravity)),
-    }
 
 
 def _set_options(spec: Any, physics: SlipPhysics, settings: "MujocoSettings") -> None:
@@ -331,8 +314,6 @@ def _add_object(
     settings: "MujocoSettings",
 ) -> None:
     """Add the object; its body frame is the principal one, its parts are in that frame."""
-    mujoco = load_mujoco()
-
     factor = max(1.0, physics.mass_floor_kg / mass_kg)
     body = spec.worldbody.add_body(name=OBJECT)
     body.add_freejoint()
@@ -340,12 +321,43 @@ def _add_object(
     body.mass = mass_kg * factor
     body.inertia = moments * factor
     for i, part in enumerate(parts):
-        mesh = spec.add_mesh(name=f"part{i}")
-        mesh.uservert = part.ravel().tolist()
-        # Thin parts have too little volume for MuJoCo; the body's inertia is given anyway.
-        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-        geom = body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
+        geom = _add_hull(spec, body, f"part{i}", part)
         _set_contact(geom, OBJECT_SIDE, physics, settings)
+
+
+def _add_hull(spec: Any, body: Any, name: str, points: Array) -> Any:
+    """Add the convex hull of points (V, 3) to a body and return its geom."""
+    mujoco = load_mujoco()
+
+    mesh = spec.add_mesh(name=name)
+    mesh.uservert = points.ravel().tolist()
+    # Thin parts have too little volume for MuJoCo; the body's inertia is given anyway.
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    return body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+
+
+# --- What the object stands on while the fingers close -------------------------------------------
+# Table and neighbours are one mocap body, put where each pair has them. A plane meets only the hull
+# of an object, so the hull of all parts stands on it: four contacts in place of dozens.
+
+
+def _add_stand(spec: Any, stand: Stand, corners: Array, settings: "MujocoSettings") -> None:
+    """Add the table, its neighbours, and the hull of the object's corners (V, 3) that stands."""
+    mujoco = load_mujoco()
+
+    body = spec.worldbody.add_body(name=STAND, mocap=True)
+    plane = body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0], pos=[0.0, 0.0, stand.height_m]
+    )
+    geoms = [plane]
+    geoms += [_add_hull(spec, body, f"beside{i}", p) for i, p in enumerate(stand.obstacles)]
+    for geom in geoms:
+        geom.friction, geom.condim = [stand.friction, 0.0, 0.0], 3
+        geom.solref = [settings.contact_time_s, 1.0]
+        # MuJoCo takes the friction of the geom with the higher priority, or else the greater one.
+        geom.priority = 1
+    hull = _add_hull(spec, spec.body(OBJECT), HULL, corners)
+    hull.contype, hull.conaffinity = 0, TABLE_SIDE
 
 
 def _add_box(body: Any, low: Array, high: Array, side: float) -> Any:

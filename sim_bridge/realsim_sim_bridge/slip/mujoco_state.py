@@ -10,11 +10,21 @@ all in the hand's frame `grasp`, because one model, whose hand does not turn, se
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from realsim.geometry import se3
+from realsim_sim_bridge.slip.mujoco_model import (
+    FINGER_NAMES,
+    HAND_SIDE,
+    OBJECT,
+    OBJECT_SIDE,
+    STAND,
+    TABLE_SIDE,
+    load_mujoco,
+)
 from realsim_sim_bridge.slip.world import Motion, PairStates
 
 Array = NDArray[np.float64]
@@ -146,3 +156,45 @@ class Samples:
             finger_n=self.finger_n,
             times_s=self.times_s,
         )
+
+
+# --- What a compiled model is told between closing and loads, and what it says -------------------
+
+
+def set_drag(model: Any, rate_per_s: float) -> None:
+    """Let the object's speeds decay at a rate [1/s]."""
+    matter = model.body(OBJECT)
+    first = int(matter.dofadr[0])
+    model.dof_damping[first : first + 3] = rate_per_s * matter.mass[0]
+    model.dof_damping[first + 3 : first + 6] = rate_per_s * matter.inertia
+
+
+def set_stand(model: Any, there: bool) -> None:
+    """Let the object meet what it stands on and beside, or not."""
+    if not model.nmocap:
+        return
+    standing = model.geom_bodyid == model.body(STAND).id
+    table = model.geom_type == load_mujoco().mjtGeom.mjGEOM_PLANE
+    model.geom_contype[standing] = np.where(table[standing], TABLE_SIDE * there, 0)
+    model.geom_conaffinity[standing] = np.where(table[standing], 0, OBJECT_SIDE * there)
+
+
+def read_settings(model: Any) -> dict[str, float]:
+    """Return what the compiled model says."""
+    hand, held = (model.geom_contype == side for side in (HAND_SIDE, OBJECT_SIDE))
+    fingers = [int(model.joint(name).dofadr[0]) for name in FINGER_NAMES]
+    matter = model.body(OBJECT)
+    return {
+        "finger_friction": float(model.geom_friction[hand, 0].min()),
+        "object_friction": float(model.geom_friction[held, 0].min()),
+        "dt_s": float(model.opt.timestep),
+        "object_mass_kg": float(model.body(OBJECT).mass[0]),
+        "force_n": float(model.tendon_frictionloss.min()),
+        "impratio": float(model.opt.impratio),
+        "noslip_iterations": float(model.opt.noslip_iterations),
+        "elliptic_cone": float(model.opt.cone),
+        "armature_kg": float(model.dof_armature[fingers].min()),
+        "finger_damping": float(model.dof_damping[fingers].max()),
+        "object_drag_per_s": float(model.dof_damping[matter.dofadr[0]] / matter.mass[0]),
+        "gravity": float(np.linalg.norm(model.opt.gravity)),
+    }

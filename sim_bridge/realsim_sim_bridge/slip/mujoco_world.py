@@ -7,6 +7,7 @@ pair's own state and a cold solver.
 import copy
 import hashlib
 from collections import OrderedDict
+from dataclasses import fields
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -24,10 +25,9 @@ from realsim_sim_bridge.slip.mujoco_model import (
     compile_pair,
     load_mujoco,
     lock_lifts,
-    read_settings,
-    set_drag,
 )
-from realsim_sim_bridge.slip.mujoco_state import Samples
+from realsim_sim_bridge.slip.mujoco_state import Samples, read_settings, set_drag, set_stand
+from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import (
     Closing,
     Engine,
@@ -67,20 +67,28 @@ class MujocoEngine(Engine):
         self._models: OrderedDict[str, PairModel] = OrderedDict()
 
     def world(
-        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: Hand
+        self,
+        body: SlipBody,
+        grips: Grips,
+        physics: SlipPhysics,
+        geometry: Hand,
+        stand: Stand | None = None,
     ) -> HandWorld:
         """Return a world with these pairs.
 
         Raises:
             InputError: MuJoCo refuses the object.
         """
-        return MujocoWorld(self.pair(body, physics, geometry), grips, physics, self.settings)
+        pair = self.pair(body, physics, geometry, stand)
+        return MujocoWorld(pair, grips, physics, self.settings)
 
-    def pair(self, body: SlipBody, physics: SlipPhysics, geometry: Hand) -> PairModel:
+    def pair(
+        self, body: SlipBody, physics: SlipPhysics, geometry: Hand, stand: Stand | None = None
+    ) -> PairModel:
         """Return the compiled model, from those kept if it is there."""
-        key = _content(body, physics, geometry)
+        key = _content(body, physics, geometry, stand)
         if key not in self._models:
-            self._models[key] = compile_pair(body, physics, geometry, self.settings)
+            self._models[key] = compile_pair(body, physics, geometry, self.settings, stand)
         self._models.move_to_end(key)
         while len(self._models) > MODELS_KEPT:
             self._models.popitem(last=False)
@@ -102,7 +110,10 @@ class MujocoWorld(HandWorld):
         self._model: Any = copy.copy(pair.model)
         self._data: Any = mujoco.MjData(self._model)
         self._rollout: Any = mujoco.rollout.Rollout(nthread=0)
-        self._control_spec = int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
+        state = mujoco.mjtState
+        self._control_spec = int(
+            state.mjSTATE_XFRC_APPLIED | state.mjSTATE_MOCAP_POS | state.mjSTATE_MOCAP_QUAT
+        )
         self._control_width = int(mujoco.mj_stateSize(self._model, self._control_spec))
         first = 6 * int(self._model.body(OBJECT).id)
         self._load = slice(first, first + 6)
@@ -110,8 +121,14 @@ class MujocoWorld(HandWorld):
         self._speed = PRESSING_SPEED
         self._Rs_world_hand = np.ascontiguousarray(grips.Ts_table_grasp[:, :3, :3])
         self._Ts_obj_grasp = grips.Ts_obj_grasp
+        # Where the table is, behind the loads in the control: nothing where there is none.
+        T_grasp_table = se3.invert(grips.Ts_table_grasp)
+        quaternions = se3.quaternion_wxyz(T_grasp_table[:, :3, :3])
+        stands = np.concatenate([T_grasp_table[:, :3, 3], quaternions], axis=1)
+        self._stands = stands[:, : 7 * int(self._model.nmocap)]
         Ts_grasp_body = se3.invert(grips.Ts_obj_grasp) @ pair.T_obj_body
         self._rows = mujoco_state.rows_at(Ts_grasp_body, grips.openings_m / 2.0)
+        set_stand(self._model, False)
         self._lock(True)
         self._open = self.alive.copy()
         """Hands that have not been closed or put anywhere yet."""
@@ -130,7 +147,7 @@ class MujocoWorld(HandWorld):
     # --- what happens in it -------------------------------------------------------------------
 
     def close(self, closing: Closing) -> Motion:
-        """Close all hands on their weightless objects and press with the hand's force from then.
+        """Close all hands on their objects and press with the hand's force from then.
 
         Hands that are open start near the object (`mujoco_approach`). A pair ends when it rests or
         its time is up, and what was seen last of it is seen from then on, unless it was lost.
@@ -145,7 +162,12 @@ class MujocoWorld(HandWorld):
             )
         self._start_near_objects()
         self._speed = closing.speed
-        set_drag(self._model, closing.drag_per_s)
+        stand, weights = self._pair.stand, None
+        set_drag(self._model, closing.drag_per_s if stand is None else 0.0)
+        set_stand(self._model, stand is not None)
+        if stand is not None:
+            weights = np.zeros((1, 1, 6))
+            weights[..., 5] = -stand.gravity * float(self._model.body(OBJECT).mass[0])
         self._lock(False)
         every = max(1, round(closing.sample_s / self.dt))
         arrival_s = self._rows[:, mujoco_state.FINGERS].max(axis=1) / closing.speed
@@ -160,7 +182,7 @@ class MujocoWorld(HandWorld):
             if len(k) == 0:
                 break
             before = self._rows[k]
-            states, forces, sound = self._run(k, every, None)
+            states, forces, sound = self._run(k, every, weights)
             seen.rows[k[sound], look] = states[sound, -1]
             seen.finger_n[k[sound], look] = forces[sound, -1]
             last[k] = look
@@ -170,6 +192,7 @@ class MujocoWorld(HandWorld):
             lost[k] = (shift > closing.lost_m) | ~sound
             going[k] = ~lost[k] & ~((moved < closing.settled_m) & pressed) & (look + 1 < looks[k])
         set_drag(self._model, 0.0)
+        set_stand(self._model, False)
         self._lock(True)
         self._speed = PRESSING_SPEED
         return seen.held(last, ~lost).motion(self._Rs_world_hand)
@@ -261,7 +284,7 @@ class MujocoWorld(HandWorld):
         Args:
             k: (n,) numbers of the pairs.
             steps: how many.
-            wrenches: (n, steps, 6) torque and force, world axes; None = no load.
+            wrenches: (n, steps, 6) or (1, 1, 6) torque and force, world axes; None = no load.
 
         Returns:
             state rows (n, steps, 20), normal forces of the fingers (n, steps, 2) [N] and whether
@@ -277,6 +300,7 @@ class MujocoWorld(HandWorld):
             # v @ R turns into the hand's axes; MuJoCo takes the force first.
             control[..., self._load.start : self._load.stop - 3] = wrenches[..., 3:] @ R
             control[..., self._load.start + 3 : self._load.stop] = wrenches[..., :3] @ R
+        control[..., self._control_width - self._stands.shape[1] :] = self._stands[k, None]
         pair = self._pair
         states = self._space("states", n, steps, len(pair.plain) + pair.lifts.size)
         forces = self._space("forces", n, steps, 2)
@@ -333,11 +357,13 @@ def _content(*parts: object) -> str:
     """Return a digest of what a model is compiled from."""
     digest = hashlib.sha256()
     for part in parts:
-        if isinstance(part, SlipBody):
-            for array in (*part.parts, part.center_of_mass, part.inertia):
-                digest.update(str(array.shape).encode())
-                digest.update(np.ascontiguousarray(array).tobytes())
-            digest.update(repr(part.mass_kg).encode())
+        if isinstance(part, SlipBody | Stand):
+            for field in fields(part):
+                value: Any = getattr(part, field.name)
+                arrays = value if isinstance(value, tuple) else (value,)  # pyright: ignore[reportUnknownVariableType]
+                for array in arrays:  # pyright: ignore[reportUnknownVariableType]
+                    content = np.ascontiguousarray(array)
+                    digest.update(str(content.shape).encode() + content.tobytes())
         else:
             digest.update(repr(part).encode())
     return digest.hexdigest()

@@ -2,8 +2,9 @@
 
 Slip is the motion of the object's centre of mass and its rotation, both relative to the gripper,
 since the start of the stage; its largest value over the stage counts. In the stage `close` the
-object is free and weightless, and the reference is where the scene has it: the slip is how far the
-closing fingers moved it. In the other stages the reference is where the stage before left it.
+object stands on its table among its neighbours (`Stand`), or is free and weightless where the trial
+has none, and the reference is where the scene has it: the slip is how far the closing fingers moved
+it. In the other stages the reference is where the stage before left it.
 """
 
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from realsim.robots.hand import Hand, find_hand
 from realsim_sim_bridge.slip.engines import BulletSettings, MujocoSettings, make_engine
 from realsim_sim_bridge.slip.motion import SlipMotion, stage_wrenches
 from realsim_sim_bridge.slip.score import ScoreLimits
+from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import (
     Closing,
     Engine,
@@ -77,6 +79,8 @@ class SlipTrial:
     """(N, 3) a point on it, in the grasp frame [m]."""
     swing_ranges: Array
     """(N, 2) least and greatest angle it may swing from there [rad]."""
+    stand: Stand | None = None
+    """What the object stands on while the fingers close, or None = it is free."""
 
     def __len__(self) -> int:
         """Return the number of grasps."""
@@ -257,7 +261,11 @@ class _SlipTest:
     def _world(self, rows: Rows) -> HandWorld:
         """Return a world of some rows."""
         return self._engine.world(
-            self._trial.body, self._grips.rows(rows), self._config.physics, self._geometry
+            self._trial.body,
+            self._grips.rows(rows),
+            self._config.physics,
+            self._geometry,
+            self._trial.stand,
         )
 
     def _parts(self, rows: Rows) -> Iterator[Rows]:

@@ -24,6 +24,7 @@ from realsim.geometry.mesh_shape import MassProperties
 from realsim.models.model_records import ConvexParts, PhysicalProperties
 from realsim.records.checked_arrays import rows_of
 from realsim.robots.hand import Hand
+from realsim_sim_bridge.slip.stand import Stand
 
 # --- An object as the physics engines need it ----------------------------------------------------
 
@@ -150,10 +151,15 @@ class Closing:
 
     speed: float = 0.1
     """Of each finger [m/s]: the Franka Hand's top speed."""
+    table_friction: float | None = 0.4
+    """Coulomb coefficient of the object with the table that it stands on and the neighbours beside
+    it: wood on wood (0.25 to 0.5 in the Engineering ToolBox's table), plastics and metals on it
+    are near. None = no table, no neighbours, no weight, as sets have it that do not name it."""
     drag_per_s: float = 40.0
-    """The object's speed decays at this rate while the fingers close [1/s]: mu g / v, what the
-    friction of 0.4 with a table does to an object that moves with a finger. Without it a weightless
-    object flies off the first finger that touches it, and the outcome is chance."""
+    """Where there is no table (a specimen, grasps of other data sets), the object is weightless
+    and its speed decays at this rate [1/s]: mu g / v, what the friction of 0.4 does to an object
+    that moves with a finger. Without it a weightless object flies off the first finger that touches
+    it, and the outcome is chance."""
     settle_s: float = 0.2
     """Time at full force after the last finger can have arrived [s]."""
     sample_s: float = 0.05
@@ -174,7 +180,7 @@ class Grips:
     """Where K hands are on K copies of the object."""
 
     Ts_table_grasp: Array
-    """(K, 4, 4) where the object stands [m]; only the rotation matters here."""
+    """(K, 4, 4) where the object stands [m]; the place matters only where there is a `Stand`."""
     Ts_obj_grasp: Array
     """(K, 4, 4) [m]."""
     openings_m: Array
@@ -236,8 +242,9 @@ class HandWorld(AbstractContextManager["HandWorld"]):
 
     @abstractmethod
     def close(self, closing: Closing) -> Motion:
-        """Close all hands on their weightless objects and press with the hand's force from then.
+        """Close all hands on their objects and press with the hand's force from then.
 
+        The objects stand as the world's `Stand` says, or are weightless where there is none.
         Before the first `close` or `put` the objects are where the grips say and fingers are open.
         """
 
@@ -293,9 +300,14 @@ class Engine(ABC):
 
     @abstractmethod
     def world(
-        self, body: SlipBody, grips: Grips, physics: SlipPhysics, geometry: Hand
+        self,
+        body: SlipBody,
+        grips: Grips,
+        physics: SlipPhysics,
+        geometry: Hand,
+        stand: Stand | None = None,
     ) -> HandWorld:
-        """Return a world with these pairs."""
+        """Return a world with these pairs; without a stand the objects close on are free."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
