@@ -22,8 +22,10 @@ INSTANCE_COLORS: tuple[Color, ...] = (
 )  # fmt: skip
 """Okabe and Ito's colour-blind-safe colours first, then ones that stay apart in brightness."""
 SCORE_STOPS = np.array([[213, 70, 20], [245, 205, 60], [0, 158, 130]], dtype=np.float64)
-"""Colours of the scores 0, 0.5 and 1: vermilion red, yellow, bluish green. Who cannot tell red from
-green still tells these apart."""
+"""Colours of the labels 0, 0.5 and 1, p_hold or score: vermilion red, yellow, bluish green. Who
+cannot tell red from green still tells these apart."""
+PALE = 0.6
+"""Share of white in the colour of a grasp whose p_hold is not sure."""
 VERDICT_RGB: dict[str, Color] = {
     "accepted": (0, 170, 130),
     "doubtful": (250, 200, 50),
@@ -33,7 +35,9 @@ VERDICT_RGB: dict[str, Color] = {
 """Colours of the verdicts on poses: green, amber, red and grey that stay apart without red-green
 vision."""
 UNTRIED: Color = (150, 150, 150)
-"""Colour of a grasp without a score."""
+"""Colour of a grasp without a label."""
+DASH_M = 0.007
+"""Length of the dashes, and of the gaps, that a hand is drawn by whose p_hold is not sure [m]."""
 FINGER_M = 0.05
 """Length of a drawn finger, from its tip back to the palm [m]."""
 STEM_M = 0.04
@@ -51,13 +55,63 @@ def instance_color(instance: int) -> Color:
     return INSTANCE_COLORS[instance % len(INSTANCE_COLORS)]
 
 
+def score_rgb(scores: ArrayLike) -> Image:
+    """Return the colours (N, 3) of labels (N,) in [0, 1]: red, yellow, green; grey for NaN."""
+    values = np.asarray(scores, dtype=np.float64).reshape(-1)
+    at = np.clip(np.nan_to_num(values), 0.0, 1.0)
+    stops = np.linspace(0.0, 1.0, len(SCORE_STOPS))
+    rgb = np.stack([np.interp(at, stops, SCORE_STOPS[:, k]) for k in range(3)], -1)
+    return np.where(np.isfinite(values)[:, None], rgb, UNTRIED).astype(np.uint8)
+
+
 def score_color(score: float) -> Color:
-    """Return red, yellow or green for a score in [0, 1], grey for NaN."""
-    if not np.isfinite(score):
-        return UNTRIED
-    at = 2 * float(np.clip(score, 0, 1))
-    rgb = [np.interp(at, [0, 1, 2], SCORE_STOPS[:, k]) for k in range(3)]
-    return int(rgb[0]), int(rgb[1]), int(rgb[2])
+    """Return the colour (r, g, b) of one label."""
+    r, g, b = score_rgb(score)[0].tolist()
+    return r, g, b
+
+
+def score_hex(score: float) -> str:
+    """Return the colour '#rrggbb' of one label."""
+    return "#{:02x}{:02x}{:02x}".format(*score_color(score))
+
+
+def grasp_rgb(grasps: GraspSet, rows: NDArray[np.int64]) -> Image:
+    """Return the colours (N, 3) of some grasps by their label, pale where p_hold is not sure."""
+    rgb = score_rgb(grasps.labels[rows])
+    pale = np.rint((1 - PALE) * rgb + PALE * 255.0).astype(np.uint8)
+    return np.where(grasps.unsure[rows, None], pale, rgb)
+
+
+def evenly_ranked(
+    grasps: GraspSet, most: int, rows: NDArray[np.int64] | None = None
+) -> NDArray[np.int64]:
+    """Return `most` rows evenly through the ranking by label, best first, unknown ones last.
+
+    So that what is drawn has the colours of the whole set.
+
+    Args:
+        grasps: the set.
+        most: number of rows; all, if there are no more.
+        rows: those to choose from; None = all.
+    """
+    rows = np.arange(len(grasps), dtype=np.int64) if rows is None else rows
+    ranked = rows[np.argsort(-np.nan_to_num(grasps.labels[rows], nan=-1.0), kind="stable")]
+    if len(ranked) <= most:
+        return ranked
+    return ranked[np.linspace(0, len(ranked) - 1, most).round().astype(np.int64)]
+
+
+def dashed(lines: Sequence[Array], length_m: float = DASH_M) -> list[Array]:
+    """Return polylines (K, 3) [m] as their dashes (2, 3); every straight piece ends with one."""
+    dashes: list[Array] = []
+    for line in lines:
+        for a, b in pairwise(line):
+            count = max(1, int(np.rint((np.linalg.norm(b - a) / length_m - 1) / 2)))
+            at = np.arange(2 * count + 1)[:, None] / (2 * count + 1)
+            points = a + at[:, :1] * (b - a)
+            ends = np.concatenate([points, b[None]])
+            dashes += [ends[k : k + 2] for k in range(0, len(ends) - 1, 2)]
+    return dashes
 
 
 def draw_outlines(
@@ -164,9 +218,11 @@ def draw_grasps(
     T_cam_obj: ArrayLike,
     grasps: GraspSet,
     indices: Sequence[int] | NDArray[np.int64] | None = None,
-    color_by: Literal["score", "instance"] = "score",
+    color_by: Literal["label", "instance"] = "label",
 ) -> Image:
     """Return the picture with grippers drawn far to near, nearer ones with wider lines.
+
+    Grippers of grasps whose p_hold is not sure are dashed.
 
     Args:
         rgb: (H, W, 3).
@@ -174,25 +230,28 @@ def draw_grasps(
         T_cam_obj: (4, 4) the grasps' object in camera [m].
         grasps: the grasps.
         indices: which of them; default all.
-        color_by: by score red, yellow, green (grey = not tried), or by instance.
+        color_by: by p_hold, of sets without it by score, red, yellow, green (grey = not known), or
+            by instance.
     """
     out = rgb.copy()
     chosen = np.arange(len(grasps)) if indices is None else np.asarray(indices, dtype=np.int64)
     Ts_cam_grasp = np.asarray(T_cam_obj, dtype=np.float64) @ grasps.Ts_obj_pads[chosen]
     depth = Ts_cam_grasp[:, 2, 3]
+    labels, unsure = grasps.labels, grasps.unsure
     for k in np.argsort(-depth):
         g = int(chosen[k])
         if depth[k] <= 0:
             continue
         color = (
-            score_color(float(grasps.scores[g]))
-            if color_by == "score"
+            score_color(float(labels[g]))
+            if color_by == "label"
             else instance_color(grasps.instance)
         )
         # About 2.5 mm thick at its depth, within what reads well: 6 px in a picture 1280 px wide.
         thickest = int(np.clip(intrinsics.width // 213, 3, 6))
         width_px = int(np.clip(np.round(0.0025 * intrinsics.fx / depth[k]), 1, thickest))
-        for line in gripper_lines(float(grasps.widths_m[g])):
+        lines = gripper_lines(float(grasps.widths_m[g]))
+        for line in dashed(lines) if unsure[g] else lines:
             points = se3.transform(Ts_cam_grasp[k], line)
             _polyline(out, intrinsics, points, color, width_px)
     return out

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.rendering.overlay import INK, PAPER, Color, Image, score_color
+from realsim.rendering.overlay import INK, PAPER, Color, Image, score_rgb
 
 Ids = NDArray[np.int32]
 
@@ -57,7 +57,7 @@ def write_legend(
     entries: Sequence[tuple[str, Color]],
     busy: NDArray[np.bool_],
     *,
-    with_scores: bool = False,
+    ramp: str = "",
     lines: Sequence[str] = (),
 ) -> Image:
     """Return the picture with a small legend in the corner that hides least.
@@ -66,17 +66,17 @@ def write_legend(
         rgb: (H, W, 3).
         entries: (text, colour) each.
         busy: (H, W) what should not be covered.
-        with_scores: whether the ramp of grasp scores is shown.
+        ramp: what the colours of the grasps say, 'p_hold' or 'score'; '' = no grasps are drawn.
         lines: further text without a colour.
     """
     import cv2
 
-    if not (entries or with_scores or lines):
+    if not (entries or ramp or lines):
         return rgb.copy()
     size = 0.85 * text_scale(rgb.shape)
     row, pad = round(34 * size), round(12 * size)
-    ramp = "grasp score 0 to 1"
-    texts = [t for t, _ in entries] + [ramp] * with_scores + list(lines)
+    told = [f"{ramp} of the grasp, 0 to 1"] if ramp else []
+    texts = [t for t, _ in entries] + told + list(lines)
     wide = [cv2.getTextSize(t, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0] for t in texts]
     swatch = round(1.6 * row)
     w = min(max(wide) + swatch + 3 * pad, rgb.shape[1])
@@ -90,9 +90,9 @@ def write_legend(
         bar = ground[y + row // 5 : y + row * 4 // 5, x : x + swatch]
         if k < len(entries):
             bar[:] = entries[k][1]
-        elif with_scores and k == len(entries):
-            bar[:] = [score_color(s) for s in np.linspace(0, 1, bar.shape[1])]
-        start = x + swatch + pad if k < len(entries) + with_scores else x
+        elif ramp and k == len(entries):
+            bar[:] = score_rgb(np.linspace(0, 1, bar.shape[1]))
+        start = x + swatch + pad if k < len(entries) + len(told) else x
         cv2.putText(
             ground, text, (start, y + row * 3 // 4), cv2.FONT_HERSHEY_SIMPLEX, size, INK, 1,
             cv2.LINE_AA,

@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 from realsim.errors import InputError
 from realsim.formats.grasps.hand_frames import hand_poses
 from realsim.formats.grasps.isaac_grasp import read_isaac_grasp, write_isaac_grasp
-from realsim.formats.grasps.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import labelled
 from realsim.records.grasps import MEASURES
 from tried_grasps import tried_set
 
@@ -39,7 +39,7 @@ def test_tried_grasps_written_and_read_are_the_same(tmp_path_factory, seed):
     s = tried_set(rng, 25, measures=some)
     path = tmp_path_factory.mktemp("ig") / "mug.yaml"
     found = read_isaac_grasp(write_isaac_grasp(path, s, object_frame="mug"))
-    rows = executed(s) & ~np.isnan(s.labels)
+    rows = labelled(s)
     np.testing.assert_allclose(found.Ts_obj_grasp, s.Ts_obj_grasp[rows], rtol=0, atol=1e-14)
     np.testing.assert_array_equal(found.confidences, s.labels[rows])
     np.testing.assert_array_equal(found.scores, s.scores[rows])
@@ -73,7 +73,7 @@ def test_the_quaternion_is_scalar_first_and_turns_the_right_way(tmp_path):
     data = YAML(typ="safe").load(write_isaac_grasp(tmp_path / "a.yaml", s, object_frame="a"))
     assert data["format"] == "isaac_grasp" and data["format_version"] == 1.0
     assert data["gripper_frame_link"] == "panda_hand"
-    for row in np.flatnonzero(executed(s) & ~np.isnan(s.labels)):
+    for row in np.flatnonzero(labelled(s)):
         entry = data["grasps"][f"grasp_{row}"]
         w, (x, y, z) = entry["orientation"]["w"], entry["orientation"]["xyz"]
         R = np.array(

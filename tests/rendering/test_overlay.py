@@ -1,5 +1,6 @@
 """Drawings land on the right pixels in the right colours."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -52,6 +53,22 @@ def test_only_the_chosen_grasps_are_drawn_and_behind_the_camera_nothing() -> Non
     astride = se3.from_translation([0, 0, 0.02])
     overlay.draw_grasps(black(), CAMERA, astride, grasps([1.0]))
     overlay.draw_axes(black(), CAMERA, astride @ se3.exp([0, np.pi, 0, 0, 0, 0]), 0.1)
+
+
+def test_a_p_hold_of_few_draws_is_dashed_in_its_own_colour() -> None:
+    T = se3.from_rt(se3.exp_so3([0, np.pi / 2, 0]), [0, 0, 0])[None]
+    many, few = (
+        replace(grasps([1.0], T), measures={"p_hold": np.zeros(1), "p_hold_draws": np.array([n])})
+        for n in (32.0, 4.0)
+    )
+    whole, cut = (overlay.draw_grasps(black(), CAMERA, T_CAM_OBJ, g) for g in (many, few))
+    red = overlay.score_color(0.0)
+    counts = [int(np.all(out == red, axis=-1).sum()) for out in (whole, cut)]
+    assert 0.4 * counts[0] < counts[1] < 0.8 * counts[0]
+    for line in overlay.gripper_lines(0.06):  # dashes begin and end where the line does
+        dashes = overlay.dashed([line])
+        np.testing.assert_array_equal(dashes[0][0], line[0])
+        np.testing.assert_array_equal(dashes[-1][1], line[-1])
 
 
 def test_scores_run_from_red_over_yellow_to_green() -> None:

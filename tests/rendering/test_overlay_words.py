@@ -81,7 +81,7 @@ def test_the_legend_goes_where_it_hides_least(corner: int) -> None:
     busy[rows, columns] = False
     rgb = np.zeros((480, 640, 3), np.uint8)
     out = write_legend(
-        rgb, [("accepted", (0, 170, 130))], busy, with_scores=True, lines=["not visible: mug"]
+        rgb, [("accepted", (0, 170, 130))], busy, ramp="p_hold", lines=["not visible: mug"]
     )
     changed = np.any(out != rgb, axis=-1)
     assert changed.any() and not np.any(changed & busy)

@@ -1,12 +1,13 @@
 """What the review shows: the cloud's levels, the models as they are sent, the grasps that pass."""
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from realsim import CameraIntrinsics, InputError, View
+from realsim import CameraIntrinsics, GraspSet, InputError, View
 from realsim.geometry import camera, depth, se3
 from realsim.rendering import overlay
 from realsim.review.content import content
@@ -14,6 +15,7 @@ from realsim.review.content.config import GripperDrawing, SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.drawing import grasp_drawing
 from realsim.review.drawing.grasp_drawing import GraspFilter, passing
+from realsim.review.window.panel_grasps import legend_html
 from realsim.store import SessionStore
 from tests.support.reviewed_boxes import CAMERAS, SCENE, boxes_session, grasp_set
 
@@ -130,17 +132,28 @@ def test_settings_that_show_nothing_are_refused(wrong: dict[str, float]) -> None
 # --- grasps -----------------------------------------------------------------------------------
 
 
+def with_p_hold(grasps: GraspSet) -> GraspSet:
+    n = len(grasps)
+    p = np.random.default_rng(2).random(n)
+    draws = np.where(np.arange(n) % 5 == 0, 6.0, 32.0)
+    measures = {"p_hold": p, "p_hold_draws": draws, "p_hold_error": np.sqrt(p * (1 - p) / draws)}
+    return replace(grasps, measures=measures)
+
+
 def test_what_passes_is_what_was_asked_for() -> None:
     grasps = grasp_set(1, 0)
     every = passing(grasps, GraspFilter())
     np.testing.assert_array_equal(every, np.arange(40))
-    rows = passing(grasps, GraspFilter(stage=3, min_score=0.4, reachable_only=True))
+    rows = passing(grasps, GraspFilter(stage=3, min_label=0.4, reachable_only=True))
     expected = [
         r for r in range(40)
         if grasps.base_scores[r] >= 0.75 and grasps.scores[r] >= 0.4 and grasps.reachable[r]
     ]  # fmt: skip
     assert rows.tolist() == expected and expected
     assert len(passing(grasps, GraspFilter(instance=5))) == 0
+    told = with_p_hold(grasps)
+    rows = passing(told, GraspFilter(min_label=0.4))
+    assert rows.tolist() == np.flatnonzero(told.measures["p_hold"] >= 0.4).tolist() and len(rows)
     lost = passing(grasps, GraspFilter(failure="LIFT"))
     assert len(lost) and all("lift" in grasps.failures[r] for r in lost)
 
@@ -155,7 +168,7 @@ def test_too_many_grasps_are_thinned_evenly_over_scores_and_objects() -> None:
     assert grasp_drawing.failure_choices(sets)[:2] == ("close", "lift")
 
 
-@pytest.mark.parametrize("wrong", [{"stage": 5}, {"stage": -1}, {"min_score": 1.5}])
+@pytest.mark.parametrize("wrong", [{"stage": 5}, {"stage": -1}, {"min_label": 1.5}])
 def test_a_filter_of_nothing_is_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError):
         GraspFilter(**wrong)  # type: ignore[arg-type]
@@ -216,7 +229,14 @@ def test_the_gripper_is_as_wide_as_the_grasp() -> None:
         assert scaled[:, 2].min() == pytest.approx(-0.065, abs=1e-6)
 
 
-def test_score_colours_are_those_of_the_pictures() -> None:
-    scores = np.append(np.linspace(0, 1, 101), np.nan)
-    expected = [overlay.score_color(float(s)) for s in scores]
-    np.testing.assert_array_equal(grasp_drawing.score_rgb(scores), expected)
+def test_colours_are_those_of_the_label_and_pale_where_it_is_not_sure() -> None:
+    grasps = with_p_hold(grasp_set(1, 0))
+    rgb = overlay.grasp_rgb(grasps, np.arange(40)).astype(int)
+    for row in range(40):
+        color = np.array(overlay.score_color(float(grasps.measures["p_hold"][row])))
+        wanted = color if not grasps.unsure[row] else 0.4 * color + 0.6 * 255
+        np.testing.assert_allclose(rgb[row], wanted, atol=1)
+    assert 0 < grasps.unsure.sum() < 40
+    plain = grasp_set(1, 0)
+    assert not plain.unsure.any() and "score" in legend_html([plain])
+    assert "p_hold" in legend_html([grasps]) and "few draws" in legend_html([grasps])

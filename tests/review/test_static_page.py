@@ -18,9 +18,9 @@ from realsim.review import journal
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.static.page_nodes import (
-    SCORE_EDGES,
+    LABEL_EDGES,
     drawn_grasps,
-    score_class,
+    label_class,
 )
 from realsim.review.static.static_page import PageWords, StaticSummary, write_static
 from realsim.store import save_grasps, save_scene
@@ -169,10 +169,10 @@ def test_what_cannot_be_written_is_refused_and_nothing_is_left(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_every_grasp_has_the_class_of_its_score() -> None:
+def test_every_grasp_has_the_class_of_its_label() -> None:
     scores = np.array([np.nan, 0.0, 0.24, 0.25, 0.5, 0.74, 0.75, 1.0])
-    assert score_class(scores).tolist() == [-1, 0, 0, 1, 2, 2, 3, 3]
-    assert len(SCORE_EDGES) == 4
+    assert label_class(scores).tolist() == [-1, 0, 0, 1, 2, 2, 3, 3]
+    assert len(LABEL_EDGES) == 4
 
 
 def test_the_drawn_grasps_keep_good_and_bad_in_proportion() -> None:

@@ -11,6 +11,7 @@ from PIL import Image
 from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import untried_set
 from realsim.records import ObjectModel
+from realsim.records.grasps import MEASURES
 from realsim_sim_bridge.school.sheet import left_after, school_sheet, sheet_figure
 from realsim_sim_bridge.school.sheet_object import STOPS, stops_of
 from realsim_sim_bridge.school.summary import summarise
@@ -75,9 +76,10 @@ def test_the_same_sets_give_the_same_bytes_and_an_object_stands_as_it_is_told_to
     assert png != school_sheet(s, {1: model()}, title="Tisch 1", Ts_up_obj={0: turned})
 
 
-def test_no_two_words_overlap_and_all_are_on_the_sheet():
+@pytest.mark.parametrize("measures", [("margin",), tuple(MEASURES)])
+def test_no_two_words_overlap_and_all_are_on_the_sheet(measures):
     name = "a name that is far too long for any panel of a sheet, with a number 000123"
-    sets = [replace(s, instance=100 + s.instance) for s in some_sets(3, 60, measures=("margin",))]
+    sets = [replace(s, instance=100 + s.instance) for s in some_sets(3, 60, measures=measures)]
     figure = sheet_figure(sets, {1: model(name=name)}, "A title that is also long " * 4, {})
     figure.canvas.draw()
     texts = [t for ax in figure.axes for t in (*ax.texts, ax.title, ax._left_title)]

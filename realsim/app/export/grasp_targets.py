@@ -8,7 +8,7 @@ import numpy as np
 from realsim.app.export.target import METRES, SceneJob, Target
 from realsim.errors import InputError
 from realsim.formats.export_folder import ExportFolder
-from realsim.formats.grasps.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import executed, labelled
 from realsim.formats.labelled_scene import LabelledScene, WrittenScene
 from realsim.formats.session_scene import SessionScene
 
@@ -47,10 +47,10 @@ def _files(scene: LabelledScene, folder: ExportFolder, job: SceneJob) -> Written
     all_of_them, count, notes = sum(len(s) for s in sets), 0, list[str]()
     for s in sets:
         rows = np.ones(len(s), dtype=np.bool_)
-        if request.target in LABELLED_ONLY:
-            rows = executed(s)
         if request.target == "isaac":
-            rows &= s.labels >= request.least_score  # NaN is not
+            rows = labelled(s) & (s.labels >= request.least_score)
+        elif request.target in LABELLED_ONLY:
+            rows = executed(s)
         count += int(rows.sum())
     if request.target in LABELLED_ONLY and count < all_of_them:
         score = f", or whose label is below {request.least_score:g}," * (request.least_score > 0)

@@ -18,8 +18,8 @@ with the same axes; frame and joint are called as the hand's description says. T
 p_hold where the set has it, else the score; a comment in the file says which. Under `realsim`,
 which other readers leave alone, stand both scores and all measures, one number or one a stage;
 null = not measured. The number in the name is the grasp's row in its set. The joint is half the
-distance of the fingers, joint 2 mimics it; of an arc it is the crank's angle. Grasps that physics
-has not tried, or whose confidence is not known, are left out.
+distance of the fingers, joint 2 mimics it; of an arc it is the crank's angle. Grasps without
+a label, those out of the arm's reach among them, are left out.
 
 Source: Isaac Sim, Grasp Editor, "What is an Isaac Grasp File?"; Isaac ROS names the two frames
 object_frame and gripper_frame, which are read, too.
@@ -38,7 +38,7 @@ from realsim.errors import InputError
 from realsim.formats.grasps.hand_frames import HandFrame, grasp_poses, hand_of_set, hand_poses
 from realsim.formats.grasps.scene_grasps import (
     check_values,
-    executed,
+    labelled,
     measures_json,
     measures_of_json,
     untried_set,
@@ -110,7 +110,7 @@ def write_isaac_grasp(
     """
     check_values(grasps)
     labels = grasps.labels
-    rows = np.flatnonzero(executed(grasps) & (labels >= least_score))  # NaN is not
+    rows = np.flatnonzero(labelled(grasps) & (labels >= least_score))
     ours = {"score": to_json(grasps.scores[rows]), "base_score": to_json(grasps.base_scores[rows])}
     ours |= measures_json(grasps, rows)
     hand = hand_of_set(grasps)
@@ -234,7 +234,9 @@ def read_isaac_grasp(path: Path | str, frame: HandFrame = "panda_hand") -> Isaac
     table = np.stack(rows) if rows else np.zeros((0, 10))
     told = [mapping(entry.get("realsim", {}), f"{path}: realsim") for entry in listed.values()]
     scores, base_scores = (
-        np.array([number(t[key], f"{path}: {key}", 0, 1) if key in t else np.nan for t in told])
+        np.array(
+            [np.nan if t.get(key) is None else number(t[key], f"{path}: {key}", 0, 1) for t in told]
+        )
         for key in ("score", "base_score")
     )
     others = {key for t in told for key in t} - {"score", "base_score"}

@@ -181,6 +181,12 @@ def executed(grasps: GraspSet) -> NDArray[np.bool_]:
     return ~np.isnan(grasps.slip_m[:, 0])
 
 
+def labelled(grasps: GraspSet) -> NDArray[np.bool_]:
+    """Return (N,) which grasps have a label of their own: tried by physics, or with a p_hold."""
+    known = ~np.isnan(grasps.measures.get("p_hold", np.full(len(grasps), np.nan)))
+    return (executed(grasps) | known) & ~np.isnan(grasps.labels)
+
+
 def held(grasps: GraspSet) -> NDArray[np.bool_]:
     """Return (N,) which grasps still held the object after all four stages, however it slipped."""
     return np.all(np.isfinite(grasps.slip_m) & np.isfinite(grasps.slip_rad), axis=1)

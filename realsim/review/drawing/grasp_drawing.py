@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from realsim.errors import InputError
 from realsim.geometry import camera, se3
 from realsim.records import STAGES, GraspSet
-from realsim.rendering import overlay
+from realsim.rendering.overlay import evenly_ranked
 from realsim.review.content import quick_png
 from realsim.review.content.config import GripperDrawing
 from realsim.store.session_store import depth_path
@@ -39,8 +39,8 @@ class GraspFilter:
 
     stage: int = 0
     """Least number of stages passed, 0 to 4; untried grasps passed none."""
-    min_score: float = 0.0
-    """Least score in [0, 1]; untried grasps count as 0."""
+    min_label: float = 0.0
+    """Least p_hold, of sets without it least score, in [0, 1]; what is not known counts as 0."""
     reachable_only: bool = False
     """Only those the arm reaches without a collision."""
     visible: Mapping[int, frozenset[int]] | None = None
@@ -53,11 +53,11 @@ class GraspFilter:
     """Whether any are drawn."""
 
     def __post_init__(self) -> None:
-        """Check the number of stages and the score."""
+        """Check the number of stages and the label."""
         if not 0 <= self.stage <= len(STAGES):
             raise InputError(f"a grasp passes 0 to {len(STAGES)} stages, not {self.stage}.")
-        if not 0.0 <= self.min_score <= 1.0:
-            raise InputError(f"a least score of {self.min_score}; scores are from 0 to 1.")
+        if not 0.0 <= self.min_label <= 1.0:
+            raise InputError(f"a least p_hold or score of {self.min_label}; they are from 0 to 1.")
 
 
 def passing(grasps: GraspSet, chosen: GraspFilter) -> Rows:
@@ -67,7 +67,7 @@ def passing(grasps: GraspSet, chosen: GraspFilter) -> Rows:
         return np.zeros(0, np.int64)
     # A tenth of a stage is room for how base scores were rounded in files.
     keep = np.nan_to_num(grasps.base_scores, nan=0.0) >= (chosen.stage - 0.1) / len(STAGES)
-    keep &= np.nan_to_num(grasps.scores, nan=0.0) >= chosen.min_score
+    keep &= np.nan_to_num(grasps.labels, nan=0.0) >= chosen.min_label
     if chosen.reachable_only:
         keep &= grasps.reachable
     if chosen.visible is not None:
@@ -86,22 +86,15 @@ def chosen_grasps(
 ) -> list[tuple[GraspSet, Rows]]:
     """Return the grasps that are drawn: those that pass, or an even choice of them.
 
-    If more than `most` pass, every k-th in the order of the scores of its object is drawn, so that
+    If more than `most` pass, every k-th in the order of the labels of its object is drawn, so that
     good and bad ones and the objects stay in proportion.
     """
     found = [(g, passing(g, chosen)) for g in sets]
     total = sum(len(rows) for _, rows in found)
     if total > most:
-        found = [(g, _thinned(g, rows, most / total)) for g, rows in found]
+        share = most / total
+        found = [(g, np.sort(evenly_ranked(g, int(share * len(r)), r))) for g, r in found]
     return [(g, rows) for g, rows in found if len(rows)]
-
-
-def _thinned(grasps: GraspSet, rows: Rows, share: float) -> Rows:
-    count = int(share * len(rows))
-    if count == 0:
-        return rows[:0]
-    ranked = rows[np.argsort(-np.nan_to_num(grasps.scores[rows], nan=-1.0), kind="stable")]
-    return np.sort(ranked[np.linspace(0, len(ranked) - 1, count).round().astype(int)])
 
 
 def failure_choices(sets: Sequence[GraspSet]) -> tuple[str, ...]:
@@ -157,15 +150,6 @@ def _unhidden(points: Array, depth_m: Floats, content: "SceneContent") -> NDArra
     rows = before[inside]
     seen[rows] = (z == 0) | (points[rows, 2] <= z + HIDDEN_M)
     return seen
-
-
-def score_rgb(scores: ArrayLike) -> Rgb:
-    """Return the colours (N, 3) of scores (N,): those of the pictures, grey = not tried."""
-    scores = np.asarray(scores, dtype=np.float64).reshape(-1)
-    at = np.clip(np.nan_to_num(scores), 0.0, 1.0)
-    stops = np.linspace(0.0, 1.0, len(overlay.SCORE_STOPS))
-    rgb = np.stack([np.interp(at, stops, overlay.SCORE_STOPS[:, k]) for k in range(3)], -1)
-    return np.where(np.isfinite(scores)[:, None], rgb, overlay.UNTRIED).astype(np.uint8)
 
 
 def linear_rgb(rgb: Rgb) -> Rgb:

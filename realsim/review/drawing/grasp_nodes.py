@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from realsim.interop import viser_wxyz_position
 from realsim.records import GraspSet
+from realsim.rendering.overlay import grasp_rgb
 from realsim.review.content.config import SceneConfig
-from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb, score_rgb
+from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -38,13 +39,13 @@ class GraspNodes:
         Ts = [Ts_world_obj[g.instance] @ g.Ts_obj_grasp[rows] for g, rows in found]
         wxyzs, positions = viser_wxyz_position(np.concatenate(Ts))
         widths = np.concatenate([g.widths_m[rows] for g, rows in found])
-        scores = np.concatenate([g.scores[rows] for g, rows in found])
+        rgb = np.concatenate([grasp_rgb(g, rows) for g, rows in found])
         vertices, faces = gripper_mesh(self._config.gripper)
         self._drawn = [(g.instance, int(row)) for g, rows in found for row in rows]
         # Off: of two dozen triangles nothing can be left out.
         self._node = self._api.add_batched_meshes_simple(
             NAME, vertices, faces, wxyzs, positions, batched_scales=gripper_scales(widths),
-            batched_colors=linear_rgb(score_rgb(scores)), lod="off", flat_shading=True,
+            batched_colors=linear_rgb(rgb), lod="off", flat_shading=True,
             side="double", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
         drawn = self._drawn

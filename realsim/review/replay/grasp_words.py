@@ -1,4 +1,4 @@
-"""What the school found out about one grasp, in words: score, slips stage by stage, why it failed.
+"""What the school found out about one grasp, in words: p_hold, score, slips, why it failed.
 
 The texts are markdown for the review's panel; names and failures that come from files are escaped.
 """
@@ -10,7 +10,15 @@ import numpy as np
 
 from realsim.records import STAGES, GraspSet
 
+SHARE_WORDS = {
+    "share_blocked": "fingers touch while open",
+    "share_missed": "a pad meets nothing",
+    "share_skewed": "pads outside the friction cone",
+    "share_overloaded": "too large a load",
+}
+"""Why draws of p_hold failed."""
 MEASURE_WORDS = {
+    "score_paper": "score by the paper's limits",
     "margin": "share of the tried frictions and forces that hold",
     "least_friction": "least friction",
     "least_force_n": "least finger force [N]",
@@ -39,7 +47,12 @@ def grasp_words(grasps: GraspSet, row: int, name: str = "") -> str:
     if not 0 <= row < len(grasps):
         raise IndexError(f"row {row} of {len(grasps)} grasps")
     of = f"{escaped(name)} (instance {grasps.instance})" if name else f"instance {grasps.instance}"
-    lines = [f"**Grasp {row}** of {len(grasps)}, {of}", "", _score(grasps, row)]
+    lines = [
+        f"**Grasp {row}** of {len(grasps)}, {of}",
+        "",
+        *_p_hold(grasps, row),
+        _score(grasps, row),
+    ]
     why = failure_words(grasps, row)
     if why:
         lines.append(f"- {why}")
@@ -53,12 +66,19 @@ def grasp_words(grasps: GraspSet, row: int, name: str = "") -> str:
 
 
 def slip_table(grasps: GraspSet, row: int) -> list[str]:
-    """Return the lines of the table of slips: one row a stage."""
-    lines = ["| stage | slip [mm] | turn [deg] |", "|:--|--:|--:|"]
+    """Return the lines of the table of slips: one row a stage, with its safety if it is known."""
+    safety = grasps.measures.get("safety")
+    known = safety is not None and not np.isnan(safety[row]).all()
+    lines = [
+        "| stage | slip [mm] | turn [deg] |" + " safety |" * known, "|:--|--:|--:|" + "--:|" * known
+    ]  # fmt: skip
     for k, stage in enumerate(STAGES):
         slip = slip_words(1e3 * float(grasps.slip_m[row, k]))
         turn = slip_words(float(np.degrees(grasps.slip_rad[row, k])))
         lines.append(f"| {stage} | {slip} | {turn} |")
+        if safety is not None and known:
+            factor = float(safety[row, k])
+            lines[-1] += f" {f'{factor:.3g}' if np.isfinite(factor) else '-'} |"
     return lines
 
 
@@ -111,12 +131,30 @@ def one_line(text: str) -> str:
     return NOT_SEEN.sub(" ", text)
 
 
+def _p_hold(grasps: GraspSet, row: int) -> list[str]:
+    """Return p_hold with its error, and why draws failed; nothing where it is not known."""
+
+    def value(name: str) -> float:
+        return float(grasps.measures[name][row]) if name in grasps.measures else np.nan
+
+    if np.isnan(value("p_hold")):
+        return []
+    told = f"- p_hold **{value('p_hold'):.2f}**"
+    if np.isfinite(value("p_hold_error")):
+        told += f" ± {value('p_hold_error'):.2f}"
+    if np.isfinite(value("p_hold_draws")):
+        told += f" of {value('p_hold_draws'):.0f} draws"
+    told += ": few, take it as a guess" if grasps.unsure[row] else ""
+    shares = [f"{words} {100 * value(n):.0f} %" for n, words in SHARE_WORDS.items() if value(n) > 0]
+    return [told, *([f"- draws that fail: {', '.join(shares)}"] if shares else [])]
+
+
 def _score(grasps: GraspSet, row: int) -> str:
     score, base = float(grasps.scores[row]), float(grasps.base_scores[row])
     if np.isnan(score):
         return "- score: not tried"
     passed = "" if np.isnan(base) else f" (base {base:.2f}: {_stages(base)})"
-    return f"- score **{score:.2f}**{passed}"
+    return f"- score **{score:.2f}** of one nominal attempt{passed}"
 
 
 def _stages(base: float) -> str:

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from realsim import local_pages
 from realsim.interop import viser_wxyz_position
 from realsim.records import GraspSet, Scene
-from realsim.rendering.overlay import VERDICT_RGB
+from realsim.rendering.overlay import VERDICT_RGB, evenly_ranked, grasp_rgb
 from realsim.review.content.config import SceneConfig
 from realsim.review.content.content import SceneContent
 from realsim.review.content.meshes import glb_of, within_budget
 from realsim.review.content.views import spread
-from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb, score_rgb
+from realsim.review.drawing.grasp_drawing import gripper_mesh, gripper_scales, linear_rgb
 
 Array = NDArray[np.float64]
-SCORE_EDGES = (0.0, 0.25, 0.5, 0.75)
-"""Lower ends of the score classes that the page can show or hide: the stages of the slip test."""
+LABEL_EDGES = (0.0, 0.25, 0.5, 0.75)
+"""Lower ends of the classes of p_hold or score that the page can show or hide."""
 BOX_LINE_M = 0.0015
 """Thickness of the box about the chosen object [m]."""
 BOX_GROWN = 0.05
@@ -190,12 +190,12 @@ def box_edges(low: Array, high: Array) -> Array:
 def _add_grasps(
     api: Any, content: SceneContent, scene: Scene, size: StaticSize, config: SceneConfig
 ) -> None:
-    """Add the grasps in one node per object and class of the score."""
+    """Add the grasps in one node per object and class of the label."""
     vertices, faces = gripper_mesh(config.gripper)
     for grasps in content.grasp_sets:
         T_world_obj = scene.object(grasps.instance).T_world_obj
         rows = drawn_grasps(grasps, size.grasps)
-        classes = score_class(grasps.scores)[rows]
+        classes = label_class(grasps.labels)[rows]
         for k in sorted(set(classes.tolist())):
             some = rows[classes == k]
             wxyzs, positions = viser_wxyz_position(T_world_obj @ grasps.Ts_obj_grasp[some])
@@ -206,7 +206,7 @@ def _add_grasps(
                 batched_wxyzs=wxyzs.astype(np.float32),
                 batched_positions=positions.astype(np.float32),
                 batched_scales=gripper_scales(grasps.widths_m[some]),
-                batched_colors=linear_rgb(score_rgb(grasps.scores[some])),
+                batched_colors=linear_rgb(grasp_rgb(grasps, some)),
                 flat_shading=True,
                 side="double",
                 lod="off",
@@ -215,14 +215,11 @@ def _add_grasps(
 
 
 def drawn_grasps(grasps: GraspSet, most: int) -> NDArray[np.int64]:
-    """Return the rows that are drawn: all, or evenly spread over the ranking by score."""
-    rank = np.argsort(-np.nan_to_num(grasps.scores, nan=-1.0), kind="stable")
-    if len(rank) > most:
-        rank = rank[np.linspace(0, len(rank) - 1, most).round().astype(np.int64)]
-    return np.sort(rank)
+    """Return the rows that are drawn: all, or evenly spread over the ranking by label."""
+    return np.sort(evenly_ranked(grasps, most))
 
 
-def score_class(scores: Array) -> NDArray[np.int64]:
-    """Return the class (N,) of scores (N,): number in SCORE_EDGES; -1 = not tried."""
-    found = np.searchsorted(SCORE_EDGES, np.nan_to_num(scores, nan=-1.0), side="right") - 1
-    return np.where(np.isnan(scores), -1, np.maximum(found, 0)).astype(np.int64)
+def label_class(labels: Array) -> NDArray[np.int64]:
+    """Return the class (N,) of labels (N,): number in LABEL_EDGES; -1 = not known."""
+    found = np.searchsorted(LABEL_EDGES, np.nan_to_num(labels, nan=-1.0), side="right") - 1
+    return np.where(np.isnan(labels), -1, np.maximum(found, 0)).astype(np.int64)

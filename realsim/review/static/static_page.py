@@ -26,15 +26,16 @@ from realsim.errors import InputError
 from realsim.formats.bop.models import model_file
 from realsim.geometry import se3
 from realsim.records import ObjectModel, ObjectPose, Scene
+from realsim.records.grasps import label_words
 from realsim.review.content.content import SceneContent
 from realsim.review.content.views import spread
 from realsim.review.corrections import reviewed_scene
 from realsim.review.journal import ReviewState
 from realsim.review.static.page_nodes import (
-    SCORE_EDGES,
+    LABEL_EDGES,
     StaticSize,
     drawn_grasps,
-    score_class,
+    label_class,
     viewer_html,
 )
 from realsim.review.static.page_text import caption_html, counts_words, object_items, photo_items
@@ -52,7 +53,8 @@ data."""
 TRIES = 6
 """How often the scene is halved to fit; 64 times smaller is no scene."""
 LEAST_CLASS = 2
-"""The class of scores from which grasps are shown at first: half of the stages passed."""
+"""The class of labels from which grasps are shown at first: half of the stages passed, or p_hold
+0.5."""
 ASIDE_M = 0.25
 """How far before a camera the point is that one looks at from it [m]."""
 MADE_WITH = (
@@ -211,7 +213,7 @@ def _page(
             state.excluded_views(),
         ),
         "grasp_switches": GRASP_SWITCHES if has_grasps else "",
-        "grasp_slider": GRASP_SLIDER if has_grasps else "",
+        "grasp_slider": _grasp_slider(content) if has_grasps else "",
         "footer": _footer(content, size, words),
         "viewer": html.escape(viewer_html(content, scene, size), quote=True),
         "data": _json(_data(content, scene, size)),
@@ -223,9 +225,18 @@ def _page(
 
 GRASP_SWITCHES = """<label><input type="checkbox" data-show="grasps" checked> Grasps</label>
 <label><input type="checkbox" id="own" checked> of the chosen only</label>"""
-GRASP_SLIDER = f"""<div class="row"><label for="least">Score</label>
-<input type="range" id="least" min="0" max="{len(SCORE_EDGES) - 1}" step="1" value="{LEAST_CLASS}">
-<span class="soft" id="least-word"></span></div>"""
+GRASP_SLIDER = Template(
+    f"""<div class="row"><label for="least">Least $label</label>
+<input type="range" id="least" min="0" max="{len(LABEL_EDGES) - 1}" step="1" value="{LEAST_CLASS}">
+<span class="soft" id="least-word"></span></div>
+<div class="soft">Grasps: red 0, yellow 0.5, green 1 by $label; grey not known$pale.</div>"""
+)
+
+
+def _grasp_slider(content: SceneContent) -> str:
+    """Return the slider of the grasps, with what their colours say."""
+    pale = "; pale: p_hold of few draws" * any(g.unsure.any() for g in content.grasp_sets)
+    return GRASP_SLIDER.substitute(label=label_words(content.grasp_sets), pale=pale)
 
 
 def _cameras(content: SceneContent, size: StaticSize) -> list[Any]:
@@ -251,7 +262,7 @@ def _data(content: SceneContent, scene: Scene, size: StaticSize) -> dict[str, An
     grasps = [
         [g.instance, k]
         for g in content.grasp_sets
-        for k in sorted(set(score_class(g.scores)[drawn_grasps(g, size.grasps)].tolist()))
+        for k in sorted(set(label_class(g.labels)[drawn_grasps(g, size.grasps)].tolist()))
     ]
     # A camera exactly above has no way up; a hundredth beside it has.
     top = look.look_at + distance * (look.up + 0.01 * across / max(distance, 1e-9))
@@ -259,7 +270,7 @@ def _data(content: SceneContent, scene: Scene, size: StaticSize) -> dict[str, An
         "objects": objects,
         "cameras": cameras,
         "grasps": grasps,
-        "edges": SCORE_EDGES,
+        "edges": LABEL_EDGES,
         "least": LEAST_CLASS,
         "cloud": len(content.cloud) > 0,
         "table": scene.plane is not None,

@@ -1,16 +1,17 @@
 """The panel of the grasps: which are drawn, what is known of a clicked one, and its replay."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import viser
 
 from realsim.errors import InputError
 from realsim.records import GraspSet
+from realsim.records.grasps import label_words
+from realsim.rendering.overlay import score_rgb
 from realsim.review.drawing.grasp_drawing import (
     GraspFilter,
     failure_choices,
-    score_rgb,
     visible_grasps,
 )
 from realsim.review.replay.grasp_replay import GraspMotion, ReplayPlayer
@@ -29,8 +30,8 @@ STAGES = {
 """What a grasp has passed at least."""
 THIS, EVERY = "this object", "all objects"
 ANY = "any, or none"
-GOOD_SCORE = 0.5
-"""Grasps drawn at first: the good ones; all of them hide the objects."""
+DRAWN_FROM = 0.5
+"""Least p_hold or score of the grasps drawn at first; all of them hide the objects."""
 
 
 class GraspsPanel:
@@ -48,14 +49,14 @@ class GraspsPanel:
         self._show = gui.add_checkbox("Show grasps", False)
         self._of = gui.add_dropdown("Of", (THIS, EVERY))
         self._stage = gui.add_dropdown("Passed", tuple(STAGES))
-        self._score = gui.add_slider("Least score", 0.0, 1.0, 0.05, GOOD_SCORE)
+        self._least = gui.add_slider("Least score", 0.0, 1.0, 0.05, DRAWN_FROM)
         self._reachable = gui.add_checkbox("The arm reaches it", False)
         self._seen = gui.add_checkbox(
             "The chosen view sees it", False, hint="The view that is chosen under Views."
         )
         self._failure: viser.GuiDropdownHandle[str] = gui.add_dropdown("Failed by", [ANY])
         self._drawn = gui.add_markdown("")
-        gui.add_html(_legend_html())
+        self._legend = gui.add_html("")
         self._words = gui.add_markdown("")
         self._player = ReplayPlayer(
             window.client.scene, gui, self, atomic=window.client.atomic,
@@ -63,7 +64,7 @@ class GraspsPanel:
         )  # fmt: skip
         self._player.on_closed(self._replay_closed)
         self._show.on_update(window.guarded(lambda _: self.draw()))
-        for control in (self._of, self._stage, self._score, self._reachable, self._seen,
+        for control in (self._of, self._stage, self._least, self._reachable, self._seen,
                         self._failure):  # fmt: skip
             control.on_update(window.guarded(lambda _: self._filtered()))
 
@@ -112,7 +113,10 @@ class GraspsPanel:
 
     def opened(self) -> None:
         """Offer the filters of another scene."""
-        self._failure.options = (ANY, *failure_choices(self._window.content.grasp_sets))
+        sets = self._window.content.grasp_sets
+        self._failure.options = (ANY, *failure_choices(sets))
+        self._least.label = f"Least {label_words(sets)}"
+        self._legend.content = legend_html(sets)
         self._words.content = ""
 
     def closed(self) -> None:
@@ -160,7 +164,7 @@ class GraspsPanel:
         return GraspFilter(
             stage=STAGES[self._stage.value],
             # Whoever asks for failures does not mean the good ones.
-            min_score=0.0 if failure else float(self._score.value),
+            min_label=0.0 if failure else float(self._least.value),
             reachable_only=self._reachable.value,
             visible=self._rows(sets),
             instance=self._window.selected if self._of.value == THIS else None,
@@ -186,16 +190,17 @@ class GraspsPanel:
         return {k: v for k, v in (every if seen is None else seen).items() if k not in swapped}
 
 
-def _legend_html() -> str:
-    """Return the legend of the scores."""
+def legend_html(sets: Sequence[GraspSet]) -> str:
+    """Return the legend of the grasps' colours: what they say, and that pale ones are not sure."""
     scores = (0.0, 0.25, 0.5, 0.75, 1.0, float("nan"))
-    words = ("0", "0.25", "0.5", "0.75", "1", "not tried")
+    words = ("0", "0.25", "0.5", "0.75", "1", "not known")
     cells = "".join(
         f'<div style="flex:1;background:rgb({r},{g},{b});text-align:center;padding:3px 0">'
         f"{word}</div>"
         for (r, g, b), word in zip(score_rgb(scores).tolist(), words, strict=True)
     )
+    pale = "; pale: few draws" * any(s.unsure.any() for s in sets)
     return (
-        '<div style="margin:4px 12px;font-size:12px;color:#000">score'
-        f'<div style="display:flex">{cells}</div></div>'
+        f'<div style="margin:4px 12px;font-size:12px"><span>{label_words(sets)}{pale}</span>'
+        f'<div style="display:flex;color:#000">{cells}</div></div>'
     )

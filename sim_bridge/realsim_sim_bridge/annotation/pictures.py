@@ -1,7 +1,8 @@
 """Pictures of views: photograph, outlines, axes, names, grasps, and what hides objects.
 
-Outlines and names have the colour of the verdict, grasps that of their score. What was taken out of
-a mask because something that is not in the scene hides it is hatched in magenta.
+Outlines and names have the colour of the verdict, grasps that of their p_hold, of sets without it
+that of their score; the legend says which. What was taken out of a mask because something that is
+not in the scene hides it is hatched in magenta.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,6 +14,7 @@ from realsim.errors import InputError
 from realsim.formats.bop.labels import mask_path
 from realsim.geometry import se3
 from realsim.records import CameraIntrinsics, GraspSet, ObjectModel, ObjectPose, Scene
+from realsim.records.grasps import label_words
 from realsim.rendering.labels import LabelRenderer, PlacedMesh
 from realsim.rendering.overlay import VERDICT_RGB, Color
 from realsim.store import SessionStore
@@ -42,8 +44,9 @@ def overlay_picture(
     """Return the photograph of a view with everything that was annotated on it.
 
     Outlines of the visible masks and names have the colour of the verdict; axes are x red, y green,
-    z blue; the best and the worst grasps of every object are coloured by score. Rejected objects
-    are drawn too: one should see why they were.
+    z blue; grasps of every object, evenly from its best to its worst, are coloured by p_hold or
+    score, dashed where p_hold is not sure. Rejected objects are drawn too: one should see why they
+    were.
 
     Args:
         store: the session; the view must be calibrated.
@@ -97,7 +100,7 @@ def overlay_pictures(
         picture = _with_grasps(picture, store.session.intrinsics, shown, poses, max_grasps)
         picture = _with_names(picture, objects, models, ids)
         if with_legend:
-            picture = _with_legend(picture, objects, models, ids, hidden, bool(shown))
+            picture = _with_legend(picture, objects, models, ids, hidden, shown)
         yield picture
 
 
@@ -132,11 +135,16 @@ def _with_grasps(
     poses: Mapping[int, Array],
     most: int,
 ) -> Rgb:
-    """Return the picture with the best and the worst grasps of every object, `most` in all."""
+    """Return the picture with grasps of every object, `most` in all.
+
+    Grasps without a label are drawn only if none has one.
+    """
     from realsim.rendering import overlay
 
     for grasps in grasp_sets:
-        chosen = best_and_worst(grasps, max(2, most // len(grasp_sets)))
+        known = np.flatnonzero(~np.isnan(grasps.labels))
+        rows = known if len(known) else None
+        chosen = overlay.evenly_ranked(grasps, max(2, most // len(grasp_sets)), rows)
         picture = overlay.draw_grasps(picture, intrinsics, poses[grasps.instance], grasps, chosen)
     return picture
 
@@ -160,7 +168,7 @@ def _with_legend(
     models: Mapping[int, ObjectModel],
     ids: Ids,
     hidden: NDArray[np.bool_],
-    has_grasps: bool,
+    grasp_sets: Sequence[GraspSet],
 ) -> Rgb:
     """Return the picture with its colours explained, and the objects that are not to be seen."""
     from realsim.rendering.overlay_words import write_legend
@@ -174,7 +182,10 @@ def _with_legend(
     lines = [f"not visible: {name}" for name in unseen[:MOST_NAMED]]
     if len(unseen) > MOST_NAMED:
         lines.append(f"and {len(unseen) - MOST_NAMED} more not visible")
-    return write_legend(picture, entries, ids >= 0, with_scores=has_grasps, lines=lines)
+    if any(s.unsure.any() for s in grasp_sets):
+        lines.insert(0, "dashed: p_hold of few draws")
+    ramp = label_words(grasp_sets) if grasp_sets else ""
+    return write_legend(picture, entries, ids >= 0, ramp=ramp, lines=lines)
 
 
 def _hidden_by_unknown(
@@ -191,18 +202,3 @@ def _hidden_by_unknown(
             visible = store.read_image(mask_path(index, entry["mask"], visible=True)) > 0
             hidden |= (ids == entry["instance"]) & amodal & ~visible
     return hidden
-
-
-def best_and_worst(grasps: GraspSet, most: int) -> NDArray[np.int64]:
-    """Return the numbers of the grasps with the highest and the lowest scores, `most` in all.
-
-    Grasps that were not tried are drawn only if none was.
-    """
-    tried = np.flatnonzero(~np.isnan(grasps.scores))
-    if len(tried) == 0:
-        return np.arange(min(most, len(grasps)), dtype=np.int64)
-    ranked = tried[np.argsort(-grasps.scores[tried], kind="stable")]
-    if len(ranked) <= most:
-        return ranked
-    worst = most // 2
-    return np.concatenate([ranked[: most - worst], ranked[len(ranked) - worst :]])

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.grasps.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import executed, labelled
 from realsim.records import GraspSet
 
 Array = NDArray[np.float64]
-QUALITIES = ("score", "margin", "ferrari_canny", "closure_friction")
+QUALITIES = ("score", "p_hold", "margin", "ferrari_canny", "closure_friction")
 """What is ranked; closure_friction is better where it is smaller, so its correlations are negative
 where it agrees."""
 LEAST_GRASPS = 10
@@ -25,6 +25,8 @@ MOST_DRAWS = 50_000_000
 """Numbers drawn in one bootstrap; beyond, there are fewer samples, and the interval is tiny."""
 INTERVAL = (2.5, 97.5)
 """Percentiles of the interval."""
+LABEL_BINS = 10
+"""Equal bins of p_hold, or of the score, over 0 to 1."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -120,6 +122,25 @@ def closure_confusions(sets: Sequence[GraspSet]) -> tuple[ClosureConfusion, ...]
             )
         )
     return tuple(found)
+
+
+def label_histogram(sets: Sequence[GraspSet]) -> NDArray[np.int64]:
+    """Return how many grasps have a p_hold, of sets without one a score, in each of ten bins.
+
+    Counted are the grasps with a label of their own, not those that the arm does not reach.
+    """
+    values = np.concatenate([np.zeros(0), *(s.labels[labelled(s)] for s in sets)])
+    return np.histogram(values, LABEL_BINS, (0.0, 1.0))[0].astype(np.int64)
+
+
+def p_hold_entropy_bits(sets: Sequence[GraspSet]) -> float:
+    """Return how much a p_hold tells apart [bits]: 0 = all in one of ten bins, 3.32 = evenly.
+
+    NaN where no set has one.
+    """
+    counts = label_histogram([s for s in sets if s.label == "p_hold"])
+    shares = counts[counts > 0] / max(1, counts.sum())
+    return float(-np.sum(shares * np.log2(shares))) + 0.0 if len(shares) else math.nan
 
 
 def spearman(x: Array, y: Array, rng: np.random.Generator) -> tuple[float, float, float]:

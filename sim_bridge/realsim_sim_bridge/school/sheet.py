@@ -1,7 +1,8 @@
 """The Robot School's picture sheet: what became of all grasps of a scene, and object by object.
 
-Above, how many candidates are left after each stage, and how scores and margins are distributed;
-below, every object with its grasps as small hands, red to green by score.
+Above, how many candidates are left after each stage, and how p_hold (else the score) and margins
+are distributed; below, every object with its grasps as small hands, red to green by the same label,
+dashed where it is of few draws.
 """
 
 import io
@@ -12,10 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from realsim.errors import InputError
-from realsim.formats.grasps.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import labelled
 from realsim.models.model_picture_views import INK, MUTED, PAPER
 from realsim.records import GraspSet, ObjectModel
-from realsim.rendering.overlay import score_color
+from realsim.records.grasps import label_words
+from realsim.rendering.overlay import score_hex, score_rgb
+from realsim_sim_bridge.school.measure_statistics import (
+    LABEL_BINS,
+    label_histogram,
+    p_hold_entropy_bits,
+)
 from realsim_sim_bridge.school.sheet_object import (
     STOPS,
     Box,
@@ -40,8 +47,6 @@ FEW = 6
 """Up to so many objects stand three in a row, more four."""
 MOST_OBJECTS = 60
 """Objects on one sheet: 15 rows, and a picture of 6,000 pixels."""
-SCORE_STEP = 1 / 12
-"""Scores are multiples of the penalty."""
 MARGIN_BINS = 10
 LEFT_AFTER = ("candidates", "trajectory", "close", "lift", "oscillate", "pendulum")
 BAR_COLOR = "#5b7f95"
@@ -94,7 +99,7 @@ def sheet_figure(
     FigureCanvasAgg(figure)
     _title(figure, sets, title)
     _charts(figure, sets)
-    _legend(figure, TITLE_PX + CHARTS_PX)
+    _legend(figure, TITLE_PX + CHARTS_PX, sets)
     names = names_of_sets(sets, {i: m.name for i, m in models.items()})
     width = (WIDTH_PX - 2 * MARGIN_PX) / columns
     for k, (s, name) in enumerate(zip(sets, names, strict=True)):
@@ -129,7 +134,8 @@ def _title(figure: Any, sets: Sequence[GraspSet], title: str) -> None:
     plural = "" if len(sets) == 1 else "s"
     said = f"{len(sets)} object{plural}, {len(scores):,} candidates"
     if len(known):
-        said += f", {100 * np.mean(known >= 0.5):.1f} % good, mean score {np.mean(known):.2f}"
+        mean = np.nanmean(_joined([s.labels for s in sets]))
+        said += f", {100 * np.mean(known >= 0.5):.1f} % good, mean {label_words(sets)} {mean:.2f}"
     text_at(figure, WIDTH_PX - MARGIN_PX, 34, said, 13, MUTED, align="right")
 
 
@@ -137,7 +143,7 @@ def _charts(figure: Any, sets: Sequence[GraspSet]) -> None:
     """Draw the stages' attrition, and the distributions of scores and margins."""
     margins = _joined([s.measures["margin"] for s in sets if "margin" in s.measures])
     margins = margins[~np.isnan(margins)]
-    charts: list[Any] = [_attrition, _score_histogram]
+    charts: list[Any] = [_attrition, _label_histogram]
     if len(margins):
         charts.append(_margin_histogram)
     width = (WIDTH_PX - 2 * MARGIN_PX) / len(charts)
@@ -199,27 +205,26 @@ def _attrition(ax: Any, sets: Sequence[GraspSet]) -> None:
     _named(ax, "Left after each stage, and what it took", "grasps")
 
 
-def _score_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
-    """Draw how many grasps have which score, by twelfths; grey is what physics has not tried."""
-    scores = _joined([s.scores for s in sets])
-    tried = _joined([executed(s).astype(np.float64) for s in sets]) > 0
-    steps = np.arange(13)
-    counts = [
-        np.bincount(np.rint(scores[rows] / SCORE_STEP).astype(np.int64), minlength=13)[:13]
-        for rows in (tried & ~np.isnan(scores), ~tried & ~np.isnan(scores))
-    ]
-    colors = ["#{:02x}{:02x}{:02x}".format(*score_color(k * SCORE_STEP)) for k in steps]
-    at = steps * SCORE_STEP
-    ax.bar(at, counts[0], width=0.8 * SCORE_STEP, color=colors)
-    ax.bar(at, counts[1], width=0.8 * SCORE_STEP, bottom=counts[0], color=STOPS[1][1])
-    ax.axvline(0.5 - SCORE_STEP / 2, color=MUTED, linewidth=1, linestyle=(0, (4, 3)))
-    top = max(1, int(np.max(counts[0] + counts[1])))
-    ax.set_ylim(0, 1.18 * top)
-    ax.text(0.5 - 0.3 * SCORE_STEP, 1.14 * top, "good", fontsize=10, color=MUTED, va="center")
-    ax.set_xlim(-0.06, 1.06)
+def _label_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
+    """Draw how many grasps have which p_hold or score in ten bins, those of no trajectory in grey.
+
+    Those have a score, which is 0, but no label of their own.
+    """
+    counts = label_histogram(sets)
+    nowhere = sum(int(np.sum(~labelled(s) & (s.scores == 0))) for s in sets)
+    width = 1 / LABEL_BINS
+    left = width * np.arange(LABEL_BINS)
+    colors = [score_hex(x) for x in np.linspace(0, 1, LABEL_BINS)]
+    ax.bar(left, counts, width=0.94 * width, align="edge", color=colors)
+    ax.bar(0, nowhere, width=0.94 * width, align="edge", bottom=counts[0], color=STOPS[1][1])
+    ax.set_ylim(0, 1.18 * max(1, int(counts[0] + nowhere), int(counts.max())))
+    ax.set_xlim(-0.02, 1.02)
     ax.set_xticks([0, 0.25, 0.5, 0.75, 1])
     ax.yaxis.get_major_locator().set_params(integer=True)
-    _named(ax, "Scores", "score", "grasps")
+    bits = p_hold_entropy_bits(sets)
+    said = "" if np.isnan(bits) else f", entropy {bits:.2f} of {np.log2(LABEL_BINS):.2f} bits"
+    label = label_words(sets)
+    _named(ax, f"Distribution of {label}{said}", label, "grasps")
 
 
 def _margin_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
@@ -236,7 +241,7 @@ def _margin_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
     _named(ax, "Margins over friction and force", "margin", "grasps")
 
 
-def _legend(figure: Any, top: float) -> None:
+def _legend(figure: Any, top: float, sets: Sequence[GraspSet]) -> None:
     """Explain the colours of the bars and of the hands, in one line."""
     width = WIDTH_PX - 2 * MARGIN_PX
     ax = axes_at(figure, (MARGIN_PX, top, width, LEGEND_PX))
@@ -245,11 +250,14 @@ def _legend(figure: Any, top: float) -> None:
     for label, color in STOPS:
         ax.add_patch(_swatch(at, middle, color))
         at = _written(ax, at + 20, middle, label, INK) + 18
-    # To the right the hands, whose colours run with the score.
-    at = _written(ax, width - 320, middle, "hands by score:  0", MUTED) + 8
-    ramp = np.array([[score_color(x) for x in np.linspace(0, 1, 64)]], dtype=np.uint8)
+    # To the right the hands, whose colours run with the label.
+    at = width - 460 if any(s.unsure.any() for s in sets) else width - 320
+    at = _written(ax, at, middle, f"hands by {label_words(sets)}:  0", MUTED) + 8
+    ramp = score_rgb(np.linspace(0, 1, 64))[None]
     ax.imshow(ramp, extent=(at, at + 120, middle + 6, middle - 6), aspect="auto")
-    _written(ax, at + 128, middle, "1", MUTED)
+    at = _written(ax, at + 128, middle, "1", MUTED)
+    if any(s.unsure.any() for s in sets):
+        _written(ax, at + 14, middle, "dashed: few draws", MUTED)
     ax.set_axis_off()
     ax.axhline(2, color="#d3d8de", linewidth=1)
     ax.set_xlim(0, width)

@@ -1,4 +1,4 @@
-"""One object of the School's picture sheet: its surface, its grasps in their scores' colours."""
+"""One object of the School's picture sheet: its surface, its grasps in their labels' colours."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from realsim.formats.grasps.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import executed, labelled
 from realsim.geometry import se3
 from realsim.models.model_picture_views import (
     INK,
@@ -21,7 +21,7 @@ from realsim.models.model_picture_views import (
     view_of,
 )
 from realsim.records import STAGES, GraspSet, Mesh
-from realsim.rendering.overlay import score_color
+from realsim.rendering.overlay import dashed, evenly_ranked, score_hex
 
 Array = NDArray[np.float64]
 Box = tuple[float, float, float, float]
@@ -35,16 +35,15 @@ STEM_M = 0.02
 """Lengths of a drawn hand [m]: shorter than the Panda's, so that the object is seen."""
 FINGER_SHARE = 0.22
 """Longest finger as a share of the object's diagonal: small objects get small hands."""
+DASH_SHARE = 0.14
+"""Dash of a hand whose p_hold is not sure, as a share of the finger."""
 HAND_WIDTH = 1.5
 """Width of a drawn hand's lines [pt]."""
 STOPS: tuple[tuple[str, str], ...] = (
     ("not tried", "#d3d8de"),
     ("no trajectory", "#8793a1"),
-    *(
-        (f"failed: {stage}", "#{:02x}{:02x}{:02x}".format(*score_color(k / len(STAGES))))
-        for k, stage in enumerate(STAGES)
-    ),
-    ("passed all", "#{:02x}{:02x}{:02x}".format(*score_color(1.0))),
+    *((f"failed: {stage}", score_hex(k / len(STAGES))) for k, stage in enumerate(STAGES)),
+    ("passed all", score_hex(1.0)),
 )
 """Where a grasp stopped, and its colour: that of the base score it has there."""
 ZOOM = 1.24
@@ -66,17 +65,9 @@ def stops_of(s: GraspSet) -> NDArray[np.int64]:
 
 
 def shown_rows(s: GraspSet) -> NDArray[np.int64]:
-    """Return the rows drawn: evenly through the tried grasps by score, worst first.
-
-    So the colours in the picture are those of the whole set. Where none was tried: of all.
-    """
-    rows = np.flatnonzero(executed(s))
-    if len(rows) == 0:
-        rows = np.arange(len(s))
-    rows = rows[np.argsort(np.nan_to_num(s.scores[rows]), kind="stable")]
-    if len(rows) > MOST_HANDS:
-        rows = rows[np.linspace(0, len(rows) - 1, MOST_HANDS).round().astype(int)]
-    return rows.astype(np.int64)
+    """Return the rows drawn: evenly through the labelled grasps; where none has a label: of all."""
+    rows = np.flatnonzero(labelled(s))
+    return evenly_ranked(s, MOST_HANDS, rows if len(rows) else None)
 
 
 def draw_object(figure: Any, box: Box, s: GraspSet, mesh: Mesh, name: str, T_up_obj: Array) -> None:
@@ -120,13 +111,11 @@ def _picture(ax: Any, s: GraspSet, mesh: Mesh, T_up_obj: Array, size: tuple[int,
     view = _near_view(np.concatenate([drawn.vertices, *lines]), size)
     picture, depth = rendered([drawn], view)
     ax.imshow(picture)
-    tried = executed(s)
+    labels = np.where(labelled(s), s.labels, np.nan)
     for k in np.argsort(-_depths(view, hands)):
         row = int(rows[k])
-        color = score_color(float(s.scores[row]) if tried[row] else float("nan"))
-        hand = Layer(
-            lines=tuple(hands[k]), color="#{:02x}{:02x}{:02x}".format(*color), width=HAND_WIDTH
-        )
+        lines = dashed(hands[k], factor * DASH_SHARE * finger) if s.unsure[row] else hands[k]
+        hand = Layer(lines=tuple(lines), color=score_hex(float(labels[row])), width=HAND_WIDTH)
         draw_layer(ax, hand, view, depth)
 
 
@@ -165,7 +154,8 @@ def _figures(s: GraspSet) -> str:
     arrived = int(np.sum(stops_of(s) > 1))
     return (
         f"n = {len(s)} · reachable {100 * arrived / len(scores):.0f} % · "
-        f"good {100 * np.mean(scores >= 0.5):.0f} % · score {np.mean(scores):.2f}"
+        f"good {100 * np.mean(scores >= 0.5):.0f} % · {s.label} "
+        f"{np.mean(s.labels[~np.isnan(s.labels)]):.2f}"
     )
 
 
