@@ -193,7 +193,7 @@ class GraspsPanel:
 def legend_html(sets: Sequence[GraspSet]) -> str:
     """Return the legend of the grasps' colours: what they say, and that pale ones are not sure."""
     scores = (0.0, 0.25, 0.5, 0.75, 1.0, float("nan"))
-    words = ("0", "0.25", "0.5", "0.75", "1", "not known")
+    words = ("0", "0.25", "0.5", "0.75", "1", "unknown")
     cells = "".join(
         f'<div style="flex:1;background:rgb({r},{g},{b});text-align:center;padding:3px 0">'
         f"{word}</div>"
