@@ -71,8 +71,9 @@ def _pads_on_fingers(hand: Hand) -> Finding:
         low[2] + hand.pad_length_m / 2,
     )  # fmt: skip
     found = f"{1e3 * hand.pad_width_m:g} x {1e3 * hand.pad_length_m:g} mm"
+    pressed = f"{1e-3 * hand.pad_stiffness_n_per_m:.4g} kN/m"
     if out <= 1e-6:
-        return Finding(what="pads", found=f"{found}, inside the fingers' boxes")
+        return Finding(what="pads", found=f"{found}, inside the fingers' boxes; {pressed}")
     return Finding(
         what="pads", found=f"{found}, {1e3 * out:.1f} mm beyond the fingers' boxes", is_right=False,
         advice="A pad is no wider than the finger, and its middle is the origin: make it smaller, "

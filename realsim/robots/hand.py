@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.geometry import se3
-from realsim.robots.hand_file import HandFile, Point
+from realsim.robots.hand_file import STIFFEST_N_PER_M, HandFile, Point, soft_n_per_m
 from realsim.robots.robot_files import RobotFolder, robot_file
 from realsim.untrusted.own_json import from_json
 
@@ -64,7 +64,8 @@ class Hand:
     """Along x and z, what presses on a large object [m]."""
     friction: float
     """Coulomb coefficient of the pads on the objects."""
-    stiffness_n_per_m: float
+    pad_stiffness_n_per_m: float
+    """Normal stiffness of one pad on which a flat object lies whole [N/m]."""
     arc_radius_m: float
     """Of the circle on which the pads run [m]; 0 = they slide along y."""
     arc_axis_y_m: float
@@ -281,6 +282,9 @@ def hand_of_json(value: Any, what: str) -> Hand:
         if sizes and all(value[n] == getattr(franka, n) for n in sizes):
             return franka
         raise InputError(f"{what} is of a hand without a name whose sizes are not the Franka's.")
+    if isinstance(value, dict) and "stiffness_n_per_m" in value:  # older: of one of six points
+        value = {**value, "pad_stiffness_n_per_m": 6.0 * value["stiffness_n_per_m"]}
+        del value["stiffness_n_per_m"]
     return from_json(value, Hand, what)
 
 
@@ -301,6 +305,8 @@ def hand_of(file: HandFile, folder: RobotFolder) -> Hand:
     if not palm:
         depth, reach = max(width, PALM_DEPTH_M) / 2.0, file.max_opening_m / 2.0 + thickness
         palm = (((-depth, -reach, root - PALM_HEIGHT_M), (depth, reach, root)),)
+    patch = pad.patch_m or (pad_width, pad_length)
+    stiffness = pad.normal_stiffness_n_per_m
     back = min(low[2] for low, _ in palm)
     distance = file.mount.distance_m
     return Hand(
@@ -314,9 +320,9 @@ def hand_of(file: HandFile, folder: RobotFolder) -> Hand:
         finger_thickness_m=thickness,
         pad_width_m=pad_width,
         pad_length_m=pad_length,
-        patch_m=pad.patch_m or (pad_width, pad_length),
+        patch_m=patch,
         friction=pad.friction,
-        stiffness_n_per_m=pad.stiffness_n_per_m,
+        pad_stiffness_n_per_m=soft_n_per_m(patch) if stiffness is None else stiffness,
         arc_radius_m=file.arc.radius_m if file.arc else 0.0,
         arc_axis_y_m=file.arc.axis_y_m if file.arc else 0.0,
         palm_boxes=palm,
@@ -346,7 +352,7 @@ _RANGES = {
     "pad_width_m": (0.001, 0.3, "m"),
     "pad_length_m": (0.001, 0.3, "m"),
     "friction": (0.01, 10.0, ""),
-    "stiffness_n_per_m": (100.0, 1e7, "N/m"),
+    "pad_stiffness_n_per_m": (1e3, STIFFEST_N_PER_M, "N/m"),
     "mass_kg": (0.01, 20.0, "kg"),
     "finger_mass_kg": (0.001, 5.0, "kg"),
     "least_force_n": (0.0, 1000.0, "N"),

@@ -8,6 +8,20 @@ from realsim.untrusted.own_json import OwnFile
 Point = tuple[float, float, float]
 
 
+STIFFEST_N_PER_M = 1e6
+"""Greatest normal stiffness of a pad that both engines press as they are told [N/m]."""
+
+
+def soft_n_per_m(patch_m: tuple[float, float]) -> float:
+    """Return the normal stiffness of 4 mm of silicone over a patch [N/m]: E A / t.
+
+    Silicone of Shore A 40 has E = 2.0 MPa (lg E = 0.0235 S - 0.6403, Larson 2016, Dow Corning
+    11-3716); the layer is taken to be free to bulge. Shore A 30 to 50 and 2 to 4 mm span 0.6 to 3.4
+    times as much. Large patches get `STIFFEST_N_PER_M`.
+    """
+    return min(2.0e6 * patch_m[0] * patch_m[1] / 4e-3, STIFFEST_N_PER_M)
+
+
 class PadFile(OwnFile, frozen=True, kw_only=True):
     """The pads, as a `robot.toml` has them."""
 
@@ -19,8 +33,8 @@ class PadFile(OwnFile, frozen=True, kw_only=True):
     """Along x and z, what presses on a large object [m]; the whole pad where it is left away."""
     friction: float = 1.0
     """Coulomb coefficient on the objects; 1.0 is the paper's."""
-    stiffness_n_per_m: float = 40_000.0
-    """Contact stiffness of each of a pad's six points [N/m], for the engine that takes one."""
+    normal_stiffness_n_per_m: float | None = None
+    """Of one pad on which a flat object lies whole [N/m]; `soft_n_per_m` where left away."""
 
 
 class ArcFile(OwnFile, frozen=True, kw_only=True):

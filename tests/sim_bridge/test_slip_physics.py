@@ -19,7 +19,7 @@ from realsim_sim_bridge.slip.motion import (
 )
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial, run_slip_test
-from realsim_sim_bridge.slip.world import Closing, PadModel, Replay, SlipPhysics
+from realsim_sim_bridge.slip.world import Closing, Replay, SlipPhysics
 
 DOWN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]])
 SIDE = 0.05
@@ -159,7 +159,7 @@ def test_every_setting_is_read_back_from_the_engine():
     assert read["object_friction"] == pytest.approx(0.37) and read["finger_friction"] == 1.0
     assert read["dt_s"] == pytest.approx(1 / 240) and read["iterations"] == settings.iterations
     assert read["object_mass_kg"] == pytest.approx(physics.mass_floor_kg)
-    assert read["substeps"] == 0 and read["contact_stiffness"] == PadModel().stiffness_n_per_m
+    assert read["substeps"] == 0 and read["pad_stiffness_n_per_m"] == pytest.approx(2e5)
     assert read["force_n"] == pytest.approx(70.0, rel=0.02)
 
 

@@ -145,7 +145,7 @@ def test_a_light_object_without_a_mass_floor_fails():
 def test_soft_friction_in_mujoco_creeps():
     pytest.importorskip("mujoco")
     assert failed(run("creep", settings=MujocoSettings())) == set()
-    report = run("creep", settings=MujocoSettings(impratio=1.0))
+    report = run("creep", settings=MujocoSettings(creep_n_s_per_m=400.0))
     assert {"no creep", "no creeping turn", "no creep on a cylinder"} <= failed(report)
 
 

@@ -124,7 +124,7 @@ class BulletPair:
             "rollingFriction": 0.0,
         }
         if self._physics.pads:
-            wanted["contactStiffness"] = settings.stiffness or self._physics.pads.stiffness_n_per_m
+            wanted["contactStiffness"] = self._physics.pads.point_n_per_m
             wanted["contactDamping"] = settings.damping
         for finger in self._fingers:
             engine.changeDynamics(hand, finger, **wanted)
@@ -318,13 +318,14 @@ class BulletPair:
     def settings(self) -> dict[str, float]:
         """Return what the engine says its settings are."""
         engine = self.engine
+        points = len(self._physics.pads.centers_xz()) if self._physics.pads else 0
         finger = engine.getDynamicsInfo(self.hand, self._fingers[0])
         held = engine.getDynamicsInfo(self.object, -1)
         parameters = engine.getPhysicsEngineParameters()
         return {
             "finger_friction": float(finger[_INFO["lateralFriction"]]),
             "object_friction": float(held[_INFO["lateralFriction"]]),
-            "contact_stiffness": float(finger[_INFO["contactStiffness"]]),
+            "pad_stiffness_n_per_m": points * float(finger[_INFO["contactStiffness"]]),
             "contact_damping": float(finger[_INFO["contactDamping"]]),
             "object_mass_kg": float(held[0]),
             "object_inertia_least": float(min(held[2])),

@@ -16,8 +16,6 @@ class BulletSettings:
     """Steps per second of simulated time."""
     iterations: int = 200
     """Most solver iterations a step; at 50 the 5 cm box turns 1.9 deg instead of 0.14."""
-    stiffness: float | None = None
-    """Contact stiffness of the pads [N/m]; None = what the hand's pads have."""
     damping: float = 1.0
     """Contact damping [N s/m]; at 100 and more the sharing is lost."""
     friction_anchor: bool = True
@@ -52,17 +50,17 @@ class MujocoSettings:
 
     step_s: float = 0.002
     """Time step [s]."""
-    impratio: float = 3000.0
-    """Stiffness of friction against that of the normal: at 1000 a load of 80 % of the limit creeps
-    0.1 mm in 5 s, at 100 0.2 mm."""
+    creep_n_s_per_m: float = 1.2e6
+    """Load over the speed at which a sphere that sticks creeps [N s/m]: with 80 % of 70 N a cube
+    moves 0.04 mm in 5 s. `impratio` follows from it, the pads' stiffness and the step."""
     noslip_iterations: int = 0
-    """Passes of the solver that removes what slip is left; not needed at a high `impratio`."""
+    """Passes of the solver that removes what slip is left; not needed against so little creep."""
     armature_kg: float = 0.4
     """Reflected inertia of a finger's drive [kg]; chosen, not measured. Without it as many objects
     are closed on."""
     contact_time_s: float = 0.004
-    """Time constant of contacts, joint limits and of the fingers' coupling [s]: two steps of 2 ms,
-    the stiffest that MuJoCo integrates."""
+    """Time constant of joint limits, of the fingers' coupling and of contacts beside the pads [s]:
+    two steps of 2 ms, the stiffest that MuJoCo integrates."""
     pairs_per_world: int = 48
     """Pairs of one rollout."""
     replay: Replay = field(default_factory=lambda: Replay(speed=4))

@@ -9,6 +9,8 @@ What makes its friction right (each was measured to be wrong without it):
 - 2 x 3 sphere pads a finger: a mesh finger touches at two or three points and carries no torque.
 - `impratio` makes friction stiff against the normal, so that objects do not creep; the cone is
   elliptic, for a pyramid is stronger along its edges.
+- A soft contact's stiffness hangs on both bodies' inertia: that of the pads is set once the model
+  has been compiled (`mujoco_pads`).
 - Light objects between stiff pads do not converge: mass floor.
 - MuJoCo takes the greater friction of the two geoms, hence both have the contact's.
 """
@@ -23,6 +25,7 @@ from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.mujoco_approach import surface_triangles
+from realsim_sim_bridge.slip.mujoco_pads import PAD_PRIORITY, set_pads
 from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import PadModel, SlipBody, SlipPhysics
 
@@ -119,6 +122,8 @@ def compile_pair(
         model = spec.compile()
         lifts = lift_joints(model)
         _keep_tolerance(model, [int(joint.dofadr[0]) for joint in lifts])
+        if physics.pads:
+            set_pads(model, int(model.body(OBJECT).id), physics.pads, settings)
         triangles = surface_triangles(body.parts)
     except (ValueError, RuntimeError) as error:
         raise InputError(
@@ -199,7 +204,6 @@ def _set_options(spec: Any, physics: SlipPhysics, settings: "MujocoSettings") ->
     option.gravity = [0.0, 0.0, 0.0]
     option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.impratio = settings.impratio
     option.noslip_iterations = settings.noslip_iterations
     off = mujoco.mjtDisableBit
     # A diverged pair must not be put back to where it began, as if nothing had happened.
@@ -251,6 +255,7 @@ def _add_finger(
                 pos=[x, side * pads.sphere_radius_m, z],
             )
             _set_contact(pad, HAND_SIDE, physics, settings)
+            pad.priority = PAD_PRIORITY
     for low, high in np.array(geometry.finger_boxes):
         if pads:
             low[1] = max(low[1], pads.protrusion_m)

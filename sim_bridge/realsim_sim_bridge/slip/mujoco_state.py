@@ -25,6 +25,7 @@ from realsim_sim_bridge.slip.mujoco_model import (
     TABLE_SIDE,
     load_mujoco,
 )
+from realsim_sim_bridge.slip.mujoco_pads import pad_stiffness
 from realsim_sim_bridge.slip.world import Motion, PairStates
 
 Array = NDArray[np.float64]
@@ -190,6 +191,7 @@ def read_settings(model: Any) -> dict[str, float]:
         "dt_s": float(model.opt.timestep),
         "object_mass_kg": float(model.body(OBJECT).mass[0]),
         "force_n": float(model.tendon_frictionloss.min()),
+        "pad_stiffness_n_per_m": pad_stiffness(model, int(matter.id)),
         "impratio": float(model.opt.impratio),
         "noslip_iterations": float(model.opt.noslip_iterations),
         "elliptic_cone": float(model.opt.cone),

@@ -19,11 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.geometry.mesh_shape import MassProperties
 from realsim.models.model_records import ConvexParts, PhysicalProperties
 from realsim.records.checked_arrays import rows_of
 from realsim.robots.hand import Hand
+from realsim.robots.hand_file import STIFFEST_N_PER_M
 from realsim_sim_bridge.slip.stand import Stand
 
 # --- An object as the physics engines need it ----------------------------------------------------
@@ -72,6 +74,10 @@ class SlipBody:
 SPREAD = 0.3
 """Distance of the outer spheres from the pad's middle, in sizes of the pad."""
 
+STIFFNESS_N_PER_M = (1e3, STIFFEST_N_PER_M)
+"""Least and greatest normal stiffness of a pad [N/m]. At 1 MN/m PyBullet's solver is up to 9 % off,
+beyond its pads become rigid, whatever was asked; MuJoCo keeps to what it is told."""
+
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class PadModel:
@@ -92,10 +98,23 @@ class PadModel:
     """z of the spheres' centres [m]."""
     finger_mass_kg: float = 0.1
     """Mass of a finger [kg]."""
-    stiffness_n_per_m: float = 40_000.0
-    """Contact stiffness of a sphere in PyBullet [N/m]: shares the load between them. At 10 kN/m
-    they sink in by a millimetre, and at curved places every twentieth grasp ends otherwise than
-    with stiff contacts. MuJoCo's contacts are as stiff as its time step allows."""
+    pad_stiffness_n_per_m: float = 200_000.0
+    """Normal stiffness of one pad, all of whose spheres touch [N/m]; each has an equal share, so
+    that a pad pressed at its edge is softer. The Franka Hand's; in every engine the same."""
+
+    def __post_init__(self) -> None:
+        """Check the stiffness.
+
+        Raises:
+            InputError: it is no number between the least and the greatest that can be.
+        """
+        least, most = STIFFNESS_N_PER_M
+        if not least <= self.pad_stiffness_n_per_m <= most:
+            raise InputError(
+                f"pads of {self.pad_stiffness_n_per_m:g} N/m cannot be: {least:g} to {most:g} N/m "
+                "is accepted, the force over how far a flat object is pressed into the whole pad; "
+                "4 mm of soft silicone under 400 mm^2 have 200000."
+            )
 
     @classmethod
     def of(cls, hand: Hand) -> "PadModel":
@@ -105,8 +124,18 @@ class PadModel:
             x_m=(-x, x),
             z_m=(-z, 0.0, z),
             finger_mass_kg=hand.finger_mass_kg,
-            stiffness_n_per_m=hand.stiffness_n_per_m,
+            pad_stiffness_n_per_m=hand.pad_stiffness_n_per_m,
         )
+
+    @property
+    def greatest_n(self) -> float:
+        """Force that presses a whole pad in as far as it stands out [N]."""
+        return self.pad_stiffness_n_per_m * self.protrusion_m
+
+    @property
+    def point_n_per_m(self) -> float:
+        """Normal stiffness of one sphere [N/m]."""
+        return self.pad_stiffness_n_per_m / len(self.centers_xz())
 
     def centers_xz(self) -> NDArray[np.float64]:
         """Return x and z (S, 2) of the spheres' centres [m], grasp frame."""
@@ -138,6 +167,21 @@ class SlipPhysics:
     def of(cls, hand: Hand) -> "SlipPhysics":
         """Return what is true of a hand: its usual force, its pads and their friction."""
         return cls(force_n=hand.force_n, friction=hand.friction, pads=PadModel.of(hand))
+
+    def __post_init__(self) -> None:
+        """Check that the force does not press the pads in as far as they are thick.
+
+        Raises:
+            InputError: it does; the finger's box would carry what the pad should.
+        """
+        pads = self.pads
+        if pads and not self.force_n <= pads.greatest_n:
+            raise InputError(
+                f"{self.force_n:g} N press pads of {pads.pad_stiffness_n_per_m:g} N/m in by more "
+                f"than the {1e3 * pads.protrusion_m:g} mm that they stand out. At this force "
+                f"{self.force_n / pads.protrusion_m:.4g} N/m or more is accepted, with these pads "
+                f"{pads.greatest_n:.4g} N or less."
+            )
 
     @property
     def contact_n(self) -> float:

@@ -89,6 +89,8 @@ class StageConfig:
     """Greatest relative difference of a setting read back from the engine."""
     force_pct: float = 2.0
     """Greatest error of the fingers' measured force [%]."""
+    stiffness_pct: float = 10.0
+    """Greatest error of the pads' measured stiffness [%]."""
     pair_slip_m: float = 5e-5
     """Greatest difference of a held grasp's slip when it shares the world [m]."""
 

@@ -63,7 +63,7 @@ def box_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
 def _arc_m(config: ValidationConfig) -> float:
     """Return how far pads on an arc rise while the force presses them into the cube [m]."""
     pads = config.slip.physics.pads or PadModel()
-    give = config.slip.physics.force_n / (len(pads.centers_xz()) * pads.stiffness_n_per_m)
+    give = config.slip.physics.force_n / pads.pad_stiffness_n_per_m
     return float(abs(config.hand.slope(SIDE_M / 2))) * give
 
 

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from realsim_sim_bridge.slip.slip_test import SlipConfig
 from realsim_sim_bridge.slip.world import Engine, PadModel, SlipBody
 from realsim_sim_bridge.validation.config import ValidationConfig
-from realsim_sim_bridge.validation.loads import Held, hand_patch, hold, with_hand
+from realsim_sim_bridge.validation.loads import LOST_M, Held, hand_patch, hold, with_hand
 from realsim_sim_bridge.validation.report import CheckResult, LimitRatio
-from realsim_sim_bridge.validation.specimens import cube, specimen
+from realsim_sim_bridge.validation.specimens import DOWN, cube, cube_trial, specimen
 
 Array = NDArray[np.float64]
 
@@ -188,6 +188,33 @@ def force_check(engine: Engine, config: ValidationConfig) -> CheckResult:
         group="settings", name="finger force", what="error of the fingers' measured normal force",
         measured=worst, unit="%", limit=config.stages.force_pct, detail=seen,
     )  # fmt: skip
+
+
+def press_checks(engine: Engine, config: ValidationConfig) -> list[CheckResult]:
+    """Return the error of the pads' stiffness, measured by pressing the cube with two forces."""
+    if config.slip.physics.pads is None:
+        return []
+    asked = config.slip.physics.pads.pad_stiffness_n_per_m
+    trial = cube_trial(_mass(config, config.slip), DOWN[None], config.hand)
+    forces = np.array([0.5, 1.0]) * config.slip.physics.force_n
+    grips = trial.grips(config.slip.headroom_m)
+    faces_m = np.zeros(2)
+    for i, force_n in enumerate(forces.tolist()):
+        slip = with_hand(config.slip, force_n, config.slip.physics.friction)
+        with engine.world(trial.body, grips, slip.physics, config.hand) as world:
+            world.close(slip.closing)
+            still = max(1, round(config.limits.hold_s / world.dt))
+            world.play(np.zeros((1, still, 6)), still, LOST_M)
+            faces_m[i] = world.states().fingers_m.mean()
+    with np.errstate(divide="ignore"):
+        found = float((forces[1] - forces[0]) / (faces_m[0] - faces_m[1]))
+    return [
+        CheckResult(
+            group="settings", name="pad stiffness", what="error of the pads' measured stiffness",
+            measured=100.0 * abs(found / asked - 1.0), unit="%", limit=config.stages.stiffness_pct,
+            detail=f"{found:.4g} of {asked:.4g} N/m, {forces[0]:g} to {forces[1]:g} N",
+        )
+    ]  # fmt: skip
 
 
 def bracket(shares: Array, slipped: NDArray[np.bool_]) -> tuple[float, float]:

@@ -24,6 +24,7 @@ from realsim_sim_bridge.validation.slip_limits import (
     creep_checks,
     curved_check,
     force_check,
+    press_checks,
     torque_checks,
 )
 from realsim_sim_bridge.validation.specimens import DOWN, cube_trial, edge_trial
@@ -113,12 +114,13 @@ def _asked(
         "object_mass_kg": max(mass_kg, physics.mass_floor_kg),
         "force_n": physics.force_n,
     }
+    if physics.pads:
+        asked["pad_stiffness_n_per_m"] = physics.pads.pad_stiffness_n_per_m
     if isinstance(settings, BulletSettings):
         asked["dt_s"] = 1.0 / settings.rate_hz
         asked |= {"iterations": float(settings.iterations), "substeps": 0.0}
         if physics.pads:
-            stiffness = settings.stiffness or physics.pads.stiffness_n_per_m
-            asked |= {"contact_stiffness": stiffness, "contact_damping": settings.damping}
+            asked["contact_damping"] = settings.damping
     else:
         asked["dt_s"] = settings.step_s
     return asked
@@ -182,7 +184,11 @@ def validate(
         if progress is not None:
             progress(part, i, len(wanted))
         if part == "settings":
-            checks += [settings_check(engine, config, engine_settings), force_check(engine, config)]
+            checks += [
+                settings_check(engine, config, engine_settings),
+                force_check(engine, config),
+                *press_checks(engine, config),
+            ]
         elif part in ("coulomb", "torque"):
             measure = coulomb_checks if part == "coulomb" else torque_checks
             found, measured = measure(engine, config)
