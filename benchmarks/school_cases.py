@@ -31,7 +31,7 @@ from realsim.records import ObjectModel, ObjectPose, Scene, SupportPlane
 from realsim.registration.simulated import TableLabConfig, scatter_objects
 from realsim_sim_bridge.grasping.antipodal import CandidateConfig
 from realsim_sim_bridge.school.config import SchoolConfig
-from realsim_sim_bridge.school.object_slips import trial_of
+from realsim_sim_bridge.school.object_slips import stand_of, trial_of
 from realsim_sim_bridge.school.object_task import ObjectTask, prepare
 from realsim_sim_bridge.school.school import object_tasks
 from realsim_sim_bridge.slip.engines import settings_of
@@ -328,7 +328,16 @@ def reached_trial(key: TrialKey) -> NamedTrial | None:
         return None
     rng = np.random.default_rng([key.seed, 2, key.instance])
     chosen = np.sort(rng.permutation(rows)[: key.grasps])
-    return NamedTrial(name=task.name, instance=key.instance, trial=trial_of(task, prepared, chosen))
+    # The world's frame is the table's.
+    beside = [
+        se3.transform(o.T_world_obj, part)
+        for o in case.scene.objects
+        if o.instance != task.instance
+        for part in case.solids[o.obj_id].parts.parts
+    ]
+    stand = stand_of(config.slip, task.T_table_obj, prepared.body, beside)
+    trial = trial_of(task, prepared, chosen, stand)
+    return NamedTrial(name=task.name, instance=key.instance, trial=trial)
 
 
 def of_density(trial: SlipTrial, density: float, now: float = 1000.0) -> SlipTrial:

@@ -51,7 +51,15 @@ def test_every_grasp_that_was_tested_has_a_trajectory_and_measures(one_result):
     assert list(grasp_set.measures) == [
         name
         for name in MEASURES
-        if name in ("force_n", "duration_s", "ferrari_canny", "closure_friction", "dexnet_closure")
+        if name
+        in (
+            "force_n",
+            "duration_s",
+            "ferrari_canny",
+            "closure_friction",
+            "dexnet_closure",
+            "score_paper",
+        )
     ]
     executed = ~np.isnan(grasp_set.slip_m)
     assert np.all(grasp_set.measures["force_n"][executed & (grasp_set.slip_m < 1)] > 1)

@@ -34,8 +34,12 @@ def school_config_of(grasps: GraspSet) -> SchoolConfig:
         missing = [n for n in ("slip", "score", "hand", "reach") if n not in (stored or {})]
         if missing:
             raise TypeError(f"{missing[0]} is not there")
+        config = _read(SchoolConfig, stored)
         # What older files do not say of closing was not done as it is now.
-        return replace(_read(SchoolConfig, stored), score=limits_of(grasps.parameters))
+        if "table_friction" not in stored["slip"].get("closing", {}):
+            closing = replace(config.slip.closing, table_friction=None)
+            config = replace(config, slip=replace(config.slip, closing=closing))
+        return replace(config, score=limits_of(grasps.parameters))
     except (TypeError, ValueError, InputError) as error:
         raise InputError(
             f"the grasps of instance {grasps.instance} do not say what they were tried with "

@@ -208,6 +208,7 @@ def replay_grasp(
     body: SlipBody,
     config: SchoolConfig,
     engine: RecordedEngine,
+    stand: Stand | None = None,
 ) -> SlipReplay:
     """Return a grasp tried again.
 
@@ -219,11 +220,12 @@ def replay_grasp(
         body: its convex parts and matter.
         config: what the set was made with.
         engine: made of the same settings.
+        stand: what it stands on while the fingers close.
 
     Raises:
         InputError: the set does not hold the openings of its grasps.
     """
-    trial = _trial(grasps, row, joints_lifted, T_table_obj, body, config)
+    trial = replace(_trial(grasps, row, joints_lifted, T_table_obj, body, config), stand=stand)
     engine.begin()
     slips = run_slip_test(trial, config.slip, config.score, config.hand, engine)
     base, score = score_stages(

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from realsim.errors import InputError
 from realsim.formats.grasps.scene_grasps import SceneGrasps
 from realsim.geometry import se3
+from realsim.geometry.mesh import hull_vertices
 from realsim.models.library_records import KnownSolid
 from realsim.records import Mesh, ObjectModel
 from realsim.records.trajectories import PHASES
@@ -43,7 +44,9 @@ from realsim_sim_bridge.demonstrations.records import (
 )
 from realsim_sim_bridge.demonstrations.school_settings import school_config_of, tried_body
 from realsim_sim_bridge.demonstrations.slip_replay import RecordedEngine, replay_grasp
+from realsim_sim_bridge.school.object_slips import stand_of
 from realsim_sim_bridge.slip.engines import make_engine
+from realsim_sim_bridge.slip.stand import Stand
 from realsim_sim_bridge.slip.world import SlipBody
 
 Array = NDArray[np.float64]
@@ -215,6 +218,7 @@ class DemonstrationSource(Sequence[Demonstration]):
         """The arm that attempted, with its hand."""
         self.scenery = self._scenery(cameras)
         self._bodies: dict[int, SlipBody] = {}
+        self._stands: dict[int, Stand | None] = {}
         self._engine: tuple[object, RecordedEngine] | None = None
 
     def __len__(self) -> int:
@@ -338,7 +342,7 @@ class DemonstrationSource(Sequence[Demonstration]):
         T_table_obj = self.scenery.Ts_table_obj[name.instance]
         replay = replay_grasp(
             s, name.grasp, self.stored_joints(name)[-1], T_table_obj, tried, config,
-            self._recorder(name.instance),
+            self._recorder(name.instance), self._stand(name.instance),
         )  # fmt: skip
         attempt = Attempt(
             arm=self.arm,
@@ -384,6 +388,28 @@ class DemonstrationSource(Sequence[Demonstration]):
                 self._cache,
             )
         return self._bodies[instance]
+
+    def _stand(self, instance: int) -> Stand | None:
+        """Return what an object stood on while the fingers closed.
+
+        Of neighbours only those are known whose grasps are; whether it mattered is told by
+        whether the replay ends as the attempt did.
+        """
+        if instance not in self._stands:
+            pieces: list[Array] = []
+            for i, T in self.scenery.Ts_table_obj.items():
+                if i != instance:
+                    tried = "convex" in self._sets[i].parameters
+                    mesh = self.scenery.models[i].mesh
+                    own = self._body(i).parts if tried else (hull_vertices(mesh.vertices),)
+                    pieces += [se3.transform(T, part) for part in own]
+            self._stands[instance] = stand_of(
+                self._configs[instance].slip,
+                self.scenery.Ts_table_obj[instance],
+                self._body(instance),
+                pieces,
+            )
+        return self._stands[instance]
 
     def _recorder(self, instance: int) -> RecordedEngine:
         """Return an engine of an instance's settings; the last one is kept."""

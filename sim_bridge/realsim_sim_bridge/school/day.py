@@ -1,15 +1,19 @@
 """A day at school: every object's preparation, then its grasps in shards, on whatever workers."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from realsim.errors import RealsimError
+from realsim.geometry import se3
+from realsim.geometry.mesh import hull_vertices
+from realsim.models.convex import convex_parts
 from realsim_sim_bridge.school.kept_sets import (
     SchoolResult,
     read_prepared,
@@ -17,7 +21,7 @@ from realsim_sim_bridge.school.kept_sets import (
     write_prepared,
     write_result,
 )
-from realsim_sim_bridge.school.object_slips import Rows, in_words, result_of, trial_of
+from realsim_sim_bridge.school.object_slips import Rows, in_words, result_of, stand_of, trial_of
 from realsim_sim_bridge.school.object_task import ObjectTask, Prepared, not_prepared, prepare
 from realsim_sim_bridge.school.shards import (
     Tested,
@@ -27,7 +31,9 @@ from realsim_sim_bridge.school.shards import (
     write_tested,
 )
 from realsim_sim_bridge.school.workers import WorkerDiedError, Workers
+from realsim_sim_bridge.slip.stand import Stand
 
+Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
 
 MOST_DEATHS = 3
@@ -49,6 +55,9 @@ class Pupil:
     shards: list[Rows] = field(default_factory=list[Rows])
     tested: list[Tested] = field(default_factory=list[Tested])
     given_up: list[tuple[Rows, str]] = field(default_factory=list[tuple[Rows, str]])
+    stand: Stand | None = None
+    standing: dict[str, Any] | None = None
+    """What the set's parameters say of the stand."""
 
     def __post_init__(self) -> None:
         """Take from the folder whatever has been done before."""
@@ -114,6 +123,47 @@ class Pupil:
             if tested is not None:
                 self.tested.append(tested)
 
+    def parts(self) -> list[Array] | None:
+        """Return the convex parts (V, 3) that the engine has of it, table frame; None = none."""
+        task = self.task
+        if self.prepared is not None:
+            own = None if self.prepared.body is None else self.prepared.body.parts
+        elif self.result is None or "convex" not in self.result.grasp_set.parameters:
+            own = None
+        elif task.solid is not None:
+            own = task.solid.parts.parts
+        else:
+            own = convex_parts(task.mesh, task.config.convex, task.cache).parts
+        return None if own is None else [se3.transform(task.T_table_obj, part) for part in own]
+
+    def stand_among(self, others: Mapping[int, list[Array]]) -> None:
+        """Find what the object stands on and beside while fingers close on it.
+
+        A neighbour whose convex parts nobody has cut (it is rejected, or not tried) is the convex
+        hull of its surface.
+
+        Args:
+            others: convex parts by instance, as far as there are any.
+        """
+        assert self.prepared is not None, "an object stands after its preparation"
+        task, around = self.task, self.task.neighbours
+        own = {i: others.get(int(i)) for i in np.unique(around.triangle_instances)}
+        hulls = {
+            i: [hull_vertices(around.triangles[around.triangle_instances == i])]
+            for i, parts in own.items()
+            if parts is None
+        }
+        pieces = [part for parts in ({**own, **hulls}).values() for part in parts or ()]
+        self.stand = stand_of(task.config.slip, task.T_table_obj, self.prepared.body, pieces)
+        if self.stand is not None:
+            self.standing = {
+                "table_height_m": self.stand.height_m,
+                "neighbour_parts": len(self.stand.obstacles),
+                "neighbour_parts_moved_m": self.stand.moved_m,
+                "neighbour_parts_left_out": self.stand.left_out,
+                "neighbours_as_hulls": [int(i) for i in hulls],
+            }
+
     def take_tested(self, tested: Tested) -> None:
         """Keep what was found of a shard."""
         path = self._shard_path(tested.rows)
@@ -127,7 +177,7 @@ class Pupil:
         One with a job that was given up is not kept, so that the next run tries that job again.
         """
         assert self.prepared is not None, "a pupil finishes after its preparation"
-        self.result = result_of(self.task, self.prepared, self.tested, self.given_up)
+        self.result = result_of(self.task, self.prepared, self.tested, self.given_up, self.standing)
         path = self.path("grasps")
         if path is None or self.given_up:
             return
@@ -172,11 +222,10 @@ class Day:
         Raises:
             RealsimError: a job met input that it cannot use; object and grasps are named.
         """
-        for pupil in self._pupils:
-            if pupil.result is None and pupil.prepared is None:
-                self._waiting.append(_Job(pupil))
-            elif pupil.result is None:
-                self._go_on(pupil)
+        unprepared = [p for p in self._pupils if p.result is None and p.prepared is None]
+        self._waiting.extend(_Job(pupil) for pupil in unprepared)
+        if not unprepared:
+            self._go_on()
         self._report()
         while self._waiting or self._under_way:
             while self._waiting and len(self._under_way) < self._workers.capacity():
@@ -195,7 +244,7 @@ class Day:
             there = task if self._workers.shares_files else replace(task, cache=None)
             return self._workers.submit(prepare, there)
         assert job.pupil.prepared is not None, "shards come out of a preparation"
-        trial = trial_of(task, job.pupil.prepared, job.rows)
+        trial = trial_of(task, job.pupil.prepared, job.rows, job.pupil.stand)
         return self._workers.submit(run_shard, trial, job.rows, task.config)
 
     def _take(self, job: _Job, future: Future[Any]) -> None:
@@ -209,7 +258,7 @@ class Day:
             raise _with_name(error, job.name) from None
         if job.rows is None:
             job.pupil.take_prepared(found)
-            self._go_on(job.pupil)
+            self._go_on()
         else:
             job.pupil.take_tested(found)
             self._finish_if_done(job.pupil)
@@ -225,14 +274,25 @@ class Day:
             nothing = not_prepared(job.pupil.task, f"the preparation failed: {why}")
             job.pupil.take_prepared(nothing, keep=False)
             job.pupil.given_up.append((np.zeros(0, dtype=np.int64), why))
+            self._go_on()
         else:
             job.pupil.given_up.append((job.rows, why))
-        self._finish_if_done(job.pupil)
+            self._finish_if_done(job.pupil)
 
-    def _go_on(self, pupil: Pupil) -> None:
-        """Let the slip tests of a prepared object wait for workers."""
-        self._waiting.extend(_Job(pupil, rows) for rows in pupil.open_shards)
-        self._finish_if_done(pupil)
+    def _go_on(self) -> None:
+        """Let all slip tests wait for workers once every object is prepared.
+
+        Fingers close on an object among its neighbours, whose convex parts are known by then.
+        """
+        open_ones = [pupil for pupil in self._pupils if pupil.result is None]
+        if any(pupil.prepared is None for pupil in open_ones):
+            return
+        found = {p.task.instance: p.parts() for p in self._pupils} if open_ones else {}
+        parts = {instance: own for instance, own in found.items() if own is not None}
+        for pupil in open_ones:
+            pupil.stand_among(parts)
+            self._waiting.extend(_Job(pupil, rows) for rows in pupil.open_shards)
+            self._finish_if_done(pupil)
 
     def _finish_if_done(self, pupil: Pupil) -> None:
         """Put a pupil's result together after its last shard."""

@@ -1,12 +1,14 @@
 """An object's grasps on their way into the slip test, and the scored set out of what it said."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from realsim.geometry import se3
 from realsim.records import STAGES, GraspSet
 from realsim.records.grasps import MEASURES
 from realsim_sim_bridge.arm.reach_config import grasping_arm
@@ -15,14 +17,43 @@ from realsim_sim_bridge.school.object_task import ObjectTask, Prepared
 from realsim_sim_bridge.school.run_record import versions
 from realsim_sim_bridge.school.shards import Tested
 from realsim_sim_bridge.slip.score import score_paper, score_stages
-from realsim_sim_bridge.slip.slip_test import SlipTrial
+from realsim_sim_bridge.slip.slip_test import SlipConfig, SlipTrial
+from realsim_sim_bridge.slip.stand import Stand
+from realsim_sim_bridge.slip.world import SlipBody
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 
-def trial_of(task: ObjectTask, prepared: Prepared, rows: Rows) -> SlipTrial:
-    """Return some rows of the candidates, ready for the slip test."""
+def stand_of(
+    config: SlipConfig, T_table_obj: Array, body: SlipBody | None, neighbours: Iterable[Array]
+) -> Stand | None:
+    """Return what an object stands on while the fingers close; None = nothing, by the config.
+
+    Args:
+        config: of the slip test.
+        T_table_obj: (4, 4) where it stands [m].
+        body: its parts; None = it is not tried.
+        neighbours: vertices (V, 3) of the neighbours' convex parts, table frame [m].
+    """
+    friction = config.closing.table_friction
+    if body is None or friction is None:
+        return None
+    parts = [se3.transform(T_table_obj, part) for part in body.parts]
+    return Stand.around(parts, list(neighbours), friction, config.motion.gravity)
+
+
+def trial_of(
+    task: ObjectTask, prepared: Prepared, rows: Rows, stand: Stand | None = None
+) -> SlipTrial:
+    """Return some rows of the candidates, ready for the slip test.
+
+    Args:
+        task: the object.
+        prepared: its candidates.
+        rows: some of them.
+        stand: what it stands on while the fingers close; None = it is free.
+    """
     assert prepared.body is not None, "rows are tested only of objects with a body"
     lifted = prepared.joints_lifted[rows]
     arm = grasping_arm(task.config.reach, task.config.hand)
@@ -36,6 +67,7 @@ def trial_of(task: ObjectTask, prepared: Prepared, rows: Rows) -> SlipTrial:
         swing_axes=axes,
         swing_points=points,
         swing_ranges=ranges,
+        stand=stand,
     )
 
 
@@ -44,6 +76,7 @@ def result_of(
     prepared: Prepared,
     tested: list[Tested],
     given_up: list[tuple[Rows, str]],
+    standing: dict[str, Any] | None = None,
 ) -> SchoolResult:
     """Return what the school made of an object.
 
@@ -52,6 +85,7 @@ def result_of(
         prepared: its candidates.
         tested: what the slip test said of its shards, in any order.
         given_up: rows that could not be tested, and why; they have no score.
+        standing: what is noted of the stand on which the fingers closed.
     """
     n = len(prepared.widths_m)
     slip_m, slip_rad = np.full((n, len(STAGES)), np.nan), np.full((n, len(STAGES)), np.nan)
@@ -77,9 +111,10 @@ def result_of(
         slip_rad=slip_rad,
         reachable=prepared.reachable,
         failures=tuple(failures),
-        measures=_measures(prepared, tested)
-        | {"score_paper": score_paper(slip_m, slip_rad, tried)},
-        parameters=_parameters(task, prepared),
+        measures=_measures(
+            prepared.measures | {"score_paper": score_paper(slip_m, slip_rad, tried)}, tested, n
+        ),
+        parameters=_parameters(task, prepared) | {"stand": standing},
     )
     return SchoolResult(
         grasp_set=grasp_set,
@@ -99,14 +134,13 @@ def in_words(rows: Rows) -> str:
     return f"{'grasp' if len(rows) == 1 else 'grasps'} {told}"
 
 
-def _measures(prepared: Prepared, tested: list[Tested]) -> dict[str, Array]:
-    """Return all measures as columns of all candidates; NaN where a shard was not tested."""
-    n = len(prepared.widths_m)
+def _measures(known: dict[str, Array], tested: list[Tested], n: int) -> dict[str, Array]:
+    """Return all measures as columns of n candidates; NaN where a shard was not tested."""
     columns: dict[str, Array] = {}
     for name in MEASURES:  # in the table's order, whichever shard came first
         shards = [shard for shard in tested if name in shard.measures]
-        if name in prepared.measures:
-            columns[name] = prepared.measures[name]
+        if name in known:
+            columns[name] = known[name]
         elif shards:
             shape = (n, len(STAGES)) if MEASURES[name].by_stage else (n,)
             columns[name] = np.full(shape, np.nan)
