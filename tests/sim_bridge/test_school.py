@@ -27,6 +27,9 @@ def test_a_box_gets_good_grasps_and_scores_that_follow_from_the_set(one_set):
     assert np.array_equal(scores, one_set.scores) and np.array_equal(base, one_set.base_scores)
     assert all(bool(f) == (s < 1) for f, s in zip(one_set.failures, one_set.scores, strict=True))
     assert np.all(one_set.scores[~one_set.reachable] == 0)
+    stand = one_set.parameters["stand"]
+    assert stand["table_height_m"] == pytest.approx(0.0, abs=1e-9)
+    assert stand["neighbour_parts"] == 0 and "lost or a finger" in one_set.parameters["score_rule"]
 
 
 def test_the_same_scene_elsewhere_in_the_world_gives_the_same_grasps(one_set):
@@ -93,6 +96,8 @@ def test_rejected_objects_are_obstacles_but_not_grasped():
     sets = run_school(objects, {1: model()}, CONFIG, workers=1)
     assert [s.instance for s in sets] == [0]
     assert sets[0].parameters["counts"]["hand_in_neighbour"] > 0
+    stand = sets[0].parameters["stand"]
+    assert stand["neighbour_parts"] == 1 and stand["neighbours_as_hulls"] == [1]
 
 
 def test_objects_that_cannot_be_tried_say_why():
