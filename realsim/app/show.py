@@ -7,6 +7,7 @@ import numpy as np
 
 from realsim.app.console import Console
 from realsim.app.stages import session_models
+from realsim.formats.grasps.scene_grasps import labelled
 from realsim.records import GraspSet, ObjectModel, Scene
 from realsim.store import SessionStore
 
@@ -29,9 +30,19 @@ def show_grasps(store: SessionStore, sets: Sequence[GraspSet], console: Console)
     """Print the outcome of the Robot School per object."""
     models = session_models(store)
     console.table("Robot School", GRASP_HEADER, grasp_rows(sets, models))
+    if line := p_hold_line(sets):
+        console.say(line)
     for s in sets:
         if len(s) == 0:
             console.warn(f"{models[s.obj_id].name}: {why_no_grasp(s)}")
+
+
+def p_hold_line(sets: Sequence[GraspSet]) -> str:
+    """Return in one line how p_hold is distributed; empty where no set has one."""
+    from realsim_sim_bridge.school.measure_statistics import p_hold_spread
+
+    spread = p_hold_spread(sets)
+    return "" if spread is None else spread.in_words
 
 
 def why_no_grasp(grasps: GraspSet) -> str:
@@ -46,7 +57,18 @@ def why_no_grasp(grasps: GraspSet) -> str:
     )
 
 
-GRASP_HEADER = ["object", "tried", "reachable", "lifted", "all four", "good", "mean score"]
+def _spread(s: GraspSet) -> str:
+    """Return below which p_hold a tenth, half and nine tenths of the reached grasps are."""
+    known = s.labels[labelled(s)]
+    if s.label != "p_hold" or len(known) == 0:
+        return "-"
+    return ", ".join(f"{v:.2f}" for v in np.percentile(known, (10, 50, 90)))
+
+
+GRASP_HEADER = [
+    "object", "tried", "reachable", "lifted", "all four", "good", "mean score",
+    "p_hold: tenth, median, ninth tenth",
+]  # fmt: skip
 
 
 def grasp_rows(sets: Sequence[GraspSet], models: Mapping[int, ObjectModel]) -> list[list[str]]:
@@ -64,6 +86,7 @@ def grasp_rows(sets: Sequence[GraspSet], models: Mapping[int, ObjectModel]) -> l
                 str(int(np.sum(s.base_scores[tried] >= 1.0))),
                 str(int(s.good.sum())),
                 mean,
+                _spread(s),
             ]
         )
     return rows

@@ -77,6 +77,17 @@ def whole_numbers(*axis: Any) -> None:
         a.set_major_locator(MaxNLocator(integer=True, nbins=8))
 
 
+def share_bars(ax: Any, counts: NDArray[np.int64], title: str, x: str, y: str) -> None:
+    """Draw how many values lie in each of equal bins from 0 to 1, those below 0.5 red."""
+    width = 1 / len(counts)
+    left = width * np.arange(len(counts))
+    colors = [GOOD if edge >= 0.5 - 1e-9 else BAD for edge in left]
+    ax.bar(left, counts, 0.94 * width, align="edge", color=colors)
+    ax.set_xlim(-0.02, 1.02)
+    whole_numbers(ax.yaxis)
+    titled(ax, title, x, y)
+
+
 def bars(
     names: Sequence[str], values: Sequence[float], colors: str | Sequence[str], title: str, x: str
 ) -> tuple[Any, Any]:

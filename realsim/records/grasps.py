@@ -104,6 +104,8 @@ MEASURES = {
     ),
 }
 """The columns that a grasp set may carry besides its score. NaN = not measured."""
+LABEL_MEASURES = ("p_hold", "p_hold_error", "p_hold_draws", "safety")
+"""What frames and episodes say of a grasp beside its score."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

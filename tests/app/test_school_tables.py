@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 
 from realsim.app.school.tables import (
+    SCHOOL_HEADER,
     doubts,
     level_tables,
     reasons,
-    school_rows,
+    school_table,
     survivors,
 )
+from realsim.app.show import p_hold_line
 from realsim.geometry.parts import part
 from tried_grasps import tried_set
 
@@ -19,7 +21,11 @@ def test_rows_add_up_and_levels_only_rise() -> None:
     rng = np.random.default_rng(5)
     sets = [tried_set(rng, 40, obj_id=2, instance=k) for k in range(3)]
     models = {2: part("cube")}
-    rows = school_rows(sets, models)
+    header, rows = school_table(sets, models)
+    assert header == SCHOOL_HEADER
+    plain = [replace(s, measures={}) for s in sets]
+    assert school_table(plain, models)[0] == SCHOOL_HEADER[:9] and not p_hold_line(plain)
+    assert p_hold_line(sets).startswith("p_hold of ")
     for column in range(1, 8):
         assert int(rows[-1][column]) == sum(int(r[column]) for r in rows[:-1])
     assert [r[0] for r in rows] == ["0 cube", "1 cube", "2 cube", "all"]

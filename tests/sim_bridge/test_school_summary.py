@@ -9,12 +9,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import spearmanr
+from scipy.stats import entropy, spearmanr
 
 from realsim.errors import InputError
 from realsim.geometry import se3
 from realsim.records import GraspSet
-from realsim_sim_bridge.school.measure_statistics import LEAST_GRASPS, spearman
+from realsim_sim_bridge.school.measure_statistics import (
+    LEAST_GRASPS,
+    p_hold_entropy_bits,
+    p_hold_spread,
+    spearman,
+)
 from realsim_sim_bridge.school.summary import OUTCOMES, outcomes_of, summarise
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 
@@ -193,6 +198,30 @@ def test_only_tried_grasps_are_compared_with_force_closure():
     assert "dexnet_closure: closed: good, bad" in names
     assert "closure_friction: closed at some level up to 0.4: good, bad" in names
     assert found == summarise([s])  # the same draws
+
+
+def test_the_entropy_of_p_hold_is_that_of_ten_equal_bins():
+    rng = np.random.default_rng(0)
+    s = scored_set(rng, 400)
+    assert p_hold_spread([s]) is None and np.isnan(p_hold_entropy_bits([s]))
+
+    def told(p):
+        return replace(s, measures={"p_hold": np.asarray(p, dtype=np.float64)})
+
+    assert p_hold_entropy_bits([told(np.full(400, 0.83))]) == 0.0
+    assert p_hold_entropy_bits([told(np.arange(400) % 2)]) == pytest.approx(1.0)  # two bars
+    even = told((np.arange(400) % 10) / 10 + 0.05)
+    assert p_hold_entropy_bits([even, s]) == pytest.approx(np.log2(10))  # sets without one: none
+    some = np.where(np.arange(400) < 100, np.nan, rng.random(400))
+    spread = p_hold_spread([told(some)])
+    assert spread.grasps == sum(spread.tenths) == 300
+    assert spread.mean == pytest.approx(np.nanmean(some))
+    counts = np.histogram(some[100:], 10, (0, 1))[0]
+    assert spread.tenths == tuple(counts)
+    assert spread.entropy_bits == pytest.approx(entropy(counts, base=2))
+    rows = {name: here for name, here, _ in summarise([told(some)]).to_rows()}
+    assert rows["p_hold: grasps, of few draws"] == "300, 0"
+    assert rows["p_hold: grasps by tenths from 0"] == " ".join(map(str, counts))
 
 
 def test_objects_of_one_number_and_other_meshes_are_different_objects():

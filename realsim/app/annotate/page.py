@@ -55,8 +55,9 @@ MOST_NOTES = 40
 """So many notes are on the page; all are in the annotations."""
 LEGEND = (
     "Outlines and names: green accepted, amber doubtful, red rejected, grey unchecked. Axes: x "
-    "red, y green, z blue. Grippers: score 0 red, 0.5 yellow, 1 green. Magenta hatching: something "
-    "that is not in the scene stands in front, and the object's mask ends there."
+    "red, y green, z blue. Grippers: p_hold (else score) 0 red, 0.5 yellow, 1 green, dashed where "
+    "p_hold is of few draws. Magenta hatching: something that is not in the scene stands in front, "
+    "and the object's mask ends there."
 )
 MAP_TITLES = {
     "instance": "instances", "depth": "exact depth", "coordinates": "object coordinates",

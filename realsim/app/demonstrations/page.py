@@ -82,7 +82,9 @@ def _add_attempt(
 ) -> None:
     """Add one attempt: its pictures and its videos."""
     outcome = "passed all stages" if note["success"] else note["failure"]
-    said = [f"{outcome}; score {note['score']:.2f}; {row['length']} steps.", *note["notes"]]
+    chance = f"; p_hold {note['p_hold']:.2f}" if note.get("p_hold") is not None else ""
+    words = f"{outcome}; score {note['score']:.2f}{chance}; {row['length']} steps."
+    said = [words, *note["notes"]]
     title = f"Episode {row['episode_index']}: {row['tasks'][0]} (grasp {note['grasp']})"
     page.section(title, " ".join(said))
     times = np.linspace(0, row["length"] - 1, COLUMNS).round().astype(int).tolist()

@@ -51,7 +51,7 @@ FORMATS = (
 @click.option("--ignore-distortion", is_flag=True, help="Raw images where no lens can be told.")
 @click.option("--table-is-world", is_flag=True, help="Where no table is known: it is z = 0.")
 @click.option("--least-score", default=0.0, show_default=True, type=click.FloatRange(0, 1),
-              help="Leave out worse grasps (isaac).")  # fmt: skip
+              help="Leave out grasps of less p_hold, else score (isaac).")  # fmt: skip
 @click.option("--name", default="", help="Of the data set, on its card.")
 @click.option("--licence", default="", help="Of images and labels, on the card.")
 @click.option("--models-licence", default="", help="Of the object models, on the card.")

@@ -137,6 +137,8 @@ CATALOGUE: dict[str, Meaning] = {
     ),
     "school.good_share": _is("", "higher", "share of the tried grasps with a score of 0.5 or more"),
     "school.mean_score": _is("", "higher", "mean score of the tried grasps"),
+    "school.mean_p_hold": _is("", "higher", "mean p_hold of the grasps that the arm reaches"),
+    "school.p_hold_entropy_bits": _is("bit", "none", "entropy of p_hold over ten equal bins"),
     "school.slip_mm": _is(
         "mm",
         "lower",

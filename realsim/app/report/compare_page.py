@@ -273,6 +273,7 @@ BY_VIEW = (
 """Series with a value a view."""
 SHARES = (
     ("school.scores", "Scores of the grasps", "score", "share of the grasps [%]"),
+    ("school.p_hold", "p_hold of the grasps", "p_hold", "share of the grasps [%]"),
     ("labels.visibility", "Visible share of the objects", "visible share",
      "share of objects in frames [%]"),
 )  # fmt: skip

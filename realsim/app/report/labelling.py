@@ -48,8 +48,8 @@ def labels_section(section: Section, store: SessionStore) -> None:
                     "be elsewhere, or that something hides it.")  # fmt: skip
     section.page.text(
         "A label is what the camera sees of an object that stands where registration put it. Red "
-        "and green grippers in the photographs: score 0 to 1. Magenta: hidden by something that is "
-        "not in the scene."
+        "to green grippers in the photographs: p_hold (else score) 0 to 1. Magenta: hidden by "
+        "something that is not in the scene."
     )
     _object_table(section, frames)
     shares = np.array([o["visib_fract"] for _, o in rows if o["px_count_all"] > 0], np.float64)

@@ -18,10 +18,11 @@ from realsim.pages.plots import (
     bars,
     legend,
     png,
+    share_bars,
     titled,
     whole_numbers,
 )
-from realsim.records import STAGES, HandEye
+from realsim.records import STAGES, GraspSet, HandEye
 
 Array = NDArray[np.float64]
 OUTLIER = 2.5
@@ -208,18 +209,13 @@ def stages(tried: int, reachable: int, base_scores: Array) -> bytes:
     return png(figure)
 
 
-def scores(values: Array, good_from: float = 0.5) -> bytes:
-    """Plot how the scores are distributed."""
+def labels(sets: Sequence[GraspSet]) -> bytes:
+    """Plot how the p_hold of grasps is distributed, of sets without one the score."""
+    from realsim_sim_bridge.school.measure_statistics import label_chart
+
     figure, ax = axes()
-    edges = np.linspace(0, 1, 21)
-    counts, _ = np.histogram(values, edges)
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    ax.bar(middle, counts, 0.045, color=[GOOD if m >= good_from else BAD for m in middle])
-    ax.axvline(good_from, color=INK, lw=1, ls="--")
-    ax.text(good_from + 0.01, 0.97, "good from here", fontsize=8, color=INK, va="top",
-            transform=ax.get_xaxis_transform())  # fmt: skip
-    whole_numbers(ax.yaxis)
-    titled(ax, f"Scores of {len(values)} grasps", "score", "grasps")
+    counts, title, name = label_chart(sets)
+    share_bars(ax, counts, title, name, "grasps")
     return png(figure)
 
 

@@ -8,14 +8,19 @@ from realsim.app.report import plots as drawing
 from realsim.app.report.figures import Figure, count, share
 from realsim.app.report.section import Section, drawn
 from realsim.app.show import GRASP_HEADER, grasp_rows, why_no_grasp
+from realsim.formats.grasps.scene_grasps import labelled
 from realsim.records import GraspSet
 from realsim.store import SessionStore
 
 SLIPS_NOTE = (
-    "Score: 0.25 for each stage passed, less 1/12 for each stage in which the object slipped by "
-    "more than the bound. Shares: of the tried grasps, ± 1 sigma of the binomial."
+    "p_hold: probability that a robot lifts the object and holds it; the label to use where there "
+    "is one. Score, one nominal attempt: 0.25 for each stage passed, less 1/12 for each stage in "
+    "which the object slipped by more than the bound. Shares: of the tried grasps, ± 1 sigma of "
+    "the binomial."
 )
-MEASURED = ("school.mean_score", "school.slip_mm")
+MEASURED = (
+    "school.mean_score", "school.mean_p_hold", "school.p_hold_entropy_bits", "school.slip_mm"
+)  # fmt: skip
 SHEET, SETTLED = "reports/school.html", "reports/settle.png"
 
 
@@ -61,6 +66,8 @@ def _kept(sets: list[GraspSet]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _figures(section: Section, sets: list[GraspSet]) -> None:
+    from realsim_sim_bridge.school.measure_statistics import p_hold_spread
+
     scores = np.concatenate([s.scores for s in sets])
     base = np.concatenate([s.base_scores for s in sets])
     reach = np.concatenate([s.reachable for s in sets])
@@ -93,6 +100,13 @@ def _figures(section: Section, sets: list[GraspSet]) -> None:
             )
         )  # fmt: skip
     section.series["school.scores"] = [round(float(v), 4) for v in scores]
+    if (p := p_hold_spread(sets)) is not None:
+        told = np.concatenate([s.labels[labelled(s)] for s in sets if s.label == "p_hold"])
+        section.add(
+            Figure(name="school.mean_p_hold", value=p.mean, sigma=_mean_error(told)),
+            Figure(name="school.p_hold_entropy_bits", value=p.entropy_bits),
+        )
+        section.series["school.p_hold"] = [round(float(v), 4) for v in told]
 
 
 def _mean_error(values: np.ndarray) -> float | None:
@@ -101,17 +115,16 @@ def _mean_error(values: np.ndarray) -> float | None:
 
 
 def _plots(section: Section, sets: list[GraspSet]) -> None:
-    scores = np.concatenate([s.scores for s in sets])
     base = np.concatenate([s.base_scores for s in sets])
     reach = np.concatenate([s.reachable for s in sets])
-    tried = np.isfinite(scores)
+    tried = np.isfinite(base)
     if not tried.any():
         return
     failed = Counter(f.partition(":")[0] for s in sets for f in s.failures if f)
     picture = drawing.stages(int(tried.sum()), int(reach[tried].sum()), base[tried])
     plots = [
         (picture, "A grasp is tried even where the arm does not reach it."),
-        (drawing.scores(scores[tried]), "Red: score below 0.5."),
+        (drawing.labels(sets), "Red: below 0.5. Without those that the arm does not reach."),
     ]
     mm, deg = _kept(sets)
     if len(mm):

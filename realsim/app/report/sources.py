@@ -102,7 +102,7 @@ ALWAYS = ("report.bad", "report.warnings")
 """Figures of every report, whatever has been run."""
 SERIES_BY_VIEW = ("calibration.view_rms_px", "registration.view_sigma_px")
 """Series with a value a view."""
-SERIES_OF_SHARES = ("school.scores", "labels.visibility")
+SERIES_OF_SHARES = ("school.scores", "school.p_hold", "labels.visibility")
 """Series of values between 0 and 1."""
 
 

@@ -230,7 +230,7 @@ def settle_command(
 @click.option("--to", "target", required=True, type=click.Choice(FORMATS), help="Format.")
 @click.option("--out", type=OutputFolder(), required=True, help="Folder to write into.")
 @click.option("--least-score", default=0.0, show_default=True, type=click.FloatRange(0, 1),
-              help="Leave out worse grasps (isaac).")  # fmt: skip
+              help="Leave out grasps of less p_hold, else score (isaac).")  # fmt: skip
 @JSON
 @QUIET
 def export_command(

@@ -12,6 +12,7 @@ from realsim.app.school.files import MODELS, stored_grasps
 from realsim.app.school.tables import (
     SUMMARY_HEADER,
     agreement_line,
+    p_hold_line,
     setting_lines,
 )
 from realsim.errors import InputError
@@ -148,7 +149,7 @@ def summarise(sources: Sequence[Path], json_file: Path | None, console: Console)
         console.warn(
             "these scenes were tried at different settings; their scores are no one thing:"
         )
-    for line in (*settings, agreement_line(sets)):
+    for line in (*settings, agreement_line(sets), p_hold_line(sets)):
         if line:
             console.say(line)
     if json_file is not None:

@@ -7,7 +7,6 @@ from realsim.app.school.tables import (
     FILTER_HEADER,
     LEVELS,
     REASON_HEADER,
-    SCHOOL_HEADER,
     SUMMARY_HEADER,
     Names,
     agreement_line,
@@ -16,8 +15,9 @@ from realsim.app.school.tables import (
     level_tables,
     named,
     not_tried,
+    p_hold_line,
     reason_rows,
-    school_rows,
+    school_table,
     setting_lines,
     survivors,
 )
@@ -29,7 +29,7 @@ SHEET, MARGINS = "school_sheet.png", "school_margins.png"
 
 
 def sheet_png(sets: Sequence[GraspSet], models: Names, scene: Scene) -> bytes:
-    """Return all objects as they stand, with their grasps by score; b'' without any.
+    """Return all objects as they stand, with their grasps by p_hold or score; b'' without any.
 
     Of a scene of more objects than a sheet takes, the first are shown.
     """
@@ -86,8 +86,9 @@ def margins_png(sets: Sequence[GraspSet], models: Names) -> bytes:
 
 
 MEANING = (
-    "A label says what a simulated hand does at one force, one friction and one mass, not what a "
-    "real hand will do. Of grasps that all pass, the margin tells which would with less of either."
+    "The score is one nominal attempt: what a simulated hand does at one force, one friction and "
+    "one mass. How likely a real hand holds is p_hold, the label to use where there is one. Of "
+    "grasps that all pass, the margin tells which would with less force or friction."
 )
 CAPTIONS: dict[str, tuple[str, str]] = {
     SHEET: (
@@ -124,8 +125,13 @@ def page_bytes(
         about=f"{sum(len(s) for s in sets)} grasps on {len(sets)} objects",
     )
     page.section("Objects", " ".join([*setting_lines(sets), MEANING]))
-    page.table(SCHOOL_HEADER, school_rows(sets, models))
-    for words in (agreement_line(sets), *not_tried(sets, models), *doubts(sets, models)):
+    page.table(*school_table(sets, models))
+    for words in (
+        agreement_line(sets),
+        p_hold_line(sets),
+        *not_tried(sets, models),
+        *doubts(sets, models),
+    ):
         if words:
             page.text(words, "note")
     for file, (title, caption) in CAPTIONS.items():

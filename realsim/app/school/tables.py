@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from realsim.app.console import Console
 from realsim.app.register.files import plain
+from realsim.app.show import p_hold_line
 from realsim.records import STAGES, GraspSet, ObjectModel
 
 Rows = list[list[str]]
@@ -18,8 +20,10 @@ Names = Mapping[int, ObjectModel]
 
 SCHOOL_HEADER = [
     "object", "candidates", "reachable", "closed", "lifted", "shaken", "swung", "good", "score",
-    "margin", "agree [%]",
+    "p_hold", "margin", "agree [%]",
 ]  # fmt: skip
+MEASURED = 3
+"""So many of its last columns are left out where nothing has been measured."""
 FILTER_HEADER = [
     "object", "turned", "in the table", "in the object", "in a neighbour", "free", "kept",
 ]  # fmt: skip
@@ -35,16 +39,21 @@ def named(grasps: GraspSet, models: Names) -> str:
     return f"{grasps.instance} {model.name if model else f'object {grasps.obj_id}'}"
 
 
-def school_rows(sets: Sequence[GraspSet], models: Names) -> Rows:
-    """Return one row an object, and all of them together; a dash is what was not measured."""
+def school_table(sets: Sequence[GraspSet], models: Names) -> tuple[list[str], Rows]:
+    """Return header and rows: one an object, and all of them together; a dash is not measured."""
     rows = [[named(s, models), *_figures([s])] for s in sets]
     if len(sets) > 1:
         rows.append(["all", *_figures(sets)])
-    return rows
+    first = len(SCHOOL_HEADER) - MEASURED
+    kept = [k for k in range(len(SCHOOL_HEADER)) if k < first or any(r[k] != "-" for r in rows)]
+    return [SCHOOL_HEADER[k] for k in kept], [[row[k] for k in kept] for row in rows]
 
 
 def _figures(sets: Sequence[GraspSet]) -> list[str]:
     """Return the figures of a row of the school's table."""
+    from realsim_sim_bridge.school.measure_statistics import p_hold_spread
+
+    spread = p_hold_spread(sets)
     base = _joined(sets, lambda s: s.base_scores)
     passed = [int(np.sum(base >= (k + 1) / len(STAGES))) for k in range(len(STAGES))]
     scores = _joined(sets, lambda s: s.scores)
@@ -56,6 +65,7 @@ def _figures(sets: Sequence[GraspSet]) -> list[str]:
         *map(str, passed),
         str(sum(int(s.good.sum()) for s in sets)),
         _mean(scores),
+        "-" if spread is None else f"{spread.mean:.2f}",
         _mean(margins),
         f"{100 * same / held:.0f}" if held else "-",
     ]
@@ -237,13 +247,13 @@ SUMMARY_HEADER = ["property", "here", "in the paper"]
 
 def show_school(sets: Sequence[GraspSet], models: Names, console: Console) -> None:
     """Print the outcome of a run."""
-    console.table("Robot School", SCHOOL_HEADER, school_rows(sets, models))
+    console.table("Robot School", *school_table(sets, models))
     for words in (*not_tried(sets, models), *doubts(sets, models)):
         console.warn(words)
     stopped = reason_rows(sets)
     if stopped:
         console.table("Why grasps stopped", REASON_HEADER, stopped)
-    for line in (*setting_lines(sets), agreement_line(sets)):
+    for line in (*setting_lines(sets), agreement_line(sets), p_hold_line(sets)):
         if line:
             console.say(line)
 
@@ -252,7 +262,9 @@ def as_json(sets: Sequence[GraspSet], models: Names) -> dict[str, Any]:
     """Return what a program wants to know, as plain JSON values."""
     from realsim.store.results import grasp_counts
     from realsim_sim_bridge.school.cross_check import agreement_of
+    from realsim_sim_bridge.school.measure_statistics import p_hold_spread
 
+    spread = p_hold_spread(sets)
     objects: list[dict[str, Any]] = []
     for s in sets:
         margins = s.measures.get("margin", np.zeros(0))
@@ -278,6 +290,7 @@ def as_json(sets: Sequence[GraspSet], models: Names) -> dict[str, Any]:
             "objects": objects,
             "reasons": reasons(sets),
             "agreement": agree if found.count else None,
+            "p_hold": None if spread is None else asdict(spread),
             "settings": setting_lines(sets),
         }
     )

@@ -5,7 +5,7 @@ from collections import Counter
 import numpy as np
 
 from realsim.app.stats.statistics import VERDICTS, Statistics
-from realsim.formats.grasps.scene_grasps import executed
+from realsim.formats.grasps.scene_grasps import labelled
 from realsim.pages.plots import (
     BAD,
     GOOD,
@@ -16,9 +16,11 @@ from realsim.pages.plots import (
     columns,
     legend,
     png,
+    share_bars,
     titled,
     whole_numbers,
 )
+from realsim_sim_bridge.school.measure_statistics import label_chart
 from realsim_sim_bridge.school.summary import GOOD as GOOD_OUTCOMES
 from realsim_sim_bridge.school.summary import OUTCOME_NAMES, PAPER_CANDIDATES, PAPER_OUTCOMES
 
@@ -28,7 +30,7 @@ LEAST_BINS = 5
 WIDE = 0.3
 """Room beside the first and the last bar [bars]."""
 VIOLIN_LEAST = 3
-"""Fewer scores make no distribution: they are drawn as points."""
+"""Fewer values make no distribution: they are drawn as points."""
 
 
 def figures(stats: Statistics) -> list[tuple[str, bytes]]:
@@ -36,7 +38,7 @@ def figures(stats: Statistics) -> list[tuple[str, bytes]]:
     drawn: list[tuple[str, bytes]] = []
     if stats.school.judged:
         drawn.append(("What became of the candidates, beside the paper's", _outcomes(stats)))
-        drawn.append(("Score, and force closure against it", _scores(stats)))
+        drawn.append(("p_hold or score, and force closure against it", _labels(stats)))
     if len(stats.visibility) or stats.objects:
         drawn.append(("How visible and how certain the objects are", _trust(stats)))
     if stats.objects:
@@ -65,24 +67,19 @@ def _outcomes(stats: Statistics) -> bytes:
     return png(figure)
 
 
-def _scores(stats: Statistics) -> bytes:
+def _labels(stats: Statistics) -> bytes:
     figure, (left, right) = columns(2)
     sets = [s for session in stats.sessions for s in session.sets]
-    scores = np.concatenate([np.zeros(0), *(s.scores for s in sets)])
-    scores = scores[np.isfinite(scores)]
-    edges = np.linspace(0.0, 1.0, BINS + 1)
-    counts, _ = np.histogram(scores, edges)
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    left.bar(middle, counts, 0.9 / BINS, color=[GOOD if m >= 0.5 else BAD for m in middle])
-    titled(left, "Scores", "score", "grasps")
+    counts, title, name = label_chart(sets)
+    share_bars(left, counts, title, name, "grasps")
     groups: dict[float, list[float]] = {}
     for s in sets:
         friction = s.measures.get("closure_friction")
         if friction is None:
             continue
-        for mu, score in zip(friction[executed(s)], s.scores[executed(s)], strict=True):
-            if not (np.isnan(mu) or np.isnan(score)):
-                groups.setdefault(float(mu), []).append(float(score))
+        known = labelled(s) & ~np.isnan(friction)
+        for mu, label in zip(friction[known].tolist(), s.labels[known].tolist(), strict=True):
+            groups.setdefault(mu, []).append(label)
     levels = sorted(groups)
     for k, mu in enumerate(levels):
         values = groups[mu]
@@ -93,8 +90,8 @@ def _scores(stats: Statistics) -> bytes:
         right.text(k, 1.04, f"{len(values)}", ha="center", fontsize=7, color=MUTED)
     right.set_xticks(range(len(levels)), ["none" if np.isinf(v) else f"{v:g}" for v in levels])
     right.set_ylim(-0.02, 1.12)
-    titled(right, "Score by the friction from which it closes (dot: mean, above: grasps)",
-            "least friction that closes", "score")  # fmt: skip
+    titled(right, f"{name} by the friction that closes (dot: mean, above: grasps)",
+            "least friction that closes", name)  # fmt: skip
     if not levels:
         right.text(0.5, 0.5, "force closure was not computed", ha="center", color=MUTED, fontsize=9)
     return png(figure)

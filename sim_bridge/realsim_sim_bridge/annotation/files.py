@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from realsim.errors import InputError
 from realsim.formats.bop import labels as bop_labels
-from realsim.records.grasps import joined_measure
+from realsim.records.grasps import LABEL_MEASURES, joined_measure
 from realsim.rendering.labels import Labels
 from realsim.store import SessionStore
 from realsim.untrusted.own_json import to_json
@@ -32,7 +32,6 @@ from realsim_sim_bridge.annotation.frame_labels import FrameLabel
 from realsim_sim_bridge.annotation.frame_maps import map_path
 from realsim_sim_bridge.annotation.inputs import (
     FORMAT_VERSION,
-    LABEL_MEASURES,
     FrameInputs,
     FrameView,
 )

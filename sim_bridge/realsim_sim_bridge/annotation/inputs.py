@@ -20,6 +20,7 @@ from realsim.records import (
     View,
     names_of,
 )
+from realsim.records.grasps import LABEL_MEASURES
 from realsim.rendering.rays import BACKGROUND, PlacedMesh
 from realsim.store import SessionStore
 from realsim.store.session_store import depth_path, rgb_path
@@ -28,8 +29,6 @@ from realsim_sim_bridge.annotation.config import AnnotationConfig
 
 FORMAT_VERSION = 3
 """Part of every digest: a new version annotates anew."""
-LABEL_MEASURES = ("p_hold", "p_hold_error", "p_hold_draws", "safety")
-"""What every frame says of its grasps beside the score."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

@@ -172,6 +172,7 @@ def _notes(demonstration: Demonstration) -> dict[str, Any]:
         "success": outcome.success,
         "stages_passed": outcome.stages_passed,
         "score": outcome.score,
+        **outcome.labels,
         "failure": outcome.failure,
         "replay_agrees": outcome.agrees,
         "notes": list(demonstration.notes),

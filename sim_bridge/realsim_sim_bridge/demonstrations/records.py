@@ -1,7 +1,8 @@
 """What a demonstration consists of: a goal, an outcome, and steps that are seen and acted in."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,13 +66,15 @@ class AttemptOutcome:
     stages_passed: int
     """0 to 4: close, lift, oscillate, pendulum."""
     score: float
-    """The school's."""
+    """The school's, of this one nominal attempt."""
     failure: str
     """Where and why it stopped; '' = it passed all."""
     agrees: bool
     """Whether the replay ended in the stored stage with the stored score."""
     disagreement: str
     """How the replay differs from what is stored, in words; '' = in nothing that is seen."""
+    labels: dict[str, Any] = field(default_factory=dict[str, Any])
+    """p_hold, its error and draws, safety by stage, as plain JSON values; empty = not measured."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)

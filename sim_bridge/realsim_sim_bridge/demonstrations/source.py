@@ -22,7 +22,9 @@ from realsim.geometry import se3
 from realsim.geometry.mesh import hull_vertices
 from realsim.models.library_records import KnownSolid
 from realsim.records import Mesh, ObjectModel
+from realsim.records.grasps import LABEL_MEASURES
 from realsim.records.trajectories import PHASES
+from realsim.untrusted.own_json import to_json
 from realsim_sim_bridge.arm.grasping_arm import GraspingArm
 from realsim_sim_bridge.arm.reach_config import base_on_table, grasping_arm
 from realsim_sim_bridge.demonstrations.attempt_motion import Attempt, AttemptMotion, attempt_motion
@@ -370,6 +372,9 @@ class DemonstrationSource(Sequence[Demonstration]):
                 failure=s.failures[name.grasp],
                 agrees=replay.agrees,
                 disagreement=replay.disagreement,
+                labels={
+                    n: to_json(s.measures[n][name.grasp]) for n in LABEL_MEASURES if n in s.measures
+                },
             ),
             motion=motion,
             scenery=self.scenery,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from realsim.formats.grasps.scene_grasps import executed, labelled
 from realsim.records import GraspSet
+from realsim.records.grasps import label_words
 
 Array = NDArray[np.float64]
 QUALITIES = ("score", "p_hold", "margin", "ferrari_canny", "closure_friction")
@@ -79,6 +80,40 @@ class ClosureConfusion:
         return 0.5 * (self.closed_good / good + self.open_bad / bad)
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
+class PHoldSpread:
+    """How the p_hold of the grasps that have one is distributed."""
+
+    grasps: int
+    mean: float
+    tenths: tuple[int, ...]
+    """Grasps in each of ten equal bins."""
+    unsure: int
+    """Grasps of few draws, or of a large error."""
+    entropy_bits: float
+
+    @property
+    def in_words(self) -> str:
+        """Return it in one line."""
+        few = f"; {self.unsure} of few draws" if self.unsure else ""
+        return (
+            f"p_hold of {self.grasps} grasps by tenths: {' '.join(map(str, self.tenths))}; mean "
+            f"{self.mean:.2f}, entropy {self.entropy_bits:.2f} of {math.log2(LABEL_BINS):.2f} bits"
+            f"{few}."
+        )
+
+
+def mean_label(sets: Sequence[GraspSet]) -> str:
+    """Return the mean p_hold with its name; where no set has one, the mean score of all judged.
+
+    The mean score counts those that the arm does not reach as 0, p_hold is of those it reaches.
+    """
+    spread = p_hold_spread(sets)
+    if spread is not None:
+        return f"p_hold {spread.mean:.2f}"
+    return f"score {np.nanmean(_quality(sets, 'score', tried=False)):.2f}"
+
+
 def rank_correlations(
     sets: Sequence[GraspSet], rng: np.random.Generator
 ) -> tuple[RankCorrelation, ...]:
@@ -133,6 +168,15 @@ def label_histogram(sets: Sequence[GraspSet]) -> NDArray[np.int64]:
     return np.histogram(values, LABEL_BINS, (0.0, 1.0))[0].astype(np.int64)
 
 
+def label_chart(sets: Sequence[GraspSet]) -> tuple[NDArray[np.int64], str, str]:
+    """Return what a chart of `label_histogram` shows: the counts, its title, and their label."""
+    counts, name, bits = label_histogram(sets), label_words(sets), p_hold_entropy_bits(sets)
+    entropy = (
+        "" if math.isnan(bits) else f", entropy {bits:.2f} of {math.log2(LABEL_BINS):.2f} bits"
+    )
+    return counts, f"{name} of {counts.sum():,} tried grasps{entropy}", name
+
+
 def p_hold_entropy_bits(sets: Sequence[GraspSet]) -> float:
     """Return how much a p_hold tells apart [bits]: 0 = all in one of ten bins, 3.32 = evenly.
 
@@ -141,6 +185,19 @@ def p_hold_entropy_bits(sets: Sequence[GraspSet]) -> float:
     counts = label_histogram([s for s in sets if s.label == "p_hold"])
     shares = counts[counts > 0] / max(1, counts.sum())
     return float(-np.sum(shares * np.log2(shares))) + 0.0 if len(shares) else math.nan
+
+
+def p_hold_spread(sets: Sequence[GraspSet]) -> "PHoldSpread | None":
+    """Return how the p_hold of sets is distributed; None where no set has one."""
+    told = [s for s in sets if s.label == "p_hold"]
+    if not told:
+        return None
+    counts = label_histogram(told)
+    known = np.concatenate([s.labels[labelled(s)] for s in told])
+    return PHoldSpread(
+        grasps=len(known), mean=float(known.mean()), tenths=tuple(counts.tolist()),
+        unsure=sum(int(s.unsure.sum()) for s in told), entropy_bits=p_hold_entropy_bits(told),
+    )  # fmt: skip
 
 
 def spearman(x: Array, y: Array, rng: np.random.Generator) -> tuple[float, float, float]:
@@ -180,11 +237,17 @@ def _mean_ranks(levels: NDArray[np.intp]) -> Array:
     return (np.cumsum(counts) - 0.5 * (counts - 1))[levels]
 
 
-def _quality(sets: Sequence[GraspSet], name: str) -> Array:
-    """Return a quality of all grasps, one after the other; NaN = not tried or not measured."""
+def _quality(sets: Sequence[GraspSet], name: str, *, tried: bool = True) -> Array:
+    """Return a quality of all grasps, one after the other; NaN = not tried or not measured.
+
+    Args:
+        sets: the grasps.
+        name: of the quality.
+        tried: whether those that physics has not tried are NaN, whatever they have.
+    """
     parts: list[Array] = [np.zeros(0)]
     for s in sets:
         nothing = np.full(len(s), np.nan)
         value = s.scores if name == "score" else s.measures.get(name, nothing)
-        parts.append(np.where(executed(s), value, np.nan))
+        parts.append(np.where(executed(s), value, np.nan) if tried else value)
     return np.concatenate(parts)

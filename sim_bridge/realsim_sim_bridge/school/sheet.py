@@ -18,11 +18,7 @@ from realsim.models.model_picture_views import INK, MUTED, PAPER
 from realsim.records import GraspSet, ObjectModel
 from realsim.records.grasps import label_words
 from realsim.rendering.overlay import score_hex, score_rgb
-from realsim_sim_bridge.school.measure_statistics import (
-    LABEL_BINS,
-    label_histogram,
-    p_hold_entropy_bits,
-)
+from realsim_sim_bridge.school.measure_statistics import LABEL_BINS, label_chart, mean_label
 from realsim_sim_bridge.school.sheet_object import (
     STOPS,
     Box,
@@ -134,8 +130,7 @@ def _title(figure: Any, sets: Sequence[GraspSet], title: str) -> None:
     plural = "" if len(sets) == 1 else "s"
     said = f"{len(sets)} object{plural}, {len(scores):,} candidates"
     if len(known):
-        mean = np.nanmean(_joined([s.labels for s in sets]))
-        said += f", {100 * np.mean(known >= 0.5):.1f} % good, mean {label_words(sets)} {mean:.2f}"
+        said += f", {100 * np.mean(known >= 0.5):.1f} % good, mean {mean_label(sets)}"
     text_at(figure, WIDTH_PX - MARGIN_PX, 34, said, 13, MUTED, align="right")
 
 
@@ -210,7 +205,7 @@ def _label_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
 
     Those have a score, which is 0, but no label of their own.
     """
-    counts = label_histogram(sets)
+    counts, title, name = label_chart(sets)
     nowhere = sum(int(np.sum(~labelled(s) & (s.scores == 0))) for s in sets)
     width = 1 / LABEL_BINS
     left = width * np.arange(LABEL_BINS)
@@ -221,10 +216,7 @@ def _label_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:
     ax.set_xlim(-0.02, 1.02)
     ax.set_xticks([0, 0.25, 0.5, 0.75, 1])
     ax.yaxis.get_major_locator().set_params(integer=True)
-    bits = p_hold_entropy_bits(sets)
-    said = "" if np.isnan(bits) else f", entropy {bits:.2f} of {np.log2(LABEL_BINS):.2f} bits"
-    label = label_words(sets)
-    _named(ax, f"Distribution of {label}{said}", label, "grasps")
+    _named(ax, title, name, "grasps")
 
 
 def _margin_histogram(ax: Any, sets: Sequence[GraspSet]) -> None:

@@ -22,6 +22,7 @@ from realsim.models.model_picture_views import (
 )
 from realsim.records import STAGES, GraspSet, Mesh
 from realsim.rendering.overlay import dashed, evenly_ranked, score_hex
+from realsim_sim_bridge.school.measure_statistics import mean_label
 
 Array = NDArray[np.float64]
 Box = tuple[float, float, float, float]
@@ -154,8 +155,7 @@ def _figures(s: GraspSet) -> str:
     arrived = int(np.sum(stops_of(s) > 1))
     return (
         f"n = {len(s)} · reachable {100 * arrived / len(scores):.0f} % · "
-        f"good {100 * np.mean(scores >= 0.5):.0f} % · {s.label} "
-        f"{np.mean(s.labels[~np.isnan(s.labels)]):.2f}"
+        f"good {100 * np.mean(scores >= 0.5):.0f} % · {mean_label([s])}"
     )
 
 

@@ -26,8 +26,10 @@ from realsim.formats.grasps.scene_grasps import check_values, executed
 from realsim.records import STAGES, GraspSet
 from realsim_sim_bridge.school.measure_statistics import (
     ClosureConfusion,
+    PHoldSpread,
     RankCorrelation,
     closure_confusions,
+    p_hold_spread,
     rank_correlations,
 )
 from realsim_sim_bridge.slip.score import judged, score_paper
@@ -117,7 +119,14 @@ def rows_of(summary: "SchoolSummary") -> list[tuple[str, str, str]]:
 
 def _measured_rows(summary: "SchoolSummary") -> list[tuple[str, str, str]]:
     """Return what was measured beside the score; the paper has none of it."""
-    rows = [
+    rows: list[tuple[str, str, str]] = []
+    if (p := summary.p_hold) is not None:
+        rows += [
+            ("p_hold: grasps, of few draws", f"{p.grasps:,}, {p.unsure:,}", NOTHING),
+            ("p_hold: mean, entropy [bits]", f"{p.mean:.2f}, {p.entropy_bits:.2f}", NOTHING),
+            ("p_hold: grasps by tenths from 0", " ".join(map(str, p.tenths)), NOTHING),
+        ]
+    rows += [
         (
             f"rank correlation {c.first}, {c.second}",
             f"{NOTHING} (n = {c.grasps:,})"
@@ -214,6 +223,8 @@ class SchoolSummary:
     """Where grasps of several hands are summed up: each hand on the objects that all have tried."""
     correlations: tuple[RankCorrelation, ...] = ()
     closures: tuple[ClosureConfusion, ...] = ()
+    p_hold: PHoldSpread | None = None
+    """None = no set has one."""
     by_paper: "SchoolSummary | None" = None
     """The same by `score_paper` in place of the nominal score; None = this is it."""
 
@@ -285,6 +296,7 @@ def summarise(
         nominal,
         correlations=rank_correlations(sets, rng or np.random.default_rng(0)),
         closures=closure_confusions(sets),
+        p_hold=p_hold_spread(sets),
         by_paper=_counted_up({name: [_by_paper(s) for s in of] for name, of in by_scene.items()}),
     )
 
