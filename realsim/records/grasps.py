@@ -59,6 +59,9 @@ MEASURES = {
         meaning="share of the swept frictions and forces at which it is passed",
         is_share=True,
     ),
+    "stiffness_share": Measure(
+        unit="1", meaning="share of the swept stiffnesses of the pads at which it is passed"
+    ),
     "ferrari_canny": Measure(
         unit="1", meaning="radius of the largest ball in the hull of the contact wrenches"
     ),

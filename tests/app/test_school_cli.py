@@ -38,7 +38,12 @@ def test_a_run_needs_no_name_and_writes_everything(tried: tuple[Path, Result]) -
                  "reports/school.json", "reports/school_sheet.png"):  # fmt: skip
         assert store.has(name), name
     assert store.verify() == []
-    for words in ("cube", "wedge", "70 N a finger, friction 1, engine mujoco", "school.html"):
+    for words in (
+        "cube",
+        "wedge",
+        "70 N a finger, friction 1, pads of 200 kN/m, engine mujoco",
+        "school.html",
+    ):
         assert words in result.output
 
 

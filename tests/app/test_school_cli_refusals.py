@@ -18,7 +18,14 @@ from school_sessions import NAMES, QUICK, T_WORLD_TABLE, refused, run, scene
 
 
 def test_physics_that_cannot_be_is_refused(pristine: Path) -> None:
-    for option, value in (("--force", "0"), ("--friction", "nan"), ("--density", "-1")):
+    for option, value in (
+        ("--force", "0"),
+        ("--friction", "nan"),
+        ("--density", "-1"),
+        ("--stiffness", "0"),
+        ("--stiffness", "inf"),
+        ("--stiffness", "2e6"),
+    ):
         assert option in refused(pristine, *QUICK, option, value)
     assert not (pristine / "grasps").exists()
 

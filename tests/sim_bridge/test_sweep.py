@@ -82,7 +82,7 @@ def test_a_grasp_that_passes_below_a_level_at_which_it_fails_is_an_exception():
 
 def test_levels_that_do_not_descend_are_refused():
     for levels in ((), (0.5, 0.5), (1.0, 0.0), (np.nan,)):
-        for name in ("frictions", "forces_n"):
+        for name in ("frictions", "forces_n", "stiffness_factors"):
             with pytest.raises(InputError, match=name):
                 SweepConfig(**{name: levels})
 
@@ -109,7 +109,20 @@ def test_the_least_friction_and_force_are_coulomb_s(engine, mass):
     assert found.friction.least == pytest.approx([peak * 1.05 / (2 * force_n)])
     assert found.force.least == pytest.approx([peak * 1.05 / (2 * friction)])
     assert found.measures()["margin"] == pytest.approx([0.5])
+    # A face that covers the pads is held by the same friction, however soft they are.
+    assert found.stiffness.levels == pytest.approx([8e5, 4e5, 2e5, 1e5])
+    assert found.measures()["stiffness_share"] == pytest.approx([1.0])
     assert not found.friction.exceptions.any() and not found.force.exceptions.any()
+
+
+def test_pads_that_cannot_be_and_forces_that_press_them_through_are_left_out():
+    pytest.importorskip("mujoco")
+    own = SlipPhysics(force_n=20.0).with_pads(3e4)
+    sweep = SweepConfig(frictions=(1.0,), forces_n=(70.0, 20.0), stiffness_factors=(50.0, 1.0, 0.3))
+    found = measured(held_from_above(held_box(0.2)), sweep, own, "mujoco")
+    assert found.stiffness.levels.tolist() == [3e4] and found.force.levels.tolist() == [20.0]
+    bare = measured(held_from_above(held_box(0.2)), sweep, SlipPhysics(pads=None), "mujoco")
+    assert bare.stiffness.scores.shape == (1, 1) and not np.isnan(bare.stiffness.scores).any()
 
 
 def test_off_centre_grasps_and_heavy_objects_need_more():

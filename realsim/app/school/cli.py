@@ -79,11 +79,15 @@ def SCHOOL() -> None:
 @click.option("--engine", default="pybullet", show_default=True, type=click.Choice(ENGINES),
               help="Which physics.")  # fmt: skip
 @click.option("--cross-check", is_flag=True, help="The other engine tries them, too.")
-@click.option("--sweep", is_flag=True, help="Least friction and force that each survives.")
+@click.option(
+    "--sweep", is_flag=True, help="Least friction and force, and stiffness, that each survives."
+)
 @click.option(
     "--force", "force_n", type=float, default=None, help="Of each finger [N].  [the hand's]"
 )
 @click.option("--friction", type=float, default=None, help="Coulomb coefficient.  [the hand's]")
+@click.option("--stiffness", "stiffness_n_per_m", type=float, default=None,
+              help="Of one pad [N/m].  [the hand's]")  # fmt: skip
 @click.option("--density", type=float, default=None,
               help="Of objects that are not weighed [kg/m^3].  [the models' own]")  # fmt: skip
 @click.option(

@@ -14,6 +14,7 @@ from realsim.app.console import Console
 from realsim.errors import InputError
 from realsim.models.library_records import KnownSolid
 from realsim.records import ObjectModel, Scene, names_of
+from realsim.robots.hand_file import STIFFEST_N_PER_M
 from realsim.store import SessionStore
 from realsim.store.opening import require_header
 
@@ -43,6 +44,8 @@ class SchoolRequest:
     force_n: float | None = None
     """Of each finger [N]."""
     friction: float | None = None
+    stiffness_n_per_m: float | None = None
+    """Normal stiffness of one pad [N/m]."""
     density: float | None = None
     """Of all objects that are not weighed [kg/m^3]."""
     masses: tuple[str, ...] = ()
@@ -73,6 +76,11 @@ class SchoolRequest:
         """
         _require_positive("--force", self.force_n, "N; 70 is the Franka Hand's", most=1000.0)
         _require_positive("--friction", self.friction, "; dry rubber on wood has 1", most=10.0)
+        _require_positive(
+            "--stiffness", self.stiffness_n_per_m,
+            "N/m of a whole pad; the Franka Hand's is taken as 200000",
+            least=1e3, most=STIFFEST_N_PER_M,
+        )  # fmt: skip
         _require_positive(
             "--density", self.density, "kg/m^3; plastics have 1000", most=25000.0, least=1.0
         )

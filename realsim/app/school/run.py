@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from realsim.app.console import Console
 from realsim.app.school.files import SchoolOutcome, write_outcome
@@ -47,12 +47,17 @@ def config_of(request: SchoolRequest, scene: Scene) -> "SchoolConfig":
     arm.found()  # as with the engine below: what is not there is said at once
     config = replace(config, reach=replace(config.reach, arm=arm))
     config = replace(config, seed=request.seed, max_candidates=request.grasps)
+    changed: dict[str, Any] = {}
     physics = config.slip.physics
     if request.force_n is not None:
         _require_force(hand, request.force_n)
-        physics = replace(physics, force_n=request.force_n)
+        changed["force_n"] = request.force_n
     if request.friction is not None:
-        physics = replace(physics, friction=request.friction)
+        changed["friction"] = request.friction
+    if request.stiffness_n_per_m is not None and physics.pads:
+        stiff = request.stiffness_n_per_m
+        changed["pads"] = replace(physics.pads, pad_stiffness_n_per_m=stiff)
+    physics = replace(physics, **changed)  # at once: a force may need these very pads
     engine = settings_of(request.engine)
     make_engine(engine)  # not in a worker, minutes later: what is not installed is said at once
     config = replace(config, slip=replace(config.slip, physics=physics, engine=engine))

@@ -186,12 +186,31 @@ def setting_lines(sets: Sequence[GraspSet]) -> list[str]:
         if physics:
             at = (
                 f"{s.hand[0]}, {physics['force_n']:g} N a finger, friction {physics['friction']:g}"
-                f"{_engine_of(s)}"
+                f"{_pads_of(physics)}{_engine_of(s)}"
             )
             densities.setdefault(at, set()).add(f"{s.parameters.get('density', float('nan')):g}")
     return [
         f"Labels hold at {at}, density {', '.join(sorted(d, key=float))} kg/m^3 where not weighed."
         for at, d in densities.items()
+    ] + _stiffness_lines(sets)
+
+
+def _pads_of(physics: Mapping[str, Any]) -> str:
+    """Return the pads' stiffness in words; empty where the set does not say it."""
+    stiffness = (physics.get("pads") or {}).get("pad_stiffness_n_per_m")
+    return "" if stiffness is None else f", pads of {1e-3 * stiffness:g} kN/m"
+
+
+def _stiffness_lines(sets: Sequence[GraspSet]) -> list[str]:
+    """Return in a line how many good grasps a sweep found to hang on the pads' stiffness."""
+    share = _joined(sets, lambda s: s.measures.get("stiffness_share", np.full(len(s), np.nan)))
+    passing = share[(_joined(sets, lambda s: s.scores) >= 1.0) & ~np.isnan(share)]
+    if len(passing) == 0:
+        return []
+    always = int(np.sum(passing >= 1.0))
+    return [
+        f"Of {len(passing)} grasps that pass all stages {always} pass with pads of every stiffness "
+        "that the sweep tried."
     ]
 
 

@@ -74,8 +74,9 @@ class Tested:
     """(n,) or (n, 4) each."""
 
 
-SWEPT = 8
-"""Slip tests that a sweep adds to each grasp, about: four levels each of friction and force."""
+SWEPT = 11
+"""Slip tests that a sweep adds to each grasp, about: four levels each of friction and force, and
+three of the pads' stiffness."""
 
 
 def default_shard_grasps(config: SchoolConfig) -> int:

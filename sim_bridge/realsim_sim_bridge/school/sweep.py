@@ -1,4 +1,4 @@
-"""The margin of a grasp: how little friction and how little force it survives.
+"""The margin of a grasp: how little friction and force it survives, and pads of what stiffness.
 
 A converged Coulomb simulation at 70 N and mu 1 holds almost anything that both fingers touch, so
 one setting hardly tells one grasp from another; the weakest setting at which a grasp still passes
@@ -9,6 +9,9 @@ A sweep assumes that passing is monotone: a grasp that passes at a level passes 
 For sticking contacts that is Coulomb's law. It can fail while the fingers close, where a slippery
 object slides into line and a rough one turns. `SweepConfig.search` "every" tries all levels and
 `LevelScores.exceptions` counts the grasps that break the rule.
+
+No such law holds for the pads' stiffness, which nobody knows to better than a factor: all of its
+levels are tried, and what counts is at how many of them a grasp passes.
 """
 
 from collections.abc import Callable
@@ -23,12 +26,12 @@ from realsim.errors import InputError
 from realsim.robots.hand import Hand
 from realsim_sim_bridge.slip.score import ScoreLimits, score_stages
 from realsim_sim_bridge.slip.slip_test import SlipConfig, Slips, SlipTrial, run_slip_test
-from realsim_sim_bridge.slip.world import Engine
+from realsim_sim_bridge.slip.world import STIFFNESS_N_PER_M, Engine, SlipPhysics
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
-Knob = Literal["friction", "force_n"]
+Levels = tuple[float, ...]
 RunLevel = Callable[[float, Rows], Array]
 """Returns the scores of some rows at a level."""
 
@@ -42,6 +45,10 @@ class SweepConfig:
     by. Antipodal contacts tilted by 45 deg need 1, flat ones on 250 g at 70 N need 0.02."""
     forces_n: tuple[float, ...] = (70.0, 50.0, 35.0, 25.0, 17.0, 12.0, 8.5, 6.0, 4.0, 2.0, 1.0)
     """Force of each finger [N], descending: from the Franka Hand's continuous force down."""
+    stiffness_factors: tuple[float, ...] = (4.0, 2.0, 1.0, 0.5)
+    """Stiffness of the pads in units of the slip test's own, descending: about what hardness and
+    thickness of silicone pads leave open (docs/decisions/0046-pad-stiffness.md). What no engine
+    can press, or would be pressed through at the test's force, is left out."""
     search: Literal["descent", "bisect", "every"] = "bisect"
     """descent: level after level, with the grasps that still pass; bisect: 4 of 11 levels a grasp,
     the same answer where passing is monotone; every: all levels for all grasps. Of 240 grasps on
@@ -54,7 +61,8 @@ class SweepConfig:
         Raises:
             InputError: they do not.
         """
-        for name, levels in (("frictions", self.frictions), ("forces_n", self.forces_n)):
+        for name in ("frictions", "forces_n", "stiffness_factors"):
+            levels: tuple[float, ...] = getattr(self, name)
             falling = all(a > b for a, b in pairwise(levels))
             if not levels or not falling or not all(np.isfinite(v) and v > 0 for v in levels):
                 raise InputError(
@@ -94,16 +102,18 @@ class LevelScores:
 
 @dataclass(frozen=True, eq=False, kw_only=True, slots=True)
 class Sweep:
-    """What both sweeps found."""
+    """What the sweeps found."""
 
     config: SweepConfig
     friction: LevelScores
     """At the slip test's force."""
     force: LevelScores
     """At the slip test's friction."""
+    stiffness: LevelScores
+    """At the slip test's friction and force [N/m]; of bare fingers that one setting alone."""
 
     def measures(self) -> dict[str, Array]:
-        """Return least_friction, least_force_n and margin, each (N,).
+        """Return least_friction, least_force_n, margin and stiffness_share, each (N,).
 
         The margin is the mean of the two shares of levels survived: 1 = survives the least friction
         and the least force tried, 0 = none.
@@ -114,6 +124,7 @@ class Sweep:
             "least_friction": self.friction.least,
             "least_force_n": self.force.least,
             "margin": (by_friction + by_force) / 2.0,
+            "stiffness_share": self.stiffness.passed.mean(axis=1),
         }
 
 
@@ -126,7 +137,7 @@ def sweep_margins(
     engine: Engine,
     sweep: SweepConfig | None = None,
 ) -> dict[str, Array]:
-    """Return least_friction, least_force_n and margin (N,) of the grasps of a trial.
+    """Return the measures (N,) of a sweep over the grasps of a trial.
 
     Args:
         trial: N grasps of an object.
@@ -152,19 +163,32 @@ def run_sweep(
     """Return the scores at every level that was tried; arguments as for `sweep_margins`."""
     sweep = sweep or SweepConfig()
     known = scores_of(slips, limits)
+    physics, pads = config.physics, config.physics.pads
 
-    def along(knob: Knob, levels: tuple[float, ...]) -> LevelScores:
+    def along(
+        of: Callable[[float], SlipPhysics], own: float, levels: Levels, search: str
+    ) -> LevelScores:
         def run(level: float, rows: Rows) -> Array:
-            physics = replace(config.physics, **{knob: level})
-            at = replace(config, physics=physics)
+            at = replace(config, physics=of(level))
             return scores_of(run_slip_test(trial.part(rows), at, limits, geometry, engine), limits)
 
-        return find_levels(run, known, float(getattr(config.physics, knob)), levels, sweep.search)
+        return find_levels(run, known, own, levels, search)
 
+    most = np.inf if pads is None else pads.greatest_n
+    forces = tuple(n for n in sweep.forces_n if n <= most)
+    own, stiffnesses = 0.0, (0.0,)
+    if pads is not None:
+        own = pads.pad_stiffness_n_per_m
+        least = max(STIFFNESS_N_PER_M[0], physics.force_n / pads.protrusion_m)
+        tried = (own * factor for factor in sweep.stiffness_factors)
+        stiffnesses = tuple(k for k in tried if least <= k <= STIFFNESS_N_PER_M[1])
     return Sweep(
         config=sweep,
-        friction=along("friction", sweep.frictions),
-        force=along("force_n", sweep.forces_n),
+        friction=along(
+            lambda v: replace(physics, friction=v), physics.friction, sweep.frictions, sweep.search
+        ),
+        force=along(lambda v: replace(physics, force_n=v), physics.force_n, forces, sweep.search),
+        stiffness=along(physics.with_pads, own, stiffnesses, "every"),
     )
 
 

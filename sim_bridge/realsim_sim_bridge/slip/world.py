@@ -12,7 +12,7 @@ in world axes. Wrenches are true ones: where an engine simulates a greater mass 
 
 from abc import ABC, abstractmethod
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -182,6 +182,15 @@ class SlipPhysics:
                 f"{self.force_n / pads.protrusion_m:.4g} N/m or more is accepted, with these pads "
                 f"{pads.greatest_n:.4g} N or less."
             )
+
+    def with_pads(self, stiffness_n_per_m: float) -> "SlipPhysics":
+        """Return the same with pads of another stiffness [N/m]; bare fingers have none to change.
+
+        Raises:
+            InputError: the stiffness cannot be, or not with this force.
+        """
+        pads = self.pads and replace(self.pads, pad_stiffness_n_per_m=stiffness_n_per_m)
+        return replace(self, pads=pads)
 
     @property
     def contact_n(self) -> float:
