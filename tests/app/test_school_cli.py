@@ -113,7 +113,14 @@ def test_margins_and_a_second_engine_come_with_the_same_grasps(
     for s, before in zip(load_grasps(folder), alone, strict=True):
         assert np.array_equal(s.scores, before.scores, equal_nan=True)
         tested, held = ~np.isnan(s.slip_m[:, 0]), s.base_scores >= 1.0
-        for name in ("margin", "least_friction", "least_force_n", "second_score", "confidence"):
+        for name in (
+            "margin",
+            "least_friction",
+            "least_force_n",
+            "stiffness_share",
+            "second_score",
+            "confidence",
+        ):
             assert np.array_equal(~np.isnan(s.measures[name]), tested)
         assert np.all(s.measures["least_friction"][held] <= 1.0)
         assert np.all(s.measures["margin"][held] > 0.0)
